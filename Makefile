@@ -1,0 +1,40 @@
+# The commands of the README. Each makes .venv and installs what it needs, once.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test test-all lint clean
+
+help:  ## what there is to make
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
+
+$(INSTALLED): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || \
+	  { echo "make: Blender's bpy needs Python 3.11; found $$($(PYTHON) --version). Say which: make PYTHON=/path/to/python3.11" >&2; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --upgrade pip
+	$(BIN)/pip install --quiet --editable '.[render,report,dev]' --constraint constraints.txt
+	@touch $@
+
+install: $(INSTALLED)  ## .venv with everything in it
+
+demo: $(INSTALLED)  ## render, train the probabilistic model, draw its calibration, print its row of the table
+	$(BIN)/python -m phd_exp preset=demo
+	$(BIN)/python -m phd_exp report
+
+lint: $(INSTALLED)  ## ruff, mypy and the import floors
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+test: lint  ## lint and the default tests (under 5 minutes on 2 cores)
+	$(BIN)/python -m pytest
+
+test-all: lint  ## the slow tests too
+	$(BIN)/python -m pytest -m 'slow or not slow'
+
+clean:  ## forget .venv and caches; renders/ and runs/ stay
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

@@ -1,0 +1,40 @@
+"""`python -m phd_exp [verb] [group=choice ...] [key=value ...]`; imports nothing heavy before it knows what to do."""
+
+import sys
+from importlib import import_module
+
+VERBS = {
+    "train": "render what is missing, train, measure and record a run (the default)",
+    "render": "render a data set, or what is missing of it",
+    "report": "print the table of all recorded runs beside the paper's numbers",
+}
+HELP = {"-h", "--help", "help"}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Find the verb among the arguments and hand the rest to it; returns the exit status."""
+    rest = list(sys.argv[1:] if arguments is None else arguments)
+    verb = _take_verb(rest)
+    if HELP & set(rest):
+        from phd_exp.cli.help import show
+
+        return show(verb)
+    if verb is not None and verb not in VERBS:
+        print(f"error: no verb {verb!r}; expected one of {', '.join(VERBS)}, or key=value", file=sys.stderr)
+        return 2
+    module = import_module(f"phd_exp.cli.{verb or 'train'}")
+    status: int = module.main(rest)
+    return status
+
+
+def _take_verb(words: list[str]) -> str | None:
+    """Remove the verb from the words and return it; it comes first, or right after -m."""
+    place = 1 if words[:1] in (["-m"], ["--multirun"]) else 0
+    word = words[place] if place < len(words) else ""
+    if not word or word in HELP or "=" in word or word.startswith(("-", "~", "+")):
+        return None
+    return words.pop(place)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

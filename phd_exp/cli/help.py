@@ -1,0 +1,79 @@
+"""What `--help` prints: read from the files under conf/, so that it cannot fall behind them."""
+
+from pathlib import Path
+
+from phd_exp.__main__ import VERBS
+from phd_exp.cli.paths import conf_folder
+
+EXAMPLES = {
+    "train": [
+        "python -m phd_exp model=mae_logz data=scale",
+        "python -m phd_exp preset=small data=occl seed=1",
+        "python -m phd_exp data.n_train=256 data.n_test=64 trainer.max_epochs=1",
+        "python -m phd_exp -m preset=small model=probabilistic,mae_vz data=default,occl",
+    ],
+    "render": [
+        "python -m phd_exp render data=scale",
+        "python -m phd_exp render data=occl data.n_train=100 data.n_test=20 data.workers=1",
+    ],
+    "report": ["python -m phd_exp report", "python -m phd_exp report runs=some/other/folder"],
+}
+
+
+def show(verb: str | None) -> int:
+    """Print the help of one verb, or of the programme; returns the exit status."""
+    if verb is not None and verb not in VERBS:
+        print(f"no verb {verb!r}; there are {', '.join(VERBS)}")
+        return 2
+    print(_verb_help(verb) if verb else _programme_help())
+    return 0
+
+
+def _programme_help() -> str:
+    verbs = [f"  {name:<8} {purpose}" for name, purpose in VERBS.items()]
+    examples = [f"  {lines[0]}" for lines in EXAMPLES.values()]
+    return "\n".join(
+        [
+            "usage: python -m phd_exp [verb] [-m] [group=choice ...] [key=value ...]",
+            "",
+            "Probabilistic 3-D position estimation from a single camera, with uncertainty you can trust.",
+            "",
+            "verbs",
+            *verbs,
+            "",
+            "groups (the first choice of a run is named in conf/config.yaml)",
+            *_groups(),
+            "",
+            "-m runs every combination of values given with commas. Every key is explained in the files of",
+            f"{conf_folder()}; `python -m phd_exp --cfg job` prints the whole configuration.",
+            "",
+            "examples",
+            *examples,
+            "",
+            "python -m phd_exp <verb> --help tells more.",
+        ]
+    )
+
+
+def _verb_help(verb: str) -> str:
+    groups = [] if verb == "report" else ["", "groups", *_groups()]
+    return "\n".join(
+        [
+            f"usage: python -m phd_exp {verb} [group=choice ...] [key=value ...]",
+            "",
+            VERBS[verb],
+            *groups,
+            "",
+            "examples",
+            *(f"  {line}" for line in EXAMPLES[verb]),
+        ]
+    )
+
+
+def _groups() -> list[str]:
+    folders = sorted(path for path in conf_folder().iterdir() if path.is_dir())
+    return [f"  {folder.name:<10} {', '.join(_choices(folder))}" for folder in folders if _choices(folder)]
+
+
+def _choices(folder: Path) -> list[str]:
+    return sorted(file.stem for file in folder.glob("*.yaml"))

@@ -1,0 +1,54 @@
+"""`python -m phd_exp [train]`: render what is missing, train, measure and record a run."""
+
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from phd_exp.cli.app import launch
+from phd_exp.cli.render import ensure_dataset
+from phd_exp.records.runs import RunFolder, RunName
+from phd_exp.training.config import RunConfig, check
+
+NAMED = ("preset", "data", "model", "seed")
+WITHOUT_INFLUENCE = ("runs", "logger", "data.root", "data.workers", "trainer.progress_bar")
+"""Overrides that change no number of a run, and so are left out of its name, as NAMED ones have a place in it."""
+
+
+def main(arguments: list[str]) -> int:
+    return launch(task, arguments)
+
+
+def task(config: dict[str, Any], overrides: list[str]) -> None:
+    checked = check(config)
+    from phd_exp.training.run import (
+        train,  # seconds of imports, which a refused configuration need not wait for
+    )
+
+    folder = RunFolder(run_name(checked, overrides).folder(checked.runs))
+    skipped = folder.is_finished()
+    if not skipped:
+        ensure_dataset(checked.data)
+    results = train(checked, folder, draw=_draw())
+    numbers = (f"{key} {value:.4g}" for key, value in results.items() if key.startswith("test/"))
+    print(f"{folder.path}: {'finished already, ' if skipped else ''}{', '.join(numbers)}")
+
+
+def run_name(config: RunConfig, overrides: list[str]) -> RunName:
+    """The choices that name a run; every other override that can change a number goes into its hash."""
+    others = (override.lstrip("+") for override in overrides)
+    telling = [text for text in others if not _is_named(text.split("=")[0])]
+    return RunName(config.preset, config.data.spec.variant, config.model.name, config.seed, tuple(telling))
+
+
+def _is_named(key: str) -> bool:
+    return key in NAMED or any(key == name or key.startswith(f"{name}.") for name in WITHOUT_INFLUENCE)
+
+
+def _draw() -> Callable[[dict[str, Any], Path], None] | None:
+    if find_spec("matplotlib") is None:
+        print("calibration curves are recorded, but not drawn: that needs `pip install 'phd_exp[report]'`")
+        return None
+    from phd_exp.reports.figures import draw_calibration
+
+    return draw_calibration

@@ -1,0 +1,89 @@
+"""Batches of a resident data set, in an order that depends on (seed, epoch) alone."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from phd_exp.geometry.camera import Camera
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Samples, one a row: what a network sees, what it is told, and the truth."""
+
+    image: UInt8[Tensor, "batch height width 3"]
+    xyz: Float[Tensor, "batch 3"]
+    """True position in the camera frame, metres."""
+    f: Float[Tensor, " batch"]
+    """Focal length in pixels of `image`, not of the sensor it was rendered on."""
+    S: float
+    """Side of `image` in pixels."""
+    row: Int[Tensor, " batch"]
+    """Place of each sample in its split."""
+
+    @property
+    def camera(self) -> Camera:
+        return Camera(self.f, self.S)
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    def select(self, rows: Int[Tensor, " rows"]) -> "Batch":
+        return Batch(self.image[rows], self.xyz[rows], self.f[rows], self.S, self.row[rows])
+
+    def to(self, device: torch.device | str, non_blocking: bool = False) -> "Batch":
+        moved = {
+            field.name: value.to(device, non_blocking=non_blocking) if isinstance(value, Tensor) else value
+            for field in fields(self)
+            for value in [getattr(self, field.name)]
+        }
+        return Batch(**moved)
+
+
+class BatchLoader:
+    """Iterates over the batches of one epoch; each iteration is the next epoch.
+
+    The order is a function of (seed, epoch), never of what ran before, and `state_dict` holds both the epoch and
+    the place in it: a resumed epoch goes on with the batches that were left, where a DataLoader would replay its
+    first ones.
+    """
+
+    def __init__(self, samples: Batch, batch_size: int, *, shuffle: bool, drop_last: bool, seed: int) -> None:
+        self.samples = samples
+        self.batch_size = batch_size
+        self.shuffle = shuffle
+        self.drop_last = drop_last
+        self.seed = seed
+        self.epoch = -1
+        self.next_batch = 0
+
+    def __len__(self) -> int:
+        whole, rest = divmod(len(self.samples), self.batch_size)
+        return whole + (rest > 0 and not self.drop_last)
+
+    def __iter__(self) -> Iterator[Batch]:
+        if self.next_batch in (0, len(self)):  # else: resumed in the middle of an epoch
+            self.epoch += 1  # at the start, since an iterator is not always exhausted
+            self.next_batch = 0
+        order = self.order(self.epoch)
+        while self.next_batch < len(self):
+            start = self.next_batch * self.batch_size
+            self.next_batch += 1
+            yield self.samples.select(order[start : start + self.batch_size])
+
+    def order(self, epoch: int) -> Int[Tensor, " samples"]:
+        """The rows in the order in which that epoch visits them."""
+        if not self.shuffle:
+            return torch.arange(len(self.samples))
+        generator = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(epoch,)))
+        return torch.from_numpy(generator.permutation(len(self.samples)))
+
+    def state_dict(self) -> dict[str, int]:
+        return {"epoch": self.epoch, "next_batch": self.next_batch}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        self.epoch, self.next_batch = state["epoch"], state["next_batch"]

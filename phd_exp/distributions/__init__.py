@@ -1,0 +1,6 @@
+"""Predictions over positions in front of a camera: the Projected Huber distribution, and the bare point estimate."""
+
+from phd_exp.distributions.point_estimate import PointEstimate
+from phd_exp.distributions.projected_huber import ProjectedHuber
+
+__all__ = ["PointEstimate", "ProjectedHuber"]

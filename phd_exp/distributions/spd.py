@@ -1,0 +1,83 @@
+"""Symmetric positive definite 2 x 2 matrices: the map from three raw numbers, and elementwise linear algebra.
+
+Nothing here calls matmul, which autocast would round to bfloat16 and TF32 to ten bits.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def positive(s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """The activation phi(s) = s + 1 for s >= 0, e^s for s < 0.
+
+    Source: paper, section "Enforcing constraints on distribution parameters" (its main text swaps the branches).
+    """
+    # with l = min(s, 0) the derivative is 1 - l' + l' = 1 at s = 0 whatever autograd takes l' to be there
+    low = s.clamp_max(0)
+    return s - low + low.exp()
+
+
+def log_positive(s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """log phi(s): finite, with its derivative, where phi(s) underflows."""
+    low = s.clamp_max(0)
+    return torch.log1p(s - low) + low
+
+
+def spectral_map(
+    b: Float[Tensor, "*batch 3"],
+) -> tuple[Float[Tensor, "*batch 2 2"], Float[Tensor, "*batch"]]:
+    """B = phi([[b_1, b_2/sqrt 2], [b_2/sqrt 2, b_3]]), phi acting on the eigenvalues, and log|B|.
+
+    With eigenvalues s = m +- r, B = (phi(s+) + phi(s-))/2 I + (phi(s+) - phi(s-))/(s+ - s-) ([[b_1, ...], ...] - m I).
+    Value and derivative are true at equal eigenvalues and at s = 0, where a network with a zero last layer starts.
+    log|B| is finite for |b| up to 1e4, where B itself underflows.
+
+    Source: paper, section "Enforcing constraints on distribution parameters"; closed form: own derivation, checked
+    by gradcheck in tests/distributions/test_spd.py.
+    """
+    b_1, b_2, b_3 = b.unbind(-1)
+    middle, half, off = (b_1 + b_3) / 2, (b_1 - b_3) / 2, b_2 / math.sqrt(2)
+    squared = half.square() + off.square()
+    equal = squared == 0
+    # everything below is even in r, hence 0 is its true derivative with respect to r at r = 0
+    r = torch.where(equal, 0, torch.where(equal, 1, squared).sqrt())
+    upper, lower = middle + r, middle - r
+    mean, slope = (positive(upper) + positive(lower)) / 2, _divided_difference(upper, lower, equal)
+    diagonal = slope * half
+    B = torch.stack([mean + diagonal, slope * off, slope * off, mean - diagonal], dim=-1)
+    return B.unflatten(-1, (2, 2)), log_positive(upper) + log_positive(lower)
+
+
+def _divided_difference(upper: Tensor, lower: Tensor, equal: Tensor) -> Tensor:
+    """(phi(upper) - phi(lower)) / (upper - lower) for upper >= lower, phi'(upper) where they are equal."""
+    upper_low, lower_low = upper.clamp_max(0), lower.clamp_max(0)
+    # phi(s) = (s - l) + e^l with l = min(s, 0): both parts grow with s, so no difference of them cancels
+    linear = (upper - upper_low) - (lower - lower_low)
+    exponential = upper_low.exp() * -torch.expm1(lower_low - upper_low)
+    gap = torch.where(equal, 1, upper - lower)
+    return torch.where(equal, upper_low.exp(), (linear + exponential) / gap)
+
+
+def matvec(M: Float[Tensor, "*#batch 2 2"], x: Float[Tensor, "*#batch 2"]) -> Float[Tensor, "*#batch 2"]:
+    """The product M x."""
+    return (M * x[..., None, :]).sum(dim=-1)
+
+
+def log_det(M: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch"]:
+    """log|M| of a symmetric positive definite matrix, from its Cholesky pivots."""
+    pivot = M[..., 0, 0]
+    return torch.log(pivot) + torch.log(M[..., 1, 1] - M[..., 0, 1] * M[..., 1, 0] / pivot)
+
+
+def inverse(M: Float[Tensor, "*batch 2 2"], log_det: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2 2"]:
+    """The inverse of a symmetric positive definite matrix whose log determinant is known: adj(M) / |M|."""
+    adjugate = torch.stack([M[..., 1, 1], -M[..., 0, 1], -M[..., 1, 0], M[..., 0, 0]], dim=-1)
+    return adjugate.unflatten(-1, (2, 2)) * torch.exp(-log_det)[..., None, None]
+
+
+def square(M: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2 2"]:
+    """The product M M."""
+    return (M[..., :, :, None] * M[..., None, :, :]).sum(dim=-2)

@@ -1,0 +1,54 @@
+"""Heads: from the raw numbers of a network and the camera it is told to a prediction.
+
+A head says how many raw numbers it wants and what kind of prediction it makes. The loss, the metrics and the
+figures see the prediction alone.
+"""
+
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Float
+from torch import Tensor
+
+from phd_exp.distributions import PointEstimate, ProjectedHuber
+from phd_exp.geometry.camera import Camera
+from phd_exp.geometry.charts import Chart, DepthScale
+
+Prediction = ProjectedHuber | PointEstimate
+
+
+@runtime_checkable
+class Head(Protocol):
+    """What a regressor asks of a head."""
+
+    n_outputs: int
+    prediction: type[Prediction]
+
+    def __call__(self, raw: Float[Tensor, "batch n_outputs"], camera: Camera) -> Prediction: ...
+
+
+class DistributionHead:
+    """Seven raw numbers -> the Projected Huber distribution."""
+
+    n_outputs = 7
+    prediction = ProjectedHuber
+
+    def __init__(self, depth: DepthScale) -> None:
+        self.mu_z0 = depth.mu_z0
+
+    def __call__(self, raw: Float[Tensor, "batch 7"], camera: Camera) -> ProjectedHuber:
+        # the loss calls this for every batch; a NaN is caught once, by the training step
+        return ProjectedHuber.from_raw(raw, f=camera.f, S=camera.S, mu_z0=self.mu_z0, validate_args=False)
+
+
+class ChartHead:
+    """Three raw numbers -> the position with these coordinates in a chart."""
+
+    n_outputs = 3
+    prediction = PointEstimate
+
+    def __init__(self, depth: DepthScale, chart: Callable[[DepthScale], Chart]) -> None:
+        self.chart = chart(depth)
+
+    def __call__(self, raw: Float[Tensor, "batch 3"], camera: Camera) -> PointEstimate:
+        return PointEstimate(raw, self.chart, camera)

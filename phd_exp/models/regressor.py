@@ -1,0 +1,40 @@
+"""The whole network: image and camera in, prediction out."""
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor, nn
+
+from phd_exp.geometry.camera import Camera
+from phd_exp.models.heads import Head, Prediction
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+class Regressor(nn.Module):
+    """backbone -> one linear layer, zero at the start -> head.
+
+    The backbone runs in whatever precision is switched on around it; the linear layer and everything after it
+    in float32, since nu_p = B v_p rounded to bf16 would be wrong by up to 0.2 pixels at the border of the image.
+    """
+
+    def __init__(self, backbone: nn.Module, head: Head) -> None:
+        super().__init__()
+        self.backbone = backbone
+        self.head = head
+        self.last = nn.Linear(backbone.n_features, head.n_outputs)
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)
+        self.register_buffer("mean", 255 * torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
+        self.register_buffer("std", 255 * torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
+
+    def forward(self, image: UInt8[Tensor, "batch height width 3"], camera: Camera) -> Prediction:
+        return self.head(self.raw(image), camera)
+
+    def raw(self, image: UInt8[Tensor, "batch height width 3"]) -> Float[Tensor, "batch n_outputs"]:
+        """The numbers before the head, in the precision of the last layer."""
+        # (batch, 3, height, width) seen through channels_last strides: no copy
+        pixels = (image.permute(0, 3, 1, 2).to(self.mean.dtype) - self.mean) / self.std
+        features = self.backbone(pixels)
+        with torch.autocast(features.device.type, enabled=False):
+            return self.last(features.to(self.last.weight.dtype))

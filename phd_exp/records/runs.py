@@ -1,0 +1,197 @@
+"""The run record: everything a run leaves on disk, readable without the model that made it.
+
+    runs/<preset>/<data>/<model>/seed<k>[-<hash of other overrides>]/
+        config.yaml          what was asked for, resolved
+        status.json          state, error, versions, git commit, hash of the data set
+        metrics.jsonl        one line an epoch
+        results.json         the final numbers
+        predictions.parquet  per test sample: truth, parameters, estimate, errors
+        calibration/         the calibration curves, as data (JSON) and as pictures (PNG)
+        checkpoints/         last.ckpt
+        wandb/               the same for wandb, ready for `wandb sync`
+
+A run is named by its choices, never by a date, so that the same command resumes it or finds it finished.
+"""
+
+import hashlib
+import json
+import time
+import traceback
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from filelock import FileLock, Timeout
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from phd_exp.records import provenance
+from phd_exp.records.errors import RunError
+from phd_exp.records.files import read_jsonl, write_atomic
+
+State = Literal["running", "finished", "failed", "interrupted"]
+
+
+class RunStatus(BaseModel):
+    """How a run stands, and what it ran on."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    state: State
+    started: float
+    ended: float | None = None
+    error: str | None = None
+    traceback: str | None = None
+    versions: dict[str, str]
+    git_commit: str | None
+    data_manifest: str | None
+    machine: str
+
+
+@dataclass(frozen=True)
+class RunName:
+    """The choices that name a run, and the folder they give."""
+
+    preset: str
+    data: str
+    model: str
+    seed: int
+    overrides: tuple[str, ...] = ()
+
+    def folder(self, runs: Path) -> Path:
+        leaf = f"seed{self.seed}"
+        if self.overrides:
+            digest = hashlib.sha256("\n".join(sorted(self.overrides)).encode()).hexdigest()
+            leaf += f"-{digest[:8]}"
+        return runs / self.preset / self.data / self.model / leaf
+
+
+class RunFolder:
+    """One run's folder: typed access to its files, each written beside itself and renamed into place."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.checkpoints = path / "checkpoints"
+        self.calibration = path / "calibration"
+        self.wandb = path / "wandb"
+        self.predictions = path / "predictions.parquet"
+        self.results_file = path / "results.json"
+        self.metrics_file = path / "metrics.jsonl"
+        self.status_file = path / "status.json"
+        self.config_file = path / "config.yaml"
+
+    @property
+    def last_checkpoint(self) -> Path:
+        return self.checkpoints / "last.ckpt"
+
+    def status(self) -> RunStatus | None:
+        """The recorded status; None where there is none. Raises RunError where it cannot be read."""
+        if not self.status_file.exists():
+            return None
+        try:
+            return RunStatus.model_validate_json(self.status_file.read_text())
+        except (ValidationError, UnicodeDecodeError) as error:
+            raise _unreadable(self.status_file, "not a run status", error) from None
+
+    def is_finished(self) -> bool:
+        status = self.status()
+        return status is not None and status.state == "finished"
+
+    def config(self) -> dict[str, Any]:
+        return _read_mapping(self.config_file, yaml.safe_load)
+
+    def results(self) -> dict[str, Any]:
+        return _read_mapping(self.results_file, json.loads)
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """One mapping an epoch, as logged; a last line torn by a kill is left out."""
+        return list(read_jsonl(self.metrics_file)) if self.metrics_file.exists() else []
+
+    def write_config(self, config: Mapping[str, Any]) -> None:
+        write_atomic(self.config_file, yaml.safe_dump(dict(config), sort_keys=False))
+
+    def write_results(self, results: Mapping[str, Any]) -> None:
+        write_atomic(self.results_file, json.dumps(results, indent=2) + "\n")
+
+    def write_status(self, status: RunStatus) -> None:
+        write_atomic(self.status_file, status.model_dump_json(indent=2) + "\n")
+
+    def write_metrics(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        write_atomic(self.metrics_file, "".join(json.dumps(row) + "\n" for row in rows))
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Hold the folder for this process alone. Raises RunError where another process has it."""
+        lock = FileLock(self.path / ".lock", timeout=0)
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            lock.acquire()
+        except Timeout:
+            raise RunError(
+                f"{self.path}: another process is working on this run; wait for it or stop it"
+            ) from None
+        except OSError as error:
+            raise RunError(
+                f"{self.path}: cannot be written ({error.strerror}); choose another folder by runs=DIR"
+            ) from None
+        try:
+            yield
+        finally:
+            lock.release()
+
+    @contextmanager
+    def recording(self, data_manifest: str | None) -> Iterator[None]:
+        """Record how the enclosed work ends: finished, failed with its traceback, or interrupted."""
+        status = _new_status(data_manifest)
+        self.write_status(status)
+        try:
+            yield
+        except Exception as error:
+            line = f"{type(error).__name__}: {error}"
+            self.write_status(_ended(status, "failed", error=line, trace=traceback.format_exc()))
+            raise
+        except BaseException as stop:
+            self.write_status(_ended(status, "interrupted", error=type(stop).__name__))
+            raise
+        self.write_status(_ended(status, "finished"))
+
+
+def find_runs(runs: Path) -> list[RunFolder]:
+    """Every run recorded under a folder, in the order of their paths."""
+    return [RunFolder(file.parent) for file in sorted(runs.glob("*/*/*/seed*/status.json"))]
+
+
+def _read_mapping(file: Path, parse: Any) -> dict[str, Any]:
+    try:
+        content = parse(file.read_text())
+    except FileNotFoundError:
+        raise RunError(f"{file}: missing; the run has not written it yet") from None
+    except (ValueError, yaml.YAMLError) as error:
+        raise _unreadable(file, "cannot be read", error) from None
+    if not isinstance(content, dict):
+        raise RunError(f"{file}: expected a mapping, found {type(content).__name__}")
+    return content
+
+
+def _unreadable(file: Path, complaint: str, error: Exception) -> RunError:
+    reason = " ".join(str(error).split())[:200]
+    return RunError(f"{file}: {complaint} ({reason}); delete the folder to run again")
+
+
+def _new_status(data_manifest: str | None) -> RunStatus:
+    return RunStatus(
+        state="running",
+        started=time.time(),
+        versions=provenance.versions(),
+        git_commit=provenance.git_commit(),
+        data_manifest=data_manifest,
+        machine=provenance.machine(),
+    )
+
+
+def _ended(status: RunStatus, state: State, error: str | None = None, trace: str | None = None) -> RunStatus:
+    return status.model_copy(
+        update={"state": state, "ended": time.time(), "error": error, "traceback": trace}
+    )

@@ -1,0 +1,17 @@
+"""What can go wrong while rendering and is the user's to mend."""
+
+from pathlib import Path
+
+from phd_exp.records.errors import UserError
+
+
+class RenderError(UserError):
+    """Rendering cannot start or go on: one line that says what happened and what to do."""
+
+
+def unwritable(error: OSError, folder: Path) -> RenderError:
+    """A folder without permission, a full disk and their like, said in one line."""
+    return RenderError(
+        f"{error.filename or folder}: cannot be written ({error.strerror or error}); free or allow the space, "
+        "or choose another data.root"
+    )

@@ -1,0 +1,130 @@
+"""The worker process: tasks come on standard input, answers go to standard output, one JSON line each.
+
+`python -m phd_exp.rendering.worker` is a process of its own rather than a `multiprocessing` child: it
+imports neither the caller's main module nor torch, it works the same from a script, a notebook and a test,
+and it ends by itself when its parent is gone, because its input then ends.
+"""
+
+import io
+import os
+import signal
+import sys
+import traceback
+from pathlib import Path
+from typing import TextIO
+
+from PIL import Image
+from pydantic import BaseModel
+
+from phd_exp.records.dataset import DatasetFolder, image_name, sha256
+from phd_exp.records.errors import UserError
+from phd_exp.records.files import write_atomic
+from phd_exp.records.scenes import SampleRecord, Split
+from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.blender import Pixels, Renderer
+from phd_exp.rendering.compose import take_picture
+from phd_exp.rendering.errors import unwritable
+from phd_exp.rendering.sampling import sample_scene
+from phd_exp.rendering.visibility import depth_maps, visibility
+
+# Level 6 of zlib: level 9 saves 2 % of the bytes for twice the time.
+PNG_COMPRESSION = 6
+
+
+class Job(BaseModel):
+    """The first line a worker reads: which data set, and where."""
+
+    root: Path
+    spec: DatasetSpec
+
+
+class Task(BaseModel):
+    """Each further line: one sample to render."""
+
+    split: Split
+    index: int
+
+
+class Answer(BaseModel):
+    """What a worker says to a task: the record of the finished image, or why there is none."""
+
+    record: SampleRecord | None = None
+    error: str | None = None
+
+
+def render_sample(
+    renderer: Renderer, folder: DatasetFolder, spec: DatasetSpec, split: Split, index: int
+) -> SampleRecord:
+    """Render one sample, write its image, and return its record.
+
+    Raises:
+        OSError: the image cannot be written.
+    """
+    scene = sample_scene(spec, split, index)
+    depths = depth_maps(scene)
+    image = encode_png(take_picture(renderer, scene, depths))
+    write_atomic(folder.image_path(split, index), image)
+    cylinder = scene.objects[0]
+    x, y, z = cylinder.position
+    return SampleRecord(
+        file_name=image_name(index),
+        x=x,
+        y=y,
+        z=z,
+        f=scene.f,
+        S=scene.S,
+        scale=cylinder.scale,
+        visibility=visibility(depths),
+        index=index,
+        split=split,
+        seed=spec.seed,
+        objects=scene.objects,
+        lamps=scene.lamps,
+        backdrop=scene.backdrop,
+        noise_seed=scene.noise_seed,
+        sha256=sha256(image),
+    )
+
+
+def encode_png(pixels: Pixels) -> bytes:
+    """The same bytes for the same pixels: Blender's own files carry times and never repeat."""
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, format="PNG", compress_level=PNG_COMPRESSION)
+    return stream.getvalue()
+
+
+def serve(tasks: TextIO, answers: TextIO) -> None:
+    """Answer tasks until they end; the renderer is built for the first, so that its errors are answers."""
+    job = Job.model_validate_json(tasks.readline())
+    folder = DatasetFolder(job.root)
+    renderer: Renderer | None = None
+    for line in tasks:
+        task = Task.model_validate_json(line)
+        try:
+            renderer = renderer or Renderer(job.spec)
+            answer = Answer(record=render_sample(renderer, folder, job.spec, task.split, task.index))
+        except UserError as error:
+            answer = Answer(error=str(error))
+        except OSError as error:
+            answer = Answer(error=str(unwritable(error, job.root)))
+        except Exception as error:
+            traceback.print_exc()
+            answer = Answer(error=f"sample {task.index} of {task.split}: {type(error).__name__}: {error}")
+        answers.write(answer.model_dump_json(exclude_none=True) + "\n")
+
+
+def main() -> None:
+    """Serve the process's own standard streams."""
+    # Ctrl-C reaches the whole group of processes; the parent alone decides what it means.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Blender's C code prints to file descriptor 1: that becomes the log, the answers keep their own channel.
+    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+    try:
+        serve(sys.stdin, answers)
+    except BrokenPipeError:
+        os._exit(1)  # the parent has gone; there is nobody to tell, and closing the channel would fail again
+
+
+if __name__ == "__main__":
+    main()

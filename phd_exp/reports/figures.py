@@ -1,0 +1,43 @@
+"""Pictures drawn from records."""
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure  # not pyplot: no global state, no window, no leak over a long sweep
+
+from phd_exp.records.files import write_atomic
+
+LABELS = {
+    "depth": ("Depth", "m²"),
+    "projected": ("Projected position", "no unit"),
+}
+
+
+def draw_calibration(curves: Mapping[str, Mapping[str, Any]], file: Path) -> None:
+    """Draw calibration curves, empirical against predicted, both axes logarithmic, the identity dashed.
+
+    Source: paper, Figure "correlation between predicted variance and empirical variance".
+    """
+    figure = Figure(figsize=(4.2 * len(curves), 4.2), layout="constrained")
+    for place, (name, curve) in enumerate(curves.items()):
+        _draw_curve(figure.add_subplot(1, len(curves), place + 1), name, curve)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=120)
+    write_atomic(file, buffer.getvalue())
+
+
+def _draw_curve(axes: Axes, name: str, curve: Mapping[str, Any]) -> None:
+    title, unit = LABELS[name]
+    predicted, empirical = curve["predicted"], curve["empirical"]
+    values = [value for value in (*predicted, *empirical) if value > 0]
+    bounds = (0.7 * min(values), 1.4 * max(values))
+    axes.plot(bounds, bounds, "--", color="tab:red", linewidth=1, label="calibrated")
+    axes.plot(predicted, empirical, color="tab:blue", label=f"window of {curve['window']}")
+    axes.set(xscale="log", yscale="log", xlim=bounds, ylim=bounds, aspect="equal", title=title)
+    axes.set_xlabel(f"predicted variance ({unit})")
+    axes.set_ylabel(f"mean squared error ({unit})")
+    axes.grid(which="both", alpha=0.25)
+    axes.legend(loc="upper left", frameon=False)

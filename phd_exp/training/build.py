@@ -1,0 +1,123 @@
+"""The one place that turns a checked configuration into objects."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.utils import instantiate
+from lightning import Trainer
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint, TQDMProgressBar
+from lightning.pytorch.loggers import Logger, WandbLogger
+
+from phd_exp.data.datamodule import RenderedData
+from phd_exp.models.regressor import Regressor
+from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.runs import RunFolder
+from phd_exp.training.callbacks import CalibrationRecorder, Draw, EpochLines, RecordLogger
+from phd_exp.training.config import RunConfig, TrainerConfig
+from phd_exp.training.module import PositionModule
+
+
+def build_data(config: RunConfig) -> RenderedData:
+    """The data set of a run. Its images are opened by `setup`, not here."""
+    data = config.data
+    return RenderedData(
+        DatasetFolder(data.folder),
+        data.spec,
+        n_train=data.n_train,
+        n_test=data.n_test,
+        image_size=data.image_size,
+        batch_size=data.batch_size,
+        seed=config.seed,
+    )
+
+
+def build_module(config: RunConfig, data: RenderedData) -> PositionModule:
+    """The network, its loss and its optimizer, initialised from torch's current random state."""
+    # partial, then called: an object among instantiate's own arguments would be turned into a configuration
+    head = instantiate(config.model.head, _partial_=True)(depth=data.depth)
+    regressor = Regressor(instantiate(config.backbone), head)
+    constant_f = data.constant_f if config.camera.focal_length == "constant" else None
+    optimizer = instantiate(config.optimizer, _partial_=True)
+    return PositionModule(regressor, instantiate(config.loss), optimizer, constant_f)
+
+
+def build_loggers(config: RunConfig, folder: RunFolder) -> list[Logger]:
+    """The run record always, wandb beside it where asked for."""
+    loggers: list[Logger] = [RecordLogger(folder)]
+    if config.logger.kind == "wandb":
+        folder.wandb.mkdir(parents=True, exist_ok=True)
+        loggers.append(
+            WandbLogger(
+                name="/".join(folder.path.parts[-4:]),
+                project=config.logger.project,
+                save_dir=folder.path,
+                offline=config.logger.offline,
+                config=config.model_dump(mode="json"),
+            )
+        )
+    return loggers
+
+
+def build_trainer(
+    config: RunConfig, folder: RunFolder, loggers: list[Logger], calibration: CalibrationRecorder | None
+) -> Trainer:
+    """Lightning's Trainer with what a run records."""
+    callbacks: list[Callback] = [
+        ModelCheckpoint(folder.checkpoints, filename="last", enable_version_counter=False)
+    ]
+    callbacks += _progress(config)
+    if calibration is not None:
+        callbacks.append(calibration)
+    return Trainer(
+        accelerator=config.trainer.accelerator,
+        devices=1,
+        precision=precision(config.trainer),
+        max_epochs=config.trainer.max_epochs,
+        logger=loggers,
+        callbacks=callbacks,
+        enable_progress_bar=False,  # ours stands among the callbacks
+        log_every_n_steps=1,  # metrics are logged once an epoch; this only keeps Lightning from remarking on it
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        use_distributed_sampler=False,
+        default_root_dir=folder.path,
+    )
+
+
+def _progress(config: RunConfig) -> list[Callback]:
+    """A bar on a terminal, lines elsewhere, nothing where nothing is wanted."""
+    if not config.trainer.progress_bar:
+        return []
+    return [TQDMProgressBar() if sys.stderr.isatty() else EpochLines()]
+
+
+def build_calibration(
+    config: RunConfig, folder: RunFolder, module: PositionModule, draw: Draw | None
+) -> CalibrationRecorder | None:
+    """The recorder of calibration curves; None for a baseline, which predicts no uncertainty."""
+    if not module.predicts_distribution:
+        return None
+    evaluation = config.evaluation
+    return CalibrationRecorder(
+        folder, evaluation.calibration_window, evaluation.calibration_every_n_epochs, draw
+    )
+
+
+def precision(config: TrainerConfig) -> Any:
+    """Lightning's name of the arithmetic: bfloat16 autocast where the hardware has units for it.
+
+    Without such units bfloat16 is three times slower than float32 on a CPU (resnet18, 112 px).
+    """
+    if config.precision != "auto":
+        return {"float32": "32-true", "bfloat16": "bf16-mixed"}[config.precision]
+    if config.accelerator != "cpu" and torch.cuda.is_available():
+        return "bf16-mixed" if torch.cuda.is_bf16_supported(including_emulation=False) else "32-true"
+    return "bf16-mixed" if _cpu_has_bfloat16() else "32-true"
+
+
+def _cpu_has_bfloat16() -> bool:
+    flags = Path("/proc/cpuinfo")
+    words = flags.read_text().split() if flags.exists() else []
+    return "amx_bf16" in words or "avx512_bf16" in words

@@ -1,0 +1,146 @@
+"""What a configuration must look like: checked as a whole before anything is built.
+
+The YAML files under conf/ hold the values, this file their types and ranges; neither repeats the other. A group
+whose choices are closed (data, trainer, ...) is a model here. A group that is open to new classes (backbone, head,
+loss, optimizer) names a `_target_`, and its keys are held against that target's own signature.
+"""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from phd_exp.records.errors import ConfigError
+from phd_exp.records.spec import DatasetSpec
+from phd_exp.training.targets import Target, describe, locate
+
+Whole = Annotated[int, Field(strict=True)]
+Name = Annotated[str, Field(strict=True, pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
+Folder = Annotated[Path, Field(strict=False)]
+SMALLEST_IMAGE = 32
+"""A ResNet halves the side five times."""
+
+
+Checked = TypeVar("Checked", bound=BaseModel)
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class DataConfig(Section):
+    """A rendered data set (the keys of `DatasetSpec`) and how much of it a run uses."""
+
+    root: Folder
+    n_train: Annotated[Whole, Field(ge=1)]
+    n_test: Annotated[Whole, Field(ge=1)]
+    image_size: Annotated[Whole, Field(ge=SMALLEST_IMAGE)]
+    batch_size: Annotated[Whole, Field(ge=1)]
+    workers: Annotated[Whole, Field(ge=1)] | None
+    spec: DatasetSpec
+
+    @model_validator(mode="before")
+    @classmethod
+    def gather_spec(cls, values: Any) -> Any:
+        """The user writes the keys of the specification beside the others, without a level of their own."""
+        if not isinstance(values, dict) or "spec" in values:
+            return values
+        spec = {key: value for key, value in values.items() if key in DatasetSpec.model_fields}
+        return {key: value for key, value in values.items() if key not in spec} | {"spec": spec}
+
+    @model_validator(mode="after")
+    def sizes_fit(self) -> "DataConfig":
+        if self.image_size > self.spec.sensor_size:
+            raise ValueError(
+                f"image_size={self.image_size} is larger than sensor_size={self.spec.sensor_size}: "
+                "images are only ever shrunk"
+            )
+        if self.batch_size > self.n_train:
+            raise ValueError(
+                f"batch_size={self.batch_size} is larger than n_train={self.n_train}: not one batch is full"
+            )
+        return self
+
+    @property
+    def folder(self) -> Path:
+        return self.root / self.spec.variant
+
+
+class ModelConfig(Section):
+    name: Name
+    head: Target
+
+
+class CameraConfig(Section):
+    focal_length: Literal["known", "constant"]
+
+
+class TrainerConfig(Section):
+    max_epochs: Annotated[Whole, Field(ge=1)]
+    accelerator: Literal["auto", "cpu", "gpu"]
+    precision: Literal["auto", "float32", "bfloat16"]
+    threads: Annotated[Whole, Field(ge=1)] | None
+    progress_bar: Annotated[bool, Field(strict=True)]
+
+
+class LoggerConfig(Section):
+    kind: Literal["none", "wandb"]
+    project: Name
+    offline: Annotated[bool, Field(strict=True)]
+
+
+class EvaluationConfig(Section):
+    calibration_window: Annotated[Whole, Field(ge=1)]
+    calibration_every_n_epochs: Annotated[Whole, Field(ge=1)]
+
+
+class RenderConfig(Section):
+    """The part of a configuration that rendering looks at."""
+
+    data: DataConfig
+
+
+class RunConfig(Section):
+    """The whole configuration of one run."""
+
+    seed: Annotated[Whole, Field(ge=0, lt=2**32)]
+    runs: Folder
+    preset: Name
+    data: DataConfig
+    model: ModelConfig
+    camera: CameraConfig
+    backbone: Target
+    loss: Target
+    optimizer: Target
+    trainer: TrainerConfig
+    logger: LoggerConfig
+    evaluation: EvaluationConfig
+
+    @model_validator(mode="after")
+    def loss_fits_head(self) -> "RunConfig":
+        made = locate(self.model.head["_target_"]).prediction
+        taken = locate(self.loss["_target_"]).prediction
+        if not issubclass(made, taken):
+            raise ValueError(
+                f"loss: takes a {taken.__name__}, but model={self.model.name} predicts a {made.__name__}; "
+                "leave out loss=..., and the model picks its own"
+            )
+        return self
+
+
+def check(config: dict[str, Any]) -> RunConfig:
+    """The configuration with its types; raises ConfigError with one line for each thing that is wrong."""
+    return _validated(RunConfig, config)
+
+
+def check_data(config: dict[str, Any]) -> DataConfig:
+    """The same for the `data` part alone, which is all that rendering looks at."""
+    return _validated(RenderConfig, {"data": config["data"]}).data
+
+
+def _validated(model: type[Checked], config: dict[str, Any]) -> Checked:
+    try:
+        return model.model_validate(config)
+    except ValidationError as error:
+        lines = [describe(problem, model) for problem in error.errors(include_url=False)]
+        raise ConfigError("\n".join(dict.fromkeys(lines))) from None

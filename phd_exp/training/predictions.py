@@ -1,0 +1,107 @@
+"""A prediction spread out into columns: one row a sample, the same for figures, calibration and the record."""
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import torch
+from torch import Tensor
+
+from phd_exp.data.batches import Batch
+from phd_exp.distributions import ProjectedHuber
+from phd_exp.metrics.calibration import CalibrationCurve, calibration_curve
+from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
+from phd_exp.models.heads import Prediction
+from phd_exp.records.files import write_atomic
+from phd_exp.records.scenes import SampleRecord
+
+Columns = dict[str, Tensor]
+"""Name -> one number a sample, float64 on the CPU."""
+
+
+@torch.no_grad()
+def columns(prediction: Prediction, batch: Batch) -> Columns:
+    """Truth, estimate and errors of a batch; for a distribution its parameters and moments too.
+
+    Positions are metres in the camera frame, errors millimetres, variances m^2 (depth) and without unit
+    (projected: of x/z and y/z), `nll` nats of the density per cubic metre.
+    """
+    estimate = prediction.mode
+    table = {"row": batch.row} | _coordinates("", batch.xyz) | _coordinates("mode_", estimate)
+    table["projected_error_mm"] = MILLIMETRES * projected_error(batch.xyz, estimate)
+    table["depth_error_mm"] = MILLIMETRES * depth_error(batch.xyz, estimate)
+    if isinstance(prediction, ProjectedHuber):
+        table |= _distribution_columns(prediction, batch.xyz)
+    return {name: column.double().cpu() for name, column in table.items()}
+
+
+def _distribution_columns(prediction: ProjectedHuber, xyz: Tensor) -> Columns:
+    projected_variance = prediction.projected_covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
+    off_centre = xyz[:, :2] / xyz[:, 2:] - prediction.mu_xy
+    return {
+        **_coordinates("mean_", prediction.mean),
+        "median_z": prediction.depth_median,
+        "mu_x": prediction.mu_xy[:, 0],
+        "mu_y": prediction.mu_xy[:, 1],
+        "mu_z": prediction.mu_z,
+        "A_xx": prediction.A[:, 0, 0],
+        "A_xy": prediction.A[:, 0, 1],
+        "A_yy": prediction.A[:, 1, 1],
+        "a": prediction.a,
+        "depth_variance": prediction.depth_variance,
+        "depth_squared_error": (xyz[:, 2] - prediction.depth_mean).square(),
+        "projected_variance": projected_variance,
+        "projected_squared_error": off_centre.square().sum(-1),
+        "nll": -prediction.log_prob(xyz),
+        "level": prediction.level(xyz),
+    }
+
+
+def joined(parts: Sequence[Columns]) -> Columns:
+    """The rows of several batches, one after the other."""
+    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+
+def calibration_curves(table: Columns, window: int) -> dict[str, CalibrationCurve]:
+    """The paper's two curves: of the depth, and of the projected position."""
+    return {
+        name: calibration_curve(table[f"{name}_variance"], table[f"{name}_squared_error"], window)
+        for name in ("depth", "projected")
+    }
+
+
+def summary(table: Columns) -> dict[str, float]:
+    """The final numbers of a run, by their metric keys: means over the rows."""
+    means = {
+        name: float(table[name].mean())
+        for name in ("projected_error_mm", "depth_error_mm", "nll")
+        if name in table
+    }
+    if "a" in table:
+        determinant = table["A_xx"] * table["A_yy"] - table["A_xy"].square()
+        means |= {
+            "depth_precision": float(table["a"].mean()),
+            "projected_precision": float(determinant.mean()),
+        }
+    return {f"test/{name}": value for name, value in means.items()}
+
+
+def write_parquet(file: Path, table: Columns, records: Sequence[SampleRecord]) -> None:
+    """Write the columns beside what is known of each sample, in the order of the data set."""
+    known: Mapping[str, list[Any]] = {
+        name: [getattr(record, name) for record in records]
+        for name in ("file_name", "f", "S", "scale", "visibility")
+    }
+    order = table["row"].argsort()
+    arrays = {name: pa.array(values) for name, values in known.items()}
+    arrays |= {name: pa.array(column[order].numpy()) for name, column in table.items() if name != "row"}
+    buffer = io.BytesIO()
+    pq.write_table(pa.table(arrays), buffer)
+    write_atomic(file, buffer.getvalue())
+
+
+def _coordinates(prefix: str, xyz: Tensor) -> Columns:
+    return {f"{prefix}{axis}": xyz[:, place] for place, axis in enumerate("xyz")}

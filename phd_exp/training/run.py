@@ -1,0 +1,152 @@
+"""One run from its configuration to its record."""
+
+import logging
+import time
+import warnings
+from typing import Any
+
+import torch
+from lightning import Trainer, seed_everything
+from lightning.pytorch.loggers import Logger, WandbLogger
+
+from phd_exp.data.datamodule import RenderedData
+from phd_exp.records.dataset import DatasetFolder, sha256
+from phd_exp.records.errors import RunError
+from phd_exp.records.runs import RunFolder
+from phd_exp.training.build import (
+    build_calibration,
+    build_data,
+    build_loggers,
+    build_module,
+    build_trainer,
+)
+from phd_exp.training.callbacks import Draw, RecordLogger
+from phd_exp.training.config import RunConfig
+from phd_exp.training.module import PositionModule
+from phd_exp.training.predictions import Columns, joined, summary, write_parquet
+
+WITHOUT_INFLUENCE = ("runs", "logger")
+"""Top-level keys that say where and how a run is recorded, not what it computes."""
+
+
+def train(config: RunConfig, folder: RunFolder, draw: Draw | None) -> dict[str, Any]:
+    """Train, measure and record one run; returns its results. A finished run is not run again.
+
+    A run that was broken off goes on after its last whole epoch.
+
+    Raises RunError where the folder holds a run of another configuration or another process works on it,
+    DatasetError where the data set is incomplete.
+    """
+    with folder.held():
+        require_same_config(folder, config)
+        if folder.is_finished():
+            return folder.results()
+        folder.write_config(config.model_dump(mode="json"))
+        with folder.recording(data_manifest=_manifest_hash(config)):
+            results = _train(config, folder, draw)
+            folder.write_results(results)
+    return results
+
+
+def require_same_config(folder: RunFolder, config: RunConfig) -> None:
+    """Raise RunError where the folder holds a run that computes something else, naming the first key."""
+    if not folder.config_file.exists():
+        return
+    recorded, asked = flatten(folder.config()), flatten(config.model_dump(mode="json"))
+    for key in sorted(recorded.keys() | asked.keys()):
+        before, now = recorded.get(key, "nothing"), asked.get(key, "nothing")
+        if before != now and not key.startswith(WITHOUT_INFLUENCE):
+            raise RunError(
+                f"{folder.path}: holds a run with {key}={before}, but {key}={now} is asked for; "
+                "move that folder away, or choose another place by runs=DIR"
+            )
+
+
+def flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one mapping with dotted keys."""
+    flat: dict[str, Any] = {}
+    for key, value in config.items():
+        path = f"{prefix}{key}"
+        flat |= flatten(value, f"{path}.") if isinstance(value, dict) else {path: value}
+    return flat
+
+
+def _train(config: RunConfig, folder: RunFolder, draw: Draw | None) -> dict[str, Any]:
+    _quiet_lightning()
+    if config.trainer.threads is not None:
+        torch.set_num_threads(config.trainer.threads)
+    seed_everything(config.seed, verbose=False)
+    data = build_data(config)
+    data.setup()
+    module = build_module(config, data)
+    calibration = build_calibration(config, folder, module, draw)
+    loggers = build_loggers(config, folder)
+    trainer = build_trainer(config, folder, loggers, calibration)
+    try:
+        seconds = _fit(trainer, module, data, folder)
+        table = _evaluate(trainer, module, data)
+    except BaseException:
+        _finish_wandb(loggers, exit_code=1)
+        raise
+    if calibration is not None:
+        calibration.write("final", table)
+    write_parquet(folder.predictions, table, data.records["test"])
+    _finish_wandb(loggers, exit_code=0)
+    return summary(table) | _circumstances(config, trainer, seconds)
+
+
+def _fit(trainer: Trainer, module: PositionModule, data: RenderedData, folder: RunFolder) -> float:
+    """Train to the last epoch, from the last checkpoint if there is one; returns the seconds it took now."""
+    resume = folder.last_checkpoint if folder.last_checkpoint.exists() else None
+    if resume is not None:
+        epoch = int(torch.load(resume, map_location="cpu", weights_only=True)["epoch"]) + 1
+        for logger in trainer.loggers:
+            if isinstance(logger, RecordLogger):
+                logger.forget_from(epoch)
+    start = time.monotonic()
+    trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
+    if trainer.interrupted:  # Lightning swallows the signal; the record must not
+        raise KeyboardInterrupt
+    return time.monotonic() - start
+
+
+def _evaluate(trainer: Trainer, module: PositionModule, data: RenderedData) -> Columns:
+    """Predictions of the last weights on the test split, a row a sample."""
+    parts = trainer.predict(module, dataloaders=data.test_dataloader())
+    assert parts is not None
+    return joined(parts)  # type: ignore[arg-type]
+
+
+def _circumstances(config: RunConfig, trainer: Trainer, seconds: float) -> dict[str, Any]:
+    return {
+        "preset": config.preset,
+        "data": config.data.spec.variant,
+        "model": config.model.name,
+        "seed": config.seed,
+        "n_train": config.data.n_train,
+        "n_test": config.data.n_test,
+        "epochs": trainer.current_epoch,
+        "fit_seconds": seconds,
+        "threads": torch.get_num_threads(),
+        "device": str(trainer.strategy.root_device),
+        "precision": str(trainer.precision),
+    }
+
+
+def _manifest_hash(config: RunConfig) -> str | None:
+    manifest = DatasetFolder(config.data.folder).manifest_path
+    return sha256(manifest.read_bytes()) if manifest.exists() else None
+
+
+def _finish_wandb(loggers: list[Logger], exit_code: int) -> None:
+    """Close wandb's run; without this the next run of a sweep would write into it."""
+    for logger in loggers:
+        if isinstance(logger, WandbLogger):
+            logger.experiment.finish(exit_code=exit_code)
+
+
+def _quiet_lightning() -> None:
+    """Leave the terminal to this programme's own lines."""
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    warnings.filterwarnings("ignore", ".*LeafSpec.*is deprecated", FutureWarning)  # Lightning's own use of torch

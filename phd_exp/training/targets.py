@@ -1,0 +1,129 @@
+"""Config nodes that name a class by `_target_`: what they may name, and whether their keys fit it."""
+
+import difflib
+import inspect
+from collections.abc import Iterable
+from importlib import import_module
+from typing import Annotated, Any
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    PydanticSchemaGenerationError,
+    TypeAdapter,
+    ValidationError,
+)
+from pydantic_core import ErrorDetails, PydanticCustomError
+
+ALLOWED = ("phd_exp.", "torch.", "torchvision.")
+"""Where a `_target_` may point: a configuration from somebody else must not run whatever it likes."""
+
+SPECIAL = {"_target_", "_partial_"}
+
+
+def check_target(node: dict[str, Any], where: str = "") -> dict[str, Any]:
+    """Hold a node's keys and values against the signature of what it names, all the way down.
+
+    Parameters without a default may be missing: the programme passes those that it alone knows (the network's
+    parameters to an optimizer, the data set's depth scale to a head).
+
+    Raises PydanticCustomError naming the key, what was given, and what was expected.
+    """
+    target = locate(node.get("_target_"), where)
+    parameters = inspect.signature(target).parameters
+    for key, value in node.items():
+        if key in SPECIAL:
+            continue
+        path = f"{where}.{key}" if where else key
+        if key not in parameters:
+            raise _error(
+                path, f"unknown key{nearest(key, parameters)}; {node['_target_']} takes {_listed(parameters)}"
+            )
+        if isinstance(value, dict) and "_target_" in value:
+            check_target(value, path)
+        else:
+            _check_value(path, value, parameters[key].annotation)
+    return node
+
+
+def locate(name: Any, where: str = "") -> Any:
+    """What a `_target_` names. Raises PydanticCustomError where that is not allowed or does not exist."""
+    path = f"{where}._target_" if where else "_target_"
+    if not isinstance(name, str) or not name.startswith(ALLOWED):
+        raise _error(
+            path,
+            f"{name!r} may not be built from a configuration; expected a name under {', '.join(ALLOWED)}",
+        )
+    module, _, attribute = name.rpartition(".")
+    try:
+        return getattr(import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise _error(path, f"{name!r} does not exist ({error})") from None
+
+
+Target = Annotated[dict[str, Any], AfterValidator(check_target)]
+
+
+def nearest(key: str, valid: Iterable[str]) -> str:
+    """`, did you mean 'lr'?` where a valid key looks like the one given; nothing otherwise."""
+    close = difflib.get_close_matches(key, list(valid), n=1)
+    return f", did you mean {close[0]!r}?" if close else ""
+
+
+def describe(problem: ErrorDetails, model: type[BaseModel]) -> str:
+    """One line for one thing wrong: the key, the value, what was expected, the nearest valid key."""
+    location = [str(part) for part in problem["loc"] if part != "spec"]
+    key, context = ".".join(location), problem.get("ctx", {})
+    if problem["type"] == "target":
+        return ".".join([key, context["path"]]) + f": {context['reason']}"
+    if problem["type"] == "extra_forbidden":
+        valid = valid_keys(model, location[:-1])
+        unknown = f"{key}: unknown key (value {problem['input']!r}){nearest(location[-1], valid)}"
+        return f"{unknown}; expected one of {_listed(valid)}"
+    if problem["type"] == "missing":
+        return f"{key}: missing; expected a value (the configuration group {location[0]!r} sets it)"
+    given = "" if isinstance(problem["input"], dict) else f"got {problem['input']!r}; "
+    return ": ".join(filter(None, [key, f"{given}{_expected(problem['msg'])}"]))
+
+
+def valid_keys(model: type[BaseModel], location: list[str]) -> list[str]:
+    """The keys that a section of the configuration knows, in the words of the user."""
+    for name in location:
+        inner = model.model_fields[name].annotation if name in model.model_fields else None
+        if not (inspect.isclass(inner) and issubclass(inner, BaseModel)):
+            return []
+        model = inner
+    fields = dict(model.model_fields)
+    inlined = fields.pop("spec", None)
+    return [*fields, *(inlined.annotation.model_fields if inlined else ())]  # type: ignore[union-attr]
+
+
+def _check_value(path: str, value: Any, annotation: Any) -> None:
+    if annotation is inspect.Parameter.empty:
+        return
+    try:
+        adapter: TypeAdapter[Any] = TypeAdapter(annotation, config=ConfigDict(arbitrary_types_allowed=True))
+    except (PydanticSchemaGenerationError, NameError):  # an annotation beyond pydantic, as torch has some
+        return
+    try:
+        adapter.validate_python(value)
+    except ValidationError as error:
+        raise _error(path, f"got {value!r}; {_expected(error.errors()[0]['msg'])}") from None
+
+
+def _error(path: str, reason: str) -> PydanticCustomError:
+    return PydanticCustomError("target", "{path}: {reason}", {"path": path, "reason": reason})
+
+
+def _expected(message: str) -> str:
+    """pydantic's words in ours."""
+    return (
+        message.removeprefix("Value error, ")
+        .replace("Input should be", "expected to be")
+        .replace("expected to be a valid", "expected a valid")
+    )
+
+
+def _listed(keys: Iterable[str]) -> str:
+    return ", ".join(keys)

@@ -1,0 +1,87 @@
+"""What a user may get wrong: one clear line that names it, a non-zero exit, nothing written."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+BAD = [
+    # (arguments, what the line must say)
+    (["data.ntrain=3"], ["data.ntrain", "did you mean 'data.n_train'"]),
+    (["modle=mae_vz"], ["modle", "did you mean 'model'"]),
+    (["model=mae_log"], ["model=mae_log", "did you mean 'mae_logz'", "probabilistic"]),
+    (["data=scal"], ["data=scal", "did you mean 'scale'"]),
+    (["+model.typo=1"], ["model.typo", "unknown key", "expected one of name, head"]),
+    (["+data.n_trian=1"], ["data.n_trian", "did you mean 'n_train'"]),
+    (["+typo=1"], ["typo", "unknown key"]),
+    (["+optimizer.lrr=1"], ["optimizer.lrr", "did you mean 'lr'", "torch.optim.Adam"]),
+    (["+model.head.depht=1"], ["model.head.depht", "unknown key"]),
+    (["data.n_train=abc"], ["data.n_train", "'abc'", "integer"]),
+    (["data.n_train=2.5"], ["data.n_train", "2.5", "integer"]),
+    (["data.n_train=true"], ["data.n_train", "True", "integer"]),
+    (["optimizer.lr=fast"], ["optimizer.lr", "'fast'", "number"]),
+    (["backbone.depth=19"], ["backbone.depth", "19", "18, 34 or 50"]),
+    (["trainer.precision=half"], ["trainer.precision", "'half'", "'bfloat16'"]),
+    (["data.n_train=0"], ["data.n_train", "got 0", "greater than or equal to 1"]),
+    (["data.n_test=-1"], ["data.n_test", "got -1"]),
+    (["data.f_range=[0,2000]"], ["data.f_range", "got 0", "greater than 0"]),
+    (["data.f_range=[-1200,2000]"], ["data.f_range", "got -1200"]),
+    (["data.f_range=[2000,1200]"], ["data.f_range", "lower bound"]),
+    (["data.z_range=[0,5]"], ["data.z_range"]),
+    (["data.image_size=7"], ["data.image_size", "got 7", "greater than or equal to 32"]),
+    (["data.image_size=448"], ["data", "image_size=448", "sensor_size=224"]),
+    (["data.batch_size=64"], ["data", "batch_size=64", "n_train=32"]),
+    (["data.xy_range=2"], ["data.xy_range"]),
+    (["data.variant=../elsewhere"], ["data.variant"]),
+    (["seed=-1"], ["seed", "got -1"]),
+    (["trainer.max_epochs=0"], ["trainer.max_epochs", "got 0"]),
+    (["trainer.threads=0"], ["trainer.threads", "got 0"]),
+    (["evaluation.calibration_window=0"], ["evaluation.calibration_window"]),
+    (["loss=mae"], ["loss", "PointEstimate", "model=probabilistic", "ProjectedHuber"]),
+    (["model=mae_vz", "loss=nll"], ["loss", "ProjectedHuber", "model=mae_vz"]),
+    (["loss._target_=os.system"], ["loss._target_", "os.system", "phd_exp."]),
+    (["loss._target_=phd_exp.losses.nll.Nothing"], ["loss._target_", "does not exist"]),
+    (["data.n_train=["], ["viable"]),
+]
+
+
+@pytest.mark.parametrize(("arguments", "said"), BAD, ids=lambda value: " ".join(value)[:40])
+def test_one_clear_line(phd_exp: Callable, tmp_path: Path, arguments: list[str], said: list[str]) -> None:
+    outcome = phd_exp("preset=smoke", "logger=none", *arguments)
+    lines = outcome.err.strip().splitlines()
+    assert outcome.status == 2
+    assert len(lines) == 1, outcome.err
+    assert lines[0].startswith("error: ")
+    for word in said:
+        assert word in lines[0]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_each_thing_wrong_gets_its_own_line(phd_exp: Callable) -> None:
+    outcome = phd_exp("preset=smoke", "seed=-1", "data.n_test=0")
+    assert outcome.err.splitlines() == [
+        "error: seed: got -1; expected to be greater than or equal to 0",
+        "error: data.n_test: got 0; expected to be greater than or equal to 1",
+    ]
+
+
+def test_unknown_verb(phd_exp: Callable) -> None:
+    outcome = phd_exp("trian")
+    assert outcome.status == 2
+    assert "no verb 'trian'" in outcome.err
+    assert "train, render, report" in outcome.err
+
+
+def test_report_without_runs(phd_exp: Callable) -> None:
+    outcome = phd_exp("report")
+    assert outcome.status == 1
+    assert outcome.err == "error: runs: no such folder; train first, or say where the runs are by runs=DIR\n"
+
+
+def test_unwritable_folder(phd_exp: Callable, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    outcome = phd_exp("preset=smoke", "logger=none", "data.root=file/renders")
+    assert outcome.status == 1
+    assert len(outcome.err.splitlines()) == 1
+    assert "file/renders" in outcome.err
+    assert {path.name for path in tmp_path.iterdir()} == {"file"}

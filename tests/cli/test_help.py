@@ -1,0 +1,41 @@
+"""`--help` is quick, complete, and imports nothing heavy."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+import pytest
+
+from phd_exp.__main__ import VERBS
+from phd_exp.cli.help import EXAMPLES
+from phd_exp.cli.paths import conf_folder
+
+
+def test_help_within_a_second_and_without_torch() -> None:
+    watch = (
+        "import sys, runpy; sys.argv = ['phd_exp', '--help']\n"
+        "try: runpy.run_module('phd_exp', run_name='__main__')\n"
+        "except SystemExit as stop: assert stop.code == 0\n"
+        "assert not {'torch', 'hydra', 'lightning', 'numpy'} & set(sys.modules)"
+    )
+    start = time.monotonic()
+    done = subprocess.run([sys.executable, "-c", watch], capture_output=True, text=True, env={**os.environ})
+    assert done.returncode == 0, done.stderr
+    assert time.monotonic() - start < 1
+
+
+def test_help_lists_verbs_groups_and_choices(phd_exp: Callable) -> None:
+    outcome = phd_exp("--help")
+    assert outcome.status == 0
+    for word in [*VERBS, *(file.stem for file in conf_folder().glob("*/*.yaml"))]:
+        assert word in outcome.out
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_has_help_with_examples(phd_exp: Callable, verb: str) -> None:
+    outcome = phd_exp(verb, "--help")
+    assert outcome.status == 0
+    for example in EXAMPLES[verb]:
+        assert example in outcome.out

@@ -1,0 +1,89 @@
+"""Every file under conf/ composes into a configuration that passes the check."""
+
+from typing import Any
+
+import hydra
+import pytest
+from omegaconf import OmegaConf
+
+from phd_exp.cli.paths import conf_folder
+from phd_exp.records.spec import DatasetSpec
+from phd_exp.training.config import RunConfig, check
+
+CHOICES = sorted(
+    f"{file.parent.name}={file.stem}" for file in conf_folder().glob("*/*.yaml") if file.parent.name != "loss"
+)
+
+
+def composed(*overrides: str) -> dict[str, Any]:
+    with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
+        plain = OmegaConf.to_container(
+            hydra.compose("config", list(overrides)), resolve=True, throw_on_missing=True
+        )
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items()}
+
+
+def checked(*overrides: str) -> RunConfig:
+    return check(composed(*overrides))
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_every_choice_of_every_group_is_a_valid_configuration(choice: str) -> None:
+    checked(choice)
+
+
+@pytest.mark.parametrize(
+    "file", sorted(conf_folder().glob("*/*.yaml")), ids=lambda file: f"{file.parent.name}/{file.stem}"
+)
+def test_every_file_opens_with_what_it_is(file: Any) -> None:
+    lines = [line for line in file.read_text().splitlines() if line != "# @package _global_"]
+    assert lines[0].startswith("# ")
+
+
+def test_defaults_are_the_authors_protocol() -> None:
+    config = checked()
+    assert (config.data.n_train, config.data.n_test, config.data.image_size) == (8000, 2000, 224)
+    assert config.data.batch_size == 64
+    assert config.trainer.max_epochs == 50
+    assert config.backbone["depth"] == 50
+    assert config.optimizer["_target_"] == "torch.optim.Adam"
+    assert config.optimizer["lr"] == 1e-3
+    assert config.camera.focal_length == "known"
+
+
+@pytest.mark.parametrize(
+    ("model", "loss", "camera"),
+    [
+        ("probabilistic", "NegativeLogLikelihood", "known"),
+        ("mae_vz", "MeanAbsoluteError", "known"),
+        ("mae_logz", "MeanAbsoluteError", "known"),
+        ("mae_xyz", "MeanAbsoluteError", "known"),
+        ("mae_constf", "MeanAbsoluteError", "constant"),
+    ],
+)
+def test_a_model_picks_its_loss_and_camera(model: str, loss: str, camera: str) -> None:
+    config = checked(f"model={model}")
+    assert config.model.name == model
+    assert config.loss["_target_"].endswith(loss)
+    assert config.camera.focal_length == camera
+
+
+def test_the_command_line_has_the_last_word() -> None:
+    config = checked(
+        "preset=smoke", "backbone=resnet50", "model=mae_vz", "camera=constant", "data.n_train=48"
+    )
+    assert config.backbone["depth"] == 50
+    assert config.camera.focal_length == "constant"
+    assert config.data.n_train == 48
+    assert config.preset == "smoke"
+
+
+def test_variants_differ_in_what_they_name_alone() -> None:
+    plain = checked("data=default").data.spec
+    changes = {"occl": {"occluders"}, "scale": {"scale_range"}, "occl_scale": {"occluders", "scale_range"}}
+    for variant, keys in changes.items():
+        other = checked(f"data={variant}").data.spec
+        differing = {key for key in DatasetSpec.model_fields if getattr(plain, key) != getattr(other, key)}
+        assert differing == keys | {"variant"}
+        assert other.variant == variant

@@ -1,0 +1,43 @@
+"""What all tests share: shapes checked at run time, the command line called in this process."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from jaxtyping import install_import_hook
+
+# before anything is imported: every annotated function of these folders checks its shapes while tests run
+HOOKED = [
+    f"phd_exp.{folder}" for folder in ("geometry", "distributions", "losses", "metrics", "models", "data")
+]
+install_import_hook(HOOKED, "beartype.beartype")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command printed and how it ended."""
+
+    status: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def phd_exp(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> Callable[..., Outcome]:
+    """`python -m phd_exp ARGUMENTS` in an empty folder, but in this process."""
+    from phd_exp.__main__ import main
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["phd_exp"])
+    monkeypatch.setenv("WANDB_ERROR_REPORTING", "false")  # no network look-ups
+
+    def run(*arguments: str) -> Outcome:
+        capfd.readouterr()
+        status = main(list(arguments))
+        out, err = capfd.readouterr()
+        return Outcome(status, out, err)
+
+    return run

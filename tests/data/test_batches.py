@@ -1,0 +1,85 @@
+"""The order of batches: a function of (seed, epoch), resumable at any batch."""
+
+import pytest
+import torch
+
+from phd_exp.data.batches import Batch, BatchLoader
+
+N = 10
+
+
+@pytest.fixture
+def samples() -> Batch:
+    return Batch(
+        image=torch.arange(N, dtype=torch.uint8).view(N, 1, 1, 1).expand(N, 4, 4, 3),
+        xyz=torch.arange(3.0 * N).view(N, 3),
+        f=torch.arange(1.0, N + 1),
+        S=4.0,
+        row=torch.arange(N),
+    )
+
+
+def loader(samples: Batch, seed: int = 0, drop_last: bool = False, shuffle: bool = True) -> BatchLoader:
+    return BatchLoader(samples, 3, shuffle=shuffle, drop_last=drop_last, seed=seed)
+
+
+def rows(batches: list[Batch]) -> list[int]:
+    return torch.cat([batch.row for batch in batches]).tolist()
+
+
+def test_every_sample_once_an_epoch_and_in_another_order_the_next(samples: Batch) -> None:
+    batches = loader(samples)
+    first, second = rows(list(batches)), rows(list(batches))
+    assert sorted(first) == sorted(second) == list(range(N))
+    assert first != second
+
+
+def test_order_depends_on_seed_and_epoch_alone(samples: Batch) -> None:
+    one, other = loader(samples), loader(samples)
+    next(iter(one))  # an epoch broken off
+    list(one.samples.row)
+    other.epoch = 0
+    assert rows(list(other)) == one.order(1).tolist()
+    assert loader(samples, seed=1).order(0).tolist() != one.order(0).tolist()
+
+
+def test_rows_stay_together(samples: Batch) -> None:
+    for batch in loader(samples):
+        assert batch.image[:, 0, 0, 0].tolist() == batch.row.tolist()
+        assert batch.f.tolist() == (batch.row + 1.0).tolist()
+        assert torch.equal(batch.xyz, samples.xyz[batch.row])
+        assert batch.S == 4.0
+
+
+@pytest.mark.parametrize(("drop_last", "sizes"), [(False, [3, 3, 3, 1]), (True, [3, 3, 3])])
+def test_length(samples: Batch, drop_last: bool, sizes: list[int]) -> None:
+    batches = loader(samples, drop_last=drop_last)
+    assert [len(batch) for batch in batches] == sizes
+    assert len(batches) == len(sizes)
+
+
+def test_without_shuffling_the_order_is_the_data_sets(samples: Batch) -> None:
+    assert rows(list(loader(samples, shuffle=False))) == list(range(N))
+
+
+@pytest.mark.parametrize("done", [0, 1, 2, 4])
+def test_resumes_with_the_batches_that_were_left(samples: Batch, done: int) -> None:
+    whole = loader(samples)
+    expected = [rows([batch]) for _ in range(3) for batch in whole]
+
+    broken = loader(samples)
+    seen = []
+    list(broken)  # epoch 0
+    epoch = iter(broken)
+    seen = [rows([next(epoch)]) for _ in range(done)]
+    resumed = loader(samples)
+    resumed.load_state_dict(broken.state_dict())
+    seen += [rows([batch]) for batch in resumed] if done < 4 else []
+    seen += [rows([batch]) for batch in resumed]
+    assert seen == expected[4:]
+
+
+def test_moves_to_a_device_whole(samples: Batch) -> None:
+    moved = samples.to("meta")
+    assert {moved.image.device.type, moved.xyz.device.type, moved.f.device.type} == {"meta"}
+    assert moved.S == samples.S

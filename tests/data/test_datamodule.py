@@ -1,0 +1,70 @@
+"""A rendered data set as batches: the camera shrinks with the image, the depth scale grows."""
+
+import math
+
+import pytest
+import torch
+
+from phd_exp.data.datamodule import RenderedData
+from phd_exp.records.dataset import DatasetError, DatasetFolder
+from phd_exp.records.spec import DatasetSpec
+
+
+def data(folder: DatasetFolder, spec: DatasetSpec, image_size: int = 64, n_train: int = 5) -> RenderedData:
+    module = RenderedData(
+        folder, spec, n_train=n_train, n_test=3, image_size=image_size, batch_size=2, seed=0
+    )
+    module.setup()
+    return module
+
+
+def test_batches_hold_what_the_records_say(folder: DatasetFolder, spec: DatasetSpec) -> None:
+    module = data(folder, spec)
+    (first, second) = list(module.test_dataloader())
+    records = folder.records("test")
+    assert [len(first), len(second)] == [2, 1]
+    xyz = torch.tensor([(record.x, record.y, record.z) for record in records])
+    assert torch.equal(torch.cat([first.xyz, second.xyz]), xyz)
+    assert torch.cat([first.f, second.f]).tolist() == [record.f for record in records]
+    assert first.S == 64.0
+
+
+def test_training_batches_are_full_and_shuffled(folder: DatasetFolder, spec: DatasetSpec) -> None:
+    loader = data(folder, spec).train_dataloader()
+    assert [len(batch) for batch in loader] == [2, 2]
+    assert loader.shuffle
+
+
+@pytest.mark.parametrize("image_size", [64, 32])
+def test_normalised_truth_does_not_depend_on_image_size(
+    folder: DatasetFolder, spec: DatasetSpec, image_size: int
+) -> None:
+    from phd_exp.geometry import compensated_depth, projected
+
+    module = data(folder, spec, image_size)
+    batch = module.samples["train"]
+    assert batch.image.shape == (5, image_size, image_size, 3)
+    assert batch.S == image_size
+    whole = data(folder, spec)
+    reference = whole.samples["train"]
+    torch.testing.assert_close(projected(batch.xyz, batch.camera), projected(reference.xyz, reference.camera))
+    torch.testing.assert_close(
+        compensated_depth(batch.xyz, batch.camera, module.depth.mu_z0),
+        compensated_depth(reference.xyz, reference.camera, whole.depth.mu_z0),
+    )
+    assert module.constant_f == pytest.approx(math.sqrt(400 * 600) * image_size / 64)
+
+
+def test_depth_scale_comes_from_the_specification(folder: DatasetFolder, spec: DatasetSpec) -> None:
+    depth = data(folder, spec).depth
+    assert depth.mu_z0 == pytest.approx(math.sqrt((5 / 400) * (3 / 600)))
+    assert math.sqrt((5 / 400) / (3 / 600)) == pytest.approx(depth.D)
+
+
+def test_uses_the_first_samples(folder: DatasetFolder, spec: DatasetSpec) -> None:
+    assert len(data(folder, spec, n_train=2).samples["train"]) == 2
+
+
+def test_too_few_samples_are_one_line(folder: DatasetFolder, spec: DatasetSpec) -> None:
+    with pytest.raises(DatasetError, match="6 samples asked for, 5 "):
+        data(folder, spec, n_train=6)

@@ -1,0 +1,152 @@
+"""The special functions against 40-digit arithmetic, over the whole range and on both sides of every border."""
+
+import math
+
+import mpmath as mp
+import numpy as np
+import pytest
+import torch
+from torch.autograd import gradcheck, gradgradcheck
+
+from phd_exp.distributions import special
+
+TOLERANCE = {torch.float64: 1e-12, torch.float32: 1e-6}
+GRID = np.unique(np.concatenate([np.logspace(-6, 6, 145), 1 + np.linspace(-1e-3, 1e-3, 9), np.linspace(0.5, 4, 36)]))
+
+
+def exact(function, a: torch.Tensor) -> torch.Tensor:
+    """A function of one number, evaluated with 40 digits at exactly the given floating point numbers."""
+    with mp.workdps(40):
+        return torch.tensor([float(function(mp.mpf(x))) for x in a.double().tolist()], dtype=torch.float64)
+
+
+def relative_error(value: torch.Tensor, truth: torch.Tensor) -> float:
+    return float(((value.detach().double() - truth) / truth).abs().max())
+
+
+def scaled_expint(n, a):
+    return mp.exp(a) * mp.expint(n, a)
+
+
+def tail_moment(k, a):
+    return a ** (k + 1) * mp.factorial(k) * mp.hyperu(k + 1, 0, a)
+
+
+def log_normaliser(a):
+    return mp.log(mp.exp(-a) / a + mp.expint(2, a))
+
+
+def log_normaliser_derivative(a):
+    return 1 / a - 2 * (1 + 1 / a) / (1 + a * scaled_expint(2, a))
+
+
+@pytest.fixture(params=[torch.float64, torch.float32], ids=["float64", "float32"])
+def a(request: pytest.FixtureRequest) -> torch.Tensor:
+    return torch.tensor(GRID, dtype=request.param)
+
+
+@pytest.mark.parametrize("n", [-3, -2, -1, 0, 1, 2, 3, 4, 5])
+def test_scaled_expint(n: int, a: torch.Tensor) -> None:
+    truth = exact(lambda x: scaled_expint(n, x), a)
+    assert relative_error(special.scaled_expint(n, a), truth) < TOLERANCE[a.dtype]
+
+
+@pytest.mark.parametrize("n", [6, 20])
+def test_scaled_expint_refuses_orders_the_rule_was_not_built_for(n: int) -> None:
+    with pytest.raises(ValueError, match=f"n must be at most 5, but is {n}"):
+        special.scaled_expint(n, torch.ones(1))
+
+
+@pytest.mark.parametrize("k", [0, 1, 2, 3])
+def test_tail_moment_to_the_precision_that_moments_need(k: int, a: torch.Tensor) -> None:
+    truth = exact(lambda x: tail_moment(k, x), a)
+    error = (special.tail_moment(k, a).double() - truth).abs().max()
+    assert error < TOLERANCE[a.dtype] * math.factorial(k)
+
+
+def test_g_is_a_small_number_to_full_relative_precision(a: torch.Tensor) -> None:
+    assert relative_error(special.tail_moment(0, a), exact(lambda x: tail_moment(0, x), a)) < TOLERANCE[a.dtype]
+
+
+def test_log_normaliser(a: torch.Tensor) -> None:
+    truth = exact(log_normaliser, a)
+    error = (special.log_normaliser(a).double() - truth).abs() / truth.abs().clamp_min(1)
+    assert error.max() < TOLERANCE[a.dtype]
+
+
+def test_log_normaliser_derivative(a: torch.Tensor) -> None:
+    a.requires_grad_()
+    (derivative,) = torch.autograd.grad(special.log_normaliser(a).sum(), a)
+    assert relative_error(derivative, exact(log_normaliser_derivative, a)) < TOLERANCE[a.dtype]
+
+
+@pytest.mark.parametrize(
+    ("value", "log_n", "derivative"),
+    [(0.3, 1.0779024, None), (1.0, -0.6609221, -1.8497079), (10.0, -11.6908288, -1.0932743)],
+)
+def test_log_normaliser_at_reference_values(value: float, log_n: float, derivative: float | None) -> None:
+    a = torch.tensor(value, dtype=torch.float64, requires_grad=True)
+    result = special.log_normaliser(a)
+    assert result.item() == pytest.approx(log_n, abs=5e-8)
+    if derivative is not None:
+        assert torch.autograd.grad(result, a)[0].item() == pytest.approx(derivative, abs=5e-8)
+
+
+@pytest.mark.parametrize("k", [0, 1])
+def test_tail_moment_differentiates_twice(k: int) -> None:
+    a = torch.tensor([0.01, 0.4, 0.99, 1.0, 1.01, 3.0, 40.0], dtype=torch.float64, requires_grad=True)
+    assert gradcheck(lambda a: special.tail_moment(k, a), a)
+    assert gradgradcheck(lambda a: special.tail_moment(k, a), a)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_log_scaled_normaliser_where_a_underflows(dtype: torch.dtype) -> None:
+    log_a = torch.tensor([-1e4, -200.0, -60.0, 60.0], dtype=dtype, requires_grad=True)
+    value = special.log_scaled_normaliser(log_a)
+    (derivative,) = torch.autograd.grad(value.sum(), log_a)
+    torch.testing.assert_close(value[:3], -log_a[:3])
+    torch.testing.assert_close(value[3], -log_a[3] + np.log(2))
+    torch.testing.assert_close(derivative, -torch.ones_like(log_a))
+
+
+def test_signed_log1p_has_its_true_derivative_at_zero() -> None:
+    x = torch.tensor([-2.0, -1e-3, 0.0, 1e-3, 5.0], dtype=torch.float64, requires_grad=True)
+    log_a = torch.tensor([-3.0, 0.0, 0.5, 4.0, 1.0], dtype=torch.float64, requires_grad=True)
+    torch.testing.assert_close(special.signed_log1p(x, log_a), x.sign() * torch.log1p(x.abs() / log_a.exp()))
+    assert gradcheck(special.signed_log1p, (x, log_a))
+    assert gradcheck(special.signed_log1p, (x, log_a[:1]))
+
+
+def test_signed_log1p_stays_finite_where_a_underflows() -> None:
+    x = torch.tensor([-1e4, 0.0, 1e4], requires_grad=True)
+    value = special.signed_log1p(x, torch.tensor(-1e4))
+    (derivative,) = torch.autograd.grad(value.sum(), x)
+    torch.testing.assert_close(value, x.detach().sign() * (np.log(1e4) + 1e4))
+    torch.testing.assert_close(derivative, torch.tensor([1e-4, 1 / torch.finfo(x.dtype).eps, 1e-4]))
+
+
+def test_gauss_rule_is_the_one_its_comment_describes() -> None:
+    """Gautschi's construction: a Gauss rule for e^(-s) / prod_j (1 + s/a_j), its weights multiplied back."""
+    poles = [mp.mpf("0.9") * (4 / mp.mpf("0.9")) ** (mp.mpf(j) / 15) for j in range(16)]
+    with mp.workdps(40):
+        grid = [mp.mpf(k) / 24 for k in range(-120, 144)]  # double exponential quadrature, exact to 40 digits
+        nodes = [mp.exp(y - mp.exp(-y)) for y in grid]
+        density = [s * (1 + mp.exp(-y)) * mp.exp(-s) / 24 for s, y in zip(nodes, grid, strict=True)]
+        density = [w / mp.fprod(1 + s / p for p in poles) for s, w in zip(nodes, density, strict=True)]
+        jacobi, current, previous, last = mp.matrix(12), [mp.mpf(1)] * len(nodes), [mp.mpf(0)] * len(nodes), None
+        for k in range(12):
+            norm = mp.fsum(w * p * p for w, p in zip(density, current, strict=True))
+            mean = mp.fsum(w * p * p * s for w, p, s in zip(density, current, nodes, strict=True)) / norm
+            ratio = norm / last if last else 0
+            jacobi[k, k] = mean
+            if k:
+                jacobi[k, k - 1] = jacobi[k - 1, k] = mp.sqrt(ratio)
+            recurrence = zip(nodes, current, previous, strict=True)
+            current, previous, last = [(s - mean) * p - ratio * q for s, p, q in recurrence], current, norm
+        eigenvalues, vectors = mp.eigsy(jacobi)
+        total = mp.fsum(density)
+        rule = [
+            (float(s), float(total * vectors[0, i] ** 2 * mp.fprod(1 + s / p for p in poles)))
+            for i, s in enumerate(eigenvalues)
+        ]
+    np.testing.assert_allclose(special._GAUSS_RULE, rule, rtol=1e-14)

@@ -1,0 +1,171 @@
+"""From the command line to a run record, on real renders."""
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+from PIL import Image
+
+from phd_exp.records.runs import RunFolder, find_runs
+
+MODELS = ("probabilistic", "mae_vz", "mae_logz", "mae_xyz", "mae_constf")
+DATA = ("default", "occl", "scale", "occl_scale")
+ERRORS = {"loss", "projected_error_mm", "depth_error_mm"}
+OF_A_DISTRIBUTION = {"nll", "depth_precision", "projected_precision"}
+
+
+def only_run(runs: Path) -> RunFolder:
+    (run,) = find_runs(runs)
+    return run
+
+
+def comparable(results: dict[str, Any]) -> dict[str, Any]:
+    """Results without the seconds that they took."""
+    return {key: value for key, value in results.items() if key != "fit_seconds"}
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_every_model_leaves_a_whole_record(train: Callable, tmp_path: Path, model: str) -> None:
+    outcome = train(f"model={model}", "logger=none")
+    assert outcome.status == 0, outcome.err
+    run = only_run(tmp_path / "runs")
+    assert run.path.relative_to(tmp_path).as_posix().startswith(f"runs/smoke/default/{model}/seed0-")
+    assert run.is_finished()
+    quantities = ERRORS | (OF_A_DISTRIBUTION if model == "probabilistic" else set())
+    rows = run.metrics()
+    assert [row["epoch"] for row in rows] == [0, 1]
+    for row in rows:
+        assert {f"{split}/{name}" for split in ("train", "test") for name in quantities} <= row.keys()
+        assert all(math.isfinite(value) for value in row.values())
+    results = run.results()
+    table = pd.read_parquet(run.predictions)
+    assert len(table) == 6
+    for name in ("projected_error_mm", "depth_error_mm"):
+        assert results[f"test/{name}"] == pytest.approx(table[name].mean())
+        assert results[f"test/{name}"] == pytest.approx(rows[-1][f"test/{name}"], rel=1e-4)
+
+
+@pytest.mark.parametrize("data", DATA)
+def test_every_data_set_trains(train: Callable, tmp_path: Path, data: str) -> None:
+    outcome = train(f"data={data}", "logger=none")
+    assert outcome.status == 0, outcome.err
+    assert only_run(tmp_path / "runs").results()["data"] == data
+
+
+def test_calibration_as_data_and_as_pictures(train: Callable, tmp_path: Path) -> None:
+    assert train("logger=none", "evaluation.calibration_every_n_epochs=1").status == 0
+    run = only_run(tmp_path / "runs")
+    for name in ("epoch-0000", "epoch-0001", "final"):
+        curves = json.loads((run.calibration / f"{name}.json").read_text())
+        assert curves.keys() == {"depth", "projected"}
+        for curve in curves.values():
+            assert len(curve["predicted"]) == len(curve["empirical"]) == 6 - curve["window"] + 1
+        assert Image.open(run.calibration / f"{name}.png").size[0] > 500
+
+
+def test_wandb_beside_the_record(train: Callable, tmp_path: Path) -> None:
+    assert train("model=probabilistic").status == 0
+    run = only_run(tmp_path / "runs")
+    (offline,) = (run.path / "wandb").glob("offline-run-*")
+    assert list(offline.glob("run-*.wandb"))
+    assert list(offline.glob("files/media/images/test/calibration*.png"))
+
+
+def test_without_a_logger_no_trace_of_wandb(train: Callable, tmp_path: Path) -> None:
+    assert train("logger=none").status == 0
+    assert not list(tmp_path.rglob("*wandb*"))
+
+
+def test_a_finished_run_is_not_run_again(train: Callable, tmp_path: Path) -> None:
+    assert train("logger=none").status == 0
+    before = only_run(tmp_path / "runs").results_file.stat().st_mtime_ns
+    again = train("logger=none")
+    assert again.status == 0
+    assert "finished already" in again.out
+    assert only_run(tmp_path / "runs").results_file.stat().st_mtime_ns == before
+
+
+def test_a_run_of_another_configuration_is_never_reused(train: Callable, tmp_path: Path) -> None:
+    assert train("logger=none").status == 0
+    run = only_run(tmp_path / "runs")
+    config = run.config()
+    config["optimizer"]["lr"] = 0.5  # as if the file under conf/ had changed since
+    run.write_config(config)
+    outcome = train("logger=none")
+    assert outcome.status == 1
+    assert "optimizer.lr=0.5, but optimizer.lr=0.001 is asked for" in outcome.err
+
+
+def test_a_broken_run_goes_on_where_it_was(
+    train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from phd_exp.training.module import PositionModule
+
+    long = ("logger=none", "trainer.max_epochs=4")
+    assert train(*long, "runs=whole").status == 0
+    whole = only_run(tmp_path / "whole")
+
+    validation_step = PositionModule.validation_step
+
+    def power_cut(self: PositionModule, *arguments: Any) -> Any:
+        if self.current_epoch == 2:
+            raise RuntimeError("power cut")
+        return validation_step(self, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PositionModule, "validation_step", power_cut)
+        broken = train(*long, "runs=broken")
+    assert broken.status == 1
+    assert "RuntimeError: power cut" in broken.err
+    run = only_run(tmp_path / "broken")
+    status = run.status()
+    assert status is not None
+    assert (status.state, status.error) == ("failed", "RuntimeError: power cut")
+
+    assert train(*long, "runs=broken").status == 0
+    assert [row["epoch"] for row in run.metrics()] == [0, 1, 2, 3]
+    assert run.metrics() == whole.metrics()
+    assert comparable(run.results()) == comparable(whole.results())
+
+
+def test_a_sweep_survives_its_failures(train: Callable, tmp_path: Path) -> None:
+    outcome = train("-m", "model=mae_vz,probabilistic", "camera=known,constant", "loss=mae", "logger=none")
+    assert outcome.status == 2
+    assert sum(run.is_finished() for run in find_runs(tmp_path / "runs")) == 2
+    lines = [line for line in outcome.err.splitlines() if line.startswith("error: ")]
+    assert lines[0] == "error: 2 runs failed"
+    assert "model=probabilistic camera=known" in lines[1]
+    assert "model=probabilistic camera=constant" in lines[2]
+
+
+def test_the_report_stands_beside_the_paper(train: Callable, phd_exp: Callable) -> None:
+    assert train("model=mae_vz", "logger=none").status == 0
+    outcome = phd_exp("report")
+    assert outcome.status == 0
+    (line,) = [line for line in outcome.out.splitlines() if "mae_vz" in line]
+    words = line.split()
+    assert "3.6" in words
+    assert "69" in words
+    assert "finished" in words
+
+
+def test_a_missing_bpy_is_one_line(
+    phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import importlib.util
+
+    real = importlib.util.find_spec
+    monkeypatch.setattr(
+        "importlib.util.find_spec", lambda name, *more: None if name == "bpy" else real(name, *more)
+    )
+    outcome = phd_exp("preset=smoke", "logger=none")
+    assert outcome.status == 1
+    (line,) = [line for line in outcome.err.splitlines() if line.startswith("error: ")]
+    assert "bpy" in line
+    assert "phd_exp[render]" in line
+    assert not list(tmp_path.rglob("*.png"))
+    assert not list(tmp_path.glob("runs"))

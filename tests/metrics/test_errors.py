@@ -1,0 +1,44 @@
+"""The tables' columns against a hand computation and their geometry."""
+
+import pytest
+import torch
+
+from phd_exp.metrics.errors import PositionErrors, along_true_ray, depth_error, projected_error
+
+
+@pytest.fixture
+def pairs() -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    xyz = torch.randn(64, 3, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0.0, 4.0])
+    return xyz, xyz + 0.1 * torch.randn(64, 3, generator=generator, dtype=torch.float64)
+
+
+def test_by_hand() -> None:
+    xyz = torch.tensor([[0.0, 0.0, 4.0]], dtype=torch.float64)
+    estimate = torch.tensor([[0.3, 0.4, 4.2]], dtype=torch.float64)
+    assert projected_error(xyz, estimate).item() == pytest.approx(0.5)
+    assert depth_error(xyz, estimate).item() == pytest.approx(0.2)
+
+
+def test_the_two_errors_are_the_legs_of_a_right_triangle(pairs: tuple[torch.Tensor, torch.Tensor]) -> None:
+    xyz, estimate = pairs
+    hypotenuse = (estimate - xyz).square().sum(-1)
+    legs = projected_error(xyz, estimate).square() + depth_error(xyz, estimate).square()
+    torch.testing.assert_close(legs, hypotenuse)
+
+
+def test_moving_along_the_true_ray_changes_depth_alone(pairs: tuple[torch.Tensor, torch.Tensor]) -> None:
+    xyz, _ = pairs
+    assert projected_error(xyz, 1.1 * xyz).max() < 1e-12
+    torch.testing.assert_close(depth_error(xyz, 1.1 * xyz), 0.1 * xyz.norm(dim=-1))
+    torch.testing.assert_close(along_true_ray(xyz, 1.1 * xyz), 1.1 * xyz)
+
+
+def test_the_metric_is_the_mean_over_all_batches(pairs: tuple[torch.Tensor, torch.Tensor]) -> None:
+    xyz, estimate = pairs
+    metric = PositionErrors()
+    for rows in (slice(0, 10), slice(10, 64)):
+        metric.update(xyz[rows], estimate[rows])
+    values = metric.compute()
+    torch.testing.assert_close(values["projected_error_mm"], 1000 * projected_error(xyz, estimate).mean())
+    torch.testing.assert_close(values["depth_error_mm"], 1000 * depth_error(xyz, estimate).mean())

@@ -1,0 +1,105 @@
+"""The whole network: what it starts from, what every output learns, what precision it keeps."""
+
+import pytest
+import torch
+
+from phd_exp.geometry import Camera, Cartesian, DepthScale, LogDepth, Projected
+from phd_exp.losses import MeanAbsoluteError, NegativeLogLikelihood
+from phd_exp.models.backbones import resnet
+from phd_exp.models.heads import ChartHead, DistributionHead, Head
+from phd_exp.models.regressor import Regressor
+
+DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
+HEADS: dict[str, Head] = {
+    "probabilistic": DistributionHead(DEPTH),
+    "mae_vz": ChartHead(DEPTH, Projected),
+    "mae_logz": ChartHead(DEPTH, LogDepth),
+    "mae_xyz": ChartHead(DEPTH, Cartesian),
+}
+LOSSES = {"probabilistic": NegativeLogLikelihood()}
+
+
+@pytest.fixture
+def camera() -> Camera:
+    return Camera(torch.tensor([1200.0, 1500.0, 1800.0, 2000.0]), 224.0)
+
+
+@pytest.fixture
+def image() -> torch.Tensor:
+    generator = torch.Generator().manual_seed(0)
+    return torch.randint(0, 256, (4, 64, 64, 3), generator=generator, dtype=torch.uint8)
+
+
+@pytest.fixture
+def xyz() -> torch.Tensor:
+    return torch.tensor([[0.1, -0.2, 3.1], [-0.2, 0.1, 4.9], [0.05, 0.2, 3.7], [-0.1, -0.1, 4.2]])
+
+
+def regressor(head: Head) -> Regressor:
+    torch.manual_seed(0)
+    return Regressor(resnet(18), head)
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_starts_at_zero_whatever_the_image(name: str, image: torch.Tensor, camera: Camera) -> None:
+    raw = regressor(HEADS[name]).raw(image)
+    assert raw.shape == (4, HEADS[name].n_outputs)
+    assert not raw.any()
+
+
+def test_starts_in_the_middle_of_the_data_set(image: torch.Tensor, camera: Camera) -> None:
+    for name, head in HEADS.items():
+        mode = regressor(head)(image, camera).mode
+        assert mode[:, :2].abs().max() < 1e-6, name
+        expected = torch.full((4,), 4.0) if name == "mae_xyz" else DEPTH.mu_z0 * camera.f
+        torch.testing.assert_close(mode[:, 2], expected)
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_every_output_learns_from_the_first_step(
+    name: str, image: torch.Tensor, camera: Camera, xyz: torch.Tensor
+) -> None:
+    network = regressor(HEADS[name])
+    loss = LOSSES.get(name, MeanAbsoluteError())(network(image, camera), xyz)
+    loss.backward()
+    assert loss.isfinite()
+    gradient = network.last.weight.grad
+    assert gradient is not None
+    assert gradient.isfinite().all()
+    assert (gradient.abs().amax(dim=1) > 1e-4).all(), gradient.abs().amax(dim=1)
+
+
+@pytest.mark.parametrize("depth", [18, 34, 50])
+def test_no_batch_norm_is_left(depth: int) -> None:
+    kinds = [type(module) for module in resnet(depth).modules()]
+    assert torch.nn.BatchNorm2d not in kinds
+    groups = {m.num_groups for m in resnet(depth).modules() if isinstance(m, torch.nn.GroupNorm)}
+    assert groups == {1}
+
+
+def test_under_autocast_the_last_layer_stays_in_float32(image: torch.Tensor, camera: Camera) -> None:
+    network = regressor(HEADS["probabilistic"])
+    with torch.autocast("cpu", torch.bfloat16):
+        assert network.backbone(torch.rand(1, 3, 64, 64)).dtype == torch.bfloat16
+        assert network.raw(image).dtype == torch.float32
+
+
+def test_normalises_as_torchvision_does(image: torch.Tensor) -> None:
+    from torchvision.transforms.v2.functional import normalize
+
+    network = regressor(HEADS["mae_vz"])
+    seen = []
+    network.backbone.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    network.raw(image)
+    expected = normalize(
+        image.permute(0, 3, 1, 2) / 255, mean=[0.485, 0.456, 0.406], std=[0.229, 0.224, 0.225]
+    )
+    torch.testing.assert_close(seen[0], expected)
+
+
+def test_images_and_cameras_may_shrink_together(camera: Camera, xyz: torch.Tensor) -> None:
+    """The full density does not change when an image, f, S and mu_z0 are resized together."""
+    raw = torch.linspace(-1, 1, 28).view(4, 7)
+    whole = DistributionHead(DEPTH)(raw, camera).log_prob(xyz)
+    half = DistributionHead(DEPTH.scaled(0.5))(raw, camera.scaled(0.5)).log_prob(xyz)
+    torch.testing.assert_close(half, whole)

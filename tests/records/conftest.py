@@ -1,0 +1,66 @@
+"""A specification, and a data set folder that took no renderer: real scenes, one-colour images."""
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from phd_exp.records.dataset import DatasetFolder, Manifest, Seal, image_name, sha256
+from phd_exp.records.files import write_atomic
+from phd_exp.records.scenes import SampleRecord, Split
+from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.sampling import sample_scene
+
+PAPER: dict[str, Any] = {
+    "variant": "default",
+    "seed": 0,
+    "sensor_size": 224,
+    "f_range": (1200.0, 2000.0),
+    "z_range": (3.0, 5.0),
+    "xy_range": 1.0,
+    "scale_range": (1.0, 1.0),
+    "occluders": False,
+    "lamp_jitter": 0.2,
+    "samples_per_pixel": 4,
+}
+
+
+@pytest.fixture(scope="session")
+def make_spec() -> Callable[..., DatasetSpec]:
+    """The paper's data set, with some values changed."""
+    return lambda **changes: DatasetSpec(**(PAPER | changes))
+
+
+@pytest.fixture
+def dataset(tmp_path: Path, make_spec: Callable[..., DatasetSpec]) -> DatasetFolder:
+    """Five training and two test samples."""
+    folder, spec = DatasetFolder(tmp_path / "default"), make_spec()
+    counts: dict[Split, int] = {"train": 5, "test": 2}
+    seals = {split: _fill(folder, spec, split, n) for split, n in counts.items()}
+    folder.write_manifest(Manifest(generator=1, renderer="none", spec=spec, splits=seals))
+    return folder
+
+
+def _fill(folder: DatasetFolder, spec: DatasetSpec, split: Split, n: int) -> Seal:
+    folder.split_folder(split).mkdir(parents=True)
+    records = [_sample(folder, spec, split, index) for index in range(n)]
+    text = "".join(record.model_dump_json() + "\n" for record in records)
+    write_atomic(folder.metadata_path(split), text)
+    return Seal(n=n, metadata_sha256=sha256(text.encode()))
+
+
+def _sample(folder: DatasetFolder, spec: DatasetSpec, split: Split, index: int) -> SampleRecord:
+    stream = io.BytesIO()
+    Image.new("RGB", (8, 8), (index, 0, 0)).save(stream, format="PNG")
+    write_atomic(folder.image_path(split, index), stream.getvalue())
+    scene = sample_scene(spec, split, index)
+    x, y, z = scene.objects[0].position
+    return SampleRecord(
+        file_name=image_name(index),
+        **{"x": x, "y": y, "z": z, "scale": 1.0, "visibility": 1.0},
+        **{"index": index, "split": split, "seed": 0, "sha256": sha256(stream.getvalue())},
+        **dict(scene),
+    )

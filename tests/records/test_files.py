@@ -1,0 +1,97 @@
+"""Files are whole or absent, and a journal survives the death of its writer."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from phd_exp.records.files import (
+    CorruptFileError,
+    open_journal,
+    read_jsonl,
+    remove_temporaries,
+    write_atomic,
+)
+
+
+@pytest.mark.parametrize("content", ["grün\n", b"\x00\xff", ""])
+def test_what_is_written_is_read(tmp_path: Path, content: str | bytes) -> None:
+    path = tmp_path / "file"
+    write_atomic(path, content)
+    assert path.read_bytes() == (content.encode() if isinstance(content, str) else content)
+
+
+def test_a_failed_write_leaves_the_old_content_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "file"
+    write_atomic(path, "old")
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_atomic(path, "new")
+    assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["file"]
+
+
+def test_a_written_file_has_the_rights_of_an_ordinary_one(tmp_path: Path) -> None:
+    (tmp_path / "ordinary").write_text("")
+    write_atomic(tmp_path / "atomic", "")
+    assert (tmp_path / "atomic").stat().st_mode == (tmp_path / "ordinary").stat().st_mode
+
+
+def test_leftovers_of_killed_writers_are_removed_and_nothing_else(tmp_path: Path) -> None:
+    script = (
+        "import os, signal; from phd_exp.records import files\n"
+        "os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL)\n"
+        f"files.write_atomic({str(tmp_path / 'file')!r}, 'new')"
+    )
+    subprocess.run([sys.executable, "-c", script], cwd=Path(__file__).parents[2], check=False)
+    (leftover,) = tmp_path.iterdir()
+    (tmp_path / "kept").write_text("")
+    remove_temporaries(tmp_path)
+    assert not leftover.exists()
+    assert (tmp_path / "kept").exists()
+
+
+def test_a_journal_goes_on_after_a_torn_line(tmp_path: Path) -> None:
+    path = tmp_path / "journal"
+    path.write_bytes(b'{"a": 1}\n{"a": 2}\n{"a": ')
+    assert read_jsonl(path) == [{"a": 1}, {"a": 2}]
+    with open_journal(path) as journal:
+        journal.write('{"a": 3}\n')
+        assert read_jsonl(path)[-1] == {"a": 3}, "a line is on disk as soon as it is written"
+    assert read_jsonl(path) == [{"a": 1}, {"a": 2}, {"a": 3}]
+
+
+def test_a_journal_may_be_new_or_empty(tmp_path: Path) -> None:
+    for _ in range(2):
+        open_journal(tmp_path / "journal").close()
+    assert read_jsonl(tmp_path / "journal") == []
+
+
+@pytest.mark.parametrize("line", ["nonsense", '{"a": ', "\ufffd", ""])
+def test_a_bad_line_is_named(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "lines"
+    path.write_text(f'{{"a": 1}}\n{line}\n{{"a": 3}}\n')
+    with pytest.raises(CorruptFileError, match=r"lines, line 2: not a valid record") as error:
+        read_jsonl(path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_sealed_file_has_no_torn_line(tmp_path: Path) -> None:
+    path = tmp_path / "lines"
+    path.write_text('{"a": 1}\n{"a"')
+    with pytest.raises(CorruptFileError, match="line 2"):
+        read_jsonl(path, sealed=True)
+
+
+def test_only_the_lines_asked_for_are_parsed(tmp_path: Path) -> None:
+    path = tmp_path / "lines"
+    path.write_text('{"a": 1}\nnonsense\n')
+    assert read_jsonl(path, limit=1) == [{"a": 1}]

@@ -1,0 +1,122 @@
+"""Run records: named by choices, whole or absent, honest about how a run ended."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from phd_exp.records.errors import RunError
+from phd_exp.records.runs import RunFolder, RunName, find_runs
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> RunFolder:
+    run = RunFolder(RunName("smoke", "occl", "mae_vz", 0).folder(tmp_path))
+    run.path.mkdir(parents=True)
+    return run
+
+
+def test_a_run_is_named_by_its_choices(tmp_path: Path) -> None:
+    plain = RunName("paper", "scale", "mae_logz", 3).folder(tmp_path)
+    assert plain.relative_to(tmp_path).as_posix() == "paper/scale/mae_logz/seed3"
+    one = RunName("paper", "scale", "mae_logz", 3, ("data.n_train=256", "optimizer.lr=0.1")).folder(tmp_path)
+    same = RunName("paper", "scale", "mae_logz", 3, ("optimizer.lr=0.1", "data.n_train=256")).folder(tmp_path)
+    other = RunName("paper", "scale", "mae_logz", 3, ("optimizer.lr=0.2", "data.n_train=256")).folder(
+        tmp_path
+    )
+    assert one == same != other
+    assert one.name.startswith("seed3-")
+
+
+def test_a_run_that_ends_well_is_finished(folder: RunFolder) -> None:
+    with folder.recording(data_manifest="abc"):
+        status = folder.status()
+        assert status is not None
+        assert status.state == "running"
+        assert not folder.is_finished()
+    assert folder.is_finished()
+    status = folder.status()
+    assert status is not None
+    assert status.data_manifest == "abc"
+    assert {"python", "torch", "lightning"} <= status.versions.keys()
+
+
+@pytest.mark.parametrize(
+    ("stop", "state"),
+    [(ValueError("no\nuse"), "failed"), (KeyboardInterrupt(), "interrupted"), (SystemExit(), "interrupted")],
+)
+def test_a_run_that_is_stopped_says_so(folder: RunFolder, stop: BaseException, state: str) -> None:
+    with pytest.raises(type(stop)), folder.recording(data_manifest=None):
+        raise stop
+    status = folder.status()
+    assert status is not None
+    assert status.state == state
+    assert not folder.is_finished()
+    if state == "failed":
+        assert status.traceback is not None
+        assert "test_runs.py" in status.traceback
+
+
+def test_two_processes_cannot_hold_one_run(folder: RunFolder) -> None:
+    with (
+        folder.held(),
+        pytest.raises(RunError, match="another process is working on this run"),
+        RunFolder(folder.path).held(),
+    ):
+        pass
+    with folder.held():
+        pass
+
+
+def test_an_unwritable_run_folder_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with (
+        pytest.raises(RunError, match=r"cannot be written .*runs=DIR"),
+        RunFolder(tmp_path / "file" / "run").held(),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"state": "done"}', "\x00"])
+def test_a_broken_status_is_named(folder: RunFolder, content: str) -> None:
+    folder.status_file.write_text(content)
+    with pytest.raises(RunError, match=r"status\.json: not a run status .*delete the folder"):
+        folder.status()
+
+
+@pytest.mark.parametrize(
+    ("content", "said"), [("{", "cannot be read"), ("[1]", "expected a mapping, found list")]
+)
+def test_broken_results_are_named(folder: RunFolder, content: str, said: str) -> None:
+    folder.results_file.write_text(content)
+    with pytest.raises(RunError, match=said):
+        folder.results()
+
+
+def test_missing_results_are_named(folder: RunFolder) -> None:
+    with pytest.raises(RunError, match=r"results\.json: missing"):
+        folder.results()
+
+
+def test_metrics_survive_a_torn_last_line(folder: RunFolder) -> None:
+    folder.write_metrics([{"epoch": 0, "test/nll": 1.5}, {"epoch": 1, "test/nll": 1.25}])
+    with folder.metrics_file.open("a") as file:
+        file.write('{"epoch": 2, "te')
+    assert folder.metrics() == [{"epoch": 0, "test/nll": 1.5}, {"epoch": 1, "test/nll": 1.25}]
+
+
+def test_config_and_results_come_back(folder: RunFolder) -> None:
+    folder.write_config({"seed": 0, "data": {"n_train": 3}})
+    folder.write_results({"test/nll": -1.5})
+    assert folder.config() == {"seed": 0, "data": {"n_train": 3}}
+    assert folder.results() == json.loads(folder.results_file.read_text()) == {"test/nll": -1.5}
+
+
+def test_finds_all_runs(tmp_path: Path) -> None:
+    for name in (RunName("smoke", "occl", "mae_vz", 1), RunName("paper", "default", "mae_vz", 0, ("a=1",))):
+        run = RunFolder(name.folder(tmp_path))
+        run.path.mkdir(parents=True)
+        with run.recording(data_manifest=None):
+            pass
+    (tmp_path / "stray").mkdir()
+    assert [run.path.name[:5] for run in find_runs(tmp_path)] == ["seed0", "seed1"]

@@ -1,0 +1,91 @@
+"""A specification refuses what makes no sense, and says what its data set spans."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from phd_exp.records.spec import DatasetSpec
+
+MakeSpec = Callable[..., DatasetSpec]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("variant", "../elsewhere"),
+        ("variant", ""),
+        ("seed", -1),
+        ("seed", 1.0),
+        ("seed", True),
+        ("sensor_size", 0),
+        ("sensor_size", 224.0),
+        ("sensor_size", "224"),
+        ("f_range", (2000.0, 1200.0)),
+        ("f_range", (0.0, 1200.0)),
+        ("f_range", (-1.0, 1200.0)),
+        ("f_range", (1200.0,)),
+        ("f_range", 1200.0),
+        ("f_range", ("1200", "2000")),
+        ("f_range", (1200.0, float("inf"))),
+        ("z_range", (0.0, 5.0)),
+        ("z_range", (3.0, float("nan"))),
+        ("xy_range", 1.1),
+        ("xy_range", -0.1),
+        ("scale_range", (0.0, 1.0)),
+        ("scale_range", (1.0, 3.0)),
+        ("occluders", 1),
+        ("occluders", "yes"),
+        ("lamp_jitter", 1.0),
+        ("samples_per_pixel", 0),
+        ("samples_per_pixel", 2.5),
+        ("sensor", 224),
+    ],
+)
+def test_nonsense_is_refused_and_the_key_named(make_spec: MakeSpec, key: str, value: Any) -> None:
+    with pytest.raises(ValidationError) as error:
+        make_spec(**{key: value})
+    assert [complaint["loc"][0] for complaint in error.value.errors()] == [key] * error.value.error_count()
+
+
+def test_every_value_has_to_be_given(make_spec: MakeSpec) -> None:
+    for key in DatasetSpec.model_fields:
+        with pytest.raises(ValidationError, match=key):
+            DatasetSpec(**{name: value for name, value in make_spec() if name != key})
+
+
+def test_what_configuration_files_hold_is_taken(make_spec: MakeSpec) -> None:
+    assert make_spec(f_range=[1200, 2000], z_range=[3, 5], xy_range=1, scale_range=[1, 1]) == make_spec()
+
+
+def test_the_papers_constants_follow(make_spec: MakeSpec) -> None:
+    """mu_z0 = 2.5e-3 and D = 5/3 (section "Dataset")."""
+    low, high = make_spec().z_over_f_range
+    assert (low * high) ** 0.5 == pytest.approx(2.5e-3)
+    assert (high / low) ** 0.5 == pytest.approx(5 / 3)
+
+
+def test_a_fingerprint_depends_on_every_value_and_on_nothing_else(make_spec: MakeSpec) -> None:
+    changes = {
+        "variant": "other",
+        "seed": 1,
+        "sensor_size": 112,
+        "f_range": (1200.0, 1999.0),
+        "z_range": (3.0, 4.9),
+        "xy_range": 0.5,
+        "scale_range": (0.8, 1.2),
+        "occluders": True,
+        "lamp_jitter": 0.1,
+        "samples_per_pixel": 8,
+    }
+    assert changes.keys() == DatasetSpec.model_fields.keys()
+    prints = {make_spec(**{key: value}).fingerprint() for key, value in changes.items()}
+    prints |= {make_spec().fingerprint(), make_spec(f_range=[1200, 2000]).fingerprint()}
+    assert len(prints) == len(changes) + 1
+    assert make_spec().fingerprint() == "3e7d3bee0e66431c", "the same on every machine, for ever"
+
+
+def test_a_specification_cannot_be_changed(make_spec: MakeSpec) -> None:
+    with pytest.raises(ValidationError):
+        make_spec().seed = 3

@@ -1,0 +1,105 @@
+"""A prediction as columns: what the record holds is what the formulas say."""
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+
+from phd_exp.data.batches import Batch
+from phd_exp.distributions import PointEstimate, ProjectedHuber
+from phd_exp.geometry import DepthScale, Projected
+from phd_exp.training.predictions import calibration_curves, columns, joined, summary
+
+DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
+
+
+@pytest.fixture
+def batch() -> Batch:
+    generator = torch.Generator().manual_seed(0)
+    n = 12
+    z = 3 + 2 * torch.rand(n, generator=generator)
+    xyz = torch.stack([0.05 * z, -0.02 * z, z], dim=-1)
+    return Batch(
+        image=torch.zeros(n, 2, 2, 3, dtype=torch.uint8),
+        xyz=xyz,
+        f=torch.linspace(1200, 2000, n),
+        S=224.0,
+        row=torch.arange(n).flip(0),
+    )
+
+
+@pytest.fixture
+def distribution(batch: Batch) -> ProjectedHuber:
+    raw = torch.randn(len(batch), 7, generator=torch.Generator().manual_seed(1))
+    return ProjectedHuber.from_raw(raw, f=batch.f, S=batch.S, mu_z0=DEPTH.mu_z0)
+
+
+def test_columns_rebuild_the_distribution(batch: Batch, distribution: ProjectedHuber) -> None:
+    table = columns(distribution, batch)
+    A = torch.stack(
+        [
+            torch.stack([table["A_xx"], table["A_xy"]], -1),
+            torch.stack([table["A_xy"], table["A_yy"]], -1),
+        ],
+        -2,
+    )
+    mu_xy = torch.stack([table["mu_x"], table["mu_y"]], -1)
+    rebuilt = ProjectedHuber(mu_xy, table["mu_z"], A, table["a"])
+    torch.testing.assert_close(-rebuilt.log_prob(batch.xyz.double()), table["nll"], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(rebuilt.depth_variance, table["depth_variance"], rtol=1e-4, atol=0)
+    torch.testing.assert_close(rebuilt.depth_median, table["median_z"], rtol=1e-4, atol=0)
+
+
+def test_summary_is_the_mean_of_the_columns(batch: Batch, distribution: ProjectedHuber) -> None:
+    table = columns(distribution, batch)
+    means = summary(table)
+    assert means["test/nll"] == pytest.approx(-distribution.log_prob(batch.xyz).mean().item(), rel=1e-5)
+    assert means["test/depth_precision"] == pytest.approx(distribution.a.mean().item(), rel=1e-5)
+    determinant = distribution.log_det_A.exp().mean().item()
+    assert means["test/projected_precision"] == pytest.approx(determinant, rel=1e-4)
+
+
+def test_a_point_estimate_has_errors_alone(batch: Batch) -> None:
+    chart = Projected(DEPTH)
+    estimate = PointEstimate(chart.coordinates(batch.xyz, batch.camera), chart, batch.camera)
+    table = columns(estimate, batch)
+    assert "nll" not in table
+    assert summary(table).keys() == {"test/projected_error_mm", "test/depth_error_mm"}
+    assert table["projected_error_mm"].max() < 0.01
+
+
+def test_curves_of_samples_of_the_distribution_itself_are_calibrated() -> None:
+    """Positions drawn from the predictions: both curves must lie on the identity."""
+    n = 20_000
+    generator = torch.Generator().manual_seed(2)
+    raw = torch.zeros(n, 7, dtype=torch.float64)
+    raw[:, 2], raw[:, 4] = 5 + 40 * torch.rand(2, n, generator=generator, dtype=torch.float64)
+    raw[:, 5] = 5 + 20 * torch.rand(n, generator=generator, dtype=torch.float64)
+    f = torch.full((n,), 1500.0, dtype=torch.float64)
+    prediction = ProjectedHuber.from_raw(raw, f=f, S=224.0, mu_z0=DEPTH.mu_z0)
+    torch.manual_seed(3)
+    image = torch.zeros(1, 1, 1, 3, dtype=torch.uint8).expand(n, 1, 1, 3)
+    batch = Batch(image=image, xyz=prediction.sample(), f=f, S=224.0, row=torch.arange(n))
+    for name, curve in calibration_curves(columns(prediction, batch), window=4000).items():
+        ratio = curve.empirical / curve.predicted
+        assert ((ratio > 0.85) & (ratio < 1.15)).all(), (name, ratio.min(), ratio.max())
+
+
+def test_the_record_is_in_the_order_of_the_data_set(
+    batch: Batch, distribution: ProjectedHuber, tmp_path: Path
+) -> None:
+    from types import SimpleNamespace
+
+    from phd_exp.training.predictions import write_parquet
+
+    records = [
+        SimpleNamespace(file_name=f"{i:06d}.png", f=1500.0 + i, S=224, scale=1.0, visibility=0.5)
+        for i in range(len(batch))
+    ]
+    table = joined([columns(distribution, batch)])
+    write_parquet(tmp_path / "predictions.parquet", table, records)  # type: ignore[arg-type]
+    frame = pd.read_parquet(tmp_path / "predictions.parquet")
+    assert frame["file_name"].tolist() == [f"{i:06d}.png" for i in range(len(batch))]
+    assert frame["z"].tolist() == batch.xyz[:, 2].flip(0).double().tolist()
+    assert "row" not in frame
