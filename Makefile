@@ -31,10 +31,10 @@ lint: $(INSTALLED)  ## ruff, mypy and the import floors
 	$(BIN)/lint-imports
 
 test: lint  ## lint and the default tests (under 5 minutes on 2 cores)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2
 
 test-all: lint  ## the slow tests too
-	$(BIN)/python -m pytest -m 'slow or not slow'
+	$(BIN)/python -m pytest -n 2 -m 'slow or not slow'
 
 clean:  ## forget .venv and caches; renders/ and runs/ stay
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

@@ -3,11 +3,8 @@
 import sys
 from importlib import import_module
 
-VERBS = {
-    "train": "render what is missing, train, measure and record a run (the default)",
-    "render": "render a data set, or what is missing of it",
-    "report": "print the table of all recorded runs beside the paper's numbers",
-}
+from phd_exp.cli.help import VERBS, show
+
 HELP = {"-h", "--help", "help"}
 
 
@@ -16,8 +13,6 @@ def main(arguments: list[str] | None = None) -> int:
     rest = list(sys.argv[1:] if arguments is None else arguments)
     verb = _take_verb(rest)
     if HELP & set(rest):
-        from phd_exp.cli.help import show
-
         return show(verb)
     if verb is not None and verb not in VERBS:
         print(f"error: no verb {verb!r}; expected one of {', '.join(VERBS)}, or key=value", file=sys.stderr)

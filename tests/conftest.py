@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import torch
 from jaxtyping import install_import_hook
 
 # before anything is imported: every annotated function of these folders checks its shapes while tests run
@@ -12,6 +13,10 @@ HOOKED = [
     f"phd_exp.{folder}" for folder in ("geometry", "distributions", "losses", "metrics", "models", "data")
 ]
 install_import_hook(HOOKED, "beartype.beartype")
+
+
+# two test processes on two cores; more threads would only wait for each other
+torch.set_num_threads(1)
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,13 @@
 
 from pathlib import Path
 
-from phd_exp.__main__ import VERBS
 from phd_exp.cli.paths import conf_folder
 
+VERBS = {
+    "train": "render what is missing, train, measure and record a run (the default)",
+    "render": "render a data set, or what is missing of it",
+    "report": "print the table of all recorded runs beside the paper's numbers",
+}
 EXAMPLES = {
     "train": [
         "python -m phd_exp model=mae_logz data=scale",

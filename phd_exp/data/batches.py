@@ -1,7 +1,7 @@
 """Batches of a resident data set, in an order that depends on (seed, epoch) alone."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -36,12 +36,10 @@ class Batch:
         return Batch(self.image[rows], self.xyz[rows], self.f[rows], self.S, self.row[rows])
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> "Batch":
-        moved = {
-            field.name: value.to(device, non_blocking=non_blocking) if isinstance(value, Tensor) else value
-            for field in fields(self)
-            for value in [getattr(self, field.name)]
-        }
-        return Batch(**moved)
+        def moved(tensor: Tensor) -> Tensor:
+            return tensor.to(device, non_blocking=non_blocking)
+
+        return Batch(moved(self.image), moved(self.xyz), moved(self.f), self.S, moved(self.row))
 
 
 class BatchLoader:

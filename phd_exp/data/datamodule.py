@@ -10,7 +10,7 @@ from phd_exp.data.batches import Batch, BatchLoader
 from phd_exp.data.images import cached_images
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.records.dataset import DatasetFolder
-from phd_exp.records.scenes import SampleRecord
+from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
 
 
@@ -36,15 +36,15 @@ class RenderedData(LightningDataModule):
     ) -> None:
         super().__init__()
         self.folder = folder
-        self.sizes = {"train": n_train, "test": n_test}
+        self.sizes: dict[Split, int] = {"train": n_train, "test": n_test}
         self.image_size = image_size
         self.batch_size = batch_size
         self.seed = seed
         self.zoom = image_size / spec.sensor_size
         self.depth = DepthScale.from_ranges(f_range=spec.f_range, z_range=spec.z_range).scaled(self.zoom)
         self.constant_f = self.zoom * float(np.sqrt(spec.f_range[0] * spec.f_range[1]))
-        self.records: dict[str, Sequence[SampleRecord]] = {}
-        self.samples: dict[str, Batch] = {}
+        self.records: dict[Split, Sequence[SampleRecord]] = {}
+        self.samples: dict[Split, Batch] = {}
 
     def setup(self, stage: str | None = None) -> None:
         """Open both splits; decodes their images the first time."""
@@ -67,7 +67,7 @@ class RenderedData(LightningDataModule):
             self.samples["test"], self.batch_size, shuffle=False, drop_last=False, seed=self.seed
         )
 
-    def _samples(self, split: str) -> Batch:
+    def _samples(self, split: Split) -> Batch:
         records = self.records[split]
         images = cached_images(self.folder, split, records, self.image_size)
         return Batch(

@@ -11,7 +11,7 @@ from rich.progress import track
 
 from phd_exp.records.dataset import DatasetError, DatasetFolder, sha256
 from phd_exp.records.files import write_atomic
-from phd_exp.records.scenes import SampleRecord
+from phd_exp.records.scenes import SampleRecord, Split
 
 DECODERS = 4
 CACHE_LAYOUT = 1
@@ -19,7 +19,7 @@ CACHE_LAYOUT = 1
 
 
 def cached_images(
-    folder: DatasetFolder, split: str, records: Sequence[SampleRecord], image_size: int
+    folder: DatasetFolder, split: Split, records: Sequence[SampleRecord], image_size: int
 ) -> np.ndarray:
     """The images of the records as a memory-mapped array (n, image_size, image_size, 3), uint8.
 
@@ -62,7 +62,7 @@ def _resized(image: Image.Image, image_size: int) -> np.ndarray:
 
 
 def _decode_all(
-    folder: DatasetFolder, split: str, records: Sequence[SampleRecord], image_size: int, array_file: Path
+    folder: DatasetFolder, split: Split, records: Sequence[SampleRecord], image_size: int, array_file: Path
 ) -> None:
     array_file.parent.mkdir(parents=True, exist_ok=True)
     unfinished = array_file.with_suffix(".unfinished")

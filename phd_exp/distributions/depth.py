@@ -22,7 +22,9 @@ def depth_energy(
     Source: paper, section "Projected Huber distribution".
     """
     distance = log_t.abs()
-    return torch.exp(log_a + distance) * -torch.expm1(-distance)  # a (e^|log t| - 1) without the underflow of a
+    return torch.exp(log_a + distance) * -torch.expm1(
+        -distance
+    )  # a (e^|log t| - 1) without the underflow of a
 
 
 def depth_log_density(

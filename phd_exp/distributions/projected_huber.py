@@ -7,7 +7,6 @@ With q = A_xy (x, y) - nu_xy z and t = z / mu_z,
 q and t are independent, and v is linear in (q, t): every statistic below rests on that.
 """
 
-import math
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -19,7 +18,8 @@ from torch.distributions.constraints import Constraint
 
 from phd_exp.distributions import depth, huber, spd
 from phd_exp.distributions.level import credible_level
-from phd_exp.distributions.special import log_scaled_normaliser, signed_log1p
+from phd_exp.distributions.natural import Natural
+from phd_exp.distributions.special import log_scaled_normaliser
 
 
 class _InFrontOfCamera(Constraint):
@@ -47,7 +47,7 @@ class ProjectedHuber(Distribution):
     Source: paper, section "Projected Huber distribution".
     """
 
-    arg_constraints: ClassVar[dict[str, Constraint]] = {  # type: ignore[misc]
+    arg_constraints: ClassVar[dict[str, Constraint]] = {
         "mu_xy": constraints.real_vector,
         "mu_z": constraints.positive,
         "A": constraints.positive_definite,
@@ -55,14 +55,6 @@ class ProjectedHuber(Distribution):
     }
     support = _InFrontOfCamera()
     has_rsample = True
-
-    # The parameters in the form in which the density needs them. Products and logarithms are kept instead of mu_xy, mu_z, A
-    # and a because these overflow or underflow for raw numbers of a network that are merely large.
-    _A_xy: Tensor  # A / mu_z
-    _nu_xy: Tensor  # A_xy mu_xy
-    _log_det_A_xy: Tensor
-    _log_mu_z: Tensor
-    _log_a: Tensor
 
     def __init__(
         self,
@@ -75,21 +67,12 @@ class ProjectedHuber(Distribution):
         if _wants_validation(validate_args):
             for name, value in (("mu_xy", mu_xy), ("mu_z", mu_z), ("A", A), ("a", a)):
                 _require(name, value, self.arg_constraints[name])
-        A_xy = A / mu_z[..., None, None]
-        log_mu_z = mu_z.log()
-        self._adopt(
-            A_xy=A_xy,
-            nu_xy=spd.matvec(A_xy, mu_xy),
-            log_det_A_xy=spd.log_det(A) - 2 * log_mu_z,
-            log_mu_z=log_mu_z,
-            log_a=a.log(),
-            validate_args=validate_args,
-        )
+        self._adopt(Natural.from_camera_frame(mu_xy, mu_z, A, a), validate_args)
 
     @classmethod
     def from_raw(
         cls,
-        raw: Float[Tensor, "*batch 7"],
+        raw: Float[Tensor, "*#batch 7"],
         *,
         f: Float[Tensor, "*#batch"] | float,
         S: float,
@@ -97,9 +80,6 @@ class ProjectedHuber(Distribution):
         validate_args: bool | None = None,
     ) -> "ProjectedHuber":
         """The distribution of seven raw numbers (n_1, n_2, b_1, b_2, b_3, w_1, w_2) of a network, any finite ones.
-
-        nu_p = (n_1, n_2); B = `spd.spectral_map`(b); a = `spd.positive`(w_1); log nu_z = sign(w_2) log(1 + |w_2|/a).
-        Then mu_z = nu_z mu_z0 f, A_xy = 2 B / (S mu_z0) and nu_xy = nu_p / (mu_z0 f).
 
         Args:
             raw: the raw numbers.
@@ -111,49 +91,27 @@ class ProjectedHuber(Distribution):
         Raises:
             ValueError: a raw number is not finite, or f, S or mu_z0 is not positive and finite.
 
-        Source: paper, sections "Parameter remapping" and "Enforcing constraints on distribution parameters".
+        Source: paper, section "Enforcing constraints on distribution parameters"; formulas in `Natural.from_raw`.
         """
         f = torch.as_tensor(f, dtype=raw.dtype, device=raw.device)
         if _wants_validation(validate_args):
             _require("raw", raw, constraints.real_vector)
             for name, value in (("f", f), ("S", torch.tensor(S)), ("mu_z0", torch.tensor(mu_z0))):
                 _require(name, value, constraints.positive)
-        B, log_det_B = spd.spectral_map(raw[..., 2:5])
-        log_a = spd.log_positive(raw[..., 5])
-        scale = 2 / (S * mu_z0)
         distribution = cls.__new__(cls)
-        distribution._adopt(
-            A_xy=scale * B,
-            nu_xy=raw[..., :2] / (mu_z0 * f)[..., None],
-            log_det_A_xy=log_det_B + 2 * math.log(scale),
-            log_mu_z=signed_log1p(raw[..., 6], log_a) + torch.log(mu_z0 * f),
-            log_a=log_a,
-            validate_args=validate_args,
-        )
+        distribution._adopt(Natural.from_raw(raw, f, S, mu_z0), validate_args)
         return distribution
 
-    def _adopt(self, *, validate_args: bool | None, **parameters: Tensor) -> None:
-        """Take the stored parameters, expanded to their common batch shape; they are not checked again."""
-        event_dims = {"A_xy": 2, "nu_xy": 1}
-        dims = {name: value.ndim - event_dims.get(name, 0) for name, value in parameters.items()}
-        batch_shape = torch.broadcast_shapes(*(value.shape[: dims[name]] for name, value in parameters.items()))
-        for name, value in parameters.items():
-            setattr(self, f"_{name}", value.expand(batch_shape + value.shape[dims[name] :]))
-        super().__init__(batch_shape, torch.Size([3]), validate_args=False)
+    def _adopt(self, natural: Natural, validate_args: bool | None) -> None:
+        """Become the distribution of these parameters, which are not checked again."""
+        self._natural = natural.expand(natural.batch_shape)
+        super().__init__(natural.batch_shape, torch.Size([3]), validate_args=False)
         self._validate_args = _wants_validation(validate_args)
 
     def expand(self, batch_shape: Sequence[int], _instance: Distribution | None = None) -> "ProjectedHuber":
         """The same distribution with a larger batch shape; nothing is copied."""
-        batch_shape = torch.Size(batch_shape)
-        distribution = type(self).__new__(type(self)) if _instance is None else _instance
-        distribution._adopt(
-            A_xy=self._A_xy.expand((*batch_shape, 2, 2)),
-            nu_xy=self._nu_xy.expand((*batch_shape, 2)),
-            log_det_A_xy=self._log_det_A_xy.expand(batch_shape),
-            log_mu_z=self._log_mu_z.expand(batch_shape),
-            log_a=self._log_a.expand(batch_shape),
-            validate_args=self._validate_args,
-        )
+        distribution = self._get_checked_instance(ProjectedHuber, _instance)
+        distribution._adopt(self._natural.expand(torch.Size(batch_shape)), self._validate_args)
         return distribution
 
     def __repr__(self) -> str:
@@ -162,22 +120,22 @@ class ProjectedHuber(Distribution):
     @property
     def mu_xy(self) -> Float[Tensor, "*batch 2"]:
         """Centre of (x, y)/z, also its mean."""
-        return spd.matvec(self._A_xy_inverse, self._nu_xy)
+        return spd.matvec(self._A_xy_inverse, self._natural.nu_xy)
 
     @property
     def mu_z(self) -> Float[Tensor, "*batch"]:
         """Centre of z and its mode, metres."""
-        return self._log_mu_z.exp()
+        return self._natural.log_mu_z.exp()
 
     @property
     def A(self) -> Float[Tensor, "*batch 2 2"]:
         """Precision of (x, y)/z."""
-        return self._A_xy * self.mu_z[..., None, None]
+        return self._natural.A_xy * self.mu_z[..., None, None]
 
     @property
     def a(self) -> Float[Tensor, "*batch"]:
         """Precision of z."""
-        return self._log_a.exp()
+        return self._natural.log_a.exp()
 
     @property
     def depth_precision(self) -> Float[Tensor, "*batch"]:
@@ -187,11 +145,11 @@ class ProjectedHuber(Distribution):
     @property
     def log_det_A(self) -> Float[Tensor, "*batch"]:
         """log|A|; half of it is the log of the typical precision of (x, y)/z."""
-        return self._log_det_A_xy + 2 * self._log_mu_z
+        return self._natural.log_det_A_xy + 2 * self._natural.log_mu_z
 
     @property
     def _A_xy_inverse(self) -> Tensor:
-        return spd.inverse(self._A_xy, self._log_det_A_xy)
+        return spd.inverse(self._natural.A_xy, self._natural.log_det_A_xy)
 
     @property
     def _direction(self) -> Tensor:
@@ -201,7 +159,7 @@ class ProjectedHuber(Distribution):
 
     def _whiten(self, xyz: Tensor) -> Tensor:
         """q = A_xy (x, y) - nu_xy z."""
-        return spd.matvec(self._A_xy, xyz[..., :2]) - self._nu_xy * xyz[..., 2:]
+        return spd.matvec(self._natural.A_xy, xyz[..., :2]) - self._natural.nu_xy * xyz[..., 2:]
 
     def log_prob(self, value: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch"]:
         """Log density of a position (metres), in nats per cubic metre; -inf, with a zero gradient, for z <= 0.
@@ -212,7 +170,12 @@ class ProjectedHuber(Distribution):
         Source: paper, section "Projected Huber distribution"; the constants are kept.
         """
         energy, visible = self._excess_energy(value)
-        log_mode = self._log_det_A_xy - huber.HUBER_LOG_NORMALISER - self._log_mu_z - log_scaled_normaliser(self._log_a)
+        log_mode = (
+            self._natural.log_det_A_xy
+            - huber.HUBER_LOG_NORMALISER
+            - self._natural.log_mu_z
+            - log_scaled_normaliser(self._natural.log_a)
+        )
         return torch.where(visible, log_mode - energy, -torch.inf)
 
     def _excess_energy(self, xyz: Tensor) -> tuple[Tensor, Tensor]:
@@ -221,12 +184,14 @@ class ProjectedHuber(Distribution):
             self._check_positions(xyz)
         visible = xyz[..., 2] > 0
         # positions that are not visible are moved, so that no NaN is computed and then multiplied by a zero gradient
-        log_t = torch.where(visible, xyz[..., 2], 1).log() - self._log_mu_z
-        return huber.huber_energy(self._whiten(xyz)) + depth.depth_energy(log_t, self._log_a), visible
+        log_t = torch.where(visible, xyz[..., 2], 1).log() - self._natural.log_mu_z
+        return huber.huber_energy(self._whiten(xyz)) + depth.depth_energy(log_t, self._natural.log_a), visible
 
     def _check_positions(self, xyz: Tensor) -> None:
         if xyz.ndim == 0 or xyz.shape[-1] != 3:
-            raise ValueError(f"a position has 3 coordinates in its last dimension, but the shape is {tuple(xyz.shape)}")
+            raise ValueError(
+                f"a position has 3 coordinates in its last dimension, but the shape is {tuple(xyz.shape)}"
+            )
         torch.broadcast_shapes(xyz.shape[:-1], self.batch_shape)
         if bool(xyz.isnan().any()):
             raise ValueError(f"positions must not be NaN, but {int(xyz.isnan().any(dim=-1).sum())} are")
@@ -279,12 +244,12 @@ class ProjectedHuber(Distribution):
     @property
     def depth_mean(self) -> Float[Tensor, "*batch"]:
         """E[z], metres."""
-        return self.mu_z * depth.depth_mean_and_variance(self._log_a)[0]
+        return self.mu_z * depth.depth_mean_and_variance(self._natural.log_a)[0]
 
     @property
     def depth_variance(self) -> Float[Tensor, "*batch"]:
         """Var[z], square metres."""
-        return self.mu_z.square() * depth.depth_mean_and_variance(self._log_a)[1]
+        return self.mu_z.square() * depth.depth_mean_and_variance(self._natural.log_a)[1]
 
     @property
     def depth_median(self) -> Float[Tensor, "*batch"]:
@@ -294,13 +259,13 @@ class ProjectedHuber(Distribution):
     def depth_cdf(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
         """P(depth <= z), z in metres; 0 for z <= 0."""
         visible = z > 0
-        log_t = torch.where(visible, z, 1).log() - self._log_mu_z
-        return torch.where(visible, depth.depth_cdf(log_t, self._log_a), 0)
+        log_t = torch.where(visible, z, 1).log() - self._natural.log_mu_z
+        return torch.where(visible, depth.depth_cdf(log_t, self._natural.log_a), 0)
 
     def depth_icdf(self, p: Float[Tensor, "*#batch"] | float) -> Float[Tensor, "*#batch"]:
         """The depth z, metres, with P(depth <= z) = p, for p in (0, 1)."""
-        p = torch.as_tensor(p, dtype=self._log_a.dtype, device=self._log_a.device)
-        return torch.exp(self._log_mu_z + depth.depth_icdf(p, self._log_a))
+        p = torch.as_tensor(p, dtype=self._natural.log_a.dtype, device=self._natural.log_a.device)
+        return torch.exp(self._natural.log_mu_z + depth.depth_icdf(p, self._natural.log_a))
 
     def rsample(self, sample_shape: torch.Size | Sequence[int] = ()) -> Float[Tensor, "*shape 3"]:
         """Exact samples, differentiable in the parameters: (x, y) = z mu_xy + A_xy^(-1) q.
@@ -308,11 +273,11 @@ class ProjectedHuber(Distribution):
         Source: own derivation (q and t are independent); gradients by the implicit function theorem.
         """
         shape = self._extended_shape(torch.Size(sample_shape))[:-1]
-        kind = {"dtype": self._log_a.dtype, "device": self._log_a.device}
-        q = huber.sample_whitened(shape, **kind)
-        smallest = torch.finfo(self._log_a.dtype).eps / 2  # rand may return 0, where the depth would be 0
-        z = self.depth_icdf(torch.rand(shape, **kind).clamp_min(smallest))
-        xy = spd.matvec(self._A_xy_inverse, q + self._nu_xy * z[..., None])
+        dtype, device = self._natural.log_a.dtype, self._natural.log_a.device
+        q = huber.sample_whitened(shape, dtype=dtype, device=device)
+        p = torch.rand(shape, dtype=dtype, device=device)
+        z = self.depth_icdf(p.clamp_min(torch.finfo(dtype).eps / 2))  # rand may return 0, where z would be 0
+        xy = spd.matvec(self._A_xy_inverse, q + self._natural.nu_xy * z[..., None])
         return torch.cat([xy, z[..., None]], dim=-1)
 
     def entropy(self) -> Float[Tensor, "*batch"]:
@@ -320,8 +285,8 @@ class ProjectedHuber(Distribution):
 
         Source: own derivation from the independence of q and t; checked against samples.
         """
-        projection = huber.HUBER_LOG_NORMALISER + huber.HUBER_MEAN_ENERGY - self._log_det_A_xy
-        return projection + self._log_mu_z + depth.depth_entropy(self._log_a)
+        projection = huber.HUBER_LOG_NORMALISER + huber.HUBER_MEAN_ENERGY - self._natural.log_det_A_xy
+        return projection + self._natural.log_mu_z + depth.depth_entropy(self._natural.log_a)
 
 
 def _wants_validation(validate_args: bool | None) -> bool:
@@ -330,7 +295,9 @@ def _wants_validation(validate_args: bool | None) -> bool:
 
 def _require(name: str, value: Tensor, constraint: Constraint) -> None:
     """Raise a ValueError that names the parameter, its shape, its constraint and an offending value."""
-    batch = value.shape[: value.ndim - constraint.event_dim]  # the constraint answers once for a vector or matrix
+    batch = value.shape[
+        : value.ndim - constraint.event_dim
+    ]  # the constraint answers once for a vector or matrix
     invalid = ~(constraint.check(value) & value.isfinite().reshape((*batch, -1)).all(-1))
     if bool(invalid.any()):
         raise ValueError(

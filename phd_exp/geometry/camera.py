@@ -29,7 +29,9 @@ class Camera:
     def __post_init__(self) -> None:
         """Refuse a camera that cannot form an image."""
         if not (math.isfinite(self.S) and self.S > 0):
-            raise ValueError(f"S, the side of the image in pixels, must be positive and finite, but is {self.S}")
+            raise ValueError(
+                f"S, the side of the image in pixels, must be positive and finite, but is {self.S}"
+            )
         valid = (self.f > 0) & self.f.isfinite()
         if not bool(valid.all()):
             raise ValueError(

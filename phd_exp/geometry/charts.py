@@ -51,7 +51,9 @@ class DepthScale:
         """
         for name, (low, high) in (("f_range", f_range), ("z_range", z_range)):
             if not 0 < low <= high < math.inf:
-                raise ValueError(f"{name} must be (low, high) with 0 < low <= high < inf, but is {(low, high)}")
+                raise ValueError(
+                    f"{name} must be (low, high) with 0 < low <= high < inf, but is {(low, high)}"
+                )
         nearest, farthest = z_range[0] / f_range[1], z_range[1] / f_range[0]
         return cls(
             mu_z0=math.sqrt(farthest * nearest),
@@ -123,9 +125,7 @@ class Chart(ABC):
         """The coordinates of a position (metres)."""
 
     @abstractmethod
-    def position(
-        self, coordinates: Float[Tensor, "*#batch 3"], camera: Camera
-    ) -> Float[Tensor, "*#batch 3"]:
+    def position(self, coordinates: Float[Tensor, "*#batch 3"], camera: Camera) -> Float[Tensor, "*#batch 3"]:
         """The position (metres) with these coordinates; the inverse of `coordinates`."""
 
     @abstractmethod
@@ -148,10 +148,10 @@ class Projected(Chart):
         z_p = compensated_depth(xyz, camera, self.depth.mu_z0)
         return torch.cat([projected(xyz, camera), z_p[..., None] - 1], dim=-1)
 
-    def position(
-        self, coordinates: Float[Tensor, "*#batch 3"], camera: Camera
-    ) -> Float[Tensor, "*#batch 3"]:
-        return _position(coordinates[..., :2], (coordinates[..., 2] + 1) * self.depth.mu_z0 * camera.f, camera)
+    def position(self, coordinates: Float[Tensor, "*#batch 3"], camera: Camera) -> Float[Tensor, "*#batch 3"]:
+        return _position(
+            coordinates[..., :2], (coordinates[..., 2] + 1) * self.depth.mu_z0 * camera.f, camera
+        )
 
     def log_abs_det_jacobian(
         self, xyz: Float[Tensor, "*#batch 3"], camera: Camera
@@ -172,9 +172,7 @@ class LogDepth(Chart):
         z_p = compensated_depth(xyz, camera, self.depth.mu_z0)
         return torch.cat([projected(xyz, camera), z_p[..., None].log() / self.depth.D], dim=-1)
 
-    def position(
-        self, coordinates: Float[Tensor, "*#batch 3"], camera: Camera
-    ) -> Float[Tensor, "*#batch 3"]:
+    def position(self, coordinates: Float[Tensor, "*#batch 3"], camera: Camera) -> Float[Tensor, "*#batch 3"]:
         z = torch.exp(self.depth.D * coordinates[..., 2]) * self.depth.mu_z0 * camera.f
         return _position(coordinates[..., :2], z, camera)
 
@@ -201,9 +199,7 @@ class Cartesian(Chart):
     def coordinates(self, xyz: Float[Tensor, "*#batch 3"], camera: Camera) -> Float[Tensor, "*#batch 3"]:
         return torch.cat([xyz[..., :2] / self.xy_unit, xyz[..., 2:] - self.depth.z_centre], dim=-1)
 
-    def position(
-        self, coordinates: Float[Tensor, "*#batch 3"], camera: Camera
-    ) -> Float[Tensor, "*#batch 3"]:
+    def position(self, coordinates: Float[Tensor, "*#batch 3"], camera: Camera) -> Float[Tensor, "*#batch 3"]:
         return torch.cat(
             [coordinates[..., :2] * self.xy_unit, coordinates[..., 2:] + self.depth.z_centre], dim=-1
         )

@@ -37,6 +37,9 @@ class PositionErrors(Metric):
     """The mean projected and depth error of all samples seen, in millimetres."""
 
     full_state_update = False
+    projected: Tensor
+    depth: Tensor
+    count: Tensor
 
     def __init__(self) -> None:
         super().__init__()

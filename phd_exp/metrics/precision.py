@@ -13,6 +13,9 @@ class Precision(Metric):
     """
 
     full_state_update = False
+    projected: Tensor
+    depth: Tensor
+    count: Tensor
 
     def __init__(self) -> None:
         super().__init__()

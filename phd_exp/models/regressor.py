@@ -5,6 +5,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from phd_exp.geometry.camera import Camera
+from phd_exp.models.backbones import Backbone
 from phd_exp.models.heads import Head, Prediction
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -18,7 +19,10 @@ class Regressor(nn.Module):
     in float32, since nu_p = B v_p rounded to bf16 would be wrong by up to 0.2 pixels at the border of the image.
     """
 
-    def __init__(self, backbone: nn.Module, head: Head) -> None:
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, backbone: Backbone, head: Head) -> None:
         super().__init__()
         self.backbone = backbone
         self.head = head
@@ -37,4 +41,5 @@ class Regressor(nn.Module):
         pixels = (image.permute(0, 3, 1, 2).to(self.mean.dtype) - self.mean) / self.std
         features = self.backbone(pixels)
         with torch.autocast(features.device.type, enabled=False):
-            return self.last(features.to(self.last.weight.dtype))
+            raw: Tensor = self.last(features.to(self.last.weight.dtype))
+        return raw

@@ -122,7 +122,7 @@ class DatasetFolder:
             return []
         path = self.metadata_path(split)
         if not path.exists():
-            raise DatasetError(f"{path}: missing though the manifest counts {finished} samples; restore it")
+            raise DatasetError(f"{path}: missing though the manifest counts {finished} samples; render again")
         records = read_jsonl(path, SampleRecord.model_validate_json, limit=wanted, sealed=True)
         if [record.index for record in records] != list(range(wanted)):
             raise DatasetError(
@@ -131,7 +131,7 @@ class DatasetFolder:
         return records
 
     def missing(self, spec: DatasetSpec, n_train: int, n_test: int) -> dict[Split, list[int]]:
-        """Indices of the samples asked for that are not finished, or whose image has gone, by split.
+        """Indices of the samples asked for that are not finished, or whose image or line has gone, by split.
 
         Raises:
             DatasetError: the folder holds a data set of another specification.
@@ -149,7 +149,7 @@ class DatasetFolder:
         return {entry.name for entry in folder.glob("[0-9]*.*")} if folder.is_dir() else set()
 
     def _unfinished(self, split: Split, n: int, finished: int) -> list[int]:
-        there = self.images(split)
+        there = self.images(split) if self.metadata_path(split).exists() else set()
         return [index for index in range(n) if index >= finished or image_name(index) not in there]
 
     def _require_same(self, found: DatasetSpec, wanted: DatasetSpec) -> None:

@@ -2,7 +2,7 @@
 
 import json
 import os
-import tempfile
+import uuid
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -29,20 +29,16 @@ def write_atomic(path: Path | str, data: bytes | str) -> None:
         OSError: the folder is missing or unwritable, or the disk is full; `path` is then unchanged.
     """
     path = Path(path)
-    payload = data.encode() if isinstance(data, str) else data
-    descriptor, temporary = tempfile.mkstemp(
-        dir=path.parent, prefix=f".{path.name}.", suffix=TEMPORARY_SUFFIX
-    )
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}{TEMPORARY_SUFFIX}")
     try:
-        with os.fdopen(descriptor, "wb") as stream:
-            stream.write(payload)
+        with open(temporary, "xb") as stream:
+            stream.write(data.encode() if isinstance(data, str) else data)
             stream.flush()
             os.fsync(stream.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())  # mkstemp gives 0600: unreadable to one's colleagues
         os.replace(temporary, path)
     except BaseException:
-        with suppress(FileNotFoundError):
-            os.unlink(temporary)
+        with suppress(OSError):
+            temporary.unlink()
         raise
 
 
@@ -100,10 +96,3 @@ def _parse_line(path: Path, number: int, line: bytes, parse: Callable[[str], Any
 def _brief(error: ValueError) -> str:
     """The gist of an error on one line: pydantic prints a heading, the key, the complaint and a link."""
     return " ".join(line.strip() for line in str(error).splitlines()[:3])[:200]
-
-
-def _umask() -> int:
-    # The system offers no way to read the mask without setting it.
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

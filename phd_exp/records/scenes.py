@@ -74,6 +74,16 @@ class Backdrop(_Described):
     centre: tuple[Finite, Finite]
 
 
+def _one_of_each(objects: tuple[SceneObject, ...]) -> tuple[SceneObject, ...]:
+    shapes = [item.shape for item in objects]
+    if shapes[0] != "cylinder" or len(set(shapes)) < len(shapes):
+        raise ValueError(f"a scene is a cylinder first, then other shapes, each once; these are {shapes}")
+    return objects
+
+
+Objects = Annotated[tuple[SceneObject, ...], Field(min_length=1), AfterValidator(_one_of_each)]
+
+
 class Scene(_Described):
     """All that the renderer needs for one image.
 
@@ -86,7 +96,7 @@ class Scene(_Described):
 
     f: Positive
     S: Annotated[int, Field(gt=0)]
-    objects: Annotated[tuple[SceneObject, ...], Field(min_length=1)]
+    objects: Objects
     lamps: tuple[Lamp, ...]
     backdrop: Backdrop
     noise_seed: Annotated[int, Field(ge=0, lt=2**31)]
@@ -116,7 +126,7 @@ class SampleRecord(_Described):
     index: Annotated[int, Field(ge=0)]
     split: Split
     seed: Annotated[int, Field(ge=0)]
-    objects: Annotated[tuple[SceneObject, ...], Field(min_length=1)]
+    objects: Objects
     lamps: tuple[Lamp, ...]
     backdrop: Backdrop
     noise_seed: Annotated[int, Field(ge=0, lt=2**31)]

@@ -9,6 +9,7 @@ import importlib.util
 import os
 import sys
 import tempfile
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from phd_exp.records.scenes import Backdrop, Lamp, LampName, Material, Scene, SceneObject, Shape
+from phd_exp.records.scenes import Lamp, LampName, Material, Scene, SceneObject, Shape
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering import shaders
 from phd_exp.rendering.errors import RenderError
 from phd_exp.rendering.meshes import build_mesh
 from phd_exp.rendering.visibility import rotation_matrix
@@ -32,15 +34,6 @@ SENSOR_WIDTH = 36.0  # mm; any value does, the focal length is given in the same
 SHAPES: tuple[Shape, ...] = get_args(Shape)
 MATERIALS: tuple[Material, ...] = get_args(Material)
 LAMP_NAMES: tuple[LampName, ...] = get_args(LampName)
-
-# Principled BSDF, by input. Rubber is matt with a faint sheen; metal is polished enough to mirror the lamps
-# as soft boxes and its neighbours as blurs.
-SURFACES: dict[Material, dict[str, float]] = {
-    "rubber": {"Metallic": 0.0, "Roughness": 0.75, "Specular IOR Level": 0.25},
-    "metal": {"Metallic": 1.0, "Roughness": 0.24},
-}
-# What objects, not the camera, see all around: dim below, brighter above, for metal to mirror.
-SURROUNDINGS = (0.10, 0.75)
 
 
 def require_bpy() -> None:
@@ -65,7 +58,12 @@ def renderer_version() -> str:
         return "bpy of unknown version"
 
 
-def _load_bpy() -> Any:
+def load_bpy() -> Any:
+    """Blender's Python module, a second or so the first time.
+
+    Raises:
+        RenderError: it, or a library of the system that it needs, is not installed.
+    """
     require_bpy()
     try:
         return importlib.import_module("bpy")
@@ -94,9 +92,9 @@ class Renderer:
     """
 
     def __init__(self, spec: DatasetSpec) -> None:
-        self._bpy = _load_bpy()
+        self._bpy = load_bpy()
         self._spec = spec
-        self._folder = tempfile.TemporaryDirectory(prefix="phd_exp-", dir=_fast_folder())
+        self._output = _fast_folder() / f"phd_exp-{uuid.uuid4().hex}.bmp"
         with _silence():
             self._build()
 
@@ -114,39 +112,45 @@ class Renderer:
                 self._place_object(handle, shown[shape])
         for lamp in scene.lamps:
             self._place_lamp(self._lamps[lamp.name], lamp)
-        self._light_backdrop(scene.backdrop)
+        self._backdrop.show(scene.backdrop)
         self._scene.cycles.seed = scene.noise_seed
         return self._shoot()
 
     def _shoot(self) -> Pixels:
         # In background mode Blender hands pixels out through files only; an uncompressed one costs 2 to 4 ms.
-        path = Path(self._folder.name) / "image.bmp"
-        self._scene.render.filepath = str(path)
-        with _silence():
-            self._bpy.ops.render.render(write_still=True)
-        with Image.open(path) as image:
-            return np.array(image.convert("RGB"))
+        self._scene.render.filepath = str(self._output)
+        try:
+            with _silence():
+                self._bpy.ops.render.render(write_still=True)
+            with Image.open(self._output) as image:
+                return np.array(image.convert("RGB"))
+        finally:
+            self._output.unlink(missing_ok=True)
 
     # Once per process.
 
     def _build(self) -> None:
         self._bpy.ops.wm.read_factory_settings(use_empty=True)
         self._scene = self._bpy.context.scene
-        self._materials = {name: self._new_material(name) for name in MATERIALS}
+        self._materials = {name: self._bpy.data.materials.new(name) for name in MATERIALS}
+        for name, material in self._materials.items():
+            shaders.paint_surface(material.node_tree, name)
         self._objects = {shape: self._new_object(shape) for shape in SHAPES}
         self._lamps = {name: self._new_lamp(name) for name in LAMP_NAMES}
         self._camera = self._new_camera()
-        self._backdrop = self._new_world()
+        self._scene.world = self._bpy.data.worlds.new("world")
+        self._scene.world.cycles.sampling_method = (
+            "NONE"  # too smooth to be worth a map of where light comes from
+        )
+        self._backdrop = shaders.paint_world(self._scene.world.node_tree)
         self._configure()
 
     def _configure(self) -> None:
         """Every setting that differs from Blender's factory settings, with its reason."""
         render, cycles = self._scene.render, self._scene.cycles
         render.engine = "CYCLES"
-        render.threads_mode, render.threads = (
-            "FIXED",
-            1,
-        )  # processes share the cores without loss, threads do not
+        render.threads_mode = "FIXED"
+        render.threads = 1  # processes share the cores without loss, threads do not
         render.use_persistent_data = True  # meshes and shaders stay loaded between samples
         render.resolution_x = render.resolution_y = self._spec.sensor_size
         render.resolution_percentage = 100
@@ -166,20 +170,9 @@ class Renderer:
         cycles.transmission_bounces = cycles.volume_bounces = cycles.transparent_max_bounces = 0
         cycles.use_denoising = True
         cycles.denoiser = "OPENIMAGEDENOISE"
-        cycles.denoising_quality = "FAST"  # a quarter of the time of HIGH for 1 dB
+        cycles.denoising_quality = "FAST"  # HIGH takes a quarter longer for half a dB
         cycles.denoising_input_passes = "RGB"  # albedo and normals made FAST worse
         cycles.denoising_prefilter = "NONE"
-
-    def _new_material(self, name: Material) -> Any:
-        """A surface whose colour is that of the object it is on."""
-        material = self._bpy.data.materials.new(name)
-        tree = material.node_tree
-        shader = tree.nodes["Principled BSDF"]
-        for key, value in SURFACES[name].items():
-            shader.inputs[key].default_value = value
-        info = tree.nodes.new("ShaderNodeObjectInfo")
-        tree.links.new(info.outputs["Color"], shader.inputs["Base Color"])
-        return material
 
     def _new_object(self, shape: Shape) -> Any:
         geometry = build_mesh(shape)
@@ -205,30 +198,6 @@ class Renderer:
     def _link(self, item: Any) -> Any:
         self._scene.collection.objects.link(item)
         return item
-
-    def _new_world(self) -> dict[str, Any]:
-        """Two worlds in one: the camera sees the backdrop, everything else the surroundings.
-
-        A backdrop that is no surface takes no shadow and no light from the objects, so that nothing in it
-        tells where they are, and it costs no samples.
-        """
-        world = self._bpy.data.worlds.new("world")
-        world.cycles.sampling_method = "NONE"  # too smooth to be worth a map of where its light comes from
-        self._scene.world = world
-        tree = world.node_tree
-        tree.nodes.clear()
-        output = tree.nodes.new("ShaderNodeOutputWorld")
-        shader = tree.nodes.new("ShaderNodeBackground")
-        mix = tree.nodes.new("ShaderNodeMix")
-        rays = tree.nodes.new("ShaderNodeLightPath")
-        ground, inputs = _backdrop_nodes(tree)
-        tree.links.new(rays.outputs["Is Camera Ray"], mix.inputs["Factor"])
-        tree.links.new(_surroundings_nodes(tree), mix.inputs["A"])
-        tree.links.new(ground, mix.inputs["B"])
-        tree.links.new(mix.outputs["Result"], shader.inputs["Strength"])
-        tree.links.new(shader.outputs["Background"], output.inputs["Surface"])
-        shader.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
-        return inputs
 
     # Once per sample.
 
@@ -266,43 +235,6 @@ class Renderer:
         handle.data.energy = lamp.power
         handle.data.size = lamp.side
 
-    def _light_backdrop(self, backdrop: Backdrop) -> None:
-        x, y = backdrop.centre
-        self._backdrop["centre"].default_value = (
-            x,
-            1 - y,
-            0.0,
-        )  # Blender's window has its origin at the bottom
-        self._backdrop["slope"].default_value = -backdrop.level * backdrop.falloff
-        self._backdrop["level"].default_value = backdrop.level
-
-
-def _backdrop_nodes(tree: Any) -> tuple[Any, dict[str, Any]]:
-    """level - level falloff |window - centre|^2, and the three inputs that change from sample to sample."""
-    window = tree.nodes.new("ShaderNodeTexCoord")
-    offset = tree.nodes.new("ShaderNodeVectorMath")
-    square = tree.nodes.new("ShaderNodeVectorMath")
-    line = tree.nodes.new("ShaderNodeMath")
-    offset.operation, square.operation, line.operation = "SUBTRACT", "DOT_PRODUCT", "MULTIPLY_ADD"
-    tree.links.new(window.outputs["Window"], offset.inputs[0])
-    tree.links.new(offset.outputs["Vector"], square.inputs[0])
-    tree.links.new(offset.outputs["Vector"], square.inputs[1])
-    tree.links.new(square.outputs["Value"], line.inputs[0])
-    changing = {"centre": offset.inputs[1], "slope": line.inputs[1], "level": line.inputs[2]}
-    return line.outputs["Value"], changing
-
-
-def _surroundings_nodes(tree: Any) -> Any:
-    """Brightness by the height of a direction, from straight below to straight above."""
-    direction = tree.nodes.new("ShaderNodeTexCoord")
-    split = tree.nodes.new("ShaderNodeSeparateXYZ")
-    ramp = tree.nodes.new("ShaderNodeMapRange")
-    ramp.inputs["From Min"].default_value, ramp.inputs["From Max"].default_value = -1.0, 1.0
-    ramp.inputs["To Min"].default_value, ramp.inputs["To Max"].default_value = SURROUNDINGS
-    tree.links.new(direction.outputs["Generated"], split.inputs["Vector"])
-    tree.links.new(split.outputs["Y"], ramp.inputs["Value"])
-    return ramp.outputs["Result"]
-
 
 def _facing(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     """A rotation (3, 3) whose -z axis is `direction`, with x level."""
@@ -317,9 +249,10 @@ def _linear(channel: float) -> float:
     return channel / 12.92 if channel <= 0.04045 else ((channel + 0.055) / 1.055) ** 2.4
 
 
-def _fast_folder() -> str | None:
+def _fast_folder() -> Path:
     """A folder in memory where the system has one."""
-    return "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
+    memory = Path("/dev/shm")
+    return memory if os.access(memory, os.W_OK) else Path(tempfile.gettempdir())
 
 
 @contextmanager

@@ -12,6 +12,6 @@ class RenderError(UserError):
 def unwritable(error: OSError, folder: Path) -> RenderError:
     """A folder without permission, a full disk and their like, said in one line."""
     return RenderError(
-        f"{error.filename or folder}: cannot be written ({error.strerror or error}); free or allow the space, "
+        f"{error.filename or folder}: cannot be written ({error.strerror or error}); make room, allow writing, "
         "or choose another data.root"
     )

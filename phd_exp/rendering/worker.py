@@ -123,7 +123,8 @@ def main() -> None:
     try:
         serve(sys.stdin, answers)
     except BrokenPipeError:
-        os._exit(1)  # the parent has gone; there is nobody to tell, and closing the channel would fail again
+        # The parent has gone. What is left unsaid goes nowhere, or closing the channel would fail once more.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), answers.fileno())
 
 
 if __name__ == "__main__":

@@ -70,7 +70,7 @@ def _render_missing(
         if index not in known[split]
     ]
     if tasks:
-        _render(folder, spec, tasks, workers or _worker_count(len(tasks)), known)
+        _render(folder, spec, tasks, workers or worker_count(len(tasks)), known)
     seals = {split: seal for split in SPLITS if (seal := _seal(folder, split, known[split])).n}
     folder.write_manifest(manifest.model_copy(update={"splits": seals}))
 
@@ -135,7 +135,8 @@ def _seal(folder: DatasetFolder, split: Split, known: dict[int, SampleRecord]) -
     return Seal(n=n, metadata_sha256=sha256(lines.encode()))
 
 
-def _worker_count(tasks: int) -> int:
+def worker_count(tasks: int) -> int:
+    """One process a core that this process may use, fewer for little work."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min(cores, math.ceil(tasks / FEWEST_PER_WORKER)))
 

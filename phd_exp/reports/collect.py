@@ -38,7 +38,7 @@ def _row(folder: RunFolder, runs: Path) -> RunRow:
         results = folder.results() if status and status.state == "finished" else {}
     except RunError as error:
         return RunRow(preset, data, model, run, state=f"broken: {error}")
-    state = status.state if status else "unknown"
+    state: str = status.state if status else "unknown"
     if status and status.error and state == "failed":
         state += f": {' '.join(status.error.split())}"
     return RunRow(

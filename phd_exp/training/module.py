@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from lightning import LightningModule
 from torch import Tensor, nn
-from torchmetrics import MeanMetric
+from torchmetrics import MeanMetric, Metric
 
 from phd_exp.data.batches import Batch
 from phd_exp.distributions import ProjectedHuber
@@ -47,6 +47,7 @@ class EpochMetrics(nn.Module):
 
     def reset(self) -> None:
         for metric in self.children():
+            assert isinstance(metric, Metric)
             metric.reset()
 
 
@@ -98,7 +99,7 @@ class PositionModule(LightningModule):
             )
         return loss
 
-    def validation_step(self, batch: Batch, batch_idx: int) -> Prediction:
+    def validation_step(self, batch: Batch, batch_idx: int) -> Prediction:  # type: ignore[override]  # for callbacks
         return self._step(batch, "test")[1]
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Columns:

@@ -75,7 +75,7 @@ def calibration_curves(table: Columns, window: int) -> dict[str, CalibrationCurv
 
 def summary(table: Columns) -> dict[str, float]:
     """The final numbers of a run, by their metric keys: means over the rows."""
-    means = {
+    means: dict[str, float] = {
         name: float(table[name].mean())
         for name in ("projected_error_mm", "depth_error_mm", "nll")
         if name in table

@@ -8,8 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from phd_exp.__main__ import VERBS
-from phd_exp.cli.help import EXAMPLES
+from phd_exp.cli.help import EXAMPLES, VERBS
 from phd_exp.cli.paths import conf_folder
 
 

@@ -44,7 +44,7 @@ def test_normalised_truth_does_not_depend_on_image_size(
     module = data(folder, spec, image_size)
     batch = module.samples["train"]
     assert batch.image.shape == (5, image_size, image_size, 3)
-    assert batch.S == image_size
+    assert image_size == batch.S
     whole = data(folder, spec)
     reference = whole.samples["train"]
     torch.testing.assert_close(projected(batch.xyz, batch.camera), projected(reference.xyz, reference.camera))

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from phd_exp.data import images
 from phd_exp.data.images import cached_images
@@ -13,9 +14,8 @@ SIDE, N = 64, 5
 
 
 def picture(folder: DatasetFolder, index: int) -> np.ndarray:
-    from PIL import Image
-
-    return np.asarray(Image.open(folder.image_path("train", index)))
+    with Image.open(folder.image_path("train", index)) as image:
+        return np.asarray(image)
 
 
 def test_at_full_size_the_pixels_are_the_files(folder: DatasetFolder) -> None:

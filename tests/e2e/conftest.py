@@ -1,5 +1,6 @@
 """Real renders, small enough for seconds: a quarter of the sensor, the same field of view."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,13 +14,16 @@ QUICK = (
     "data.n_test=6",
     "data.batch_size=8",
     "trainer.progress_bar=false",
+    "trainer.threads=1",  # of the two cores, pytest-xdist keeps the other busy
 )
 
 
 @pytest.fixture(scope="session")
 def renders(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One folder of data sets for all tests: whoever needs a data set first renders it."""
-    return tmp_path_factory.mktemp("renders")
+    """One folder of data sets for all tests, in whatever process: whoever needs a data set first renders it."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    return shared / "renders"
 
 
 @pytest.fixture

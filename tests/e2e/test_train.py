@@ -64,7 +64,8 @@ def test_calibration_as_data_and_as_pictures(train: Callable, tmp_path: Path) ->
         assert curves.keys() == {"depth", "projected"}
         for curve in curves.values():
             assert len(curve["predicted"]) == len(curve["empirical"]) == 6 - curve["window"] + 1
-        assert Image.open(run.calibration / f"{name}.png").size[0] > 500
+        with Image.open(run.calibration / f"{name}.png") as picture:
+            assert picture.size[0] > 500
 
 
 def test_wandb_beside_the_record(train: Callable, tmp_path: Path) -> None:

@@ -34,9 +34,11 @@ def test_all_is_missing_from_nothing(tmp_path: Path, make_spec: MakeSpec) -> Non
     assert DatasetFolder(tmp_path / "new").missing(make_spec(), 2, 1) == {"train": [0, 1], "test": [0]}
 
 
-def test_a_deleted_image_is_missing(dataset: DatasetFolder, make_spec: MakeSpec) -> None:
+def test_what_is_deleted_is_missing(dataset: DatasetFolder, make_spec: MakeSpec) -> None:
     dataset.image_path("train", 3).unlink()
     assert dataset.missing(make_spec(), 5, 2)["train"] == [3]
+    dataset.metadata_path("test").unlink()
+    assert dataset.missing(make_spec(), 5, 2)["test"] == [0, 1]
 
 
 def test_another_specification_is_refused(dataset: DatasetFolder, make_spec: MakeSpec) -> None:

@@ -50,6 +50,14 @@ def test_what_is_no_record_is_refused(record: SampleRecord, key: str, value: Any
         SampleRecord.model_validate(record.model_dump() | {key: value})
 
 
+def test_a_scene_is_one_cylinder_and_at_most_one_of_each_other_shape(record: SampleRecord) -> None:
+    fields = record.model_dump()
+    (cylinder,) = fields["objects"]
+    for objects in ([cylinder, cylinder], [cylinder | {"shape": "cube"}]):
+        with pytest.raises(ValidationError, match="a cylinder first, then other shapes, each once"):
+            SampleRecord.model_validate(fields | {"objects": objects})
+
+
 def test_a_rotation_has_norm_one(record: SampleRecord) -> None:
     fields = record.model_dump()
     fields["objects"][0]["rotation"] = (1.0, 1.0, 0.0, 0.0)

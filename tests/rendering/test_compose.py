@@ -1,6 +1,6 @@
 """Pictures show the objects where the scene says, and nothing but the backdrop elsewhere."""
 
-from pathlib import Path
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -8,9 +8,19 @@ from PIL import Image
 
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.scenes import Backdrop, SampleRecord
+from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Box
 from phd_exp.rendering.compose import REACH, backdrop_pixels, box_around, grown
 from phd_exp.rendering.visibility import cylinder_mask, depth_maps, silhouettes
+from phd_exp.rendering.workers import ensure_rendered
+
+
+@pytest.fixture(scope="module")
+def centred(make_spec: Callable[..., DatasetSpec], tmp_path_factory: pytest.TempPathFactory) -> DatasetFolder:
+    """Cylinders that lie within the image as a whole."""
+    folder = DatasetFolder(tmp_path_factory.mktemp("centred") / "default")
+    ensure_rendered(folder, make_spec(xy_range=0.2), n_train=8, n_test=0)
+    return folder
 
 
 def pixels(folder: DatasetFolder, record: SampleRecord) -> np.ndarray:
@@ -59,17 +69,14 @@ def test_objects_are_where_the_scene_says(rendered: dict[str, DatasetFolder], va
         assert np.median(away[grown(mask, REACH) & ~grown(mask, 1)]) <= 4
 
 
-def test_the_cylinder_is_the_one_in_the_record(rendered: dict[str, DatasetFolder]) -> None:
-    """Rubber keeps its hue in any light: the visible pixels have it, those of the occluders mostly not."""
-    shown = 0
-    for record in rendered["occl_scale"].records("train"):
+@pytest.mark.parametrize("variant", ["default", "occl", "scale", "occl_scale"])
+def test_the_cylinder_has_the_colour_of_its_record(rendered: dict[str, DatasetFolder], variant: str) -> None:
+    """Its visible pixels have its hue on average: under white lamps both materials keep it."""
+    for record in rendered[variant].records("train"):
         mask = ~grown(~cylinder_mask(depth_maps(record.scene)), 1)
-        if record.objects[0].material == "metal" or mask.sum() < 50:
-            continue
-        colour = pixels(rendered["occl_scale"], record)[mask].mean(axis=0)
-        assert int(colour.argmax()) == int(np.argmax(record.objects[0].colour))
-        shown += 1
-    assert shown >= 2
+        if mask.sum() > 50:
+            colour = pixels(rendered[variant], record)[mask].mean(axis=0)
+            assert int(colour.argmax()) == int(np.argmax(record.objects[0].colour))
 
 
 def test_silhouettes_have_no_bias(centred: DatasetFolder) -> None:
@@ -80,7 +87,7 @@ def test_silhouettes_have_no_bias(centred: DatasetFolder) -> None:
         away = np.abs(image - backdrop_pixels(record.backdrop, record.S)).max(axis=-1)
         mask = silhouettes(depth_maps(record.scene))
         assert not (mask[0] | mask[-1] | mask[:, 0] | mask[:, -1]).any()
-        seen = np.argwhere(away > 0.5 * np.median(away[mask])).mean(axis=0)
+        seen = np.argwhere(away > 10).mean(axis=0)
         offsets.append(seen - np.argwhere(mask).mean(axis=0))
     assert np.abs(offsets).max() < 0.5
     assert np.abs(np.mean(offsets, axis=0)).max() < 0.1
@@ -93,13 +100,3 @@ def test_paired_variants_show_the_same_light(rendered: dict[str, DatasetFolder])
         free = ~grown(silhouettes(depth_maps(occluded.scene)), REACH)
         difference = np.abs(pixels(rendered["default"], alone) - pixels(rendered["occl"], occluded))
         assert (difference[free] == 0).all()
-
-
-@pytest.fixture(scope="module")
-def centred(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> DatasetFolder:
-    from phd_exp.rendering.workers import ensure_rendered
-
-    make_spec = request.getfixturevalue("make_spec")
-    root: Path = tmp_path_factory.mktemp("centred")
-    ensure_rendered(DatasetFolder(root / "default"), make_spec(xy_range=0.4), n_train=8, n_test=0)
-    return DatasetFolder(root / "default")

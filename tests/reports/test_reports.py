@@ -45,7 +45,7 @@ def test_the_table_says_it_all(runs: Path, capsys: pytest.CaptureFixture[str]) -
     print_table(collect(runs))
     out = capsys.readouterr().out
     (line,) = [line for line in out.splitlines() if "probabilistic" in line]
-    assert line.split() == "small occl probabilistic seed0 12.3 13.0 168 168 -1.23 finished".split()
+    assert " ".join(line.split()) == "small occl probabilistic seed0 12.3 13.0 168 168 -1.23 finished"
 
 
 def test_no_runs_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -61,6 +61,7 @@ def test_a_calibration_picture_has_ink(tmp_path: Path) -> None:
     predicted = np.geomspace(1e-4, 1e-1, 50)
     curve = {"predicted": predicted.tolist(), "empirical": (2 * predicted).tolist(), "window": 200}
     draw_calibration({"depth": curve, "projected": curve}, tmp_path / "curve.png")
-    pixels = np.asarray(Image.open(tmp_path / "curve.png").convert("RGB")).astype(int)
+    with Image.open(tmp_path / "curve.png") as picture:
+        pixels = np.asarray(picture.convert("RGB")).astype(int)
     assert (np.abs(pixels - (31, 119, 180)).max(axis=-1) < 30).sum() > 300  # the curves, blue
     assert (np.abs(pixels - (214, 39, 40)).max(axis=-1) < 90).sum() > 100  # the identities, red and thin

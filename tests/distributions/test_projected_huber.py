@@ -1,0 +1,289 @@
+"""The laws of a distribution, each over the list of instances in conftest.py."""
+
+import itertools
+import math
+
+import pytest
+import torch
+from scipy import stats
+from torch.autograd import gradcheck
+
+from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions.huber import HUBER_COVARIANCE, huber_energy
+from phd_exp.distributions.special import log_normaliser
+
+N_SAMPLES = 200_000
+
+
+@pytest.fixture(scope="module")
+def samples() -> dict[int, torch.Tensor]:
+    return {}
+
+
+def draw(distribution: ProjectedHuber, kept: dict[int, torch.Tensor]) -> torch.Tensor:
+    """The same 200,000 samples of a distribution for every test."""
+    if id(distribution) not in kept:
+        torch.manual_seed(3)
+        kept[id(distribution)] = distribution.sample(torch.Size([N_SAMPLES]))
+    return kept[id(distribution)]
+
+
+def gauss_legendre(borders: list[float], n: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Nodes and weights of n points on each interval between borders, from the Jacobi matrix."""
+    k = torch.arange(1, n, dtype=torch.float64)
+    off = k / (4 * k * k - 1).sqrt()
+    nodes, vectors = torch.linalg.eigh(torch.diag(off, 1) + torch.diag(off, -1))
+    weights = 2 * vectors[0].square()
+    pieces = list(itertools.pairwise(borders))
+    x = torch.cat([(low + high) / 2 + (high - low) / 2 * nodes for low, high in pieces])
+    w = torch.cat([(high - low) / 2 * weights for low, high in pieces])
+    return x, w
+
+
+def test_integrates_to_one(distribution: ProjectedHuber) -> None:
+    """Quadrature in depth and, at each depth, in ellipses around the centre of the projection."""
+    tails = [1e-9, 1e-6, 1e-3, 0.05]
+    p = torch.tensor([*tails, 0.2, 0.5, 0.8, *(1 - x for x in reversed(tails))], dtype=torch.float64)
+    borders = sorted([*distribution.depth_icdf(p).tolist(), distribution.mu_z.item()])
+    z, w_z = gauss_legendre(borders, 16)
+    r, w_r = gauss_legendre([0.0, 1.0, 8.0, 30.0], 16)
+    angle = torch.arange(8, dtype=torch.float64) * math.pi / 4
+    circle = torch.stack([angle.cos(), angle.sin()], dim=-1)
+    q = r[:, None, None] * circle  # r, angle, 2
+    inverse = torch.linalg.inv(distribution.A) * distribution.mu_z
+    xy = z[:, None, None, None] * distribution.mu_xy + q @ inverse
+    xyz = torch.cat([xy, z[:, None, None, None].expand(*xy.shape[:-1], 1)], dim=-1)
+    element = w_z[:, None, None] * (w_r * r)[:, None] * (2 * math.pi / 8) * torch.linalg.det(inverse)
+    assert (distribution.log_prob(xyz).exp() * element).sum().item() == pytest.approx(1, abs=2e-7)
+
+
+def test_log_prob_is_the_papers_density(distribution: ProjectedHuber) -> None:
+    """-log p = h(|q|) + a max(t, 1/t) + log K_proj + log K_depth in the camera frame, as printed."""
+    torch.manual_seed(4)
+    xyz = distribution.sample(torch.Size([500]))
+    mu_xy, mu_z, A, a = distribution.mu_xy, distribution.mu_z, distribution.A, distribution.a
+    z = xyz[:, 2]
+    q = ((xyz[:, :2] / z[:, None] - mu_xy) @ A) * (z / mu_z)[:, None]
+    t = z / mu_z
+    log_K_proj = torch.log(2 * math.pi * (1 + math.exp(-0.5)) * mu_z**2 / torch.linalg.det(A))
+    log_K_depth = torch.log(mu_z) + log_normaliser(a)
+    expected = -(huber_energy(q) + a * torch.maximum(t, 1 / t) + log_K_proj + log_K_depth)
+    torch.testing.assert_close(distribution.log_prob(xyz), expected, rtol=1e-8, atol=1e-8)
+
+
+def test_mean_and_covariance_are_those_of_samples(
+    distribution: ProjectedHuber, samples: dict[int, torch.Tensor]
+) -> None:
+    xyz = draw(distribution, samples)
+    scale = distribution.stddev
+    torch.testing.assert_close(
+        (xyz.mean(0) - distribution.mean) / scale, torch.zeros(3).double(), rtol=0, atol=0.01
+    )
+    difference = torch.cov(xyz.T) - distribution.covariance_matrix
+    assert (difference / (scale[:, None] * scale)).abs().max() < 0.02
+    torch.testing.assert_close(distribution.covariance_matrix.diagonal(), distribution.variance)
+    torch.testing.assert_close(distribution.variance[2], distribution.depth_variance)
+    torch.testing.assert_close(distribution.mean[2], distribution.depth_mean)
+
+
+def test_projection_has_its_mean_and_covariance(
+    distribution: ProjectedHuber, samples: dict[int, torch.Tensor]
+) -> None:
+    """E[(x, y)/z] = mu_xy and Cov = c A^(-2); by E over q alone, since (mu_z/z)^2 has heavy tails but mean one."""
+    xyz = draw(distribution, samples)
+    expected = HUBER_COVARIANCE * torch.linalg.inv(distribution.A) @ torch.linalg.inv(distribution.A)
+    torch.testing.assert_close(distribution.projected_covariance, expected)
+    offset = xyz[:, :2] / xyz[:, 2:] - distribution.mu_xy
+    near = xyz[:, 2] > distribution.mu_z / 50  # what is left out is below 2 % of the covariance
+    sampled = (offset[near, :, None] * offset[near, None, :]).sum(0) / N_SAMPLES
+    scale = expected.diagonal().sqrt()
+    assert ((sampled - expected) / (scale[:, None] * scale)).abs().max() < 0.04
+
+
+def test_depths_of_samples_follow_depth_cdf(
+    distribution: ProjectedHuber, samples: dict[int, torch.Tensor]
+) -> None:
+    z = draw(distribution, samples)[:, 2]
+    assert stats.kstest(distribution.depth_cdf(z), "uniform").pvalue > 1e-3
+    assert (z < distribution.depth_median).double().mean().item() == pytest.approx(0.5, abs=0.005)
+
+
+def test_levels_of_samples_are_uniform(
+    distribution: ProjectedHuber, samples: dict[int, torch.Tensor]
+) -> None:
+    level = distribution.level(draw(distribution, samples))
+    assert stats.kstest(level, "uniform").pvalue > 1e-3
+
+
+def test_level_orders_positions_as_the_density_does(distribution: ProjectedHuber) -> None:
+    torch.manual_seed(5)
+    xyz = distribution.sample(torch.Size([1000]))
+    level, order = distribution.level(xyz), distribution.log_prob(xyz).argsort(descending=True)
+    assert (level[order].diff() >= -1e-9).all()
+    assert distribution.level(distribution.mode) == pytest.approx(0, abs=1e-7)
+    assert distribution.level(distribution.mode * 1e6) == 1
+    assert distribution.level(-distribution.mode) == 1
+
+
+def test_mode_is_a_maximum(distribution: ProjectedHuber) -> None:
+    generator = torch.Generator().manual_seed(6)
+    top = distribution.log_prob(distribution.mode)
+    for size in (1e-6, 1e-3, 0.1, 1.0):
+        step = size * distribution.stddev * torch.randn(200, 3, generator=generator, dtype=torch.float64)
+        assert (distribution.log_prob(distribution.mode + step) <= top).all()
+
+
+def test_entropy_is_minus_the_mean_log_prob(
+    distribution: ProjectedHuber, samples: dict[int, torch.Tensor]
+) -> None:
+    log_prob = distribution.log_prob(draw(distribution, samples))
+    standard_error = (log_prob.std() / math.sqrt(N_SAMPLES)).item()
+    assert distribution.entropy().item() == pytest.approx(-log_prob.mean().item(), abs=4 * standard_error)
+
+
+def test_depth_icdf_inverts_depth_cdf(distribution: ProjectedHuber) -> None:
+    p = torch.linspace(0.001, 0.999, 99, dtype=torch.float64)
+    torch.testing.assert_close(distribution.depth_cdf(distribution.depth_icdf(p)), p, rtol=1e-8, atol=1e-12)
+    assert distribution.depth_cdf(distribution.depth_median).item() == pytest.approx(0.5, abs=1e-9)
+    zero = torch.tensor([0.0, -1.0, -torch.inf], dtype=torch.float64)
+    assert torch.equal(distribution.depth_cdf(zero), torch.zeros_like(zero))
+
+
+def test_gradients_of_positions(distribution: ProjectedHuber) -> None:
+    torch.manual_seed(7)
+    scale = distribution.stddev
+    offset = torch.randn(
+        5, 3, dtype=torch.float64
+    ).requires_grad_()  # in standard deviations, for the step of gradcheck
+    assert gradcheck(
+        lambda offset: distribution.log_prob(distribution.mode + 0.3 * scale * offset),
+        offset,
+        rtol=1e-3,
+        atol=1e-4,
+    )
+
+
+def test_reparameterised_samples_have_the_gradients_of_their_moments() -> None:
+    """d/d parameters of E[z] and Var[z] by samples, against those of the closed forms."""
+    raw = torch.tensor([0.4, -0.8, 1.3, 0.7, 2.1, 3.0, -0.9], dtype=torch.float64, requires_grad=True)
+    distribution = ProjectedHuber.from_raw(raw, f=1500.0, S=224.0, mu_z0=2.5e-3)
+    torch.manual_seed(8)
+    xyz = distribution.rsample(torch.Size([N_SAMPLES]))
+    for statistic, exact in (
+        (xyz.mean(0).sum(), distribution.mean.sum()),
+        (xyz.var(0)[2], distribution.depth_variance),
+        (torch.cov(xyz.T)[0, 1], distribution.covariance_matrix[0, 1]),
+    ):
+        sampled, expected = (torch.autograd.grad(x, raw, retain_graph=True)[0] for x in (statistic, exact))
+        torch.testing.assert_close(sampled, expected, rtol=0, atol=0.03 * expected.abs().max().item())
+
+
+def test_a_sample_is_differentiable() -> None:
+    raw = torch.tensor([0.4, -0.8, 1.3, 0.7, 2.1, 0.5, -0.9], dtype=torch.float64, requires_grad=True)
+
+    def sample(raw: torch.Tensor) -> torch.Tensor:
+        torch.manual_seed(9)
+        return ProjectedHuber.from_raw(raw, f=1500.0, S=224.0, mu_z0=2.5e-3).rsample(torch.Size([7]))
+
+    assert gradcheck(sample, raw)
+
+
+def test_samples_of_nearly_certain_and_nearly_ignorant_predictions_are_finite() -> None:
+    raw = torch.tensor([[0.0, 0.0, 1e4, 0.0, 1e4, 1e4, 0.0], [0.0, 0.0, -20.0, 0.0, -20.0, -20.0, 0.0]])
+    xyz = ProjectedHuber.from_raw(raw, f=1500.0, S=224.0, mu_z0=2.5e-3).sample(torch.Size([1000]))
+    assert xyz.isfinite().all()
+    assert (xyz[..., 2] > 0).all()
+
+
+@pytest.mark.parametrize("sample_shape", [(), (5,), (2, 3)])
+def test_shapes_of_a_batch(sample_shape: tuple[int, ...]) -> None:
+    """A batch of two images with four points each."""
+    raw = torch.randn(2, 4, 7, generator=torch.Generator().manual_seed(10))
+    f = torch.tensor([[1200.0], [1800.0]])
+    batch = ProjectedHuber.from_raw(raw, f=f, S=224.0, mu_z0=2.5e-3)
+    assert batch.batch_shape == (2, 4)
+    assert batch.event_shape == (3,)
+    xyz = batch.sample(torch.Size(sample_shape))
+    assert xyz.shape == (*sample_shape, 2, 4, 3)
+    assert batch.log_prob(xyz).shape == batch.level(xyz).shape == (*sample_shape, 2, 4)
+    assert batch.mode.shape == batch.mean.shape == batch.variance.shape == (2, 4, 3)
+    assert batch.covariance_matrix.shape == (2, 4, 3, 3)
+    assert batch.projected_covariance.shape == batch.A.shape == (2, 4, 2, 2)
+    assert batch.entropy().shape == batch.depth_median.shape == batch.log_det_A.shape == (2, 4)
+    torch.testing.assert_close(batch.log_det_A, torch.linalg.slogdet(batch.A).logabsdet, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(batch.depth_precision, batch.a)
+    one = ProjectedHuber.from_raw(raw[1, 2], f=1800.0, S=224.0, mu_z0=2.5e-3)
+    torch.testing.assert_close(batch.log_prob(xyz)[..., 1, 2], one.log_prob(xyz[..., 1, 2, :]))
+
+
+def test_expand(distribution: ProjectedHuber) -> None:
+    larger = distribution.expand((4, 5))
+    assert larger.batch_shape == (4, 5)
+    assert isinstance(larger, ProjectedHuber)
+    assert torch.equal(larger.mode[2, 3], distribution.mode)
+    assert larger.sample().shape == (4, 5, 3)
+    assert torch.equal(larger.log_prob(larger.mode), distribution.log_prob(distribution.mode).expand(4, 5))
+    assert repr(larger) == "ProjectedHuber(batch_shape=(4, 5))"
+
+
+def test_parameters_come_back(distribution: ProjectedHuber) -> None:
+    again = ProjectedHuber(distribution.mu_xy, distribution.mu_z, distribution.A, distribution.a)
+    torch.testing.assert_close(again.mode, distribution.mode)
+    torch.testing.assert_close(again.covariance_matrix, distribution.covariance_matrix)
+    torch.testing.assert_close(again.log_prob(again.mean), distribution.log_prob(again.mean))
+
+
+def test_positions_behind_the_camera_have_no_density_and_no_gradient() -> None:
+    xyz = torch.tensor([[0.0, 0.0, -1.0], [0.1, 0.2, 0.0], [0.0, 0.0, 1.0]], requires_grad=True)
+    raw = torch.zeros(7, requires_grad=True)
+    log_prob = ProjectedHuber.from_raw(raw, f=1500.0, S=224.0, mu_z0=2.5e-3).log_prob(xyz)
+    assert log_prob.tolist()[:2] == [-math.inf, -math.inf]
+    log_prob[:2].sum().backward()
+    for gradient in (xyz.grad, raw.grad):
+        assert gradient is not None
+        assert torch.equal(gradient, torch.zeros_like(gradient))
+
+
+GOOD = {"mu_xy": torch.zeros(2), "mu_z": torch.tensor(4.0), "A": torch.eye(2), "a": torch.tensor(1.0)}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("mu_xy", torch.tensor([0.0, torch.nan]), r"mu_xy of shape \(2,\) must be finite .* nan"),
+        ("mu_z", torch.tensor(-4.0), r"mu_z of shape \(\) must be .*GreaterThan\(lower_bound=0.0\).* -4.0"),
+        ("mu_z", torch.tensor([4.0, torch.inf]), r"mu_z of shape \(2,\) must be .* 1 of 2 do not.* inf"),
+        ("A", torch.tensor([[1.0, 2.0], [2.0, 1.0]]), r"A of shape \(2, 2\) must be .*PositiveDefinite"),
+        ("A", torch.tensor([[1.0, 0.5], [0.0, 1.0]]), r"A of shape \(2, 2\) must be .*PositiveDefinite"),
+        ("a", torch.tensor(0.0), r"a of shape \(\) must be .* 0.0"),
+    ],
+)
+def test_refuses_bad_parameters(name: str, value: torch.Tensor, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        ProjectedHuber(**{**GOOD, name: value})
+    ProjectedHuber(**{**GOOD, name: value}, validate_args=False)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"raw": torch.full((2, 7), torch.nan)}, r"raw of shape \(2, 7\) must be finite"),
+        ({"f": torch.tensor([1500.0, -1.0])}, r"f of shape \(2,\) must be .* -1.0"),
+        ({"f": 0.0}, r"f of shape \(\) must be .* 0.0"),
+        ({"S": -224.0}, "S of shape"),
+        ({"mu_z0": math.inf}, "mu_z0 of shape"),
+    ],
+)
+def test_refuses_bad_raw_numbers_and_cameras(arguments: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        ProjectedHuber.from_raw(
+            **{"raw": torch.zeros(2, 7), "f": 1500.0, "S": 224.0, "mu_z0": 2.5e-3, **arguments}
+        )
+
+
+def test_refuses_positions_of_a_wrong_shape_or_kind() -> None:
+    distribution = ProjectedHuber(**GOOD).expand((4,))
+    with pytest.raises(ValueError, match="1 are"):
+        distribution.log_prob(torch.tensor([[0.0, 0.0, math.nan], [0.0, 0.0, 4.0]])[:, None])
+    with pytest.raises(RuntimeError, match=r"[Ss]hape"):
+        distribution.log_prob(torch.zeros(3, 3))

@@ -1,0 +1,94 @@
+"""The spectral map against an eigendecomposition, and its derivative where that has none."""
+
+import math
+
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from phd_exp.distributions import spd
+
+GENERIC = [(0.3, -0.7, 1.2), (-2.0, 0.5, -1.0), (3.0, 4.0, 5.0), (-0.4, 1.3, 0.6), (2.0, -9.0, -3.0)]
+EQUAL = [(0.0, 0.0, 0.0), (1.5, 0.0, 1.5), (-1.5, 0.0, -1.5), (1e-9, 0.0, -1e-9), (-2.0, 1e-7, -2.0)]
+ONE_ZERO = [(0.0, 0.0, -1.0), (0.0, 0.0, 1.0), (1.0, math.sqrt(2), 1.0), (-1.0, math.sqrt(2), -1.0)]
+
+
+def points(*lists: list[tuple[float, ...]]) -> torch.Tensor:
+    return torch.tensor([point for points in lists for point in points], dtype=torch.float64)
+
+
+def reference(b: torch.Tensor) -> torch.Tensor:
+    """The map by an eigendecomposition."""
+    off = b[..., 1] / math.sqrt(2)
+    symmetric = torch.stack([b[..., 0], off, off, b[..., 2]], dim=-1).unflatten(-1, (2, 2))
+    s, U = torch.linalg.eigh(symmetric)
+    return U @ torch.diag_embed(torch.where(s >= 0, s + 1, s.exp())) @ U.mT
+
+
+def test_spectral_map_is_that_of_the_eigenvalues() -> None:
+    b = points(GENERIC, EQUAL, ONE_ZERO)
+    B, log_det = spd.spectral_map(b)
+    torch.testing.assert_close(B, reference(b))
+    torch.testing.assert_close(log_det, torch.linalg.slogdet(reference(b)).logabsdet)
+
+
+@pytest.mark.parametrize("b", points(GENERIC, EQUAL, ONE_ZERO), ids=lambda b: str(b.tolist()))
+def test_spectral_map_has_its_true_derivative(b: torch.Tensor) -> None:
+    assert gradcheck(spd.spectral_map, b.requires_grad_(), atol=2e-6)
+
+
+def test_spectral_map_at_zero_is_the_identity_map() -> None:
+    """A network with a zero last layer starts here: B = I, and B moves as I + [[b_1, b_2/sqrt 2], [., b_3]] does."""
+    jacobian_B, jacobian_log_det = torch.autograd.functional.jacobian(
+        spd.spectral_map, torch.zeros(3, dtype=torch.float64)
+    )
+    r = 1 / math.sqrt(2)
+    expected = torch.tensor([[[1, 0, 0], [0, r, 0]], [[0, r, 0], [0, 0, 1]]], dtype=torch.float64)
+    assert torch.equal(spd.spectral_map(torch.zeros(3))[0], torch.eye(2))
+    torch.testing.assert_close(jacobian_B, expected)
+    torch.testing.assert_close(jacobian_log_det, torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-12, 1e-4, 1.0, 30.0])
+def test_spectral_map_in_float32_is_near_float64(scale: float) -> None:
+    b64 = (scale * torch.randn(200, 3, generator=torch.Generator().manual_seed(0))).double().requires_grad_()
+    b32 = b64.detach().float().requires_grad_()
+    for b in (b32, b64):
+        B, log_det = spd.spectral_map(b)
+        (B.diagonal(dim1=-2, dim2=-1).sum() + B[..., 0, 1].sum() + log_det.sum()).backward()
+    (B32, log_det32), (B64, log_det64) = spd.spectral_map(b32), spd.spectral_map(b64)
+    size = B64.detach().norm(dim=(-2, -1), keepdim=True).clamp_min(1e-30)
+    torch.testing.assert_close(B32.double() / size, B64 / size, rtol=0, atol=1e-6 * max(1.0, scale))
+    torch.testing.assert_close(log_det32.double(), log_det64, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(b32.grad.double(), b64.grad, rtol=1e-4, atol=1e-5)
+
+
+def test_spectral_map_of_extremes_is_finite() -> None:
+    values = torch.tensor([-1e4, 0.0, 1e4])
+    b = torch.cartesian_prod(values, values, values).requires_grad_()
+    B, log_det = spd.spectral_map(b)
+    (B.sum() + log_det.sum()).backward()
+    assert B.isfinite().all()
+    assert log_det.isfinite().all()
+    assert b.grad is not None
+    assert b.grad.isfinite().all()
+
+
+def test_positive_has_slope_one_at_zero() -> None:
+    s = torch.tensor([-2.0, -1e-3, 0.0, 1e-3, 3.0], dtype=torch.float64, requires_grad=True)
+    torch.testing.assert_close(spd.positive(s), torch.where(s < 0, s.exp(), s + 1))
+    torch.testing.assert_close(spd.log_positive(s), spd.positive(s).log())
+    for function in (spd.positive, spd.log_positive):
+        (slope,) = torch.autograd.grad(function(s).sum(), s)
+        assert slope[2] == 1
+        assert gradcheck(function, s)
+
+
+def test_linear_algebra_is_that_of_torch() -> None:
+    generator = torch.Generator().manual_seed(1)
+    M = reference(torch.randn(7, 3, generator=generator, dtype=torch.float64))
+    x = torch.randn(7, 2, generator=generator, dtype=torch.float64)
+    torch.testing.assert_close(spd.matvec(M, x), (M @ x[..., None]).squeeze(-1))
+    torch.testing.assert_close(spd.log_det(M), torch.linalg.slogdet(M).logabsdet)
+    torch.testing.assert_close(spd.inverse(M, spd.log_det(M)), torch.linalg.inv(M))
+    torch.testing.assert_close(spd.square(M), M @ M)

@@ -1,0 +1,124 @@
+"""Charts: one law each for the inverse, the Jacobian and the centre; and the constants that scale depth."""
+
+import math
+
+import pytest
+import torch
+
+from phd_exp.geometry import (
+    Camera,
+    Cartesian,
+    Chart,
+    DepthScale,
+    LogDepth,
+    Projected,
+    compensated_depth,
+    projected,
+)
+
+DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
+CAMERA = Camera(torch.tensor([1200.0, 1500.0, 1500.0, 2000.0], dtype=torch.float64), 224.0)
+XYZ = torch.tensor(
+    [[0.1, -0.2, 3.0], [-0.3, 0.25, 4.0], [0.0, 0.0, 3.75], [0.2, 0.1, 5.0]], dtype=torch.float64
+)
+CHARTS = [Projected(DEPTH), LogDepth(DEPTH), Cartesian(DEPTH), Cartesian(DEPTH, xy_unit=0.5)]
+
+
+@pytest.fixture(params=CHARTS, ids=repr)
+def chart(request: pytest.FixtureRequest) -> Chart:
+    return request.param
+
+
+def test_position_inverts_coordinates(chart: Chart) -> None:
+    torch.testing.assert_close(chart.position(chart.coordinates(XYZ, CAMERA), CAMERA), XYZ)
+
+
+def test_jacobian_is_that_of_autograd(chart: Chart) -> None:
+    for xyz, f, log_det in zip(XYZ, CAMERA.f, chart.log_abs_det_jacobian(XYZ, CAMERA), strict=True):
+        jacobian = torch.autograd.functional.jacobian(
+            lambda xyz, f=f: chart.coordinates(xyz, Camera(f, CAMERA.S)), xyz
+        )
+        torch.testing.assert_close(torch.linalg.slogdet(jacobian).logabsdet, log_det)
+
+
+def test_coordinates_are_of_order_one_over_the_data_set(chart: Chart) -> None:
+    corners = [(u * 112 * z / f, v * 112 * z / f, z, f) for u in (-1, 1) for v in (-1, 1) for z in (3, 5)
+               for f in (1200, 2000)]  # fmt: skip
+    corners = torch.tensor(corners, dtype=torch.float64)
+    coordinates = chart.coordinates(corners[:, :3], Camera(corners[:, 3], 224.0))
+    assert coordinates.abs().max() < 2
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_coordinates_do_not_change_when_the_image_is_resized(factor: float) -> None:
+    for make in (Projected, LogDepth, Cartesian):
+        resized = make(DEPTH.scaled(factor)).coordinates(XYZ, CAMERA.scaled(factor))
+        torch.testing.assert_close(resized, make(DEPTH).coordinates(XYZ, CAMERA))
+
+
+def test_definitions_of_the_baselines() -> None:
+    xyz, one = XYZ[1], Camera(CAMERA.f[1], CAMERA.S)  # (-0.3, 0.25, 4) seen with f = 1500
+    v_p = [2 * 1500 * -0.3 / (224 * 4), 2 * 1500 * 0.25 / (224 * 4)]
+    z_p = 4 / (2.5e-3 * 1500)
+    expected = {
+        Projected: [*v_p, z_p - 1],
+        LogDepth: [*v_p, math.log(z_p) / (5 / 3)],
+        Cartesian: [-0.3 / 0.25, 0.25 / 0.25, 0.0],
+    }
+    for make, coordinates in expected.items():
+        torch.testing.assert_close(
+            make(DEPTH).coordinates(xyz, one), torch.tensor(coordinates, dtype=torch.float64)
+        )
+
+
+def test_projected_agrees_with_the_camera() -> None:
+    torch.testing.assert_close(projected(XYZ, CAMERA), CAMERA.project(XYZ) / (CAMERA.S / 2) - 1)
+
+
+def test_depth_scale_of_the_papers_ranges() -> None:
+    assert pytest.approx(2.5e-3) == DEPTH.mu_z0
+    assert pytest.approx(5 / 3) == DEPTH.D
+    assert DEPTH.z_centre == 4.0
+
+
+def test_depth_scale_from_samples_is_that_of_their_range() -> None:
+    z = torch.tensor([3.0, 5.0, 4.0], dtype=torch.float64)
+    f = torch.tensor([2000.0, 1200.0, 1500.0], dtype=torch.float64)
+    scale = DepthScale.from_samples(z, f)
+    assert (scale.mu_z0, scale.D, scale.z_centre) == pytest.approx((DEPTH.mu_z0, DEPTH.D, DEPTH.z_centre))
+
+
+def test_compensated_depth_spans_one_over_D_to_D() -> None:
+    z, f = torch.tensor([3.0, 5.0], dtype=torch.float64), torch.tensor([2000.0, 1200.0], dtype=torch.float64)
+    xyz = torch.stack([torch.zeros_like(z), torch.zeros_like(z), z], dim=-1)
+    z_p = compensated_depth(xyz, Camera(f, 224.0), DEPTH.mu_z0)
+    torch.testing.assert_close(z_p, torch.tensor([1 / DEPTH.D, DEPTH.D], dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((0.0, 2.0, 4.0), "mu_z0 must be positive and finite, but is 0.0"),
+        ((2.5e-3, 0.5, 4.0), "D must be at least 1 and finite, but is 0.5"),
+        ((2.5e-3, float("nan"), 4.0), "D must be at least 1"),
+        ((2.5e-3, 2.0, -4.0), "z_centre must be positive and finite, but is -4.0"),
+    ],
+)
+def test_depth_scale_refuses_impossible_constants(arguments: tuple[float, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        DepthScale(*arguments)
+
+
+@pytest.mark.parametrize("bad", [(0.0, 5.0), (5.0, 3.0), (1.0, float("inf"))])
+def test_depth_scale_refuses_impossible_ranges(bad: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match="f_range must be"):
+        DepthScale.from_ranges(f_range=bad, z_range=(3.0, 5.0))
+    with pytest.raises(ValueError, match="z_range must be"):
+        DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=bad)
+
+
+def test_depth_scale_refuses_impossible_samples() -> None:
+    with pytest.raises(ValueError, match="at least one sample"):
+        DepthScale.from_samples(torch.ones(0), torch.ones(0))
+    with pytest.raises(ValueError, match="z must be positive, but its smallest value is -1"):
+        DepthScale.from_samples(torch.tensor([-1.0, 2.0]), torch.ones(2))

@@ -1,0 +1,185 @@
+"""Killed at any moment, a render loses at most the samples in flight, and ends with the same bytes."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from phd_exp.records.dataset import DatasetError, DatasetFolder
+from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.errors import RenderError
+from phd_exp.rendering.workers import ensure_rendered
+
+pytestmark = pytest.mark.skipif(not Path("/proc/self").exists(), reason="finds processes through /proc")
+
+N_TRAIN, N_TEST = 12, 4
+PATIENCE = 60.0  # s
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> DatasetFolder:
+    return DatasetFolder(tmp_path / "default")
+
+
+def contents(folder: DatasetFolder) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder.root)): path.read_bytes()
+        for path in folder.root.rglob("*")
+        if path.is_file() and folder.cache not in path.parents
+    }
+
+
+def journaled(folder: DatasetFolder) -> int:
+    path = folder.journal_path("train")
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def wait_until(condition: Callable[[], object]) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline, "waited too long"
+        time.sleep(0.005)
+
+
+def render_workers(parent: int) -> list[int]:
+    """Process ids of the living workers of a process."""
+    found = []
+    for status in Path("/proc").glob("[0-9]*/status"):
+        try:
+            fields = dict(line.split(":", 1) for line in status.read_text().splitlines())
+            command = (status.parent / "cmdline").read_bytes()
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+        if int(fields["PPid"]) == parent and b"phd_exp.rendering.worker" in command:
+            found.append(int(status.parent.name))
+    return found
+
+
+def alive(process: int) -> bool:
+    try:
+        state = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return state != "Z"
+
+
+@contextmanager
+def rendering_elsewhere(folder: DatasetFolder, spec: DatasetSpec) -> Iterator[subprocess.Popen[bytes]]:
+    """The same work in a process of its own, to be killed."""
+    script = (
+        "from phd_exp.records.dataset import DatasetFolder\n"
+        "from phd_exp.records.spec import DatasetSpec\n"
+        "from phd_exp.rendering.workers import ensure_rendered\n"
+        f"spec = DatasetSpec.model_validate_json({spec.model_dump_json()!r})\n"
+        f"ensure_rendered(DatasetFolder({str(folder.root)!r}), spec, {N_TRAIN}, {N_TEST}, workers=2)\n"
+    )
+    home = Path(__file__).parents[2]
+    with subprocess.Popen([sys.executable, "-c", script], cwd=home, stderr=subprocess.DEVNULL) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def test_a_killed_parent_leaves_no_workers_and_no_half_files(
+    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec
+) -> None:
+    with rendering_elsewhere(folder, small_spec) as process:
+        wait_until(lambda: journaled(folder) >= 2)
+        orphans = render_workers(process.pid)
+        assert len(orphans) == 2
+        process.kill()
+        process.wait()
+        done = journaled(folder)
+        wait_until(lambda: not any(alive(orphan) for orphan in orphans))
+    assert done < N_TRAIN
+    before = {path.name: path.stat().st_mtime_ns for path in folder.split_folder("train").glob("*.png")}
+    assert len(before) <= done + 2
+    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=2)
+    assert contents(folder) == contents(small)
+    kept = sum(
+        folder.image_path("train", int(name[:6])).stat().st_mtime_ns == t for name, t in before.items()
+    )
+    assert kept >= done, "finished images are not rendered again"
+
+
+def test_a_killed_worker_is_one_line_and_its_work_is_kept(
+    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec
+) -> None:
+    def kill_one() -> None:
+        wait_until(lambda: journaled(folder) >= 1)
+        os.kill(render_workers(os.getpid())[0], signal.SIGKILL)
+
+    killer = threading.Thread(target=kill_one)
+    killer.start()
+    with pytest.raises(
+        RenderError, match=r"a render worker .* was killed by SIGKILL; finished images are kept"
+    ):
+        ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=2)
+    killer.join()
+    assert not render_workers(os.getpid())
+    assert journaled(folder) >= 1
+    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=2)
+    assert contents(folder) == contents(small)
+
+
+def test_two_at_once_share_the_work(
+    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with rendering_elsewhere(folder, small_spec) as process:
+        wait_until(lambda: journaled(folder) >= 1)
+        ensure_rendered(folder, small_spec, N_TRAIN, N_TEST)
+        assert process.wait() == 0
+    assert contents(folder) == contents(small)
+    said = capfd.readouterr().err
+    assert "another process is rendering here; waiting" in said
+    assert "rendering the remaining" not in said
+
+
+def test_a_kill_between_sealing_and_the_manifest(
+    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec
+) -> None:
+    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=2)
+    folder.write_manifest(folder.manifest.model_copy(update={"splits": {}}))
+    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST)
+    assert contents(folder) == contents(small)
+
+
+def test_a_torn_last_line_is_rendered_again_and_a_torn_line_elsewhere_is_named(
+    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec
+) -> None:
+    ensure_rendered(folder, small_spec, 3, 0, workers=1)
+    folder.write_manifest(folder.manifest.model_copy(update={"splits": {}}))
+    journal = folder.metadata_path("train").rename(folder.journal_path("train"))
+    whole = journal.read_text()
+    first, second, third = whole.splitlines(keepends=True)
+
+    journal.write_text(first + second[:100] + "\n" + third)
+    with pytest.raises(DatasetError, match=r"metadata\.partial\.jsonl, line 2: .*; remove that line"):
+        ensure_rendered(folder, small_spec, N_TRAIN, N_TEST)
+    assert journal.read_text() == first + second[:100] + "\n" + third
+
+    journal.write_text(first + second + third[:100])
+    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST)
+    assert contents(folder) == contents(small)
+
+
+@pytest.mark.slow
+def test_twenty_kills_at_random_moments(
+    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec
+) -> None:
+    moments = random.Random(0)
+    for _ in range(20):
+        with rendering_elsewhere(folder, small_spec) as process:
+            time.sleep(moments.uniform(0.2, 3.0))
+            process.kill()
+    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST)
+    assert contents(folder) == contents(small)
