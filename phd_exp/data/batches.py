@@ -45,9 +45,9 @@ class Batch:
 class BatchLoader:
     """Iterates over the batches of one epoch; each iteration is the next epoch.
 
-    The order is a function of (seed, epoch), never of what ran before, and `state_dict` holds both the epoch and
-    the place in it: a resumed epoch goes on with the batches that were left, where a DataLoader would replay its
-    first ones.
+    The order is a function of (seed, epoch), never of what ran before, and `place` holds both the epoch and how far
+    it has come: a resumed epoch goes on with the batches that were left, where a DataLoader would replay its first
+    ones.
     """
 
     def __init__(self, samples: Batch, batch_size: int, *, shuffle: bool, drop_last: bool, seed: int) -> None:
@@ -80,8 +80,11 @@ class BatchLoader:
         generator = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(epoch,)))
         return torch.from_numpy(generator.permutation(len(self.samples)))
 
-    def state_dict(self) -> dict[str, int]:
+    @property
+    def place(self) -> dict[str, int]:
+        """Where the iteration stands, for a checkpoint."""
         return {"epoch": self.epoch, "next_batch": self.next_batch}
 
-    def load_state_dict(self, state: dict[str, int]) -> None:
-        self.epoch, self.next_batch = state["epoch"], state["next_batch"]
+    def go_to(self, place: dict[str, int]) -> None:
+        """Let the next iteration go on from a `place`."""
+        self.epoch, self.next_batch = place["epoch"], place["next_batch"]

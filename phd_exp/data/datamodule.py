@@ -45,6 +45,7 @@ class RenderedData(LightningDataModule):
         self.constant_f = self.zoom * float(np.sqrt(spec.f_range[0] * spec.f_range[1]))
         self.records: dict[Split, Sequence[SampleRecord]] = {}
         self.samples: dict[Split, Batch] = {}
+        self.train_batches: BatchLoader | None = None
 
     def setup(self, stage: str | None = None) -> None:
         """Open both splits; decodes their images the first time."""
@@ -52,11 +53,14 @@ class RenderedData(LightningDataModule):
             if split not in self.samples:
                 self.records[split] = self.folder.records(split, n)
                 self.samples[split] = self._samples(split)
+        if self.train_batches is None:
+            self.train_batches = BatchLoader(
+                self.samples["train"], self.batch_size, shuffle=True, drop_last=True, seed=self.seed
+            )
 
     def train_dataloader(self) -> BatchLoader:
-        return BatchLoader(
-            self.samples["train"], self.batch_size, shuffle=True, drop_last=True, seed=self.seed
-        )
+        assert self.train_batches is not None, "setup comes first"
+        return self.train_batches
 
     def val_dataloader(self) -> BatchLoader:
         # the paper reports the test split after every epoch; nothing is selected by it
@@ -66,6 +70,13 @@ class RenderedData(LightningDataModule):
         return BatchLoader(
             self.samples["test"], self.batch_size, shuffle=False, drop_last=False, seed=self.seed
         )
+
+    # Lightning restores the state of a loader in the middle of an epoch alone, that of a datamodule always
+    def state_dict(self) -> dict[str, int]:
+        return self.train_dataloader().place
+
+    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+        self.train_dataloader().go_to(state_dict)
 
     def _samples(self, split: Split) -> Batch:
         records = self.records[split]

@@ -1,11 +1,13 @@
 """Images decoded once: a memory-mapped uint8 array beside the data set, so that no epoch decodes a file again."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from filelock import FileLock
 from PIL import Image, UnidentifiedImageError
 from rich.progress import track
 
@@ -31,9 +33,10 @@ def cached_images(
     array_file = folder.cache / f"{split}-{len(records)}x{image_size}.npy"
     key_file = array_file.with_suffix(".json")
     key = {"layout": CACHE_LAYOUT, "images": _digest(records)}
-    if not (array_file.exists() and _read_key(key_file) == key):
-        _decode_all(folder, split, records, image_size, array_file)
-        write_atomic(key_file, json.dumps(key) + "\n")
+    with _alone_in(folder.cache):  # the runs of a parallel sweep all come here first
+        if not (array_file.exists() and _read_key(key_file) == key):
+            _decode_all(folder, split, records, image_size, array_file)
+            write_atomic(key_file, json.dumps(key) + "\n")
     # copy-on-write: torch wants a writable array, and nothing may write into this file
     return np.load(array_file, mmap_mode="c")
 
@@ -54,6 +57,17 @@ def decode(file: Path, checksum: str, image_size: int) -> np.ndarray:
         raise DatasetError(f"{file}: cannot be decoded ({error}); {advice}") from None
 
 
+@contextmanager
+def _alone_in(cache: Path) -> Iterator[None]:
+    """One process at a time decodes; the others wait and find the work done."""
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        with FileLock(cache / "decoding.lock"):
+            yield
+    except OSError as error:
+        raise DatasetError(f"{cache}: decoded images cannot be kept here ({error.strerror})") from None
+
+
 def _resized(image: Image.Image, image_size: int) -> np.ndarray:
     colour = image.convert("RGB")
     if colour.size != (image_size, image_size):
@@ -64,7 +78,6 @@ def _resized(image: Image.Image, image_size: int) -> np.ndarray:
 def _decode_all(
     folder: DatasetFolder, split: Split, records: Sequence[SampleRecord], image_size: int, array_file: Path
 ) -> None:
-    array_file.parent.mkdir(parents=True, exist_ok=True)
     unfinished = array_file.with_suffix(".unfinished")
     shape = (len(records), image_size, image_size, 3)
     array = np.lib.format.open_memmap(unfinished, mode="w+", dtype=np.uint8, shape=shape)

@@ -1,8 +1,8 @@
 """The depth law of t = z / mu_z, with density exp(-a max(t, 1/t)) / N(a), as functions of log t and log a.
 
-Logarithms keep every quantity finite where a or t would underflow. Two facts carry the file: the excess energy
-w = a (max(t, 1/t) - 1) has density e^(-w) / (1 + g(a)) on the side t > 1 and e^(-w) (1 + w/a)^(-2) / (1 + g(a)) on the
-side t < 1; and J_k(a) = int_0^inf s^k e^(-s) (1 + s/a)^(-k-2) ds (`tail_moment`) holds all moments.
+Logarithms keep every quantity finite where a or t would underflow. Two facts carry the file. The excess energy
+w = a (max(t, 1/t) - 1) has the density e^(-w) / (1 + g(a)) on the side t > 1, and (1 + w/a)^(-2) times that on the
+side t < 1. The moments are those of `tail_moment`, J_k(a) = int_0^inf s^k e^(-s) (1 + s/a)^(-k-2) ds.
 """
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from phd_exp.distributions.special import log_scaled_normaliser, scaled_expint, signed_log1p, tail_moment
 
-_NEWTON_STEPS = 8
+_NEWTON_STEPS = 8  # to rounding from any a and p; test_icdf_inverts_cdf covers both tails
 
 
 def depth_energy(
@@ -35,9 +35,12 @@ def depth_log_density(
 
 
 def depth_cdf(log_t: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
-    """P(z/mu_z <= t): t^2 g(a/t) e^(-w) / (1 + g(a)) for t <= 1 and 1 - e^(-w) / (1 + g(a)) beyond, w the excess energy.
+    """The probability of depths up to t.
 
-    Source: own derivation (paper's integrals with another border); checked against mpmath in
+    P(z/mu_z <= t) = t^2 g(a/t) e^(-w) / (1 + g(a)) for t <= 1 and 1 - e^(-w) / (1 + g(a)) beyond, with the excess
+    energy w of t.
+
+    Source: own derivation (the normaliser's integral with another border); checked in
     tests/distributions/test_depth.py.
     """
     below = log_t.clamp_max(0)
@@ -47,12 +50,13 @@ def depth_cdf(log_t: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]) 
 
 
 def depth_icdf(p: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
-    """log t with P(z/mu_z <= t) = p, for p in (0, 1); differentiable once, in p and in log a.
+    """The log t with P(z/mu_z <= t) = p, for p in (0, 1); differentiable once, in p and in log a.
 
-    Above the mode t = 1 + w/a with e^(-w) = (1 - p)(1 + g(a)). Below, l = -log t solves
-    a (e^l - 1) + 2 l - log g(a e^l) = -log(p (1 + g(a))), whose left side is increasing and convex with the derivative
-    1 / (e^x E_2(x)), x = a e^l, between x + 1 and x + 2. Newton's method starts from an upper bound of l and only goes
-    down; its last step is taken with gradients, which makes it the implicit function's derivative.
+    Above the mode t = 1 + w/a with e^(-w) = (1 - p)(1 + g(a)). Below it l = -log t solves
+    a (e^l - 1) + 2 l - log g(a e^l) = -log(p (1 + g(a))). The left side is increasing and convex: its derivative is
+    1 / (e^x E_2(x)) at x = a e^l, which lies between x + 1 and x + 2 and grows. Newton's method starts from the upper
+    bound that x + 1 gives and only goes down; its last step is taken with gradients, which makes them those of the
+    implicit function.
 
     Source: own derivation; round trip and gradients checked in tests/distributions/test_depth.py.
     """
@@ -60,11 +64,11 @@ def depth_icdf(p: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]) -> 
     a = log_a.exp()
     g = tail_moment(0, a)
     below = p * (1 + g) < g
-    w = -torch.log(torch.where(below, 0.5, 1 - p) * (1 + g))
-    upper = signed_log1p(torch.where(below, 1, w), log_a)
+    w = -torch.log((1 - p).masked_fill(below, 0.5) * (1 + g))
+    upper = signed_log1p(w.masked_fill(below, 1), log_a)
     log_e_2 = scaled_expint(2, a).log()
-    drop = log_a + log_e_2 - torch.log1p(g) - torch.log(torch.where(below, p, 0.5))  # log(P(t < 1) / p)
-    return torch.where(below, -_solve_lower(torch.where(below, drop, 1), log_a, log_e_2), upper)
+    drop = log_a + log_e_2 - torch.log1p(g) - p.masked_fill(~below, 0.5).log()  # log(P(t < 1) / p)
+    return torch.where(below, -_solve_lower(drop.masked_fill(~below, 1), log_a, log_e_2), upper)
 
 
 def _solve_lower(drop: Tensor, log_a: Tensor, log_e_2: Tensor) -> Tensor:
@@ -87,8 +91,8 @@ def depth_mean_and_variance(
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
     """Mean and variance of t.
 
-    E[t] = 1 + (1 - J_1) / (a (1 + J_0)) and Var[t] = ((2 + J_2) / (1 + J_0) - ((1 - J_1) / (1 + J_0))^2) / a^2: where a is
-    large, M_2/M_0 - (M_1/M_0)^2 of the paper's raw moments would lose every digit.
+    E[t] = 1 + (1 - J_1) / (a (1 + J_0)) and Var[t] = ((2 + J_2) / (1 + J_0) - ((1 - J_1) / (1 + J_0))^2) / a^2.
+    Where a is large, M_2/M_0 - (M_1/M_0)^2 of the paper's raw moments would lose every digit.
 
     Source: own derivation (moments around the mode); checked against mpmath in tests/distributions/test_depth.py.
     """
@@ -99,10 +103,10 @@ def depth_mean_and_variance(
 
 
 def depth_entropy(log_a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Entropy of t in nats, log(e^a N(a)) + E[w] with the mean excess energy E[w] = 2 (1 + a) e^a E_3(a) / (1 + g(a)).
+    """Entropy of t in nats, log(e^a N(a)) + E[w], with E[w] = 2 (1 + a) e^a E_3(a) / (1 + g(a)).
 
-    Source: own derivation (E[max(t, 1/t)] = -d log N/da, rearranged so that nothing cancels where a is large); checked
-    in tests/distributions/test_depth.py.
+    Source: own derivation (E[max(t, 1/t)] = -d log N/da, rearranged so that nothing cancels where a is large);
+    checked in tests/distributions/test_depth.py.
     """
     a = log_a.exp()
     mean_energy = 2 * (1 + a) * scaled_expint(3, a) / (1 + tail_moment(0, a))

@@ -27,7 +27,7 @@ def huber_energy(q: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
     squared = q.square().sum(dim=-1)
     outer = squared > 1
     # the root is taken of 1 where it is not wanted: its gradient at q = 0 would be 0/0
-    r = torch.where(outer, squared, 1).sqrt()
+    r = squared.masked_fill(~outer, 1).sqrt()
     return torch.where(outer, r - 0.5, squared / 2)
 
 

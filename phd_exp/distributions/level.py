@@ -13,9 +13,9 @@ from phd_exp.distributions.special import tail_moment
 def credible_level(energy: Float[Tensor, "*#batch"], a: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
     """P(h(|q|) + a (max(t, 1/t) - 1) <= W) for an energy W >= 0 above the mode's, in [0, 1].
 
-    The excess depth energy w has density e^(-w) (1 + (1 + w/a)^(-2)) / (1 + g(a)), one term for each side of the mode, and
-    G(y) = P(h(|q|) > y) is elementary, (e^(-1/2) + e^(-y))/Z up to y = 1/2 and (y + 3/2) e^(-y)/Z beyond. Hence
-    1 - level = P(w > W) + int_0^W e^(-w) (1 + (1 + w/a)^(-2)) G(W - w) dw / (1 + g(a)) in closed form.
+    The excess depth energy w has the density e^(-w) (1 + (1 + w/a)^(-2)) / (1 + g(a)), one term for each side of the
+    mode, and G(y) = P(h(|q|) > y) is elementary (`energy_survival`). Hence 1 - level = P(w > W) +
+    int_0^W e^(-w) (1 + (1 + w/a)^(-2)) G(W - w) dw / (1 + g(a)), which has a closed form: G changes its own at w = X.
 
     Source: own derivation; checked against quadrature in tests/distributions/test_level.py.
     """
@@ -44,9 +44,10 @@ def _log_remainder(y: Tensor) -> Tensor:
     """log(1 + y) - y / (1 + y) for y >= 0, about y^2/2 where y is small, with full relative accuracy."""
     # with u = y/(2 + y), log(1 + y) = 2 artanh u and y/(1 + y) = 2 u/(1 + u); their linear terms drop out by hand
     small = y < 0.5
-    u = torch.where(small, y, 0) / (2 + torch.where(small, y, 0))
+    u = y.masked_fill(~small, 0)
+    u = u / (2 + u)
     series = torch.zeros_like(u)
     for k in reversed(range(1, 12)):
         series = (series + 1 / (2 * k + 1)) * u.square()
-    large = torch.where(small, 1, y)
+    large = y.masked_fill(small, 1)
     return torch.where(small, 2 * u * (series + u / (1 + u)), torch.log1p(large) - large / (1 + large))

@@ -1,7 +1,7 @@
 """The parameters of the Projected Huber distribution in the form in which its density needs them, and the maps to it.
 
-Products and logarithms are kept in place of mu_xy, mu_z, A and a, because these overflow or underflow for raw numbers of
-a network that are merely large; and no matrix is inverted and multiplied back on the way to the density.
+Products and logarithms are kept in place of mu_xy, mu_z, A and a, because these overflow or underflow for raw numbers
+of a network that are merely large; and no matrix is inverted and multiplied back on the way to the density.
 """
 
 import math
@@ -58,7 +58,8 @@ class Natural:
         """From seven raw numbers (n_1, n_2, b_1, b_2, b_3, w_1, w_2) of a network and the camera it was told.
 
         In the frame of the network nu_p = (n_1, n_2), B = `spectral_map`(b_1, b_2, b_3), a = `positive`(w_1) and
-        log nu_z = sign(w_2) log(1 + |w_2|/a). Then mu_z = nu_z mu_z0 f, A_xy = 2 B / (S mu_z0), nu_xy = nu_p / (mu_z0 f).
+        log nu_z = sign(w_2) log(1 + |w_2|/a). Then mu_z = nu_z mu_z0 f, A_xy = 2 B / (S mu_z0) and
+        nu_xy = nu_p / (mu_z0 f): in camera frame and network frame alike, nu_z leaves the projection alone.
 
         Source: paper, sections "Parameter remapping" and "Enforcing constraints on distribution parameters".
         """

@@ -83,7 +83,7 @@ class ProjectedHuber(Distribution):
 
         Args:
             raw: the raw numbers.
-            f: focal length, pixels, one for each element of the batch; for several points per camera, of shape (*, 1).
+            f: focal length, pixels, for each element of the batch; of shape (*, 1) for several points per camera.
             S: side of the image, pixels.
             mu_z0: the data set's depth per focal length, metres per pixel.
             validate_args: as for the constructor.
@@ -176,7 +176,7 @@ class ProjectedHuber(Distribution):
             - self._natural.log_mu_z
             - log_scaled_normaliser(self._natural.log_a)
         )
-        return torch.where(visible, log_mode - energy, -torch.inf)
+        return (log_mode - energy).masked_fill(~visible, -torch.inf)
 
     def _excess_energy(self, xyz: Tensor) -> tuple[Tensor, Tensor]:
         """Log density at the mode minus log density at a position with z > 0, and whether z > 0."""
@@ -184,7 +184,7 @@ class ProjectedHuber(Distribution):
             self._check_positions(xyz)
         visible = xyz[..., 2] > 0
         # positions that are not visible are moved, so that no NaN is computed and then multiplied by a zero gradient
-        log_t = torch.where(visible, xyz[..., 2], 1).log() - self._natural.log_mu_z
+        log_t = xyz[..., 2].masked_fill(~visible, 1).log() - self._natural.log_mu_z
         return huber.huber_energy(self._whiten(xyz)) + depth.depth_energy(log_t, self._natural.log_a), visible
 
     def _check_positions(self, xyz: Tensor) -> None:
@@ -204,7 +204,7 @@ class ProjectedHuber(Distribution):
         Source: own derivation, see `credible_level`.
         """
         energy, visible = self._excess_energy(xyz)
-        return torch.where(visible, credible_level(energy, self.a), 1)
+        return credible_level(energy, self.a).masked_fill(~visible, 1)
 
     @property
     def mode(self) -> Float[Tensor, "*batch 3"]:
@@ -259,8 +259,8 @@ class ProjectedHuber(Distribution):
     def depth_cdf(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
         """P(depth <= z), z in metres; 0 for z <= 0."""
         visible = z > 0
-        log_t = torch.where(visible, z, 1).log() - self._natural.log_mu_z
-        return torch.where(visible, depth.depth_cdf(log_t, self._natural.log_a), 0)
+        log_t = z.masked_fill(~visible, 1).log() - self._natural.log_mu_z
+        return depth.depth_cdf(log_t, self._natural.log_a).masked_fill(~visible, 0)
 
     def depth_icdf(self, p: Float[Tensor, "*#batch"] | float) -> Float[Tensor, "*#batch"]:
         """The depth z, metres, with P(depth <= z) = p, for p in (0, 1)."""

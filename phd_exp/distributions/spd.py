@@ -29,9 +29,9 @@ def log_positive(s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 def spectral_map(
     b: Float[Tensor, "*batch 3"],
 ) -> tuple[Float[Tensor, "*batch 2 2"], Float[Tensor, "*batch"]]:
-    """B = phi([[b_1, b_2/sqrt 2], [b_2/sqrt 2, b_3]]), phi acting on the eigenvalues, and log|B|.
+    """B = phi(M), `positive` acting on the eigenvalues of M = [[b_1, b_2/sqrt 2], [b_2/sqrt 2, b_3]], and log|B|.
 
-    With eigenvalues s = m +- r, B = (phi(s+) + phi(s-))/2 I + (phi(s+) - phi(s-))/(s+ - s-) ([[b_1, ...], ...] - m I).
+    With M's eigenvalues s = m +- r, B = (phi(s+) + phi(s-))/2 I + (phi(s+) - phi(s-))/(s+ - s-) (M - m I).
     Value and derivative are true at equal eigenvalues and at s = 0, where a network with a zero last layer starts.
     log|B| is finite for |b| up to 1e4, where B itself underflows.
 
@@ -43,7 +43,7 @@ def spectral_map(
     squared = half.square() + off.square()
     equal = squared == 0
     # everything below is even in r, hence 0 is its true derivative with respect to r at r = 0
-    r = torch.where(equal, 0, torch.where(equal, 1, squared).sqrt())
+    r = squared.masked_fill(equal, 1).sqrt().masked_fill(equal, 0)
     upper, lower = middle + r, middle - r
     mean, slope = (positive(upper) + positive(lower)) / 2, _divided_difference(upper, lower, equal)
     diagonal = slope * half
@@ -57,7 +57,7 @@ def _divided_difference(upper: Tensor, lower: Tensor, equal: Tensor) -> Tensor:
     # phi(s) = (s - l) + e^l with l = min(s, 0): both parts grow with s, so no difference of them cancels
     linear = (upper - upper_low) - (lower - lower_low)
     exponential = upper_low.exp() * -torch.expm1(lower_low - upper_low)
-    gap = torch.where(equal, 1, upper - lower)
+    gap = (upper - lower).masked_fill(equal, 1)
     return torch.where(equal, upper_low.exp(), (linear + exponential) / gap)
 
 

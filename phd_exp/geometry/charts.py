@@ -132,7 +132,7 @@ class Chart(ABC):
     def log_abs_det_jacobian(
         self, xyz: Float[Tensor, "*#batch 3"], camera: Camera
     ) -> Float[Tensor, "*#batch"]:
-        """log|det d coordinates / d xyz| at a position; a density in coordinates times its exponential is one in xyz."""
+        """log|det d coordinates / d xyz| at a position, by which log densities in the two frames differ."""
 
 
 @dataclass(frozen=True)

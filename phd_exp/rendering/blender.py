@@ -139,9 +139,7 @@ class Renderer:
         self._lamps = {name: self._new_lamp(name) for name in LAMP_NAMES}
         self._camera = self._new_camera()
         self._scene.world = self._bpy.data.worlds.new("world")
-        self._scene.world.cycles.sampling_method = (
-            "NONE"  # too smooth to be worth a map of where light comes from
-        )
+        self._scene.world.cycles.sampling_method = "NONE"  # too smooth for a map of its light to be worth it
         self._backdrop = shaders.paint_world(self._scene.world.node_tree)
         self._configure()
 

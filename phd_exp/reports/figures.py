@@ -1,6 +1,7 @@
 """Pictures drawn from records."""
 
 import io
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,8 @@ def _draw_curve(axes: Axes, name: str, curve: Mapping[str, Any]) -> None:
     title, unit = LABELS[name]
     predicted, empirical = curve["predicted"], curve["empirical"]
     values = [value for value in (*predicted, *empirical) if value > 0]
-    bounds = (0.7 * min(values), 1.4 * max(values))
+    # whole decades: the labels between them would run into each other
+    bounds = (10 ** math.floor(math.log10(min(values))), 10 ** math.ceil(math.log10(max(values))))
     axes.plot(bounds, bounds, "--", color="tab:red", linewidth=1, label="calibrated")
     axes.plot(predicted, empirical, color="tab:blue", label=f"window of {curve['window']}")
     axes.set(xscale="log", yscale="log", xlim=bounds, ylim=bounds, aspect="equal", title=title)

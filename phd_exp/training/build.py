@@ -65,7 +65,10 @@ def build_trainer(
 ) -> Trainer:
     """Lightning's Trainer with what a run records."""
     callbacks: list[Callback] = [
-        ModelCheckpoint(folder.checkpoints, filename="last", enable_version_counter=False)
+        # after the whole epoch: a checkpoint taken after its validation would leave the epoch half-counted
+        ModelCheckpoint(
+            folder.checkpoints, filename="last", enable_version_counter=False, save_on_train_epoch_end=True
+        )
     ]
     callbacks += _progress(config)
     if calibration is not None:

@@ -84,3 +84,19 @@ def test_what_is_no_image_is_one_line(tmp_path: Path) -> None:
     file.write_bytes(b"no image")
     with pytest.raises(DatasetError, match="cannot be decoded"):
         images.decode(file, sha256(b"no image"), 32)
+
+
+def test_two_processes_may_decode_at_once(folder: DatasetFolder) -> None:
+    from concurrent.futures import ThreadPoolExecutor
+
+    records = folder.records("train")
+    with ThreadPoolExecutor(4) as pool:  # each call opens the lock file anew, as a process would
+        arrays = list(pool.map(lambda _: cached_images(folder, "train", records, 32), range(8)))
+    for array in arrays:
+        np.testing.assert_array_equal(array, arrays[0])
+
+
+def test_a_read_only_data_set_is_one_line(folder: DatasetFolder) -> None:
+    folder.cache.write_text("in the way of the folder")
+    with pytest.raises(DatasetError, match=r"\.cache: decoded images cannot be kept here"):
+        cached_images(folder, "train", folder.records("train"), 32)

@@ -1,4 +1,4 @@
-"""From seven raw numbers to a loss: the printed formulas, the seams, the extremes, convexity and bounded gradients."""
+"""From seven raw numbers to a loss: printed formulas, seams, extremes, convexity and bounded gradients."""
 
 import itertools
 import math
@@ -168,8 +168,8 @@ def convex_points(n: int, scale: float, seed: int) -> torch.Tensor:
 def test_loss_without_log_nu_z_is_convex_in_the_outputs(scale: float) -> None:
     """Along chords of the region B > I, a > 1.
 
-    log nu_z itself is concave for w_2 > 0 (the paper's proof leaves it out): its curvature, -1/(a + w_2)^2, is all that
-    the loss lacks to be convex.
+    log nu_z itself is concave for w_2 > 0 (the paper's proof leaves it out): its curvature, -1/(a + w_2)^2, is all
+    that the loss lacks to be convex.
     """
 
     def convex_part(raw: torch.Tensor, xyz: torch.Tensor) -> torch.Tensor:

@@ -129,6 +129,21 @@ def test_signed_log1p_stays_finite_where_a_underflows() -> None:
     torch.testing.assert_close(derivative, torch.tensor([1e-4, 1 / torch.finfo(x.dtype).eps, 1e-4]))
 
 
+def test_validation_before_training_leaves_no_inference_tensors_behind() -> None:
+    special._kept_constants.cache_clear()
+    a = torch.tensor([0.5, 2.0], requires_grad=True)
+    with torch.inference_mode():
+        special.scaled_expint(2, a)
+    special.scaled_expint(2, a).sum().backward()
+
+
+def test_autocast_changes_nothing() -> None:
+    a = torch.logspace(-2, 2, 20)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        values = special.log_normaliser(a)
+    torch.testing.assert_close(values, special.log_normaliser(a), rtol=0, atol=0)
+
+
 def test_gauss_rule_is_the_one_its_comment_describes() -> None:
     """Gautschi's construction: a Gauss rule for e^(-s) / prod_j (1 + s/a_j), its weights multiplied back."""
     with mp.workdps(40):
