@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from phd_exp.cli.paths import conf_folder
+from phd_exp.cli.signals import Stopped, stopping_on_signals
 from phd_exp.records.errors import ConfigError, UserError
 
 BAD_CONFIGURATION = 2
@@ -68,7 +69,11 @@ def launch(task: Task, arguments: list[str], config_name: str = "config") -> int
     # argparse takes the overrides in one piece alone: flags to the front, wherever the user put them
     sys.argv = [sys.argv[0], *sorted(arguments, key=lambda word: word not in MULTIRUN)]
     try:
-        decorated()
+        with stopping_on_signals():
+            decorated()
+    except Stopped as stop:
+        print(f"error: stopped by {stop}; the same command goes on from here", file=sys.stderr)
+        return int(str(stop.code))
     except (HydraException, OmegaConfBaseException) as error:
         print(f"error: {explain(error, config_name)}", file=sys.stderr)
         return BAD_CONFIGURATION

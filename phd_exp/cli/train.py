@@ -28,10 +28,15 @@ def task(config: dict[str, Any], overrides: list[str]) -> None:
     folder = RunFolder(run_name(checked, overrides).folder(checked.runs))
     skipped = folder.is_finished()
     if not skipped:
+        folder.require_writable()
         ensure_dataset(checked.data)
     results = train(checked, folder, draw=_draw())
-    numbers = (f"{key} {value:.4g}" for key, value in results.items() if key.startswith("test/"))
-    print(f"{folder.path}: {'finished already, ' if skipped else ''}{', '.join(numbers)}")
+    print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
+    for key, value in results.items():
+        if key.startswith("test/"):
+            print(f"  {key} {value:.4g} (untrained {results[f'untrained/{key}']:.4g})")
+    if (folder.calibration / "final.png").exists():
+        print(f"  calibration curves: {folder.calibration / 'final.png'}")
 
 
 def run_name(config: RunConfig, overrides: list[str]) -> RunName:

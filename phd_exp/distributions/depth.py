@@ -11,7 +11,7 @@ from torch import Tensor
 
 from phd_exp.distributions.special import log_scaled_normaliser, scaled_expint, signed_log1p, tail_moment
 
-_NEWTON_STEPS = 8  # to rounding from any a and p; test_icdf_inverts_cdf covers both tails
+_NEWTON_STEPS = 6  # to rounding from any a and p; test_icdf_inverts_cdf covers both tails
 
 
 def depth_energy(
@@ -21,10 +21,12 @@ def depth_energy(
 
     Source: paper, section "Projected Huber distribution".
     """
-    distance = log_t.abs()
-    return torch.exp(log_a + distance) * -torch.expm1(
-        -distance
-    )  # a (e^|log t| - 1) without the underflow of a
+    return _energy_of_distance(log_t.abs(), log_a)
+
+
+def _energy_of_distance(distance: Tensor, log_a: Tensor) -> Tensor:
+    """a (e^distance - 1), where a may underflow and e^distance overflow."""
+    return torch.exp(log_a + distance) * -torch.expm1(-distance)
 
 
 def depth_log_density(
@@ -43,10 +45,12 @@ def depth_cdf(log_t: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]) 
     Source: own derivation (the normaliser's integral with another border); checked in
     tests/distributions/test_depth.py.
     """
-    below = log_t.clamp_max(0)
-    decay = torch.exp(-depth_energy(log_t, log_a)) / (1 + tail_moment(0, log_a.exp()))
-    lower = torch.exp(2 * below) * tail_moment(0, torch.exp(log_a - below)) * decay
-    return torch.where(log_t <= 0, lower, 1 - decay)
+    near = log_t <= 0
+    below, above = log_t.masked_fill(~near, 0), log_t.masked_fill(near, 0)
+    log_norm = torch.log1p(tail_moment(0, log_a.exp()))
+    decay = torch.exp(2 * below - _energy_of_distance(-below, log_a) - log_norm)
+    lower = decay * tail_moment(0, torch.exp(log_a - below))
+    return torch.where(near, lower, -torch.expm1(-_energy_of_distance(above, log_a) - log_norm))
 
 
 def depth_icdf(p: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
@@ -64,7 +68,7 @@ def depth_icdf(p: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]) -> 
     a = log_a.exp()
     g = tail_moment(0, a)
     below = p * (1 + g) < g
-    w = -torch.log((1 - p).masked_fill(below, 0.5) * (1 + g))
+    w = -torch.log1p(-p.masked_fill(below, 0.5)) - torch.log1p(g)
     upper = signed_log1p(w.masked_fill(below, 1), log_a)
     log_e_2 = scaled_expint(2, a).log()
     drop = log_a + log_e_2 - torch.log1p(g) - p.masked_fill(~below, 0.5).log()  # log(P(t < 1) / p)
@@ -76,13 +80,13 @@ def _solve_lower(drop: Tensor, log_a: Tensor, log_e_2: Tensor) -> Tensor:
 
     def newton_step(distance: Tensor, drop: Tensor, log_a: Tensor, log_e_2: Tensor) -> Tensor:
         e_2 = scaled_expint(2, torch.exp(log_a + distance))
-        excess = depth_energy(distance, log_a) + distance - e_2.log() + log_e_2 - drop
-        return (distance - excess * e_2).clamp_min(0)
+        excess = _energy_of_distance(distance, log_a) + distance - e_2.log() + log_e_2 - drop
+        return distance - excess * e_2
 
     with torch.no_grad():
         distance = torch.minimum(drop, signed_log1p(drop, log_a))
         for _ in range(_NEWTON_STEPS):
-            distance = newton_step(distance, drop, log_a, log_e_2)
+            distance = newton_step(distance, drop, log_a, log_e_2).clamp_min(0)
     return newton_step(distance, drop, log_a, log_e_2)
 
 

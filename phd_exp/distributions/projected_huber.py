@@ -192,7 +192,11 @@ class ProjectedHuber(Distribution):
             raise ValueError(
                 f"a position has 3 coordinates in its last dimension, but the shape is {tuple(xyz.shape)}"
             )
-        torch.broadcast_shapes(xyz.shape[:-1], self.batch_shape)
+        try:
+            torch.broadcast_shapes(xyz.shape[:-1], self.batch_shape)
+        except RuntimeError as error:
+            shapes = f"{tuple(xyz.shape[:-1])}, the distribution's is {tuple(self.batch_shape)}"
+            raise ValueError(f"batch shapes must broadcast, but that of the positions is {shapes}") from error
         if bool(xyz.isnan().any()):
             raise ValueError(f"positions must not be NaN, but {int(xyz.isnan().any(dim=-1).sum())} are")
 
@@ -295,9 +299,8 @@ def _wants_validation(validate_args: bool | None) -> bool:
 
 def _require(name: str, value: Tensor, constraint: Constraint) -> None:
     """Raise a ValueError that names the parameter, its shape, its constraint and an offending value."""
-    batch = value.shape[
-        : value.ndim - constraint.event_dim
-    ]  # the constraint answers once for a vector or matrix
+    # a constraint on vectors or matrices answers once for each of them
+    batch = value.shape[: value.ndim - constraint.event_dim]
     invalid = ~(constraint.check(value) & value.isfinite().reshape((*batch, -1)).all(-1))
     if bool(invalid.any()):
         raise ValueError(

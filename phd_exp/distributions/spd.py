@@ -41,18 +41,19 @@ def spectral_map(
     b_1, b_2, b_3 = b.unbind(-1)
     middle, half, off = (b_1 + b_3) / 2, (b_1 - b_3) / 2, b_2 / math.sqrt(2)
     squared = half.square() + off.square()
-    equal = squared == 0
+    zero = squared == 0
     # everything below is even in r, hence 0 is its true derivative with respect to r at r = 0
-    r = squared.masked_fill(equal, 1).sqrt().masked_fill(equal, 0)
+    r = squared.masked_fill(zero, 1).sqrt().masked_fill(zero, 0)
     upper, lower = middle + r, middle - r
-    mean, slope = (positive(upper) + positive(lower)) / 2, _divided_difference(upper, lower, equal)
+    mean, slope = (positive(upper) + positive(lower)) / 2, _divided_difference(upper, lower)
     diagonal = slope * half
     B = torch.stack([mean + diagonal, slope * off, slope * off, mean - diagonal], dim=-1)
     return B.unflatten(-1, (2, 2)), log_positive(upper) + log_positive(lower)
 
 
-def _divided_difference(upper: Tensor, lower: Tensor, equal: Tensor) -> Tensor:
+def _divided_difference(upper: Tensor, lower: Tensor) -> Tensor:
     """(phi(upper) - phi(lower)) / (upper - lower) for upper >= lower, phi'(upper) where they are equal."""
+    equal = upper == lower  # which rounding can make them
     upper_low, lower_low = upper.clamp_max(0), lower.clamp_max(0)
     # phi(s) = (s - l) + e^l with l = min(s, 0): both parts grow with s, so no difference of them cancels
     linear = (upper - upper_low) - (lower - lower_low)
@@ -72,10 +73,13 @@ def log_det(M: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch"]:
     return torch.log(pivot) + torch.log(M[..., 1, 1] - M[..., 0, 1] * M[..., 1, 0] / pivot)
 
 
-def inverse(M: Float[Tensor, "*batch 2 2"], log_det: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2 2"]:
+def inverse(
+    M: Float[Tensor, "*batch 2 2"], log_det_M: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch 2 2"]:
     """The inverse of a symmetric positive definite matrix whose log determinant is known: adj(M) / |M|."""
     adjugate = torch.stack([M[..., 1, 1], -M[..., 0, 1], -M[..., 1, 0], M[..., 0, 0]], dim=-1)
-    return adjugate.unflatten(-1, (2, 2)) * torch.exp(-log_det)[..., None, None]
+    root = torch.exp(-log_det_M / 2)[..., None, None]  # of 1/|M|, which may itself overflow
+    return adjugate.unflatten(-1, (2, 2)) * root * root
 
 
 def square(M: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2 2"]:

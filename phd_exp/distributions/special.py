@@ -56,7 +56,8 @@ def scaled_expint(n: int, a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]
     if n <= 0:
         return _elementary(-n, a)
     small = a <= 1
-    below, above = a.clamp_max(1), a.clamp_min(1)  # each scheme sees only what it is for
+    # each scheme sees only what it is for; a clamp would have no gradient at a = 1, where a network starts
+    below, above = a.masked_fill(~small, 1), a.masked_fill(small, 1)
     return torch.where(small, _series(n, below)[-1], _by_rule(above, (0, n))[0] / above)
 
 
@@ -64,9 +65,10 @@ def tail_moment(k: int, a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """The k-th moment of the lower tail of the depth law, J_k(a) = int_0^inf s^k e^(-s) (1 + s/a)^(-k-2) ds, k >= 0.
 
     J_0 is the paper's g(a) = a e^a E_2(a), and J_k(inf) = k!. The family is closed under differentiation:
-    dJ_k/da = (k + 2) J_(k+1)(a) / a^2, so derivatives of any order are exact. a may have underflowed to 0.
+    dJ_k/da = (k + 2) J_(k+1)(a) / a^2, so derivatives of every order follow. a may have underflowed to 0.
 
-    Source: own derivation (expand s^k around s + a); checked against mpmath in tests/distributions/test_special.py.
+    Source: own derivation (differentiate under the integral); checked against mpmath in
+    tests/distributions/test_special.py.
     """
     value: Tensor = _TailMoment.apply(a, k)
     return value
@@ -138,7 +140,7 @@ class _TailMoment(torch.autograd.Function):
         a, derivative = ctx.saved_tensors  # type: ignore[attr-defined]
         if torch.is_grad_enabled():  # a derivative of this derivative is wanted: climb the ladder
             k = ctx.k  # type: ignore[attr-defined]
-            derivative = (k + 2) * tail_moment(k + 1, a) / a.square()
+            derivative = (k + 2) * tail_moment(k + 1, a) / a.square().clamp_min(torch.finfo(a.dtype).tiny)
         return grad * derivative, None
 
 
@@ -151,9 +153,8 @@ def _tail_moment_and_derivative(k: int, a: Tensor) -> tuple[Tensor, Tensor]:
     derivative_below = (k + 2) * below**k * _difference(k + 1, e)
     value_above, next_above = _by_rule(above, (k, k + 2), (k + 1, k + 3))
     derivative_above = (k + 2) * next_above / above.square()
-    return torch.where(small, value_below, value_above), torch.where(
-        small, derivative_below, derivative_above
-    )
+    value = torch.where(small, value_below, value_above)
+    return value, torch.where(small, derivative_below, derivative_above)
 
 
 def _elementary(k: int, a: Tensor) -> Tensor:

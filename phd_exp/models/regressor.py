@@ -17,14 +17,16 @@ class Regressor(nn.Module):
 
     The backbone runs in whatever precision is switched on around it; the linear layer and everything after it
     in float32, since nu_p = B v_p rounded to bf16 would be wrong by up to 0.2 pixels at the border of the image.
+    `memory_format` says in which order of dimensions images lie in memory; it changes speed alone.
     """
 
     mean: Tensor
     std: Tensor
 
-    def __init__(self, backbone: Backbone, head: Head) -> None:
+    def __init__(self, backbone: Backbone, head: Head, memory_format: torch.memory_format) -> None:
         super().__init__()
-        self.backbone = backbone
+        self.memory_format = memory_format
+        self.backbone = backbone.to(memory_format=memory_format)
         self.head = head
         self.last = nn.Linear(backbone.n_features, head.n_outputs)
         nn.init.zeros_(self.last.weight)
@@ -37,8 +39,8 @@ class Regressor(nn.Module):
 
     def raw(self, image: UInt8[Tensor, "batch height width 3"]) -> Float[Tensor, "batch n_outputs"]:
         """The numbers before the head, in the precision of the last layer."""
-        # (batch, 3, height, width) seen through channels_last strides: no copy
         pixels = (image.permute(0, 3, 1, 2).to(self.mean.dtype) - self.mean) / self.std
+        pixels = pixels.contiguous(memory_format=self.memory_format)
         features = self.backbone(pixels)
         with torch.autocast(features.device.type, enabled=False):
             raw: Tensor = self.last(features.to(self.last.weight.dtype))

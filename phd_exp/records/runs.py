@@ -15,6 +15,7 @@ A run is named by its choices, never by a date, so that the same command resumes
 
 import hashlib
 import json
+import os
 import time
 import traceback
 from collections.abc import Iterable, Iterator, Mapping
@@ -121,6 +122,14 @@ class RunFolder:
     def write_metrics(self, rows: Iterable[Mapping[str, Any]]) -> None:
         write_atomic(self.metrics_file, "".join(json.dumps(row) + "\n" for row in rows))
 
+    def require_writable(self) -> None:
+        """Raise RunError where the folder could not be made, before hours are spent on what goes into it."""
+        nearest = next(path for path in (self.path, *self.path.absolute().parents) if path.exists())
+        if not (nearest.is_dir() and os.access(nearest, os.W_OK)):
+            raise RunError(
+                f"{self.path}: cannot be written ({nearest} is in the way or read-only); choose runs=DIR"
+            )
+
     @contextmanager
     def held(self) -> Iterator[None]:
         """Hold the folder for this process alone. Raises RunError where another process has it."""
@@ -153,7 +162,7 @@ class RunFolder:
             self.write_status(_ended(status, "failed", error=line, trace=traceback.format_exc()))
             raise
         except BaseException as stop:
-            self.write_status(_ended(status, "interrupted", error=type(stop).__name__))
+            self.write_status(_ended(status, "interrupted", error=f"{type(stop).__name__}: {stop}"))
             raise
         self.write_status(_ended(status, "finished"))
 

@@ -14,7 +14,7 @@ from phd_exp.data.datamodule import RenderedData
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.callbacks import CalibrationRecorder, Draw, EpochLines, RecordLogger
+from phd_exp.training.callbacks import CalibrationRecorder, Draw, EpochLines
 from phd_exp.training.config import RunConfig, TrainerConfig
 from phd_exp.training.module import PositionModule
 
@@ -37,27 +37,26 @@ def build_module(config: RunConfig, data: RenderedData) -> PositionModule:
     """The network, its loss and its optimizer, initialised from torch's current random state."""
     # partial, then called: an object among instantiate's own arguments would be turned into a configuration
     head = instantiate(config.model.head, _partial_=True)(depth=data.depth)
-    regressor = Regressor(instantiate(config.backbone), head)
+    regressor = Regressor(instantiate(config.backbone), head, memory_format(config.trainer))
     constant_f = data.constant_f if config.camera.focal_length == "constant" else None
     optimizer = instantiate(config.optimizer, _partial_=True)
     return PositionModule(regressor, instantiate(config.loss), optimizer, constant_f)
 
 
 def build_loggers(config: RunConfig, folder: RunFolder) -> list[Logger]:
-    """The run record always, wandb beside it where asked for."""
-    loggers: list[Logger] = [RecordLogger(folder)]
-    if config.logger.kind == "wandb":
-        folder.wandb.mkdir(parents=True, exist_ok=True)
-        loggers.append(
-            WandbLogger(
-                name="/".join(folder.path.parts[-4:]),
-                project=config.logger.project,
-                save_dir=folder.path,
-                offline=config.logger.offline,
-                config=config.model_dump(mode="json"),
-            )
+    """What a run is sent to besides its own record."""
+    if config.logger.kind == "none":
+        return []
+    folder.wandb.mkdir(parents=True, exist_ok=True)
+    return [
+        WandbLogger(
+            name="/".join(folder.path.parts[-4:]),
+            project=config.logger.project,
+            save_dir=folder.path,
+            offline=config.logger.offline,
+            config=config.model_dump(mode="json"),
         )
-    return loggers
+    ]
 
 
 def build_trainer(
@@ -118,6 +117,11 @@ def precision(config: TrainerConfig) -> Any:
     if config.accelerator != "cpu" and torch.cuda.is_available():
         return "bf16-mixed" if torch.cuda.is_bf16_supported(including_emulation=False) else "32-true"
     return "bf16-mixed" if _cpu_has_bfloat16() else "32-true"
+
+
+def memory_format(config: TrainerConfig) -> torch.memory_format:
+    """Channels last where it is faster: with bfloat16; float32 on a CPU is a fifth faster without it."""
+    return torch.channels_last if precision(config) == "bf16-mixed" else torch.contiguous_format
 
 
 def _cpu_has_bfloat16() -> bool:

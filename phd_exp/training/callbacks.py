@@ -57,9 +57,9 @@ class RecordLogger(Logger):
         self.rows[epoch] = self.rows.get(epoch, {"epoch": epoch}) | {"step": step} | finite
         self.folder.write_metrics(self.rows[key] for key in sorted(self.rows))
 
-    def forget_from(self, epoch: int) -> None:
+    def forget_after(self, epoch: int) -> None:
         """Drop the epochs that a resumed run will train again."""
-        self.rows = {key: row for key, row in self.rows.items() if key < epoch}
+        self.rows = {key: row for key, row in self.rows.items() if key <= epoch}
 
 
 class EpochLines(Callback):

@@ -25,6 +25,9 @@ from phd_exp.training.config import RunConfig
 from phd_exp.training.module import PositionModule
 from phd_exp.training.predictions import Columns, joined, summary, write_parquet
 
+UNTRAINED = -1
+"""The epoch before the first: what the untrained network gives."""
+
 WITHOUT_INFLUENCE = ("runs", "logger")
 """Top-level keys that say where and how a run is recorded, not what it computes."""
 
@@ -80,10 +83,11 @@ def _train(config: RunConfig, folder: RunFolder, draw: Draw | None) -> dict[str,
     data.setup()
     module = build_module(config, data)
     calibration = build_calibration(config, folder, module, draw)
-    loggers = build_loggers(config, folder)
+    record = RecordLogger(folder)
+    loggers = [record, *build_loggers(config, folder)]
     trainer = build_trainer(config, folder, loggers, calibration)
     try:
-        seconds = _fit(trainer, module, data, folder)
+        seconds = _fit(trainer, module, data, folder, record)
         table = _evaluate(trainer, module, data)
     except BaseException:
         _finish_wandb(loggers, exit_code=1)
@@ -92,21 +96,23 @@ def _train(config: RunConfig, folder: RunFolder, draw: Draw | None) -> dict[str,
         calibration.write("final", table)
     write_parquet(folder.predictions, table, data.records["test"])
     _finish_wandb(loggers, exit_code=0)
-    return summary(table) | _circumstances(config, trainer, seconds)
+    untrained = {f"untrained/{key}": value for key, value in record.rows[UNTRAINED].items() if "test/" in key}
+    return summary(table) | untrained | _circumstances(config, trainer, seconds)
 
 
-def _fit(trainer: Trainer, module: PositionModule, data: RenderedData, folder: RunFolder) -> float:
+def _fit(
+    trainer: Trainer, module: PositionModule, data: RenderedData, folder: RunFolder, record: RecordLogger
+) -> float:
     """Train to the last epoch, from the last checkpoint if there is one; returns the seconds it took now."""
-    resume = folder.last_checkpoint if folder.last_checkpoint.exists() else None
-    if resume is not None:
-        epoch = int(torch.load(resume, map_location="cpu", weights_only=True)["epoch"]) + 1
-        for logger in trainer.loggers:
-            if isinstance(logger, RecordLogger):
-                logger.forget_from(epoch)
     start = time.monotonic()
-    trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
-    if trainer.interrupted:  # Lightning swallows the signal; the record must not
-        raise KeyboardInterrupt
+    if folder.last_checkpoint.exists():
+        epoch = int(torch.load(folder.last_checkpoint, map_location="cpu", weights_only=True)["epoch"])
+        record.forget_after(epoch)
+        trainer.fit(module, datamodule=data, ckpt_path=folder.last_checkpoint, weights_only=True)
+    else:
+        record.forget_after(UNTRAINED)
+        record.log_metrics({"epoch": UNTRAINED} | summary(_evaluate(trainer, module, data)), step=0)
+        trainer.fit(module, datamodule=data)
     return time.monotonic() - start
 
 

@@ -3,6 +3,7 @@
 import mpmath as mp
 import pytest
 import torch
+from torch.autograd import gradcheck
 
 from phd_exp.distributions import depth
 from phd_exp.distributions.special import log_scaled_normaliser
@@ -108,6 +109,20 @@ def test_icdf_is_differentiable(a: float) -> None:
     change = depth.depth_cdf(point, log_a.detach() + step) - depth.depth_cdf(point, log_a.detach() - step)
     torch.testing.assert_close(by_p, 1 / density, rtol=1e-8, atol=0)
     torch.testing.assert_close(by_log_a, -change / (2 * step) / density, rtol=1e-4, atol=1e-6)
+
+
+def test_cdf_is_differentiable(a: float) -> None:
+    """In log t its derivative is the density of log t, at the mode too."""
+    log_t = (torch.tensor([-2.0, -0.1, 0.0, 0.1, 2.0], dtype=torch.float64) / (1 + a)).requires_grad_()
+    (slope,) = torch.autograd.grad(depth.depth_cdf(log_t, log(a)).sum(), log_t)
+    torch.testing.assert_close(slope, (depth.depth_log_density(log_t, log(a)) + log_t).exp())
+
+
+def test_moments_and_entropy_are_differentiable(a: float) -> None:
+    log_a = log(a).requires_grad_()
+    assert gradcheck(lambda log_a: depth.depth_mean_and_variance(log_a)[0], log_a)
+    assert gradcheck(lambda log_a: depth.depth_mean_and_variance(log_a)[1], log_a)
+    assert gradcheck(depth.depth_entropy, log_a)
 
 
 def test_derivatives_of_the_log_density(a: float) -> None:

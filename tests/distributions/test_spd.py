@@ -9,7 +9,15 @@ from torch.autograd import gradcheck
 from phd_exp.distributions import spd
 
 GENERIC = [(0.3, -0.7, 1.2), (-2.0, 0.5, -1.0), (3.0, 4.0, 5.0), (-0.4, 1.3, 0.6), (2.0, -9.0, -3.0)]
-EQUAL = [(0.0, 0.0, 0.0), (1.5, 0.0, 1.5), (-1.5, 0.0, -1.5), (1e-9, 0.0, -1e-9), (-2.0, 1e-7, -2.0)]
+EQUAL = [
+    (0.0, 0.0, 0.0),
+    (1.5, 0.0, 1.5),
+    (-1.5, 0.0, -1.5),
+    (1e-9, 0.0, -1e-9),
+    (-2.0, 1e-7, -2.0),
+    (-2.0, 1e-20, -2.0),
+    (3.0, 1e-17, 3.0),
+]
 ONE_ZERO = [(0.0, 0.0, -1.0), (0.0, 0.0, 1.0), (1.0, math.sqrt(2), 1.0), (-1.0, math.sqrt(2), -1.0)]
 
 
@@ -57,10 +65,25 @@ def test_spectral_map_in_float32_is_near_float64(scale: float) -> None:
         B, log_det = spd.spectral_map(b)
         (B.diagonal(dim1=-2, dim2=-1).sum() + B[..., 0, 1].sum() + log_det.sum()).backward()
     (B32, log_det32), (B64, log_det64) = spd.spectral_map(b32), spd.spectral_map(b64)
+    rounding = 1e-6 * max(1.0, scale)  # of an eigenvalue near 0, when the other is of the given scale
     size = B64.detach().norm(dim=(-2, -1), keepdim=True).clamp_min(1e-30)
-    torch.testing.assert_close(B32.double() / size, B64 / size, rtol=0, atol=1e-6 * max(1.0, scale))
-    torch.testing.assert_close(log_det32.double(), log_det64, rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(b32.grad.double(), b64.grad, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(B32.double() / size, B64 / size, rtol=0, atol=rounding)
+    torch.testing.assert_close(log_det32.double(), log_det64, rtol=1e-5, atol=rounding)
+    torch.testing.assert_close(b32.grad.double(), b64.grad, rtol=1e-4, atol=10 * rounding)
+
+
+@pytest.mark.parametrize("middle", [-3.0, -1e-8, 0.0, 1e-8, 2.0])
+def test_spectral_map_of_nearly_equal_eigenvalues_in_float32(middle: float) -> None:
+    """B is I + M or e^m (I + M - m I) to first order, whatever rounding does to the eigenvalues."""
+    r = torch.logspace(-30, -5, 200)
+    b = torch.stack([middle + r, r, torch.full_like(r, middle)], dim=-1).requires_grad_()
+    B, log_det = spd.spectral_map(b)
+    slope = math.exp(min(middle, 0.0))
+    torch.testing.assert_close(B[:, 0, 1], slope * b[:, 1] / math.sqrt(2), rtol=1e-4, atol=0)
+    (gradient,) = torch.autograd.grad(B[:, 0, 1].sum() + log_det.sum(), b)
+    expected = torch.tensor([slope / (1 + max(middle, 0.0)), 0.0, 0.0]) / slope
+    expected[2], expected[1] = expected[0], slope / math.sqrt(2)
+    torch.testing.assert_close(gradient, expected.expand_as(gradient), rtol=1e-3, atol=1e-4)
 
 
 def test_spectral_map_of_extremes_is_finite() -> None:

@@ -103,6 +103,12 @@ def test_tail_moment_differentiates_twice(k: int) -> None:
     assert gradgradcheck(lambda a: special.tail_moment(k, a), a)
 
 
+@pytest.mark.parametrize("n", [-2, 0, 1, 2, 3, 5])
+def test_scaled_expint_is_differentiable(n: int) -> None:
+    a = torch.tensor([0.01, 0.4, 0.99, 1.0, 1.01, 3.0, 40.0], dtype=torch.float64, requires_grad=True)
+    assert gradcheck(lambda a: special.scaled_expint(n, a), a)
+
+
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_log_scaled_normaliser_where_a_underflows(dtype: torch.dtype) -> None:
     log_a = torch.tensor([-1e4, -200.0, -60.0, 60.0], dtype=dtype, requires_grad=True)

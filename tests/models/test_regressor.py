@@ -37,7 +37,7 @@ def xyz() -> torch.Tensor:
 
 def regressor(head: Head) -> Regressor:
     torch.manual_seed(0)
-    return Regressor(resnet(18), head)
+    return Regressor(resnet(18), head, torch.contiguous_format)
 
 
 @pytest.mark.parametrize("name", HEADS)
@@ -67,6 +67,16 @@ def test_every_output_learns_from_the_first_step(
     assert gradient is not None
     assert gradient.isfinite().all()
     assert (gradient.abs().amax(dim=1) > 1e-4).all(), gradient.abs().amax(dim=1)
+
+
+def test_memory_format_changes_no_number(image: torch.Tensor, camera: Camera) -> None:
+    raw = []
+    for memory_format in (torch.contiguous_format, torch.channels_last):
+        torch.manual_seed(0)
+        network = Regressor(resnet(18), HEADS["mae_vz"], memory_format)
+        torch.nn.init.normal_(network.last.weight)
+        raw.append(network.raw(image))
+    torch.testing.assert_close(raw[0], raw[1], rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("depth", [18, 34, 50])
