@@ -2,6 +2,8 @@
 
 import json
 import math
+import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -36,7 +38,8 @@ def test_every_model_leaves_a_whole_record(train: Callable, tmp_path: Path, mode
     assert run.path.relative_to(tmp_path).as_posix().startswith(f"runs/smoke/default/{model}/seed0-")
     assert run.is_finished()
     quantities = ERRORS | (OF_A_DISTRIBUTION if model == "probabilistic" else set())
-    rows = run.metrics()
+    untrained, *rows = run.metrics()
+    assert untrained["epoch"] == -1
     assert [row["epoch"] for row in rows] == [0, 1]
     for row in rows:
         assert {f"{split}/{name}" for split in ("train", "test") for name in quantities} <= row.keys()
@@ -47,6 +50,7 @@ def test_every_model_leaves_a_whole_record(train: Callable, tmp_path: Path, mode
     for name in ("projected_error_mm", "depth_error_mm"):
         assert results[f"test/{name}"] == pytest.approx(table[name].mean())
         assert results[f"test/{name}"] == pytest.approx(rows[-1][f"test/{name}"], rel=1e-4)
+        assert results[f"untrained/test/{name}"] == untrained[f"test/{name}"]
 
 
 @pytest.mark.parametrize("data", DATA)
@@ -128,9 +132,67 @@ def test_a_broken_run_goes_on_where_it_was(
     assert (status.state, status.error) == ("failed", "RuntimeError: power cut")
 
     assert train(*long, "runs=broken").status == 0
-    assert [row["epoch"] for row in run.metrics()] == [0, 1, 2, 3]
+    assert [row["epoch"] for row in run.metrics()] == [-1, 0, 1, 2, 3]
     assert run.metrics() == whole.metrics()
     assert comparable(run.results()) == comparable(whole.results())
+
+
+def test_the_untrained_network_gives_the_middle_of_the_data_set(train: Callable, tmp_path: Path) -> None:
+    assert train("logger=none").status == 0
+    run = only_run(tmp_path / "runs")
+    table = pd.read_parquet(run.predictions)
+    mu_z0 = math.sqrt((3 / 571) * (5 / 343))
+    z = mu_z0 * table["f"]
+    along = (z * table["z"]) / (table[["x", "y", "z"]] ** 2).sum(axis=1)
+    depth_error = (along - 1).abs() * (table[["x", "y", "z"]] ** 2).sum(axis=1) ** 0.5
+    assert run.results()["untrained/test/depth_error_mm"] == pytest.approx(
+        1000 * depth_error.mean(), rel=1e-4
+    )
+
+
+@pytest.mark.parametrize(("name", "status"), [("SIGTERM", 143), ("SIGINT", 130)])
+def test_a_signal_stops_in_order_and_the_run_goes_on(
+    train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, status: int
+) -> None:
+    from phd_exp.training.module import PositionModule
+
+    training_step = PositionModule.training_step
+
+    def signalled(self: PositionModule, *arguments: Any) -> Any:
+        if self.current_epoch == 1:
+            os.kill(os.getpid(), signal.Signals[name])
+        return training_step(self, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PositionModule, "training_step", signalled)
+        outcome = train("logger=none")
+    assert outcome.status == status
+    assert f"stopped by {name}" in outcome.err
+    run = only_run(tmp_path / "runs")
+    recorded = run.status()
+    assert recorded is not None
+    assert (recorded.state, recorded.error) == ("interrupted", f"Stopped: {name}")
+    assert [row["epoch"] for row in run.metrics()] == [-1, 0]
+    assert train("logger=none").status == 0
+    assert run.is_finished()
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_with_the_samples(train: Callable, tmp_path: Path) -> None:
+    outcome = train("logger=none", "optimizer.lr=1e30")
+    assert outcome.status == 1
+    (line,) = [line for line in outcome.err.splitlines() if line.startswith("error: ")]
+    assert "loss is " in line
+    assert "training samples [" in line
+    assert "lower optimizer.lr" in line
+
+
+def test_an_unwritable_runs_folder_is_said_before_anything_is_done(train: Callable, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    outcome = train("logger=none", "runs=file/runs")
+    assert outcome.status == 1
+    assert "file" in outcome.err
+    assert "runs=DIR" in outcome.err
+    assert len(outcome.err.splitlines()) == 1
 
 
 def test_a_sweep_survives_its_failures(train: Callable, tmp_path: Path) -> None:
