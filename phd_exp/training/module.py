@@ -91,13 +91,7 @@ class PositionModule(LightningModule):
         return Camera(torch.full_like(camera.f, self.constant_f), camera.S)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        loss, _ = self._step(batch, "train")
-        if not loss.isfinite():
-            raise RunError(
-                f"loss is {loss.item()} in epoch {self.current_epoch}, batch {batch_idx} (training samples "
-                f"{batch.row.tolist()}); the last checkpoint is whole: lower optimizer.lr and run again"
-            )
-        return loss
+        return self._step(batch, "train")[0]
 
     def validation_step(self, batch: Batch, batch_idx: int) -> Prediction:  # type: ignore[override]  # for callbacks
         return self._step(batch, "test")[1]
@@ -117,6 +111,11 @@ class PositionModule(LightningModule):
     def _step(self, batch: Batch, split: str) -> tuple[Tensor, Prediction]:
         prediction = self(batch)
         loss = self.loss(prediction, batch.xyz)
+        if not loss.isfinite():
+            raise RunError(
+                f"loss is {loss.item()} in epoch {self.current_epoch}, at {split} samples {batch.row.tolist()}; "
+                "the last checkpoint is whole: lower optimizer.lr, or look at these images"
+            )
         self._metrics(split).update(loss.detach(), prediction, batch.xyz)
         return loss, prediction
 

@@ -182,7 +182,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_with_the_samples(train: Callabl
     assert outcome.status == 1
     (line,) = [line for line in outcome.err.splitlines() if line.startswith("error: ")]
     assert "loss is " in line
-    assert "training samples [" in line
+    assert "samples [" in line
     assert "lower optimizer.lr" in line
 
 
