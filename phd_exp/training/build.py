@@ -1,10 +1,12 @@
 """The one place that turns a checked configuration into objects."""
 
+import os
 import sys
 from pathlib import Path
 from typing import Any
 
 import torch
+import wandb
 from hydra.utils import instantiate
 from lightning import Trainer
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, TQDMProgressBar
@@ -48,6 +50,9 @@ def build_loggers(config: RunConfig, folder: RunFolder) -> list[Logger]:
     if config.logger.kind == "none":
         return []
     folder.wandb.mkdir(parents=True, exist_ok=True)
+    os.environ.setdefault(
+        "WANDB_ERROR_REPORTING", str(not config.logger.offline).lower()
+    )  # no look-up of hosts
     return [
         WandbLogger(
             name="/".join(folder.path.parts[-4:]),
@@ -55,6 +60,7 @@ def build_loggers(config: RunConfig, folder: RunFolder) -> list[Logger]:
             save_dir=folder.path,
             offline=config.logger.offline,
             config=config.model_dump(mode="json"),
+            settings=wandb.Settings(silent=True, console="off"),  # the terminal is ours, and so is its end
         )
     ]
 
