@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from filelock import FileLock
 from PIL import Image, UnidentifiedImageError
+from rich.console import Console
 from rich.progress import track
 
 from phd_exp.records.dataset import DatasetError, DatasetFolder, sha256
@@ -88,7 +89,9 @@ def _decode_all(
 
     with ThreadPoolExecutor(DECODERS) as pool:
         jobs = pool.map(fill, range(len(records)))
-        for _ in track(jobs, f"decoding {split} images once", total=len(records), transient=True):
+        words, console = f"decoding {split} images once", Console(stderr=True)
+        quiet = not console.is_terminal
+        for _ in track(jobs, words, len(records), console=console, transient=True, disable=quiet):
             pass
     array.flush()
     unfinished.replace(array_file)

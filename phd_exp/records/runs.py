@@ -100,6 +100,14 @@ class RunFolder:
         status = self.status()
         return status is not None and status.state == "finished"
 
+    def is_held(self) -> bool:
+        """Whether a process works on the run now."""
+        try:
+            with FileLock(self.path / ".lock", timeout=0):
+                return False
+        except Timeout:
+            return True
+
     def config(self) -> dict[str, Any]:
         return _read_mapping(self.config_file, yaml.safe_load)
 

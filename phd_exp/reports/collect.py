@@ -39,6 +39,8 @@ def _row(folder: RunFolder, runs: Path) -> RunRow:
     except RunError as error:
         return RunRow(preset, data, model, run, state=f"broken: {error}")
     state: str = status.state if status else "unknown"
+    if state == "running" and not folder.is_held():
+        state = "broken off; the same command goes on"
     if status and status.error and state == "failed":
         state += f": {' '.join(status.error.split())}"
     return RunRow(

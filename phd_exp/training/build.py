@@ -1,16 +1,14 @@
 """The one place that turns a checked configuration into objects."""
 
-import os
 import sys
 from pathlib import Path
 from typing import Any
 
 import torch
-import wandb
 from hydra.utils import instantiate
 from lightning import Trainer
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, TQDMProgressBar
-from lightning.pytorch.loggers import Logger, WandbLogger
+from lightning.pytorch.loggers import Logger
 
 from phd_exp.data.datamodule import RenderedData
 from phd_exp.models.regressor import Regressor
@@ -43,26 +41,6 @@ def build_module(config: RunConfig, data: RenderedData) -> PositionModule:
     constant_f = data.constant_f if config.camera.focal_length == "constant" else None
     optimizer = instantiate(config.optimizer, _partial_=True)
     return PositionModule(regressor, instantiate(config.loss), optimizer, constant_f)
-
-
-def build_loggers(config: RunConfig, folder: RunFolder) -> list[Logger]:
-    """What a run is sent to besides its own record."""
-    if config.logger.kind == "none":
-        return []
-    folder.wandb.mkdir(parents=True, exist_ok=True)
-    os.environ.setdefault(
-        "WANDB_ERROR_REPORTING", str(not config.logger.offline).lower()
-    )  # no look-up of hosts
-    return [
-        WandbLogger(
-            name="/".join(folder.path.parts[-4:]),
-            project=config.logger.project,
-            save_dir=folder.path,
-            offline=config.logger.offline,
-            config=config.model_dump(mode="json"),
-            settings=wandb.Settings(silent=True, console="off"),  # the terminal is ours, and so is its end
-        )
-    ]
 
 
 def build_trainer(

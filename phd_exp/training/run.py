@@ -3,11 +3,12 @@
 import logging
 import time
 import warnings
+from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import torch
 from lightning import Trainer, seed_everything
-from lightning.pytorch.loggers import Logger, WandbLogger
 
 from phd_exp.data.datamodule import RenderedData
 from phd_exp.records.dataset import DatasetFolder, sha256
@@ -16,7 +17,6 @@ from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import (
     build_calibration,
     build_data,
-    build_loggers,
     build_module,
     build_trainer,
 )
@@ -24,6 +24,7 @@ from phd_exp.training.callbacks import Draw, RecordLogger
 from phd_exp.training.config import RunConfig
 from phd_exp.training.module import PositionModule
 from phd_exp.training.predictions import Columns, joined, summary, write_parquet
+from phd_exp.training.tracking import tracked
 
 UNTRAINED = -1
 """The epoch before the first: what the untrained network gives."""
@@ -84,18 +85,13 @@ def _train(config: RunConfig, folder: RunFolder, draw: Draw | None) -> dict[str,
     module = build_module(config, data)
     calibration = build_calibration(config, folder, module, draw)
     record = RecordLogger(folder)
-    loggers = [record, *build_loggers(config, folder)]
-    trainer = build_trainer(config, folder, loggers, calibration)
-    try:
+    with tracked(config, folder) as others:
+        trainer = build_trainer(config, folder, [record, *others], calibration)
         seconds = _fit(trainer, module, data, folder, record)
         table = _evaluate(trainer, module, data)
-    except BaseException:
-        _finish_wandb(loggers, exit_code=1)
-        raise
     if calibration is not None:
         calibration.write("final", table)
     write_parquet(folder.predictions, table, data.records["test"])
-    _finish_wandb(loggers, exit_code=0)
     untrained = {f"untrained/{key}": value for key, value in record.rows[UNTRAINED].items() if "test/" in key}
     return summary(table) | untrained | _circumstances(config, trainer, seconds)
 
@@ -106,14 +102,24 @@ def _fit(
     """Train to the last epoch, from the last checkpoint if there is one; returns the seconds it took now."""
     start = time.monotonic()
     if folder.last_checkpoint.exists():
-        epoch = int(torch.load(folder.last_checkpoint, map_location="cpu", weights_only=True)["epoch"])
-        record.forget_after(epoch)
+        record.forget_after(_epoch_of(folder.last_checkpoint))
         trainer.fit(module, datamodule=data, ckpt_path=folder.last_checkpoint, weights_only=True)
     else:
         record.forget_after(UNTRAINED)
         record.log_metrics({"epoch": UNTRAINED} | summary(_evaluate(trainer, module, data)), step=0)
         trainer.fit(module, datamodule=data)
     return time.monotonic() - start
+
+
+def _epoch_of(checkpoint: Path) -> int:
+    """The last epoch that a checkpoint has seen whole. Raises RunError where it cannot be read."""
+    try:
+        return int(torch.load(checkpoint, map_location="cpu", weights_only=True)["epoch"])
+    except (RuntimeError, OSError, EOFError, KeyError, UnpicklingError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise RunError(
+            f"{checkpoint}: not a whole checkpoint ({reason}); delete it to begin the run again"
+        ) from None
 
 
 def _evaluate(trainer: Trainer, module: PositionModule, data: RenderedData) -> Columns:
@@ -142,13 +148,6 @@ def _circumstances(config: RunConfig, trainer: Trainer, seconds: float) -> dict[
 def _manifest_hash(config: RunConfig) -> str | None:
     manifest = DatasetFolder(config.data.folder).manifest_path
     return sha256(manifest.read_bytes()) if manifest.exists() else None
-
-
-def _finish_wandb(loggers: list[Logger], exit_code: int) -> None:
-    """Close wandb's run; without this the next run of a sweep would write into it."""
-    for logger in loggers:
-        if isinstance(logger, WandbLogger):
-            logger.experiment.finish(exit_code=exit_code)
 
 
 def _quiet_lightning() -> None:

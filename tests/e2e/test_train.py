@@ -177,6 +177,21 @@ def test_a_signal_stops_in_order_and_the_run_goes_on(
     assert run.is_finished()
 
 
+def test_a_broken_checkpoint_is_one_line(train: Callable, tmp_path: Path) -> None:
+    assert train("logger=none").status == 0
+    run = only_run(tmp_path / "runs")
+    run.status_file.write_text(run.status_file.read_text().replace("finished", "running"))
+    whole = run.last_checkpoint.read_bytes()
+    for content in (whole[: len(whole) // 2], b"", b"no checkpoint"):
+        run.last_checkpoint.write_bytes(content)
+        outcome = train("logger=none")
+        assert outcome.status == 1
+        assert len(outcome.err.splitlines()) == 1
+        assert "last.ckpt: not a whole checkpoint" in outcome.err
+    run.last_checkpoint.unlink()
+    assert train("logger=none").status == 0
+
+
 def test_a_loss_that_is_not_finite_stops_the_run_with_the_samples(train: Callable, tmp_path: Path) -> None:
     outcome = train("logger=none", "optimizer.lr=1e30")
     assert outcome.status == 1

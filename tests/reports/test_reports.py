@@ -48,6 +48,17 @@ def test_the_table_says_it_all(runs: Path, capsys: pytest.CaptureFixture[str]) -
     assert " ".join(line.split()) == "small occl probabilistic seed0 12.3 13.0 168 168 -1.23 finished"
 
 
+def test_a_killed_run_does_not_look_alive(tmp_path: Path) -> None:
+    run = RunFolder(RunName("small", "occl", "mae_vz", 0).folder(tmp_path))
+    with run.held():
+        with run.recording(data_manifest=None):
+            status = run.status()
+        assert status is not None
+        run.write_status(status)  # as a SIGKILL would have left it
+        assert [row.state for row in collect(tmp_path)] == ["running"]
+    assert [row.state for row in collect(tmp_path)] == ["broken off; the same command goes on"]
+
+
 def test_no_runs_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     print_table(collect(tmp_path))
     assert capsys.readouterr().out == "no runs recorded yet\n"
