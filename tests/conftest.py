@@ -3,10 +3,15 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import hydra
 import pytest
 import torch
 from jaxtyping import install_import_hook
+from omegaconf import OmegaConf
+
+from phd_exp.cli.paths import conf_folder
 
 # before anything is imported: every annotated function of these folders checks its shapes while tests run
 HOOKED = [
@@ -26,6 +31,20 @@ class Outcome:
     status: int
     out: str
     err: str
+
+
+@pytest.fixture
+def composed() -> Callable[..., dict[str, Any]]:
+    """The configuration that Hydra composes from overrides, as plain containers."""
+
+    def compose(*overrides: str) -> dict[str, Any]:
+        with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
+            config = hydra.compose("config", list(overrides))
+        plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+        assert isinstance(plain, dict)
+        return {str(key): value for key, value in plain.items()}
+
+    return compose
 
 
 @pytest.fixture

@@ -8,11 +8,10 @@ from typing import Any
 from phd_exp.cli.app import launch
 from phd_exp.cli.render import ensure_dataset
 from phd_exp.records.runs import RunFolder, RunName
-from phd_exp.training.config import RunConfig, check
+from phd_exp.training.config import RunConfig, check, has_influence
 
 NAMED = ("preset", "data", "model", "seed")
-WITHOUT_INFLUENCE = ("runs", "logger", "data.root", "data.workers", "trainer.progress_bar")
-"""Overrides that change no number of a run, and so are left out of its name, as NAMED ones have a place in it."""
+"""Choices that have a place of their own in a run's name."""
 
 
 def main(arguments: list[str]) -> int:
@@ -21,14 +20,13 @@ def main(arguments: list[str]) -> int:
 
 def task(config: dict[str, Any], overrides: list[str]) -> None:
     checked = check(config)
-    from phd_exp.training.run import (
-        train,  # seconds of imports, which a refused configuration need not wait for
-    )
+    # seconds of imports, which a refused configuration need not wait for
+    from phd_exp.training.run import require_possible, train
 
     folder = RunFolder(run_name(checked, overrides).folder(checked.runs))
+    require_possible(checked, folder)
     skipped = folder.is_finished()
     if not skipped:
-        folder.require_writable()
         ensure_dataset(checked.data)
     results = train(checked, folder, draw=_draw())
     print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
@@ -41,13 +39,12 @@ def task(config: dict[str, Any], overrides: list[str]) -> None:
 
 def run_name(config: RunConfig, overrides: list[str]) -> RunName:
     """The choices that name a run; every other override that can change a number goes into its hash."""
-    others = (override.lstrip("+") for override in overrides)
-    telling = [text for text in others if not _is_named(text.split("=")[0])]
+    others = [override.lstrip("+") for override in overrides]
+    keys = [override.split("=")[0] for override in others]
+    telling = [
+        text for key, text in zip(keys, others, strict=True) if key not in NAMED and has_influence(key)
+    ]
     return RunName(config.preset, config.data.spec.variant, config.model.name, config.seed, tuple(telling))
-
-
-def _is_named(key: str) -> bool:
-    return key in NAMED or any(key == name or key.startswith(f"{name}.") for name in WITHOUT_INFLUENCE)
 
 
 def _draw() -> Callable[[dict[str, Any], Path], None] | None:

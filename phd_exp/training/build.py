@@ -11,6 +11,7 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint, TQDMProgressB
 from lightning.pytorch.loggers import Logger
 
 from phd_exp.data.datamodule import RenderedData
+from phd_exp.distributions import ProjectedHuber
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.runs import RunFolder
@@ -83,7 +84,7 @@ def build_calibration(
     config: RunConfig, folder: RunFolder, module: PositionModule, draw: Draw | None
 ) -> CalibrationRecorder | None:
     """The recorder of calibration curves; None for a baseline, which predicts no uncertainty."""
-    if not module.predicts_distribution:
+    if not issubclass(module.regressor.head.prediction, ProjectedHuber):
         return None
     evaluation = config.evaluation
     return CalibrationRecorder(

@@ -17,6 +17,8 @@ from phd_exp.training.targets import Target, describe, locate
 Whole = Annotated[int, Field(strict=True)]
 Name = Annotated[str, Field(strict=True, pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 Folder = Annotated[Path, Field(strict=False)]
+WITHOUT_INFLUENCE = ("runs", "logger", "data.root", "data.workers", "trainer.progress_bar")
+"""Keys, or sections, that say where and how a run is made and recorded, and change no number of it."""
 SMALLEST_IMAGE = 32
 """A ResNet halves the side five times."""
 
@@ -126,6 +128,11 @@ class RunConfig(Section):
                 "leave out loss=..., and the model picks its own"
             )
         return self
+
+
+def has_influence(key: str) -> bool:
+    """Whether a key, with dots, can change what a run computes."""
+    return not any(key == name or key.startswith(f"{name}.") for name in WITHOUT_INFLUENCE)
 
 
 def check(config: dict[str, Any]) -> RunConfig:

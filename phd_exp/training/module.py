@@ -6,49 +6,14 @@ from typing import Any
 import torch
 from lightning import LightningModule
 from torch import Tensor, nn
-from torchmetrics import MeanMetric, Metric
 
 from phd_exp.data.batches import Batch
-from phd_exp.distributions import ProjectedHuber
 from phd_exp.geometry.camera import Camera
-from phd_exp.metrics.errors import PositionErrors
-from phd_exp.metrics.precision import Precision
+from phd_exp.metrics.means import Means
 from phd_exp.models.heads import Prediction
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.errors import RunError
-from phd_exp.training.predictions import Columns, columns
-
-
-class EpochMetrics(nn.Module):
-    """What one split logs for an epoch: loss, errors and, for a distribution, NLL and precision."""
-
-    def __init__(self, prediction: type[Prediction]) -> None:
-        super().__init__()
-        self.loss = MeanMetric()
-        self.errors = PositionErrors()
-        self.is_distribution = issubclass(prediction, ProjectedHuber)
-        if self.is_distribution:
-            self.nll = MeanMetric()
-            self.precision = Precision()
-
-    @torch.no_grad()
-    def update(self, loss: Tensor, prediction: Prediction, xyz: Tensor) -> None:
-        self.loss.update(loss, weight=len(xyz))
-        self.errors.update(xyz, prediction.mode)
-        if isinstance(prediction, ProjectedHuber):
-            self.nll.update(-prediction.log_prob(xyz))
-            self.precision.update(prediction.a, prediction.log_det_A)
-
-    def compute(self) -> dict[str, Tensor]:
-        values = {"loss": self.loss.compute()} | self.errors.compute()
-        if self.is_distribution:
-            values |= {"nll": self.nll.compute()} | self.precision.compute()
-        return values
-
-    def reset(self) -> None:
-        for metric in self.children():
-            assert isinstance(metric, Metric)
-            metric.reset()
+from phd_exp.training.predictions import Columns, columns, quantities, quantity_names
 
 
 class PositionModule(LightningModule):
@@ -73,13 +38,9 @@ class PositionModule(LightningModule):
         self.loss = loss
         self.make_optimizer = optimizer
         self.constant_f = constant_f
-        self.epoch_metrics = nn.ModuleDict(
-            {f"{split}_metrics": EpochMetrics(regressor.head.prediction) for split in ("train", "test")}
-        )
-
-    @property
-    def predicts_distribution(self) -> bool:
-        return issubclass(self.regressor.head.prediction, ProjectedHuber)
+        names = ("loss", *quantity_names(regressor.head.prediction))
+        # "train" itself is taken: every module has a method of that name
+        self.means = nn.ModuleDict({f"{split}_means": Means(names) for split in ("train", "test")})
 
     def forward(self, batch: Batch) -> Prediction:
         return self.regressor(batch.image, self.told(batch.camera))
@@ -116,13 +77,15 @@ class PositionModule(LightningModule):
                 f"loss is {loss.item()} in epoch {self.current_epoch}, at {split} samples {batch.row.tolist()}; "
                 "the last checkpoint is whole: lower optimizer.lr, or look at these images"
             )
-        self._metrics(split).update(loss.detach(), prediction, batch.xyz)
+        with torch.no_grad():
+            losses = {"loss": loss.expand(len(batch))}
+            self._means(split).update(losses | quantities(prediction, batch.xyz))
         return loss, prediction
 
-    def _metrics(self, split: str) -> Any:
-        return self.epoch_metrics[f"{split}_metrics"]
+    def _means(self, split: str) -> Any:
+        return self.means[f"{split}_means"]
 
     def _log_epoch(self, split: str) -> None:
-        metrics = self._metrics(split)
-        self.log_dict({f"{split}/{name}": value.float() for name, value in metrics.compute().items()})
-        metrics.reset()
+        means = self._means(split)
+        self.log_dict({f"{split}/{name}": value.float() for name, value in means.compute().items()})
+        means.reset()

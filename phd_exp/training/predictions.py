@@ -19,27 +19,47 @@ from phd_exp.records.files import write_atomic
 from phd_exp.records.scenes import SampleRecord
 
 Columns = dict[str, Tensor]
-"""Name -> one number a sample, float64 on the CPU."""
+"""Name -> one number a sample."""
+
+ERRORS = ("projected_error_mm", "depth_error_mm")
+OF_A_DISTRIBUTION = ("nll", "depth_precision", "projected_precision")
+
+
+def quantity_names(prediction: type[Prediction]) -> tuple[str, ...]:
+    """What `quantities` measures of a kind of prediction."""
+    return ERRORS + (OF_A_DISTRIBUTION if issubclass(prediction, ProjectedHuber) else ())
+
+
+def quantities(prediction: Prediction, xyz: Tensor) -> Columns:
+    """The metrics of a batch, a number a sample: errors in millimetres; of a distribution also `nll`, in nats of the
+    density per cubic metre, and the precisions a and |A|.
+    """
+    estimate = prediction.mode
+    values = {
+        "projected_error_mm": MILLIMETRES * projected_error(xyz, estimate),
+        "depth_error_mm": MILLIMETRES * depth_error(xyz, estimate),
+    }
+    if isinstance(prediction, ProjectedHuber):
+        values["nll"] = -prediction.log_prob(xyz)
+        values["depth_precision"] = prediction.a
+        values["projected_precision"] = prediction.log_det_A.exp()
+    return values
 
 
 @torch.no_grad()
 def columns(prediction: Prediction, batch: Batch) -> Columns:
-    """Truth, estimate and errors of a batch; for a distribution its parameters and moments too.
+    """A batch as a table: truth, estimate and `quantities`; for a distribution its parameters and moments too.
 
-    Positions are metres in the camera frame, errors millimetres, variances m^2 (depth) and without unit
-    (projected: of x/z and y/z), `nll` nats of the density per cubic metre.
+    Positions are metres in the camera frame, variances m^2 (depth) and without unit (projected: of x/z and y/z).
     """
-    estimate = prediction.mode
-    table = {"row": batch.row} | _coordinates("", batch.xyz) | _coordinates("mode_", estimate)
-    table["projected_error_mm"] = MILLIMETRES * projected_error(batch.xyz, estimate)
-    table["depth_error_mm"] = MILLIMETRES * depth_error(batch.xyz, estimate)
+    table = {"row": batch.row} | _coordinates("", batch.xyz) | _coordinates("mode_", prediction.mode)
+    table |= quantities(prediction, batch.xyz)
     if isinstance(prediction, ProjectedHuber):
         table |= _distribution_columns(prediction, batch.xyz)
     return {name: column.double().cpu() for name, column in table.items()}
 
 
 def _distribution_columns(prediction: ProjectedHuber, xyz: Tensor) -> Columns:
-    projected_variance = prediction.projected_covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
     off_centre = xyz[:, :2] / xyz[:, 2:] - prediction.mu_xy
     return {
         **_coordinates("mean_", prediction.mean),
@@ -53,9 +73,8 @@ def _distribution_columns(prediction: ProjectedHuber, xyz: Tensor) -> Columns:
         "a": prediction.a,
         "depth_variance": prediction.depth_variance,
         "depth_squared_error": (xyz[:, 2] - prediction.depth_mean).square(),
-        "projected_variance": projected_variance,
+        "projected_variance": prediction.projected_covariance.diagonal(dim1=-2, dim2=-1).sum(-1),
         "projected_squared_error": off_centre.square().sum(-1),
-        "nll": -prediction.log_prob(xyz),
         "level": prediction.level(xyz),
     }
 
@@ -75,18 +94,7 @@ def calibration_curves(table: Columns, window: int) -> dict[str, CalibrationCurv
 
 def summary(table: Columns) -> dict[str, float]:
     """The final numbers of a run, by their metric keys: means over the rows."""
-    means: dict[str, float] = {
-        name: float(table[name].mean())
-        for name in ("projected_error_mm", "depth_error_mm", "nll")
-        if name in table
-    }
-    if "a" in table:
-        determinant = table["A_xx"] * table["A_yy"] - table["A_xy"].square()
-        means |= {
-            "depth_precision": float(table["a"].mean()),
-            "projected_precision": float(determinant.mean()),
-        }
-    return {f"test/{name}": value for name, value in means.items()}
+    return {f"test/{name}": float(table[name].mean()) for name in ERRORS + OF_A_DISTRIBUTION if name in table}
 
 
 def write_parquet(file: Path, table: Columns, records: Sequence[SampleRecord]) -> None:

@@ -12,7 +12,7 @@ from lightning import Trainer, seed_everything
 
 from phd_exp.data.datamodule import RenderedData
 from phd_exp.records.dataset import DatasetFolder, sha256
-from phd_exp.records.errors import RunError
+from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import (
     build_calibration,
@@ -21,16 +21,13 @@ from phd_exp.training.build import (
     build_trainer,
 )
 from phd_exp.training.callbacks import Draw, RecordLogger
-from phd_exp.training.config import RunConfig
+from phd_exp.training.config import RunConfig, has_influence
 from phd_exp.training.module import PositionModule
 from phd_exp.training.predictions import Columns, joined, summary, write_parquet
 from phd_exp.training.tracking import tracked
 
 UNTRAINED = -1
 """The epoch before the first: what the untrained network gives."""
-
-WITHOUT_INFLUENCE = ("runs", "logger")
-"""Top-level keys that say where and how a run is recorded, not what it computes."""
 
 
 def train(config: RunConfig, folder: RunFolder, draw: Draw | None) -> dict[str, Any]:
@@ -52,6 +49,19 @@ def train(config: RunConfig, folder: RunFolder, draw: Draw | None) -> dict[str, 
     return results
 
 
+def require_possible(config: RunConfig, folder: RunFolder) -> None:
+    """Raise, before anything is rendered or written, what would stop the run later.
+
+    RunError: the folder holds a run of another configuration, or cannot be written. ConfigError: there is no GPU.
+    """
+    require_same_config(folder, config)
+    folder.require_writable()
+    if config.trainer.accelerator == "gpu" and not torch.cuda.is_available():
+        raise ConfigError(
+            "trainer.accelerator: got 'gpu', but torch sees none here; expected 'cpu' or 'auto'"
+        )
+
+
 def require_same_config(folder: RunFolder, config: RunConfig) -> None:
     """Raise RunError where the folder holds a run that computes something else, naming the first key."""
     if not folder.config_file.exists():
@@ -59,7 +69,7 @@ def require_same_config(folder: RunFolder, config: RunConfig) -> None:
     recorded, asked = flatten(folder.config()), flatten(config.model_dump(mode="json"))
     for key in sorted(recorded.keys() | asked.keys()):
         before, now = recorded.get(key, "nothing"), asked.get(key, "nothing")
-        if before != now and not key.startswith(WITHOUT_INFLUENCE):
+        if before != now and has_influence(key):
             raise RunError(
                 f"{folder.path}: holds a run with {key}={before}, but {key}={now} is asked for; "
                 "move that folder away, or choose another place by runs=DIR"

@@ -1,10 +1,9 @@
 """Every file under conf/ composes into a configuration that passes the check."""
 
+from collections.abc import Callable
 from typing import Any
 
-import hydra
 import pytest
-from omegaconf import OmegaConf
 
 from phd_exp.cli.paths import conf_folder
 from phd_exp.records.spec import DatasetSpec
@@ -15,21 +14,13 @@ CHOICES = sorted(
 )
 
 
-def composed(*overrides: str) -> dict[str, Any]:
-    with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
-        plain = OmegaConf.to_container(
-            hydra.compose("config", list(overrides)), resolve=True, throw_on_missing=True
-        )
-    assert isinstance(plain, dict)
-    return {str(key): value for key, value in plain.items()}
-
-
-def checked(*overrides: str) -> RunConfig:
-    return check(composed(*overrides))
+@pytest.fixture
+def checked(composed: Callable[..., dict[str, Any]]) -> Callable[..., RunConfig]:
+    return lambda *overrides: check(composed(*overrides))
 
 
 @pytest.mark.parametrize("choice", CHOICES)
-def test_every_choice_of_every_group_is_a_valid_configuration(choice: str) -> None:
+def test_every_choice_of_every_group_is_a_valid_configuration(checked: Callable, choice: str) -> None:
     checked(choice)
 
 
@@ -41,7 +32,7 @@ def test_every_file_opens_with_what_it_is(file: Any) -> None:
     assert lines[0].startswith("# ")
 
 
-def test_defaults_are_the_authors_protocol() -> None:
+def test_defaults_are_the_authors_protocol(checked: Callable) -> None:
     config = checked()
     assert (config.data.n_train, config.data.n_test, config.data.image_size) == (8000, 2000, 224)
     assert config.data.batch_size == 64
@@ -62,14 +53,14 @@ def test_defaults_are_the_authors_protocol() -> None:
         ("mae_constf", "MeanAbsoluteError", "constant"),
     ],
 )
-def test_a_model_picks_its_loss_and_camera(model: str, loss: str, camera: str) -> None:
+def test_a_model_picks_its_loss_and_camera(checked: Callable, model: str, loss: str, camera: str) -> None:
     config = checked(f"model={model}")
     assert config.model.name == model
     assert config.loss["_target_"].endswith(loss)
     assert config.camera.focal_length == camera
 
 
-def test_the_command_line_has_the_last_word() -> None:
+def test_the_command_line_has_the_last_word(checked: Callable) -> None:
     config = checked(
         "preset=smoke", "backbone=resnet50", "model=mae_vz", "camera=constant", "data.n_train=48"
     )
@@ -79,7 +70,7 @@ def test_the_command_line_has_the_last_word() -> None:
     assert config.preset == "smoke"
 
 
-def test_variants_differ_in_what_they_name_alone() -> None:
+def test_variants_differ_in_what_they_name_alone(checked: Callable) -> None:
     plain = checked("data=default").data.spec
     changes = {"occl": {"occluders"}, "scale": {"scale_range"}, "occl_scale": {"occluders", "scale_range"}}
     for variant, keys in changes.items():

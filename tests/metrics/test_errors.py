@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from phd_exp.metrics.errors import PositionErrors, along_true_ray, depth_error, projected_error
+from phd_exp.metrics.errors import along_true_ray, depth_error, projected_error
 
 
 @pytest.fixture
@@ -32,13 +32,3 @@ def test_moving_along_the_true_ray_changes_depth_alone(pairs: tuple[torch.Tensor
     assert projected_error(xyz, 1.1 * xyz).max() < 1e-12
     torch.testing.assert_close(depth_error(xyz, 1.1 * xyz), 0.1 * xyz.norm(dim=-1))
     torch.testing.assert_close(along_true_ray(xyz, 1.1 * xyz), 1.1 * xyz)
-
-
-def test_the_metric_is_the_mean_over_all_batches(pairs: tuple[torch.Tensor, torch.Tensor]) -> None:
-    xyz, estimate = pairs
-    metric = PositionErrors()
-    for rows in (slice(0, 10), slice(10, 64)):
-        metric.update(xyz[rows], estimate[rows])
-    values = metric.compute()
-    torch.testing.assert_close(values["projected_error_mm"], 1000 * projected_error(xyz, estimate).mean())
-    torch.testing.assert_close(values["depth_error_mm"], 1000 * depth_error(xyz, estimate).mean())

@@ -1,0 +1,41 @@
+"""A run's name: every override that can change a number is in it, and no other."""
+
+import pytest
+
+from phd_exp.cli.train import run_name
+from phd_exp.training.config import RunConfig, check
+
+
+@pytest.fixture
+def config(composed) -> RunConfig:  # type: ignore[no-untyped-def]
+    return check(composed("preset=smoke"))
+
+
+def test_choices_have_a_place_in_the_name(config: RunConfig) -> None:
+    name = run_name(config, ["preset=smoke", "data=default", "model=probabilistic", "seed=0"])
+    assert (name.preset, name.data, name.model, name.seed) == ("smoke", "default", "probabilistic", 0)
+    assert name.overrides == ()
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "runs=elsewhere",
+        "logger=none",
+        "logger.project=mine",
+        "data.root=/data",
+        "data.workers=1",
+        "trainer.progress_bar=false",
+    ],
+)
+def test_what_changes_no_number_is_left_out(config: RunConfig, override: str) -> None:
+    assert run_name(config, [override]).overrides == ()
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["data.n_train=8", "backbone=resnet50", "camera=constant", "optimizer.lr=0.1", "trainer.threads=1"],
+)
+def test_everything_else_is_in_it(config: RunConfig, override: str) -> None:
+    assert run_name(config, [override]).overrides == (override,)
+    assert run_name(config, [f"+{override}"]).overrides == (override,)
