@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from jaxtyping import install_import_hook
 from omegaconf import OmegaConf
 
 from phd_exp.cli.paths import conf_folder
+from phd_exp.records.spec import DatasetSpec
 
 # before anything is imported: every annotated function of these folders checks its shapes while tests run
 HOOKED = [
@@ -33,7 +35,7 @@ class Outcome:
     err: str
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def composed() -> Callable[..., dict[str, Any]]:
     """The configuration that Hydra composes from overrides, as plain containers."""
 
@@ -45,6 +47,21 @@ def composed() -> Callable[..., dict[str, Any]]:
         return {str(key): value for key, value in plain.items()}
 
     return compose
+
+
+@pytest.fixture(scope="session")
+def make_spec(composed: Callable[..., dict[str, Any]]) -> Callable[..., DatasetSpec]:
+    """What conf/data says of a variant, with some values changed; of an unknown one, what it says of `default`."""
+
+    @cache
+    def values(variant: str) -> dict[str, Any]:
+        known = (conf_folder() / "data" / f"{variant}.yaml").exists()
+        data = composed(f"data={variant if known else 'default'}")["data"]
+        return {key: value for key, value in data.items() if key in DatasetSpec.model_fields}
+
+    return lambda variant="default", **changes: DatasetSpec(
+        **(values(variant) | {"variant": variant} | changes)
+    )
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """A small data set made by hand, without a renderer: noise for images, known positions."""
 
 import io
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,19 +17,8 @@ COUNTS: dict[Split, int] = {"train": 5, "test": 3}
 
 
 @pytest.fixture
-def spec() -> DatasetSpec:
-    return DatasetSpec(
-        variant="handmade",
-        seed=0,
-        sensor_size=SIDE,
-        f_range=(400.0, 600.0),
-        z_range=(3.0, 5.0),
-        xy_range=1.0,
-        scale_range=(1.0, 1.0),
-        occluders=False,
-        lamp_jitter=0.0,
-        samples_per_pixel=1,
-    )
+def spec(make_spec: Callable[..., DatasetSpec]) -> DatasetSpec:
+    return make_spec("handmade", sensor_size=SIDE, f_range=(400.0, 600.0))
 
 
 def picture(index: int) -> np.ndarray:

@@ -1,9 +1,8 @@
-"""A specification, and a data set folder that took no renderer: real scenes, one-colour images."""
+"""A data set folder that took no renderer: real scenes, one-colour images."""
 
 import io
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from PIL import Image
@@ -13,25 +12,6 @@ from phd_exp.records.files import write_atomic
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.sampling import sample_scene
-
-PAPER: dict[str, Any] = {
-    "variant": "default",
-    "seed": 0,
-    "sensor_size": 224,
-    "f_range": (1200.0, 2000.0),
-    "z_range": (3.0, 5.0),
-    "xy_range": 1.0,
-    "scale_range": (1.0, 1.0),
-    "occluders": False,
-    "lamp_jitter": 0.2,
-    "samples_per_pixel": 4,
-}
-
-
-@pytest.fixture(scope="session")
-def make_spec() -> Callable[..., DatasetSpec]:
-    """The paper's data set, with some values changed."""
-    return lambda **changes: DatasetSpec(**(PAPER | changes))
 
 
 @pytest.fixture

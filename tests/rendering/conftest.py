@@ -9,34 +9,9 @@ from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.workers import ensure_rendered
 
-PAPER: dict[str, Any] = {
-    "variant": "default",
-    "seed": 0,
-    "sensor_size": 224,
-    "f_range": (1200.0, 2000.0),
-    "z_range": (3.0, 5.0),
-    "xy_range": 1.0,
-    "scale_range": (1.0, 1.0),
-    "occluders": False,
-    "lamp_jitter": 0.2,
-    "samples_per_pixel": 4,
-}
-VARIANTS: dict[str, dict[str, Any]] = {
-    "default": {},
-    "occl": {"occluders": True},
-    "scale": {"scale_range": (0.8, 1.2)},
-    "occl_scale": {"occluders": True, "scale_range": (0.8, 1.2)},
-}
+VARIANTS = ("default", "occl", "scale", "occl_scale")
 # A quarter of the sensor and of the focal length: the same pictures, in a moment.
 SMALL: dict[str, Any] = {"sensor_size": 56, "f_range": (300.0, 500.0), "samples_per_pixel": 1}
-
-
-@pytest.fixture(scope="session")
-def make_spec() -> Callable[..., DatasetSpec]:
-    """The paper's data set of a variant, with some values changed."""
-    return lambda variant="default", **changes: DatasetSpec(
-        **(PAPER | {"variant": variant} | VARIANTS[variant] | changes)
-    )
 
 
 @pytest.fixture(scope="session")
