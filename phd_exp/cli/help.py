@@ -1,6 +1,6 @@
 """What `--help` prints: read from the files under conf/, so that it cannot fall behind them."""
 
-from pathlib import Path
+from collections.abc import Iterable
 
 from phd_exp.cli.paths import conf_folder
 
@@ -9,6 +9,12 @@ VERBS = {
     "render": "render a data set, or what is missing of it",
     "report": "print the table of all recorded runs beside the paper's numbers",
 }
+OF_VERB = {
+    "train": ("model", "data", "preset", "backbone", "camera", "loss", "optimizer", "trainer", "logger"),
+    "render": ("data", "preset"),
+    "report": (),
+}
+"""The groups whose choice a verb looks at."""
 EXAMPLES = {
     "train": [
         "python -m phd_exp model=mae_logz data=scale",
@@ -46,7 +52,7 @@ def _programme_help() -> str:
             *verbs,
             "",
             "groups (the first choice of a run is named in conf/config.yaml)",
-            *_groups(),
+            *_groups(OF_VERB["train"]),
             "",
             "-m runs every combination of values given with commas. Every key is explained in the files of",
             f"{conf_folder()}; `python -m phd_exp --cfg job` prints the whole configuration.",
@@ -60,7 +66,7 @@ def _programme_help() -> str:
 
 
 def _verb_help(verb: str) -> str:
-    groups = [] if verb == "report" else ["", "groups", *_groups()]
+    groups = ["", "groups", *_groups(OF_VERB[verb])] if OF_VERB[verb] else []
     return "\n".join(
         [
             f"usage: python -m phd_exp {verb} [group=choice ...] [key=value ...]",
@@ -74,10 +80,9 @@ def _verb_help(verb: str) -> str:
     )
 
 
-def _groups() -> list[str]:
-    folders = sorted(path for path in conf_folder().iterdir() if path.is_dir())
-    return [f"  {folder.name:<10} {', '.join(_choices(folder))}" for folder in folders if _choices(folder)]
+def _groups(names: Iterable[str]) -> list[str]:
+    return [f"  {name:<10} {', '.join(_choices(name))}" for name in names]
 
 
-def _choices(folder: Path) -> list[str]:
-    return sorted(file.stem for file in folder.glob("*.yaml"))
+def _choices(group: str) -> list[str]:
+    return sorted(file.stem for file in (conf_folder() / group).glob("*.yaml"))

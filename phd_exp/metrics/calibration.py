@@ -17,6 +17,8 @@ class CalibrationCurve:
     predicted: Float[Tensor, " points"]
     empirical: Float[Tensor, " points"]
     window: int
+    left_out: int
+    """Samples whose variance or error was not finite, as an untrained network may predict."""
 
 
 def calibration_curve(
@@ -27,16 +29,15 @@ def calibration_curve(
     The window holds `window` samples, or a fifth of the samples where there are fewer than five windows of
     them. A set of n samples gives n - window + 1 points, in the unit of the variance.
 
-    Raises ValueError for no samples, a window below 1, or numbers that are not finite.
+    Raises ValueError for a window below 1, or where no sample has a finite variance and error.
     Source: paper, section "Empirical error vs. estimated error" (window 200).
     """
-    if window < 1 or predicted_variance.numel() == 0:
-        raise ValueError(f"a calibration curve needs samples and a window >= 1, not {window=}")
     both = torch.stack([predicted_variance, squared_error]).double()
-    if not both.isfinite().all():
-        raise ValueError("a calibration curve needs finite variances and errors")
-    window = max(1, min(window, both.shape[1] // FEWEST_POINTS))
-    ordered = both[:, predicted_variance.argsort(stable=True)]
+    finite = both[:, both.isfinite().all(dim=0)]
+    if window < 1 or finite.numel() == 0:
+        raise ValueError(f"a calibration curve needs finite samples and a window >= 1, not {window=}")
+    window = max(1, min(window, finite.shape[1] // FEWEST_POINTS))
+    ordered = finite[:, finite[0].argsort(stable=True)]
     # averages by pooling rather than by differences of running sums, which cancel over orders of magnitude
     predicted, empirical = torch.nn.functional.avg_pool1d(ordered[None], window, stride=1)[0]
-    return CalibrationCurve(predicted, empirical, window)
+    return CalibrationCurve(predicted, empirical, window, left_out=both.shape[1] - finite.shape[1])

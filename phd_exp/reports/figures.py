@@ -37,9 +37,14 @@ def _draw_curve(axes: Axes, name: str, curve: Mapping[str, Any]) -> None:
     # whole decades: the labels between them would run into each other
     bounds = (10 ** math.floor(math.log10(min(values))), 10 ** math.ceil(math.log10(max(values))))
     axes.plot(bounds, bounds, "--", color="tab:red", linewidth=1, label="calibrated")
-    axes.plot(predicted, empirical, color="tab:blue", label=f"window of {curve['window']}")
+    axes.plot(predicted, empirical, color="tab:blue", label=_words(curve))
     axes.set(xscale="log", yscale="log", xlim=bounds, ylim=bounds, aspect="equal", title=title)
     axes.set_xlabel(f"predicted variance ({unit})")
     axes.set_ylabel(f"mean squared error ({unit})")
     axes.grid(which="both", alpha=0.25)
     axes.legend(loc="upper left", frameon=False)
+
+
+def _words(curve: Mapping[str, Any]) -> str:
+    left_out = f", {curve['left_out']} samples left out" if curve["left_out"] else ""
+    return f"window of {curve['window']}{left_out}"

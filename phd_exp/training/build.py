@@ -1,19 +1,23 @@
 """The one place that turns a checked configuration into objects."""
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from lightning import Trainer
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint, TQDMProgressBar
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar, TQDMProgressBar
 from lightning.pytorch.loggers import Logger
 
 from phd_exp.data.datamodule import RenderedData
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.callbacks import CalibrationRecorder, Draw, EpochLines
 from phd_exp.training.config import RunConfig, TrainerConfig
@@ -35,13 +39,30 @@ def build_data(config: RunConfig) -> RenderedData:
 
 
 def build_module(config: RunConfig, data: RenderedData) -> PositionModule:
-    """The network, its loss and its optimizer, initialised from torch's current random state."""
+    """The network, its loss and its optimizer, initialised from torch's current random state.
+
+    Raises ConfigError, naming the key, where a part refuses its values.
+    """
     # partial, then called: an object among instantiate's own arguments would be turned into a configuration
-    head = instantiate(config.model.head, _partial_=True)(depth=data.depth)
-    regressor = Regressor(instantiate(config.backbone), head, memory_format(config.trainer))
+    with _naming("model.head"):
+        head = instantiate(config.model.head, _partial_=True)(depth=data.depth)
+    with _naming("backbone"):
+        regressor = Regressor(instantiate(config.backbone), head, memory_format(config.trainer))
+    with _naming("optimizer"):
+        optimizer = instantiate(config.optimizer, _partial_=True)
+        optimizer(regressor.parameters())  # refuses bad values now rather than after hours of rendering
     constant_f = data.constant_f if config.camera.focal_length == "constant" else None
-    optimizer = instantiate(config.optimizer, _partial_=True)
     return PositionModule(regressor, instantiate(config.loss), optimizer, constant_f)
+
+
+@contextmanager
+def _naming(key: str) -> Iterator[None]:
+    """Let what a part says of its values name the part of the configuration that they stand in."""
+    try:
+        yield
+    except (ValueError, TypeError, InstantiationException) as error:
+        reason = " ".join(str(error.__cause__ or error).split())
+        raise ConfigError(f"{key}: {reason}") from None
 
 
 def build_trainer(
@@ -64,7 +85,7 @@ def build_trainer(
         max_epochs=config.trainer.max_epochs,
         logger=loggers,
         callbacks=callbacks,
-        enable_progress_bar=False,  # ours stands among the callbacks
+        enable_progress_bar=any(isinstance(callback, ProgressBar) for callback in callbacks),
         log_every_n_steps=1,  # metrics are logged once an epoch; this only keeps Lightning from remarking on it
         enable_model_summary=False,
         num_sanity_val_steps=0,
@@ -77,7 +98,11 @@ def _progress(config: RunConfig) -> list[Callback]:
     """A bar on a terminal, lines elsewhere, nothing where nothing is wanted."""
     if not config.trainer.progress_bar:
         return []
-    return [TQDMProgressBar() if sys.stderr.isatty() else EpochLines()]
+    return [TQDMProgressBar() if on_a_terminal() else EpochLines()]
+
+
+def on_a_terminal() -> bool:
+    return sys.stderr.isatty()
 
 
 def build_calibration(

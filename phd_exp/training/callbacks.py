@@ -127,6 +127,7 @@ class CalibrationRecorder(Callback):
 def _as_data(curve: CalibrationCurve) -> dict[str, Any]:
     return {
         "window": curve.window,
+        "left_out": curve.left_out,
         "predicted": curve.predicted.tolist(),
         "empirical": curve.empirical.tolist(),
     }

@@ -52,7 +52,8 @@ def train(config: RunConfig, folder: RunFolder, draw: Draw | None) -> dict[str, 
 def require_possible(config: RunConfig, folder: RunFolder) -> None:
     """Raise, before anything is rendered or written, what would stop the run later.
 
-    RunError: the folder holds a run of another configuration, or cannot be written. ConfigError: there is no GPU.
+    RunError: the folder holds a run of another configuration, or cannot be written. ConfigError: there is no GPU, or
+    a part of the model refuses its values.
     """
     require_same_config(folder, config)
     folder.require_writable()
@@ -60,6 +61,7 @@ def require_possible(config: RunConfig, folder: RunFolder) -> None:
         raise ConfigError(
             "trainer.accelerator: got 'gpu', but torch sees none here; expected 'cpu' or 'auto'"
         )
+    build_module(config, build_data(config))
 
 
 def require_same_config(folder: RunFolder, config: RunConfig) -> None:

@@ -42,6 +42,10 @@ BAD = [
     (["loss._target_=os.system"], ["loss._target_", "os.system", "phd_exp."]),
     (["loss._target_=phd_exp.losses.nll.Nothing"], ["loss._target_", "does not exist"]),
     (["data.n_train=["], ["viable"]),
+    (["optimizer.lr=-1"], ["optimizer: ", "learning rate", "-1"]),
+    (["+optimizer.betas=[0.9,1.5]"], ["optimizer: ", "beta", "1.5"]),
+    (["optimizer._target_=torch.optim.Nadam"], ["optimizer._target_", "does not exist"]),
+    (["optimizer._target_=torch.optim.SGD", "+optimizer.momentum=-1"], ["optimizer: ", "momentum"]),
 ]
 
 

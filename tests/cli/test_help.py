@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from phd_exp.cli.help import EXAMPLES, VERBS
+from phd_exp.cli.help import EXAMPLES, OF_VERB, VERBS
 from phd_exp.cli.paths import conf_folder
 
 
@@ -30,6 +30,12 @@ def test_help_lists_verbs_groups_and_choices(phd_exp: Callable) -> None:
     assert outcome.status == 0
     for word in [*VERBS, *(file.stem for file in conf_folder().glob("*/*.yaml"))]:
         assert word in outcome.out
+
+
+def test_no_group_is_forgotten() -> None:
+    groups = {path.name for path in conf_folder().iterdir() if path.is_dir()}
+    assert set(OF_VERB["train"]) == groups
+    assert OF_VERB.keys() == VERBS.keys() == EXAMPLES.keys()
 
 
 @pytest.mark.parametrize("verb", VERBS)

@@ -29,4 +29,4 @@ def renders(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def train(phd_exp: Callable, renders: Path) -> Callable:
     """A run at the smallest size, on the shared data sets."""
-    return lambda *arguments: phd_exp(*arguments, *QUICK, f"data.root={renders}")
+    return lambda *arguments: phd_exp(*QUICK, f"data.root={renders}", *arguments)

@@ -85,6 +85,17 @@ def test_without_a_logger_no_trace_of_wandb(train: Callable, tmp_path: Path) -> 
     assert not list(tmp_path.rglob("*wandb*"))
 
 
+@pytest.mark.parametrize("terminal", [True, False])
+def test_progress_is_a_bar_on_a_terminal_and_lines_elsewhere(
+    train: Callable, monkeypatch: pytest.MonkeyPatch, terminal: bool
+) -> None:
+    monkeypatch.setattr("phd_exp.training.build.on_a_terminal", lambda: terminal)
+    outcome = train("model=mae_vz", "logger=none", "trainer.progress_bar=true")
+    assert outcome.status == 0, outcome.err
+    assert ("epoch 2/2: test/loss" in outcome.out) is not terminal
+    assert ("Epoch 1: 100%" in outcome.out + outcome.err) is terminal
+
+
 def test_a_finished_run_is_not_run_again(train: Callable, tmp_path: Path) -> None:
     assert train("logger=none").status == 0
     before = only_run(tmp_path / "runs").results_file.stat().st_mtime_ns

@@ -46,6 +46,18 @@ def test_does_not_lose_small_variances_beside_large_ones() -> None:
     assert curve.predicted[0].item() == pytest.approx(1e-12)
 
 
+def test_what_is_not_finite_is_left_out_and_counted() -> None:
+    variance, error = samples(100, 1.0)
+    whole = calibration_curve(variance, error, window=10)
+    assert whole.left_out == 0
+    broken = torch.cat([variance, torch.tensor([torch.inf, 1.0, torch.nan])])
+    with_broken = torch.cat([error, torch.tensor([1.0, torch.nan, 1.0])])
+    curve = calibration_curve(broken, with_broken, window=10)
+    assert curve.left_out == 3
+    torch.testing.assert_close(curve.predicted, whole.predicted)
+    torch.testing.assert_close(curve.empirical, whole.empirical)
+
+
 @pytest.mark.parametrize("bad", [[], [float("nan")], [float("inf")]])
 def test_refuses_what_has_no_curve(bad: list[float]) -> None:
     values = torch.tensor(bad, dtype=torch.float64)

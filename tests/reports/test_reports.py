@@ -70,7 +70,12 @@ def test_published_numbers_cover_both_tables() -> None:
 
 def test_a_calibration_picture_has_ink(tmp_path: Path) -> None:
     predicted = np.geomspace(1e-4, 1e-1, 50)
-    curve = {"predicted": predicted.tolist(), "empirical": (2 * predicted).tolist(), "window": 200}
+    curve = {
+        "predicted": predicted.tolist(),
+        "empirical": (2 * predicted).tolist(),
+        "window": 200,
+        "left_out": 0,
+    }
     draw_calibration({"depth": curve, "projected": curve}, tmp_path / "curve.png")
     with Image.open(tmp_path / "curve.png") as picture:
         pixels = np.asarray(picture.convert("RGB")).astype(int)
