@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.loggers import Logger
+from lightning.pytorch.loggers import Logger, WandbLogger
 from lightning.pytorch.utilities import rank_zero_only
 
 from phd_exp.data.batches import Batch
@@ -106,22 +106,34 @@ class CalibrationRecorder(Callback):
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not self.parts:
             return
-        name = f"epoch-{trainer.current_epoch:04d}"
-        picture = self.write(name, joined(self.parts))
+        curves = self.write(f"epoch-{trainer.current_epoch:04d}", joined(self.parts))
         for logger in trainer.loggers:
-            if picture is not None and hasattr(logger, "log_image"):
-                logger.log_image("test/calibration", [str(picture)], step=trainer.global_step)
+            if isinstance(logger, WandbLogger):
+                self._send(logger, curves, trainer)
 
-    def write(self, name: str, table: Columns) -> Path | None:
-        """Write the curves of a table of predictions; returns the picture's file, if pictures are drawn."""
+    def write(self, name: str, table: Columns) -> CalibrationData:
+        """Write the curves of a table of predictions into the record, and draw them; returns them as data."""
         curves = {key: _as_data(curve) for key, curve in calibration_curves(table, self.window).items()}
         self.folder.calibration.mkdir(parents=True, exist_ok=True)
         write_atomic(self.folder.calibration / f"{name}.json", json.dumps(curves) + "\n")
-        if self.draw is None:
-            return None
-        picture = self.folder.calibration / f"{name}.png"
-        self.draw(curves, picture)
-        return picture
+        if self.draw is not None:
+            self.draw(curves, self._picture(name))
+        return curves
+
+    def _send(self, logger: WandbLogger, curves: CalibrationData, trainer: Trainer) -> None:
+        points = [
+            [name, *point]
+            for name, curve in curves.items()
+            for point in zip(curve["predicted"], curve["empirical"], strict=True)
+        ]
+        header = ["curve", "predicted", "empirical"]
+        logger.log_table("test/calibration_curves", header, points, step=trainer.global_step)
+        picture = self._picture(f"epoch-{trainer.current_epoch:04d}")
+        if picture.exists():
+            logger.log_image("test/calibration", [str(picture)], step=trainer.global_step)
+
+    def _picture(self, name: str) -> Path:
+        return self.folder.calibration / f"{name}.png"
 
 
 def _as_data(curve: CalibrationCurve) -> dict[str, Any]:
