@@ -1,6 +1,5 @@
 """Hydra as this programme uses it: compose, check, run; every mistake of the user is one line."""
 
-import difflib
 import os
 import re
 import sys
@@ -18,6 +17,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from phd_exp.cli.paths import conf_folder
 from phd_exp.cli.signals import Stopped, stopping_on_signals
 from phd_exp.records.errors import ConfigError, UserError
+from phd_exp.training.targets import nearest
 
 BAD_CONFIGURATION = 2
 FAILED = 1
@@ -87,13 +87,15 @@ def explain(error: Exception, config_name: str) -> str:
     unknown = re.search(r"Could not override '([^']+)'", text)
     if unknown:
         key = unknown[1].lstrip("+~")
-        return f"{key}: unknown key{_did_you_mean(key, _known_keys(config_name))}; see `python -m phd_exp --cfg job`"
+        return (
+            f"{key}: unknown key{nearest(key, _known_keys(config_name))}; see `python -m phd_exp --cfg job`"
+        )
     choice = re.search(
         r"Could not find '([^']+)/([^']+)' Available options in '[^']+': (.*?) Config search path", text
     )
     if choice:
         group, name, options = choice[1], choice[2], choice[3].split()
-        return f"{group}={name}: no such choice{_did_you_mean(name, options)}; expected one of {', '.join(options)}"
+        return f"{group}={name}: no such choice{nearest(name, options)}; expected one of {', '.join(options)}"
     return re.sub(r" Set the environment variable.*| Config search path:.*", "", text)
 
 
@@ -114,11 +116,6 @@ def _plain(config: DictConfig) -> dict[str, Any]:
         raise ConfigError(f"{error.full_key}: missing; a preset sets it, or {error.full_key}=VALUE") from None
     assert isinstance(plain, dict)
     return {str(key): value for key, value in plain.items()}
-
-
-def _did_you_mean(key: str, valid: list[str]) -> str:
-    close = difflib.get_close_matches(key, valid, n=1)
-    return f", did you mean {close[0]!r}?" if close else ""
 
 
 def _known_keys(config_name: str) -> list[str]:

@@ -24,9 +24,9 @@ def task(config: dict[str, Any], overrides: list[str]) -> None:
     from phd_exp.training.run import require_possible, train
 
     folder = RunFolder(run_name(checked, overrides).folder(checked.runs))
-    require_possible(checked, folder)
     skipped = folder.is_finished()
     if not skipped:
+        require_possible(checked, folder)
         ensure_dataset(checked.data)
     results = train(checked, folder, draw=_draw())
     print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
@@ -39,12 +39,13 @@ def task(config: dict[str, Any], overrides: list[str]) -> None:
 
 def run_name(config: RunConfig, overrides: list[str]) -> RunName:
     """The choices that name a run; every other override that can change a number goes into its hash."""
-    others = [override.lstrip("+") for override in overrides]
-    keys = [override.split("=")[0] for override in others]
-    telling = [
-        text for key, text in zip(keys, others, strict=True) if key not in NAMED and has_influence(key)
-    ]
+    telling = [text for override in overrides if _is_telling(text := override.lstrip("+"))]
     return RunName(config.preset, config.data.spec.variant, config.model.name, config.seed, tuple(telling))
+
+
+def _is_telling(override: str) -> bool:
+    key = override.split("=")[0]
+    return key not in NAMED and has_influence(key)
 
 
 def _draw() -> Callable[[dict[str, Any], Path], None] | None:

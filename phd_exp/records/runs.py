@@ -100,10 +100,13 @@ class RunFolder:
         status = self.status()
         return status is not None and status.state == "finished"
 
+    def _lock(self) -> FileLock:
+        return FileLock(self.path / ".lock", timeout=0)
+
     def is_held(self) -> bool:
         """Whether a process works on the run now."""
         try:
-            with FileLock(self.path / ".lock", timeout=0):
+            with self._lock():
                 return False
         except Timeout:
             return True
@@ -141,7 +144,7 @@ class RunFolder:
     @contextmanager
     def held(self) -> Iterator[None]:
         """Hold the folder for this process alone. Raises RunError where another process has it."""
-        lock = FileLock(self.path / ".lock", timeout=0)
+        lock = self._lock()
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             lock.acquire()

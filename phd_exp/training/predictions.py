@@ -60,19 +60,20 @@ def columns(prediction: Prediction, batch: Batch) -> Columns:
 
 
 def _distribution_columns(prediction: ProjectedHuber, xyz: Tensor) -> Columns:
-    off_centre = xyz[:, :2] / xyz[:, 2:] - prediction.mu_xy
+    A, mu_xy, mean = prediction.A, prediction.mu_xy, prediction.mean
+    off_centre = xyz[:, :2] / xyz[:, 2:] - mu_xy
     return {
-        **_coordinates("mean_", prediction.mean),
+        **_coordinates("mean_", mean),
         "median_z": prediction.depth_median,
-        "mu_x": prediction.mu_xy[:, 0],
-        "mu_y": prediction.mu_xy[:, 1],
+        "mu_x": mu_xy[:, 0],
+        "mu_y": mu_xy[:, 1],
         "mu_z": prediction.mu_z,
-        "A_xx": prediction.A[:, 0, 0],
-        "A_xy": prediction.A[:, 0, 1],
-        "A_yy": prediction.A[:, 1, 1],
+        "A_xx": A[:, 0, 0],
+        "A_xy": A[:, 0, 1],
+        "A_yy": A[:, 1, 1],
         "a": prediction.a,
         "depth_variance": prediction.depth_variance,
-        "depth_squared_error": (xyz[:, 2] - prediction.depth_mean).square(),
+        "depth_squared_error": (xyz[:, 2] - mean[:, 2]).square(),
         "projected_variance": prediction.projected_covariance.diagonal(dim1=-2, dim2=-1).sum(-1),
         "projected_squared_error": off_centre.square().sum(-1),
         "level": prediction.level(xyz),

@@ -166,9 +166,7 @@ def _quiet_lightning() -> None:
     """Leave the terminal to this programme's own lines, and say nothing of what is meant."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
-    warnings.filterwarnings(
-        "ignore", ".*LeafSpec.*is deprecated", FutureWarning
-    )  # Lightning's own use of torch
-    warnings.filterwarnings(
-        "ignore", "Checkpoint directory .* exists and is not empty"
-    )  # a run goes on in it
+    # Lightning calls an old name of torch
+    warnings.filterwarnings("ignore", ".*LeafSpec.*is deprecated", FutureWarning)
+    # a run that was broken off goes on in its own folder
+    warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
