@@ -2,7 +2,7 @@
 
 renders/<variant>/
     manifest.json                 what made the folder, and how many samples are finished
-    <split>/000123.png            images
+    <split>/000123.png            images (.webp, .jpg)
     <split>/metadata.jsonl        one line a sample, sorted by index
     <split>/metadata.partial.jsonl    only while rendering: one line a finished image
     .cache/                       whatever programmes derive from the images
@@ -18,9 +18,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from phd_exp.records.errors import UserError
 from phd_exp.records.files import read_jsonl, write_atomic
 from phd_exp.records.scenes import SampleRecord, Split
-from phd_exp.records.spec import DatasetSpec
+from phd_exp.records.spec import DatasetSpec, ImageFormat
 
 SPLITS: tuple[Split, ...] = get_args(Split)
+SUFFIXES: dict[ImageFormat, str] = {"png": ".png", "webp": ".webp", "jpeg": ".jpg"}
 
 
 class DatasetError(UserError):
@@ -78,8 +79,8 @@ class DatasetFolder:
     def journal_path(self, split: Split) -> Path:
         return self.root / split / "metadata.partial.jsonl"
 
-    def image_path(self, split: Split, index: int) -> Path:
-        return self.root / split / image_name(index)
+    def image_path(self, split: Split, index: int, image_format: ImageFormat = "png") -> Path:
+        return self.root / split / image_name(index, image_format)
 
     @property
     def manifest(self) -> Manifest:
@@ -141,16 +142,17 @@ class DatasetFolder:
             return {split: list(range(n)) for split, n in wanted.items()}
         manifest = self.manifest
         self._require_same(manifest.spec, spec)
-        return {split: self._unfinished(split, n, manifest.count(split)) for split, n in wanted.items()}
+        return {split: self._unfinished(split, n, manifest) for split, n in wanted.items()}
 
     def images(self, split: Split) -> set[str]:
         """Names of the images that are there."""
         folder = self.split_folder(split)
         return {entry.name for entry in folder.glob("[0-9]*.*")} if folder.is_dir() else set()
 
-    def _unfinished(self, split: Split, n: int, finished: int) -> list[int]:
+    def _unfinished(self, split: Split, n: int, manifest: Manifest) -> list[int]:
         there = self.images(split) if self.metadata_path(split).exists() else set()
-        return [index for index in range(n) if index >= finished or image_name(index) not in there]
+        finished, kind = manifest.count(split), manifest.spec.image_format
+        return [index for index in range(n) if index >= finished or image_name(index, kind) not in there]
 
     def _require_same(self, found: DatasetSpec, wanted: DatasetSpec) -> None:
         for key in DatasetSpec.model_fields:
@@ -162,9 +164,9 @@ class DatasetFolder:
                 )
 
 
-def image_name(index: int) -> str:
+def image_name(index: int, image_format: ImageFormat = "png") -> str:
     """File name of a sample's image."""
-    return f"{index:06d}.png"
+    return f"{index:06d}{SUFFIXES[image_format]}"
 
 
 def sha256(data: bytes) -> str:

@@ -1,7 +1,7 @@
 """A scene as data, and the line of `metadata.jsonl` that says what an image shows.
 
-Camera frame: x right, y down, z forward, metres. An object's local frame has its origin at the object's
-centre; a cylinder's axis is the local z axis.
+Camera frame: x right, y down, z forward, metres. A scene's own frame is the camera frame of its first view. An
+object's local frame has its origin at the object's centre; a cylinder's axis is the local z axis.
 """
 
 import math
@@ -18,6 +18,8 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Vector = tuple[Finite, Finite, Finite]
+Seed = Annotated[int, Field(ge=0, lt=2**31)]
+Count = Annotated[int, Field(ge=0)]
 
 
 def _unit(quaternion: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
@@ -25,6 +27,9 @@ def _unit(quaternion: tuple[float, float, float, float]) -> tuple[float, float, 
     if abs(norm - 1) > 1e-6:
         raise ValueError(f"a rotation is a unit quaternion, this one has norm {norm:.6g}")
     return quaternion
+
+
+Quaternion = Annotated[tuple[Finite, Finite, Finite, Finite], AfterValidator(_unit)]
 
 
 class _Described(BaseModel):
@@ -37,8 +42,8 @@ class SceneObject(_Described):
     """One rigid object.
 
     Attributes:
-        position: centre, camera frame, m.
-        rotation: unit quaternion (w, x, y, z) turning local axes into camera axes.
+        position: centre, scene frame, m.
+        rotation: unit quaternion (w, x, y, z) turning local axes into the scene's.
         dimensions: extent along the local axes at scale 1, m.
         scale: factor on all three dimensions.
         colour: sRGB.
@@ -46,7 +51,7 @@ class SceneObject(_Described):
 
     shape: Shape
     position: tuple[Finite, Finite, Positive]
-    rotation: Annotated[tuple[Finite, Finite, Finite, Finite], AfterValidator(_unit)]
+    rotation: Quaternion
     dimensions: tuple[Positive, Positive, Positive]
     scale: Positive
     colour: tuple[Share, Share, Share]
@@ -54,10 +59,11 @@ class SceneObject(_Described):
 
 
 class Lamp(_Described):
-    """A square area lamp facing the scene: place in the camera frame (m), side (m), power (W)."""
+    """A square area lamp: its place and the point it faces (scene frame, m), side (m), power (W)."""
 
     name: LampName
     position: Vector
+    towards: Vector
     side: Positive
     power: Positive
 
@@ -72,6 +78,21 @@ class Backdrop(_Described):
     level: Share
     falloff: Share
     centre: tuple[Finite, Finite]
+
+
+class Pose(_Described):
+    """Where a camera stands, as the motion from the scene's frame to its own: p_camera = R p_scene + translation.
+
+    Attributes:
+        rotation: unit quaternion (w, x, y, z) of R.
+        translation: m.
+    """
+
+    rotation: Quaternion
+    translation: Vector
+
+
+FIRST_VIEW = Pose(rotation=(1.0, 0.0, 0.0, 0.0), translation=(0.0, 0.0, 0.0))
 
 
 def _one_of_each(objects: tuple[SceneObject, ...]) -> tuple[SceneObject, ...]:
@@ -90,16 +111,18 @@ class Scene(_Described):
     Attributes:
         f: focal length, px; the principal point is the middle of the image.
         S: side of the square image, px.
+        pose: of the camera.
         objects: the cylinder first.
         noise_seed: seed of the path tracer.
     """
 
     f: Positive
     S: Annotated[int, Field(gt=0)]
+    pose: Pose
     objects: Objects
     lamps: tuple[Lamp, ...]
     backdrop: Backdrop
-    noise_seed: Annotated[int, Field(ge=0, lt=2**31)]
+    noise_seed: Seed
 
 
 class SampleRecord(_Described):
@@ -111,7 +134,9 @@ class SampleRecord(_Described):
         f, S: focal length and side of the image, px.
         scale: size factor of the cylinder.
         visibility: visible pixels of the cylinder over those it would show alone; 0 if it would show none.
+        truncation: share of the cylinder's silhouette, alone, that lies outside the image.
         index, split, seed: the three numbers from which everything else follows, given the specification.
+        scene, view: which scene of the split the image shows, and which of its views it is.
         sha256: of the image file.
     """
 
@@ -123,21 +148,26 @@ class SampleRecord(_Described):
     S: Annotated[int, Field(gt=0)]
     scale: Positive
     visibility: Share
-    index: Annotated[int, Field(ge=0)]
+    truncation: Share
+    index: Count
     split: Split
-    seed: Annotated[int, Field(ge=0)]
+    seed: Count
+    scene: Count
+    view: Count
+    pose: Pose
     objects: Objects
     lamps: tuple[Lamp, ...]
     backdrop: Backdrop
-    noise_seed: Annotated[int, Field(ge=0, lt=2**31)]
+    noise_seed: Seed
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
     @property
-    def scene(self) -> Scene:
-        """The scene that this image shows, as the renderer takes it."""
+    def shown(self) -> Scene:
+        """What this image shows, as the renderer takes it."""
         return Scene(
             f=self.f,
             S=self.S,
+            pose=self.pose,
             objects=self.objects,
             lamps=self.lamps,
             backdrop=self.backdrop,

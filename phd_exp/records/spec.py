@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StrictBool
 
@@ -19,7 +19,10 @@ Positive = Annotated[Number, Field(gt=0)]
 # Half a metre keeps the camera outside the largest object (a cube of 0.2 m, scaled by 2, reaches 0.35 m).
 Distance = Annotated[Number, Field(ge=0.5, le=100)]
 Factor = Annotated[Number, Field(ge=0.1, le=2)]
+# Beyond a right angle, half the cameras would look at the lamps.
+Angle = Annotated[Number, Field(ge=0, le=90)]
 Range = AfterValidator(_ascending)
+ImageFormat = Literal["png", "webp", "jpeg"]
 
 
 class DatasetSpec(BaseModel):
@@ -39,6 +42,10 @@ class DatasetSpec(BaseModel):
         occluders: whether a cube and a sphere join the cylinder.
         lamp_jitter: largest relative change of a lamp's place and strength.
         samples_per_pixel: light paths traced per pixel, before denoising.
+        views: cameras that look at each scene; sample i is view i mod views of scene i div views.
+        view_angle_range: bounds of the angle, in degrees, by which a further view's camera is turned against the first.
+        image_format: of the files; png keeps every pixel, webp and jpeg are small.
+        image_quality: of webp and jpeg, in per cent.
 
     Raises:
         pydantic.ValidationError: a missing or unknown key, a wrong type, a value out of range.
@@ -58,6 +65,10 @@ class DatasetSpec(BaseModel):
     occluders: StrictBool
     lamp_jitter: Annotated[Number, Field(ge=0, le=0.5)]
     samples_per_pixel: Annotated[int, Field(strict=True, ge=1, le=4096)]
+    views: Annotated[int, Field(strict=True, ge=1, le=64)]
+    view_angle_range: Annotated[tuple[Angle, Angle], Range]
+    image_format: ImageFormat
+    image_quality: Annotated[int, Field(strict=True, ge=1, le=100)]
 
     @property
     def z_over_f_range(self) -> tuple[float, float]:

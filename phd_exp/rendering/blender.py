@@ -1,7 +1,4 @@
-"""Scenes to pixels with Cycles: the one file that knows Blender.
-
-Blender's camera looks along -z with y up, ours along z with y down: p_blender = diag(1, -1, -1) p.
-"""
+"""Scenes to pixels with Cycles: the one file that imports Blender."""
 
 import importlib
 import importlib.metadata
@@ -13,27 +10,20 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from phd_exp.records.scenes import Lamp, LampName, Material, Scene, SceneObject, Shape
+from phd_exp.records.scenes import Scene
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering import shaders
 from phd_exp.rendering.errors import RenderError
-from phd_exp.rendering.meshes import build_mesh
-from phd_exp.rendering.visibility import rotation_matrix
+from phd_exp.rendering.stage import build_stage
 
 Pixels = NDArray[np.uint8]
 
 X_LIBRARIES = "libx11-6 libxext6 libxfixes3 libxi6 libxrender1 libxkbcommon0 libsm6 libice6 libgl1"
-TO_BLENDER = np.diag([1.0, -1.0, -1.0])
-SENSOR_WIDTH = 36.0  # mm; any value does, the focal length is given in the same unit
-SHAPES: tuple[Shape, ...] = get_args(Shape)
-MATERIALS: tuple[Material, ...] = get_args(Material)
-LAMP_NAMES: tuple[LampName, ...] = get_args(LampName)
 
 
 def require_bpy() -> None:
@@ -95,8 +85,10 @@ class Renderer:
         self._bpy = load_bpy()
         self._spec = spec
         self._output = _fast_folder() / f"phd_exp-{uuid.uuid4().hex}.bmp"
-        with _silence():
-            self._build()
+        with silence():
+            self._stage = build_stage(self._bpy)
+        self._scene = self._bpy.context.scene
+        self._configure()
 
     def render(self, scene: Scene, box: Box | None = None) -> Pixels:
         """Image of a box of pixels (height, width, 3), or of all (S, S, 3): sRGB, rows from the top.
@@ -104,15 +96,7 @@ class Renderer:
         A pure function of the scene, the box and the specification.
         """
         self._frame(box or Box(0, 0, scene.S, scene.S), scene.S)
-        self._place_camera(scene)
-        shown = {item.shape: item for item in scene.objects}
-        for shape, handle in self._objects.items():
-            handle.hide_render = shape not in shown
-            if shape in shown:
-                self._place_object(handle, shown[shape])
-        for lamp in scene.lamps:
-            self._place_lamp(self._lamps[lamp.name], lamp)
-        self._backdrop.show(scene.backdrop)
+        self._stage.show(scene)
         self._scene.cycles.seed = scene.noise_seed
         return self._shoot()
 
@@ -120,28 +104,22 @@ class Renderer:
         # In background mode Blender hands pixels out through files only; an uncompressed one costs 2 to 4 ms.
         self._scene.render.filepath = str(self._output)
         try:
-            with _silence():
+            with silence():
                 self._bpy.ops.render.render(write_still=True)
             with Image.open(self._output) as image:
                 return np.array(image.convert("RGB"))
         finally:
             self._output.unlink(missing_ok=True)
 
-    # Once per process.
+    def _frame(self, box: Box, side: int) -> None:
+        """Blender wants shares of the image from the bottom left corner, and cuts them off to whole pixels.
 
-    def _build(self) -> None:
-        self._bpy.ops.wm.read_factory_settings(use_empty=True)
-        self._scene = self._bpy.context.scene
-        self._materials = {name: self._bpy.data.materials.new(name) for name in MATERIALS}
-        for name, material in self._materials.items():
-            shaders.paint_surface(material.node_tree, name)
-        self._objects = {shape: self._new_object(shape) for shape in SHAPES}
-        self._lamps = {name: self._new_lamp(name) for name in LAMP_NAMES}
-        self._camera = self._new_camera()
-        self._scene.world = self._bpy.data.worlds.new("world")
-        self._scene.world.cycles.sampling_method = "NONE"  # too smooth for a map of its light to be worth it
-        self._backdrop = shaders.paint_world(self._scene.world.node_tree)
-        self._configure()
+        Half a pixel more, and rounding cannot lose one.
+        """
+        render = self._scene.render
+        render.border_min_x, render.border_max_x = (box.left + 0.5) / side, (box.right + 0.5) / side
+        render.border_min_y = (side - box.bottom + 0.5) / side
+        render.border_max_y = (side - box.top + 0.5) / side
 
     def _configure(self) -> None:
         """Every setting that differs from Blender's factory settings, with its reason."""
@@ -172,80 +150,6 @@ class Renderer:
         cycles.denoising_input_passes = "RGB"  # albedo and normals made FAST worse
         cycles.denoising_prefilter = "NONE"
 
-    def _new_object(self, shape: Shape) -> Any:
-        geometry = build_mesh(shape)
-        mesh = self._bpy.data.meshes.new(shape)
-        mesh.from_pydata(geometry.vertices, [], geometry.faces)
-        mesh.polygons.foreach_set("use_smooth", geometry.smooth)
-        mesh.materials.append(None)
-        return self._link(self._bpy.data.objects.new(shape, mesh))
-
-    def _new_lamp(self, name: str) -> Any:
-        light = self._bpy.data.lights.new(name, "AREA")
-        light.shape = "SQUARE"
-        return self._link(self._bpy.data.objects.new(name, light))
-
-    def _new_camera(self) -> Any:
-        camera = self._bpy.data.cameras.new("camera")
-        camera.sensor_fit = "HORIZONTAL"
-        camera.sensor_width = SENSOR_WIDTH
-        camera.clip_start, camera.clip_end = 0.01, 1000.0
-        self._scene.camera = self._link(self._bpy.data.objects.new("camera", camera))
-        return camera
-
-    def _link(self, item: Any) -> Any:
-        self._scene.collection.objects.link(item)
-        return item
-
-    # Once per sample.
-
-    def _frame(self, box: Box, side: int) -> None:
-        """Blender wants shares of the image from the bottom left corner, and cuts them off to whole pixels.
-
-        Half a pixel more, and rounding cannot lose one.
-        """
-        render = self._scene.render
-        render.border_min_x, render.border_max_x = (box.left + 0.5) / side, (box.right + 0.5) / side
-        render.border_min_y = (side - box.bottom + 0.5) / side
-        render.border_max_y = (side - box.top + 0.5) / side
-
-    def _place_camera(self, scene: Scene) -> None:
-        self._camera.lens = scene.f * SENSOR_WIDTH / scene.S
-
-    def _place_object(self, handle: Any, item: SceneObject) -> None:
-        matrix = np.eye(4)
-        stretch = 0.5 * item.scale * np.array(item.dimensions)
-        matrix[:3, :3] = TO_BLENDER @ rotation_matrix(item.rotation) * stretch
-        matrix[:3, 3] = TO_BLENDER @ np.array(item.position)
-        handle.matrix_world = matrix.T.tolist()
-        handle.color = (*(_linear(channel) for channel in item.colour), 1.0)
-        handle.material_slots[0].link = "OBJECT"
-        handle.material_slots[0].material = self._materials[item.material]
-
-    def _place_lamp(self, handle: Any, lamp: Lamp) -> None:
-        """An area lamp shines along its own -z."""
-        position = TO_BLENDER @ np.array(lamp.position)
-        middle = TO_BLENDER @ np.array([0.0, 0.0, sum(self._spec.z_range) / 2])
-        matrix = np.eye(4)
-        matrix[:3, :3] = _facing(middle - position)
-        matrix[:3, 3] = position
-        handle.matrix_world = matrix.T.tolist()
-        handle.data.energy = lamp.power
-        handle.data.size = lamp.side
-
-
-def _facing(direction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A rotation (3, 3) whose -z axis is `direction`, with x level."""
-    back = -direction / np.linalg.norm(direction)
-    right = np.cross([0.0, 1.0, 0.0], back)
-    right /= np.linalg.norm(right)
-    return np.column_stack([right, np.cross(back, right), back])
-
-
-def _linear(channel: float) -> float:
-    """sRGB to linear light (IEC 61966-2-1)."""
-    return channel / 12.92 if channel <= 0.04045 else ((channel + 0.055) / 1.055) ** 2.4
-
 
 def _fast_folder() -> Path:
     """A folder in memory where the system has one."""
@@ -254,7 +158,7 @@ def _fast_folder() -> Path:
 
 
 @contextmanager
-def _silence() -> Iterator[None]:
+def silence() -> Iterator[None]:
     """Send nowhere what Blender's C code prints, past Python, to the standard output and error."""
     sys.stdout.flush()
     sys.stderr.flush()

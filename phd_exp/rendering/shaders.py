@@ -3,7 +3,6 @@
 Handles of Blender's objects are given; nothing here imports it.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 from phd_exp.records.scenes import Backdrop, Material
@@ -18,20 +17,20 @@ SURFACES: dict[Material, dict[str, float]] = {
 SURROUNDINGS = (0.10, 0.75)
 
 
-@dataclass(frozen=True)
 class BackdropInputs:
-    """The three inputs of the backdrop's nodes that change from sample to sample."""
+    """The three inputs of a painted world's nodes that change from sample to sample."""
 
-    centre: Any
-    slope: Any
-    level: Any
+    def __init__(self, tree: Any) -> None:
+        nodes = tree.nodes
+        self._centre = nodes["offset"].inputs[1]
+        self._slope, self._level = nodes["line"].inputs[1], nodes["line"].inputs[2]
 
     def show(self, backdrop: Backdrop) -> None:
         """Let the camera see this backdrop."""
         x, y = backdrop.centre
-        self.centre.default_value = (x, 1 - y, 0.0)  # Blender counts from the bottom
-        self.slope.default_value = -backdrop.level * backdrop.falloff
-        self.level.default_value = backdrop.level
+        self._centre.default_value = (x, 1 - y, 0.0)  # Blender counts from the bottom
+        self._slope.default_value = -backdrop.level * backdrop.falloff
+        self._level.default_value = backdrop.level
 
 
 def paint_surface(tree: Any, material: Material) -> None:
@@ -43,7 +42,7 @@ def paint_surface(tree: Any, material: Material) -> None:
     tree.links.new(info.outputs["Color"], shader.inputs["Base Color"])
 
 
-def paint_world(tree: Any) -> BackdropInputs:
+def paint_world(tree: Any) -> None:
     """Make a new world's node tree two worlds in one: the camera sees the backdrop, all else the surroundings.
 
     A backdrop that is no surface takes no shadow and no light from the objects, so that nothing in it tells where
@@ -54,28 +53,27 @@ def paint_world(tree: Any) -> BackdropInputs:
     shader = tree.nodes.new("ShaderNodeBackground")
     mix = tree.nodes.new("ShaderNodeMix")
     rays = tree.nodes.new("ShaderNodeLightPath")
-    ground, inputs = _backdrop_nodes(tree)
     tree.links.new(rays.outputs["Is Camera Ray"], mix.inputs["Factor"])
     tree.links.new(_surroundings_nodes(tree), mix.inputs["A"])
-    tree.links.new(ground, mix.inputs["B"])
+    tree.links.new(_backdrop_nodes(tree), mix.inputs["B"])
     tree.links.new(mix.outputs["Result"], shader.inputs["Strength"])
     tree.links.new(shader.outputs["Background"], output.inputs["Surface"])
     shader.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
-    return inputs
 
 
-def _backdrop_nodes(tree: Any) -> tuple[Any, BackdropInputs]:
-    """level + slope |window - centre|^2, with slope = -level falloff."""
+def _backdrop_nodes(tree: Any) -> Any:
+    """level + slope |window - centre|^2, with slope = -level falloff; named, for `BackdropInputs` to find."""
     window = tree.nodes.new("ShaderNodeTexCoord")
     offset = tree.nodes.new("ShaderNodeVectorMath")
     square = tree.nodes.new("ShaderNodeVectorMath")
     line = tree.nodes.new("ShaderNodeMath")
+    offset.name, line.name = "offset", "line"
     offset.operation, square.operation, line.operation = "SUBTRACT", "DOT_PRODUCT", "MULTIPLY_ADD"
     tree.links.new(window.outputs["Window"], offset.inputs[0])
     tree.links.new(offset.outputs["Vector"], square.inputs[0])
     tree.links.new(offset.outputs["Vector"], square.inputs[1])
     tree.links.new(square.outputs["Value"], line.inputs[0])
-    return line.outputs["Value"], BackdropInputs(offset.inputs[1], line.inputs[1], line.inputs[2])
+    return line.outputs["Value"]
 
 
 def _surroundings_nodes(tree: Any) -> Any:

@@ -5,10 +5,13 @@ is still a straight line with the same parameter z: every object is one of three
 where the line enters.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-from phd_exp.records.scenes import Scene, SceneObject
+from phd_exp.records.scenes import Pose, Scene, SceneObject
+from phd_exp.rendering.rotations import rotation_matrix
 
 Image = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -16,8 +19,12 @@ Mask = NDArray[np.bool_]
 
 def depth_maps(scene: Scene) -> Image:
     """Depth z (objects, S, S), m, at which the ray of each pixel meets each object; infinity where it does not."""
-    rays = _view_rays(scene)
-    return np.stack([_depth_map(item, rays) for item in scene.objects])
+    depths = np.full((len(scene.objects), scene.S, scene.S), np.inf)
+    for depth, item in zip(depths, scene.objects, strict=True):
+        rows, columns = (_clipped(span, scene.S) for span in _window(scene, item))
+        if rows and columns:
+            depth[rows.start : rows.stop, columns.start : columns.stop] = _depths(scene, item, rows, columns)
+    return depths
 
 
 def silhouettes(depths: Image) -> Mask:
@@ -36,34 +43,65 @@ def visibility(depths: Image) -> float:
     return float(cylinder_mask(depths).sum() / alone) if alone else 0.0
 
 
-def _depth_map(item: SceneObject, rays: Image) -> Image:
-    to_unit = rotation_matrix(item.rotation).T / (0.5 * item.scale * np.array(item.dimensions))[:, None]
-    origin = -to_unit @ np.array(item.position)
+def truncation(scene: Scene, depths: Image) -> float:
+    """Share of the cylinder's pixels, were it alone, that an image without borders would show and this one does not.
+
+    1 if it would show none anywhere.
+    """
+    rows, columns = _window(scene, scene.objects[0])
+    whole = np.isfinite(_depths(scene, scene.objects[0], rows, columns)).sum()
+    return float(1 - np.isfinite(depths[0]).sum() / whole) if whole else 1.0
+
+
+def in_camera_frame(position: Image, pose: Pose) -> Image:
+    """A point (3,) of the scene's frame as the camera sees it, m."""
+    return rotation_matrix(pose.rotation) @ position + np.array(pose.translation)
+
+
+def _window(scene: Scene, item: SceneObject) -> tuple[range, range]:
+    """Rows and columns, not only of the image, that hold an object's silhouette: those of a ball around it.
+
+    The ball's shadow on an axis of the image reaches from tan(angle - width) to tan(angle + width).
+    """
+    x, y, z = in_camera_frame(np.array(item.position), scene.pose)
+    radius = 0.5 * item.scale * math.hypot(*item.dimensions)
+    if z <= radius:  # beside or around the camera: nothing is known but the image's own borders
+        return range(scene.S), range(scene.S)
+    rows, columns = (_shadow(off_axis, z, radius, scene) for off_axis in (y, x))
+    return rows, columns
+
+
+def _shadow(off_axis: float, z: float, radius: float, scene: Scene) -> range:
+    angle, width = math.atan2(off_axis, z), math.asin(radius / math.hypot(off_axis, z))
+    first, last = (
+        scene.f * math.tan(min(max(angle + side, -1.5), 1.5)) + scene.S / 2 for side in (-width, width)
+    )
+    return range(math.floor(first), math.ceil(last))
+
+
+def _clipped(span: range, side: int) -> range:
+    return range(max(span.start, 0), min(span.stop, side))
+
+
+def _depths(scene: Scene, item: SceneObject, rows: range, columns: range) -> Image:
+    """Depth (rows, columns) at which the rays of some pixels meet one object."""
+    rotation = rotation_matrix(scene.pose.rotation) @ rotation_matrix(item.rotation)
+    to_unit = rotation.T / (0.5 * item.scale * np.array(item.dimensions))[:, None]
+    origin = -to_unit @ in_camera_frame(np.array(item.position), scene.pose)
     enter_and_leave = {"cylinder": _cylinder, "cube": _slabs, "sphere": _ball}[item.shape]
     with np.errstate(divide="ignore", invalid="ignore"):
-        enter, leave = enter_and_leave(origin, rays @ to_unit.T)
+        enter, leave = enter_and_leave(origin, _view_rays(scene, rows, columns) @ to_unit.T)
         # An interval whose ends are NaN or reversed is empty; what lies behind the camera is not seen.
         hit = (enter <= leave) & (enter > 0)
     return np.where(hit, enter, np.inf)
 
 
-def rotation_matrix(quaternion: tuple[float, float, float, float]) -> Image:
-    """Matrix (3, 3) of a unit quaternion (w, x, y, z)."""
-    w, x, y, z = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def _view_rays(scene: Scene) -> Image:
-    """Ray directions (S, S, 3) with z = 1; pixel (column c, row r) has its middle at (c + 1/2, r + 1/2)."""
-    middles = (np.arange(scene.S) + 0.5 - scene.S / 2) / scene.f
-    u, w = np.meshgrid(middles, middles)
-    return np.stack([u, w, np.ones_like(u)], axis=-1)
+def _view_rays(scene: Scene, rows: range, columns: range) -> Image:
+    """Ray directions (rows, columns, 3) with z = 1; pixel (column c, row r) has its middle at (c + 1/2, r + 1/2)."""
+    u, w = ((np.asarray(span) + 0.5 - scene.S / 2) / scene.f for span in (columns, rows))
+    rays = np.ones((len(w), len(u), 3))
+    rays[..., 0], rays[..., 1] = u[None, :], w[:, None]
+    return rays
 
 
 def _slabs(origin: Image, rays: Image) -> tuple[Image, Image]:

@@ -5,7 +5,6 @@ imports neither the caller's main module nor torch, it works the same from a scr
 and it ends by itself when its parent is gone, because its input then ends.
 """
 
-import io
 import os
 import signal
 import sys
@@ -13,22 +12,21 @@ import traceback
 from pathlib import Path
 from typing import TextIO
 
-from PIL import Image
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from phd_exp.records.dataset import DatasetFolder, image_name, sha256
 from phd_exp.records.errors import UserError
 from phd_exp.records.files import write_atomic
-from phd_exp.records.scenes import SampleRecord, Split
+from phd_exp.records.scenes import SampleRecord, Scene, Split
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.blender import Pixels, Renderer
+from phd_exp.rendering.blender import Renderer
 from phd_exp.rendering.compose import take_picture
+from phd_exp.rendering.encoding import encode
 from phd_exp.rendering.errors import unwritable
-from phd_exp.rendering.sampling import sample_scene
-from phd_exp.rendering.visibility import depth_maps, visibility
-
-# Level 6 of zlib: level 9 saves 2 % of the bytes for twice the time.
-PNG_COMPRESSION = 6
+from phd_exp.rendering.sampling import sample_scene, scene_and_view
+from phd_exp.rendering.visibility import depth_maps, in_camera_frame, truncation, visibility
 
 
 class Job(BaseModel):
@@ -62,12 +60,20 @@ def render_sample(
     """
     scene = sample_scene(spec, split, index)
     depths = depth_maps(scene)
-    image = encode_png(take_picture(renderer, scene, depths))
-    write_atomic(folder.image_path(split, index), image)
+    image = encode(take_picture(renderer, scene, depths), spec)
+    write_atomic(folder.image_path(split, index, spec.image_format), image)
+    return describe(spec, split, index, scene, depths, sha256(image))
+
+
+def describe(
+    spec: DatasetSpec, split: Split, index: int, scene: Scene, depths: NDArray[np.float64], checksum: str
+) -> SampleRecord:
+    """The record of a sample whose image has a checksum; depth maps as of `depth_maps`."""
+    number, view = scene_and_view(spec, index)
     cylinder = scene.objects[0]
-    x, y, z = cylinder.position
+    x, y, z = in_camera_frame(np.array(cylinder.position), scene.pose).tolist()
     return SampleRecord(
-        file_name=image_name(index),
+        file_name=image_name(index, spec.image_format),
         x=x,
         y=y,
         z=z,
@@ -75,22 +81,19 @@ def render_sample(
         S=scene.S,
         scale=cylinder.scale,
         visibility=visibility(depths),
+        truncation=truncation(scene, depths),
         index=index,
         split=split,
         seed=spec.seed,
+        scene=number,
+        view=view,
+        pose=scene.pose,
         objects=scene.objects,
         lamps=scene.lamps,
         backdrop=scene.backdrop,
         noise_seed=scene.noise_seed,
-        sha256=sha256(image),
+        sha256=checksum,
     )
-
-
-def encode_png(pixels: Pixels) -> bytes:
-    """The same bytes for the same pixels: Blender's own files carry times and never repeat."""
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, format="PNG", compress_level=PNG_COMPRESSION)
-    return stream.getvalue()
 
 
 def serve(tasks: TextIO, answers: TextIO) -> None:

@@ -72,7 +72,12 @@ def test_the_command_line_has_the_last_word(checked: Callable) -> None:
 
 def test_variants_differ_in_what_they_name_alone(checked: Callable) -> None:
     plain = checked("data=default").data.spec
-    changes = {"occl": {"occluders"}, "scale": {"scale_range"}, "occl_scale": {"occluders", "scale_range"}}
+    changes = {
+        "occl": {"occluders"},
+        "scale": {"scale_range"},
+        "occl_scale": {"occluders", "scale_range"},
+        "multiview": {"scale_range", "views", "view_angle_range"},
+    }
     for variant, keys in changes.items():
         other = checked(f"data={variant}").data.spec
         differing = {key for key in DatasetSpec.model_fields if getattr(plain, key) != getattr(other, key)}

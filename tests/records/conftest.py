@@ -7,11 +7,13 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from phd_exp.records.dataset import DatasetFolder, Manifest, Seal, image_name, sha256
+from phd_exp.records.dataset import DatasetFolder, Manifest, Seal, sha256
 from phd_exp.records.files import write_atomic
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.sampling import sample_scene
+from phd_exp.rendering.visibility import depth_maps
+from phd_exp.rendering.worker import describe
 
 
 @pytest.fixture
@@ -37,10 +39,4 @@ def _sample(folder: DatasetFolder, spec: DatasetSpec, split: Split, index: int) 
     Image.new("RGB", (8, 8), (index, 0, 0)).save(stream, format="PNG")
     write_atomic(folder.image_path(split, index), stream.getvalue())
     scene = sample_scene(spec, split, index)
-    x, y, z = scene.objects[0].position
-    return SampleRecord(
-        file_name=image_name(index),
-        **{"x": x, "y": y, "z": z, "scale": 1.0, "visibility": 1.0},
-        **{"index": index, "split": split, "seed": 0, "sha256": sha256(stream.getvalue())},
-        **dict(scene),
-    )
+    return describe(spec, split, index, scene, depth_maps(scene), sha256(stream.getvalue()))

@@ -26,7 +26,7 @@ def test_the_image_comes_first(record: SampleRecord) -> None:
 
 
 def test_position_is_that_of_the_cylinder(record: SampleRecord) -> None:
-    cylinder = record.scene.objects[0]
+    cylinder = record.shown.objects[0]
     assert cylinder.shape == "cylinder"
     assert (record.x, record.y, record.z, record.scale) == (*cylinder.position, cylinder.scale)
 
@@ -38,6 +38,9 @@ def test_position_is_that_of_the_cylinder(record: SampleRecord) -> None:
         ("f", 0.0),
         ("x", float("nan")),
         ("visibility", 1.5),
+        ("truncation", -0.1),
+        ("view", -1),
+        ("pose", {"rotation": (2.0, 0.0, 0.0, 0.0), "translation": (0.0, 0.0, 0.0)}),
         ("split", "validation"),
         ("sha256", "0"),
         ("objects", []),

@@ -62,7 +62,7 @@ def test_objects_are_where_the_scene_says(rendered: dict[str, DatasetFolder], va
     folder = rendered[variant]
     for record in folder.records("train"):
         away = np.abs(pixels(folder, record) - backdrop_pixels(record.backdrop, record.S)).max(axis=-1)
-        mask = silhouettes(depth_maps(record.scene))
+        mask = silhouettes(depth_maps(record.shown))
         inner = ~grown(~mask, 1)
         assert (away[inner] > 8).all()
         assert (away[~grown(mask, REACH)] == 0).all()
@@ -73,7 +73,7 @@ def test_objects_are_where_the_scene_says(rendered: dict[str, DatasetFolder], va
 def test_the_cylinder_has_the_colour_of_its_record(rendered: dict[str, DatasetFolder], variant: str) -> None:
     """Its visible pixels have its hue on average: under white lamps both materials keep it."""
     for record in rendered[variant].records("train"):
-        mask = ~grown(~cylinder_mask(depth_maps(record.scene)), 1)
+        mask = ~grown(~cylinder_mask(depth_maps(record.shown)), 1)
         if mask.sum() > 50:
             colour = pixels(rendered[variant], record)[mask].mean(axis=0)
             assert int(colour.argmax()) == int(np.argmax(record.objects[0].colour))
@@ -85,7 +85,7 @@ def test_silhouettes_have_no_bias(centred: DatasetFolder) -> None:
     for record in centred.records("train"):
         image = pixels(centred, record)
         away = np.abs(image - backdrop_pixels(record.backdrop, record.S)).max(axis=-1)
-        mask = silhouettes(depth_maps(record.scene))
+        mask = silhouettes(depth_maps(record.shown))
         assert not (mask[0] | mask[-1] | mask[:, 0] | mask[:, -1]).any()
         seen = np.argwhere(away > 10).mean(axis=0)
         offsets.append(seen - np.argwhere(mask).mean(axis=0))
@@ -97,6 +97,6 @@ def test_paired_variants_show_the_same_light(rendered: dict[str, DatasetFolder])
     """Where neither has an object, paired images are equal; where they differ, an object is the reason."""
     for index in range(5):
         alone, occluded = (rendered[variant].records("train")[index] for variant in ("default", "occl"))
-        free = ~grown(silhouettes(depth_maps(occluded.scene)), REACH)
+        free = ~grown(silhouettes(depth_maps(occluded.shown)), REACH)
         difference = np.abs(pixels(rendered["default"], alone) - pixels(rendered["occl"], occluded))
         assert (difference[free] == 0).all()

@@ -8,11 +8,11 @@ import pytest
 
 from phd_exp.records.scenes import Scene, SceneObject
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.rotations import rotation_matrix
 from phd_exp.rendering.sampling import sample_scene
 from phd_exp.rendering.visibility import (
     cylinder_mask,
     depth_maps,
-    rotation_matrix,
     silhouettes,
     visibility,
 )

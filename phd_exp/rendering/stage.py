@@ -1,0 +1,135 @@
+"""Blender's scene as a stage: built once, and then set for one scene after another.
+
+Blender's camera looks along -z with y up, ours along z with y down: p_blender = diag(1, -1, -1) p. Blender's module is
+given; nothing here imports it.
+"""
+
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phd_exp.records.scenes import Lamp, LampName, Material, Pose, Scene, SceneObject, Shape
+from phd_exp.rendering import shaders
+from phd_exp.rendering.meshes import build_mesh
+from phd_exp.rendering.rotations import rotation_matrix
+
+TO_BLENDER = np.diag([1.0, -1.0, -1.0])
+SENSOR_WIDTH = 36.0  # mm; any value does, the focal length is given in the same unit
+SHAPES: tuple[Shape, ...] = get_args(Shape)
+MATERIALS: tuple[Material, ...] = get_args(Material)
+LAMP_NAMES: tuple[LampName, ...] = get_args(LampName)
+
+
+class Stage:
+    """What a scene moves, found by name in Blender's open file."""
+
+    def __init__(self, bpy: Any) -> None:
+        data = bpy.data
+        self._camera = data.objects["camera"]
+        self._objects = {shape: data.objects[shape] for shape in SHAPES}
+        self._lamps = {name: data.objects[name] for name in LAMP_NAMES}
+        self._materials = {name: data.materials[name] for name in MATERIALS}
+        self._backdrop = shaders.BackdropInputs(data.worlds["world"].node_tree)
+
+    def show(self, scene: Scene) -> None:
+        """Put everything where the scene says."""
+        self._camera.data.lens = scene.f * SENSOR_WIDTH / scene.S
+        self._camera.matrix_world = _camera_matrix(scene.pose)
+        shown = {item.shape: item for item in scene.objects}
+        for shape, handle in self._objects.items():
+            handle.hide_render = shape not in shown
+            if shape in shown:
+                self._place_object(handle, shown[shape])
+        for lamp in scene.lamps:
+            _place_lamp(self._lamps[lamp.name], lamp)
+        self._backdrop.show(scene.backdrop)
+
+    def _place_object(self, handle: Any, item: SceneObject) -> None:
+        stretch = 0.5 * item.scale * np.array(item.dimensions)
+        handle.matrix_world = _matrix(rotation_matrix(item.rotation) * stretch, np.array(item.position))
+        handle.color = (*(_linear(channel) for channel in item.colour), 1.0)
+        handle.material_slots[0].link = "OBJECT"
+        handle.material_slots[0].material = self._materials[item.material]
+
+
+def build_stage(bpy: Any) -> Stage:
+    """Empty Blender's file and fill it with one of everything that a scene can hold."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    for name in MATERIALS:
+        shaders.paint_surface(bpy.data.materials.new(name).node_tree, name)
+    for shape in SHAPES:
+        _add(bpy, shape, _new_mesh(bpy, shape))
+    for name in LAMP_NAMES:
+        _add(bpy, name, _new_lamp(bpy, name)).visible_camera = False  # a turned camera may look at one
+    bpy.context.scene.camera = _add(bpy, "camera", _new_camera(bpy))
+    world = bpy.context.scene.world = bpy.data.worlds.new("world")
+    world.cycles.sampling_method = "NONE"  # too smooth for a map of its light to be worth it
+    shaders.paint_world(world.node_tree)
+    return Stage(bpy)
+
+
+def _add(bpy: Any, name: str, data: Any) -> Any:
+    handle = bpy.data.objects.new(name, data)
+    bpy.context.scene.collection.objects.link(handle)
+    return handle
+
+
+def _new_mesh(bpy: Any, shape: Shape) -> Any:
+    geometry = build_mesh(shape)
+    mesh = bpy.data.meshes.new(shape)
+    mesh.from_pydata(geometry.vertices, [], geometry.faces)
+    mesh.polygons.foreach_set("use_smooth", geometry.smooth)
+    mesh.materials.append(None)
+    return mesh
+
+
+def _new_lamp(bpy: Any, name: str) -> Any:
+    light = bpy.data.lights.new(name, "AREA")
+    light.shape = "SQUARE"
+    return light
+
+
+def _new_camera(bpy: Any) -> Any:
+    camera = bpy.data.cameras.new("camera")
+    camera.sensor_fit = "HORIZONTAL"
+    camera.sensor_width = SENSOR_WIDTH
+    camera.clip_start, camera.clip_end = 0.01, 1000.0
+    return camera
+
+
+def _place_lamp(handle: Any, lamp: Lamp) -> None:
+    """An area lamp shines along its own -z."""
+    position = np.array(lamp.position)
+    forward = np.array(lamp.towards) - position
+    handle.matrix_world = _matrix(TO_BLENDER @ _facing(TO_BLENDER @ forward), position)
+    handle.data.energy = lamp.power
+    handle.data.size = lamp.side
+
+
+def _camera_matrix(pose: Pose) -> list[list[float]]:
+    """The camera's own axes are Blender's on both sides: p_scene = R^T (p_camera - translation)."""
+    back = rotation_matrix(pose.rotation).T
+    return _matrix(back @ TO_BLENDER, -back @ np.array(pose.translation))
+
+
+def _matrix(linear: NDArray[np.float64], place: NDArray[np.float64]) -> list[list[float]]:
+    """Blender's matrix, by columns, of p = linear local + place in our axes."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = TO_BLENDER @ linear
+    matrix[:3, 3] = TO_BLENDER @ place
+    columns: list[list[float]] = matrix.T.tolist()
+    return columns
+
+
+def _facing(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A rotation (3, 3) whose -z axis is `direction`, with x level."""
+    back = -direction / np.linalg.norm(direction)
+    right = np.cross([0.0, 1.0, 0.0], back)
+    right /= np.linalg.norm(right)
+    return np.column_stack([right, np.cross(back, right), back])
+
+
+def _linear(channel: float) -> float:
+    """sRGB to linear light (IEC 61966-2-1)."""
+    return channel / 12.92 if channel <= 0.04045 else ((channel + 0.055) / 1.055) ** 2.4
