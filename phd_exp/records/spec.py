@@ -43,7 +43,7 @@ class DatasetSpec(BaseModel):
         lamp_jitter: largest relative change of a lamp's place and strength.
         samples_per_pixel: light paths traced per pixel, before denoising.
         views: cameras that look at each scene; sample i is view i mod views of scene i div views.
-        view_angle_range: bounds of the angle, in degrees, by which a further view's camera is turned against the first.
+        view_angle_range: bounds of the angle between a further view's line of sight and the first's, degrees.
         image_format: of the files; png keeps every pixel, webp and jpeg are small.
         image_quality: of webp and jpeg, in per cent.
 

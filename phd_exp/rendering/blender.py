@@ -9,19 +9,19 @@ import tempfile
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from phd_exp.records.scenes import Scene
-from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.errors import RenderError
+from phd_exp.rendering.exr import read_light
 from phd_exp.rendering.stage import build_stage
 
-Pixels = NDArray[np.uint8]
+Light = NDArray[np.float64]
 
 X_LIBRARIES = "libx11-6 libxext6 libxfixes3 libxi6 libxrender1 libxkbcommon0 libsm6 libice6 libgl1"
 
@@ -72,8 +72,27 @@ class Box(NamedTuple):
     bottom: int
 
 
+@dataclass(frozen=True)
+class Settings:
+    """How the tracer finds light.
+
+    Attributes:
+        samples: light paths a pixel.
+        denoised: by Open Image Denoise.
+        at_middles: the light at the middle of each pixel; else Blender's own mean over a pixel and its surroundings.
+    """
+
+    samples: int
+    denoised: bool
+    at_middles: bool
+
+
+REFERENCE = Settings(samples=1024, denoised=False, at_middles=False)
+"""Blender's own picture, as good as converged: what pictures are measured against."""
+
+
 class Renderer:
-    """Renders scenes of one specification; builds Blender's scene once and then only moves what differs.
+    """Renders scenes; builds Blender's scene once and then only moves what differs.
 
     Blender keeps its state per process, so a second renderer in the same process takes the scene over.
 
@@ -81,33 +100,32 @@ class Renderer:
         RenderError: bpy or a library it needs is missing.
     """
 
-    def __init__(self, spec: DatasetSpec) -> None:
+    def __init__(self, settings: Settings) -> None:
         self._bpy = load_bpy()
-        self._spec = spec
-        self._output = _fast_folder() / f"phd_exp-{uuid.uuid4().hex}.bmp"
+        self._output = _fast_folder() / f"phd_exp-{uuid.uuid4().hex}.exr"
         with silence():
             self._stage = build_stage(self._bpy)
         self._scene = self._bpy.context.scene
-        self._configure()
+        _configure_image(self._scene)
+        _configure_tracer(self._scene.cycles, settings)
 
-    def render(self, scene: Scene, box: Box | None = None) -> Pixels:
-        """Image of a box of pixels (height, width, 3), or of all (S, S, 3): sRGB, rows from the top.
+    def render(self, scene: Scene, box: Box | None = None) -> Light:
+        """Linear light of a box of pixels (height, width, 3), or of all (S, S, 3), rows from the top.
 
-        A pure function of the scene, the box and the specification.
+        1 is the brightest that a picture can show. A pure function of the scene, the box and the settings.
         """
-        self._frame(box or Box(0, 0, scene.S, scene.S), scene.S)
+        box = box or Box(0, 0, scene.S, scene.S)
+        self._frame(box, scene.S)
         self._stage.show(scene)
         self._scene.cycles.seed = scene.noise_seed
-        return self._shoot()
+        return read_light(self._shoot(), box.bottom - box.top, box.right - box.left)
 
-    def _shoot(self) -> Pixels:
-        # In background mode Blender hands pixels out through files only; an uncompressed one costs 2 to 4 ms.
+    def _shoot(self) -> bytes:
         self._scene.render.filepath = str(self._output)
         try:
             with silence():
                 self._bpy.ops.render.render(write_still=True)
-            with Image.open(self._output) as image:
-                return np.array(image.convert("RGB"))
+            return self._output.read_bytes()
         finally:
             self._output.unlink(missing_ok=True)
 
@@ -117,38 +135,46 @@ class Renderer:
         Half a pixel more, and rounding cannot lose one.
         """
         render = self._scene.render
+        render.resolution_x = render.resolution_y = side
         render.border_min_x, render.border_max_x = (box.left + 0.5) / side, (box.right + 0.5) / side
         render.border_min_y = (side - box.bottom + 0.5) / side
         render.border_max_y = (side - box.top + 0.5) / side
 
-    def _configure(self) -> None:
-        """Every setting that differs from Blender's factory settings, with its reason."""
-        render, cycles = self._scene.render, self._scene.cycles
-        render.engine = "CYCLES"
-        render.threads_mode = "FIXED"
-        render.threads = 1  # processes share the cores without loss, threads do not
-        render.use_persistent_data = True  # meshes and shaders stay loaded between samples
-        render.resolution_x = render.resolution_y = self._spec.sensor_size
-        render.resolution_percentage = 100
-        render.use_border = render.use_crop_to_border = True
-        render.use_file_extension = False
-        render.image_settings.file_format = "BMP"
-        render.image_settings.color_mode = "RGB"
-        render.dither_intensity = 0.0
-        self._scene.display_settings.display_device = "sRGB"
-        self._scene.view_settings.view_transform = "Standard"  # plain sRGB: colours stay what the records say
-        cycles.device = "CPU"
-        cycles.samples = self._spec.samples_per_pixel
-        cycles.use_adaptive_sampling = False  # would spend a variable number of samples; there are few anyway
-        cycles.use_light_tree = True  # +4 dB
-        cycles.max_bounces = 2  # objects colour each other once; more changes nothing one can measure
-        cycles.diffuse_bounces = cycles.glossy_bounces = 2
-        cycles.transmission_bounces = cycles.volume_bounces = cycles.transparent_max_bounces = 0
-        cycles.use_denoising = True
-        cycles.denoiser = "OPENIMAGEDENOISE"
-        cycles.denoising_quality = "FAST"  # HIGH takes a quarter longer for half a dB
-        cycles.denoising_input_passes = "RGB"  # albedo and normals made FAST worse
-        cycles.denoising_prefilter = "NONE"
+
+def _configure_image(scene: Any) -> None:
+    """What differs from Blender's factory settings in the making of an image, with its reason."""
+    render = scene.render
+    render.engine = "CYCLES"
+    render.threads_mode = "FIXED"
+    render.threads = 1  # processes share the cores without loss, threads do not
+    render.use_persistent_data = True  # meshes and shaders stay loaded between samples
+    render.resolution_percentage = 100
+    render.use_border = render.use_crop_to_border = True
+    render.use_file_extension = False
+    image = render.image_settings  # light as it is, in a file that is read in a moment
+    image.file_format, image.color_mode, image.color_depth, image.exr_codec = "OPEN_EXR", "RGB", "16", "NONE"
+
+
+def _configure_tracer(cycles: Any, settings: Settings) -> None:
+    """The same for the path tracer."""
+    cycles.device = "CPU"
+    cycles.samples = settings.samples
+    cycles.use_adaptive_sampling = False  # would spend a variable number of samples; there are few anyway
+    cycles.sampling_pattern = (
+        "BLUE_NOISE"  # the denoiser takes the default one's noise for texture now and then
+    )
+    cycles.use_light_tree = True  # a fifth slower, and worth more than a fifth more samples
+    cycles.max_bounces = 2  # objects colour each other once; more changes nothing one can measure
+    cycles.diffuse_bounces = cycles.glossy_bounces = 2
+    cycles.transmission_bounces = cycles.volume_bounces = cycles.transparent_max_bounces = 0
+    if settings.at_middles:
+        cycles.pixel_filter_type = "GAUSSIAN"  # the one whose width may be next to nothing
+        cycles.filter_width = 0.01
+    cycles.use_denoising = settings.denoised
+    cycles.denoiser = "OPENIMAGEDENOISE"
+    cycles.denoising_quality = "FAST"  # HIGH takes a quarter longer for half a dB
+    cycles.denoising_input_passes = "RGB"  # albedo and normals made FAST worse
+    cycles.denoising_prefilter = "NONE"
 
 
 def _fast_folder() -> Path:

@@ -1,48 +1,42 @@
-"""A picture: objects as the path tracer sees them, before a backdrop that is a formula.
+"""A picture: light as the path tracer finds it, edges by geometry, before a backdrop that is a formula.
 
-The tracer renders only the box around the objects. Beyond the reach of its pixel filter from every silhouette a
-picture shows nothing but the backdrop, which is written there exactly: the box leaves no seam that could tell where
-the objects are, and the denoiser no trace along the rim of the image.
+The tracer renders only the box around the objects, and its pixels are taken only where an object is seen. All else is
+the formula: the box leaves no seam that could tell where the objects are.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
 from phd_exp.records.scenes import Backdrop, Scene
-from phd_exp.rendering.blender import Box, Pixels, Renderer
-from phd_exp.rendering.visibility import Mask, silhouettes
+from phd_exp.rendering.antialias import smoothed
+from phd_exp.rendering.blender import Box, Light, Renderer
+from phd_exp.rendering.rays import NOTHING, Hits
+from phd_exp.rendering.visibility import Mask
 
-REACH = 2  # px: the tracer's filter ends 0.75 px from a pixel's middle; one more for the mask's own rounding
-MARGIN = 8  # px around the objects that the denoiser sees, for what it does along the rim of its image
+Pixels = NDArray[np.uint8]
+
+MARGIN = 4  # px around the objects that the denoiser sees, for what it does along the rim of its image
 
 
-def take_picture(renderer: Renderer, scene: Scene, depths: NDArray[np.float64]) -> Pixels:
-    """Image (S, S, 3) of a scene whose depth maps (objects, S, S) are given; sRGB, rows from the top."""
-    picture = backdrop_pixels(scene.backdrop, scene.S)
-    near = grown(silhouettes(depths), REACH)
-    if not near.any():
-        return picture
-    box = box_around(near, MARGIN)
+def take_picture(renderer: Renderer, scene: Scene, hits: Hits) -> Pixels:
+    """Image (S, S, 3) of a scene whose pixels' rays have been traced; sRGB, rows from the top."""
+    light = backdrop_light(scene.backdrop, scene.S)
+    first = hits.first
+    shown = first != NOTHING
+    if not shown.any():
+        return encoded(light)
+    box = box_around(shown, MARGIN)
     inside = (slice(box.top, box.bottom), slice(box.left, box.right))
-    picture[inside] = np.where(near[inside][..., None], renderer.render(scene, box), picture[inside])
-    return picture
+    light[inside] = np.where(shown[inside][..., None], renderer.render(scene, box), light[inside])
+    return encoded(smoothed(light, first, scene))
 
 
-def backdrop_pixels(backdrop: Backdrop, side: int) -> Pixels:
-    """The backdrop alone (S, S, 3), as the tracer would show it."""
+def backdrop_light(backdrop: Backdrop, side: int) -> Light:
+    """The backdrop alone (S, S, 3), linear light."""
     middles = (np.arange(side) + 0.5) / side
     x, y = middles - backdrop.centre[0], middles - backdrop.centre[1]
     light = backdrop.level * (1 - backdrop.falloff * (x[None, :] ** 2 + y[:, None] ** 2))
-    return np.repeat(_encode(light)[..., None], 3, axis=-1)
-
-
-def grown(mask: Mask, reach: int) -> Mask:
-    """The mask (S, S) with all pixels added that lie within `reach` columns and rows of it."""
-    side = mask.shape[0]
-    padded = np.pad(mask, reach)
-    steps = range(2 * reach + 1)
-    rows = np.logical_or.reduce([padded[step : step + side] for step in steps])
-    return np.asarray(np.logical_or.reduce([rows[:, step : step + side] for step in steps]))
+    return np.repeat(light[..., None], 3, axis=-1)
 
 
 def box_around(mask: Mask, margin: int) -> Box:
@@ -57,8 +51,14 @@ def box_around(mask: Mask, margin: int) -> Box:
     )
 
 
-def _encode(light: NDArray[np.float64]) -> NDArray[np.uint8]:
+def encoded(light: Light) -> Pixels:
     """Linear light to 8-bit sRGB (IEC 61966-2-1)."""
-    light = light.clip(0, 1)
-    signal = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-    return (255 * signal + 0.5).astype(np.uint8)
+    return np.searchsorted(_STEPS, light, side="right").astype(np.uint8)
+
+
+def _linear(signal: Light) -> Light:
+    return np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4)
+
+
+_STEPS: Light = _linear((np.arange(255) + 0.5) / 255)
+"""The light at which the nearest 8-bit value becomes the next one."""

@@ -6,7 +6,7 @@ from typing import Any
 from PIL import Image
 
 from phd_exp.records.spec import DatasetSpec, ImageFormat
-from phd_exp.rendering.blender import Pixels
+from phd_exp.rendering.compose import Pixels
 
 # Level 6 of zlib: level 9 saves 2 % of the bytes for twice the time. Colour at full resolution in a JPEG: a
 # silhouette is often a step in colour alone.

@@ -110,8 +110,8 @@ def _stream(spec: DatasetSpec, split: Split, scene: int, *purpose: int) -> np.ra
 def _seen_again(scene: Scene, spec: DatasetSpec, rng: np.random.Generator) -> Scene:
     """The same scene before another camera, whose images alone cannot be told from those of the first.
 
-    Its focal length and the cylinder's place before it follow the law of the first view; as the cylinder's rotation is
-    uniform, so is it before every camera. The camera is turned about an axis across its line of sight.
+    Its focal length and the cylinder's place before it follow the law of the first view, and as the cylinder's
+    rotation is uniform, it is so before every camera. The camera is turned about an axis across its line of sight.
     """
     f = _uniform(rng, spec.f_range)
     return scene.model_copy(

@@ -1,7 +1,7 @@
 """Blender's scene as a stage: built once, and then set for one scene after another.
 
-Blender's camera looks along -z with y up, ours along z with y down: p_blender = diag(1, -1, -1) p. Blender's module is
-given; nothing here imports it.
+Blender's camera looks along -z with y up, ours along z with y down: p_blender = diag(1, -1, -1) p. Blender's
+module is given; nothing here imports it.
 """
 
 from typing import Any, get_args
@@ -56,8 +56,8 @@ class Stage:
 def build_stage(bpy: Any) -> Stage:
     """Empty Blender's file and fill it with one of everything that a scene can hold."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    for name in MATERIALS:
-        shaders.paint_surface(bpy.data.materials.new(name).node_tree, name)
+    for material in MATERIALS:
+        shaders.paint_surface(bpy.data.materials.new(material).node_tree, material)
     for shape in SHAPES:
         _add(bpy, shape, _new_mesh(bpy, shape))
     for name in LAMP_NAMES:

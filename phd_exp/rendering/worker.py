@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TextIO
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from phd_exp.records.dataset import DatasetFolder, image_name, sha256
@@ -21,12 +20,13 @@ from phd_exp.records.errors import UserError
 from phd_exp.records.files import write_atomic
 from phd_exp.records.scenes import SampleRecord, Scene, Split
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.blender import Renderer
+from phd_exp.rendering.blender import Renderer, Settings
 from phd_exp.rendering.compose import take_picture
 from phd_exp.rendering.encoding import encode
 from phd_exp.rendering.errors import unwritable
+from phd_exp.rendering.rays import Hits, in_camera_frame, trace_pixels
 from phd_exp.rendering.sampling import sample_scene, scene_and_view
-from phd_exp.rendering.visibility import depth_maps, in_camera_frame, truncation, visibility
+from phd_exp.rendering.visibility import truncation, visibility
 
 
 class Job(BaseModel):
@@ -50,6 +50,11 @@ class Answer(BaseModel):
     error: str | None = None
 
 
+def fast_settings(spec: DatasetSpec) -> Settings:
+    """How the tracer is run for a data set's pictures."""
+    return Settings(samples=spec.samples_per_pixel, denoised=True, at_middles=True)
+
+
 def render_sample(
     renderer: Renderer, folder: DatasetFolder, spec: DatasetSpec, split: Split, index: int
 ) -> SampleRecord:
@@ -59,16 +64,16 @@ def render_sample(
         OSError: the image cannot be written.
     """
     scene = sample_scene(spec, split, index)
-    depths = depth_maps(scene)
-    image = encode(take_picture(renderer, scene, depths), spec)
+    hits = trace_pixels(scene)
+    image = encode(take_picture(renderer, scene, hits), spec)
     write_atomic(folder.image_path(split, index, spec.image_format), image)
-    return describe(spec, split, index, scene, depths, sha256(image))
+    return describe(spec, split, index, scene, hits, sha256(image))
 
 
 def describe(
-    spec: DatasetSpec, split: Split, index: int, scene: Scene, depths: NDArray[np.float64], checksum: str
+    spec: DatasetSpec, split: Split, index: int, scene: Scene, hits: Hits, checksum: str
 ) -> SampleRecord:
-    """The record of a sample whose image has a checksum; depth maps as of `depth_maps`."""
+    """The record of a sample whose image has a checksum, and whose pixels' rays have been traced."""
     number, view = scene_and_view(spec, index)
     cylinder = scene.objects[0]
     x, y, z = in_camera_frame(np.array(cylinder.position), scene.pose).tolist()
@@ -80,8 +85,8 @@ def describe(
         f=scene.f,
         S=scene.S,
         scale=cylinder.scale,
-        visibility=visibility(depths),
-        truncation=truncation(scene, depths),
+        visibility=visibility(hits),
+        truncation=truncation(scene, hits),
         index=index,
         split=split,
         seed=spec.seed,
@@ -104,7 +109,7 @@ def serve(tasks: TextIO, answers: TextIO) -> None:
     for line in tasks:
         task = Task.model_validate_json(line)
         try:
-            renderer = renderer or Renderer(job.spec)
+            renderer = renderer or Renderer(fast_settings(job.spec))
             answer = Answer(record=render_sample(renderer, folder, job.spec, task.split, task.index))
         except UserError as error:
             answer = Answer(error=str(error))

@@ -11,8 +11,8 @@ from phd_exp.records.dataset import DatasetFolder, Manifest, Seal, sha256
 from phd_exp.records.files import write_atomic
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.rays import trace_pixels
 from phd_exp.rendering.sampling import sample_scene
-from phd_exp.rendering.visibility import depth_maps
 from phd_exp.rendering.worker import describe
 
 
@@ -39,4 +39,4 @@ def _sample(folder: DatasetFolder, spec: DatasetSpec, split: Split, index: int) 
     Image.new("RGB", (8, 8), (index, 0, 0)).save(stream, format="PNG")
     write_atomic(folder.image_path(split, index), stream.getvalue())
     scene = sample_scene(spec, split, index)
-    return describe(spec, split, index, scene, depth_maps(scene), sha256(stream.getvalue()))
+    return describe(spec, split, index, scene, trace_pixels(scene), sha256(stream.getvalue()))

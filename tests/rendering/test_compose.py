@@ -9,9 +9,11 @@ from PIL import Image
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.scenes import Backdrop, SampleRecord
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.antialias import REACH, edges
 from phd_exp.rendering.blender import Box
-from phd_exp.rendering.compose import REACH, backdrop_pixels, box_around, grown
-from phd_exp.rendering.visibility import cylinder_mask, depth_maps, silhouettes
+from phd_exp.rendering.compose import backdrop_light, box_around, encoded
+from phd_exp.rendering.rays import trace_pixels
+from phd_exp.rendering.visibility import cylinder_mask, silhouettes
 from phd_exp.rendering.workers import ensure_rendered
 
 
@@ -30,13 +32,8 @@ def pixels(folder: DatasetFolder, record: SampleRecord) -> np.ndarray:
         return np.asarray(image).astype(int)
 
 
-def test_grown_is_the_neighbourhood() -> None:
-    mask = np.zeros((9, 9), dtype=bool)
-    mask[0, 4] = True
-    expected = np.zeros((9, 9), dtype=bool)
-    expected[:3, 2:7] = True
-    assert (grown(mask, 2) == expected).all()
-    assert (grown(mask, 0) == mask).all()
+def backdrop_pixels(record: SampleRecord) -> np.ndarray:
+    return encoded(backdrop_light(record.backdrop, record.S)).astype(int)
 
 
 def test_a_box_holds_the_mask_and_stays_in_the_image() -> None:
@@ -48,32 +45,37 @@ def test_a_box_holds_the_mask_and_stays_in_the_image() -> None:
 
 def test_the_backdrop_is_its_formula() -> None:
     backdrop = Backdrop(level=0.6, falloff=0.4, centre=(0.25, 0.5))
-    image = backdrop_pixels(backdrop, 8)
     light = 0.6 * (1 - 0.4 * ((7.5 / 8 - 0.25) ** 2 + (0.5 / 8 - 0.5) ** 2))
-    assert image[0, 7].tolist() == [round(255 * (1.055 * light ** (1 / 2.4) - 0.055))] * 3
+    assert backdrop_light(backdrop, 8)[0, 7] == pytest.approx([light] * 3)
+    assert encoded(np.array([light])) == round(255 * (1.055 * light ** (1 / 2.4) - 0.055))
+
+
+def test_every_value_of_a_picture_stands_for_its_light() -> None:
+    values = np.arange(256)
+    signal = values / 255
+    light = np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4)
+    assert (encoded(light) == values).all()
+    assert encoded(np.array([-0.1, 1.5, 100.0])).tolist() == [0, 255, 255]
 
 
 @pytest.mark.parametrize("variant", ["default", "occl", "scale", "occl_scale"])
 def test_objects_are_where_the_scene_says(rendered: dict[str, DatasetFolder], variant: str) -> None:
-    """No pixel within a silhouette shows the backdrop, and from two pixels beyond none shows anything else.
-
-    In between, the tracer's own backdrop meets the formula's: its shader is the same function.
-    """
+    """Within a silhouette no pixel shows the backdrop; beyond the reach of the filter every one shows its formula."""
     folder = rendered[variant]
     for record in folder.records("train"):
-        away = np.abs(pixels(folder, record) - backdrop_pixels(record.backdrop, record.S)).max(axis=-1)
-        mask = silhouettes(depth_maps(record.shown))
-        inner = ~grown(~mask, 1)
-        assert (away[inner] > 8).all()
-        assert (away[~grown(mask, REACH)] == 0).all()
-        assert np.median(away[grown(mask, REACH) & ~grown(mask, 1)]) <= 4
+        away = np.abs(pixels(folder, record) - backdrop_pixels(record)).max(axis=-1)
+        mask = silhouettes(trace_pixels(record.shown))
+        near_an_edge = edges(mask.astype(np.int8), REACH)
+        assert (away[mask & ~near_an_edge] > 8).all()
+        assert (away[~mask & ~near_an_edge] == 0).all()
 
 
 @pytest.mark.parametrize("variant", ["default", "occl", "scale", "occl_scale"])
 def test_the_cylinder_has_the_colour_of_its_record(rendered: dict[str, DatasetFolder], variant: str) -> None:
     """Its visible pixels have its hue on average: under white lamps both materials keep it."""
     for record in rendered[variant].records("train"):
-        mask = ~grown(~cylinder_mask(depth_maps(record.shown)), 1)
+        mask = cylinder_mask(trace_pixels(record.shown))
+        mask &= ~edges(mask.astype(np.int8), 1)
         if mask.sum() > 50:
             colour = pixels(rendered[variant], record)[mask].mean(axis=0)
             assert int(colour.argmax()) == int(np.argmax(record.objects[0].colour))
@@ -83,9 +85,8 @@ def test_silhouettes_have_no_bias(centred: DatasetFolder) -> None:
     """The centroid of what differs from the backdrop, against the analytic one, in pixels."""
     offsets = []
     for record in centred.records("train"):
-        image = pixels(centred, record)
-        away = np.abs(image - backdrop_pixels(record.backdrop, record.S)).max(axis=-1)
-        mask = silhouettes(depth_maps(record.shown))
+        away = np.abs(pixels(centred, record) - backdrop_pixels(record)).max(axis=-1)
+        mask = silhouettes(trace_pixels(record.shown))
         assert not (mask[0] | mask[-1] | mask[:, 0] | mask[:, -1]).any()
         seen = np.argwhere(away > 10).mean(axis=0)
         offsets.append(seen - np.argwhere(mask).mean(axis=0))
@@ -97,6 +98,7 @@ def test_paired_variants_show_the_same_light(rendered: dict[str, DatasetFolder])
     """Where neither has an object, paired images are equal; where they differ, an object is the reason."""
     for index in range(5):
         alone, occluded = (rendered[variant].records("train")[index] for variant in ("default", "occl"))
-        free = ~grown(silhouettes(depth_maps(occluded.shown)), REACH)
+        mask = silhouettes(trace_pixels(occluded.shown))
+        free = ~mask & ~edges(mask.astype(np.int8), REACH)
         difference = np.abs(pixels(rendered["default"], alone) - pixels(rendered["occl"], occluded))
         assert (difference[free] == 0).all()

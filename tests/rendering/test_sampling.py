@@ -8,8 +8,8 @@ from scipy import stats
 
 from phd_exp.records.scenes import Scene
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.rotations import rotation_matrix
 from phd_exp.rendering.sampling import sample_scene
-from phd_exp.rendering.visibility import rotation_matrix
 
 MakeSpec = Callable[..., DatasetSpec]
 MANY = 2000

@@ -8,12 +8,13 @@ import pytest
 
 from phd_exp.records.scenes import Scene, SceneObject
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.rays import trace_pixels
 from phd_exp.rendering.rotations import rotation_matrix
 from phd_exp.rendering.sampling import sample_scene
 from phd_exp.rendering.visibility import (
     cylinder_mask,
-    depth_maps,
     silhouettes,
+    truncation,
     visibility,
 )
 
@@ -49,7 +50,7 @@ def first_inside(item: SceneObject, points: np.ndarray, depths: np.ndarray) -> n
 
 def test_rays_find_what_a_search_finds(scenes: list[Scene]) -> None:
     for scene in scenes[:3]:
-        cast, walked = depth_maps(scene), marched(scene)
+        cast, walked = trace_pixels(scene).depths, marched(scene)
         # A ray that grazes a solid for less than a step is missed by the search.
         assert (np.isfinite(cast) & ~np.isfinite(walked)).sum() <= 3
         assert not (np.isfinite(walked) & ~np.isfinite(cast)).any()
@@ -62,15 +63,16 @@ def test_rays_find_what_a_search_finds(scenes: list[Scene]) -> None:
 
 def test_visibility_counts_pixels(scenes: list[Scene]) -> None:
     for scene in scenes:
-        depths = depth_maps(scene)
+        hits = trace_pixels(scene)
+        depths = hits.depths
         alone = sum(np.isfinite(depths[0]).ravel().tolist())
         seen = sum(
             own < min(other)
             for own, *other in zip(*(depth.ravel().tolist() for depth in depths), strict=True)
         )
-        assert visibility(depths) == pytest.approx(seen / alone)
-        assert 0 <= visibility(depths) <= 1
-    assert min(visibility(depth_maps(scene)) for scene in scenes) < 1, "some cylinder has to be occluded"
+        assert visibility(hits) == pytest.approx(seen / alone)
+        assert 0 <= visibility(hits) <= 1
+    assert min(visibility(trace_pixels(scene)) for scene in scenes) < 1, "some cylinder has to be occluded"
 
 
 def placed(scene: Scene, **changes: Any) -> SceneObject:
@@ -89,18 +91,35 @@ def test_a_large_occluder_hides_all_or_nothing(
     cylinder = placed(scenes[0], position=(0.0, 0.0, 4.0))
     cube = placed(scenes[0], shape="cube", position=position, scale=2.0)
     scene = scenes[0].model_copy(update={"objects": (cylinder, cube)})
-    assert visibility(depth_maps(scene)) == expected
+    assert visibility(trace_pixels(scene)) == expected
 
 
 def test_a_cylinder_outside_the_image_is_not_visible(scenes: list[Scene]) -> None:
     scene = scenes[0].model_copy(update={"objects": (placed(scenes[0], position=(2.0, 0.0, 3.0)),)})
-    assert not silhouettes(depth_maps(scene)).any()
-    assert visibility(depth_maps(scene)) == 0.0
+    assert not silhouettes(trace_pixels(scene)).any()
+    assert visibility(trace_pixels(scene)) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("x", "expected"), [(0.0, 0.0), (0.4, 0.5), (2.0, 1.0)], ids=["inside", "half outside", "outside"]
+)
+def test_truncation_is_the_share_beyond_the_border(scenes: list[Scene], x: float, expected: float) -> None:
+    """A ball about the middle of the right border lies half outside, but for what perspective adds."""
+    scene = scenes[0].model_copy(update={"f": 200.0})  # the border is at x = 0.1 z
+    ball = placed(scene, shape="sphere", position=(x, 0.0, 4.0))
+    alone = scene.model_copy(update={"objects": (ball,)})
+    assert truncation(alone, trace_pixels(alone)) == pytest.approx(expected, abs=0.05)
+
+
+def test_an_occluder_truncates_nothing(scenes: list[Scene]) -> None:
+    for scene in scenes:
+        alone = scene.model_copy(update={"objects": scene.objects[:1]})
+        assert truncation(scene, trace_pixels(scene)) == truncation(alone, trace_pixels(alone))
 
 
 def test_what_lies_behind_the_camera_is_not_seen(scenes: list[Scene]) -> None:
     scene = scenes[0].model_copy(update={"objects": (placed(scenes[0], position=(0.0, 0.0, -3.0)),)})
-    assert not silhouettes(depth_maps(scene)).any()
+    assert not silhouettes(trace_pixels(scene)).any()
 
 
 def test_axes_and_pixel_middles(scenes: list[Scene]) -> None:
@@ -109,7 +128,7 @@ def test_axes_and_pixel_middles(scenes: list[Scene]) -> None:
     for direction, (row, column) in {(1, 0): (0, 10), (0, 1): (10, 0)}.items():
         centre = tuple(10 * 4.0 / f * axis for axis in direction)
         ball = placed(scenes[0], shape="sphere", position=(*centre, 4.0))
-        mask = cylinder_mask(depth_maps(scenes[0].model_copy(update={"objects": (ball,)})))
+        mask = cylinder_mask(trace_pixels(scenes[0].model_copy(update={"objects": (ball,)})))
         middle = np.argwhere(mask).mean(axis=0) + 0.5
         assert middle == pytest.approx([side / 2 + row, side / 2 + column], abs=0.2)
 
@@ -120,7 +139,7 @@ def test_the_axis_of_a_cylinder_is_its_local_z(scenes: list[Scene]) -> None:
     along = placed(scenes[0], position=(0.0, 0.0, 4.1))
     aside = placed(scenes[0], position=(0.0, 0.0, 4.1), rotation=(0.5**0.5, 0.5**0.5, 0.0, 0.0))
     for item, share in ((along, np.pi / 4), (aside, 1.0)):
-        pixels = silhouettes(depth_maps(scenes[0].model_copy(update={"objects": (item,)}))).sum()
+        pixels = silhouettes(trace_pixels(scenes[0].model_copy(update={"objects": (item,)}))).sum()
         assert pixels == pytest.approx(area * share, rel=0.12)
 
 
@@ -130,5 +149,5 @@ def test_a_silhouette_lies_about_the_projected_position(make_spec: MakeSpec) -> 
         scene = sample_scene(make_spec(xy_range=0.2), "train", index)
         x, y, z = scene.objects[0].position
         projection = np.array([y, x]) / z * scene.f + scene.S / 2
-        middle = np.argwhere(silhouettes(depth_maps(scene))).mean(axis=0) + 0.5
+        middle = np.argwhere(silhouettes(trace_pixels(scene))).mean(axis=0) + 0.5
         assert np.abs(middle - projection).max() < 1.5
