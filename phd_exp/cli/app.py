@@ -16,8 +16,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from phd_exp.cli.paths import conf_folder
 from phd_exp.cli.signals import Stopped, stopping_on_signals
-from phd_exp.records.errors import ConfigError, UserError
-from phd_exp.training.targets import nearest
+from phd_exp.records.errors import ConfigError, UserError, nearest
 
 BAD_CONFIGURATION = 2
 FAILED = 1

@@ -1,6 +1,5 @@
 """Config nodes that name a class by `_target_`: what they may name, and whether their keys fit it."""
 
-import difflib
 import inspect
 from collections.abc import Iterable
 from importlib import import_module
@@ -15,6 +14,8 @@ from pydantic import (
     ValidationError,
 )
 from pydantic_core import ErrorDetails, PydanticCustomError
+
+from phd_exp.records.errors import in_our_words, nearest
 
 ALLOWED = ("phd_exp.", "torch.", "torchvision.")
 """Where a `_target_` may point: a configuration from somebody else must not run whatever it likes."""
@@ -65,12 +66,6 @@ def locate(name: Any, where: str = "") -> Any:
 Target = Annotated[dict[str, Any], AfterValidator(check_target)]
 
 
-def nearest(key: str, valid: Iterable[str]) -> str:
-    """`, did you mean 'lr'?` where a valid key looks like the one given; nothing otherwise."""
-    close = difflib.get_close_matches(key, list(valid), n=1)
-    return f", did you mean {close[0]!r}?" if close else ""
-
-
 def describe(problem: ErrorDetails, model: type[BaseModel]) -> str:
     """One line for one thing wrong: the key, the value, what was expected, the nearest valid key."""
     location = [str(part) for part in problem["loc"] if part != "spec"]
@@ -84,7 +79,7 @@ def describe(problem: ErrorDetails, model: type[BaseModel]) -> str:
     if problem["type"] == "missing":
         return f"{key}: missing; expected a value (the configuration group {location[0]!r} sets it)"
     given = "" if isinstance(problem["input"], dict) else f"got {problem['input']!r}; "
-    return ": ".join(filter(None, [key, f"{given}{_expected(problem['msg'])}"]))
+    return ": ".join(filter(None, [key, f"{given}{in_our_words(problem['msg'])}"]))
 
 
 def valid_keys(model: type[BaseModel], location: list[str]) -> list[str]:
@@ -109,20 +104,11 @@ def _check_value(path: str, value: Any, annotation: Any) -> None:
     try:
         adapter.validate_python(value)
     except ValidationError as error:
-        raise _error(path, f"got {value!r}; {_expected(error.errors()[0]['msg'])}") from None
+        raise _error(path, f"got {value!r}; {in_our_words(error.errors()[0]['msg'])}") from None
 
 
 def _error(path: str, reason: str) -> PydanticCustomError:
     return PydanticCustomError("target", "{path}: {reason}", {"path": path, "reason": reason})
-
-
-def _expected(message: str) -> str:
-    """pydantic's words in ours."""
-    return (
-        message.removeprefix("Value error, ")
-        .replace("Input should be", "expected to be")
-        .replace("expected to be a valid", "expected a valid")
-    )
 
 
 def _listed(keys: Iterable[str]) -> str:
