@@ -11,8 +11,8 @@ from typing import Any
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from phd_exp.cli.paths import conf_folder
 from phd_exp.cli.signals import Stopped, stopping_on_signals
@@ -108,13 +108,15 @@ def _print(failures: list[Failure]) -> None:
 
 
 def _plain(config: DictConfig) -> dict[str, Any]:
-    """The configuration as plain containers, every interpolation resolved."""
-    try:
-        plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    except MissingMandatoryValue as error:
-        raise ConfigError(f"{error.full_key}: missing; a preset sets it, or {error.full_key}=VALUE") from None
-    assert isinstance(plain, dict)
+    """The configuration as plain containers, every interpolation resolved; what is missing is left for the check."""
+    plain = _without_missing(OmegaConf.to_container(config, resolve=True))
     return {str(key): value for key, value in plain.items()}
+
+
+def _without_missing(node: Any) -> Any:
+    if not isinstance(node, dict):
+        return node
+    return {key: _without_missing(value) for key, value in node.items() if value != MISSING}
 
 
 def _known_keys(config_name: str) -> list[str]:

@@ -1,8 +1,7 @@
 """Virtual cameras: any box in the image of a real camera, seen by a square camera that looks straight at it.
 
-A crop is no pinhole image of its own kind: its principal point lies elsewhere. Turning the camera about its centre
-towards the box mends that, and a turn changes an image by a homography whatever the scene holds, so that the labels of
-the turned camera are exact.
+The principal point of a crop lies anywhere. Turning the camera about its centre towards the box mends that, and a
+turn changes an image by a homography whatever the scene holds, so that the labels of the turned camera are exact.
 """
 
 from dataclasses import dataclass
@@ -48,7 +47,9 @@ class VirtualCamera:
         R = smallest_rotation(middle / np.linalg.norm(middle))
         corners = rays(K, np.array([[left, top], [right, top], [left, bottom], [right, bottom]])) @ R.T
         if not (corners[:, 2] > 0).all():
-            raise ValueError("its corners are 90 degrees or more from its middle; no pinhole image shows that")
+            raise ValueError(
+                "its corners are 90 degrees or more from its middle; no pinhole image shows that"
+            )
         half_width = np.abs(corners[:, :2] / corners[:, 2:]).max()
         seen = np.array([[x, y, 1.0] for x in (-half_width, half_width) for y in (-half_width, half_width)])
         if not (seen @ R[:, 2] > 0).all():  # z in the frame of the real camera, from R^T
@@ -97,7 +98,7 @@ def rays(K: Float[np.ndarray, "3 3"], pixel: Float[np.ndarray, "*batch 2"]) -> F
 
 
 def smallest_rotation(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation about an axis in the image plane, so without roll, that takes a unit vector with z > 0 to (0, 0, 1).
+    """The rotation without roll, about an axis in the image plane, that takes a unit vector (z > 0) to (0, 0, 1).
 
     For (a, b, c) it is [[1 - a^2/(1+c), -ab/(1+c), -a], [-ab/(1+c), 1 - b^2/(1+c), -b], [a, b, c]].
 

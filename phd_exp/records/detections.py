@@ -1,4 +1,4 @@
-"""The user's own images: `metadata.jsonl` says of each detection in which image it is, seen by what camera, and where.
+"""The user's own images: `metadata.jsonl` says of each detection which image shows it, by what camera, and where.
 
 <folder>/
     <split>/metadata.jsonl    one JSON object a line
@@ -88,16 +88,19 @@ class Detection:
         """True position, frame of the real camera, m. Raises DatasetError where the line has none."""
         x, y, z = self.line.x, self.line.y, self.line.z
         if x is None or y is None or z is None:
-            raise DatasetError(f"{self.where}: x, y, z are missing; training and testing need the true position")
+            raise DatasetError(
+                f"{self.where}: x, y, z are missing; training and testing need the true position"
+            )
         return x, y, z
 
     def focal_lengths_and_centre(self, width: int, height: int) -> tuple[float, float, float, float]:
         """fx, fy, cx, cy of an image of that size, px."""
         line = self.line
-        fx, fy = line.fx or line.f, line.fy or line.f
+        fx, fy = (
+            value for value in (line.f or line.fx, line.f or line.fy) if value
+        )  # never zero nor missing
         cx = width / 2 if line.cx is None else line.cx
         cy = height / 2 if line.cy is None else line.cy
-        assert fx is not None and fy is not None, "one or the other is there: the line was checked"
         return fx, fy, cx, cy
 
     def box(self, width: int, height: int) -> tuple[float, float, float, float]:
@@ -173,7 +176,8 @@ class DetectionFolder:
     def _inside(self, folder: Path, name: str, where: str) -> Path:
         """The image file; a data set from somebody else must not read what lies elsewhere."""
         try:
-            leaves = ".." in Path(name).parts or not (folder / name).resolve().is_relative_to(folder.resolve())
+            leaves = Path(name).is_absolute() or ".." in Path(name).parts
+            leaves = leaves or not (folder / name).resolve().is_relative_to(folder.resolve())
         except (ValueError, OSError, RuntimeError) as error:  # a NUL byte, a link that leads to itself
             raise DatasetError(f"{where}: file_name={name!r} is no file name ({error})") from None
         if leaves:
@@ -185,7 +189,9 @@ def _complaint(problem: ErrorDetails) -> str:
     """What is wrong with a line: the key, the value, what was expected."""
     key = ".".join(str(part) for part in problem["loc"])
     if problem["type"] == "extra_forbidden" and DISTORTION.fullmatch(key):
-        return f"{key}: a distorted image is no pinhole image; undistort the images first, then leave out {key}"
+        return (
+            f"{key}: a distorted image is no pinhole image; undistort the images first, then leave out {key}"
+        )
     if problem["type"] == "extra_forbidden":
         known = DetectionLine.model_fields
         return f"{key}: unknown key{nearest(key, known)}; expected one of {', '.join(known)}"

@@ -1,6 +1,5 @@
 """The errors a user can mend: each is one line that says what, where, what was expected and what to do."""
 
-
 import difflib
 from collections.abc import Iterable
 

@@ -1,0 +1,153 @@
+"""Samples from a folder of the user's own images: each detection seen by its own virtual camera."""
+
+import hashlib
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from phd_exp.data.batches import Batch
+from phd_exp.data.cache import CacheError, cached, fill_all
+from phd_exp.data.crops import bombs_refused, cut, image_size, read_image
+from phd_exp.data.sources import Known, Source
+from phd_exp.geometry.charts import DepthScale
+from phd_exp.geometry.virtual import VirtualCamera, intrinsics
+from phd_exp.records.dataset import DatasetError, sha256
+from phd_exp.records.detections import Detection, DetectionFolder
+from phd_exp.records.scenes import Split
+
+CROP_LAYOUT = 1
+"""Raised whenever the meaning of a cached array of crops changes, so that no old one is taken for a new one."""
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A detection as a virtual camera sees it, `xyz` (metres) in the frame of that camera."""
+
+    detection: Detection
+    camera: VirtualCamera
+    xyz: Float[np.ndarray, "3"]
+
+
+class FolderSource(Source):
+    """The first n detections (None: all) of each split of a folder, each seen by its own virtual camera.
+
+    The constants follow from the training detections. Everything but the images themselves is read and checked here.
+
+    Raises DatasetError, naming file and line, for what cannot be a sample.
+    """
+
+    def __init__(self, folder: DetectionFolder, n: Mapping[Split, int | None], side: int) -> None:
+        self.folder = folder
+        self.side = side
+        sizes: dict[Path, tuple[int, int]] = {}
+        self.crops: dict[Split, list[Crop]] = {
+            split: [_crop(detection, side, sizes) for detection in folder.detections(split, count)]
+            for split, count in n.items()
+        }
+        z, f = (torch.tensor(column, dtype=torch.float64) for column in self._z_and_f("train"))
+        self.depth = DepthScale.from_samples(z, f)
+        self.constant_f = float((f.min() * f.max()).sqrt())
+
+    def samples(self, split: Split) -> Batch:
+        crops = self.crops[split]
+        with bombs_refused():
+            images = self._images(split)
+        return Batch(
+            image=torch.from_numpy(images),
+            xyz=torch.from_numpy(np.stack([crop.xyz for crop in crops]).astype(np.float32)),
+            f=torch.tensor([crop.camera.f for crop in crops], dtype=torch.float32),
+            S=float(self.side),
+            row=torch.arange(len(crops)),
+        )
+
+    def known(self, split: Split) -> Known:
+        crops = self.crops[split]
+        lines = [crop.detection.line for crop in crops]
+        columns: dict[str, list[Any]] = {
+            "file_name": [line.file_name for line in lines],
+            "f": [crop.camera.f for crop in crops],
+            "S": [self.side] * len(crops),
+        }
+        rendered = {name: [getattr(line, name) for line in lines] for name in ("scale", "visibility")}
+        return columns | {name: values for name, values in rendered.items() if values != [None] * len(lines)}
+
+    def count(self, split: Split) -> int:
+        return len(self.crops[split])
+
+    def _z_and_f(self, split: Split) -> tuple[list[float], list[float]]:
+        crops = self.crops[split]
+        return [float(crop.xyz[2]) for crop in crops], [crop.camera.f for crop in crops]
+
+    def _images(self, split: Split) -> np.ndarray:
+        """The crops, from the cache, or decoded into memory where the folder cannot be written."""
+        crops = self.crops[split]
+        rows: dict[Path, list[int]] = {}
+        for row, crop in enumerate(crops):
+            rows.setdefault(crop.detection.file, []).append(row)
+        checksums = {file: _checksum(file) for file in rows}
+
+        def fill(
+            array: np.ndarray, file: Path
+        ) -> None:  # a whole file at a time: it may hold many detections
+            image = read_image(file, _content(file, checksums[file]))
+            for row in rows[file]:
+                array[row] = cut(image, crops[row].camera)
+
+        digest = hashlib.sha256()
+        for crop in crops:
+            digest.update(checksums[crop.detection.file].encode() + crop.camera.homography.tobytes())
+        key = {"layout": CROP_LAYOUT, "crops": digest.hexdigest()}
+        shape, words = (len(crops), self.side, self.side, 3), f"decoding {split} images once"
+        try:
+            file = self.folder.cache / f"crops-{split}-{len(crops)}x{self.side}.npy"
+            return cached(file, key, shape, list(rows), fill, words)
+        except CacheError as error:
+            print(f"{error}; they are decoded into memory, each run anew", file=sys.stderr)
+            array = np.empty(shape, dtype=np.uint8)
+            fill_all(array, list(rows), fill, words)
+            return array
+
+
+def _crop(detection: Detection, side: int, sizes: dict[Path, tuple[int, int]]) -> Crop:
+    """The virtual camera and the position of one detection; `sizes` remembers those of the images."""
+    try:
+        if detection.file not in sizes:
+            sizes[detection.file] = image_size(detection.file)
+    except DatasetError as error:
+        raise DatasetError(f"{detection.where}: {error}") from None
+    size = sizes[detection.file]
+    box = detection.box(*size)
+    try:
+        camera = VirtualCamera.of_box(
+            intrinsics(*detection.focal_lengths_and_centre(*size)), box, float(side)
+        )
+    except ValueError as error:
+        raise DatasetError(f"{detection.where}: box={list(box)}: {error}") from None
+    xyz = camera.to_virtual(np.array(detection.position))
+    if not xyz[2] > 0:
+        raise DatasetError(
+            f"{detection.where}: the position {list(detection.position)} lies 90 degrees or more from the middle of "
+            f"box={list(box)}; check x, y, z, the box and the focal length"
+        )
+    return Crop(detection, camera, xyz)
+
+
+def _content(file: Path, checksum: str) -> bytes:
+    content = file.read_bytes()
+    if sha256(content) != checksum:
+        raise DatasetError(f"{file}: changes while it is read; start again")
+    return content
+
+
+def _checksum(file: Path) -> str:
+    try:
+        with file.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise DatasetError(f"{file}: cannot be read ({error.strerror})") from None
