@@ -86,6 +86,8 @@ def explain(error: Exception, config_name: str) -> str:
     unknown = re.search(r"Could not override '([^']+)'", text)
     if unknown:
         key = unknown[1].lstrip("+~")
+        if owners := _choices_with(key):
+            return f"{key}: not a key of this choice, but of {' or '.join(owners)}; name that choice too"
         return (
             f"{key}: unknown key{nearest(key, _known_keys(config_name))}; see `python -m phd_exp --cfg job`"
         )
@@ -125,6 +127,13 @@ def _known_keys(config_name: str) -> list[str]:
         config = hydra.compose(config_name)
     groups = [path.name for path in conf_folder().iterdir() if path.is_dir()]
     return groups + list(_dotted(OmegaConf.to_container(config)))
+
+
+def _choices_with(key: str) -> list[str]:
+    """The choices of a group whose file has a key, with dots."""
+    group, _, leaf = key.partition(".")
+    files = sorted((conf_folder() / group).glob("*.yaml")) if leaf else []
+    return [f"{group}={file.stem}" for file in files if leaf in OmegaConf.load(file)]
 
 
 def _dotted(node: Any, prefix: str = "") -> Iterator[str]:

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from PIL import ExifTags, Image, UnidentifiedImageError
 
 from phd_exp.data.images import shrunk
@@ -26,21 +26,24 @@ BROKEN = (
     OSError, SyntaxError, ValueError, LookupError, EOFError, OverflowError, MemoryError, struct.error, zlib.error,
 )  # fmt: skip
 """What Pillow's decoders raise on broken files."""
+MARGIN = 2
+"""Pixels about a place that bicubic interpolation looks at."""
 FINEST = 2
 """An image is enlarged to this multiple of its longer side at most, before its areas are averaged."""
 
 
 @contextmanager
-def bombs_refused() -> Iterator[None]:
-    """Let an image beyond Pillow's limit be an error, not a warning; in all threads, so outside of them."""
+def pillow_warnings() -> Iterator[None]:
+    """Too many pixels are an error; oddities of metadata, of which Pillow warns too, are none. Outside of threads."""
     with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         yield
 
 
 def image_size(file: Path) -> tuple[int, int]:
     """Width and height, from the head of the file. Raises DatasetError where that is no image."""
-    with _naming(file), bombs_refused(), Image.open(file) as image:
+    with _naming(file), pillow_warnings(), Image.open(file) as image:
         return image.size
 
 
@@ -74,12 +77,28 @@ def cut(image: Image.Image, camera: VirtualCamera) -> UInt8[np.ndarray, "S S 3"]
     multiple = max(1, math.ceil(min(camera.density, finest) - 1e-6))  # 2.0000000001 is two
     side = S * multiple
     back = np.linalg.inv(camera.homography) @ np.diag([1 / multiple, 1 / multiple, 1.0])
+    return shrunk(_transformed(image, back, side), S)
+
+
+def _transformed(image: Image.Image, back: Float[np.ndarray, "3 3"], side: int) -> Image.Image:
+    """The square image whose pixel p shows what the given one has at back p, bicubic and rounded; grey beyond."""
+    corners = back @ np.array([[0, side, 0, side], [0, 0, side, side], [1, 1, 1, 1]])
+    size = np.array(image.size)[:, None]
+    reached = (corners[:2] / corners[2]).clip(-MARGIN, size + MARGIN)
+    left, top = np.floor(reached.min(axis=1) - MARGIN).clip(0).astype(int).tolist()
+    right, bottom = np.ceil(reached.max(axis=1) + MARGIN).clip(None, size[:, 0]).astype(int).tolist()
+    shifted = np.array([[1, 0, -left], [0, 1, -top], [0, 0, 1]]) @ back
     # Pillow takes the middle of an output pixel, (column + 1/2, row + 1/2), to input pixels counted in the same way
-    coefficients = (back / back[2, 2]).flatten()[:8].tolist()
-    seen = image.transform(
-        (side, side), Image.Transform.PERSPECTIVE, coefficients, Image.Resampling.BICUBIC, fillcolor=GREY
-    )
-    return shrunk(seen, S)
+    coefficients = (shifted / shifted[2, 2]).flatten()[:8].tolist()
+    # band by band in floating point: of whole bytes Pillow would cut off what lies behind the point
+    bands = [
+        band.convert("F").transform(
+            (side, side), Image.Transform.PERSPECTIVE, coefficients, Image.Resampling.BICUBIC, fillcolor=grey
+        )
+        for band, grey in zip(image.crop((left, top, right, bottom)).split(), GREY, strict=True)
+    ]
+    levels = np.stack([np.asarray(band) for band in bands], axis=-1)
+    return Image.fromarray(levels.round().clip(0, 255).astype(np.uint8))
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from phd_exp.data.batches import Batch
 from phd_exp.data.cache import CacheError, cached, fill_all
-from phd_exp.data.crops import bombs_refused, cut, image_size, read_image
+from phd_exp.data.crops import cut, image_size, pillow_warnings, read_image
 from phd_exp.data.sources import Known, Source
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.geometry.virtual import VirtualCamera, intrinsics
@@ -56,7 +56,7 @@ class FolderSource(Source):
 
     def samples(self, split: Split) -> Batch:
         crops = self.crops[split]
-        with bombs_refused():
+        with pillow_warnings():
             images = self._images(split)
         return Batch(
             image=torch.from_numpy(images),

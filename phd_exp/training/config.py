@@ -91,10 +91,11 @@ class FolderConfig(SizesConfig):
 
 
 def _kind(values: Any) -> str:
-    """Which of the two a `data` section is: a rendered data set names its variant."""
+    """Which of the two a `data` section is: one with a specification is rendered, and a stray key makes none."""
     if isinstance(values, BaseModel):
         return "<rendered>" if isinstance(values, RenderedConfig) else "<folder>"
-    return "<rendered>" if "variant" in values or "spec" in values else "<folder>"
+    specified = "spec" in values or len(DatasetSpec.model_fields.keys() & values.keys()) > 1
+    return "<rendered>" if specified else "<folder>"
 
 
 DataConfig = Annotated[
