@@ -133,9 +133,8 @@ def _choices_with(key: str) -> list[str]:
     """The choices of a group whose file has a key, with dots."""
     group, _, leaf = key.partition(".")
     files = sorted((conf_folder() / group).glob("*.yaml")) if leaf else []
-    return [
-        f"{group}={file.stem}" for file in files if leaf in OmegaConf.load(file).keys()
-    ]  # `in` alone denies ???
+    # a list, since a DictConfig denies to hold what is ???
+    return [f"{group}={file.stem}" for file in files if leaf in list(OmegaConf.load(file))]
 
 
 def _dotted(node: Any, prefix: str = "") -> Iterator[str]:

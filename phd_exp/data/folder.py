@@ -90,12 +90,15 @@ class FolderSource(Source):
         rows: dict[Path, list[int]] = {}
         for row, crop in enumerate(crops):
             rows.setdefault(crop.detection.file, []).append(row)
-        checksums = {file: _checksum(file) for file in rows}
+        checksums = {file: sha256(_content(file)) for file in rows}
 
         def fill(
             array: np.ndarray, file: Path
         ) -> None:  # a whole file at a time: it may hold many detections
-            image = read_image(file, _content(file, checksums[file]))
+            content = _content(file)
+            if sha256(content) != checksums[file]:
+                raise DatasetError(f"{file}: changed while it was read; start again")
+            image = read_image(file, content)
             for row in rows[file]:
                 array[row] = cut(image, crops[row].camera)
 
@@ -138,16 +141,8 @@ def _crop(detection: Detection, side: int, sizes: dict[Path, tuple[int, int]]) -
     return Crop(detection, camera, xyz)
 
 
-def _content(file: Path, checksum: str) -> bytes:
-    content = file.read_bytes()
-    if sha256(content) != checksum:
-        raise DatasetError(f"{file}: changes while it is read; start again")
-    return content
-
-
-def _checksum(file: Path) -> str:
+def _content(file: Path) -> bytes:
     try:
-        with file.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
+        return file.read_bytes()
     except OSError as error:
         raise DatasetError(f"{file}: cannot be read ({error.strerror})") from None

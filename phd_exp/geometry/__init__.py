@@ -40,6 +40,7 @@ from phd_exp.geometry.charts import (
     compensated_depth,
     projected,
 )
+from phd_exp.geometry.virtual import VirtualCamera, intrinsics
 
 __all__ = [
     "Camera",
@@ -48,6 +49,8 @@ __all__ = [
     "DepthScale",
     "LogDepth",
     "Projected",
+    "VirtualCamera",
     "compensated_depth",
+    "intrinsics",
     "projected",
 ]
