@@ -10,6 +10,7 @@ import pytest
 import torch
 from PIL import ExifTags, Image
 
+from phd_exp.data import crops
 from phd_exp.data.crops import GREY, cut, image_size, pillow_warnings, read_image
 from phd_exp.geometry import Camera
 from phd_exp.geometry.virtual import Box, VirtualCamera, intrinsics, rays
@@ -81,6 +82,31 @@ def test_shrinking_averages_instead_of_picking() -> None:
     camera = VirtualCamera.of_box(np.diag([4.0, 4.0, 1.0]) @ K, (300.0, 100.0, 900.0, 700.0), 75.0)
     seen = cut(Image.fromarray(stripes), camera)[8:-8, 8:-8]
     assert np.abs(seen - 100.0).max() < 8
+
+
+def test_light_is_neither_lost_nor_gained() -> None:
+    """A slow ramp, enlarged: what is seen is the ramp at the place that is looked at, on average without a bias."""
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    ramp = np.round(40 + 0.37 * u + 0.29 * v).astype(np.uint8)
+    camera = VirtualCamera.of_box(K, (100.0, 40.0, 220.0, 160.0), 200.0)
+    seen = cut(Image.fromarray(ramp).convert("RGB"), camera)
+    u, v = np.meshgrid(np.arange(200) + 0.5, np.arange(200) + 0.5)
+    X = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(camera.homography).T
+    expected = 40 + (0.37 * X[..., 0] + 0.29 * X[..., 1]) / X[..., 2]
+    assert abs((seen[..., 0] - expected).mean()) < 0.05
+
+
+def test_a_view_along_the_image_plane_costs_no_more_than_the_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Near 90 degrees from the axis, pixels of the image lie without end in one pixel of the view."""
+    camera = VirtualCamera.of_box(
+        intrinsics(251.2, 251.2, 200.2, -257.1), (418.3, 271.3, 818.3, 276.9), 100.0
+    )
+    assert camera.density > 1e3
+    sides: list[int] = []
+    transformed = crops._transformed
+    monkeypatch.setattr(crops, "_transformed", lambda *given: sides.append(given[-1]) or transformed(*given))
+    assert cut(Image.new("RGB", (1000, 1000)), camera).shape == (100, 100, 3)
+    assert sides == [2000]
 
 
 def test_beyond_the_image_all_is_grey() -> None:
