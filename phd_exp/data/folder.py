@@ -50,7 +50,8 @@ class FolderSource(Source):
             split: [_crop(detection, side, sizes) for detection in folder.detections(split, count)]
             for split, count in n.items()
         }
-        z, f = (torch.tensor(column, dtype=torch.float64) for column in self._z_and_f("train"))
+        z = torch.tensor([crop.xyz[2] for crop in self.crops["train"]], dtype=torch.float64)
+        f = torch.tensor([crop.camera.f for crop in self.crops["train"]], dtype=torch.float64)
         self.depth = DepthScale.from_samples(z, f)
         self.constant_f = float((f.min() * f.max()).sqrt())
 
@@ -80,10 +81,6 @@ class FolderSource(Source):
     def count(self, split: Split) -> int:
         return len(self.crops[split])
 
-    def _z_and_f(self, split: Split) -> tuple[list[float], list[float]]:
-        crops = self.crops[split]
-        return [float(crop.xyz[2]) for crop in crops], [crop.camera.f for crop in crops]
-
     def _images(self, split: Split) -> np.ndarray:
         """The crops, from the cache, or decoded into memory where the folder cannot be written."""
         crops = self.crops[split]
@@ -92,9 +89,8 @@ class FolderSource(Source):
             rows.setdefault(crop.detection.file, []).append(row)
         checksums = {file: sha256(_content(file)) for file in rows}
 
-        def fill(
-            array: np.ndarray, file: Path
-        ) -> None:  # a whole file at a time: it may hold many detections
+        # a whole file at a time, since it may hold many detections
+        def fill(array: np.ndarray, file: Path) -> None:
             content = _content(file)
             if sha256(content) != checksums[file]:
                 raise DatasetError(f"{file}: changed while it was read; start again")
@@ -102,19 +98,23 @@ class FolderSource(Source):
             for row in rows[file]:
                 array[row] = cut(image, crops[row].camera)
 
-        digest = hashlib.sha256()
-        for crop in crops:
-            digest.update(checksums[crop.detection.file].encode() + crop.camera.homography.tobytes())
-        key = {"layout": CROP_LAYOUT, "crops": digest.hexdigest()}
+        kept = self.folder.cache / f"crops-{split}-{len(crops)}x{self.side}.npy"
         shape, words = (len(crops), self.side, self.side, 3), f"decoding {split} images once"
         try:
-            file = self.folder.cache / f"crops-{split}-{len(crops)}x{self.side}.npy"
-            return cached(file, key, shape, list(rows), fill, words)
+            return cached(kept, _key(crops, checksums), shape, list(rows), fill, words)
         except CacheError as error:
             print(f"{error}; they are decoded into memory, each run anew", file=sys.stderr)
             array = np.empty(shape, dtype=np.uint8)
             fill_all(array, list(rows), fill, words)
             return array
+
+
+def _key(crops: list[Crop], checksums: Mapping[Path, str]) -> dict[str, Any]:
+    """What the pixels of crops depend on: the content of the files, and cameras, boxes and side, all in H."""
+    digest = hashlib.sha256()
+    for crop in crops:
+        digest.update(checksums[crop.detection.file].encode() + crop.camera.homography.tobytes())
+    return {"layout": CROP_LAYOUT, "crops": digest.hexdigest()}
 
 
 def _crop(detection: Detection, side: int, sizes: dict[Path, tuple[int, int]]) -> Crop:

@@ -91,7 +91,7 @@ class FolderConfig(SizesConfig):
 
 
 def _kind(values: Any) -> str:
-    """Which of the two a `data` section is: one with a specification is rendered, and a stray key makes none."""
+    """Which of the two a `data` section is: a rendered set has a specification, of which one stray key is none."""
     if isinstance(values, BaseModel):
         return "<rendered>" if isinstance(values, RenderedConfig) else "<folder>"
     specified = "spec" in values or len(DatasetSpec.model_fields.keys() & values.keys()) > 1
