@@ -11,13 +11,12 @@ from typing import Any
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from phd_exp.cli.paths import conf_folder
 from phd_exp.cli.signals import Stopped, stopping_on_signals
-from phd_exp.records.errors import ConfigError, UserError
-from phd_exp.training.targets import nearest
+from phd_exp.records.errors import ConfigError, UserError, nearest
 
 BAD_CONFIGURATION = 2
 FAILED = 1
@@ -87,6 +86,8 @@ def explain(error: Exception, config_name: str) -> str:
     unknown = re.search(r"Could not override '([^']+)'", text)
     if unknown:
         key = unknown[1].lstrip("+~")
+        if owners := _choices_with(key):
+            return f"{key}: not a key of this choice, but of {' or '.join(owners)}; name that choice too"
         return (
             f"{key}: unknown key{nearest(key, _known_keys(config_name))}; see `python -m phd_exp --cfg job`"
         )
@@ -109,13 +110,15 @@ def _print(failures: list[Failure]) -> None:
 
 
 def _plain(config: DictConfig) -> dict[str, Any]:
-    """The configuration as plain containers, every interpolation resolved."""
-    try:
-        plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    except MissingMandatoryValue as error:
-        raise ConfigError(f"{error.full_key}: missing; a preset sets it, or {error.full_key}=VALUE") from None
-    assert isinstance(plain, dict)
+    """The configuration as plain containers, every interpolation resolved; what is missing is left for the check."""
+    plain = _without_missing(OmegaConf.to_container(config, resolve=True))
     return {str(key): value for key, value in plain.items()}
+
+
+def _without_missing(node: Any) -> Any:
+    if not isinstance(node, dict):
+        return node
+    return {key: _without_missing(value) for key, value in node.items() if value != MISSING}
 
 
 def _known_keys(config_name: str) -> list[str]:
@@ -124,6 +127,14 @@ def _known_keys(config_name: str) -> list[str]:
         config = hydra.compose(config_name)
     groups = [path.name for path in conf_folder().iterdir() if path.is_dir()]
     return groups + list(_dotted(OmegaConf.to_container(config)))
+
+
+def _choices_with(key: str) -> list[str]:
+    """The choices of a group whose file has a key, with dots."""
+    group, _, leaf = key.partition(".")
+    files = sorted((conf_folder() / group).glob("*.yaml")) if leaf else []
+    # a list, since a DictConfig denies to hold what is ???
+    return [f"{group}={file.stem}" for file in files if leaf in list(OmegaConf.load(file))]
 
 
 def _dotted(node: Any, prefix: str = "") -> Iterator[str]:

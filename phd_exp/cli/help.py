@@ -20,6 +20,7 @@ EXAMPLES = {
         "python -m phd_exp model=mae_logz data=scale",
         "python -m phd_exp preset=small data=occl seed=1",
         "python -m phd_exp data.n_train=256 data.n_test=64 trainer.max_epochs=1",
+        "python -m phd_exp data=folder data.folder=photos preset=small",
         "python -m phd_exp -m preset=small model=probabilistic,mae_vz data=default,occl",
     ],
     "render": [

@@ -8,9 +8,9 @@ from typing import Any
 from phd_exp.cli.app import launch
 from phd_exp.cli.render import ensure_dataset
 from phd_exp.records.runs import RunFolder, RunName
-from phd_exp.training.config import RunConfig, check, has_influence
+from phd_exp.training.config import RenderedConfig, RunConfig, check, has_influence
 
-NAMED = ("preset", "data", "model", "seed")
+NAMED = ("preset", "data", "data.name", "model", "seed")
 """Choices that have a place of their own in a run's name."""
 
 
@@ -27,7 +27,8 @@ def task(config: dict[str, Any], overrides: list[str]) -> None:
     skipped = folder.is_finished()
     if not skipped:
         require_possible(checked, folder)
-        ensure_dataset(checked.data)
+        if isinstance(checked.data, RenderedConfig):
+            ensure_dataset(checked.data)
     results = train(checked, folder, draw=_draw())
     print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
     for key, value in results.items():
@@ -40,7 +41,7 @@ def task(config: dict[str, Any], overrides: list[str]) -> None:
 def run_name(config: RunConfig, overrides: list[str]) -> RunName:
     """The choices that name a run; every other override that can change a number goes into its hash."""
     telling = [text for override in overrides if _is_telling(text := override.lstrip("+"))]
-    return RunName(config.preset, config.data.spec.variant, config.model.name, config.seed, tuple(telling))
+    return RunName(config.preset, config.data.name, config.model.name, config.seed, tuple(telling))
 
 
 def _is_telling(override: str) -> bool:

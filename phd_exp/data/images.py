@@ -1,22 +1,15 @@
-"""Images decoded once: a memory-mapped uint8 array beside the data set, so that no epoch decodes a file again."""
+"""The images of a rendered data set: as recorded, or refused."""
 
-import json
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from filelock import FileLock
 from PIL import Image, UnidentifiedImageError
-from rich.console import Console
-from rich.progress import track
 
+from phd_exp.data.cache import cached
 from phd_exp.records.dataset import DatasetError, DatasetFolder, sha256
-from phd_exp.records.files import write_atomic
 from phd_exp.records.scenes import SampleRecord, Split
 
-DECODERS = 4
 CACHE_LAYOUT = 1
 """Raised whenever the meaning of a cached array changes, so that no old one is taken for a new one."""
 
@@ -31,15 +24,19 @@ def cached_images(
 
     Raises DatasetError for an image that is missing, is damaged, or cannot be decoded.
     """
-    array_file = folder.cache / f"{split}-{len(records)}x{image_size}.npy"
-    key_file = array_file.with_suffix(".json")
-    key = {"layout": CACHE_LAYOUT, "images": _digest(records)}
-    with _alone_in(folder.cache):  # the runs of a parallel sweep all come here first
-        if not (array_file.exists() and _read_key(key_file) == key):
-            _decode_all(folder, split, records, image_size, array_file)
-            write_atomic(key_file, json.dumps(key) + "\n")
-    # copy-on-write: torch wants a writable array, and nothing may write into this file
-    return np.load(array_file, mmap_mode="c")
+
+    def fill(array: np.ndarray, row: int) -> None:
+        record = records[row]
+        array[row] = decode(folder.split_folder(split) / record.file_name, record.sha256, image_size)
+
+    return cached(
+        folder.cache / f"{split}-{len(records)}x{image_size}.npy",
+        {"layout": CACHE_LAYOUT, "images": sha256("".join(record.sha256 for record in records).encode())},
+        (len(records), image_size, image_size, 3),
+        range(len(records)),
+        fill,
+        f"decoding {split} images once",
+    )
 
 
 def decode(file: Path, checksum: str, image_size: int) -> np.ndarray:
@@ -53,57 +50,13 @@ def decode(file: Path, checksum: str, image_size: int) -> np.ndarray:
         raise DatasetError(f"{file}: its checksum is not the recorded one; {advice}")
     try:
         with Image.open(file) as image:
-            return _resized(image, image_size)
+            return shrunk(image.convert("RGB"), image_size)
     except (OSError, UnidentifiedImageError) as error:
         raise DatasetError(f"{file}: cannot be decoded ({error}); {advice}") from None
 
 
-@contextmanager
-def _alone_in(cache: Path) -> Iterator[None]:
-    """One process at a time decodes; the others wait and find the work done."""
-    try:
-        cache.mkdir(parents=True, exist_ok=True)
-        with FileLock(cache / "decoding.lock"):
-            yield
-    except OSError as error:
-        raise DatasetError(f"{cache}: decoded images cannot be kept here ({error.strerror})") from None
-
-
-def _resized(image: Image.Image, image_size: int) -> np.ndarray:
-    colour = image.convert("RGB")
-    if colour.size != (image_size, image_size):
-        colour = colour.resize((image_size, image_size), Image.Resampling.BOX)
-    return np.asarray(colour)
-
-
-def _decode_all(
-    folder: DatasetFolder, split: Split, records: Sequence[SampleRecord], image_size: int, array_file: Path
-) -> None:
-    unfinished = array_file.with_suffix(".unfinished")
-    shape = (len(records), image_size, image_size, 3)
-    array = np.lib.format.open_memmap(unfinished, mode="w+", dtype=np.uint8, shape=shape)
-
-    def fill(row: int) -> None:
-        record = records[row]
-        array[row] = decode(folder.split_folder(split) / record.file_name, record.sha256, image_size)
-
-    with ThreadPoolExecutor(DECODERS) as pool:
-        jobs = pool.map(fill, range(len(records)))
-        words, console = f"decoding {split} images once", Console(stderr=True)
-        quiet = not console.is_terminal
-        for _ in track(jobs, words, len(records), console=console, transient=True, disable=quiet):
-            pass
-    array.flush()
-    unfinished.replace(array_file)
-
-
-def _digest(records: Sequence[SampleRecord]) -> str:
-    return sha256("".join(record.sha256 for record in records).encode())
-
-
-def _read_key(key_file: Path) -> object:
-    """What the array beside it was made of; None where that is unknown, so that it is made again."""
-    try:
-        return json.loads(key_file.read_text())
-    except (OSError, ValueError):
-        return None
+def shrunk(image: Image.Image, side: int) -> np.ndarray:
+    """The image as (side, side, 3), each pixel the mean of the area that it stands for."""
+    if image.size != (side, side):
+        image = image.resize((side, side), Image.Resampling.BOX)
+    return np.asarray(image)

@@ -1,4 +1,4 @@
-"""The pinhole camera and the charts in which positions are regressed; and the glossary of this project's symbols.
+"""The pinhole camera, virtual cameras, the charts in which positions are regressed; and this project's symbols.
 
 Frames. The camera frame has x to the right, y down and z forward along the optical axis, in metres. Pixels count
 from the top left corner of the image; the centre of the pixel in column c and row r lies at (c + 0.5, r + 0.5).
@@ -8,6 +8,7 @@ from the top left corner of the image; the centre of the pixel in column c and r
 | v = (x, y, z) | `xyz` | position in the camera frame | metres |
 | f | `f` | focal length | pixels |
 | S | `S` | side of the square image; the principal point is (S/2, S/2) | pixels |
+| K, R | `K`, `R` | intrinsics of a real camera, and the rotation from its frame to that of a virtual one | - |
 | v_p | `v_p` | projected position 2 f (x, y) / (S z), in [-1, 1] inside the image | - |
 | z_p | `z_p` | depth z / (mu_z0 f) after compensation for the focal length, in [1/D, D] | - |
 | mu_z0 | `mu_z0` | the data set's typical depth per focal length, sqrt(max(z/f) min(z/f)) | metres per pixel |
@@ -39,6 +40,7 @@ from phd_exp.geometry.charts import (
     compensated_depth,
     projected,
 )
+from phd_exp.geometry.virtual import VirtualCamera, intrinsics
 
 __all__ = [
     "Camera",
@@ -47,6 +49,8 @@ __all__ = [
     "DepthScale",
     "LogDepth",
     "Projected",
+    "VirtualCamera",
     "compensated_depth",
+    "intrinsics",
     "projected",
 ]

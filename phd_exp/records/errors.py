@@ -1,5 +1,8 @@
 """The errors a user can mend: each is one line that says what, where, what was expected and what to do."""
 
+import difflib
+from collections.abc import Iterable
+
 
 class UserError(Exception):
     """Something the user asked for cannot be done as asked; the command line prints it without a traceback."""
@@ -11,3 +14,18 @@ class ConfigError(UserError):
 
 class RunError(UserError):
     """A run folder that cannot be used: held by another process, made by another configuration, or broken."""
+
+
+def nearest(key: str, valid: Iterable[str]) -> str:
+    """`, did you mean 'lr'?` where a valid key looks like the one given; nothing otherwise."""
+    close = difflib.get_close_matches(key, list(valid), n=1)
+    return f", did you mean {close[0]!r}?" if close else ""
+
+
+def in_our_words(message: str) -> str:
+    """What pydantic says of a value, as the lines of this programme say it."""
+    return (
+        message.removeprefix("Value error, ")
+        .replace("Input should be", "expected to be")
+        .replace("expected to be a valid", "expected a valid")
+    )

@@ -13,45 +13,49 @@ from lightning import Trainer
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar, TQDMProgressBar
 from lightning.pytorch.loggers import Logger
 
-from phd_exp.data.datamodule import RenderedData
+from phd_exp.data.datamodule import PositionData
+from phd_exp.data.folder import FolderSource
+from phd_exp.data.sources import RenderedSource, Source
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.callbacks import CalibrationRecorder, Draw, EpochLines
-from phd_exp.training.config import RunConfig, TrainerConfig
+from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig, TrainerConfig
 from phd_exp.training.module import PositionModule
 
 
-def build_data(config: RunConfig) -> RenderedData:
+def build_data(config: RunConfig) -> PositionData:
     """The data set of a run. Its images are opened by `setup`, not here."""
-    data = config.data
-    return RenderedData(
-        DatasetFolder(data.folder),
-        data.spec,
-        n_train=data.n_train,
-        n_test=data.n_test,
-        image_size=data.image_size,
-        batch_size=data.batch_size,
-        seed=config.seed,
+    return PositionData(_source(config.data), batch_size=config.data.batch_size, seed=config.seed)
+
+
+def _source(data: RenderedConfig | FolderConfig) -> Source:
+    if isinstance(data, FolderConfig):
+        return FolderSource(
+            DetectionFolder(data.folder), {"train": data.n_train, "test": data.n_test}, data.image_size
+        )
+    return RenderedSource(
+        DatasetFolder(data.folder), data.spec, {"train": data.n_train, "test": data.n_test}, data.image_size
     )
 
 
-def build_module(config: RunConfig, data: RenderedData) -> PositionModule:
+def build_module(config: RunConfig, data: PositionData) -> PositionModule:
     """The network, its loss and its optimizer, initialised from torch's current random state.
 
     Raises ConfigError, naming the key, where a part refuses its values.
     """
     # partial, then called: an object among instantiate's own arguments would be turned into a configuration
     with _naming("model.head"):
-        head = instantiate(config.model.head, _partial_=True)(depth=data.depth)
+        head = instantiate(config.model.head, _partial_=True)(depth=data.source.depth)
     with _naming("backbone"):
         regressor = Regressor(instantiate(config.backbone), head, memory_format(config.trainer))
     with _naming("optimizer"):
         optimizer = instantiate(config.optimizer, _partial_=True)
         optimizer(regressor.parameters())  # refuses bad values now rather than after hours of rendering
-    constant_f = data.constant_f if config.camera.focal_length == "constant" else None
+    constant_f = data.source.constant_f if config.camera.focal_length == "constant" else None
     return PositionModule(regressor, instantiate(config.loss), optimizer, constant_f)
 
 

@@ -8,7 +8,7 @@ loss, optimizer) names a `_target_`, and its keys are held against that target's
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
 
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.spec import DatasetSpec
@@ -30,14 +30,29 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class DataConfig(Section):
+class SizesConfig(Section):
+    """How much of a data set a run uses, whatever its kind; None: all there is."""
+
+    n_train: Annotated[Whole, Field(ge=1)] | None
+    n_test: Annotated[Whole, Field(ge=1)] | None
+    image_size: Annotated[Whole, Field(ge=SMALLEST_IMAGE)]
+    batch_size: Annotated[Whole, Field(ge=1)]
+
+    @model_validator(mode="after")
+    def a_batch_is_full(self) -> "SizesConfig":
+        if self.n_train is not None and self.batch_size > self.n_train:
+            raise ValueError(
+                f"batch_size={self.batch_size} is larger than n_train={self.n_train}: not one batch is full"
+            )
+        return self
+
+
+class RenderedConfig(SizesConfig):
     """A rendered data set (the keys of `DatasetSpec`) and how much of it a run uses."""
 
     root: Folder
     n_train: Annotated[Whole, Field(ge=1)]
     n_test: Annotated[Whole, Field(ge=1)]
-    image_size: Annotated[Whole, Field(ge=SMALLEST_IMAGE)]
-    batch_size: Annotated[Whole, Field(ge=1)]
     workers: Annotated[Whole, Field(ge=1)] | None
     spec: DatasetSpec
 
@@ -51,21 +66,42 @@ class DataConfig(Section):
         return {key: value for key, value in values.items() if key not in spec} | {"spec": spec}
 
     @model_validator(mode="after")
-    def sizes_fit(self) -> "DataConfig":
+    def images_shrink(self) -> "RenderedConfig":
         if self.image_size > self.spec.sensor_size:
             raise ValueError(
                 f"image_size={self.image_size} is larger than sensor_size={self.spec.sensor_size}: "
                 "images are only ever shrunk"
             )
-        if self.batch_size > self.n_train:
-            raise ValueError(
-                f"batch_size={self.batch_size} is larger than n_train={self.n_train}: not one batch is full"
-            )
         return self
+
+    @property
+    def name(self) -> str:
+        return self.spec.variant
 
     @property
     def folder(self) -> Path:
         return self.root / self.spec.variant
+
+
+class FolderConfig(SizesConfig):
+    """A folder of the user's own images; `name` names its runs."""
+
+    name: Name
+    folder: Folder
+
+
+def _kind(values: Any) -> str:
+    """Which of the two a `data` section is: a rendered set has a specification, of which one stray key is none."""
+    if isinstance(values, BaseModel):
+        return "<rendered>" if isinstance(values, RenderedConfig) else "<folder>"
+    specified = "spec" in values or len(DatasetSpec.model_fields.keys() & values.keys()) > 1
+    return "<rendered>" if specified else "<folder>"
+
+
+DataConfig = Annotated[
+    Annotated[RenderedConfig, Tag("<rendered>")] | Annotated[FolderConfig, Tag("<folder>")],
+    Discriminator(_kind),
+]
 
 
 class ModelConfig(Section):
@@ -99,7 +135,7 @@ class EvaluationConfig(Section):
 class RenderConfig(Section):
     """The part of a configuration that rendering looks at."""
 
-    data: DataConfig
+    data: RenderedConfig
 
 
 class RunConfig(Section):
@@ -140,8 +176,12 @@ def check(config: dict[str, Any]) -> RunConfig:
     return _validated(RunConfig, config)
 
 
-def check_data(config: dict[str, Any]) -> DataConfig:
+def check_data(config: dict[str, Any]) -> RenderedConfig:
     """The same for the `data` part alone, which is all that rendering looks at."""
+    if _kind(config["data"]) == "<folder>":
+        raise ConfigError(
+            "data=folder: there is nothing to render, these are your own images; leave out `render` to train on them"
+        )
     return _validated(RenderConfig, {"data": config["data"]}).data
 
 

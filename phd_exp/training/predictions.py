@@ -1,9 +1,8 @@
 """A prediction spread out into columns: one row a sample, the same for figures, calibration and the record."""
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -11,12 +10,12 @@ import torch
 from torch import Tensor
 
 from phd_exp.data.batches import Batch
+from phd_exp.data.sources import Known
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.metrics.calibration import CalibrationCurve, calibration_curve
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
 from phd_exp.models.heads import Prediction
 from phd_exp.records.files import write_atomic
-from phd_exp.records.scenes import SampleRecord
 
 Columns = dict[str, Tensor]
 """Name -> one number a sample."""
@@ -98,12 +97,8 @@ def summary(table: Columns) -> dict[str, float]:
     return {f"test/{name}": float(table[name].mean()) for name in ERRORS + OF_A_DISTRIBUTION if name in table}
 
 
-def write_parquet(file: Path, table: Columns, records: Sequence[SampleRecord]) -> None:
+def write_parquet(file: Path, table: Columns, known: Known) -> None:
     """Write the columns beside what is known of each sample, in the order of the data set."""
-    known: Mapping[str, list[Any]] = {
-        name: [getattr(record, name) for record in records]
-        for name in ("file_name", "f", "S", "scale", "visibility")
-    }
     order = table["row"].argsort()
     arrays = {name: pa.array(values) for name, values in known.items()}
     arrays |= {name: pa.array(column[order].numpy()) for name, column in table.items() if name != "row"}

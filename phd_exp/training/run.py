@@ -10,8 +10,9 @@ from typing import Any
 import torch
 from lightning import Trainer, seed_everything
 
-from phd_exp.data.datamodule import RenderedData
+from phd_exp.data.datamodule import PositionData
 from phd_exp.records.dataset import DatasetFolder, sha256
+from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import (
@@ -21,7 +22,7 @@ from phd_exp.training.build import (
     build_trainer,
 )
 from phd_exp.training.callbacks import Draw, RecordLogger
-from phd_exp.training.config import RunConfig, has_influence
+from phd_exp.training.config import FolderConfig, RunConfig, has_influence
 from phd_exp.training.module import PositionModule
 from phd_exp.training.predictions import Columns, joined, summary, write_parquet
 from phd_exp.training.tracking import tracked
@@ -76,6 +77,19 @@ def require_same_config(folder: RunFolder, config: RunConfig) -> None:
                 f"{folder.path}: holds a run with {key}={before}, but {key}={now} is asked for; "
                 "move that folder away, or choose another place by runs=DIR"
             )
+    _require_same_data(folder, config)
+
+
+def _require_same_data(folder: RunFolder, config: RunConfig) -> None:
+    """The user's own data may be another under the same name; a rendered set that differs is no more than longer."""
+    status = folder.status()
+    if isinstance(config.data, FolderConfig) and status is not None:
+        recorded, now = status.data_manifest, _manifest_hash(config)
+        if now is not None and recorded != now:
+            raise RunError(
+                f"{folder.path}: holds a run on {config.data.folder} as it was before its metadata.jsonl changed; "
+                "move that run's folder away, or choose another place by runs=DIR"
+            )
 
 
 def flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -103,13 +117,13 @@ def _train(config: RunConfig, folder: RunFolder, draw: Draw | None) -> dict[str,
         table = _evaluate(trainer, module, data)
     if calibration is not None:
         calibration.write("final", table)
-    write_parquet(folder.predictions, table, data.records["test"])
+    write_parquet(folder.predictions, table, data.source.known("test"))
     untrained = {f"untrained/{key}": value for key, value in record.rows[UNTRAINED].items() if "test/" in key}
-    return summary(table) | untrained | _circumstances(config, trainer, seconds)
+    return summary(table) | untrained | _circumstances(config, data, trainer, seconds)
 
 
 def _fit(
-    trainer: Trainer, module: PositionModule, data: RenderedData, folder: RunFolder, record: RecordLogger
+    trainer: Trainer, module: PositionModule, data: PositionData, folder: RunFolder, record: RecordLogger
 ) -> float:
     """Train to the last epoch, from the last checkpoint if there is one; returns the seconds it took now."""
     start = time.monotonic()
@@ -134,21 +148,21 @@ def _epoch_of(checkpoint: Path) -> int:
         ) from None
 
 
-def _evaluate(trainer: Trainer, module: PositionModule, data: RenderedData) -> Columns:
+def _evaluate(trainer: Trainer, module: PositionModule, data: PositionData) -> Columns:
     """Predictions of the last weights on the test split, a row a sample."""
     parts = trainer.predict(module, dataloaders=data.test_dataloader())
     assert parts is not None
     return joined(parts)  # type: ignore[arg-type]
 
 
-def _circumstances(config: RunConfig, trainer: Trainer, seconds: float) -> dict[str, Any]:
+def _circumstances(config: RunConfig, data: PositionData, trainer: Trainer, seconds: float) -> dict[str, Any]:
     return {
         "preset": config.preset,
-        "data": config.data.spec.variant,
+        "data": config.data.name,
         "model": config.model.name,
         "seed": config.seed,
-        "n_train": config.data.n_train,
-        "n_test": config.data.n_test,
+        "n_train": data.source.count("train"),
+        "n_test": data.source.count("test"),
         "epochs": trainer.current_epoch,
         "fit_seconds": seconds,
         "threads": torch.get_num_threads(),
@@ -158,6 +172,11 @@ def _circumstances(config: RunConfig, trainer: Trainer, seconds: float) -> dict[
 
 
 def _manifest_hash(config: RunConfig) -> str | None:
+    if isinstance(config.data, FolderConfig):
+        try:
+            return DetectionFolder(config.data.folder).fingerprint()
+        except OSError:  # the data of a finished run may have gone
+            return None
     manifest = DatasetFolder(config.data.folder).manifest_path
     return sha256(manifest.read_bytes()) if manifest.exists() else None
 

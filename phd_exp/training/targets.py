@@ -1,20 +1,22 @@
 """Config nodes that name a class by `_target_`: what they may name, and whether their keys fit it."""
 
-import difflib
 import inspect
 from collections.abc import Iterable
 from importlib import import_module
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 from pydantic import (
     AfterValidator,
     BaseModel,
     ConfigDict,
     PydanticSchemaGenerationError,
+    Tag,
     TypeAdapter,
     ValidationError,
 )
 from pydantic_core import ErrorDetails, PydanticCustomError
+
+from phd_exp.records.errors import in_our_words, nearest
 
 ALLOWED = ("phd_exp.", "torch.", "torchvision.")
 """Where a `_target_` may point: a configuration from somebody else must not run whatever it likes."""
@@ -65,38 +67,45 @@ def locate(name: Any, where: str = "") -> Any:
 Target = Annotated[dict[str, Any], AfterValidator(check_target)]
 
 
-def nearest(key: str, valid: Iterable[str]) -> str:
-    """`, did you mean 'lr'?` where a valid key looks like the one given; nothing otherwise."""
-    close = difflib.get_close_matches(key, list(valid), n=1)
-    return f", did you mean {close[0]!r}?" if close else ""
-
-
 def describe(problem: ErrorDetails, model: type[BaseModel]) -> str:
     """One line for one thing wrong: the key, the value, what was expected, the nearest valid key."""
-    location = [str(part) for part in problem["loc"] if part != "spec"]
+    place = [str(part) for part in problem["loc"]]
+    location = [part for part in place if part != "spec" and not part.startswith("<")]
     key, context = ".".join(location), problem.get("ctx", {})
     if problem["type"] == "target":
         return ".".join([key, context["path"]]) + f": {context['reason']}"
     if problem["type"] == "extra_forbidden":
-        valid = valid_keys(model, location[:-1])
+        valid = valid_keys(model, place[:-1])
         unknown = f"{key}: unknown key (value {problem['input']!r}){nearest(location[-1], valid)}"
         return f"{unknown}; expected one of {_listed(valid)}"
     if problem["type"] == "missing":
-        return f"{key}: missing; expected a value (the configuration group {location[0]!r} sets it)"
+        return f"{key}: missing; expected {key}=VALUE"
     given = "" if isinstance(problem["input"], dict) else f"got {problem['input']!r}; "
-    return ": ".join(filter(None, [key, f"{given}{_expected(problem['msg'])}"]))
+    return ": ".join(filter(None, [key, f"{given}{in_our_words(problem['msg'])}"]))
 
 
 def valid_keys(model: type[BaseModel], location: list[str]) -> list[str]:
     """The keys that a section of the configuration knows, in the words of the user."""
+    node: Any = model
     for name in location:
-        inner = model.model_fields[name].annotation if name in model.model_fields else None
-        if not (inspect.isclass(inner) and issubclass(inner, BaseModel)):
-            return []
-        model = inner
-    fields = dict(model.model_fields)
+        node = _under(node, name)
+    if not _is_model(node):
+        return []
+    fields = dict(node.model_fields)
     inlined = fields.pop("spec", None)
-    return [*fields, *(inlined.annotation.model_fields if inlined else ())]  # type: ignore[union-attr]
+    return [*fields, *(inlined.annotation.model_fields if inlined else ())]
+
+
+def _under(node: Any, name: str) -> Any:
+    """What a name leads to: a field of a model, or, by its tag, one of several models; None where that is nothing."""
+    if _is_model(node):
+        return node.model_fields[name].annotation if name in node.model_fields else None
+    members = [get_args(member) for member in get_args(node)]
+    return next((member[0] for member in members if member[1:] == (Tag(name),)), None)
+
+
+def _is_model(node: Any) -> bool:
+    return inspect.isclass(node) and issubclass(node, BaseModel)
 
 
 def _check_value(path: str, value: Any, annotation: Any) -> None:
@@ -109,20 +118,11 @@ def _check_value(path: str, value: Any, annotation: Any) -> None:
     try:
         adapter.validate_python(value)
     except ValidationError as error:
-        raise _error(path, f"got {value!r}; {_expected(error.errors()[0]['msg'])}") from None
+        raise _error(path, f"got {value!r}; {in_our_words(error.errors()[0]['msg'])}") from None
 
 
 def _error(path: str, reason: str) -> PydanticCustomError:
     return PydanticCustomError("target", "{path}: {reason}", {"path": path, "reason": reason})
-
-
-def _expected(message: str) -> str:
-    """pydantic's words in ours."""
-    return (
-        message.removeprefix("Value error, ")
-        .replace("Input should be", "expected to be")
-        .replace("expected to be a valid", "expected a valid")
-    )
 
 
 def _listed(keys: Iterable[str]) -> str:

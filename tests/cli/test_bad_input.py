@@ -45,6 +45,14 @@ BAD = [
     (["optimizer.lr=-1"], ["optimizer: ", "learning rate", "-1"]),
     (["+optimizer.betas=[0.9,1.5]"], ["optimizer: ", "beta", "1.5"]),
     (["optimizer._target_=torch.optim.Nadam"], ["optimizer._target_", "does not exist"]),
+    (["data=folder"], ["data.folder: missing", "data.folder=VALUE"]),
+    (["data.folder=photos"], ["data.folder", "not a key of this choice", "data=folder"]),
+    (["+data.folder=photos"], ["data.folder: unknown key", "expected one of", "sensor_size"]),
+    (["data=folder", "data.folder=photos", "+data.variant=x"], ["data.variant: unknown key", "name, folder"]),
+    (["data=folder", "data.folder=photos", "+data.n_trian=1"], ["data.n_trian", "did you mean 'n_train'"]),
+    (["data=folder", "data.folder=photos", "data.n_train=2.5"], ["data.n_train", "2.5", "integer"]),
+    (["data=folder", "data.folder=photos", "data.n_train=3"], ["data", "batch_size=16", "n_train=3"]),
+    (["data=folder", "data.folder=photos", "data.name=../x"], ["data.name", "'../x'"]),
     (["optimizer._target_=torch.optim.SGD", "+optimizer.momentum=-1"], ["optimizer: ", "momentum"]),
 ]
 
@@ -58,6 +66,23 @@ def test_one_clear_line(phd_exp: Callable, tmp_path: Path, arguments: list[str],
     assert lines[0].startswith("error: ")
     for word in said:
         assert word in lines[0]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_own_images_are_not_rendered(phd_exp: Callable, tmp_path: Path) -> None:
+    for arguments in (["data=folder"], ["data=folder", "data.folder=photos"]):
+        outcome = phd_exp("render", *arguments)
+        assert outcome.status == 2
+        (line,) = outcome.err.splitlines()
+        assert "data=folder: there is nothing to render, these are your own images" in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_without_metadata(phd_exp: Callable, tmp_path: Path) -> None:
+    outcome = phd_exp("preset=smoke", "logger=none", "data=folder", "data.folder=photos")
+    assert outcome.status == 1
+    (line,) = outcome.err.splitlines()
+    assert line.startswith("error: photos/train/metadata.jsonl: cannot be read (No such file")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -23,6 +23,7 @@ def test_choices_have_a_place_in_the_name(config: RunConfig) -> None:
         "runs=elsewhere",
         "logger=none",
         "logger.project=mine",
+        "data.name=mine",
         "data.root=/data",
         "data.workers=1",
         "trainer.progress_bar=false",
@@ -34,7 +35,14 @@ def test_what_changes_no_number_is_left_out(config: RunConfig, override: str) ->
 
 @pytest.mark.parametrize(
     "override",
-    ["data.n_train=8", "backbone=resnet50", "camera=constant", "optimizer.lr=0.1", "trainer.threads=1"],
+    [
+        "data.n_train=8",
+        "data.folder=photos",
+        "backbone=resnet50",
+        "camera=constant",
+        "optimizer.lr=0.1",
+        "trainer.threads=1",
+    ],
 )
 def test_everything_else_is_in_it(config: RunConfig, override: str) -> None:
     assert run_name(config, [override]).overrides == (override,)

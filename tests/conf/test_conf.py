@@ -13,6 +13,9 @@ CHOICES = sorted(
     f"{file.parent.name}={file.stem}" for file in conf_folder().glob("*/*.yaml") if file.parent.name != "loss"
 )
 
+NEEDS = {"data=folder": ("data.folder=photos",)}
+"""What a choice leaves for the user to say."""
+
 
 @pytest.fixture
 def checked(composed: Callable[..., dict[str, Any]]) -> Callable[..., RunConfig]:
@@ -21,7 +24,7 @@ def checked(composed: Callable[..., dict[str, Any]]) -> Callable[..., RunConfig]
 
 @pytest.mark.parametrize("choice", CHOICES)
 def test_every_choice_of_every_group_is_a_valid_configuration(checked: Callable, choice: str) -> None:
-    checked(choice)
+    checked(choice, *NEEDS.get(choice, ()))
 
 
 @pytest.mark.parametrize(
@@ -68,6 +71,23 @@ def test_the_command_line_has_the_last_word(checked: Callable) -> None:
     assert config.camera.focal_length == "constant"
     assert config.data.n_train == 48
     assert config.preset == "smoke"
+
+
+@pytest.mark.parametrize("preset", sorted(file.stem for file in (conf_folder() / "preset").glob("*.yaml")))
+def test_of_a_folder_all_is_taken_whatever_the_preset(checked: Callable, preset: str) -> None:
+    own, rendered = (
+        checked(f"preset={preset}", "data=folder", "data.folder=photos").data,
+        checked(f"preset={preset}").data,
+    )
+    assert (own.n_train, own.n_test) == (None, None)
+    assert (own.image_size, own.batch_size) == (rendered.image_size, rendered.batch_size)
+
+
+def test_of_a_folder_as_much_is_taken_as_the_user_says(checked: Callable) -> None:
+    data = checked(
+        "data=folder", "data.folder=photos", "data.n_train=100", "data.n_test=7", "data.image_size=96"
+    ).data
+    assert (data.n_train, data.n_test, data.image_size) == (100, 7, 96)
 
 
 def test_variants_differ_in_what_they_name_alone(checked: Callable) -> None:

@@ -5,15 +5,15 @@ import math
 import pytest
 import torch
 
-from phd_exp.data.datamodule import RenderedData
+from phd_exp.data.datamodule import PositionData
+from phd_exp.data.sources import RenderedSource
 from phd_exp.records.dataset import DatasetError, DatasetFolder
 from phd_exp.records.spec import DatasetSpec
 
 
-def data(folder: DatasetFolder, spec: DatasetSpec, image_size: int = 64, n_train: int = 5) -> RenderedData:
-    module = RenderedData(
-        folder, spec, n_train=n_train, n_test=3, image_size=image_size, batch_size=2, seed=0
-    )
+def data(folder: DatasetFolder, spec: DatasetSpec, image_size: int = 64, n_train: int = 5) -> PositionData:
+    source = RenderedSource(folder, spec, {"train": n_train, "test": 3}, image_size)
+    module = PositionData(source, batch_size=2, seed=0)
     module.setup()
     return module
 
@@ -49,14 +49,14 @@ def test_normalised_truth_does_not_depend_on_image_size(
     reference = whole.samples["train"]
     torch.testing.assert_close(projected(batch.xyz, batch.camera), projected(reference.xyz, reference.camera))
     torch.testing.assert_close(
-        compensated_depth(batch.xyz, batch.camera, module.depth.mu_z0),
-        compensated_depth(reference.xyz, reference.camera, whole.depth.mu_z0),
+        compensated_depth(batch.xyz, batch.camera, module.source.depth.mu_z0),
+        compensated_depth(reference.xyz, reference.camera, whole.source.depth.mu_z0),
     )
-    assert module.constant_f == pytest.approx(math.sqrt(400 * 600) * image_size / 64)
+    assert module.source.constant_f == pytest.approx(math.sqrt(400 * 600) * image_size / 64)
 
 
 def test_depth_scale_comes_from_the_specification(folder: DatasetFolder, spec: DatasetSpec) -> None:
-    depth = data(folder, spec).depth
+    depth = data(folder, spec).source.depth
     assert depth.mu_z0 == pytest.approx(math.sqrt((5 / 400) * (3 / 600)))
     assert math.sqrt((5 / 400) / (3 / 600)) == pytest.approx(depth.D)
 

@@ -89,17 +89,16 @@ def test_curves_of_samples_of_the_distribution_itself_are_calibrated() -> None:
 def test_the_record_is_in_the_order_of_the_data_set(
     batch: Batch, distribution: ProjectedHuber, tmp_path: Path
 ) -> None:
-    from types import SimpleNamespace
-
     from phd_exp.training.predictions import write_parquet
 
-    records = [
-        SimpleNamespace(file_name=f"{i:06d}.png", f=1500.0 + i, S=224, scale=1.0, visibility=0.5)
-        for i in range(len(batch))
-    ]
+    known = {
+        "file_name": [f"{i:06d}.png" for i in range(len(batch))],
+        "f": [1500.0 + i for i in range(len(batch))],
+    }
     table = joined([columns(distribution, batch)])
-    write_parquet(tmp_path / "predictions.parquet", table, records)  # type: ignore[arg-type]
+    write_parquet(tmp_path / "predictions.parquet", table, known)
     frame = pd.read_parquet(tmp_path / "predictions.parquet")
     assert frame["file_name"].tolist() == [f"{i:06d}.png" for i in range(len(batch))]
+    assert frame["f"].tolist() == known["f"]
     assert frame["z"].tolist() == batch.xyz[:, 2].flip(0).double().tolist()
     assert "row" not in frame

@@ -1,0 +1,75 @@
+"""Images decoded once: a memory-mapped uint8 array beside the data set, so that no epoch decodes a file again."""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from filelock import FileLock
+from rich.console import Console
+from rich.progress import track
+
+from phd_exp.records.dataset import DatasetError
+from phd_exp.records.files import write_atomic
+
+DECODERS = 4
+
+Job = TypeVar("Job")
+Fill = Callable[[np.ndarray, Job], None]
+"""Decodes what one job asks for into rows of the array that no other job writes."""
+
+
+class CacheError(DatasetError):
+    """There is no place for decoded images."""
+
+
+def cached(
+    file: Path, key: dict[str, Any], shape: tuple[int, ...], jobs: Sequence[Job], fill: Fill, words: str
+) -> np.ndarray:
+    """The array of this key, memory-mapped from the file; filled first unless the file holds precisely that.
+
+    Raises CacheError where the file's folder cannot be written, and whatever `fill` raises.
+    """
+    key_file = file.with_suffix(".json")
+    with _alone_in(file.parent):  # the runs of a parallel sweep all come here first
+        if not (file.exists() and _read_key(key_file) == key):
+            unfinished = file.with_suffix(".unfinished")
+            array = np.lib.format.open_memmap(unfinished, mode="w+", dtype=np.uint8, shape=shape)
+            fill_all(array, jobs, fill, words)
+            array.flush()
+            unfinished.replace(file)
+            write_atomic(key_file, json.dumps(key) + "\n")
+    # copy-on-write: torch wants a writable array, and nothing may write into this file
+    return np.load(file, mmap_mode="c")
+
+
+def fill_all(array: np.ndarray, jobs: Sequence[Job], fill: Fill, words: str) -> None:
+    """Do all jobs in several threads, with a bar on a terminal."""
+    with ThreadPoolExecutor(DECODERS) as pool:
+        done = pool.map(lambda job: fill(array, job), jobs)
+        console = Console(stderr=True)
+        quiet = not console.is_terminal
+        for _ in track(done, words, len(jobs), console=console, transient=True, disable=quiet):
+            pass
+
+
+@contextmanager
+def _alone_in(cache: Path) -> Iterator[None]:
+    """One process at a time decodes; the others wait and find the work done."""
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        with FileLock(cache / "decoding.lock"):
+            yield
+    except OSError as error:
+        raise CacheError(f"{cache}: decoded images cannot be kept here ({error.strerror})") from None
+
+
+def _read_key(key_file: Path) -> object:
+    """What the array beside it was made of; None where that is unknown, so that it is made again."""
+    try:
+        return json.loads(key_file.read_text())
+    except (OSError, ValueError):
+        return None

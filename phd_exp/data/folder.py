@@ -1,0 +1,148 @@
+"""Samples from a folder of the user's own images: each detection seen by its own virtual camera."""
+
+import hashlib
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from phd_exp.data.batches import Batch
+from phd_exp.data.cache import CacheError, cached, fill_all
+from phd_exp.data.crops import cut, image_size, pillow_warnings, read_image
+from phd_exp.data.sources import Known, Source
+from phd_exp.geometry.charts import DepthScale
+from phd_exp.geometry.virtual import VirtualCamera, intrinsics
+from phd_exp.records.dataset import DatasetError, sha256
+from phd_exp.records.detections import Detection, DetectionFolder
+from phd_exp.records.scenes import Split
+
+CROP_LAYOUT = 1
+"""Raised whenever the meaning of a cached array of crops changes, so that no old one is taken for a new one."""
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A detection as a virtual camera sees it, `xyz` (metres) in the frame of that camera."""
+
+    detection: Detection
+    camera: VirtualCamera
+    xyz: Float[np.ndarray, "3"]
+
+
+class FolderSource(Source):
+    """The first n detections (None: all) of each split of a folder, each seen by its own virtual camera.
+
+    The constants follow from the training detections. Everything but the images themselves is read and checked here.
+
+    Raises DatasetError, naming file and line, for what cannot be a sample.
+    """
+
+    def __init__(self, folder: DetectionFolder, n: Mapping[Split, int | None], side: int) -> None:
+        self.folder = folder
+        self.side = side
+        sizes: dict[Path, tuple[int, int]] = {}
+        self.crops: dict[Split, list[Crop]] = {
+            split: [_crop(detection, side, sizes) for detection in folder.detections(split, count)]
+            for split, count in n.items()
+        }
+        z = torch.tensor([crop.xyz[2] for crop in self.crops["train"]], dtype=torch.float64)
+        f = torch.tensor([crop.camera.f for crop in self.crops["train"]], dtype=torch.float64)
+        self.depth = DepthScale.from_samples(z, f)
+        self.constant_f = float((f.min() * f.max()).sqrt())
+
+    def samples(self, split: Split) -> Batch:
+        crops = self.crops[split]
+        with pillow_warnings():
+            images = self._images(split)
+        return Batch(
+            image=torch.from_numpy(images),
+            xyz=torch.from_numpy(np.stack([crop.xyz for crop in crops]).astype(np.float32)),
+            f=torch.tensor([crop.camera.f for crop in crops], dtype=torch.float32),
+            S=float(self.side),
+            row=torch.arange(len(crops)),
+        )
+
+    def known(self, split: Split) -> Known:
+        crops = self.crops[split]
+        lines = [crop.detection.line for crop in crops]
+        columns: dict[str, list[Any]] = {
+            "file_name": [line.file_name for line in lines],
+            "f": [crop.camera.f for crop in crops],
+            "S": [self.side] * len(crops),
+        }
+        rendered = {name: [getattr(line, name) for line in lines] for name in ("scale", "visibility")}
+        return columns | {name: values for name, values in rendered.items() if values != [None] * len(lines)}
+
+    def count(self, split: Split) -> int:
+        return len(self.crops[split])
+
+    def _images(self, split: Split) -> np.ndarray:
+        """The crops, from the cache, or decoded into memory where the folder cannot be written."""
+        crops = self.crops[split]
+        rows: dict[Path, list[int]] = {}
+        for row, crop in enumerate(crops):
+            rows.setdefault(crop.detection.file, []).append(row)
+        checksums = {file: sha256(_content(file)) for file in rows}
+
+        # a whole file at a time, since it may hold many detections
+        def fill(array: np.ndarray, file: Path) -> None:
+            content = _content(file)
+            if sha256(content) != checksums[file]:
+                raise DatasetError(f"{file}: changed while it was read; start again")
+            image = read_image(file, content)
+            for row in rows[file]:
+                array[row] = cut(image, crops[row].camera)
+
+        kept = self.folder.cache / f"crops-{split}-{len(crops)}x{self.side}.npy"
+        shape, words = (len(crops), self.side, self.side, 3), f"decoding {split} images once"
+        try:
+            return cached(kept, _key(crops, checksums), shape, list(rows), fill, words)
+        except CacheError as error:
+            print(f"{error}; they are decoded into memory, each run anew", file=sys.stderr)
+            array = np.empty(shape, dtype=np.uint8)
+            fill_all(array, list(rows), fill, words)
+            return array
+
+
+def _key(crops: list[Crop], checksums: Mapping[Path, str]) -> dict[str, Any]:
+    """What the pixels of crops depend on: the content of the files, and cameras, boxes and side, all in H."""
+    digest = hashlib.sha256()
+    for crop in crops:
+        digest.update(checksums[crop.detection.file].encode() + crop.camera.homography.tobytes())
+    return {"layout": CROP_LAYOUT, "crops": digest.hexdigest()}
+
+
+def _crop(detection: Detection, side: int, sizes: dict[Path, tuple[int, int]]) -> Crop:
+    """The virtual camera and the position of one detection; `sizes` remembers those of the images."""
+    try:
+        if detection.file not in sizes:
+            sizes[detection.file] = image_size(detection.file)
+    except DatasetError as error:
+        raise DatasetError(f"{detection.where}: {error}") from None
+    size = sizes[detection.file]
+    box = detection.box(*size)
+    try:
+        camera = VirtualCamera.of_box(
+            intrinsics(*detection.focal_lengths_and_centre(*size)), box, float(side)
+        )
+    except ValueError as error:
+        raise DatasetError(f"{detection.where}: box={list(box)}: {error}") from None
+    xyz = camera.to_virtual(np.array(detection.position))
+    if not xyz[2] > 0:
+        raise DatasetError(
+            f"{detection.where}: the position {list(detection.position)} lies 90 degrees or more from the middle of "
+            f"box={list(box)}; check x, y, z, the box and the focal length"
+        )
+    return Crop(detection, camera, xyz)
+
+
+def _content(file: Path) -> bytes:
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        raise DatasetError(f"{file}: cannot be read ({error.strerror})") from None

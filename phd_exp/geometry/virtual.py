@@ -1,0 +1,114 @@
+"""Virtual cameras: any box in the image of a real camera, seen by a square camera that looks straight at it.
+
+The principal point of a crop lies anywhere. Turning the camera about its centre towards the box mends that, and a
+turn changes an image by a homography whatever the scene holds, so that the labels of the turned camera are exact.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+Box = tuple[float, float, float, float]
+"""Left, top, right, bottom: pixels of the real image, counted from its top left corner."""
+
+
+@dataclass(frozen=True, eq=False)
+class VirtualCamera:
+    """A real camera turned about its centre, with a square image and the principal point in its middle.
+
+    Args:
+        K: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] of the real camera, pixels; it has no distortion.
+        R: rotation from the frame of the real camera to that of the virtual one.
+        f: focal length of the virtual camera, pixels.
+        S: side of the virtual image, pixels.
+
+    Source: own derivation; both cameras are pinholes with one centre.
+    """
+
+    K: Float[np.ndarray, "3 3"]
+    R: Float[np.ndarray, "3 3"]
+    f: float
+    S: float
+
+    @classmethod
+    def of_box(cls, K: Float[np.ndarray, "3 3"], box: Box, S: float) -> "VirtualCamera":
+        """The virtual camera that looks at the middle of a box and just sees all four corners of it.
+
+        R is the smallest rotation that takes the ray through the middle of the box to the optical axis, and
+        f = S / (2 max(|x|, |y|) / z) over the corners (x, y, z) of the box in the virtual frame.
+
+        Raises:
+            ValueError: the box is so wide that some of what the virtual image shows lies 90 degrees or more from
+                the optical axis of either camera, where there is no pinhole image.
+        """
+        left, top, right, bottom = box
+        middle = rays(K, np.array([(left + right) / 2, (top + bottom) / 2]))
+        R = smallest_rotation(middle / np.linalg.norm(middle))
+        corners = rays(K, np.array([[left, top], [right, top], [left, bottom], [right, bottom]])) @ R.T
+        if not (corners[:, 2] > 0).all():
+            raise ValueError(
+                "its corners are 90 degrees or more from its middle; no pinhole image shows that"
+            )
+        half_width = np.abs(corners[:, :2] / corners[:, 2:]).max()
+        seen = np.array([[x, y, 1.0] for x in (-half_width, half_width) for y in (-half_width, half_width)])
+        if not (seen @ R[:, 2] > 0).all():  # z in the frame of the real camera, from R^T
+            raise ValueError("a square view of it reaches 90 degrees or more from the axis of its camera")
+        return cls(K, R, f=float(S / (2 * half_width)), S=float(S))
+
+    def to_virtual(self, xyz: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Positions (metres) of the frame of the real camera in that of the virtual one: R xyz."""
+        return xyz @ self.R.T
+
+    def to_real(self, xyz: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Positions (metres) of the frame of the virtual camera in that of the real one: R^T xyz."""
+        return xyz @ self.R
+
+    @property
+    def homography(self) -> Float[np.ndarray, "3 3"]:
+        """H = K_v R K^-1, from homogeneous pixels of the real image to those of the virtual one."""
+        return intrinsics(self.f, self.f, self.S / 2, self.S / 2) @ self.R @ np.linalg.inv(self.K)
+
+    @property
+    def density(self) -> float:
+        """Pixels of the real image along one pixel of the virtual one, where they are densest among five places.
+
+        The largest singular value of the Jacobian of the map (u, v) -> (p, q) = (X, Y)/W that H^-1 is; the places
+        are the middle and the corners of the virtual image.
+        """
+        back = np.linalg.inv(self.homography)
+        places = [(0.5, 0.5), (0, 0), (0, 1), (1, 0), (1, 1)]
+        densities = []
+        for u, v in places:
+            X = back @ np.array([u * self.S, v * self.S, 1.0])
+            jacobian = (back[:2, :2] - np.outer(X[:2] / X[2], back[2, :2])) / X[2]
+            densities.append(np.linalg.norm(jacobian, ord=2))
+        return float(max(densities))
+
+
+def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
+    """K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: positions to homogeneous pixels; all in pixels."""
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def rays(K: Float[np.ndarray, "3 3"], pixel: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
+    """What is seen in a pixel, at depth one: ((u - cx)/fx, (v - cy)/fy, 1)."""
+    xy = (pixel - K[:2, 2]) / np.diagonal(K)[:2]
+    return np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
+
+
+def smallest_rotation(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation without roll, about an axis in the image plane, that takes a unit vector (z > 0) to (0, 0, 1).
+
+    For (a, b, c) it is [[1 - a^2/(1+c), -ab/(1+c), -a], [-ab/(1+c), 1 - b^2/(1+c), -b], [a, b, c]].
+
+    Source: Rodrigues' formula for the axis (b, -a, 0).
+    """
+    a, b, c = direction
+    return np.array(
+        [
+            [1 - a * a / (1 + c), -a * b / (1 + c), -a],
+            [-a * b / (1 + c), 1 - b * b / (1 + c), -b],
+            [a, b, c],
+        ]
+    )

@@ -1,0 +1,220 @@
+"""The user's own images: read as what they are or refused in one line, and resampled to a fraction of a pixel."""
+
+import io
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import ExifTags, Image
+
+from phd_exp.data import crops
+from phd_exp.data.crops import GREY, cut, image_size, pillow_warnings, read_image
+from phd_exp.geometry import Camera
+from phd_exp.geometry.virtual import Box, VirtualCamera, intrinsics, rays
+from phd_exp.records.dataset import DatasetError
+
+K = intrinsics(400.0, 520.0, 120.3, 140.8)  # pixels not square, the principal point off the middle
+WIDTH, HEIGHT = 301, 220
+PLACES = np.array([(a, b) for a in (0.25, 0.5, 0.75) for b in (0.25, 0.5, 0.75)])
+"""Of blobs in a box, in units of its sides."""
+
+
+def blobs(camera_K: np.ndarray, size: tuple[int, int], pixels: np.ndarray, sigma: float) -> Image.Image:
+    """White blobs on black about the pixels given; the middle of a pixel is (column + 1/2, row + 1/2)."""
+    u, v = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
+    light = sum(np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * sigma**2)) for x, y in pixels)
+    grey = np.round(255 * np.asarray(light).clip(0, 1)).astype(np.uint8)
+    return Image.fromarray(grey).convert("RGB")
+
+
+def centroid(picture: np.ndarray, about: np.ndarray, reach: float) -> np.ndarray:
+    light = picture[..., 0].astype(float)
+    v, u = np.indices(light.shape) + 0.5
+    light = light * ((u - about[0]) ** 2 + (v - about[1]) ** 2 < reach**2)
+    return np.array([(u * light).sum(), (v * light).sum()]) / light.sum()
+
+
+@pytest.mark.parametrize(
+    ("zoom", "box", "S"),
+    [
+        (1, (0.0, 0.0, 301.0, 220.0), 301.0),
+        (1, (150.0, 10.0, 290.0, 120.0), 140.0),
+        (1, (10.5, 90.25, 110.5, 200.0), 200.0),  # enlarged
+        (4, (400.0, 100.0, 1100.0, 700.0), 96.0),  # shrunk
+        (4, (0.0, 0.0, 1204.0, 880.0), 100.0),
+    ],
+    ids=["whole", "off centre", "enlarged", "shrunk", "whole, shrunk"],
+)
+def test_what_lies_at_a_place_is_seen_where_the_virtual_camera_projects_it(
+    zoom: int, box: Box, S: float
+) -> None:
+    camera_K = np.diag([zoom, zoom, 1.0]) @ K
+    left, top, right, bottom = box
+    pixels = np.array([left, top]) + PLACES * [right - left, bottom - top]
+    depth = np.linspace(2, 5, len(pixels))[:, None]
+    xyz = depth * rays(camera_K, pixels)
+    camera = VirtualCamera.of_box(camera_K, box, S)
+    sigma = (right - left) / 80
+    seen = cut(blobs(camera_K, (zoom * WIDTH, zoom * HEIGHT), pixels, sigma), camera)
+    f = torch.tensor(camera.f, dtype=torch.float64)
+    expected = Camera(f, S).project(torch.from_numpy(camera.to_virtual(xyz))).numpy()
+    reach = 4.5 * sigma * camera.f / (camera_K[0, 0] * 1.0)
+    for place in expected:
+        assert np.abs(centroid(seen, place, reach) - place).max() < 0.05
+
+
+def test_the_whole_of_a_square_image_is_itself() -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (96, 96, 3), dtype=np.uint8)
+    whole = (intrinsics(333.3, 333.3, 48.0, 48.0), (0.0, 0.0, 96.0, 96.0))
+    np.testing.assert_array_equal(cut(Image.fromarray(noise), VirtualCamera.of_box(*whole, 96.0)), noise)
+    means = noise.reshape(32, 3, 32, 3, 3).mean(axis=(1, 3))
+    shrunk = cut(Image.fromarray(noise), VirtualCamera.of_box(*whole, 32.0))
+    assert np.abs(shrunk - means).max() <= 1  # rounded twice: along rows, then along columns
+
+
+def test_shrinking_averages_instead_of_picking() -> None:
+    """Stripes of two pixels, seen eight times smaller: their mean everywhere, not a pattern of its own."""
+    stripes = np.zeros((880, 1204, 3), dtype=np.uint8)
+    stripes[:, ::2] = 200
+    camera = VirtualCamera.of_box(np.diag([4.0, 4.0, 1.0]) @ K, (300.0, 100.0, 900.0, 700.0), 75.0)
+    seen = cut(Image.fromarray(stripes), camera)[8:-8, 8:-8]
+    assert np.abs(seen - 100.0).max() < 8
+
+
+def test_light_is_neither_lost_nor_gained() -> None:
+    """A slow ramp, enlarged: what is seen is the ramp at the place that is looked at, on average without a bias."""
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    ramp = np.round(40 + 0.37 * u + 0.29 * v).astype(np.uint8)
+    camera = VirtualCamera.of_box(K, (100.0, 40.0, 220.0, 160.0), 200.0)
+    seen = cut(Image.fromarray(ramp).convert("RGB"), camera)
+    u, v = np.meshgrid(np.arange(200) + 0.5, np.arange(200) + 0.5)
+    X = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(camera.homography).T
+    expected = 40 + (0.37 * X[..., 0] + 0.29 * X[..., 1]) / X[..., 2]
+    assert abs((seen[..., 0] - expected).mean()) < 0.05
+
+
+def test_a_view_along_the_image_plane_costs_no_more_than_the_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Near 90 degrees from the axis, pixels of the image lie without end in one pixel of the view."""
+    camera = VirtualCamera.of_box(
+        intrinsics(251.2, 251.2, 200.2, -257.1), (418.3, 271.3, 818.3, 276.9), 100.0
+    )
+    assert camera.density > 1e3
+    sides: list[int] = []
+    transformed = crops._transformed
+    monkeypatch.setattr(crops, "_transformed", lambda *given: sides.append(given[-1]) or transformed(*given))
+    assert cut(Image.new("RGB", (1000, 1000)), camera).shape == (100, 100, 3)
+    assert sides == [2000]
+
+
+def test_beyond_the_image_all_is_grey() -> None:
+    white = Image.new("RGB", (WIDTH, HEIGHT), (255, 255, 255))
+    box = (-100.0, 20.0, 100.0, 200.0)
+    camera = VirtualCamera.of_box(K, box, 100.0)
+    seen = cut(white, camera)
+    edge = camera.homography @ [0, 110, 1]
+    column = round(edge[0] / edge[2])
+    assert 30 < column < 70
+    assert (seen[20:80, : column - 2] == GREY).all()
+    assert (seen[20:80, column + 2 :] == 255).all()
+
+
+def saved(image: Image.Image, kind: str = "png", **options: Any) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, kind, **options)
+    return buffer.getvalue()
+
+
+RED = Image.new("RGB", (4, 3), (255, 0, 0))
+KINDS: dict[str, tuple[bytes, tuple[int, int, int]]] = {
+    "RGB": (saved(RED), (255, 0, 0)),
+    "grey": (saved(Image.new("L", (4, 3), 77)), (77, 77, 77)),
+    "black and white": (saved(Image.new("1", (4, 3), 1)), (255, 255, 255)),
+    "16 bits": (saved(Image.fromarray(np.full((3, 4), 0x4D80, dtype=np.uint16))), (0x4D, 0x4D, 0x4D)),
+    "palette": (saved(RED.convert("P")), (255, 0, 0)),
+    "palette with a transparent colour": (saved(Image.new("P", (4, 3), 0), transparency=0), GREY),
+    "transparent": (saved(Image.new("RGBA", (4, 3), (255, 0, 0, 0))), GREY),
+    "opaque": (saved(Image.new("RGBA", (4, 3), (255, 0, 0, 255))), (255, 0, 0)),
+    "half transparent grey": (saved(Image.new("LA", (4, 3), (0, 128))), (64, 64, 64)),
+    "CMYK": (saved(Image.new("CMYK", (4, 3), (0, 255, 255, 0)), "tiff"), (255, 0, 0)),
+}
+
+
+@pytest.mark.parametrize(("content", "colour"), KINDS.values(), ids=KINDS.keys())
+def test_all_kinds_of_colour_become_rgb(content: bytes, colour: tuple[int, int, int]) -> None:
+    image = read_image(Path("a.png"), content)
+    assert (image.mode, image.size) == ("RGB", (4, 3))
+    assert np.abs(np.asarray(image).astype(int) - colour).max() <= 1
+
+
+@pytest.mark.parametrize("mode", ["I", "F"])
+def test_values_without_a_known_white_are_refused(mode: str) -> None:
+    content = saved(Image.new(mode, (4, 3)), "tiff")
+    with pytest.raises(DatasetError, match=rf"^a\.tif: has colours of the kind '{mode}'; save it as RGB"):
+        read_image(Path("a.tif"), content)
+
+
+NOISE = Image.fromarray(np.random.default_rng(0).integers(0, 256, (40, 40, 3), dtype=np.uint8))
+
+
+@pytest.mark.parametrize("kind", ["png", "jpeg", "tiff", "webp", "gif", "bmp"])
+def test_a_file_cut_off_anywhere_is_one_line(kind: str, tmp_path: Path) -> None:
+    whole = saved(NOISE, kind)
+    assert read_image(Path("a"), whole).size == (40, 40)
+    for length in [0, 1, 4, 10, 20, 30, 50, 100, len(whole) // 2, len(whole) * 9 // 10]:
+        with (
+            pillow_warnings(),
+            pytest.raises(DatasetError, match=r"^a: (cannot be read as|not) an image.*") as caught,
+        ):
+            read_image(Path("a"), whole[:length])
+        assert "\n" not in str(caught.value)
+
+
+def test_bytes_turned_over_never_raise_anything_else() -> None:
+    draw = np.random.default_rng(1)
+    for kind in ("png", "jpeg", "tiff", "gif"):
+        whole = np.frombuffer(saved(NOISE, kind), dtype=np.uint8)
+        for _ in range(60):
+            broken = whole.copy()
+            broken[draw.integers(0, min(200, len(whole)), 3)] = draw.integers(0, 256, 3)
+            with pillow_warnings(), suppress(DatasetError):
+                read_image(Path("a"), broken.tobytes())
+
+
+@pytest.mark.parametrize("content", [b"", b"no image", b"\x89PNG\r\n\x1a\n"], ids=["empty", "text", "head"])
+def test_no_image_is_one_line_at_first_sight(tmp_path: Path, content: bytes) -> None:
+    file = tmp_path / "a.png"
+    file.write_bytes(content)
+    with pytest.raises(DatasetError, match=r"a\.png: not an image of any kind that Pillow knows"):
+        image_size(file)
+    with pytest.raises(DatasetError, match=r"b\.png: cannot be read as an image \(No such file"):
+        image_size(tmp_path / "b.png")
+
+
+@pytest.mark.parametrize("limit", [1000, 200], ids=["over the limit", "twice over the limit"])
+def test_a_decompression_bomb_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: int
+) -> None:
+    file = tmp_path / "a.png"
+    file.write_bytes(saved(NOISE))
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", limit)
+    for read in (lambda: image_size(file), lambda: read_image(file, file.read_bytes())):
+        with pillow_warnings(), pytest.raises(DatasetError, match=rf"a\.png: has more pixels .* {limit} "):
+            read()
+
+
+@pytest.mark.parametrize("kind", ["jpeg", "png", "tiff", "webp"])
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+def test_an_orientation_is_neither_applied_nor_ignored(kind: str, orientation: int) -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    content = saved(NOISE, kind, exif=exif)
+    if orientation == 1:
+        assert read_image(Path("a"), content).size == (40, 40)
+        return
+    with pytest.raises(
+        DatasetError, match=rf"^a: has the EXIF orientation {orientation}.*mogrify -auto-orient"
+    ):
+        read_image(Path("a"), content)

@@ -1,0 +1,204 @@
+"""A folder of own images as a source: exact where it must be, cached, and never served stale."""
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import ExifTags, Image
+
+from phd_exp.data import folder as folder_module
+from phd_exp.data.datamodule import PositionData
+from phd_exp.data.folder import FolderSource
+from phd_exp.data.sources import RenderedSource
+from phd_exp.geometry import projected
+from phd_exp.records.dataset import DatasetError, DatasetFolder
+from phd_exp.records.detections import DetectionFolder
+from phd_exp.records.errors import ConfigError
+from phd_exp.records.spec import DatasetSpec
+
+ALL = {"train": None, "test": None}
+BOXED: dict[str, Any] = {"file_name": "wide.jpg", "fx": 300.0, "fy": 320.0, "cx": 70.0, "cy": 40.0, "z": 2.0}
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> DetectionFolder:
+    """Three detections in two images for training, one for testing; two sensors, neither square."""
+    draw = np.random.default_rng(0)
+    lines = {
+        "train": [
+            BOXED | {"x": 0.1, "y": 0.0, "box": [60, 20, 120, 70]},
+            BOXED | {"x": -0.4, "y": 0.1, "box": [-10, 30, 30, 90]},
+            {"file_name": "deep/tall.png", "f": 500, "x": 0, "y": 0, "z": 6.0},
+        ],
+        "test": [{"file_name": "tall.png", "f": 500, "x": 0.1, "y": 0.1, "z": 5.0, "visibility": 0.5}],
+    }
+    folder = DetectionFolder(tmp_path / "photos")
+    for split, (name, size) in [
+        ("train", ("wide.jpg", (160, 90))),
+        ("train", ("deep/tall.png", (90, 160))),
+        ("test", ("tall.png", (90, 160))),
+    ]:
+        file = folder.root / split / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(draw.integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)).save(file)
+    for split, rows in lines.items():
+        text = "".join(json.dumps(row) + "\n" for row in rows)
+        folder.metadata_path(split).write_text(text)  # type: ignore[arg-type]
+    return folder
+
+
+def source(folder: DetectionFolder, side: int = 48) -> FolderSource:
+    return FolderSource(folder, ALL, side)  # type: ignore[arg-type]
+
+
+def images(folder: DetectionFolder) -> np.ndarray:
+    return source(folder).samples("train").image.numpy().copy()
+
+
+def test_a_rendered_data_set_read_as_a_folder_is_itself(folder: DatasetFolder, spec: DatasetSpec) -> None:
+    """Square images whole: the virtual camera is the camera, and every pixel and label stays what it was."""
+    for side in (64, 32):
+        rendered = RenderedSource(folder, spec, {"train": 5, "test": 3}, side)
+        own = FolderSource(DetectionFolder(folder.root), ALL, side)  # type: ignore[arg-type]
+        for split in ("train", "test"):
+            here, there = own.samples(split), rendered.samples(split)  # type: ignore[arg-type]
+            assert torch.equal(here.image, there.image)
+            assert torch.equal(here.xyz, there.xyz)
+            torch.testing.assert_close(here.f, there.f, rtol=1e-7, atol=0)
+            assert here.S == there.S
+        assert all(np.array_equal(crop.camera.R, np.eye(3)) for crop in own.crops["train"])
+    assert own.known("test").keys() == rendered.known("test").keys()
+
+
+def test_samples_are_in_the_frame_of_their_virtual_cameras(photos: DetectionFolder) -> None:
+    own = source(photos)
+    batch = own.samples("train")
+    assert batch.image.shape == (3, 48, 48, 3)
+    assert batch.row.tolist() == [0, 1, 2]
+    for crop, xyz in zip(own.crops["train"], batch.xyz, strict=True):
+        real = crop.camera.to_real(xyz.double().numpy())
+        np.testing.assert_allclose(real, crop.detection.position, rtol=1e-6, atol=1e-6)
+    assert (projected(batch.xyz, batch.camera)[:1].abs() < 1).all()  # the first lies in its box
+
+
+def test_constants_follow_from_the_training_detections(photos: DetectionFolder) -> None:
+    own = source(photos)
+    batch = own.samples("train")
+    ratio = (batch.xyz[:, 2] / batch.f).double()
+    depth, f = own.depth, batch.f.double()
+    assert depth.mu_z0 == pytest.approx(math.sqrt(ratio.max() * ratio.min()))
+    assert math.sqrt(ratio.max() / ratio.min()) == pytest.approx(depth.D)
+    assert depth.z_centre == pytest.approx(float(batch.xyz[:, 2].max() + batch.xyz[:, 2].min()) / 2)
+    assert own.constant_f == pytest.approx(math.sqrt(f.min() * f.max()))
+
+
+def test_what_is_known_is_what_the_lines_say(photos: DetectionFolder) -> None:
+    own = source(photos)
+    assert own.known("train").keys() == {"file_name", "f", "S"}
+    known = own.known("test")
+    assert known.keys() == {"file_name", "f", "S", "visibility"}
+    assert (known["file_name"], known["S"], known["visibility"]) == (["tall.png"], [48], [0.5])
+    assert (own.count("train"), own.count("test")) == (3, 1)
+
+
+def test_decodes_each_image_once(photos: DetectionFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded = []
+    read = folder_module.read_image
+    monkeypatch.setattr(
+        folder_module, "read_image", lambda file, content: decoded.append(file.name) or read(file, content)
+    )
+    first = images(photos)
+    assert sorted(decoded) == ["tall.png", "wide.jpg"]
+    np.testing.assert_array_equal(images(photos), first)
+    assert len(decoded) == 2
+
+
+def change_line(photos: DetectionFolder, **changes: Any) -> None:
+    path = photos.metadata_path("train")
+    first, *others = path.read_text().splitlines()
+    path.write_text("\n".join([json.dumps(json.loads(first) | changes), *others]) + "\n")
+
+
+@pytest.mark.parametrize("key", ["box", "fx", "cy"])
+def test_a_changed_line_is_never_served_the_old_crop(photos: DetectionFolder, key: str) -> None:
+    before = images(photos)
+    changes = {"box": [70, 20, 130, 70], "fx": 250.0, "cy": 10.0}
+    change_line(photos, **{key: changes[key], **({"cx": 0.0} if key == "cy" else {})})
+    after = images(photos)
+    assert not np.array_equal(after[0], before[0])
+    np.testing.assert_array_equal(after[2], before[2])
+
+
+def test_a_changed_image_of_the_same_name_and_time_is_never_served_from_the_cache(
+    photos: DetectionFolder,
+) -> None:
+    import os
+
+    before, file = images(photos), photos.root / "train" / "deep" / "tall.png"
+    time = file.stat().st_mtime_ns
+    Image.new("RGB", (90, 160), (9, 9, 9)).save(file)
+    os.utime(file, ns=(time, time))
+    after = images(photos)
+    np.testing.assert_array_equal(after[:2], before[:2])
+    assert (after[2, 24] == 9).sum() > (before[2, 24] == 9).sum()
+
+
+def test_a_folder_that_cannot_be_written_is_decoded_into_memory_and_said_so(
+    photos: DetectionFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    expected = images(photos)
+    assert capsys.readouterr().err == ""
+    for file in photos.cache.iterdir():
+        file.unlink()
+    photos.cache.rmdir()
+    photos.cache.write_text("in the way of the folder")
+    np.testing.assert_array_equal(images(photos), expected)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert ".cache: decoded images cannot be kept here" in line
+    assert "decoded into memory" in line
+
+
+def test_a_broken_image_leaves_no_cache(photos: DetectionFolder) -> None:
+    file = photos.root / "train" / "wide.jpg"
+    file.write_bytes(file.read_bytes()[:1000])
+    with pytest.raises(DatasetError, match=r"wide\.jpg: cannot be read as an image"):
+        images(photos)
+    assert not list(photos.cache.glob("*.npy"))
+
+
+def turned(photos: DetectionFolder) -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    Image.new("RGB", (160, 90)).save(photos.root / "train" / "wide.jpg", exif=exif)
+
+
+BAD: list[tuple[Callable[[DetectionFolder], None], str]] = [
+    (lambda photos: change_line(photos, box=[200, 20, 250, 70]), "line 1: box=.* outside the image of 160 x 90"),
+    (lambda photos: change_line(photos, file_name="no.jpg"), "line 1: .*no.jpg: cannot be read"),
+    (lambda photos: (photos.root / "train" / "wide.jpg").write_bytes(b""), "line 1: .*wide.jpg: not an image"),
+    (lambda photos: change_line(photos, box=[140, 60, 160, 90], x=-90.0), "line 1: the position .* 90 degrees"),
+    (lambda photos: change_line(photos, fx=0.1, fy=0.1), "line 1: box=.*: .* 90 degrees or more"),
+    (lambda photos: change_line(photos, x=None, y=None, z=None), "line 1: x, y, z are missing"),
+    (turned, r"wide\.jpg: has the EXIF orientation 6"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("spoil", "said"), BAD, ids=[said for _, said in BAD])
+def test_what_cannot_be_a_sample_is_one_line(photos: DetectionFolder, spoil: Callable, said: str) -> None:
+    spoil(photos)
+    with pytest.raises(DatasetError, match=said) as caught:
+        images(photos)
+    assert "\n" not in str(caught.value)
+
+
+def test_fewer_images_than_a_batch_is_one_line(photos: DetectionFolder) -> None:
+    with pytest.raises(ConfigError, match=r"^data: batch_size=4 is larger than the 3 training samples"):
+        PositionData(source(photos), batch_size=4, seed=0)
+    module = PositionData(source(photos), batch_size=3, seed=0)
+    module.setup()
+    assert len(module.train_dataloader()) == 1

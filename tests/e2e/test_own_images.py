@@ -1,0 +1,222 @@
+"""Own images from files to a run record; rendered images stand in for photographs, since of them all is known."""
+
+import importlib.util
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+from scipy import ndimage
+
+from phd_exp.data.crops import cut
+from phd_exp.data.folder import FolderSource
+from phd_exp.data.sources import RenderedSource
+from phd_exp.geometry.virtual import Box, VirtualCamera, intrinsics
+from phd_exp.records.dataset import DatasetFolder, sha256
+from phd_exp.records.detections import DetectionFolder
+from phd_exp.records.runs import RunFolder, find_runs
+from phd_exp.records.scenes import SampleRecord, Scene
+from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.compose import backdrop_pixels
+from phd_exp.rendering.visibility import depth_maps, rotation_matrix, silhouettes
+from phd_exp.rendering.workers import ensure_rendered
+
+N = {"train": 14, "test": 2}
+SIDE = 96
+
+
+@pytest.fixture(scope="module")
+def spec(make_spec: Callable[..., DatasetSpec]) -> DatasetSpec:
+    """Cylinders that lie within the image as a whole."""
+    return make_spec("default", xy_range=0.5)
+
+
+@pytest.fixture(scope="module")
+def rendered(spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory) -> DatasetFolder:
+    folder = DatasetFolder(tmp_path_factory.mktemp("own") / "default")
+    ensure_rendered(folder, spec, N["train"], N["test"], workers=1)
+    return folder
+
+
+def box_about(scene: Scene) -> Box:
+    """A box with the object anywhere but in its middle."""
+    rows, columns = np.nonzero(silhouettes(depth_maps(scene)))
+    return columns.min() - 12.0, rows.min() - 20.0, columns.max() + 25.0, rows.max() + 9.0
+
+
+@pytest.fixture(scope="module")
+def photos(rendered: DatasetFolder) -> Path:
+    """The same images as somebody else would hand them over: nothing but camera, box and position."""
+    folder = rendered.root.parent / "photos"
+    for split in ("train", "test"):
+        (folder / split).mkdir(parents=True)
+        lines = []
+        for record in rendered.records(split):  # type: ignore[arg-type]
+            image = rendered.image_path(split, record.index)  # type: ignore[arg-type]
+            (folder / split / image.name).write_bytes(image.read_bytes())
+            line = {"file_name": image.name, "f": record.f, "box": box_about(record.scene)}
+            lines.append(json.dumps(line | {"x": record.x, "y": record.y, "z": record.z}) + "\n")
+        (folder / split / "metadata.jsonl").write_text("".join(lines))
+    return folder
+
+
+@pytest.mark.parametrize("side", [224, 112])
+def test_a_rendered_image_seen_as_a_whole_is_itself(
+    rendered: DatasetFolder, spec: DatasetSpec, side: int
+) -> None:
+    there = RenderedSource(rendered, spec, N, side).samples("train")  # type: ignore[arg-type]
+    own = FolderSource(DetectionFolder(rendered.root), N, side)  # type: ignore[arg-type]
+    here = own.samples("train")
+    assert all(np.array_equal(crop.camera.R, np.eye(3)) for crop in own.crops["train"])
+    np.testing.assert_array_equal(here.image.numpy(), there.image.numpy())
+    np.testing.assert_array_equal(here.xyz.numpy(), there.xyz.numpy())
+    np.testing.assert_allclose(here.f.numpy(), there.f.numpy(), rtol=1e-7)
+
+
+def quaternion(R: np.ndarray) -> np.ndarray:
+    """Unit quaternion (w, x, y, z) of a rotation by less than 180 degrees."""
+    w = np.sqrt(1 + np.trace(R)) / 2
+    return np.array([w, *np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (4 * w)])
+
+
+def product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    vector = p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:])
+    return np.array([p[0] * q[0] - p[1:] @ q[1:], *vector])
+
+
+def seen_by(camera: VirtualCamera, scene: Scene, finer: int) -> Scene:
+    """The scene in the frame of a virtual camera, on `finer` times as many pixels."""
+    objects = []
+    for item in scene.objects:
+        rotation = product(quaternion(camera.R), np.array(item.rotation))
+        np.testing.assert_allclose(
+            rotation_matrix(tuple(rotation)),
+            camera.R @ rotation_matrix(item.rotation),
+            atol=1e-12,
+        )
+        position = camera.to_virtual(np.array(item.position))
+        objects.append(item.model_copy(update={"position": tuple(position), "rotation": tuple(rotation)}))
+    update = {"f": finer * camera.f, "S": finer * int(camera.S), "objects": tuple(objects)}
+    return scene.model_copy(update=update)
+
+
+def centroid(mask: np.ndarray) -> np.ndarray:
+    rows, columns = np.nonzero(mask)
+    return np.array([(columns + 0.5).mean(), (rows + 0.5).mean()])
+
+
+def shown(folder: DatasetFolder, record: SampleRecord, camera: VirtualCamera) -> np.ndarray:
+    """Pixels of the virtual image that show the object: those that differ from the backdrop, seen the same way.
+
+    An edge lies where the difference is half of the largest within three pixels.
+    """
+    with Image.open(folder.image_path("train", record.index)) as image:
+        seen = cut(image.convert("RGB"), camera).astype(float)
+    backdrop = cut(Image.fromarray(backdrop_pixels(record.backdrop, record.S)), camera)
+    difference = np.abs(seen - backdrop).max(axis=-1)
+    contrast = ndimage.maximum_filter(difference, 7)
+    return ndimage.binary_fill_holes((difference > 0.5 * contrast) & (contrast > 16))
+
+
+def test_a_rendered_image_seen_in_a_box_shows_the_object_where_the_virtual_camera_sees_it(
+    rendered: DatasetFolder,
+) -> None:
+    # the rim of a metal object may be of the backdrop's own colour
+    records = [record for record in rendered.records("train") if record.objects[0].material == "rubber"]
+    off = []
+    for record in records:
+        K = intrinsics(record.f, record.f, record.S / 2, record.S / 2)
+        camera = VirtualCamera.of_box(K, box_about(record.scene), float(SIDE))
+        expected = centroid(silhouettes(depth_maps(seen_by(camera, record.scene, finer=4)))) / 4
+        assert np.abs(expected - SIDE / 2).max() > 2  # the object is not in the middle
+        off.append(centroid(shown(rendered, record, camera)) - expected)
+    assert len(off) >= 4
+    assert np.abs(off).max() < 0.1
+
+
+def only_run(runs: Path) -> RunFolder:
+    (run,) = find_runs(runs)
+    return run
+
+
+@pytest.fixture
+def train(phd_exp: Callable, photos: Path, monkeypatch: pytest.MonkeyPatch) -> Callable:
+    """A run on the photographs, on a machine without Blender."""
+    real = importlib.util.find_spec
+    monkeypatch.setattr(
+        "importlib.util.find_spec", lambda name, *more: None if name == "bpy" else real(name, *more)
+    )
+    quick = ("preset=smoke", "data=folder", "data.batch_size=4", "trainer.progress_bar=false")
+    quick += ("trainer.threads=1", "logger=none", "data.name=mycams")
+    return lambda *arguments: phd_exp(*quick, f"data.folder={photos}", *arguments)
+
+
+@pytest.mark.parametrize("model", ["probabilistic", "mae_constf"])
+def test_a_run_on_own_images_leaves_a_whole_record(
+    train: Callable, photos: Path, tmp_path: Path, model: str
+) -> None:
+    outcome = train(f"model={model}")
+    assert outcome.status == 0, outcome.err
+    run = only_run(tmp_path / "runs")
+    assert run.path.relative_to(tmp_path).as_posix().startswith(f"runs/smoke/mycams/{model}/seed0-")
+    results = run.results()
+    assert (results["data"], results["n_train"], results["n_test"]) == ("mycams", 14, 2)
+    assert np.isfinite(results["test/depth_error_mm"])
+    status = run.status()
+    assert status is not None
+    assert status.data_manifest == DetectionFolder(photos).fingerprint()
+    table = pd.read_parquet(run.predictions)
+    assert {"file_name", "f", "S", "x", "y", "z"} <= set(table.columns)
+    assert not {"scale", "visibility"} & set(table.columns)
+    (crop, *_) = FolderSource(DetectionFolder(photos), N, 64).crops["test"]  # type: ignore[arg-type]
+    np.testing.assert_allclose(table.loc[0, ["x", "y", "z"]].astype(float), crop.xyz, rtol=1e-6)
+    assert table.loc[0, "f"] == crop.camera.f
+
+
+def test_a_run_on_other_metadata_of_the_same_name_is_never_reused(
+    train: Callable, photos: Path, tmp_path: Path
+) -> None:
+    assert train("model=mae_vz").status == 0
+    assert "finished already" in train("model=mae_vz").out
+    metadata = photos / "train" / "metadata.jsonl"
+    before = metadata.read_text()
+    metadata.write_text(before + "\n")
+    outcome = train("model=mae_vz")
+    metadata.write_text(before)
+    assert outcome.status == 1
+    assert "as it was before its metadata.jsonl changed" in outcome.err
+    assert len(outcome.err.splitlines()) == 1
+
+
+def test_where_the_data_lie_is_part_of_the_run(
+    train: Callable, phd_exp: Callable, photos: Path, tmp_path: Path
+) -> None:
+    assert train("model=mae_vz").status == 0
+    run = only_run(tmp_path / "runs")
+    config = run.config()
+    assert config["data"]["folder"] == str(photos)
+    config["data"]["folder"] = "elsewhere"
+    run.write_config(config)
+    outcome = train("model=mae_vz")
+    assert outcome.status == 1
+    assert f"data.folder=elsewhere, but data.folder={photos} is asked for" in outcome.err
+
+
+def test_too_few_images_for_a_batch_is_one_line_and_nothing_is_written(
+    train: Callable, tmp_path: Path
+) -> None:
+    outcome = train("data.batch_size=16")
+    assert outcome.status == 2
+    assert outcome.err == (
+        "error: data: batch_size=16 is larger than the 14 training samples there are: not one batch is full; "
+        "choose a smaller data.batch_size\n"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_fingerprint_is_of_what_the_files_say(photos: Path) -> None:
+    digests = [sha256((photos / split / "metadata.jsonl").read_bytes()) for split in ("train", "test")]
+    assert DetectionFolder(photos).fingerprint() == sha256("".join(digests).encode())

@@ -1,0 +1,174 @@
+"""The lines of a folder of own images: what they may leave out, and what is refused with file and line."""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from phd_exp.records.dataset import DatasetError, DatasetFolder
+from phd_exp.records.detections import Detection, DetectionFolder
+from phd_exp.records.errors import UserError
+
+GOOD: dict[str, Any] = {"file_name": "a.png", "f": 900.0, "x": 0.1, "y": -0.2, "z": 4.0}
+PLACED = {"x": 0.1, "y": -0.2, "z": 4.0}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> DetectionFolder:
+    (tmp_path / "photos" / "train").mkdir(parents=True)
+    return DetectionFolder(tmp_path / "photos")
+
+
+@pytest.fixture
+def read(folder: DetectionFolder) -> Callable[..., list[Detection]]:
+    """The detections of a metadata.jsonl of these lines."""
+
+    def read(*lines: Any, n: int | None = None) -> list[Detection]:
+        text = "".join((line if isinstance(line, str) else json.dumps(line)) + "\n" for line in lines)
+        folder.metadata_path("train").write_text(text)
+        return folder.detections("train", n)
+
+    return read
+
+
+def test_what_is_left_out_follows_from_the_image(read: Callable) -> None:
+    (detection,) = read(GOOD)
+    assert detection.focal_lengths_and_centre(640, 481) == (900, 900, 320, 240.5)
+    assert detection.box(640, 481) == (0, 0, 640, 481)
+    assert detection.position == (0.1, -0.2, 4)
+
+
+def test_what_is_said_stands(read: Callable, folder: DetectionFolder) -> None:
+    (detection,) = read(
+        {"file_name": "b/c.jpg", "fx": 800, "fy": 810.5, "cx": 0, "cy": -3.5, "box": [1, 2, 3.5, 4]} | PLACED
+    )
+    assert detection.focal_lengths_and_centre(640, 480) == (800, 810.5, 0, -3.5)
+    assert detection.box(640, 480) == (1, 2, 3.5, 4)
+    assert detection.file == folder.root / "train" / "b" / "c.jpg"
+
+
+def test_the_lines_of_a_rendered_data_set_are_detections(dataset: DatasetFolder) -> None:
+    records = dataset.records("train")
+    detections = DetectionFolder(dataset.root).detections("train")
+    assert [detection.position for detection in detections] == [(r.x, r.y, r.z) for r in records]
+    assert [detection.line.f for detection in detections] == [record.f for record in records]
+    assert [detection.line.scale for detection in detections] == [record.scale for record in records]
+
+
+def test_blank_lines_count_and_say_nothing(read: Callable) -> None:
+    detections = read(GOOD, "", "  ", GOOD)
+    assert [detection.where[-6:] for detection in detections] == ["line 1", "line 4"]
+
+
+def test_a_number_takes_the_first(read: Callable) -> None:
+    assert len(read(GOOD, GOOD, "not read at all", n=2)) == 2
+
+
+def test_a_position_is_asked_for_where_it_is_needed(read: Callable) -> None:
+    (detection,) = read({"file_name": "a.png", "f": 900})
+    with pytest.raises(DatasetError, match=r"metadata\.jsonl, line 1: x, y, z are missing"):
+        assert detection.position
+
+
+BAD: list[tuple[Any, str]] = [
+    ({"f": 900}, "file_name: missing"),
+    ({"file_name": "a.png"}, "expected either f, or fx and fy"),
+    (GOOD | {"fx": 900, "fy": 900}, "expected either f, or fx and fy"),
+    (PLACED | {"file_name": "a.png", "fx": 900}, "fx is given alone; expected all of fx, fy"),
+    (GOOD | {"cx": 10}, "cx is given alone; expected all of cx, cy"),
+    ({"file_name": "a.png", "f": 900, "x": 1, "z": 3}, "x, z is given alone; expected all of x, y, z"),
+    (GOOD | {"z": 0}, "z: got 0; expected to be greater than 0"),
+    (GOOD | {"z": -3.5}, "z: got -3.5; expected to be greater than 0"),
+    (GOOD | {"f": 0}, "f: got 0; expected to be greater than 0"),
+    (GOOD | {"f": -900}, "f: got -900"),
+    (GOOD | {"f": "900"}, "f: got '900'; expected a valid number"),
+    (GOOD | {"f": True}, "f: got True; expected a valid number"),
+    ('{"file_name": "a.png", "f": 900, "x": NaN, "y": 0, "z": 3}', "x: got nan; expected to be a finite"),
+    ('{"file_name": "a.png", "f": Infinity, "x": 0, "y": 0, "z": 3}', "f: got inf; expected to be a finite"),
+    (GOOD | {"box": [3, 0, 3, 5]}, "expected [left, top, right, bottom] of positive size"),
+    (GOOD | {"box": [0, 9, 3, 5]}, "expected [left, top, right, bottom] of positive size"),
+    (GOOD | {"box": [0, 9, 3]}, "box.3: missing"),
+    (GOOD | {"bx": [0, 0, 3, 5]}, "bx: unknown key, did you mean 'box'?"),
+    (GOOD | {"filename": "a.png"}, "filename: unknown key, did you mean 'file_name'?"),
+    (GOOD | {"k1": 0.1}, "k1: a distorted image is no pinhole image; undistort the images first"),
+    (GOOD | {"distortion": [0.1]}, "undistort the images first"),
+    (GOOD | {"dist_coeffs": []}, "undistort the images first"),
+    ('{"file_name": "a.png", "f": 900', "not JSON"),
+    ("[1, 2]", "expected"),
+    (GOOD | {"file_name": "../a.png"}, "file_name='../a.png' leaves"),
+    (GOOD | {"file_name": "b/../../a.png"}, "leaves"),
+    (GOOD | {"file_name": "/etc/passwd"}, "leaves"),
+    (GOOD | {"file_name": ""}, "file_name: got ''"),
+    (GOOD | {"file_name": "a\0.png"}, "is no file name"),
+]
+
+
+@pytest.mark.parametrize(("line", "said"), BAD, ids=[str(said)[:40] for _, said in BAD])
+def test_a_bad_line_is_one_line_that_names_it(
+    read: Callable, folder: DetectionFolder, line: Any, said: str
+) -> None:
+    with pytest.raises(UserError) as caught:
+        read(GOOD, "", line)
+    assert str(caught.value).startswith(f"{folder.metadata_path('train')}, line 3: ")
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("absolute", [True, False])
+def test_no_link_leaves_the_folder(
+    read: Callable, folder: DetectionFolder, tmp_path: Path, absolute: bool
+) -> None:
+    (tmp_path / "secret.png").touch()
+    (folder.root / "train" / "inside.png").touch()
+    target = tmp_path / "secret.png" if absolute else Path("../../secret.png")
+    os.symlink(target, folder.root / "train" / "out.png")
+    os.symlink("inside.png", folder.root / "train" / "in.png")
+    os.symlink(tmp_path, folder.root / "train" / "up")
+    assert len(read(GOOD | {"file_name": "in.png"})) == 1
+    for name in ("out.png", "up/secret.png"):
+        with pytest.raises(DatasetError, match="leaves"):
+            read(GOOD | {"file_name": name})
+
+
+def test_a_linked_folder_is_no_way_out(folder: DetectionFolder, read: Callable, tmp_path: Path) -> None:
+    read(GOOD)
+    os.symlink(folder.root, tmp_path / "link")
+    assert len(DetectionFolder(tmp_path / "link").detections("train")) == 1
+
+
+@pytest.mark.parametrize("box", [(640, 0, 700, 10), (-9, 0, 0, 10), (0, 480, 5, 500), (0, -7, 5, 0)])
+def test_a_box_beside_the_image_is_refused(read: Callable, box: tuple[float, ...]) -> None:
+    (detection,) = read(GOOD | {"box": list(box)})
+    with pytest.raises(DatasetError, match=r"line 1: box=.* lies outside the image of 640 x 480 pixels"):
+        detection.box(640, 480)
+
+
+def test_a_box_may_reach_beyond_the_image_but_not_without_end(read: Callable) -> None:
+    inside, huge = read(GOOD | {"box": [-600, -100, 1200, 500]}, GOOD | {"box": [-600, -100, 1400, 500]})
+    assert inside.box(640, 480) == (-600, -100, 1200, 500)
+    with pytest.raises(DatasetError, match=r"line 2: box=.* more than 3 times as large"):
+        huge.box(640, 480)
+
+
+def test_too_few_none_and_no_file_at_all(read: Callable, folder: DetectionFolder) -> None:
+    with pytest.raises(DatasetError, match=r"3 detections asked for \(data.n_train\), 2 found"):
+        read(GOOD, GOOD, n=3)
+    with pytest.raises(DatasetError, match=r"metadata\.jsonl: some detections asked for .*, 0 found"):
+        read("")
+    with pytest.raises(DatasetError, match=r"test/metadata\.jsonl: cannot be read .*Your own images"):
+        folder.detections("test")
+
+
+def test_the_fingerprint_is_of_both_splits(read: Callable, folder: DetectionFolder) -> None:
+    (folder.root / "test").mkdir()
+    folder.metadata_path("test").write_text("")
+    seen = set()
+    for split in ("train", "test"):
+        read(GOOD)
+        for f in (901.0, 902.0):
+            folder.metadata_path(split).write_text(json.dumps(GOOD | {"f": f}) + "\n")  # type: ignore[arg-type]
+            seen.add(folder.fingerprint())
+    assert len(seen) == 4
