@@ -21,7 +21,9 @@ from phd_exp.records.runs import RunFolder, find_runs
 from phd_exp.records.scenes import SampleRecord, Scene
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.compose import backdrop_pixels
-from phd_exp.rendering.visibility import depth_maps, rotation_matrix, silhouettes
+from phd_exp.rendering.rays import trace_pixels
+from phd_exp.rendering.rotations import rotation_matrix
+from phd_exp.rendering.visibility import silhouettes
 from phd_exp.rendering.workers import ensure_rendered
 
 N = {"train": 14, "test": 2}
@@ -43,7 +45,7 @@ def rendered(spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory) -> Dat
 
 def box_about(scene: Scene) -> Box:
     """A box with the object anywhere but in its middle."""
-    rows, columns = np.nonzero(silhouettes(depth_maps(scene)))
+    rows, columns = np.nonzero(silhouettes(trace_pixels(scene)))
     return columns.min() - 12.0, rows.min() - 20.0, columns.max() + 25.0, rows.max() + 9.0
 
 
@@ -57,7 +59,7 @@ def photos(rendered: DatasetFolder) -> Path:
         for record in rendered.records(split):  # type: ignore[arg-type]
             image = rendered.image_path(split, record.index)  # type: ignore[arg-type]
             (folder / split / image.name).write_bytes(image.read_bytes())
-            line = {"file_name": image.name, "f": record.f, "box": box_about(record.scene)}
+            line = {"file_name": image.name, "f": record.f, "box": box_about(record.shown)}
             lines.append(json.dumps(line | {"x": record.x, "y": record.y, "z": record.z}) + "\n")
         (folder / split / "metadata.jsonl").write_text("".join(lines))
     return folder
@@ -129,8 +131,8 @@ def test_a_rendered_image_seen_in_a_box_shows_the_object_where_the_virtual_camer
     off = []
     for record in records:
         K = intrinsics(record.f, record.f, record.S / 2, record.S / 2)
-        camera = VirtualCamera.of_box(K, box_about(record.scene), float(SIDE))
-        expected = centroid(silhouettes(depth_maps(seen_by(camera, record.scene, finer=4)))) / 4
+        camera = VirtualCamera.of_box(K, box_about(record.shown), float(SIDE))
+        expected = centroid(silhouettes(trace_pixels(seen_by(camera, record.shown, finer=4)))) / 4
         assert np.abs(expected - SIDE / 2).max() > 2  # the object is not in the middle
         off.append(centroid(shown(rendered, record, camera)) - expected)
     assert len(off) >= 4
