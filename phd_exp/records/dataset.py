@@ -140,8 +140,8 @@ class DatasetFolder:
         wanted: dict[Split, int] = {"train": n_train, "test": n_test}
         if not self.manifest_path.exists():
             return {split: list(range(n)) for split, n in wanted.items()}
+        self.require(spec)
         manifest = self.manifest
-        self._require_same(manifest.spec, spec)
         return {split: self._unfinished(split, n, manifest) for split, n in wanted.items()}
 
     def images(self, split: Split) -> set[str]:
@@ -154,9 +154,15 @@ class DatasetFolder:
         finished, kind = manifest.count(split), manifest.spec.image_format
         return [index for index in range(n) if index >= finished or image_name(index, kind) not in there]
 
-    def _require_same(self, found: DatasetSpec, wanted: DatasetSpec) -> None:
+    def require(self, spec: DatasetSpec) -> None:
+        """Check that the folder holds a data set of this specification.
+
+        Raises:
+            DatasetError: it holds another one, naming the first key that differs, or none.
+        """
+        found = self.manifest.spec
         for key in DatasetSpec.model_fields:
-            here, asked = getattr(found, key), getattr(wanted, key)
+            here, asked = getattr(found, key), getattr(spec, key)
             if here != asked:
                 raise DatasetError(
                     f"{self.root}: holds a data set with {key}={here}, but {key}={asked} is asked for; "
