@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all lint clean
+.PHONY: help install demo test test-all lint bench clean
 
 help:  ## what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -34,7 +34,10 @@ test: lint  ## lint and the default tests (under 5 minutes on 2 cores)
 	$(BIN)/python -m pytest -n 2
 
 test-all: lint  ## the slow tests too
-	$(BIN)/python -m pytest -n 2 -m 'slow or not slow'
+	$(BIN)/python -m pytest -n 2 -m 'not bench'
+
+bench: $(INSTALLED)  ## quality and speed, each beside a named reference, in one run
+	$(BIN)/python -m pytest tests/benchmarks -m bench
 
 clean:  ## forget .venv and caches; renders/ and runs/ stay
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
