@@ -8,9 +8,10 @@ loss, optimizer) names a `_target_`, and its keys are held against that target's
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from phd_exp.records.errors import ConfigError
+from phd_exp.records.shards import Shard
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.training.targets import Target, describe, locate
 
@@ -97,9 +98,10 @@ class EvaluationConfig(Section):
 
 
 class RenderConfig(Section):
-    """The part of a configuration that rendering looks at."""
+    """What rendering looks at: the data, and the keys of conf/render.yaml."""
 
     data: DataConfig
+    shard: Annotated[Shard, BeforeValidator(Shard.parse)] | None
 
 
 class RunConfig(Section):
@@ -140,9 +142,10 @@ def check(config: dict[str, Any]) -> RunConfig:
     return _validated(RunConfig, config)
 
 
-def check_data(config: dict[str, Any]) -> DataConfig:
-    """The same for the `data` part alone, which is all that rendering looks at."""
-    return _validated(RenderConfig, {"data": config["data"]}).data
+def check_render(config: dict[str, Any]) -> RenderConfig:
+    """The same for what rendering looks at; the rest of the run, which comes along, is not its business."""
+    others = RunConfig.model_fields.keys() - RenderConfig.model_fields.keys()
+    return _validated(RenderConfig, {key: value for key, value in config.items() if key not in others})
 
 
 def _validated(model: type[Checked], config: dict[str, Any]) -> Checked:
