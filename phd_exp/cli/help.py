@@ -25,6 +25,7 @@ EXAMPLES = {
     "render": [
         "python -m phd_exp render data=scale",
         "python -m phd_exp render data=occl data.n_train=100 data.n_test=20 data.workers=1",
+        "python -m phd_exp -m render data=scale data.workers=1 shard=0/4,1/4,2/4,3/4 hydra/launcher=joblib",
     ],
     "report": ["python -m phd_exp report", "python -m phd_exp report runs=some/other/folder"],
 }

@@ -63,7 +63,9 @@ class JobRecords:
         try:
             path.mkdir(parents=True)
         except OSError as error:
-            raise RunError(f"{path}: cannot be written ({error.strerror}); choose another runs=DIR") from error
+            raise RunError(
+                f"{path}: cannot be written ({error.strerror}); choose another runs=DIR"
+            ) from error
         return cls(path)
 
     @contextmanager
@@ -101,7 +103,8 @@ def run_job(task: Task, records: JobRecords, home: str, config: DictConfig) -> N
     A stop goes up in the launcher's own process, where it ends everything. In another process it ends that job.
     """
     hydra = HydraConfig.get()
-    overrides, number = list(hydra.overrides.task), OmegaConf.select(hydra, "job.num") or 0
+    overrides = list(hydra.overrides.task)
+    number = 0 if OmegaConf.is_missing(hydra.job, "num") else hydra.job.num  # a single run has none
     with records.running(number):
         ending = Ending(overrides=overrides)
         try:
