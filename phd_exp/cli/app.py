@@ -69,26 +69,27 @@ def _run_all(task: Task, arguments: list[str], config_name: str) -> list[Ending]
 def _sweep(task: Task, words: list[str], config_name: str) -> list[Ending]:
     """The same where a launcher may run the jobs in other processes, on other machines: they share a folder.
 
-    The folder is removed unless a job failed.
+    The folder is removed where no job needs it any more and none failed. It stays when this process is stopped:
+    jobs in a queue outlive it.
     """
     folder, jobs = _plan(words, config_name)
     records = JobRecords.begin(folder)
-    endings: list[Ending] = []
     gave_up: Exception | None = None
     try:
-        try:
-            _hand_to_hydra(task, records, config_name)
-        except Exception as error:  # joblib's and submitit's way to say that a job has died
-            if not any(records.path.iterdir()):
-                raise
-            gave_up = error
-        endings = [records.ending(number, overrides) for number, overrides in enumerate(jobs)]
-    finally:
-        failed = any(ending.exit_status for ending in endings)
-        if not failed:
-            records.remove()
-    if gave_up is not None and not failed:
+        _hand_to_hydra(task, records, config_name)
+    except (HydraException, OmegaConfBaseException):
+        records.remove()  # a combination that cannot be composed is found before any job begins
+        raise
+    except Exception as error:  # joblib's and submitit's way to say that a job has died
+        if not any(records.path.iterdir()):
+            raise
+        gave_up = error
+    endings = [records.ending(number, overrides) for number, overrides in enumerate(jobs)]
+    if any(ending.exit_status for ending in endings):
+        return endings
+    if gave_up is not None:
         raise gave_up
+    records.remove()
     return endings
 
 

@@ -1,8 +1,11 @@
 """Whatever launcher runs the jobs of a sweep, wherever: all of them end, and every failure comes back."""
 
 import os
+import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -121,3 +124,26 @@ def test_nothing_stays_of_a_launch_without_failures(sweep, tmp_path: Path) -> No
     assert done.returncode == 0, done.stderr
     assert errors(done) == []
     assert not list((tmp_path / "runs" / ".sweep").glob("launch-*"))
+
+
+@pytest.mark.slow
+def test_jobs_of_a_queue_outlive_a_stopped_launcher(tmp_path: Path) -> None:
+    """Stopped before its jobs begin, it leaves them the folder of their records."""
+    (tmp_path / "task.py").write_text(TASK)
+    words = [sys.executable, "task.py", "-m", "seed=0,5", "preset=smoke", *LAUNCHERS["submitit"]]
+    environment = os.environ | {"PYTHONPATH": str(HOME)}
+    launches = tmp_path / "runs" / ".sweep"
+    with subprocess.Popen(words, cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL) as launcher:
+        wait_for(lambda: len(list(launches.glob(".submitit/*/*_submitted.pkl"))) == 2)
+        assert not list(launches.glob("launch-*/*")), "no job has begun"
+        launcher.send_signal(signal.SIGTERM)
+        assert launcher.wait(60) == 143
+    wait_for(lambda: len(list(launches.glob("launch-*/*.json"))) == 2)
+    assert {path.name for path in tmp_path.glob("*.done")} == {"0.done", "5.done"}
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < deadline, "waited too long"
+        time.sleep(0.02)
