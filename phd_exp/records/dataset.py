@@ -5,6 +5,7 @@ renders/<variant>/
     <split>/000123.png            images (.webp, .jpg)
     <split>/metadata.jsonl        one line a sample, sorted by index
     <split>/metadata.partial.jsonl    only while rendering: one line a finished image
+    <split>/metadata.partial-0-of-4.jsonl    the same for one of several shards
     .cache/                       whatever programmes derive from the images
 """
 
@@ -18,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from phd_exp.records.errors import UserError
 from phd_exp.records.files import read_jsonl, write_atomic
 from phd_exp.records.scenes import SampleRecord, Split
+from phd_exp.records.shards import Shard
 from phd_exp.records.spec import DatasetSpec, ImageFormat
 
 SPLITS: tuple[Split, ...] = get_args(Split)
@@ -76,8 +78,18 @@ class DatasetFolder:
     def metadata_path(self, split: Split) -> Path:
         return self.root / split / "metadata.jsonl"
 
-    def journal_path(self, split: Split) -> Path:
-        return self.root / split / "metadata.partial.jsonl"
+    @property
+    def render_lock(self) -> Path:
+        """Held by whoever writes here: alone by one, together by shards."""
+        return self.cache / "render.lock"
+
+    def journal_path(self, split: Split, shard: Shard | None = None) -> Path:
+        share = "" if shard is None else f"-{shard.slug}"
+        return self.root / split / f"metadata.partial{share}.jsonl"
+
+    def journals(self, split: Split) -> list[Path]:
+        """Journals that are there, of whatever shards."""
+        return list(self.split_folder(split).glob("metadata.partial*.jsonl"))
 
     def image_path(self, split: Split, index: int, image_format: ImageFormat = "png") -> Path:
         return self.root / split / image_name(index, image_format)

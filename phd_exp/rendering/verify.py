@@ -71,7 +71,7 @@ def _metadata(folder: DatasetFolder, split: Split) -> tuple[list[SampleRecord], 
 
 def _strangers(folder: DatasetFolder, split: Split, records: list[SampleRecord]) -> Iterator[str]:
     """Images without a line of metadata: a loader of images would take them for samples."""
-    if not records or folder.journal_path(split).exists():
+    if not records or folder.journals(split):
         return  # a render under way, or broken off, has images that are not sealed yet
     for name in sorted(folder.images(split) - {record.file_name for record in records}):
         yield f"{folder.split_folder(split) / name}: no line of metadata.jsonl names it; delete it"
