@@ -4,7 +4,7 @@ from typing import Any
 
 from phd_exp.cli.app import launch
 from phd_exp.records.dataset import DatasetFolder
-from phd_exp.rendering.masks import write_masks
+from phd_exp.rendering.masks import require_elsewhere, write_masks
 from phd_exp.rendering.shards import render_shard
 from phd_exp.rendering.verify import verify
 from phd_exp.rendering.workers import ensure_rendered
@@ -18,6 +18,8 @@ def main(arguments: list[str]) -> int:
 def task(config: dict[str, Any], overrides: list[str]) -> None:
     checked = check_render(config)
     data, folder = checked.data, DatasetFolder(checked.data.folder)
+    if checked.masks is not None:
+        require_elsewhere(folder, checked.masks)
     if checked.verify:
         n = verify(folder, data.spec, checked.rerender)
         print(f"{folder.root}: all {n} samples are as they were rendered")

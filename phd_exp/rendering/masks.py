@@ -18,12 +18,9 @@ def write_masks(folder: DatasetFolder, masks: Path) -> int:
 
     Raises:
         DatasetError: there is no data set, or a broken one.
-        RenderError: the masks cannot be written, or would lie among the images, where loaders take them for samples.
+        RenderError: the masks cannot be written, or would lie among the images.
     """
-    if masks.absolute().is_relative_to(folder.root):
-        raise RenderError(
-            f"masks={masks}: lies in the data set itself; expected a folder outside {folder.root}"
-        )
+    require_elsewhere(folder, masks)
     records = [record for split in SPLITS for record in folder.records(split)]
     try:
         for split in SPLITS:
@@ -40,3 +37,11 @@ def write_masks(folder: DatasetFolder, masks: Path) -> int:
             f"{error.filename or masks}: cannot be written ({error.strerror or error}); choose another masks=FOLDER"
         ) from error
     return len(records)
+
+
+def require_elsewhere(folder: DatasetFolder, masks: Path) -> None:
+    """Raise RenderError where masks would lie among the images: loaders would take them for samples."""
+    if masks.absolute().is_relative_to(folder.root):
+        raise RenderError(
+            f"masks={masks}: lies in the data set itself; expected a folder outside {folder.root}"
+        )
