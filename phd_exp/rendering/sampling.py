@@ -108,10 +108,10 @@ def _stream(spec: DatasetSpec, split: Split, scene: int, *purpose: int) -> np.ra
 
 
 def _seen_again(scene: Scene, spec: DatasetSpec, rng: np.random.Generator) -> Scene:
-    """The same scene before another camera, whose images alone cannot be told from those of the first.
+    """The same scene before another camera, turned about an axis across the first one's line of sight.
 
     Its focal length and the cylinder's place before it follow the law of the first view, and as the cylinder's
-    rotation is uniform, it is so before every camera. The camera is turned about an axis across its line of sight.
+    rotation is uniform, it is so before every camera. The lamps stand where they stood.
     """
     f = _uniform(rng, spec.f_range)
     return scene.model_copy(
