@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all lint clean
+.PHONY: help install demo test test-all lint bench clean
 
 help:  ## what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -15,7 +15,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	  { echo "make: Blender's bpy needs Python 3.11; found $$($(PYTHON) --version). Say which: make PYTHON=/path/to/python3.11" >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
-	$(BIN)/pip install --quiet --editable '.[render,report,dev]' --constraint constraints.txt
+	$(BIN)/pip install --quiet --editable '.[render,report,launchers,dev]' --constraint constraints.txt
 	@touch $@
 
 install: $(INSTALLED)  ## .venv with everything in it
@@ -34,7 +34,10 @@ test: lint  ## lint and the default tests (under 5 minutes on 2 cores)
 	$(BIN)/python -m pytest -n 2
 
 test-all: lint  ## the slow tests too
-	$(BIN)/python -m pytest -n 2 -m 'slow or not slow'
+	$(BIN)/python -m pytest -n 2 -m 'not bench'
+
+bench: $(INSTALLED)  ## quality and speed, each beside a named reference, in one run
+	$(BIN)/python -m pytest tests/benchmarks -m bench
 
 clean:  ## forget .venv and caches; renders/ and runs/ stay
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

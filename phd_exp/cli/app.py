@@ -3,81 +3,115 @@
 import os
 import re
 import sys
-import traceback
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+import tempfile
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from omegaconf import MISSING, DictConfig, OmegaConf
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from phd_exp.cli.jobs import BAD_CONFIGURATION, HOME, Ending, JobRecords, Task, run_job
 from phd_exp.cli.paths import conf_folder
 from phd_exp.cli.signals import Stopped, stopping_on_signals
-from phd_exp.records.errors import ConfigError, UserError, nearest
+from phd_exp.records.errors import UserError, nearest
 
-BAD_CONFIGURATION = 2
-FAILED = 1
 MULTIRUN = ("-m", "--multirun")
-
-
-@dataclass(frozen=True)
-class Failure:
-    """A job that did not finish: what was asked for, and why not."""
-
-    overrides: list[str]
-    error: Exception
-
-    @property
-    def exit_status(self) -> int:
-        return BAD_CONFIGURATION if isinstance(self.error, ConfigError) else FAILED
-
-    @property
-    def lines(self) -> list[str]:
-        """What is wrong, one thing a line."""
-        if isinstance(self.error, UserError):
-            return str(self.error).splitlines()
-        return [f"{type(self.error).__name__}: {' '.join(str(self.error).split())}"]
-
-
-Task = Callable[[dict[str, Any], list[str]], None]
-"""Takes the resolved configuration and the overrides that led to it."""
 
 
 def launch(task: Task, arguments: list[str], config_name: str = "config") -> int:
     """Run a task through Hydra, once or (-m) for every combination; returns the exit status.
 
-    In a sweep one failing job does not stop the others; at the end every failure is named.
+    In a sweep one failing job does not stop the others, whatever launcher runs them and wherever; at the end
+    every failure is named, and so is every job that died without a word.
     """
     # Hydra would print errors its own way, over several lines, and exit; we want them as exceptions
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    failures: list[Failure] = []
-
-    def job(config: DictConfig) -> None:
-        overrides = list(HydraConfig.get().overrides.task)
-        try:
-            task(_plain(config), overrides)
-        except Exception as error:
-            if not isinstance(error, UserError):
-                traceback.print_exc()  # a fault of the programme, not of its user
-            failures.append(Failure(overrides, error))
-
-    decorated = hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=config_name)(job)
     # argparse takes the overrides in one piece alone: flags to the front, wherever the user put them
-    sys.argv = [sys.argv[0], *sorted(arguments, key=lambda word: word not in MULTIRUN)]
+    arguments = sorted(arguments, key=lambda word: word not in MULTIRUN)
+    sys.argv = [sys.argv[0], *arguments]
     try:
         with stopping_on_signals():
-            decorated()
+            endings = _run_all(task, arguments, config_name)
     except Stopped as stop:
         print(f"error: stopped by {stop}; the same command goes on from here", file=sys.stderr)
         return int(str(stop.code))
     except (HydraException, OmegaConfBaseException) as error:
         print(f"error: {explain(error, config_name)}", file=sys.stderr)
         return BAD_CONFIGURATION
-    _print(failures)
-    return max((failure.exit_status for failure in failures), default=0)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    _print_failures(endings)
+    return max((ending.exit_status for ending in endings), default=0)
+
+
+def _run_all(task: Task, arguments: list[str], config_name: str) -> list[Ending]:
+    """Run the jobs and collect how they ended."""
+    flags = [word for word in arguments if word.startswith("-")]
+    if len(flags) == 1 and flags[0] in MULTIRUN:
+        return _sweep(task, arguments[1:], config_name)
+    with tempfile.TemporaryDirectory(prefix="phd_exp-") as folder:
+        records = JobRecords(Path(folder))
+        _hand_to_hydra(task, records, config_name)
+        # a flag like --cfg runs no job
+        return [records.ending(0, [])] if any(records.path.iterdir()) else []
+
+
+def _sweep(task: Task, words: list[str], config_name: str) -> list[Ending]:
+    """The same where a launcher may run the jobs in other processes, on other machines: they share a folder.
+
+    The folder is removed where no job needs it any more and none failed. It stays when this process is stopped:
+    jobs in a queue outlive it.
+    """
+    folder, jobs = _plan(words, config_name)
+    records = JobRecords.begin(folder)
+    gave_up: Exception | None = None
+    try:
+        _hand_to_hydra(task, records, config_name)
+    except (HydraException, OmegaConfBaseException):
+        records.remove()  # a combination that cannot be composed is found before any job begins
+        raise
+    except Exception as error:  # joblib's and submitit's way to say that a job has died
+        if not any(records.path.iterdir()):
+            raise
+        gave_up = error
+    endings = [records.ending(number, overrides) for number, overrides in enumerate(jobs)]
+    if any(ending.exit_status for ending in endings):
+        return endings
+    if gave_up is not None:
+        raise gave_up
+    records.remove()
+    return endings
+
+
+def _hand_to_hydra(task: Task, records: JobRecords, config_name: str) -> None:
+    home = HOME  # here: what a launcher pickles is this function and what it holds
+
+    def job(config: DictConfig) -> None:
+        run_job(task, records, home, config)
+
+    hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=config_name)(job)()
+
+
+def _plan(words: list[str], config_name: str) -> tuple[Path, list[list[str]]]:
+    """A fresh folder for the records of a sweep, below Hydra's own, and the overrides of each of its jobs."""
+    with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
+        loader = GlobalHydra.instance().config_loader()
+        config = loader.load_configuration(config_name, words, RunMode.MULTIRUN)
+        params = [f"{key}={value}" for key, value in (config.hydra.sweeper.params or {}).items()]
+        overrides = OverridesParser.create(loader).parse_overrides([*params, *words])
+        own = [override for override in overrides if not override.is_hydra_override()]
+        (jobs,) = BasicSweeper.split_arguments(own, max_batch_size=None)
+    folder = Path(config.hydra.sweep.dir).absolute() / f"launch-{uuid.uuid4().hex[:8]}"
+    return folder, jobs
 
 
 def explain(error: Exception, config_name: str) -> str:
@@ -88,9 +122,9 @@ def explain(error: Exception, config_name: str) -> str:
         key = unknown[1].lstrip("+~")
         if owners := _choices_with(key):
             return f"{key}: not a key of this choice, but of {' or '.join(owners)}; name that choice too"
-        return (
-            f"{key}: unknown key{nearest(key, _known_keys(config_name))}; see `python -m phd_exp --cfg job`"
-        )
+        verb = "" if config_name == "config" else f" {config_name}"
+        close = nearest(key, _known_keys(config_name))
+        return f"{key}: unknown key{close}; see `python -m phd_exp{verb} --cfg job`"
     choice = re.search(
         r"Could not find '([^']+)/([^']+)' Available options in '[^']+': (.*?) Config search path", text
     )
@@ -100,25 +134,14 @@ def explain(error: Exception, config_name: str) -> str:
     return re.sub(r" Set the environment variable.*| Config search path:.*", "", text)
 
 
-def _print(failures: list[Failure]) -> None:
+def _print_failures(endings: list[Ending]) -> None:
+    failures = [ending for ending in endings if ending.exit_status]
     if len(failures) > 1:
         print(f"error: {len(failures)} runs failed", file=sys.stderr)
     for failure in failures:
-        run = f"{' '.join(failure.overrides)}: " if len(failures) > 1 else ""
+        run = f"{' '.join(failure.overrides)}: " if len(endings) > 1 else ""
         for line in failure.lines:
             print(f"error: {run}{line}", file=sys.stderr)
-
-
-def _plain(config: DictConfig) -> dict[str, Any]:
-    """The configuration as plain containers, every interpolation resolved; what is missing is left for the check."""
-    plain = _without_missing(OmegaConf.to_container(config, resolve=True))
-    return {str(key): value for key, value in plain.items()}
-
-
-def _without_missing(node: Any) -> Any:
-    if not isinstance(node, dict):
-        return node
-    return {key: _without_missing(value) for key, value in node.items() if value != MISSING}
 
 
 def _known_keys(config_name: str) -> list[str]:

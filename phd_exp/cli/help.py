@@ -7,11 +7,13 @@ from phd_exp.cli.paths import conf_folder
 VERBS = {
     "train": "render what is missing, train, measure and record a run (the default)",
     "render": "render a data set, or what is missing of it",
+    "gallery": "draw the pictures of renders/README.md: paired data sets, the camera's axes",
     "report": "print the table of all recorded runs beside the paper's numbers",
 }
 OF_VERB = {
     "train": ("model", "data", "preset", "backbone", "camera", "loss", "optimizer", "trainer", "logger"),
     "render": ("data", "preset"),
+    "gallery": (),
     "report": (),
 }
 """The groups whose choice a verb looks at."""
@@ -26,7 +28,11 @@ EXAMPLES = {
     "render": [
         "python -m phd_exp render data=scale",
         "python -m phd_exp render data=occl data.n_train=100 data.n_test=20 data.workers=1",
+        "python -m phd_exp -m render data=scale data.workers=1 shard=0/4,1/4,2/4,3/4 hydra/launcher=joblib",
+        "python -m phd_exp render data=scale verify=true",
+        "python -m phd_exp render data=occl masks=masks/occl",
     ],
+    "gallery": ["python -m phd_exp gallery", "python -m phd_exp gallery folder=some/folder"],
     "report": ["python -m phd_exp report", "python -m phd_exp report runs=some/other/folder"],
 }
 

@@ -1,21 +1,41 @@
-"""`python -m phd_exp render`: a data set, or what is missing of it."""
+"""`python -m phd_exp render`: a data set, or what is missing of it, or one share of that; or whether it is sound."""
 
 from typing import Any
 
 from phd_exp.cli.app import launch
 from phd_exp.records.dataset import DatasetFolder
+from phd_exp.rendering.masks import write_masks
+from phd_exp.rendering.shards import render_shard
+from phd_exp.rendering.verify import verify
 from phd_exp.rendering.workers import ensure_rendered
-from phd_exp.training.config import RenderedConfig, check_data
+from phd_exp.training.config import RenderConfig, RenderedConfig, check_render
 
 
 def main(arguments: list[str]) -> int:
-    return launch(task, arguments)
+    return launch(task, arguments, config_name="render")
 
 
 def task(config: dict[str, Any], overrides: list[str]) -> None:
-    data = check_data(config)
-    ensure_dataset(data)
-    print(f"{data.folder}: {data.n_train} training and {data.n_test} test samples are there")
+    checked = check_render(config)
+    data, folder = checked.data, DatasetFolder(checked.data.folder)
+    if checked.verify:
+        n = verify(folder, data.spec, checked.rerender)
+        print(f"{folder.root}: all {n} samples are as they were rendered")
+    elif _render(checked, folder):
+        print(f"{folder.root}: {data.n_train} training and {data.n_test} test samples are there")
+    else:
+        return  # other shards are not done yet
+    if checked.masks is not None:
+        print(f"{checked.masks}: {write_masks(folder, checked.masks)} masks")
+
+
+def _render(checked: RenderConfig, folder: DatasetFolder) -> bool:
+    """Render all of a data set, or one share of it; whether all of it is there."""
+    data = checked.data
+    if checked.shard is None:
+        ensure_dataset(data)
+        return True
+    return render_shard(folder, data.spec, data.n_train, data.n_test, checked.shard, data.workers)
 
 
 def ensure_dataset(data: RenderedConfig) -> None:

@@ -67,7 +67,7 @@ class RenderedSource(Source):
         )
 
     def known(self, split: Split) -> Known:
-        names = ("file_name", "f", "S", "scale", "visibility")
+        names = ("file_name", "f", "S", "scale", "visibility", "truncation", "scene", "view")
         records = self._records(split)
         return {name: [getattr(record, name) for record in records] for name in names}
 

@@ -5,6 +5,7 @@ renders/<variant>/
     <split>/000123.png            images (.webp, .jpg)
     <split>/metadata.jsonl        one line a sample, sorted by index
     <split>/metadata.partial.jsonl    only while rendering: one line a finished image
+    <split>/metadata.partial-0-of-4.jsonl    the same for one of several shards
     .cache/                       whatever programmes derive from the images
 """
 
@@ -18,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from phd_exp.records.errors import UserError
 from phd_exp.records.files import read_jsonl, write_atomic
 from phd_exp.records.scenes import SampleRecord, Split
+from phd_exp.records.shards import Shard
 from phd_exp.records.spec import DatasetSpec, ImageFormat
 
 SPLITS: tuple[Split, ...] = get_args(Split)
@@ -76,8 +78,18 @@ class DatasetFolder:
     def metadata_path(self, split: Split) -> Path:
         return self.root / split / "metadata.jsonl"
 
-    def journal_path(self, split: Split) -> Path:
-        return self.root / split / "metadata.partial.jsonl"
+    @property
+    def render_lock(self) -> Path:
+        """Held by whoever writes here: alone by one, together by shards."""
+        return self.cache / "render.lock"
+
+    def journal_path(self, split: Split, shard: Shard | None = None) -> Path:
+        share = "" if shard is None else f"-{shard.slug}"
+        return self.root / split / f"metadata.partial{share}.jsonl"
+
+    def journals(self, split: Split) -> list[Path]:
+        """Journals that are there, of whatever shards."""
+        return list(self.split_folder(split).glob("metadata.partial*.jsonl"))
 
     def image_path(self, split: Split, index: int, image_format: ImageFormat = "png") -> Path:
         return self.root / split / image_name(index, image_format)
@@ -140,8 +152,8 @@ class DatasetFolder:
         wanted: dict[Split, int] = {"train": n_train, "test": n_test}
         if not self.manifest_path.exists():
             return {split: list(range(n)) for split, n in wanted.items()}
+        self.require(spec)
         manifest = self.manifest
-        self._require_same(manifest.spec, spec)
         return {split: self._unfinished(split, n, manifest) for split, n in wanted.items()}
 
     def images(self, split: Split) -> set[str]:
@@ -154,9 +166,15 @@ class DatasetFolder:
         finished, kind = manifest.count(split), manifest.spec.image_format
         return [index for index in range(n) if index >= finished or image_name(index, kind) not in there]
 
-    def _require_same(self, found: DatasetSpec, wanted: DatasetSpec) -> None:
+    def require(self, spec: DatasetSpec) -> None:
+        """Check that the folder holds a data set of this specification.
+
+        Raises:
+            DatasetError: it holds another one, naming the first key that differs, or none.
+        """
+        found = self.manifest.spec
         for key in DatasetSpec.model_fields:
-            here, asked = getattr(found, key), getattr(wanted, key)
+            here, asked = getattr(found, key), getattr(spec, key)
             if here != asked:
                 raise DatasetError(
                     f"{self.root}: holds a data set with {key}={here}, but {key}={asked} is asked for; "

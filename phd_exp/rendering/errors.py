@@ -1,5 +1,7 @@
 """What can go wrong while rendering and is the user's to mend."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from phd_exp.records.errors import UserError
@@ -15,3 +17,12 @@ def unwritable(error: OSError, folder: Path) -> RenderError:
         f"{error.filename or folder}: cannot be written ({error.strerror or error}); make room, allow writing, "
         "or choose another data.root"
     )
+
+
+@contextmanager
+def writing(folder: Path) -> Iterator[None]:
+    """An unwritable folder or a full disk is one line, not a stack of calls."""
+    try:
+        yield
+    except OSError as error:
+        raise unwritable(error, folder) from error

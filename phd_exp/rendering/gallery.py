@@ -1,44 +1,127 @@
-"""One picture of several data sets side by side: a row for each, the same indices in each column."""
+"""The two pictures of `renders/README.md`: paired data sets side by side, and where things are in an image."""
 
 import io
 from collections.abc import Sequence
 from pathlib import Path
 
-from PIL import Image
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
-from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.files import write_atomic
-from phd_exp.records.scenes import Split
-from phd_exp.rendering.errors import RenderError
+from phd_exp.records.scenes import SampleRecord, Split
+from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.blender import Renderer
+from phd_exp.rendering.rays import trace_pixels
+from phd_exp.rendering.visibility import cylinder_mask
+from phd_exp.rendering.worker import fast_settings, make_sample
 
 GAP = 4  # px of white between pictures
 QUALITY = 88
+SPLIT: Split = "train"
+ZOOM = 4
+INK, MARK = (20, 20, 20), (200, 0, 60)
+PIXEL = 96  # px of the drawing that one pixel takes where two of them are explained
 
 
-def draw_gallery(
-    path: Path, folders: Sequence[DatasetFolder], indices: Sequence[int], split: Split = "train"
-) -> None:
-    """Write a JPEG of the images `indices` of every folder; all of them have to be rendered already.
+def draw_gallery(path: Path, specs: Sequence[DatasetSpec], indices: Sequence[int]) -> None:
+    """Write a JPEG of the same samples of every data set, rendered for it: a row a data set, a column a sample.
 
     Raises:
-        RenderError: there is nothing to draw, or an image is missing.
+        RenderError: bpy is missing.
     """
-    if not folders or not indices:
-        raise RenderError(f"{path}: a gallery needs at least one data set and one index")
-    rows = [[_open(folder.image_path(split, index)) for index in indices] for folder in folders]
+    rows = [[image for image, _ in _samples(spec, indices)] for spec in specs]
     side = max(image.width for row in rows for image in row) + GAP
-    sheet = Image.new("RGB", (len(indices) * side - GAP, len(folders) * side - GAP), "white")
+    sheet = Image.new("RGB", (len(indices) * side - GAP, len(specs) * side - GAP), "white")
     for y, row in enumerate(rows):
         for x, image in enumerate(row):
             sheet.paste(image, (x * side, y * side))
+    _write(path, sheet, format="JPEG", quality=QUALITY)
+
+
+def draw_camera(path: Path, spec: DatasetSpec, index: int) -> None:
+    """Write a PNG of one sample with the camera's axes, the principal point, and the truth of its record on top.
+
+    Raises:
+        RenderError: bpy is missing.
+    """
+    ((image, record),) = _samples(spec, [index])
+    side = ZOOM * record.S
+    sheet = Image.new("RGB", (side + 3 * PIXEL, side), "white")
+    sheet.paste(image.resize((side, side), Image.Resampling.NEAREST))
+    draw = ImageDraw.Draw(sheet)
+    _draw_truth(draw, record)
+    _draw_axes(draw, side)
+    _draw_pixels(draw, side + PIXEL // 2)
+    _write(path, sheet, format="PNG")
+
+
+def _samples(spec: DatasetSpec, indices: Sequence[int]) -> list[tuple[Image.Image, SampleRecord]]:
+    renderer = Renderer(fast_settings(spec))
+    made = [make_sample(renderer, spec, SPLIT, index) for index in indices]
+    return [(Image.open(io.BytesIO(content)).convert("RGB"), record) for content, record in made]
+
+
+def _draw_truth(draw: ImageDraw.ImageDraw, record: SampleRecord) -> None:
+    """The outline of the cylinder's mask, and its centre as the record's x, y, z, f and S place it."""
+    mask = np.pad(cylinder_mask(trace_pixels(record.shown)), 1)
+    for row, column in np.argwhere(mask[:, 1:] != mask[:, :-1]):
+        draw.line([(ZOOM * column, ZOOM * (row - 1)), (ZOOM * column, ZOOM * row)], MARK, 2)
+    for row, column in np.argwhere(mask[1:] != mask[:-1]):
+        draw.line([(ZOOM * (column - 1), ZOOM * row), (ZOOM * column, ZOOM * row)], MARK, 2)
+    u, v = (ZOOM * (record.f * place / record.z + record.S / 2) for place in (record.x, record.y))
+    _dot(draw, u, v, MARK)
+    lines = (
+        "red: truth of the record",
+        f"x {record.x:.3f}  y {record.y:.3f}  z {record.z:.3f} m",
+        f"f {record.f:.1f}  S {record.S} px",
+        "centre seen at",
+        "(f x/z + S/2, f y/z + S/2)",
+        f"= ({u / ZOOM:.1f}, {v / ZOOM:.1f})",
+        "outline: its mask",
+    )
+    draw.multiline_text((ZOOM * record.S + PIXEL // 2, 4 * PIXEL), "\n".join(lines), MARK, _font(16))
+
+
+def _draw_axes(draw: ImageDraw.ImageDraw, side: int) -> None:
+    middle, reach = side / 2, side / 5
+    _arrow(draw, (middle, middle), (middle + reach, middle))
+    _arrow(draw, (middle, middle), (middle, middle + reach))
+    _dot(draw, middle, middle, INK)
+    draw.text((middle + reach + 8, middle - 10), "x", INK, _font(20))
+    draw.text((middle + 8, middle + reach - 10), "y", INK, _font(20))
+    draw.text((middle + 14, middle - 30), "principal point (S/2, S/2)", INK, _font(16))
+    draw.text((middle + 14, middle + 10), "z goes in", INK, _font(16))
+    draw.text((6, 4), "(0, 0)", INK, _font(16))
+    draw.text((side - 60, side - 24), "(S, S)", INK, _font(16))
+
+
+def _draw_pixels(draw: ImageDraw.ImageDraw, left: int) -> None:
+    """Two pixels of the top row, large."""
+    for column in (0, 1):
+        x = left + column * PIXEL
+        draw.rectangle((x, PIXEL, x + PIXEL, 2 * PIXEL), outline=INK, width=2)
+        _dot(draw, x + PIXEL / 2, 1.5 * PIXEL, MARK)
+        draw.text((x + 20, 2 * PIXEL + 6), f"({column}.5, 0.5)", MARK, _font(14))
+    text = "pixels of column 0 and 1,\nrow 0: a pixel's middle is\nhalf a pixel from its corner"
+    draw.multiline_text((left, 2 * PIXEL + 40), text, INK, _font(14))
+
+
+def _arrow(draw: ImageDraw.ImageDraw, begin: tuple[float, float], end: tuple[float, float]) -> None:
+    draw.line([begin, end], INK, 3)
+    (x, y), along = end, np.array(end) - np.array(begin)
+    right, down = 10 * along / np.hypot(*along)
+    draw.polygon([(x + right, y + down), (x - down, y + right), (x + down, y - right)], INK)
+
+
+def _dot(draw: ImageDraw.ImageDraw, x: float, y: float, colour: tuple[int, int, int]) -> None:
+    draw.ellipse((x - 5, y - 5, x + 5, y + 5), colour)
+
+
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size)
+
+
+def _write(path: Path, sheet: Image.Image, **options: object) -> None:
     stream = io.BytesIO()
-    sheet.save(stream, format="JPEG", quality=QUALITY)
+    sheet.save(stream, **options)  # type: ignore[arg-type]
     write_atomic(path, stream.getvalue())
-
-
-def _open(path: Path) -> Image.Image:
-    try:
-        with Image.open(path) as image:
-            return image.convert("RGB")
-    except FileNotFoundError:
-        raise RenderError(f"{path}: not rendered yet; render this data set first") from None

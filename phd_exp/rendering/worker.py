@@ -63,11 +63,19 @@ def render_sample(
     Raises:
         OSError: the image cannot be written.
     """
+    image, record = make_sample(renderer, spec, split, index)
+    write_atomic(folder.image_path(split, index, spec.image_format), image)
+    return record
+
+
+def make_sample(
+    renderer: Renderer, spec: DatasetSpec, split: Split, index: int
+) -> tuple[bytes, SampleRecord]:
+    """The image file and the record of one sample."""
     scene = sample_scene(spec, split, index)
     hits = trace_pixels(scene)
     image = encode(take_picture(renderer, scene, hits), spec)
-    write_atomic(folder.image_path(split, index, spec.image_format), image)
-    return describe(spec, split, index, scene, hits, sha256(image))
+    return image, describe(spec, split, index, scene, hits, sha256(image))
 
 
 def describe(

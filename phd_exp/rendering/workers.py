@@ -2,31 +2,30 @@
 
 Order of writing, so that a kill at any moment leaves a folder that the same call completes: the manifest (what
 is being made); then for every image the image itself and its line in the journal; at the end `metadata.jsonl` out
-of the journal, the journal's removal, and the manifest again, which now counts the samples.
+of the journals, the journals' removal, and the manifest again, which now counts the samples (`sealing.py`).
 """
 
 import math
 import os
-from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+import resource
+import sys
+import time
+from contextlib import ExitStack, closing
 
-from filelock import FileLock, Timeout
-
-from phd_exp.records.dataset import SPLITS, DatasetError, DatasetFolder, Manifest, Seal, sha256
-from phd_exp.records.files import CorruptFileError, open_journal, read_jsonl, remove_temporaries, write_atomic
-from phd_exp.records.scenes import SampleRecord, Split
+from phd_exp.records.dataset import SPLITS, DatasetFolder
+from phd_exp.records.files import open_journal, remove_temporaries
+from phd_exp.records.shards import Shard
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.blender import renderer_version, require_bpy
-from phd_exp.rendering.errors import RenderError, unwritable
+from phd_exp.rendering.blender import require_bpy
+from phd_exp.rendering.errors import RenderError, writing
+from phd_exp.rendering.locks import held
 from phd_exp.rendering.pool import render_all
 from phd_exp.rendering.progress import announce, shown_progress
-from phd_exp.rendering.sampling import GENERATOR_VERSION
+from phd_exp.rendering.sealing import Known, Wanted, begin, known_samples, seal
 from phd_exp.rendering.worker import Task
 
 FEWEST_PER_WORKER = 8  # starting one more process costs about as much as rendering this many images
-SECONDS_PER_IMAGE = 0.2  # one core, 224 px, 4 samples a pixel: for the announcement only
-
-Known = dict[Split, dict[int, SampleRecord]]
+SECONDS_PER_OBJECT = 0.085  # one core, 224 px, 3 samples a pixel: for the announcement only
 
 
 def ensure_rendered(
@@ -34,8 +33,9 @@ def ensure_rendered(
 ) -> None:
     """Return when the first `n_train` and `n_test` samples are on disk, rendering those that are not.
 
-    One process renders a folder at a time, others wait. What is rendered stays, whatever happens; the same
-    call goes on from there, and the finished folder has the same bytes as one rendered without interruption.
+    One process, or the shards of one data set (`shards.py`), render a folder at a time; others wait. What is
+    rendered stays, whatever happens; the same call goes on from there, and the finished folder has the same
+    bytes as one rendered without interruption.
 
     Args:
         workers: number of processes; by default one a core, fewer where there is little to do.
@@ -44,95 +44,73 @@ def ensure_rendered(
         DatasetError: the folder holds another data set, or a broken one.
         RenderError: bpy is missing, a worker died, the folder cannot be written.
     """
-    if workers is not None and workers < 1:
-        raise RenderError(f"workers={workers}: expected a number of processes, at least 1")
+    _require_some(workers)
     if not any(folder.missing(spec, n_train, n_test).values()):
         return
     require_bpy()
-    with _writing(folder), _alone_in(folder):
-        # Another process may have finished the work while this one waited.
-        if any(folder.missing(spec, n_train, n_test).values()):
-            _render_missing(folder, spec, {"train": n_train, "test": n_test}, workers)
+    with writing(folder.root):
+        folder.cache.mkdir(parents=True, exist_ok=True)
+        occupied = f"{folder.root}: another process is rendering here; waiting for it to finish"
+        with held(folder.render_lock, waiting=occupied):
+            # Another process may have finished the work while this one waited.
+            if not any(folder.missing(spec, n_train, n_test).values()):
+                return
+            begin(folder, spec)
+            for split in SPLITS:
+                remove_temporaries(folder.split_folder(split))
+            known = known_samples(folder)
+            render_missing(folder, spec, {"train": n_train, "test": n_test}, known, workers)
+            seal(folder, known)
 
 
-def _render_missing(
-    folder: DatasetFolder, spec: DatasetSpec, wanted: dict[Split, int], workers: int | None
-) -> None:
-    manifest = _open_manifest(folder, spec)
-    for split in SPLITS:
-        folder.split_folder(split).mkdir(exist_ok=True)
-        remove_temporaries(folder.split_folder(split))
-    known: Known = {split: _finished_before(folder, split) for split in SPLITS}
+def render_missing(
+    folder: DatasetFolder,
+    spec: DatasetSpec,
+    wanted: Wanted,
+    known: Known,
+    workers: int | None,
+    shard: Shard | None = None,
+) -> int:
+    """Render the samples asked for, or those of a share, that are not yet in `known`, into it; returns how many.
+
+    The caller holds the locks. Each record is journaled as soon as its image is on disk.
+    """
+    _require_some(workers)
     tasks = [
         Task(split=split, index=index)
         for split in SPLITS
         for index in range(wanted[split])
-        if index not in known[split]
+        if index not in known[split] and (shard is None or shard.holds(index))
     ]
-    if tasks:
-        _render(folder, spec, tasks, workers or worker_count(len(tasks)), known)
-    seals = {split: seal for split in SPLITS if (seal := _seal(folder, split, known[split])).n}
-    folder.write_manifest(manifest.model_copy(update={"splits": seals}))
-
-
-def _render(folder: DatasetFolder, spec: DatasetSpec, tasks: list[Task], workers: int, known: Known) -> None:
-    """Render the tasks into `known`, each record journaled as soon as its image is on disk."""
+    if not tasks:
+        return 0
+    workers = workers or worker_count(len(tasks))
+    title = spec.variant if shard is None else f"{spec.variant} {shard}"
     announce(_first_words(folder, spec, len(tasks), workers, resumed=any(known.values())))
+    begun = time.monotonic()
     with ExitStack() as stack:
-        journals = {split: stack.enter_context(open_journal(folder.journal_path(split))) for split in SPLITS}
-        advance = stack.enter_context(shown_progress(len(tasks), f"rendering {spec.variant}"))
+        journals = {
+            split: stack.enter_context(open_journal(folder.journal_path(split, shard))) for split in SPLITS
+        }
+        advance = stack.enter_context(shown_progress(len(tasks), f"rendering {title}"))
         for record in stack.enter_context(closing(render_all(folder, spec, tasks, workers))):
             journals[record.split].write(record.model_dump_json() + "\n")
             known[record.split][record.index] = record
             advance()
+    announce(_last_words(len(tasks), time.monotonic() - begun))
+    return len(tasks)
 
 
-def _open_manifest(folder: DatasetFolder, spec: DatasetSpec) -> Manifest:
-    """The folder's manifest, begun if there is none: before the first image, it says of which data set it is.
-
-    Raises:
-        DatasetError: the folder was made by another generator or another Blender: the rest would not match.
-    """
-    ours = Manifest(generator=GENERATOR_VERSION, renderer=renderer_version(), spec=spec, splits={})
-    if not folder.manifest_path.exists():
-        folder.write_manifest(ours)
-        return ours
-    found = folder.manifest
-    for key in ("generator", "renderer"):
-        theirs, mine = getattr(found, key), getattr(ours, key)
-        if theirs != mine:
-            raise DatasetError(
-                f"{folder.root}: begun with {key} {theirs}, this is {mine}, and the rest would not match; "
-                "move the folder away or choose another data.root"
-            )
-    return found
+def _last_words(n: int, seconds: float) -> str:
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / (
+        2**30 if sys.platform == "darwin" else 2**20
+    )
+    return f"rendered {n} images in {seconds:.0f} s, {n / seconds:.1f} a second; a process took at most {peak:.2f} GiB"
 
 
-def _finished_before(folder: DatasetFolder, split: Split) -> dict[int, SampleRecord]:
-    """Records of samples whose image is on disk, from the sealed file and from a killed run's journal."""
-    records: list[SampleRecord] = []
-    for path in (folder.metadata_path(split), folder.journal_path(split)):
-        try:
-            if path.exists():
-                records += read_jsonl(path, SampleRecord.model_validate_json)
-        except CorruptFileError as error:
-            raise DatasetError(f"{error}; remove that line, and its image is rendered again") from error
-    images = folder.images(split)
-    return {record.index: record for record in records if record.file_name in images}
-
-
-def _seal(folder: DatasetFolder, split: Split, known: dict[int, SampleRecord]) -> Seal:
-    """Turn all samples without a gap into `metadata.jsonl`; what lies beyond a gap stays in the journal."""
-    n = next(index for index in range(len(known) + 1) if index not in known)
-    lines = "".join(known[index].model_dump_json() + "\n" for index in range(n))
-    if n:
-        write_atomic(folder.metadata_path(split), lines)
-    beyond = "".join(known[index].model_dump_json() + "\n" for index in sorted(known) if index > n)
-    if beyond:
-        write_atomic(folder.journal_path(split), beyond)
-    else:
-        folder.journal_path(split).unlink(missing_ok=True)
-    return Seal(n=n, metadata_sha256=sha256(lines.encode()))
+def _require_some(workers: int | None) -> None:
+    if workers is not None and workers < 1:
+        raise RenderError(f"workers={workers}: expected a number of processes, at least 1")
 
 
 def worker_count(tasks: int) -> int:
@@ -142,8 +120,9 @@ def worker_count(tasks: int) -> int:
 
 
 def _first_words(folder: DatasetFolder, spec: DatasetSpec, n: int, workers: int, *, resumed: bool) -> str:
-    pixels, samples = (spec.sensor_size / 224) ** 2, spec.samples_per_pixel / 4
-    minutes = n * SECONDS_PER_IMAGE * pixels * max(samples, 1.0) / workers / 60
+    objects, pixels = 3 if spec.occluders else 1, (spec.sensor_size / 224) ** 2
+    seconds = SECONDS_PER_OBJECT * objects * pixels * max(spec.samples_per_pixel / 3, 1.0)
+    minutes = n * seconds / workers / 60
     about = "less than a minute" if minutes < 1 else f"about {minutes:.0f} min"
     left = f"the remaining {n}" if resumed else f"{n}"
     return (
@@ -151,28 +130,3 @@ def _first_words(folder: DatasetFolder, spec: DatasetSpec, n: int, workers: int,
         f"process{'es' if workers > 1 else ''}; fewer with data.n_train=... data.n_test=...; "
         "stop at any time, the same command goes on"
     )
-
-
-@contextmanager
-def _alone_in(folder: DatasetFolder) -> Iterator[None]:
-    """Hold the folder's lock, which the system drops when the process dies, however it dies."""
-    folder.cache.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder.cache / "render.lock")
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        announce(f"{folder.root}: another process is rendering here; waiting for it to finish")
-        lock.acquire()
-    try:
-        yield
-    finally:
-        lock.release()
-
-
-@contextmanager
-def _writing(folder: DatasetFolder) -> Iterator[None]:
-    """An unwritable folder or a full disk is one line, not a stack of calls."""
-    try:
-        yield
-    except OSError as error:
-        raise unwritable(error, folder.root) from error

@@ -8,9 +8,19 @@ loss, optimizer) names a `_target_`, and its keys are held against that target's
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    model_validator,
+)
 
 from phd_exp.records.errors import ConfigError
+from phd_exp.records.shards import Shard
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.training.targets import Target, describe, locate
 
@@ -133,9 +143,13 @@ class EvaluationConfig(Section):
 
 
 class RenderConfig(Section):
-    """The part of a configuration that rendering looks at."""
+    """What rendering looks at: the data, and the keys of conf/render.yaml."""
 
     data: RenderedConfig
+    shard: Annotated[Shard, BeforeValidator(Shard.parse)] | None
+    verify: Annotated[bool, Field(strict=True)]
+    rerender: Annotated[Whole, Field(ge=0)]
+    masks: Folder | None
 
 
 class RunConfig(Section):
@@ -176,13 +190,14 @@ def check(config: dict[str, Any]) -> RunConfig:
     return _validated(RunConfig, config)
 
 
-def check_data(config: dict[str, Any]) -> RenderedConfig:
-    """The same for the `data` part alone, which is all that rendering looks at."""
+def check_render(config: dict[str, Any]) -> RenderConfig:
+    """The same for what rendering looks at; the rest of the run, which comes along, is not its business."""
     if _kind(config["data"]) == "<folder>":
         raise ConfigError(
             "data=folder: there is nothing to render, these are your own images; leave out `render` to train on them"
         )
-    return _validated(RenderConfig, {"data": config["data"]}).data
+    others = RunConfig.model_fields.keys() - RenderConfig.model_fields.keys()
+    return _validated(RenderConfig, {key: value for key, value in config.items() if key not in others})
 
 
 def _validated(model: type[Checked], config: dict[str, Any]) -> Checked:

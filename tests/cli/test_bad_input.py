@@ -86,6 +86,43 @@ def test_a_folder_without_metadata(phd_exp: Callable, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [
+        ("shard=4/4", "shard: got '4/4'; expected INDEX/COUNT with 0 <= INDEX < COUNT, from 0/4 to 3/4"),
+        ("shard=-1/2", "shard: got '-1/2'; expected INDEX/COUNT"),
+        ("shard=1/0", "shard: got '1/0'; expected INDEX/COUNT"),
+        ("shard=a", "shard: got 'a'; expected INDEX/COUNT"),
+        ("shard=2", "shard: got 2; expected INDEX/COUNT"),
+        ("shrad=0/2", "shrad: unknown key, did you mean 'shard'?; see `python -m phd_exp render --cfg job`"),
+        ("+shards=0/2", "shards: unknown key"),
+        ("data.workers=0", "data.workers: got 0"),
+    ],
+)
+def test_render_says_in_one_line_what_is_wrong(
+    phd_exp: Callable, tmp_path: Path, argument: str, said: str
+) -> None:
+    outcome = phd_exp("render", "preset=smoke", argument)
+    assert outcome.status == 2
+    (line,) = outcome.err.splitlines()
+    assert line.startswith(f"error: {said}")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_rendering_has_keys_that_a_run_has_not(phd_exp: Callable) -> None:
+    assert "shard: null" in phd_exp("render", "--cfg", "job").out
+    assert "shard: unknown key" in phd_exp("train", "preset=smoke", "shard=0/2").err
+
+
+def test_an_unwritable_folder_of_a_sweep(phd_exp: Callable, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    outcome = phd_exp("-m", "preset=smoke", "seed=0,1", "runs=file/runs")
+    assert outcome.status == 1
+    (line,) = outcome.err.splitlines()
+    assert "cannot be written" in line
+    assert "runs=DIR" in line
+
+
 def test_each_thing_wrong_gets_its_own_line(phd_exp: Callable) -> None:
     outcome = phd_exp("preset=smoke", "seed=-1", "data.n_test=0")
     assert outcome.err.splitlines() == [

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from phd_exp.records.dataset import DatasetFolder, Manifest, Seal, image_name, sha256
-from phd_exp.records.scenes import Backdrop, SampleRecord, SceneObject, Split
+from phd_exp.records.scenes import FIRST_VIEW, Backdrop, SampleRecord, SceneObject, Split
 from phd_exp.records.spec import DatasetSpec
 
 SIDE = 64
@@ -45,9 +45,13 @@ def record(index: int, split: Split, content: bytes) -> SampleRecord:
         S=SIDE,
         scale=1.0,
         visibility=1.0,
+        truncation=0.0,
         index=index,
         split=split,
         seed=0,
+        scene=index,
+        view=0,
+        pose=FIRST_VIEW,
         objects=(cylinder,),
         lamps=(),
         backdrop=Backdrop(level=0.5, falloff=0.0, centre=(0.5, 0.5)),

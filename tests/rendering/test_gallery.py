@@ -1,18 +1,20 @@
-"""The gallery shows the images it is asked for, one data set a row."""
+"""The pictures of the README show what a data set would hold."""
 
+import io
 from pathlib import Path
 
 import numpy as np
-import pytest
 from PIL import Image
 
 from phd_exp.records.dataset import DatasetFolder
-from phd_exp.rendering.errors import RenderError
-from phd_exp.rendering.gallery import GAP, draw_gallery
+from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.gallery import GAP, MARK, ZOOM, draw_camera, draw_gallery
 
 
-def test_images_stand_in_rows_and_columns(small: DatasetFolder, tmp_path: Path) -> None:
-    draw_gallery(tmp_path / "gallery.jpg", [small, small], [4, 2, 0])
+def test_samples_stand_in_rows_and_columns(
+    small: DatasetFolder, small_spec: DatasetSpec, tmp_path: Path
+) -> None:
+    draw_gallery(tmp_path / "gallery.jpg", [small_spec, small_spec], [4, 2, 0])
     with Image.open(tmp_path / "gallery.jpg") as picture:
         sheet = np.asarray(picture).astype(int)
     side = 56
@@ -22,9 +24,12 @@ def test_images_stand_in_rows_and_columns(small: DatasetFolder, tmp_path: Path) 
         assert np.abs(shown - np.asarray(image).astype(int)).mean() < 6
 
 
-def test_what_is_not_rendered_is_named(small: DatasetFolder, tmp_path: Path) -> None:
-    with pytest.raises(RenderError, match=r"000099\.png: not rendered yet"):
-        draw_gallery(tmp_path / "gallery.jpg", [small], [99])
-    with pytest.raises(RenderError, match="at least one"):
-        draw_gallery(tmp_path / "gallery.jpg", [], [0])
-    assert not (tmp_path / "gallery.jpg").exists()
+def test_the_centre_is_marked_where_the_record_says(
+    small: DatasetFolder, small_spec: DatasetSpec, tmp_path: Path
+) -> None:
+    draw_camera(tmp_path / "camera.png", small_spec, 4)
+    record = small.records("train")[4]
+    u, v = (int(ZOOM * (record.f * place / record.z + record.S / 2)) for place in (record.x, record.y))
+    with Image.open(io.BytesIO((tmp_path / "camera.png").read_bytes())) as picture:
+        assert picture.height == ZOOM * record.S
+        assert picture.getpixel((u, v)) == MARK
