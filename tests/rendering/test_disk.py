@@ -1,5 +1,6 @@
 """A disk that is full, turns read-only or goes away costs one line and nothing else: the same call goes on."""
 
+import os
 import shutil
 import subprocess
 import threading
@@ -113,7 +114,9 @@ def test_a_journal_without_room_is_one_line(
 ) -> None:
     folder = DatasetFolder(tmp_path / "default")
     with monkeypatch.context() as patch:
-        patch.setattr(workers, "open_journal", lambda _: Path("/dev/full").open("a", buffering=1))
+        patch.setattr(
+            workers, "open_journal", lambda _: os.fdopen(os.open("/dev/full", os.O_WRONLY), "w", buffering=1)
+        )
         assert refused(folder, small_spec, "No space left on device") == {}
     assert 0 < len(folder.images("train")) < N_TRAIN, "no further image is begun"
     ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=2)
