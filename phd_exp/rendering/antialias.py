@@ -42,12 +42,12 @@ def edges(surfaces: Labels, reach: int) -> Mask:
 
 def filter_points() -> tuple[Light, Light]:
     """Offsets to the right and down (POINTS,), px, as dense as the filter is high, for equal weights."""
-    number = np.arange(POINTS)
+    number = np.arange(POINTS) - POINTS // 2  # about the middle: the lattice is its own quarter turn
     places = np.linspace(0, 1, 4097)
     angle = 2 * np.pi * places
     window = 0.35875 - 0.48829 * np.cos(angle) + 0.14128 * np.cos(2 * angle) - 0.01168 * np.cos(3 * angle)
     share = (np.cumsum(window) - window / 2) / window.sum()
-    even = ((number + 0.5) / POINTS, (number * GENERATOR / POINTS + 0.5 / POINTS) % 1)
+    even = (number / POINTS + 0.5, (number * GENERATOR / POINTS + 0.5) % 1)
     right, down = (FILTER_WIDTH * (np.interp(u, share, places) - 0.5) for u in even)
     return right, down
 

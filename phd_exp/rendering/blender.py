@@ -101,13 +101,13 @@ class Renderer:
     """
 
     def __init__(self, settings: Settings) -> None:
-        self._bpy = load_bpy()
         self._output = _fast_folder() / f"phd_exp-{uuid.uuid4().hex}.exr"
         with silence():
+            self._bpy = load_bpy()
             self._stage = build_stage(self._bpy)
-        self._scene = self._bpy.context.scene
-        _configure_image(self._scene)
-        _configure_tracer(self._scene.cycles, settings)
+            self._scene = self._bpy.context.scene
+            _configure_image(self._scene)
+            _configure_tracer(self._scene.cycles, settings)
 
     def render(self, scene: Scene, box: Box | None = None) -> Light:
         """Linear light of a box of pixels (height, width, 3), or of all (S, S, 3), rows from the top.

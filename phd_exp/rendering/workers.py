@@ -105,7 +105,10 @@ def _last_words(n: int, seconds: float) -> str:
     peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / (
         2**30 if sys.platform == "darwin" else 2**20
     )
-    return f"rendered {n} images in {seconds:.0f} s, {n / seconds:.1f} a second; a process took at most {peak:.2f} GiB"
+    return (
+        f"rendered {n} images in {seconds:.0f} s, {n / seconds:.1f} a second; "
+        f"a process took at most {peak:.2f} GiB"
+    )
 
 
 def _require_some(workers: int | None) -> None:

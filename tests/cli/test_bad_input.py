@@ -135,7 +135,7 @@ def test_unknown_verb(phd_exp: Callable) -> None:
     outcome = phd_exp("trian")
     assert outcome.status == 2
     assert "no verb 'trian'" in outcome.err
-    assert "train, render, report" in outcome.err
+    assert "train, render, gallery, report" in outcome.err
 
 
 def test_report_without_runs(phd_exp: Callable) -> None:

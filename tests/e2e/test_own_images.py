@@ -20,7 +20,7 @@ from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.runs import RunFolder, find_runs
 from phd_exp.records.scenes import SampleRecord, Scene
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.compose import backdrop_pixels
+from phd_exp.rendering.compose import backdrop_light, encoded
 from phd_exp.rendering.rays import trace_pixels
 from phd_exp.rendering.rotations import rotation_matrix
 from phd_exp.rendering.visibility import silhouettes
@@ -117,7 +117,7 @@ def shown(folder: DatasetFolder, record: SampleRecord, camera: VirtualCamera) ->
     """
     with Image.open(folder.image_path("train", record.index)) as image:
         seen = cut(image.convert("RGB"), camera).astype(float)
-    backdrop = cut(Image.fromarray(backdrop_pixels(record.backdrop, record.S)), camera)
+    backdrop = cut(Image.fromarray(encoded(backdrop_light(record.backdrop, record.S))), camera)
     difference = np.abs(seen - backdrop).max(axis=-1)
     contrast = ndimage.maximum_filter(difference, 7)
     return ndimage.binary_fill_holes((difference > 0.5 * contrast) & (contrast > 16))

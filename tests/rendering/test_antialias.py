@@ -32,7 +32,7 @@ def test_points_have_the_moments_of_the_filter() -> None:
         assert np.abs(offsets).max() < FILTER_WIDTH / 2 < REACH
         assert offsets.mean() == pytest.approx(0, abs=1e-12)
         assert offsets.var() == pytest.approx(variance, rel=0.1)
-    assert np.corrcoef(*filter_points())[0, 1] == pytest.approx(0, abs=0.15)
+    assert np.corrcoef(*filter_points())[0, 1] == pytest.approx(0, abs=1e-9)
 
 
 def test_edges_are_where_another_surface_is_near() -> None:
