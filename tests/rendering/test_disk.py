@@ -73,7 +73,7 @@ def journaled(folder: DatasetFolder) -> int:
 def refused(folder: DatasetFolder, spec: DatasetSpec, reason: str) -> dict[Path, int]:
     """Let a render fail in one line for a reason; what is finished then."""
     with pytest.raises(RenderError, match=rf"cannot be written \({reason}\); make room, allow") as error:
-        ensure_rendered(folder, spec, N_TRAIN, N_TEST, workers=2)
+        ensure_rendered(folder, spec, N_TRAIN, N_TEST, workers=1)
     assert "\n" not in str(error.value)
     return finished(folder)
 
@@ -96,7 +96,7 @@ def test_a_full_disk_is_one_line_and_nothing_is_lost(
     some = refused(folder, small_spec, "No space left on device")
     assert 0 < len(some) < N_TRAIN + N_TEST
     (disk / "ballast").unlink()
-    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=2)
+    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=1)
     assert contents(folder) == contents(small)
     assert all(path.stat().st_mtime_ns == moment for path, moment in some.items())
 
@@ -119,7 +119,7 @@ def test_a_journal_without_room_is_one_line(
         )
         assert refused(folder, small_spec, "No space left on device") == {}
     assert 0 < len(folder.images("train")) < N_TRAIN, "no further image is begun"
-    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=2)
+    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=1)
     assert contents(folder) == contents(small)
 
 
@@ -135,7 +135,7 @@ def test_a_disk_that_turns_read_only_serves_what_it_has(
     assert folder.records("train") == small.records("train", 3)
     assert contents(folder) == before
     subprocess.run(["mount", "-o", "remount,rw", str(disk)], check=True)
-    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=2)
+    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=1)
     assert contents(folder) == contents(small)
 
 
@@ -158,13 +158,13 @@ def test_a_folder_that_goes_away_amid_a_render_is_one_line(
     with pytest.raises(
         RenderError, match=r"cannot be written \(Not a directory\); make room, allow"
     ) as error:
-        ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=2)
+        ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=1)
     thief.join()
     assert "\n" not in str(error.value)
     train.unlink()
     away.rename(train)
     safe = finished(folder)
     assert len(safe) >= 2
-    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=2)
+    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=1)
     assert contents(folder) == contents(small)
     assert all(path.stat().st_mtime_ns == moment for path, moment in safe.items())

@@ -124,7 +124,7 @@ def test_mesh_and_solid_are_one_shape(
 def test_another_view_is_drawn_from_where_its_pose_says(
     make_spec: MakeSpec, drawn: Callable[[Scene], np.ndarray]
 ) -> None:
-    """A ball a millimetre wide, large by its focal length: it stands at the projection of its recorded position."""
+    """A cylinder of two centimetres stands at the projection of its recorded position."""
     spec = make_spec("multiview")
     for index in (1, 2, 3):
         scene = sample_scene(spec, "train", index)
