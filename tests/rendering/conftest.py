@@ -44,3 +44,11 @@ def small(small_spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory) -> 
     folder = DatasetFolder(tmp_path_factory.mktemp("small") / "default")
     ensure_rendered(folder, small_spec, n_train=12, n_test=4, workers=1)
     return folder
+
+
+@pytest.fixture(scope="session")
+def small_webp(small_spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory) -> DatasetFolder:
+    """The first samples of `small` as WebP files."""
+    folder = DatasetFolder(tmp_path_factory.mktemp("webp") / "default")
+    ensure_rendered(folder, small_spec.model_copy(update={"image_format": "webp"}), 5, 2, workers=1)
+    return folder

@@ -1,5 +1,6 @@
 """Killed at any moment, a render loses at most the samples in flight, and ends with the same bytes."""
 
+import json
 import os
 import random
 import signal
@@ -12,8 +13,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
-from phd_exp.records.dataset import DatasetError, DatasetFolder
+from phd_exp.records.dataset import SPLITS, DatasetError, DatasetFolder
+from phd_exp.records.scenes import Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.errors import RenderError
 from phd_exp.rendering.workers import ensure_rendered
@@ -38,8 +41,19 @@ def contents(folder: DatasetFolder) -> dict[str, bytes]:
 
 
 def journaled(folder: DatasetFolder) -> int:
-    path = folder.journal_path("train")
-    return path.read_bytes().count(b"\n") if path.exists() else 0
+    return sum(len(finished(folder, split)) for split in SPLITS)
+
+
+def finished(folder: DatasetFolder, split: Split) -> list[Path]:
+    """The images that have their line in the journal."""
+    path = folder.journal_path(split)
+    lines = path.read_text().split("\n")[:-1] if path.exists() else []
+    return [folder.split_folder(split) / json.loads(line)["file_name"] for line in lines]
+
+
+def written(folder: DatasetFolder) -> dict[Path, int]:
+    """When each image on disk was written, ns."""
+    return {path: path.stat().st_mtime_ns for path in folder.root.rglob("*.png")}
 
 
 def wait_until(condition: Callable[[], object]) -> None:
@@ -72,17 +86,21 @@ def alive(process: int) -> bool:
 
 
 @contextmanager
-def rendering_elsewhere(folder: DatasetFolder, spec: DatasetSpec) -> Iterator[subprocess.Popen[bytes]]:
-    """The same work in a process of its own, to be killed."""
+def rendering_elsewhere(
+    folder: DatasetFolder, spec: DatasetSpec, n_train: int = N_TRAIN, n_test: int = N_TEST
+) -> Iterator[subprocess.Popen[bytes]]:
+    """The same work in a process, and a group of processes, of its own, to be killed."""
     script = (
         "from phd_exp.records.dataset import DatasetFolder\n"
         "from phd_exp.records.spec import DatasetSpec\n"
         "from phd_exp.rendering.workers import ensure_rendered\n"
         f"spec = DatasetSpec.model_validate_json({spec.model_dump_json()!r})\n"
-        f"ensure_rendered(DatasetFolder({str(folder.root)!r}), spec, {N_TRAIN}, {N_TEST}, workers=2)\n"
+        f"ensure_rendered(DatasetFolder({str(folder.root)!r}), spec, {n_train}, {n_test}, workers=2)\n"
     )
     home = Path(__file__).parents[2]
-    with subprocess.Popen([sys.executable, "-c", script], cwd=home, stderr=subprocess.DEVNULL) as process:
+    with subprocess.Popen(
+        [sys.executable, "-c", script], cwd=home, stderr=subprocess.DEVNULL, start_new_session=True
+    ) as process:
         try:
             yield process
         finally:
@@ -172,14 +190,43 @@ def test_a_torn_last_line_is_rendered_again_and_a_torn_line_elsewhere_is_named(
     assert contents(folder) == contents(small)
 
 
+def kill_amid_work(process: subprocess.Popen[bytes], folder: DatasetFolder, moments: random.Random) -> None:
+    """After a few more images and a moment: the parent alone, whose workers finish what they hold, or the group."""
+    enough = journaled(folder) + moments.randint(1, 2)
+    wait_until(lambda: journaled(folder) >= enough)
+    time.sleep(moments.uniform(0.0, 0.02))
+    workers = render_workers(process.pid)
+    if moments.random() < 0.5:
+        process.kill()
+    else:
+        os.killpg(process.pid, signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+    wait_until(lambda: not any(alive(worker) for worker in workers))
+
+
 @pytest.mark.slow
-def test_twenty_kills_at_random_moments(
-    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec
+def test_twenty_kills_at_random_moments_of_one_render(
+    folder: DatasetFolder, small_spec: DatasetSpec, tmp_path: Path
 ) -> None:
-    moments = random.Random(0)
-    for _ in range(20):
-        with rendering_elsewhere(folder, small_spec) as process:
-            time.sleep(moments.uniform(0.2, 3.0))
-            process.kill()
-    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST)
-    assert contents(folder) == contents(small)
+    """Every image on disk is whole, none that is finished is touched again, and hardly any is rendered twice."""
+    moments, kills, workers, n_train, n_test = random.Random(0), 20, 2, 60, 20
+    safe: dict[Path, int] = {}
+    seen: set[tuple[Path, int]] = set()  # an image that is rendered twice is here twice
+    for _ in range(kills):
+        with rendering_elsewhere(folder, small_spec, n_train, n_test) as process:
+            kill_amid_work(process, folder, moments)
+        now = written(folder)
+        for path in now:
+            with Image.open(path) as image:
+                image.load()
+        assert safe.items() <= now.items()
+        safe = {path: now[path] for split in SPLITS for path in finished(folder, split)}
+        seen |= now.items()
+    assert len(safe) < n_train + n_test, "every kill met a render under way"
+    ensure_rendered(folder, small_spec, n_train, n_test, workers)
+    now = written(folder)
+    assert safe.items() <= now.items()
+    assert n_train + n_test <= len(seen | now.items()) <= n_train + n_test + kills * workers
+    whole = DatasetFolder(tmp_path / "whole")
+    ensure_rendered(whole, small_spec, n_train, n_test, workers)
+    assert contents(folder) == contents(whole)

@@ -1,0 +1,170 @@
+"""A disk that is full, turns read-only or goes away costs one line and nothing else: the same call goes on."""
+
+import os
+import shutil
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from phd_exp.records.dataset import SPLITS, DatasetFolder
+from phd_exp.records.files import read_jsonl
+from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering import workers
+from phd_exp.rendering.errors import RenderError
+from phd_exp.rendering.workers import ensure_rendered
+
+N_TRAIN, N_TEST = 12, 4
+KIB = 1024
+PATIENCE = 60.0  # s
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of its own, of 1 MiB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(place)]
+    if not shutil.which("mount") or subprocess.run(command, capture_output=True, check=False).returncode:
+        pytest.skip("mounting a small disk takes root, and a system that lets root mount")
+    try:
+        yield place
+    finally:
+        subprocess.run(["umount", str(place)], check=True)
+
+
+def leave_room(disk: Path, room: int) -> None:
+    """Fill a disk up to some bytes, by a file that is easily removed."""
+    ballast = disk / "ballast"
+    ballast.unlink(missing_ok=True)
+    free = shutil.disk_usage(disk).free
+    ballast.write_bytes(bytes(free - room))
+    assert shutil.disk_usage(disk).free == room
+
+
+def contents(folder: DatasetFolder) -> dict[str, bytes]:
+    found = (path for path in folder.root.rglob("*") if path.is_file() and folder.cache not in path.parents)
+    return {str(path.relative_to(folder.root)): path.read_bytes() for path in found}
+
+
+def finished(folder: DatasetFolder) -> dict[Path, int]:
+    """The images that have their line in a journal, each of them whole, and when it was written."""
+    paths = [
+        folder.split_folder(split) / line["file_name"]
+        for split in SPLITS
+        if folder.journal_path(split).exists()
+        for line in read_jsonl(folder.journal_path(split))
+    ]
+    for path in paths:
+        with Image.open(path) as image:
+            image.load()
+    return {path: path.stat().st_mtime_ns for path in paths}
+
+
+def journaled(folder: DatasetFolder) -> int:
+    path = folder.journal_path("train")
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def refused(folder: DatasetFolder, spec: DatasetSpec, reason: str) -> dict[Path, int]:
+    """Let a render fail in one line for a reason; what is finished then."""
+    with pytest.raises(RenderError, match=rf"cannot be written \({reason}\); make room, allow") as error:
+        ensure_rendered(folder, spec, N_TRAIN, N_TEST, workers=1)
+    assert "\n" not in str(error.value)
+    return finished(folder)
+
+
+def unseal(folder: DatasetFolder) -> None:
+    """As a kill just before the end leaves it: every image and every line in the journals."""
+    for split in SPLITS:
+        folder.metadata_path(split).rename(folder.journal_path(split))
+    folder.write_manifest(folder.manifest.model_copy(update={"splits": {}}))
+
+
+def test_a_full_disk_is_one_line_and_nothing_is_lost(
+    disk: Path, small: DatasetFolder, small_spec: DatasetSpec
+) -> None:
+    """Full before the first byte, among the images, and when the journals become `metadata.jsonl`."""
+    folder = DatasetFolder(disk / "default")
+    leave_room(disk, 0)
+    assert refused(folder, small_spec, "No space left on device") == {}
+    leave_room(disk, 28 * KIB)
+    some = refused(folder, small_spec, "No space left on device")
+    assert 0 < len(some) < N_TRAIN + N_TEST
+    (disk / "ballast").unlink()
+    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=1)
+    assert contents(folder) == contents(small)
+    assert all(path.stat().st_mtime_ns == moment for path, moment in some.items())
+
+    unseal(folder)
+    leave_room(disk, 8 * KIB)
+    assert len(refused(folder, small_spec, "No space left on device")) == N_TRAIN + N_TEST
+    (disk / "ballast").unlink()
+    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST)
+    assert contents(folder) == contents(small)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="the system has no file that is always full")
+def test_a_journal_without_room_is_one_line(
+    tmp_path: Path, small: DatasetFolder, small_spec: DatasetSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = DatasetFolder(tmp_path / "default")
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            workers, "open_journal", lambda _: os.fdopen(os.open("/dev/full", os.O_WRONLY), "w", buffering=1)
+        )
+        assert refused(folder, small_spec, "No space left on device") == {}
+    assert 0 < len(folder.images("train")) < N_TRAIN, "no further image is begun"
+    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=1)
+    assert contents(folder) == contents(small)
+
+
+def test_a_disk_that_turns_read_only_serves_what_it_has(
+    disk: Path, small: DatasetFolder, small_spec: DatasetSpec
+) -> None:
+    folder = DatasetFolder(disk / "default")
+    ensure_rendered(folder, small_spec, 3, 1, workers=1)
+    before = contents(folder)
+    subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
+    refused(folder, small_spec, "Read-only file system")
+    ensure_rendered(folder, small_spec, 3, 1)
+    assert folder.records("train") == small.records("train", 3)
+    assert contents(folder) == before
+    subprocess.run(["mount", "-o", "remount,rw", str(disk)], check=True)
+    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=1)
+    assert contents(folder) == contents(small)
+
+
+def test_a_folder_that_goes_away_amid_a_render_is_one_line(
+    tmp_path: Path, small: DatasetFolder, small_spec: DatasetSpec
+) -> None:
+    """A file in its place: refused even to root, who may write wherever there is a folder."""
+    folder = DatasetFolder(tmp_path / "default")
+    train, away = folder.split_folder("train"), tmp_path / "away"
+
+    def take_away() -> None:
+        deadline = time.monotonic() + PATIENCE
+        while time.monotonic() < deadline and journaled(folder) < 2:
+            time.sleep(0.005)
+        train.rename(away)
+        train.touch()
+
+    thief = threading.Thread(target=take_away)
+    thief.start()
+    with pytest.raises(
+        RenderError, match=r"cannot be written \(Not a directory\); make room, allow"
+    ) as error:
+        ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=1)
+    thief.join()
+    assert "\n" not in str(error.value)
+    train.unlink()
+    away.rename(train)
+    safe = finished(folder)
+    assert len(safe) >= 2
+    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=1)
+    assert contents(folder) == contents(small)
+    assert all(path.stat().st_mtime_ns == moment for path, moment in safe.items())

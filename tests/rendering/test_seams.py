@@ -1,0 +1,127 @@
+"""Nothing but the objects tells where they are: the box that the path tracer renders leaves no seam."""
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.scenes import SampleRecord
+from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.antialias import REACH, edges
+from phd_exp.rendering.blender import Box
+from phd_exp.rendering.compose import MARGIN, backdrop_light, box_around, encoded
+from phd_exp.rendering.rays import trace_pixels
+from phd_exp.rendering.visibility import Mask, silhouettes
+from phd_exp.rendering.workers import ensure_rendered
+
+MakeSpec = Callable[..., DatasetSpec]
+FEW, MANY = 20, 1000
+UNLIKELY = 4.0  # standard errors
+
+
+class Picture(NamedTuple):
+    """An image (S, S, 3), its pixels that no object touches, and the box that was rendered."""
+
+    pixels: np.ndarray
+    free: Mask
+    box: Box
+    record: SampleRecord
+
+
+def pictures(folder: DatasetFolder, spec: DatasetSpec, count: int) -> list[Picture]:
+    """Images at a quarter of the sensor that show any object."""
+    ensure_rendered(folder, spec, count, 0, workers=2)
+    found = []
+    for record in folder.records("train", count):
+        shown = silhouettes(trace_pixels(record.shown))
+        if shown.any():
+            free = ~shown & ~edges(shown.astype(np.int8), REACH)
+            with Image.open(folder.image_path("train", record.index)) as image:
+                pixels = np.asarray(image).astype(int)
+            found.append(Picture(pixels, free, box_around(shown, MARGIN), record))
+    assert len(found) > 0.9 * count
+    return found
+
+
+@pytest.fixture(scope="module")
+def spec(make_spec: MakeSpec) -> DatasetSpec:
+    return make_spec("occl_scale", sensor_size=56, f_range=(300.0, 500.0))
+
+
+@pytest.fixture(scope="module")
+def few(spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory) -> list[Picture]:
+    return pictures(DatasetFolder(tmp_path_factory.mktemp("few") / "occl_scale"), spec, FEW)
+
+
+@pytest.fixture(scope="module")
+def many(spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory) -> list[Picture]:
+    return pictures(DatasetFolder(tmp_path_factory.mktemp("many") / "occl_scale"), spec, MANY)
+
+
+def steps(picture: Picture, box: Box) -> tuple[np.ndarray, np.ndarray]:
+    """Largest difference over colours of free neighbours: those with a box's border between them, and all others."""
+    inside = np.zeros_like(picture.free)
+    inside[box.top : box.bottom, box.left : box.right] = True
+    across, elsewhere = [], []
+    for axis in (0, 1):
+        pixels, free, within = (np.moveaxis(map_, axis, 0) for map_ in (picture.pixels, picture.free, inside))
+        step, both, border = (
+            np.abs(np.diff(pixels, axis=0)).max(axis=-1),
+            free[1:] & free[:-1],
+            within[1:] != within[:-1],
+        )
+        across.append(step[both & border])
+        elsewhere.append(step[both & ~border])
+    return np.concatenate(across), np.concatenate(elsewhere)
+
+
+def check_formula(found: list[Picture]) -> None:
+    """Beyond the reach of the filter, every pixel is the backdrop's formula, inside the box and outside it."""
+    for picture in found:
+        expected = encoded(backdrop_light(picture.record.backdrop, picture.record.S))
+        assert picture.free.any()
+        assert (picture.pixels[picture.free] == expected[picture.free]).all()
+
+
+def check_borders(found: list[Picture]) -> None:
+    """A picture changes across its own box's border as across that of the next picture's box, and as elsewhere.
+
+    Boxes and backdrops are drawn independently, so that without a seam the two differ by chance alone.
+    """
+    own, foreign, rest = [], [], []
+    for picture, other in pairwise([*found, found[0]]):
+        across, elsewhere = steps(picture, picture.box)
+        strange, _ = steps(picture, other.box)
+        if len(across) and len(strange):
+            own.append(across)
+            foreign.append(strange)
+            rest.append(elsewhere)
+    excess = np.array([one.mean() - other.mean() for one, other in zip(own, foreign, strict=True)])
+    assert len(excess) > 0.5 * len(found), "a box may fill the image, and then has no border"
+    assert abs(excess.mean()) < UNLIKELY * excess.std() / len(excess) ** 0.5
+    assert abs(np.concatenate(own).max() - np.concatenate(foreign).max()) <= 1
+    assert np.concatenate(own).max() <= np.concatenate(rest).max()
+
+
+def test_the_backdrop_is_its_formula_in_a_few_images(few: list[Picture]) -> None:
+    check_formula(few)
+
+
+def test_a_few_images_have_no_seam(few: list[Picture]) -> None:
+    check_borders(few)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_the_backdrop_is_its_formula_in_a_thousand_images(many: list[Picture]) -> None:
+    check_formula(many)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_a_thousand_images_have_no_seam(many: list[Picture]) -> None:
+    check_borders(many)

@@ -1,0 +1,134 @@
+"""The labels tell what Blender itself draws: each object's pixels, counted by ray casting and by the renderer."""
+
+from collections.abc import Callable
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from phd_exp.records.scenes import Scene, SceneObject, Shape
+from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.blender import Renderer, Settings, load_bpy
+from phd_exp.rendering.rays import FACES, NOTHING, in_camera_frame, trace_pixels
+from phd_exp.rendering.rotations import uniform_rotation
+from phd_exp.rendering.sampling import sample_scene
+from phd_exp.rendering.visibility import cylinder_mask, visibility
+
+MakeSpec = Callable[..., DatasetSpec]
+SHAPES = get_args(Shape)
+VARIANTS = ("default", "occl", "scale", "occl_scale", "multiview")
+# Meshes are polygons, up to 0.01 px inside their solids: a silhouette of a thousand pixels' length shifts ten.
+FEW = 10  # px
+EVERY = 5  # takes the views of `multiview` in turn
+
+
+@pytest.fixture(scope="module")
+def drawn() -> Callable[[Scene], np.ndarray]:
+    """Blender's own picture of which object shows in each pixel: 0 for none, 1 for the first of SHAPES, and so on."""
+    renderer = Renderer(Settings(samples=1, denoised=False, at_middles=True))
+    bpy = load_bpy()
+    for number, shape in enumerate(SHAPES, start=1):
+        bpy.data.objects[shape].pass_index = number
+    for material in bpy.data.materials:
+        shine_with_number(material.node_tree)
+    bpy.context.scene.world = None
+
+    def draw(scene: Scene) -> np.ndarray:
+        light = renderer.render(scene)
+        assert np.isin(light, range(len(SHAPES) + 1)).all(), "one object a pixel, nothing mixed"
+        return light[..., 0].astype(int)
+
+    return draw
+
+
+def shine_with_number(tree: object) -> None:
+    """Make a material's surface a light as strong as the pass index of the object it is on."""
+    nodes, links = tree.nodes, tree.links  # type: ignore[attr-defined]
+    nodes.clear()
+    info, light, output = (
+        nodes.new(f"ShaderNode{kind}") for kind in ("ObjectInfo", "Emission", "OutputMaterial")
+    )
+    light.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
+    links.new(info.outputs["Object Index"], light.inputs["Strength"])
+    links.new(light.outputs["Emission"], output.inputs["Surface"])
+
+
+def cast(scene: Scene) -> np.ndarray:
+    """The same by ray casting."""
+    first = trace_pixels(scene).first.astype(int)
+    numbers = np.array([0, *(SHAPES.index(item.shape) + 1 for item in scene.objects)])
+    return numbers[np.where(first == NOTHING, 0, (first - 1) // FACES + 1)]
+
+
+def alone(scene: Scene, item: SceneObject) -> Scene:
+    """The scene with one object; a `Scene` would insist on a cylinder."""
+    return scene.model_copy(update={"objects": (item,)})
+
+
+def check(scene: Scene, drawn: Callable[[Scene], np.ndarray]) -> None:
+    """All that a record says of pixels, against Blender's."""
+    hits, seen, bare = trace_pixels(scene), drawn(scene) == 1, drawn(alone(scene, scene.objects[0])) == 1
+    mask, whole = cylinder_mask(hits), hits.surfaces[0] != NOTHING
+    assert abs(int(mask.sum()) - int(seen.sum())) <= FEW
+    assert abs(int(whole.sum()) - int(bare.sum())) <= FEW
+    assert (cast(scene) != drawn(scene)).sum() <= FEW * len(scene.objects)
+    if bare.any():
+        assert visibility(hits) == pytest.approx(seen.sum() / bare.sum(), abs=2 * FEW / bare.sum())
+    if seen.sum() >= 100:
+        offset = np.argwhere(mask).mean(axis=0) - np.argwhere(seen).mean(axis=0)
+        assert np.abs(offset).max() <= 0.05
+
+
+def check_variant(spec: DatasetSpec, count: int, drawn: Callable[[Scene], np.ndarray]) -> None:
+    scenes = [sample_scene(spec, "train", EVERY * number) for number in range(count)]
+    assert any(cylinder_mask(trace_pixels(scene)).sum() >= 100 for scene in scenes)
+    for scene in scenes:
+        check(scene, drawn)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_labels_are_those_of_blenders_pixels(
+    make_spec: MakeSpec, drawn: Callable[[Scene], np.ndarray], variant: str
+) -> None:
+    check_variant(make_spec(variant), 3, drawn)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_labels_are_those_of_blenders_pixels_in_many_samples(
+    make_spec: MakeSpec, drawn: Callable[[Scene], np.ndarray], variant: str
+) -> None:
+    check_variant(make_spec(variant), 30, drawn)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_mesh_and_solid_are_one_shape(
+    make_spec: MakeSpec, drawn: Callable[[Scene], np.ndarray], shape: Shape
+) -> None:
+    """Close up, turned, and stretched by another factor along each axis: silhouettes of 10,000 pixels and more."""
+    scene, rng = sample_scene(make_spec("occl"), "train", 0), np.random.default_rng(0)
+    for _ in range(2):
+        item = scene.objects[SHAPES.index(shape)].model_copy(
+            update={
+                "position": (0.02, -0.03, 3.0),
+                "rotation": uniform_rotation(rng),
+                "dimensions": (0.18, 0.23, 0.28),
+            }
+        )
+        near = alone(scene, item).model_copy(update={"f": 1500.0})
+        solid, mesh = cast(near), drawn(near)
+        assert (solid > 0).sum() > 5_000
+        assert (solid != mesh).sum() <= FEW
+
+
+def test_another_view_is_drawn_from_where_its_pose_says(
+    make_spec: MakeSpec, drawn: Callable[[Scene], np.ndarray]
+) -> None:
+    """A cylinder of two centimetres stands at the projection of its recorded position."""
+    spec = make_spec("multiview")
+    for index in (1, 2, 3):
+        scene = sample_scene(spec, "train", index)
+        x, y, z = in_camera_frame(np.array(scene.objects[0].position), scene.pose)
+        tiny = scene.objects[0].model_copy(update={"scale": 0.1})
+        middle = np.argwhere(drawn(alone(scene, tiny)) == 1).mean(axis=0) + 0.5
+        assert middle == pytest.approx(scene.f * np.array([y, x]) / z + scene.S / 2, abs=0.5)
