@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from itertools import pairwise
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -55,11 +56,6 @@ def spec(make_spec: MakeSpec) -> DatasetSpec:
 @pytest.fixture(scope="module")
 def few(spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory) -> list[Picture]:
     return pictures(DatasetFolder(tmp_path_factory.mktemp("few") / "occl_scale"), spec, FEW)
-
-
-@pytest.fixture(scope="module")
-def many(spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory) -> list[Picture]:
-    return pictures(DatasetFolder(tmp_path_factory.mktemp("many") / "occl_scale"), spec, MANY)
 
 
 def steps(picture: Picture, box: Box) -> tuple[np.ndarray, np.ndarray]:
@@ -117,11 +113,7 @@ def test_a_few_images_have_no_seam(few: list[Picture]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_the_backdrop_is_its_formula_in_a_thousand_images(many: list[Picture]) -> None:
+def test_a_thousand_images_have_no_seam(spec: DatasetSpec, tmp_path: Path) -> None:
+    many = pictures(DatasetFolder(tmp_path / "occl_scale"), spec, MANY)
     check_formula(many)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-def test_a_thousand_images_have_no_seam(many: list[Picture]) -> None:
     check_borders(many)
