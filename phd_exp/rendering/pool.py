@@ -5,8 +5,9 @@ import queue
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Generator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import CancelledError, ThreadPoolExecutor, as_completed
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
@@ -103,20 +104,25 @@ def render_all(
 ) -> Generator[SampleRecord, None, None]:
     """Render samples with several processes and yield each record as soon as its image is on disk.
 
-    At most one sample a worker is in flight. When the consumer stops early or a worker fails, no further
-    sample is begun, those in flight are finished, and all processes have ended before the error goes on.
+    At most one sample a worker is in flight: it gets the next when the consumer has dealt with the last, so that a
+    kill loses no more. When the consumer stops early or a worker fails, no further sample is begun, those in flight
+    are finished, and all processes have ended before the error goes on.
 
     Raises:
         RenderError: a worker failed or died.
     """
-    idle: queue.SimpleQueue[Worker] = queue.SimpleQueue()
+    idle: queue.SimpleQueue[Worker | None] = queue.SimpleQueue()  # None: there will be no more work
+    stopping = threading.Event()
 
-    def on_an_idle_worker(task: Task) -> SampleRecord:
+    def on_an_idle_worker(task: Task) -> tuple[Worker, SampleRecord]:
         worker = idle.get()
         try:
-            return worker.render(task)
-        finally:
-            idle.put(worker)
+            if worker is None or stopping.is_set():
+                raise CancelledError
+            return worker, worker.render(task)
+        except BaseException:
+            idle.put(worker)  # for the next thread that waits
+            raise
 
     with ExitStack() as stack:
         job, log = Job(root=folder.root, spec=spec), folder.cache / "render.log"
@@ -126,8 +132,12 @@ def render_all(
         futures = [threads.submit(on_an_idle_worker, task) for task in tasks]
         try:
             for future in as_completed(futures):
-                yield future.result()
+                worker, record = future.result()
+                yield record
+                idle.put(worker)
         finally:
+            stopping.set()
+            idle.put(None)
             threads.shutdown(wait=False, cancel_futures=True)
 
 

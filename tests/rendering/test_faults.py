@@ -129,6 +129,20 @@ def test_a_killed_parent_leaves_no_workers_and_no_half_files(
     assert kept >= done, "finished images are not rendered again"
 
 
+def test_an_interrupt_ends_all_processes_after_the_samples_in_flight(
+    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec
+) -> None:
+    with rendering_elsewhere(folder, small_spec) as process:
+        wait_until(lambda: journaled(folder) >= 2)
+        workers = render_workers(process.pid)
+        process.send_signal(signal.SIGINT)
+        process.wait(timeout=PATIENCE)
+        assert not any(alive(worker) for worker in workers)
+    assert len(list(folder.split_folder("train").glob("*.png"))) <= journaled(folder) + 2
+    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=2)
+    assert contents(folder) == contents(small)
+
+
 def test_a_killed_worker_is_one_line_and_its_work_is_kept(
     folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec
 ) -> None:
