@@ -50,8 +50,9 @@ def painted(kind: str, spec: DatasetSpec, folder: Path, samples: int, indices: S
     environment = os.environ | {"PYTHONPATH": str(HOME)}
     result = subprocess.run(
         [*command, str(folder), str(samples), *map(str, indices)],
-        env=environment, check=True, capture_output=True, text=True,
+        env=environment, capture_output=True, text=True,
     )  # fmt: skip
+    assert result.returncode == 0, result.stderr
     return [json.loads(line)["seconds"] for line in result.stdout.splitlines() if line.startswith("{")]
 
 
