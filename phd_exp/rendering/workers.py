@@ -7,8 +7,6 @@ of the journals, the journals' removal, and the manifest again, which now counts
 
 import math
 import os
-import resource
-import sys
 import time
 from contextlib import ExitStack, closing
 
@@ -97,18 +95,9 @@ def render_missing(
             journals[record.split].write(record.model_dump_json() + "\n")
             known[record.split][record.index] = record
             advance()
-    announce(_last_words(len(tasks), time.monotonic() - begun))
+    seconds = time.monotonic() - begun
+    announce(f"rendered {len(tasks)} images in {seconds:.0f} s, {len(tasks) / seconds:.1f} a second")
     return len(tasks)
-
-
-def _last_words(n: int, seconds: float) -> str:
-    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / (
-        2**30 if sys.platform == "darwin" else 2**20
-    )
-    return (
-        f"rendered {n} images in {seconds:.0f} s, {n / seconds:.1f} a second; "
-        f"a process took at most {peak:.2f} GiB"
-    )
 
 
 def _require_some(workers: int | None) -> None:
