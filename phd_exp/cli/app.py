@@ -21,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from phd_exp.cli.jobs import BAD_CONFIGURATION, HOME, Ending, JobRecords, Task, run_job
 from phd_exp.cli.paths import conf_folder
 from phd_exp.cli.signals import Stopped, stopping_on_signals
-from phd_exp.records.errors import UserError, nearest
+from phd_exp.records.errors import RunError, UserError, nearest
 
 MULTIRUN = ("-m", "--multirun")
 
@@ -81,7 +81,12 @@ def _sweep(task: Task, words: list[str], config_name: str) -> list[Ending]:
         raise
     except Exception as error:  # joblib's and submitit's way to say that a job has died
         if not any(records.path.iterdir()):
-            raise
+            records.remove()
+            reason = " ".join(str(error).split())
+            raise RunError(
+                f"the launcher failed before any job began ({type(error).__name__}: {reason}); "
+                "choose another by hydra/launcher=NAME"
+            ) from error
         gave_up = error
     endings = [records.ending(number, overrides) for number, overrides in enumerate(jobs)]
     if any(ending.exit_status for ending in endings):

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from shutil import which
 
 import pytest
 
@@ -147,3 +148,12 @@ def wait_for(condition: Callable[[], bool]) -> None:
     while not condition():
         assert time.monotonic() < deadline, "waited too long"
         time.sleep(0.02)
+
+
+@pytest.mark.skipif(which("srun") is not None, reason="needs a machine without SLURM")
+def test_a_launcher_that_cannot_begin_is_one_line(phd_exp: Callable, tmp_path: Path) -> None:
+    outcome = phd_exp("-m", "render", *TINY, "shard=0/2,1/2", "hydra/launcher=submitit_slurm")
+    assert outcome.status == 1
+    (line,) = outcome.err.splitlines()
+    assert line.startswith("error: the launcher failed before any job began (RuntimeError: Could not detect")
+    assert not list(tmp_path.glob("runs/.sweep/launch-*"))
