@@ -4,10 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from phd_exp.data.cache import cached
 from phd_exp.records.dataset import DatasetError, DatasetFolder, sha256
+from phd_exp.records.images import recorded_image
 from phd_exp.records.scenes import SampleRecord, Split
 
 CACHE_LAYOUT = 1
@@ -41,18 +42,13 @@ def cached_images(
 
 def decode(file: Path, checksum: str, image_size: int) -> np.ndarray:
     """One image as (image_size, image_size, 3), uint8. Raises DatasetError where the file is not as recorded."""
-    advice = "delete the file and run `python -m phd_exp render` to make it again"
     try:
-        content = file.read_bytes()
-    except OSError as error:
-        raise DatasetError(f"{file}: cannot be read ({error.strerror}); {advice}") from None
-    if sha256(content) != checksum:
-        raise DatasetError(f"{file}: its checksum is not the recorded one; {advice}")
-    try:
-        with Image.open(file) as image:
-            return shrunk(image.convert("RGB"), image_size)
-    except (OSError, UnidentifiedImageError) as error:
-        raise DatasetError(f"{file}: cannot be decoded ({error}); {advice}") from None
+        image = recorded_image(file, checksum)
+    except DatasetError as error:
+        raise DatasetError(
+            f"{error}; delete the file and run `python -m phd_exp render` to make it again"
+        ) from None
+    return shrunk(image.convert("RGB"), image_size)
 
 
 def shrunk(image: Image.Image, side: int) -> np.ndarray:

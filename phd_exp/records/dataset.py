@@ -152,8 +152,7 @@ class DatasetFolder:
         wanted: dict[Split, int] = {"train": n_train, "test": n_test}
         if not self.manifest_path.exists():
             return {split: list(range(n)) for split, n in wanted.items()}
-        self.require(spec)
-        manifest = self.manifest
+        manifest = self.require(spec)
         return {split: self._unfinished(split, n, manifest) for split, n in wanted.items()}
 
     def images(self, split: Split) -> set[str]:
@@ -166,20 +165,21 @@ class DatasetFolder:
         finished, kind = manifest.count(split), manifest.spec.image_format
         return [index for index in range(n) if index >= finished or image_name(index, kind) not in there]
 
-    def require(self, spec: DatasetSpec) -> None:
-        """Check that the folder holds a data set of this specification.
+    def require(self, spec: DatasetSpec) -> Manifest:
+        """The manifest, of a folder that holds a data set of this specification.
 
         Raises:
             DatasetError: it holds another one, naming the first key that differs, or none.
         """
-        found = self.manifest.spec
+        manifest = self.manifest
         for key in DatasetSpec.model_fields:
-            here, asked = getattr(found, key), getattr(spec, key)
+            here, asked = getattr(manifest.spec, key), getattr(spec, key)
             if here != asked:
                 raise DatasetError(
                     f"{self.root}: holds a data set with {key}={here}, but {key}={asked} is asked for; "
                     "move the folder away or choose another data.root"
                 )
+        return manifest
 
 
 def image_name(index: int, image_format: ImageFormat = "png") -> str:

@@ -6,11 +6,13 @@ Along edges a tracer finds the shares of the surfaces by a few random rays a pix
 error that is left after denoising; here they come from rays that carry no light and cost next to nothing.
 """
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
 from phd_exp.records.scenes import Scene
-from phd_exp.rendering.blender import Light
+from phd_exp.rendering.colour import Light
 from phd_exp.rendering.rays import Labels, trace_points
 from phd_exp.rendering.visibility import Mask
 
@@ -40,6 +42,7 @@ def edges(surfaces: Labels, reach: int) -> Mask:
     return np.asarray(low != high)
 
 
+@cache  # the same for every picture
 def filter_points() -> tuple[Light, Light]:
     """Offsets to the right and down (POINTS,), px, as dense as the filter is high, for equal weights."""
     number = np.arange(POINTS) - POINTS // 2  # about the middle: the lattice is its own quarter turn
@@ -84,6 +87,11 @@ def _extreme(ufunc: np.ufunc, values: Labels, reach: int, axis: int) -> Labels:
 
 
 _NEIGHBOURS = sorted(
-    ((down, right) for down in range(-2, 3) for right in range(-2, 3) if down or right),
+    (
+        (down, right)
+        for down in range(-REACH, REACH + 1)
+        for right in range(-REACH, REACH + 1)
+        if down or right
+    ),
     key=lambda step: step[0] ** 2 + step[1] ** 2,
 )

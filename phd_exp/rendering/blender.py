@@ -13,15 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from phd_exp.records.scenes import Scene
+from phd_exp.rendering.colour import Light
 from phd_exp.rendering.errors import RenderError
 from phd_exp.rendering.exr import read_light
 from phd_exp.rendering.stage import build_stage
-
-Light = NDArray[np.float64]
 
 X_LIBRARIES = "libx11-6 libxext6 libxfixes3 libxi6 libxrender1 libxkbcommon0 libsm6 libice6 libgl1"
 

@@ -5,15 +5,13 @@ the formula: the box leaves no seam that could tell where the objects are.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from phd_exp.records.scenes import Backdrop, Scene
 from phd_exp.rendering.antialias import smoothed
-from phd_exp.rendering.blender import Box, Light, Renderer
+from phd_exp.rendering.blender import Box, Renderer
+from phd_exp.rendering.colour import Light, Pixels, encoded
 from phd_exp.rendering.rays import NOTHING, Hits
 from phd_exp.rendering.visibility import Mask
-
-Pixels = NDArray[np.uint8]
 
 MARGIN = 4  # px around the objects that the denoiser sees, for what it does along the rim of its image
 
@@ -49,16 +47,3 @@ def box_around(mask: Mask, margin: int) -> Box:
         right=min(int(columns[-1]) + 1 + margin, side),
         bottom=min(int(rows[-1]) + 1 + margin, side),
     )
-
-
-def encoded(light: Light) -> Pixels:
-    """Linear light to 8-bit sRGB (IEC 61966-2-1)."""
-    return np.searchsorted(_STEPS, light, side="right").astype(np.uint8)
-
-
-def _linear(signal: Light) -> Light:
-    return np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4)
-
-
-_STEPS: Light = _linear((np.arange(255) + 0.5) / 255)
-"""The light at which the nearest 8-bit value becomes the next one."""

@@ -11,6 +11,7 @@ from phd_exp.records.files import write_atomic
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer
+from phd_exp.rendering.encoding import file_of
 from phd_exp.rendering.rays import trace_pixels
 from phd_exp.rendering.visibility import cylinder_mask
 from phd_exp.rendering.worker import fast_settings, make_sample
@@ -35,7 +36,7 @@ def draw_gallery(path: Path, specs: Sequence[DatasetSpec], indices: Sequence[int
     for y, row in enumerate(rows):
         for x, image in enumerate(row):
             sheet.paste(image, (x * side, y * side))
-    _write(path, sheet, format="JPEG", quality=QUALITY)
+    write_atomic(path, file_of(sheet, "jpeg", quality=QUALITY))
 
 
 def draw_camera(path: Path, spec: DatasetSpec, index: int) -> None:
@@ -52,7 +53,7 @@ def draw_camera(path: Path, spec: DatasetSpec, index: int) -> None:
     _draw_truth(draw, record)
     _draw_axes(draw, side)
     _draw_pixels(draw, side + PIXEL // 2)
-    _write(path, sheet, format="PNG")
+    write_atomic(path, file_of(sheet, "png"))
 
 
 def _samples(spec: DatasetSpec, indices: Sequence[int]) -> list[tuple[Image.Image, SampleRecord]]:
@@ -119,9 +120,3 @@ def _dot(draw: ImageDraw.ImageDraw, x: float, y: float, colour: tuple[int, int, 
 
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(size)
-
-
-def _write(path: Path, sheet: Image.Image, **options: object) -> None:
-    stream = io.BytesIO()
-    sheet.save(stream, **options)  # type: ignore[arg-type]
-    write_atomic(path, stream.getvalue())

@@ -1,13 +1,13 @@
 """The cylinder's pixels of every sample, as images of one bit: from the records, without Blender."""
 
-import io
 from pathlib import Path
 
 from PIL import Image
 
 from phd_exp.records.dataset import SPLITS, DatasetFolder
 from phd_exp.records.files import write_atomic
-from phd_exp.rendering.errors import RenderError
+from phd_exp.rendering.encoding import file_of
+from phd_exp.rendering.errors import RenderError, writing
 from phd_exp.rendering.progress import shown_progress
 from phd_exp.rendering.rays import trace_pixels
 from phd_exp.rendering.visibility import cylinder_mask
@@ -22,20 +22,15 @@ def write_masks(folder: DatasetFolder, masks: Path) -> int:
     """
     require_elsewhere(folder, masks)
     records = [record for split in SPLITS for record in folder.records(split)]
-    try:
+    with writing(masks, instead="masks=FOLDER"):
         for split in SPLITS:
             (masks / split).mkdir(parents=True, exist_ok=True)
         with shown_progress(len(records), "drawing masks") as advance:
             for record in records:
                 image = Image.fromarray(cylinder_mask(trace_pixels(record.shown)))
-                stream = io.BytesIO()
-                image.save(stream, format="PNG")
-                write_atomic((masks / record.split / record.file_name).with_suffix(".png"), stream.getvalue())
+                path = (masks / record.split / record.file_name).with_suffix(".png")
+                write_atomic(path, file_of(image, "png"))
                 advance()
-    except OSError as error:
-        raise RenderError(
-            f"{error.filename or masks}: cannot be written ({error.strerror or error}); choose another masks=FOLDER"
-        ) from error
     return len(records)
 
 

@@ -17,27 +17,33 @@ Wanted = dict[Split, int]
 Known = dict[Split, dict[int, SampleRecord]]
 
 
-def begin(folder: DatasetFolder, spec: DatasetSpec) -> Manifest:
-    """The folder's manifest, written if there is none: before the first image, it says of which data set it is.
+def begin(folder: DatasetFolder, spec: DatasetSpec) -> None:
+    """Write the folder's manifest if there is none: before the first image, it says of which data set it is.
 
     Raises:
         DatasetError: the folder was made by another generator or another Blender: the rest would not match.
     """
     for split in SPLITS:
         folder.split_folder(split).mkdir(exist_ok=True)
-    ours = Manifest(generator=GENERATOR_VERSION, renderer=renderer_version(), spec=spec, splits={})
     if not folder.manifest_path.exists():
-        folder.write_manifest(ours)
-        return ours
-    found = folder.manifest
-    for key in ("generator", "renderer"):
-        theirs, mine = getattr(found, key), getattr(ours, key)
-        if theirs != mine:
-            raise DatasetError(
-                f"{folder.root}: begun with {key} {theirs}, this is {mine}, and the rest would not match; "
-                "move the folder away or choose another data.root"
-            )
-    return found
+        folder.write_manifest(
+            Manifest(generator=GENERATOR_VERSION, renderer=renderer_version(), spec=spec, splits={})
+        )
+        return
+    for key, theirs, ours in other_make(folder.manifest):
+        raise DatasetError(
+            f"{folder.root}: begun with {key} {theirs}, this is {ours}, and the rest would not match; "
+            "move the folder away or choose another data.root"
+        )
+
+
+def other_make(manifest: Manifest) -> list[tuple[str, int | str, int | str]]:
+    """What differs between the programmes that made a data set and these: its name, theirs, ours."""
+    made = (
+        ("generator", manifest.generator, GENERATOR_VERSION),
+        ("renderer", manifest.renderer, renderer_version()),
+    )
+    return [(key, theirs, ours) for key, theirs, ours in made if theirs != ours]
 
 
 def known_samples(folder: DatasetFolder) -> Known:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from phd_exp.records.scenes import Lamp, LampName, Material, Pose, Scene, SceneObject, Shape
 from phd_exp.rendering import shaders
+from phd_exp.rendering.colour import linear
 from phd_exp.rendering.meshes import build_mesh
 from phd_exp.rendering.rotations import rotation_matrix
 
@@ -48,7 +49,7 @@ class Stage:
     def _place_object(self, handle: Any, item: SceneObject) -> None:
         stretch = 0.5 * item.scale * np.array(item.dimensions)
         handle.matrix_world = _matrix(rotation_matrix(item.rotation) * stretch, np.array(item.position))
-        handle.color = (*(_linear(channel) for channel in item.colour), 1.0)
+        handle.color = (*(linear(channel) for channel in item.colour), 1.0)
         handle.material_slots[0].link = "OBJECT"
         handle.material_slots[0].material = self._materials[item.material]
 
@@ -128,8 +129,3 @@ def _facing(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     right = np.cross([0.0, 1.0, 0.0], back)
     right /= np.linalg.norm(right)
     return np.column_stack([right, np.cross(back, right), back])
-
-
-def _linear(channel: float) -> float:
-    """sRGB to linear light (IEC 61966-2-1)."""
-    return channel / 12.92 if channel <= 0.04045 else ((channel + 0.055) / 1.055) ** 2.4

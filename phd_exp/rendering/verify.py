@@ -1,19 +1,18 @@
 """Whether a data set on disk is what its manifest says, and what its specification gives."""
 
-import io
 import random
 from collections.abc import Iterator
 from pathlib import Path
 
-from PIL import Image
-
-from phd_exp.records.dataset import SPLITS, DatasetError, DatasetFolder, sha256
+from phd_exp.records.dataset import SPLITS, DatasetError, DatasetFolder, Manifest, Seal, sha256
 from phd_exp.records.errors import UserError
+from phd_exp.records.images import recorded_image
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer, renderer_version, require_bpy
 from phd_exp.rendering.progress import announce, shown_progress
 from phd_exp.rendering.sampling import GENERATOR_VERSION
+from phd_exp.rendering.sealing import other_make
 from phd_exp.rendering.worker import fast_settings, make_sample
 
 
@@ -28,15 +27,15 @@ def verify(folder: DatasetFolder, spec: DatasetSpec, rerender: int, seed: int | 
         DatasetError: a line for each thing that is wrong, with what to do; or there is no such data set here.
         RenderError: samples are to be rendered again, and bpy is missing.
     """
-    folder.require(spec)
+    manifest = folder.require(spec)
     if rerender:
         require_bpy()
-        _require_same_make(folder)
+        _require_same_make(folder, manifest)
     wrong: list[str] = []
     sound: list[SampleRecord] = []
     records: list[SampleRecord] = []
     for split in SPLITS:
-        found, faults = _metadata(folder, split)
+        found, faults = _metadata(folder, split, manifest.splits.get(split))
         records += found
         wrong += [*faults, *_strangers(folder, split, found)]
     with shown_progress(len(records), f"verifying {spec.variant}") as advance:
@@ -53,9 +52,8 @@ def verify(folder: DatasetFolder, spec: DatasetSpec, rerender: int, seed: int | 
     return len(sound)
 
 
-def _metadata(folder: DatasetFolder, split: Split) -> tuple[list[SampleRecord], list[str]]:
+def _metadata(folder: DatasetFolder, split: Split, seal: Seal | None) -> tuple[list[SampleRecord], list[str]]:
     """The records of a split, and what is wrong with the file that holds them."""
-    seal = folder.manifest.splits.get(split)
     if seal is None or not seal.n:
         return [], []
     path, faults = folder.metadata_path(split), []
@@ -80,30 +78,20 @@ def _strangers(folder: DatasetFolder, split: Split, records: list[SampleRecord])
 def _fault(path: Path, record: SampleRecord) -> str | None:
     advice = "delete it, and `render` makes it again"
     try:
-        content = path.read_bytes()
-    except OSError as error:
-        return f"{path}: cannot be read ({error.strerror}); `render` makes it again"
-    if sha256(content) != record.sha256:
-        return f"{path}: its checksum is not the recorded one; {advice}"
-    try:
-        with Image.open(io.BytesIO(content)) as image:
-            image.load()
-            if image.size == (record.S, record.S):
-                return None
-            return (
-                f"{path}: {image.width} x {image.height} pixels, {record.S} x {record.S} recorded; {advice}"
-            )
-    except OSError as error:
-        return f"{path}: cannot be decoded ({error}); {advice}"
+        width, height = recorded_image(path, record.sha256).size
+    except DatasetError as error:
+        return f"{error}; {advice if path.exists() else '`render` makes it again'}"
+    if (width, height) == (record.S, record.S):
+        return None
+    return f"{path}: {width} x {height} pixels, {record.S} x {record.S} recorded; {advice}"
 
 
-def _require_same_make(folder: DatasetFolder) -> None:
-    manifest = folder.manifest
-    ours = (GENERATOR_VERSION, renderer_version())
-    if (manifest.generator, manifest.renderer) != ours:
+def _require_same_make(folder: DatasetFolder, manifest: Manifest) -> None:
+    if other_make(manifest):
         raise DatasetError(
             f"{folder.root}: made by generator {manifest.generator} with {manifest.renderer}, this is generator "
-            f"{ours[0]} with {ours[1]}: its images cannot be compared; verify files alone by rerender=0"
+            f"{GENERATOR_VERSION} with {renderer_version()}: its images cannot be compared; verify files alone by "
+            "rerender=0"
         )
 
 

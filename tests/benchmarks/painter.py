@@ -23,7 +23,7 @@ from PIL import Image
 from phd_exp.records.scenes import Scene
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import REFERENCE, Renderer, load_bpy, silence
-from phd_exp.rendering.compose import encoded
+from phd_exp.rendering.colour import encoded
 from phd_exp.rendering.sampling import sample_scene
 from phd_exp.rendering.stage import MATERIALS, SHAPES, Stage, build_stage
 from phd_exp.rendering.worker import fast_settings, make_sample

@@ -20,7 +20,8 @@ from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.runs import RunFolder, find_runs
 from phd_exp.records.scenes import SampleRecord, Scene
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.compose import backdrop_light, encoded
+from phd_exp.rendering.colour import encoded
+from phd_exp.rendering.compose import backdrop_light
 from phd_exp.rendering.rays import trace_pixels
 from phd_exp.rendering.rotations import rotation_matrix
 from phd_exp.rendering.visibility import silhouettes

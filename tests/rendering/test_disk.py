@@ -4,7 +4,6 @@ import os
 import shutil
 import subprocess
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,10 +16,10 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering import workers
 from phd_exp.rendering.errors import RenderError
 from phd_exp.rendering.workers import ensure_rendered
+from tests.rendering.folders import contents, wait_until
 
 N_TRAIN, N_TEST = 12, 4
 KIB = 1024
-PATIENCE = 60.0  # s
 
 
 @pytest.fixture
@@ -44,11 +43,6 @@ def leave_room(disk: Path, room: int) -> None:
     free = shutil.disk_usage(disk).free
     ballast.write_bytes(bytes(free - room))
     assert shutil.disk_usage(disk).free == room
-
-
-def contents(folder: DatasetFolder) -> dict[str, bytes]:
-    found = (path for path in folder.root.rglob("*") if path.is_file() and folder.cache not in path.parents)
-    return {str(path.relative_to(folder.root)): path.read_bytes() for path in found}
 
 
 def finished(folder: DatasetFolder) -> dict[Path, int]:
@@ -147,9 +141,7 @@ def test_a_folder_that_goes_away_amid_a_render_is_one_line(
     train, away = folder.split_folder("train"), tmp_path / "away"
 
     def take_away() -> None:
-        deadline = time.monotonic() + PATIENCE
-        while time.monotonic() < deadline and journaled(folder) < 2:
-            time.sleep(0.005)
+        wait_until(lambda: journaled(folder) >= 2)
         train.rename(away)
         train.touch()
 

@@ -5,10 +5,9 @@ import os
 import random
 import signal
 import subprocess
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,24 +19,16 @@ from phd_exp.records.scenes import Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.errors import RenderError
 from phd_exp.rendering.workers import ensure_rendered
+from tests.rendering.folders import PATIENCE, contents, in_a_process, wait_until
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self").exists(), reason="finds processes through /proc")
 
 N_TRAIN, N_TEST = 12, 4
-PATIENCE = 60.0  # s
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> DatasetFolder:
     return DatasetFolder(tmp_path / "default")
-
-
-def contents(folder: DatasetFolder) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(folder.root)): path.read_bytes()
-        for path in folder.root.rglob("*")
-        if path.is_file() and folder.cache not in path.parents
-    }
 
 
 def journaled(folder: DatasetFolder) -> int:
@@ -54,13 +45,6 @@ def finished(folder: DatasetFolder, split: Split) -> list[Path]:
 def written(folder: DatasetFolder) -> dict[Path, int]:
     """When each image on disk was written, ns."""
     return {path: path.stat().st_mtime_ns for path in folder.root.rglob("*.png")}
-
-
-def wait_until(condition: Callable[[], object]) -> None:
-    deadline = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < deadline, "waited too long"
-        time.sleep(0.005)
 
 
 def render_workers(parent: int) -> list[int]:
@@ -90,21 +74,9 @@ def rendering_elsewhere(
     folder: DatasetFolder, spec: DatasetSpec, n_train: int = N_TRAIN, n_test: int = N_TEST
 ) -> Iterator[subprocess.Popen[bytes]]:
     """The same work in a process, and a group of processes, of its own, to be killed."""
-    script = (
-        "from phd_exp.records.dataset import DatasetFolder\n"
-        "from phd_exp.records.spec import DatasetSpec\n"
-        "from phd_exp.rendering.workers import ensure_rendered\n"
-        f"spec = DatasetSpec.model_validate_json({spec.model_dump_json()!r})\n"
-        f"ensure_rendered(DatasetFolder({str(folder.root)!r}), spec, {n_train}, {n_test}, workers=2)\n"
-    )
-    home = Path(__file__).parents[2]
-    with subprocess.Popen(
-        [sys.executable, "-c", script], cwd=home, stderr=subprocess.DEVNULL, start_new_session=True
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
+    call = f"ensure_rendered(folder, spec, {n_train}, {n_test}, workers=2)"
+    with in_a_process(call, folder, spec, stderr=subprocess.DEVNULL, start_new_session=True) as process:
+        yield process
 
 
 def test_a_killed_parent_leaves_no_workers_and_no_half_files(

@@ -14,7 +14,8 @@ from phd_exp.records.scenes import SampleRecord
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.antialias import REACH, edges
 from phd_exp.rendering.blender import Box
-from phd_exp.rendering.compose import MARGIN, backdrop_light, box_around, encoded
+from phd_exp.rendering.colour import encoded
+from phd_exp.rendering.compose import MARGIN, backdrop_light, box_around
 from phd_exp.rendering.rays import trace_pixels
 from phd_exp.rendering.visibility import Mask, silhouettes
 from phd_exp.rendering.workers import ensure_rendered

@@ -1,9 +1,7 @@
 """Shards render one folder together: whoever starts, ends or dies when, it ends with the bytes of one render."""
 
 import subprocess
-import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -16,9 +14,9 @@ from phd_exp.rendering import sealing, workers
 from phd_exp.rendering.locks import held, held_if_free
 from phd_exp.rendering.shards import render_shard
 from phd_exp.rendering.workers import ensure_rendered
+from tests.rendering.folders import PATIENCE, contents, in_a_process, wait_until
 
 N_TRAIN, N_TEST = 12, 4
-PATIENCE = 60.0  # s
 FIRST, SECOND = Shard(0, 2), Shard(1, 2)
 
 
@@ -27,42 +25,17 @@ def folder(tmp_path: Path) -> DatasetFolder:
     return DatasetFolder(tmp_path / "default")
 
 
-def contents(folder: DatasetFolder) -> dict[str, bytes]:
-    files = (path for path in folder.root.rglob("*") if path.is_file() and folder.cache not in path.parents)
-    return {str(path.relative_to(folder.root)): path.read_bytes() for path in files}
-
-
 def journaled(folder: DatasetFolder, shard: Shard | None) -> int:
     path = folder.journal_path("train", shard)
     return path.read_bytes().count(b"\n") if path.exists() else 0
 
 
-def wait_until(condition: Callable[[], object]) -> None:
-    deadline = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < deadline, "waited too long"
-        time.sleep(0.005)
-
-
 @contextmanager
 def elsewhere(folder: DatasetFolder, spec: DatasetSpec, shard: Shard) -> Iterator[subprocess.Popen[str]]:
     """A shard in a process of its own."""
-    script = (
-        "from phd_exp.records.dataset import DatasetFolder\n"
-        "from phd_exp.records.shards import Shard\n"
-        "from phd_exp.records.spec import DatasetSpec\n"
-        "from phd_exp.rendering.shards import render_shard\n"
-        f"spec = DatasetSpec.model_validate_json({spec.model_dump_json()!r})\n"
-        f"render_shard(DatasetFolder({str(folder.root)!r}), spec, {N_TRAIN}, {N_TEST}, {shard!r}, workers=1)\n"
-    )
-    home = Path(__file__).parents[2]
-    with subprocess.Popen(
-        [sys.executable, "-c", script], cwd=home, stderr=subprocess.PIPE, text=True
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
+    call = f"render_shard(folder, spec, {N_TRAIN}, {N_TEST}, {shard!r}, workers=1)"
+    with in_a_process(call, folder, spec, stderr=subprocess.PIPE, text=True) as process:
+        yield process
 
 
 def test_one_after_the_other_in_any_order(

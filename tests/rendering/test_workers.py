@@ -13,18 +13,9 @@ from phd_exp.rendering.errors import RenderError
 from phd_exp.rendering.pool import render_all
 from phd_exp.rendering.worker import Task
 from phd_exp.rendering.workers import ensure_rendered
+from tests.rendering.folders import contents
 
 MakeSpec = Callable[..., DatasetSpec]
-
-
-def contents(folder: DatasetFolder) -> dict[str, bytes]:
-    """Every file of a data set, without what programmes keep for themselves."""
-    files = (path for path in folder.root.rglob("*") if path.is_file())
-    return {
-        str(path.relative_to(folder.root)): path.read_bytes()
-        for path in files
-        if folder.cache not in path.parents
-    }
 
 
 def test_the_manifest_and_the_records_fit_the_files(small: DatasetFolder, small_spec: DatasetSpec) -> None:
