@@ -31,10 +31,16 @@ UNTRAINED = -1
 """The epoch before the first: what the untrained network gives."""
 
 
-def train(config: RunConfig, folder: RunFolder, draw: Draw | None) -> dict[str, Any]:
+def train(config: RunConfig, folder: RunFolder, draw: Draw | None, cores: int) -> dict[str, Any]:
     """Train, measure and record one run; returns its results. A finished run is not run again.
 
     A run that was broken off goes on after its last whole epoch.
+
+    Args:
+        config: what to run.
+        folder: where its record goes.
+        draw: draws calibration curves; None records them alone.
+        cores: how many threads it has, unless trainer.threads says otherwise.
 
     Raises RunError where the folder holds a run of another configuration or another process works on it,
     DatasetError where the data set is incomplete.
@@ -45,7 +51,7 @@ def train(config: RunConfig, folder: RunFolder, draw: Draw | None) -> dict[str, 
             return folder.results()
         folder.write_config(config.model_dump(mode="json"))
         with folder.recording(data_manifest=_manifest_hash(config)):
-            results = _train(config, folder, draw)
+            results = _train(config, folder, draw, cores)
             folder.write_results(results)
     return results
 
@@ -101,10 +107,9 @@ def flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _train(config: RunConfig, folder: RunFolder, draw: Draw | None) -> dict[str, Any]:
+def _train(config: RunConfig, folder: RunFolder, draw: Draw | None, cores: int) -> dict[str, Any]:
     _quiet_lightning()
-    if config.trainer.threads is not None:
-        torch.set_num_threads(config.trainer.threads)
+    torch.set_num_threads(config.trainer.threads or cores)
     seed_everything(config.seed, verbose=False)
     data = build_data(config)
     data.setup()
