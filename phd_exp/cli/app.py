@@ -47,7 +47,7 @@ def launch(
     except Stopped as stop:
         print(f"error: stopped by {stop}; the same command goes on from here", file=sys.stderr)
         return int(str(stop.code))
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, ValueError) as error:  # ValueError: a group set to null
         print(f"error: {explain(error, config_name)}", file=sys.stderr)
         return BAD_CONFIGURATION
     except UserError as error:
@@ -76,9 +76,10 @@ def _run_all(
 
 def _require_one_run(words: list[str]) -> None:
     for word in words:
-        key, _, value = word.partition("=")
-        if key.lstrip("+") == "experiment" and value not in ("", "null"):
-            raise ConfigError(f"{word}: an experiment is several runs; write -m before it: -m {' '.join(words)}")
+        if word.partition("=")[0].lstrip("+") == "experiment":
+            raise ConfigError(
+                f"{word}: an experiment is several runs; write -m before it: -m {' '.join(words)}"
+            )
 
 
 def explain(error: Exception, config_name: str) -> str:

@@ -46,9 +46,7 @@ class Ending(BaseModel):
     def of(cls, overrides: list[str], error: BaseException) -> "Ending":
         if isinstance(error, Stopped):
             line = f"stopped by {error}; the same command goes on from here"
-            return cls(
-                overrides=overrides, state="stopped", exit_status=int(str(error.code)), lines=[line]
-            )
+            return cls(overrides=overrides, state="stopped", exit_status=int(str(error.code)), lines=[line])
         if isinstance(error, UserError):
             status = BAD_CONFIGURATION if isinstance(error, ConfigError) else FAILED
             return cls(overrides=overrides, exit_status=status, lines=str(error).splitlines())

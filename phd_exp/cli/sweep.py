@@ -156,7 +156,10 @@ def _print_states(endings: list[Ending]) -> None:
     for ending in endings:
         print(f"{' '.join(ending.overrides)}: {ending.state}")
     states = Counter(ending.state for ending in endings)
-    print(f"{_counted(len(endings))}: {', '.join(f'{count} {state}' for state, count in states.items())}", flush=True)
+    print(
+        f"{_counted(len(endings))}: {', '.join(f'{count} {state}' for state, count in states.items())}",
+        flush=True,
+    )
 
 
 def _counted(jobs: int) -> str:

@@ -14,6 +14,7 @@ from phd_exp.data.datamodule import PositionData
 from phd_exp.records.dataset import DatasetFolder, sha256
 from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError, RunError
+from phd_exp.records.files import remove_temporaries
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import (
     build_calibration,
@@ -49,6 +50,7 @@ def train(config: RunConfig, folder: RunFolder, draw: Draw | None, cores: int) -
         require_same_config(folder, config)
         if folder.is_finished():
             return folder.results()
+        remove_temporaries(folder.path)  # of a process that was killed
         folder.write_config(config.model_dump(mode="json"))
         with folder.recording(data_manifest=_manifest_hash(config)):
             results = _train(config, folder, draw, cores)
