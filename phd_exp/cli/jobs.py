@@ -29,8 +29,9 @@ HOME = uuid.uuid4().hex
 """This process: another one that imports this module has another."""
 
 Task = Callable[[dict[str, Any], list[str], int], str]
-"""Takes the resolved configuration, the overrides that led to it and the number of cores it may use; says in a word or
-two how it ended, if it ended well.
+"""Takes the resolved configuration, the overrides that led to it, and how many cores it may use.
+
+Returns, if it ends well, its state in a word or two.
 """
 
 

@@ -35,7 +35,7 @@ def git_commit() -> str | None:
 
 
 def usable_cores() -> int:
-    """How many cores this process may use: fewer than the machine has where it is bound to some, or a queue says so."""
+    """How many cores this process may use: not all, where it is bound to some or a queue granted it fewer."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     granted = os.environ.get("SLURM_CPUS_PER_TASK", "")  # a queue may grant cores without binding to them
     return min(cores, int(granted)) if granted.isdigit() else cores

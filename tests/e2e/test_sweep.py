@@ -57,7 +57,7 @@ def begun(tmp_path: Path, renders: Path) -> Callable[..., BaseProcess]:
 def test_killed_at_any_moment_the_same_command_goes_on(
     train: Callable, begun: Callable, tmp_path: Path, kills: int, words: tuple[str, ...]
 ) -> None:
-    """What is finished stays as it is, to the bit and the second; the rest comes to the numbers of one whole sweep."""
+    """What is finished stays as it is, to the bit; the rest comes to the numbers of one whole sweep."""
     assert train(*words, f"runs={tmp_path / 'whole'}").status == 0
     runs, before = tmp_path / "killed", dict[Path, Any]()
     chance = random.Random(kills)
