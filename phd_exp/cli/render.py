@@ -24,7 +24,7 @@ def task(config: dict[str, Any], overrides: list[str]) -> None:
         n = verify(folder, data.spec, checked.rerender)
         print(f"{folder.root}: all {n} samples are as they were rendered")
     elif _render(checked, folder):
-        print(f"{folder.root}: {data.n_train} training and {data.n_test} test samples are there")
+        print(f"{folder.root}: {data.n_training_split} training and {data.n_test} test samples are there")
     else:
         return  # other shards are not done yet
     if checked.masks is not None:
@@ -37,9 +37,9 @@ def _render(checked: RenderConfig, folder: DatasetFolder) -> bool:
     if checked.shard is None:
         ensure_dataset(data)
         return True
-    return render_shard(folder, data.spec, data.n_train, data.n_test, checked.shard, data.workers)
+    return render_shard(folder, data.spec, data.n_training_split, data.n_test, checked.shard, data.workers)
 
 
 def ensure_dataset(data: RenderedConfig) -> None:
     """Render what a run needs and the folder lacks."""
-    ensure_rendered(DatasetFolder(data.folder), data.spec, data.n_train, data.n_test, data.workers)
+    ensure_rendered(DatasetFolder(data.folder), data.spec, data.n_training_split, data.n_test, data.workers)

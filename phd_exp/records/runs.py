@@ -6,6 +6,7 @@
         metrics.jsonl        one line an epoch
         results.json         the final numbers
         predictions.parquet  per test sample: truth, parameters, estimate, errors
+        held_out.parquet     the same of training samples that were held out, for recalibration
         calibration/         the calibration curves, as data (JSON) and as pictures (PNG)
         checkpoints/         last.ckpt
         wandb/               the same for wandb, ready for `wandb sync`
@@ -78,6 +79,7 @@ class RunFolder:
         self.calibration = path / "calibration"
         self.wandb = path / "wandb"
         self.predictions = path / "predictions.parquet"
+        self.held_out = path / "held_out.parquet"
         self.results_file = path / "results.json"
         self.metrics_file = path / "metrics.jsonl"
         self.status_file = path / "status.json"

@@ -15,7 +15,7 @@ from lightning.pytorch.loggers import Logger
 
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.folder import FolderSource
-from phd_exp.data.sources import RenderedSource, Source
+from phd_exp.data.sources import Part, RenderedSource, Source
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.dataset import DatasetFolder
@@ -34,12 +34,10 @@ def build_data(config: RunConfig) -> PositionData:
 
 def _source(data: RenderedConfig | FolderConfig) -> Source:
     if isinstance(data, FolderConfig):
-        return FolderSource(
-            DetectionFolder(data.folder), {"train": data.n_train, "test": data.n_test}, data.image_size
-        )
-    return RenderedSource(
-        DatasetFolder(data.folder), data.spec, {"train": data.n_train, "test": data.n_test}, data.image_size
-    )
+        folder = DetectionFolder(data.folder)
+        return FolderSource(folder, data.n_train, data.n_held_out, data.n_test, data.image_size)
+    sizes: dict[Part, int] = {"train": data.n_train, "held_out": data.n_held_out, "test": data.n_test}
+    return RenderedSource(DatasetFolder(data.folder), data.spec, sizes, data.image_size)
 
 
 def build_module(config: RunConfig, data: PositionData) -> PositionModule:

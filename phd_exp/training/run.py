@@ -11,6 +11,7 @@ import torch
 from lightning import Trainer, seed_everything
 
 from phd_exp.data.datamodule import PositionData
+from phd_exp.data.sources import Part
 from phd_exp.records.dataset import DatasetFolder, sha256
 from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError, RunError
@@ -114,12 +115,14 @@ def _train(config: RunConfig, folder: RunFolder, draw: Draw | None) -> dict[str,
     with tracked(config, folder) as others:
         trainer = build_trainer(config, folder, [record, *others], calibration)
         seconds = _fit(trainer, module, data, folder, record)
-        table = _evaluate(trainer, module, data)
+        tables = {part: _evaluate(trainer, module, data, part) for part in data.samples if part != "train"}
     if calibration is not None:
-        calibration.write("final", table)
-    write_parquet(folder.predictions, table, data.source.known("test"))
+        calibration.write("final", tables["test"])
+    for part, table in tables.items():
+        file = folder.held_out if part == "held_out" else folder.predictions
+        write_parquet(file, table, data.source.known(part))
     untrained = {f"untrained/{key}": value for key, value in record.rows[UNTRAINED].items() if "test/" in key}
-    return summary(table) | untrained | _circumstances(config, data, trainer, seconds)
+    return summary(tables["test"]) | untrained | _circumstances(config, data, trainer, seconds)
 
 
 def _fit(
@@ -132,7 +135,7 @@ def _fit(
         trainer.fit(module, datamodule=data, ckpt_path=folder.last_checkpoint, weights_only=True)
     else:
         record.forget_after(UNTRAINED)
-        record.log_metrics({"epoch": UNTRAINED} | summary(_evaluate(trainer, module, data)), step=0)
+        record.log_metrics({"epoch": UNTRAINED} | summary(_evaluate(trainer, module, data, "test")), step=0)
         trainer.fit(module, datamodule=data)
     return time.monotonic() - start
 
@@ -148,11 +151,11 @@ def _epoch_of(checkpoint: Path) -> int:
         ) from None
 
 
-def _evaluate(trainer: Trainer, module: PositionModule, data: PositionData) -> Columns:
-    """Predictions of the last weights on the test split, a row a sample."""
-    parts = trainer.predict(module, dataloaders=data.test_dataloader())
-    assert parts is not None
-    return joined(parts)  # type: ignore[arg-type]
+def _evaluate(trainer: Trainer, module: PositionModule, data: PositionData, part: Part) -> Columns:
+    """Predictions of the present weights, a row a sample."""
+    batches = trainer.predict(module, dataloaders=data.in_order(part))
+    assert batches is not None
+    return joined(batches)  # type: ignore[arg-type]
 
 
 def _circumstances(config: RunConfig, data: PositionData, trainer: Trainer, seconds: float) -> dict[str, Any]:
@@ -162,6 +165,7 @@ def _circumstances(config: RunConfig, data: PositionData, trainer: Trainer, seco
         "model": config.model.name,
         "seed": config.seed,
         "n_train": data.source.count("train"),
+        "n_held_out": data.source.count("held_out"),
         "n_test": data.source.count("test"),
         "epochs": trainer.current_epoch,
         "fit_seconds": seconds,

@@ -51,6 +51,10 @@ def test_every_model_leaves_a_whole_record(train: Callable, tmp_path: Path, mode
         assert results[f"test/{name}"] == pytest.approx(table[name].mean())
         assert results[f"test/{name}"] == pytest.approx(rows[-1][f"test/{name}"], rel=1e-4)
         assert results[f"untrained/test/{name}"] == untrained[f"test/{name}"]
+    held_out = pd.read_parquet(run.held_out)
+    assert list(held_out.columns) == list(table.columns)
+    assert held_out["file_name"].tolist() == [f"{index:06d}.png" for index in range(16, 20)]
+    assert (results["n_train"], results["n_held_out"], results["n_test"]) == (16, 4, 6)
 
 
 @pytest.mark.parametrize("data", DATA)
