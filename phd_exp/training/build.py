@@ -82,7 +82,7 @@ def build_trainer(
         callbacks.append(calibration)
     return Trainer(
         accelerator=config.trainer.accelerator,
-        devices=1,
+        devices=config.trainer.devices,
         precision=precision(config.trainer),
         max_epochs=config.trainer.max_epochs,
         logger=loggers,

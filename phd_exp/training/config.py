@@ -134,6 +134,7 @@ class TrainerConfig(Section):
     accelerator: Literal["auto", "cpu", "gpu"]
     precision: Literal["auto", "float32", "bfloat16"]
     threads: Annotated[Whole, Field(ge=1)] | None
+    devices: Annotated[Whole, Field(ge=1)]
     progress_bar: Annotated[bool, Field(strict=True)]
 
 
