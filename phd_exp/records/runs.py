@@ -85,6 +85,10 @@ class RunFolder:
         self.status_file = path / "status.json"
         self.config_file = path / "config.yaml"
 
+    def curves(self, name: str) -> Path:
+        """Calibration curves, of an epoch or "final"; their picture, if there is one, differs in the suffix."""
+        return self.calibration / f"{name}.json"
+
     @property
     def last_checkpoint(self) -> Path:
         return self.checkpoints / "last.ckpt"
@@ -178,6 +182,11 @@ class RunFolder:
             self.write_status(_ended(status, "interrupted", error=f"{type(stop).__name__}: {stop}"))
             raise
         self.write_status(_ended(status, "finished"))
+
+
+def epoch_name(epoch: int) -> str:
+    """What files of an epoch are called."""
+    return f"epoch-{epoch:04d}"
 
 
 def find_runs(runs: Path) -> list[RunFolder]:

@@ -25,6 +25,7 @@ from phd_exp.records.runs import RunFolder
 from phd_exp.training.callbacks import CalibrationRecorder, Draw, EpochLines
 from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig, TrainerConfig
 from phd_exp.training.module import PositionModule
+from phd_exp.training.tracking import Tracker
 
 
 def build_data(config: RunConfig) -> PositionData:
@@ -108,14 +109,14 @@ def on_a_terminal() -> bool:
 
 
 def build_calibration(
-    config: RunConfig, folder: RunFolder, module: PositionModule, draw: Draw | None
+    config: RunConfig, folder: RunFolder, module: PositionModule, draw: Draw | None, tracker: Tracker | None
 ) -> CalibrationRecorder | None:
     """The recorder of calibration curves; None for a baseline, which predicts no uncertainty."""
     if not issubclass(module.regressor.head.prediction, ProjectedHuber):
         return None
     evaluation = config.evaluation
     return CalibrationRecorder(
-        folder, evaluation.calibration_window, evaluation.calibration_every_n_epochs, draw
+        folder, evaluation.calibration_window, evaluation.calibration_every_n_epochs, draw, tracker
     )
 
 

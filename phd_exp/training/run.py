@@ -110,34 +110,54 @@ def _train(config: RunConfig, folder: RunFolder, draw: Draw | None) -> dict[str,
     data = build_data(config)
     data.setup()
     module = build_module(config, data)
-    calibration = build_calibration(config, folder, module, draw)
     record = RecordLogger(folder)
-    with tracked(config, folder) as others:
-        trainer = build_trainer(config, folder, [record, *others], calibration)
-        seconds = _fit(trainer, module, data, folder, record)
+    with tracked(config, folder) as tracker:
+        calibration = build_calibration(config, folder, module, draw, tracker)
+        trainer = build_trainer(config, folder, [record, *([tracker.logger] if tracker else [])], calibration)
+        checkpoint = _take_up(trainer, module, data, record)
+        if tracker:
+            tracker.send_epochs(record.rows.values())
+        seconds = _fit(trainer, module, data, checkpoint)
         tables = {part: _evaluate(trainer, module, data, part) for part in data.samples if part != "train"}
-    if calibration is not None:
-        calibration.write("final", tables["test"])
-    for part, table in tables.items():
-        file = folder.held_out if part == "held_out" else folder.predictions
-        write_parquet(file, table, data.source.known(part))
-    untrained = {f"untrained/{key}": value for key, value in record.rows[UNTRAINED].items() if "test/" in key}
-    return summary(tables["test"]) | untrained | _circumstances(config, data, trainer, seconds)
+        if calibration is not None:
+            calibration.write("final", tables["test"])
+        for part, table in tables.items():
+            file = folder.held_out if part == "held_out" else folder.predictions
+            write_parquet(file, table, data.source.known(part))
+        results = (
+            summary(tables["test"]) | _untrained(record) | _circumstances(config, data, trainer, seconds)
+        )
+        if tracker:
+            tracker.send_results(results)
+    return results
 
 
-def _fit(
-    trainer: Trainer, module: PositionModule, data: PositionData, folder: RunFolder, record: RecordLogger
-) -> float:
-    """Train to the last epoch, from the last checkpoint if there is one; returns the seconds it took now."""
+def _take_up(
+    trainer: Trainer, module: PositionModule, data: PositionData, record: RecordLogger
+) -> Path | None:
+    """Leave in the record what was done before: the epochs up to the last checkpoint, which is returned.
+
+    A new run has none; what its untrained network gives is recorded.
+    """
+    checkpoint = record.folder.last_checkpoint
+    if checkpoint.exists():
+        record.forget_after(_epoch_of(checkpoint))
+        return checkpoint
+    record.forget_after(UNTRAINED)
+    record.log_metrics({"epoch": UNTRAINED} | summary(_evaluate(trainer, module, data, "test")), step=0)
+    return None
+
+
+def _fit(trainer: Trainer, module: PositionModule, data: PositionData, checkpoint: Path | None) -> float:
+    """Train to the last epoch, from the checkpoint if there is one; returns the seconds it took now."""
     start = time.monotonic()
-    if folder.last_checkpoint.exists():
-        record.forget_after(_epoch_of(folder.last_checkpoint))
-        trainer.fit(module, datamodule=data, ckpt_path=folder.last_checkpoint, weights_only=True)
-    else:
-        record.forget_after(UNTRAINED)
-        record.log_metrics({"epoch": UNTRAINED} | summary(_evaluate(trainer, module, data, "test")), step=0)
-        trainer.fit(module, datamodule=data)
+    trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     return time.monotonic() - start
+
+
+def _untrained(record: RecordLogger) -> dict[str, Any]:
+    """The numbers of the untrained network, for comparison."""
+    return {f"untrained/{key}": value for key, value in record.rows[UNTRAINED].items() if "test/" in key}
 
 
 def _epoch_of(checkpoint: Path) -> int:
