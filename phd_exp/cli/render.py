@@ -26,7 +26,7 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> str:
         return "sound"
     if not _render(checked, folder, cores):
         return "done"  # other shards are not
-    print(f"{folder.root}: {data.n_train} training and {data.n_test} test samples are there")
+    print(f"{folder.root}: {data.n_training_split} training and {data.n_test} test samples are there")
     if checked.masks is not None:
         print(f"{checked.masks}: {write_masks(folder, checked.masks)} masks")
     return "done"
@@ -38,9 +38,9 @@ def _render(checked: RenderConfig, folder: DatasetFolder, cores: int) -> bool:
     if checked.shard is None:
         ensure_dataset(data, cores)
         return True
-    return render_shard(folder, data.spec, data.n_train, data.n_test, checked.shard, data.workers, cores)
+    return render_shard(folder, data.spec, data.n_training_split, data.n_test, checked.shard, data.workers, cores)
 
 
 def ensure_dataset(data: RenderedConfig, cores: int) -> None:
     """Render what a run needs and the folder lacks."""
-    ensure_rendered(DatasetFolder(data.folder), data.spec, data.n_train, data.n_test, data.workers, cores)
+    ensure_rendered(DatasetFolder(data.folder), data.spec, data.n_training_split, data.n_test, data.workers, cores)

@@ -3,10 +3,8 @@
 from lightning import LightningDataModule
 
 from phd_exp.data.batches import Batch, BatchLoader
-from phd_exp.data.sources import Source
-from phd_exp.records.dataset import SPLITS
+from phd_exp.data.sources import PARTS, Part, Source
 from phd_exp.records.errors import ConfigError
-from phd_exp.records.scenes import Split
 
 
 class PositionData(LightningDataModule):
@@ -26,14 +24,14 @@ class PositionData(LightningDataModule):
         self.source = source
         self.batch_size = batch_size
         self.seed = seed
-        self.samples: dict[Split, Batch] = {}
+        self.samples: dict[Part, Batch] = {}
         self.train_batches: BatchLoader | None = None
 
     def setup(self, stage: str | None = None) -> None:
-        """Open both splits; decodes their images the first time."""
-        for split in SPLITS:
-            if split not in self.samples:
-                self.samples[split] = self.source.samples(split)
+        """Open every part that has samples; decodes their images the first time."""
+        for part in PARTS:
+            if part not in self.samples and self.source.count(part):
+                self.samples[part] = self.source.samples(part)
         if self.train_batches is None:
             self.train_batches = BatchLoader(
                 self.samples["train"], self.batch_size, shuffle=True, drop_last=True, seed=self.seed
@@ -48,8 +46,12 @@ class PositionData(LightningDataModule):
         return self.test_dataloader()
 
     def test_dataloader(self) -> BatchLoader:
+        return self.in_order("test")
+
+    def in_order(self, part: Part) -> BatchLoader:
+        """Every sample of a part once, as they come."""
         return BatchLoader(
-            self.samples["test"], self.batch_size, shuffle=False, drop_last=False, seed=self.seed
+            self.samples[part], self.batch_size, shuffle=False, drop_last=False, seed=self.seed
         )
 
     # Lightning restores the state of a loader in the middle of an epoch alone, that of a datamodule always

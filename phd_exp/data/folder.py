@@ -14,11 +14,12 @@ from jaxtyping import Float
 from phd_exp.data.batches import Batch
 from phd_exp.data.cache import CacheError, cached, fill_all
 from phd_exp.data.crops import cut, image_size, pillow_warnings, read_image
-from phd_exp.data.sources import Known, Source
+from phd_exp.data.sources import Known, Part, Source
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.geometry.virtual import VirtualCamera, intrinsics
 from phd_exp.records.dataset import DatasetError, sha256
 from phd_exp.records.detections import Detection, DetectionFolder
+from phd_exp.records.errors import ConfigError
 from phd_exp.records.scenes import Split
 
 CROP_LAYOUT = 1
@@ -37,28 +38,44 @@ class Crop:
 class FolderSource(Source):
     """The first n detections (None: all) of each split of a folder, each seen by its own virtual camera.
 
-    The constants follow from the training detections. Everything but the images themselves is read and checked here.
+    Those held out follow those trained on: without a number for these, they are the last of the training split. The
+    constants follow from the detections trained on. Everything but the images themselves is read and checked here.
 
-    Raises DatasetError, naming file and line, for what cannot be a sample.
+    Raises DatasetError, naming file and line, for what cannot be a sample; ConfigError where nothing is left to
+    train on.
     """
 
-    def __init__(self, folder: DetectionFolder, n: Mapping[Split, int | None], side: int) -> None:
+    def __init__(
+        self, folder: DetectionFolder, n_train: int | None, n_held_out: int, n_test: int | None, side: int
+    ) -> None:
         self.folder = folder
         self.side = side
         sizes: dict[Path, tuple[int, int]] = {}
-        self.crops: dict[Split, list[Crop]] = {
-            split: [_crop(detection, side, sizes) for detection in folder.detections(split, count)]
-            for split, count in n.items()
+
+        def crops(split: Split, n: int | None) -> list[Crop]:
+            return [_crop(detection, side, sizes) for detection in folder.detections(split, n)]
+
+        training = crops("train", None if n_train is None else n_train + n_held_out)
+        n_train = len(training) - n_held_out
+        if n_train < 1:
+            raise ConfigError(
+                f"data.n_held_out: got {n_held_out}, but {folder.metadata_path('train')} has {len(training)} "
+                "detections in all; expected fewer than that"
+            )
+        self.crops: dict[Part, list[Crop]] = {
+            "train": training[:n_train],
+            "held_out": training[n_train:],
+            "test": crops("test", n_test),
         }
         z = torch.tensor([crop.xyz[2] for crop in self.crops["train"]], dtype=torch.float64)
         f = torch.tensor([crop.camera.f for crop in self.crops["train"]], dtype=torch.float64)
         self.depth = DepthScale.from_samples(z, f)
         self.constant_f = float((f.min() * f.max()).sqrt())
 
-    def samples(self, split: Split) -> Batch:
-        crops = self.crops[split]
+    def samples(self, part: Part) -> Batch:
+        crops = self.crops[part]
         with pillow_warnings():
-            images = self._images(split)
+            images = self._images(part)
         return Batch(
             image=torch.from_numpy(images),
             xyz=torch.from_numpy(np.stack([crop.xyz for crop in crops]).astype(np.float32)),
@@ -67,8 +84,8 @@ class FolderSource(Source):
             row=torch.arange(len(crops)),
         )
 
-    def known(self, split: Split) -> Known:
-        crops = self.crops[split]
+    def known(self, part: Part) -> Known:
+        crops = self.crops[part]
         lines = [crop.detection.line for crop in crops]
         columns: dict[str, list[Any]] = {
             "file_name": [line.file_name for line in lines],
@@ -78,12 +95,12 @@ class FolderSource(Source):
         rendered = {name: [getattr(line, name) for line in lines] for name in ("scale", "visibility")}
         return columns | {name: values for name, values in rendered.items() if values != [None] * len(lines)}
 
-    def count(self, split: Split) -> int:
-        return len(self.crops[split])
+    def count(self, part: Part) -> int:
+        return len(self.crops[part])
 
-    def _images(self, split: Split) -> np.ndarray:
+    def _images(self, part: Part) -> np.ndarray:
         """The crops, from the cache, or decoded into memory where the folder cannot be written."""
-        crops = self.crops[split]
+        crops = self.crops[part]
         rows: dict[Path, list[int]] = {}
         for row, crop in enumerate(crops):
             rows.setdefault(crop.detection.file, []).append(row)
@@ -98,8 +115,8 @@ class FolderSource(Source):
             for row in rows[file]:
                 array[row] = cut(image, crops[row].camera)
 
-        kept = self.folder.cache / f"crops-{split}-{len(crops)}x{self.side}.npy"
-        shape, words = (len(crops), self.side, self.side, 3), f"decoding {split} images once"
+        kept = self.folder.cache / f"crops-{part}-{len(crops)}x{self.side}.npy"
+        shape, words = (len(crops), self.side, self.side, 3), f"decoding {part.replace('_', '-')} images once"
         try:
             return cached(kept, _key(crops, checksums), shape, list(rows), fill, words)
         except CacheError as error:

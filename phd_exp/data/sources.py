@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -14,12 +14,18 @@ from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
 
+Part = Literal["train", "held_out", "test"]
+"""What a run uses samples for; both of the first come out of the training split."""
+PARTS: tuple[Part, ...] = ("train", "held_out", "test")
+
 Known = Mapping[str, Sequence[Any]]
 """What is known of samples besides their positions: name -> a value a sample."""
 
 
 class Source(ABC):
-    """Samples of two splits, all of one image size.
+    """Samples to train on, to recalibrate on and to test on, all of one image size.
+
+    What is held out is never trained on, nor looked at before the training has ended; there may be none of it.
 
     `depth` holds the constants that normalise depth, in the pixels of the samples' images; `constant_f` is the focal
     length of models that know none, the geometric mean of the extremes.
@@ -29,26 +35,28 @@ class Source(ABC):
     constant_f: float
 
     @abstractmethod
-    def samples(self, split: Split) -> Batch:
-        """All samples of a split; decodes their images the first time. Raises DatasetError."""
+    def samples(self, part: Part) -> Batch:
+        """All samples of a part; decodes their images the first time. Raises DatasetError."""
 
     @abstractmethod
-    def known(self, split: Split) -> Known:
+    def known(self, part: Part) -> Known:
         """The columns that the record of predictions repeats, in the order of the samples."""
 
     @abstractmethod
-    def count(self, split: Split) -> int:
-        """How many samples a split has."""
+    def count(self, part: Part) -> int:
+        """How many samples a part has."""
 
 
 class RenderedSource(Source):
-    """The first n samples of each split of a rendered data set, shrunk to image_size pixels a side.
+    """The first samples of each split of a rendered data set, shrunk to image_size pixels a side.
+
+    Of the training split, those held out follow those trained on.
 
     The constants follow from the specification, so that nothing need be rendered yet. Where an image shrinks, f and S
     shrink with it and mu_z0 grows.
     """
 
-    def __init__(self, folder: DatasetFolder, spec: DatasetSpec, n: Mapping[Split, int], side: int) -> None:
+    def __init__(self, folder: DatasetFolder, spec: DatasetSpec, n: Mapping[Part, int], side: int) -> None:
         self.folder = folder
         self.n = n
         self.side = side
@@ -56,23 +64,35 @@ class RenderedSource(Source):
         self.depth = DepthScale.from_ranges(f_range=spec.f_range, z_range=spec.z_range).scaled(self.zoom)
         self.constant_f = self.zoom * float(np.sqrt(spec.f_range[0] * spec.f_range[1]))
 
-    def samples(self, split: Split) -> Batch:
-        records = self._records(split)
+    def samples(self, part: Part) -> Batch:
+        split, rows = self._place(part)
+        images = cached_images(self.folder, split, self._records(split), self.side)
+        records = self._records(split)[rows]
         return Batch(
-            image=torch.from_numpy(cached_images(self.folder, split, records, self.side)),
+            image=torch.from_numpy(images[rows]),
             xyz=torch.tensor([(record.x, record.y, record.z) for record in records], dtype=torch.float32),
             f=torch.tensor([self.zoom * record.f for record in records], dtype=torch.float32),
             S=float(self.side),
             row=torch.arange(len(records)),
         )
 
-    def known(self, split: Split) -> Known:
+    def known(self, part: Part) -> Known:
         names = ("file_name", "f", "S", "scale", "visibility", "truncation", "scene", "view")
-        records = self._records(split)
+        split, rows = self._place(part)
+        records = self._records(split)[rows]
         return {name: [getattr(record, name) for record in records] for name in names}
 
-    def count(self, split: Split) -> int:
-        return self.n[split]
+    def count(self, part: Part) -> int:
+        return self.n[part]
+
+    def _place(self, part: Part) -> tuple[Split, slice]:
+        """The split that holds a part, and which of its samples they are."""
+        if part == "test":
+            return "test", slice(0, self.n["test"])
+        start = self.n["train"] if part == "held_out" else 0
+        return "train", slice(start, start + self.n[part])
 
     def _records(self, split: Split) -> list[SampleRecord]:
-        return self.folder.records(split, self.n[split])
+        """Everything that a run uses of a split."""
+        n = self.n["test"] if split == "test" else self.n["train"] + self.n["held_out"]
+        return self.folder.records(split, n)

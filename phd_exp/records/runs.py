@@ -6,6 +6,7 @@
         metrics.jsonl        one line an epoch
         results.json         the final numbers
         predictions.parquet  per test sample: truth, parameters, estimate, errors
+        held_out.parquet     the same of training samples that were held out, for recalibration
         calibration/         the calibration curves, as data (JSON) and as pictures (PNG)
         checkpoints/         last.ckpt
         wandb/               the same for wandb, ready for `wandb sync`
@@ -78,10 +79,15 @@ class RunFolder:
         self.calibration = path / "calibration"
         self.wandb = path / "wandb"
         self.predictions = path / "predictions.parquet"
+        self.held_out = path / "held_out.parquet"
         self.results_file = path / "results.json"
         self.metrics_file = path / "metrics.jsonl"
         self.status_file = path / "status.json"
         self.config_file = path / "config.yaml"
+
+    def curves(self, name: str) -> Path:
+        """Calibration curves, of an epoch or "final"; their picture, if there is one, differs in the suffix."""
+        return self.calibration / f"{name}.json"
 
     @property
     def last_checkpoint(self) -> Path:
@@ -176,6 +182,11 @@ class RunFolder:
             self.write_status(_ended(status, "interrupted", error=f"{type(stop).__name__}: {stop}"))
             raise
         self.write_status(_ended(status, "finished"))
+
+
+def epoch_name(epoch: int) -> str:
+    """What files of an epoch are called."""
+    return f"epoch-{epoch:04d}"
 
 
 def find_runs(runs: Path) -> list[RunFolder]:

@@ -15,7 +15,7 @@ from lightning.pytorch.loggers import Logger
 
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.folder import FolderSource
-from phd_exp.data.sources import RenderedSource, Source
+from phd_exp.data.sources import Part, RenderedSource, Source
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.dataset import DatasetFolder
@@ -25,6 +25,7 @@ from phd_exp.records.runs import RunFolder
 from phd_exp.training.callbacks import CalibrationRecorder, Draw, EpochLines
 from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig, TrainerConfig
 from phd_exp.training.module import PositionModule
+from phd_exp.training.tracking import Tracker
 
 
 def build_data(config: RunConfig) -> PositionData:
@@ -34,12 +35,10 @@ def build_data(config: RunConfig) -> PositionData:
 
 def _source(data: RenderedConfig | FolderConfig) -> Source:
     if isinstance(data, FolderConfig):
-        return FolderSource(
-            DetectionFolder(data.folder), {"train": data.n_train, "test": data.n_test}, data.image_size
-        )
-    return RenderedSource(
-        DatasetFolder(data.folder), data.spec, {"train": data.n_train, "test": data.n_test}, data.image_size
-    )
+        folder = DetectionFolder(data.folder)
+        return FolderSource(folder, data.n_train, data.n_held_out, data.n_test, data.image_size)
+    sizes: dict[Part, int] = {"train": data.n_train, "held_out": data.n_held_out, "test": data.n_test}
+    return RenderedSource(DatasetFolder(data.folder), data.spec, sizes, data.image_size)
 
 
 def build_module(config: RunConfig, data: PositionData) -> PositionModule:
@@ -84,7 +83,7 @@ def build_trainer(
         callbacks.append(calibration)
     return Trainer(
         accelerator=config.trainer.accelerator,
-        devices=1,
+        devices=config.trainer.devices,
         precision=precision(config.trainer),
         max_epochs=config.trainer.max_epochs,
         logger=loggers,
@@ -110,14 +109,14 @@ def on_a_terminal() -> bool:
 
 
 def build_calibration(
-    config: RunConfig, folder: RunFolder, module: PositionModule, draw: Draw | None
+    config: RunConfig, folder: RunFolder, module: PositionModule, draw: Draw | None, tracker: Tracker | None
 ) -> CalibrationRecorder | None:
     """The recorder of calibration curves; None for a baseline, which predicts no uncertainty."""
     if not issubclass(module.regressor.head.prediction, ProjectedHuber):
         return None
     evaluation = config.evaluation
     return CalibrationRecorder(
-        folder, evaluation.calibration_window, evaluation.calibration_every_n_epochs, draw
+        folder, evaluation.calibration_window, evaluation.calibration_every_n_epochs, draw, tracker
     )
 
 

@@ -8,15 +8,16 @@ from pathlib import Path
 from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.loggers import Logger, WandbLogger
+from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
 from phd_exp.data.batches import Batch
 from phd_exp.metrics.calibration import CalibrationCurve
 from phd_exp.models.heads import Prediction
 from phd_exp.records.files import write_atomic
-from phd_exp.records.runs import RunFolder
+from phd_exp.records.runs import RunFolder, epoch_name
 from phd_exp.training.predictions import Columns, calibration_curves, columns, joined
+from phd_exp.training.tracking import Tracker
 
 SHOWN = ("test/loss", "test/projected_error_mm", "test/depth_error_mm")
 
@@ -76,11 +77,14 @@ class EpochLines(Callback):
 class CalibrationRecorder(Callback):
     """Every n epochs, and after the last, the calibration curves of the test split, as data and as pictures."""
 
-    def __init__(self, folder: RunFolder, window: int, every_n_epochs: int, draw: Draw | None) -> None:
+    def __init__(
+        self, folder: RunFolder, window: int, every_n_epochs: int, draw: Draw | None, tracker: Tracker | None
+    ) -> None:
         self.folder = folder
         self.window = window
         self.every_n_epochs = every_n_epochs
         self.draw = draw
+        self.tracker = tracker
         self.parts: list[Columns] = []
 
     def is_due(self, trainer: Trainer) -> bool:
@@ -106,34 +110,19 @@ class CalibrationRecorder(Callback):
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not self.parts:
             return
-        curves = self.write(f"epoch-{trainer.current_epoch:04d}", joined(self.parts))
-        for logger in trainer.loggers:
-            if isinstance(logger, WandbLogger):
-                self._send(logger, curves, trainer)
+        name = epoch_name(trainer.current_epoch)
+        self.write(name, joined(self.parts))
+        if self.tracker is not None:
+            self.tracker.send_calibration(name, trainer.global_step)
 
-    def write(self, name: str, table: Columns) -> CalibrationData:
-        """Write the curves of a table of predictions into the record, and draw them; returns them as data."""
+    def write(self, name: str, table: Columns) -> None:
+        """Write the curves of a table of predictions into the record, and draw them."""
         curves = {key: _as_data(curve) for key, curve in calibration_curves(table, self.window).items()}
         self.folder.calibration.mkdir(parents=True, exist_ok=True)
-        write_atomic(self.folder.calibration / f"{name}.json", json.dumps(curves) + "\n")
+        file = self.folder.curves(name)
+        write_atomic(file, json.dumps(curves) + "\n")
         if self.draw is not None:
-            self.draw(curves, self._picture(name))
-        return curves
-
-    def _send(self, logger: WandbLogger, curves: CalibrationData, trainer: Trainer) -> None:
-        points = [
-            [name, *point]
-            for name, curve in curves.items()
-            for point in zip(curve["predicted"], curve["empirical"], strict=True)
-        ]
-        header = ["curve", "predicted", "empirical"]
-        logger.log_table("test/calibration_curves", header, points, step=trainer.global_step)
-        picture = self._picture(f"epoch-{trainer.current_epoch:04d}")
-        if picture.exists():
-            logger.log_image("test/calibration", [str(picture)], step=trainer.global_step)
-
-    def _picture(self, name: str) -> Path:
-        return self.folder.calibration / f"{name}.png"
+            self.draw(curves, file.with_suffix(".png"))
 
 
 def _as_data(curve: CalibrationCurve) -> dict[str, Any]:

@@ -44,6 +44,7 @@ class SizesConfig(Section):
     """How much of a data set a run uses, whatever its kind; None: all there is."""
 
     n_train: Annotated[Whole, Field(ge=1)] | None
+    n_held_out: Annotated[Whole, Field(ge=0)]
     n_test: Annotated[Whole, Field(ge=1)] | None
     image_size: Annotated[Whole, Field(ge=SMALLEST_IMAGE)]
     batch_size: Annotated[Whole, Field(ge=1)]
@@ -83,6 +84,11 @@ class RenderedConfig(SizesConfig):
                 "images are only ever shrunk"
             )
         return self
+
+    @property
+    def n_training_split(self) -> int:
+        """Samples to render of the training split."""
+        return self.n_train + self.n_held_out
 
     @property
     def name(self) -> str:
@@ -128,6 +134,7 @@ class TrainerConfig(Section):
     accelerator: Literal["auto", "cpu", "gpu"]
     precision: Literal["auto", "float32", "bfloat16"]
     threads: Annotated[Whole, Field(ge=1)] | None
+    devices: Annotated[Whole, Field(ge=1)]
     progress_bar: Annotated[bool, Field(strict=True)]
 
 

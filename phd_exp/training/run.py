@@ -11,6 +11,7 @@ import torch
 from lightning import Trainer, seed_everything
 
 from phd_exp.data.datamodule import PositionData
+from phd_exp.data.sources import Part
 from phd_exp.records.dataset import DatasetFolder, sha256
 from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError, RunError
@@ -116,32 +117,54 @@ def _train(config: RunConfig, folder: RunFolder, draw: Draw | None, cores: int) 
     data = build_data(config)
     data.setup()
     module = build_module(config, data)
-    calibration = build_calibration(config, folder, module, draw)
     record = RecordLogger(folder)
-    with tracked(config, folder) as others:
-        trainer = build_trainer(config, folder, [record, *others], calibration)
-        seconds = _fit(trainer, module, data, folder, record)
-        table = _evaluate(trainer, module, data)
-    if calibration is not None:
-        calibration.write("final", table)
-    write_parquet(folder.predictions, table, data.source.known("test"))
-    untrained = {f"untrained/{key}": value for key, value in record.rows[UNTRAINED].items() if "test/" in key}
-    return summary(table) | untrained | _circumstances(config, data, trainer, seconds)
+    with tracked(config, folder) as tracker:
+        calibration = build_calibration(config, folder, module, draw, tracker)
+        trainer = build_trainer(config, folder, [record, *([tracker.logger] if tracker else [])], calibration)
+        checkpoint = _take_up(trainer, module, data, record)
+        if tracker:
+            tracker.send_epochs(record.rows.values())
+        seconds = _fit(trainer, module, data, checkpoint)
+        tables = {part: _evaluate(trainer, module, data, part) for part in data.samples if part != "train"}
+        if calibration is not None:
+            calibration.write("final", tables["test"])
+        for part, table in tables.items():
+            file = folder.held_out if part == "held_out" else folder.predictions
+            write_parquet(file, table, data.source.known(part))
+        results = (
+            summary(tables["test"]) | _untrained(record) | _circumstances(config, data, trainer, seconds)
+        )
+        if tracker:
+            tracker.send_results(results)
+    return results
 
 
-def _fit(
-    trainer: Trainer, module: PositionModule, data: PositionData, folder: RunFolder, record: RecordLogger
-) -> float:
-    """Train to the last epoch, from the last checkpoint if there is one; returns the seconds it took now."""
+def _take_up(
+    trainer: Trainer, module: PositionModule, data: PositionData, record: RecordLogger
+) -> Path | None:
+    """Leave in the record what was done before: the epochs up to the last checkpoint, which is returned.
+
+    A new run has none; what its untrained network gives is recorded.
+    """
+    checkpoint = record.folder.last_checkpoint
+    if checkpoint.exists():
+        record.forget_after(_epoch_of(checkpoint))
+        return checkpoint
+    record.forget_after(UNTRAINED)
+    record.log_metrics({"epoch": UNTRAINED} | summary(_evaluate(trainer, module, data, "test")), step=0)
+    return None
+
+
+def _fit(trainer: Trainer, module: PositionModule, data: PositionData, checkpoint: Path | None) -> float:
+    """Train to the last epoch, from the checkpoint if there is one; returns the seconds it took now."""
     start = time.monotonic()
-    if folder.last_checkpoint.exists():
-        record.forget_after(_epoch_of(folder.last_checkpoint))
-        trainer.fit(module, datamodule=data, ckpt_path=folder.last_checkpoint, weights_only=True)
-    else:
-        record.forget_after(UNTRAINED)
-        record.log_metrics({"epoch": UNTRAINED} | summary(_evaluate(trainer, module, data)), step=0)
-        trainer.fit(module, datamodule=data)
+    trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     return time.monotonic() - start
+
+
+def _untrained(record: RecordLogger) -> dict[str, Any]:
+    """The numbers of the untrained network, for comparison."""
+    return {f"untrained/{key}": value for key, value in record.rows[UNTRAINED].items() if "test/" in key}
 
 
 def _epoch_of(checkpoint: Path) -> int:
@@ -155,11 +178,11 @@ def _epoch_of(checkpoint: Path) -> int:
         ) from None
 
 
-def _evaluate(trainer: Trainer, module: PositionModule, data: PositionData) -> Columns:
-    """Predictions of the last weights on the test split, a row a sample."""
-    parts = trainer.predict(module, dataloaders=data.test_dataloader())
-    assert parts is not None
-    return joined(parts)  # type: ignore[arg-type]
+def _evaluate(trainer: Trainer, module: PositionModule, data: PositionData, part: Part) -> Columns:
+    """Predictions of the present weights, a row a sample."""
+    batches = trainer.predict(module, dataloaders=data.in_order(part))
+    assert batches is not None
+    return joined(batches)  # type: ignore[arg-type]
 
 
 def _circumstances(config: RunConfig, data: PositionData, trainer: Trainer, seconds: float) -> dict[str, Any]:
@@ -169,6 +192,7 @@ def _circumstances(config: RunConfig, data: PositionData, trainer: Trainer, seco
         "model": config.model.name,
         "seed": config.seed,
         "n_train": data.source.count("train"),
+        "n_held_out": data.source.count("held_out"),
         "n_test": data.source.count("test"),
         "epochs": trainer.current_epoch,
         "fit_seconds": seconds,

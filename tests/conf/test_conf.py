@@ -79,15 +79,15 @@ def test_of_a_folder_all_is_taken_whatever_the_preset(checked: Callable, preset:
         checked(f"preset={preset}", "data=folder", "data.folder=photos").data,
         checked(f"preset={preset}").data,
     )
-    assert (own.n_train, own.n_test) == (None, None)
+    assert (own.n_train, own.n_held_out, own.n_test) == (None, 0, None)
     assert (own.image_size, own.batch_size) == (rendered.image_size, rendered.batch_size)
 
 
 def test_of_a_folder_as_much_is_taken_as_the_user_says(checked: Callable) -> None:
     data = checked(
-        "data=folder", "data.folder=photos", "data.n_train=100", "data.n_test=7", "data.image_size=96"
+        "data=folder", "data.folder=photos", "data.n_train=100", "data.n_held_out=9", "data.n_test=7"
     ).data
-    assert (data.n_train, data.n_test, data.image_size) == (100, 7, 96)
+    assert (data.n_train, data.n_held_out, data.n_test) == (100, 9, 7)
 
 
 def test_variants_differ_in_what_they_name_alone(checked: Callable) -> None:

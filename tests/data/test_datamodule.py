@@ -6,13 +6,16 @@ import pytest
 import torch
 
 from phd_exp.data.datamodule import PositionData
-from phd_exp.data.sources import RenderedSource
+from phd_exp.data.sources import Part, RenderedSource
 from phd_exp.records.dataset import DatasetError, DatasetFolder
 from phd_exp.records.spec import DatasetSpec
 
 
-def data(folder: DatasetFolder, spec: DatasetSpec, image_size: int = 64, n_train: int = 5) -> PositionData:
-    source = RenderedSource(folder, spec, {"train": n_train, "test": 3}, image_size)
+def data(
+    folder: DatasetFolder, spec: DatasetSpec, image_size: int = 64, n_train: int = 5, n_held_out: int = 0
+) -> PositionData:
+    sizes: dict[Part, int] = {"train": n_train, "held_out": n_held_out, "test": 3}
+    source = RenderedSource(folder, spec, sizes, image_size)
     module = PositionData(source, batch_size=2, seed=0)
     module.setup()
     return module
@@ -65,6 +68,24 @@ def test_uses_the_first_samples(folder: DatasetFolder, spec: DatasetSpec) -> Non
     assert len(data(folder, spec, n_train=2).samples["train"]) == 2
 
 
+def test_held_out_samples_follow_those_trained_on(folder: DatasetFolder, spec: DatasetSpec) -> None:
+    module = data(folder, spec, n_train=3, n_held_out=2)
+    whole = data(folder, spec)
+    assert [len(module.samples[part]) for part in ("train", "held_out", "test")] == [3, 2, 3]  # type: ignore[index]
+    assert torch.equal(module.samples["train"].image, whole.samples["train"].image[:3])
+    assert torch.equal(module.samples["held_out"].image, whole.samples["train"].image[3:])
+    assert torch.equal(module.samples["held_out"].xyz, whole.samples["train"].xyz[3:])
+    assert module.source.known("held_out")["file_name"] == whole.source.known("train")["file_name"][3:]
+    (batch,) = module.in_order("held_out")
+    assert batch.row.tolist() == [0, 1]
+
+
+def test_none_need_be_held_out(folder: DatasetFolder, spec: DatasetSpec) -> None:
+    assert "held_out" not in data(folder, spec).samples
+
+
 def test_too_few_samples_are_one_line(folder: DatasetFolder, spec: DatasetSpec) -> None:
     with pytest.raises(DatasetError, match="6 samples asked for, 5 "):
         data(folder, spec, n_train=6)
+    with pytest.raises(DatasetError, match="6 samples asked for, 5 "):
+        data(folder, spec, n_train=4, n_held_out=2)

@@ -21,7 +21,6 @@ from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.spec import DatasetSpec
 
-ALL = {"train": None, "test": None}
 BOXED: dict[str, Any] = {"file_name": "wide.jpg", "fx": 300.0, "fy": 320.0, "cx": 70.0, "cy": 40.0, "z": 2.0}
 
 
@@ -53,7 +52,7 @@ def photos(tmp_path: Path) -> DetectionFolder:
 
 
 def source(folder: DetectionFolder, side: int = 48) -> FolderSource:
-    return FolderSource(folder, ALL, side)  # type: ignore[arg-type]
+    return FolderSource(folder, None, 0, None, side)
 
 
 def images(folder: DetectionFolder) -> np.ndarray:
@@ -63,8 +62,8 @@ def images(folder: DetectionFolder) -> np.ndarray:
 def test_a_rendered_data_set_read_as_a_folder_is_itself(folder: DatasetFolder, spec: DatasetSpec) -> None:
     """Square images whole: the virtual camera is the camera, and every pixel and label stays what it was."""
     for side in (64, 32):
-        rendered = RenderedSource(folder, spec, {"train": 5, "test": 3}, side)
-        own = FolderSource(DetectionFolder(folder.root), ALL, side)  # type: ignore[arg-type]
+        rendered = RenderedSource(folder, spec, {"train": 5, "held_out": 0, "test": 3}, side)
+        own = source(DetectionFolder(folder.root), side)
         for split in ("train", "test"):
             here, there = own.samples(split), rendered.samples(split)  # type: ignore[arg-type]
             assert torch.equal(here.image, there.image)
@@ -103,7 +102,28 @@ def test_what_is_known_is_what_the_lines_say(photos: DetectionFolder) -> None:
     known = own.known("test")
     assert known.keys() == {"file_name", "f", "S", "visibility"}
     assert (known["file_name"], known["S"], known["visibility"]) == (["tall.png"], [48], [0.5])
-    assert (own.count("train"), own.count("test")) == (3, 1)
+    assert (own.count("train"), own.count("held_out"), own.count("test")) == (3, 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("n_train", "n_held_out", "counts"), [(None, 1, (2, 1)), (1, 1, (1, 1)), (1, 2, (1, 2))]
+)
+def test_what_is_held_out_follows_what_is_trained_on(
+    photos: DetectionFolder, n_train: int | None, n_held_out: int, counts: tuple[int, int]
+) -> None:
+    own, whole = FolderSource(photos, n_train, n_held_out, None, 48), source(photos)
+    assert (own.count("train"), own.count("held_out")) == counts
+    there = whole.samples("train").select(torch.arange(counts[0], sum(counts)))
+    held_out = own.samples("held_out")
+    assert torch.equal(held_out.image, there.image)
+    assert torch.equal(held_out.xyz, there.xyz)
+    ratio = (own.samples("train").xyz[:, 2] / own.samples("train").f).double()
+    assert own.depth.mu_z0 == pytest.approx(math.sqrt(ratio.max() * ratio.min())), "of those trained on alone"
+
+
+def test_something_must_be_left_to_train_on(photos: DetectionFolder) -> None:
+    with pytest.raises(ConfigError, match=r"data.n_held_out: got 3, but .* has 3 detections"):
+        FolderSource(photos, None, 3, None, 48)
 
 
 def test_decodes_each_image_once(photos: DetectionFolder, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ QUICK = (
     "data.sensor_size=64",
     "data.f_range=[343,571]",
     "data.n_train=16",
+    "data.n_held_out=4",
     "data.n_test=6",
     "data.batch_size=8",
     "trainer.progress_bar=false",

@@ -27,7 +27,7 @@ from phd_exp.rendering.rotations import rotation_matrix
 from phd_exp.rendering.visibility import silhouettes
 from phd_exp.rendering.workers import ensure_rendered
 
-N = {"train": 14, "test": 2}
+N = {"train": 14, "held_out": 0, "test": 2}
 SIDE = 96
 
 
@@ -71,7 +71,7 @@ def test_a_rendered_image_seen_as_a_whole_is_itself(
     rendered: DatasetFolder, spec: DatasetSpec, side: int
 ) -> None:
     there = RenderedSource(rendered, spec, N, side).samples("train")  # type: ignore[arg-type]
-    own = FolderSource(DetectionFolder(rendered.root), N, side)  # type: ignore[arg-type]
+    own = FolderSource(DetectionFolder(rendered.root), None, 0, None, side)
     here = own.samples("train")
     assert all(np.array_equal(crop.camera.R, np.eye(3)) for crop in own.crops["train"])
     np.testing.assert_array_equal(here.image.numpy(), there.image.numpy())
@@ -174,7 +174,7 @@ def test_a_run_on_own_images_leaves_a_whole_record(
     table = pd.read_parquet(run.predictions)
     assert {"file_name", "f", "S", "x", "y", "z"} <= set(table.columns)
     assert not {"scale", "visibility"} & set(table.columns)
-    (crop, *_) = FolderSource(DetectionFolder(photos), N, 64).crops["test"]  # type: ignore[arg-type]
+    (crop, *_) = FolderSource(DetectionFolder(photos), None, 0, None, 64).crops["test"]
     np.testing.assert_allclose(table.loc[0, ["x", "y", "z"]].astype(float), crop.xyz, rtol=1e-6)
     assert table.loc[0, "f"] == crop.camera.f
 

@@ -4,6 +4,8 @@ import json
 import math
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -51,6 +53,10 @@ def test_every_model_leaves_a_whole_record(train: Callable, tmp_path: Path, mode
         assert results[f"test/{name}"] == pytest.approx(table[name].mean())
         assert results[f"test/{name}"] == pytest.approx(rows[-1][f"test/{name}"], rel=1e-4)
         assert results[f"untrained/test/{name}"] == untrained[f"test/{name}"]
+    held_out = pd.read_parquet(run.held_out)
+    assert list(held_out.columns) == list(table.columns)
+    assert held_out["file_name"].tolist() == [f"{index:06d}.png" for index in range(16, 20)]
+    assert (results["n_train"], results["n_held_out"], results["n_test"]) == (16, 4, 6)
 
 
 @pytest.mark.parametrize("data", DATA)
@@ -85,6 +91,45 @@ def test_wandb_beside_the_record(train: Callable, tmp_path: Path) -> None:
     depth = [row[1:] for row in table["data"] if row[0] == "depth"]
     expected = list(zip(curves["depth"]["predicted"], curves["depth"]["empirical"], strict=True))
     assert depth == [pytest.approx(point) for point in expected]
+
+
+def in_wandb_viewer(run: RunFolder, *words: str) -> str:
+    """What wandb's own viewer prints of the one offline run."""
+    (offline,) = run.wandb.glob("offline-run-*")
+    command = [sys.executable, "-m", "wandb", "leet", "inspect", "--json", *words, str(offline)]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+def test_wandb_ends_as_the_run_ended(
+    train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One run of theirs: failed where ours failed; whole, from the first epoch on, when ours was resumed."""
+    from phd_exp.training.module import PositionModule
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PositionModule, "on_train_epoch_end", power_cut_in_epoch_1)
+        assert train("evaluation.calibration_every_n_epochs=1").status == 1
+    run = only_run(tmp_path / "runs")
+    assert json.loads(in_wandb_viewer(run, "--summary"))["state"] == "failed"
+
+    assert train("evaluation.calibration_every_n_epochs=1").status == 0
+    seen = json.loads(in_wandb_viewer(run, "--summary"))
+    assert seen["state"] == "finished"
+    results = run.results()
+    assert {key: seen["summary"][key] for key in results} == pytest.approx(results)
+    assert seen["config"]["model"]["name"] == "probabilistic"
+    records = [json.loads(line) for line in in_wandb_viewer(run).splitlines()]
+    items = [record["history"]["item"] for record in records if record["type"] == "history"]
+    errors = {item["epoch"]: item["test/depth_error_mm"] for item in items if "test/depth_error_mm" in item}
+    assert errors == pytest.approx({row["epoch"]: row["test/depth_error_mm"] for row in run.metrics()})
+    pictures = [item for item in items if "test/calibration._type" in item or "test/calibration" in item]
+    assert len(pictures) == 2
+
+
+def power_cut_in_epoch_1(self: Any) -> None:
+    if self.current_epoch == 1:
+        raise RuntimeError("power cut")
+    self._log_epoch("train")
 
 
 def test_without_a_logger_no_trace_of_wandb(train: Callable, tmp_path: Path) -> None:
