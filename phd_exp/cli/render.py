@@ -38,9 +38,13 @@ def _render(checked: RenderConfig, folder: DatasetFolder, cores: int) -> bool:
     if checked.shard is None:
         ensure_dataset(data, cores)
         return True
-    return render_shard(folder, data.spec, data.n_training_split, data.n_test, checked.shard, data.workers, cores)
+    return render_shard(
+        folder, data.spec, data.n_training_split, data.n_test, checked.shard, data.workers, cores
+    )
 
 
 def ensure_dataset(data: RenderedConfig, cores: int) -> None:
     """Render what a run needs and the folder lacks."""
-    ensure_rendered(DatasetFolder(data.folder), data.spec, data.n_training_split, data.n_test, data.workers, cores)
+    ensure_rendered(
+        DatasetFolder(data.folder), data.spec, data.n_training_split, data.n_test, data.workers, cores
+    )
