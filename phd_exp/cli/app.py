@@ -13,7 +13,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from phd_exp.cli.jobs import BAD_CONFIGURATION, Ending, JobRecords, Task, hydra_function
+from phd_exp.cli.jobs import BAD_CONFIGURATION, Ending, JobRecords, Launch, Task
 from phd_exp.cli.paths import conf_folder
 from phd_exp.cli.signals import Stopped, stopping_on_signals
 from phd_exp.cli.sweep import IsFinished, sweep
@@ -68,7 +68,7 @@ def _run_all(
         _require_one_run(arguments)
     with tempfile.TemporaryDirectory(prefix="phd_exp-") as folder:
         records = JobRecords(Path(folder))
-        job = hydra_function(task, records, cores=None)
+        job = Launch(records).function(task)
         hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=config_name)(job)()
         # a flag like --cfg runs no job
         return [records.ending(0, [])] if any(records.path.iterdir()) else []

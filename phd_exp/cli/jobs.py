@@ -18,7 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import MISSING, DictConfig, OmegaConf
 from pydantic import BaseModel
 
-from phd_exp.cli.signals import Stopped, stopping_on_signals
+from phd_exp.cli.signals import Stopped, ending_with, stopping_on_signals
 from phd_exp.records.errors import ConfigError, RunError, UserError
 from phd_exp.records.files import write_atomic
 from phd_exp.records.provenance import usable_cores
@@ -101,17 +101,32 @@ class JobRecords:
         shutil.rmtree(self.path, ignore_errors=True)
 
 
-def hydra_function(task: Task, records: JobRecords, cores: int | None) -> Callable[[DictConfig], None]:
-    """The task as Hydra calls it, wherever: a launcher may pickle this function with what it holds."""
-    home = HOME
+@dataclass(frozen=True)
+class Launch:
+    """What all jobs of one launch are told, wherever they run.
 
-    def job(config: DictConfig) -> None:
-        run_job(task, records, home, cores, config)
+    Attributes:
+        records: where they say how they ended.
+        cores: how many each may use; None: all that its process may use.
+        parent: the process whose children they are and with which they end; None: they outlive the launcher.
+        home: the launcher's own process.
+    """
 
-    return job
+    records: JobRecords
+    cores: int | None = None
+    parent: int | None = None
+    home: str = HOME
+
+    def function(self, task: Task) -> Callable[[DictConfig], None]:
+        """The task as Hydra calls it; a launcher may pickle this function with what it holds."""
+
+        def job(config: DictConfig) -> None:
+            run_job(task, self, config)
+
+        return job
 
 
-def run_job(task: Task, records: JobRecords, home: str, cores: int | None, config: DictConfig) -> None:
+def run_job(task: Task, launch: Launch, config: DictConfig) -> None:
     """Run one job and record how it ended; a failure is recorded and not raised, so that a sweep goes on.
 
     A stop goes up in the launcher's own process, where it ends everything. In another process it ends that job.
@@ -119,21 +134,22 @@ def run_job(task: Task, records: JobRecords, home: str, cores: int | None, confi
     hydra = HydraConfig.get()
     overrides = list(hydra.overrides.task)
     number = 0 if OmegaConf.is_missing(hydra.job, "num") else hydra.job.num  # a single run has none
-    with records.running(number):
+    at_home = launch.home == HOME
+    with launch.records.running(number):
         try:
             # hydra's launchers put signal handlers of their own into their processes, or none
-            with stopping_on_signals():
-                state = task(plain(config), overrides, cores or usable_cores())
+            with stopping_on_signals(), ending_with(None if at_home else launch.parent):
+                state = task(plain(config), overrides, launch.cores or usable_cores())
             ending = Ending(overrides=overrides, state=state)
         except Stopped as stop:
-            if home == HOME:
+            if at_home:
                 raise
             ending = Ending.of(overrides, stop)
         except Exception as error:
             if not isinstance(error, UserError):
                 traceback.print_exc()  # a fault of the programme, not of its user
             ending = Ending.of(overrides, error)
-        records.end(number, ending)
+        launch.records.end(number, ending)
 
 
 def plain(config: DictConfig) -> dict[str, Any]:

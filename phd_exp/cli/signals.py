@@ -1,6 +1,8 @@
 """SIGINT and SIGTERM as an orderly stop: what runs is recorded as interrupted, and the exit status says why."""
 
+import os
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -35,3 +37,25 @@ def stopping_on_signals() -> Iterator[None]:
     finally:
         for signum, handler in before.items():
             signal.signal(signum, handler)
+
+
+@contextmanager
+def ending_with(parent: int | None) -> Iterator[None]:
+    """Let this process ask itself to stop when its parent is gone, while the body runs; None: whatever happens to it.
+
+    A killed parent cannot tell its children. Those of joblib would work through all that they were given.
+    """
+    over = threading.Event()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            if over.wait(1.0):
+                return
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    if parent is not None:
+        threading.Thread(target=watch, daemon=True).start()
+    try:
+        yield
+    finally:
+        over.set()

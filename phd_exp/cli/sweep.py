@@ -1,6 +1,7 @@
 """A sweep: what its jobs are, known before any begins; who runs them; how all of them ended."""
 
 import json
+import os
 import uuid
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -21,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from phd_exp.cli.cores import cores_a_job
-from phd_exp.cli.jobs import Ending, JobRecords, Task, hydra_function, plain
+from phd_exp.cli.jobs import Ending, JobRecords, Launch, Task, plain
 from phd_exp.cli.paths import conf_folder
 from phd_exp.records.errors import ConfigError, RunError
 
@@ -120,13 +121,14 @@ def _combinations(words: list[str], master: DictConfig, loader: ConfigLoader) ->
 
 def _run(task: Task, planned: Plan, records: JobRecords) -> Exception | None:
     """Let the launcher run the jobs; returns the error with which it gave up, if it did so on the way."""
-    cores = cores_a_job(planned.launcher, len(planned.jobs))
+    parent = os.getpid() if planned.launcher["_target_"].endswith(".JoblibLauncher") else None
+    launch = Launch(records, cores_a_job(planned.launcher, len(planned.jobs)), parent)
     context = HydraContext(
         config_loader=GlobalHydra.instance().config_loader(), callbacks=Callbacks(planned.config)
     )
     try:
         launcher = Plugins.instance().instantiate_launcher(
-            hydra_context=context, task_function=hydra_function(task, records, cores), config=planned.config
+            hydra_context=context, task_function=launch.function(task), config=planned.config
         )
         for done in launcher.launch([job.overrides for job in planned.jobs], initial_job_idx=0):
             _ = done.return_value  # raises what went wrong around the job
@@ -153,13 +155,13 @@ def _announce(jobs: list[Job], is_finished: IsFinished | None) -> None:
 
 
 def _print_states(endings: list[Ending]) -> None:
+    shared = set.intersection(*(set(ending.overrides) for ending in endings))
     for ending in endings:
-        print(f"{' '.join(ending.overrides)}: {ending.state}")
+        own = [override for override in ending.overrides if override not in shared]
+        print(f"{' '.join(own or ending.overrides)}: {ending.state}")
     states = Counter(ending.state for ending in endings)
-    print(
-        f"{_counted(len(endings))}: {', '.join(f'{count} {state}' for state, count in states.items())}",
-        flush=True,
-    )
+    summary = ", ".join(f"{count} {state}" for state, count in states.items())
+    print(f"{_counted(len(endings))}: {summary}", flush=True)
 
 
 def _counted(jobs: int) -> str:

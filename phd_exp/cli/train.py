@@ -5,6 +5,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
 from phd_exp.cli.app import launch
 from phd_exp.cli.render import ensure_dataset
 from phd_exp.records.errors import RunError
@@ -57,7 +59,10 @@ def run_name(config: RunConfig, overrides: list[str]) -> RunName:
 
 
 def _telling(overrides: list[str]) -> tuple[str, ...]:
-    return tuple(text for override in overrides if _is_telling(text := override.lstrip("+")))
+    parsed = OverridesParser.create().parse_overrides(overrides)
+    # 1e-3 and 0.001, true and True are one value: a sweep hands on the one where the user wrote the other
+    texts = [f"{item.key_or_group}={item.get_value_element_as_str()}" for item in parsed]
+    return tuple(text for text in texts if _is_telling(text))
 
 
 def _is_telling(override: str) -> bool:

@@ -42,7 +42,7 @@ def task(config, overrides, cores):
         time.sleep(60)
     if seed == 4:
         os.kill(os.getpid(), signal.SIGKILL)
-    time.sleep(1)
+    time.sleep(60 if seed == 6 else 1)
     Path(f"{seed}.done").write_text(str(cores))
     return "done"
 
@@ -124,6 +124,9 @@ def test_a_job_that_is_killed_is_named(sweep, tmp_path: Path, launcher: str) -> 
 def test_nothing_stays_of_a_launch_without_failures(sweep, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     done = sweep("joblib", "0,5")
     assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == ["2 jobs", "seed=0: done", "seed=5: done", "2 jobs: 2 done"]
+    cores = max(1, len(os.sched_getaffinity(0)) // 2)
+    assert [(tmp_path / f"{seed}.done").read_text() for seed in (0, 5)] == [str(cores)] * 2
     assert errors(done) == []
     assert not list((tmp_path / "runs" / ".sweep").glob("launch-*"))
 
@@ -142,6 +145,22 @@ def test_jobs_of_a_queue_outlive_a_stopped_launcher(tmp_path: Path) -> None:
         assert launcher.wait(60) == 143
     wait_for(lambda: len(list(launches.glob("launch-*/*.json"))) == 2)
     assert {path.name for path in tmp_path.glob("*.done")} == {"0.done", "5.done"}
+
+
+def test_jobs_of_joblib_end_with_a_killed_launcher(tmp_path: Path) -> None:
+    """Those that have begun, and those that were handed out and have not."""
+    (tmp_path / "task.py").write_text(TASK)
+    words = [sys.executable, "task.py", "-m", "seed=6", "preset=smoke,small,paper,demo", *LAUNCHERS["joblib"]]
+    environment = os.environ | {"PYTHONPATH": str(HOME)}
+    with subprocess.Popen(words, cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL) as launcher:
+        wait_for(lambda: len(list(tmp_path.glob("runs/.sweep/launch-*/*.begun"))) == 2)
+        launcher.kill()
+    (records,) = tmp_path.glob("runs/.sweep/launch-*")
+    wait_for(lambda: {"0.json", "1.json"} <= {file.name for file in records.glob("*.json")})
+    time.sleep(0.5)
+    for file in records.glob("*.json"):
+        assert "stopped by SIGTERM" in file.read_text()
+    assert not list(tmp_path.glob("*.done"))
 
 
 def wait_for(condition: Callable[[], bool]) -> None:

@@ -47,3 +47,17 @@ def test_what_changes_no_number_is_left_out(config: RunConfig, override: str) ->
 def test_everything_else_is_in_it(config: RunConfig, override: str) -> None:
     assert run_name(config, [override]).overrides == (override,)
     assert run_name(config, [f"+{override}"]).overrides == (override,)
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("optimizer.lr=1e-3", "optimizer.lr=0.001"),
+        ("data.occluders=true", "data.occluders=True"),
+        ("data.f_range=[1, 2]", "data.f_range=[1,2]"),
+        ("+optimizer.eps=1e-7", "++optimizer.eps=1e-7"),
+    ],
+)
+def test_one_value_has_one_name(config: RunConfig, one: str, other: str) -> None:
+    """A sweep writes values anew before it hands them to its runs."""
+    assert run_name(config, [one]) == run_name(config, [other])

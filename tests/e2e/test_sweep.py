@@ -4,11 +4,13 @@ import multiprocessing
 import random
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from phd_exp.__main__ import main
 from phd_exp.records.runs import RunFolder, find_runs
@@ -98,9 +100,9 @@ def test_a_failing_run_among_others(train: Callable, tmp_path: Path, monkeypatch
     assert error.endswith("RuntimeError: planted")
     assert "model=mae_vz seed=1" in error
     *_, zero, one, two, total = outcome.out.splitlines()
-    assert zero.endswith("seed=0 logger=none: finished")
-    assert one.endswith("seed=1 logger=none: failed")
-    assert two.endswith("seed=2 logger=none: finished")
+    assert zero == "seed=0: finished"
+    assert one == "seed=1: failed"
+    assert two == "seed=2: finished"
     assert total == "3 jobs: 2 finished, 1 failed"
     before = finished(tmp_path / "runs")
     assert len(before) == 2
@@ -128,3 +130,36 @@ def test_a_changed_configuration_never_reuses_a_run(train: Callable, tmp_path: P
     assert "optimizer.lr=0.5, but optimizer.lr=0.001 is asked for" in line
     assert outcome.out.splitlines()[-1] == "2 jobs: 1 finished already, 1 failed"
     assert finished(tmp_path / "runs") == before
+
+
+WITHOUT_RAY = pytest.mark.skipif(
+    find_spec("ray") is None, reason="needs the extra `ray`, in a venv of its own"
+)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["seed=1,0"],
+        pytest.param(
+            ["seed=1,0", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"], marks=pytest.mark.slow
+        ),
+        pytest.param(["seed=0,1", "hydra/launcher=submitit_local"], marks=pytest.mark.slow),
+        pytest.param(["seed=0,1", "hydra/launcher=ray"], marks=[pytest.mark.slow, WITHOUT_RAY]),
+    ],
+    ids=["order", "joblib", "submitit", "ray"],
+)
+def test_neither_order_nor_launcher_changes_a_number(
+    train: Callable, tmp_path: Path, words: list[str]
+) -> None:
+    """At one number of threads, which the shared words set."""
+    assert train(*TWO, "runs=here").status == 0
+    outcome = train("-m", "model=mae_vz", "logger=none", *words, "runs=there")
+    assert outcome.status == 0, outcome.err
+    assert numbers(tmp_path / "here") == numbers(tmp_path / "there")
+    here, there = find_runs(tmp_path / "here"), find_runs(tmp_path / "there")
+    assert len(here) == 2
+    for one, other in zip(here, there, strict=True):
+        weights = [torch.load(run.last_checkpoint, weights_only=True)["state_dict"] for run in (one, other)]
+        assert weights[0].keys() == weights[1].keys()
+        assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])

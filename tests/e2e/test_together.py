@@ -16,7 +16,6 @@ import pytest
 from phd_exp.records.runs import RunFolder, find_runs
 from tests.e2e.conftest import QUICK
 
-pytestmark = pytest.mark.slow
 THREE_EPOCHS = (
     "logger=none",
     "trainer.max_epochs=3",
@@ -59,6 +58,7 @@ def wait_for(condition: Callable[[], Any], seconds: float = 120) -> None:
         time.sleep(0.02)
 
 
+@pytest.mark.slow
 def test_the_numbers_are_those_of_one_process(train: Callable, tmp_path: Path) -> None:
     assert train(*THREE_EPOCHS, "runs=alone").status == 0
     outcome = train(*THREE_EPOCHS, *TOGETHER, "trainer.threads=2", "runs=together")
@@ -103,6 +103,7 @@ def killing_a_rank() -> Iterator[Callable[[Path, int], list[int]]]:
         thread.join()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [0, 1])
 def test_one_killed_ends_all_and_the_same_command_goes_on(
     train: Callable, tmp_path: Path, killing_a_rank: Callable, place: int
@@ -132,6 +133,7 @@ def test_one_killed_ends_all_and_the_same_command_goes_on(
     assert only_run(tmp_path / "whole").metrics() == run.metrics()
 
 
+@pytest.mark.slow
 def test_a_loss_that_is_not_finite_is_one_line(train: Callable) -> None:
     outcome = train("logger=none", "optimizer.lr=1e30", *TOGETHER)
     assert outcome.status == 1
@@ -140,6 +142,7 @@ def test_a_loss_that_is_not_finite_is_one_line(train: Callable) -> None:
     assert "lower optimizer.lr" in line
 
 
+@pytest.mark.slow
 def test_none_outlives_the_process_that_started_them(renders: Path, tmp_path: Path) -> None:
     from phd_exp.__main__ import main
 
@@ -163,6 +166,7 @@ def test_none_outlives_the_process_that_started_them(renders: Path, tmp_path: Pa
     assert not only_run(tmp_path).is_held()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "launcher",
     [
