@@ -23,7 +23,13 @@ from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.callbacks import CalibrationRecorder, Draw, EpochLines
+from phd_exp.training.callbacks import (
+    CalibrationRecorder,
+    Draw,
+    EpochLines,
+    RecordBeforeCheckpoint,
+    RecordLogger,
+)
 from phd_exp.training.checkpoints import AtomicCheckpoints
 from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig, TrainerConfig
 from phd_exp.training.module import PositionModule
@@ -77,14 +83,16 @@ def _naming(key: str) -> Iterator[None]:
 
 
 def build_trainer(
-    config: RunConfig, folder: RunFolder, loggers: list[Logger], calibration: CalibrationRecorder | None
+    config: RunConfig, record: RecordLogger, loggers: list[Logger], calibration: CalibrationRecorder | None
 ) -> Trainer:
     """Lightning's Trainer with what a run records."""
+    folder = record.folder
     callbacks: list[Callback] = [
+        RecordBeforeCheckpoint(record),
         # after the whole epoch: a checkpoint taken after its validation would leave the epoch half-counted
         ModelCheckpoint(
             folder.checkpoints, filename="last", enable_version_counter=False, save_on_train_epoch_end=True
-        )
+        ),
     ]
     callbacks += _progress(config)
     if calibration is not None:
@@ -97,7 +105,7 @@ def build_trainer(
         plugins=[LightningEnvironment(), AtomicCheckpoints()],
         precision=precision(config.trainer),
         max_epochs=config.trainer.max_epochs,
-        logger=loggers,
+        logger=[record, *loggers],
         callbacks=callbacks,
         enable_progress_bar=any(isinstance(callback, ProgressBar) for callback in callbacks),
         log_every_n_steps=1,  # metrics are logged once an epoch; this only keeps Lightning from remarking on it

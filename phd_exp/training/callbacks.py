@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
@@ -64,6 +65,22 @@ class RecordLogger(Logger):
     def forget_after(self, epoch: int) -> None:
         """Drop the epochs that a resumed run will train again."""
         self.rows = {key: row for key, row in self.rows.items() if key <= epoch}
+
+
+class RecordBeforeCheckpoint(Checkpoint):
+    """Has an epoch in the record before there is a checkpoint of it.
+
+    Lightning logs what training measured after its checkpoints are written: a run that is killed in between would go
+    on with the next epoch, and this one would stay half recorded. Being a Checkpoint, this comes after the module.
+    """
+
+    def __init__(self, record: RecordLogger) -> None:
+        self.record = record
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        values = {key: float(value) for key, value in trainer.callback_metrics.items()}
+        step = trainer.global_step - 1  # as Lightning counts when it logs
+        self.record.log_metrics({"epoch": trainer.current_epoch} | values, step=step)
 
 
 class EpochLines(Callback):

@@ -141,7 +141,7 @@ def run(
     record = RecordLogger(folder)
     with tracked(config, folder) if rank == 0 else nullcontext() as tracker:
         calibration = build_calibration(config, folder, module, draw, tracker)
-        trainer = build_trainer(config, folder, [record, *([tracker.logger] if tracker else [])], calibration)
+        trainer = build_trainer(config, record, [tracker.logger] if tracker else [], calibration)
         checkpoint = _take_up(trainer, module, data, record)
         if tracker:
             tracker.send_epochs(record.rows.values())

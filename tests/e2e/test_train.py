@@ -200,6 +200,28 @@ def test_a_broken_run_goes_on_where_it_was(
     assert comparable(run.results()) == comparable(whole.results())
 
 
+def test_an_epoch_is_recorded_before_there_is_a_checkpoint_of_it(
+    train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run that ends right after writing one goes on with the next epoch, and misses no number of this."""
+    from phd_exp.training.checkpoints import AtomicCheckpoints
+
+    assert train("model=mae_vz", "logger=none", "runs=whole").status == 0
+    save_checkpoint = AtomicCheckpoints.save_checkpoint
+
+    def power_cut(self: AtomicCheckpoints, *arguments: Any) -> None:
+        save_checkpoint(self, *arguments)
+        raise RuntimeError("power cut")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(AtomicCheckpoints, "save_checkpoint", power_cut)
+        assert train("model=mae_vz", "logger=none").status == 1
+    run = only_run(tmp_path / "runs")
+    assert [row["epoch"] for row in run.metrics()] == [-1, 0]
+    assert train("model=mae_vz", "logger=none").status == 0
+    assert run.metrics() == only_run(tmp_path / "whole").metrics()
+
+
 def test_the_untrained_network_gives_the_middle_of_the_data_set(train: Callable, tmp_path: Path) -> None:
     assert train("logger=none").status == 0
     run = only_run(tmp_path / "runs")
