@@ -28,6 +28,8 @@ EXAMPLES = {
         "python -m phd_exp data=folder data.folder=photos preset=small",
         "python -m phd_exp -m preset=small model=probabilistic,mae_vz data=default,occl",
         "python -m phd_exp -m experiment=table1,table2 preset=small seed=0,1,2",
+        "python -m phd_exp -m experiment=table2 preset=small hydra/launcher=joblib hydra.launcher.n_jobs=2",
+        "python -m phd_exp trainer=ddp trainer.devices=2",
     ],
     "render": [
         "python -m phd_exp render data=scale",

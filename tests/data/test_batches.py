@@ -83,3 +83,21 @@ def test_moves_to_a_device_whole(samples: Batch) -> None:
     moved = samples.to("meta")
     assert {moved.image.device.type, moved.xyz.device.type, moved.f.device.type} == {"meta"}
     assert moved.S == samples.S
+
+
+@pytest.mark.parametrize("world", [1, 2, 3])
+@pytest.mark.parametrize("drop_last", [False, True])
+def test_shares_are_each_batch_without_gaps_and_repeats(samples: Batch, world: int, drop_last: bool) -> None:
+    whole = BatchLoader(samples, 3, shuffle=True, drop_last=drop_last, seed=5)
+    shares = [
+        BatchLoader(samples, 3, shuffle=True, drop_last=drop_last, seed=5, rank=rank, world=world)
+        for rank in range(world)
+    ]
+    for _ in range(2):  # epochs
+        batches, of_ranks = list(whole), [list(share) for share in shares]
+        assert [len(parts) for parts in of_ranks] == [len(share) for share in shares]
+        for place, batch in enumerate(batches):
+            parts = [rows([share[place]]) for share in of_ranks if place < len(share)]
+            assert sorted(row for part in parts for row in part) == sorted(rows([batch]))
+            assert parts[0] == rows([batch])[::world]
+    assert len({tuple(share.place.items()) for share in shares if drop_last}) <= 1
