@@ -85,7 +85,7 @@ def _run(folder: RunFolder, runs: Path) -> Run:
         try:
             errors = mean_errors(folder.predictions, estimates_of(model))
         except RunError as error:
-            state, detail = "unreadable", str(error)
+            state, detail = "unreadable", f"{error}; delete the folder to run again"
     nll = mean_nll(folder.predictions) if errors else None
     return Run(folder, preset, data, model, seed, state, overrides, " ".join(detail.split()), errors, nll)
 

@@ -3,43 +3,19 @@
 `tables(collect(runs))` gives them; `phd_exp.reports.formats` writes them for a terminal, Markdown, LaTeX and CSV.
 """
 
-import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from phd_exp.reports.captions import FEWER_SEEDS, ONE_SEED, making_command, notes, title
 from phd_exp.reports.cells import Cell, Gap, Interval, make_cell, seeds_of
 from phd_exp.reports.collect import PROBABILISTIC, Records
-from phd_exp.reports.paper import ASSUMED, LAYOUTS, Floor, Layout, Line, TableName
+from phd_exp.reports.paper import LAYOUTS, Floor, Layout, Line, TableName
 from phd_exp.reports.point_errors import READINGS, ErrorKey, Quantity, Reading
 
 DIGITS: dict[Quantity, int] = {"projected": 1, "depth": 0}
 """Decimals of a millimetre, the paper's."""
 MOST_DIGITS = 4
 NOTHING = "–"
-ONE_SEED = "†"
-FEWER_SEEDS = "‡"
-DEFAULT_RUNS = "runs"
-
-IN_WORDS: dict[Reading, str] = {
-    "whole": "the whole field of view",
-    "central": "the central half of the field of view",
-}
-OF_THE_READING: dict[Reading, str] = {
-    "whole": "Test samples: all, over the whole field of view, as the paper's text draws them.",
-    "central": "Test samples: those in the central half of the field of view, |v_p| ≤ 1/2 in both coordinates, where "
-    "the authors' generator places all its objects. The networks were trained on the whole.",
-}
-OF_A_CELL = (
-    "A cell: ours, the mean error in mm; below it the paper's figure and (× ours / paper). Bold (or *): the smallest of "
-    "ours on that data set and error; figures that print alike share it, and one model alone gets none."
-)
-OF_AN_INTERVAL = {
-    "student_t_over_seeds": "±: 95 % interval of the mean over seeds, Student's t.",
-    "normal_over_samples": f"±{ONE_SEED}: one seed; 1.96 standard errors over its test samples, which says nothing "
-    "of how another training would differ.",
-    "none": "No ±: one seed, one test sample.",
-}
-OF_FEWER_SEEDS = f"{FEWER_SEEDS}: fewer seeds than other cells of this table have."
 
 
 @dataclass(frozen=True)
@@ -78,7 +54,7 @@ class PaperTable:
         columns: headings of the columns of cells.
         groups: lines, with a rule between groups: models, the other estimates, floors.
         gaps: runs that are missing, unfinished or unreadable.
-        command: what makes them.
+        command: what makes them; empty where no further run would help.
         notes: how to read it, a sentence or two each.
     """
 
@@ -114,42 +90,6 @@ def tables(records: Records) -> list[PaperTable]:
     ]
 
 
-def gap_lines(gaps: Iterable[Gap]) -> list[str]:
-    """A line for each reason and model: which runs a table lacks."""
-    lacking: dict[tuple[str, str, str], list[str]] = {}
-    for (reason, model, data), seeds in _seeds_by_reason(gaps).items():
-        numbers = f"seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}"
-        lacking.setdefault((reason, model, numbers), []).append(data)
-    return [
-        f"{model} on {', '.join(data)} ({numbers}): {reason}"
-        for (reason, model, numbers), data in lacking.items()
-    ]
-
-
-def _seeds_by_reason(gaps: Iterable[Gap]) -> dict[tuple[str, str, str], list[int]]:
-    """(reason, model, data set) -> seeds."""
-    seeds: dict[tuple[str, str, str], list[int]] = {}
-    for gap in gaps:
-        reason = f"{gap.state}: {one_line(gap.detail)}" if gap.detail else gap.state
-        seeds.setdefault((reason, gap.model, gap.data), []).append(gap.seed)
-    return seeds
-
-
-def making_command(records: Records, preset: str, name: TableName, seeds: Iterable[int] = (0,)) -> str:
-    """The command line that makes whatever a table lacks."""
-    words = [f"experiment={name}", f"preset={preset}"]
-    if list(seeds) != [0]:
-        words.append(f"seed={','.join(map(str, seeds))}")
-    if records.folder.as_posix() != DEFAULT_RUNS:
-        words.append(f"runs={records.folder}")
-    return one_line(shlex.join(["python", "-m", "phd_exp", "-m", *words]))
-
-
-def one_line(text: str) -> str:
-    """Text from outside as one line of visible characters: a terminal would obey the others."""
-    return "".join(letter if letter.isprintable() else "?" for letter in " ".join(text.split()))
-
-
 def _table(
     records: Records, preset: str, layout: Layout, reading: Reading, seeds: Sequence[int]
 ) -> PaperTable:
@@ -157,26 +97,31 @@ def _table(
         [_measured(records, preset, layout, line, reading, seeds) for line in group]
         for group in layout.groups
     ]
-    best = _best(cell for group in measured for line in group for cell in line)
+    cells = [cell for group in measured for line in group for cell in line]
+    best = _best(cells)
     groups = [
         tuple(_row(line, cells, best) for line, cells in zip(lines, group, strict=True))
         for lines, group in zip(layout.groups, measured, strict=True)
     ]
-    cells = [cell for group in measured for line in group for cell in line]
+    gaps = tuple(dict.fromkeys(gap for cell in cells for gap in cell.gaps))
     return PaperTable(
         preset=preset,
         name=layout.name,
         reading=reading,
-        title=f"{layout.title}, preset {one_line(preset)}: {IN_WORDS[reading]}{_samples(cells)}",
+        title=title(preset, layout, reading, cells),
         stub=_stub(layout),
         columns=tuple(
             f"{column.quantity} error (mm)" if column.quantity else column.data for column in layout.columns
         ),
         groups=(*groups, tuple(_floor_row(floor, layout) for floor in layout.floors)),
-        gaps=tuple(dict.fromkeys(gap for cell in cells for gap in cell.gaps)),
-        command=making_command(records, preset, layout.name, seeds),
-        notes=_notes(layout, reading, cells),
+        gaps=gaps,
+        command=making_command(records, preset, layout.name, seeds) if _can_be_made(gaps) else "",
+        notes=notes(layout, reading, cells),
     )
+
+
+def _can_be_made(gaps: Iterable[Gap]) -> bool:
+    return any(gap.state != "no sample" for gap in gaps)
 
 
 def _measured(
@@ -256,20 +201,3 @@ def _floor_row(floor: Floor, layout: Layout) -> TableRow:
             for column in layout.columns
         ),
     )
-
-
-def _notes(layout: Layout, reading: Reading, cells: Sequence[Cell]) -> tuple[str, ...]:
-    kinds = {cell.interval.kind for cell in cells if cell.interval}
-    notes = [OF_THE_READING[reading], OF_A_CELL]
-    notes += [text for kind, text in OF_AN_INTERVAL.items() if kind in kinds]
-    if any(cell.interval and cell.gaps for cell in cells):
-        notes.append(OF_FEWER_SEEDS)
-    return (*notes, ASSUMED, layout.note)
-
-
-def _samples(cells: Sequence[Cell]) -> str:
-    """How many test samples count; a range where runs were tested on different numbers of them."""
-    counts = sorted({n for cell in cells for n in cell.n_test})
-    if not counts:
-        return ""
-    return f", {counts[0]} to {counts[-1]} test samples" if len(counts) > 1 else f", {counts[0]} test samples"

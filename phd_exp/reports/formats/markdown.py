@@ -3,10 +3,11 @@
 import re
 from collections.abc import Sequence
 
-from phd_exp.reports.tables import PaperTable, TableCell, TableRow, gap_lines
+from phd_exp.reports.captions import gap_lines
+from phd_exp.reports.tables import PaperTable, TableCell, TableRow
 
-SPECIAL = re.compile(r"([\\`*_{}\[\]<>()#+!|~&:@$])")
-"""What GitHub may read as markup, an address, a mention or mathematics."""
+SPECIAL = re.compile(r"([\\`*_\[\]<>#|~&@$])")
+"""What GitHub may read as markup, a mention, an issue or mathematics."""
 
 
 def markdown(table: PaperTable) -> str:
@@ -21,7 +22,9 @@ def markdown(table: PaperTable) -> str:
     ]
     if table.gaps:
         gaps = [f"- {escaped(line)}" for line in gap_lines(table.gaps)]
-        parts.append("\n".join(["Not there:", "", *gaps, "", f"Made by {_code(table.command)}"]))
+        parts.append("\n".join(["Not there:", "", *gaps]))
+    if table.command:
+        parts.append(f"Made by {_code(table.command)}")
     parts.append("\n".join(f"- {escaped(note)}" for note in table.notes))
     return "\n\n".join(parts) + "\n"
 
