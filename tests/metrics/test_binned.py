@@ -117,10 +117,8 @@ def _process(rank: int, file: Path, columns: dict[str, torch.Tensor]) -> None:
     distributed.init_process_group("gloo", f"file://{file}", rank=rank, world_size=2)
     torch.set_num_threads(1)
     scores = seen(batches(columns, 50)[rank::2]).compute()
-    expected = seen(batches(columns, 50)).sums.sum()
-    assert scores["left_out"] == 0
     if rank == 0:
-        torch.save((scores, expected), file.with_suffix(".pt"))
+        torch.save(scores, file.with_suffix(".pt"))
     distributed.destroy_process_group()
 
 
@@ -128,7 +126,7 @@ def _process(rank: int, file: Path, columns: dict[str, torch.Tensor]) -> None:
 def test_two_processes_by_gloo(claimed: Callable, tmp_path: Path) -> None:
     columns = {name: claimed(700)[name] for name in COLUMNS}
     multiprocessing.spawn(_process, (tmp_path / "meeting", columns), nprocs=2)
-    scores, _ = torch.load(tmp_path / "meeting.pt")
+    scores = torch.load(tmp_path / "meeting.pt")
     for name, value in seen(batches(columns, 50)).compute().items():
         assert scores[name].item() == pytest.approx(value.item(), rel=1e-9, abs=1e-12), name
 
@@ -140,4 +138,4 @@ def test_an_update_takes_a_millisecond(claimed: Callable) -> None:
     start = time.perf_counter()
     for part in parts:
         metric.update(part)
-    assert (time.perf_counter() - start) / len(parts) < 2e-3
+    assert (time.perf_counter() - start) / len(parts) < 1e-3
