@@ -1,5 +1,6 @@
 """Recalibration: two temperatures that make every prediction more or less certain without moving it."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -77,4 +78,4 @@ def _temperature(slope: Callable[[Tensor], Tensor]) -> float:
             raise ValueError(
                 "no temperature fits: the errors are zero, or out of all proportion to the predictions"
             )
-    return float(torch.tensor(-brentq(at, -width, width, xtol=1e-12)).exp())
+    return math.exp(-brentq(at, -width, width, xtol=1e-12))

@@ -8,6 +8,8 @@ from torch import Tensor
 
 from phd_exp.metrics.ordered import Ordered, in_order_of, require_finite
 
+DRAWS = 64
+"""Of a prediction, for its energy score."""
 _CHUNK = 512
 """Rows whose pairs of draws are held in memory at once."""
 

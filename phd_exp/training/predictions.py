@@ -17,14 +17,12 @@ from phd_exp.distributions.columns import coordinates, distribution_columns, dra
 from phd_exp.metrics.calibration import CalibrationCurve, calibration_curve
 from phd_exp.metrics.calibration_scores import exact_scores
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
-from phd_exp.metrics.scores import energy_score
+from phd_exp.metrics.scores import DRAWS, energy_score
 from phd_exp.models.heads import Prediction
 from phd_exp.records.files import write_atomic
 
 ERRORS = ("projected_error_mm", "depth_error_mm")
 OF_A_DISTRIBUTION = ("nll", "depth_precision", "projected_precision")
-DRAWS = 64
-"""Of each prediction, for its energy score."""
 
 
 def quantity_names(prediction: type[Prediction]) -> tuple[str, ...]:
