@@ -4,33 +4,37 @@ import os
 import re
 import sys
 import tempfile
-import uuid
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from phd_exp.cli.jobs import BAD_CONFIGURATION, HOME, Ending, JobRecords, Task, run_job
+from phd_exp.cli.jobs import BAD_CONFIGURATION, Ending, JobRecords, Task, hydra_function
 from phd_exp.cli.paths import conf_folder
 from phd_exp.cli.signals import Stopped, stopping_on_signals
-from phd_exp.records.errors import RunError, UserError, nearest
+from phd_exp.cli.sweep import IsFinished, sweep
+from phd_exp.records.errors import ConfigError, UserError, nearest
 
 MULTIRUN = ("-m", "--multirun")
 
 
-def launch(task: Task, arguments: list[str], config_name: str = "config") -> int:
+def launch(
+    task: Task, arguments: list[str], config_name: str = "config", is_finished: IsFinished | None = None
+) -> int:
     """Run a task through Hydra, once or (-m) for every combination; returns the exit status.
 
     In a sweep one failing job does not stop the others, whatever launcher runs them and wherever; at the end
     every failure is named, and so is every job that died without a word.
+
+    Args:
+        task: what a job does.
+        arguments: the words of the command line after the verb.
+        config_name: the file under conf/ that they change.
+        is_finished: which jobs of a sweep need not do it again, for what is said when it begins.
     """
     # Hydra would print errors its own way, over several lines, and exit; we want them as exceptions
     os.environ["HYDRA_FULL_ERROR"] = "1"
@@ -39,84 +43,43 @@ def launch(task: Task, arguments: list[str], config_name: str = "config") -> int
     sys.argv = [sys.argv[0], *arguments]
     try:
         with stopping_on_signals():
-            endings = _run_all(task, arguments, config_name)
+            endings = _run_all(task, arguments, config_name, is_finished)
     except Stopped as stop:
         print(f"error: stopped by {stop}; the same command goes on from here", file=sys.stderr)
         return int(str(stop.code))
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, ValueError) as error:  # ValueError: a group set to null
         print(f"error: {explain(error, config_name)}", file=sys.stderr)
         return BAD_CONFIGURATION
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
-        return 1
+        return Ending.of([], error).exit_status
     _print_failures(endings)
     return max((ending.exit_status for ending in endings), default=0)
 
 
-def _run_all(task: Task, arguments: list[str], config_name: str) -> list[Ending]:
+def _run_all(
+    task: Task, arguments: list[str], config_name: str, is_finished: IsFinished | None
+) -> list[Ending]:
     """Run the jobs and collect how they ended."""
     flags = [word for word in arguments if word.startswith("-")]
     if len(flags) == 1 and flags[0] in MULTIRUN:
-        return _sweep(task, arguments[1:], config_name)
+        return sweep(task, arguments[1:], config_name, is_finished)
+    if not flags:
+        _require_one_run(arguments)
     with tempfile.TemporaryDirectory(prefix="phd_exp-") as folder:
         records = JobRecords(Path(folder))
-        _hand_to_hydra(task, records, config_name)
+        job = hydra_function(task, records, cores=None)
+        hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=config_name)(job)()
         # a flag like --cfg runs no job
         return [records.ending(0, [])] if any(records.path.iterdir()) else []
 
 
-def _sweep(task: Task, words: list[str], config_name: str) -> list[Ending]:
-    """The same where a launcher may run the jobs in other processes, on other machines: they share a folder.
-
-    The folder is removed where no job needs it any more and none failed. It stays when this process is stopped:
-    jobs in a queue outlive it.
-    """
-    folder, jobs = _plan(words, config_name)
-    records = JobRecords.begin(folder)
-    gave_up: Exception | None = None
-    try:
-        _hand_to_hydra(task, records, config_name)
-    except (HydraException, OmegaConfBaseException):
-        records.remove()  # a combination that cannot be composed is found before any job begins
-        raise
-    except Exception as error:  # joblib's and submitit's way to say that a job has died
-        if not any(records.path.iterdir()):
-            records.remove()
-            reason = " ".join(str(error).split())
-            raise RunError(
-                f"the launcher failed before any job began ({type(error).__name__}: {reason}); "
-                "choose another by hydra/launcher=NAME"
-            ) from error
-        gave_up = error
-    endings = [records.ending(number, overrides) for number, overrides in enumerate(jobs)]
-    if any(ending.exit_status for ending in endings):
-        return endings
-    if gave_up is not None:
-        raise gave_up
-    records.remove()
-    return endings
-
-
-def _hand_to_hydra(task: Task, records: JobRecords, config_name: str) -> None:
-    home = HOME  # here: what a launcher pickles is this function and what it holds
-
-    def job(config: DictConfig) -> None:
-        run_job(task, records, home, config)
-
-    hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=config_name)(job)()
-
-
-def _plan(words: list[str], config_name: str) -> tuple[Path, list[list[str]]]:
-    """A fresh folder for the records of a sweep, below Hydra's own, and the overrides of each of its jobs."""
-    with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
-        loader = GlobalHydra.instance().config_loader()
-        config = loader.load_configuration(config_name, words, RunMode.MULTIRUN)
-        params = [f"{key}={value}" for key, value in (config.hydra.sweeper.params or {}).items()]
-        overrides = OverridesParser.create(loader).parse_overrides([*params, *words])
-        own = [override for override in overrides if not override.is_hydra_override()]
-        (jobs,) = BasicSweeper.split_arguments(own, max_batch_size=None)
-    folder = Path(config.hydra.sweep.dir).absolute() / f"launch-{uuid.uuid4().hex[:8]}"
-    return folder, jobs
+def _require_one_run(words: list[str]) -> None:
+    for word in words:
+        if word.partition("=")[0].lstrip("+") == "experiment":
+            raise ConfigError(
+                f"{word}: an experiment is several runs; write -m before it: -m {' '.join(words)}"
+            )
 
 
 def explain(error: Exception, config_name: str) -> str:

@@ -11,7 +11,10 @@ VERBS = {
     "report": "the paper's tables from all recorded runs: printed, and as Markdown, LaTeX and CSV",
 }
 OF_VERB = {
-    "train": ("model", "data", "preset", "backbone", "camera", "loss", "optimizer", "trainer", "logger"),
+    "train": (
+        *("model", "data", "preset", "experiment"),
+        *("backbone", "camera", "loss", "optimizer", "trainer", "logger"),
+    ),
     "render": ("data", "preset"),
     "gallery": (),
     "report": (),
@@ -24,6 +27,7 @@ EXAMPLES = {
         "python -m phd_exp data.n_train=256 data.n_test=64 trainer.max_epochs=1",
         "python -m phd_exp data=folder data.folder=photos preset=small",
         "python -m phd_exp -m preset=small model=probabilistic,mae_vz data=default,occl",
+        "python -m phd_exp -m experiment=table1,table2 preset=small seed=0,1,2",
     ],
     "render": [
         "python -m phd_exp render data=scale",
@@ -61,7 +65,8 @@ def _programme_help() -> str:
             "groups (the first choice of a run is named in conf/config.yaml)",
             *_groups(OF_VERB["train"]),
             "",
-            "-m runs every combination of values given with commas. Every key is explained in the files of",
+            "-m runs every combination of values given with commas, or of an experiment; the same command again",
+            "skips what is finished and goes on with the rest. Every key is explained in the files of",
             f"{conf_folder()}; `python -m phd_exp --cfg job` prints the whole configuration.",
             "",
             "examples",

@@ -21,20 +21,25 @@ from pydantic import BaseModel
 from phd_exp.cli.signals import Stopped, stopping_on_signals
 from phd_exp.records.errors import ConfigError, RunError, UserError
 from phd_exp.records.files import write_atomic
+from phd_exp.records.provenance import usable_cores
 
 BAD_CONFIGURATION = 2
 FAILED = 1
 HOME = uuid.uuid4().hex
 """This process: another one that imports this module has another."""
 
-Task = Callable[[dict[str, Any], list[str]], None]
-"""Takes the resolved configuration and the overrides that led to it."""
+Task = Callable[[dict[str, Any], list[str], int], str]
+"""Takes the resolved configuration, the overrides that led to it, and how many cores it may use.
+
+Returns, if it ends well, its state in a word or two.
+"""
 
 
 class Ending(BaseModel):
-    """How a job ended: what was asked for, the exit status, and what is wrong, one thing a line."""
+    """How a job ended: what was asked for, its state, the exit status, and what is wrong, one thing a line."""
 
     overrides: list[str]
+    state: str = "failed"
     exit_status: int = 0
     lines: list[str] = []
 
@@ -42,7 +47,7 @@ class Ending(BaseModel):
     def of(cls, overrides: list[str], error: BaseException) -> "Ending":
         if isinstance(error, Stopped):
             line = f"stopped by {error}; the same command goes on from here"
-            return cls(overrides=overrides, exit_status=int(str(error.code)), lines=[line])
+            return cls(overrides=overrides, state="stopped", exit_status=int(str(error.code)), lines=[line])
         if isinstance(error, UserError):
             status = BAD_CONFIGURATION if isinstance(error, ConfigError) else FAILED
             return cls(overrides=overrides, exit_status=status, lines=str(error).splitlines())
@@ -96,7 +101,17 @@ class JobRecords:
         shutil.rmtree(self.path, ignore_errors=True)
 
 
-def run_job(task: Task, records: JobRecords, home: str, config: DictConfig) -> None:
+def hydra_function(task: Task, records: JobRecords, cores: int | None) -> Callable[[DictConfig], None]:
+    """The task as Hydra calls it, wherever: a launcher may pickle this function with what it holds."""
+    home = HOME
+
+    def job(config: DictConfig) -> None:
+        run_job(task, records, home, cores, config)
+
+    return job
+
+
+def run_job(task: Task, records: JobRecords, home: str, cores: int | None, config: DictConfig) -> None:
     """Run one job and record how it ended; a failure is recorded and not raised, so that a sweep goes on.
 
     A stop goes up in the launcher's own process, where it ends everything. In another process it ends that job.
@@ -105,11 +120,11 @@ def run_job(task: Task, records: JobRecords, home: str, config: DictConfig) -> N
     overrides = list(hydra.overrides.task)
     number = 0 if OmegaConf.is_missing(hydra.job, "num") else hydra.job.num  # a single run has none
     with records.running(number):
-        ending = Ending(overrides=overrides)
         try:
             # hydra's launchers put signal handlers of their own into their processes, or none
             with stopping_on_signals():
-                task(plain(config), overrides)
+                state = task(plain(config), overrides, cores or usable_cores())
+            ending = Ending(overrides=overrides, state=state)
         except Stopped as stop:
             if home == HOME:
                 raise

@@ -15,7 +15,7 @@ def main(arguments: list[str]) -> int:
     return launch(task, arguments, config_name="render")
 
 
-def task(config: dict[str, Any], overrides: list[str]) -> None:
+def task(config: dict[str, Any], overrides: list[str], cores: int) -> str:
     checked = check_render(config)
     data, folder = checked.data, DatasetFolder(checked.data.folder)
     if checked.masks is not None:
@@ -23,23 +23,28 @@ def task(config: dict[str, Any], overrides: list[str]) -> None:
     if checked.verify:
         n = verify(folder, data.spec, checked.rerender)
         print(f"{folder.root}: all {n} samples are as they were rendered")
-    elif _render(checked, folder):
-        print(f"{folder.root}: {data.n_training_split} training and {data.n_test} test samples are there")
-    else:
-        return  # other shards are not done yet
+        return "sound"
+    if not _render(checked, folder, cores):
+        return "done"  # other shards are not
+    print(f"{folder.root}: {data.n_training_split} training and {data.n_test} test samples are there")
     if checked.masks is not None:
         print(f"{checked.masks}: {write_masks(folder, checked.masks)} masks")
+    return "done"
 
 
-def _render(checked: RenderConfig, folder: DatasetFolder) -> bool:
+def _render(checked: RenderConfig, folder: DatasetFolder, cores: int) -> bool:
     """Render all of a data set, or one share of it; whether all of it is there."""
     data = checked.data
     if checked.shard is None:
-        ensure_dataset(data)
+        ensure_dataset(data, cores)
         return True
-    return render_shard(folder, data.spec, data.n_training_split, data.n_test, checked.shard, data.workers)
+    return render_shard(
+        folder, data.spec, data.n_training_split, data.n_test, checked.shard, data.workers, cores
+    )
 
 
-def ensure_dataset(data: RenderedConfig) -> None:
+def ensure_dataset(data: RenderedConfig, cores: int) -> None:
     """Render what a run needs and the folder lacks."""
-    ensure_rendered(DatasetFolder(data.folder), data.spec, data.n_training_split, data.n_test, data.workers)
+    ensure_rendered(
+        DatasetFolder(data.folder), data.spec, data.n_training_split, data.n_test, data.workers, cores
+    )

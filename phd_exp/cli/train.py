@@ -7,18 +7,19 @@ from typing import Any
 
 from phd_exp.cli.app import launch
 from phd_exp.cli.render import ensure_dataset
+from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder, RunName
 from phd_exp.training.config import RenderedConfig, RunConfig, check, has_influence
 
-NAMED = ("preset", "data", "data.name", "model", "seed")
-"""Choices that have a place of their own in a run's name."""
+NAMED = ("preset", "data", "data.name", "model", "seed", "experiment")
+"""Choices that have a place of their own in a run's name, and the one that does nothing but name several runs."""
 
 
 def main(arguments: list[str]) -> int:
-    return launch(task, arguments)
+    return launch(task, arguments, is_finished=is_finished)
 
 
-def task(config: dict[str, Any], overrides: list[str]) -> None:
+def task(config: dict[str, Any], overrides: list[str], cores: int) -> str:
     checked = check(config)
     # seconds of imports, which a refused configuration need not wait for
     from phd_exp.training.run import require_possible, train
@@ -28,20 +29,35 @@ def task(config: dict[str, Any], overrides: list[str]) -> None:
     if not skipped:
         require_possible(checked, folder)
         if isinstance(checked.data, RenderedConfig):
-            ensure_dataset(checked.data)
-    results = train(checked, folder, draw=_draw())
-    print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
+            ensure_dataset(checked.data, cores)
+    results = train(checked, folder, draw=_draw(), cores=cores)
+    state = "finished already" if skipped else "finished"
+    print(f"{folder.path}: {state}")
     for key, value in results.items():
         if key.startswith("test/"):
             print(f"  {key} {value:.4g} (untrained {results[f'untrained/{key}']:.4g})")
     if (folder.calibration / "final.png").exists():
         print(f"  calibration curves: {folder.calibration / 'final.png'}")
+    return state
+
+
+def is_finished(config: dict[str, Any], overrides: list[str]) -> bool:
+    """Whether the run of a configuration is there; one that is not checked yet, since checking imports torch."""
+    try:
+        data = config["data"].get("variant") or config["data"]["name"]
+        choices = (config["preset"], data, config["model"]["name"], config["seed"])
+        return RunFolder(RunName(*choices, _telling(overrides)).folder(Path(config["runs"]))).is_finished()
+    except (KeyError, TypeError, AttributeError, RunError):  # the run itself will say what is wrong
+        return False
 
 
 def run_name(config: RunConfig, overrides: list[str]) -> RunName:
     """The choices that name a run; every other override that can change a number goes into its hash."""
-    telling = [text for override in overrides if _is_telling(text := override.lstrip("+"))]
-    return RunName(config.preset, config.data.name, config.model.name, config.seed, tuple(telling))
+    return RunName(config.preset, config.data.name, config.model.name, config.seed, _telling(overrides))
+
+
+def _telling(overrides: list[str]) -> tuple[str, ...]:
+    return tuple(text for override in overrides if _is_telling(text := override.lstrip("+")))
 
 
 def _is_telling(override: str) -> bool:

@@ -48,20 +48,35 @@ class BatchLoader:
     The order is a function of (seed, epoch), never of what ran before, and `place` holds both the epoch and how far
     it has come: a resumed epoch goes on with the batches that were left, where a DataLoader would replay its first
     ones.
+
+    Of several processes that train together each takes its share of every batch: rank r the rows r, r + world, ...
+    No row is seen twice, and a last batch that has no row for a rank does not exist for it.
     """
 
-    def __init__(self, samples: Batch, batch_size: int, *, shuffle: bool, drop_last: bool, seed: int) -> None:
+    def __init__(
+        self,
+        samples: Batch,
+        batch_size: int,
+        *,
+        shuffle: bool,
+        drop_last: bool,
+        seed: int,
+        rank: int = 0,
+        world: int = 1,
+    ) -> None:
         self.samples = samples
         self.batch_size = batch_size
         self.shuffle = shuffle
         self.drop_last = drop_last
         self.seed = seed
+        self.rank = rank
+        self.world = world
         self.epoch = -1
         self.next_batch = 0
 
     def __len__(self) -> int:
         whole, rest = divmod(len(self.samples), self.batch_size)
-        return whole + (rest > 0 and not self.drop_last)
+        return whole + (rest > self.rank and not self.drop_last)
 
     def __iter__(self) -> Iterator[Batch]:
         if self.next_batch in (0, len(self)):  # else: resumed in the middle of an epoch
@@ -71,7 +86,8 @@ class BatchLoader:
         while self.next_batch < len(self):
             start = self.next_batch * self.batch_size
             self.next_batch += 1
-            yield self.samples.select(order[start : start + self.batch_size])
+            rows = order[start : start + self.batch_size]
+            yield self.samples.select(rows[self.rank :: self.world])
 
     def order(self, epoch: int) -> Int[Tensor, " samples"]:
         """The rows in the order in which that epoch visits them."""

@@ -8,22 +8,25 @@ from phd_exp.records.errors import ConfigError
 
 
 class PositionData(LightningDataModule):
-    """The samples of a source in batches.
+    """The samples of a source in batches; of several processes that train together (`world`), those of one (`rank`).
 
-    Raises ConfigError where there are too few training samples for one batch; on `setup`, DatasetError where the
-    source lacks samples or an image is damaged.
+    Raises ConfigError where there are too few samples for one batch, or where processes could not share them; on
+    `setup`, DatasetError where the source lacks samples or an image is damaged.
     """
 
-    def __init__(self, source: Source, *, batch_size: int, seed: int) -> None:
+    def __init__(self, source: Source, *, batch_size: int, seed: int, rank: int = 0, world: int = 1) -> None:
         super().__init__()
         if batch_size > source.count("train"):
             raise ConfigError(
                 f"data: batch_size={batch_size} is larger than the {source.count('train')} training samples there "
                 "are: not one batch is full; choose a smaller data.batch_size"
             )
+        _require_shares(source, batch_size, world)
         self.source = source
         self.batch_size = batch_size
         self.seed = seed
+        self.rank = rank
+        self.world = world
         self.samples: dict[Part, Batch] = {}
         self.train_batches: BatchLoader | None = None
 
@@ -33,9 +36,7 @@ class PositionData(LightningDataModule):
             if part not in self.samples and self.source.count(part):
                 self.samples[part] = self.source.samples(part)
         if self.train_batches is None:
-            self.train_batches = BatchLoader(
-                self.samples["train"], self.batch_size, shuffle=True, drop_last=True, seed=self.seed
-            )
+            self.train_batches = self._batches("train", shuffle=True, drop_last=True)
 
     def train_dataloader(self) -> BatchLoader:
         assert self.train_batches is not None, "setup comes first"
@@ -50,8 +51,17 @@ class PositionData(LightningDataModule):
 
     def in_order(self, part: Part) -> BatchLoader:
         """Every sample of a part once, as they come."""
+        return self._batches(part, shuffle=False, drop_last=False)
+
+    def _batches(self, part: Part, *, shuffle: bool, drop_last: bool) -> BatchLoader:
         return BatchLoader(
-            self.samples[part], self.batch_size, shuffle=False, drop_last=False, seed=self.seed
+            self.samples[part],
+            self.batch_size,
+            shuffle=shuffle,
+            drop_last=drop_last,
+            seed=self.seed,
+            rank=self.rank,
+            world=self.world,
         )
 
     # Lightning restores the state of a loader in the middle of an epoch alone, that of a datamodule always
@@ -60,3 +70,16 @@ class PositionData(LightningDataModule):
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
         self.train_dataloader().go_to(state_dict)
+
+
+def _require_shares(source: Source, batch_size: int, world: int) -> None:
+    if batch_size % world:
+        raise ConfigError(
+            f"trainer.devices: got {world}, which does not divide batch_size={batch_size}: the mean of the shares' "
+            "gradients is that of the batch only if all shares are of one size"
+        )
+    for part in PARTS:
+        if 0 < (n := source.count(part)) < world:
+            raise ConfigError(
+                f"trainer.devices: got {world}, more than the {n} samples of {part} that there are"
+            )

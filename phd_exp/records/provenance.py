@@ -34,6 +34,13 @@ def git_commit() -> str | None:
     return answer.stdout.strip() if answer.returncode == 0 else None
 
 
+def usable_cores() -> int:
+    """How many cores this process may use: not all, where it is bound to some or a queue granted it fewer."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    granted = os.environ.get("SLURM_CPUS_PER_TASK", "")  # a queue may grant cores without binding to them
+    return min(cores, int(granted)) if granted.isdigit() else cores
+
+
 def machine() -> str:
     """Processor architecture and number of cores."""
     return f"{platform.machine()}, {os.cpu_count()} cores"

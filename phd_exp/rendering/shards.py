@@ -31,6 +31,7 @@ def render_shard(
     n_test: int,
     shard: Shard,
     workers: int | None = None,
+    cores: int | None = None,
 ) -> bool:
     """Render what is missing of one share, and seal the folder if that was the last; whether all of it is there.
 
@@ -51,7 +52,7 @@ def render_shard(
             with held(folder.cache / "begin.lock", waiting=f"{folder.root}: waiting for the manifest"):
                 folder.missing(spec, n_train, n_test)  # refuses another data set, begun a moment ago
                 begin(folder, spec)
-            if not render_missing(folder, spec, wanted, known_samples(folder), workers, shard):
+            if not render_missing(folder, spec, wanted, known_samples(folder), workers, shard, cores):
                 announce(f"{folder.root}: nothing left to render in shard {shard}")
         return _seal_if_last(folder, wanted, shard)
 

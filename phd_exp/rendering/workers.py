@@ -6,12 +6,12 @@ of the journals, the journals' removal, and the manifest again, which now counts
 """
 
 import math
-import os
 import time
 from contextlib import ExitStack, closing
 
 from phd_exp.records.dataset import SPLITS, DatasetFolder
 from phd_exp.records.files import open_journal, remove_temporaries
+from phd_exp.records.provenance import usable_cores
 from phd_exp.records.shards import Shard
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import require_bpy
@@ -27,7 +27,12 @@ SECONDS_PER_OBJECT = 0.085  # one core, 224 px, 3 samples a pixel: for the annou
 
 
 def ensure_rendered(
-    folder: DatasetFolder, spec: DatasetSpec, n_train: int, n_test: int, workers: int | None = None
+    folder: DatasetFolder,
+    spec: DatasetSpec,
+    n_train: int,
+    n_test: int,
+    workers: int | None = None,
+    cores: int | None = None,
 ) -> None:
     """Return when the first `n_train` and `n_test` samples are on disk, rendering those that are not.
 
@@ -37,6 +42,7 @@ def ensure_rendered(
 
     Args:
         workers: number of processes; by default one a core, fewer where there is little to do.
+        cores: how many there are to use; by default all that this process may use.
 
     Raises:
         DatasetError: the folder holds another data set, or a broken one.
@@ -57,7 +63,7 @@ def ensure_rendered(
             for split in SPLITS:
                 remove_temporaries(folder.split_folder(split))
             known = known_samples(folder)
-            render_missing(folder, spec, {"train": n_train, "test": n_test}, known, workers)
+            render_missing(folder, spec, {"train": n_train, "test": n_test}, known, workers, cores=cores)
             seal(folder, known)
 
 
@@ -68,6 +74,7 @@ def render_missing(
     known: Known,
     workers: int | None,
     shard: Shard | None = None,
+    cores: int | None = None,
 ) -> int:
     """Render the samples asked for, or those of a share, that are not yet in `known`, into it; returns how many.
 
@@ -82,7 +89,7 @@ def render_missing(
     ]
     if not tasks:
         return 0
-    workers = workers or worker_count(len(tasks))
+    workers = workers or worker_count(len(tasks), cores)
     title = spec.variant if shard is None else f"{spec.variant} {shard}"
     announce(_first_words(folder, spec, len(tasks), workers, resumed=any(known.values())))
     begun = time.monotonic()
@@ -105,10 +112,9 @@ def _require_some(workers: int | None) -> None:
         raise RenderError(f"workers={workers}: expected a number of processes, at least 1")
 
 
-def worker_count(tasks: int) -> int:
-    """One process a core that this process may use, fewer for little work."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(cores, math.ceil(tasks / FEWEST_PER_WORKER)))
+def worker_count(tasks: int, cores: int | None = None) -> int:
+    """One process a core, by default each core that this process may use; fewer for little work."""
+    return max(1, min(cores or usable_cores(), math.ceil(tasks / FEWEST_PER_WORKER)))
 
 
 def _first_words(folder: DatasetFolder, spec: DatasetSpec, n: int, workers: int, *, resumed: bool) -> str:

@@ -10,6 +10,7 @@ import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from lightning import Trainer
+from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar, TQDMProgressBar
 from lightning.pytorch.loggers import Logger
 
@@ -23,14 +24,21 @@ from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.callbacks import CalibrationRecorder, Draw, EpochLines
+from phd_exp.training.checkpoints import AtomicCheckpoints
 from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig, TrainerConfig
 from phd_exp.training.module import PositionModule
 from phd_exp.training.tracking import Tracker
 
 
-def build_data(config: RunConfig) -> PositionData:
-    """The data set of a run. Its images are opened by `setup`, not here."""
-    return PositionData(_source(config.data), batch_size=config.data.batch_size, seed=config.seed)
+def build_data(config: RunConfig, rank: int = 0) -> PositionData:
+    """The data set of a run, or of one of its processes. Its images are opened by `setup`, not here."""
+    return PositionData(
+        _source(config.data),
+        batch_size=config.data.batch_size,
+        seed=config.seed,
+        rank=rank,
+        world=config.trainer.devices,
+    )
 
 
 def _source(data: RenderedConfig | FolderConfig) -> Source:
@@ -84,6 +92,9 @@ def build_trainer(
     return Trainer(
         accelerator=config.trainer.accelerator,
         devices=config.trainer.devices,
+        strategy="ddp" if config.trainer.devices > 1 else "auto",
+        # not a queue's environment: ours are the processes, and a queue's job is no process of a run
+        plugins=[LightningEnvironment(), AtomicCheckpoints()],
         precision=precision(config.trainer),
         max_epochs=config.trainer.max_epochs,
         logger=loggers,

@@ -17,7 +17,7 @@ from phd_exp.metrics.calibration import CalibrationCurve
 from phd_exp.models.heads import Prediction
 from phd_exp.records.files import write_atomic
 from phd_exp.records.runs import RunFolder, epoch_name
-from phd_exp.training.predictions import calibration_curves, columns, joined
+from phd_exp.training.predictions import calibration_curves, columns, gathered, joined
 from phd_exp.training.tracking import Tracker
 
 SHOWN = ("test/loss", "test/projected_error_mm", "test/depth_error_mm")
@@ -51,12 +51,15 @@ class RecordLogger(Logger):
     def log_hyperparams(self, params: dict[str, Any] | Namespace, *args: Any, **kwargs: Any) -> None:
         """Nothing: config.yaml holds them already."""
 
-    @rank_zero_only
     def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
         epoch = int(metrics["epoch"])
         values = {key: value for key, value in metrics.items() if key != "epoch"}
         finite = {key: value if math.isfinite(value) else None for key, value in values.items()}
         self.rows[epoch] = self.rows.get(epoch, {"epoch": epoch}) | {"step": step} | finite
+        self._write()
+
+    @rank_zero_only
+    def _write(self) -> None:
         self.folder.write_metrics(self.rows[key] for key in sorted(self.rows))
 
     def forget_after(self, epoch: int) -> None:
@@ -67,6 +70,7 @@ class RecordLogger(Logger):
 class EpochLines(Callback):
     """One line an epoch, for where a progress bar would be noise: log files, pipes."""
 
+    @rank_zero_only
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         metrics = {
             key: float(trainer.callback_metrics[key]) for key in SHOWN if key in trainer.callback_metrics
@@ -111,11 +115,12 @@ class CalibrationRecorder(Callback):
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not self.parts:
             return
-        name = epoch_name(trainer.current_epoch)
-        self.write(name, joined(self.parts))
+        name, table = epoch_name(trainer.current_epoch), gathered(joined(self.parts))
+        self.write(name, table)
         if self.tracker is not None:
             self.tracker.send_calibration(name, trainer.global_step)
 
+    @rank_zero_only
     def write(self, name: str, table: Columns) -> None:
         """Write the curves of a table of predictions into the record, and draw them."""
         curves = {key: _as_data(curve) for key, curve in calibration_curves(table, self.window).items()}

@@ -7,6 +7,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
+import torch.distributed as dist
 from torch import Tensor
 
 from phd_exp.data.batches import Batch
@@ -66,6 +67,17 @@ def columns(prediction: Prediction, batch: Batch) -> Columns:
 def joined(parts: Sequence[Columns]) -> Columns:
     """The rows of several batches, one after the other."""
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+
+def gathered(table: Columns) -> Columns:
+    """The rows of all processes that train together, in the order of the data set; each of them has to call this."""
+    if not dist.is_initialized():
+        return table
+    tables: list[Columns] = [{} for _ in range(dist.get_world_size())]
+    dist.all_gather_object(tables, table)
+    whole = joined(tables)
+    order = whole["row"].argsort()
+    return {name: column[order] for name, column in whole.items()}
 
 
 def calibration_curves(table: Columns, window: int) -> dict[str, CalibrationCurve]:

@@ -3,6 +3,8 @@
 import logging
 import time
 import warnings
+from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -15,6 +17,7 @@ from phd_exp.data.sources import Part
 from phd_exp.records.dataset import DatasetFolder, sha256
 from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError, RunError
+from phd_exp.records.files import remove_temporaries
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import (
     build_calibration,
@@ -22,20 +25,27 @@ from phd_exp.training.build import (
     build_module,
     build_trainer,
 )
-from phd_exp.training.callbacks import Draw, RecordLogger
-from phd_exp.training.config import FolderConfig, RunConfig, has_influence
+from phd_exp.training.callbacks import CalibrationRecorder, Draw, RecordLogger
+from phd_exp.training.config import FolderConfig, RunConfig, TrainerConfig, has_influence
 from phd_exp.training.module import PositionModule
-from phd_exp.training.predictions import Columns, joined, summary, write_parquet
+from phd_exp.training.predictions import Columns, gathered, joined, summary, write_parquet
+from phd_exp.training.ranks import train_together
 from phd_exp.training.tracking import tracked
 
 UNTRAINED = -1
 """The epoch before the first: what the untrained network gives."""
 
 
-def train(config: RunConfig, folder: RunFolder, draw: Draw | None) -> dict[str, Any]:
+def train(config: RunConfig, folder: RunFolder, draw: Draw | None, cores: int) -> dict[str, Any]:
     """Train, measure and record one run; returns its results. A finished run is not run again.
 
     A run that was broken off goes on after its last whole epoch.
+
+    Args:
+        config: what to run.
+        folder: where its record goes.
+        draw: draws calibration curves; None records them alone.
+        cores: how many threads it has, unless trainer.threads says otherwise.
 
     Raises RunError where the folder holds a run of another configuration or another process works on it,
     DatasetError where the data set is incomplete.
@@ -44,9 +54,15 @@ def train(config: RunConfig, folder: RunFolder, draw: Draw | None) -> dict[str, 
         require_same_config(folder, config)
         if folder.is_finished():
             return folder.results()
+        for place in (folder.path, folder.checkpoints, folder.calibration):
+            remove_temporaries(place)  # of a process that was killed
         folder.write_config(config.model_dump(mode="json"))
+        threads = config.trainer.threads or cores
         with folder.recording(data_manifest=_manifest_hash(config)):
-            results = _train(config, folder, draw)
+            if config.trainer.devices > 1:
+                results = train_together(config, folder.path, draw, threads)
+            else:
+                results = run(config, folder, draw, threads)
             folder.write_results(results)
     return results
 
@@ -63,7 +79,14 @@ def require_possible(config: RunConfig, folder: RunFolder) -> None:
         raise ConfigError(
             "trainer.accelerator: got 'gpu', but torch sees none here; expected 'cpu' or 'auto'"
         )
+    _require_devices(config.trainer)
     build_module(config, build_data(config))
+
+
+def _require_devices(trainer: TrainerConfig) -> None:
+    found = torch.cuda.device_count()
+    if trainer.accelerator != "cpu" and 0 < found < trainer.devices:
+        raise ConfigError(f"trainer.devices: got {trainer.devices}, but torch sees {found} GPUs here")
 
 
 def require_same_config(folder: RunFolder, config: RunConfig) -> None:
@@ -102,34 +125,51 @@ def flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _train(config: RunConfig, folder: RunFolder, draw: Draw | None) -> dict[str, Any]:
+def run(
+    config: RunConfig, folder: RunFolder, draw: Draw | None, threads: int, rank: int = 0
+) -> dict[str, Any]:
+    """What one process does of a run: all of it, or its share where several train together (`ranks.py`).
+
+    Returns the results. Of several processes, all compute them and the first (`rank` 0) alone writes the record.
+    """
     _quiet_lightning()
-    if config.trainer.threads is not None:
-        torch.set_num_threads(config.trainer.threads)
+    torch.set_num_threads(threads)
     seed_everything(config.seed, verbose=False)
-    data = build_data(config)
+    data = build_data(config, rank)
     data.setup()
     module = build_module(config, data)
     record = RecordLogger(folder)
-    with tracked(config, folder) as tracker:
+    with tracked(config, folder) if rank == 0 else nullcontext() as tracker:
         calibration = build_calibration(config, folder, module, draw, tracker)
         trainer = build_trainer(config, folder, [record, *([tracker.logger] if tracker else [])], calibration)
         checkpoint = _take_up(trainer, module, data, record)
         if tracker:
             tracker.send_epochs(record.rows.values())
         seconds = _fit(trainer, module, data, checkpoint)
-        tables = {part: _evaluate(trainer, module, data, part) for part in data.samples if part != "train"}
-        if calibration is not None:
-            calibration.write("final", tables["test"])
-        for part, table in tables.items():
-            file = folder.held_out if part == "held_out" else folder.predictions
-            write_parquet(file, table, data.source.known(part))
+        tables: dict[Part, Columns] = {
+            part: _evaluate(trainer, module, data, part) for part in data.samples if part != "train"
+        }
         results = (
             summary(tables["test"]) | _untrained(record) | _circumstances(config, data, trainer, seconds)
         )
+        if trainer.is_global_zero:
+            _record(folder, tables, data, calibration)
         if tracker:
             tracker.send_results(results)
     return results
+
+
+def _record(
+    folder: RunFolder,
+    tables: Mapping[Part, Columns],
+    data: PositionData,
+    calibration: CalibrationRecorder | None,
+) -> None:
+    if calibration is not None:
+        calibration.write("final", tables["test"])
+    for part, table in tables.items():
+        file = folder.held_out if part == "held_out" else folder.predictions
+        write_parquet(file, table, data.source.known(part))
 
 
 def _take_up(
@@ -172,10 +212,10 @@ def _epoch_of(checkpoint: Path) -> int:
 
 
 def _evaluate(trainer: Trainer, module: PositionModule, data: PositionData, part: Part) -> Columns:
-    """Predictions of the present weights, a row a sample."""
+    """Predictions of the present weights, a row a sample, whichever process made them."""
     batches = trainer.predict(module, dataloaders=data.in_order(part))
     assert batches is not None
-    return joined(batches)  # type: ignore[arg-type]
+    return gathered(joined(batches))  # type: ignore[arg-type]
 
 
 def _circumstances(config: RunConfig, data: PositionData, trainer: Trainer, seconds: float) -> dict[str, Any]:
@@ -189,7 +229,8 @@ def _circumstances(config: RunConfig, data: PositionData, trainer: Trainer, seco
         "n_test": data.source.count("test"),
         "epochs": trainer.current_epoch,
         "fit_seconds": seconds,
-        "threads": torch.get_num_threads(),
+        "devices": trainer.world_size,
+        "threads": torch.get_num_threads(),  # of each process
         "device": str(trainer.strategy.root_device),
         "precision": str(trainer.precision),
     }
@@ -213,3 +254,5 @@ def _quiet_lightning() -> None:
     warnings.filterwarnings("ignore", ".*LeafSpec.*is deprecated", FutureWarning)
     # a run that was broken off goes on in its own folder
     warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
+    # what is logged are sums over all processes already
+    warnings.filterwarnings("ignore", "It is recommended to use .*sync_dist=True")

@@ -31,7 +31,7 @@ from pathlib import Path
 from phd_exp.cli.app import launch
 from phd_exp.records.errors import UserError
 
-def task(config, overrides):
+def task(config, overrides, cores):
     seed = config["seed"]
     if seed == 1:
         raise UserError("a mistake")
@@ -43,7 +43,8 @@ def task(config, overrides):
     if seed == 4:
         os.kill(os.getpid(), signal.SIGKILL)
     time.sleep(1)
-    Path(f"{seed}.done").touch()
+    Path(f"{seed}.done").write_text(str(cores))
+    return "done"
 
 if __name__ == "__main__":
     sys.exit(launch(task, sys.argv[1:]))

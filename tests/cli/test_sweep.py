@@ -1,0 +1,151 @@
+"""What a sweep is, before anything runs: its jobs, where they go, and how many cores each has."""
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import hydra
+import pytest
+
+from phd_exp.cli import cores
+from phd_exp.cli.cores import cores_a_job
+from phd_exp.cli.paths import conf_folder
+from phd_exp.cli.sweep import Job, plan
+from phd_exp.cli.train import is_finished, run_name
+from phd_exp.records.provenance import usable_cores
+from phd_exp.records.runs import RunFolder
+from phd_exp.training.config import check
+
+HYDRA = "hydra_plugins"
+
+
+@pytest.fixture
+def jobs() -> Iterator[Callable[..., list[Job]]]:
+    """The jobs that the words of a command line stand for."""
+    with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
+        yield lambda *words: plan(list(words), "config").jobs
+
+
+def folder(job: Job) -> Path:
+    config = check(job.config)
+    return run_name(config, job.overrides).folder(config.runs)
+
+
+@pytest.mark.parametrize(
+    ("words", "n"),
+    [
+        (["experiment=table1"], 12),
+        (["experiment=table2"], 3),
+        (["experiment=glob(table*)"], 14),
+        (["experiment=table1,table2", "seed=0,1,2", "preset=small"], 3 * 14),
+        (["experiment=table1", "data=occl"], 3),
+        (["data=occl", "experiment=table1", "model=mae_vz,probabilistic"], 2),
+        (["seed=0,0,1,0"], 2),
+        (["logger=none"], 1),
+    ],
+)
+def test_as_many_runs_as_the_files_say(jobs: Callable, words: list[str], n: int) -> None:
+    found = [folder(job) for job in jobs(*words)]
+    assert len(found) == len(set(found)) == n
+
+
+@pytest.mark.parametrize("experiment", sorted(file.stem for file in (conf_folder() / "experiment").iterdir()))
+def test_an_experiment_says_how_many_runs_it_has(jobs: Callable, experiment: str) -> None:
+    text = (conf_folder() / "experiment" / f"{experiment}.yaml").read_text()
+    assert f"\n# Runs: {len(jobs(f'experiment={experiment}'))}" in text
+    assert f"python -m phd_exp -m experiment={experiment}" in text
+
+
+def test_an_experiment_changes_nothing_but_which_runs_there_are(jobs: Callable) -> None:
+    """Its run of (mae_vz, occl) is the run of that model on that data, in the same folder."""
+    for words in (["preset=small"], ["preset=small", "optimizer.lr=0.01"], ["seed=3"]):
+        found = {folder(job): job.config for job in jobs("experiment=table1", *words)}
+        (alone,) = jobs("model=mae_vz", "data=occl", *words)
+        assert found[folder(alone)] == alone.config
+
+
+def test_what_the_user_says_counts(jobs: Callable) -> None:
+    for job in jobs("experiment=table1", "preset=smoke", "data=scale,occl", "seed=7"):
+        assert (job.config["preset"], job.config["seed"]) == ("smoke", 7)
+        assert job.config["data"]["variant"] in ("scale", "occl")
+        keys = [override.split("=")[0] for override in job.overrides]
+        assert len(keys) == len(set(keys))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ["experiment=table1"],
+            "experiment=table1: an experiment is several runs; write -m before it: -m exp",
+        ),
+        (["+experiment=table2", "seed=1"], "write -m before it: -m +experiment=table2 seed=1"),
+        (["-m", "experiment=tabel1"], "experiment=tabel1: no such choice, did you mean 'table1'?"),
+        (["-m", "experiment=table1,tabel2"], "experiment=tabel2: no such choice, did you mean 'table2'?"),
+        (["-m", "experiment=glob(nothing*)"], "experiment=glob(nothing*): not one combination"),
+        (
+            ["-m", "experiment=null", "seed=0,1"],
+            "Config group override must be a string or a list. Got NoneType",
+        ),
+    ],
+)
+def test_mistakes_are_one_line(phd_exp: Callable, tmp_path: Path, words: list[str], said: str) -> None:
+    outcome = phd_exp(*words)
+    assert outcome.status == 2
+    (line,) = outcome.err.splitlines()
+    assert line.startswith("error: ")
+    assert said in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_finished_run_is_seen_before_the_sweep_begins(
+    jobs: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    planned = jobs("experiment=table2", "preset=smoke", "optimizer.lr=0.01", "data.xy_range=0.5")
+    assert not any(is_finished(job.config, job.overrides) for job in planned)
+    run = RunFolder(folder(planned[1]))
+    run.path.mkdir(parents=True)
+    with run.recording(data_manifest=None):
+        pass
+    assert [is_finished(job.config, job.overrides) for job in planned] == [False, True, False]
+
+
+@pytest.mark.parametrize("change", [{"data": 3}, {"model": {}}, {"runs": None}, {"seed": [1]}])
+def test_a_configuration_that_makes_no_sense_is_not_finished(jobs: Callable, change: dict[str, Any]) -> None:
+    (job,) = jobs("preset=smoke")
+    assert not is_finished(job.config | change, job.overrides)
+
+
+@pytest.mark.parametrize(
+    ("launcher", "jobs_", "expected"),
+    [
+        ({"_target_": "hydra._internal.core_plugins.basic_launcher.BasicLauncher"}, 8, None),
+        ({"_target_": f"{HYDRA}.hydra_submitit_launcher.submitit_launcher.SlurmLauncher"}, 8, None),
+        ({"_target_": f"{HYDRA}.hydra_submitit_launcher.submitit_launcher.LocalLauncher"}, 3, 4),
+        ({"_target_": f"{HYDRA}.hydra_submitit_launcher.submitit_launcher.LocalLauncher"}, 30, 1),
+        *(
+            (
+                {"_target_": f"{HYDRA}.hydra_joblib_launcher.joblib_launcher.JoblibLauncher", "n_jobs": n},
+                8,
+                each,
+            )
+            for n, each in ((1, 12), (2, 6), (5, 2), (20, 1), (-1, 1), (-5, 1), (-11, 6), (-50, 12))
+        ),
+    ],
+)
+def test_jobs_at_once_share_the_cores(
+    monkeypatch: pytest.MonkeyPatch, launcher: dict[str, Any], jobs_: int, expected: int | None
+) -> None:
+    monkeypatch.setattr(cores, "usable_cores", lambda: 12)
+    assert cores_a_job(launcher, jobs_) == expected
+
+
+def test_cores_are_those_that_this_process_was_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("SLURM_CPUS_PER_TASK", raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(8)))
+    assert usable_cores() == 8
+    for granted, usable in (("3", 3), ("64", 8), ("", 8)):
+        monkeypatch.setenv("SLURM_CPUS_PER_TASK", granted)
+        assert usable_cores() == usable

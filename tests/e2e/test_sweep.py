@@ -1,0 +1,130 @@
+"""Sweeps on real renders: killed at any moment, with failures among them, with a configuration that has changed."""
+
+import multiprocessing
+import random
+import time
+from collections.abc import Callable
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from phd_exp.__main__ import main
+from phd_exp.records.runs import RunFolder, find_runs
+from phd_exp.training.module import PositionModule
+from tests.e2e.conftest import QUICK
+
+TWO = ("-m", "model=mae_vz", "seed=0,1", "logger=none")
+FOUR = ("-m", "experiment=table2", "model=mae_xyz,mae_constf", "seed=0,1", "logger=none")
+
+
+def seen(run: RunFolder) -> dict[str, tuple[int, bytes]]:
+    """Every file of a run: when it was written, and what it holds."""
+    files = [file for file in run.path.rglob("*") if file.is_file() and file.name != ".lock"]
+    return {
+        file.relative_to(run.path).as_posix(): (file.stat().st_mtime_ns, file.read_bytes()) for file in files
+    }
+
+
+def finished(runs: Path) -> dict[Path, dict[str, tuple[int, bytes]]]:
+    return {run.path: seen(run) for run in find_runs(runs) if run.is_finished()}
+
+
+def numbers(runs: Path) -> dict[str, Any]:
+    """What the runs of a folder came to, without the seconds that it took."""
+    return {
+        run.path.relative_to(runs).as_posix(): (run.results() | {"fit_seconds": None}, run.metrics())
+        for run in find_runs(runs)
+    }
+
+
+@pytest.fixture
+def begun(tmp_path: Path, renders: Path) -> Callable[..., BaseProcess]:
+    """A command in a process of its own, forked from one that has imported torch already."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["phd_exp.cli.train", "phd_exp.training.run"])
+
+    def begin(*words: str) -> BaseProcess:
+        process = context.Process(target=main, args=([*QUICK, f"data.root={renders}", *words],))
+        process.start()
+        return process
+
+    return begin
+
+
+@pytest.mark.parametrize(("kills", "words"), [(2, TWO), pytest.param(20, FOUR, marks=pytest.mark.slow)])
+def test_killed_at_any_moment_the_same_command_goes_on(
+    train: Callable, begun: Callable, tmp_path: Path, kills: int, words: tuple[str, ...]
+) -> None:
+    """What is finished stays as it is, to the bit; the rest comes to the numbers of one whole sweep."""
+    assert train(*words, f"runs={tmp_path / 'whole'}").status == 0
+    runs, before = tmp_path / "killed", dict[Path, Any]()
+    chance = random.Random(kills)
+    for _ in range(kills):
+        process = begun(*words, f"runs={runs}")
+        time.sleep(chance.uniform(0.5, 3))
+        process.kill()
+        process.join()
+        now = finished(runs)
+        assert {path: now[path] for path in before} == before
+        before = now
+    outcome = train(*words, f"runs={runs}")
+    assert outcome.status == 0, outcome.err
+    now = finished(runs)
+    assert f"{len(now)} jobs, {len(before)} of them finished already" in outcome.out
+    assert {path: now[path] for path in before} == before
+    assert numbers(runs) == numbers(tmp_path / "whole")
+    for files in now.values():
+        assert not [name for name in files if name.endswith(".tmp")]
+        assert [name for name in files if name.startswith("checkpoints/")] == ["checkpoints/last.ckpt"]
+
+
+def test_a_failing_run_among_others(train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is named with its error and stops no other; the same command takes it up where it failed, and no other."""
+    words = ("-m", "model=mae_vz", "seed=0,1,2", "logger=none")
+    training_step = PositionModule.training_step
+
+    def faulty(self: PositionModule, *arguments: Any) -> Any:
+        if self.current_epoch == 1 and self.trainer.default_root_dir.split("/")[-1].startswith("seed1"):
+            raise RuntimeError("planted")
+        return training_step(self, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PositionModule, "training_step", faulty)
+        outcome = train(*words)
+    assert outcome.status == 1
+    (error,) = [line for line in outcome.err.splitlines() if line.startswith("error: ")]
+    assert error.endswith("RuntimeError: planted")
+    assert "model=mae_vz seed=1" in error
+    *_, zero, one, two, total = outcome.out.splitlines()
+    assert zero.endswith("seed=0 logger=none: finished")
+    assert one.endswith("seed=1 logger=none: failed")
+    assert two.endswith("seed=2 logger=none: finished")
+    assert total == "3 jobs: 2 finished, 1 failed"
+    before = finished(tmp_path / "runs")
+    assert len(before) == 2
+
+    again = train(*words)
+    assert again.status == 0, again.err
+    assert "3 jobs, 2 of them finished already" in again.out
+    assert again.out.splitlines()[-1] == "3 jobs: 2 finished already, 1 finished"
+    now = finished(tmp_path / "runs")
+    assert {path: now[path] for path in before} == before
+    assert all([row["epoch"] for row in run.metrics()] == [-1, 0, 1] for run in find_runs(tmp_path / "runs"))
+
+
+def test_a_changed_configuration_never_reuses_a_run(train: Callable, tmp_path: Path) -> None:
+    assert train(*TWO).status == 0
+    changed = next(run for run in find_runs(tmp_path / "runs") if "seed1" in run.path.name)
+    config = changed.config()
+    config["optimizer"]["lr"] = 0.5  # as if the file under conf/ had changed since
+    changed.write_config(config)
+    before = finished(tmp_path / "runs")
+    outcome = train(*TWO)
+    assert outcome.status == 1
+    (line,) = [line for line in outcome.err.splitlines() if line.startswith("error: ")]
+    assert "seed=1 logger=none: " in line
+    assert "optimizer.lr=0.5, but optimizer.lr=0.001 is asked for" in line
+    assert outcome.out.splitlines()[-1] == "2 jobs: 1 finished already, 1 failed"
+    assert finished(tmp_path / "runs") == before

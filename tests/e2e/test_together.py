@@ -1,0 +1,201 @@
+"""Several processes that train one run: the numbers of one process, one record, and one end."""
+
+import json
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from phd_exp.records.runs import RunFolder, find_runs
+from tests.e2e.conftest import QUICK
+
+pytestmark = pytest.mark.slow
+THREE_EPOCHS = (
+    "logger=none",
+    "trainer.max_epochs=3",
+    "evaluation.calibration_every_n_epochs=1",
+    "data.n_test=7",
+)
+TOGETHER = ("trainer=ddp", "trainer.accelerator=cpu")
+
+
+def only_run(runs: Path) -> RunFolder:
+    (run,) = find_runs(runs)
+    return run
+
+
+def descendants(process: int) -> list[int]:
+    """The processes that a process started and that run phd_exp.training.rank, in the order of their ranks."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parent = int(stat.read_text().rpartition(")")[2].split()[1])
+            words = (stat.parent / "cmdline").read_text().split("\0")
+        except (OSError, IndexError):
+            continue
+        if parent == process and "phd_exp.training.rank" in words:
+            found.append(int(stat.parent.name))
+    return sorted(found)
+
+
+def alive(process: int) -> bool:
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def wait_for(condition: Callable[[], Any], seconds: float = 120) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited too long"
+        time.sleep(0.02)
+
+
+def test_the_numbers_are_those_of_one_process(train: Callable, tmp_path: Path) -> None:
+    assert train(*THREE_EPOCHS, "runs=alone").status == 0
+    outcome = train(*THREE_EPOCHS, *TOGETHER, "trainer.threads=2", "runs=together")
+    assert outcome.status == 0, outcome.err
+    assert "Warning" not in outcome.err
+    assert outcome.err == ""
+    assert outcome.out.count("epoch 1/3") == 0
+    alone, together = only_run(tmp_path / "alone"), only_run(tmp_path / "together")
+    assert together.results()["devices"] == 2
+    assert together.results()["threads"] == 1
+    for one, other in zip(alone.metrics(), together.metrics(), strict=True):
+        assert other == pytest.approx(one, rel=1e-4)
+    for name in ("predictions.parquet", "held_out.parquet"):
+        one, other = pd.read_parquet(alone.path / name), pd.read_parquet(together.path / name)
+        assert list(other["file_name"]) == list(one["file_name"])
+        pd.testing.assert_frame_equal(one, other, rtol=1e-3, atol=1e-5)
+    for curve in ("epoch-0000", "final"):
+        curves = [json.loads(run.curves(curve).read_text()) for run in (alone, together)]
+        assert curves[1]["depth"]["predicted"] == pytest.approx(curves[0]["depth"]["predicted"], rel=1e-3)
+    assert {file.name for file in together.path.rglob("*")} == {file.name for file in alone.path.rglob("*")}
+
+
+@pytest.fixture
+def killing_a_rank() -> Iterator[Callable[[Path, int], list[int]]]:
+    """Kill one of the processes once a run has trained for an epoch; the ids of all of them come back."""
+    threads: list[threading.Thread] = []
+
+    def arm(runs: Path, place: int) -> list[int]:
+        found: list[int] = []
+
+        def kill() -> None:
+            wait_for(lambda: len(list(runs.rglob("last.ckpt"))) == 1)
+            found.extend(descendants(os.getpid()))
+            os.kill(found[place], signal.SIGKILL)
+
+        threads.append(threading.Thread(target=kill))
+        threads[-1].start()
+        return found
+
+    yield arm
+    for thread in threads:
+        thread.join()
+
+
+@pytest.mark.parametrize("place", [0, 1])
+def test_one_killed_ends_all_and_the_same_command_goes_on(
+    train: Callable, tmp_path: Path, killing_a_rank: Callable, place: int
+) -> None:
+    words = ("model=mae_vz", "logger=none", "trainer.max_epochs=12", *TOGETHER)
+    ranks = killing_a_rank(tmp_path / "runs", place)
+    outcome = train(*words)
+    assert outcome.status == 1
+    assert len(ranks) == 2
+    assert not any(alive(rank) for rank in ranks)
+    (line,) = outcome.err.splitlines()
+    assert (
+        f"process {place} of 2 was killed by SIGKILL; the others were ended, and the same command goes on"
+        in line
+    )
+    run = only_run(tmp_path / "runs")
+    status = run.status()
+    assert status is not None
+    assert status.state == "failed"
+    assert status.error is not None
+    assert "killed by SIGKILL" in status.error
+    done = len(run.metrics())
+    assert 1 < done < 13
+    assert train(*words).status == 0
+    assert [row["epoch"] for row in run.metrics()] == list(range(-1, 12))
+    assert train(*words, "runs=whole").status == 0
+    assert only_run(tmp_path / "whole").metrics() == run.metrics()
+
+
+def test_a_loss_that_is_not_finite_is_one_line(train: Callable) -> None:
+    outcome = train("logger=none", "optimizer.lr=1e30", *TOGETHER)
+    assert outcome.status == 1
+    (line,) = outcome.err.splitlines()
+    assert "loss is " in line
+    assert "lower optimizer.lr" in line
+
+
+def test_none_outlives_the_process_that_started_them(renders: Path, tmp_path: Path) -> None:
+    from phd_exp.__main__ import main
+
+    words = [
+        *QUICK,
+        f"data.root={renders}",
+        f"runs={tmp_path}",
+        "logger=none",
+        "trainer.max_epochs=50",
+        *TOGETHER,
+    ]
+    process = multiprocessing.get_context("spawn").Process(target=main, args=(words,))
+    process.start()
+    wait_for(lambda: list(tmp_path.rglob("last.ckpt")))
+    assert process.pid is not None
+    ranks = descendants(process.pid)
+    assert len(ranks) == 2
+    process.kill()
+    process.join()
+    wait_for(lambda: not any(alive(rank) for rank in ranks), seconds=10)
+    assert not only_run(tmp_path).is_held()
+
+
+@pytest.mark.parametrize(
+    "launcher",
+    [
+        [],
+        ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
+        ["hydra/launcher=submitit_local"],
+    ],
+)
+def test_runs_of_a_sweep_under_any_launcher(train: Callable, tmp_path: Path, launcher: list[str]) -> None:
+    """Two runs, each of two processes."""
+    words = ("model=mae_vz", "logger=none", *TOGETHER)
+    outcome = train("-m", "seed=0,1", *words, *launcher)
+    assert outcome.status == 0, outcome.err
+    runs = find_runs(tmp_path / "runs")
+    assert [run.results()["devices"] for run in runs] == [2, 2]
+    assert [run.results()["seed"] for run in runs] == [0, 1]
+    assert train("seed=1", *words, "runs=alone").status == 0
+    assert only_run(tmp_path / "alone").metrics() == runs[1].metrics()
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("trainer.devices=3", "trainer.devices: got 3, which does not divide batch_size=8"),
+        ("trainer.devices=8", "trainer.devices: got 8, more than the 4 samples of held_out that there are"),
+        ("trainer.devices=0", "trainer.devices: got 0"),
+    ],
+)
+def test_processes_that_cannot_share_are_refused(
+    train: Callable, tmp_path: Path, word: str, said: str
+) -> None:
+    outcome = train("logger=none", *TOGETHER, word)
+    assert outcome.status == 2
+    (line,) = outcome.err.splitlines()
+    assert said in line
+    assert list(tmp_path.iterdir()) == []
