@@ -13,8 +13,7 @@ from torch import Tensor
 from phd_exp.data.batches import Batch
 from phd_exp.data.sources import Known
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.columns import Columns as Columns
-from phd_exp.distributions.columns import coordinates, distribution_columns, draws
+from phd_exp.distributions.columns import Columns, coordinates, distribution_columns, draws
 from phd_exp.metrics.calibration import CalibrationCurve, calibration_curve
 from phd_exp.metrics.calibration_scores import exact_scores
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
