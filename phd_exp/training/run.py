@@ -65,7 +65,7 @@ def train(config: RunConfig, folder: RunFolder, draw: Draw | None, cores: int) -
             else:
                 results = run(config, folder, draw, threads)
             folder.write_results(results)
-    return results
+    return folder.results()
 
 
 def require_possible(config: RunConfig, folder: RunFolder) -> None:
