@@ -1,0 +1,235 @@
+"""The best and the worst test images of a run: the level curves on the image and from above, as SVG."""
+
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import torch
+from matplotlib.ticker import MaxNLocator
+from PIL import Image
+
+from phd_exp.distributions import ProjectedHuber
+from phd_exp.records.files import write_atomic
+from phd_exp.reports.level_curves import LEVELS, LevelCurves, level_curves, on_image
+from phd_exp.reports.site.assessment import is_distribution
+from phd_exp.reports.site.quantities import SCORES
+
+EACH = 6
+LARGEST = 448  # pixels; larger test images are shrunk for the page
+_CLOSE = 0.25  # a share of the image below which curves deserve a close-up
+_PANEL, _LEFT, _BOTTOM, _EDGE = 200.0, 44.0, 30.0, 6.0  # of the bird's-eye view, in its own units
+_FACTS = {
+    "visibility": ("visibility", "", 2),
+    "truncation": ("truncation", "", 2),
+    "f": ("focal length", "px", 0),
+    "z": ("true depth", "m", 2),
+    "mode_z": ("estimated depth", "m", 2),
+}
+
+
+@dataclass(frozen=True)
+class BirdsEye:
+    """The curves of (x, z) in a square of `_PANEL` units, with ticks in metres."""
+
+    paths: list[str]
+    mode: tuple[float, float]
+    truth: tuple[float, float]
+    x_ticks: list[tuple[float, str]]
+    z_ticks: list[tuple[float, str]]
+    size: float = _PANEL
+    left: float = _LEFT
+    bottom: float = _PANEL - _BOTTOM
+    edge: float = _EDGE
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One test sample.
+
+    Attributes:
+        image: its file's name; None where the image is not at hand.
+        side: of the image, pixels, in which `paths`, `mode` and `truth` are given.
+        close_up: left, top and side of the part worth enlarging; None where the curves fill the image.
+        facts: what is known of it, as pairs of a name and a value.
+    """
+
+    name: str
+    alt: str
+    image: str | None
+    side: float
+    paths: list[str]
+    mode: tuple[float, float]
+    truth: tuple[float, float]
+    close_up: tuple[float, float, float] | None
+    birds_eye: BirdsEye | None
+    facts: list[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """The pictures of a run, the best first and the worst first; `ranked_by` names what says which they are."""
+
+    ranked_by: str
+    best: list[Picture]
+    worst: list[Picture]
+    notes: list[str] = field(default_factory=list)
+    levels: tuple[float, ...] = LEVELS
+
+
+def images_folder(config: Mapping[str, Any]) -> Path | None:
+    """Where the test images of a run on a rendered data set lie; None for images of another kind."""
+    data = config.get("data")
+    spec = data.get("spec") if isinstance(data, Mapping) else None
+    if not (isinstance(data, Mapping) and isinstance(spec, Mapping)):
+        return None
+    root, variant = data.get("root"), spec.get("variant")
+    return Path(root) / variant / "test" if isinstance(root, str) and isinstance(variant, str) else None
+
+
+def make_gallery(predictions: pa.Table, config: Mapping[str, Any], out: Path) -> Gallery:
+    """Choose the pictures, and write their images into `out` (made if missing)."""
+    columns = {name: predictions[name].to_numpy() for name in predictions.column_names}
+    key, ranked_by, error = _ranking(predictions, columns)
+    order = np.argsort(error, kind="stable")  # NaN comes last: a prediction that is none is the worst
+    each = min(EACH, len(order) // 2) or 1
+    source = images_folder(config)
+    notes = _why_no_images(source)
+    out.mkdir(parents=True, exist_ok=True)
+
+    def pictures(kind: str, rows: np.ndarray) -> list[Picture]:
+        return [
+            _picture({name: column[row] for name, column in columns.items()}, key, source, out / f"{kind}-{rank}.webp")
+            for rank, row in enumerate(rows, start=1)
+        ]
+
+    return Gallery(ranked_by, pictures("best", order[:each]), pictures("worst", order[::-1][:each]), notes)
+
+
+def _ranking(predictions: pa.Table, columns: Mapping[str, np.ndarray]) -> tuple[str, str, np.ndarray]:
+    if is_distribution(predictions):
+        return "nll", "negative log density at the truth", columns["nll"]
+    off = np.stack([columns[f"mode_{axis}"] - columns[axis] for axis in "xyz"])
+    return "", "distance from the truth", np.linalg.norm(off, axis=0)
+
+
+def _why_no_images(source: Path | None) -> list[str]:
+    if source is None:
+        return ["These images are your own and are not kept with the run: the panels show where things lie in them."]
+    if not source.is_dir():
+        return [f"{source}: the images are no longer there; the panels show where things lie in them."]
+    return []
+
+
+def _picture(row: Mapping[str, Any], key: str, source: Path | None, file: Path) -> Picture:
+    truth = np.array([row[axis] for axis in "xyz"], dtype=float)
+    mode = np.array([row[f"mode_{axis}"] for axis in "xyz"], dtype=float)
+    f, S = float(row["f"]), float(row["S"])
+    curves = _curves(row)
+    outlines = [on_image(points, f, S) for points in curves.projected] if curves else []
+    facts = _facts(row, key)
+    image = _copy_image(source, str(row["file_name"]), file)
+    on = {"truth": on_image(truth[:2] / truth[2], f, S), "mode": on_image(mode[:2] / mode[2], f, S)}
+    return Picture(
+        name=str(row["file_name"]),
+        alt=f"Test image {row['file_name']}: " + ", ".join(f"{name} {value}" for name, value in facts),
+        image=file.name if image else None,
+        side=S,
+        paths=[_path(points) for points in outlines],
+        mode=_pair(on["mode"]),
+        truth=_pair(on["truth"]),
+        close_up=_close_up(np.concatenate([*outlines, on["truth"][None], on["mode"][None]]), S),
+        birds_eye=_birds_eye(curves, truth) if curves else None,
+        facts=facts,
+    )
+
+
+def _curves(row: Mapping[str, Any]) -> LevelCurves | None:
+    """The level curves of a row; None for a baseline, and for numbers that are no distribution."""
+    names = ("mu_x", "mu_y", "mu_z", "A_xx", "A_xy", "A_yy", "a")
+    if any(name not in row for name in names):
+        return None
+    x, y, z, A_xx, A_xy, A_yy, a = (torch.tensor(float(row[name]), dtype=torch.float64) for name in names)
+    A = torch.stack([torch.stack([A_xx, A_xy]), torch.stack([A_xy, A_yy])])
+    try:
+        return level_curves(ProjectedHuber(torch.stack([x, y]), z, A, a, validate_args=True))
+    except ValueError:
+        return None
+
+
+def _facts(row: Mapping[str, Any], key: str) -> list[tuple[str, str]]:
+    errors = [name for name in (key, "projected_error_mm", "depth_error_mm") if name in row]
+    facts = [(SCORES[name].label, f"{SCORES[name].text(row[name])} {SCORES[name].unit}") for name in errors]
+    if "level" in row:
+        facts.append(("credible level of the truth", f"{row['level']:.2f}"))
+    known = [(name, *_FACTS[name]) for name in _FACTS if name in row]
+    return facts + [(label, f"{row[name]:.{digits}f} {unit}".strip()) for name, label, unit, digits in known]
+
+
+def _copy_image(source: Path | None, name: str, file: Path) -> bool:
+    """Write a copy fit for a page; False where the image is not there, no image, or outside its folder."""
+    if source is None or not (source / name).resolve().is_relative_to(source.resolve()):
+        return False
+    try:
+        with Image.open(source / name, formats=("PNG", "WEBP", "JPEG")) as image:
+            image.thumbnail((LARGEST, LARGEST))
+            buffer = io.BytesIO()
+            image.convert("RGB").save(buffer, "WEBP", quality=90)
+    except (OSError, ValueError, Image.DecompressionBombError):
+        return False
+    write_atomic(file, buffer.getvalue())
+    return True
+
+
+def _close_up(points: np.ndarray, S: float) -> tuple[float, float, float] | None:
+    low, high = points.min(axis=0), points.max(axis=0)
+    extent = float((high - low).max())
+    if not np.isfinite(extent) or extent > _CLOSE * S:
+        return None
+    side = max(1.6 * extent, 8.0)
+    left, top = (low + high) / 2 - side / 2
+    return round(float(left), 2), round(float(top), 2), round(side, 2)
+
+
+def _birds_eye(curves: LevelCurves, truth: np.ndarray) -> BirdsEye:
+    seen = np.concatenate([*curves.birds_eye, curves.mode[None, ::2], truth[None, ::2]])
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    margin = 0.06 * (high - low)
+    low, high = low - margin, high + margin
+    width, height = _PANEL - _LEFT - _EDGE, _PANEL - _BOTTOM - _EDGE
+
+    def place(points: np.ndarray) -> np.ndarray:
+        share = (points - low) / (high - low)
+        return np.stack([_LEFT + width * share[..., 0], _PANEL - _BOTTOM - height * share[..., 1]], axis=-1)
+
+    def ticks(axis: int) -> list[tuple[float, str]]:
+        values = MaxNLocator(3, steps=[1, 2, 5, 10]).tick_values(low[axis], high[axis])
+        step = values[1] - values[0]
+        digits = max(0, int(np.ceil(-np.log10(step) - 1e-9)))
+        inside = [value for value in values if low[axis] <= value <= high[axis]]
+        where = place(np.array([[value, value] for value in inside]))[:, axis] if inside else []
+        return [
+            (round(float(w), 1), f"{v + 0.0:.{digits}f}".replace("-", "−"))
+            for w, v in zip(where, inside, strict=True)
+        ]
+
+    return BirdsEye(
+        paths=[_path(place(points)) for points in curves.birds_eye],
+        mode=_pair(place(curves.mode[::2])),
+        truth=_pair(place(truth[::2])),
+        x_ticks=ticks(0),
+        z_ticks=ticks(1),
+    )
+
+
+def _path(points: np.ndarray) -> str:
+    """Points as an SVG path; what lies far outside a picture is brought nearer, or renderers would lose digits."""
+    return "M" + " ".join(f"{x:.2f},{y:.2f}" for x, y in np.clip(points, -1e4, 1e4)) + "Z"
+
+
+def _pair(point: np.ndarray) -> tuple[float, float]:
+    x, y = np.clip(np.nan_to_num(point, nan=-1e4), -1e4, 1e4)
+    return round(float(x), 2), round(float(y), 2)

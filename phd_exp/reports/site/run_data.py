@@ -1,0 +1,122 @@
+"""What pages share of a run: one JSON in `data/<slug>.js`, a script because pages opened as files may not fetch."""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from phd_exp.records.runs import RunFolder
+from phd_exp.reports.evaluation import Band
+from phd_exp.reports.site.charts import Chart, calibration_charts, learning_charts, strata_charts
+from phd_exp.reports.site.dossier import Dossier
+from phd_exp.reports.site.gallery import images_folder
+
+
+@dataclass(frozen=True)
+class RunData:
+    """What the overview and the comparison need of a run.
+
+    Attributes:
+        key: of the files and the code that all of it follows from.
+        n: test samples; None without predictions.
+        scores, recalibrated: means over the test split with their intervals; the second empty for most.
+        config: every value of config.yaml, by its path.
+    """
+
+    key: str
+    slug: str
+    preset: str
+    data: str
+    model: str
+    run: str
+    title: str
+    state: str
+    n: int | None
+    scores: dict[str, Band]
+    recalibrated: dict[str, Band]
+    config: dict[str, str]
+    charts: dict[str, Chart]
+
+
+_ADAPTER: TypeAdapter[RunData] = TypeAdapter(RunData)
+
+
+def gather(dossier: Dossier, key: str) -> RunData:
+    """The data of a run from its dossier."""
+    assessment = dossier.assessment
+    before, after = (assessment.before, assessment.after) if assessment else (None, None)
+    charts = learning_charts(dossier)
+    if before:
+        charts |= calibration_charts(before, after) | strata_charts(before)
+    name = dossier.identity
+    return RunData(
+        key=key,
+        slug=name.slug,
+        preset=name.preset,
+        data=name.data,
+        model=name.model,
+        run=name.run,
+        title=name.title,
+        state=dossier.state,
+        n=before.n if before else None,
+        scores=dict(before.scores) if before else {},
+        recalibrated=dict(after.scores) if after else {},
+        config=dict(flattened(dossier.config)),
+        charts=charts,
+    )
+
+
+def flattened(config: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, str]]:
+    """Every value of nested mappings, as text, by its dotted path."""
+    for name, value in config.items():
+        if isinstance(value, Mapping):
+            yield from flattened(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", "" if value is None else str(value)
+
+
+def as_script(name: str, content: Any) -> str:
+    """`phdExp.receive("<name>", {...});`, safe wherever it is put: no `</script>`, no line separator of JavaScript."""
+    text = f"phdExp.receive({json.dumps(name)}, {json.dumps(content, allow_nan=False, separators=(',', ':'))});\n"
+    for character in "<>&\u2028\u2029":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return text
+
+
+def run_script(run: RunData) -> str:
+    return as_script(run.slug, asdict(run))
+
+
+def read_script(file: Path) -> RunData | None:
+    """The run that `run_script` wrote; None where there is none or it is of another version."""
+    try:
+        text = file.read_text()
+        return _ADAPTER.validate_json(text[text.index("{") : text.rindex("}") + 1])
+    except (OSError, ValueError, ValidationError):
+        return None
+
+
+def key_of(folder: RunFolder, state: str, config: Mapping[str, Any]) -> str:
+    """A digest that changes whenever a page of the run would: its files, its state, its images, this code."""
+    files = [entry for entry in folder.path.iterdir() if entry.is_file()]
+    images = images_folder(config)
+    seen = [_stamp(file) for file in sorted([*files, *([images] if images else [])])]
+    return hashlib.sha256(json.dumps([_code(), state, seen]).encode()).hexdigest()[:16]
+
+
+def _stamp(path: Path) -> tuple[str, int, int]:
+    try:
+        stat = path.stat()
+    except OSError:
+        return str(path), 0, 0
+    return str(path), stat.st_mtime_ns, stat.st_size
+
+
+def _code() -> str:
+    package = Path(__file__).parents[2]
+    files = sorted(file for kind in ("py", "html") for file in package.rglob(f"*.{kind}"))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
