@@ -59,7 +59,12 @@ def _band(values: np.ndarray) -> Band:
 
 def _strata(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> list[Stratum]:
     found = []
-    for quantity, column in (("visibility", "visibility"), ("truncation", "truncation"), ("depth", "z"), ("focal length", "f")):
+    for quantity, column in (
+        ("visibility", "visibility"),
+        ("truncation", "truncation"),
+        ("depth", "z"),
+        ("focal length", "f"),
+    ):
         if column not in columns:
             continue
         edges = np.unique(np.quantile(columns[column], [0, 0.25, 0.5, 0.75, 1]))
@@ -77,7 +82,9 @@ def _curve(x: np.ndarray, y: np.ndarray, spread: float = 0.1) -> Curve:
 def _smooth(table: dict[str, np.ndarray], name: str, window: int) -> Curve:
     order = np.argsort(table[f"{name}_variance"])
     kernel = np.ones(window) / window
-    x, y = (np.convolve(table[f"{name}_{part}"][order], kernel, "valid") for part in ("variance", "squared_error"))
+    x, y = (
+        np.convolve(table[f"{name}_{part}"][order], kernel, "valid") for part in ("variance", "squared_error")
+    )
     return _curve(x, y, 0.2)
 
 

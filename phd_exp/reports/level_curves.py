@@ -23,7 +23,7 @@ from phd_exp.distributions.huber import radial_cdf
 Points = Float[np.ndarray, "points 2"]
 
 LEVELS = (0.5, 0.9, 0.99)
-_POINTS = 97  # of half a curve
+_POINTS = 73  # of a curve, and of half an outline
 _STRATA = 500  # equally probable values that stand for a one-dimensional law
 _FURTHEST = 45.0  # |q_1| beyond which there is no probability left in float64
 
@@ -51,7 +51,9 @@ def level_curves(distribution: ProjectedHuber, levels: tuple[float, ...] = LEVEL
     Raises ValueError for a batch of distributions, or a level outside (0, 1).
     """
     if distribution.batch_shape != torch.Size([]):
-        raise ValueError(f"level curves are those of one distribution, not of {tuple(distribution.batch_shape)}")
+        raise ValueError(
+            f"level curves are those of one distribution, not of {tuple(distribution.batch_shape)}"
+        )
     if not all(0 < level < 1 for level in levels):
         raise ValueError(f"levels lie between 0 and 1, exclusive; these are {levels}")
     t = _depth_strata(distribution)
@@ -93,7 +95,7 @@ def _radius(t: Float[np.ndarray, " strata"], level: float) -> float:
 
 def _ellipse(distribution: ProjectedHuber, radius: float) -> Points:
     """u = mu_xy + A^(-1) rho (cos, sin), once around."""
-    angle = np.linspace(0, 2 * np.pi, 2 * _POINTS - 1)
+    angle = np.linspace(0, 2 * np.pi, _POINTS)
     circle = radius * np.stack([np.cos(angle), np.sin(angle)])
     return _float64(distribution.mu_xy) + np.linalg.solve(_float64(distribution.A), circle).T
 
@@ -166,7 +168,9 @@ def draw_on_image(
         axes.plot(*on_image(points, f, S).T, color="#ffb000", linewidth=width)
     axes.plot(*on_image(curves.mode[:2] / curves.mode[2], f, S), "x", color="#ffb000", markersize=6)
     if truth is not None:
-        axes.plot(*on_image(truth[:2] / truth[2], f, S), "o", color="white", markeredgecolor="black", markersize=4)
+        axes.plot(
+            *on_image(truth[:2] / truth[2], f, S), "o", color="white", markeredgecolor="black", markersize=4
+        )
     axes.set(xlim=(0, S), ylim=(S, 0), aspect="equal", xlabel="column (px)", ylabel="row (px)")
 
 

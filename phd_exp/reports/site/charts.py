@@ -86,7 +86,9 @@ def calibration_charts(evaluation: Evaluation, after: Evaluation | None) -> dict
         key: chart
         for key, kind in _KINDS.items()
         if key in evaluation.curves
-        for chart in [_calibration_chart(kind, evaluation.curves[key], after.curves.get(key) if after else None)]
+        for chart in [
+            _calibration_chart(kind, evaluation.curves[key], after.curves.get(key) if after else None)
+        ]
     }
 
 
@@ -110,13 +112,17 @@ _KINDS = {
         "calibrated",
         log=True,
     ),
-    "coverage": _Kind("Coverage of credible regions", "credible level", "share of truths inside", "calibrated"),
+    "coverage": _Kind(
+        "Coverage of credible regions", "credible level", "share of truths inside", "calibrated"
+    ),
     "depth_pit": _Kind("Depth PIT", "PIT of the true depth", "share of samples below", "calibrated"),
     "depth_risk_coverage": _Kind(
         "Depth: risk and coverage", "share of predictions kept, surest first", "mean depth error (mm)"
     ),
     "projected_risk_coverage": _Kind(
-        "Projection: risk and coverage", "share of predictions kept, surest first", "mean projected error (mm)"
+        "Projection: risk and coverage",
+        "share of predictions kept, surest first",
+        "mean projected error (mm)",
     ),
 }
 
@@ -164,7 +170,9 @@ def _in_words(kind: _Kind, curve: Curve) -> str:
         middle = f"{ratios[len(ratios) // 2]:.2g}" if ratios else "unknown"
         return f"The squared error is {middle} times the predicted variance in the median; 1 is calibrated."
     if kind.diagonal:
-        furthest = max(zip(curve.x, curve.y, strict=True), key=lambda pair: abs(pair[1] - pair[0]), default=(0, 0))
+        furthest = max(
+            zip(curve.x, curve.y, strict=True), key=lambda pair: abs(pair[1] - pair[0]), default=(0, 0)
+        )
         return f"Furthest from the diagonal at {furthest[0]:.2f}, where the share is {furthest[1]:.2f}."
     if not curve.y:
         return "No points."
@@ -207,13 +215,19 @@ def _course(trace: Trace, metric: Quantity) -> str:
 
 
 _OVER_EPOCHS = ("depth_ence", "projected_ence", "miscalibration_area", "depth_pit_area")
-_DASHES = ("solid", "dash", "dot", "dashdot")
+DASHES = ("solid", "dash", "dot", "dashdot")
 
 
 def _calibration_over_epochs(dossier: Dossier) -> Chart | None:
     known = [key for key in _OVER_EPOCHS if f"test/calibration/{key}" in dossier.metrics]
     traces = [
-        line(quantity(key).label, dossier.epochs, dossier.metrics[f"test/calibration/{key}"], i + 1, dash=_DASHES[i])
+        line(
+            quantity(key).label,
+            dossier.epochs,
+            dossier.metrics[f"test/calibration/{key}"],
+            i + 1,
+            dash=DASHES[i],
+        )
         for i, key in enumerate(known)
     ]
     if not traces:
@@ -237,8 +251,12 @@ def _strata_chart(evaluation: Evaluation, name: str, key: str, colour: int) -> C
     strata = [stratum for stratum in evaluation.strata if stratum.quantity == name and key in stratum.scores]
     bands = [stratum.scores[key] for stratum in strata]
     labels = [stratum.label for stratum in strata]
-    trace = bars(score.label, labels, [b.value for b in bands], colour, [b.low for b in bands], [b.high for b in bands])
+    trace = bars(
+        score.label, labels, [b.value for b in bands], colour, [b.low for b in bands], [b.high for b in bands]
+    )
     trace["meta"]["n"] = [stratum.n for stratum in strata]
-    said = "; ".join(f"{label}: {score.text(b.value)} {score.unit}" for label, b in zip(labels, bands, strict=True))
+    said = "; ".join(
+        f"{label}: {score.text(b.value)} {score.unit}" for label, b in zip(labels, bands, strict=True)
+    )
     layout = {"xaxis": axis(name) | {"type": "category"}, "yaxis": axis(score.axis, rangemode="tozero")}
     return Chart(f"{score.label} by {name}", f"{score.label} by {name}: {said}.", [trace], layout)

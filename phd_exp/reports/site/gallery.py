@@ -102,7 +102,12 @@ def make_gallery(predictions: pa.Table, config: Mapping[str, Any], out: Path) ->
 
     def pictures(kind: str, rows: np.ndarray) -> list[Picture]:
         return [
-            _picture({name: column[row] for name, column in columns.items()}, key, source, out / f"{kind}-{rank}.webp")
+            _picture(
+                {name: column[row] for name, column in columns.items()},
+                key,
+                source,
+                out / f"{kind}-{rank}.webp",
+            )
             for rank, row in enumerate(rows, start=1)
         ]
 
@@ -118,7 +123,9 @@ def _ranking(predictions: pa.Table, columns: Mapping[str, np.ndarray]) -> tuple[
 
 def _why_no_images(source: Path | None) -> list[str]:
     if source is None:
-        return ["These images are your own and are not kept with the run: the panels show where things lie in them."]
+        return [
+            "These images are your own and are not kept with the run: the panels show where things lie in them."
+        ]
     if not source.is_dir():
         return [f"{source}: the images are no longer there; the panels show where things lie in them."]
     return []

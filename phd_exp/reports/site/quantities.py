@@ -37,17 +37,25 @@ _RISK = "mean error of the predictions kept when the least certain are dropped f
 _EXCESS = "0 where predicted variance sorts the errors perfectly, 1 where it sorts them no better than chance"
 
 SCORES = {
-    "projected_error_mm": Quantity("Projected error", "mm", 1, "distance of the estimate from the true viewing ray"),
+    "projected_error_mm": Quantity(
+        "Projected error", "mm", 1, "distance of the estimate from the true viewing ray"
+    ),
     "depth_error_mm": Quantity("Depth error", "mm", 1, "error along the true viewing ray"),
     "nll": Quantity("NLL", "nats", 2, "mean negative log density at the truth, per cubic metre", None),
-    "depth_crps_mm": Quantity("CRPS of depth", "mm", 1, "continuous ranked probability score of the depth's law"),
+    "depth_crps_mm": Quantity(
+        "CRPS of depth", "mm", 1, "continuous ranked probability score of the depth's law"
+    ),
     "energy_score_mm": Quantity("Energy score", "mm", 1, "the same idea for the position in space"),
-    "depth_ence": Quantity("Depth ENCE", "", 3, "expected normalised calibration error of the depth's variance"),
+    "depth_ence": Quantity(
+        "Depth ENCE", "", 3, "expected normalised calibration error of the depth's variance"
+    ),
     "projected_ence": Quantity("Projected ENCE", "", 3, "the same for the projected position"),
     "miscalibration_area": Quantity(
         "Miscalibration area", "", 3, "between the coverage of credible regions and the diagonal"
     ),
-    "depth_pit_area": Quantity("Depth PIT area", "", 3, "between the depth's PIT distribution and the diagonal"),
+    "depth_pit_area": Quantity(
+        "Depth PIT area", "", 3, "between the depth's PIT distribution and the diagonal"
+    ),
     "depth_sharpness_mm": Quantity("Depth sharpness", "mm", 1, f"{_SHARPNESS} of z", None),
     "projected_sharpness_mrad": Quantity("Projected sharpness", "mrad", 2, f"{_SHARPNESS} of (x, y)/z", None),
     "depth_risk_coverage_area": Quantity("Depth risk–coverage area", "mm", 1, _RISK),

@@ -4,15 +4,17 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from phd_exp.records.runs import RunFolder
+from phd_exp.records.errors import RunError
+from phd_exp.reports.collect import Run
 from phd_exp.reports.evaluation import Band
 from phd_exp.reports.site.charts import Chart, calibration_charts, learning_charts, strata_charts
-from phd_exp.reports.site.dossier import Dossier
+from phd_exp.reports.site.dossier import Dossier, slug_of
 from phd_exp.reports.site.gallery import images_folder
 
 
@@ -52,16 +54,16 @@ def gather(dossier: Dossier, key: str) -> RunData:
     charts = learning_charts(dossier)
     if before:
         charts |= calibration_charts(before, after) | strata_charts(before)
-    name = dossier.identity
+    run = dossier.run
     return RunData(
         key=key,
-        slug=name.slug,
-        preset=name.preset,
-        data=name.data,
-        model=name.model,
-        run=name.run,
-        title=name.title,
-        state=dossier.state,
+        slug=slug_of(run),
+        preset=run.preset,
+        data=run.data,
+        model=run.model,
+        run=run.folder.path.name,
+        title=f"{run.model} on {run.data}",
+        state=run.state,
         n=before.n if before else None,
         scores=dict(before.scores) if before else {},
         recalibrated=dict(after.scores) if after else {},
@@ -100,12 +102,15 @@ def read_script(file: Path) -> RunData | None:
         return None
 
 
-def key_of(folder: RunFolder, state: str, config: Mapping[str, Any]) -> str:
+def key_of(run: Run) -> str:
     """A digest that changes whenever a page of the run would: its files, its state, its images, this code."""
-    files = [entry for entry in folder.path.iterdir() if entry.is_file()]
-    images = images_folder(config)
+    files = [file for file in run.folder.path.iterdir() if file.is_file() and not file.name.startswith(".")]
+    try:
+        images = images_folder(run.folder.config())
+    except (RunError, OSError):
+        images = None
     seen = [_stamp(file) for file in sorted([*files, *([images] if images else [])])]
-    return hashlib.sha256(json.dumps([_code(), state, seen]).encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps([_code(), run.state, run.detail, seen]).encode()).hexdigest()[:16]
 
 
 def _stamp(path: Path) -> tuple[str, int, int]:
@@ -116,6 +121,7 @@ def _stamp(path: Path) -> tuple[str, int, int]:
     return str(path), stat.st_mtime_ns, stat.st_size
 
 
+@cache
 def _code() -> str:
     package = Path(__file__).parents[2]
     files = sorted(file for kind in ("py", "html") for file in package.rglob(f"*.{kind}"))

@@ -1,0 +1,108 @@
+"""The site of all runs: written file by file, each whole, so that a report that is killed leaves pages that open."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from plotly.offline import get_plotlyjs
+
+from phd_exp.records.errors import UserError
+from phd_exp.records.files import write_atomic
+from phd_exp.reports.collect import Records, Run, collect
+from phd_exp.reports.site.dossier import read_dossier, slug_of
+from phd_exp.reports.site.gallery import Gallery, make_gallery
+from phd_exp.reports.site.overview import overview_charts
+from phd_exp.reports.site.pages import comparison_page, overview_page, run_page
+from phd_exp.reports.site.run_data import RunData, as_script, gather, key_of, read_script, run_script
+from phd_exp.reports.tables import tables
+
+_ASSETS = Path(__file__).parent / "assets"
+
+
+@dataclass(frozen=True)
+class SiteFolder:
+    """Where things lie in a site.
+
+    site/
+        index.html  compare.html
+        runs/<slug>.html           a page a run
+        data/<slug>.js             what its charts show; data/overview.js those of the overview
+        images/<slug>/*.webp       of its gallery
+        assets/                    scripts and style, shared by all pages
+    """
+
+    path: Path
+
+    def page(self, slug: str) -> Path:
+        return self.path / "runs" / f"{slug}.html"
+
+    def script(self, slug: str) -> Path:
+        return self.path / "data" / f"{slug}.js"
+
+    def images(self, slug: str) -> Path:
+        return self.path / "images" / slug
+
+    def make(self) -> None:
+        for name in ("runs", "data", "images", "assets"):
+            (self.path / name).mkdir(parents=True, exist_ok=True)
+
+
+def build_site(runs: Path, out: Path) -> Path:
+    """Write `<out>/site/` from every run recorded under `runs`; returns its `index.html`.
+
+    A run whose files have not changed since is not read again.
+
+    Raises UserError where the folder cannot be written.
+    """
+    site = SiteFolder(out / "site")
+    try:
+        site.make()
+        return _write(site, collect(runs))
+    except OSError as error:
+        raise UserError(
+            f"{site.path}: cannot be written ({error.strerror}); choose another folder by out=DIR"
+        ) from None
+
+
+def _write(site: SiteFolder, records: Records) -> Path:
+    for asset in sorted(_ASSETS.iterdir()):
+        write_atomic(site.path / "assets" / asset.name, asset.read_bytes())
+    write_atomic(site.path / "assets" / "plotly.min.js", get_plotlyjs())
+    found = [_write_run(site, run) for run in records.runs]
+    charts = overview_charts(found)
+    flat = {"charts": {key: asdict(chart) for group in charts.values() for key, chart in group.items()}}
+    write_atomic(site.script("overview"), as_script("overview", flat))
+    write_atomic(site.path / "compare.html", comparison_page(found))
+    index = site.path / "index.html"
+    write_atomic(index, overview_page(found, tables(records), charts, []))
+    _forget(site, [run.slug for run in found])
+    return index
+
+
+def _write_run(site: SiteFolder, run: Run) -> RunData:
+    """The page of a run, its images and its data; the data comes last, because it says that the others are there."""
+    slug, key = slug_of(run), key_of(run)
+    known = read_script(site.script(slug))
+    if known and known.key == key and site.page(slug).exists():
+        return known
+    dossier = read_dossier(run)
+    gallery: Gallery | None = None
+    if dossier.assessment and dossier.predictions is not None:
+        gallery = make_gallery(dossier.predictions, dossier.config, site.images(slug))
+    data = gather(dossier, key)
+    write_atomic(site.page(slug), run_page(data, dossier, gallery))
+    write_atomic(site.script(slug), run_script(data))
+    return data
+
+
+def _forget(site: SiteFolder, slugs: Sequence[str]) -> None:
+    """Remove what belongs to runs that are no longer there."""
+    kept = {*slugs, "overview"}
+    for file in [*(site.path / "runs").glob("*.html"), *(site.path / "data").glob("*.js")]:
+        if file.stem not in kept:
+            file.unlink()
+    for folder in (site.path / "images").iterdir():
+        if folder.name not in kept:
+            for image in folder.iterdir():
+                image.unlink()
+            folder.rmdir()
