@@ -11,7 +11,7 @@ from phd_exp.records.files import write_atomic
 from phd_exp.reports.collect import Records, Run, collect
 from phd_exp.reports.site.dossier import read_dossier, slug_of
 from phd_exp.reports.site.gallery import Gallery, make_gallery
-from phd_exp.reports.site.overview import overview_charts
+from phd_exp.reports.site.overview import overview_groups
 from phd_exp.reports.site.pages import comparison_page, overview_page, run_page
 from phd_exp.reports.site.run_data import RunData, as_script, gather, key_of, read_script, run_script
 from phd_exp.reports.tables import tables
@@ -69,12 +69,14 @@ def _write(site: SiteFolder, records: Records) -> Path:
         write_atomic(site.path / "assets" / asset.name, asset.read_bytes())
     write_atomic(site.path / "assets" / "plotly.min.js", get_plotlyjs())
     found = [_write_run(site, run) for run in records.runs]
-    charts = overview_charts(found)
-    flat = {"charts": {key: asdict(chart) for group in charts.values() for key, chart in group.items()}}
+    groups = overview_groups(found)
+    flat = {
+        "charts": {key: asdict(chart) for group in groups.values() for key, chart in group.charts.items()}
+    }
     write_atomic(site.script("overview"), as_script("overview", flat))
     write_atomic(site.path / "compare.html", comparison_page(found))
     index = site.path / "index.html"
-    write_atomic(index, overview_page(found, tables(records), charts, []))
+    write_atomic(index, overview_page(found, tables(records), groups, []))
     _forget(site, [run.slug for run in found])
     return index
 

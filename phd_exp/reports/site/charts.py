@@ -52,14 +52,14 @@ def line(name: str, x: Numbers, y: Numbers, colour: int, *, dash: str = "solid",
     }
 
 
-def bars(name: str, x: Sequence[str], y: Numbers, colour: int, low: Numbers, high: Numbers) -> Trace:
-    """Points with intervals, one a category."""
+def bars(name: str, x: Numbers, y: Sequence[str], colour: int, low: Numbers, high: Numbers) -> Trace:
+    """Points with intervals, one a category of the vertical axis."""
     return {
         "type": "scatter",
         "mode": "markers",
         "name": name,
-        "x": list(x),
-        "y": _rounded(y),
+        "x": _rounded(x),
+        "y": list(y),
         "marker": {"color": f"var(--series-{colour})", "size": 8},
         "meta": {"role": "points", "low": _rounded(low), "high": _rounded(high)},
     }
@@ -69,6 +69,13 @@ def identity(low: float, high: float, name: str) -> Trace:
     trace = line(name, (low, high), (low, high), 0, dash="dash", role="identity")
     trace["line"]["width"] = 1.5
     return trace
+
+
+def square(layout: dict[str, Any], low: float, high: float) -> dict[str, Any]:
+    """A layout whose axes both reach from low to high."""
+    log = layout["xaxis"]["type"] == "log"
+    ends = [math.log10(low), math.log10(high)] if log else [low, high]
+    return {name: given | {"range": ends} for name, given in layout.items()}
 
 
 def _compact(value: Any) -> Any:
@@ -139,9 +146,9 @@ def _calibration_chart(kind: _Kind, before: Curve, after: Curve | None) -> Chart
     if after:
         said += f" Recalibrated: {_in_words(kind, after)}"
     layout = {"xaxis": axis(kind.x, kind.log), "yaxis": axis(kind.y, kind.log)}
-    if kind.diagonal and not kind.log:
-        layout |= {"xaxis": axis(kind.x, range=[0, 1]), "yaxis": axis(kind.y, range=[0, 1])}
-    elif not kind.diagonal:
+    if kind.diagonal:
+        layout = square(layout, *ends)
+    else:
         layout["yaxis"] |= {"rangemode": "tozero"}
     return Chart(kind.title, said, traces, layout)
 
@@ -251,12 +258,14 @@ def _strata_chart(evaluation: Evaluation, name: str, key: str, colour: int) -> C
     strata = [stratum for stratum in evaluation.strata if stratum.quantity == name and key in stratum.scores]
     bands = [stratum.scores[key] for stratum in strata]
     labels = [stratum.label for stratum in strata]
-    trace = bars(
-        score.label, labels, [b.value for b in bands], colour, [b.low for b in bands], [b.high for b in bands]
-    )
+    lows, highs = [band.low for band in bands], [band.high for band in bands]
+    trace = bars(score.label, [band.value for band in bands], labels, colour, lows, highs)
     trace["meta"]["n"] = [stratum.n for stratum in strata]
     said = "; ".join(
         f"{label}: {score.text(b.value)} {score.unit}" for label, b in zip(labels, bands, strict=True)
     )
-    layout = {"xaxis": axis(name) | {"type": "category"}, "yaxis": axis(score.axis, rangemode="tozero")}
+    layout = {
+        "xaxis": axis(score.axis, rangemode="tozero", nticks=5),
+        "yaxis": axis(name) | {"type": "category", "autorange": "reversed"},
+    }
     return Chart(f"{score.label} by {name}", f"{score.label} by {name}: {said}.", [trace], layout)

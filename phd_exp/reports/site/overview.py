@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from phd_exp.reports.paper import PUBLISHED
-from phd_exp.reports.site.charts import DASHES, Chart, Trace, axis, identity
+from phd_exp.reports.site.charts import DASHES, Chart, Trace, axis, identity, square
 from phd_exp.reports.site.quantities import METRICS, Quantity
 from phd_exp.reports.site.run_data import RunData
 
@@ -15,7 +16,24 @@ PRECISION = ("depth_precision", "projected_precision")
 LEARNING = ("projected_error_mm", "depth_error_mm", "nll")
 
 
-def overview_charts(runs: Sequence[RunData]) -> dict[str, dict[str, Chart]]:
+@dataclass(frozen=True)
+class Key:
+    """One entry of a legend: what a colour, a dash or both stand for."""
+
+    label: str
+    colour: int
+    dash: str = "solid"
+
+
+@dataclass(frozen=True)
+class Group:
+    """Charts that share a legend."""
+
+    charts: dict[str, Chart]
+    legend: list[Key]
+
+
+def overview_groups(runs: Sequence[RunData]) -> dict[str, Group]:
     """Calibration, precision and learning curves, a line a run; a group that would be empty is left out."""
     colours = Colours(runs)
     groups = {
@@ -23,8 +41,16 @@ def overview_charts(runs: Sequence[RunData]) -> dict[str, dict[str, Chart]]:
         "precision": {key: _precision(runs, key, colours) for key in PRECISION},
         "learning": {key: _learning(runs, key, colours) for key in LEARNING},
     }
-    found = {group: {key: chart for key, chart in charts.items() if chart} for group, charts in groups.items()}
-    return {group: {f"{group}_{key}": chart for key, chart in charts.items()} for group, charts in found.items() if charts}
+    found = {
+        name: {f"{name}_{key}": chart for key, chart in charts.items() if chart}
+        for name, charts in groups.items()
+    }
+    legends = {
+        "calibration": [Key("calibrated", 0, "dash"), *colours.of_data(runs, dashed=True)],
+        "precision": [*colours.of_data(runs, dashed=False), Key("test", 0), Key("train", 0, "dot")],
+        "learning": [*colours.of_models(runs), *colours.dashes_of_data(runs)],
+    }
+    return {name: Group(charts, legends[name]) for name, charts in found.items() if charts}
 
 
 class Colours:
@@ -34,6 +60,22 @@ class Colours:
         runs = list(runs)
         self.data = _places([data for _, data in PUBLISHED], (run.data for run in runs))
         self.models = _places([model for model, _ in PUBLISHED], (run.model for run in runs))
+
+    def of_data(self, runs: Iterable[RunData], dashed: bool) -> list[Key]:
+        there = {run.data for run in runs if "depth_calibration" in run.charts}
+        return [
+            Key(name, self.colour(place), self.dash(place) if dashed else "solid")
+            for name, place in self.data.items()
+            if name in there
+        ]
+
+    def of_models(self, runs: Iterable[RunData]) -> list[Key]:
+        there = {run.model for run in runs}
+        return [Key(name, self.colour(place)) for name, place in self.models.items() if name in there]
+
+    def dashes_of_data(self, runs: Iterable[RunData]) -> list[Key]:
+        there = {run.data for run in runs}
+        return [Key(name, 0, self.dash(place)) for name, place in self.data.items() if name in there]
 
     @staticmethod
     def colour(place: int) -> int:
@@ -53,16 +95,18 @@ def _calibration(runs: Sequence[RunData], key: str, colours: Colours) -> Chart |
     if not shown:
         return None
     traces = [
-        _of_run(trace, run, run.data, colours.colour(colours.data[run.data]), colours.dash(colours.data[run.data]))
+        _of_run(
+            trace, run, run.data, colours.colour(colours.data[run.data]), colours.dash(colours.data[run.data])
+        )
         for run in shown
         for trace in _with_role(run.charts[key], "before")
     ]
     first = shown[0].charts[key]
     diagonals = [trace["x"] for run in shown for trace in _with_role(run.charts[key], "identity")]
-    if diagonals:
-        traces.insert(0, identity(min(x[0] for x in diagonals), max(x[1] for x in diagonals), "calibrated"))
+    ends = min(x[0] for x in diagonals), max(x[1] for x in diagonals)
+    traces.insert(0, identity(*ends, "calibrated"))
     label = f"{first.title} of {len(shown)} runs, one line each, coloured by data set; calibrated runs lie on the diagonal."
-    return Chart(first.title, f"{label} {_medians(shown, key)}", traces, first.layout)
+    return Chart(first.title, f"{label} {_medians(shown, key)}", traces, square(first.layout, *ends))
 
 
 def _medians(shown: Sequence[RunData], key: str) -> str:
@@ -70,10 +114,16 @@ def _medians(shown: Sequence[RunData], key: str) -> str:
     ratios: dict[str, list[float]] = {}
     for run in shown:
         for trace in _with_role(run.charts[key], "before"):
-            pairs = [(x, y) for x, y in zip(trace["x"], trace["y"], strict=True) if x and y and x > 0 and y > 0]
+            pairs = [
+                (x, y) for x, y in zip(trace["x"], trace["y"], strict=True) if x and y and x > 0 and y > 0
+            ]
             ratios.setdefault(run.data, []).extend(math.log(y / x) for x, y in pairs)
     means = {data: math.exp(sum(values) / len(values)) for data, values in ratios.items() if values}
-    return "Vertical over horizontal, geometric mean: " + ", ".join(f"{data} {v:.2g}" for data, v in means.items()) + "."
+    return (
+        "Vertical over horizontal, geometric mean: "
+        + ", ".join(f"{data} {v:.2g}" for data, v in means.items())
+        + "."
+    )
 
 
 def _precision(runs: Sequence[RunData], key: str, colours: Colours) -> Chart | None:

@@ -1,8 +1,9 @@
 """HTML of the pages; whatever comes from files is escaped."""
 
 import time
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ from phd_exp.reports.paper import PUBLISHED
 from phd_exp.reports.site.charts import Chart
 from phd_exp.reports.site.dossier import Dossier
 from phd_exp.reports.site.gallery import Gallery
-from phd_exp.reports.site.quantities import Quantity, quantity
+from phd_exp.reports.site.overview import Group
+from phd_exp.reports.site.quantities import SCORES, Quantity, quantity
 from phd_exp.reports.site.run_data import RunData
 from phd_exp.reports.tables import PaperTable
 
@@ -62,15 +64,16 @@ _ENVIRONMENT = _environment()
 def overview_page(
     runs: Sequence[RunData],
     tables: Sequence[PaperTable],
-    charts: dict[str, dict[str, Chart]],
+    groups: dict[str, Group],
     figures: Sequence[Path],
 ) -> str:
-    presets = list(dict.fromkeys(table.preset for table in tables))
+    measured = Counter(table.preset for table in tables for cell in table.sources if cell.mean is not None)
+    presets = [preset for preset, _ in measured.most_common()]  # the fullest tables first
     return _ENVIRONMENT.get_template("overview.html").render(
         root="",
         runs=runs,
         tables=[[table for table in tables if table.preset == preset] for preset in presets],
-        charts=charts,
+        groups=groups,
         figures=figures,
         finished=sum(run.state == "finished" for run in runs),
         choices={"preset": sorted({run.preset for run in runs}), "data": sorted({run.data for run in runs})},
@@ -94,7 +97,8 @@ def run_page(run: RunData, dossier: Dossier, gallery: Gallery | None) -> str:
 
 
 def comparison_page(runs: Sequence[RunData]) -> str:
-    return _ENVIRONMENT.get_template("compare.html").render(root="", runs=runs)
+    quantities = {key: asdict(score) for key, score in SCORES.items()}
+    return _ENVIRONMENT.get_template("compare.html").render(root="", runs=runs, quantities=quantities)
 
 
 _GROUPS = {"learning": "learning_", "strata": "strata_", "calibration": ""}
@@ -121,6 +125,10 @@ def _strata(dossier: Dossier) -> list[tuple[str, int, list[tuple[Quantity, Band]
     if not dossier.assessment:
         return []
     return [
-        (f"{stratum.quantity} {stratum.label}", stratum.n, [(quantity(k), b) for k, b in stratum.scores.items()])
+        (
+            f"{stratum.quantity} {stratum.label}",
+            stratum.n,
+            [(quantity(k), b) for k, b in stratum.scores.items()],
+        )
         for stratum in dossier.assessment.before.strata
     ]

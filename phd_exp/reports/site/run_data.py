@@ -51,9 +51,9 @@ def gather(dossier: Dossier, key: str) -> RunData:
     """The data of a run from its dossier."""
     assessment = dossier.assessment
     before, after = (assessment.before, assessment.after) if assessment else (None, None)
-    charts = learning_charts(dossier)
-    if before:
-        charts |= calibration_charts(before, after) | strata_charts(before)
+    charts = calibration_charts(before, after) if before else {}
+    charts |= learning_charts(dossier)
+    charts |= strata_charts(before) if before else {}
     run = dossier.run
     return RunData(
         key=key,

@@ -20,35 +20,55 @@
 
   const label = (run) => [run.preset, run.data, run.model, run.run].join(" / ");
 
-  const SIGNIFICANT = 4;
-  const shown = (value) => (value === undefined || value === null ? "–" : String(Number(value.toPrecision(SIGNIFICANT))).replace("-", "−"));
-  const band = (score) => (score ? `${shown(score.value)} [${shown(score.low)}, ${shown(score.high)}]` : "–");
+  /** Values as run pages print them; differences and ratios to three digits. */
+  const signed = (text) => text.replace("-", "−");
+  const brief = (value) => (value === null ? "–" : signed(String(Number(value.toPrecision(3)))));
+  const band = (score, digits) => (score ? `${signed(score.value.toFixed(digits))} [${signed(score.low.toFixed(digits))}, ${signed(score.high.toFixed(digits))}]` : "–");
 
   function scores(a, b) {
+    const known = JSON.parse(document.getElementById("scores").dataset.quantities);
     const keys = [...new Set([...Object.keys(a.scores), ...Object.keys(b.scores)])];
     const rows = keys.map((key) => {
+      const { label, unit, digits } = known[key] ?? { label: key.replaceAll("_", " "), unit: "", digits: 3 };
       const [of_a, of_b] = [a.scores[key], b.scores[key]];
-      const difference = of_a && of_b ? of_b.value - of_a.value : null;
-      const apart = of_a && of_b && (of_a.high < of_b.low || of_b.high < of_a.low);
-      const ratio = difference !== null && of_a.value > 0 && of_b.value > 0 ? of_b.value / of_a.value : null;
-      return [key.replaceAll("_", " "), band(of_a), band(of_b), shown(difference), shown(ratio), difference === null ? "" : apart ? "apart" : "overlap"];
+      const both = of_a && of_b;
+      const ratio = both && of_a.value > 0 && of_b.value > 0 ? of_b.value / of_a.value : null;
+      const apart = both && (of_a.high < of_b.low || of_b.high < of_a.low);
+      return [
+        unit ? `${label} (${unit})` : label, band(of_a, digits), band(of_b, digits),
+        brief(both ? of_b.value - of_a.value : null), brief(ratio), both ? (apart ? "apart" : "overlap") : "",
+      ];
     });
-    return phdExp.table(["quantity", "A", "B", "B − A", "B / A", "intervals"], rows);
+    return phdExp.table(["Quantity", "A", "B", "B − A", "B / A", "Intervals"], rows);
   }
 
   function configuration(a, b) {
     const keys = [...new Set([...Object.keys(a.config), ...Object.keys(b.config)])];
     const rows = keys.filter((key) => a.config[key] !== b.config[key]).map((key) => [key, a.config[key] ?? "–", b.config[key] ?? "–"]);
-    return rows.length ? phdExp.table(["key", "A", "B"], rows) : Object.assign(document.createElement("p"), { textContent: "Nothing." });
+    return rows.length ? phdExp.table(["Key", "A", "B"], rows) : Object.assign(document.createElement("p"), { textContent: "Nothing." });
   }
 
   const main = (chart) => chart.data.filter((trace) => ROLES.includes(trace.meta.role));
+
+  /** Both runs' axes and diagonal, as far as either reaches. */
+  function frame(known) {
+    const layout = structuredClone(known[0].layout);
+    const diagonals = known.flatMap((chart) => chart.data.filter((trace) => trace.meta.role === "identity"));
+    if (!diagonals.length) return { layout, data: [] };
+    for (const name of ["xaxis", "yaxis"]) {
+      const ends = known.flatMap((chart) => chart.layout[name].range);
+      layout[name].range = [Math.min(...ends), Math.max(...ends)];
+    }
+    const ends = diagonals.flatMap((trace) => trace.x);
+    const reach = [Math.min(...ends), Math.max(...ends)];
+    return { layout, data: [{ ...diagonals[0], x: reach, y: reach }] };
+  }
 
   /** One chart of both runs; the second's lines are dashed, so that colour is not all that tells them apart. */
   function overlaid(key, runs) {
     const charts = runs.map((run) => run.charts[key]);
     const known = charts.filter(Boolean);
-    const data = known[0].data.filter((trace) => trace.meta.role === "identity");
+    const { layout, data } = frame(known);
     charts.forEach((chart, place) => {
       if (!chart) return;
       const traces = main(chart);
@@ -63,7 +83,7 @@
       }
     });
     const said = charts.map((chart, place) => `${NAMES[place].toUpperCase()}: ${chart ? chart.label : "not recorded"}`).join(" ");
-    return { title: known[0].title, label: said, data, layout: known[0].layout };
+    return { title: known[0].title, label: said, data, layout };
   }
 
   function figure(key, chart) {

@@ -37,27 +37,26 @@ const phdExp = (() => {
     return Object.entries(chosen).every(([key, value]) => !(key in trace.meta) || trace.meta[key] === value);
   }
 
+  const shownOf = (chart) => chart.data.filter((trace) => visible(trace, filters()));
+
   function traces(chart) {
-    const groups = new Set();
-    const shown = chart.data.filter((trace) => visible(trace, filters()));
-    return shown.flatMap((trace) => {
-      const group = trace.legendgroup ?? trace.name;
-      const line = { ...themed(trace), name: escaped(trace.name), showlegend: !groups.has(group) };
-      groups.add(group);
-      line.hovertemplate = `${trace.text ? escaped(trace.text) + "<br>" : ""}%{x:.4g}, %{y:.4g}<extra>${escaped(trace.name)}</extra>`;
+    return shownOf(chart).flatMap((trace) => {
+      const line = { ...themed(trace), name: escaped(trace.name) };
+      const place = trace.meta.role === "points" ? "%{y}: %{x:.4g}" : "%{x:.4g}, %{y:.4g}";
+      line.hovertemplate = `${trace.text ? escaped(trace.text) + "<br>" : ""}${place}<extra>${escaped(trace.name)}</extra>`;
       delete line.text;
-      if (trace.legendgroup) line.legendgroup = escaped(trace.legendgroup);
       if (trace.meta.role === "points") return [withBars(line, trace.meta)];
       return trace.meta.low ? [band(line, chart), line] : [line];
     });
   }
 
+  /** Categories on the vertical axis, the first on top: their names may be long. */
   function withBars(line, { low, high }) {
-    const y = line.y;
-    line.x = line.x.map(escaped);
-    line.error_y = {
+    const x = line.x;
+    line.y = line.y.map(escaped);
+    line.error_x = {
       type: "data", symmetric: false, thickness: 1.5, width: 4,
-      array: high.map((value, i) => value - y[i]), arrayminus: low.map((value, i) => y[i] - value),
+      array: high.map((value, i) => value - x[i]), arrayminus: low.map((value, i) => x[i] - value),
     };
     return line;
   }
@@ -67,7 +66,7 @@ const phdExp = (() => {
     const floor = chart.layout.yaxis.type === LOG ? 0 : -Infinity;
     const keep = line.x.map((_, i) => i).filter((i) => low[i] !== null && high[i] !== null && low[i] > floor);
     return {
-      type: "scatter", mode: "lines", hoverinfo: "skip", showlegend: false, legendgroup: line.legendgroup,
+      type: "scatter", mode: "lines", hoverinfo: "skip",
       x: [...keep.map((i) => line.x[i]), ...keep.map((i) => line.x[i]).reverse()],
       y: [...keep.map((i) => high[i]), ...keep.map((i) => low[i]).reverse()],
       fill: "toself", fillcolor: faint(line.line.color), line: { width: 0 },
@@ -79,30 +78,61 @@ const phdExp = (() => {
     return `rgba(${r}, ${g}, ${b}, 0.16)`;
   }
 
-  function layout(chart, named) {
-    const axis = (given) => ({
-      ...given, title: { text: escaped(given.title.text), font: { size: 13 }, standoff: 8 }, automargin: true,
-      gridcolor: style("--grid"), linecolor: style("--rule"), zeroline: false, ticks: "outside", ticklen: 4,
-      tickcolor: style("--rule"), exponentformat: "power", ...(given.type === LOG ? { dtick: logStep(chart, given) } : {}),
-    });
+  function layout(chart) {
+    const axis = (name) => {
+      const given = chart.layout[`${name}axis`];
+      return {
+        ...given, title: { text: escaped(given.title.text), font: { size: 12.5 }, standoff: 8 }, automargin: true,
+        gridcolor: style("--grid"), linecolor: style("--rule"), zeroline: false, ticks: "outside", ticklen: 4, tickangle: 0,
+        tickcolor: style("--rule"), ...(given.type === LOG ? logTicks(chart, name) : { exponentformat: "power" }),
+      };
+    };
     return {
-      ...chart.layout, xaxis: axis(chart.layout.xaxis), yaxis: axis(chart.layout.yaxis),
-      showlegend: named > 1, legend: { orientation: "h", x: 0, y: -0.24, yanchor: "top", font: { size: 12 } },
+      ...chart.layout, xaxis: axis("x"), yaxis: axis("y"), showlegend: false,
       font: { family: style("--sans"), size: 12.5, color: style("--ink") },
       paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
-      margin: { l: 8, r: 12, t: 8, b: 8 }, hovermode: "closest",
+      margin: { l: 8, r: 22, t: 12, b: 8 }, hovermode: "closest",
       hoverlabel: { bgcolor: style("--paper"), bordercolor: style("--rule"), font: { color: style("--ink") } },
       // on a touch screen a drag scrolls the page
       dragmode: window.matchMedia("(pointer: fine)").matches ? "zoom" : false,
     };
   }
 
-  /** Whole decades where the values span several, else 1, 2 and 5. */
-  function logStep(chart, given) {
-    const key = given === chart.layout.xaxis ? "x" : "y";
-    const values = chart.data.flatMap((trace) => trace[key]).filter((value) => value > 0);
-    const spread = values.length ? Math.log10(Math.max(...values) / Math.min(...values)) : 0;
-    return spread > 1.5 ? (spread > 8 ? 2 : 1) : "D2";
+  /** Ticks at powers of ten, and at 2 and 5 between them where there are few; numbers in full where they are short. */
+  function logTicks(chart, name) {
+    const values = chart.data.flatMap((trace) => [...trace[name], ...(trace.meta.low ?? [])]).filter((value) => value > 0);
+    if (!values.length) return {};
+    const [low, high] = [Math.min(...values), Math.max(...values)].map(Math.log10);
+    const decades = Array.from({ length: Math.ceil(high) - Math.floor(low) + 1 }, (_, i) => Math.floor(low) + i);
+    const every = Math.ceil(decades.length / 7);
+    const steps = high - low > 1.5 ? [1] : [1, 2, 5];
+    const ticks = decades.filter((_, i) => i % every === 0).flatMap((power) => steps.map((step) => [step, power]));
+    const text = (step, power) => (power >= -2 && power <= 4 ? Number((step * 10 ** power).toPrecision(2)).toLocaleString("en") : `${step === 1 ? "" : `${step}·`}10<sup>${power}</sup>`);
+    return { tickvals: ticks.map(([step, power]) => step * 10 ** power), ticktext: ticks.map(([step, power]) => text(step, power)) };
+  }
+
+  const DASHES = { solid: "none", dash: "7 4", dot: "2 3", dashdot: "7 3 2 3" };
+
+  /** What each line means, below the caption; not where a whole group of charts shares one legend. */
+  function legend(figure, chart) {
+    const named = new Map(shownOf(chart).map((trace) => [trace.name, trace]));
+    figure.querySelector(".legend")?.remove();
+    if (figure.closest("[data-legend=shared]") || named.size < 2) return;
+    const list = Object.assign(document.createElement("ul"), { className: "legend" });
+    for (const [name, { line, marker }] of named) {
+      const item = document.createElement("li");
+      const sample = document.createElementNS("http://www.w3.org/2000/svg", "svg");
+      sample.setAttribute("viewBox", "0 0 28 8");
+      sample.setAttribute("aria-hidden", "true");
+      const stroke = document.createElementNS("http://www.w3.org/2000/svg", "path");
+      stroke.setAttribute("d", "M0,4H28");
+      stroke.style.stroke = (line ?? marker).color;
+      stroke.style.strokeDasharray = DASHES[line?.dash ?? "solid"];
+      sample.append(stroke);
+      item.append(sample, name);
+      list.append(item);
+    }
+    figure.querySelector("figcaption").append(list);
   }
 
   const chartOf = (figure) => figure.chart ?? runs.get(figure.dataset.run)?.charts[figure.dataset.chart];
@@ -110,10 +140,9 @@ const phdExp = (() => {
   function draw(figure) {
     const chart = chartOf(figure);
     if (!chart) return Promise.resolve();
-    const data = traces(chart);
-    const named = new Set(data.filter((trace) => trace.showlegend !== false).map((trace) => trace.name)).size;
     drawn.add(figure);
-    return Plotly.react(figure.querySelector(".plot"), data, layout(chart, named), {
+    legend(figure, chart);
+    return Plotly.react(figure.querySelector(".plot"), traces(chart), layout(chart), {
       responsive: true, displayModeBar: false, displaylogo: false,
     }).then(() => figure.classList.add("drawn"));
   }
@@ -121,7 +150,7 @@ const phdExp = (() => {
   /** Numbers of the shown lines, as a table and as a file, made when asked for. */
   function tabulate(figure) {
     const chart = chartOf(figure);
-    const shown = chart.data.filter((trace) => visible(trace, filters()) && trace.meta.role !== "identity");
+    const shown = shownOf(chart).filter((trace) => trace.meta.role !== "identity");
     const bounds = shown.some((trace) => trace.meta.low);
     const head = ["line", chart.layout.xaxis.title.text, chart.layout.yaxis.title.text, ...(bounds ? ["low", "high"] : [])];
     const rows = shown.flatMap((trace) => trace.x.map((x, i) => [
