@@ -76,7 +76,11 @@ def mean_errors(file: Path, estimates: Sequence[Estimate]) -> MeanErrors:
     table = _read(file, names)
     truth = np.stack([table["x"], table["y"], table["z"]], axis=-1)
     central = in_central_half(truth, table["f"], table["S"])
-    return dict(_means(truth, central, {name: _points(table, name) for name in estimates}))
+    with np.errstate(over="ignore", invalid="ignore"):  # told below, with the file's name
+        means = dict(_means(truth, central, {name: _points(table, name) for name in estimates}))
+    if not all(np.isfinite(mean.value) for mean in means.values()):
+        raise RunError(f"{file.name}: holds estimates so far off that their mean error is no finite number")
+    return means
 
 
 def mean_nll(file: Path) -> float | None:

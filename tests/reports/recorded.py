@@ -9,6 +9,8 @@ import pandas as pd
 from phd_exp.records.runs import RunFolder, RunName
 
 COORDINATES = ("x", "y", "z")
+DATA = ("default", "occl", "scale", "occl_scale")
+ODD_PRESET = "a_b & [red]|c| `$1` %"
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,15 @@ def predicted(seed: int, n: int = 40, noise: float = 0.02, probabilistic: bool =
     return Predicted(pd.DataFrame(columns), truth, estimates, v_p)
 
 
+def by_hand(drawn: Predicted, estimate: str, quantity: str) -> np.ndarray:
+    """Sine and cosine between the true ray and the estimate, by cross and dot product; millimetres."""
+    v, v_hat = drawn.truth, drawn.estimates[estimate]
+    length = np.sqrt((v**2).sum(axis=1))
+    across = np.sqrt((np.cross(v, v_hat) ** 2).sum(axis=1)) / length
+    along = (v * v_hat).sum(axis=1) / length
+    return 1000 * (across if quantity == "projected" else np.abs(along - length))
+
+
 def record(
     runs: Path,
     data: str,
@@ -60,3 +71,40 @@ def record(
         if frame is not None:
             frame.to_parquet(folder.predictions)
     return folder
+
+
+HOSTILE = "\\end{table} $x_1$ & 5 % #1 ^~ {a} |b| `c` **d** <script> [red]e[/red] \x1b[31m 中 ' \" --"
+"""What an error's message may hold: markup of every format, and an order to the terminal."""
+
+
+def fail(
+    runs: Path, data: str, model: str, seed: int = 0, preset: str = "small", message: str = HOSTILE
+) -> None:
+    """A run that failed."""
+    folder = RunFolder(RunName(preset, data, model, seed).folder(runs))
+    folder.path.mkdir(parents=True)
+    try:
+        with folder.recording(data_manifest=None):
+            raise ValueError(message)
+    except ValueError:
+        return
+
+
+def both_tables(runs: Path) -> dict[tuple[str, str, int], Predicted]:
+    """Two seeds of every run of both tables, but one that failed and one that is missing, and another preset."""
+    drawn = {}
+    choices = [(model, data) for model in ("mae_vz", "mae_logz", "probabilistic") for data in DATA]
+    for model, data in [*choices, ("mae_xyz", "default"), ("mae_constf", "default")]:
+        for seed in (0, 1):
+            if (model, data, seed) not in (
+                ("mae_vz", "scale", 1),
+                ("mae_logz", "occl", 0),
+                ("mae_logz", "occl", 1),
+            ):
+                number = len(drawn)
+                point = predicted(number, noise=0.01 + 0.001 * number, probabilistic=model == "probabilistic")
+                drawn[model, data, seed] = point
+                record(runs, data, model, seed, point.frame)
+    fail(runs, "scale", "mae_vz", 1)
+    record(runs, "default", "mae_xyz", 0, predicted(99, probabilistic=False).frame, preset=ODD_PRESET)
+    return drawn

@@ -8,7 +8,7 @@ from phd_exp.reports.tables import PaperTable, TableCell, TableRow
 
 SYMBOLS = {
     "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
+    "~": r"$\sim$",
     "^": r"\textasciicircum{}",
     "<": r"\textless{}",
     ">": r"\textgreater{}",
@@ -97,7 +97,7 @@ def _below(table: PaperTable) -> list[str]:
         lines.append(f"Made by {_code(table.command)}")
     return [
         r"\par\medskip",
-        r"\begin{minipage}{\linewidth}\footnotesize\sloppy",
+        r"\begin{minipage}{\linewidth}\footnotesize\raggedright",
         "\\par\n".join(lines),
         r"\end{minipage}",
     ]

@@ -26,9 +26,8 @@ def print_report(records: Records, tables: Sequence[PaperTable]) -> None:
         _print_readings(console, list(readings))
     for note in dict.fromkeys(note for table in tables for note in table.notes):
         _say(console, note)
-    if tables and not console.is_terminal:
-        _say(console, OF_A_STAR)
-    console.print()
+    if tables:
+        _say(console, "" if console.is_terminal else OF_A_STAR)
     _print_runs(console, records.runs)
     if not tables:
         what = "no run of a table yet" if records.runs else "no runs recorded yet"
