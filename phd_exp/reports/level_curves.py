@@ -5,16 +5,13 @@ the bird's-eye view. Both laws are marginals of the density of (x, y, z), and bo
 are independent (see `ProjectedHuber`).
 """
 
-import io
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from scipy import integrate, optimize, special
 
 from phd_exp.distributions import ProjectedHuber
@@ -184,16 +181,3 @@ def draw_birds_eye(axes: Axes, curves: LevelCurves, truth: np.ndarray | None) ->
     axes.set(xlabel="x (m)", ylabel="z (m)")
     axes.grid(alpha=0.25)
     axes.legend(frameon=False, fontsize="small")
-
-
-def write_figure(figure: Figure, stem: Path) -> list[Path]:
-    """Write a figure as `<stem>.png` and `<stem>.pdf`, without a date, and say where."""
-    from phd_exp.records.files import write_atomic
-
-    written = []
-    for kind, metadata in (("png", {"Software": None}), ("pdf", {"CreationDate": None})):
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format=kind, dpi=200, metadata=metadata)
-        written.append(stem.with_name(f"{stem.name}.{kind}"))
-        write_atomic(written[-1], buffer.getvalue())
-    return written

@@ -9,7 +9,8 @@ from plotly.offline import get_plotlyjs
 from phd_exp.records.errors import UserError
 from phd_exp.records.files import write_atomic
 from phd_exp.reports.collect import Records, Run, collect
-from phd_exp.reports.site.dossier import read_dossier, slug_of
+from phd_exp.reports.site.dossier import read_dossier, read_predictions, slug_of
+from phd_exp.reports.site.figures import first_seeds, write_figures, write_level_curves
 from phd_exp.reports.site.gallery import Gallery, make_gallery
 from phd_exp.reports.site.overview import overview_groups
 from phd_exp.reports.site.pages import comparison_page, overview_page, run_page
@@ -57,18 +58,20 @@ def build_site(runs: Path, out: Path) -> Path:
     site = SiteFolder(out / "site")
     try:
         site.make()
-        return _write(site, collect(runs))
+        return _write(site, collect(runs), out / "figures")
     except OSError as error:
         raise UserError(
             f"{site.path}: cannot be written ({error.strerror}); choose another folder by out=DIR"
         ) from None
 
 
-def _write(site: SiteFolder, records: Records) -> Path:
+def _write(site: SiteFolder, records: Records, figures: Path) -> Path:
     for asset in sorted(_ASSETS.iterdir()):
         write_atomic(site.path / "assets" / asset.name, asset.read_bytes())
     write_atomic(site.path / "assets" / "plotly.min.js", get_plotlyjs())
     found = [_write_run(site, run) for run in records.runs]
+    write_figures(found, figures)
+    _write_level_curves(site, records, found, figures)
     groups = overview_groups(found)
     flat = {
         "charts": {key: asdict(chart) for group in groups.values() for key, chart in group.charts.items()}
@@ -76,7 +79,7 @@ def _write(site: SiteFolder, records: Records) -> Path:
     write_atomic(site.script("overview"), as_script("overview", flat))
     write_atomic(site.path / "compare.html", comparison_page(found))
     index = site.path / "index.html"
-    write_atomic(index, overview_page(found, tables(records), groups, []))
+    write_atomic(index, overview_page(found, tables(records), groups, _shown(figures)))
     _forget(site, [run.slug for run in found])
     return index
 
@@ -95,6 +98,21 @@ def _write_run(site: SiteFolder, run: Run) -> RunData:
     write_atomic(site.page(slug), run_page(data, dossier, gallery))
     write_atomic(site.script(slug), run_script(data))
     return data
+
+
+def _write_level_curves(site: SiteFolder, records: Records, found: Sequence[RunData], figures: Path) -> None:
+    """The paper's first figure of every preset and data set, where the run's page has changed since."""
+    runs = {slug_of(run): run for run in records.runs}
+    for data in first_seeds(found):
+        stem = figures / f"level_curves-{data.preset}-{data.data}"
+        drawn = stem.with_name(f"{stem.name}.pdf")
+        if not drawn.exists() or drawn.stat().st_mtime < site.script(data.slug).stat().st_mtime:
+            write_level_curves(read_predictions(runs[data.slug].folder), data.config, stem)
+
+
+def _shown(figures: Path) -> list[str]:
+    """Names of the pictures that are there as PNG and PDF."""
+    return sorted(file.stem for file in figures.glob("*.png") if file.with_suffix(".pdf").exists())
 
 
 def _forget(site: SiteFolder, slugs: Sequence[str]) -> None:

@@ -3,16 +3,15 @@
 import hashlib
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, TypeVar
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from phd_exp.records.errors import RunError, UserError
-from phd_exp.records.runs import RunStatus
+from phd_exp.records.runs import RunFolder, RunStatus
 from phd_exp.reports.collect import Run
 from phd_exp.reports.site.assessment import Assessment, assess
 
@@ -29,12 +28,13 @@ class Dossier:
         run: its choices and its state.
         metrics: a series a key of metrics.jsonl, all as long as `epochs`; None where a row lacks the key.
         epochs: epochs trained before each row; 0 is the untrained network.
+        config: every value of config.yaml as text, by its dotted path.
         predictions: the table of predictions.parquet.
     """
 
     run: Run
     status: RunStatus | None
-    config: Mapping[str, Any]
+    config: Mapping[str, str]
     epochs: list[int]
     metrics: Mapping[str, list[float | None]]
     predictions: pa.Table | None
@@ -49,18 +49,31 @@ def read_dossier(run: Run) -> Dossier:
     rows = _sound(_attempt(folder.metrics, notes) or [])
     predictions = None
     if folder.predictions.exists():
-        predictions = _attempt(lambda: _table(folder.predictions), notes)
+        predictions = _attempt(lambda: read_predictions(folder), notes)
     assessment = None if predictions is None else _attempt(lambda: assess(folder, predictions), notes)
     return Dossier(
         run=run,
         status=_attempt(folder.status, notes),
-        config=_attempt(folder.config, notes) or {},
+        config=_attempt(lambda: read_config(folder), notes) or {},
         epochs=[row[EPOCH] + 1 for row in rows],
         metrics=_series(rows),
         predictions=predictions,
         assessment=assessment,
         notes=list(dict.fromkeys(notes)),
     )
+
+
+def read_config(folder: RunFolder) -> dict[str, str]:
+    """Every value of a run's configuration as text, by its dotted path. Raises RunError where it cannot be read."""
+    return dict(_flattened(folder.config()))
+
+
+def _flattened(config: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, str]]:
+    for name, value in config.items():
+        if isinstance(value, Mapping):
+            yield from _flattened(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", "" if value is None else str(value)
 
 
 def slug_of(run: Run) -> str:
@@ -82,7 +95,9 @@ def _attempt(read: Callable[[], Found], notes: list[str]) -> Found | None:
         return None
 
 
-def _table(file: Path) -> pa.Table:
+def read_predictions(folder: RunFolder) -> pa.Table:
+    """The table of a run's predictions. Raises RunError where it cannot be read or is empty."""
+    file = folder.predictions
     try:
         table = pq.read_table(file)
     except (pa.ArrowException, OSError) as error:

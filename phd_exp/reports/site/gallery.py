@@ -80,17 +80,16 @@ class Gallery:
     levels: tuple[float, ...] = LEVELS
 
 
-def images_folder(config: Mapping[str, Any]) -> Path | None:
-    """Where the test images of a run on a rendered data set lie; None for images of another kind."""
-    data = config.get("data")
-    spec = data.get("spec") if isinstance(data, Mapping) else None
-    if not (isinstance(data, Mapping) and isinstance(spec, Mapping)):
-        return None
-    root, variant = data.get("root"), spec.get("variant")
-    return Path(root) / variant / "test" if isinstance(root, str) and isinstance(variant, str) else None
+def images_folder(config: Mapping[str, str]) -> Path | None:
+    """Where the test images of a run on a rendered data set lie; None for images of another kind.
+
+    `config` holds every value by its dotted path.
+    """
+    root, variant = config.get("data.root"), config.get("data.spec.variant")
+    return Path(root) / variant / "test" if root and variant else None
 
 
-def make_gallery(predictions: pa.Table, config: Mapping[str, Any], out: Path) -> Gallery:
+def make_gallery(predictions: pa.Table, config: Mapping[str, str], out: Path) -> Gallery:
     """Choose the pictures, and write their images into `out` (made if missing)."""
     columns = {name: predictions[name].to_numpy() for name in predictions.column_names}
     key, ranked_by, error = _ranking(predictions, columns)
@@ -135,7 +134,7 @@ def _picture(row: Mapping[str, Any], key: str, source: Path | None, file: Path) 
     truth = np.array([row[axis] for axis in "xyz"], dtype=float)
     mode = np.array([row[f"mode_{axis}"] for axis in "xyz"], dtype=float)
     f, S = float(row["f"]), float(row["S"])
-    curves = _curves(row)
+    curves = curves_of(row)
     outlines = [on_image(points, f, S) for points in curves.projected] if curves else []
     facts = _facts(row, key)
     image = _copy_image(source, str(row["file_name"]), file)
@@ -154,7 +153,7 @@ def _picture(row: Mapping[str, Any], key: str, source: Path | None, file: Path) 
     )
 
 
-def _curves(row: Mapping[str, Any]) -> LevelCurves | None:
+def curves_of(row: Mapping[str, Any]) -> LevelCurves | None:
     """The level curves of a row; None for a baseline, and for numbers that are no distribution."""
     names = ("mu_x", "mu_y", "mu_z", "A_xx", "A_xy", "A_yy", "a")
     if any(name not in row for name in names):
@@ -176,17 +175,26 @@ def _facts(row: Mapping[str, Any], key: str) -> list[tuple[str, str]]:
     return facts + [(label, f"{row[name]:.{digits}f} {unit}".strip()) for name, label, unit, digits in known]
 
 
-def _copy_image(source: Path | None, name: str, file: Path) -> bool:
-    """Write a copy fit for a page; False where the image is not there, no image, or outside its folder."""
-    if source is None or not (source / name).resolve().is_relative_to(source.resolve()):
-        return False
+def load_image(source: Path, name: str) -> Image.Image | None:
+    """A test image, shrunk where it is large; None where it is not there, no image, or outside its folder."""
+    file = source / name
+    if not file.resolve().is_relative_to(source.resolve()):
+        return None
     try:
-        with Image.open(source / name, formats=("PNG", "WEBP", "JPEG")) as image:
+        with Image.open(file, formats=("PNG", "WEBP", "JPEG")) as image:
             image.thumbnail((LARGEST, LARGEST))
-            buffer = io.BytesIO()
-            image.convert("RGB").save(buffer, "WEBP", quality=90)
+            return image.convert("RGB")
     except (OSError, ValueError, Image.DecompressionBombError):
+        return None
+
+
+def _copy_image(source: Path | None, name: str, file: Path) -> bool:
+    """Write a copy fit for a page; False where there is no image."""
+    image = load_image(source, name) if source else None
+    if image is None:
         return False
+    buffer = io.BytesIO()
+    image.save(buffer, "WEBP", quality=90)
     write_atomic(file, buffer.getvalue())
     return True
 

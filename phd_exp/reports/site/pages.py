@@ -65,7 +65,7 @@ def overview_page(
     runs: Sequence[RunData],
     tables: Sequence[PaperTable],
     groups: dict[str, Group],
-    figures: Sequence[Path],
+    figures: Sequence[str],
 ) -> str:
     measured = Counter(table.preset for table in tables for cell in table.sources if cell.mean is not None)
     presets = [preset for preset, _ in measured.most_common()]  # the fullest tables first

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -14,7 +13,7 @@ from phd_exp.records.errors import RunError
 from phd_exp.reports.collect import Run
 from phd_exp.reports.evaluation import Band
 from phd_exp.reports.site.charts import Chart, calibration_charts, learning_charts, strata_charts
-from phd_exp.reports.site.dossier import Dossier, slug_of
+from phd_exp.reports.site.dossier import Dossier, read_config, slug_of
 from phd_exp.reports.site.gallery import images_folder
 
 
@@ -67,18 +66,9 @@ def gather(dossier: Dossier, key: str) -> RunData:
         n=before.n if before else None,
         scores=dict(before.scores) if before else {},
         recalibrated=dict(after.scores) if after else {},
-        config=dict(flattened(dossier.config)),
+        config=dict(dossier.config),
         charts=charts,
     )
-
-
-def flattened(config: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, str]]:
-    """Every value of nested mappings, as text, by its dotted path."""
-    for name, value in config.items():
-        if isinstance(value, Mapping):
-            yield from flattened(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", "" if value is None else str(value)
 
 
 def as_script(name: str, content: Any) -> str:
@@ -106,7 +96,7 @@ def key_of(run: Run) -> str:
     """A digest that changes whenever a page of the run would: its files, its state, its images, this code."""
     files = [file for file in run.folder.path.iterdir() if file.is_file() and not file.name.startswith(".")]
     try:
-        images = images_folder(run.folder.config())
+        images = images_folder(read_config(run.folder))
     except (RunError, OSError):
         images = None
     seen = [_stamp(file) for file in sorted([*files, *([images] if images else [])])]
