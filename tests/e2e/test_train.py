@@ -20,6 +20,7 @@ MODELS = ("probabilistic", "mae_vz", "mae_logz", "mae_xyz", "mae_constf")
 DATA = ("default", "occl", "scale", "occl_scale")
 ERRORS = {"loss", "projected_error_mm", "depth_error_mm"}
 OF_A_DISTRIBUTION = {"nll", "depth_precision", "projected_precision"}
+CALIBRATION = {"depth_ence", "projected_ence", "miscalibration_area", "depth_crps_mm", "left_out"}
 
 
 def only_run(runs: Path) -> RunFolder:
@@ -47,6 +48,10 @@ def test_every_model_leaves_a_whole_record(train: Callable, tmp_path: Path, mode
         assert {f"{split}/{name}" for split in ("train", "test") for name in quantities} <= row.keys()
         assert all(math.isfinite(value) for value in row.values())
     results = run.results()
+    for name in CALIBRATION:  # of the same weights: binned after the last epoch, exact in the results
+        key = f"test/calibration/{name}"
+        assert (key in results) is (key in rows[-1]) is (model == "probabilistic")
+        assert results.get(key, 0) == pytest.approx(rows[-1].get(key, 0), rel=0.02)
     table = pd.read_parquet(run.predictions)
     assert len(table) == 6
     for name in ("projected_error_mm", "depth_error_mm"):
