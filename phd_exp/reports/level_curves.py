@@ -120,7 +120,7 @@ def _marginal() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _excess(distribution: ProjectedHuber, t: np.ndarray, level: float) -> float:
     """The c with P(a (max(t, 1/t) - 1) + e(q_1) <= c) = level."""
-    s, energy, cumulative = _marginal()
+    _, energy, cumulative = _marginal()
     of_depth = _depth_energy(distribution, t)
 
     def surplus(c: float) -> float:
@@ -136,8 +136,8 @@ def _depth_energy(distribution: ProjectedHuber, t: np.ndarray) -> np.ndarray:
 def _outline(distribution: ProjectedHuber, excess: float) -> Points:
     """The (x, z) with a (max(t, 1/t) - 1) + e(q_1) = c, once around.
 
-    Given z, x = z mu_x + |g| q_1 in law, where g is the first row of mu_z A^(-1); so (x, z) has the density of t times
-    that of q_1, both at their own scale.
+    Given z, x = z mu_x + |g| q_1 in law, where g is the first row of mu_z A^(-1); so (x, z) has the density of t
+    times that of q_1, both at their own scale.
 
     Source: own derivation; the law of (x, z) is constant along the curve, checked by quadrature.
     """

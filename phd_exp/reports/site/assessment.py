@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from phd_exp.distributions.temperature import Temperature
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.reports.evaluation import (
     Evaluation,
-    Temperature,
     evaluate,
     evaluate_points,
     fit_temperature,
@@ -19,12 +19,12 @@ from phd_exp.reports.evaluation import (
 
 @dataclass(frozen=True)
 class Assessment:
-    """Of a baseline, errors alone; of a distribution, everything, and again under a temperature fitted on data held out.
+    """Of a baseline, errors alone; of a distribution, everything, and again after recalibration.
 
     Attributes:
         before: of the predictions as recorded.
         after: of the same predictions recalibrated; None where nothing was held out.
-        temperature: what recalibrated them.
+        temperature: what recalibrated them, fitted on samples held out of training.
     """
 
     before: Evaluation

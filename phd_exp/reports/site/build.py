@@ -2,15 +2,22 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import groupby
 from pathlib import Path
 
 from plotly.offline import get_plotlyjs
 
-from phd_exp.records.errors import UserError
+from phd_exp.records.errors import RunError, UserError
 from phd_exp.records.files import write_atomic
 from phd_exp.reports.collect import Records, Run, collect
-from phd_exp.reports.site.dossier import read_dossier, read_predictions, slug_of
-from phd_exp.reports.site.figures import first_seeds, write_figures, write_level_curves
+from phd_exp.reports.site.dossier import Dossier, read_dossier, read_predictions, slug_of
+from phd_exp.reports.site.figures import (
+    CALIBRATION,
+    LEVEL_CURVES,
+    first_seeds,
+    write_figures,
+    write_level_curves,
+)
 from phd_exp.reports.site.gallery import Gallery, make_gallery
 from phd_exp.reports.site.overview import overview_groups
 from phd_exp.reports.site.pages import comparison_page, overview_page, run_page
@@ -70,8 +77,7 @@ def _write(site: SiteFolder, records: Records, figures: Path) -> Path:
         write_atomic(site.path / "assets" / asset.name, asset.read_bytes())
     write_atomic(site.path / "assets" / "plotly.min.js", get_plotlyjs())
     found = [_write_run(site, run) for run in records.runs]
-    write_figures(found, figures)
-    _write_level_curves(site, records, found, figures)
+    _write_figures(site, records, found, figures)
     groups = overview_groups(found)
     flat = {
         "charts": {key: asdict(chart) for group in groups.values() for key, chart in group.charts.items()}
@@ -91,23 +97,40 @@ def _write_run(site: SiteFolder, run: Run) -> RunData:
     if known and known.key == key and site.page(slug).exists():
         return known
     dossier = read_dossier(run)
-    gallery: Gallery | None = None
-    if dossier.assessment and dossier.predictions is not None:
-        gallery = make_gallery(dossier.predictions, dossier.config, site.images(slug))
+    gallery = _gallery(dossier, site.images(slug))
     data = gather(dossier, key)
     write_atomic(site.page(slug), run_page(data, dossier, gallery))
     write_atomic(site.script(slug), run_script(data))
     return data
 
 
-def _write_level_curves(site: SiteFolder, records: Records, found: Sequence[RunData], figures: Path) -> None:
-    """The paper's first figure of every preset and data set, where the run's page has changed since."""
-    runs = {slug_of(run): run for run in records.runs}
-    for data in first_seeds(found):
-        stem = figures / f"level_curves-{data.preset}-{data.data}"
-        drawn = stem.with_name(f"{stem.name}.pdf")
-        if not drawn.exists() or drawn.stat().st_mtime < site.script(data.slug).stat().st_mtime:
-            write_level_curves(read_predictions(runs[data.slug].folder), data.config, stem)
+def _gallery(dossier: Dossier, images: Path) -> Gallery | None:
+    if dossier.assessment is None or dossier.predictions is None:
+        return None
+    try:
+        return make_gallery(dossier.predictions, dossier.config, images)
+    except RunError as error:
+        dossier.notes.append(str(error))
+        return None
+
+
+def _write_figures(site: SiteFolder, records: Records, found: Sequence[RunData], figures: Path) -> None:
+    """The figures of every preset, where any run in them has changed since."""
+    folders = {slug_of(run): run.folder for run in records.runs}
+    chosen = first_seeds(found)
+    for preset, group in groupby(chosen, key=lambda run: run.preset):
+        of_preset = list(group)
+        changed = {run.slug: site.script(run.slug).stat().st_mtime for run in of_preset}
+        if _older(figures / f"{CALIBRATION}-{preset}.pdf", max(changed.values())):
+            write_figures(preset, of_preset, figures)
+        for run in of_preset:
+            stem = figures / f"{LEVEL_CURVES}-{preset}-{run.data}"
+            if _older(stem.with_name(f"{stem.name}.pdf"), changed[run.slug]):
+                write_level_curves(read_predictions(folders[run.slug]), run.config, stem)
+
+
+def _older(file: Path, changed: float) -> bool:
+    return not file.exists() or file.stat().st_mtime < changed
 
 
 def _shown(figures: Path) -> list[str]:

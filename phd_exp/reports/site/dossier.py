@@ -51,6 +51,8 @@ def read_dossier(run: Run) -> Dossier:
     if folder.predictions.exists():
         predictions = _attempt(lambda: read_predictions(folder), notes)
     assessment = None if predictions is None else _attempt(lambda: assess(folder, predictions), notes)
+    if assessment and assessment.before.left_out:
+        notes.append(f"{assessment.before.left_out} test samples are left out: a prediction was not finite")
     return Dossier(
         run=run,
         status=_attempt(folder.status, notes),

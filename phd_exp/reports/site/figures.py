@@ -16,6 +16,8 @@ from phd_exp.reports.site.charts import Trace
 from phd_exp.reports.site.gallery import curves_of, images_folder, load_image
 from phd_exp.reports.site.run_data import RunData
 
+CALIBRATION, PRECISION, LEVEL_CURVES = "calibration", "precision", "level_curves"
+"""What the files are called, before preset and data set."""
 _STYLES = (("#0072b2", "-"), ("#c44e00", "--"), ("#007d5a", ":"), ("#a3487c", "-."), ("#8a6200", "-"))
 _ORDER = list(dict.fromkeys(data for _, data in PUBLISHED))
 
@@ -36,17 +38,16 @@ def first_seeds(runs: Iterable[RunData]) -> list[RunData]:
     )
 
 
-def write_figures(runs: Sequence[RunData], folder: Path) -> list[Path]:
-    """Calibration and precision of every preset, a line a data set: `{calibration,precision}-<preset>.{png,pdf}`."""
+def write_figures(preset: str, runs: Sequence[RunData], folder: Path) -> list[Path]:
+    """Calibration and precision of a preset, a line a run: `{calibration,precision}-<preset>.{png,pdf}`."""
     folder.mkdir(parents=True, exist_ok=True)
-    written = []
-    chosen = first_seeds(runs)
-    for preset in dict.fromkeys(run.preset for run in chosen):
-        of_preset = [run for run in chosen if run.preset == preset]
-        for name, draw in (("calibration", _calibration), ("precision", _precision)):
-            if (figure := draw(of_preset)) is not None:
-                written += write_figure(figure, folder / f"{name}-{preset}")
-    return written
+    drawn = {CALIBRATION: _calibration(runs), PRECISION: _precision(runs)}
+    return [
+        file
+        for name, figure in drawn.items()
+        if figure is not None
+        for file in write_figure(figure, folder / f"{name}-{preset}")
+    ]
 
 
 def _calibration(runs: Sequence[RunData]) -> Figure | None:

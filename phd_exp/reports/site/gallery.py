@@ -9,19 +9,19 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import torch
-from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
-from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions.columns import PARAMETERS, from_columns
+from phd_exp.records.errors import RunError
 from phd_exp.records.files import write_atomic
 from phd_exp.reports.level_curves import LEVELS, LevelCurves, level_curves, on_image
 from phd_exp.reports.site.assessment import is_distribution
+from phd_exp.reports.site.panels import BirdsEye, birds_eye_view, close_up, point, svg_path
 from phd_exp.reports.site.quantities import SCORES
 
 EACH = 6
+NEEDED = ("file_name", "f", "S", "x", "y", "z", "mode_x", "mode_y", "mode_z")
 LARGEST = 448  # pixels; larger test images are shrunk for the page
-_CLOSE = 0.25  # a share of the image below which curves deserve a close-up
-_PANEL, _LEFT, _BOTTOM, _EDGE = 200.0, 44.0, 30.0, 6.0  # of the bird's-eye view, in its own units
 _FACTS = {
     "visibility": ("visibility", "", 2),
     "truncation": ("truncation", "", 2),
@@ -29,21 +29,6 @@ _FACTS = {
     "z": ("true depth", "m", 2),
     "mode_z": ("estimated depth", "m", 2),
 }
-
-
-@dataclass(frozen=True)
-class BirdsEye:
-    """The curves of (x, z) in a square of `_PANEL` units, with ticks in metres."""
-
-    paths: list[str]
-    mode: tuple[float, float]
-    truth: tuple[float, float]
-    x_ticks: list[tuple[float, str]]
-    z_ticks: list[tuple[float, str]]
-    size: float = _PANEL
-    left: float = _LEFT
-    bottom: float = _PANEL - _BOTTOM
-    edge: float = _EDGE
 
 
 @dataclass(frozen=True)
@@ -90,7 +75,13 @@ def images_folder(config: Mapping[str, str]) -> Path | None:
 
 
 def make_gallery(predictions: pa.Table, config: Mapping[str, str], out: Path) -> Gallery:
-    """Choose the pictures, and write their images into `out` (made if missing)."""
+    """Choose the pictures, and write their images into `out` (made if missing).
+
+    Raises RunError where the table lacks a column.
+    """
+    missing = [name for name in NEEDED if name not in predictions.column_names]
+    if missing:
+        raise RunError(f"no gallery: predictions lack the column {', '.join(missing)}; run the model again")
     columns = {name: predictions[name].to_numpy() for name in predictions.column_names}
     key, ranked_by, error = _ranking(predictions, columns)
     order = np.argsort(error, kind="stable")  # NaN comes last: a prediction that is none is the worst
@@ -144,24 +135,22 @@ def _picture(row: Mapping[str, Any], key: str, source: Path | None, file: Path) 
         alt=f"Test image {row['file_name']}: " + ", ".join(f"{name} {value}" for name, value in facts),
         image=file.name if image else None,
         side=S,
-        paths=[_path(points) for points in outlines],
-        mode=_pair(on["mode"]),
-        truth=_pair(on["truth"]),
-        close_up=_close_up(np.concatenate([*outlines, on["truth"][None], on["mode"][None]]), S),
-        birds_eye=_birds_eye(curves, truth) if curves else None,
+        paths=[svg_path(points) for points in outlines],
+        mode=point(on["mode"]),
+        truth=point(on["truth"]),
+        close_up=close_up(np.concatenate([*outlines, on["truth"][None], on["mode"][None]]), S),
+        birds_eye=birds_eye_view(curves, truth) if curves and np.isfinite(truth).all() else None,
         facts=facts,
     )
 
 
 def curves_of(row: Mapping[str, Any]) -> LevelCurves | None:
     """The level curves of a row; None for a baseline, and for numbers that are no distribution."""
-    names = ("mu_x", "mu_y", "mu_z", "A_xx", "A_xy", "A_yy", "a")
-    if any(name not in row for name in names):
+    if any(name not in row for name in PARAMETERS):
         return None
-    x, y, z, A_xx, A_xy, A_yy, a = (torch.tensor(float(row[name]), dtype=torch.float64) for name in names)
-    A = torch.stack([torch.stack([A_xx, A_xy]), torch.stack([A_xy, A_yy])])
+    numbers = {name: torch.tensor(float(row[name]), dtype=torch.float64) for name in PARAMETERS}
     try:
-        return level_curves(ProjectedHuber(torch.stack([x, y]), z, A, a, validate_args=True))
+        return level_curves(from_columns(numbers))
     except ValueError:
         return None
 
@@ -197,54 +186,3 @@ def _copy_image(source: Path | None, name: str, file: Path) -> bool:
     image.save(buffer, "WEBP", quality=90)
     write_atomic(file, buffer.getvalue())
     return True
-
-
-def _close_up(points: np.ndarray, S: float) -> tuple[float, float, float] | None:
-    low, high = points.min(axis=0), points.max(axis=0)
-    extent = float((high - low).max())
-    if not np.isfinite(extent) or extent > _CLOSE * S:
-        return None
-    side = max(1.6 * extent, 8.0)
-    left, top = (low + high) / 2 - side / 2
-    return round(float(left), 2), round(float(top), 2), round(side, 2)
-
-
-def _birds_eye(curves: LevelCurves, truth: np.ndarray) -> BirdsEye:
-    seen = np.concatenate([*curves.birds_eye, curves.mode[None, ::2], truth[None, ::2]])
-    low, high = seen.min(axis=0), seen.max(axis=0)
-    margin = 0.06 * (high - low)
-    low, high = low - margin, high + margin
-    width, height = _PANEL - _LEFT - _EDGE, _PANEL - _BOTTOM - _EDGE
-
-    def place(points: np.ndarray) -> np.ndarray:
-        share = (points - low) / (high - low)
-        return np.stack([_LEFT + width * share[..., 0], _PANEL - _BOTTOM - height * share[..., 1]], axis=-1)
-
-    def ticks(axis: int) -> list[tuple[float, str]]:
-        values = MaxNLocator(3, steps=[1, 2, 5, 10]).tick_values(low[axis], high[axis])
-        step = values[1] - values[0]
-        digits = max(0, int(np.ceil(-np.log10(step) - 1e-9)))
-        inside = [value for value in values if low[axis] <= value <= high[axis]]
-        where = place(np.array([[value, value] for value in inside]))[:, axis] if inside else []
-        return [
-            (round(float(w), 1), f"{v + 0.0:.{digits}f}".replace("-", "−"))
-            for w, v in zip(where, inside, strict=True)
-        ]
-
-    return BirdsEye(
-        paths=[_path(place(points)) for points in curves.birds_eye],
-        mode=_pair(place(curves.mode[::2])),
-        truth=_pair(place(truth[::2])),
-        x_ticks=ticks(0),
-        z_ticks=ticks(1),
-    )
-
-
-def _path(points: np.ndarray) -> str:
-    """Points as an SVG path; what lies far outside a picture is brought nearer, or renderers would lose digits."""
-    return "M" + " ".join(f"{x:.2f},{y:.2f}" for x, y in np.clip(points, -1e4, 1e4)) + "Z"
-
-
-def _pair(point: np.ndarray) -> tuple[float, float]:
-    x, y = np.clip(np.nan_to_num(point, nan=-1e4), -1e4, 1e4)
-    return round(float(x), 2), round(float(y), 2)

@@ -105,7 +105,7 @@ def _calibration(runs: Sequence[RunData], key: str, colours: Colours) -> Chart |
     diagonals = [trace["x"] for run in shown for trace in _with_role(run.charts[key], "identity")]
     ends = min(x[0] for x in diagonals), max(x[1] for x in diagonals)
     traces.insert(0, identity(*ends, "calibrated"))
-    label = f"{first.title} of {len(shown)} runs, one line each, coloured by data set; calibrated runs lie on the diagonal."
+    label = f"{first.title}, {len(shown)} runs, coloured by data set; a calibrated one lies on the diagonal."
     return Chart(first.title, f"{label} {_medians(shown, key)}", traces, square(first.layout, *ends))
 
 
@@ -135,7 +135,9 @@ def _precision(runs: Sequence[RunData], key: str, colours: Colours) -> Chart | N
         for trace in _with_role(run.charts[f"learning_{key}"], role)
     ]
     metric = METRICS[key]
-    label = f"{metric.label} over the epochs, solid on the test and dotted on the training split. {_ends(traces, metric)}"
+    label = (
+        f"{metric.label} over the epochs, solid: test split, dotted: training split. {_ends(traces, metric)}"
+    )
     return _over_epochs(metric, metric.label, label, traces)
 
 

@@ -32,9 +32,8 @@ class Quantity:
         return f"{value:.{self.digits}f}".replace("-", "−")
 
 
-_SHARPNESS = "how narrow the predictions are, right or wrong: root mean square predicted deviation"
 _RISK = "mean error of the predictions kept when the least certain are dropped first, averaged over the share kept"
-_EXCESS = "0 where predicted variance sorts the errors perfectly, 1 where it sorts them no better than chance"
+_EXCESS = "0 if predicted variance ranks the errors perfectly, 1 if no better than chance"
 
 SCORES = {
     "projected_error_mm": Quantity(
@@ -43,23 +42,34 @@ SCORES = {
     "depth_error_mm": Quantity("Depth error", "mm", 1, "error along the true viewing ray"),
     "nll": Quantity("NLL", "nats", 2, "mean negative log density at the truth, per cubic metre", None),
     "depth_crps_mm": Quantity(
-        "CRPS of depth", "mm", 1, "continuous ranked probability score of the depth's law"
+        "CRPS of depth", "mm", 1, "continuous ranked probability score of the depth’s law"
     ),
-    "energy_score_mm": Quantity("Energy score", "mm", 1, "the same idea for the position in space"),
+    "energy_score_mm": Quantity("Energy score", "mm", 1, "the same of the position in space"),
     "depth_ence": Quantity(
-        "Depth ENCE", "", 3, "expected normalised calibration error of the depth's variance"
+        "Depth ENCE", "", 3, "expected normalised calibration error of the depth’s variance"
     ),
-    "projected_ence": Quantity("Projected ENCE", "", 3, "the same for the projected position"),
+    "projected_ence": Quantity("Projected ENCE", "", 3, "the same of the variance of (x, y)/z"),
     "miscalibration_area": Quantity(
         "Miscalibration area", "", 3, "between the coverage of credible regions and the diagonal"
     ),
-    "depth_pit_area": Quantity(
-        "Depth PIT area", "", 3, "between the depth's PIT distribution and the diagonal"
+    "overconfidence": Quantity(
+        "Overconfidence",
+        "",
+        3,
+        "mean credible level of the truths, less 1/2; negative where predictions are too cautious",
     ),
-    "depth_sharpness_mm": Quantity("Depth sharpness", "mm", 1, f"{_SHARPNESS} of z", None),
-    "projected_sharpness_mrad": Quantity("Projected sharpness", "mrad", 2, f"{_SHARPNESS} of (x, y)/z", None),
+    "depth_pit_area": Quantity(
+        "Depth PIT area", "", 3, "between the distribution of the depth’s PIT and the diagonal"
+    ),
+    "depth_pit_ks": Quantity(
+        "Depth PIT distance", "", 3, "the largest gap between those two (Kolmogorov–Smirnov)"
+    ),
+    "depth_sharpness_mm": Quantity(
+        "Depth sharpness", "mm", 1, "root mean square of the predicted standard deviation of z", None
+    ),
+    "projected_sharpness_mrad": Quantity("Projected sharpness", "mrad", 2, "the same of x/z and y/z", None),
     "depth_risk_coverage_area": Quantity("Depth risk–coverage area", "mm", 1, _RISK),
-    "projected_risk_coverage_area": Quantity("Projected risk–coverage area", "mm", 1, _RISK),
+    "projected_risk_coverage_area": Quantity("Projected risk–coverage area", "mrad", 2, _RISK),
     "depth_risk_coverage_excess": Quantity("Depth risk–coverage excess", "", 3, _EXCESS),
     "projected_risk_coverage_excess": Quantity("Projected risk–coverage excess", "", 3, _EXCESS),
 }

@@ -12,9 +12,10 @@ from pydantic import TypeAdapter, ValidationError
 from phd_exp.records.errors import RunError
 from phd_exp.reports.collect import Run
 from phd_exp.reports.evaluation import Band
-from phd_exp.reports.site.charts import Chart, calibration_charts, learning_charts, strata_charts
+from phd_exp.reports.site.charts import Chart
 from phd_exp.reports.site.dossier import Dossier, read_config, slug_of
 from phd_exp.reports.site.gallery import images_folder
+from phd_exp.reports.site.run_charts import calibration_charts, learning_charts, strata_charts
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ def gather(dossier: Dossier, key: str) -> RunData:
 
 
 def as_script(name: str, content: Any) -> str:
-    """`phdExp.receive("<name>", {...});`, safe wherever it is put: no `</script>`, no line separator of JavaScript."""
+    """`phdExp.receive("<name>", {...});`, safe in HTML and JavaScript: without <, >, & and line separators."""
     text = f"phdExp.receive({json.dumps(name)}, {json.dumps(content, allow_nan=False, separators=(',', ':'))});\n"
     for character in "<>&\u2028\u2029":
         text = text.replace(character, f"\\u{ord(character):04x}")
