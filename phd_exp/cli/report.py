@@ -1,6 +1,8 @@
-"""`python -m phd_exp report`: the paper's tables from all recorded runs, printed and written."""
+"""`python -m phd_exp report`: the paper's tables from all recorded runs, printed and written, and the site of them."""
 
 import sys
+from importlib.util import find_spec
+from pathlib import Path
 
 from phd_exp.cli.folders import named_folders, require_folder
 from phd_exp.records.errors import UserError
@@ -10,6 +12,7 @@ from phd_exp.reports.formats.terminal import print_report
 from phd_exp.reports.tables import tables
 
 FOLDERS = {"runs": "runs", "out": "report"}
+FOR_THE_SITE = ("matplotlib", "plotly", "jinja2")
 
 
 def main(arguments: list[str]) -> int:
@@ -21,7 +24,20 @@ def main(arguments: list[str]) -> int:
         print_report(records, drawn)
         if drawn:
             print(f"tables: {write_tables(drawn, folders['out'])}")
+        if records.runs:
+            _build_site(folders["runs"], folders["out"])
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0
+
+
+def _build_site(runs: Path, out: Path) -> None:
+    if not all(map(find_spec, FOR_THE_SITE)):
+        print("the site was not built: that needs `pip install 'phd_exp[report]'`")
+        return
+    # seconds of imports, torch among them, which the tables need not wait for
+    from phd_exp.reports.site.build import build_site
+
+    print(f"site: {build_site(runs, out)}, to be opened in a browser")
+    print(f"figures: {out / 'figures'}")

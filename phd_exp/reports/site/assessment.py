@@ -42,11 +42,10 @@ def assess(folder: RunFolder, predictions: pa.Table) -> Assessment:
     if not is_distribution(predictions):
         return Assessment(evaluate_points(predictions))
     before = evaluate(predictions)
-    held_out = folder.path / "held_out.parquet"
-    if not held_out.exists():
+    if not folder.held_out.exists():
         return Assessment(before)
     try:
-        temperature = fit_temperature(pq.read_table(held_out))
+        temperature = fit_temperature(pq.read_table(folder.held_out))
     except (pa.ArrowException, OSError) as error:
-        raise RunError(f"{held_out}: cannot be read ({' '.join(str(error).split())[:200]})") from None
+        raise RunError(f"{folder.held_out}: cannot be read ({' '.join(str(error).split())[:200]})") from None
     return Assessment(before, evaluate(recalibrated(predictions, temperature)), temperature)
