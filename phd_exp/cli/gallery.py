@@ -4,7 +4,7 @@ import sys
 
 import hydra
 
-from phd_exp.cli.folders import named_folder
+from phd_exp.cli.folders import named_folders, require_folder
 from phd_exp.cli.jobs import plain
 from phd_exp.cli.paths import conf_folder
 from phd_exp.records.errors import UserError
@@ -18,9 +18,8 @@ INDICES = (0, 3, 6, 8, 12, 14)
 
 def main(arguments: list[str]) -> int:
     try:
-        folder = named_folder(
-            "gallery", "folder", "renders", arguments, if_missing="make it, or name another"
-        )
+        folder = named_folders("gallery", {"folder": "renders"}, arguments)["folder"]
+        require_folder("folder", folder, "make it, or name another")
         specs = [_spec(variant) for variant in VARIANTS]
         draw_gallery(folder / "gallery.jpg", specs, INDICES)
         draw_camera(folder / "camera.png", specs[0], INDICES[4])

@@ -8,7 +8,7 @@ VERBS = {
     "train": "render what is missing, train, measure and record a run (the default)",
     "render": "render a data set, or what is missing of it",
     "gallery": "draw the pictures of renders/README.md: paired data sets, the camera's axes",
-    "report": "print the table of all recorded runs beside the paper's numbers",
+    "report": "the paper's tables from all recorded runs: printed, and as Markdown, LaTeX and CSV",
 }
 OF_VERB = {
     "train": (
@@ -39,7 +39,7 @@ EXAMPLES = {
         "python -m phd_exp render data=occl masks=masks/occl",
     ],
     "gallery": ["python -m phd_exp gallery", "python -m phd_exp gallery folder=some/folder"],
-    "report": ["python -m phd_exp report", "python -m phd_exp report runs=some/other/folder"],
+    "report": ["python -m phd_exp report", "python -m phd_exp report runs=some/folder out=another"],
 }
 
 

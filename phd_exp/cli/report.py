@@ -1,18 +1,43 @@
-"""`python -m phd_exp report`: the table of all recorded runs beside the paper's numbers."""
+"""`python -m phd_exp report`: the paper's tables from all recorded runs, printed and written, and the site of them."""
 
 import sys
+from importlib.util import find_spec
+from pathlib import Path
 
-from phd_exp.cli.folders import named_folder
+from phd_exp.cli.folders import named_folders, require_folder
 from phd_exp.records.errors import UserError
 from phd_exp.reports.collect import collect
-from phd_exp.reports.tables import print_table
+from phd_exp.reports.formats.files import write_tables
+from phd_exp.reports.formats.terminal import print_report
+from phd_exp.reports.tables import tables
+
+FOLDERS = {"runs": "runs", "out": "report"}
+FOR_THE_SITE = ("matplotlib", "plotly", "jinja2")
 
 
 def main(arguments: list[str]) -> int:
     try:
-        advice = "train first, or say where the runs are"
-        print_table(collect(named_folder("report", "runs", "runs", arguments, if_missing=advice)))
+        folders = named_folders("report", FOLDERS, arguments)
+        require_folder("runs", folders["runs"], "train first, or say where the runs are")
+        records = collect(folders["runs"])
+        drawn = tables(records)
+        print_report(records, drawn)
+        if drawn:
+            print(f"tables: {write_tables(drawn, folders['out'])}")
+        if records.runs:
+            _build_site(folders["runs"], folders["out"])
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0
+
+
+def _build_site(runs: Path, out: Path) -> None:
+    if not all(map(find_spec, FOR_THE_SITE)):
+        print("the site was not built: that needs `pip install 'phd_exp[report]'`")
+        return
+    # seconds of imports, torch among them, which the tables need not wait for
+    from phd_exp.reports.site.build import build_site
+
+    print(f"site: {build_site(runs, out)}, to be opened in a browser")
+    print(f"figures: {out / 'figures'}")

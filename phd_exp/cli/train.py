@@ -15,6 +15,15 @@ from phd_exp.training.config import RenderedConfig, RunConfig, check, has_influe
 
 NAMED = ("preset", "data", "data.name", "model", "seed", "experiment")
 """Choices that have a place of their own in a run's name, and the one that does nothing but name several runs."""
+SHOWN = (
+    "test/projected_error_mm",
+    "test/depth_error_mm",
+    "test/nll",
+    "test/calibration/depth_ence",
+    "test/calibration/projected_ence",
+    "test/calibration/miscalibration_area",
+)
+"""What is printed at the end of a run; results.json holds more."""
 
 
 def main(arguments: list[str]) -> int:
@@ -35,12 +44,15 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> str:
     results = train(checked, folder, draw=_draw(), cores=cores)
     state = "finished already" if skipped else "finished"
     print(f"{folder.path}: {state}")
-    for key, value in results.items():
-        if key.startswith("test/"):
-            print(f"  {key} {value:.4g} (untrained {results[f'untrained/{key}']:.4g})")
+    for key in filter(results.__contains__, SHOWN):
+        print(f"  {key} {_number(results[key])} (untrained {_number(results[f'untrained/{key}'])})")
     if (folder.calibration / "final.png").exists():
         print(f"  calibration curves: {folder.calibration / 'final.png'}")
     return state
+
+
+def _number(value: float | None) -> str:
+    return "not finite" if value is None else f"{value:.4g}"
 
 
 def is_finished(config: dict[str, Any], overrides: list[str]) -> bool:

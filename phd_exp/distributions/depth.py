@@ -11,6 +11,8 @@ from torch import Tensor
 
 from phd_exp.distributions.special import log_scaled_normaliser, scaled_expint, signed_log1p, tail_moment
 
+LARGEST_ENERGY = 700.0
+"""An excess energy beyond which e^(-w) is nothing beside 1, in any precision."""
 _NEWTON_STEPS = 6  # to rounding from any a and p; test_icdf_inverts_cdf covers both tails
 
 
@@ -107,11 +109,15 @@ def depth_mean_and_variance(
 
 
 def depth_entropy(log_a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Entropy of t in nats, log(e^a N(a)) + E[w], with E[w] = 2 (1 + a) e^a E_3(a) / (1 + g(a)).
+    """Entropy of t in nats, log(e^a N(a)) + E[w]."""
+    return log_scaled_normaliser(log_a) + depth_mean_energy(log_a)
+
+
+def depth_mean_energy(log_a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """The mean excess energy E[w] = 2 (1 + a) e^a E_3(a) / (1 + g(a)).
 
     Source: own derivation (E[max(t, 1/t)] = -d log N/da, rearranged so that nothing cancels where a is large);
     checked in tests/distributions/test_depth.py.
     """
     a = log_a.exp()
-    mean_energy = 2 * (1 + a) * scaled_expint(3, a) / (1 + tail_moment(0, a))
-    return log_scaled_normaliser(log_a) + mean_energy
+    return 2 * (1 + a) * scaled_expint(3, a) / (1 + tail_moment(0, a))

@@ -69,9 +69,9 @@ def radial_icdf(p: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 
 
 def sample_whitened(
-    shape: torch.Size, *, dtype: torch.dtype, device: torch.device
+    shape: torch.Size, *, dtype: torch.dtype, device: torch.device, generator: torch.Generator | None = None
 ) -> Float[Tensor, "*shape 2"]:
     """Samples of q: a radius by its inverse CDF, a direction at random."""
-    p, turn = torch.rand((2, *shape), dtype=dtype, device=device)
+    p, turn = torch.rand((2, *shape), dtype=dtype, device=device, generator=generator)
     angle = 2 * math.pi * turn
     return radial_icdf(p)[..., None] * torch.stack([angle.cos(), angle.sin()], dim=-1)

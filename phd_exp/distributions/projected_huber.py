@@ -17,6 +17,7 @@ from torch.distributions import Distribution, constraints
 from torch.distributions.constraints import Constraint
 
 from phd_exp.distributions import depth, huber, spd
+from phd_exp.distributions.crps import crps_beyond_distance
 from phd_exp.distributions.level import credible_level
 from phd_exp.distributions.natural import Natural
 from phd_exp.distributions.special import log_scaled_normaliser
@@ -114,6 +115,12 @@ class ProjectedHuber(Distribution):
         distribution._adopt(self._natural.expand(torch.Size(batch_shape)), self._validate_args)
         return distribution
 
+    def tempered(self, projected: float, depth: float) -> "ProjectedHuber":
+        """The distribution with A / projected and a / depth in place of A and a, around the same mode."""
+        distribution = ProjectedHuber.__new__(ProjectedHuber)
+        distribution._adopt(self._natural.tempered(projected, depth), self._validate_args)
+        return distribution
+
     def __repr__(self) -> str:
         return f"ProjectedHuber(batch_shape={tuple(self.batch_shape)})"
 
@@ -157,9 +164,13 @@ class ProjectedHuber(Distribution):
         mu_xy = self.mu_xy
         return torch.cat([mu_xy, torch.ones_like(mu_xy[..., :1])], dim=-1)
 
-    def _whiten(self, xyz: Tensor) -> Tensor:
-        """q = A_xy (x, y) - nu_xy z."""
+    def whiten(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 2"]:
+        """The projection of a position in units of its precision, q = A ((x, y)/z - mu_xy) z/mu_z."""
         return spd.matvec(self._natural.A_xy, xyz[..., :2]) - self._natural.nu_xy * xyz[..., 2:]
+
+    def depth_energy(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
+        """The excess energy of a depth z > 0 (metres), a (max(t, 1/t) - 1) with t = z/mu_z."""
+        return depth.depth_energy(z.log() - self._natural.log_mu_z, self._natural.log_a)
 
     def log_prob(self, value: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch"]:
         """Log density of a position (metres), in nats per cubic metre; -inf, with a zero gradient, for z <= 0.
@@ -185,7 +196,7 @@ class ProjectedHuber(Distribution):
         visible = xyz[..., 2] > 0
         # positions that are not visible are moved, so that no NaN is computed and then multiplied by a zero gradient
         log_t = xyz[..., 2].masked_fill(~visible, 1).log() - self._natural.log_mu_z
-        return huber.huber_energy(self._whiten(xyz)) + depth.depth_energy(log_t, self._natural.log_a), visible
+        return huber.huber_energy(self.whiten(xyz)) + depth.depth_energy(log_t, self._natural.log_a), visible
 
     def _check_positions(self, xyz: Tensor) -> None:
         if xyz.ndim == 0 or xyz.shape[-1] != 3:
@@ -266,20 +277,33 @@ class ProjectedHuber(Distribution):
         log_t = z.masked_fill(~visible, 1).log() - self._natural.log_mu_z
         return depth.depth_cdf(log_t, self._natural.log_a).masked_fill(~visible, 0)
 
+    def depth_crps(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
+        """Continuous ranked probability score of a depth, int (P(depth <= u) - 1[u >= z])^2 du, metres, as is z.
+
+        Source: own derivation, see `crps_beyond_distance`.
+        """
+        log_t = z.clamp_min(torch.finfo(z.dtype).tiny).log() - self._natural.log_mu_z
+        width = torch.exp(self._natural.log_mu_z - self._natural.log_a)
+        return (z - self.mu_z).abs() + width * crps_beyond_distance(log_t, self._natural.log_a)
+
     def depth_icdf(self, p: Float[Tensor, "*#batch"] | float) -> Float[Tensor, "*#batch"]:
         """The depth z, metres, with P(depth <= z) = p, for p in (0, 1)."""
         p = torch.as_tensor(p, dtype=self._natural.log_a.dtype, device=self._natural.log_a.device)
         return torch.exp(self._natural.log_mu_z + depth.depth_icdf(p, self._natural.log_a))
 
-    def rsample(self, sample_shape: torch.Size | Sequence[int] = ()) -> Float[Tensor, "*shape 3"]:
+    def rsample(
+        self, sample_shape: torch.Size | Sequence[int] = (), generator: torch.Generator | None = None
+    ) -> Float[Tensor, "*shape 3"]:
         """Exact samples, differentiable in the parameters: (x, y) = z mu_xy + A_xy^(-1) q.
+
+        Random numbers come from the generator, or from torch's global one.
 
         Source: own derivation (q and t are independent); gradients by the implicit function theorem.
         """
         shape = self._extended_shape(torch.Size(sample_shape))[:-1]
         dtype, device = self._natural.log_a.dtype, self._natural.log_a.device
-        q = huber.sample_whitened(shape, dtype=dtype, device=device)
-        p = torch.rand(shape, dtype=dtype, device=device)
+        q = huber.sample_whitened(shape, dtype=dtype, device=device, generator=generator)
+        p = torch.rand(shape, dtype=dtype, device=device, generator=generator)
         z = self.depth_icdf(p.clamp_min(torch.finfo(dtype).eps / 2))  # rand may return 0, where z would be 0
         xy = spd.matvec(self._A_xy_inverse, q + self._natural.nu_xy * z[..., None])
         return torch.cat([xy, z[..., None]], dim=-1)

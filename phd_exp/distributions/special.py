@@ -10,6 +10,7 @@ Source: DLMF 6.6 and 8.19 for the series; the rule is an own derivation, see `_G
 """
 
 import math
+from collections.abc import Callable
 from functools import cache
 
 import torch
@@ -93,6 +94,17 @@ def log_normaliser(a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     Source: paper, section "Computing normalizing factor".
     """
     return log_scaled_normaliser(a.log()) - a
+
+
+def weighted_integral(
+    F: Callable[[Tensor], Tensor], like: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch"]:
+    """int_0^inf e^(-s) F(s) ds by the Gauss rule, where F has its singularities at s <= -1; for the batch of `like`.
+
+    F takes nodes s of shape (nodes, 1, ..., 1) and returns (nodes, *batch).
+    """
+    s, w = (constant.view(-1, *[1] * like.ndim) for constant in _constants(like)[:2])
+    return (w * F(s)).sum(0)
 
 
 def signed_log1p(x: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:

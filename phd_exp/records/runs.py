@@ -16,6 +16,7 @@ A run is named by its choices, never by a date, so that the same command resumes
 
 import hashlib
 import json
+import math
 import os
 import time
 import traceback
@@ -131,7 +132,9 @@ class RunFolder:
         write_atomic(self.config_file, yaml.safe_dump(dict(config), sort_keys=False))
 
     def write_results(self, results: Mapping[str, Any]) -> None:
-        write_atomic(self.results_file, json.dumps(results, indent=2) + "\n")
+        """Write the final numbers; null stands for one that is not finite, which JSON does not know."""
+        finite = {key: None if _is_infinite(value) else value for key, value in results.items()}
+        write_atomic(self.results_file, json.dumps(finite, indent=2, allow_nan=False) + "\n")
 
     def write_status(self, status: RunStatus) -> None:
         write_atomic(self.status_file, status.model_dump_json(indent=2) + "\n")
@@ -192,6 +195,10 @@ def epoch_name(epoch: int) -> str:
 def find_runs(runs: Path) -> list[RunFolder]:
     """Every run recorded under a folder, in the order of their paths."""
     return [RunFolder(file.parent) for file in sorted(runs.glob("*/*/*/seed*/status.json"))]
+
+
+def _is_infinite(value: Any) -> bool:
+    return isinstance(value, float) and not math.isfinite(value)
 
 
 def _read_mapping(file: Path, parse: Any) -> dict[str, Any]:

@@ -1,54 +1,203 @@
-"""Tables for the terminal."""
+"""The paper's two tables as data: what stands where, in words and figures, whatever draws it.
 
-from collections.abc import Sequence
+`tables(collect(runs))` gives them; `phd_exp.reports.formats` writes them for a terminal, Markdown, LaTeX and CSV.
+"""
 
-from rich import box
-from rich.console import Console
-from rich.table import Table
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
-from phd_exp.reports.collect import RunRow
+from phd_exp.reports.captions import FEWER_SEEDS, ONE_SEED, making_command, notes, title
+from phd_exp.reports.cells import Cell, Gap, Interval, make_cell, seeds_of
+from phd_exp.reports.collect import PROBABILISTIC, Records
+from phd_exp.reports.paper import LAYOUTS, Floor, Layout, Line, TableName
+from phd_exp.reports.point_errors import READINGS, ErrorKey, Quantity, Reading
 
-WIDTH = 118
-"""Columns, also where the output is no terminal and rich would fall back to 80."""
+DIGITS: dict[Quantity, int] = {"projected": 1, "depth": 0}
+"""Decimals of a millimetre, the paper's."""
+MOST_DIGITS = 4
+NOTHING = "–"
 
 
-def print_table(rows: Sequence[RunRow]) -> None:
-    """Print all runs beside the paper's numbers."""
-    console = Console(width=max(WIDTH, Console().width))
-    if not rows:
-        console.print("no runs recorded yet")
-        return
-    console.print(_table(rows))
-    console.print(
-        "Errors in millimetres on the test split; [dim]paper[/dim]: 50 epochs of ResNet-50 on 8000 images, 2000 "
-        "test images. NLL in nats.",
-        highlight=False,
+@dataclass(frozen=True)
+class TableCell:
+    """What stands in one place of a table.
+
+    Attributes:
+        ours: a mean, a floor, or why there is no number.
+        spread: ± half the interval, with its marks.
+        paper: the paper's figure and the ratio to it.
+        bold: whether `ours` is the best of its column.
+        source: what it was made from; None of a floor.
+    """
+
+    ours: str
+    spread: str = ""
+    paper: str = ""
+    bold: bool = False
+    source: Cell | None = None
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """One line: what it is about, and a cell a column."""
+
+    stub: tuple[str, ...]
+    cells: tuple[TableCell, ...]
+
+
+@dataclass(frozen=True)
+class PaperTable:
+    """One of the paper's tables, for one preset in one reading.
+
+    Attributes:
+        stub: headings of the columns that say what a line is about.
+        columns: headings of the columns of cells.
+        groups: lines, with a rule between groups: models, the other estimates, floors.
+        gaps: runs that are missing, unfinished or unreadable.
+        command: what makes them; empty where no further run would help.
+        notes: how to read it, a sentence or two each.
+    """
+
+    preset: str
+    name: TableName
+    reading: Reading
+    title: str
+    stub: tuple[str, ...]
+    columns: tuple[str, ...]
+    groups: tuple[tuple[TableRow, ...], ...]
+    gaps: tuple[Gap, ...]
+    command: str
+    notes: tuple[str, ...]
+
+    @property
+    def rows(self) -> tuple[TableRow, ...]:
+        return tuple(row for group in self.groups for row in group)
+
+    @property
+    def sources(self) -> list[Cell]:
+        """Everything measured, line by line."""
+        return [place.source for row in self.rows for place in row.cells if place.source is not None]
+
+
+def tables(records: Records) -> list[PaperTable]:
+    """Both tables in both readings, for every preset that has any of a table's runs."""
+    return [
+        _table(records, preset, layout, reading, seeds)
+        for preset in records.presets
+        for layout in LAYOUTS
+        if (seeds := seeds_of(records, preset, layout.choices))
+        for reading in READINGS
+    ]
+
+
+def _table(
+    records: Records, preset: str, layout: Layout, reading: Reading, seeds: Sequence[int]
+) -> PaperTable:
+    measured = [
+        [_measured(records, preset, layout, line, reading, seeds) for line in group]
+        for group in layout.groups
+    ]
+    cells = [cell for group in measured for line in group for cell in line]
+    best = _best(cells)
+    groups = [
+        tuple(_row(line, cells, best) for line, cells in zip(lines, group, strict=True))
+        for lines, group in zip(layout.groups, measured, strict=True)
+    ]
+    gaps = tuple(dict.fromkeys(gap for cell in cells for gap in cell.gaps))
+    return PaperTable(
+        preset=preset,
+        name=layout.name,
+        reading=reading,
+        title=title(preset, layout, reading, cells),
+        stub=_stub(layout),
+        columns=tuple(
+            f"{column.quantity} error (mm)" if column.quantity else column.data for column in layout.columns
+        ),
+        groups=(*groups, tuple(_floor_row(floor, layout) for floor in layout.floors)),
+        gaps=gaps,
+        command=making_command(records, preset, layout.name, seeds) if _can_be_made(gaps) else "",
+        notes=notes(layout, reading, cells),
     )
 
 
-def _table(rows: Sequence[RunRow]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD)
-    for name in ("preset", "data", "model", "run"):
-        table.add_column(name, no_wrap=True)
-    for name, style in (("projected", ""), ("paper", "dim"), ("depth", ""), ("paper", "dim"), ("NLL", "")):
-        table.add_column(name, style=style, justify="right", no_wrap=True)
-    table.add_column("state")
-    for row in rows:
-        published = row.published
-        table.add_row(
-            row.preset,
-            row.data,
-            row.model,
-            row.run,
-            _number(row.projected_error_mm, 1),
-            _number(published.projected_error_mm if published else None, 1),
-            _number(row.depth_error_mm, 0),
-            _number(published.depth_error_mm if published else None, 0),
-            _number(row.nll, 2),
-            row.state,
+def _can_be_made(gaps: Iterable[Gap]) -> bool:
+    return any(gap.state != "no sample" for gap in gaps)
+
+
+def _measured(
+    records: Records, preset: str, layout: Layout, line: Line, reading: Reading, seeds: Sequence[int]
+) -> list[Cell]:
+    return [
+        make_cell(
+            records,
+            preset,
+            column.data,
+            line.model,
+            ErrorKey(line.estimate, reading, line.quantity_in(column)),
+            seeds,
         )
-    return table
+        for column in layout.columns
+    ]
 
 
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
+def _best(cells: Iterable[Cell]) -> dict[tuple[str, Quantity], str]:
+    """(data set, error) -> the smallest mean as it is printed, where more than one model has one."""
+    means: dict[tuple[str, Quantity], list[tuple[float, str]]] = {}
+    for cell in cells:
+        if cell.mean is not None:
+            means.setdefault((cell.data, cell.key.quantity), []).append((cell.mean, cell.model))
+    return {
+        place: _number(min(values)[0], place[1])
+        for place, values in means.items()
+        if len({model for _, model in values}) > 1
+    }
+
+
+def _row(line: Line, cells: Sequence[Cell], best: Mapping[tuple[str, Quantity], str]) -> TableRow:
+    label = f"{line.model} ({line.estimate})" if line.model == PROBABILISTIC else line.model
+    stub = (label, line.quantity) if line.quantity else (label,)
+    return TableRow(stub, tuple(_table_cell(cell, best) for cell in cells))
+
+
+def _table_cell(cell: Cell, best: Mapping[tuple[str, Quantity], str]) -> TableCell:
+    quantity = cell.key.quantity
+    paper = "" if cell.published is None else _number(cell.published, quantity)
+    if cell.interval is None:
+        return TableCell(cell.state, paper=paper, source=cell)
+    ours = _number(cell.interval.mean, quantity)
+    if cell.ratio is not None:
+        paper += f" (×{cell.ratio:.2f})"
+    bold = ours == best.get((cell.data, quantity))
+    return TableCell(ours, _spread(cell, cell.interval), paper, bold, cell)
+
+
+def _spread(cell: Cell, interval: Interval) -> str:
+    marks = FEWER_SEEDS if cell.gaps else ""
+    if interval.half_width is None:
+        return marks
+    if interval.kind == "normal_over_samples":
+        marks = ONE_SEED + marks
+    digits = DIGITS[cell.key.quantity]
+    while digits < MOST_DIGITS and 0 < interval.half_width < 0.5 * 10.0**-digits:
+        digits += 1  # a small interval is not an exact number
+    return f"±{interval.half_width:.{digits}f}{marks}"
+
+
+def _number(value: float, quantity: Quantity) -> str:
+    return f"{value:.{DIGITS[quantity]}f}"
+
+
+def _stub(layout: Layout) -> tuple[str, ...]:
+    by_line = all(line.quantity for group in layout.groups for line in group)
+    return ("model", "error (mm)") if by_line else ("model",)
+
+
+def _floor_row(floor: Floor, layout: Layout) -> TableRow:
+    stub = (floor.label, "depth") if len(_stub(layout)) > 1 else (floor.label,)
+    return TableRow(
+        stub,
+        tuple(
+            TableCell(NOTHING if column.quantity == "projected" else floor.depth.get(column.data, NOTHING))
+            for column in layout.columns
+        ),
+    )

@@ -13,11 +13,12 @@ from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
 from phd_exp.data.batches import Batch
+from phd_exp.distributions.columns import Columns
 from phd_exp.metrics.calibration import CalibrationCurve
 from phd_exp.models.heads import Prediction
 from phd_exp.records.files import write_atomic
 from phd_exp.records.runs import RunFolder, epoch_name
-from phd_exp.training.predictions import Columns, calibration_curves, columns, gathered, joined
+from phd_exp.training.predictions import calibration_curves, columns, gathered, joined
 from phd_exp.training.tracking import Tracker
 
 SHOWN = ("test/loss", "test/projected_error_mm", "test/depth_error_mm")

@@ -8,12 +8,15 @@ from lightning import LightningModule
 from torch import Tensor, nn
 
 from phd_exp.data.batches import Batch
+from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions.columns import Columns, calibration_columns
 from phd_exp.geometry.camera import Camera
+from phd_exp.metrics.binned import Calibration
 from phd_exp.metrics.means import Means
 from phd_exp.models.heads import Prediction
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.errors import RunError
-from phd_exp.training.predictions import Columns, columns, quantities, quantity_names
+from phd_exp.training.predictions import columns, quantities, quantity_names
 
 
 class PositionModule(LightningModule):
@@ -41,6 +44,8 @@ class PositionModule(LightningModule):
         names = ("loss", *quantity_names(regressor.head.prediction))
         # "train" itself is taken: every module has a method of that name
         self.means = nn.ModuleDict({f"{split}_means": Means(names) for split in ("train", "test")})
+        is_distribution = issubclass(regressor.head.prediction, ProjectedHuber)
+        self.calibration = Calibration() if is_distribution else None
 
     def forward(self, batch: Batch) -> Prediction:
         return self.regressor(batch.image, self.told(batch.camera))
@@ -55,7 +60,10 @@ class PositionModule(LightningModule):
         return self._step(batch, "train")[0]
 
     def validation_step(self, batch: Batch, batch_idx: int) -> Prediction:  # type: ignore[override]  # for callbacks
-        return self._step(batch, "test")[1]
+        prediction = self._step(batch, "test")[1]
+        if self.calibration is not None and isinstance(prediction, ProjectedHuber):
+            self.calibration.update(calibration_columns(prediction, batch.xyz))
+        return prediction
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Columns:
         return columns(self(batch), batch)
@@ -65,6 +73,10 @@ class PositionModule(LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         self._log_epoch("test")
+        if self.calibration is not None:
+            scores = self.calibration.compute()
+            self.log_dict({f"test/calibration/{name}": score.float() for name, score in scores.items()})
+            self.calibration.reset()
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         return self.make_optimizer(self.regressor.parameters())

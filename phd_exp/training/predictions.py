@@ -13,13 +13,13 @@ from torch import Tensor
 from phd_exp.data.batches import Batch
 from phd_exp.data.sources import Known
 from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions.columns import Columns, coordinates, distribution_columns, draws
 from phd_exp.metrics.calibration import CalibrationCurve, calibration_curve
+from phd_exp.metrics.calibration_scores import exact_scores
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
+from phd_exp.metrics.scores import DRAWS, energy_score
 from phd_exp.models.heads import Prediction
 from phd_exp.records.files import write_atomic
-
-Columns = dict[str, Tensor]
-"""Name -> one number a sample."""
 
 ERRORS = ("projected_error_mm", "depth_error_mm")
 OF_A_DISTRIBUTION = ("nll", "depth_precision", "projected_precision")
@@ -48,36 +48,19 @@ def quantities(prediction: Prediction, xyz: Tensor) -> Columns:
 
 @torch.no_grad()
 def columns(prediction: Prediction, batch: Batch) -> Columns:
-    """A batch as a table: truth, estimate and `quantities`; for a distribution its parameters and moments too.
+    """A batch as a table: truth, estimate and `quantities`; of a distribution parameters, moments and scores too.
 
-    Positions are metres in the camera frame, variances m^2 (depth) and without unit (projected: of x/z and y/z).
+    Positions, `depth_crps` and `energy_score` are in metres, in the camera frame; see `distribution_columns`.
     """
-    table = {"row": batch.row} | _coordinates("", batch.xyz) | _coordinates("mode_", prediction.mode)
+    table = {"row": batch.row} | coordinates("", batch.xyz) | coordinates("mode_", prediction.mode)
     table |= quantities(prediction, batch.xyz)
     if isinstance(prediction, ProjectedHuber):
-        table |= _distribution_columns(prediction, batch.xyz)
+        del table["depth_precision"]  # it is a, below
+        table |= distribution_columns(prediction, batch.xyz)
+        # seeded by the sample: the score depends neither on the epoch nor on what ran before
+        drawn = draws(prediction, DRAWS, seed=int(batch.row[0]))
+        table["energy_score"] = energy_score(drawn, batch.xyz)
     return {name: column.double().cpu() for name, column in table.items()}
-
-
-def _distribution_columns(prediction: ProjectedHuber, xyz: Tensor) -> Columns:
-    A, mu_xy, mean = prediction.A, prediction.mu_xy, prediction.mean
-    off_centre = xyz[:, :2] / xyz[:, 2:] - mu_xy
-    return {
-        **_coordinates("mean_", mean),
-        "median_z": prediction.depth_median,
-        "mu_x": mu_xy[:, 0],
-        "mu_y": mu_xy[:, 1],
-        "mu_z": prediction.mu_z,
-        "A_xx": A[:, 0, 0],
-        "A_xy": A[:, 0, 1],
-        "A_yy": A[:, 1, 1],
-        "a": prediction.a,
-        "depth_variance": prediction.depth_variance,
-        "depth_squared_error": (xyz[:, 2] - mean[:, 2]).square(),
-        "projected_variance": prediction.projected_covariance.diagonal(dim1=-2, dim2=-1).sum(-1),
-        "projected_squared_error": off_centre.square().sum(-1),
-        "level": prediction.level(xyz),
-    }
 
 
 def joined(parts: Sequence[Columns]) -> Columns:
@@ -105,8 +88,14 @@ def calibration_curves(table: Columns, window: int) -> dict[str, CalibrationCurv
 
 
 def summary(table: Columns) -> dict[str, float]:
-    """The final numbers of a run, by their metric keys: means over the rows."""
-    return {f"test/{name}": float(table[name].mean()) for name in ERRORS + OF_A_DISTRIBUTION if name in table}
+    """The final numbers of a run, by their metric keys: means over the rows, and scores of calibration."""
+    if "a" not in table:
+        return {f"test/{name}": float(table[name].mean()) for name in ERRORS}
+    means = {
+        name: table["a" if name == "depth_precision" else name].mean() for name in ERRORS + OF_A_DISTRIBUTION
+    }
+    scores = {f"calibration/{name}": score for name, score in exact_scores(table).items()}
+    return {f"test/{name}": float(value) for name, value in (means | scores).items()}
 
 
 def write_parquet(file: Path, table: Columns, known: Known) -> None:
@@ -117,7 +106,3 @@ def write_parquet(file: Path, table: Columns, known: Known) -> None:
     buffer = io.BytesIO()
     pq.write_table(pa.table(arrays), buffer)
     write_atomic(file, buffer.getvalue())
-
-
-def _coordinates(prefix: str, xyz: Tensor) -> Columns:
-    return {f"{prefix}{axis}": xyz[:, place] for place, axis in enumerate("xyz")}

@@ -14,6 +14,7 @@ from lightning import Trainer, seed_everything
 
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.sources import Part
+from phd_exp.distributions.columns import Columns
 from phd_exp.records.dataset import DatasetFolder, sha256
 from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError, RunError
@@ -28,7 +29,7 @@ from phd_exp.training.build import (
 from phd_exp.training.callbacks import CalibrationRecorder, Draw, RecordLogger
 from phd_exp.training.config import FolderConfig, RunConfig, TrainerConfig, has_influence
 from phd_exp.training.module import PositionModule
-from phd_exp.training.predictions import Columns, gathered, joined, summary, write_parquet
+from phd_exp.training.predictions import gathered, joined, summary, write_parquet
 from phd_exp.training.ranks import train_together
 from phd_exp.training.tracking import tracked
 
@@ -64,7 +65,7 @@ def train(config: RunConfig, folder: RunFolder, draw: Draw | None, cores: int) -
             else:
                 results = run(config, folder, draw, threads)
             folder.write_results(results)
-    return results
+    return folder.results()
 
 
 def require_possible(config: RunConfig, folder: RunFolder) -> None:

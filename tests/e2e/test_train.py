@@ -15,11 +15,14 @@ import pytest
 from PIL import Image
 
 from phd_exp.records.runs import RunFolder, find_runs
+from phd_exp.reports.collect import collect
+from phd_exp.reports.point_errors import QUANTITIES, ErrorKey
 
 MODELS = ("probabilistic", "mae_vz", "mae_logz", "mae_xyz", "mae_constf")
 DATA = ("default", "occl", "scale", "occl_scale")
 ERRORS = {"loss", "projected_error_mm", "depth_error_mm"}
 OF_A_DISTRIBUTION = {"nll", "depth_precision", "projected_precision"}
+CALIBRATION = {"depth_ence", "projected_ence", "miscalibration_area", "depth_crps_mm", "left_out"}
 
 
 def only_run(runs: Path) -> RunFolder:
@@ -47,8 +50,15 @@ def test_every_model_leaves_a_whole_record(train: Callable, tmp_path: Path, mode
         assert {f"{split}/{name}" for split in ("train", "test") for name in quantities} <= row.keys()
         assert all(math.isfinite(value) for value in row.values())
     results = run.results()
+    for name in CALIBRATION:  # of the same weights: binned after the last epoch, exact in the results
+        key = f"test/calibration/{name}"
+        assert (key in results) is (key in rows[-1]) is (model == "probabilistic")
+        assert results.get(key, 0) == pytest.approx(rows[-1].get(key, 0), rel=0.02)
     table = pd.read_parquet(run.predictions)
     assert len(table) == 6
+    scored = {"depth_pit", "depth_crps", "energy_score"}
+    assert scored & set(table.columns) == (scored if model == "probabilistic" else set())
+    assert "depth_precision" not in table  # it is a
     for name in ("projected_error_mm", "depth_error_mm"):
         assert results[f"test/{name}"] == pytest.approx(table[name].mean())
         assert results[f"test/{name}"] == pytest.approx(rows[-1][f"test/{name}"], rel=1e-4)
@@ -305,15 +315,24 @@ def test_a_sweep_survives_its_failures(train: Callable, tmp_path: Path) -> None:
     assert "model=probabilistic camera=constant" in lines[2]
 
 
-def test_the_report_stands_beside_the_paper(train: Callable, phd_exp: Callable) -> None:
-    assert train("model=mae_vz", "logger=none").status == 0
+def test_the_report_computes_what_training_recorded(
+    train: Callable, phd_exp: Callable, tmp_path: Path
+) -> None:
+    assert train("model=probabilistic", "logger=none").status == 0
+    (run,) = collect(tmp_path / "runs").runs
+    assert (run.state, run.seed) == ("finished", 0)
+    assert run.overrides is not None
+    results = run.folder.results()
+    for quantity in QUANTITIES:
+        mean = run.errors[ErrorKey("mode", "whole", quantity)]
+        assert mean.n == 6
+        assert mean.value == pytest.approx(results[f"test/{quantity}_error_mm"], rel=1e-4)
+    assert run.nll == pytest.approx(results["test/nll"])
     outcome = phd_exp("report")
     assert outcome.status == 0
-    (line,) = [line for line in outcome.out.splitlines() if "mae_vz" in line]
-    words = line.split()
-    assert "3.6" in words
-    assert "69" in words
-    assert "finished" in words
+    (line,) = [line for line in outcome.out.splitlines() if run.folder.path.name in line]
+    assert f"{results['test/nll']:.2f}" in line.split()
+    assert "finished" in line
 
 
 def test_a_missing_bpy_is_one_line(

@@ -1,10 +1,21 @@
-"""Calibration curves against a plain loop, and on samples whose calibration is known."""
+"""Measures of calibration against plain loops, scipy and uncertainty-toolbox, and where the answer is known."""
 
 import numpy as np
 import pytest
 import torch
+import uncertainty_toolbox as uct
+from scipy import stats
 
-from phd_exp.metrics.calibration import calibration_curve
+from phd_exp.metrics.calibration import (
+    calibration_curve,
+    coverage,
+    ence,
+    miscalibration_area,
+    overconfidence,
+    pit_histogram,
+    uniformity_test,
+)
+from phd_exp.metrics.scores import sharpness
 
 
 def samples(n: int, overconfidence: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -63,3 +74,121 @@ def test_refuses_what_has_no_curve(bad: list[float]) -> None:
     values = torch.tensor(bad, dtype=torch.float64)
     with pytest.raises(ValueError, match="calibration curve needs"):
         calibration_curve(values, values, window=200)
+
+
+def uniform(n: int, power: float = 1.0, seed: int = 3) -> torch.Tensor:
+    """Levels that are uniform for power 1, too high below it, too low above it."""
+    return torch.rand(n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) ** power
+
+
+@pytest.mark.parametrize(("n", "bins"), [(1000, 10), (1003, 10), (57, 4), (3, 5), (40, 1)])
+def test_ence_equals_a_loop_over_bins(n: int, bins: int) -> None:
+    variance, error = samples(n, 2.0)
+    order = np.argsort(variance.numpy())
+    place = np.floor(bins * (np.arange(n) + 0.5) / n).astype(int)
+    gaps = []
+    for chosen in (order[place == k] for k in range(bins)):
+        if len(chosen):
+            rmv, rmse = np.sqrt(variance.numpy()[chosen].mean()), np.sqrt(error.numpy()[chosen].mean())
+            gaps += [abs(rmv - rmse) / rmv] * len(chosen)
+    assert ence(variance, error, bins).item() == pytest.approx(np.mean(gaps), rel=1e-12)
+
+
+@pytest.mark.parametrize("overconfidence", [0.25, 1.0, 4.0])
+def test_ence_is_how_far_the_ratio_of_deviations_is_from_one(overconfidence: float) -> None:
+    """|1 - sqrt(overconfidence)|; where calibrated, what scatter leaves of Gaussian errors."""
+    value = ence(*samples(50_000, overconfidence), bins=10).item()
+    scatter = 0.4 * np.sqrt(2 * 10 / 50_000)
+    assert value == pytest.approx(abs(1 - overconfidence**0.5), abs=3 * scatter)
+
+
+def test_ence_of_ties_does_not_depend_on_the_order_of_rows() -> None:
+    variance, error = torch.tensor([1.0, 1.0, 1.0, 1.0]), torch.tensor([0.0, 0.0, 4.0, 4.0])
+    assert ence(variance, error, bins=2).item() == pytest.approx(2**0.5 - 1)
+    assert ence(variance, error.flip(0), bins=2) == ence(variance, error, bins=2)
+
+
+def test_coverage_is_the_empirical_cdf() -> None:
+    levels, at = uniform(500), torch.tensor([0.0, 0.25, 0.5, 0.99, 1.0], dtype=torch.float64)
+    expected = stats.ecdf(levels.numpy()).cdf.evaluate(at.numpy())
+    np.testing.assert_allclose(coverage(levels, at), expected, atol=1e-12)
+    torch.testing.assert_close(coverage(levels, levels.sort().values), torch.arange(1, 501).double() / 500)
+
+
+@pytest.mark.parametrize("power", [0.3, 1.0, 4.0])
+def test_miscalibration_area_is_the_integral(power: float) -> None:
+    """By a fine grid, and for many levels by hand: int |p^(1/power) - p| dp."""
+    levels, p = uniform(400, power), (torch.arange(200_000, dtype=torch.float64) + 0.5) / 200_000
+    by_grid = (coverage(levels, p) - p).abs().mean().item()
+    assert miscalibration_area(levels).item() == pytest.approx(by_grid, abs=1e-5)
+    by_hand = abs(power / (1 + power) - 0.5)
+    assert miscalibration_area(uniform(200_000, power)).item() == pytest.approx(by_hand, abs=3e-3)
+
+
+@pytest.mark.parametrize("power", [0.3, 1.0, 4.0])
+def test_overconfidence_has_a_sign(power: float) -> None:
+    """The mean of u^power is 1/(1 + power); where all coverage is on one side it is the area."""
+    levels = uniform(100_000, power)
+    assert overconfidence(levels).item() == pytest.approx(1 / (1 + power) - 0.5, abs=3e-3)
+    if power != 1:
+        assert abs(overconfidence(levels).item()) == pytest.approx(
+            miscalibration_area(levels).item(), abs=1e-4
+        )
+
+
+@pytest.mark.parametrize(("extreme", "area"), [([0.0], 0.5), ([1.0], 0.5), ([0.5], 0.25), ([0.0, 1.0], 0.25)])
+def test_area_of_a_few_levels_by_hand(extreme: list[float], area: float) -> None:
+    assert miscalibration_area(torch.tensor(extreme)).item() == pytest.approx(area)
+
+
+@pytest.mark.parametrize("power", [0.8, 1.0, 1.02])
+@pytest.mark.parametrize("n", [5, 300, 2000])
+def test_uniformity_agrees_with_scipy(power: float, n: int) -> None:
+    levels = uniform(n, power)
+    expected = stats.kstest(levels.numpy(), "uniform")
+    found = uniformity_test(levels)
+    assert found.statistic == pytest.approx(expected.statistic, rel=1e-9)
+    assert found.pvalue == pytest.approx(expected.pvalue, rel=1e-6)
+
+
+def test_pit_histogram_is_numpys() -> None:
+    pit = torch.cat([uniform(300, 2.0), torch.tensor([0.0, 1.0])])
+    expected = np.histogram(pit.numpy(), bins=20, range=(0, 1), density=True)[0]
+    np.testing.assert_allclose(pit_histogram(pit, 20), expected)
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
+def test_agrees_with_uncertainty_toolbox(scale: float) -> None:
+    """Gaussian predictions whose deviation is `scale` times the true one; its curves have 100 points."""
+    generator = np.random.default_rng(4)
+    deviation = generator.uniform(0.5, 2, 3000)
+    mean, truth = generator.normal(size=(2, 3000))
+    truth = mean + deviation * truth
+    standard = (truth - mean) / (scale * deviation)
+    level = torch.from_numpy(2 * stats.norm.cdf(np.abs(standard)) - 1)
+    pit = torch.from_numpy(stats.norm.cdf(-standard))  # it counts predicted minus true
+    for levels, kind in ((level, "interval"), (pit, "quantile")):
+        arguments = (mean, scale * deviation, truth)
+        p, share = uct.get_proportion_lists_vectorized(*arguments, num_bins=100, prop_type=kind)
+        np.testing.assert_allclose(coverage(levels, torch.from_numpy(p)), share, atol=1e-3)
+        area = uct.miscalibration_area(*arguments, num_bins=100, vectorized=True, prop_type=kind)
+        assert miscalibration_area(levels).item() == pytest.approx(area, abs=1e-3)
+    predicted = torch.from_numpy((scale * deviation) ** 2)
+    assert sharpness(predicted).item() == pytest.approx(uct.sharpness(scale * deviation))
+
+
+@pytest.mark.parametrize("bad", [[], [0.5, float("nan")], [float("inf")]])
+def test_no_measure_of_what_is_not_finite(bad: list[float]) -> None:
+    values = torch.tensor(bad, dtype=torch.float64)
+    for measure in (miscalibration_area, overconfidence, uniformity_test, sharpness):
+        with pytest.raises(ValueError, match="all of them finite"):
+            measure(values)
+    for measure in (
+        lambda x: ence(x, x, 3),
+        lambda x: pit_histogram(x, 3),
+        lambda x: coverage(x, torch.ones(1)),
+    ):
+        with pytest.raises(ValueError, match="all of them finite"):
+            measure(values)
+    with pytest.raises(ValueError, match="bins must be at least 1"):
+        ence(torch.ones(3), torch.ones(3), 0)

@@ -1,6 +1,7 @@
 """Run records: named by choices, whole or absent, honest about how a run ended."""
 
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -107,9 +108,11 @@ def test_metrics_survive_a_torn_last_line(folder: RunFolder) -> None:
 
 def test_config_and_results_come_back(folder: RunFolder) -> None:
     folder.write_config({"seed": 0, "data": {"n_train": 3}})
-    folder.write_results({"test/nll": -1.5})
+    folder.write_results({"test/nll": -1.5, "test/calibration/depth_ence": math.nan, "epochs": 3})
     assert folder.config() == {"seed": 0, "data": {"n_train": 3}}
-    assert folder.results() == json.loads(folder.results_file.read_text()) == {"test/nll": -1.5}
+    written = {"test/nll": -1.5, "test/calibration/depth_ence": None, "epochs": 3}
+    assert folder.results() == json.loads(folder.results_file.read_text()) == written
+    assert "NaN" not in folder.results_file.read_text(), "JSON knows no such number"
 
 
 def test_finds_all_runs(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ def config(precision: str, accelerator: str = "cpu") -> TrainerConfig:
     return TrainerConfig.model_validate(
         {
             "max_epochs": 1,
+            "devices": 1,
             "accelerator": accelerator,
             "precision": precision,
             "threads": None,

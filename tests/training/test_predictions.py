@@ -8,6 +8,7 @@ import torch
 
 from phd_exp.data.batches import Batch
 from phd_exp.distributions import PointEstimate, ProjectedHuber
+from phd_exp.distributions.columns import calibration_columns
 from phd_exp.geometry import DepthScale, Projected
 from phd_exp.training.predictions import calibration_curves, columns, joined, summary
 
@@ -60,6 +61,24 @@ def test_summary_is_the_mean_of_the_columns(batch: Batch, distribution: Projecte
     assert means["test/projected_precision"] == pytest.approx(determinant, rel=1e-4)
 
 
+def test_summary_scores_calibration(batch: Batch, distribution: ProjectedHuber) -> None:
+    means = summary(columns(distribution, batch))
+    scale = 1000 * distribution.depth_crps(batch.xyz[:, 2]).mean().item()
+    assert means["test/calibration/depth_crps_mm"] == pytest.approx(scale, rel=1e-5)
+    assert means["test/calibration/left_out"] == 0
+
+
+def test_an_energy_score_disturbs_no_other_random_numbers(batch: Batch, distribution: ProjectedHuber) -> None:
+    """The same every time, whatever was drawn before."""
+    torch.manual_seed(0)
+    expected = torch.rand(3)
+    torch.manual_seed(0)
+    once = columns(distribution, batch)["energy_score"]
+    assert torch.equal(torch.rand(3), expected)
+    assert torch.equal(columns(distribution, batch)["energy_score"], once)
+    assert (once > 0).all()
+
+
 def test_a_point_estimate_has_errors_alone(batch: Batch) -> None:
     chart = Projected(DEPTH)
     estimate = PointEstimate(chart.coordinates(batch.xyz, batch.camera), chart, batch.camera)
@@ -79,9 +98,8 @@ def test_curves_of_samples_of_the_distribution_itself_are_calibrated() -> None:
     f = torch.full((n,), 1500.0, dtype=torch.float64)
     prediction = ProjectedHuber.from_raw(raw, f=f, S=224.0, mu_z0=DEPTH.mu_z0)
     torch.manual_seed(3)
-    image = torch.zeros(1, 1, 1, 3, dtype=torch.uint8).expand(n, 1, 1, 3)
-    batch = Batch(image=image, xyz=prediction.sample(), f=f, S=224.0, row=torch.arange(n))
-    for name, curve in calibration_curves(columns(prediction, batch), window=4000).items():
+    table = calibration_columns(prediction, prediction.sample())
+    for name, curve in calibration_curves(table, window=4000).items():
         ratio = curve.empirical / curve.predicted
         assert ((ratio > 0.85) & (ratio < 1.15)).all(), (name, ratio.min(), ratio.max())
 

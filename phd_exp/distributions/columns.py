@@ -1,0 +1,71 @@
+"""A batch of distributions as columns of numbers, one row a sample, and back."""
+
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from phd_exp.distributions.projected_huber import ProjectedHuber
+
+Columns = dict[str, Tensor]
+"""Name -> one number a sample."""
+
+PARAMETERS = ("mu_x", "mu_y", "mu_z", "A_xx", "A_xy", "A_yy", "a")
+
+
+def parameter_columns(distribution: ProjectedHuber) -> Columns:
+    """The parameters of the camera frame: a distribution's columns from which `from_columns` rebuilds it."""
+    mu_xy, A = distribution.mu_xy, distribution.A
+    values = (*mu_xy.unbind(-1), distribution.mu_z, A[:, 0, 0], A[:, 0, 1], A[:, 1, 1], distribution.a)
+    return dict(zip(PARAMETERS, values, strict=True))
+
+
+def from_columns(columns: Mapping[str, Tensor]) -> ProjectedHuber:
+    """The distributions with the parameters of a table. Raises ValueError where one violates its constraint."""
+    mu_x, mu_y, mu_z, A_xx, A_xy, A_yy, a = (columns[name] for name in PARAMETERS)
+    A = torch.stack([A_xx, A_xy, A_xy, A_yy], dim=-1).unflatten(-1, (2, 2))
+    return ProjectedHuber(torch.stack([mu_x, mu_y], dim=-1), mu_z, A, a)
+
+
+def distribution_columns(distribution: ProjectedHuber, xyz: Float[Tensor, "samples 3"]) -> Columns:
+    """Parameters, `calibration_columns`, mean and median depth (metres), and the NLL of true positions (nats)."""
+    return {
+        **coordinates("mean_", distribution.mean),
+        "median_z": distribution.depth_median,
+        **parameter_columns(distribution),
+        **calibration_columns(distribution, xyz),
+        "nll": -distribution.log_prob(xyz),
+        "projected_precision": distribution.log_det_A.exp(),
+    }
+
+
+def coordinates(prefix: str, xyz: Float[Tensor, "samples 3"]) -> Columns:
+    """The columns of positions."""
+    return {f"{prefix}{axis}": xyz[:, place] for place, axis in enumerate("xyz")}
+
+
+def draws(distribution: ProjectedHuber, n: int, seed: int) -> Float[Tensor, "n samples 3"]:
+    """n positions from each distribution, the same for the same seed; torch's own random numbers stay untouched."""
+    generator = torch.Generator(device=distribution.a.device).manual_seed(seed)
+    return distribution.rsample((n,), generator)
+
+
+def calibration_columns(distribution: ProjectedHuber, xyz: Float[Tensor, "samples 3"]) -> Columns:
+    """What is predicted of each error and how the true position (metres) stands to it.
+
+    Variances and squared errors are m^2 (of depth, about its mean) and without unit (projected: of x/z plus of y/z);
+    `level` is the credible level of the position, `depth_pit` the predicted probability of a smaller depth, and
+    `depth_crps` the score of the depth in metres.
+    """
+    z = xyz[:, 2]
+    off_centre = xyz[:, :2] / z[:, None] - distribution.mu_xy
+    return {
+        "depth_variance": distribution.depth_variance,
+        "depth_squared_error": (z - distribution.depth_mean).square(),
+        "projected_variance": distribution.projected_covariance.diagonal(dim1=-2, dim2=-1).sum(-1),
+        "projected_squared_error": off_centre.square().sum(-1),
+        "level": distribution.level(xyz),
+        "depth_pit": distribution.depth_cdf(z),
+        "depth_crps": distribution.depth_crps(z),
+    }

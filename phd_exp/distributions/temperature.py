@@ -1,0 +1,81 @@
+"""Recalibration: two temperatures that make every prediction more or less certain without moving it."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from scipy.optimize import brentq
+from torch import Tensor
+
+from phd_exp.distributions.depth import depth_mean_energy
+from phd_exp.distributions.projected_huber import ProjectedHuber
+
+_WIDEST = 80.0  # of log(1/temperature); a fit beyond has no minimum
+
+
+@dataclass(frozen=True)
+class Temperature:
+    """A' = A / projected and a' = a / depth: above 1 the predictions were too certain, below 1 too cautious."""
+
+    projected: float
+    depth: float
+
+    @classmethod
+    def fit(cls, distribution: ProjectedHuber, xyz: Float[Tensor, "samples 3"]) -> "Temperature":
+        """The temperatures of least mean NLL over positions (metres) that belong to a batch of predictions.
+
+        The mean NLL is a sum of one function of each temperature, convex in its reciprocal r:
+        h(r |q|) - 2 log r and a r max(t, 1/t) + log N(a r). Each minimum is the one root of a derivative.
+
+        Raises ValueError without samples, with one that is not finite or not in front of the camera, and where all
+        lie at their modes, so that no temperature is low enough.
+        Source: temperature scaling (Guo et al., 2017); convexity: h is convex and grows, and log N(a) is the log of
+        an integral of exponentials of a. Checked in tests/distributions/test_temperature.py.
+        """
+        xyz = xyz.detach().double()
+        radius = distribution.whiten(xyz).norm(dim=-1).detach().double()
+        energy = distribution.depth_energy(xyz[..., 2]).detach().double()
+        log_a = distribution.a.detach().double().log().expand_as(energy)
+        for values in (xyz, radius, energy, log_a):
+            if values.numel() == 0 or not bool(values.isfinite().all()):
+                raise ValueError(
+                    "temperatures are fitted to finite predictions and positions with z > 0, at least one, but "
+                    f"{int((~values.isfinite()).sum())} of {values.numel()} numbers are not finite"
+                )
+        return cls(
+            projected=_temperature(lambda r: _projected_slope(radius, r)),
+            depth=_temperature(lambda r: _depth_slope(energy, log_a, r)),
+        )
+
+    def apply(self, distribution: ProjectedHuber) -> ProjectedHuber:
+        """The same predictions at these temperatures; mu_xy and mu_z stay."""
+        return distribution.tempered(self.projected, self.depth)
+
+
+def _projected_slope(radius: Tensor, r: Tensor) -> Tensor:
+    """r d/dr of the mean of h(r |q|) - 2 log r."""
+    scaled = r * radius
+    return torch.minimum(scaled, scaled.square()).mean() - 2
+
+
+def _depth_slope(energy: Tensor, log_a: Tensor, r: Tensor) -> Tensor:
+    """r d/dr of the mean of r a max(t, 1/t) + log N(r a): energies as they are minus as they are predicted."""
+    return (r * energy - depth_mean_energy(log_a + r.log())).mean()
+
+
+def _temperature(slope: Callable[[Tensor], Tensor]) -> float:
+    """The 1/r at which the slope, negative for small r and positive for large r, is zero."""
+
+    def at(log_r: float) -> float:
+        return float(slope(torch.tensor(log_r, dtype=torch.float64).exp()))
+
+    width = 1.0
+    while not at(-width) < 0 < at(width):
+        width *= 2
+        if width > _WIDEST:
+            raise ValueError(
+                "no temperature fits: the errors are zero, or out of all proportion to the predictions"
+            )
+    return math.exp(-brentq(at, -width, width, xtol=1e-12))

@@ -1,0 +1,69 @@
+"""Samples by what makes them hard: named parts of a data set, each sample in exactly one."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Stratum:
+    """A part of the samples, and what it is called."""
+
+    label: str
+    mask: Bool[Tensor, " samples"]
+
+
+def strata(
+    name: str, values: Float[Tensor, " samples"], edges: Sequence[float] | int, unit: str = ""
+) -> list[Stratum]:
+    """Split samples between edges, or into n parts of about equal size; empty parts are left out.
+
+    A part holds its lower edge and not its upper one, except for the last, which holds both. What lies outside all
+    edges is `below` or `above`, and NaN is `unknown`. Labels read `depth 3.0-3.5 m`.
+
+    Raises ValueError for edges that do not ascend, or for fewer than one part.
+    """
+    values = values.double()
+    known = values[~values.isnan()]
+    borders = _quantiles(known, edges) if isinstance(edges, int) else [float(edge) for edge in edges]
+    if not borders:
+        return _named([(f"{name} unknown", values.isnan())])
+    if any(high <= low for low, high in pairwise(borders)):
+        raise ValueError(f"the edges of {name} must ascend, but are {borders}")
+    rule = f".{_decimals(borders)}f" if isinstance(edges, int) else "g"
+    words, suffix = [format(border, rule) for border in borders], f" {unit}" if unit else ""
+    parts = [(f"{name} below {words[0]}{suffix}", values < borders[0])]
+    for (low, high), (low_word, high_word) in zip(pairwise(borders), pairwise(words), strict=True):
+        inside = (values >= low) & ((values <= high) if high == borders[-1] else (values < high))
+        parts.append((f"{name} {low_word}-{high_word}{suffix}", inside))
+    if len(borders) == 1:
+        parts.append((f"{name} {words[0]}{suffix}", values == borders[0]))
+    parts.append((f"{name} above {words[-1]}{suffix}", values > borders[-1]))
+    parts.append((f"{name} unknown", values.isnan()))
+    return _named(parts)
+
+
+def _quantiles(known: Tensor, n: int) -> list[float]:
+    """n + 1 borders of parts of equal size; fewer where many values are equal."""
+    if n < 1:
+        raise ValueError(f"samples split into at least 1 part, not {n}")
+    if len(known) == 0:
+        return []
+    shares = torch.linspace(0, 1, n + 1, dtype=torch.float64)
+    borders: list[float] = known.quantile(shares).unique().tolist()
+    return borders
+
+
+def _decimals(borders: Sequence[float]) -> int:
+    """As few as let neighbouring borders read as different."""
+    gaps = [high - low for low, high in pairwise(borders)]
+    return max(0, -math.floor(math.log10(min(gaps)))) if gaps else 2
+
+
+def _named(parts: Sequence[tuple[str, Tensor]]) -> list[Stratum]:
+    return [Stratum(label, mask) for label, mask in parts if bool(mask.any())]

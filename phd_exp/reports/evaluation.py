@@ -1,0 +1,220 @@
+"""What one table of predictions says of its model: scores, curves and strata, all with bootstrap bands."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import pyarrow as pa
+import torch
+from torch import Tensor
+
+from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions.columns import PARAMETERS, distribution_columns, draws, from_columns
+from phd_exp.distributions.temperature import Temperature
+from phd_exp.metrics.bootstrap import Interval, Statistic, bands
+from phd_exp.metrics.calibration_scores import COLUMNS, calibration_scores, ordered
+from phd_exp.metrics.curves import abscissae, curves
+from phd_exp.metrics.errors import MILLIMETRES
+from phd_exp.metrics.scores import DRAWS, energy_score
+from phd_exp.metrics.strata import strata
+from phd_exp.records.errors import RunError
+
+Arrays = Mapping[str, np.ndarray]
+"""Name of a column -> a value a sample."""
+Columns = dict[str, Tensor]
+
+SEED = 0
+ERRORS = ("projected_error_mm", "depth_error_mm")
+OF_A_DISTRIBUTION = (*COLUMNS, *ERRORS, "nll", "energy_score")
+XYZ = ("x", "y", "z")
+QUANTITIES: Mapping[str, tuple[str, str, tuple[float, ...] | int]] = {
+    "visibility": ("visibility", "", (0.0, 0.25, 0.5, 0.75, 0.95, 1.0)),
+    "truncation": ("truncation", "", (0.0, 0.05, 0.25, 0.5, 1.0)),
+    "depth": ("z", "m", 4),
+    "focal length": ("f", "px", 4),
+}
+"""Quantity of the strata -> its column, its unit, and edges or a number of equal parts.
+
+The true depth is what is predicted: even calibrated predictions are not calibrated among samples chosen by it.
+"""
+
+
+@dataclass(frozen=True)
+class Band:
+    """A number and its 95 % bootstrap interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Points of a curve, and the 95 % bootstrap interval of each y."""
+
+    x: list[float]
+    y: list[float]
+    low: list[float]
+    high: list[float]
+
+
+@dataclass(frozen=True)
+class Stratum:
+    """The scores of a part of the samples."""
+
+    quantity: str
+    label: str
+    n: int
+    scores: dict[str, Band]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A table of predictions, measured; `left_out` further samples had a number that is not finite.
+
+    Scores of a distribution are `calibration_scores` and the means of `nll` (nats) and `energy_score_mm`; of a point
+    estimate too those of `projected_error_mm` and `depth_error_mm`. Curves are those of `metrics.curves.curves`: x is
+    predicted variance, credible level, PIT, or share of samples kept.
+    """
+
+    n: int
+    scores: dict[str, Band]
+    curves: dict[str, Curve]
+    strata: list[Stratum]
+    left_out: int
+
+
+def evaluate(table: pa.Table | Arrays, window: int = 200, resamples: int = 200) -> Evaluation:
+    """Measure predictions of a distribution.
+
+    Raises RunError where a column is missing, or where no sample has all of them finite.
+    """
+    columns, left_out = _finite(table, OF_A_DISTRIBUTION)
+    x = abscissae(columns, window)
+    intervals = bands(partial(curves, window=window), columns, resamples, SEED)
+    return Evaluation(
+        n=len(columns["nll"]),
+        scores=_scores(_distribution_scores, columns, resamples),
+        curves={name: _curve(x[name], interval) for name, interval in intervals.items()},
+        strata=_strata(_distribution_scores, columns, resamples),
+        left_out=left_out,
+    )
+
+
+def evaluate_points(table: pa.Table | Arrays, resamples: int = 200) -> Evaluation:
+    """Measure predictions of a point alone: its errors, no curves. Raises RunError as `evaluate` does."""
+    columns, left_out = _finite(table, ERRORS)
+    return Evaluation(
+        n=len(columns[ERRORS[0]]),
+        scores=_scores(_point_scores, columns, resamples),
+        curves={},
+        strata=_strata(_point_scores, columns, resamples),
+        left_out=left_out,
+    )
+
+
+def fit_temperature(held_out_table: pa.Table | Arrays) -> Temperature:
+    """The temperatures that fit predictions of samples that were held out of training.
+
+    Raises RunError where a column is missing, or where none fits.
+    """
+    columns, _ = _finite(held_out_table, (*PARAMETERS, *XYZ))
+    try:
+        return Temperature.fit(_distribution(columns), _positions(columns))
+    except ValueError as error:
+        raise RunError(f"predictions: no temperature fits them ({error})") from None
+
+
+def recalibrated(table: pa.Table | Arrays, temperature: Temperature) -> dict[str, np.ndarray]:
+    """The same columns for A / projected and a / depth: estimates of the mode stay, all that is uncertain changes.
+
+    Samples whose parameters are not finite are dropped. Raises RunError where a column is missing.
+    """
+    arrays = _arrays(table, (*PARAMETERS, *XYZ))
+    columns = {name: _tensor(arrays[name]) for name in (*PARAMETERS, *XYZ)}
+    finite = torch.stack(list(columns.values())).isfinite().all(dim=0)
+    columns = {name: column[finite] for name, column in columns.items()}
+    distribution, xyz = temperature.apply(_distribution(columns)), _positions(columns)
+    changed = distribution_columns(distribution, xyz)
+    changed["energy_score"] = energy_score(draws(distribution, DRAWS, SEED), xyz)
+    kept = {name: array[finite.numpy()] for name, array in arrays.items()}
+    return kept | {name: column.numpy() for name, column in changed.items()}
+
+
+def _distribution_scores(columns: Mapping[str, Tensor], weight: Tensor) -> dict[str, Tensor]:
+    energy = {"energy_score_mm": MILLIMETRES * _mean(columns["energy_score"], weight)}
+    nll = {"nll": _mean(columns["nll"], weight)}
+    return _point_scores(columns, weight) | nll | energy | calibration_scores(ordered(columns, weight))
+
+
+def _point_scores(columns: Mapping[str, Tensor], weight: Tensor) -> dict[str, Tensor]:
+    return {name: _mean(columns[name], weight) for name in ERRORS}
+
+
+def _mean(column: Tensor, weight: Tensor) -> Tensor:
+    return (weight * column).sum(-1) / weight.sum(-1)
+
+
+def _scores(statistic: Statistic, columns: Columns, resamples: int) -> dict[str, Band]:
+    intervals = bands(statistic, columns, resamples, SEED)
+    return {
+        name: Band(float(interval.value), float(interval.low), float(interval.high))
+        for name, interval in intervals.items()
+    }
+
+
+def _curve(x: Tensor, interval: Interval) -> Curve:
+    return Curve(x.tolist(), interval.value.tolist(), interval.low.tolist(), interval.high.tolist())
+
+
+def _strata(statistic: Statistic, columns: Columns, resamples: int) -> list[Stratum]:
+    found = []
+    for quantity, (column, unit, edges) in QUANTITIES.items():
+        if column not in columns:
+            continue
+        for stratum in strata(quantity, columns[column], edges, unit):
+            part = {name: values[stratum.mask] for name, values in columns.items()}
+            scores = _scores(statistic, part, resamples)
+            found.append(Stratum(quantity, stratum.label, int(stratum.mask.sum()), scores))
+    return found
+
+
+def _finite(table: pa.Table | Arrays, names: tuple[str, ...]) -> tuple[Columns, int]:
+    """The columns asked for and those of the strata, of the samples where the former are finite; how many are not."""
+    arrays = _arrays(table, names)
+    of_strata = [column for column, _, _ in QUANTITIES.values() if column in arrays]
+    columns = {name: _tensor(arrays[name]) for name in dict.fromkeys((*names, *of_strata))}
+    finite = torch.stack([columns[name] for name in names]).isfinite().all(dim=0)
+    if not bool(finite.any()):
+        raise RunError(
+            f"predictions: none of {len(finite)} samples has finite {', '.join(names)}; train longer, or look at nll"
+        )
+    return {name: column[finite] for name, column in columns.items()}, int((~finite).sum())
+
+
+def _arrays(table: pa.Table | Arrays, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    if isinstance(table, pa.Table):
+        table = {name: table[name].to_numpy() for name in table.column_names}
+    missing = [name for name in names if name not in table]
+    if missing:
+        raise RunError(
+            f"predictions: column {', '.join(missing)} missing, which an older version may not have written; "
+            "run the model again"
+        )
+    return dict(table)
+
+
+def _tensor(array: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.array(array, dtype=np.float64))
+
+
+def _distribution(columns: Mapping[str, Tensor]) -> ProjectedHuber:
+    try:
+        return from_columns(columns)
+    except ValueError as error:
+        raise RunError(f"predictions: parameters are of no distribution ({error})") from None
+
+
+def _positions(columns: Mapping[str, Tensor]) -> Tensor:
+    return torch.stack([columns[name] for name in XYZ], dim=-1)

@@ -1,0 +1,120 @@
+"""Tables for the terminal, and the list of all runs."""
+
+from collections.abc import Sequence
+from itertools import groupby
+
+from rich import box
+from rich.console import Console
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from phd_exp.reports.captions import gap_lines, making_command, one_line
+from phd_exp.reports.collect import Records, Run
+from phd_exp.reports.point_errors import ErrorKey, Quantity
+from phd_exp.reports.tables import DIGITS, NOTHING, PaperTable, TableCell
+
+WIDTH = 118
+"""Columns, also where the output is no terminal and rich would fall back to 80."""
+OF_A_STAR = "*: bold."
+
+
+def print_report(records: Records, tables: Sequence[PaperTable]) -> None:
+    """Print both tables of every preset in both readings, then every run with its state."""
+    console = Console(width=max(WIDTH, Console().width), highlight=False)
+    for _, readings in groupby(tables, key=lambda table: (table.preset, table.name)):
+        _print_readings(console, list(readings))
+    for note in dict.fromkeys(note for table in tables for note in table.notes):
+        _say(console, note)
+    if tables:
+        _say(console, "" if console.is_terminal else OF_A_STAR)
+    _print_runs(console, records.runs)
+    if not tables:
+        what = "no run of a table yet" if records.runs else "no runs recorded yet"
+        _say_command(console, f"{what}; begin by", making_command(records, "paper", "table1"))
+
+
+def _print_readings(console: Console, readings: Sequence[PaperTable]) -> None:
+    """The readings of one table below each other, then what they lack, once."""
+    for table in readings:
+        _say(console, table.title, style="bold")
+        console.print(_paper_table(table, starred=not console.is_terminal))
+        console.print()
+    if gaps := dict.fromkeys(gap for table in readings for gap in table.gaps):
+        _say(console, "Not there:")
+        for line in gap_lines(gaps):
+            _say(console, line, left=2)
+        if command := readings[0].command:
+            _say_command(console, "Made by", command)
+        console.print()
+
+
+def _print_runs(console: Console, runs: Sequence[Run]) -> None:
+    plain = [run for run in runs if run.overrides is None]
+    apart = [run for run in runs if run.overrides is not None]
+    for title, chosen in (("Runs", plain), ("Runs with other overrides, in no table", apart)):
+        if chosen:
+            _say(console, f"{title}; projected and depth error in mm, NLL in nats", style="bold")
+            console.print(_run_list(chosen))
+            console.print()
+
+
+def _say(console: Console, text: str, style: str = "", left: int = 0) -> None:
+    # Text, not str: square brackets from a file are no markup
+    console.print(Padding(Text(text, style=style), (0, 0, 0, left), expand=False))
+
+
+def _say_command(console: Console, before: str, command: str) -> None:
+    console.print(Text(f"{before}: {command}"), soft_wrap=True)  # what is copied must not be broken
+
+
+def _paper_table(table: PaperTable, *, starred: bool) -> Table:
+    """As rich draws it; the best are bold, and starred where the output shows no bold."""
+    drawn = Table(box=box.SIMPLE_HEAD, show_edge=False)
+    for heading in table.stub:
+        drawn.add_column(heading, no_wrap=True)
+    for heading in table.columns:
+        drawn.add_column(heading, justify="right", no_wrap=True)
+    for group in table.groups:
+        for row in group:
+            stub = [Text(text) for text in row.stub]
+            drawn.add_row(*stub, *(_cell(cell, starred) for cell in row.cells), end_section=row is group[-1])
+    return drawn
+
+
+def _cell(cell: TableCell, starred: bool) -> Text:
+    text = Text("*" if cell.bold and starred else "")
+    text.append(cell.ours, style="bold" if cell.bold else "")
+    if cell.spread:
+        text.append(f" {cell.spread}")
+    if cell.paper:
+        text.append(f"\n{cell.paper}", style="dim")
+    return text
+
+
+def _run_list(runs: Sequence[Run]) -> Table:
+    drawn = Table(box=box.SIMPLE_HEAD, show_edge=False)
+    drawn.add_column("run", overflow="fold")
+    for heading in ("projected", "depth", "NLL"):
+        drawn.add_column(heading, justify="right", no_wrap=True)
+    drawn.add_column("state", overflow="fold")
+    for run in runs:
+        drawn.add_row(
+            Text(one_line("/".join((run.preset, run.data, run.model, run.folder.path.name)))),
+            _error(run, "projected"),
+            _error(run, "depth"),
+            NOTHING if run.nll is None else f"{run.nll:.2f}",
+            Text(_state(run)),
+        )
+    return drawn
+
+
+def _error(run: Run, quantity: Quantity) -> str:
+    mean = run.errors.get(ErrorKey("mode", "whole", quantity))
+    return NOTHING if mean is None else f"{mean.value:.{DIGITS[quantity]}f}"
+
+
+def _state(run: Run) -> str:
+    words = f"{run.state}: {run.detail}" if run.detail else run.state
+    apart = "" if run.overrides is None else f"; overrides: {run.overrides}"
+    return one_line(words + apart)

@@ -1,0 +1,183 @@
+"""Level curves of one predicted density: on the image, and from above (the paper's first figure).
+
+A curve of level p bounds the smallest region that holds the probability p, of (x, y)/z on the image and of (x, z) in
+the bird's-eye view. Both laws are marginals of the density of (x, y, z), and both have closed curves because q and t
+are independent (see `ProjectedHuber`).
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from scipy import integrate, optimize, special
+
+from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions.huber import radial_cdf
+
+Points = Float[np.ndarray, "points 2"]
+
+LEVELS = (0.5, 0.9, 0.99)
+_POINTS = 73  # of a curve, and of half an outline
+_STRATA = 500  # equally probable values that stand for a one-dimensional law
+_FURTHEST = 45.0  # |q_1| beyond which there is no probability left in float64
+
+
+@dataclass(frozen=True)
+class LevelCurves:
+    """Closed curves of one distribution, one for each level.
+
+    Attributes:
+        levels: the probability inside each curve.
+        projected: (x, y)/z along each curve, without unit.
+        birds_eye: (x, z) along each curve, metres.
+        mode: position of highest density, metres.
+    """
+
+    levels: tuple[float, ...]
+    projected: tuple[Points, ...]
+    birds_eye: tuple[Points, ...]
+    mode: Float[np.ndarray, " 3"]
+
+
+def level_curves(distribution: ProjectedHuber, levels: tuple[float, ...] = LEVELS) -> LevelCurves:
+    """The curves of a distribution with an empty batch shape, computed in float64.
+
+    Raises ValueError for a batch of distributions, or a level outside (0, 1).
+    """
+    if distribution.batch_shape != torch.Size([]):
+        raise ValueError(
+            f"level curves are those of one distribution, not of {tuple(distribution.batch_shape)}"
+        )
+    if not all(0 < level < 1 for level in levels):
+        raise ValueError(f"levels lie between 0 and 1, exclusive; these are {levels}")
+    t = _depth_strata(distribution)
+    return LevelCurves(
+        levels=levels,
+        projected=tuple(_ellipse(distribution, _radius(t, level)) for level in levels),
+        birds_eye=tuple(_outline(distribution, _excess(distribution, t, level)) for level in levels),
+        mode=_float64(distribution.mode),
+    )
+
+
+def on_image(projected: Points, f: float, S: float) -> Points:
+    """Pixels of (x, y)/z in an image of S pixels a side and focal length f (pixels): S/2 + f (x, y)/z."""
+    return S / 2 + f * projected
+
+
+def _float64(values: torch.Tensor) -> np.ndarray:
+    return values.detach().cpu().double().numpy()
+
+
+def _depth_strata(distribution: ProjectedHuber) -> Float[np.ndarray, " strata"]:
+    """Equally probable values of t = z / mu_z, the middles of strata."""
+    middles = (torch.arange(_STRATA, dtype=torch.float64) + 0.5) / _STRATA
+    return _float64(distribution.depth_icdf(middles) / distribution.mu_z)
+
+
+def _radius(t: Float[np.ndarray, " strata"], level: float) -> float:
+    """The rho with P(|A (u - mu_xy)| <= rho) = level for u = (x, y)/z, where A (u - mu_xy) = q/t.
+
+    Source: own derivation: the density of q/t falls with |q/t|, so its level sets are discs; checked against samples.
+    """
+
+    def excess(log_rho: float) -> float:
+        return float(radial_cdf(torch.from_numpy(np.exp(log_rho) * t)).mean()) - level
+
+    # |q| lies in [1e-6, 60] at any level that is asked for
+    return float(np.exp(optimize.brentq(excess, np.log(1e-6 / t.max()), np.log(60 / t.min()), xtol=1e-10)))
+
+
+def _ellipse(distribution: ProjectedHuber, radius: float) -> Points:
+    """u = mu_xy + A^(-1) rho (cos, sin), once around."""
+    angle = np.linspace(0, 2 * np.pi, _POINTS)
+    circle = radius * np.stack([np.cos(angle), np.sin(angle)])
+    return _float64(distribution.mu_xy) + np.linalg.solve(_float64(distribution.A), circle).T
+
+
+@cache
+def _marginal() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of q_1, one coordinate of q: values s >= 0, its energy e(s) = log m(0)/m(s), and P(|q_1| <= s).
+
+    m(s) K = int exp(-h(sqrt(s^2 + w^2))) dw. Where s^2 + w^2 <= 1 it is an error function; the linear branch gives
+    2 e^(1/2) s K_1(s), less what lies inside the unit disc.
+
+    Source: own derivation; checked against samples.
+    """
+    s = np.concatenate([np.linspace(0, 2, 2001), np.linspace(2, _FURTHEST, 4001)[1:]])
+    half = np.sqrt(np.clip(1 - s**2, 0, None))
+    quadratic = np.exp(-(s**2) / 2) * np.sqrt(np.pi / 2) * special.erf(half / np.sqrt(2))
+    nodes, weights = np.polynomial.legendre.leggauss(64)
+    w = half[:, None] * (nodes + 1) / 2
+    inside = half / 2 * (np.exp(-np.hypot(s[:, None], w)) @ weights)
+    linear = np.concatenate([[1.0], s[1:] * special.k1(s[1:])]) - inside
+    m = 2 * (quadratic + np.exp(0.5) * linear)
+    cumulative = integrate.cumulative_simpson(m, x=s, initial=0)
+    return s, -np.log(m / m[0]), cumulative / cumulative[-1]
+
+
+def _excess(distribution: ProjectedHuber, t: np.ndarray, level: float) -> float:
+    """The c with P(a (max(t, 1/t) - 1) + e(q_1) <= c) = level."""
+    _, energy, cumulative = _marginal()
+    of_depth = _depth_energy(distribution, t)
+
+    def surplus(c: float) -> float:
+        return float(np.interp(c - of_depth, energy, cumulative, left=0).mean()) - level
+
+    return float(optimize.brentq(surplus, 0, of_depth.max() + energy[-1], xtol=1e-10))
+
+
+def _depth_energy(distribution: ProjectedHuber, t: np.ndarray) -> np.ndarray:
+    return float(distribution.a) * (np.maximum(t, 1 / t) - 1)
+
+
+def _outline(distribution: ProjectedHuber, excess: float) -> Points:
+    """The (x, z) with a (max(t, 1/t) - 1) + e(q_1) = c, once around.
+
+    Given z, x = z mu_x + |g| q_1 in law, where g is the first row of mu_z A^(-1); so (x, z) has the density of t
+    times that of q_1, both at their own scale.
+
+    Source: own derivation; the law of (x, z) is constant along the curve, checked by quadrature.
+    """
+    s, energy, _ = _marginal()
+    furthest = 1 + excess / float(distribution.a)
+    bend = np.linspace(0, np.pi / 2, (_POINTS + 1) // 2)
+    above = 1 + (furthest - 1) * np.sin(bend)  # dense where the curve closes
+    t = np.concatenate([1 / above[:0:-1], above])
+    half_width = np.interp(np.clip(excess - _depth_energy(distribution, t), 0, None), energy, s)
+    z = float(distribution.mu_z) * t
+    reach = float(distribution.mu_z) * np.linalg.norm(np.linalg.inv(_float64(distribution.A))[0])
+    middle = z * float(distribution.mu_xy[0])
+    right = np.stack([middle + reach * half_width, z], axis=-1)
+    left = np.stack([middle - reach * half_width, z], axis=-1)
+    return np.concatenate([right, left[::-1], right[:1]])
+
+
+def draw_on_image(
+    axes: Axes, curves: LevelCurves, image: np.ndarray | None, f: float, S: float, truth: np.ndarray | None
+) -> None:
+    """The image with the curves of (x, y)/z, the mode as a cross and the projected truth as a dot."""
+    if image is not None:
+        axes.imshow(image, extent=(0, S, S, 0))
+    for width, points in zip((1.6, 1.1, 0.7), curves.projected, strict=False):
+        axes.plot(*on_image(points, f, S).T, color="#ffb000", linewidth=width)
+    axes.plot(*on_image(curves.mode[:2] / curves.mode[2], f, S), "x", color="#ffb000", markersize=6)
+    if truth is not None:
+        axes.plot(
+            *on_image(truth[:2] / truth[2], f, S), "o", color="white", markeredgecolor="black", markersize=4
+        )
+    axes.set(xlim=(0, S), ylim=(S, 0), aspect="equal", xlabel="column (px)", ylabel="row (px)")
+
+
+def draw_birds_eye(axes: Axes, curves: LevelCurves, truth: np.ndarray | None) -> None:
+    """The curves of (x, z), the mode as a cross and the truth as a dot; the axes have scales of their own."""
+    for width, level, points in zip((1.6, 1.1, 0.7), curves.levels, curves.birds_eye, strict=False):
+        axes.plot(*points.T, color="#0072b2", linewidth=width, label=f"{100 * level:g} %")
+    axes.plot(curves.mode[0], curves.mode[2], "x", color="#0072b2", markersize=6, label="mode")
+    if truth is not None:
+        axes.plot(truth[0], truth[2], "o", color="black", markersize=4, label="truth")
+    axes.set(xlabel="x (m)", ylabel="z (m)")
+    axes.grid(alpha=0.25)
+    axes.legend(frameon=False, fontsize="small")

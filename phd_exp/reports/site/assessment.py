@@ -1,0 +1,51 @@
+"""How good the predictions of a run are, before and after recalibration: where pages meet the evaluation."""
+
+from dataclasses import dataclass
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from phd_exp.distributions.temperature import Temperature
+from phd_exp.records.errors import RunError
+from phd_exp.records.runs import RunFolder
+from phd_exp.reports.evaluation import (
+    Evaluation,
+    evaluate,
+    evaluate_points,
+    fit_temperature,
+    recalibrated,
+)
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """Of a baseline, errors alone; of a distribution, everything, and again after recalibration.
+
+    Attributes:
+        before: of the predictions as recorded.
+        after: of the same predictions recalibrated; None where nothing was held out.
+        temperature: what recalibrated them, fitted on samples held out of training.
+    """
+
+    before: Evaluation
+    after: Evaluation | None = None
+    temperature: Temperature | None = None
+
+
+def is_distribution(predictions: pa.Table) -> bool:
+    """Whether predictions are densities, not points alone."""
+    return "a" in predictions.column_names
+
+
+def assess(folder: RunFolder, predictions: pa.Table) -> Assessment:
+    """Evaluate the predictions of a run. Raises RunError where a table lacks what is needed."""
+    if not is_distribution(predictions):
+        return Assessment(evaluate_points(predictions))
+    before = evaluate(predictions)
+    if not folder.held_out.exists():
+        return Assessment(before)
+    try:
+        temperature = fit_temperature(pq.read_table(folder.held_out))
+    except (pa.ArrowException, OSError) as error:
+        raise RunError(f"{folder.held_out}: cannot be read ({' '.join(str(error).split())[:200]})") from None
+    return Assessment(before, evaluate(recalibrated(predictions, temperature)), temperature)

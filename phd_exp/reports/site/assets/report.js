@@ -1,0 +1,228 @@
+// Draws the charts of a page: each `figure.chart` names a run and a chart of its data file.
+const phdExp = (() => {
+  const runs = new Map();
+  const drawn = new Set();
+  const LOG = "log";
+
+  /** Called by every data file. */
+  function receive(name, content) {
+    runs.set(name, content);
+    document.dispatchEvent(new CustomEvent("received", { detail: name }));
+  }
+
+  const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  const escaped = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
+
+  /** A copy in which colours named by the style sheet are those of the present theme. */
+  function themed(value) {
+    if (typeof value === "string") {
+      const name = /^var\((--[\w-]+)\)$/.exec(value);
+      return name ? style(name[1]) : value;
+    }
+    if (Array.isArray(value)) return value.map(themed);
+    if (value === null || typeof value !== "object") return value;
+    return Object.fromEntries(Object.entries(value).map(([key, inner]) => [key, themed(inner)]));
+  }
+
+  function filters() {
+    const chosen = {};
+    for (const select of document.querySelectorAll("select[data-filter]")) {
+      if (select.value) chosen[select.dataset.filter] = select.value;
+    }
+    return chosen;
+  }
+
+  /** Lines without filtered fields, such as the diagonal, always stay. */
+  function visible(trace, chosen) {
+    return Object.entries(chosen).every(([key, value]) => !(key in trace.meta) || trace.meta[key] === value);
+  }
+
+  const shownOf = (chart) => chart.data.filter((trace) => visible(trace, filters()));
+
+  function traces(chart) {
+    return shownOf(chart).flatMap((trace) => {
+      const line = { ...themed(trace), name: escaped(trace.name) };
+      const place = trace.meta.role === "points" ? "%{y}: %{x:.4g}" : "%{x:.4g}, %{y:.4g}";
+      line.hovertemplate = `${trace.text ? escaped(trace.text) + "<br>" : ""}${place}<extra>${escaped(trace.name)}</extra>`;
+      delete line.text;
+      if (trace.meta.role === "points") return [withBars(line, trace.meta)];
+      return trace.meta.low ? [band(line, chart), line] : [line];
+    });
+  }
+
+  /** Categories on the vertical axis, the first on top: their names may be long. */
+  function withBars(line, { low, high }) {
+    const x = line.x;
+    line.y = line.y.map(escaped);
+    line.error_x = {
+      type: "data", symmetric: false, thickness: 1.5, width: 4,
+      array: high.map((value, i) => value - x[i]), arrayminus: low.map((value, i) => x[i] - value),
+    };
+    return line;
+  }
+
+  function band(line, chart) {
+    const { low, high } = line.meta;
+    const floor = chart.layout.yaxis.type === LOG ? 0 : -Infinity;
+    const keep = line.x.map((_, i) => i).filter((i) => low[i] !== null && high[i] !== null && low[i] > floor);
+    return {
+      type: "scatter", mode: "lines", hoverinfo: "skip",
+      x: [...keep.map((i) => line.x[i]), ...keep.map((i) => line.x[i]).reverse()],
+      y: [...keep.map((i) => high[i]), ...keep.map((i) => low[i]).reverse()],
+      fill: "toself", fillcolor: faint(line.line.color), line: { width: 0 },
+    };
+  }
+
+  function faint(colour) {
+    const [r, g, b] = colour.slice(1).match(/../g).map((pair) => parseInt(pair, 16));
+    return `rgba(${r}, ${g}, ${b}, 0.16)`;
+  }
+
+  function layout(chart) {
+    const axis = (name) => {
+      const given = chart.layout[`${name}axis`];
+      return {
+        ...given, title: { text: escaped(given.title.text), font: { size: 12.5 }, standoff: 8 }, automargin: true,
+        gridcolor: style("--grid"), linecolor: style("--rule"), zeroline: false, ticks: "outside", ticklen: 4, tickangle: 0,
+        tickcolor: style("--rule"), ...(given.type === LOG ? logTicks(chart, name) : { exponentformat: "power" }),
+      };
+    };
+    return {
+      ...chart.layout, xaxis: axis("x"), yaxis: axis("y"), showlegend: false,
+      font: { family: style("--sans"), size: 12.5, color: style("--ink") },
+      paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+      margin: { l: 8, r: 22, t: 12, b: 8 }, hovermode: "closest",
+      hoverlabel: { bgcolor: style("--paper"), bordercolor: style("--rule"), font: { color: style("--ink") } },
+      // on a touch screen a drag scrolls the page
+      dragmode: window.matchMedia("(pointer: fine)").matches ? "zoom" : false,
+    };
+  }
+
+  /** Ticks at powers of ten, and at 2 and 5 between them where there are few; numbers in full where they are short. */
+  function logTicks(chart, name) {
+    const values = chart.data.flatMap((trace) => [...trace[name], ...(trace.meta.low ?? [])]).filter((value) => value > 0);
+    if (!values.length) return {};
+    const [low, high] = [Math.min(...values), Math.max(...values)].map(Math.log10);
+    const decades = Array.from({ length: Math.ceil(high) - Math.floor(low) + 1 }, (_, i) => Math.floor(low) + i);
+    const every = Math.ceil(decades.length / 7);
+    const steps = high - low > 1.5 ? [1] : [1, 2, 5];
+    const ticks = decades.filter((_, i) => i % every === 0).flatMap((power) => steps.map((step) => [step, power]));
+    const text = (step, power) => (power >= -2 && power <= 4 ? Number((step * 10 ** power).toPrecision(2)).toLocaleString("en") : `${step === 1 ? "" : `${step}·`}10<sup>${power}</sup>`);
+    return { tickvals: ticks.map(([step, power]) => step * 10 ** power), ticktext: ticks.map(([step, power]) => text(step, power)) };
+  }
+
+  const DASHES = { solid: "none", dash: "7 4", dot: "2 3", dashdot: "7 3 2 3" };
+
+  /** What each line means, below the caption; not where a whole group of charts shares one legend. */
+  function legend(figure, chart) {
+    const named = new Map(shownOf(chart).map((trace) => [trace.name, trace]));
+    figure.querySelector(".legend")?.remove();
+    if (figure.closest("[data-legend=shared]") || named.size < 2) return;
+    const list = Object.assign(document.createElement("ul"), { className: "legend" });
+    for (const [name, { line, marker }] of named) {
+      const item = document.createElement("li");
+      const sample = document.createElementNS("http://www.w3.org/2000/svg", "svg");
+      sample.setAttribute("viewBox", "0 0 28 8");
+      sample.setAttribute("aria-hidden", "true");
+      const stroke = document.createElementNS("http://www.w3.org/2000/svg", "path");
+      stroke.setAttribute("d", "M0,4H28");
+      stroke.style.stroke = (line ?? marker).color;
+      stroke.style.strokeDasharray = DASHES[line?.dash ?? "solid"];
+      sample.append(stroke);
+      item.append(sample, name);
+      list.append(item);
+    }
+    figure.querySelector("figcaption").append(list);
+  }
+
+  const chartOf = (figure) => figure.chart ?? runs.get(figure.dataset.run)?.charts[figure.dataset.chart];
+
+  function draw(figure) {
+    const chart = chartOf(figure);
+    if (!chart) return Promise.resolve();
+    drawn.add(figure);
+    legend(figure, chart);
+    return Plotly.react(figure.querySelector(".plot"), traces(chart), layout(chart), {
+      responsive: true, displayModeBar: false, displaylogo: false,
+    }).then(() => figure.classList.add("drawn"));
+  }
+
+  /** Numbers of the shown lines, as a table and as a file, made when asked for. */
+  function tabulate(figure) {
+    const chart = chartOf(figure);
+    const shown = shownOf(chart).filter((trace) => trace.meta.role !== "identity");
+    const bounds = shown.some((trace) => trace.meta.low);
+    const head = ["line", chart.layout.xaxis.title.text, chart.layout.yaxis.title.text, ...(bounds ? ["low", "high"] : [])];
+    const rows = shown.flatMap((trace) => trace.x.map((x, i) => [
+      trace.text ?? trace.name, x, trace.y[i], ...(bounds ? [trace.meta.low?.[i], trace.meta.high?.[i]] : []),
+    ]));
+    const details = figure.querySelector("details");
+    details.querySelectorAll(":scope > :not(summary)").forEach((old) => old.remove());
+    const box = document.createElement("div");
+    box.className = "scroll tall";
+    box.tabIndex = 0;
+    box.setAttribute("role", "region");
+    box.setAttribute("aria-label", `Numbers of ${chart.title}`);
+    box.append(table(head, rows.slice(0, 2000)));
+    details.append(download(figure, [head, ...rows]), box);
+  }
+
+  function download(figure, rows) {
+    const quoted = (value) => `"${String(value ?? "").replace(/"/g, '""')}"`;
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(new Blob([rows.map((row) => row.map(quoted).join(",")).join("\r\n")], { type: "text/csv" }));
+    link.download = `${figure.dataset.run ?? "comparison"}-${figure.dataset.chart}.csv`;
+    link.textContent = "Download as CSV";
+    return link;
+  }
+
+  function table(head, rows) {
+    const result = document.createElement("table");
+    const line = (values, tag, parent) => {
+      const row = parent.insertRow();
+      for (const value of values) {
+        const cell = document.createElement(tag);
+        if (tag === "th") cell.scope = "col";
+        if (typeof value === "number") cell.className = "n";
+        cell.textContent = value ?? "";
+        row.append(cell);
+      }
+    };
+    line(head, "th", result.createTHead());
+    const body = result.createTBody();
+    rows.forEach((row) => line(row, "td", body));
+    return result;
+  }
+
+  const watcher = new IntersectionObserver((entries) => {
+    for (const entry of entries) {
+      if (entry.isIntersecting && !drawn.has(entry.target)) draw(entry.target);
+    }
+  }, { rootMargin: "300px" });
+
+  /** Draw the charts below an element when they come into view. */
+  function watch(parent = document) {
+    for (const figure of parent.querySelectorAll("figure.chart")) {
+      watcher.observe(figure);
+      figure.querySelector("details").addEventListener("toggle", (event) => event.target.open && tabulate(figure));
+    }
+  }
+
+  const all = () => [...document.querySelectorAll("figure.chart")];
+  const drawAll = () => Promise.all(all().map(draw));
+  const redraw = () => Promise.all(all().filter((figure) => drawn.has(figure)).map(draw));
+
+  document.addEventListener("DOMContentLoaded", () => {
+    watch();
+    for (const select of document.querySelectorAll("select[data-filter]")) {
+      select.addEventListener("change", () => {
+        redraw();
+        all().filter((figure) => figure.querySelector("details").open).forEach(tabulate);
+      });
+    }
+  });
+  document.documentElement.addEventListener("themechange", redraw);
+  window.addEventListener("beforeprint", drawAll);
+
+  return { receive, runs, watch, drawAll, table };
+})();

@@ -1,0 +1,108 @@
+"""Charts as plain plotly figures: data and layout, in JSON.
+
+Colours are the style sheet's (`var(--series-1)`), so that a page can change them with its theme. A trace's `meta`
+says what the script needs to know: its `role`, and `low` and `high` of an interval, drawn as a band or as bars.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from phd_exp.reports.evaluation import Curve
+
+Trace = dict[str, Any]
+Numbers = Sequence[float | None]
+
+DASHES = ("solid", "dash", "dot", "dashdot")
+POINTS = 120
+"""Of a curve; more would only make pages heavy."""
+
+
+@dataclass(frozen=True)
+class Chart:
+    """One chart.
+
+    Attributes:
+        title: what it shows.
+        label: the same for those who do not see it, with the main numbers.
+    """
+
+    title: str
+    label: str
+    data: list[Trace]
+    layout: dict[str, Any] = field(default_factory=dict)
+
+
+def axis(title: str, log: bool = False, **more: Any) -> dict[str, Any]:
+    return {"title": {"text": title}, "type": "log" if log else "linear", **more}
+
+
+def line(name: str, x: Numbers, y: Numbers, colour: int, *, dash: str = "solid", **meta: Any) -> Trace:
+    """A line; `low` and `high` in `meta` make it a line with a band."""
+    return {
+        "type": "scatter",
+        "mode": "lines",
+        "name": name,
+        "x": _rounded(x),
+        "y": _rounded(y),
+        "line": {"color": f"var(--series-{colour})", "dash": dash, "width": 2},
+        "meta": {"role": "line"} | {key: _compact(value) for key, value in meta.items()},
+    }
+
+
+def bars(name: str, x: Numbers, y: Sequence[str], colour: int, low: Numbers, high: Numbers) -> Trace:
+    """Points with intervals, one a category of the vertical axis."""
+    return {
+        "type": "scatter",
+        "mode": "markers",
+        "name": name,
+        "x": _rounded(x),
+        "y": list(y),
+        "marker": {"color": f"var(--series-{colour})", "size": 8},
+        "meta": {"role": "points", "low": _rounded(low), "high": _rounded(high)},
+    }
+
+
+def identity(low: float, high: float, name: str) -> Trace:
+    """The diagonal on which something calibrated lies."""
+    trace = line(name, (low, high), (low, high), 0, dash="dash", role="identity")
+    trace["line"]["width"] = 1.5
+    return trace
+
+
+def square(layout: dict[str, Any], low: float, high: float) -> dict[str, Any]:
+    """A layout whose axes both reach from low to high."""
+    log = layout["xaxis"]["type"] == "log"
+    ends = [math.log10(low), math.log10(high)] if log else [low, high]
+    return {name: given | {"range": ends} for name, given in layout.items()}
+
+
+def _compact(value: Any) -> Any:
+    return _rounded(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
+
+
+def _rounded(values: Numbers) -> list[float | None]:
+    """Five digits are more than any screen shows; JSON knows neither NaN nor infinity."""
+    return [None if v is None or not math.isfinite(v) else float(f"{v:.5g}") for v in values]
+
+
+def curve_line(name: str, curve: Curve, colour: int, dash: str, role: str) -> Trace:
+    """A curve with its band."""
+    chosen = thinned(len(curve.x))
+    x, y, low, high = ([values[i] for i in chosen] for values in (curve.x, curve.y, curve.low, curve.high))
+    return line(name, x, y, colour, dash=dash, role=role, low=low, high=high)
+
+
+def thinned(n: int, points: int = POINTS) -> list[int]:
+    """Indices of at most `points` of n values, the first and the last among them."""
+    if n <= points:
+        return list(range(n))
+    return [round(i * (n - 1) / (points - 1)) for i in range(points)]
+
+
+def decades(values: Numbers) -> tuple[float, float]:
+    """The powers of ten between which the positive ones of some values lie, at least one decade apart."""
+    positive = [value for value in values if value and value > 0 and math.isfinite(value)] or [1.0]
+    low, high = math.floor(math.log10(min(positive))), math.ceil(math.log10(max(positive)))
+    return 10.0**low, 10.0 ** max(high, low + 1)

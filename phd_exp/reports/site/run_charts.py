@@ -1,0 +1,184 @@
+"""The charts of one run: its calibration, its training, and where its errors are."""
+
+from dataclasses import dataclass
+
+from phd_exp.reports.evaluation import Curve, Evaluation
+from phd_exp.reports.site.charts import (
+    DASHES,
+    Chart,
+    Trace,
+    axis,
+    bars,
+    curve_line,
+    decades,
+    identity,
+    line,
+    square,
+)
+from phd_exp.reports.site.dossier import Dossier
+from phd_exp.reports.site.quantities import METRICS, Quantity, quantity
+
+
+def calibration_charts(evaluation: Evaluation, after: Evaluation | None) -> dict[str, Chart]:
+    """The six charts of a distribution, of the predictions as they are and after recalibration."""
+    return {
+        key: chart
+        for key, kind in _KINDS.items()
+        if key in evaluation.curves
+        for chart in [
+            _calibration_chart(kind, evaluation.curves[key], after.curves.get(key) if after else None)
+        ]
+    }
+
+
+@dataclass(frozen=True)
+class _Kind:
+    title: str
+    x: str
+    y: str
+    diagonal: str = ""
+    log: bool = False
+
+
+_KINDS = {
+    "depth_calibration": _Kind(
+        "Calibration of depth", "predicted variance (m²)", "mean squared error (m²)", "calibrated", log=True
+    ),
+    "projected_calibration": _Kind(
+        "Calibration of the projected position",
+        "predicted variance of (x, y)/z",
+        "mean squared error of (x, y)/z",
+        "calibrated",
+        log=True,
+    ),
+    "coverage": _Kind(
+        "Coverage of credible regions", "credible level", "share of truths inside", "calibrated"
+    ),
+    "depth_pit": _Kind("Depth PIT", "PIT of the true depth", "share of samples below", "calibrated"),
+    "depth_risk_coverage": _Kind(
+        "Depth: risk and coverage", "share of predictions kept, surest first", "mean error of depth (mm)"
+    ),
+    "projected_risk_coverage": _Kind(
+        "Projection: risk and coverage",
+        "share of predictions kept, surest first",
+        "mean projected error (mm)",
+    ),
+}
+
+
+def _calibration_chart(kind: _Kind, before: Curve, after: Curve | None) -> Chart:
+    traces = []
+    if kind.diagonal:
+        ends = decades([*before.x, *before.y]) if kind.log else (0.0, 1.0)
+        traces.append(identity(*ends, kind.diagonal))
+    traces.append(curve_line("as predicted" if after else "predictions", before, 1, "solid", "before"))
+    if after:
+        traces.append(curve_line("recalibrated", after, 2, "dash", "after"))
+    said = f"{kind.title}: {kind.y} against {kind.x}. {_in_words(kind, before)}"
+    if after:
+        said += f" Recalibrated: {_in_words(kind, after)}"
+    layout = {"xaxis": axis(kind.x, kind.log), "yaxis": axis(kind.y, kind.log)}
+    if kind.diagonal:
+        layout = square(layout, *ends)
+    else:
+        layout["yaxis"] |= {"rangemode": "tozero"}
+    return Chart(kind.title, said, traces, layout)
+
+
+def _in_words(kind: _Kind, curve: Curve) -> str:
+    if kind.log:
+        ratios = sorted(y / x for x, y in zip(curve.x, curve.y, strict=True) if x > 0 and y > 0)
+        middle = f"{ratios[len(ratios) // 2]:.2g}" if ratios else "unknown"
+        return f"The squared error is {middle} times the predicted variance in the median; 1 is calibrated."
+    if kind.diagonal:
+        furthest = max(
+            zip(curve.x, curve.y, strict=True), key=lambda pair: abs(pair[1] - pair[0]), default=(0, 0)
+        )
+        return f"Furthest from the diagonal at {furthest[0]:.2f}, where the share is {furthest[1]:.2f}."
+    if not curve.y:
+        return "No points."
+    half = min(range(len(curve.x)), key=lambda i: abs(curve.x[i] - 0.5))
+    return f"The surer half has {curve.y[half]:.3g}, all predictions have {curve.y[-1]:.3g}."
+
+
+def learning_charts(dossier: Dossier) -> dict[str, Chart]:
+    """A chart a metric, training and test split over the epochs."""
+    charts = {
+        f"learning_{key}": chart
+        for key, metric in METRICS.items()
+        if (chart := _learning_chart(dossier, key, metric)) is not None
+    }
+    calibration = _calibration_over_epochs(dossier)
+    return charts | ({"learning_calibration": calibration} if calibration else {})
+
+
+def _learning_chart(dossier: Dossier, key: str, metric: Quantity) -> Chart | None:
+    splits = {split: dossier.metrics.get(f"{split}/{key}") for split in ("test", "train")}
+    traces = [
+        line(split, dossier.epochs, values, colour, dash=dash, role=split)
+        for (split, values), colour, dash in zip(splits.items(), (1, 2), ("solid", "dot"), strict=True)
+        if values is not None
+    ]
+    if not traces:
+        return None
+    log = key not in ("nll", "loss")
+    layout = {"xaxis": axis("epochs of training"), "yaxis": axis(metric.axis, log)}
+    said = "; ".join(_course(trace, metric) for trace in traces)
+    return Chart(f"{metric.label} over training", f"{metric.axis} over the epochs: {said}.", traces, layout)
+
+
+def _course(trace: Trace, metric: Quantity) -> str:
+    known = [(x, y) for x, y in zip(trace["x"], trace["y"], strict=True) if y is not None]
+    if not known:
+        return f"{trace['name']}: no values"
+    (start, first), (end, last) = known[0], known[-1]
+    return f"{trace['name']} from {metric.text(first)} at epoch {start:g} to {metric.text(last)} at epoch {end:g}"
+
+
+_OVER_EPOCHS = ("depth_ence", "projected_ence", "miscalibration_area", "depth_pit_area")
+
+
+def _calibration_over_epochs(dossier: Dossier) -> Chart | None:
+    known = [key for key in _OVER_EPOCHS if f"test/calibration/{key}" in dossier.metrics]
+    traces = [
+        line(
+            quantity(key).label,
+            dossier.epochs,
+            dossier.metrics[f"test/calibration/{key}"],
+            i + 1,
+            dash=DASHES[i],
+        )
+        for i, key in enumerate(known)
+    ]
+    if not traces:
+        return None
+    said = "; ".join(_course(trace, quantity(key)) for trace, key in zip(traces, known, strict=True))
+    layout = {"xaxis": axis("epochs of training"), "yaxis": axis("calibration error", rangemode="tozero")}
+    return Chart("Calibration over training", f"Calibration errors over the epochs: {said}.", traces, layout)
+
+
+def strata_charts(evaluation: Evaluation) -> dict[str, Chart]:
+    """Both errors of the tables by visibility, truncation, depth and focal length."""
+    charts = {}
+    for name in dict.fromkeys(stratum.quantity for stratum in evaluation.strata):
+        for key, colour in (("projected_error_mm", 1), ("depth_error_mm", 2)):
+            charts[f"strata_{name}_{key}".replace(" ", "_")] = _strata_chart(evaluation, name, key, colour)
+    return charts
+
+
+def _strata_chart(evaluation: Evaluation, name: str, key: str, colour: int) -> Chart:
+    score = quantity(key)
+    strata = [stratum for stratum in evaluation.strata if stratum.quantity == name and key in stratum.scores]
+    bands = [stratum.scores[key] for stratum in strata]
+    labels = [stratum.label.removeprefix(f"{name} ") for stratum in strata]
+    lows, highs = [band.low for band in bands], [band.high for band in bands]
+    trace = bars(score.label, [band.value for band in bands], labels, colour, lows, highs)
+    trace["meta"]["n"] = [stratum.n for stratum in strata]
+    said = "; ".join(
+        f"{label}: {score.text(b.value)} {score.unit}" for label, b in zip(labels, bands, strict=True)
+    )
+    layout = {
+        "xaxis": axis(score.axis, rangemode="tozero", nticks=5),
+        "yaxis": axis(name) | {"type": "category", "autorange": "reversed"},
+    }
+    return Chart(f"{score.label} by {name}", f"{score.label} by {name}: {said}.", [trace], layout)

@@ -1,0 +1,70 @@
+"""`python -m phd_exp report` from the outside."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.reports.recorded import predicted, record
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    record(tmp_path / "runs", "occl", "probabilistic", 0, predicted(0).frame)
+    return tmp_path / "runs"
+
+
+def test_tables_are_printed_and_written(phd_exp: Callable, runs: Path, tmp_path: Path) -> None:
+    outcome = phd_exp("report")
+    assert (outcome.status, outcome.err) == (0, "")
+    assert "Table 1, preset small: the whole field of view" in outcome.out
+    assert "Table 1, preset small: the central half of the field of view" in outcome.out
+    assert "Made by: python -m phd_exp -m experiment=table1 preset=small\n" in outcome.out
+    assert "tables: report/tables\n" in outcome.out
+    assert {path.name for path in (tmp_path / "report" / "tables").iterdir()} == {
+        "table1-small-whole.md",
+        "table1-small-whole.tex",
+        "table1-small-central.md",
+        "table1-small-central.tex",
+        "tables.csv",
+    }
+
+
+def test_both_folders_can_be_named(phd_exp: Callable, runs: Path, tmp_path: Path) -> None:
+    runs.rename(tmp_path / "elsewhere")
+    outcome = phd_exp("report", "out=for the paper", "runs=elsewhere")
+    assert outcome.status == 0
+    assert (tmp_path / "for the paper" / "tables" / "tables.csv").exists()
+    assert not (tmp_path / "report").exists()
+    assert "runs=elsewhere\n" in outcome.out
+
+
+def test_nothing_is_written_where_nothing_is_recorded(phd_exp: Callable, tmp_path: Path) -> None:
+    (tmp_path / "runs").mkdir()
+    outcome = phd_exp("report")
+    assert outcome.status == 0
+    assert outcome.out.startswith("no runs recorded yet; begin by: python -m phd_exp -m experiment=table1")
+    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+
+
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [
+        ("rnus=x", "rnus=x: report takes runs=DIR and out=DIR and nothing else, did you mean 'runs'?"),
+        ("out=", "out=: report takes runs=DIR and out=DIR and nothing else"),
+        ("runs", "runs: report takes runs=DIR and out=DIR and nothing else"),
+        ("runs=x", "x: no such folder; train first, or say where the runs are by runs=DIR"),
+    ],
+)
+def test_a_mistake_is_one_line(phd_exp: Callable, runs: Path, argument: str, said: str) -> None:
+    outcome = phd_exp("report", argument)
+    assert (outcome.status, outcome.out) == (1, "")
+    assert outcome.err == f"error: {said}\n"
+
+
+def test_a_folder_in_the_way_is_one_line(phd_exp: Callable, runs: Path, tmp_path: Path) -> None:
+    (tmp_path / "report").write_text("in the way")
+    outcome = phd_exp("report")
+    assert outcome.status == 1
+    (line,) = outcome.err.splitlines()
+    assert line.startswith("error: report/tables: cannot be written (")

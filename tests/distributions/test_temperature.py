@@ -1,0 +1,119 @@
+"""Temperatures: known ones are found again, and the fit is the minimum that it claims to be."""
+
+import math
+
+import pytest
+import torch
+
+from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions.columns import distribution_columns, draws, from_columns, parameter_columns
+from phd_exp.distributions.temperature import Temperature
+
+
+@pytest.fixture(scope="module")
+def truth() -> ProjectedHuber:
+    generator = torch.Generator().manual_seed(1)
+    raw = torch.randn(10_000, 7, generator=generator, dtype=torch.float64)
+    raw[:, 2:6] = 4 + 2 * raw[:, 2:6].abs()
+    return ProjectedHuber.from_raw(raw, f=1500.0, S=224.0, mu_z0=2.5e-3)
+
+
+@pytest.fixture(scope="module")
+def xyz(truth: ProjectedHuber) -> torch.Tensor:
+    return draws(truth, 1, seed=2)[0]
+
+
+@pytest.mark.parametrize(("projected", "depth"), [(2.0, 3.0), (1.0, 1.0), (0.25, 0.1), (1.0, 50.0)])
+def test_finds_by_how_much_predictions_are_overconfident(
+    truth: ProjectedHuber, xyz: torch.Tensor, projected: float, depth: float
+) -> None:
+    predicted = Temperature(1 / projected, 1 / depth).apply(truth)
+    found = Temperature.fit(predicted, xyz)
+    assert found.projected == pytest.approx(projected, rel=0.02)
+    assert found.depth == pytest.approx(depth, rel=0.03)
+    # what it mends is the truth again, not merely something of the same spread
+    mended = found.apply(predicted)
+    torch.testing.assert_close(mended.depth_variance, truth.depth_variance, rtol=0.07, atol=0)
+    torch.testing.assert_close(mended.projected_covariance, truth.projected_covariance, rtol=0.05, atol=1e-9)
+
+
+def test_is_the_minimum_of_the_mean_nll(truth: ProjectedHuber, xyz: torch.Tensor) -> None:
+    predicted = truth.tempered(0.5, 0.3)
+    found = Temperature.fit(predicted, xyz)
+
+    def nll(projected: float, depth: float) -> float:
+        return -float(predicted.tempered(projected, depth).log_prob(xyz).mean())
+
+    least = nll(found.projected, found.depth)
+    for step in (1e-2, 1e-3):
+        assert nll(found.projected * (1 + step), found.depth) > least
+        assert nll(found.projected * (1 - step), found.depth) > least
+        assert nll(found.projected, found.depth * (1 + step)) > least
+        assert nll(found.projected, found.depth * (1 - step)) > least
+
+
+def test_mean_nll_is_convex_in_both_reciprocals(truth: ProjectedHuber, xyz: torch.Tensor) -> None:
+    truth, xyz = (
+        from_columns({name: column[:2000] for name, column in parameter_columns(truth).items()}),
+        xyz[:2000],
+    )
+    r = torch.linspace(0.05, 6, 20).tolist()
+    for line in (lambda r: (1 / r, 1.0), lambda r: (1.0, 1 / r), lambda r: (1 / r, 1 / r)):
+        nll = torch.tensor([-float(truth.tempered(*line(at)).log_prob(xyz).mean()) for at in r]).double()
+        assert (nll.diff().diff() > 0).all()
+
+
+def test_separates_into_two_problems(truth: ProjectedHuber, xyz: torch.Tensor) -> None:
+    once, other = (Temperature.fit(truth.tempered(projected, 0.5), xyz) for projected in (0.5, 4.0))
+    assert once.depth == pytest.approx(other.depth, rel=1e-9)
+    assert once.projected * 0.5 == pytest.approx(other.projected * 4.0, rel=1e-9)
+
+
+def test_leaves_mode_and_batch(distribution: ProjectedHuber) -> None:
+    hotter = Temperature(2.0, 3.0).apply(distribution.expand((2, 3)))
+    assert hotter.batch_shape == (2, 3)
+    torch.testing.assert_close(hotter.mode[0, 0], distribution.mode)
+    torch.testing.assert_close(hotter.mu_xy[0, 0], distribution.mu_xy)
+    torch.testing.assert_close(hotter.A[0, 0], distribution.A / 2)
+    torch.testing.assert_close(hotter.a[0, 0], distribution.a / 3)
+    torch.testing.assert_close(hotter.log_det_A[0, 0], distribution.log_det_A - 2 * math.log(2))
+    rebuilt = ProjectedHuber(hotter.mu_xy, hotter.mu_z, hotter.A, hotter.a)
+    torch.testing.assert_close(hotter.log_prob(distribution.mean), rebuilt.log_prob(distribution.mean))
+
+
+def test_extremes_stay_finite() -> None:
+    raw = torch.tensor([[1e4, -1e4, -1e4, 1e4, -1e4, -1e4, 0.0], [0, 0, 1e4, 0, 1e4, 1e4, 1e4]])
+    hotter = Temperature(3.0, 0.1).apply(ProjectedHuber.from_raw(raw, f=1500.0, S=224.0, mu_z0=2.5e-3))
+    assert hotter.log_prob(torch.tensor([0.1, 0.2, 4.0])).isfinite().all()
+
+
+@pytest.mark.parametrize(
+    "positions",
+    [torch.zeros(0, 3), torch.tensor([[0.0, torch.nan, 4.0]]), torch.tensor([[0.0, 0.0, -4.0]])],
+    ids=["none", "NaN", "behind the camera"],
+)
+def test_refuses_what_cannot_be_fitted(positions: torch.Tensor) -> None:
+    one = ProjectedHuber(torch.zeros(2), torch.tensor(4.0), torch.eye(2), torch.tensor(1.0))
+    with pytest.raises(ValueError, match="fitted to finite predictions"):
+        Temperature.fit(one.expand((len(positions),)), positions)
+
+
+def test_refuses_errors_of_zero(truth: ProjectedHuber) -> None:
+    with pytest.raises(ValueError, match="no temperature fits"):
+        Temperature.fit(truth.tempered(1e-30, 1e-30), 1e3 * truth.mean)
+
+
+def test_a_table_rebuilds_its_distributions(truth: ProjectedHuber, xyz: torch.Tensor) -> None:
+    table = distribution_columns(truth, xyz)
+    again = distribution_columns(from_columns(table), xyz)
+    assert again.keys() == table.keys()
+    for name, column in table.items():
+        torch.testing.assert_close(again[name], column, rtol=1e-6, atol=1e-8)
+
+
+def test_draws_are_seeded_samples(truth: ProjectedHuber) -> None:
+    state = torch.random.get_rng_state()
+    one, same, other = (draws(truth, 3, seed) for seed in (1, 1, 2))
+    assert torch.equal(torch.random.get_rng_state(), state)
+    assert torch.equal(one, same)
+    assert not torch.equal(one, other)

@@ -1,0 +1,74 @@
+"""Bootstrap intervals: their width is that of theory, and they hold what they should."""
+
+from collections.abc import Mapping
+
+import pytest
+import torch
+
+from phd_exp.metrics.bootstrap import bands, resample_counts
+
+
+def means(columns: Mapping[str, torch.Tensor], weight: torch.Tensor) -> dict[str, torch.Tensor]:
+    scalar = (weight * columns["x"]).sum(-1) / weight.sum(-1)
+    return {"mean": scalar, "curve": scalar[:, None] * torch.tensor([1.0, 2.0, 3.0])}
+
+
+def numbers(n: int, seed: int) -> torch.Tensor:
+    return 2 * torch.randn(n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def test_a_resample_draws_as_many_with_replacement() -> None:
+    counts = resample_counts(50, 4000, seed=0)
+    assert (counts.sum(-1) == 50).all()
+    assert counts.mean(0).sub(1).abs().max() < 0.08
+    assert (counts == 0).double().mean().item() == pytest.approx((1 - 1 / 50) ** 50, abs=0.01)
+
+
+def test_interval_of_a_mean_has_the_width_of_theory() -> None:
+    x = numbers(2000, seed=1)
+    band = bands(means, {"x": x}, resamples=2000, seed=0)["mean"]
+    assert band.value.item() == pytest.approx(x.mean().item())
+    assert (band.high - band.low).item() == pytest.approx(2 * 1.96 * x.std().item() / 2000**0.5, rel=0.06)
+    half = bands(means, {"x": x}, resamples=2000, seed=0, confidence=0.5)["mean"]
+    assert (half.high - half.low).item() == pytest.approx(2 * 0.6745 * x.std().item() / 2000**0.5, rel=0.08)
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
+    held = [
+        band.low <= 0 <= band.high
+        for seed in range(300)
+        for band in [bands(means, {"x": numbers(200, seed)}, resamples=200, seed=seed)["mean"]]
+    ]
+    assert sum(held) / 300 == pytest.approx(0.95, abs=0.035)
+
+
+def test_curves_have_an_interval_at_each_point() -> None:
+    found = bands(means, {"x": numbers(100, seed=1)}, resamples=50, seed=0)
+    torch.testing.assert_close(
+        found["curve"].high, found["mean"].high * torch.tensor([1.0, 2.0, 3.0]).double()
+    )
+
+
+def test_the_same_seed_gives_the_same_interval() -> None:
+    one, same, other = (bands(means, {"x": numbers(100, seed=1)}, 50, seed)["mean"] for seed in (0, 0, 1))
+    assert (one.low, one.high) == (same.low, same.high)
+    assert one.low != other.low
+
+
+def test_an_interval_holds_its_value_where_resampling_adds_noise() -> None:
+    """The distance of a mean from one that it equals: no resample is as near."""
+    x = torch.tensor([-1.0, 1.0] * 50, dtype=torch.float64)
+    x[0] += 1e-9
+
+    def distance(columns: Mapping[str, torch.Tensor], weight: torch.Tensor) -> dict[str, torch.Tensor]:
+        mean = means(columns, weight)["mean"].abs()
+        return {"distance": mean.clamp_min(1e-3) * (1 + (weight != 1).any(-1))}
+
+    band = bands(distance, {"x": x}, resamples=100, seed=0)["distance"]
+    assert band.low == band.value < band.high
+
+
+@pytest.mark.parametrize(("n", "resamples", "confidence"), [(0, 10, 0.9), (5, 0, 0.9), (5, 10, 1.0)])
+def test_refuses_what_has_no_interval(n: int, resamples: int, confidence: float) -> None:
+    with pytest.raises(ValueError, match="a bootstrap needs"):
+        bands(means, {"x": torch.ones(n)}, resamples, 0, confidence)

@@ -1,0 +1,86 @@
+"""Scores against plain loops and where theory gives them."""
+
+import numpy as np
+import pytest
+import torch
+
+from phd_exp.metrics.ordered import in_order_of
+from phd_exp.metrics.scores import energy_score, risk_at, risk_coverage
+
+
+def numbers(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def test_energy_score_equals_a_loop_over_pairs() -> None:
+    samples, truth = numbers(6, 2, 3, 3), numbers(2, 3, 3, seed=1)
+    score = energy_score(samples, truth)
+    for i, j in np.ndindex(2, 3):
+        drawn = samples[:, i, j].numpy()
+        to_truth = np.mean([np.linalg.norm(x - truth[i, j].numpy()) for x in drawn])
+        apart = [np.linalg.norm(x - y) for k, x in enumerate(drawn) for m, y in enumerate(drawn) if k != m]
+        assert score[i, j].item() == pytest.approx(to_truth - np.mean(apart) / 2)
+
+
+def test_energy_score_is_unbiased_with_few_draws() -> None:
+    """Of standard normal positions scored at their centre: E|X| - E|X - X'|/2 = (1 - 1/sqrt 2) sqrt(8/pi)."""
+    expected = (1 - 0.5**0.5) * (8 / np.pi) ** 0.5
+    few = energy_score(numbers(3, 100_000, 3), torch.zeros(100_000, 3).double())
+    assert few.mean().item() == pytest.approx(expected, abs=4 * few.std().item() / 100_000**0.5)
+
+
+def test_energy_score_keeps_the_digits_of_near_draws() -> None:
+    samples = 4 + 1e-7 * numbers(64, 5, 3)
+    truth = torch.full((5, 3), 4.0, dtype=torch.float64)
+    expected = 1e-7 * energy_score((samples - 4) * 1e7, torch.zeros(5, 3).double())
+    torch.testing.assert_close(energy_score(samples, truth), expected, rtol=1e-6, atol=0)
+
+
+def test_energy_score_needs_two_draws() -> None:
+    with pytest.raises(ValueError, match="at least 2 draws"):
+        energy_score(torch.zeros(1, 4, 3), torch.zeros(4, 3))
+
+
+def test_risk_coverage_equals_a_loop() -> None:
+    uncertainty, error = numbers(200).exp(), numbers(200, seed=1).square()
+    curve = risk_coverage(uncertainty, error)
+    ordered = error.numpy()[np.argsort(uncertainty.numpy())]
+    risk = [ordered[: k + 1].mean() for k in range(200)]
+    best = np.sort(error.numpy())
+    np.testing.assert_allclose(curve.risk, risk)
+    np.testing.assert_allclose(curve.coverage, np.arange(1, 201) / 200)
+    assert curve.area.item() == pytest.approx(np.mean(risk))
+    assert curve.oracle_area.item() == pytest.approx(np.mean([best[: k + 1].mean() for k in range(200)]))
+    assert curve.random_area.item() == pytest.approx(error.mean().item())
+
+
+def test_risk_at_a_coverage_is_on_the_curve() -> None:
+    uncertainty, error = numbers(200).exp(), numbers(200, seed=1).square()
+    curve = risk_coverage(uncertainty, error)
+    ordered = in_order_of(uncertainty, {"error": error})
+    torch.testing.assert_close(risk_at(ordered, "error", curve.coverage), curve.risk)
+    first = curve.risk[0].item()  # less than one sample is that sample
+    assert risk_at(ordered, "error", torch.tensor([1e-3])).item() == pytest.approx(first)
+
+
+def test_ties_count_as_if_in_random_order() -> None:
+    uncertainty, error = numbers(60).mul(2).round(), numbers(60, seed=1).square()
+    rng = np.random.default_rng(0)
+    areas = []
+    for _ in range(4000):
+        shuffled = rng.permutation(60)
+        order = shuffled[np.argsort(uncertainty.numpy()[shuffled], kind="stable")]
+        areas.append(np.mean(np.cumsum(error.numpy()[order]) / np.arange(1, 61)))
+    standard_error = np.std(areas) / 4000**0.5
+    assert risk_coverage(uncertainty, error).area.item() == pytest.approx(
+        np.mean(areas), abs=4 * standard_error
+    )
+
+
+def test_excess_is_zero_for_an_oracle_and_one_for_what_knows_nothing() -> None:
+    error = numbers(4000).square()
+    assert risk_coverage(3 * error + 1, error).excess.item() == pytest.approx(0)
+    assert risk_coverage(torch.ones(4000), error).excess.item() == pytest.approx(1)
+    assert risk_coverage(numbers(4000, seed=5), error).excess.item() == pytest.approx(1, abs=0.05)
+    assert risk_coverage(-error, error).excess.item() > 1.5
+    assert risk_coverage(error + numbers(4000, seed=6).abs(), error).excess.item() < 0.5

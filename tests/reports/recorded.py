@@ -1,0 +1,110 @@
+"""Run folders as a training would leave them, with predictions that a test has drawn itself."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from phd_exp.records.runs import RunFolder, RunName
+
+COORDINATES = ("x", "y", "z")
+DATA = ("default", "occl", "scale", "occl_scale")
+ODD_PRESET = "a_b & [red]|c| `$1` %"
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """The table of a run, and what stands behind it."""
+
+    frame: pd.DataFrame
+    truth: np.ndarray
+    estimates: dict[str, np.ndarray]
+    v_p: np.ndarray
+
+
+def predicted(seed: int, n: int = 40, noise: float = 0.02, probabilistic: bool = True) -> Predicted:
+    """Truths all over the field of view, and estimates about them; `noise` is relative."""
+    random = np.random.default_rng(seed)
+    f, z = random.uniform(1200, 2000, n), random.uniform(3, 5, n)
+    v_p = random.uniform(-1, 1, (n, 2))
+    truth = np.column_stack([v_p * (224 * z / (2 * f))[:, None], z])
+    mode = truth * (1 + noise * random.standard_normal((n, 3)))
+    mu_xy = mode[:, :2] / mode[:, 2:]
+    median_z = mode[:, 2] * random.uniform(0.98, 1.0, n)
+    estimates = {
+        "mode": mode,
+        "mean": mode * random.uniform(1.0, 1.02, (n, 1)),
+        "median": np.column_stack([median_z[:, None] * mu_xy, median_z]),
+    }
+    columns = {"f": f, "S": np.full(n, 224), **dict(zip(COORDINATES, truth.T, strict=True))}
+    columns |= {f"mode_{axis}": column for axis, column in zip(COORDINATES, mode.T, strict=True)}
+    if probabilistic:
+        columns |= {f"mean_{axis}": estimates["mean"][:, place] for place, axis in enumerate(COORDINATES)}
+        columns |= {"median_z": median_z, "mu_x": mu_xy[:, 0], "mu_y": mu_xy[:, 1]}
+        columns["nll"] = random.standard_normal(n)
+    return Predicted(pd.DataFrame(columns), truth, estimates, v_p)
+
+
+def by_hand(drawn: Predicted, estimate: str, quantity: str) -> np.ndarray:
+    """Sine and cosine between the true ray and the estimate, by cross and dot product; millimetres."""
+    v, v_hat = drawn.truth, drawn.estimates[estimate]
+    length = np.sqrt((v**2).sum(axis=1))
+    across = np.sqrt((np.cross(v, v_hat) ** 2).sum(axis=1)) / length
+    along = (v * v_hat).sum(axis=1) / length
+    return 1000 * (across if quantity == "projected" else np.abs(along - length))
+
+
+def record(
+    runs: Path,
+    data: str,
+    model: str,
+    seed: int = 0,
+    frame: pd.DataFrame | None = None,
+    preset: str = "small",
+    overrides: tuple[str, ...] = (),
+) -> RunFolder:
+    """A finished run with these predictions; without any, with a file of none."""
+    folder = RunFolder(RunName(preset, data, model, seed, overrides).folder(runs))
+    folder.path.mkdir(parents=True)
+    with folder.recording(data_manifest=None):
+        if frame is not None:
+            frame.to_parquet(folder.predictions)
+    return folder
+
+
+HOSTILE = "\\end{table} $x_1$ & 5 % #1 ^~ {a} |b| `c` **d** <script> [red]e[/red] \x1b[31m 中 ' \" --"
+"""What an error's message may hold: markup of every format, and an order to the terminal."""
+
+
+def fail(
+    runs: Path, data: str, model: str, seed: int = 0, preset: str = "small", message: str = HOSTILE
+) -> None:
+    """A run that failed."""
+    folder = RunFolder(RunName(preset, data, model, seed).folder(runs))
+    folder.path.mkdir(parents=True)
+    try:
+        with folder.recording(data_manifest=None):
+            raise ValueError(message)
+    except ValueError:
+        return
+
+
+def both_tables(runs: Path) -> dict[tuple[str, str, int], Predicted]:
+    """Two seeds of every run of both tables, but one that failed and one that is missing, and another preset."""
+    drawn = {}
+    choices = [(model, data) for model in ("mae_vz", "mae_logz", "probabilistic") for data in DATA]
+    for model, data in [*choices, ("mae_xyz", "default"), ("mae_constf", "default")]:
+        for seed in (0, 1):
+            if (model, data, seed) not in (
+                ("mae_vz", "scale", 1),
+                ("mae_logz", "occl", 0),
+                ("mae_logz", "occl", 1),
+            ):
+                number = len(drawn)
+                point = predicted(number, noise=0.01 + 0.001 * number, probabilistic=model == "probabilistic")
+                drawn[model, data, seed] = point
+                record(runs, data, model, seed, point.frame)
+    fail(runs, "scale", "mae_vz", 1)
+    record(runs, "default", "mae_xyz", 0, predicted(99, probabilistic=False).frame, preset=ODD_PRESET)
+    return drawn

@@ -1,0 +1,91 @@
+"""One site for all tests, from one run of each kind: good, bad and hostile."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from shutil import which
+
+import numpy as np
+import pytest
+from filelock import FileLock
+from PIL import Image
+
+from phd_exp.records.runs import RunFolder, RunName
+from phd_exp.reports.site.build import build_site
+from tests.reports.site.synthetic import write_run
+
+HOSTILE = "<img src=x onerror=window.owned=1>"
+
+
+def write_runs(folder: Path) -> Path:
+    """Two distributions, one too sure, one recalibrated; a baseline; one run failed, one broken off, two broken."""
+    runs, images = folder / "runs", folder / "renders" / "default" / "test"
+    images.mkdir(parents=True)
+    random = np.random.default_rng(0)
+    for index in range(100):
+        Image.fromarray(random.integers(0, 255, (56, 56, 3), dtype=np.uint8)).save(
+            images / f"{index:06d}.png"
+        )
+    write_run(runs, "default", n=100, root=folder / "renders")
+    certain = write_run(runs, "occl", n=100, overconfidence=2.0)
+    held_out = write_run(folder / "elsewhere", "occl", seed=1, n=100, overconfidence=2.0)
+    held_out.predictions.rename(certain.path / "held_out.parquet")
+    write_run(runs, "default", "mae_logz", n=100, root=folder / "renders")
+    write_run(runs, "default", "mae_vz", preset="demo", overrides=("optimizer.lr=0.1",), n=100)
+    with pytest.raises(ValueError, match="script"):
+        _fail(_folder(runs, "occl", "mae_vz"))
+    broken_off = _folder(runs, "scale", "probabilistic")
+    with broken_off.recording(data_manifest=None):
+        status = broken_off.status()
+    assert status is not None
+    broken_off.write_status(status.model_copy(update={"state": "running"}))
+    _folder(runs, "scale", "mae_vz").status_file.write_text("{")
+    odd = write_run(runs, HOSTILE, n=100)
+    odd.predictions.write_bytes(b"no parquet")
+    return runs
+
+
+def _fail(run: RunFolder) -> None:
+    with run.recording(data_manifest=None):
+        run.write_config({"model": {"name": HOSTILE}})
+        run.write_metrics([{"epoch": -1, "test/nll": 3.0, HOSTILE: 1.0}, {"epoch": 0, "test/nll": "NaN"}])
+        raise ValueError(f"</script><script>window.owned=1</script>{HOSTILE}")
+
+
+def _folder(runs: Path, data: str, model: str) -> RunFolder:
+    folder = RunFolder(RunName("small", data, model, 0).folder(runs))
+    folder.path.mkdir(parents=True)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that all test processes share, with `runs/`, `renders/` and `out/site/`; nobody changes it."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared_site"
+    with FileLock(folder.with_suffix(".lock")):
+        if not folder.exists():
+            folder.mkdir()
+            build_site(write_runs(folder), folder / "out")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def site(shared: Path) -> Path:
+    return shared / "out" / "site"
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[object]:
+    """A real browser, without a network."""
+    executable = which("chromium") or which("chromium-browser") or which("google-chrome")
+    if executable is None:
+        pytest.skip("no Chromium is installed (apt-get install chromium)")
+    sync_api = pytest.importorskip("playwright.sync_api")
+    with sync_api.sync_playwright() as driver:
+        browser = driver.chromium.launch(
+            executable_path=executable,
+            args=["--no-sandbox", "--disable-gpu", "--disable-background-networking"],
+        )
+        yield browser
+        browser.close()

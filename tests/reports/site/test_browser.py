@@ -1,0 +1,186 @@
+"""The site as people meet it: in a real browser, from the file system, without a network."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import pytest
+
+RUN = "runs/small-default-probabilistic-seed0.html"
+OTHER = "small-occl-probabilistic-seed0"
+COMPARISON = f"compare.html#a=small-default-probabilistic-seed0&b={OTHER}"
+
+
+class Visit:
+    """One page, and everything that went wrong on it."""
+
+    def __init__(self, browser: Any, site: Path, **options: Any) -> None:
+        self.site = site
+        self.context = browser.new_context(offline=True, **options)
+        self.page = self.context.new_page()
+        self.faults: list[str] = []
+        self.page.on("console", lambda message: self._heard(message))
+        self.page.on("pageerror", lambda error: self.faults.append(str(error)))
+        self.page.on("requestfailed", lambda request: self.faults.append(f"failed: {request.url}"))
+        self.page.on("request", lambda request: self._asked(request.url))
+
+    def _heard(self, message: Any) -> None:
+        if message.type in ("error", "warning"):
+            self.faults.append(message.text)
+
+    def _asked(self, url: str) -> None:
+        if not url.startswith(("file:", "data:", "blob:")):
+            self.faults.append(f"asked the network for {url}")
+
+    def open(self, address: str) -> None:
+        path, _, fragment = address.partition("#")
+        self.page.goto(f"{(self.site / path).as_uri()}{'#' + fragment if fragment else ''}")
+        self.page.wait_for_load_state("load")
+
+    def draw(self) -> int:
+        """Draw every chart, also those out of sight; how many there are."""
+        figures = self.page.locator("figure.chart")
+        self.page.evaluate("phdExp.drawAll()")
+        self.page.wait_for_function(
+            "document.querySelectorAll('figure.chart').length === document.querySelectorAll('figure.drawn').length"
+        )
+        return figures.count()
+
+    def width_beyond(self) -> int:
+        return self.page.evaluate("document.documentElement.scrollWidth - window.innerWidth")
+
+
+@pytest.fixture
+def visit(chromium: Any, site: Path, request: pytest.FixtureRequest) -> Iterator[Visit]:
+    options = getattr(request, "param", {"viewport": {"width": 1280, "height": 800}})
+    visited = Visit(chromium, site, **options)
+    yield visited
+    visited.context.close()
+    assert visited.faults == []
+
+
+PHONE_DARK = {"viewport": {"width": 360, "height": 740}, "color_scheme": "dark", "has_touch": True}
+LAPTOP = {"viewport": {"width": 1280, "height": 800}, "color_scheme": "light"}
+
+
+@pytest.mark.parametrize(
+    "visit",
+    [
+        pytest.param(LAPTOP, marks=pytest.mark.slow, id="laptop, light"),
+        pytest.param(PHONE_DARK, id="phone, dark"),
+    ],
+    indirect=True,
+)
+def test_every_page_opens_and_draws_its_charts(visit: Visit, site: Path) -> None:
+    pages = ["index.html", COMPARISON, *(f"runs/{quote(file.name)}" for file in (site / "runs").iterdir())]
+    charts = {}
+    for page in sorted(pages):
+        visit.open(page)
+        charts[page] = visit.draw()
+        # a line, a band or points: what plotly has drawn, not its empty frame
+        drawn = visit.page.locator("figure.drawn .plot").evaluate_all(
+            "plots => plots.map(plot => plot.querySelectorAll('.scatterlayer path').length)"
+        )
+        assert len(drawn) == charts[page]
+        assert all(drawn), page
+        assert visit.width_beyond() <= 0, f"{page} is wider than the screen"
+        assert visit.page.evaluate("window.owned === undefined"), page
+    assert charts["index.html"] == 9
+    assert charts[RUN] == charts[COMPARISON] > 15
+    assert charts["runs/small-scale-mae_vz-seed0.html"] == 0
+
+
+def test_links_lead_somewhere(visit: Visit) -> None:
+    visit.open("index.html")
+    visit.page.get_by_role("link", name="probabilistic on default").first.click()
+    visit.page.wait_for_url(f"**/{RUN}")
+    visit.page.get_by_role("link", name="Compare with another run").click()
+    visit.page.wait_for_url("**/compare.html**")
+    assert visit.page.locator("#run-a").input_value() == "small-default-probabilistic-seed0"
+    visit.page.get_by_role("link", name="Overview").click()
+    visit.page.wait_for_url("**/index.html")
+
+
+def test_the_comparison_is_in_its_address(visit: Visit) -> None:
+    visit.open(COMPARISON)
+    scores = visit.page.locator("#scores table")
+    scores.wait_for()
+    assert visit.page.locator("#run-b").input_value() == OTHER
+    before = scores.locator("tbody tr").first.inner_text().split("\t")
+    assert before[0] == "Projected error (mm)"
+    visit.page.get_by_role("button", name="Swap").click()
+    visit.page.wait_for_function("location.hash.startsWith('#a=small-occl')")
+    after = scores.locator("tbody tr").first.inner_text().split("\t")
+    assert [after[1], after[2]] == [before[2], before[1]]
+    visit.page.locator("#run-b").select_option("small-default-mae_logz-seed0")
+    visit.page.wait_for_function("location.hash.endsWith('mae_logz-seed0')")
+    assert "data.spec.variant" in visit.page.locator("#config").inner_text()
+
+
+def test_charts_can_be_read_as_numbers(visit: Visit) -> None:
+    visit.open(RUN)
+    figure = visit.page.locator("figure[data-chart=coverage]")
+    figure.locator("summary").click()
+    rows = figure.locator("tbody tr")
+    rows.first.wait_for()
+    head = [cell.inner_text() for cell in figure.locator("thead th").all()]
+    assert head == ["line", "credible level", "share of truths inside", "low", "high"]
+    assert rows.count() > 10
+    with visit.page.expect_download() as download:
+        figure.get_by_role("link", name="Download as CSV").click()
+    assert len(Path(download.value.path()).read_text().splitlines()) == rows.count() + 1
+
+
+def test_the_theme_stays_as_chosen_and_reaches_the_charts(visit: Visit) -> None:
+    visit.open(RUN)
+    visit.draw()
+    stroke = "getComputedStyle(document.querySelector('[data-chart=coverage] .xtick text')).fill"
+    light, paper = (
+        visit.page.evaluate(stroke),
+        visit.page.evaluate("getComputedStyle(document.body).backgroundColor"),
+    )
+    button = visit.page.get_by_role("button", name="Dark theme")
+    assert button.get_attribute("aria-pressed") == "false"
+    button.click()
+    assert button.get_attribute("aria-pressed") == "true"
+    visit.page.wait_for_function(f"{stroke} !== '{light}'")
+    assert visit.page.evaluate("getComputedStyle(document.body).backgroundColor") != paper
+    visit.open("index.html")
+    assert visit.page.locator("html").get_attribute("data-theme") == "dark"
+
+
+def test_filters_choose_lines(visit: Visit) -> None:
+    visit.open("index.html")
+    visit.draw()
+    lines = visit.page.locator("[data-chart=calibration_coverage] .scatterlayer .trace")
+    every = lines.count()
+    visit.page.locator("[data-filter=data]").select_option("occl")
+    visit.page.wait_for_function(
+        f"document.querySelectorAll('[data-chart=calibration_coverage] .scatterlayer .trace').length < {every}"
+    )
+    assert lines.count() == 2  # the diagonal and one run
+
+
+def test_the_keyboard_reaches_the_content_first(visit: Visit) -> None:
+    visit.open("index.html")
+    visit.page.keyboard.press("Tab")
+    assert visit.page.evaluate("document.activeElement.textContent") == "Skip to the content"
+    visit.page.keyboard.press("Enter")
+    assert visit.page.evaluate("document.activeElement.id") == "main"
+
+
+def test_pictures_are_there(visit: Visit) -> None:
+    visit.open(RUN)
+    images = visit.page.locator("svg.panel image")
+    assert images.count() >= 12
+    loaded = visit.page.evaluate(
+        """() => Promise.all([...document.querySelectorAll('svg.panel image')].map(image => {
+            const copy = new Image(); copy.src = new URL(image.getAttribute('href'), location.href);
+            return copy.decode().then(() => copy.naturalWidth);
+        }))"""
+    )
+    assert set(loaded) == {56}
+    assert visit.page.locator("svg.birds-eye").count() == 12
+    for panel in visit.page.locator("svg.panel").all():
+        assert panel.get_attribute("aria-label")

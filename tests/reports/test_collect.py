@@ -1,0 +1,134 @@
+"""Runs and how they stand, from records alone."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from phd_exp.records.runs import RunFolder, RunName
+from phd_exp.reports.collect import Run, collect
+from phd_exp.reports.point_errors import ErrorKey
+from tests.reports.recorded import predicted, record
+
+DEPTH = ErrorKey("mode", "whole", "depth")
+
+
+def only(runs: Path) -> Run:
+    (run,) = collect(runs).runs
+    return run
+
+
+def unfinished(runs: Path, error: BaseException) -> RunFolder:
+    folder = RunFolder(RunName("small", "occl", "mae_vz", 0).folder(runs))
+    folder.path.mkdir(parents=True)
+    with pytest.raises(type(error)), folder.recording(data_manifest=None):
+        raise error
+    return folder
+
+
+def test_a_finished_run_has_its_errors(tmp_path: Path) -> None:
+    record(tmp_path, "occl", "probabilistic", 3, predicted(0).frame)
+    run = only(tmp_path)
+    assert (run.preset, run.data, run.model, run.seed) == ("small", "occl", "probabilistic", 3)
+    assert (run.state, run.overrides, run.detail) == ("finished", None, "")
+    assert len(run.errors) == 12
+    assert run.nll is not None
+
+
+def test_a_baseline_has_one_estimate_and_no_nll(tmp_path: Path) -> None:
+    record(tmp_path, "occl", "mae_vz", 0, predicted(0, probabilistic=False).frame)
+    run = only(tmp_path)
+    assert {key.estimate for key in run.errors} == {"mode"}
+    assert run.nll is None
+
+
+def test_a_failed_run_says_why_on_one_line(tmp_path: Path) -> None:
+    unfinished(tmp_path, ValueError("odd\nnumber"))
+    run = only(tmp_path)
+    assert (run.state, run.detail, run.errors) == ("failed", "ValueError: odd number", {})
+
+
+def test_a_stopped_run_is_broken_off(tmp_path: Path) -> None:
+    unfinished(tmp_path, KeyboardInterrupt())
+    assert only(tmp_path).state == "broken off"
+
+
+def test_a_killed_run_does_not_look_alive(tmp_path: Path) -> None:
+    run = RunFolder(RunName("small", "occl", "mae_vz", 0).folder(tmp_path))
+    with run.held():
+        with run.recording(data_manifest=None):
+            status = run.status()
+        assert status is not None
+        run.write_status(status)  # as a SIGKILL would have left it
+        assert only(tmp_path).state == "running"
+    assert only(tmp_path).state == "broken off"
+
+
+def test_a_lock_that_cannot_be_tried_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = unfinished(tmp_path, ValueError())
+    status = folder.status()
+    assert status is not None
+    folder.write_status(status.model_copy(update={"state": "running"}))
+
+    def read_only(self: RunFolder) -> bool:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(RunFolder, "is_held", read_only)
+    run = only(tmp_path)
+    assert run.state == "running"
+    assert "broken off" in run.detail
+    assert "Permission denied" in run.detail
+
+
+@pytest.mark.parametrize("content", ["{", "[]", "\udcff"], ids=["torn", "no status", "no text"])
+def test_a_broken_status_is_named_and_the_others_live(tmp_path: Path, content: str) -> None:
+    broken = record(tmp_path, "default", "mae_vz", 0)
+    broken.status_file.write_bytes(os.fsencode(content))
+    record(tmp_path, "occl", "probabilistic", 0, predicted(0).frame)
+    bad, good = collect(tmp_path).runs
+    assert bad.state == "unreadable"
+    assert "status.json" in bad.detail
+    assert "\n" not in bad.detail
+    assert good.state == "finished"
+
+
+def test_predictions_that_cannot_be_used_are_named_and_the_others_live(tmp_path: Path) -> None:
+    record(tmp_path, "default", "mae_vz", 0)
+    record(tmp_path, "default", "mae_vz", 1, predicted(0).frame.drop(columns="mode_x"))
+    record(tmp_path, "default", "mae_vz", 2, predicted(0).frame)
+    missing, lacking, good = collect(tmp_path).runs
+    assert [run.state for run in (missing, lacking, good)] == ["unreadable", "unreadable", "finished"]
+    assert missing.detail == (
+        "predictions.parquet: missing, though the run says finished; delete the folder to run again"
+    )
+    assert "has no column mode_x" in lacking.detail
+
+
+def test_runs_with_other_overrides_are_apart_and_say_which(tmp_path: Path) -> None:
+    plain = record(tmp_path, "occl", "mae_vz", 0, predicted(0).frame)
+    other = record(tmp_path, "occl", "mae_vz", 0, predicted(1).frame, overrides=("optimizer.lr=0.5",))
+    config = {"seed": 0, "runs": "runs", "optimizer": {"lr": 0.001, "eps": 1}, "backbone": {"depth": 50}}
+    plain.write_config(config)
+    other.write_config({**config, "runs": "elsewhere", "optimizer": {"lr": 0.5, "eps": 1, "foreach": True}})
+    records = collect(tmp_path)
+    assert [run.overrides for run in records.runs] == [None, "optimizer.lr=0.5, optimizer.foreach=True"]
+    chosen = records.at_defaults("small", "occl", "mae_vz")
+    assert list(chosen) == [0]
+    assert chosen[0].folder.path == plain.path
+
+
+def test_overrides_without_a_run_to_compare_with_are_not_guessed(tmp_path: Path) -> None:
+    record(tmp_path, "occl", "mae_vz", 0, predicted(1).frame, overrides=("optimizer.lr=0.5",))
+    assert only(tmp_path).overrides == "not told: no run without overrides to compare with"
+
+
+@pytest.mark.parametrize("leaf", ["seed", "seedx", "seed00", "seed1-xyz", "seed-1"])
+def test_a_folder_that_no_run_is_given_stays_out_of_the_tables(tmp_path: Path, leaf: str) -> None:
+    folder = record(tmp_path, "occl", "mae_vz", 0, predicted(0).frame)
+    folder.path.rename(folder.path.with_name(leaf))
+    assert only(tmp_path).state == "unreadable"
+    assert collect(tmp_path).at_defaults("small", "occl", "mae_vz") == {}
+
+
+def test_no_runs_are_no_error(tmp_path: Path) -> None:
+    assert collect(tmp_path).runs == ()

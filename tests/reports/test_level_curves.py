@@ -1,0 +1,111 @@
+"""Level curves against samples and quadrature."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.figure import Figure
+from matplotlib.path import Path as Outline
+from scipy import integrate
+
+from phd_exp.distributions import ProjectedHuber
+from phd_exp.geometry.camera import Camera
+from phd_exp.geometry.charts import DepthScale, Projected
+from phd_exp.reports.level_curves import LEVELS, draw_birds_eye, draw_on_image, level_curves, on_image
+
+SAMPLES = 100_000
+
+
+def _distribution(a: float, precision: float = 200.0) -> ProjectedHuber:
+    A = precision * torch.tensor([[1.5, 0.6], [0.6, 0.9]], dtype=torch.float64)
+    mu_xy = torch.tensor([0.05, -0.03], dtype=torch.float64)
+    return ProjectedHuber(
+        mu_xy, torch.tensor(4.0, dtype=torch.float64), A, torch.tensor(a, dtype=torch.float64)
+    )
+
+
+CASES = [
+    pytest.param(_distribution(0.5), id="depth hardly known"),
+    pytest.param(_distribution(4.0), id="depth vague"),
+    pytest.param(_distribution(60.0), id="depth known"),
+    pytest.param(_distribution(2e3, precision=2.0), id="depth exact, projection vague"),
+]
+
+
+@pytest.mark.parametrize("distribution", CASES)
+def test_a_curve_holds_its_probability(distribution: ProjectedHuber) -> None:
+    torch.manual_seed(0)
+    xyz = distribution.rsample((SAMPLES,)).numpy()
+    curves = level_curves(distribution)
+    for places, points in ((curves.projected, xyz[:, :2] / xyz[:, 2:]), (curves.birds_eye, xyz[:, ::2])):
+        for level, curve in zip(LEVELS, places, strict=True):
+            share = Outline(curve).contains_points(points).mean()
+            # polygons lie inside their curves, by less than 0.002 of the probability
+            assert abs(share - level) < 4 * math.sqrt(level * (1 - level) / SAMPLES) + 2e-3
+
+
+@pytest.mark.parametrize("distribution", CASES)
+def test_the_law_of_the_projection_is_constant_along_a_curve(distribution: ProjectedHuber) -> None:
+    """p(u) = int p(z u, z) z^2 dz: a curve of equal density bounds the smallest region."""
+    log_z = np.linspace(-12, 12, 4001) / np.sqrt(float(distribution.a)) + math.log(4)
+    z = torch.from_numpy(np.exp(log_z))
+    for curve in level_curves(distribution).projected:
+        u = torch.from_numpy(curve[::9])
+        xyz = torch.cat([u[:, None] * z[:, None], z[:, None].expand(len(u), -1, 1)], dim=-1)
+        density = integrate.simpson((distribution.log_prob(xyz).exp() * z**3).numpy(), x=log_z)
+        np.testing.assert_allclose(density, density[0], rtol=1e-3)
+
+
+@pytest.mark.parametrize("distribution", CASES)
+def test_the_law_of_the_birds_eye_view_is_constant_along_a_curve(distribution: ProjectedHuber) -> None:
+    """p(x, z) = int p(x, y, z) dy."""
+    A_inverse = torch.linalg.inv(distribution.A).numpy()
+    for curve in level_curves(distribution).birds_eye:
+        xz = curve[::11]
+        reach = 60 * 4 * A_inverse[1, 1]
+        y = torch.from_numpy(np.linspace(-reach, reach, 8001) - 0.03 * 4)
+        places = torch.from_numpy(xz)
+        x, z = (places[:, None, i].expand(-1, len(y)) for i in (0, 1))
+        xyz = torch.stack([x, y.expand(len(places), -1), z], dim=-1)
+        density = integrate.simpson(distribution.log_prob(xyz).exp().numpy(), x=y.numpy())
+        np.testing.assert_allclose(density, density[0], rtol=5e-3)
+
+
+def test_curves_are_nested_around_the_mode() -> None:
+    curves = level_curves(_distribution(20.0))
+    mode = curves.mode
+    for places, middle in ((curves.projected, mode[:2] / mode[2]), (curves.birds_eye, mode[::2])):
+        inner, between, outer = (Outline(points) for points in places)
+        assert inner.contains_point(middle)
+        assert between.contains_points(inner.vertices).all()
+        assert outer.contains_points(between.vertices).all()
+
+
+def test_pixels_are_the_cameras() -> None:
+    camera = Camera(torch.tensor([1500.0], dtype=torch.float64), 224.0)
+    xyz = torch.tensor([[0.11, -0.07, 3.7]], dtype=torch.float64)
+    depth = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
+    v_p = Projected(depth).coordinates(xyz, camera)[:, :2].numpy()
+    u = (xyz[:, :2] / xyz[:, 2:]).numpy()
+    np.testing.assert_allclose(on_image(u, 1500.0, 224.0), 112 * (1 + v_p), rtol=1e-12)
+
+
+def test_one_distribution_and_levels_between_none_and_all() -> None:
+    with pytest.raises(ValueError, match=r"one distribution, not of \(2,\)"):
+        level_curves(_distribution(3.0).expand([2]))
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        level_curves(_distribution(3.0), (0.5, 1.0))
+
+
+def test_the_figure_shows_curves_mode_and_truth() -> None:
+    curves, truth = level_curves(_distribution(20.0)), np.array([0.25, -0.1, 4.2])
+    left, right = Figure().subplots(1, 2)
+    draw_on_image(left, curves, np.zeros((224, 224, 3), dtype=np.uint8), 1500.0, 224.0, truth)
+    draw_birds_eye(right, curves, truth)
+    assert len(left.images) == 1
+    for axes, dot in ((left, on_image(truth[:2] / truth[2], 1500.0, 224.0)), (right, truth[::2])):
+        *outlines, mode, last = axes.lines
+        assert [len(line.get_xdata()) > 10 for line in outlines] == [True] * 3
+        assert mode.get_marker() == "x"
+        np.testing.assert_allclose(np.ravel(last.get_data()), dot)
