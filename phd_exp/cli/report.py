@@ -1,4 +1,4 @@
-"""`python -m phd_exp report`: the paper's tables from all recorded runs, printed and written, and the site of them."""
+"""`python -m phd_exp report`: the paper's tables from all recorded runs, printed and written, and their site."""
 
 import sys
 from importlib.util import find_spec
