@@ -55,7 +55,7 @@ def begun(tmp_path: Path, renders: Path) -> Callable[..., BaseProcess]:
     return begin
 
 
-@pytest.mark.parametrize(("kills", "words"), [(2, TWO), pytest.param(20, FOUR, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("kills", "words"), [(1, TWO), pytest.param(20, FOUR, marks=pytest.mark.slow)])
 def test_killed_at_any_moment_the_same_command_goes_on(
     train: Callable, begun: Callable, tmp_path: Path, kills: int, words: tuple[str, ...]
 ) -> None:
