@@ -30,6 +30,11 @@ def only_run(runs: Path) -> RunFolder:
     return run
 
 
+def errors(text: str) -> list[str]:
+    """The lines that say what is wrong; others tell of a data set that is rendered first."""
+    return [line for line in text.splitlines() if line.startswith("error: ")]
+
+
 def descendants(process: int) -> list[int]:
     """The processes that a process started and that run phd_exp.training.rank, in the order of their ranks."""
     found = []
@@ -140,7 +145,7 @@ def test_one_killed_ends_all_and_the_same_command_goes_on(
 def test_a_loss_that_is_not_finite_is_one_line(train: Callable) -> None:
     outcome = train("logger=none", "optimizer.lr=1e30", *TOGETHER)
     assert outcome.status == 1
-    (line,) = outcome.err.splitlines()
+    (line,) = errors(outcome.err)
     assert "loss is " in line
     assert "lower optimizer.lr" in line
 
