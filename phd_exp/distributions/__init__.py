@@ -2,5 +2,6 @@
 
 from phd_exp.distributions.point_estimate import PointEstimate
 from phd_exp.distributions.projected_huber import ProjectedHuber
+from phd_exp.distributions.temperature import Temperature
 
-__all__ = ["PointEstimate", "ProjectedHuber"]
+__all__ = ["PointEstimate", "ProjectedHuber", "Temperature"]

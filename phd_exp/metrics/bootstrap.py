@@ -1,7 +1,7 @@
 """How far a number would move with another test set: percentile bootstrap over samples.
 
-A resample is a row of counts, how often each sample was drawn. A statistic that takes counts sorts its samples once and
-sees all resamples in one go.
+A resample is a row of counts, how often each sample was drawn. A statistic that takes counts sorts its samples once
+and sees all resamples in one go.
 """
 
 from collections.abc import Callable, Mapping

@@ -34,7 +34,10 @@ QUANTITIES: Mapping[str, tuple[str, str, tuple[float, ...] | int]] = {
     "depth": ("z", "m", 4),
     "focal length": ("f", "px", 4),
 }
-"""Quantity of the strata -> its column, its unit, and edges or a number of equal parts."""
+"""Quantity of the strata -> its column, its unit, and edges or a number of equal parts.
+
+The true depth is what is predicted: even calibrated predictions are not calibrated among samples chosen by it.
+"""
 
 
 @dataclass(frozen=True)

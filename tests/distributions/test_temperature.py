@@ -13,7 +13,7 @@ from phd_exp.distributions.temperature import Temperature
 @pytest.fixture(scope="module")
 def truth() -> ProjectedHuber:
     generator = torch.Generator().manual_seed(1)
-    raw = torch.randn(20_000, 7, generator=generator, dtype=torch.float64)
+    raw = torch.randn(10_000, 7, generator=generator, dtype=torch.float64)
     raw[:, 2:6] = 4 + 2 * raw[:, 2:6].abs()
     return ProjectedHuber.from_raw(raw, f=1500.0, S=224.0, mu_z0=2.5e-3)
 

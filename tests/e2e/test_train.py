@@ -54,6 +54,9 @@ def test_every_model_leaves_a_whole_record(train: Callable, tmp_path: Path, mode
         assert results.get(key, 0) == pytest.approx(rows[-1].get(key, 0), rel=0.02)
     table = pd.read_parquet(run.predictions)
     assert len(table) == 6
+    scored = {"depth_pit", "depth_crps", "energy_score"}
+    assert scored & set(table.columns) == (scored if model == "probabilistic" else set())
+    assert "depth_precision" not in table  # it is a
     for name in ("projected_error_mm", "depth_error_mm"):
         assert results[f"test/{name}"] == pytest.approx(table[name].mean())
         assert results[f"test/{name}"] == pytest.approx(rows[-1][f"test/{name}"], rel=1e-4)
