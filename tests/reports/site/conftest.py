@@ -18,7 +18,7 @@ HOSTILE = "<img src=x onerror=window.owned=1>"
 
 
 def write_runs(folder: Path) -> Path:
-    """Two distributions, one too sure and one recalibrated; a baseline; a run that failed, one broken off, two broken."""
+    """A calibrated run, a recalibrated and an unusual one; a baseline; failed, broken off, unreadable ones."""
     runs, images = folder / "runs", folder / "renders" / "default" / "test"
     images.mkdir(parents=True)
     random = np.random.default_rng(0)
@@ -32,11 +32,7 @@ def write_runs(folder: Path) -> Path:
     held_out.predictions.rename(certain.path / "held_out.parquet")
     write_run(runs, "default", "mae_logz", n=100, root=folder / "renders")
     write_run(runs, "default", "mae_vz", preset="demo", overrides=("optimizer.lr=0.1",), n=100)
-    failed = _folder(runs, "occl", "mae_vz")
-    with pytest.raises(ValueError, match="script"), failed.recording(data_manifest=None):
-        failed.write_config({"model": {"name": HOSTILE}})
-        failed.write_metrics([{"epoch": -1, "test/nll": 3.0, HOSTILE: 1.0}, {"epoch": 0, "test/nll": "NaN"}])
-        raise ValueError(f"</script><script>window.owned=1</script>{HOSTILE}")
+    _fail(_folder(runs, "occl", "mae_vz"))
     broken_off = _folder(runs, "scale", "probabilistic")
     with broken_off.recording(data_manifest=None):
         status = broken_off.status()
@@ -46,6 +42,13 @@ def write_runs(folder: Path) -> Path:
     odd = write_run(runs, HOSTILE, n=100)
     odd.predictions.write_bytes(b"no parquet")
     return runs
+
+
+def _fail(folder: RunFolder) -> None:
+    folder.write_config({"model": {"name": HOSTILE}})
+    folder.write_metrics([{"epoch": -1, "test/nll": 3.0, HOSTILE: 1.0}, {"epoch": 0, "test/nll": "NaN"}])
+    with pytest.raises(ValueError, match="script"), folder.recording(data_manifest=None):
+        raise ValueError(f"</script><script>window.owned=1</script>{HOSTILE}")
 
 
 def _folder(runs: Path, data: str, model: str) -> RunFolder:
