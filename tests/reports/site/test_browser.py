@@ -69,15 +69,18 @@ LAPTOP = {"viewport": {"width": 1280, "height": 800}, "color_scheme": "light"}
 FAILED = "runs/small-occl-mae_vz-seed0.html"
 
 
+LONGEST_LINES = """plots => plots.map(plot => Math.max(
+    ...[...plot.querySelectorAll('.scatterlayer path')].map(path => path.getTotalLength())
+))"""
+"""Of the lines, bands or points of each chart: more than its empty frame."""
+
+
 def _opens_and_draws(visit: Visit, page: str) -> int:
     visit.open(page)
     charts = visit.draw()
-    # a line, a band or points: what plotly has drawn, not its empty frame
-    drawn = visit.page.locator("figure.drawn .plot").evaluate_all(
-        "plots => plots.map(plot => plot.querySelectorAll('.scatterlayer path').length)"
-    )
+    drawn = visit.page.locator("figure.drawn .plot").evaluate_all(LONGEST_LINES)
     assert len(drawn) == charts
-    assert all(drawn), page
+    assert min(drawn, default=1) > 0, page
     assert visit.width_beyond() <= 0, f"{page} is wider than the screen"
     assert visit.page.evaluate("window.owned === undefined"), page
     return charts
