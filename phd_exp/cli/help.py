@@ -8,7 +8,7 @@ VERBS = {
     "train": "render what is missing, train, measure and record a run (the default)",
     "render": "render a data set, or what is missing of it",
     "gallery": "draw the pictures of renders/README.md: paired data sets, the camera's axes",
-    "report": "the paper's tables from all recorded runs: printed, and as Markdown, LaTeX and CSV",
+    "report": "the paper's tables, the dashboard and the figures of all recorded runs",
 }
 OF_VERB = {
     "train": (

@@ -1,7 +1,6 @@
 """The metric of fixed size against the scores of the samples themselves, however they are dealt out."""
 
 import math
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -129,13 +128,3 @@ def test_two_processes_by_gloo(claimed: Callable, tmp_path: Path) -> None:
     scores = torch.load(tmp_path / "meeting.pt")
     for name, value in seen(batches(columns, 50)).compute().items():
         assert scores[name].item() == pytest.approx(value.item(), rel=1e-9, abs=1e-12), name
-
-
-@pytest.mark.bench
-def test_an_update_takes_a_millisecond(claimed: Callable) -> None:
-    parts, metric = batches(claimed(6400), 64), Calibration()
-    metric.update(parts[0])
-    start = time.perf_counter()
-    for part in parts:
-        metric.update(part)
-    assert (time.perf_counter() - start) / len(parts) < 1e-3

@@ -199,19 +199,3 @@ def test_what_cannot_be_measured_is_one_line(table: Callable) -> None:
         recalibrated(columns | {"a": -columns["a"]}, fit_temperature(columns))
     with pytest.raises(RunError, match="no temperature fits"):
         fit_temperature(columns | {"z": -columns["z"]})
-
-
-@pytest.mark.bench
-def test_two_thousand_samples_take_three_seconds() -> None:
-    import time
-
-    truth, f = predictions(2000)
-    xyz = draws(truth, 1, seed=2)[0]
-    columns = {name: column.numpy() for name, column in distribution_columns(truth, xyz).items()}
-    columns |= {"f": f, "z": xyz[:, 2].numpy(), "visibility": np.linspace(0, 1, 2000)}
-    columns |= {
-        name: np.linspace(1, 2, 2000) for name in ("projected_error_mm", "depth_error_mm", "energy_score")
-    }
-    start = time.perf_counter()
-    evaluate(columns)
-    assert time.perf_counter() - start < 3

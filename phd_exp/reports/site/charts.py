@@ -40,9 +40,10 @@ def axis(title: str, log: bool = False, **more: Any) -> dict[str, Any]:
 
 def line(name: str, x: Numbers, y: Numbers, colour: int, *, dash: str = "solid", **meta: Any) -> Trace:
     """A line; `low` and `high` in `meta` make it a line with a band."""
+    points = sum(value is not None for value in y)
     return {
         "type": "scatter",
-        "mode": "lines",
+        "mode": "lines" if points > 1 else "markers",  # one point makes no line
         "name": name,
         "x": _rounded(x),
         "y": _rounded(y),

@@ -8,7 +8,7 @@ from matplotlib.ticker import MaxNLocator
 from phd_exp.reports.level_curves import LevelCurves
 
 _CLOSE = 0.25  # a share of the image below which curves deserve a close-up
-_SMALLEST = 8.0  # side of a close-up, pixels
+_SMALLEST = 0.1  # the same for the side of a close-up
 _PANEL, _LEFT, _BOTTOM, _EDGE = 200.0, 44.0, 30.0, 6.0  # of the bird's-eye view, in its own units
 
 
@@ -33,7 +33,7 @@ def close_up(points: np.ndarray, S: float) -> tuple[float, float, float] | None:
     extent = float((high - low).max())
     if not np.isfinite(extent) or extent > _CLOSE * S:
         return None
-    side = max(1.6 * extent, _SMALLEST)
+    side = max(1.6 * extent, _SMALLEST * S)
     left, top = (low + high) / 2 - side / 2
     return _round(left), _round(top), _round(side)
 

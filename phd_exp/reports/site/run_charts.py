@@ -1,5 +1,6 @@
 """The charts of one run: its calibration, its training, and where its errors are."""
 
+import re
 from dataclasses import dataclass
 
 from phd_exp.reports.evaluation import Curve, Evaluation
@@ -26,7 +27,9 @@ def calibration_charts(evaluation: Evaluation, after: Evaluation | None) -> dict
         for key, kind in _KINDS.items()
         if key in evaluation.curves
         for chart in [
-            _calibration_chart(kind, evaluation.curves[key], after.curves.get(key) if after else None)
+            _calibration_chart(
+                kind, evaluation.curves[key], after.curves.get(key) if after and kind.diagonal else None
+            )
         ]
     }
 
@@ -61,7 +64,7 @@ _KINDS = {
     "projected_risk_coverage": _Kind(
         "Projection: risk and coverage",
         "share of predictions kept, surest first",
-        "mean projected error (mm)",
+        "mean error of (x, y)/z (mrad)",
     ),
 }
 
@@ -170,7 +173,7 @@ def _strata_chart(evaluation: Evaluation, name: str, key: str, colour: int) -> C
     score = quantity(key)
     strata = [stratum for stratum in evaluation.strata if stratum.quantity == name and key in stratum.scores]
     bands = [stratum.scores[key] for stratum in strata]
-    labels = [stratum.label.removeprefix(f"{name} ") for stratum in strata]
+    labels = [_range(stratum.label.removeprefix(f"{name} ")) for stratum in strata]
     lows, highs = [band.low for band in bands], [band.high for band in bands]
     trace = bars(score.label, [band.value for band in bands], labels, colour, lows, highs)
     trace["meta"]["n"] = [stratum.n for stratum in strata]
@@ -178,7 +181,12 @@ def _strata_chart(evaluation: Evaluation, name: str, key: str, colour: int) -> C
         f"{label}: {score.text(b.value)} {score.unit}" for label, b in zip(labels, bands, strict=True)
     )
     layout = {
-        "xaxis": axis(score.axis, rangemode="tozero", nticks=5),
+        "xaxis": axis(score.axis, rangemode="tozero", nticks=4),
         "yaxis": axis(name) | {"type": "category", "autorange": "reversed"},
     }
     return Chart(f"{score.label} by {name}", f"{score.label} by {name}: {said}.", [trace], layout)
+
+
+def _range(label: str) -> str:
+    """With an en dash between two numbers."""
+    return re.sub(r"(?<=\d)-(?=\d)", "–", label)

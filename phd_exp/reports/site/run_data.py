@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -15,6 +16,7 @@ from phd_exp.reports.evaluation import Band
 from phd_exp.reports.site.charts import Chart
 from phd_exp.reports.site.dossier import Dossier, read_config, slug_of
 from phd_exp.reports.site.gallery import images_folder
+from phd_exp.reports.site.quantities import SCORES
 from phd_exp.reports.site.run_charts import calibration_charts, learning_charts, strata_charts
 
 
@@ -65,11 +67,17 @@ def gather(dossier: Dossier, key: str) -> RunData:
         title=f"{run.model} on {run.data}",
         state=run.state,
         n=before.n if before else None,
-        scores=dict(before.scores) if before else {},
-        recalibrated=dict(after.scores) if after else {},
+        scores=_in_order(before.scores) if before else {},
+        recalibrated=_in_order(after.scores) if after else {},
         config=dict(dossier.config),
         charts=charts,
     )
+
+
+def _in_order(scores: Mapping[str, Band]) -> dict[str, Band]:
+    """As a page lists them; those it has not met come last."""
+    places = {name: place for place, name in enumerate(SCORES)}
+    return dict(sorted(scores.items(), key=lambda item: places.get(item[0], len(places))))
 
 
 def as_script(name: str, content: Any) -> str:

@@ -18,7 +18,7 @@ HOSTILE = "<img src=x onerror=window.owned=1>"
 
 
 def write_runs(folder: Path) -> Path:
-    """Two distributions, one too sure, one recalibrated; a baseline; one run failed, one broken off, two broken."""
+    """A calibrated run, a recalibrated and an unusual one; a baseline; failed, broken off, unreadable ones."""
     runs, images = folder / "runs", folder / "renders" / "default" / "test"
     images.mkdir(parents=True)
     random = np.random.default_rng(0)
@@ -32,8 +32,7 @@ def write_runs(folder: Path) -> Path:
     held_out.predictions.rename(certain.path / "held_out.parquet")
     write_run(runs, "default", "mae_logz", n=100, root=folder / "renders")
     write_run(runs, "default", "mae_vz", preset="demo", overrides=("optimizer.lr=0.1",), n=100)
-    with pytest.raises(ValueError, match="script"):
-        _fail(_folder(runs, "occl", "mae_vz"))
+    _fail(_folder(runs, "occl", "mae_vz"))
     broken_off = _folder(runs, "scale", "probabilistic")
     with broken_off.recording(data_manifest=None):
         status = broken_off.status()
@@ -45,10 +44,10 @@ def write_runs(folder: Path) -> Path:
     return runs
 
 
-def _fail(run: RunFolder) -> None:
-    with run.recording(data_manifest=None):
-        run.write_config({"model": {"name": HOSTILE}})
-        run.write_metrics([{"epoch": -1, "test/nll": 3.0, HOSTILE: 1.0}, {"epoch": 0, "test/nll": "NaN"}])
+def _fail(folder: RunFolder) -> None:
+    folder.write_config({"model": {"name": HOSTILE}})
+    folder.write_metrics([{"epoch": -1, "test/nll": 3.0, HOSTILE: 1.0}, {"epoch": 0, "test/nll": "NaN"}])
+    with pytest.raises(ValueError, match="script"), folder.recording(data_manifest=None):
         raise ValueError(f"</script><script>window.owned=1</script>{HOSTILE}")
 
 

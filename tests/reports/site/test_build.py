@@ -84,9 +84,9 @@ def test_colours_stand_out_from_the_page(site: Path, theme: str) -> None:
     style = (site / "assets" / "report.css").read_text()
     (block,) = re.findall(rf':root\[data-theme="{theme}"\] {{(.*?)}}', style, re.DOTALL)
     colours = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6});", block))
-    for name, least in {"ink": 4.5, "quiet": 4.5, "link": 4.5, "good": 4.5, "bad": 4.5, "wait": 4.5} | {
-        f"series-{place}": 3.0 for place in range(8)
-    }.items():
+    texts = dict.fromkeys(("ink", "quiet", "link", "good", "bad", "wait"), 4.5)
+    lines = {f"series-{place}": 3.0 for place in range(8)}
+    for name, least in (texts | lines).items():
         for ground in ("paper", "raised"):
             low, high = sorted((_luminance(colours[name]), _luminance(colours[ground])))
             assert (high + 0.05) / (low + 0.05) >= least, f"{name} on {ground}"
