@@ -16,6 +16,7 @@ from phd_exp.reports.site.dossier import Dossier, read_dossier, read_predictions
 from phd_exp.reports.site.figures import (
     CALIBRATION,
     LEVEL_CURVES,
+    PRECISION,
     first_seeds,
     write_figures,
     write_level_curves,
@@ -94,7 +95,7 @@ def _write(site: SiteFolder, records: Records, figures: Path) -> Path:
         write_atomic(site.path / "assets" / asset.name, asset.read_bytes())
     write_atomic(site.path / "assets" / "plotly.min.js", get_plotlyjs())
     found = [_write_run(site, run) for run in records.runs]
-    _write_figures(site, records, found, figures)
+    drawn = _write_figures(site, records, found, figures)
     groups = overview_groups(found)
     flat = {
         "charts": {key: asdict(chart) for group in groups.values() for key, chart in group.charts.items()}
@@ -102,7 +103,7 @@ def _write(site: SiteFolder, records: Records, figures: Path) -> Path:
     write_atomic(site.script("overview"), as_script("overview", flat))
     write_atomic(site.path / "compare.html", comparison_page(found))
     index = site.path / "index.html"
-    write_atomic(index, overview_page(found, tables(records), groups, _shown(figures)))
+    write_atomic(index, overview_page(found, tables(records), groups, drawn))
     _forget(site, [run.slug for run in found])
     return index
 
@@ -131,28 +132,26 @@ def _gallery(dossier: Dossier, images: Path) -> Gallery | None:
         return None
 
 
-def _write_figures(site: SiteFolder, records: Records, found: Sequence[RunData], figures: Path) -> None:
-    """The figures of every preset, where any run in them has changed since."""
+def _write_figures(site: SiteFolder, records: Records, found: Sequence[RunData], figures: Path) -> list[str]:
+    """Draw the figures of every preset in which a run has changed since; names of all that are there."""
     folders = {slug_of(run): run.folder for run in records.runs}
-    chosen = first_seeds(found)
-    for preset, group in groupby(chosen, key=lambda run: run.preset):
+    names: list[str] = []
+    for preset, group in groupby(first_seeds(found), key=lambda run: run.preset):
         of_preset = list(group)
         changed = {run.slug: site.script(run.slug).stat().st_mtime for run in of_preset}
         if _older(figures / f"{CALIBRATION}-{preset}.pdf", max(changed.values())):
             write_figures(preset, of_preset, figures)
+        names += [f"{CALIBRATION}-{preset}", f"{PRECISION}-{preset}"]
         for run in of_preset:
             stem = figures / f"{LEVEL_CURVES}-{preset}-{run.data}"
             if _older(stem.with_name(f"{stem.name}.pdf"), changed[run.slug]):
                 write_level_curves(read_predictions(folders[run.slug]), run.config, stem)
+            names.append(stem.name)
+    return [name for name in names if (figures / f"{name}.pdf").exists()]
 
 
 def _older(file: Path, changed: float) -> bool:
     return not file.exists() or file.stat().st_mtime < changed
-
-
-def _shown(figures: Path) -> list[str]:
-    """Names of the pictures that are there as PNG and PDF."""
-    return sorted(file.stem for file in figures.glob("*.png") if file.with_suffix(".pdf").exists())
 
 
 def _forget(site: SiteFolder, slugs: Sequence[str]) -> None:

@@ -1,6 +1,7 @@
 """The charts of one run: its calibration, its training, and where its errors are."""
 
 import re
+from collections import Counter
 from dataclasses import dataclass
 
 from phd_exp.reports.evaluation import Curve, Evaluation
@@ -161,9 +162,10 @@ def _calibration_over_epochs(dossier: Dossier) -> Chart | None:
 
 
 def strata_charts(evaluation: Evaluation) -> dict[str, Chart]:
-    """Both errors of the tables by visibility, truncation, depth and focal length."""
+    """Both errors of the tables by visibility, truncation, depth and focal length, where samples differ in them."""
     charts = {}
-    for name in dict.fromkeys(stratum.quantity for stratum in evaluation.strata):
+    parts = Counter(stratum.quantity for stratum in evaluation.strata)
+    for name in [name for name, count in parts.items() if count > 1]:
         for key, colour in (("projected_error_mm", 1), ("depth_error_mm", 2)):
             charts[f"strata_{name}_{key}".replace(" ", "_")] = _strata_chart(evaluation, name, key, colour)
     return charts

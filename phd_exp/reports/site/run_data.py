@@ -109,7 +109,9 @@ def key_of(run: Run) -> str:
     except (RunError, OSError):
         images = None
     seen = [_stamp(file) for file in sorted([*files, *([images] if images else [])])]
-    return hashlib.sha256(json.dumps([_code(), run.state, run.detail, seen]).encode()).hexdigest()[:16]
+    return hashlib.sha256(
+        json.dumps([_code(), run.state, run.detail, run.overrides, seen]).encode()
+    ).hexdigest()[:16]
 
 
 def _stamp(path: Path) -> tuple[str, int, int]:

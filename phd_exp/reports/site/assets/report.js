@@ -98,14 +98,14 @@ const phdExp = (() => {
     };
   }
 
-  /** Ticks at powers of ten, and at 2 and 5 between them where there are few; numbers in full where they are short. */
+  /** Ticks at powers of ten, with others between them where there are few; numbers in full where they are short. */
   function logTicks(chart, name) {
     const values = chart.data.flatMap((trace) => [...trace[name], ...(trace.meta.low ?? [])]).filter((value) => value > 0);
     if (!values.length) return {};
     const [low, high] = [Math.min(...values), Math.max(...values)].map(Math.log10);
     const decades = Array.from({ length: Math.ceil(high) - Math.floor(low) + 1 }, (_, i) => Math.floor(low) + i);
     const every = Math.ceil(decades.length / 7);
-    const steps = high - low > 1.5 ? [1] : [1, 2, 5];
+    const steps = high - low > 1.5 ? [1] : high - low > 0.7 ? [1, 2, 5] : [1, 1.5, 2, 3, 4, 5, 7];
     const ticks = decades.filter((_, i) => i % every === 0).flatMap((power) => steps.map((step) => [step, power]));
     const text = (step, power) => (power >= -2 && power <= 4 ? Number((step * 10 ** power).toPrecision(2)).toLocaleString("en") : `${step === 1 ? "" : `${step}·`}10<sup>${power}</sup>`);
     return { tickvals: ticks.map(([step, power]) => step * 10 ** power), ticktext: ticks.map(([step, power]) => text(step, power)) };
