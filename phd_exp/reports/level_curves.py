@@ -179,5 +179,6 @@ def draw_birds_eye(axes: Axes, curves: LevelCurves, truth: np.ndarray | None) ->
     if truth is not None:
         axes.plot(truth[0], truth[2], "o", color="black", markersize=4, label="truth")
     axes.set(xlabel="x (m)", ylabel="z (m)")
+    axes.locator_params(axis="x", nbins=5)  # more labels would run into each other
     axes.grid(alpha=0.25)
     axes.legend(frameon=False, fontsize="small")
