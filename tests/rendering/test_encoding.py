@@ -100,7 +100,9 @@ def test_webp_files_hold_the_pixels_of_the_png_files(
 def test_the_data_module_reads_webp(small_webp: DatasetFolder) -> None:
     spec = small_webp.manifest.spec
     data = PositionData(
-        RenderedSource(small_webp, spec, {"train": 5, "test": 2}, spec.sensor_size), batch_size=5, seed=0
+        RenderedSource(small_webp, spec, {"train": 5, "held_out": 0, "test": 2}, spec.sensor_size),
+        batch_size=5,
+        seed=0,
     )
     data.setup()
     for split in SPLITS:

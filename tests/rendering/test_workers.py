@@ -155,5 +155,6 @@ def test_no_workers_is_refused(small_spec: DatasetSpec, tmp_path: Path, count: i
 
 
 def test_few_samples_take_few_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers.os, "sched_getaffinity", lambda _: range(16), raising=False)
+    monkeypatch.setattr(workers, "usable_cores", lambda: 16)
     assert [workers.worker_count(tasks) for tasks in (1, 8, 9, 64, 10_000)] == [1, 1, 2, 8, 16]
+    assert [workers.worker_count(tasks, cores=4) for tasks in (1, 9, 10_000)] == [1, 2, 4]
