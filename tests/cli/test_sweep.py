@@ -57,6 +57,13 @@ def test_an_experiment_says_how_many_runs_it_has(jobs: Callable, experiment: str
     assert f"python -m phd_exp -m experiment={experiment}" in text
 
 
+def test_jobs_in_a_queue_come_back() -> None:
+    with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
+        launcher = plan(["hydra/launcher=slurm", "hydra.launcher.partition=gpu"], "config").launcher
+    assert launcher["_target_"].endswith("SlurmLauncher")
+    assert (launcher["timeout_min"], launcher["max_num_timeout"], launcher["partition"]) == (1440, 10, "gpu")
+
+
 def test_an_experiment_changes_nothing_but_which_runs_there_are(jobs: Callable) -> None:
     """Its run of (mae_vz, occl) is the run of that model on that data, in the same folder."""
     for words in (["preset=small"], ["seed=3", "optimizer.lr=1e-2"]):

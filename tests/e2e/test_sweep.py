@@ -1,9 +1,12 @@
 """Sweeps on real renders: killed at any moment, with failures among them, with a configuration that has changed."""
 
 import multiprocessing
+import os
 import random
+import signal
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from importlib.util import find_spec
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -80,6 +83,38 @@ def test_killed_at_any_moment_the_same_command_goes_on(
     for files in now.values():
         assert not [name for name in files if name.endswith(".tmp")]
         assert [name for name in files if name.startswith("checkpoints/")] == ["checkpoints/last.ckpt"]
+
+
+@pytest.mark.slow
+def test_a_preempted_job_comes_back_and_takes_up_its_run(
+    train: Callable, begun: Callable, tmp_path: Path
+) -> None:
+    """As SLURM does it: the queue tells the job by SIGUSR2, submitit puts it back, and it goes on where it was."""
+    words = ("-m", "model=mae_vz", "seed=0", "logger=none", "trainer.max_epochs=12")
+    assert train(*words, f"runs={tmp_path / 'whole'}").status == 0
+    runs = tmp_path / "preempted"
+    process = begun(*words, f"runs={runs}", "hydra/launcher=submitit_local", "hydra.launcher.timeout_min=60")
+    while not list(runs.glob("*/*/*/*/checkpoints/last.ckpt")):
+        assert process.is_alive()
+        time.sleep(0.05)
+    (told,) = jobs_of_submitit(runs)
+    os.kill(told, signal.SIGUSR2)
+    process.join()
+    assert process.exitcode == 0
+    (log,) = (runs / ".sweep" / ".submitit").glob("*/*_log.err")
+    assert "this job is preempted" in log.read_text()
+    assert numbers(runs) == numbers(tmp_path / "whole")
+
+
+def jobs_of_submitit(runs: Path) -> list[int]:
+    """The processes that work for submitit's folder below `runs`."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            command = (entry / "cmdline").read_bytes().decode().split("\0")
+            if "submitit.core._submit" in command and any(word.startswith(str(runs)) for word in command):
+                found.append(int(entry.name))
+    return found
 
 
 def test_a_failing_run_among_others(train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
