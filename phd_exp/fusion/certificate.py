@@ -85,7 +85,7 @@ def _least_curvature(
     """A lower bound of the curvature within a radius of u, with respect to what is seen.
 
     |q| changes by at most delta. Below 1 - delta, h has curvature 1; else at least (P - delta/|q|)/(|q| + delta), where
-    P projects across q: its direction turns by at most asin(delta/|q|), and projectors differ in norm by the sine.
+    P projects across q: that direction turns by at most asin(delta/|q|), by whose sine projectors differ in norm.
     """
     squares = views.slope.square().sum(1)
     delta = (squares[0] + squares[1]).sqrt() * radius

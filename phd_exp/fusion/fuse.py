@@ -8,8 +8,7 @@ from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.level import credible_level
 from phd_exp.fusion.certificate import certify
 from phd_exp.fusion.energy import energy
-from phd_exp.fusion.fused import Fused, unfused
-from phd_exp.fusion.moments import moments
+from phd_exp.fusion.fused import Fused
 from phd_exp.fusion.newton import minimise
 from phd_exp.fusion.polish import polish
 from phd_exp.fusion.pose import Plane, Pose
@@ -50,15 +49,14 @@ def fuse(
     Source: paper, section "Multi-view fusion and ground plane constraints".
     """
     problems = Problems.posed(predictions, pose, plane, mask)
-    result = unfused(problems.status(), problems.mask.shape[1])
-    sound = (result.status == Status.FUSED).nonzero().squeeze(-1)
+    status = problems.status()
+    sound = (status == Status.FUSED).nonzero().squeeze(-1)
     part = problems.subset(sound)
     u, lam, seen = find_optimum(part.views())
-    unseen = (~seen).nonzero().squeeze(-1)
-    result.status[sound[unseen]] = _why_unseen(part.subset(unseen))
-    kept = seen.nonzero().squeeze(-1)
-    _fill(result, sound[kept], part.subset(kept), u[:, kept], lam[:, kept], contradiction)
-    return result.reshaped(predictions.batch_shape[:-1])
+    unseen, seen = (~seen).nonzero().squeeze(-1), seen.nonzero().squeeze(-1)
+    status[sound[unseen]] = _why_unseen(part.subset(unseen))
+    shape = predictions.batch_shape[:-1]
+    return _judged(part.subset(seen), u[:, seen], lam[:, seen], sound[seen], status, shape, contradiction)
 
 
 def find_optimum(
@@ -89,34 +87,40 @@ def _why_unseen(problems: Problems) -> Int[Tensor, " problems"]:
     return status
 
 
-def _fill(
-    result: Fused,
-    where: Int[Tensor, " some"],
+def _judged(
     problems: Problems,
     u: Unknown,
-    lam: Float[Tensor, "cameras some"],
+    lam: Float[Tensor, "cameras solved"],
+    where: Int[Tensor, " solved"],
+    status: Int[Tensor, " problems"],
+    shape: torch.Size,
     contradiction: float,
-) -> None:
-    """Polish, certify and judge the optima of some problems, and enter those that stand."""
+) -> Fused:
+    """The optima polished and certified, and those that stand entered among all problems, which have this shape."""
     views = problems.views()
     u, lam = polish(views, u, lam)
     certificate = certify(views, u, lam)
     surprise = _surprise(views, u).T
     ruled_out = ((surprise > 1 - contradiction) & problems.mask).sum(-1)
-    status = torch.full_like(ruled_out, int(Status.FUSED))
-    status[2 * ruled_out >= problems.mask.sum(-1)] = Status.CONTRADICTION
-    status[~(certificate.relative <= CONVERGED)] = Status.NOT_CONVERGED
-    result.status[where] = status
-    good = (status == Status.FUSED).nonzero().squeeze(-1)
-    where, problems, views = where[good], problems.subset(good), views.subset(good)
-    mean, covariance = moments(views, u[:, good])
-    D = problems.directions
-    result.point[where] = problems.in_world(u[:, good])
-    result.mean[where] = problems.in_world(mean)
-    result.covariance[where] = D @ covariance.permute(2, 0, 1) @ D.mT
-    result.certificate[where] = certificate.distance[good]
-    result.subgradient[where] = certificate.subgradient[good]
-    result.surprise[where] = surprise[good].masked_fill(~problems.mask, torch.nan)
+    status[where[2 * ruled_out >= problems.mask.sum(-1)]] = Status.CONTRADICTION
+    status[where[~(certificate.relative <= CONVERGED)]] = Status.NOT_CONVERGED
+    good = (status[where] == Status.FUSED).nonzero().squeeze(-1)
+    where, solved, u = where[good], problems.subset(good), u[:, good]
+
+    def entered(values: Tensor) -> Tensor:
+        entries = values.new_full((len(status), *values.shape[1:]), torch.nan)
+        entries[where] = values
+        return entries.reshape(shape + values.shape[1:])
+
+    return Fused(
+        entered(solved.in_world(u)),
+        entered(certificate.distance[good]),
+        entered(certificate.subgradient[good]),
+        entered(surprise[good].masked_fill(~solved.mask, torch.nan)),
+        status.reshape(shape),
+        solved,
+        u,
+    )
 
 
 def _surprise(views: Views, u: Unknown) -> Float[Tensor, "cameras problems"]:

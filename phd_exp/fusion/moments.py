@@ -17,19 +17,20 @@ from phd_exp.fusion.cholesky import Triangle, backward, factor, forward
 from phd_exp.fusion.energy import energy
 from phd_exp.fusion.views import Unknown, Views, total
 
-_POINTS = 512
+_POINTS, _PASSES = 256, 3
 _FREEDOM = 5.0  # of Student's law, whose tails cover the exponential ones of the density
 _FIXED_POINT_STEPS = 6
 _AT_ONCE = 1 << 17  # cameras times points times problems
 
 
 def moments(views: Views, u: Unknown) -> tuple[Unknown, Float[Tensor, "k k problems"]]:
-    """Mean (metres) and covariance (square metres) of u with density exp(-energy), around the optimum u.
+    """Mean (metres) and covariance (square metres) of u with density exp(-energy), of which u is the mode.
 
-    Self-normalised importance sampling by a fixed set of 512 points of low discrepancy, which follow Student's law
-    with 5 degrees of freedom around the optimum: the same numbers every time.
+    Self-normalised importance sampling with a fixed set of 256 points of low discrepancy, which follow Student's law
+    with 5 degrees of freedom: first about the mode, then twice more with the mean and covariance found so far. The
+    same numbers every time; of variances along the axes, half are within 2 % and 95 in 100 within 10 % or so.
 
-    Source: own derivation; checked against exact samples and Markov chains in tests/fusion/test_moments.py.
+    Source: own derivation; checked against exact moments and Markov chains in tests/fusion/test_moments.py.
     """
     size = max(1, _AT_ONCE // (_POINTS * len(views.a)))
     parts = [_moments(*part) for part in zip(views.chunks(size), u.split(size, dim=-1), strict=True)]
@@ -39,16 +40,38 @@ def moments(views: Views, u: Unknown) -> tuple[Unknown, Float[Tensor, "k k probl
 
 def _moments(views: Views, u: Unknown) -> tuple[Tensor, Tensor]:
     points, log_proposal = (part.to(u.device) for part in _rule(len(u)))
-    L = [[entry[:, None] for entry in row] for row in factor(averaged_precision(views, u))]
-    offset = backward(L, points[:, None].expand(-1, u.shape[1], -1))  # k problems points
-    seen = views.seen(u)[..., None]
+    precision = factor(averaged_precision(views, u))
+    offset = backward([[entry[:, None] for entry in row] for row in precision], points[:, None])
+    mean, covariance = _weighted(views, u, offset, log_proposal)
+    for _ in range(_PASSES - 1):
+        root = factor([[covariance[i, j] for j in range(i + 1)] for i in range(len(u))])
+        offset = _product(root, points)
+        mean, covariance = _weighted(views, mean, offset, log_proposal)
+    return mean, covariance
+
+
+def _product(L: Triangle, points: Float[Tensor, "k points"]) -> Float[Tensor, "k problems points"]:
+    """L times each point."""
+    return torch.stack(
+        [total(torch.stack([entry[:, None] * points[j] for j, entry in enumerate(row)]), 0) for row in L]
+    )
+
+
+def _weighted(
+    views: Views,
+    centre: Unknown,
+    offset: Float[Tensor, "k problems points"],
+    log_proposal: Float[Tensor, " points"],
+) -> tuple[Unknown, Float[Tensor, "k k problems"]]:
+    """Mean and covariance from the density at centre + offset, the points having been drawn from a proposal."""
+    seen = views.seen(centre)[..., None]
     for j, component in enumerate(offset):
         seen = seen + views.slope[:, j, ..., None] * component
     value = total(energy(seen, views.a[..., None]), 0)
     weight = torch.softmax(-value - log_proposal, dim=-1)
     mean = (weight * offset).sum(-1)
     centred = offset - mean[..., None]
-    return u + mean, (weight * centred[:, None] * centred).sum(-1)
+    return centre + mean, (weight * centred[:, None] * centred).sum(-1)
 
 
 def averaged_precision(views: Views, u: Unknown) -> Triangle:

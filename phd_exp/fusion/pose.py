@@ -21,21 +21,10 @@ class Pose:
     Args:
         R: rotations from the world's axes to the camera's.
         t: where the world's origin lies in the camera frame, metres.
-
-    Raises:
-        ValueError: the shapes do not fit one another.
     """
 
-    R: Float[Tensor, "*batch 3 3"]
-    t: Float[Tensor, "*batch 3"]
-
-    def __post_init__(self) -> None:
-        """Refuse shapes that are no poses."""
-        if self.R.shape[-2:] != (3, 3) or self.t.shape != self.R.shape[:-1]:
-            raise ValueError(
-                "a pose is R of shape (*batch, 3, 3) and t of shape (*batch, 3), but the shapes are "
-                f"{tuple(self.R.shape)} and {tuple(self.t.shape)}"
-            )
+    R: Float[Tensor, "*#batch 3 3"]
+    t: Float[Tensor, "*#batch 3"]
 
     @classmethod
     def from_scene(cls, poses: Sequence[scenes.Pose]) -> "Pose":
@@ -78,8 +67,8 @@ class Plane:
         offset: in metres if the normal has unit length.
     """
 
-    normal: Float[Tensor, "*batch 3"]
-    offset: Float[Tensor, "*batch"]
+    normal: Float[Tensor, "*#batch 3"]
+    offset: Float[Tensor, "*#batch"]
 
     def nearest(self, v: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
         """The point of the plane that is nearest to v."""
