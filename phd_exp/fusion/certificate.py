@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from phd_exp.fusion.cholesky import solve
+from phd_exp.fusion.linear import solve, total
 from phd_exp.fusion.polish import KINK
-from phd_exp.fusion.views import Seen, Unknown, Views, total
+from phd_exp.fusion.views import Seen, Unknown, Views
 
 _RADII = (1e-8, 1e-6, 1e-4, 1e-2)  # metres; balls in which the curvature is bounded from below
 
@@ -84,8 +84,8 @@ def _least_curvature(
 ) -> Float[Tensor, "4 cameras problems"]:
     """A lower bound of the curvature within a radius of u, with respect to what is seen.
 
-    |q| changes by at most delta. Below 1 - delta, h has curvature 1; else at least (P - delta/|q|)/(|q| + delta), where
-    P projects across q: that direction turns by at most asin(delta/|q|), by whose sine projectors differ in norm.
+    |q| changes by at most delta. Below 1 - delta, h has curvature 1; else at least (P - delta/|q|)/(|q| + delta).
+    P projects across q, whose direction turns by at most asin(delta/|q|), and projectors differ in norm by the sine.
     """
     squares = views.slope.square().sum(1)
     delta = (squares[0] + squares[1]).sqrt() * radius

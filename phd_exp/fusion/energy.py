@@ -4,10 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from phd_exp.fusion.views import Seen
 
-
-def energy(seen: Seen, a: Float[Tensor, "cameras problems"]) -> Float[Tensor, "cameras problems"]:
+def energy(seen: Float[Tensor, "3 *#batch"], a: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
     """h(|q|) + a max(t, 1/t) of each camera; infinite for t <= 0.
 
     Source: paper, section "Projected Huber distribution".
@@ -17,7 +15,7 @@ def energy(seen: Seen, a: Float[Tensor, "cameras problems"]) -> Float[Tensor, "c
     return huber(seen) + torch.where(a > 0, a * depth, 0)
 
 
-def huber(seen: Seen) -> Float[Tensor, "cameras problems"]:
+def huber(seen: Float[Tensor, "3 *#batch"]) -> Float[Tensor, "*#batch"]:
     """h(|q|)."""
     squared = seen[0].square() + seen[1].square()
     return torch.where(squared > 1, squared.clamp_min(1).sqrt() - 0.5, squared / 2)
@@ -35,8 +33,8 @@ def extended_inverse(t: Tensor, least: float) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def smooth_energy(
-    seen: Seen, a: Float[Tensor, "cameras problems"], width: float, least: float
-) -> Float[Tensor, "cameras problems"]:
+    seen: Float[Tensor, "3 *#batch"], a: Float[Tensor, "*#batch"], width: float, least: float
+) -> Float[Tensor, "*#batch"]:
     """The energy with max(t, 1/t) replaced by (t + 1/t)/2 + sqrt(g^2 + width^2), g = (t - 1/t)/2.
 
     This is the w of the epigraph's barrier, (w - t)(w - 1/t) = width^2. It is convex in t, because its second

@@ -89,10 +89,10 @@ def _why_unseen(problems: Problems) -> Int[Tensor, " problems"]:
 
 def _judged(
     problems: Problems,
-    u: Unknown,
+    u: Float[Tensor, "k solved"],
     lam: Float[Tensor, "cameras solved"],
     where: Int[Tensor, " solved"],
-    status: Int[Tensor, " problems"],
+    status: Int[Tensor, " all"],
     shape: torch.Size,
     contradiction: float,
 ) -> Fused:

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from phd_exp.fusion.linear import product
 from phd_exp.fusion.moments import moments
 from phd_exp.fusion.problems import Problems
 from phd_exp.fusion.status import FusionError, Status
@@ -55,7 +56,7 @@ class Fused:
             u_mean, u_covariance = moments(self.solved.views(), self.optimum)
             D = self.solved.directions
             mean[found] = self.solved.in_world(u_mean)
-            covariance[found] = D @ u_covariance.permute(2, 0, 1) @ D.mT
+            covariance[found] = product(product(D, u_covariance.permute(2, 0, 1)), D.mT)
         return mean, covariance
 
     def errors(self) -> list[str]:

@@ -4,15 +4,17 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from phd_exp.fusion.linear import total
+
 
 def average(
     positions: Float[Tensor, "*batch cameras 3"], mask: Bool[Tensor, "*batch cameras"] | None = None
 ) -> Float[Tensor, "*batch 3"]:
     """The mean over the cameras of positions in the world, in their unit; NaN where no camera takes part."""
     if mask is None:
-        return positions.mean(-2)
+        return total(positions, -2) / positions.shape[-2]
     # a camera that takes no part may hold NaN
-    return torch.where(mask[..., None], positions, 0).sum(-2) / mask.sum(-1, keepdim=True)
+    return total(torch.where(mask[..., None], positions, 0), -2) / mask.sum(-1, keepdim=True)
 
 
 def gaussian_fusion(

@@ -13,9 +13,9 @@ from jaxtyping import Float
 from scipy import stats
 from torch import Tensor
 
-from phd_exp.fusion.cholesky import Triangle, backward, factor, forward
 from phd_exp.fusion.energy import energy
-from phd_exp.fusion.views import Unknown, Views, total
+from phd_exp.fusion.linear import Triangle, backward, factor, forward, total
+from phd_exp.fusion.views import Unknown, Views
 
 _POINTS, _PASSES = 256, 3
 _FREEDOM = 5.0  # of Student's law, whose tails cover the exponential ones of the density

@@ -15,9 +15,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from phd_exp.fusion.cholesky import solve
 from phd_exp.fusion.energy import extended_inverse, smooth_energy
-from phd_exp.fusion.views import Seen, Unknown, Views, total
+from phd_exp.fusion.linear import solve, total
+from phd_exp.fusion.views import Seen, Unknown, Views
 
 WIDTH_FLOOR = 1e-9
 _FIRST_WIDTH, _SHRINK = 1.0, 0.05

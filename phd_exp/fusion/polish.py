@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from phd_exp.fusion.cholesky import solve
+from phd_exp.fusion.linear import solve
 from phd_exp.fusion.views import Seen, Unknown, Views
 
 KINK = 1e-6
@@ -53,7 +53,7 @@ def _newton_step(
     unit = torch.where(weight < 1, q * weight, 0)
     slope = torch.where(side > 0, 1, -t.square().reciprocal())
     slope = torch.where(kink, lam + _PENALTY * (t - 1), slope)
-    bend = torch.where(kink, _PENALTY, torch.where(side > 0, 0, 2 * t**-3))
+    bend = torch.where(kink, _PENALTY, torch.where(side > 0, 0, 2 / t**3))
     curvature = (
         weight * (1 + _RIDGE - unit[0].square()),
         -weight * unit[0] * unit[1],

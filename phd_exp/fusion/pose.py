@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from phd_exp.fusion.linear import apply, total
 from phd_exp.records import scenes
 
 _RIGID_WITHIN = 1e-6  # float32 keeps a rotation to 1e-7
@@ -51,11 +52,11 @@ class Pose:
 
     def into_camera(self, v: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
         """World to camera frame, R v + t."""
-        return (self.R @ v[..., None]).squeeze(-1) + self.t
+        return apply(self.R, v) + self.t
 
     def into_world(self, v: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
         """Camera frame to world, R^T (v - t)."""
-        return (self.R.mT @ (v - self.t)[..., None]).squeeze(-1)
+        return apply(self.R.mT, v - self.t)
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class Plane:
 
     def nearest(self, v: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
         """The point of the plane that is nearest to v."""
-        excess = ((self.normal * v).sum(-1) - self.offset) / self.normal.square().sum(-1)
+        excess = (total(self.normal * v, -1) - self.offset) / total(self.normal.square(), -1)
         return v - excess[..., None] * self.normal
 
     @property

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion.gaussian import average
+from phd_exp.fusion.linear import apply, product
 from phd_exp.fusion.pose import Plane, Pose
 from phd_exp.fusion.status import Status
 from phd_exp.fusion.views import Unknown, Views
@@ -106,8 +107,8 @@ class Problems:
 
     def views(self) -> Views:
         """What the cameras see of origin + directions u."""
-        slope = self.to_seen @ self.pose.R @ self.directions[:, None]
-        at_origin = (self.to_seen @ self.pose.into_camera(self.origin[:, None])[..., None]).squeeze(-1)
+        slope = product(product(self.to_seen, self.pose.R), self.directions[:, None])
+        at_origin = apply(self.to_seen, self.pose.into_camera(self.origin[:, None]))
         nothing = torch.tensor([0.0, 0.0, 1.0], dtype=self.a.dtype, device=self.a.device)
         slope = torch.where(self.mask[..., None, None], slope, 0)
         at_origin = torch.where(self.mask[..., None], at_origin, nothing)
@@ -118,7 +119,7 @@ class Problems:
 
     def in_world(self, u: Unknown) -> Float[Tensor, "problems 3"]:
         """origin + directions u."""
-        return self.origin + (self.directions @ u.T[..., None]).squeeze(-1)
+        return self.origin + apply(self.directions, u.T)
 
 
 def _linear_map(predictions: ProjectedHuber) -> Float[Tensor, "*batch 3 3"]:

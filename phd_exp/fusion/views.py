@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from phd_exp.fusion.cholesky import Triangle
+from phd_exp.fusion.linear import Triangle, total
 
 Seen = Float[Tensor, "3 cameras problems"]
 Unknown = Float[Tensor, "k problems"]
@@ -64,12 +64,3 @@ class Views:
             [total(wx * x[j] + wy * y[j] + wt * t[j], 0) for j in range(i + 1)]
             for i, (wx, wy, wt) in enumerate(weighted)
         ]
-
-
-def total(terms: Tensor, dim: int) -> Tensor:
-    """A sum in the order of the terms: so a batch's size never changes a bit of one problem's result."""
-    first, *rest = terms.unbind(dim)
-    result = first.clone()
-    for term in rest:
-        result += term
-    return result

@@ -20,7 +20,7 @@ class Camera:
 
 
 class Program:
-    """minimise x.P x/2 + c.x subject to affine expressions of x lying in cones; x = (v - origin)/unit, then the rest."""
+    """minimise x.P x/2 + c.x with affine expressions of x in cones; x = (v - origin)/unit, then the rest."""
 
     def __init__(self, cameras: list[Camera], origin: np.ndarray, unit: float) -> None:
         self.n = 3 + 3 * len(cameras)

@@ -1,4 +1,4 @@
-"""Random problems of fusion: cameras all around an object, predictions with errors of their own law, and some outliers."""
+"""Random problems: cameras all around an object, predictions with errors of their own law, and some outliers."""
 
 import math
 
@@ -43,12 +43,13 @@ def random_problems(
     error = ProjectedHuber(*centre, A, a).rsample((), generator)  # (A^(-1) q, t)
     mu_xy, mu_z = xy_over_z - error[..., :2] / error[..., 2:], z / error[..., 2]
     wild = (uniform(n, cameras, low=0, high=1) < outliers).double()
-    mu_xy = mu_xy + 0.1 * wild[..., None] * torch.randn(n, cameras, 2, generator=generator, dtype=torch.float64)
+    mu_xy = mu_xy + 0.1 * wild[..., None] * torch.randn(
+        n, cameras, 2, generator=generator, dtype=torch.float64
+    )
     mu_z = mu_z * torch.exp(0.5 * wild * torch.randn(n, cameras, generator=generator, dtype=torch.float64))
     return ProjectedHuber(mu_xy, mu_z, A, a), pose, truth.squeeze(1)
 
 
-def part(predictions: ProjectedHuber, problems: Tensor | slice) -> ProjectedHuber:
-    """Some of the predictions, by their problem; not checked again."""
-    values = (predictions.mu_xy, predictions.mu_z, predictions.A, predictions.a)
-    return ProjectedHuber(*(value[problems] for value in values), validate_args=False)
+def columns_of(predictions: ProjectedHuber) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """What the constructor takes."""
+    return predictions.mu_xy, predictions.mu_z, predictions.A, predictions.a

@@ -7,13 +7,13 @@ import torch
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion import Plane, Pose, Status, fuse
 from tests.fusion.conic import Camera, Program
-from tests.fusion.random_problems import random_problems
+from tests.fusion.random_problems import columns_of, random_problems
 
 AGREE = 1e-6  # metres
 
 
 def cameras_of(predictions: ProjectedHuber, pose: Pose) -> list[list[Camera]]:
-    columns = (predictions.mu_xy, predictions.mu_z, predictions.A, predictions.a, pose.R, pose.t)
+    columns = (*columns_of(predictions), pose.R, pose.t)
     arrays = [column.numpy() for column in columns]
     problems, cameras = predictions.batch_shape
     return [[Camera(*(array[i, j] for array in arrays)) for j in range(cameras)] for i in range(problems)]
@@ -30,6 +30,26 @@ def energy(cameras: list[Camera], v: np.ndarray) -> np.longdouble:
     return result
 
 
+# tolerance, and unit of length in metres: where the energy is flat, Clarabel stops short at one and not at another
+SETTINGS = ((1e-14, 1.0), (1e-15, 0.1), (1e-12, 1.0), (1e-12, 0.1), (1e-15, 0.01), (1e-11, 0.01))
+
+
+def conic_optimum(
+    cameras: list[Camera], plane: tuple[np.ndarray, float] | None, origin: np.ndarray, ours: np.ndarray
+) -> np.ndarray:
+    """Clarabel's optimum; while it is not ours, the lowest that it finds at several settings."""
+    best: np.ndarray | None = None
+    for tolerance, unit in SETTINGS:
+        program = Program(cameras, origin if best is None else best, unit)
+        theirs, _ = (program if plane is None else program.on_plane(*plane)).solve(tolerance)
+        if best is None or energy(cameras, theirs) < energy(cameras, best):
+            best = theirs
+        if np.abs(best - ours).max() <= AGREE:
+            break
+    assert best is not None
+    return best
+
+
 def compare(n: int, cameras: int, seed: int, on_plane: bool) -> tuple[np.ndarray, int, int]:
     """Distances between the optima (metres), how many kinks hold ours, and how often Clarabel's energy is lower."""
     predictions, pose, truth = random_problems(n, cameras, seed)
@@ -43,17 +63,16 @@ def compare(n: int, cameras: int, seed: int, on_plane: bool) -> tuple[np.ndarray
     origin = pose.into_world(predictions.mode).mean(1).numpy()
     distances, worse = np.empty(n), 0
     for i, problem in enumerate(cameras_of(predictions, pose)):
-        program = Program(problem, origin[i], unit=1.0)
-        if plane is not None:
-            program.on_plane(plane.normal[i].numpy(), float(plane.offset[i]))
-        ours, (theirs, _) = fused.point[i].numpy(), program.solve()
+        ours = fused.point[i].numpy()
+        where = None if plane is None else (normal[i].numpy(), float(plane.offset[i]))
+        theirs = conic_optimum(problem, where, origin[i], ours)
         distances[i] = np.abs(ours - theirs).max()
         worse += bool(distances[i] > AGREE and energy(problem, theirs) < energy(problem, ours))
     return distances, kinks, worse
 
 
 def check(n: int, cameras: int, seed: int, on_plane: bool) -> None:
-    """All agree within 1e-6 m, but for a few where the energy is so flat that Clarabel stops early, higher up."""
+    """All agree within 1e-6 m, but for one in a hundred at most, so flat that Clarabel stops early and higher up."""
     distances, kinks, worse = compare(n, cameras, seed, on_plane)
     where = "plane" if on_plane else "space"
     apart = int((distances > AGREE).sum())
@@ -63,8 +82,8 @@ def check(n: int, cameras: int, seed: int, on_plane: bool) -> None:
         f"Clarabel's energy is lower; {kinks / n:.2f} kinks a problem"
     )
     assert worse == 0
-    assert apart <= max(2, 0.02 * n)
-    assert distances.max() < 1e-3
+    assert apart <= 0.01 * n
+    assert distances.max() < 1e-4
     assert kinks > 0.05 * n
 
 

@@ -1,6 +1,7 @@
-"""Linear systems of two or three unknowns, one for each problem of a batch, by Cholesky's method.
+"""Sums, products and linear systems of two or three unknowns, one for each problem of a batch.
 
-Written out, because a library call for each of ten thousand 3 x 3 matrices takes longer than the arithmetic.
+Written out, because a library call for each of ten thousand 3 x 3 matrices takes longer than the arithmetic, and adds
+in an order that depends on the size of the batch: here no problem depends on its neighbours, not in the last bit.
 """
 
 import torch
@@ -9,6 +10,25 @@ from torch import Tensor
 
 Triangle = list[list[Tensor]]
 """The lower triangle of a matrix, row by row."""
+
+
+def total(terms: Tensor, dim: int) -> Tensor:
+    """A sum in the order of the terms."""
+    first, *rest = terms.unbind(dim)
+    result = first.clone()
+    for term in rest:
+        result += term
+    return result
+
+
+def product(A: Float[Tensor, "*#batch m n"], B: Float[Tensor, "*#batch n k"]) -> Float[Tensor, "*#batch m k"]:
+    """A B."""
+    return total(A[..., None] * B[..., None, :, :], -2)
+
+
+def apply(A: Float[Tensor, "*#batch m n"], b: Float[Tensor, "*#batch n"]) -> Float[Tensor, "*#batch m"]:
+    """A b."""
+    return total(A * b[..., None, :], -1)
 
 
 def solve(H: Triangle, b: Float[Tensor, "k ..."]) -> Float[Tensor, "k ..."]:
