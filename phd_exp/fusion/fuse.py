@@ -1,5 +1,7 @@
 """One position from the predictions of several cameras that saw the same object, and perhaps from a plane."""
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -52,11 +54,13 @@ def fuse(
     status = problems.status()
     sound = (status == Status.FUSED).nonzero().squeeze(-1)
     part = problems.subset(sound)
-    u, lam, seen = find_optimum(part.views())
+    views = part.views()
+    u, lam, seen = find_optimum(views)
     unseen, seen = (~seen).nonzero().squeeze(-1), seen.nonzero().squeeze(-1)
     status[sound[unseen]] = _why_unseen(part.subset(unseen))
-    shape = predictions.batch_shape[:-1]
-    return _judged(part.subset(seen), u[:, seen], lam[:, seen], sound[seen], status, shape, contradiction)
+    part, views = part.subset(seen), views.subset(seen)
+    optima = Optima(part, views, *polish(views, u[:, seen], lam[:, seen]))
+    return _judged(optima, sound[seen], status, predictions.batch_shape[:-1], contradiction)
 
 
 def find_optimum(
@@ -87,19 +91,26 @@ def _why_unseen(problems: Problems) -> Int[Tensor, " problems"]:
     return status
 
 
+@dataclass(frozen=True)
+class Optima:
+    """Problems, what their cameras see, and their polished optima with multipliers."""
+
+    problems: Problems
+    views: Views
+    u: Float[Tensor, "k problems"]
+    lam: Float[Tensor, "cameras problems"]
+
+
 def _judged(
-    problems: Problems,
-    u: Float[Tensor, "k solved"],
-    lam: Float[Tensor, "cameras solved"],
-    where: Int[Tensor, " solved"],
+    optima: Optima,
+    where: Int[Tensor, " optima"],
     status: Int[Tensor, " all"],
     shape: torch.Size,
     contradiction: float,
 ) -> Fused:
-    """The optima polished and certified, and those that stand entered among all problems, which have this shape."""
-    views = problems.views()
-    u, lam = polish(views, u, lam)
-    certificate = certify(views, u, lam)
+    """The optima certified, and those that stand entered among all problems, which have this shape."""
+    problems, views, u = optima.problems, optima.views, optima.u
+    certificate = certify(views, u, optima.lam)
     surprise = _surprise(views, u).T
     ruled_out = ((surprise > 1 - contradiction) & problems.mask).sum(-1)
     status[where[2 * ruled_out >= problems.mask.sum(-1)]] = Status.CONTRADICTION

@@ -20,7 +20,10 @@ from phd_exp.fusion.views import Unknown, Views
 _POINTS, _PASSES = 256, 3
 _FREEDOM = 5.0  # of Student's law, whose tails cover the exponential ones of the density
 _FIXED_POINT_STEPS = 6
-_AT_ONCE = 1 << 17  # cameras times points times problems
+_AT_ONCE = {
+    "cpu": 1 << 17,
+    "cuda": 1 << 24,
+}  # cameras x points x problems: what a processor's cache, or a GPU, holds
 
 
 def moments(views: Views, u: Unknown) -> tuple[Unknown, Float[Tensor, "k k problems"]]:
@@ -32,7 +35,8 @@ def moments(views: Views, u: Unknown) -> tuple[Unknown, Float[Tensor, "k k probl
 
     Source: own derivation; checked against exact moments and Markov chains in tests/fusion/test_moments.py.
     """
-    size = max(1, _AT_ONCE // (_POINTS * len(views.a)))
+    at_once = _AT_ONCE.get(u.device.type, _AT_ONCE["cuda"])
+    size = max(1, at_once // (_POINTS * len(views.a)))
     parts = [_moments(*part) for part in zip(views.chunks(size), u.split(size, dim=-1), strict=True)]
     means, covariances = zip(*parts, strict=True)
     return torch.cat(means, dim=-1), torch.cat(covariances, dim=-1)

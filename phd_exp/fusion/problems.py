@@ -107,7 +107,9 @@ class Problems:
 
     def views(self) -> Views:
         """What the cameras see of origin + directions u."""
-        slope = product(product(self.to_seen, self.pose.R), self.directions[:, None])
+        slope = product(self.to_seen, self.pose.R)
+        if self.plane is not None:
+            slope = product(slope, self.directions[:, None])
         at_origin = apply(self.to_seen, self.pose.into_camera(self.origin[:, None]))
         nothing = torch.tensor([0.0, 0.0, 1.0], dtype=self.a.dtype, device=self.a.device)
         slope = torch.where(self.mask[..., None, None], slope, 0)
