@@ -36,7 +36,7 @@ def certify(views: Views, u: Unknown, lam: Float[Tensor, "cameras problems"]) ->
         G.d + d.H d/2 - e    while |d| <= rho,
 
     where H bounds the curvature from below within that radius. To it a kink adds 2 a (1 - |lam|)/(|r| rho) r r^T with
-    r = dt/du, because its energy grows by a (1 - |lam|) |r.d|; and e = sum 2 a |t - 1| is what the kinks are off.
+    r = dt/du, because its energy grows by a (1 - |lam|) |r.d|; and e = sum 3 a |t - 1| covers what kinks are off.
     An optimum is no higher, so its d has |d| <= sqrt(tr H^(-1)) (|G| + sqrt(|G|^2 + 2 e)) with |G|^2 = G.H^(-1) G.
     If that is at most rho, it bounds the distance; by convexity no optimum lies outside the ball either.
 
@@ -47,7 +47,7 @@ def certify(views: Views, u: Unknown, lam: Float[Tensor, "cameras problems"]) ->
     by_seen = _subgradient(seen, views.a, lam, kink)
     G = views.gradient(by_seen)
     pull = total(views.a * views.slope[2].square().sum(0).sqrt(), 0)
-    error = total(torch.where(kink, 2 * views.a * (seen[2] - 1).abs(), 0), 0)
+    error = total(torch.where(kink, 3 * views.a * (seen[2] - 1).abs(), 0), 0)
     distance = torch.full_like(pull, torch.inf)
     for radius in _RADII:
         bound = _distance(views, seen, lam, kink, radius, G, error)

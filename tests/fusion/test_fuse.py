@@ -1,7 +1,9 @@
 """Known solutions, invariances, and failures that leave their neighbours alone."""
 
+import numpy as np
 import pytest
 import torch
+from scipy.optimize import linprog
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
@@ -180,6 +182,56 @@ def test_a_failure_is_named_and_leaves_its_neighbours_alone(kind: Status) -> Non
     assert fused.errors() == [f"problem 1: {kind.reason}"]
     with pytest.raises(FusionError, match="problem 1: "):
         fused.raise_if_failed()
+
+
+def test_a_common_view_is_found_where_there_is_one() -> None:
+    """Cameras that look anywhere, against a linear program: the largest depth, up to 1 m, that all can reach."""
+    generator = torch.Generator().manual_seed(2)
+    n, cameras = 150, 5
+    pose = Pose(
+        rotations(n * cameras, generator).unflatten(0, (n, cameras)),
+        2 * torch.randn(n, cameras, 3, generator=generator, dtype=torch.float64),
+    )
+    eye = torch.eye(2, dtype=torch.float64).expand(n, cameras, 2, 2)
+    ahead = torch.full((n, cameras), 4.0, dtype=torch.float64)
+    fused = fuse(
+        ProjectedHuber(torch.zeros_like(eye[..., 0]), ahead, 30 * eye, ahead), pose, contradiction=0.0
+    )
+    reached = []
+    for R, t in zip(pose.R.numpy(), pose.t.numpy(), strict=True):
+        rows = np.concatenate([-R[:, 2], np.ones((cameras, 1))], axis=1)
+        result = linprog([0, 0, 0, -1], A_ub=rows, b_ub=t[:, 2], bounds=[(None, None)] * 3 + [(None, 1)])
+        reached.append(float(result.x[3]))
+    feasible = torch.tensor(reached) > 0
+    assert (torch.tensor(reached).abs() > 1e-4).all()  # none is too close to call
+    assert 20 < feasible.sum() < n - 5
+    assert fused.status.tolist() == [Status.FUSED if any_ else Status.NO_COMMON_VIEW for any_ in feasible]
+
+
+def test_a_batch_may_fail_as_a_whole() -> None:
+    predictions, pose, _ = random_problems(5, 2, seed=14)
+    fused = fuse(predictions, Pose(2 * pose.R, pose.t))
+    assert (fused.status == Status.NOT_A_ROTATION).all()
+    assert fused.covariance.isnan().all()
+    assert len(fused.errors()) == 5
+
+
+@pytest.mark.parametrize("on_plane", [False, True])
+def test_extreme_predictions_are_fused_too(on_plane: bool) -> None:
+    """Precisions over five decades, modes a third or three times as far as the truth."""
+    predictions, pose, truth = random_problems(2000, 3, seed=15, outliers=0.5)
+    generator = torch.Generator().manual_seed(0)
+    uniform = torch.rand(4, 2000, 3, generator=generator, dtype=torch.float64)
+    mu_xy, mu_z, A, _ = columns_of(predictions)
+    factor = 3 ** (2 * uniform[2] - 1)
+    predictions = ProjectedHuber(
+        mu_xy, mu_z * factor, A * 10 ** (3 * uniform[0] - 2)[..., None, None], 10 ** (5 * uniform[1] - 2)
+    )
+    plane = Plane(torch.ones(2000, 3, dtype=torch.float64), truth.sum(-1)) if on_plane else None
+    fused = fuse(predictions, pose, plane, contradiction=0.0)
+    assert (fused.status == Status.FUSED).all()
+    assert (fused.certificate < 1e-5).double().mean() > 0.999
+    assert (torch.linalg.eigvalsh(fused.covariance)[:, -1] > 0).all()
 
 
 def same_bits(one: Fused, other: Fused, kept: Tensor) -> None:
