@@ -62,10 +62,10 @@ def test_one_camera_has_the_moments_of_its_prediction() -> None:
 
 def test_two_cameras_have_the_moments_of_reweighted_samples() -> None:
     """Exact samples of the first camera's prediction, weighted by the second's density."""
-    predictions, pose, _ = random_problems(20, 2, seed=21, outliers=0.0)
+    predictions, pose, _ = random_problems(16, 2, seed=21, outliers=0.0)
     columns = columns_of(predictions)
     first, second = (ProjectedHuber(*(column[:, i] for column in columns)) for i in (0, 1))
-    samples = first.rsample((40_000,), torch.Generator().manual_seed(0))
+    samples = first.rsample((20_000,), torch.Generator().manual_seed(0))
     world = Pose(pose.R[:, 0], pose.t[:, 0]).into_world(samples)
     weight = torch.softmax(second.log_prob(Pose(pose.R[:, 1], pose.t[:, 1]).into_camera(world)), dim=0)
     mean = (weight[..., None] * world).sum(0)
@@ -73,8 +73,8 @@ def test_two_cameras_have_the_moments_of_reweighted_samples() -> None:
     reference = torch.einsum("sp,spi,spj->pij", weight, centred, centred)
     effective = 1 / weight.square().sum(0)
     fused = fuse(predictions, pose, contradiction=0.0)
-    enough = effective > 1000
-    assert enough.sum() > 10
+    enough = effective > 500
+    assert enough.sum() > 8
     ratio = ratios(fused.covariance, reference)[enough]
     assert (ratio.median() - 1).abs() < 0.05
     assert ((ratio - 1).abs() < 0.15).double().mean() > 0.85
