@@ -27,6 +27,8 @@ from the top left corner of the image; the centre of the pixel in column c and r
 | E_n | `scaled_expint` | generalised exponential integral E_n(a) = int_1^inf e^(-a u) u^(-n) du | - |
 | N | `log_normaliser` | normaliser of the depth law, e^(-a)/a + E_2(a) | - |
 | g | `tail_moment(0, a)` | a e^a E_2(a), in (0, 1): the odds of t < 1 | - |
+| u | `u` | unknowns of a fusion: the position itself, or its place on a plane | metres |
+| lam | `lam` | subgradient of max(t, 1/t) at its kink t = 1, in [-1, 1] | - |
 | 7 outputs | `raw` | (n_1, n_2, b_1, b_2, b_3, w_1, w_2): what a network returns | - |
 """
 

@@ -1,0 +1,241 @@
+"""The seven constraints that the paper asks of a predicted density, each as a measurement on a family of densities.
+
+A family turns raw numbers of a network and a camera into densities. Each measurement returns how far the worst case
+is from the constraint, and whether that is near enough. What theory says of each family is held against it in
+tests/distributions/test_constraint_table.py.
+
+Source: paper, section "Desired constraints for estimated distribution".
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from phd_exp.distributions.point_density import PointDensity
+from phd_exp.distributions.point_estimate import PointEstimate
+from phd_exp.distributions.projected_huber import ProjectedHuber
+from phd_exp.geometry import Camera, Cartesian, Chart, DepthScale, LogDepth, Projected
+
+F_RANGE, Z_RANGE, S = (1200.0, 2000.0), (3.0, 5.0), 224.0
+DEPTH = DepthScale.from_ranges(F_RANGE, Z_RANGE)
+SCALE = 0.1
+"""Of the baselines' residuals, in units of their charts."""
+_PAIRS = 20_000
+
+
+Density = ProjectedHuber | PointDensity
+
+
+@dataclass(frozen=True)
+class Family:
+    """A model's densities: `predict` makes them of raw numbers and a camera, `raws` gives raw numbers to try."""
+
+    predict: Callable[[Tensor, Camera], Density]
+    raws: Callable[[int, torch.Generator], Tensor]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Whether a constraint holds, and the number that says so."""
+
+    holds: bool
+    measured: float
+
+
+def families() -> dict[str, Family]:
+    """The probabilistic model and the four baselines, these as densities of constant scale in their charts."""
+    constant = torch.tensor((F_RANGE[0] * F_RANGE[1]) ** 0.5, dtype=torch.float64)
+
+    def told(camera: Camera) -> Camera:
+        return Camera(constant.expand_as(camera.f), camera.S)
+
+    return {
+        "probabilistic": Family(_projected_huber, _seven_numbers),
+        "mae_vz": _baseline(Projected(DEPTH)),
+        "mae_logz": _baseline(LogDepth(DEPTH)),
+        "mae_xyz": _baseline(Cartesian(DEPTH)),
+        "mae_constf": _baseline(Projected(DEPTH), told),
+    }
+
+
+def _projected_huber(raw: Tensor, camera: Camera) -> ProjectedHuber:
+    return ProjectedHuber.from_raw(raw, f=camera.f, S=camera.S, mu_z0=DEPTH.mu_z0, validate_args=False)
+
+
+def _seven_numbers(n: int, generator: torch.Generator) -> Tensor:
+    """B over four decades, nu_p inside the image, a over four decades, nu_z within the range of depths or so."""
+    uniform = torch.rand(n, 7, generator=generator, dtype=torch.float64)
+    b, a = 10 ** (5 * uniform[:, 2] - 2), 10 ** (4 * uniform[:, 5] - 1)
+    nu_p = b[:, None] * (2 * uniform[:, :2] - 1)
+    b_raw, w_1 = (torch.where(value < 1, value.log(), value - 1) for value in (b, a))
+    w_2 = a * (uniform[:, 6] - 0.5)
+    return torch.stack([*nu_p.T, b_raw, torch.zeros_like(b), b_raw, w_1, w_2], dim=-1)
+
+
+def _baseline(chart: Chart, told: Callable[[Camera], Camera] = lambda camera: camera) -> Family:
+    def predict(raw: Tensor, camera: Camera) -> PointDensity:
+        return PointDensity(PointEstimate(raw, chart, told(camera)), SCALE)
+
+    def raws(n: int, generator: torch.Generator) -> Tensor:
+        camera = _camera(_middle_f(), n)
+        return chart.coordinates(_in_view(n, camera, generator), camera)
+
+    return Family(predict, raws)
+
+
+def _middle_f() -> float:
+    return (F_RANGE[0] * F_RANGE[1]) ** 0.5
+
+
+def _camera(f: float, n: int) -> Camera:
+    return Camera(torch.full((n,), f, dtype=torch.float64), S)
+
+
+def _in_view(n: int, camera: Camera, generator: torch.Generator) -> Float[Tensor, "n 3"]:
+    """Positions all over the field of view, at depths of the data set."""
+    u, v, z = torch.rand(3, n, generator=generator, dtype=torch.float64)
+    return camera.unproject(S * torch.stack([u, v], dim=-1), Z_RANGE[0] + (Z_RANGE[1] - Z_RANGE[0]) * z)
+
+
+def variances_are_free(family: Family, generator: torch.Generator) -> Finding:
+    """1: any depth variance goes with any projected covariance.
+
+    Measured: the factor by which the nearest of 2000 members misses spreads (between the quartiles) of 1 %, 10 % and
+    100 % in depth with 0.001, 0.01 and 0.1 in x/z; free means below 1.5, a step of the search.
+    """
+    n = 2000
+    density = family.predict(family.raws(n, generator), _camera(_middle_f(), n))
+    samples = density.rsample((100,), generator)
+    z, ray = samples[..., 2], samples[..., 0] / samples[..., 2]
+    # by the quartiles: x/z has no variance where a density has mass on both sides of z = 0
+    spreads = [_interquartile(z) / z.median(0).values.abs(), _interquartile(ray)]
+    worst = 0.0
+    for depth in (0.01, 0.1, 1.0):
+        for projected in (0.001, 0.01, 0.1):
+            miss = torch.maximum((spreads[0] / depth).log().abs(), (spreads[1] / projected).log().abs())
+            worst = max(worst, float(miss.min().exp()))
+    return Finding(worst < 1.5, worst)
+
+
+def _interquartile(values: Tensor) -> Tensor:
+    low, high = values.quantile(torch.tensor([0.25, 0.75], dtype=values.dtype), dim=0)
+    return high - low
+
+
+def focal_length_enters_through_the_ray_and_z_over_f(family: Family, generator: torch.Generator) -> Finding:
+    """2: for the same raw numbers, the density over (v_p, z/f) is the same whatever f is.
+
+    Measured: its largest change in nats between the ends of the data set's range of f.
+    """
+    n, chart = 500, Projected(DEPTH)
+    raw = family.raws(n, generator)
+    middle = _camera(_middle_f(), n)
+    coordinates = chart.coordinates(_in_view(n, middle, generator), middle)
+    values = []
+    for f in F_RANGE:
+        camera = _camera(f, n)
+        xyz = chart.position(coordinates, camera)
+        values.append(family.predict(raw, camera).log_prob(xyz) - chart.log_abs_det_jacobian(xyz, camera))
+    worst = _largest((values[0] - values[1]).abs() / values[0].abs().clamp_min(1))
+    return Finding(worst < 1e-6, worst)
+
+
+def nothing_is_behind(family: Family, generator: torch.Generator) -> Finding:
+    """3: p = 0 for z < 0. Measured: the largest density behind the camera over that at the same place in front."""
+    n = 500
+    camera = _camera(_middle_f(), n)
+    raw, xyz = family.raws(n, generator), _in_view(n, camera, generator)
+    density = family.predict(raw, camera)
+    behind = density.log_prob(xyz * torch.tensor([1.0, 1.0, -1.0], dtype=xyz.dtype))
+    worst = float((behind - density.log_prob(xyz)).exp().max())
+    return Finding(worst == 0, worst)
+
+
+def everything_in_view_is_possible(family: Family, generator: torch.Generator) -> Finding:
+    """4: p > 0 in the field of view. Measured: the share of its positions where -log p is infinite."""
+    n = 5000
+    camera = _camera(_middle_f(), n)
+    value = family.predict(family.raws(n, generator), camera).log_prob(_in_view(n, camera, generator))
+    share = float((~value.isfinite()).double().mean())
+    return Finding(share == 0, share)
+
+
+def minus_log_is_convex(family: Family, generator: torch.Generator) -> Finding:
+    """5: -log p is convex in v. Measured: the largest excess over a chord between positions in view, nats."""
+    camera = _camera(_middle_f(), _PAIRS)
+    density = family.predict(family.raws(_PAIRS, generator), camera)
+    one, other = _in_view(_PAIRS, camera, generator), _in_view(_PAIRS, camera, generator)
+    share = torch.rand(_PAIRS, 1, generator=generator, dtype=torch.float64)
+    ends = density.log_prob(one), density.log_prob(other)
+    chord = torch.lerp(*ends, share.squeeze(-1))
+    excess = chord - density.log_prob(torch.lerp(one, other, share))
+    rounding = 1e-9 * torch.maximum(ends[0].abs(), ends[1].abs()).clamp_min(1)
+    return Finding(bool((excess <= rounding).all()), float(excess.max().clamp_min(0)))
+
+
+def it_vanishes_far_away_and_at_the_camera(family: Family, generator: torch.Generator) -> Finding:
+    """6: p -> 0 at infinity and as z -> 0.
+
+    Measured: the least fall of log p, nats, on the last factor of 1000 of three ways from positions in view: along
+    the ray to 10^9 times as far, along it to the camera (10^(-12)), and straight to the plane z = 0.
+    """
+    n = 500
+    camera = _camera(_middle_f(), n)
+    density = family.predict(family.raws(n, generator), camera)
+    xyz = _in_view(n, camera, generator)
+    falls = []
+    for near, far in (
+        ((1e6, 1e6, 1e6), (1e9, 1e9, 1e9)),
+        ((1e-9, 1e-9, 1e-9), (1e-12, 1e-12, 1e-12)),
+        ((1.0, 1.0, 1e-9), (1.0, 1.0, 1e-12)),
+    ):
+        places = [xyz * torch.tensor(factors, dtype=xyz.dtype) for factors in (near, far)]
+        falls.append(density.log_prob(places[0]) - density.log_prob(places[1]))
+    least = float(torch.stack(falls).min())
+    return Finding(least > 1, least)
+
+
+def it_is_continuous(family: Family, generator: torch.Generator) -> Finding:
+    """7: p is continuous.
+
+    Measured: the largest jump of log p, nats, found by halving segments in view towards their largest change.
+    """
+    n = 2000
+    camera = _camera(_middle_f(), n)
+    density = family.predict(family.raws(n, generator), camera)
+    one, other = _in_view(n, camera, generator), _in_view(n, camera, generator)
+    for _ in range(60):
+        middle = (one + other) / 2
+        values = [density.log_prob(place) for place in (one, middle, other)]
+        first = ((values[1] - values[0]).abs() > (values[2] - values[1]).abs())[:, None]
+        one, other = torch.where(first, one, middle), torch.where(first, middle, other)
+    jump = (density.log_prob(one) - density.log_prob(other)).abs()
+    return Finding(bool((jump < 1e-6).all()), float(jump.max()))
+
+
+def _largest(values: Tensor) -> float:
+    return float(values.nan_to_num(nan=torch.inf).max())
+
+
+CONSTRAINTS: dict[str, Callable[[Family, torch.Generator], Finding]] = {
+    "1 any depth variance with any projected covariance": variances_are_free,
+    "2 f enters only through (v_p, z/f)": focal_length_enters_through_the_ray_and_z_over_f,
+    "3 p = 0 behind the camera": nothing_is_behind,
+    "4 p > 0 in the field of view": everything_in_view_is_possible,
+    "5 -log p convex in v": minus_log_is_convex,
+    "6 p -> 0 at infinity and at z -> 0": it_vanishes_far_away_and_at_the_camera,
+    "7 p continuous in v": it_is_continuous,
+}
+
+
+def findings(seed: int = 0) -> dict[str, dict[str, Finding]]:
+    """Every constraint on every family, by the names of both."""
+    return {
+        constraint: {
+            name: measure(family, torch.Generator().manual_seed(seed)) for name, family in families().items()
+        }
+        for constraint, measure in CONSTRAINTS.items()
+    }

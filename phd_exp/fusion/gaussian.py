@@ -1,0 +1,41 @@
+"""What fusion is compared with: the average of the views' positions, and their best Gaussian combination."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from phd_exp.fusion.linear import total
+
+
+def average(
+    positions: Float[Tensor, "*batch cameras 3"], mask: Bool[Tensor, "*batch cameras"] | None = None
+) -> Float[Tensor, "*batch 3"]:
+    """The mean over the cameras of positions in the world, in their unit; NaN where no camera takes part."""
+    if mask is None:
+        return total(positions, -2) / positions.shape[-2]
+    # a camera that takes no part may hold NaN
+    return total(torch.where(mask[..., None], positions, 0), -2) / mask.sum(-1, keepdim=True)
+
+
+def gaussian_fusion(
+    means: Float[Tensor, "*batch cameras 3"],
+    covariances: Float[Tensor, "*batch cameras 3 3"],
+    mask: Bool[Tensor, "*batch cameras"] | None = None,
+) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3 3"]]:
+    """Position and covariance of a product of Gaussians in the world: precisions add, means weighted by them.
+
+    C = (sum C_i^(-1))^(-1) and v = C sum C_i^(-1) v_i, in the units of the means. Raises torch.linalg.LinAlgError
+    where a covariance is singular or no camera takes part.
+
+    Source: inverse-covariance weighting; checked in tests/fusion/test_gaussian.py.
+    """
+    if mask is not None:
+        means = torch.where(mask[..., None], means, 0)
+        identity = torch.eye(3, dtype=covariances.dtype, device=covariances.device)
+        covariances = torch.where(mask[..., None, None], covariances, identity)
+    precisions = torch.linalg.inv(covariances)
+    if mask is not None:
+        precisions = torch.where(mask[..., None, None], precisions, 0)
+    covariance = torch.linalg.inv(precisions.sum(-3))
+    weighted = (precisions @ means[..., None]).sum(-3)
+    return (covariance @ weighted).squeeze(-1), covariance

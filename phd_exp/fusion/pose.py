@@ -1,0 +1,87 @@
+"""Where cameras and a plane stand in the world."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from phd_exp.fusion.linear import apply, total
+from phd_exp.records import scenes
+
+_RIGID_WITHIN = 1e-6  # float32 keeps a rotation to 1e-7
+
+
+@dataclass(frozen=True)
+class Pose:
+    """The motion from the world into the frame of each camera: v_camera = R v_world + t.
+
+    This is the convention of the `pose` in the metadata of a data set, where the world is the scene's own frame.
+
+    Args:
+        R: rotations from the world's axes to the camera's.
+        t: where the world's origin lies in the camera frame, metres.
+    """
+
+    R: Float[Tensor, "*#batch 3 3"]
+    t: Float[Tensor, "*#batch 3"]
+
+    @classmethod
+    def from_scene(cls, poses: Sequence[scenes.Pose]) -> "Pose":
+        """The poses of a data set's records, one camera each, in float64; the quaternion (w, x, y, z) becomes R.
+
+        Source: R = (w^2 - |u|^2) I + 2 u u^T + 2 w [u]_x for the unit quaternion (w, u).
+        """
+        quaternion = torch.tensor([pose.rotation for pose in poses], dtype=torch.float64).reshape(-1, 4)
+        w, u = quaternion[:, :1, None], quaternion[:, 1:]
+        x, y, z = u.unbind(-1)
+        zero = torch.zeros_like(x)
+        cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+        scale = w.square() - u.square().sum(-1)[:, None, None]
+        R = scale * torch.eye(3, dtype=torch.float64) + 2 * u[:, :, None] * u[:, None] + 2 * w * cross
+        return cls(R, torch.tensor([pose.translation for pose in poses], dtype=torch.float64).reshape(-1, 3))
+
+    @property
+    def is_rigid(self) -> Bool[Tensor, "*batch"]:
+        """Whether R is a rotation, R R^T = I within 1e-6 and |R| > 0; false where R is not finite."""
+        R = self.R.double()
+        error = (R @ R.mT - torch.eye(3, dtype=R.dtype, device=R.device)).abs().amax((-2, -1))
+        handed = (R[..., 0, :] * torch.linalg.cross(R[..., 1, :], R[..., 2, :])).sum(-1) > 0
+        return (error <= _RIGID_WITHIN) & handed
+
+    def into_camera(self, v: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
+        """World to camera frame, R v + t."""
+        return apply(self.R, v) + self.t
+
+    def into_world(self, v: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
+        """Camera frame to world, R^T (v - t)."""
+        return apply(self.R.mT, v - self.t)
+
+
+@dataclass(frozen=True)
+class Plane:
+    """The points of the world with normal . v = offset, one plane for each problem or one for all.
+
+    Args:
+        normal: of any length but zero.
+        offset: in metres if the normal has unit length.
+    """
+
+    normal: Float[Tensor, "*#batch 3"]
+    offset: Float[Tensor, "*#batch"]
+
+    def nearest(self, v: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
+        """The point of the plane that is nearest to v."""
+        excess = (total(self.normal * v, -1) - self.offset) / total(self.normal.square(), -1)
+        return v - excess[..., None] * self.normal
+
+    @property
+    def directions(self) -> Float[Tensor, "*batch 3 2"]:
+        """Two orthonormal directions in the plane, as columns."""
+        unit = self.normal / self.normal.norm(dim=-1, keepdim=True)
+        # the axis that is farthest from the normal, so that the cross product is long
+        axis = torch.nn.functional.one_hot(unit.abs().argmin(-1), 3).to(unit.dtype)
+        first = torch.linalg.cross(unit, axis)
+        first = first / first.norm(dim=-1, keepdim=True)
+        return torch.stack([first, torch.linalg.cross(unit, first)], dim=-1)

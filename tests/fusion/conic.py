@@ -1,0 +1,82 @@
+"""The same problem for a generic conic solver (Clarabel), written down from the paper's formulas."""
+
+from dataclasses import dataclass
+
+import clarabel
+import numpy as np
+from scipy import sparse
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One prediction and its pose, as arrays."""
+
+    mu_xy: np.ndarray
+    mu_z: float
+    A: np.ndarray
+    a: float
+    R: np.ndarray
+    t: np.ndarray
+
+
+class Program:
+    """minimise x.P x/2 + c.x with affine expressions of x in cones; x = (v - origin)/unit, then the rest."""
+
+    def __init__(self, cameras: list[Camera], origin: np.ndarray, unit: float) -> None:
+        self.n = 3 + 3 * len(cameras)
+        self.P, self.c = np.zeros((self.n, self.n)), np.zeros(self.n)
+        self.rows: list[np.ndarray] = []
+        self.constants: list[np.ndarray] = []
+        self.cones: list[object] = []
+        self.origin, self.unit = origin, unit
+        for i, camera in enumerate(cameras):
+            self.add_camera(camera, 3 + 3 * i)
+
+    def require(self, cone: object, slope: np.ndarray, constant: np.ndarray) -> None:
+        """slope x + constant lies in the cone."""
+        self.rows.append(-slope)
+        self.constants.append(constant)
+        self.cones.append(cone)
+
+    def add_camera(self, camera: Camera, first: int) -> None:
+        """h(|q|) = min m^2/2 + n over |q| <= m + n, n >= 0; max(t, 1/t) = min w over w >= t, w t >= 1."""
+        m, n, w = np.eye(self.n)[first : first + 3]
+        self.P[first, first] = 1
+        self.c[first + 1], self.c[first + 2] = 1, camera.a
+        seen = np.zeros((3, self.n))
+        seen[:, :3] = camera.R * self.unit
+        at_origin = camera.R @ self.origin + camera.t
+        q = camera.A @ (seen[:2] - np.outer(camera.mu_xy, seen[2])) / camera.mu_z
+        q_0 = camera.A @ (at_origin[:2] - camera.mu_xy * at_origin[2]) / camera.mu_z
+        t, t_0 = seen[2] / camera.mu_z, at_origin[2] / camera.mu_z
+        self.require(clarabel.NonnegativeConeT(2), np.stack([n, w - t]), np.array([0, -t_0]))
+        self.require(clarabel.SecondOrderConeT(3), np.vstack([m + n, q]), np.array([0, *q_0]))
+        self.require(
+            clarabel.SecondOrderConeT(3), np.stack([w + t, w - t, np.zeros(self.n)]), np.array([t_0, -t_0, 2])
+        )
+
+    def on_plane(self, normal: np.ndarray, offset: float) -> "Program":
+        """With normal . v = offset besides."""
+        row = np.zeros((1, self.n))
+        row[0, :3] = normal * self.unit
+        self.require(clarabel.ZeroConeT(1), row, np.array([normal @ self.origin - offset]))
+        return self
+
+    def solver(self, tolerance: float = 1e-14) -> clarabel.DefaultSolver:
+        """Ready to solve."""
+        settings = clarabel.DefaultSettings()
+        settings.verbose = False
+        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
+        return clarabel.DefaultSolver(
+            sparse.csc_matrix(self.P),
+            self.c,
+            sparse.csc_matrix(np.vstack(self.rows)),
+            np.concatenate(self.constants),
+            self.cones,
+            settings,
+        )
+
+    def solve(self, tolerance: float = 1e-14) -> tuple[np.ndarray, str]:
+        """The position v, and how the solver says it ended."""
+        solution = self.solver(tolerance).solve()
+        return self.origin + self.unit * np.array(solution.x[:3]), str(solution.status)

@@ -1,0 +1,102 @@
+"""Optima held against Clarabel's, a generic interior-point solver, through its own interface."""
+
+import numpy as np
+import pytest
+import torch
+
+from phd_exp.distributions import ProjectedHuber
+from phd_exp.fusion import Plane, Pose, Status, fuse
+from tests.fusion.conic import Camera, Program
+from tests.fusion.random_problems import columns_of, random_problems
+
+AGREE = 1e-6  # metres
+
+
+def cameras_of(predictions: ProjectedHuber, pose: Pose) -> list[list[Camera]]:
+    columns = (*columns_of(predictions), pose.R, pose.t)
+    arrays = [column.numpy() for column in columns]
+    problems, cameras = predictions.batch_shape
+    return [[Camera(*(array[i, j] for array in arrays)) for j in range(cameras)] for i in range(problems)]
+
+
+def energy(cameras: list[Camera], v: np.ndarray) -> np.longdouble:
+    """The summed -log p but for constants, in extended precision: float64 cannot rank what both solvers find."""
+    result = np.longdouble(0)
+    for camera in cameras:
+        x, y, z = camera.R.astype(np.longdouble) @ v.astype(np.longdouble) + camera.t
+        q = camera.A.astype(np.longdouble) @ (np.stack([x, y]) - camera.mu_xy * z) / camera.mu_z
+        r, t = np.sqrt((q**2).sum()), z / camera.mu_z
+        result += (r**2 / 2 if r <= 1 else r - np.longdouble(0.5)) + camera.a * max(t, 1 / t)
+    return result
+
+
+# tolerance, and unit of length in metres: where the energy is flat, Clarabel stops short at one and not at another
+SETTINGS = ((1e-14, 1.0), (1e-15, 0.1), (1e-12, 1.0), (1e-12, 0.1), (1e-15, 0.01), (1e-11, 0.01))
+
+
+def conic_optimum(
+    cameras: list[Camera], plane: tuple[np.ndarray, float] | None, origin: np.ndarray, ours: np.ndarray
+) -> np.ndarray:
+    """Clarabel's optimum; while it is not ours, the lowest that it finds at several settings."""
+    best: np.ndarray | None = None
+    for tolerance, unit in SETTINGS:
+        program = Program(cameras, origin if best is None else best, unit)
+        theirs, _ = (program if plane is None else program.on_plane(*plane)).solve(tolerance)
+        if best is None or energy(cameras, theirs) < energy(cameras, best):
+            best = theirs
+        if np.abs(best - ours).max() <= AGREE:
+            break
+    assert best is not None
+    return best
+
+
+def compare(n: int, cameras: int, seed: int, on_plane: bool) -> tuple[np.ndarray, int, int]:
+    """Distances between the optima (metres), how many kinks hold ours, and how often Clarabel's energy is lower."""
+    predictions, pose, truth = random_problems(n, cameras, seed)
+    generator = torch.Generator().manual_seed(seed)
+    normal = torch.randn(n, 3, generator=generator, dtype=torch.float64)
+    plane = Plane(normal, (normal * truth).sum(-1)) if on_plane else None
+    fused = fuse(predictions, pose, plane, contradiction=0.0)
+    assert (fused.status == Status.FUSED).all()
+    z = pose.into_camera(fused.point[:, None])[..., 2]
+    kinks = int(((z / predictions.mu_z - 1).abs() < 1e-9).sum())
+    origin = pose.into_world(predictions.mode).mean(1).numpy()
+    distances, worse = np.empty(n), 0
+    for i, problem in enumerate(cameras_of(predictions, pose)):
+        ours = fused.point[i].numpy()
+        where = None if plane is None else (normal[i].numpy(), float(plane.offset[i]))
+        theirs = conic_optimum(problem, where, origin[i], ours)
+        distances[i] = np.abs(ours - theirs).max()
+        worse += bool(distances[i] > AGREE and energy(problem, theirs) < energy(problem, ours))
+    return distances, kinks, worse
+
+
+def check(n: int, cameras: int, seed: int, on_plane: bool) -> None:
+    """All agree within 1e-6 m, but for one in a hundred at most, so flat that Clarabel stops early and higher up."""
+    distances, kinks, worse = compare(n, cameras, seed, on_plane)
+    where = "plane" if on_plane else "space"
+    apart = int((distances > AGREE).sum())
+    print(
+        f"{n} problems of {cameras} cameras, {where}: median {np.median(distances):.1e} m, 99 % "
+        f"{np.quantile(distances, 0.99):.1e} m, worst {distances.max():.1e} m; {apart} apart, in {worse} of them "
+        f"Clarabel's energy is lower; {kinks / n:.2f} kinks a problem"
+    )
+    assert worse == 0
+    assert apart <= 0.01 * n
+    assert distances.max() < 1e-4
+    assert kinks > 0.05 * n
+
+
+CASES = [(1, False), (2, False), (4, False), (8, False), (1, True), (3, True)]
+
+
+@pytest.mark.parametrize(("cameras", "on_plane"), CASES)
+def test_the_optimum_is_that_of_a_conic_solver(cameras: int, on_plane: bool) -> None:
+    check(50, cameras, cameras, on_plane)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("on_plane", [False, True])
+@pytest.mark.parametrize("cameras", range(1, 9))
+def test_ten_thousand_optima_are_those_of_a_conic_solver(cameras: int, on_plane: bool) -> None:
+    check(250 if on_plane else 1000, cameras, 100 + cameras, on_plane)
