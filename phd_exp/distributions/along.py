@@ -46,7 +46,7 @@ def quantiles_along(
     """The values s with P(direction . v <= s) = p, for p in (0, 1); metres for a unit vector.
 
     P = E[P(z <= (s - |g| q_1) / kappa)] with kappa = direction . m > 0, an integral over the law of q_1, computed in
-    float64 to about 1e-9 between the places where either law is not smooth. Along (0, 0, 1) it is `depth_icdf`.
+    float64 to about 1e-8 between the places where either law is not smooth. Along (0, 0, 1) it is `depth_icdf`.
 
     Raises ValueError for a batch of distributions, or a direction in which the mode does not lie (kappa <= 0).
     Source: own derivation (q and t are independent); checked against samples in tests/distributions/test_along.py.
