@@ -55,4 +55,5 @@ def _complaint(verb: str, model: type[Arguments], problem: ErrorDetails) -> str:
 
 
 def _takes(verb: str, model: type[Arguments]) -> str:
-    return f"{verb} takes {', '.join(f'{key}=' for key in model.model_fields)} (see `python -m phd_exp {verb} --help`)"
+    keys = ", ".join(f"{key}=" for key in model.model_fields)
+    return f"{verb} takes {keys} (see `python -m phd_exp {verb} --help`)"

@@ -37,7 +37,10 @@ def _export(arguments: ExportArguments, file: Path) -> None:
 
     predictor = load(arguments.run, device="cpu", recalibrate=arguments.recalibrate)
     if predictor.state != "finished":
-        print(f"note: {arguments.run}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
+        print(
+            f"note: {arguments.run}: the run is {predictor.state}; its last checkpoint is used",
+            file=sys.stderr,
+        )
     output_folder(file.parent)
     from phd_exp.inference.onnx import CHECKED, TOLERANCE, export
 

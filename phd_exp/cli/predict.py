@@ -1,4 +1,4 @@
-"""`python -m phd_exp predict`: where the object in an image is, and how sure a trained run is of it, as JSON lines."""
+"""`python -m phd_exp predict`: where the object in an image is, and how sure a run is of it, as JSON lines."""
 
 import json
 import sys
@@ -54,7 +54,9 @@ class PredictArguments(Arguments):
             )
         given = [key for key in OF_A_CAMERA if getattr(self, key) is not None]
         if self.folder is not None and given:
-            raise ValueError(f"{given[0]}: belongs to image=FILE; of a folder each line of metadata.jsonl says it")
+            raise ValueError(
+                f"{given[0]}: belongs to image=FILE; of a folder each line of metadata.jsonl says it"
+            )
         return self
 
     def detections(self) -> list[Detection]:
@@ -85,7 +87,10 @@ def _predict(arguments: PredictArguments, detections: list[Detection]) -> None:
 
     predictor = load(arguments.run, recalibrate=arguments.recalibrate)
     if predictor.state != "finished":
-        print(f"note: {arguments.run}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
+        print(
+            f"note: {arguments.run}: the run is {predictor.state}; its last checkpoint is used",
+            file=sys.stderr,
+        )
     lines = _answers(predictor, detections, arguments.out)
     if arguments.out is None:
         for line in lines:
@@ -145,4 +150,6 @@ def _require_no_image_lost(detections: list[Detection], out: Path) -> None:
 
 def _require_drawing() -> None:
     if find_spec("matplotlib") is None:
-        raise ConfigError("out: pictures need `pip install 'phd_exp[report]'`; without out= there is JSON alone")
+        raise ConfigError(
+            "out: pictures need `pip install 'phd_exp[report]'`; without out= there is JSON alone"
+        )

@@ -68,7 +68,9 @@ class Decoder:
             f: focal length in pixels of the network's image: of an image W pixels wide, f of it times side / W.
         """
         raw = np.asarray(raw, dtype=float)
-        f = np.broadcast_to(np.asarray(f if self.constant_f is None else self.constant_f, float), raw.shape[:-1])
+        f = np.broadcast_to(
+            np.asarray(f if self.constant_f is None else self.constant_f, float), raw.shape[:-1]
+        )
         if not (f > 0).all():
             raise ValueError(f"f must be positive, but is {f}")
         return self._position(raw, f) if self.head == "ProjectedHuber" else self._point(raw, f)
@@ -153,7 +155,9 @@ class Position:
     def log_prob(self, xyz: Any) -> Array:
         """Log density of positions (metres), nats per cubic metre; -inf behind the camera."""
         xyz = np.asarray(xyz, dtype=float)
-        log_peak = self.log_det_A_xy - _LOG_K - self.log_mu_z - np.log1p(_tail(0, np.exp(self.log_a))) + self.log_a
+        log_peak = (
+            self.log_det_A_xy - _LOG_K - self.log_mu_z - np.log1p(_tail(0, np.exp(self.log_a))) + self.log_a
+        )
         return np.where(xyz[..., 2] > 0, log_peak - self._energy(xyz), -np.inf)
 
     def level(self, xyz: Any) -> Array:
@@ -179,7 +183,7 @@ def _log_positive(s: Array) -> Array:
 
 
 def _spectral_map(b: Array) -> tuple[Array, Array]:
-    """The matrix [[b_1, b_2/sqrt 2], [b_2/sqrt 2, b_3]] with exp(`_log_positive`) of its eigenvalues, and its log|.|."""
+    """[[b_1, b_2/sqrt 2], [b_2/sqrt 2, b_3]] with `_log_positive` of its eigenvalues as their logs, and its log|.|."""
     middle, half, off = (b[..., 0] + b[..., 2]) / 2, (b[..., 0] - b[..., 2]) / 2, b[..., 1] / math.sqrt(2)
     r = np.hypot(half, off)
     log_upper, log_lower = _log_positive(middle + r), _log_positive(middle - r)

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import onnxruntime
 import torch
 from jaxtyping import Float, UInt8
@@ -114,7 +113,7 @@ def decoder_of(predictor: Predictor) -> Decoder:
 
 
 def largest_deviation(predictor: Predictor, content: bytes) -> float:
-    """The largest relative deviation of the file and its decoder from torch, over 64 images in batches of 1, 7 and 56.
+    """The largest relative deviation of the file and its decoder from torch, over 64 images in three batches.
 
     Relative to the size of each output of the network over all images, and to that of each decoded vector or matrix.
     """
@@ -130,7 +129,9 @@ def largest_deviation(predictor: Predictor, content: bytes) -> float:
     return max(float((np.abs(here - there.numpy()) / size).max()), *decoded)
 
 
-def _decoded(predictor: Predictor, decoder: Decoder, here: np.ndarray, there: Tensor, f: float) -> list[float]:
+def _decoded(
+    predictor: Predictor, decoder: Decoder, here: np.ndarray, there: Tensor, f: float
+) -> list[float]:
     prediction = predictor.predict(there, torch.full((len(there),), f, dtype=torch.float64))
     position = decoder(here, f)
     if not (isinstance(prediction, ProjectedHuber) and isinstance(position, Position)):

@@ -20,9 +20,7 @@ _AMBER = "#ffb000"
 
 def picture(sighting: Sighting) -> bytes:
     """A PNG: the image with the curves of 50, 90 and 99 %, and the bird's-eye view; of a baseline the point alone."""
-    curves = (
-        level_curves(sighting.prediction) if isinstance(sighting.prediction, ProjectedHuber) else None
-    )
+    curves = level_curves(sighting.prediction) if isinstance(sighting.prediction, ProjectedHuber) else None
     figure = Figure(figsize=(9.0 if curves else 4.6, 4.4), layout="constrained")
     _draw_image(figure.add_subplot(1, 2 if curves else 1, 1), sighting, curves)
     if curves:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
 
 import numpy as np
@@ -104,11 +103,11 @@ class Predictor:
         """
         (array,) = _images(image[None])
         height, width = array.shape[:2]
-        whole = (0.0, 0.0, float(width), float(height))
-        return self.preparation.view(Image.fromarray(array), K, whole if box is None else box, "image")
+        left, top, right, bottom = map(float, (0, 0, width, height) if box is None else box)
+        return self.preparation.view(Image.fromarray(array), K, (left, top, right, bottom), "image")
 
     def see(self, views: View | Sequence[View]) -> Prediction:
-        """The predictions for views, each in the frame of its own virtual camera; of one view, one without a batch."""
+        """Predictions for views, each in the frame of its own virtual camera; for one view, one without a batch."""
         one = isinstance(views, View)
         sequence = [views] if isinstance(views, View) else views
         parts = [
@@ -147,9 +146,7 @@ def load(run: Path, device: str = "auto", recalibrate: bool = False) -> Predicto
         raise RunError(f"{folder.path}: no run; expected a folder with config.yaml and checkpoints/last.ckpt")
     config = check(folder.config())
     constants = _constants(folder, config)
-    place = torch.device(
-        ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
-    )
+    place = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)
     regressor = build_regressor(config, constants.depth, torch.contiguous_format)
     _load_weights(regressor, folder.last_checkpoint)
     status = folder.status()
@@ -193,7 +190,9 @@ def _load_weights(regressor: Regressor, checkpoint: Path) -> None:
             name.removeprefix(WEIGHTS): value for name, value in state.items() if name.startswith(WEIGHTS)
         }
         regressor.load_state_dict(weights)
-    except (RuntimeError, OSError, EOFError, KeyError, TypeError, AttributeError, UnpicklingError) as error:
+    except (
+        Exception
+    ) as error:  # on bytes that are no checkpoint torch's reader raises whatever it stumbles over
         reason = " ".join(str(error).split())[:120]
         raise RunError(f"{checkpoint}: not a whole checkpoint of this network ({reason})") from None
 
@@ -232,5 +231,7 @@ def _images(images: Any) -> UInt8[np.ndarray, "batch height width 3"]:
 def _focal_lengths(f: Any, n: int) -> list[float]:
     values = np.broadcast_to(np.asarray(f, dtype=float), (n,)) if np.size(f) in (1, n) else None
     if values is None or not (np.isfinite(values).all() and (values > 0).all()):
-        raise DatasetError(f"f: got {f}; expected a focal length in pixels, positive: one, or one for each of {n}")
+        raise DatasetError(
+            f"f: got {f}; expected a focal length in pixels, positive: one, or one for each of {n}"
+        )
     return [float(value) for value in values]

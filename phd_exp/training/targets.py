@@ -58,7 +58,9 @@ def check_target(node: dict[str, Any], where: str = "") -> dict[str, Any]:
 
 def _check_inner(path: str, value: Any) -> None:
     """Check the targets deep inside lists and mappings, which would be built as well."""
-    children = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    children = (
+        value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    )
     for key, child in children:
         inner = f"{path}.{key}"
         if isinstance(child, dict) and "_target_" in child:

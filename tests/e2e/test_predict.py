@@ -55,7 +55,13 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
             width, height = (120, 90) if index % 2 else (90, 120)
             noise = draw.integers(0, 256, (height, width, 3), dtype=np.uint8)
             Image.fromarray(noise).save(folder / split / f"{index}.png")
-            camera = {"fx": 300.0, "fy": 310.0, "cx": 50.0, "cy": 40.0, "box": [5 + index, 10, 60, 70 + index]}
+            camera = {
+                "fx": 300.0,
+                "fy": 310.0,
+                "cx": 50.0,
+                "cy": 40.0,
+                "box": [5 + index, 10, 60, 70 + index],
+            }
             position = {"x": 0.01 * index, "y": -0.02, "z": 3.0 + 0.1 * index}
             lines.append(json.dumps({"file_name": f"{index}.png"} | camera | position) + "\n")
         (folder / split / "metadata.jsonl").write_text("".join(lines))
@@ -99,7 +105,7 @@ def cameras(photos: Path) -> Iterator[VirtualCamera]:
     for text in (photos / "test" / "metadata.jsonl").read_text().splitlines():
         line = json.loads(text)
         K = intrinsics(*(line[name] for name in ("fx", "fy", "cx", "cy")))
-        yield VirtualCamera.of_box(K, tuple(line["box"]), float(SIDE))
+        yield VirtualCamera.of_box(K, tuple(map(float, line["box"])), float(SIDE))  # type: ignore[arg-type]
 
 
 def test_the_test_images_of_a_rendered_set_are_predicted_as_recorded(
@@ -143,7 +149,7 @@ def test_depth_of_a_crop_is_that_along_the_axis_of_the_real_camera(
     row, camera = lines(outcome.out)[0], next(cameras(photos))
     predictor = package.load(own_run.path)
     image = np.asarray(Image.open(photos / "test" / "0.png"))
-    view = predictor.view(image, camera.K, (5.0, 10.0, 60.0, 70.0))
+    view = predictor.view(image, camera.K, (5, 10, 60, 70))
     prediction = predictor.see(view)
     assert isinstance(prediction, ProjectedHuber)
     n = 100_000
@@ -373,7 +379,9 @@ def test_the_lines_of_the_readme_deploy_it_without_torch(
     coarse = Image.fromarray(draw.integers(0, 256, (6, 6, 3), dtype=np.uint8))
     coarse.resize((150, 150), Image.Resampling.BICUBIC).save(tmp_path / "photo.png")
     block = "import sys\nfor name in ('torch', 'phd_exp', 'onnx'): sys.modules[name] = None\n"
-    tell = "import json\nprint(json.dumps([p.mode[0].tolist(), p.covariance[0].tolist(), p.median_depth[0]]))\n"
+    tell = (
+        "import json\nprint(json.dumps([p.mode[0].tolist(), p.covariance[0].tolist(), p.median_depth[0]]))\n"
+    )
     (tmp_path / "deployed.py").write_text(block + lines_of_readme + tell)
     done = subprocess.run(
         [sys.executable, "-P", "-c", "import sys; sys.path.insert(0, '.'); exec(open('deployed.py').read())"],
@@ -390,6 +398,8 @@ def test_the_lines_of_the_readme_deploy_it_without_torch(
 def test_an_export_that_deviates_is_refused_and_leaves_no_file(
     phd_exp: Callable, exported: Path, run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    from onnx import load_from_string
+
     from phd_exp.inference import onnx
 
     predictor = package.load(run.path, device="cpu")
@@ -398,7 +408,7 @@ def test_an_export_that_deviates_is_refused_and_leaves_no_file(
     with torch.no_grad():
         other.regressor.last.bias.add_(1e-3)
     assert onnx.largest_deviation(other, exported.read_bytes()) > onnx.TOLERANCE
-    monkeypatch.setattr(onnx, "_exported", lambda _: onnx.onnx.load_from_string(exported.read_bytes()))
+    monkeypatch.setattr(onnx, "_exported", lambda _: load_from_string(exported.read_bytes()))
     monkeypatch.setattr(onnx, "largest_deviation", lambda *_: 2e-5)
     outcome = phd_exp("export", f"run={run.path}", "out=here.onnx")
     assert outcome.status == 1

@@ -24,7 +24,10 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"_target_": "phd_exp.geometry.virtual.dataclass"}, r"is no class or function of its own"),
     ({"_target_": "phd_exp.geometry.charts.math"}, r"is no class or function of its own"),
     ({"_target_": ADAM, "betas": [{"_target_": "os.system"}]}, r"^betas\.0\._target_: 'os.system' may not"),
-    ({"_target_": ADAM, "lr": {"deep": {"_target_": "os.system"}}}, r"^lr\.deep\._target_: 'os.system' may not"),
+    (
+        {"_target_": ADAM, "lr": {"deep": {"_target_": "os.system"}}},
+        r"^lr\.deep\._target_: 'os.system' may not",
+    ),
     ({"_target_": "phd_exp.models.nothing.There"}, r"does not exist"),
     (
         {"_target_": ADAM, "lrr": 1.0},
