@@ -183,7 +183,7 @@ def _log_positive(s: Array) -> Array:
 
 
 def _spectral_map(b: Array) -> tuple[Array, Array]:
-    """[[b_1, b_2/sqrt 2], [b_2/sqrt 2, b_3]] with `_log_positive` of its eigenvalues as their logs, and its log|.|."""
+    """[[b_1, b_2/sqrt 2], [b_2/sqrt 2, b_3]] with exp(`_log_positive`) of its eigenvalues, and log|.|."""
     middle, half, off = (b[..., 0] + b[..., 2]) / 2, (b[..., 0] - b[..., 2]) / 2, b[..., 1] / math.sqrt(2)
     r = np.hypot(half, off)
     log_upper, log_lower = _log_positive(middle + r), _log_positive(middle - r)

@@ -16,6 +16,7 @@ from phd_exp.inference.predictor import BATCH, Predictor
 from phd_exp.inference.views import View
 from phd_exp.models.heads import Prediction
 from phd_exp.records.detections import Detection
+from phd_exp.records.errors import RunError
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +30,19 @@ class Sighting:
 
 
 def sightings(predictor: Predictor, detections: Sequence[Detection]) -> Iterator[Sighting]:
-    """What the network says of each detection. Raises DatasetError, naming the file, where an image is none."""
+    """What the network says of each detection.
+
+    Raises DatasetError, naming the file, where an image is none, and RunError where the network's numbers are not
+    finite.
+    """
     seen = _seen(predictor, detections)
     while batch := list(islice(seen, BATCH)):
         raw = predictor.raw(np.stack([view.image for _, _, view in batch])).double()
         for row, (detection, image, view) in enumerate(batch):
+            if not bool(raw[row].isfinite().all()):
+                raise RunError(
+                    f"{detection.where}: the network returns numbers that are not finite; train the run again"
+                )
             f = torch.tensor(view.camera.f, dtype=torch.float64)
             yield Sighting(detection, image, view, predictor.predict(raw[row], f))
 

@@ -297,12 +297,19 @@ def change_config(folder: RunFolder, **changes: Any) -> None:
     folder.config_file.write_text(yaml.safe_dump(folder.config() | changes))
 
 
+def diverge(folder: RunFolder) -> None:
+    checkpoint = torch.load(folder.last_checkpoint, weights_only=True)
+    checkpoint["state_dict"]["regressor.last.bias"][0] = torch.nan
+    torch.save(checkpoint, folder.last_checkpoint)
+
+
 SPOILED: list[tuple[Callable[[RunFolder], Any], str]] = [
     (lambda it: it.config_file.unlink(), "no run; expected a folder with config.yaml"),
     (lambda it: it.config_file.write_text("!!python/object/apply:os.abort []"), "config.yaml: cannot be read"),
     (lambda it: it.last_checkpoint.unlink(), "last.ckpt: missing; the run has not trained a whole epoch yet"),
     (lambda it: it.last_checkpoint.write_bytes(b"torn"), "last.ckpt: not a whole checkpoint of this network"),
     (lambda it: torch.save({"state_dict": _Evil()}, it.last_checkpoint), "not a whole checkpoint"),
+    (diverge, "000000.png: the network returns numbers that are not finite; train the run again"),
     (lambda it: torch.save({"state_dict": {}}, it.last_checkpoint), "not a whole checkpoint"),
     (
         lambda it: change_config(it, backbone={"_target_": "os.system", "command": "touch owned"}),
