@@ -15,7 +15,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	  { echo "make: Blender's bpy needs Python 3.11; found $$($(PYTHON) --version). Say which: make PYTHON=/path/to/python3.11" >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
-	$(BIN)/pip install --quiet --editable '.[render,report,launchers,dev]' --constraint constraints.txt
+	$(BIN)/pip install --quiet --editable '.[render,report,export,launchers,dev]' --constraint constraints.txt
 	@touch $@
 
 install: $(INSTALLED)  ## .venv with everything in it

@@ -9,6 +9,8 @@ VERBS = {
     "render": "render a data set, or what is missing of it",
     "gallery": "draw the pictures of renders/README.md: paired data sets, the camera's axes",
     "report": "the paper's tables, the dashboard and the figures of all recorded runs",
+    "predict": "where the object in an image is and how sure a run is of it: JSON lines, and pictures with out=",
+    "export": "write a run's network as ONNX, checked against torch; decoding it needs NumPy and SciPy alone",
 }
 OF_VERB = {
     "train": (
@@ -18,6 +20,8 @@ OF_VERB = {
     "render": ("data", "preset"),
     "gallery": (),
     "report": (),
+    "predict": (),
+    "export": (),
 }
 """The groups whose choice a verb looks at."""
 EXAMPLES = {
@@ -40,6 +44,15 @@ EXAMPLES = {
     ],
     "gallery": ["python -m phd_exp gallery", "python -m phd_exp gallery folder=some/folder"],
     "report": ["python -m phd_exp report", "python -m phd_exp report runs=some/folder out=another"],
+    "predict": [
+        "python -m phd_exp predict run=runs/small/default/probabilistic/seed0 image=photo.jpg f=1550",
+        "python -m phd_exp predict run=DIR image=a.jpg fx=900 fy=900 cx=320 cy=240 box=400,30,620,140 out=pictures",
+        "python -m phd_exp predict run=DIR folder=photos/test recalibrate=true > predictions.jsonl",
+    ],
+    "export": [
+        "python -m phd_exp export run=runs/small/default/probabilistic/seed0",
+        "python -m phd_exp export run=DIR out=network.onnx",
+    ],
 }
 
 

@@ -104,11 +104,11 @@ class FolderSource(Source):
         rows: dict[Path, list[int]] = {}
         for row, crop in enumerate(crops):
             rows.setdefault(crop.detection.file, []).append(row)
-        checksums = {file: sha256(_content(file)) for file in rows}
+        checksums = {file: sha256(content_of(file)) for file in rows}
 
         # a whole file at a time, since it may hold many detections
         def fill(array: np.ndarray, file: Path) -> None:
-            content = _content(file)
+            content = content_of(file)
             if sha256(content) != checksums[file]:
                 raise DatasetError(f"{file}: changed while it was read; start again")
             image = read_image(file, content)
@@ -158,7 +158,8 @@ def _crop(detection: Detection, side: int, sizes: dict[Path, tuple[int, int]]) -
     return Crop(detection, camera, xyz)
 
 
-def _content(file: Path) -> bytes:
+def content_of(file: Path) -> bytes:
+    """The bytes of a file. Raises DatasetError where it cannot be read."""
     try:
         return file.read_bytes()
     except OSError as error:

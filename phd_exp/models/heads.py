@@ -24,7 +24,7 @@ class Head(Protocol):
     n_outputs: int
     prediction: type[Prediction]
 
-    def __call__(self, raw: Float[Tensor, "batch n_outputs"], camera: Camera) -> Prediction: ...
+    def __call__(self, raw: Float[Tensor, "*batch n_outputs"], camera: Camera) -> Prediction: ...
 
 
 class DistributionHead:
@@ -36,7 +36,7 @@ class DistributionHead:
     def __init__(self, depth: DepthScale) -> None:
         self.mu_z0 = depth.mu_z0
 
-    def __call__(self, raw: Float[Tensor, "batch 7"], camera: Camera) -> ProjectedHuber:
+    def __call__(self, raw: Float[Tensor, "*batch 7"], camera: Camera) -> ProjectedHuber:
         # the loss calls this for every batch; a NaN is caught once, by the training step
         return ProjectedHuber.from_raw(raw, f=camera.f, S=camera.S, mu_z0=self.mu_z0, validate_args=False)
 
@@ -50,5 +50,5 @@ class ChartHead:
     def __init__(self, depth: DepthScale, chart: Callable[[DepthScale], Chart]) -> None:
         self.chart = chart(depth)
 
-    def __call__(self, raw: Float[Tensor, "batch 3"], camera: Camera) -> PointEstimate:
+    def __call__(self, raw: Float[Tensor, "*batch 3"], camera: Camera) -> PointEstimate:
         return PointEstimate(raw, self.chart, camera)

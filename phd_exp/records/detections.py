@@ -8,6 +8,7 @@
 
 import json
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -141,20 +142,7 @@ class DetectionFolder:
             DatasetError: the file cannot be read, a line is not a detection, or there are fewer than n.
             CorruptFileError: a line is not text.
         """
-        path = self.metadata_path(split)
-        try:
-            lines = read_jsonl(path, str.strip, sealed=True)
-        except OSError as error:
-            raise DatasetError(
-                f"{path}: cannot be read ({error.strerror}); expected one JSON object a line, "
-                "see `Your own images` in README.md"
-            ) from None
-        numbered = [(number, text) for number, text in enumerate(lines, start=1) if text][:n]
-        if not numbered or len(numbered) < (n or 0):
-            raise DatasetError(
-                f"{path}: {n or 'some'} detections asked for (data.n_{split}), {len(numbered)} found"
-            )
-        return [self._detection(split, text, f"{path}, line {number}") for number, text in numbered]
+        return detections_in(self.root / split, n, f" (data.n_{split})")
 
     def fingerprint(self) -> str:
         """Checksum of what is said of all images, though not of the images themselves.
@@ -164,25 +152,59 @@ class DetectionFolder:
         """
         return sha256("".join(sha256(self.metadata_path(split).read_bytes()) for split in SPLITS).encode())
 
-    def _detection(self, split: Split, text: str, where: str) -> Detection:
-        try:
-            line = DetectionLine.model_validate(json.loads(text))
-        except json.JSONDecodeError as error:
-            raise DatasetError(f"{where}: not JSON ({error}); expected one object a line") from None
-        except ValidationError as error:
-            raise DatasetError(f"{where}: {_complaint(error.errors(include_url=False)[0])}") from None
-        return Detection(line, self._inside(self.root / split, line.file_name, where), where)
 
-    def _inside(self, folder: Path, name: str, where: str) -> Path:
-        """The image file; a data set from somebody else must not read what lies elsewhere."""
-        try:
-            leaves = Path(name).is_absolute() or ".." in Path(name).parts
-            leaves = leaves or not (folder / name).resolve().is_relative_to(folder.resolve())
-        except (ValueError, OSError, RuntimeError) as error:  # a NUL byte, a link that leads to itself
-            raise DatasetError(f"{where}: file_name={name!r} is no file name ({error})") from None
-        if leaves:
-            raise DatasetError(f"{where}: file_name={name!r} leaves {folder}; expected a path below it")
-        return folder / name
+def detections_in(folder: Path, n: int | None = None, asked_by: str = "") -> list[Detection]:
+    """The first n detections (all by default) of one folder's `metadata.jsonl`, in the order of the lines.
+
+    Raises:
+        DatasetError: the file cannot be read, a line is not a detection, or there are fewer than n.
+        CorruptFileError: a line is not text.
+    """
+    path = folder / "metadata.jsonl"
+    try:
+        lines = read_jsonl(path, str.strip, sealed=True)
+    except OSError as error:
+        raise DatasetError(
+            f"{path}: cannot be read ({error.strerror}); expected one JSON object a line, "
+            "see `Your own images` in README.md"
+        ) from None
+    numbered = [(number, text) for number, text in enumerate(lines, start=1) if text][:n]
+    if not numbered or len(numbered) < (n or 0):
+        raise DatasetError(f"{path}: {n or 'some'} detections asked for{asked_by}, {len(numbered)} found")
+    return [_detection(folder, text, f"{path}, line {number}") for number, text in numbered]
+
+
+def detection_of(file: Path, values: Mapping[str, Any]) -> Detection:
+    """A detection in one image file, from values as a line of `metadata.jsonl` has them. Raises DatasetError."""
+    return Detection(_line({"file_name": file.name, **values}, str(file)), file, str(file))
+
+
+def _detection(folder: Path, text: str, where: str) -> Detection:
+    try:
+        values = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise DatasetError(f"{where}: not JSON ({error}); expected one object a line") from None
+    line = _line(values, where)
+    return Detection(line, _inside(folder, line.file_name, where), where)
+
+
+def _line(values: Any, where: str) -> DetectionLine:
+    try:
+        return DetectionLine.model_validate(values)
+    except ValidationError as error:
+        raise DatasetError(f"{where}: {_complaint(error.errors(include_url=False)[0])}") from None
+
+
+def _inside(folder: Path, name: str, where: str) -> Path:
+    """The image file; a data set from somebody else must not read what lies elsewhere."""
+    try:
+        leaves = Path(name).is_absolute() or ".." in Path(name).parts
+        leaves = leaves or not (folder / name).resolve().is_relative_to(folder.resolve())
+    except (ValueError, OSError, RuntimeError) as error:  # a NUL byte, a link that leads to itself
+        raise DatasetError(f"{where}: file_name={name!r} is no file name ({error})") from None
+    if leaves:
+        raise DatasetError(f"{where}: file_name={name!r} leaves {folder}; expected a path below it")
+    return folder / name
 
 
 def _complaint(problem: ErrorDetails) -> str:

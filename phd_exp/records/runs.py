@@ -2,6 +2,7 @@
 
     runs/<preset>/<data>/<model>/seed<k>[-<hash of other overrides>]/
         config.yaml          what was asked for, resolved
+        constants.json       what the network was told of the data set: depth scale, constant focal length
         status.json          state, error, versions, git commit, hash of the data set
         metrics.jsonl        one line an epoch
         results.json         the final numbers
@@ -85,6 +86,7 @@ class RunFolder:
         self.metrics_file = path / "metrics.jsonl"
         self.status_file = path / "status.json"
         self.config_file = path / "config.yaml"
+        self.constants_file = path / "constants.json"
 
     def curves(self, name: str) -> Path:
         """Calibration curves, of an epoch or "final"; their picture, if there is one, differs in the suffix."""
@@ -124,12 +126,18 @@ class RunFolder:
     def results(self) -> dict[str, Any]:
         return _read_mapping(self.results_file, json.loads)
 
+    def constants(self) -> dict[str, Any]:
+        return _read_mapping(self.constants_file, json.loads)
+
     def metrics(self) -> list[dict[str, Any]]:
         """One mapping an epoch, as logged; a last line torn by a kill is left out."""
         return list(read_jsonl(self.metrics_file)) if self.metrics_file.exists() else []
 
     def write_config(self, config: Mapping[str, Any]) -> None:
         write_atomic(self.config_file, yaml.safe_dump(dict(config), sort_keys=False))
+
+    def write_constants(self, constants: Mapping[str, float]) -> None:
+        write_atomic(self.constants_file, json.dumps(dict(constants), indent=2, allow_nan=False) + "\n")
 
     def write_results(self, results: Mapping[str, Any]) -> None:
         """Write the final numbers; null stands for one that is not finite, which JSON does not know."""

@@ -25,18 +25,18 @@ def draw_calibration(curves: Mapping[str, Mapping[str, Any]], file: Path) -> Non
     figure = Figure(figsize=(4.2 * len(curves), 4.2), layout="constrained")
     for place, (name, curve) in enumerate(curves.items()):
         _draw_curve(figure.add_subplot(1, len(curves), place + 1), name, curve)
-    write_atomic(file, _encoded(figure, "png", dpi=120))
+    write_atomic(file, encoded(figure, "png", dpi=120))
 
 
 def write_figure(figure: Figure, stem: Path) -> list[Path]:
     """Write `<stem>.png` and `<stem>.pdf` for a paper, the same bytes for the same figure, and say where."""
     files = {kind: stem.with_name(f"{stem.name}.{kind}") for kind in ("png", "pdf")}
     for kind, file in files.items():
-        write_atomic(file, _encoded(figure, kind, dpi=250))
+        write_atomic(file, encoded(figure, kind, dpi=250))
     return list(files.values())
 
 
-def _encoded(figure: Figure, kind: str, dpi: int) -> bytes:
+def encoded(figure: Figure, kind: str, dpi: int) -> bytes:
     dateless = {"CreationDate": None} if kind == "pdf" else {}
     buffer = io.BytesIO()
     figure.savefig(buffer, format=kind, dpi=dpi, metadata=dateless)

@@ -12,9 +12,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from scipy import integrate, optimize, special
+from scipy import integrate, optimize
 
 from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions.along import FURTHEST, whitened_marginal
 from phd_exp.distributions.huber import radial_cdf
 
 Points = Float[np.ndarray, "points 2"]
@@ -22,7 +23,6 @@ Points = Float[np.ndarray, "points 2"]
 LEVELS = (0.5, 0.9, 0.99)
 _POINTS = 73  # of a curve, and of half an outline
 _STRATA = 500  # equally probable values that stand for a one-dimensional law
-_FURTHEST = 45.0  # |q_1| beyond which there is no probability left in float64
 
 
 @dataclass(frozen=True)
@@ -99,21 +99,9 @@ def _ellipse(distribution: ProjectedHuber, radius: float) -> Points:
 
 @cache
 def _marginal() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of q_1, one coordinate of q: values s >= 0, its energy e(s) = log m(0)/m(s), and P(|q_1| <= s).
-
-    m(s) K = int exp(-h(sqrt(s^2 + w^2))) dw. Where s^2 + w^2 <= 1 it is an error function; the linear branch gives
-    2 e^(1/2) s K_1(s), less what lies inside the unit disc.
-
-    Source: own derivation; checked against samples.
-    """
-    s = np.concatenate([np.linspace(0, 2, 2001), np.linspace(2, _FURTHEST, 4001)[1:]])
-    half = np.sqrt(np.clip(1 - s**2, 0, None))
-    quadratic = np.exp(-(s**2) / 2) * np.sqrt(np.pi / 2) * special.erf(half / np.sqrt(2))
-    nodes, weights = np.polynomial.legendre.leggauss(64)
-    w = half[:, None] * (nodes + 1) / 2
-    inside = half / 2 * (np.exp(-np.hypot(s[:, None], w)) @ weights)
-    linear = np.concatenate([[1.0], s[1:] * special.k1(s[1:])]) - inside
-    m = 2 * (quadratic + np.exp(0.5) * linear)
+    """Of q_1, one coordinate of q: values s >= 0, its energy e(s) = log m(0)/m(s), and P(|q_1| <= s)."""
+    s = np.concatenate([np.linspace(0, 2, 2001), np.linspace(2, FURTHEST, 4001)[1:]])
+    m = whitened_marginal(s)
     cumulative = integrate.cumulative_simpson(m, x=s, initial=0)
     return s, -np.log(m / m[0]), cumulative / cumulative[-1]
 

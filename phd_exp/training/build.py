@@ -1,13 +1,7 @@
-"""The one place that turns a checked configuration into objects."""
+"""The one place, with `network.py`, that turns a checked configuration into objects."""
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
 
-import torch
-from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from lightning import Trainer
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
@@ -18,10 +12,8 @@ from phd_exp.data.datamodule import PositionData
 from phd_exp.data.folder import FolderSource
 from phd_exp.data.sources import Part, RenderedSource, Source
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.models.regressor import Regressor
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.detections import DetectionFolder
-from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.callbacks import (
     CalibrationRecorder,
@@ -31,8 +23,9 @@ from phd_exp.training.callbacks import (
     RecordLogger,
 )
 from phd_exp.training.checkpoints import AtomicCheckpoints
-from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig, TrainerConfig
+from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig
 from phd_exp.training.module import PositionModule
+from phd_exp.training.network import build_regressor, memory_format, naming, precision
 from phd_exp.training.tracking import Tracker
 
 
@@ -60,26 +53,12 @@ def build_module(config: RunConfig, data: PositionData) -> PositionModule:
 
     Raises ConfigError, naming the key, where a part refuses its values.
     """
-    # partial, then called: an object among instantiate's own arguments would be turned into a configuration
-    with _naming("model.head"):
-        head = instantiate(config.model.head, _partial_=True)(depth=data.source.depth)
-    with _naming("backbone"):
-        regressor = Regressor(instantiate(config.backbone), head, memory_format(config.trainer))
-    with _naming("optimizer"):
+    regressor = build_regressor(config, data.source.depth, memory_format(config.trainer))
+    with naming("optimizer"):
         optimizer = instantiate(config.optimizer, _partial_=True)
         optimizer(regressor.parameters())  # refuses bad values now rather than after hours of rendering
     constant_f = data.source.constant_f if config.camera.focal_length == "constant" else None
     return PositionModule(regressor, instantiate(config.loss), optimizer, constant_f)
-
-
-@contextmanager
-def _naming(key: str) -> Iterator[None]:
-    """Let what a part says of its values name the part of the configuration that they stand in."""
-    try:
-        yield
-    except (ValueError, TypeError, InstantiationException) as error:
-        reason = " ".join(str(error.__cause__ or error).split())
-        raise ConfigError(f"{key}: {reason}") from None
 
 
 def build_trainer(
@@ -137,26 +116,3 @@ def build_calibration(
     return CalibrationRecorder(
         folder, evaluation.calibration_window, evaluation.calibration_every_n_epochs, draw, tracker
     )
-
-
-def precision(config: TrainerConfig) -> Any:
-    """Lightning's name of the arithmetic: bfloat16 autocast where the hardware has units for it.
-
-    Without such units bfloat16 is three times slower than float32 on a CPU (resnet18, 112 px).
-    """
-    if config.precision != "auto":
-        return {"float32": "32-true", "bfloat16": "bf16-mixed"}[config.precision]
-    if config.accelerator != "cpu" and torch.cuda.is_available():
-        return "bf16-mixed" if torch.cuda.is_bf16_supported(including_emulation=False) else "32-true"
-    return "bf16-mixed" if _cpu_has_bfloat16() else "32-true"
-
-
-def memory_format(config: TrainerConfig) -> torch.memory_format:
-    """Channels last where it is faster: with bfloat16; float32 on a CPU is a fifth faster without it."""
-    return torch.channels_last if precision(config) == "bf16-mixed" else torch.contiguous_format
-
-
-def _cpu_has_bfloat16() -> bool:
-    flags = Path("/proc/cpuinfo")
-    words = flags.read_text().split() if flags.exists() else []
-    return "amx_bf16" in words or "avx512_bf16" in words

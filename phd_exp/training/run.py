@@ -5,6 +5,7 @@ import time
 import warnings
 from collections.abc import Mapping
 from contextlib import nullcontext
+from dataclasses import asdict
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -138,6 +139,8 @@ def run(
     seed_everything(config.seed, verbose=False)
     data = build_data(config, rank)
     data.setup()
+    if rank == 0:
+        folder.write_constants(asdict(data.source.depth) | {"constant_f": data.source.constant_f})
     module = build_module(config, data)
     record = RecordLogger(folder)
     with tracked(config, folder) if rank == 0 else nullcontext() as tracker:

@@ -18,8 +18,14 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 
 from phd_exp.records.errors import in_our_words, nearest
 
-ALLOWED = ("phd_exp.", "torch.", "torchvision.")
-"""Where a `_target_` may point: a configuration from somebody else must not run whatever it likes."""
+ALLOWED = (
+    *("phd_exp.models.", "phd_exp.losses.", "phd_exp.geometry."),
+    *("torch.optim.", "torch.nn.", "torchvision.models."),
+)
+"""Where a `_target_` may point: a configuration from somebody else must not run whatever it likes.
+
+What is named must have been defined there too, since modules also hold what they import.
+"""
 
 SPECIAL = {"_target_", "_partial_"}
 
@@ -45,8 +51,22 @@ def check_target(node: dict[str, Any], where: str = "") -> dict[str, Any]:
         if isinstance(value, dict) and "_target_" in value:
             check_target(value, path)
         else:
+            _check_inner(path, value)
             _check_value(path, value, parameters[key].annotation)
     return node
+
+
+def _check_inner(path: str, value: Any) -> None:
+    """Check the targets deep inside lists and mappings, which would be built as well."""
+    children = (
+        value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    )
+    for key, child in children:
+        inner = f"{path}.{key}"
+        if isinstance(child, dict) and "_target_" in child:
+            check_target(child, inner)
+        else:
+            _check_inner(inner, child)
 
 
 def locate(name: Any, where: str = "") -> Any:
@@ -59,9 +79,13 @@ def locate(name: Any, where: str = "") -> Any:
         )
     module, _, attribute = name.rpartition(".")
     try:
-        return getattr(import_module(module), attribute)
+        target = getattr(import_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise _error(path, f"{name!r} does not exist ({error})") from None
+    defined = getattr(target, "__module__", None)
+    if not (callable(target) and isinstance(defined, str) and f"{defined}.".startswith(ALLOWED)):
+        raise _error(path, f"{name!r} is no class or function of its own; expected one defined there")
+    return target
 
 
 Target = Annotated[dict[str, Any], AfterValidator(check_target)]

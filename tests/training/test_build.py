@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from phd_exp.training import build
+from phd_exp.training import network
 from phd_exp.training.config import TrainerConfig
 
 
@@ -22,15 +22,15 @@ def config(precision: str, accelerator: str = "cpu") -> TrainerConfig:
 
 @pytest.mark.parametrize(("named", "lightning"), [("float32", "32-true"), ("bfloat16", "bf16-mixed")])
 def test_a_named_precision_is_taken(named: str, lightning: str) -> None:
-    assert build.precision(config(named)) == lightning
+    assert network.precision(config(named)) == lightning
 
 
 @pytest.mark.parametrize(("has_units", "lightning"), [(True, "bf16-mixed"), (False, "32-true")])
 def test_bfloat16_only_where_the_cpu_has_units_for_it(
     monkeypatch: pytest.MonkeyPatch, has_units: bool, lightning: str
 ) -> None:
-    monkeypatch.setattr(build, "_cpu_has_bfloat16", lambda: has_units)
-    assert build.precision(config("auto")) == lightning
+    monkeypatch.setattr(network, "_cpu_has_bfloat16", lambda: has_units)
+    assert network.precision(config("auto")) == lightning
 
 
 @pytest.mark.parametrize(("has_units", "lightning"), [(True, "bf16-mixed"), (False, "32-true")])
@@ -39,4 +39,4 @@ def test_bfloat16_only_where_the_gpu_has_units_for_it(
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: has_units)
-    assert build.precision(config("auto", "auto")) == lightning
+    assert network.precision(config("auto", "auto")) == lightning

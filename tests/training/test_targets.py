@@ -19,7 +19,16 @@ GOOD: list[dict[str, Any]] = [
 BAD: list[tuple[dict[str, Any], str]] = [
     ({"lr": 1.0}, r"^_target_: None may not be built"),
     ({"_target_": "builtins.eval"}, r"^_target_: 'builtins.eval' may not be built"),
-    ({"_target_": "phd_exp.nothing.There"}, r"does not exist"),
+    ({"_target_": "torch.hub.load"}, r"^_target_: 'torch.hub.load' may not be built"),
+    ({"_target_": "phd_exp.records.files.write_atomic"}, r"may not be built"),
+    ({"_target_": "phd_exp.geometry.virtual.dataclass"}, r"is no class or function of its own"),
+    ({"_target_": "phd_exp.geometry.charts.math"}, r"is no class or function of its own"),
+    ({"_target_": ADAM, "betas": [{"_target_": "os.system"}]}, r"^betas\.0\._target_: 'os.system' may not"),
+    (
+        {"_target_": ADAM, "lr": {"deep": {"_target_": "os.system"}}},
+        r"^lr\.deep\._target_: 'os.system' may not",
+    ),
+    ({"_target_": "phd_exp.models.nothing.There"}, r"does not exist"),
     (
         {"_target_": ADAM, "lrr": 1.0},
         r"^lrr: unknown key, did you mean 'lr'\?; torch.optim.Adam takes params",

@@ -1,0 +1,59 @@
+"""The arguments of verbs that are no Hydra programmes: key=value, held against a model of what there may be."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
+
+from phd_exp.records.errors import ConfigError, in_our_words, nearest
+
+Arguments_ = TypeVar("Arguments_", bound="Arguments")
+
+
+class Arguments(BaseModel):
+    """Arguments of a verb; a key without a default must be given."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def parsed(verb: str, model: type[Arguments_], words: Sequence[str]) -> Arguments_:
+    """The arguments of `key=value` words. Raises ConfigError, in one line, for the first that is none."""
+    values: dict[str, str] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not equals or not value:
+            raise ConfigError(f"{word}: expected key=value; {_takes(verb, model)}")
+        if key in values:
+            raise ConfigError(f"{key}: given twice")
+        values[key] = value
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(_complaint(verb, model, error.errors(include_url=False)[0])) from None
+
+
+def output_folder(out: Path) -> Path:
+    """A folder to write into, made if missing. Raises ConfigError where that cannot be."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot be written ({error.strerror}); choose another by out=") from None
+    return out
+
+
+def _complaint(verb: str, model: type[Arguments], problem: ErrorDetails) -> str:
+    key = ".".join(str(part) for part in problem["loc"])
+    if problem["type"] == "extra_forbidden":
+        return f"{key}: unknown key{nearest(key, model.model_fields)}; {_takes(verb, model)}"
+    if problem["type"] == "missing":
+        return f"{key}: missing; {_takes(verb, model)}"
+    if not key:  # of all arguments together
+        return in_our_words(problem["msg"])
+    return f"{key}: got {problem['input']!r}; {in_our_words(problem['msg'])}"
+
+
+def _takes(verb: str, model: type[Arguments]) -> str:
+    keys = ", ".join(f"{key}=" for key in model.model_fields)
+    return f"{verb} takes {keys} (see `python -m phd_exp {verb} --help`)"

@@ -1,0 +1,155 @@
+"""`python -m phd_exp predict`: where the object in an image is, and how sure a run is of it, as JSON lines."""
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import field_validator, model_validator
+
+from phd_exp.cli.arguments import Arguments, output_folder, parsed
+from phd_exp.records.detections import Detection, detection_of, detections_in
+from phd_exp.records.errors import ConfigError, UserError
+from phd_exp.records.files import write_atomic
+
+if TYPE_CHECKING:  # seconds of imports, which a mistake need not wait for
+    from phd_exp.inference.predictor import Predictor
+    from phd_exp.inference.sightings import Sighting
+
+OF_A_CAMERA = ("f", "fx", "fy", "cx", "cy", "box")
+
+
+class PredictArguments(Arguments):
+    """What to look at and with which run; lengths in pixels of the image file."""
+
+    run: Path
+    image: Path | None = None
+    folder: Path | None = None
+    f: float | None = None
+    fx: float | None = None
+    fy: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    box: tuple[float, float, float, float] | None = None
+    out: Path | None = None
+    recalibrate: bool = False
+
+    @field_validator("box", mode="before")
+    @classmethod
+    def four_numbers(cls, text: Any) -> Any:
+        numbers = str(text).strip("[]()").split(",")
+        try:
+            return tuple(float(number) for number in (*numbers[:3], numbers[3:].pop()))
+        except (ValueError, IndexError):
+            raise ValueError("expected box=LEFT,TOP,RIGHT,BOTTOM in pixels") from None
+
+    @model_validator(mode="after")
+    def one_source(self) -> "PredictArguments":
+        if (self.image is None) == (self.folder is None):
+            raise ValueError(
+                "predict: expected either image=FILE with f=PIXELS, or folder=DIR with a metadata.jsonl in it"
+            )
+        given = [key for key in OF_A_CAMERA if getattr(self, key) is not None]
+        if self.folder is not None and given:
+            raise ValueError(
+                f"{given[0]}: belongs to image=FILE; of a folder each line of metadata.jsonl says it"
+            )
+        return self
+
+    def detections(self) -> list[Detection]:
+        if self.folder is not None:
+            return detections_in(self.folder)
+        assert self.image is not None
+        camera = {key: getattr(self, key) for key in OF_A_CAMERA}
+        return [detection_of(self.image, {key: value for key, value in camera.items() if value is not None})]
+
+
+def main(words: list[str]) -> int:
+    try:
+        arguments = parsed("predict", PredictArguments, words)
+        detections = arguments.detections()
+        if arguments.out is not None:
+            _require_drawing()
+            _require_no_image_lost(detections, arguments.out)
+            output_folder(arguments.out)
+        _predict(arguments, detections)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _predict(arguments: PredictArguments, detections: list[Detection]) -> None:
+    from phd_exp.inference.predictor import load
+
+    predictor = load(arguments.run, recalibrate=arguments.recalibrate)
+    if predictor.state != "finished":
+        print(
+            f"note: {arguments.run}: the run is {predictor.state}; its last checkpoint is used",
+            file=sys.stderr,
+        )
+    lines = _answers(predictor, detections, arguments.out)
+    if arguments.out is None:
+        for line in lines:
+            print(line, flush=True)
+    else:
+        file = arguments.out / "predictions.jsonl"
+        write_atomic(file, "".join(f"{line}\n" for line in lines))
+        print(f"{file}, and a picture beside it for each line", file=sys.stderr)
+
+
+def _answers(predictor: "Predictor", detections: list[Detection], out: Path | None) -> Iterator[str]:
+    """The JSON lines; pictures are drawn on the way."""
+    from phd_exp.inference.answers import answer
+    from phd_exp.inference.sightings import sightings
+
+    names = iter(_picture_names(detections))
+    for sighting in _with_progress(sightings(predictor, detections), len(detections)):
+        if out is not None:
+            _draw(sighting, out / next(names))
+        yield json.dumps(answer(sighting, predictor.temperature), allow_nan=False)
+
+
+def _with_progress(sightings: "Iterator[Sighting]", n: int) -> "Iterator[Sighting]":
+    """With a bar where stderr is a terminal and there are several."""
+    if n == 1 or not sys.stderr.isatty():
+        yield from sightings
+        return
+    from rich.console import Console
+    from rich.progress import track
+
+    yield from track(sightings, "predicting", n, console=Console(stderr=True), transient=True)
+
+
+def _draw(sighting: "Sighting", file: Path) -> None:
+    from phd_exp.inference.pictures import picture
+
+    write_atomic(file, picture(sighting))
+
+
+def _picture_names(detections: list[Detection]) -> list[str]:
+    """<name of the image>.png; a further detection in the same image, or one of the same name, has its number too."""
+    seen: Counter[str] = Counter()
+    names = []
+    for detection in detections:
+        name = "-".join(Path(detection.line.file_name).with_suffix("").parts)
+        seen[name] += 1
+        names.append(f"{name}.png" if seen[name] == 1 else f"{name}-{seen[name]}.png")
+    return names
+
+
+def _require_no_image_lost(detections: list[Detection], out: Path) -> None:
+    images = {detection.file.resolve() for detection in detections}
+    for name in _picture_names(detections):
+        if (out / name).resolve() in images:
+            raise ConfigError(f"out={out}: {out / name} is one of the images; choose another folder")
+
+
+def _require_drawing() -> None:
+    if find_spec("matplotlib") is None:
+        raise ConfigError(
+            "out: pictures need `pip install 'phd_exp[report]'`; without out= there is JSON alone"
+        )

@@ -1,0 +1,57 @@
+"""The law of a coordinate along any direction, against samples and quadrature."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import integrate
+
+from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions.along import quantiles_along, whitened_marginal
+
+P = np.array([0.005, 0.05, 0.25, 0.5, 0.75, 0.95, 0.995])
+SIDEWAYS = np.array([0.3, -0.4, math.sqrt(0.75)])
+PRECISIONS = [(0.05, 3.0), (1.0, 0.5), (3.0, 10.0), (30.0, 40.0), (300.0, 5.0), (5.0, 1e4)]
+
+
+def distribution(a: float, A: float) -> ProjectedHuber:
+    tensors = ([0.1, -0.2], 4.0, [[A, 0.1 * A], [0.1 * A, 2 * A]], a)
+    return ProjectedHuber(*(torch.tensor(values, dtype=torch.float64) for values in tensors))
+
+
+@pytest.mark.parametrize(("a", "A"), PRECISIONS)
+def test_quantiles_are_those_of_samples(a: float, A: float) -> None:
+    p = distribution(a, A)
+    n = 200_000
+    samples = p.rsample((n,), torch.Generator().manual_seed(0)).numpy() @ SIDEWAYS
+    below = (samples[:, None] <= quantiles_along(p, SIDEWAYS, P)).mean(axis=0)
+    assert (np.abs(below - P) < 4 * np.sqrt(P * (1 - P) / n)).all()
+
+
+@pytest.mark.parametrize(("a", "A"), PRECISIONS)
+def test_hardly_turned_they_are_those_of_depth(a: float, A: float) -> None:
+    p = distribution(a, A)
+    expected = p.depth_icdf(torch.from_numpy(P)).numpy()
+    np.testing.assert_array_equal(quantiles_along(p, np.array([0.0, 0.0, 1.0]), P), expected)
+    hardly = np.array([1e-7, 0.0, 1.0])
+    np.testing.assert_allclose(quantiles_along(p, hardly, P), expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("s", [0.0, 0.3, 0.999, 1.0, 2.5, 20.0])
+def test_the_marginal_is_an_integral_of_the_density(s: float) -> None:
+    def density(w: float) -> float:
+        r = math.hypot(s, w)
+        return math.exp(-(r * r / 2 if r <= 1 else r - 0.5)) / (2 * math.pi * (1 + math.exp(-0.5)))
+
+    seam = math.sqrt(max(0, 1 - s * s))
+    expected = 2 * (integrate.quad(density, 0, seam)[0] + integrate.quad(density, seam, 60, limit=200)[0])
+    assert whitened_marginal(np.array([s]))[0] == pytest.approx(expected, rel=1e-6)
+
+
+def test_what_is_no_single_distribution_or_lies_behind_is_refused() -> None:
+    p = distribution(3.0, 10.0)
+    with pytest.raises(ValueError, match="of one distribution"):
+        quantiles_along(p.expand((2,)), SIDEWAYS, P)
+    with pytest.raises(ValueError, match="90 degrees"):
+        quantiles_along(p, -SIDEWAYS, P)
