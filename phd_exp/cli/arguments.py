@@ -1,5 +1,6 @@
 """The arguments of verbs that are no Hydra programmes: key=value, held against a model of what there may be."""
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -41,6 +42,12 @@ def output_folder(out: Path) -> Path:
     except OSError as error:
         raise ConfigError(f"{out}: cannot be written ({error.strerror}); choose another by out=") from None
     return out
+
+
+def say_if_unfinished(run: Path, state: str) -> None:
+    """A note on stderr where a run is used that has not ended well."""
+    if state != "finished":
+        print(f"note: {run}: the run is {state}; its last checkpoint is used", file=sys.stderr)
 
 
 def _complaint(verb: str, model: type[Arguments], problem: ErrorDetails) -> str:

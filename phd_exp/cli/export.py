@@ -4,7 +4,7 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-from phd_exp.cli.arguments import Arguments, output_folder, parsed
+from phd_exp.cli.arguments import Arguments, output_folder, parsed, say_if_unfinished
 from phd_exp.records.errors import ConfigError, UserError
 
 NEEDED = ("onnx", "onnxscript", "onnxruntime")
@@ -36,11 +36,7 @@ def _export(arguments: ExportArguments, file: Path) -> None:
     from phd_exp.inference.predictor import load  # seconds of imports, which a mistake need not wait for
 
     predictor = load(arguments.run, device="cpu", recalibrate=arguments.recalibrate)
-    if predictor.state != "finished":
-        print(
-            f"note: {arguments.run}: the run is {predictor.state}; its last checkpoint is used",
-            file=sys.stderr,
-        )
+    say_if_unfinished(arguments.run, predictor.state)
     output_folder(file.parent)
     from phd_exp.inference.onnx import CHECKED, TOLERANCE, export
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import field_validator, model_validator
 
-from phd_exp.cli.arguments import Arguments, output_folder, parsed
+from phd_exp.cli.arguments import Arguments, output_folder, parsed, say_if_unfinished
 from phd_exp.records.detections import Detection, detection_of, detections_in
 from phd_exp.records.errors import ConfigError, UserError
 from phd_exp.records.files import write_atomic
@@ -86,11 +86,7 @@ def _predict(arguments: PredictArguments, detections: list[Detection]) -> None:
     from phd_exp.inference.predictor import load
 
     predictor = load(arguments.run, recalibrate=arguments.recalibrate)
-    if predictor.state != "finished":
-        print(
-            f"note: {arguments.run}: the run is {predictor.state}; its last checkpoint is used",
-            file=sys.stderr,
-        )
+    say_if_unfinished(arguments.run, predictor.state)
     lines = _answers(predictor, detections, arguments.out)
     if arguments.out is None:
         for line in lines:

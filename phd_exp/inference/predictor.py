@@ -204,18 +204,11 @@ def _temperature(folder: RunFolder, regressor: Regressor) -> Temperature:
         raise RunError(
             f"{folder.held_out}: missing; recalibration is fitted on held-out samples: train with data.n_held_out > 0"
         )
-    # of these two alone recalibration needs more than the network
-    import pyarrow as pa
-    import pyarrow.parquet as pq
+    from phd_exp.reports.evaluation import (
+        held_out_temperature,
+    )  # recalibration alone needs it, and pyarrow with it
 
-    from phd_exp.reports.evaluation import fit_temperature
-
-    try:
-        table = pq.read_table(folder.held_out)
-    except (pa.ArrowException, OSError) as error:
-        reason = " ".join(str(error).split())[:120]
-        raise RunError(f"{folder.held_out}: cannot be read ({reason})") from None
-    return fit_temperature(table)
+    return held_out_temperature(folder)
 
 
 def _images(images: Any) -> UInt8[np.ndarray, "batch height width 3"]:

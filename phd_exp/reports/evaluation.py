@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
@@ -19,6 +20,7 @@ from phd_exp.metrics.errors import MILLIMETRES
 from phd_exp.metrics.scores import DRAWS, energy_score
 from phd_exp.metrics.strata import strata
 from phd_exp.records.errors import RunError
+from phd_exp.records.runs import RunFolder
 
 Arrays = Mapping[str, np.ndarray]
 """Name of a column -> a value a sample."""
@@ -124,6 +126,19 @@ def fit_temperature(held_out_table: pa.Table | Arrays) -> Temperature:
         return Temperature.fit(_distribution(columns), _positions(columns))
     except ValueError as error:
         raise RunError(f"predictions: no temperature fits them ({error})") from None
+
+
+def held_out_temperature(folder: RunFolder) -> Temperature:
+    """The temperatures that fit a run's recorded predictions of held-out samples.
+
+    Raises RunError where they cannot be read, and as `fit_temperature` does.
+    """
+    try:
+        table = pq.read_table(folder.held_out)
+    except (pa.ArrowException, OSError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise RunError(f"{folder.held_out}: cannot be read ({reason})") from None
+    return fit_temperature(table)
 
 
 def recalibrated(table: pa.Table | Arrays, temperature: Temperature) -> dict[str, np.ndarray]:

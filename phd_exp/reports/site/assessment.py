@@ -3,16 +3,14 @@
 from dataclasses import dataclass
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from phd_exp.distributions.temperature import Temperature
-from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.reports.evaluation import (
     Evaluation,
     evaluate,
     evaluate_points,
-    fit_temperature,
+    held_out_temperature,
     recalibrated,
 )
 
@@ -44,8 +42,5 @@ def assess(folder: RunFolder, predictions: pa.Table) -> Assessment:
     before = evaluate(predictions)
     if not folder.held_out.exists():
         return Assessment(before)
-    try:
-        temperature = fit_temperature(pq.read_table(folder.held_out))
-    except (pa.ArrowException, OSError) as error:
-        raise RunError(f"{folder.held_out}: cannot be read ({' '.join(str(error).split())[:200]})") from None
+    temperature = held_out_temperature(folder)
     return Assessment(before, evaluate(recalibrated(predictions, temperature)), temperature)
