@@ -20,7 +20,7 @@ from phd_exp.records.dataset import DatasetFolder, sha256
 from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import remove_temporaries
-from phd_exp.records.runs import RunFolder
+from phd_exp.records.runs import RunFolder, flatten
 from phd_exp.training.build import (
     build_calibration,
     build_data,
@@ -116,15 +116,6 @@ def _require_same_data(folder: RunFolder, config: RunConfig) -> None:
                 f"{folder.path}: holds a run on {config.data.folder} as it was before its metadata.jsonl changed; "
                 "move that run's folder away, or choose another place by runs=DIR"
             )
-
-
-def flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested mappings as one mapping with dotted keys."""
-    flat: dict[str, Any] = {}
-    for key, value in config.items():
-        path = f"{prefix}{key}"
-        flat |= flatten(value, f"{path}.") if isinstance(value, dict) else {path: value}
-    return flat
 
 
 def run(

@@ -3,7 +3,7 @@
 import hashlib
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from phd_exp.records.errors import RunError, UserError
-from phd_exp.records.runs import RunFolder, RunStatus
+from phd_exp.records.runs import RunFolder, RunStatus, flatten
 from phd_exp.reports.collect import Run
 from phd_exp.reports.site.assessment import Assessment, assess
 
@@ -67,15 +67,7 @@ def read_dossier(run: Run) -> Dossier:
 
 def read_config(folder: RunFolder) -> dict[str, str]:
     """Every value of a run's configuration as text, by its dotted path. Raises RunError where it cannot be read."""
-    return dict(_flattened(folder.config()))
-
-
-def _flattened(config: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, str]]:
-    for name, value in config.items():
-        if isinstance(value, Mapping):
-            yield from _flattened(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", "" if value is None else str(value)
+    return {key: "" if value is None else str(value) for key, value in flatten(folder.config()).items()}
 
 
 def slug_of(run: Run) -> str:
