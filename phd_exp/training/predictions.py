@@ -34,11 +34,7 @@ def quantities(prediction: Prediction, xyz: Tensor) -> Columns:
     """The metrics of a batch, a number a sample: errors in millimetres; of a distribution also `nll`, in nats of the
     density per cubic metre, and the precisions a and |A|.
     """
-    estimate = prediction.mode
-    values = {
-        "projected_error_mm": MILLIMETRES * projected_error(xyz, estimate),
-        "depth_error_mm": MILLIMETRES * depth_error(xyz, estimate),
-    }
+    values = _errors(prediction, xyz)
     if isinstance(prediction, ProjectedHuber):
         values["nll"] = -prediction.log_prob(xyz)
         values["depth_precision"] = prediction.a
@@ -46,16 +42,23 @@ def quantities(prediction: Prediction, xyz: Tensor) -> Columns:
     return values
 
 
+def _errors(prediction: Prediction, xyz: Tensor) -> Columns:
+    estimate = prediction.mode
+    return {
+        "projected_error_mm": MILLIMETRES * projected_error(xyz, estimate),
+        "depth_error_mm": MILLIMETRES * depth_error(xyz, estimate),
+    }
+
+
 @torch.no_grad()
 def columns(prediction: Prediction, batch: Batch) -> Columns:
-    """A batch as a table: truth, estimate and `quantities`; of a distribution parameters, moments and scores too.
+    """A batch as a table: truth, estimate and its errors; of a distribution parameters, moments and scores too.
 
     Positions, `depth_crps` and `energy_score` are in metres, in the camera frame; see `distribution_columns`.
     """
     table = {"row": batch.row} | coordinates("", batch.xyz) | coordinates("mode_", prediction.mode)
-    table |= quantities(prediction, batch.xyz)
+    table |= _errors(prediction, batch.xyz)
     if isinstance(prediction, ProjectedHuber):
-        del table["depth_precision"]  # it is a, below
         table |= distribution_columns(prediction, batch.xyz)
         # seeded by the sample: the score depends neither on the epoch nor on what ran before
         drawn = draws(prediction, DRAWS, seed=int(batch.row[0]))
