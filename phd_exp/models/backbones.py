@@ -5,9 +5,15 @@ from typing import Literal
 
 from jaxtyping import Float
 from torch import Tensor, nn
-from torchvision.models import resnet18, resnet34, resnet50
+from torchvision.models.resnet import BasicBlock, Bottleneck, ResNet
 
-RESNETS = {18: resnet18, 34: resnet34, 50: resnet50}
+BLOCKS: dict[int, tuple[type[BasicBlock | Bottleneck], list[int]]] = {
+    10: (BasicBlock, [1, 1, 1, 1]),
+    18: (BasicBlock, [2, 2, 2, 2]),
+    34: (BasicBlock, [3, 4, 6, 3]),
+    50: (Bottleneck, [3, 4, 6, 3]),
+}
+"""Depth -> kind of block, and how many of them at each of the four resolutions."""
 
 
 class Backbone(nn.Module):
@@ -23,12 +29,12 @@ class Backbone(nn.Module):
         return features
 
 
-def resnet(depth: Literal[18, 34, 50]) -> Backbone:
+def resnet(depth: Literal[10, 18, 34, 50]) -> Backbone:
     """A ResNet of torchvision without its last layer, every BatchNorm replaced by GroupNorm(1, C).
 
     Source: the authors' training protocol.
     """
-    network = RESNETS[depth](weights=None, norm_layer=partial(nn.GroupNorm, 1))
+    network = ResNet(*BLOCKS[depth], norm_layer=partial(nn.GroupNorm, 1))
     n_features = network.fc.in_features
     network.fc = nn.Identity()
     return Backbone(network, n_features)

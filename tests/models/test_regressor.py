@@ -1,7 +1,10 @@
 """The whole network: what it starts from, what every output learns, what precision it keeps."""
 
+from collections.abc import Callable
+
 import pytest
 import torch
+from torchvision.models import resnet18, resnet34, resnet50
 
 from phd_exp.geometry import Camera, Cartesian, DepthScale, LogDepth, Projected
 from phd_exp.losses import MeanAbsoluteError, NegativeLogLikelihood
@@ -79,12 +82,19 @@ def test_memory_format_changes_no_number(image: torch.Tensor, camera: Camera) ->
     torch.testing.assert_close(raw[0], raw[1], rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("depth", [18, 34, 50])
+@pytest.mark.parametrize("depth", [10, 18, 34, 50])
 def test_no_batch_norm_is_left(depth: int) -> None:
     kinds = [type(module) for module in resnet(depth).modules()]
     assert torch.nn.BatchNorm2d not in kinds
     groups = {m.num_groups for m in resnet(depth).modules() if isinstance(m, torch.nn.GroupNorm)}
     assert groups == {1}
+
+
+@pytest.mark.parametrize(("depth", "torchvisions"), [(18, resnet18), (34, resnet34), (50, resnet50)])
+def test_the_layers_are_torchvisions(depth: int, torchvisions: Callable[..., torch.nn.Module]) -> None:
+    theirs = {name: weight.shape for name, weight in torchvisions().named_parameters() if "fc" not in name}
+    ours = {name: weight.shape for name, weight in resnet(depth).network.named_parameters()}
+    assert ours == theirs
 
 
 def test_under_autocast_the_last_layer_stays_in_float32(image: torch.Tensor, camera: Camera) -> None:

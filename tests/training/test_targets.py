@@ -36,7 +36,7 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"_target_": ADAM, "lr": "fast"}, r"^lr: got 'fast'; expected a valid number"),
     (
         {"_target_": "phd_exp.models.backbones.resnet", "depth": 7},
-        r"^depth: got 7; expected to be 18, 34 or 50",
+        r"^depth: got 7; expected to be 10, 18, 34 or 50",
     ),
     (
         {"_target_": "phd_exp.models.heads.ChartHead", "chart": CHART | {"unit": 1}},
