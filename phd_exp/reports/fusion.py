@@ -121,7 +121,7 @@ def _estimates(
     averaged = average(seen.pose.into_world(seen.predictions.mode))
     try:
         gaussian = gaussian_fusion(*world_moments(seen.predictions, seen.pose))
-    except torch.linalg.LinAlgError as error:
+    except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
         raise RunError(f"several views: a covariance is singular ({error}); train longer") from None
     if plane is not None:
         averaged, gaussian = plane.nearest(averaged), conditioned(*gaussian, plane)

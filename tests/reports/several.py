@@ -8,7 +8,6 @@ from torch import Tensor
 from phd_exp.data.batches import Batch
 from phd_exp.fusion import Pose
 from phd_exp.records import scenes
-from phd_exp.records.runs import RunFolder
 from phd_exp.rendering.rotations import about_axis
 from phd_exp.reports.several_views import ROTATION, TRANSLATION
 from phd_exp.training.predictions import columns, write_parquet
