@@ -111,7 +111,7 @@ def _places(views: int) -> list[tuple[int, bool]]:
 def _fused(views: SeveralViews, k: int, on_plane: bool) -> Fused:
     """However much its views contradict one another, no scene is refused: that would spare ours its worst errors."""
     seen = views.cameras(k)
-    return fuse(seen.predictions, seen.pose, views.ground if on_plane else None, contradiction=0)
+    return fuse(seen.predictions, seen.pose, views.ground if on_plane else None, contradiction=0.0)
 
 
 def _estimates(

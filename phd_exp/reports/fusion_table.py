@@ -104,7 +104,7 @@ def fusion_table(run: Run, scores: FusionScores) -> FusionTable:
     return FusionTable(
         stem=f"fusion-{run.preset}-{run.data}-{run.model}-{leaf}",
         title=one_line(title),
-        stub=("", "method"),
+        stub=("quantity", "method"),
         columns=tuple(f"{k} camera{'s' if k > 1 else ''}" for k in _cameras(scores)),
         groups=tuple(_groups(scores)),
         notes=(OF_A_LINE, OF_METHODS, OF_THE_GROUND, *_measured(scores)),

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from phd_exp.data.batches import Batch
+from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion import Pose
 from phd_exp.records import scenes
 from phd_exp.rendering.rotations import about_axis
@@ -47,10 +48,7 @@ def write_views(
     write_parquet(file, table, known)
 
 
-def _grown(prediction: "object", scale: Tensor) -> "object":
-    from phd_exp.distributions import ProjectedHuber
-
-    p = prediction
+def _grown(p: ProjectedHuber, scale: Tensor) -> ProjectedHuber:
     return ProjectedHuber(p.mu_xy, p.mu_z * scale, p.A, p.a)
 
 

@@ -18,6 +18,7 @@ SYMBOLS = {
     "-": r"-{}",  # two in a row would join to a dash
     **{letter: f"\\{letter}" for letter in "&%$#_{}"},
     "±": r"$\pm$",
+    "°": r"$^\circ$",
     "×": r"$\times$",
     "≥": r"$\geq$",
     "≤": r"$\leq$",

@@ -172,6 +172,26 @@ def test_filters_choose_lines(visit: Visit) -> None:
     assert lines.count() == 2  # the diagonal and one run
 
 
+def test_several_cameras_have_their_charts_and_table(visit: Visit) -> None:
+    visit.open("index.html")
+    visit.page.locator("#several-views a").click()
+    visit.page.wait_for_url(f"**/runs/{OTHER}.html#several-views")
+    visit.draw()
+    section = visit.page.locator("section[aria-labelledby=several-views-title]")
+    assert section.locator("figure.drawn").count() == 5
+    lines = section.locator("[data-chart=fusion_depth_error_mm] .scatterlayer .trace .js-line")
+    assert lines.count() == 8
+    assert section.locator("table thead th").all_inner_texts() == [
+        "quantity",
+        "method",
+        "1 camera",
+        "2 cameras",
+        "3 cameras",
+        "4 cameras",
+    ]
+    assert visit.width_beyond() <= 0
+
+
 def test_the_keyboard_reaches_the_content_first(visit: Visit) -> None:
     visit.open("index.html")
     visit.page.keyboard.press("Tab")
