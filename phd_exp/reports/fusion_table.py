@@ -31,9 +31,9 @@ NAMES: dict[Method, str] = {
 QUANTITIES = {
     "depth_error_mm": "depth (mm)",
     "distance_mm": "distance (mm)",
-    "coverage_50": "inside 50 % (%)",
-    "coverage_90": "inside 90 % (%)",
-    "coverage_99": "inside 99 % (%)",
+    "coverage_50": "inside 50 %",
+    "coverage_90": "inside 90 %",
+    "coverage_99": "inside 99 %",
     "normalised_squared_error": "squared error",
 }
 ON_GROUND = ", ground"
@@ -155,8 +155,8 @@ def _measured(scores: FusionScores) -> list[str]:
     covered = ", ".join(f"{share:.0f}" for share in scores.calibrated_coverage)
     levels = ", ".join(map(str, LEVELS))
     said = [
-        f"Inside {levels} %: the share of true positions in the ellipsoids of mean and covariance that hold so much "
-        f"of a Gaussian; the densities have longer tails, and of one camera {covered} % would be inside if they were "
+        f"Inside {levels} %: per cent of true positions in the ellipsoids of mean and covariance that hold so much "
+        f"of a Gaussian; the densities have longer tails, and of one camera {covered} would be inside if they were "
         "exact. Squared error: the squared Mahalanobis distance per dimension, 1 on average where calibrated, above "
         "1 where overconfident."
     ]

@@ -8,6 +8,8 @@ from phd_exp.reports.site.charts import Chart, Trace, axis, identity, line, squa
 COLOURS: dict[Method, int] = {"mode": 1, "mean": 2, "average": 3, "gaussian": 4}
 GROUND = {False: "", True: ", ground"}
 DASH = {False: "solid", True: "dash"}
+MAIN, ASIDE = "line", "aside"
+"""Roles: what the comparison of two runs shows of a chart, and what it leaves out."""
 
 
 def fusion_charts(scores: FusionScores) -> dict[str, Chart]:
@@ -38,7 +40,7 @@ def _squared_error(scores: FusionScores) -> Chart:
     ]
     said = "; ".join(_course(trace) for trace in traces)
     ends = (1.0, float(scores.views))
-    traces.insert(0, line("calibrated", ends, (1.0, 1.0), 0, dash="dash", role="identity"))
+    traces.insert(0, line("calibrated", ends, (1.0, 1.0), 0, dash="dash", role=ASIDE))
     layout = {
         "xaxis": axis("cameras", dtick=1),
         "yaxis": axis("squared error / predicted", rangemode="tozero"),
@@ -55,7 +57,8 @@ def _coverage(scores: FusionScores) -> Chart:
             bands = [scores.bands[Place(f"coverage_{level}", method, k, False)] for level in LEVELS]
             name = f"{_name(method)}, {k} camera{'s' if k > 1 else ''}"
             shown = [Band(band.value / 100, band.low / 100, band.high / 100) for band in bands]
-            traces.append(_line(name, x, shown, COLOURS[method], DASH[k == 1]))
+            role = MAIN if (k, method) == (scores.views, "mean") else ASIDE
+            traces.append(_line(name, x, shown, COLOURS[method], DASH[k == 1], role))
     said = "; ".join(
         f"{trace['name']}: {', '.join(f'{100 * y:.0f} %' for y in trace['y'])}" for trace in traces[1:]
     )
@@ -86,12 +89,14 @@ def _over_cameras(scores: FusionScores, quantity: str, method: Method, on_plane:
     cameras = range(1, scores.views + 1)
     bands = [scores.bands[Place(quantity, method, k, on_plane)] for k in cameras]
     name = NAMES[method] if quantity != "normalised_squared_error" else _name(method)
-    return _line(name + GROUND[on_plane], [float(k) for k in cameras], bands, COLOURS[method], DASH[on_plane])
+    role = MAIN if method == "mean" and not on_plane else ASIDE
+    x = [float(k) for k in cameras]
+    return _line(name + GROUND[on_plane], x, bands, COLOURS[method], DASH[on_plane], role)
 
 
-def _line(name: str, x: list[float], bands: list[Band], colour: int, dash: str) -> Trace:
+def _line(name: str, x: list[float], bands: list[Band], colour: int, dash: str, role: str) -> Trace:
     low, high = [band.low for band in bands], [band.high for band in bands]
-    return line(name, x, [band.value for band in bands], colour, dash=dash, low=low, high=high)
+    return line(name, x, [band.value for band in bands], colour, dash=dash, role=role, low=low, high=high)
 
 
 def _name(method: Method) -> str:
