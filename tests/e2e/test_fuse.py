@@ -15,20 +15,9 @@ import phd_exp as package
 from phd_exp.__main__ import main
 from phd_exp.geometry import intrinsics
 from phd_exp.records.runs import RunFolder, find_runs
-from tests.e2e.conftest import QUICK
+from tests.e2e.conftest import QUICK, QUICKER
 
-QUICKER = ("trainer.max_epochs=1", "logger=none", "trainer.precision=float32", "data.image_size=48")
 VIEWS, SCENES = 3, 4
-
-
-@pytest.fixture(scope="module")
-def run(renders: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    runs = tmp_path_factory.mktemp("runs")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", ["phd_exp"])
-        assert main([*QUICK, *QUICKER, f"data.root={renders}", f"runs={runs}"]) == 0
-    (found,) = find_runs(runs)
-    return found
 
 
 @pytest.fixture(scope="module")
