@@ -1,9 +1,9 @@
 """The arguments of verbs that are no Hydra programmes: key=value, held against a model of what there may be."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
@@ -11,6 +11,7 @@ from pydantic_core import ErrorDetails
 from phd_exp.records.errors import ConfigError, in_our_words, nearest
 
 Arguments_ = TypeVar("Arguments_", bound="Arguments")
+Item = TypeVar("Item")
 
 
 class Arguments(BaseModel):
@@ -35,6 +36,16 @@ def parsed(verb: str, model: type[Arguments_], words: Sequence[str]) -> Argument
         raise ConfigError(_complaint(verb, model, error.errors(include_url=False)[0])) from None
 
 
+def four_numbers(text: Any, expected: str) -> tuple[float, float, float, float]:
+    """The numbers of A,B,C,D, with brackets or without. Raises ValueError, saying what was expected."""
+    numbers = str(text).strip("[]()").split(",")
+    try:
+        a, b, c, d = map(float, numbers)
+    except ValueError:
+        raise ValueError(f"expected {expected}") from None
+    return a, b, c, d
+
+
 def output_folder(out: Path) -> Path:
     """A folder to write into, made if missing. Raises ConfigError where that cannot be."""
     try:
@@ -48,6 +59,17 @@ def say_if_unfinished(run: Path, state: str) -> None:
     """A note on stderr where a run is used that has not ended well."""
     if state != "finished":
         print(f"note: {run}: the run is {state}; its last checkpoint is used", file=sys.stderr)
+
+
+def with_progress(items: Iterable[Item], n: int, words: str) -> Iterator[Item]:
+    """The items, with a bar where stderr is a terminal and there are several."""
+    if n == 1 or not sys.stderr.isatty():
+        yield from items
+        return
+    from rich.console import Console
+    from rich.progress import track
+
+    yield from track(items, words, n, console=Console(stderr=True), transient=True)
 
 
 def _complaint(verb: str, model: type[Arguments], problem: ErrorDetails) -> str:

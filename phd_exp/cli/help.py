@@ -10,6 +10,7 @@ VERBS = {
     "gallery": "draw the pictures of renders/README.md: paired data sets, the camera's axes",
     "report": "the paper's tables, the dashboard and the figures of all recorded runs",
     "predict": "where the object in an image is and how sure a run is of it: JSON lines, and pictures with out=",
+    "fuse": "one position from the predictions of several cameras, and/or on a ground plane: a JSON line a scene",
     "export": "write a run's network as ONNX, checked against torch; decoding it needs NumPy and SciPy alone",
 }
 OF_VERB = {
@@ -21,6 +22,7 @@ OF_VERB = {
     "gallery": (),
     "report": (),
     "predict": (),
+    "fuse": (),
     "export": (),
 }
 """The groups whose choice a verb looks at."""
@@ -48,6 +50,10 @@ EXAMPLES = {
         "python -m phd_exp predict run=runs/small/default/probabilistic/seed0 image=photo.jpg f=1550",
         "python -m phd_exp predict run=DIR image=a.jpg fx=900 fy=900 cx=320 cy=240 box=400,30,620,140 out=pictures",
         "python -m phd_exp predict run=DIR folder=photos/test recalibrate=true > predictions.jsonl",
+    ],
+    "fuse": [
+        "python -m phd_exp fuse run=runs/small/scale/probabilistic/seed0 folder=renders/multiview/test",
+        "python -m phd_exp fuse run=DIR folder=photos/test plane=0,1,0,1.5 recalibrate=true out=fused.jsonl",
     ],
     "export": [
         "python -m phd_exp export run=runs/small/default/probabilistic/seed0",

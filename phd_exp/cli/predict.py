@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import field_validator, model_validator
 
-from phd_exp.cli.arguments import Arguments, output_folder, parsed, say_if_unfinished
+from phd_exp.cli.arguments import (
+    Arguments,
+    four_numbers,
+    output_folder,
+    parsed,
+    say_if_unfinished,
+    with_progress,
+)
 from phd_exp.records.detections import Detection, detection_of, detections_in
 from phd_exp.records.errors import ConfigError, UserError
 from phd_exp.records.files import write_atomic
@@ -39,12 +46,8 @@ class PredictArguments(Arguments):
 
     @field_validator("box", mode="before")
     @classmethod
-    def four_numbers(cls, text: Any) -> Any:
-        numbers = str(text).strip("[]()").split(",")
-        try:
-            return tuple(float(number) for number in (*numbers[:3], numbers[3:].pop()))
-        except (ValueError, IndexError):
-            raise ValueError("expected box=LEFT,TOP,RIGHT,BOTTOM in pixels") from None
+    def box_of_four_numbers(cls, text: Any) -> Any:
+        return four_numbers(text, "box=LEFT,TOP,RIGHT,BOTTOM in pixels")
 
     @model_validator(mode="after")
     def one_source(self) -> "PredictArguments":
@@ -103,21 +106,10 @@ def _answers(predictor: "Predictor", detections: list[Detection], out: Path | No
     from phd_exp.inference.sightings import sightings
 
     names = iter(_picture_names(detections))
-    for sighting in _with_progress(sightings(predictor, detections), len(detections)):
+    for sighting in with_progress(sightings(predictor, detections), len(detections), "predicting"):
         if out is not None:
             _draw(sighting, out / next(names))
         yield json.dumps(answer(sighting, predictor.temperature), allow_nan=False)
-
-
-def _with_progress(sightings: "Iterator[Sighting]", n: int) -> "Iterator[Sighting]":
-    """With a bar where stderr is a terminal and there are several."""
-    if n == 1 or not sys.stderr.isatty():
-        yield from sightings
-        return
-    from rich.console import Console
-    from rich.progress import track
-
-    yield from track(sightings, "predicting", n, console=Console(stderr=True), transient=True)
 
 
 def _draw(sighting: "Sighting", file: Path) -> None:

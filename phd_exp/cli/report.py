@@ -6,9 +6,9 @@ from pathlib import Path
 
 from phd_exp.cli.folders import named_folders, require_folder
 from phd_exp.records.errors import UserError
-from phd_exp.reports.collect import collect
-from phd_exp.reports.formats.files import write_tables
-from phd_exp.reports.formats.terminal import print_report
+from phd_exp.reports.collect import Records, collect
+from phd_exp.reports.formats.files import write_fusion_tables, write_tables
+from phd_exp.reports.formats.terminal import print_fusion, print_report
 from phd_exp.reports.tables import tables
 
 FOLDERS = {"runs": "runs", "out": "report"}
@@ -24,12 +24,24 @@ def main(arguments: list[str]) -> int:
         print_report(records, drawn)
         if drawn:
             print(f"tables: {write_tables(drawn, folders['out'])}")
+        if any(run.folder.views.exists() for run in records.runs):
+            _fusion(records, folders["out"])
         if records.runs:
             _build_site(folders["runs"], folders["out"])
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0
+
+
+def _fusion(records: Records, out: Path) -> None:
+    # torch, which a report on single views gets its tables without
+    from phd_exp.reports.fusion_table import fusion_tables
+
+    drawn, complaints = fusion_tables(records)
+    print_fusion(drawn, complaints)
+    if drawn:
+        print(f"tables of fusion: {write_fusion_tables(drawn, out)}")
 
 
 def _build_site(runs: Path, out: Path) -> None:

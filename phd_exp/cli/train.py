@@ -9,6 +9,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from phd_exp.cli.app import launch
 from phd_exp.cli.render import ensure_dataset
+from phd_exp.cli.several_views import Several
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder, RunName
 from phd_exp.training.config import RenderedConfig, RunConfig, check, has_influence
@@ -36,12 +37,17 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> str:
     from phd_exp.training.run import require_possible, train
 
     folder = RunFolder(run_name(checked, overrides).folder(checked.runs))
+    several = Several.of(checked)
     skipped = folder.is_finished()
     if not skipped:
         require_possible(checked, folder)
+        if several:
+            several.require_possible()
         if isinstance(checked.data, RenderedConfig):
             ensure_dataset(checked.data, cores)
     results = train(checked, folder, draw=_draw(), cores=cores)
+    if several:
+        several.record(folder, cores)
     state = "finished already" if skipped else "finished"
     print(f"{folder.path}: {state}")
     for key in filter(results.__contains__, SHOWN):
@@ -60,7 +66,9 @@ def is_finished(config: dict[str, Any], overrides: list[str]) -> bool:
     try:
         data = config["data"].get("variant") or config["data"]["name"]
         choices = (config["preset"], data, config["model"]["name"], config["seed"])
-        return RunFolder(RunName(*choices, _telling(overrides)).folder(Path(config["runs"]))).is_finished()
+        folder = RunFolder(RunName(*choices, _telling(overrides)).folder(Path(config["runs"])))
+        several = config["evaluation"]["multiview"]["scenes"] > 0
+        return folder.is_finished() and (folder.views.exists() or not several)
     except (KeyError, TypeError, AttributeError, RunError):  # the run itself will say what is wrong
         return False
 

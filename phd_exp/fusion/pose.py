@@ -34,6 +34,8 @@ class Pose:
         Source: R = (w^2 - |u|^2) I + 2 u u^T + 2 w [u]_x for the unit quaternion (w, u).
         """
         quaternion = torch.tensor([pose.rotation for pose in poses], dtype=torch.float64).reshape(-1, 4)
+        # a record's are of unit length to 1e-6, of which R has the square
+        quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
         w, u = quaternion[:, :1, None], quaternion[:, 1:]
         x, y, z = u.unbind(-1)
         zero = torch.zeros_like(x)

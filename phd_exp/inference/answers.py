@@ -30,10 +30,10 @@ def answer(sighting: Sighting, temperature: Temperature | None) -> dict[str, Any
     if line.box is not None:
         named["box"] = list(line.box)
     if isinstance(prediction, ProjectedHuber):
-        named |= _distribution(prediction, view) | {"uncertainty": _uncertainty(temperature)}
+        named |= _distribution(prediction, view) | {"uncertainty": uncertainty(temperature)}
     else:
         position = view.camera.to_real(_array(prediction.mode))
-        named |= {"position": _rounded(position), "uncertainty": "none: this model predicts a position alone"}
+        named |= {"position": rounded(position), "uncertainty": "none: this model predicts a position alone"}
     camera = Camera(torch.tensor(view.camera.f, dtype=torch.float64), view.camera.S)
     named["out_of_field"] = not bool(camera.contains(prediction.mode))
     return named | (_errors(sighting) if line.z is not None else {})
@@ -43,12 +43,12 @@ def _distribution(distribution: ProjectedHuber, view: View) -> dict[str, Any]:
     R = view.camera.R
     quantiles = _depth_quantiles(distribution, view)
     return {
-        "mode": _rounded(view.camera.to_real(_array(distribution.mode))),
-        "mean": _rounded(view.camera.to_real(_array(distribution.mean))),
-        "covariance": _rounded(R.T @ _array(distribution.covariance_matrix) @ R),
-        "median_depth": None if quantiles is None else _rounded(quantiles[0]),
+        "mode": rounded(view.camera.to_real(_array(distribution.mode))),
+        "mean": rounded(view.camera.to_real(_array(distribution.mean))),
+        "covariance": rounded(R.T @ _array(distribution.covariance_matrix) @ R),
+        "median_depth": None if quantiles is None else rounded(quantiles[0]),
         "depth_interval": {
-            str(level): None if quantiles is None else _rounded(quantiles[[1 + place, -1 - place]])
+            str(level): None if quantiles is None else rounded(quantiles[[1 + place, -1 - place]])
             for place, level in enumerate(LEVELS)
         },
     }
@@ -67,7 +67,8 @@ def _depth_quantiles(distribution: ProjectedHuber, view: View) -> Float[np.ndarr
     return quantiles_along(distribution, axis, p)
 
 
-def _uncertainty(temperature: Temperature | None) -> str:
+def uncertainty(temperature: Temperature | None) -> str:
+    """Whose uncertainty it is: the run's own, or recalibrated."""
     if temperature is None:
         return "as trained"
     return f"recalibrated: A / {temperature.projected:.4g}, a / {temperature.depth:.4g}"
@@ -83,7 +84,7 @@ def _errors(sighting: Sighting) -> dict[str, Any]:
     }
     if isinstance(prediction, ProjectedHuber):
         errors |= {"credible_level": prediction.level(truth), "nll": -prediction.log_prob(truth)}
-    return {name: _rounded(value.numpy()) for name, value in errors.items()}
+    return {name: rounded(value.numpy()) for name, value in errors.items()}
 
 
 def _array(tensor: torch.Tensor) -> Float[np.ndarray, "..."]:
@@ -91,8 +92,8 @@ def _array(tensor: torch.Tensor) -> Float[np.ndarray, "..."]:
     return array
 
 
-def _rounded(values: Float[np.ndarray, "..."]) -> Any:
+def rounded(values: Float[np.ndarray, "..."]) -> Any:
     """As lists of numbers; null for one that is not finite, which JSON does not know."""
     if np.ndim(values):
-        return [_rounded(value) for value in values]
+        return [rounded(value) for value in values]
     return float(f"{values:.{DIGITS}g}") if np.isfinite(values) else None

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from PIL import Image
+from torch import Tensor
 
 from phd_exp.data.crops import pillow_warnings, read_image
 from phd_exp.data.folder import content_of
@@ -21,11 +23,15 @@ from phd_exp.records.errors import RunError
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """A detection, its image, and what a network says of it in the frame of the view's virtual camera (float64)."""
+    """A detection, its image, and what a network says of it in the frame of the view's virtual camera (float64).
+
+    `raw` are the network's numbers, of which `Predictor.predict` makes the prediction.
+    """
 
     detection: Detection
     image: Image.Image
     view: View
+    raw: Float[Tensor, " n_outputs"]
     prediction: Prediction
 
 
@@ -44,7 +50,7 @@ def sightings(predictor: Predictor, detections: Sequence[Detection]) -> Iterator
                     f"{detection.where}: the network returns numbers that are not finite; train the run again"
                 )
             f = torch.tensor(view.camera.f, dtype=torch.float64)
-            yield Sighting(detection, image, view, predictor.predict(raw[row], f))
+            yield Sighting(detection, image, view, raw[row], predictor.predict(raw[row], f))
 
 
 def _seen(

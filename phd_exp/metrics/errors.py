@@ -1,5 +1,6 @@
-"""The two columns of the paper's tables: error along the true viewing ray, and across it."""
+"""The two columns of the paper's tables, error along the true viewing ray and across it; error against covariance."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -29,3 +30,12 @@ def depth_error(
 ) -> Float[Tensor, "*batch"]:
     """| |v_par| - |v| |: the error along the true viewing ray, in metres."""
     return (along_true_ray(xyz, estimate).norm(dim=-1) - xyz.norm(dim=-1)).abs()
+
+
+def squared_mahalanobis(
+    error: Float[Tensor, "*batch k"], covariance: Float[Tensor, "*batch k k"]
+) -> Float[Tensor, "*batch"]:
+    """e^T C^(-1) e, of expectation k where C is the covariance of e; NaN where C is singular or not finite."""
+    solution, info = torch.linalg.solve_ex(covariance, error[..., None])
+    distance = (error[..., None] * solution).sum((-2, -1))
+    return torch.where(info == 0, distance, torch.nan)

@@ -13,18 +13,27 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
 from phd_exp.records.dataset import SPLITS, DatasetError, sha256
 from phd_exp.records.errors import in_our_words, nearest
 from phd_exp.records.files import read_jsonl
-from phd_exp.records.scenes import SampleRecord, Split
+from phd_exp.records.scenes import Pose, SampleRecord, Split
 from phd_exp.records.spec import Number, Positive
 
 DISTORTION = re.compile(r"[kp][1-8]|.*distort.*|dist(_?coeff.*)?|.*fisheye.*", re.IGNORECASE)
 LARGEST_BOX = 3
 """Sides of a box over the longer side of its image; what lies outside the image is grey and tells nothing."""
+
+
+def _name(value: Any) -> int | str:
+    if isinstance(value, bool) or not isinstance(value, int | str) or value == "":
+        raise ValueError("expected a whole number or a name")
+    return value
+
+
+SceneName = Annotated[int | str, PlainValidator(_name)]
 
 
 class DetectionLine(BaseModel):
@@ -37,6 +46,8 @@ class DetectionLine(BaseModel):
         box: left, top, right, bottom of the detection, px; the whole image by default.
         x, y, z: true position in the frame of the camera (x right, y down, z forward), m.
         scale, visibility: as in a rendered data set; recorded beside the predictions.
+        scene: lines of one scene show the same object at the same time.
+        pose: of the camera in the world that the scene's cameras share.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -53,6 +64,8 @@ class DetectionLine(BaseModel):
     z: Positive | None = None
     scale: Positive | None = None
     visibility: Annotated[Number, Field(ge=0, le=1)] | None = None
+    scene: SceneName | None = None
+    pose: Pose | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -215,7 +228,7 @@ def _complaint(problem: ErrorDetails) -> str:
             f"{key}: a distorted image is no pinhole image; undistort the images first, then leave out {key}"
         )
     if problem["type"] == "extra_forbidden":
-        known = DetectionLine.model_fields
+        known = (Pose if key.startswith("pose.") else DetectionLine).model_fields
         return f"{key}: unknown key{nearest(key, known)}; expected one of {', '.join(known)}"
     if problem["type"] == "missing":
         return f"{key}: missing"

@@ -8,6 +8,7 @@
         results.json         the final numbers
         predictions.parquet  per test sample: truth, parameters, estimate, errors
         held_out.parquet     the same of training samples that were held out, for recalibration
+        views.parquet        the same of scenes that several cameras see, with their poses, where that was asked for
         calibration/         the calibration curves, as data (JSON) and as pictures (PNG)
         checkpoints/         last.ckpt
         wandb/               the same for wandb, ready for `wandb sync`
@@ -82,6 +83,7 @@ class RunFolder:
         self.wandb = path / "wandb"
         self.predictions = path / "predictions.parquet"
         self.held_out = path / "held_out.parquet"
+        self.views = path / "views.parquet"
         self.results_file = path / "results.json"
         self.metrics_file = path / "metrics.jsonl"
         self.status_file = path / "status.json"

@@ -5,6 +5,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 from phd_exp.reports.captions import FEWER_SEEDS, ONE_SEED, making_command, notes, title
 from phd_exp.reports.cells import Cell, Gap, Interval, make_cell, seeds_of
@@ -45,6 +46,29 @@ class TableRow:
     cells: tuple[TableCell, ...]
 
 
+class Table(Protocol):
+    """What every format draws; `PaperTable` says what it is. Its files are named by its stem."""
+
+    @property
+    def stem(self) -> str: ...
+    @property
+    def title(self) -> str: ...
+    @property
+    def caption(self) -> str: ...
+    @property
+    def stub(self) -> tuple[str, ...]: ...
+    @property
+    def columns(self) -> tuple[str, ...]: ...
+    @property
+    def groups(self) -> tuple[tuple[TableRow, ...], ...]: ...
+    @property
+    def gaps(self) -> tuple[Gap, ...]: ...
+    @property
+    def command(self) -> str: ...
+    @property
+    def notes(self) -> tuple[str, ...]: ...
+
+
 @dataclass(frozen=True)
 class PaperTable:
     """One of the paper's tables, for one preset in one reading.
@@ -68,6 +92,14 @@ class PaperTable:
     gaps: tuple[Gap, ...]
     command: str
     notes: tuple[str, ...]
+
+    @property
+    def stem(self) -> str:
+        return f"{self.name}-{self.preset}-{self.reading}"
+
+    @property
+    def caption(self) -> str:
+        return f"The paper's {self.title}"
 
     @property
     def rows(self) -> tuple[TableRow, ...]:

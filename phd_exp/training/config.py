@@ -21,16 +21,26 @@ from pydantic import (
 
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.shards import Shard
-from phd_exp.records.spec import DatasetSpec
+from phd_exp.records.spec import Angle, DatasetSpec, Range
 from phd_exp.training.targets import Target, describe, locate
 
 Whole = Annotated[int, Field(strict=True)]
 Name = Annotated[str, Field(strict=True, pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 Folder = Annotated[Path, Field(strict=False)]
-WITHOUT_INFLUENCE = ("runs", "logger", "data.root", "data.workers", "trainer.progress_bar")
-"""Keys, or sections, that say where and how a run is made and recorded, and change no number of it."""
+WITHOUT_INFLUENCE = (
+    "runs",
+    "logger",
+    "data.root",
+    "data.workers",
+    "trainer.progress_bar",
+    "evaluation.multiview",
+)
+"""Keys, or sections, that say where and how a run is made and recorded, or what is measured of it afterwards besides
+its results: they change no number of it."""
 SMALLEST_IMAGE = 32
 """A ResNet halves the side five times."""
+SINGLE_VIEW, MULTIVIEW = "scale", "multiview"
+"""The data set whose runs can be tried on several views, and the one that shows its scenes so."""
 
 
 Checked = TypeVar("Checked", bound=BaseModel)
@@ -144,9 +154,23 @@ class LoggerConfig(Section):
     offline: Annotated[bool, Field(strict=True)]
 
 
+class MultiviewConfig(Section):
+    """What several cameras are to see after the training: nothing, or so many scenes of the variant `multiview`."""
+
+    scenes: Annotated[Whole, Field(ge=0)]
+    views: Annotated[Whole, Field(ge=2, le=64)]
+    angle_range: Annotated[tuple[Angle, Angle], Range]
+
+    def spec_beside(self, spec: DatasetSpec) -> DatasetSpec:
+        """The data set of several views that is otherwise the one of this specification."""
+        changes = {"variant": MULTIVIEW, "views": self.views, "view_angle_range": self.angle_range}
+        return DatasetSpec(**(spec.model_dump() | changes))
+
+
 class EvaluationConfig(Section):
     calibration_window: Annotated[Whole, Field(ge=1)]
     calibration_every_n_epochs: Annotated[Whole, Field(ge=1)]
+    multiview: MultiviewConfig | None = None  # so in records from before there was this
 
 
 class RenderConfig(Section):
@@ -175,14 +199,40 @@ class RunConfig(Section):
     logger: LoggerConfig
     evaluation: EvaluationConfig
 
+    @property
+    def prediction(self) -> type[Any]:
+        """What the model predicts."""
+        kind: type[Any] = locate(self.model.head["_target_"]).prediction
+        return kind
+
     @model_validator(mode="after")
     def loss_fits_head(self) -> "RunConfig":
-        made = locate(self.model.head["_target_"]).prediction
+        made = self.prediction
         taken = locate(self.loss["_target_"]).prediction
         if not issubclass(made, taken):
             raise ValueError(
                 f"loss: takes a {taken.__name__}, but model={self.model.name} predicts a {made.__name__}; "
                 "leave out loss=..., and the model picks its own"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def several_views_fit(self) -> "RunConfig":
+        multiview = self.evaluation.multiview
+        if multiview is None or multiview.scenes == 0:
+            return self
+        from phd_exp.distributions import ProjectedHuber  # torch, which importing this file does without
+
+        expected = "or evaluation.multiview.scenes=0"
+        if not issubclass(self.prediction, ProjectedHuber):
+            raise ValueError(
+                f"evaluation.multiview.scenes: model={self.model.name} predicts points, which cannot be fused by "
+                f"their uncertainty; expected model=probabilistic, {expected}"
+            )
+        if not isinstance(self.data, RenderedConfig) or self.data.name != SINGLE_VIEW:
+            raise ValueError(
+                f"evaluation.multiview.scenes: several cameras see the scenes of data={SINGLE_VIEW}, not of "
+                f"data={self.data.name}; expected data={SINGLE_VIEW}, {expected}"
             )
         return self
 

@@ -1,7 +1,7 @@
 """A prediction spread out into columns: one row a sample, the same for figures, calibration and the record."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pyarrow as pa
@@ -101,11 +101,14 @@ def summary(table: Columns) -> dict[str, float]:
     return {f"test/{name}": float(value) for name, value in (means | scores).items()}
 
 
-def write_parquet(file: Path, table: Columns, known: Known) -> None:
-    """Write the columns beside what is known of each sample, in the order of the data set."""
+def write_parquet(file: Path, table: Columns, known: Known, said: Mapping[str, str] | None = None) -> None:
+    """Write the columns beside what is known of each sample, in the order of the data set.
+
+    What is `said` of the table as a whole goes into the metadata of its schema.
+    """
     order = table["row"].argsort()
     arrays = {name: pa.array(values) for name, values in known.items()}
     arrays |= {name: pa.array(column[order].numpy()) for name, column in table.items() if name != "row"}
     buffer = io.BytesIO()
-    pq.write_table(pa.table(arrays), buffer)
+    pq.write_table(pa.table(arrays, metadata=dict(said or {})), buffer)
     write_atomic(file, buffer.getvalue())

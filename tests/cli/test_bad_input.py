@@ -37,6 +37,18 @@ BAD = [
     (["trainer.max_epochs=0"], ["trainer.max_epochs", "got 0"]),
     (["trainer.threads=0"], ["trainer.threads", "got 0"]),
     (["evaluation.calibration_window=0"], ["evaluation.calibration_window"]),
+    (["evaluation.multiview.scenes=-1"], ["evaluation.multiview.scenes", "got -1"]),
+    (["evaluation.multiview.views=1"], ["evaluation.multiview.views", "got 1"]),
+    (["evaluation.multiview.angle_range=[60,20]"], ["evaluation.multiview.angle_range", "lower bound"]),
+    (["evaluation.multiview.scenes=9", "data=occl"], ["evaluation.multiview.scenes", "expected data=scale"]),
+    (
+        ["evaluation.multiview.scenes=9", "data=folder", "data.folder=photos"],
+        ["not of data=", "expected data=scale"],
+    ),
+    (
+        ["evaluation.multiview.scenes=9", "data=scale", "model=mae_vz"],
+        ["model=mae_vz predicts points", "expected model=probabilistic"],
+    ),
     (["loss=mae"], ["loss", "PointEstimate", "model=probabilistic", "ProjectedHuber"]),
     (["model=mae_vz", "loss=nll"], ["loss", "ProjectedHuber", "model=mae_vz"]),
     (["loss._target_=os.system"], ["loss._target_", "os.system", "phd_exp."]),

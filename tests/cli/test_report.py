@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.reports.recorded import predicted, record
+from tests.reports.several import write_views
 
 
 @pytest.fixture
@@ -28,6 +29,25 @@ def test_tables_are_printed_and_written(phd_exp: Callable, runs: Path, tmp_path:
         "table1-small-central.tex",
         "tables.csv",
     }
+
+
+def test_several_views_are_printed_and_written_where_they_are_recorded(
+    phd_exp: Callable, runs: Path, tmp_path: Path
+) -> None:
+    before = phd_exp("report")
+    assert "Fusion" not in before.out
+    write_views(runs / "small" / "occl" / "probabilistic" / "seed0" / "views.parquet", 20)
+    outcome = phd_exp("report")
+    assert (outcome.status, outcome.err) == (0, "")
+    assert "Fusion, preset small, probabilistic on occl, seed0: 20 scenes seen by 4 cameras" in outcome.out
+    assert "tables of fusion: report/tables\n" in outcome.out
+    assert (tmp_path / "report" / "tables" / "fusion-small-occl-probabilistic-seed0.tex").exists()
+    assert 'id="several-views"' in (tmp_path / "report" / "site" / "index.html").read_text()
+    (runs / "small" / "occl" / "probabilistic" / "seed0" / "views.parquet").write_bytes(b"torn")
+    torn = phd_exp("report")
+    assert torn.status == 0
+    assert "Not fused: runs/small/occl/probabilistic/seed0/views.parquet: cannot be read" in torn.out
+    assert "tables: report/tables\n" in torn.out
 
 
 def test_both_folders_can_be_named(phd_exp: Callable, runs: Path, tmp_path: Path) -> None:

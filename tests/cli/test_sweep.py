@@ -37,6 +37,8 @@ def folder(job: Job) -> Path:
     [
         (["experiment=table1"], 12),
         (["experiment=table2"], 3),
+        (["experiment=fusion"], 1),
+        (["experiment=fusion", "seed=0,1", "evaluation.multiview.scenes=7"], 2),
         (["experiment=glob(table*)"], 14),
         (["experiment=table2", "seed=0,1,2", "preset=small"], 9),
         (["experiment=table1", "data=occl"], 3),

@@ -103,3 +103,17 @@ def test_variants_differ_in_what_they_name_alone(checked: Callable) -> None:
         differing = {key for key in DatasetSpec.model_fields if getattr(plain, key) != getattr(other, key)}
         assert differing == keys | {"variant"}
         assert other.variant == variant
+
+
+def test_several_views_are_those_of_the_data_set_of_several_views(checked: Callable) -> None:
+    config = checked("data=scale", "evaluation.multiview.scenes=9", "data.sensor_size=256", "data.seed=3")
+    beside = config.evaluation.multiview.spec_beside(config.data.spec)
+    assert beside == checked("data=multiview", "data.sensor_size=256", "data.seed=3").data.spec
+
+
+def test_a_record_from_before_there_were_several_views_is_one(
+    composed: Callable[..., dict[str, Any]],
+) -> None:
+    config = composed("data=scale")
+    del config["evaluation"]["multiview"]
+    assert check(config).evaluation.multiview is None

@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from phd_exp.__main__ import main
+from phd_exp.records.runs import RunFolder, find_runs
+
 QUICK = (
     "preset=smoke",
     "data.sensor_size=64",
@@ -17,6 +20,25 @@ QUICK = (
     "trainer.progress_bar=false",
     "trainer.threads=1",  # of the two cores, pytest-xdist keeps the other busy
 )
+
+
+SIDE = 48
+QUICKER = ("trainer.max_epochs=1", "logger=none", "trainer.precision=float32", f"data.image_size={SIDE}")
+
+
+def trained(runs: Path, *arguments: str) -> RunFolder:
+    """The one run that a command leaves in a folder of its own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["phd_exp"])
+        assert main([*arguments, *QUICKER, f"runs={runs}"]) == 0
+    (run,) = find_runs(runs)
+    return run
+
+
+@pytest.fixture(scope="session")
+def run(renders: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """On a rendered data set, whose images shrink by no whole number; nobody changes it."""
+    return trained(tmp_path_factory.mktemp("rendered"), *QUICK, f"data.root={renders}")
 
 
 @pytest.fixture(scope="session")

@@ -21,26 +21,10 @@ from phd_exp.__main__ import main
 from phd_exp.distributions import PointEstimate, ProjectedHuber
 from phd_exp.geometry import VirtualCamera, intrinsics
 from phd_exp.records.dataset import DatasetError
-from phd_exp.records.runs import RunFolder, find_runs
-from tests.e2e.conftest import QUICK
+from phd_exp.records.runs import RunFolder
+from tests.e2e.conftest import SIDE, trained
 
-SIDE = 48
-QUICKER = ("trainer.max_epochs=1", "logger=none", "trainer.precision=float32", f"data.image_size={SIDE}")
 README = Path(__file__).parents[2] / "README.md"
-
-
-def trained(runs: Path, *arguments: str) -> RunFolder:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", ["phd_exp"])
-        assert main([*arguments, *QUICKER, f"runs={runs}"]) == 0
-    (run,) = find_runs(runs)
-    return run
-
-
-@pytest.fixture(scope="module")
-def run(renders: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """On a rendered data set, whose images shrink by no whole number."""
-    return trained(tmp_path_factory.mktemp("rendered"), *QUICK, f"data.root={renders}")
 
 
 @pytest.fixture(scope="module")

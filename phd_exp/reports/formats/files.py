@@ -1,14 +1,19 @@
 """Tables on disk, each written whole."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from phd_exp.records.errors import UserError
 from phd_exp.records.files import write_atomic
 from phd_exp.reports.formats.latex import latex
 from phd_exp.reports.formats.markdown import markdown
 from phd_exp.reports.formats.tidy import tidy
-from phd_exp.reports.tables import PaperTable
+from phd_exp.reports.tables import PaperTable, Table
+
+if TYPE_CHECKING:  # torch, which tables on single views need not wait for
+    from phd_exp.reports.fusion_table import FusionTable
 
 
 def write_tables(tables: Sequence[PaperTable], out: Path) -> Path:
@@ -16,16 +21,38 @@ def write_tables(tables: Sequence[PaperTable], out: Path) -> Path:
 
     Raises UserError where the folder cannot be written.
     """
+    with _folder(out) as folder:
+        _write_each(tables, folder)
+        write_atomic(folder / "tables.csv", tidy(tables))
+    return folder
+
+
+def write_fusion_tables(tables: "Sequence[FusionTable]", out: Path) -> Path:
+    """Write <out>/tables/fusion-<run>.{md,tex} and fusion.csv; returns that folder.
+
+    Raises UserError where the folder cannot be written.
+    """
+    from phd_exp.reports.formats.tidy_fusion import tidy_fusion
+
+    with _folder(out) as folder:
+        _write_each(tables, folder)
+        write_atomic(folder / "fusion.csv", tidy_fusion(tables))
+    return folder
+
+
+def _write_each(tables: Sequence[Table], folder: Path) -> None:
+    for table in tables:
+        write_atomic(folder / f"{table.stem}.md", markdown(table))
+        write_atomic(folder / f"{table.stem}.tex", latex(table))
+
+
+@contextmanager
+def _folder(out: Path) -> Iterator[Path]:
     folder = out / "tables"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for table in tables:
-            name = f"{table.name}-{table.preset}-{table.reading}"
-            write_atomic(folder / f"{name}.md", markdown(table))
-            write_atomic(folder / f"{name}.tex", latex(table))
-        write_atomic(folder / "tables.csv", tidy(tables))
+        yield folder
     except OSError as error:
         raise UserError(
             f"{folder}: cannot be written ({error.strerror}); choose another folder by out=DIR"
         ) from None
-    return folder

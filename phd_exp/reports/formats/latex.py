@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 
 from phd_exp.reports.captions import gap_lines
-from phd_exp.reports.tables import PaperTable, TableCell, TableRow
+from phd_exp.reports.tables import Table, TableCell, TableRow
 
 SYMBOLS = {
     "\\": r"\textbackslash{}",
@@ -18,6 +18,7 @@ SYMBOLS = {
     "-": r"-{}",  # two in a row would join to a dash
     **{letter: f"\\{letter}" for letter in "&%$#_{}"},
     "±": r"$\pm$",
+    "°": r"$^\circ$",
     "×": r"$\times$",
     "≥": r"$\geq$",
     "≤": r"$\leq$",
@@ -27,7 +28,7 @@ SYMBOLS = {
 }
 
 
-def latex(table: PaperTable) -> str:
+def latex(table: Table) -> str:
     """The environment, to be read by \\input: caption, tabular, what it lacks, how to read it."""
     stub, columns = len(table.stub), len(table.columns)
     headings = " & ".join(escaped(text) for text in (*table.stub, *table.columns))
@@ -37,7 +38,7 @@ def latex(table: PaperTable) -> str:
             f"% {escaped(table.title)}; needs \\usepackage{{booktabs}}",
             r"\begin{table}",
             r"\centering",
-            f"\\caption{{The paper's {escaped(table.title)}}}",
+            f"\\caption{{{escaped(table.caption)}}}",
             f"\\label{{tab:{_label(table)}}}",
             r"\footnotesize\setlength{\tabcolsep}{2.5pt}",
             f"\\begin{{tabular}}{{@{{}}{'l' * stub}{'r' * columns}@{{}}}}",
@@ -89,7 +90,7 @@ def _ours(cell: TableCell) -> str:
     return f"{ours} {escaped(cell.spread)}".rstrip()
 
 
-def _below(table: PaperTable) -> list[str]:
+def _below(table: Table) -> list[str]:
     lines = [escaped(note) for note in table.notes]
     if table.gaps:
         lines += ["Not there:", *(escaped(line) for line in gap_lines(table.gaps))]
@@ -109,5 +110,5 @@ def _code(text: str) -> str:
     return f"\\texttt{{{straight}}}"
 
 
-def _label(table: PaperTable) -> str:
-    return re.sub(r"[^A-Za-z0-9-]", "-", f"{table.name}-{table.preset}-{table.reading}")
+def _label(table: Table) -> str:
+    return re.sub(r"[^A-Za-z0-9-]", "-", table.stem)

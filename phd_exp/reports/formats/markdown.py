@@ -4,13 +4,13 @@ import re
 from collections.abc import Sequence
 
 from phd_exp.reports.captions import gap_lines
-from phd_exp.reports.tables import PaperTable, TableCell, TableRow
+from phd_exp.reports.tables import Table, TableCell, TableRow
 
 SPECIAL = re.compile(r"([\\`*_\[\]<>#|~&@$])")
 """What GitHub may read as markup, a mention, an issue or mathematics."""
 
 
-def markdown(table: PaperTable) -> str:
+def markdown(table: Table) -> str:
     """A heading, the table, what it lacks with the command that makes it, and how to read it."""
     headings = [*table.stub, *table.columns]
     aligned = ["---"] * len(table.stub) + ["---:"] * len(table.columns)

@@ -6,13 +6,13 @@ from itertools import groupby
 from rich import box
 from rich.console import Console
 from rich.padding import Padding
-from rich.table import Table
+from rich.table import Table as Grid
 from rich.text import Text
 
 from phd_exp.reports.captions import gap_lines, making_command, one_line
 from phd_exp.reports.collect import Records, Run
 from phd_exp.reports.point_errors import ErrorKey, Quantity
-from phd_exp.reports.tables import DIGITS, NOTHING, PaperTable, TableCell
+from phd_exp.reports.tables import DIGITS, NOTHING, PaperTable, Table, TableCell
 
 WIDTH = 118
 """Columns, also where the output is no terminal and rich would fall back to 80."""
@@ -21,7 +21,7 @@ OF_A_STAR = "*: bold."
 
 def print_report(records: Records, tables: Sequence[PaperTable]) -> None:
     """Print both tables of every preset in both readings, then every run with its state."""
-    console = Console(width=max(WIDTH, Console().width), highlight=False)
+    console = _console()
     for _, readings in groupby(tables, key=lambda table: (table.preset, table.name)):
         _print_readings(console, list(readings))
     for note in dict.fromkeys(note for table in tables for note in table.notes):
@@ -34,11 +34,30 @@ def print_report(records: Records, tables: Sequence[PaperTable]) -> None:
         _say_command(console, f"{what}; begin by", making_command(records, "paper", "table1"))
 
 
+def print_fusion(tables: Sequence[Table], complaints: Sequence[str]) -> None:
+    """Print the tables of several views, and what cannot be used of them."""
+    console = _console()
+    for table in tables:
+        _say(console, table.title, style="bold")
+        console.print(_drawn(table, starred=not console.is_terminal))
+        console.print()
+    for note in dict.fromkeys(note for table in tables for note in table.notes):
+        _say(console, note)
+    for complaint in complaints:
+        _say(console, f"Not fused: {complaint}")
+    if tables:
+        _say(console, "" if console.is_terminal else OF_A_STAR)
+
+
+def _console() -> Console:
+    return Console(width=max(WIDTH, Console().width), highlight=False)
+
+
 def _print_readings(console: Console, readings: Sequence[PaperTable]) -> None:
     """The readings of one table below each other, then what they lack, once."""
     for table in readings:
         _say(console, table.title, style="bold")
-        console.print(_paper_table(table, starred=not console.is_terminal))
+        console.print(_drawn(table, starred=not console.is_terminal))
         console.print()
     if gaps := dict.fromkeys(gap for table in readings for gap in table.gaps):
         _say(console, "Not there:")
@@ -68,9 +87,9 @@ def _say_command(console: Console, before: str, command: str) -> None:
     console.print(Text(f"{before}: {command}"), soft_wrap=True)  # what is copied must not be broken
 
 
-def _paper_table(table: PaperTable, *, starred: bool) -> Table:
+def _drawn(table: Table, *, starred: bool) -> Grid:
     """As rich draws it; the best are bold, and starred where the output shows no bold."""
-    drawn = Table(box=box.SIMPLE_HEAD, show_edge=False)
+    drawn = Grid(box=box.SIMPLE_HEAD, show_edge=False)
     for heading in table.stub:
         drawn.add_column(heading, no_wrap=True)
     for heading in table.columns:
@@ -92,8 +111,8 @@ def _cell(cell: TableCell, starred: bool) -> Text:
     return text
 
 
-def _run_list(runs: Sequence[Run]) -> Table:
-    drawn = Table(box=box.SIMPLE_HEAD, show_edge=False)
+def _run_list(runs: Sequence[Run]) -> Grid:
+    drawn = Grid(box=box.SIMPLE_HEAD, show_edge=False)
     drawn.add_column("run", overflow="fold")
     for heading in ("projected", "depth", "NLL"):
         drawn.add_column(heading, justify="right", no_wrap=True)

@@ -13,6 +13,8 @@ import pyarrow.parquet as pq
 from phd_exp.records.errors import RunError, UserError
 from phd_exp.records.runs import RunFolder, RunStatus, flatten
 from phd_exp.reports.collect import Run
+from phd_exp.reports.fusion import FusionScores, fusion_scores
+from phd_exp.reports.several_views import read_views
 from phd_exp.reports.site.assessment import Assessment, assess
 
 Found = TypeVar("Found")
@@ -30,6 +32,7 @@ class Dossier:
         epochs: epochs trained before each row; 0 is the untrained network.
         config: every value of config.yaml as text, by its dotted path.
         predictions: the table of predictions.parquet.
+        fusion: what several cameras see together, of a run that was tried on that.
     """
 
     run: Run
@@ -39,6 +42,7 @@ class Dossier:
     metrics: Mapping[str, list[float | None]]
     predictions: pa.Table | None
     assessment: Assessment | None
+    fusion: FusionScores | None = None
     notes: list[str] = field(default_factory=list)
 
 
@@ -53,6 +57,9 @@ def read_dossier(run: Run) -> Dossier:
     assessment = None if predictions is None else _attempt(lambda: assess(folder, predictions), notes)
     if assessment and assessment.before.left_out:
         notes.append(f"{assessment.before.left_out} test samples are left out: a prediction was not finite")
+    fusion = None
+    if folder.views.exists():
+        fusion = _attempt(lambda: fusion_scores(read_views(folder.views)), notes)
     return Dossier(
         run=run,
         status=_attempt(folder.status, notes),
@@ -61,6 +68,7 @@ def read_dossier(run: Run) -> Dossier:
         metrics=_series(rows),
         predictions=predictions,
         assessment=assessment,
+        fusion=fusion,
         notes=list(dict.fromkeys(notes)),
     )
 

@@ -11,6 +11,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from phd_exp.reports.captions import gap_lines
 from phd_exp.reports.evaluation import Band
+from phd_exp.reports.fusion_table import fusion_table
 from phd_exp.reports.paper import PUBLISHED
 from phd_exp.reports.site.charts import Chart
 from phd_exp.reports.site.dossier import Dossier
@@ -72,6 +73,7 @@ def overview_page(
     return _ENVIRONMENT.get_template("overview.html").render(
         root="",
         runs=runs,
+        fused=[run for run in runs if run.fusion],
         tables=[[table for table in tables if table.preset == preset] for preset in presets],
         groups=groups,
         figures=figures,
@@ -91,6 +93,7 @@ def run_page(run: RunData, dossier: Dossier, gallery: Gallery | None) -> str:
         "scores": _score_rows(run),
         "strata": _strata(dossier),
         "charts": {group: _chosen(run, prefix) for group, prefix in _GROUPS.items()},
+        "fusion": fusion_table(dossier.run, dossier.fusion) if dossier.fusion else None,
         "temperature": dossier.assessment.temperature if dossier.assessment else None,
     }
     return _ENVIRONMENT.get_template("run.html").render(**context)
@@ -101,7 +104,7 @@ def comparison_page(runs: Sequence[RunData]) -> str:
     return _ENVIRONMENT.get_template("compare.html").render(root="", runs=runs, quantities=quantities)
 
 
-_GROUPS = {"learning": "learning_", "strata": "strata_", "calibration": ""}
+_GROUPS = {"learning": "learning_", "strata": "strata_", "fusion": "fusion_", "calibration": ""}
 
 
 def _chosen(run: RunData, prefix: str) -> dict[str, Chart]:

@@ -13,8 +13,10 @@ from pydantic import TypeAdapter, ValidationError
 from phd_exp.records.errors import RunError
 from phd_exp.reports.collect import Run
 from phd_exp.reports.evaluation import Band
+from phd_exp.reports.fusion_table import headline
 from phd_exp.reports.site.charts import Chart
 from phd_exp.reports.site.dossier import Dossier, read_config, slug_of
+from phd_exp.reports.site.fusion_charts import fusion_charts
 from phd_exp.reports.site.gallery import images_folder
 from phd_exp.reports.site.quantities import SCORES
 from phd_exp.reports.site.run_charts import calibration_charts, learning_charts, strata_charts
@@ -29,6 +31,7 @@ class RunData:
         n: test samples; None without predictions.
         scores, recalibrated: means over the test split with their intervals; the second empty for most.
         config: every value of config.yaml, by its path.
+        fusion: in one line, what fusion gives; empty where several views were not recorded.
     """
 
     key: str
@@ -44,6 +47,7 @@ class RunData:
     recalibrated: dict[str, Band]
     config: dict[str, str]
     charts: dict[str, Chart]
+    fusion: str = ""
 
 
 _ADAPTER: TypeAdapter[RunData] = TypeAdapter(RunData)
@@ -56,6 +60,7 @@ def gather(dossier: Dossier, key: str) -> RunData:
     charts = calibration_charts(before, after) if before else {}
     charts |= learning_charts(dossier)
     charts |= strata_charts(before) if before else {}
+    charts |= fusion_charts(dossier.fusion) if dossier.fusion else {}
     run = dossier.run
     return RunData(
         key=key,
@@ -71,6 +76,7 @@ def gather(dossier: Dossier, key: str) -> RunData:
         recalibrated=_in_order(after.scores) if after else {},
         config=dict(dossier.config),
         charts=charts,
+        fusion=headline(dossier.fusion) if dossier.fusion else "",
     )
 
 

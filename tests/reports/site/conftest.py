@@ -12,6 +12,7 @@ from PIL import Image
 
 from phd_exp.records.runs import RunFolder, RunName
 from phd_exp.reports.site.build import build_site
+from tests.reports.several import write_views
 from tests.reports.site.synthetic import write_run
 
 HOSTILE = "<img src=x onerror=window.owned=1>"
@@ -30,6 +31,7 @@ def write_runs(folder: Path) -> Path:
     certain = write_run(runs, "occl", n=100, overconfidence=2.0)
     held_out = write_run(folder / "elsewhere", "occl", seed=1, n=100, overconfidence=2.0)
     held_out.predictions.rename(certain.path / "held_out.parquet")
+    write_views(certain.views, 50)
     write_run(runs, "default", "mae_logz", n=100, root=folder / "renders")
     write_run(runs, "default", "mae_vz", preset="demo", overrides=("optimizer.lr=0.1",), n=100)
     _fail(_folder(runs, "occl", "mae_vz"))

@@ -1,0 +1,147 @@
+"""Scenes as JSON objects: one position of an object that several cameras saw, or one camera above a known plane."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from phd_exp.distributions import ProjectedHuber
+from phd_exp.fusion import Fused, Plane, Pose, Status, fuse
+from phd_exp.inference.answers import rounded, uncertainty
+from phd_exp.inference.predictor import Predictor
+from phd_exp.inference.sightings import Sighting
+from phd_exp.metrics.errors import MILLIMETRES, squared_mahalanobis
+from phd_exp.records.dataset import DatasetError
+from phd_exp.records.observed import Observed
+
+AGREE = 0.01
+"""How far apart a scene's true positions may be that its lines give, over their distance from the camera."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What a network says of views, one after the other, and the poses of their virtual cameras in the world."""
+
+    raw: Float[Tensor, "views 7"]
+    f: Float[Tensor, " views"]
+    pose: Pose
+
+    @classmethod
+    def of(cls, scenes: Sequence[Observed], sightings: Iterable[Sighting]) -> "Seen":
+        """Of the sightings of the scenes' detections, in their order; no image is kept.
+
+        A virtual camera is the real one turned: v_virtual = R_v v_camera, so that its pose is (R_v R, R_v t).
+        """
+        told = [(sighting.raw, sighting.view.camera) for sighting in sightings]
+        R = torch.stack([torch.from_numpy(camera.R) for _, camera in told])
+        real = Pose.from_scene([pose for scene in scenes for pose in scene.poses])
+        return cls(
+            torch.stack([raw for raw, _ in told]),
+            torch.tensor([camera.f for _, camera in told], dtype=torch.float64),
+            Pose(R @ real.R, (R @ real.t[..., None]).squeeze(-1)),
+        )
+
+
+def fused_answers(
+    scenes: Sequence[Observed], sightings: Iterable[Sighting], predictor: Predictor, plane: Plane | None
+) -> list[dict[str, Any]]:
+    """What the cameras of each scene say together; of a scene whose true position is known, the errors too.
+
+    Lengths are in metres, in the world of the poses. A scene that fails has null for numbers and its `reason`.
+
+    Args:
+        scenes: of which to answer.
+        sightings: of their detections, one scene after the other.
+        predictor: of a distribution, which made the sightings.
+        plane: on which every position lies, if any.
+
+    Raises DatasetError, before the first sighting is asked for, where lines of a scene give different true positions.
+    """
+    truth = true_positions(scenes)
+    seen = Seen.of(scenes, sightings)
+    rows, mask = layout([len(scene.detections) for scene in scenes])
+    predictions = predictor.predict(seen.raw[rows], seen.f[rows])
+    assert isinstance(predictions, ProjectedHuber)
+    fused = fuse(predictions, Pose(seen.pose.R[rows], seen.pose.t[rows]), plane, mask)
+    errors = _errors(fused, truth, plane)
+    told = {"uncertainty": uncertainty(predictor.temperature)}
+    return [
+        _answer(scene, fused, place) | told | _errors_of(errors, place) for place, scene in enumerate(scenes)
+    ]
+
+
+def layout(
+    counts: Sequence[int],
+) -> tuple[Int[Tensor, "scenes cameras"], Bool[Tensor, "scenes cameras"]]:
+    """Which view is which camera of which scene, and which cameras there are, where the views are in one row."""
+    n = torch.tensor(counts)
+    place = torch.arange(int(n.max()))
+    mask = place < n[:, None]
+    first = n.cumsum(0) - n
+    return torch.where(mask, first[:, None] + place, 0), mask
+
+
+def true_positions(scenes: Sequence[Observed]) -> Float[Tensor, "scenes 3"]:
+    """The true position of each scene's object in the world, metres; NaN where no line gives it.
+
+    Raises DatasetError where two lines disagree by more than 1 % of its distance: poses or scenes are wrong then.
+    """
+    return torch.stack([_true_position(scene) for scene in scenes])
+
+
+def _true_position(scene: Observed) -> Float[Tensor, "3"]:
+    known = [(d, pose) for d, pose in zip(scene.detections, scene.poses, strict=True) if d.line.z is not None]
+    if not known:
+        return torch.full((3,), torch.nan, dtype=torch.float64)
+    xyz = torch.tensor([detection.position for detection, _ in known], dtype=torch.float64)
+    world = Pose.from_scene([pose for _, pose in known]).into_world(xyz)
+    apart = (world - world[0]).norm(dim=-1)
+    if bool((apart > AGREE * xyz.norm(dim=-1)).any()):
+        worst = int(apart.argmax())
+        raise DatasetError(
+            f"{known[worst][0].where}: its x, y, z and pose place the object of scene {scene.scene!r} "
+            f"{float(apart[worst]):.3g} m away from where {known[0][0].where} places it; check pose (world to "
+            "camera, R v + t), scene and x, y, z"
+        )
+    return world.mean(0)
+
+
+def _answer(scene: Observed, fused: Fused, place: int) -> dict[str, Any]:
+    status = Status(int(fused.status[place]))
+    named = {
+        "scene": scene.scene,
+        "file_names": [detection.line.file_name for detection in scene.detections],
+        "status": status.name.lower(),
+    }
+    if status != Status.FUSED:
+        named["reason"] = status.reason
+    views = len(scene.detections)
+    numbers = {
+        "point": fused.point[place],
+        "mean": fused.mean[place],
+        "covariance": fused.covariance[place],
+        "certificate": fused.certificate[place],
+        "surprise": fused.surprise[place, :views],
+    }
+    return named | {name: rounded(value.numpy()) for name, value in numbers.items()}
+
+
+def _errors(fused: Fused, truth: Float[Tensor, "scenes 3"], plane: Plane | None) -> dict[str, Tensor]:
+    """Distance of the point from the truth, and that of the mean in units of the covariance, along a plane if any."""
+    off, covariance = truth - fused.mean, fused.covariance
+    if plane is not None:
+        along = plane.directions
+        off, covariance = (along.mT @ off[..., None]).squeeze(-1), along.mT @ covariance @ along
+    point = MILLIMETRES * (fused.point - truth).norm(dim=-1)
+    known = truth.isfinite().all(-1)
+    return {"error_mm": point, "squared_mahalanobis": squared_mahalanobis(off, covariance), "known": known}
+
+
+def _errors_of(errors: dict[str, Tensor], place: int) -> dict[str, Any]:
+    """Those of one scene; none where its true position is unknown."""
+    if not bool(errors["known"][place]):
+        return {}
+    return {name: rounded(errors[name][place].numpy()) for name in ("error_mm", "squared_mahalanobis")}

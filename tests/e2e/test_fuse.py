@@ -1,0 +1,246 @@
+"""Scenes of several cameras become one position each; what cannot be fused, and what a user gets wrong."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+import phd_exp as package
+from phd_exp.__main__ import main
+from phd_exp.geometry import intrinsics
+from phd_exp.records.runs import RunFolder, find_runs
+from tests.e2e.conftest import QUICK, QUICKER
+
+VIEWS, SCENES = 3, 4
+
+
+@pytest.fixture(scope="module")
+def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The test split of a rendered data set of several views."""
+    root = tmp_path_factory.mktemp("several")
+    sizes = ("data.n_train=2", "data.n_held_out=0", f"data.n_test={VIEWS * SCENES}", "data.batch_size=2")
+    views = ("data=multiview", f"data.views={VIEWS}", "data.workers=1")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["phd_exp"])
+        assert main(["render", *QUICK, *sizes, *views, f"data.root={root}"]) == 0
+    return root / "multiview" / "test"
+
+
+def answers(out: str) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in out.splitlines()]
+
+
+def metadata(folder: Path) -> list[dict[str, Any]]:
+    return answers((folder / "metadata.jsonl").read_text())
+
+
+def matrix(line: dict[str, Any]) -> np.ndarray:
+    w, x, y, z = line["pose"]["rotation"]
+    return Rotation.from_quat([x, y, z, w]).as_matrix()
+
+
+def require_most_likely(
+    run: RunFolder, folder: Path, views: list[dict[str, Any]], point: list[float]
+) -> None:
+    """All positions around are less likely, by the densities of the views, each of them asked for by itself."""
+    predictor = package.load(run.path)
+    around = 0.02 * np.random.default_rng(0).standard_normal((1000, 3))
+    tried = np.concatenate([np.zeros((1, 3)), around]) + point
+    energy = torch.zeros(len(tried), dtype=torch.float64)
+    for line in views:
+        image = np.asarray(Image.open(folder / line["file_name"]).convert("RGB"))
+        height, width = image.shape[:2]
+        f = line.get("f", line.get("fx"))
+        K = intrinsics(f, line.get("fy", f), line.get("cx", width / 2), line.get("cy", height / 2))
+        view = predictor.view(image, K, line.get("box"))
+        seen = view.camera.to_virtual(tried @ matrix(line).T + line["pose"]["translation"])
+        energy -= predictor.see([view]).log_prob(torch.from_numpy(seen)).double()
+    assert bool((energy[0] < energy[1:]).all())
+
+
+def test_the_test_split_of_a_rendered_set_is_fused_as_it_is(
+    phd_exp: Callable, run: RunFolder, several: Path
+) -> None:
+    outcome = phd_exp("fuse", f"run={run.path}", f"folder={several}")
+    assert (outcome.status, outcome.err) == (0, "")
+    rows, lines = answers(outcome.out), metadata(several)
+    assert [row["scene"] for row in rows] == list(range(SCENES))
+    for row in rows:
+        views = [line for line in lines if line["scene"] == row["scene"]]
+        assert row["file_names"] == [line["file_name"] for line in views]
+        assert row["status"] == "fused"
+        assert row["certificate"] < 1e-6
+        assert len(row["surprise"]) == VIEWS
+        assert 0 <= min(row["surprise"]) <= max(row["surprise"]) <= 1
+        truth = np.array([views[0][axis] for axis in "xyz"])  # the world is the frame of view 0
+        assert row["error_mm"] == pytest.approx(1000 * np.linalg.norm(truth - row["point"]), rel=1e-5)
+        off = truth - row["mean"]
+        distance = off @ np.linalg.inv(row["covariance"]) @ off
+        assert row["squared_mahalanobis"] == pytest.approx(distance, rel=1e-5)
+    views = lines[VIEWS : 2 * VIEWS]
+    require_most_likely(run, several, views, rows[1]["point"])
+
+
+def test_on_a_plane_positions_and_their_uncertainty_lie_in_it(
+    phd_exp: Callable, run: RunFolder, several: Path
+) -> None:
+    outcome = phd_exp("fuse", f"run={run.path}", f"folder={several}", "plane=[0,0.6,0.8,3.2]")
+    assert (outcome.status, outcome.err) == (0, "")
+    normal = np.array([0, 0.6, 0.8])
+    for row in answers(outcome.out):
+        assert normal @ row["point"] == pytest.approx(3.2)
+        assert normal @ row["mean"] == pytest.approx(3.2)
+        values, directions = np.linalg.eigh(row["covariance"])
+        assert values[0] == pytest.approx(0, abs=1e-7 * values[2])
+        assert abs(directions[:, 0] @ normal) == pytest.approx(1)
+        assert row["squared_mahalanobis"] > 0
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    """Crops of noise by cameras that stand close together; one scene of two of them, one of three, one of one."""
+    folder, draw = tmp_path / "photos", np.random.default_rng(0)
+    folder.mkdir()
+    lines = []
+    for index, scene in enumerate(["two", "three", "one", "three", "two", "three"]):
+        noise = draw.integers(0, 256, (90, 120, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(folder / f"{index}.png")
+        x, y, z, w = Rotation.from_rotvec(0.05 * draw.standard_normal(3)).as_quat()
+        pose = {"rotation": [w, x, y, z], "translation": (0.05 * draw.standard_normal(3)).tolist()}
+        camera = {"fx": 300.0, "fy": 310.0, "cx": 50.0, "cy": 40.0, "box": [15, 10, 90, 70 + index]}
+        lines.append({"file_name": f"{index}.png", "scene": scene, "pose": pose} | camera)
+    write(folder, lines)
+    return folder
+
+
+def write(folder: Path, lines: list[dict[str, Any]]) -> None:
+    (folder / "metadata.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+def test_crops_of_any_cameras_are_fused_in_the_world_of_their_poses(
+    phd_exp: Callable, run: RunFolder, photos: Path, tmp_path: Path
+) -> None:
+    outcome = phd_exp("fuse", f"run={run.path}", f"folder={photos}", "out=there/fused.jsonl")
+    assert (outcome.status, outcome.out) == (0, ""), outcome.err
+    rows, lines = answers((tmp_path / "there" / "fused.jsonl").read_text()), metadata(photos)
+    assert [(row["scene"], len(row["surprise"])) for row in rows] == [("two", 2), ("three", 3), ("one", 1)]
+    assert all("error_mm" not in row for row in rows)
+    for row in rows:
+        views = [line for line in lines if line["scene"] == row["scene"]]
+        require_most_likely(run, photos, views, row["point"])
+    # alone, a view's most likely position is its mode
+    alone = answers(phd_exp("predict", f"run={run.path}", f"folder={photos}").out)[2]
+    pose = lines[2]["pose"]
+    world = matrix(lines[2]).T @ (np.array(alone["mode"]) - pose["translation"])
+    np.testing.assert_allclose(rows[2]["point"], world, rtol=1e-5, atol=1e-5)
+    # a scene does not depend on what else is in the file
+    write(photos, [line for line in lines if line["scene"] == "three"])
+    (three,) = answers(phd_exp("fuse", f"run={run.path}", f"folder={photos}").out)
+    np.testing.assert_allclose(three["point"], rows[1]["point"], rtol=1e-5)
+    np.testing.assert_allclose(three["covariance"], rows[1]["covariance"], rtol=1e-4)
+
+
+def test_a_scene_that_fails_says_why_and_harms_no_other(
+    phd_exp: Callable, run: RunFolder, photos: Path
+) -> None:
+    before = answers(phd_exp("fuse", f"run={run.path}", f"folder={photos}").out)
+    lines = metadata(photos)
+    back_to_back = {"rotation": [0.0, 0.0, 1.0, 0.0], "translation": [0.0, 0.0, 0.0]}
+    lines[4]["pose"] = back_to_back
+    lines[0]["pose"] = {"rotation": [1.0, 0.0, 0.0, 0.0], "translation": [0.0, 0.0, 0.0]}
+    write(photos, lines)
+    outcome = phd_exp("fuse", f"run={run.path}", f"folder={photos}")
+    assert outcome.status == 1
+    assert outcome.err.splitlines() == [
+        "error: 1 of 3 scenes have no fused position: two; the line of each says why"
+    ]
+    failed, *others = answers(outcome.out)
+    assert (failed["status"], failed["point"]) == ("contradiction", [None] * 3)
+    assert failed["reason"].startswith("at least half of the views rule out")
+    for row, same in zip(others, before[1:], strict=True):
+        np.testing.assert_allclose(row["point"], same["point"], rtol=1e-6)
+
+
+def test_recalibration_reaches_the_fused_covariance(phd_exp: Callable, run: RunFolder, several: Path) -> None:
+    words = ("fuse", f"run={run.path}", f"folder={several}")
+    before, after = answers(phd_exp(*words).out), answers(phd_exp(*words, "recalibrate=true").out)
+    assert after[0]["uncertainty"].startswith("recalibrated: A / ")
+    assert after[0]["covariance"] != before[0]["covariance"]
+
+
+def test_a_baseline_is_refused(phd_exp: Callable, run: RunFolder, several: Path, tmp_path: Path) -> None:
+    outcome = phd_exp(
+        *QUICK, *QUICKER, "model=mae_vz", f"data.root={run.config()['data']['root']}", "runs=points"
+    )
+    assert outcome.status == 0, outcome.err
+    (points,) = find_runs(tmp_path / "points")
+    refused = phd_exp("fuse", f"run={points.path}", f"folder={several}")
+    assert (refused.status, refused.out) == (1, "")
+    (line,) = refused.err.splitlines()
+    assert "predicts positions without uncertainty" in line
+
+
+POSE = {"rotation": [1, 0, 0, 0], "translation": [0, 0, 0]}
+LINES = [
+    ({}, "line 1: scene is missing"),
+    ({"scene": 1}, "line 1: pose is missing; expected the rotation [w, x, y, z]"),
+    ({"scene": True, "pose": POSE}, "line 1: scene: got True; expected a whole number or a name"),
+    (
+        {"scene": 1, "pose": POSE | {"rotation": [1, 1, 0, 0]}},
+        "pose.rotation: got [1, 1, 0, 0]; a rotation is",
+    ),
+    ({"scene": 1, "pose": {"rotation": [1, 0, 0, 0]}}, "line 1: pose.translation: missing"),
+    ({"scene": 1, "pose": POSE | {"R": 1}}, "pose.R: unknown key; expected one of rotation, translation"),
+]
+
+
+@pytest.mark.parametrize(("line", "said"), LINES, ids=[said for _, said in LINES])
+def test_a_mistake_in_a_line_is_one_line(
+    phd_exp: Callable, tmp_path: Path, line: dict[str, Any], said: str
+) -> None:
+    write(tmp_path, [{"file_name": "a.png", "f": 400} | line])
+    outcome = phd_exp("fuse", "run=nowhere", "folder=.")
+    assert (outcome.status, outcome.out) == (1, "")
+    (complaint,) = outcome.err.splitlines()
+    assert complaint.startswith("error: ")
+    assert said in complaint
+
+
+ARGUMENTS = [
+    (("run=nowhere",), "folder: missing; fuse takes run=, folder=, plane=, out=, recalibrate="),
+    (("run=nowhere", "folder=."), "nowhere: no run; expected a folder with config.yaml"),
+    (("run=nowhere", "folder=.", "plane=1,2,3"), "plane: got '1,2,3'; expected plane=NX,NY,NZ,OFFSET"),
+    (("run=nowhere", "folder=.", "plane=0,0,0,1"), "a normal that is not zero"),
+    (("run=nowhere", "folder=.", "plane=0,nan,0,1"), "expected finite numbers"),
+    (("run=nowhere", "folder=.", "out=."), "out=.: is a folder"),
+    (("run=nowhere", "folder=.", "out=metadata.jsonl"), "is one of the files that are read"),
+    (("run=nowhere", "folder=.", "out=a.png"), "is one of the files that are read"),
+]
+
+
+@pytest.mark.parametrize(("words", "said"), ARGUMENTS, ids=[" ".join(words) for words, _ in ARGUMENTS])
+def test_a_mistake_in_the_arguments_is_one_line(
+    phd_exp: Callable, tmp_path: Path, words: tuple[str, ...], said: str
+) -> None:
+    write(tmp_path, [{"file_name": "a.png", "f": 400, "scene": 1, "pose": POSE}])
+    outcome = phd_exp("fuse", *words)
+    assert (outcome.status, outcome.out) == (1, "")
+    (complaint,) = outcome.err.splitlines()
+    assert said in complaint
+
+
+def test_truths_that_contradict_the_poses_are_found_before_anything_is_predicted(
+    phd_exp: Callable, run: RunFolder, several: Path, tmp_path: Path
+) -> None:
+    lines = metadata(several)
+    lines[1]["pose"] = lines[2]["pose"]
+    write(tmp_path, lines)  # without the images
+    outcome = phd_exp("fuse", f"run={run.path}", "folder=.")
+    (complaint,) = outcome.err.splitlines()
+    assert "line 2: its x, y, z and pose place the object of scene 0" in complaint

@@ -1,0 +1,96 @@
+"""A run on single views is tried on several views of each scene, once, and is not trained again for that."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+import torch
+
+from phd_exp.fusion import Pose
+from phd_exp.records import scenes
+from phd_exp.records.runs import RunFolder, find_runs
+from tests.e2e.conftest import QUICK
+
+QUICKER = ("data=scale", "trainer.max_epochs=1", "logger=none", "data.workers=1")
+VIEWS = "evaluation.multiview.views=2"
+
+
+def asked(n: int) -> tuple[str, ...]:
+    return (*QUICK, *QUICKER, VIEWS, f"evaluation.multiview.scenes={n}")
+
+
+def stamps(run: RunFolder) -> dict[str, int]:
+    files = (run.last_checkpoint, run.predictions, run.views)
+    return {file.name: file.stat().st_mtime_ns for file in files if file.exists()}
+
+
+def test_views_are_recorded_once_and_the_run_stays_as_it_was(phd_exp: Callable, tmp_path: Path) -> None:
+    assert phd_exp(*QUICK, *QUICKER).status == 0
+    (run,) = find_runs(tmp_path / "runs")
+    trained = stamps(run)
+    assert "views.parquet" not in trained
+    outcome = phd_exp(*asked(4))
+    assert outcome.status == 0, outcome.err
+    assert "views.parquet: 4 scenes seen by 2 cameras each" in outcome.out
+    assert len(find_runs(tmp_path / "runs")) == 1
+    recorded = stamps(run)
+    assert trained.items() <= recorded.items()
+
+    table, single = pd.read_parquet(run.views), pd.read_parquet(run.predictions)
+    assert table["scene"].tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert table["view"].tolist() == [0, 1] * 4
+    assert table.columns.to_series().isin(single.columns).sum() == len(single.columns)
+    # the first view is what the data set of single views shows
+    first = table[table["view"] == 0].reset_index(drop=True)
+    for column in ("x", "z", "f", "mode_x", "mode_z", "a", "nll"):
+        np.testing.assert_allclose(first[column], single[column][:4], rtol=1e-5, atol=1e-6)
+    poses = [
+        scenes.Pose(rotation=tuple(row[:4]), translation=tuple(row[4:]))
+        for row in table.filter(like="pose_").to_numpy().tolist()
+    ]
+    xyz = Pose.from_scene(poses).into_world(torch.tensor(table[["x", "y", "z"]].to_numpy())).reshape(4, 2, 3)
+    np.testing.assert_allclose(xyz[:, 0], xyz[:, 1], atol=1e-5)
+
+    again = phd_exp(*asked(4))
+    assert again.status == 0
+    assert "views.parquet" not in again.out
+    assert stamps(run) == recorded
+
+    # another number of scenes, another record; another data set, none
+    assert "2 scenes" in phd_exp(*asked(2)).out
+    assert pq.read_metadata(run.views).num_rows == 4
+    before = run.views.read_bytes()
+    refused = phd_exp(*asked(2), "evaluation.multiview.views=3")
+    assert refused.status == 1
+    assert "holds a data set with views=2, but views=3 is asked for" in refused.err
+    assert run.views.read_bytes() == before
+
+
+def test_another_data_set_in_its_place_is_found_before_the_training(
+    phd_exp: Callable, tmp_path: Path
+) -> None:
+    sizes = ("data.n_train=2", "data.n_held_out=0", "data.n_test=2", "data.batch_size=2", "data.workers=1")
+    assert phd_exp("render", *QUICK, *sizes, "data=multiview", "data.views=3").status == 0
+    outcome = phd_exp(*asked(2))
+    assert outcome.status == 1
+    assert "multiview: holds a data set with views=3, but views=2 is asked for" in outcome.err
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.slow
+def test_a_run_that_lacks_its_views_counts_as_begun(phd_exp: Callable, tmp_path: Path) -> None:
+    words = ("-m", "experiment=fusion", *asked(1))
+    first = phd_exp(*words)
+    assert first.status == 0, first.err
+    assert "1 of them finished already" in phd_exp(*words).out
+    (run,) = find_runs(tmp_path / "runs")
+    run.views.write_bytes(b"torn")
+    outcome = phd_exp(*words)
+    assert "views.parquet: 1 scene seen by 2" in outcome.out
+    run.views.unlink()
+    assert "1 job, 0 of them finished already" in phd_exp(*words).out
+    assert json.loads(run.status_file.read_text())["state"] == "finished"
