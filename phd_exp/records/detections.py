@@ -6,7 +6,6 @@
     .cache/                   crops, decoded once
 """
 
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,13 +15,15 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
-from phd_exp.records.dataset import SPLITS, DatasetError, sha256
+from phd_exp.records.dataset import SPLITS, DatasetError, checksum, sha256
 from phd_exp.records.errors import in_our_words, nearest
 from phd_exp.records.files import read_jsonl
+from phd_exp.records.parsing import parse_json
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import Number, Positive
 
 DISTORTION = re.compile(r"[kp][1-8]|.*distort.*|dist(_?coeff.*)?|.*fisheye.*", re.IGNORECASE)
+UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 LARGEST_BOX = 3
 """Sides of a box over the longer side of its image; what lies outside the image is grey and tells nothing."""
 
@@ -150,7 +151,7 @@ class DetectionFolder:
         Raises:
             OSError: a `metadata.jsonl` cannot be read.
         """
-        return sha256("".join(sha256(self.metadata_path(split).read_bytes()) for split in SPLITS).encode())
+        return sha256("".join(checksum(self.metadata_path(split)) for split in SPLITS).encode())
 
 
 def detections_in(folder: Path, n: int | None = None, asked_by: str = "") -> list[Detection]:
@@ -181,8 +182,8 @@ def detection_of(file: Path, values: Mapping[str, Any]) -> Detection:
 
 def _detection(folder: Path, text: str, where: str) -> Detection:
     try:
-        values = json.loads(text)
-    except json.JSONDecodeError as error:
+        values = parse_json(text)
+    except ValueError as error:
         raise DatasetError(f"{where}: not JSON ({error}); expected one object a line") from None
     line = _line(values, where)
     return Detection(line, _inside(folder, line.file_name, where), where)
@@ -197,10 +198,12 @@ def _line(values: Any, where: str) -> DetectionLine:
 
 def _inside(folder: Path, name: str, where: str) -> Path:
     """The image file; a data set from somebody else must not read what lies elsewhere."""
+    if UNPRINTABLE.search(name):  # it would end the line of a message, or steer the terminal
+        raise DatasetError(f"{where}: file_name={name!r} is no file name (control characters)")
     try:
         leaves = Path(name).is_absolute() or ".." in Path(name).parts
         leaves = leaves or not (folder / name).resolve().is_relative_to(folder.resolve())
-    except (ValueError, OSError, RuntimeError) as error:  # a NUL byte, a link that leads to itself
+    except (ValueError, OSError, RuntimeError) as error:  # a link that leads to itself, a name without end
         raise DatasetError(f"{where}: file_name={name!r} is no file name ({error})") from None
     if leaves:
         raise DatasetError(f"{where}: file_name={name!r} leaves {folder}; expected a path below it")

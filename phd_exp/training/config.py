@@ -19,7 +19,8 @@ from pydantic import (
     model_validator,
 )
 
-from phd_exp.records.errors import ConfigError
+from phd_exp.records.errors import ConfigError, shown
+from phd_exp.records.runs import flatten
 from phd_exp.records.shards import Shard
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.training.targets import Target, describe, locate
@@ -31,6 +32,8 @@ WITHOUT_INFLUENCE = ("runs", "logger", "data.root", "data.workers", "trainer.pro
 """Keys, or sections, that say where and how a run is made and recorded, and change no number of it."""
 SMALLEST_IMAGE = 32
 """A ResNet halves the side five times."""
+LARGEST_IMAGE = 4096
+"""As the largest that are rendered."""
 
 
 Checked = TypeVar("Checked", bound=BaseModel)
@@ -46,7 +49,7 @@ class SizesConfig(Section):
     n_train: Annotated[Whole, Field(ge=1)] | None
     n_held_out: Annotated[Whole, Field(ge=0)]
     n_test: Annotated[Whole, Field(ge=1)] | None
-    image_size: Annotated[Whole, Field(ge=SMALLEST_IMAGE)]
+    image_size: Annotated[Whole, Field(ge=SMALLEST_IMAGE, le=LARGEST_IMAGE)]
     batch_size: Annotated[Whole, Field(ge=1)]
 
     @model_validator(mode="after")
@@ -108,6 +111,8 @@ class FolderConfig(SizesConfig):
 
 def _kind(values: Any) -> str:
     """Which of the two a `data` section is: a rendered set has a specification, of which one stray key is none."""
+    if not isinstance(values, dict | BaseModel):
+        return "<rendered>"
     if isinstance(values, BaseModel):
         return "<rendered>" if isinstance(values, RenderedConfig) else "<folder>"
     specified = "spec" in values or len(DatasetSpec.model_fields.keys() & values.keys()) > 1
@@ -176,15 +181,24 @@ class RunConfig(Section):
     evaluation: EvaluationConfig
 
     @model_validator(mode="after")
-    def loss_fits_head(self) -> "RunConfig":
-        made = locate(self.model.head["_target_"]).prediction
-        taken = locate(self.loss["_target_"]).prediction
+    def parts_fit(self) -> "RunConfig":
+        made = _prediction("model.head", self.model.head)
+        taken = _prediction("loss", self.loss)
         if not issubclass(made, taken):
             raise ValueError(
                 f"loss: takes a {taken.__name__}, but model={self.model.name} predicts a {made.__name__}; "
                 "leave out loss=..., and the model picks its own"
             )
         return self
+
+
+def _prediction(key: str, node: dict[str, Any]) -> type:
+    """What kind of prediction a head makes or a loss takes."""
+    kind = getattr(locate(node["_target_"]), "prediction", None)
+    if not isinstance(kind, type) or node.get("_partial_"):
+        name = key.rpartition(".")[2]
+        raise ValueError(f"{key}._target_: {node['_target_']!r} is no {name}; expected one as in conf/model")
+    return kind
 
 
 def has_influence(key: str) -> bool:
@@ -199,7 +213,7 @@ def check(config: dict[str, Any]) -> RunConfig:
 
 def check_render(config: dict[str, Any]) -> RenderConfig:
     """The same for what rendering looks at; the rest of the run, which comes along, is not its business."""
-    if _kind(config["data"]) == "<folder>":
+    if _kind(config.get("data")) == "<folder>":
         raise ConfigError(
             "data=folder: there is nothing to render, these are your own images; leave out `render` to train on them"
         )
@@ -208,6 +222,12 @@ def check_render(config: dict[str, Any]) -> RenderConfig:
 
 
 def _validated(model: type[Checked], config: dict[str, Any]) -> Checked:
+    for key, value in flatten(config).items():
+        # Hydra evaluates it where an object is built: it would tell of this machine, whoever wrote the configuration
+        if "${" in str(value):
+            raise ConfigError(
+                f"{key}: got {shown(value)}; expected a value, since no interpolation is evaluated here"
+            )
     try:
         return model.model_validate(config)
     except ValidationError as error:
