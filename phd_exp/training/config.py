@@ -5,6 +5,7 @@ whose choices are closed (data, trainer, ...) is a model here. A group that is o
 loss, optimizer) names a `_target_`, and its keys are held against that target's own signature.
 """
 
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -27,7 +28,16 @@ from phd_exp.training.targets import Target, describe, locate
 
 Whole = Annotated[int, Field(strict=True)]
 Name = Annotated[str, Field(strict=True, pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
-Folder = Annotated[Path, Field(strict=False)]
+
+
+def _named(folder: Any) -> Any:
+    """An empty text would be the present folder, which nobody means."""
+    if not folder:
+        raise ValueError("expected the name of a folder")
+    return folder
+
+
+Folder = Annotated[Path, Field(strict=False), BeforeValidator(_named)]
 WITHOUT_INFLUENCE = ("runs", "logger", "data.root", "data.workers", "trainer.progress_bar")
 """Keys, or sections, that say where and how a run is made and recorded, and change no number of it."""
 SMALLEST_IMAGE = 32
@@ -222,14 +232,20 @@ def check_render(config: dict[str, Any]) -> RenderConfig:
 
 
 def _validated(model: type[Checked], config: dict[str, Any]) -> Checked:
+    _require_plain_values(config)
+    try:
+        return model.model_validate(config)
+    except ValidationError as error:
+        lines = [describe(problem, model) for problem in error.errors(include_url=False)]
+        raise ConfigError("\n".join(dict.fromkeys(lines))) from None
+
+
+def _require_plain_values(config: dict[str, Any]) -> None:
     for key, value in flatten(config).items():
         # Hydra evaluates it where an object is built: it would tell of this machine, whoever wrote the configuration
         if "${" in str(value):
             raise ConfigError(
                 f"{key}: got {shown(value)}; expected a value, since no interpolation is evaluated here"
             )
-    try:
-        return model.model_validate(config)
-    except ValidationError as error:
-        lines = [describe(problem, model) for problem in error.errors(include_url=False)]
-        raise ConfigError("\n".join(dict.fromkeys(lines))) from None
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigError(f"{key}: got {value}; expected to be a finite number")
