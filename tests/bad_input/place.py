@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import hydra
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -16,22 +17,23 @@ import yaml
 from PIL import Image
 
 from phd_exp.__main__ import main
+from phd_exp.cli.paths import conf_folder
+from phd_exp.records.dataset import SPLITS, DatasetFolder, Manifest, Seal, sha256
 from phd_exp.records.runs import RunFolder, find_runs
+from phd_exp.records.spec import DatasetSpec
+from tests.data.conftest import picture, record
 
 TRAIN = (
     "preset=smoke", "logger=none", "data=folder", "data.batch_size=4", "data.image_size=32", "data.n_held_out=0",
     "trainer.threads=1", "trainer.precision=float32", "trainer.progress_bar=false", "trainer.max_epochs=1",
     "trainer.accelerator=cpu",
 )  # fmt: skip
-VERIFY = (
-    "render", "preset=smoke", "data.sensor_size=64", "data.f_range=[400,600]", "verify=true", "rerender=0",
-    "data.variant=handmade",
-)  # fmt: skip
+HANDMADE = ("preset=smoke", "data.variant=handmade", "data.sensor_size=64", "data.f_range=[400,600]")
 
 
 @dataclass(frozen=True)
 class Place:
-    """A folder of one test: `photos/`, `runs/` with one run, `handmade/`; the working directory of the command."""
+    """A folder of one test: `photos/`, `renders/handmade/`, `runs/` with one run; where the command is given."""
 
     root: Path
 
@@ -53,6 +55,22 @@ class Place:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
         path.write_bytes(content.encode() if isinstance(content, str) else content)
+
+    @property
+    def handmade(self) -> DatasetFolder:
+        return DatasetFolder(self.root / "renders/handmade")
+
+    def put_record(self, image: bytes | None = None, **changes: Any) -> None:
+        """Change the first line of the handmade test split, and its image, as somebody who knows the format."""
+        folder = self.handmade
+        if image is not None:
+            folder.image_path("test", 0).write_bytes(image)
+            changes["sha256"] = sha256(image)
+        first, *rest = folder.metadata_path("test").read_text().splitlines()
+        text = "\n".join([json.dumps(json.loads(first) | changes), *rest]) + "\n"
+        folder.metadata_path("test").write_text(text)
+        seals = folder.manifest.splits | {"test": Seal(n=2, metadata_sha256=sha256(text.encode()))}
+        folder.write_manifest(folder.manifest.model_copy(update={"splits": seals}))
 
     def put_line(self, **changes: Any) -> None:
         """Change the first line of the metadata of the test images."""
@@ -102,9 +120,31 @@ def write_photos(folder: Path) -> None:
         (folder / split / "metadata.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
 
 
+def write_handmade(folder: DatasetFolder, spec: DatasetSpec) -> None:
+    """Noise as a rendered data set, sealed."""
+    seals = {}
+    for split in SPLITS:
+        folder.split_folder(split).mkdir(parents=True)
+        lines = ""
+        for index in range(2):
+            file = folder.image_path(split, index)
+            Image.fromarray(picture(index)).save(file)
+            lines += record(index, split, file.read_bytes()).model_dump_json() + "\n"
+        folder.metadata_path(split).write_text(lines)
+        seals[split] = Seal(n=2, metadata_sha256=sha256(lines.encode()))
+    folder.write_manifest(Manifest(generator=1, renderer="none", spec=spec, splits=seals))
+
+
+def handmade_spec() -> DatasetSpec:
+    with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
+        data = hydra.compose("config", list(HANDMADE)).data
+    return DatasetSpec(**{key: data[key] for key in DatasetSpec.model_fields})
+
+
 def make(root: Path) -> None:
     """Everything sound; the run is trained for one epoch."""
     write_photos(root / "photos")
+    write_handmade(DatasetFolder(root / "renders/handmade"), handmade_spec())
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(root)
         patch.setattr("sys.argv", ["phd_exp"])
