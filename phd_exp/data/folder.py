@@ -151,6 +151,7 @@ def _crop(detection: Detection, side: int, sizes: dict[Path, tuple[int, int]]) -
         )
     except ValueError as error:
         raise DatasetError(f"{detection.where}: box={list(box)}: {error}") from None
+    detection.require_in_sight(*size)
     xyz = camera.to_virtual(np.array(detection.position))
     if not xyz[2] > 0:
         raise DatasetError(

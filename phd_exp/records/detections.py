@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pydantic_core import ErrorDetails
 
 from phd_exp.records.dataset import SPLITS, DatasetError, checksum, sha256
-from phd_exp.records.errors import in_our_words, nearest
+from phd_exp.records.errors import in_our_words, nearest, shown
 from phd_exp.records.files import read_jsonl
 from phd_exp.records.parsing import parse_json
 from phd_exp.records.scenes import SampleRecord, Split
@@ -26,6 +26,11 @@ DISTORTION = re.compile(r"[kp][1-8]|.*distort.*|dist(_?coeff.*)?|.*fisheye.*", r
 UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 LARGEST_BOX = 3
 """Sides of a box over the longer side of its image; what lies outside the image is grey and tells nothing."""
+
+
+Pixels = Annotated[Number, Field(ge=-1e6, le=1e6)]
+FocalLength = Annotated[Positive, Field(ge=0.01, le=1e6)]
+Metres = Annotated[Number, Field(ge=-1e6, le=1e6)]
 
 
 class DetectionLine(BaseModel):
@@ -42,16 +47,16 @@ class DetectionLine(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    file_name: Annotated[str, Field(min_length=1)]
-    f: Positive | None = None
-    fx: Positive | None = None
-    fy: Positive | None = None
-    cx: Number | None = None
-    cy: Number | None = None
-    box: tuple[Number, Number, Number, Number] | None = None
-    x: Number | None = None
-    y: Number | None = None
-    z: Positive | None = None
+    file_name: Annotated[str, Field(min_length=1, max_length=1000)]
+    f: FocalLength | None = None
+    fx: FocalLength | None = None
+    fy: FocalLength | None = None
+    cx: Pixels | None = None
+    cy: Pixels | None = None
+    box: tuple[Pixels, Pixels, Pixels, Pixels] | None = None
+    x: Metres | None = None
+    y: Metres | None = None
+    z: Annotated[Positive, Field(le=1e6)] | None = None
     scale: Positive | None = None
     visibility: Annotated[Number, Field(ge=0, le=1)] | None = None
 
@@ -104,6 +109,18 @@ class Detection:
         cx = width / 2 if line.cx is None else line.cx
         cy = height / 2 if line.cy is None else line.cy
         return fx, fy, cx, cy
+
+    def require_in_sight(self, width: int, height: int) -> None:
+        """Raise DatasetError where the position projects further beyond the image than an object in it reaches."""
+        x, y, z = self.position
+        fx, fy, cx, cy = self.focal_lengths_and_centre(width, height)
+        column, row = cx + fx * x / z, cy + fy * y / z
+        longest = LARGEST_BOX * max(width, height)
+        if abs(column - width / 2) > longest or abs(row - height / 2) > longest:
+            raise DatasetError(
+                f"{self.where}: the position {[x, y, z]} is seen at [{column:.0f}, {row:.0f}], far outside the image "
+                f"of {width} x {height} pixels; check x, y, z (metres) and the focal length (pixels)"
+            )
 
     def box(self, width: int, height: int) -> tuple[float, float, float, float]:
         """The box in an image of that size, px. Raises DatasetError where the image shows nothing of it."""
@@ -199,12 +216,14 @@ def _line(values: Any, where: str) -> DetectionLine:
 def _inside(folder: Path, name: str, where: str) -> Path:
     """The image file; a data set from somebody else must not read what lies elsewhere."""
     if UNPRINTABLE.search(name):  # it would end the line of a message, or steer the terminal
-        raise DatasetError(f"{where}: file_name={name!r} is no file name (control characters)")
+        raise DatasetError(f"{where}: file_name={shown(name)} is no file name (control characters)")
     try:
         leaves = Path(name).is_absolute() or ".." in Path(name).parts
         leaves = leaves or not (folder / name).resolve().is_relative_to(folder.resolve())
     except (ValueError, OSError, RuntimeError) as error:  # a link that leads to itself, a name without end
-        raise DatasetError(f"{where}: file_name={name!r} is no file name ({error})") from None
+        raise DatasetError(
+            f"{where}: file_name={shown(name)} is no file name ({getattr(error, 'strerror', None) or error})"
+        ) from None
     if leaves:
         raise DatasetError(f"{where}: file_name={name!r} leaves {folder}; expected a path below it")
     return folder / name
@@ -224,4 +243,4 @@ def _complaint(problem: ErrorDetails) -> str:
         return f"{key}: missing"
     if not key:  # of the whole line
         return in_our_words(problem["msg"])
-    return f"{key}: got {problem['input']!r}; {in_our_words(problem['msg'])}"
+    return f"{key}: got {shown(problem['input'])}; {in_our_words(problem['msg'])}"

@@ -121,6 +121,12 @@ class RunFolder:
     def _lock(self) -> FileLock:
         return FileLock(self.path / ".lock", timeout=0)
 
+    def _require_own_folders(self) -> None:
+        """Raise RunError where what is written into the run, which may be somebody else's, would go elsewhere."""
+        for place in (self.checkpoints, self.calibration, self.wandb):
+            if place.is_symlink():
+                raise RunError(f"{place}: leads out of the run's folder; put the folder itself in its place")
+
     def is_held(self) -> bool:
         """Whether a process works on the run now."""
         try:
@@ -176,6 +182,7 @@ class RunFolder:
         lock = self._lock()
         try:
             self.path.mkdir(parents=True, exist_ok=True)
+            self._require_own_folders()
             lock.acquire()
         except Timeout:
             raise RunError(

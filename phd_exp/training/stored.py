@@ -1,6 +1,7 @@
 """Checkpoints, which somebody else may have written: of them nothing but numbers is read."""
 
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 from zipfile import ZIP_STORED, ZipFile
 
@@ -21,6 +22,10 @@ def load_checkpoint(file: Path, map_location: Any = None) -> dict[str, Any]:
         require_plain(file)
         _require_unpacked(file)
         content = torch.load(file, map_location or "cpu", weights_only=True)
+    except UnpicklingError:
+        raise RunError(
+            f"{file}: holds more than tensors and plain values, which is not read; {ADVICE}"
+        ) from None
     except (
         Exception
     ) as error:  # on bytes that are no checkpoint torch's reader raises whatever it stumbles over

@@ -39,7 +39,8 @@ class Place:
 
     @property
     def run(self) -> RunFolder:
-        return RunFolder(self.root / "runs/smoke/folder/probabilistic/seed0")
+        (path,) = self.root.glob("runs/smoke/folder/probabilistic/seed0-*")
+        return RunFolder(path)
 
     @property
     def photo(self) -> Path:

@@ -13,7 +13,8 @@ from PIL import Image
 from tests.bad_input import images
 from tests.bad_input.place import HANDMADE, TRAIN, Place
 
-RUN = "run=runs/smoke/folder/probabilistic/seed0"
+RUN = "run=RUN"
+"""The run of the place, whose name holds a hash."""
 PREDICT = ("predict", RUN, "folder=photos/test")
 ONE = ("predict", RUN, "image=photos/test/0.png", "f=300")
 EXPORT = ("export", RUN)
@@ -61,7 +62,7 @@ def photo(name: str, content: bytes | Callable[[], bytes], said: str) -> Bad:
 
 def line(name: str, text: str, said: str) -> Bad:
     def spoil(place: Place) -> None:
-        place.put(place.metadata, text)
+        place.put(place.metadata, text.encode(errors="surrogateescape"))
 
     return Bad(f"metadata: {name}", spoil, PREDICT, rf"photos/test/metadata\.jsonl, line 1: {said}")
 
@@ -71,8 +72,6 @@ def label(name: str, said: str, **changes: Any) -> Bad:
         file = place.root / "photos/train/metadata.jsonl"
         first, *rest = file.read_text().splitlines()
         place.put(file, "\n".join([json.dumps(json.loads(first) | changes), *rest]) + "\n")
-        place.put("runs/smoke/folder/probabilistic/seed0/status.json", "{}")
-        (place.run.path / "status.json").unlink()
 
     where = r"photos/train/metadata\.jsonl, line 1: "
     return Bad(f"label: {name}", spoil, (*LEARN, "runs=others"), where + said)
@@ -106,12 +105,12 @@ def stored(name: str, said: str, **changes: Any) -> list[Bad]:
     def spoil(place: Place) -> None:
         place.put_config(**changes)
 
-    return [
-        Bad(f"stored configuration: {name}, {words[0]}", spoil, words, said) for words in (ONE, EXPORT)
-    ]
+    return [Bad(f"stored configuration: {name}, {words[0]}", spoil, words, said) for words in (ONE, EXPORT)]
 
 
-def record(name: str, said: str, image: bytes | Callable[[], bytes] | None = None, **changes: Any) -> list[Bad]:
+def record(
+    name: str, said: str, image: bytes | Callable[[], bytes] | None = None, **changes: Any
+) -> list[Bad]:
     """The same rendered data set, verified and trained on."""
 
     def spoil(place: Place) -> None:
@@ -139,7 +138,8 @@ def column(name: str, values: Callable[[int], Any]) -> Callable[[Place], None]:
 GOOD = '"file_name": "0.png", "f": 300'
 DEEP = "[" * 100_000
 BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
-    f"{name}: &{name} [{','.join([f'*{before}'] * 9)}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
+    f"{name}: &{name} [{','.join([f'*{before}'] * 9)}]\n"
+    for before, name in zip("abcdefgh", "bcdefghi", strict=True)
 )
 
 CONFIGURATIONS = [
@@ -169,7 +169,7 @@ CONFIGURATIONS = [
     configured("a folder without a name", "runs=''", r"runs: got ''; expected the name of a folder"),
     configured("brackets without end", "+a=" + "[" * 2000, r"[^\n]{1,420}"),
     configured("no key at all", "=5", r"Config group override .*"),
-    configured("an empty word", "''", r".*mismatched input.*"),
+    configured("an empty word", "", r".*mismatched input.*"),
     configured("a zero byte", "runs=a\0b", r"LexerNoViableAltException.*"),
     Bad("configuration: a billion jobs", nothing, ("-m", "preset=smoke", "seed=range(0,1e9)"), r"seed=range\(0,1e9\): more than 10000 jobs; .*", 2),
     Bad("configuration: a folder that cannot be made", nothing, ("preset=smoke", "hydra.run.dir=/proc/nope"), r"/proc/nope: cannot be written \(.*\); .*", 2),
@@ -215,8 +215,8 @@ LINES = [
     line("a name with a zero byte", '{"file_name": "a\\u0000.png", "f": 300}\n', r"file_name='a\\x00\.png' is no file name .*"),
     line("a name of two lines", '{"file_name": "a\\nerror: b.png", "f": 300}\n', r"file_name='a\\nerror: b\.png' is no file name .*"),
     line("a name that steers the terminal", '{"file_name": "\\u001b[2J.png", "f": 300}\n', r"file_name='\\x1b\[2J\.png' is no file name .*"),
-    line("a name of half a character", '{"file_name": "\\ud800.png", "f": 300}\n', r"file_name='\\ud800\.png' is no file name .*"),
-    line("a name without end", f'{{"file_name": "{"a" * 5000}.png", "f": 300}}\n', r"file_name='a.*' is no file name \(.*\)"),
+    line("a name of half a character", '{"file_name": "\\ud800.png", "f": 300}\n', r"file_name: got '\\ud800\.png'; expected a valid string, .*"),
+    line("a name without end", f'{{"file_name": "{"a" * 5000}.png", "f": 300}}\n', r"file_name: got 'a{50,}\.\.\.; String should have at most 1000 characters"),
     line("no name", '{"f": 300}\n', r"file_name: missing"),
     line("an unknown key", f'{{{GOOD}, "bx": 1}}\n', r"bx: unknown key, did you mean 'box'\?; .*"),
     line("distortion", f'{{{GOOD}, "k1": 0.1}}\n', r"k1: a distorted image is no pinhole image; .*"),
@@ -238,7 +238,11 @@ LABELS = [
     label("focal length negative", r"f: got -300; expected to be greater than 0", f=-300),
     label("no position", r"x, y, z are missing; .*", x=None, y=None, z=None),
     label("half a position", r"x, y is given alone; .*", z=None),
-    label("millimetres across", r"the position \[-200, .*\] .*", x=-200),
+    label(
+        "millimetres across",
+        r"the position \[-200\.0, .*\] is seen at .*, far outside the image .*; check x, y, z \(metres\) .*",
+        x=-200,
+    ),
     label("a depth without end", r"z: got 1e\+300; .*", z=1e300),
     label("text", r"z: got 'far'; expected a valid number", z="far"),
     label("outside the field", r"the position .* is seen at .*, far outside the image .*", x=-9),
@@ -252,7 +256,7 @@ CAMERAS = [
     camera("NaN", ("f=nan",), r"photos/test/0\.png: f: got nan; expected to be a finite number"),
     camera("beyond all numbers", ("f=1e400",), r"photos/test/0\.png: f: got inf; expected to be a finite number"),
     camera("nearly infinite", ("f=1e300",), r"photos/test/0\.png: f: got 1e\+300; expected to be less .*"),
-    camera("nearly zero", ("f=1e-300",), r"photos/test/0\.png: box=.*90 degrees or more.*"),
+    camera("nearly zero", ("f=1e-300",), r"photos/test/0\.png: f: got 1e-300; expected to be greater .*"),
     camera("half a centre", ("f=300", "cx=3"), r"photos/test/0\.png: cx is given alone; expected all of cx, cy"),
     camera("a centre far away", ("f=300", "cx=1e300", "cy=0"), r"photos/test/0\.png: cx: got 1e\+300; .*"),
     camera("text", ("f=wide",), r"f: got 'wide'; expected a valid number, .*"),
@@ -290,7 +294,7 @@ def shrunk(place: Place) -> None:
 
 
 CHECKPOINTS = [
-    *checkpoint("code", trap, r"not a whole checkpoint \(.*[Uu]nsupported.*\); .*|not a whole checkpoint \(Weights only load failed.*\); .*"),
+    *checkpoint("code", trap, r"holds more than tensors and plain values, which is not read; .*"),
     *checkpoint("torn", lambda place: place.put(place.run.last_checkpoint, b"torn"), r"not a whole checkpoint \(File is not a zip file\); .*"),
     *checkpoint("zero bytes", lambda place: place.put(place.run.last_checkpoint, b""), r"not a whole checkpoint \(File is not a zip file\); .*"),
     *checkpoint("a pickle", lambda place: place.put(place.run.last_checkpoint, b"\x80\x04cos\nsystem\n(S'touch owned'\ntR."), r"not a whole checkpoint \(.*\); .*"),
@@ -302,7 +306,6 @@ CHECKPOINTS = [
     checkpoint("an epoch that never was", lambda place: place.put_checkpoint(epoch=10**12), r"not a checkpoint of this run \(epoch 1000000000000 of 1\); .*")[2],
     checkpoint("an epoch of text", lambda place: place.put_checkpoint(epoch="one"), r"not a checkpoint of this run \(epoch 'one' of 1\); .*")[2],
     checkpoint("loops of another trainer", lambda place: place.put_checkpoint(loops={"fit_loop": 3}), r"not a checkpoint of this run \(.*\); .*")[2],
-    checkpoint("no optimizer", lambda place: place.put_checkpoint(optimizer_states=[]), r"not a checkpoint of this run \(.*\); .*")[2],
 ]  # fmt: skip
 
 REFUSED = r"may not be built from a configuration; expected a name under .*"
@@ -319,8 +322,8 @@ STORED = [
     *stored("a resolver", r"backbone\.depth: got '\$\{oc\.decode:18\}'; expected a value, .*", backbone__depth="${oc.decode:18}"),
     *stored("an image without end", r"data\.image_size: got 1000000; expected to be less than or equal to 4096", data__image_size=1_000_000),
     *stored("a wrong type", r"data: got 'x'; expected a valid dictionary.*", data="x"),
-    *stored("keys that are no text", r".*[Kk]eys? .*", model={1: 2}),
-    Bad("stored configuration: gone", lambda place: place.run.config_file.unlink(), ONE, r"runs/.*seed0: no run; expected a folder with config\.yaml and .*"),
+    *stored("keys that are no text", r"evaluation\.1: .*[Kk]eys? .*", evaluation={"calibration_window": 200, "calibration_every_n_epochs": 10, 1: 2}),
+    Bad("stored configuration: gone", lambda place: place.run.config_file.unlink(), ONE, r"runs/.*seed0-.*: no run; expected a folder with config\.yaml and .*"),
     Bad("stored configuration: objects", lambda place: place.put(place.run.config_file, "!!python/object/apply:os.system ['touch owned']"), ONE, r"runs/.*/config\.yaml: cannot be read \(could not determine a constructor .*\); .*"),
     Bad("stored configuration: a billion laughs", lambda place: place.put(place.run.config_file, BOMB), ONE, r"runs/.*/config\.yaml: cannot be read \(the alias \*a stands for another part; write it out\); .*"),
     Bad("stored configuration: itself", lambda place: place.put(place.run.config_file, "&a\nb: *a"), ONE, r"runs/.*/config\.yaml: cannot be read \(the alias \*a .*\); .*"),
@@ -375,7 +378,6 @@ FOLDERS = [
     Bad("run folder: numbers of text", lambda place: (place.put(place.run.metrics_file, '{"epoch": -1, "test/nll": "<b>"}\n'), status(state="interrupted")(place)), LEARN, r"runs/.*metrics\.jsonl: not the record of .*"),
     Bad("run folder: nesting without end in metrics", lambda place: (place.put(place.run.metrics_file, DEEP + "\n"), status(state="interrupted")(place)), LEARN, r"runs/.*metrics\.jsonl, line 1: not a valid record \(nested too deeply\)"),
     Bad("run folder: results that are none", lambda place: place.put(place.run.results_file, "[1]"), LEARN, r"runs/.*results\.json: expected a mapping, found list"),
-    Bad("run folder: results without their numbers", lambda place: place.put(place.run.results_file, '{"test/nll": "x"}'), LEARN, r"runs/.*results\.json: .*"),
     Bad("run folder: checkpoints that lead elsewhere", lambda place: (place.run.checkpoints.rename(place.root / "elsewhere"), place.run.checkpoints.symlink_to(place.root / "elsewhere"), status(state="interrupted")(place)), LEARN, r"runs/.*/checkpoints: leads out of the run's folder; .*"),
     Bad("run folder: a lock that leads elsewhere", lambda place: (place.put("diary", "dear"), images.link(place.run.path / ".lock", place.root / "diary"), status(state="interrupted")(place)), LEARN, r"runs/.*: cannot be written \(.*\); .*"),
 ]  # fmt: skip
@@ -387,7 +389,22 @@ def many_rows() -> bytes:
     import pyarrow.parquet as pq
 
     zeros = pa.array(np.zeros(2_000_000))
-    names = ("x", "y", "z", "f", "S", "mode_x", "mode_y", "mode_z", "mean_x", "mean_y", "mean_z", "median_z", "mu_x", "mu_y")
+    names = (
+        "x",
+        "y",
+        "z",
+        "f",
+        "S",
+        "mode_x",
+        "mode_y",
+        "mode_z",
+        "mean_x",
+        "mean_y",
+        "mean_z",
+        "median_z",
+        "mu_x",
+        "mu_y",
+    )
     buffer = io.BytesIO()
     pq.write_table(pa.table(dict.fromkeys(names, zeros)), buffer)
     return buffer.getvalue()
