@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
 from phd_exp.records.dataset import SPLITS, DatasetError, checksum, sha256
@@ -24,12 +24,20 @@ from phd_exp.records.spec import Number, Positive
 
 DISTORTION = re.compile(r"[kp][1-8]|.*distort.*|dist(_?coeff.*)?|.*fisheye.*", re.IGNORECASE)
 UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+SHORTEST = 0.01
+"""Focal length, px; what is shorter was meant in metres, or is none."""
 LARGEST_BOX = 3
 """Sides of a box over the longer side of its image; what lies outside the image is grey and tells nothing."""
 
 
+def _in_pixels(f: float) -> float:
+    if f < SHORTEST:
+        raise ValueError(f"expected a focal length in pixels, at least {SHORTEST}")
+    return f
+
+
 Pixels = Annotated[Number, Field(ge=-1e6, le=1e6)]
-FocalLength = Annotated[Positive, Field(ge=0.01, le=1e6)]
+FocalLength = Annotated[Positive, Field(le=1e6), AfterValidator(_in_pixels)]
 Metres = Annotated[Number, Field(ge=-1e6, le=1e6)]
 
 

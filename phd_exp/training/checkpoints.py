@@ -27,7 +27,7 @@ class AtomicCheckpoints(CheckpointIO):
     def load_checkpoint(
         self, path: Any, map_location: Any = None, weights_only: bool | None = True
     ) -> dict[str, Any]:
-        # Lightning's callbacks have nothing to remember here, and would remove the file that a checkpoint calls their best
+        # Lightning's callbacks have nothing to remember here, and would remove the file that it calls the best
         return load_checkpoint(Path(path), map_location) | {"callbacks": {}}
 
     def remove_checkpoint(self, path: Any) -> None:

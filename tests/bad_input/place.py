@@ -1,4 +1,4 @@
-"""What the bad inputs are made from: a sound run, sound images and a sound data set, small and made without a renderer."""
+"""What bad inputs are made from: a sound run, sound images and a sound data set, made without a renderer."""
 
 import json
 import os
