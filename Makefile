@@ -24,11 +24,12 @@ demo: $(INSTALLED)  ## render, train the probabilistic model, draw its calibrati
 	$(BIN)/python -m phd_exp preset=demo
 	$(BIN)/python -m phd_exp report
 
-lint: $(INSTALLED)  ## ruff, mypy and the import floors
+lint: $(INSTALLED)  ## ruff, mypy, the import floors, and no release that is known to be bad
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache  # a cache survives a merge and then sees imports that are gone
+	$(BIN)/python .ci/audit.py
 
 test: lint  ## lint and the default tests (under 5 minutes on 2 cores)
 	$(BIN)/python -m pytest -n 2

@@ -6,9 +6,10 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import hydra
+from hydra._internal.utils import get_args_parser
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -19,6 +20,8 @@ from phd_exp.cli.signals import Stopped, stopping_on_signals
 from phd_exp.cli.sweep import IsFinished, sweep
 from phd_exp.records.errors import ConfigError, UserError, nearest
 
+LONGEST = 400
+"""Characters of what Hydra says."""
 MULTIRUN = ("-m", "--multirun")
 
 
@@ -50,6 +53,12 @@ def launch(
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # ValueError: a group set to null
         print(f"error: {explain(error, config_name)}", file=sys.stderr)
         return BAD_CONFIGURATION
+    except OSError as error:  # what goes wrong within a job is the job's to record
+        print(
+            f"error: {error.filename}: cannot be written ({error.strerror}); check hydra.*.dir",
+            file=sys.stderr,
+        )
+        return BAD_CONFIGURATION
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return Ending.of([], error).exit_status
@@ -61,6 +70,7 @@ def _run_all(
     task: Task, arguments: list[str], config_name: str, is_finished: IsFinished | None
 ) -> list[Ending]:
     """Run the jobs and collect how they ended."""
+    _require_known_flags(arguments)
     flags = [word for word in arguments if word.startswith("-")]
     if len(flags) == 1 and flags[0] in MULTIRUN:
         return sweep(task, arguments[1:], config_name, is_finished)
@@ -72,6 +82,17 @@ def _run_all(
         hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=config_name)(job)()
         # a flag like --cfg runs no job
         return [records.ending(0, [])] if any(records.path.iterdir()) else []
+
+
+def _require_known_flags(words: list[str]) -> None:
+    """Raise ConfigError for what Hydra's parser would refuse with its usage, over several lines."""
+
+    def refuse(message: str) -> NoReturn:
+        raise ConfigError(f"{message}; see `python -m phd_exp --help`")
+
+    parser = get_args_parser()
+    parser.error = refuse  # type: ignore[method-assign]
+    parser.parse_args(words)
 
 
 def _require_one_run(words: list[str]) -> None:
@@ -99,7 +120,8 @@ def explain(error: Exception, config_name: str) -> str:
     if choice:
         group, name, options = choice[1], choice[2], choice[3].split()
         return f"{group}={name}: no such choice{nearest(name, options)}; expected one of {', '.join(options)}"
-    return re.sub(r" Set the environment variable.*| Config search path:.*", "", text)
+    text = re.sub(r" Set the environment variable.*| Config search path:.*", "", text)
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
 
 def _print_failures(endings: list[Ending]) -> None:

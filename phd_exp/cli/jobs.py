@@ -16,6 +16,7 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from pydantic import BaseModel
 
 from phd_exp.cli.signals import Stopped, ending_with, stopping_on_signals
@@ -132,19 +133,23 @@ def run_job(task: Task, launch: Launch, config: DictConfig) -> None:
     A stop goes up in the launcher's own process, where it ends everything. In another process it ends that job.
     """
     hydra = HydraConfig.get()
-    overrides = list(hydra.overrides.task)
+    overrides = OmegaConf.to_container(hydra.overrides.task)
+    assert isinstance(overrides, list)
     number = 0 if OmegaConf.is_missing(hydra.job, "num") else hydra.job.num  # a single run has none
     at_home = launch.home == HOME
     with launch.records.running(number):
         try:
             # hydra's launchers put signal handlers of their own into their processes, or none
             with stopping_on_signals(), ending_with(None if at_home else launch.parent):
-                state = task(plain(config), overrides, launch.cores or usable_cores())
+                # as they read once interpolations are resolved: what they say has its part in the run's name
+                state = task(plain(config), list(hydra.overrides.task), launch.cores or usable_cores())
             ending = Ending(overrides=overrides, state=state)
         except Stopped as stop:
             if at_home:
                 raise
             ending = Ending.of(overrides, stop)
+        except OmegaConfBaseException as error:  # an interpolation that leads nowhere
+            ending = Ending.of(overrides, ConfigError(" ".join(str(error).split())))
         except Exception as error:
             if not isinstance(error, UserError):
                 traceback.print_exc()  # a fault of the programme, not of its user

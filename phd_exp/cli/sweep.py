@@ -15,6 +15,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, RangeSweep
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
 from hydra.types import HydraContext, RunMode
@@ -26,6 +27,7 @@ from phd_exp.cli.jobs import Ending, JobRecords, Launch, Task, plain
 from phd_exp.cli.paths import conf_folder
 from phd_exp.records.errors import ConfigError, RunError
 
+MOST_JOBS = 10_000
 IsFinished = Callable[[dict[str, Any], list[str]], bool]
 """Whether the job of a configuration, reached by these overrides, has been done before."""
 
@@ -115,8 +117,21 @@ def _combinations(words: list[str], master: DictConfig, loader: ConfigLoader) ->
     keys = {item.key_or_group for item in said}
     params = parse([f"{key}={value}" for key, value in (master.hydra.sweeper.params or {}).items()])
     unsaid = [item for item in params if item.key_or_group not in keys]
+    _require_countable([*unsaid, *said])
     (combinations,) = BasicSweeper.split_arguments([*unsaid, *said], max_batch_size=None)
     return combinations
+
+
+def _require_countable(overrides: list[Override]) -> None:
+    """Raise ConfigError for a range that would be counted out in memory, number by number, without end."""
+    for item in overrides:
+        value = item.value()
+        if isinstance(value, RangeSweep) and _span(value) > MOST_JOBS * abs(value.step):
+            raise ConfigError(f"{item.input_line}: more than {MOST_JOBS} jobs; expected a shorter range")
+
+
+def _span(values: RangeSweep) -> float:
+    return abs(float(values.stop or 0) - float(values.start or 0))
 
 
 def _run(task: Task, planned: Plan, records: JobRecords) -> Exception | None:

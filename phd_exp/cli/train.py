@@ -51,14 +51,14 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> str:
     state = "finished already" if skipped else "finished"
     print(f"{folder.path}: {state}")
     for key in filter(results.__contains__, SHOWN):
-        print(f"  {key} {_number(results[key])} (untrained {_number(results[f'untrained/{key}'])})")
+        print(f"  {key} {_number(results[key])} (untrained {_number(results.get(f'untrained/{key}'))})")
     if (folder.calibration / "final.png").exists():
         print(f"  calibration curves: {folder.calibration / 'final.png'}")
     return state
 
 
-def _number(value: float | None) -> str:
-    return "not finite" if value is None else f"{value:.4g}"
+def _number(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, int | float) else "not finite"
 
 
 def is_finished(config: dict[str, Any], overrides: list[str]) -> bool:

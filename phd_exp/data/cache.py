@@ -13,7 +13,8 @@ from rich.console import Console
 from rich.progress import track
 
 from phd_exp.records.dataset import DatasetError
-from phd_exp.records.files import write_atomic
+from phd_exp.records.files import read_plain, require_plain, write_atomic
+from phd_exp.records.parsing import parse_json
 
 DECODERS = 4
 
@@ -35,15 +36,18 @@ def cached(
     """
     key_file = file.with_suffix(".json")
     with _alone_in(file.parent):  # the runs of a parallel sweep all come here first
-        if not (file.exists() and _read_key(key_file) == key):
+        if (kept := _kept(file, key_file, key, shape)) is None:
             unfinished = file.with_suffix(".unfinished")
+            unfinished.unlink(
+                missing_ok=True
+            )  # a link there, of somebody else, would have its target written
             array = np.lib.format.open_memmap(unfinished, mode="w+", dtype=np.uint8, shape=shape)
             fill_all(array, jobs, fill, words)
             array.flush()
             unfinished.replace(file)
             write_atomic(key_file, json.dumps(key) + "\n")
-    # copy-on-write: torch wants a writable array, and nothing may write into this file
-    return np.load(file, mmap_mode="c")
+            kept = _mapped(file)
+    return kept
 
 
 def fill_all(array: np.ndarray, jobs: Sequence[Job], fill: Fill, words: str) -> None:
@@ -67,9 +71,19 @@ def _alone_in(cache: Path) -> Iterator[None]:
         raise CacheError(f"{cache}: decoded images cannot be kept here ({error.strerror})") from None
 
 
-def _read_key(key_file: Path) -> object:
-    """What the array beside it was made of; None where that is unknown, so that it is made again."""
+def _kept(file: Path, key_file: Path, key: dict[str, Any], shape: tuple[int, ...]) -> np.ndarray | None:
+    """The array that is there; None where it is none of this key and shape, so that it is made again."""
     try:
-        return json.loads(key_file.read_text())
+        if parse_json(read_plain(key_file).decode()) != key:
+            return None
+        require_plain(file)
+        array = _mapped(file)
     except (OSError, ValueError):
         return None
+    return array if array.shape == shape and array.dtype == np.uint8 else None
+
+
+def _mapped(file: Path) -> np.ndarray:
+    # copy-on-write: torch wants a writable array, and nothing may write into this file
+    array: np.ndarray = np.load(file, mmap_mode="c", allow_pickle=False)
+    return array

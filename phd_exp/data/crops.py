@@ -2,58 +2,47 @@
 
 import io
 import math
-import struct
-import warnings
-import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import ExifTags, Image
 
 from phd_exp.data.images import shrunk
 from phd_exp.geometry.virtual import VirtualCamera
 from phd_exp.records.dataset import DatasetError
+from phd_exp.records.files import require_plain
+from phd_exp.records.images import FORMATS, LARGEST_IMAGE, decoding, pillow_warnings
 
 GREY = (128, 128, 128)
 """What a virtual camera sees where the image has nothing: beyond its edges, and where it is transparent."""
 PLAIN = ("1", "L", "RGB", "YCbCr", "CMYK")
 WITH_ALPHA = ("P", "PA", "LA", "La", "RGBA", "RGBa")  # a palette may hold a transparent colour
 SIXTEEN_BITS = ("I;16", "I;16L", "I;16B", "I;16N")
-BROKEN = (
-    OSError, SyntaxError, ValueError, LookupError, EOFError, OverflowError, MemoryError, struct.error, zlib.error,
-)  # fmt: skip
-"""What Pillow's decoders raise on broken files."""
+ONE_PICTURE = ("JPEG", "MPO")
+"""Kinds whose further frames, where there are any, are previews and depth maps of the first."""
 MARGIN = 2
 """Pixels about a place that bicubic interpolation looks at."""
 FINEST = 2
 """An image is enlarged to this multiple of its longer side at most, before its areas are averaged."""
 
 
-@contextmanager
-def pillow_warnings() -> Iterator[None]:
-    """Too many pixels are an error; oddities of metadata, of which Pillow warns too, are none. Outside of threads."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        warnings.simplefilter("error", Image.DecompressionBombWarning)
-        yield
-
-
 def image_size(file: Path) -> tuple[int, int]:
     """Width and height, from the head of the file. Raises DatasetError where that is no image."""
-    with _naming(file), pillow_warnings(), Image.open(file) as image:
-        return image.size
+    with decoding(file), pillow_warnings():
+        require_plain(file, LARGEST_IMAGE)
+        with Image.open(file, formats=FORMATS) as image:
+            return image.size
 
 
 def read_image(file: Path, content: bytes) -> Image.Image:
     """The image as RGB: grey, palette and 16 bits (the upper 8 of them) converted, transparency laid over grey.
 
-    Raises DatasetError, naming the file, for what is no whole image, exceeds Pillow's limit of pixels, has an EXIF
-    orientation (it is then unclear to which pixels the intrinsics refer), or has colours that are no RGB.
+    Raises DatasetError, naming the file, for what is no whole image or holds several, exceeds Pillow's limit of
+    pixels, has an EXIF orientation (it is then unclear to which pixels the intrinsics refer), or has colours that are
+    no RGB.
     """
-    with _naming(file), Image.open(io.BytesIO(content)) as image:
+    with decoding(file), Image.open(io.BytesIO(content), formats=FORMATS) as image:
         orientation = image.getexif().get(
             ExifTags.Base.Orientation, 1
         )  # first: Pillow turns a TIFF as it loads
@@ -62,6 +51,7 @@ def read_image(file: Path, content: bytes) -> Image.Image:
                 f"{file}: has the EXIF orientation {orientation}, so that its stored pixels are turned; "
                 "turn them for good (`mogrify -auto-orient`), and let f, cx, cy and box refer to the result"
             )
+        _require_one_picture(file, image)
         image.load()
         return _as_rgb(file, image)
 
@@ -101,21 +91,11 @@ def _transformed(image: Image.Image, back: Float[np.ndarray, "3 3"], side: int) 
     return Image.fromarray(levels.round().clip(0, 255).astype(np.uint8))
 
 
-@contextmanager
-def _naming(file: Path) -> Iterator[None]:
-    """Let what goes wrong with a file be one line that names it."""
-    try:
-        yield
-    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
+def _require_one_picture(file: Path, image: Image.Image) -> None:
+    if getattr(image, "is_animated", False) and image.format not in ONE_PICTURE:
         raise DatasetError(
-            f"{file}: has more pixels than Pillow's limit of {Image.MAX_IMAGE_PIXELS} lets pass; shrink it, and with "
-            "it f, cx, cy and box"
-        ) from None
-    except UnidentifiedImageError:
-        raise DatasetError(f"{file}: not an image of any kind that Pillow knows") from None
-    except BROKEN as error:
-        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
-        raise DatasetError(f"{file}: cannot be read as an image ({reason}); replace it") from None
+            f"{file}: holds several pictures; expected one, save that which is meant by itself"
+        )
 
 
 def _as_rgb(file: Path, image: Image.Image) -> Image.Image:

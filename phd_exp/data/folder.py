@@ -13,13 +13,15 @@ from jaxtyping import Float
 
 from phd_exp.data.batches import Batch
 from phd_exp.data.cache import CacheError, cached, fill_all
-from phd_exp.data.crops import cut, image_size, pillow_warnings, read_image
+from phd_exp.data.crops import cut, image_size, read_image
 from phd_exp.data.sources import Known, Part, Source
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.geometry.virtual import VirtualCamera, intrinsics
 from phd_exp.records.dataset import DatasetError, sha256
 from phd_exp.records.detections import Detection, DetectionFolder
 from phd_exp.records.errors import ConfigError
+from phd_exp.records.files import read_plain
+from phd_exp.records.images import LARGEST_IMAGE, pillow_warnings
 from phd_exp.records.scenes import Split
 
 CROP_LAYOUT = 1
@@ -149,6 +151,7 @@ def _crop(detection: Detection, side: int, sizes: dict[Path, tuple[int, int]]) -
         )
     except ValueError as error:
         raise DatasetError(f"{detection.where}: box={list(box)}: {error}") from None
+    detection.require_in_sight(*size)
     xyz = camera.to_virtual(np.array(detection.position))
     if not xyz[2] > 0:
         raise DatasetError(
@@ -161,6 +164,6 @@ def _crop(detection: Detection, side: int, sizes: dict[Path, tuple[int, int]]) -
 def content_of(file: Path) -> bytes:
     """The bytes of a file. Raises DatasetError where it cannot be read."""
     try:
-        return file.read_bytes()
+        return read_plain(file, LARGEST_IMAGE)
     except OSError as error:
         raise DatasetError(f"{file}: cannot be read ({error.strerror})") from None

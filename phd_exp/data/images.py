@@ -28,7 +28,7 @@ def cached_images(
 
     def fill(array: np.ndarray, row: int) -> None:
         record = records[row]
-        array[row] = decode(folder.split_folder(split) / record.file_name, record.sha256, image_size)
+        array[row] = decode(folder.split_folder(split) / record.file_name, record, image_size)
 
     return cached(
         folder.cache / f"{split}-{len(records)}x{image_size}.npy",
@@ -40,15 +40,15 @@ def cached_images(
     )
 
 
-def decode(file: Path, checksum: str, image_size: int) -> np.ndarray:
+def decode(file: Path, record: SampleRecord, image_size: int) -> np.ndarray:
     """One image as (image_size, image_size, 3), uint8. Raises DatasetError where the file is not as recorded."""
     try:
-        image = recorded_image(file, checksum)
+        image = recorded_image(file, record)
     except DatasetError as error:
         raise DatasetError(
             f"{error}; delete the file and run `python -m phd_exp render` to make it again"
         ) from None
-    return shrunk(image.convert("RGB"), image_size)
+    return shrunk(image, image_size)
 
 
 def shrunk(image: Image.Image, side: int) -> np.ndarray:

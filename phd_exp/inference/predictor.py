@@ -1,5 +1,6 @@
 """A trained run as a function: `load(DIR)` gives a callable from image arrays to distributions."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,7 @@ from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import FolderConfig, RunConfig, check
 from phd_exp.training.network import build_regressor
+from phd_exp.training.stored import load_checkpoint
 
 WEIGHTS = "regressor."
 """What the names of the network's weights begin with in a checkpoint."""
@@ -175,8 +177,11 @@ def _constants(folder: RunFolder, config: RunConfig) -> Constants:
     values = folder.constants()
     try:
         depth = DepthScale(*(float(values[name]) for name in ("mu_z0", "D", "z_centre")))
-        return Constants(depth, float(values["constant_f"]))
-    except (KeyError, TypeError, ValueError) as error:
+        constant_f = float(values["constant_f"])
+        if not 0 < constant_f < math.inf:
+            raise ValueError(f"constant_f must be positive and finite, but is {constant_f}")
+        return Constants(depth, constant_f)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise RunError(f"{folder.constants_file}: not the constants of a run ({error})") from None
 
 
@@ -184,15 +189,14 @@ def _load_weights(regressor: Regressor, checkpoint: Path) -> None:
     """Take the network's weights from a checkpoint, of which nothing but numbers is read."""
     if not checkpoint.exists():
         raise RunError(f"{checkpoint}: missing; the run has not trained a whole epoch yet")
+    content = load_checkpoint(checkpoint)
     try:
-        state: dict[str, Any] = torch.load(checkpoint, map_location="cpu", weights_only=True)["state_dict"]
+        state: dict[str, Any] = content["state_dict"]
         weights = {
             name.removeprefix(WEIGHTS): value for name, value in state.items() if name.startswith(WEIGHTS)
         }
         regressor.load_state_dict(weights)
-    except (
-        Exception
-    ) as error:  # on bytes that are no checkpoint torch's reader raises whatever it stumbles over
+    except Exception as error:  # whatever torch stumbles over where these are other weights, or none
         reason = " ".join(str(error).split())[:120]
         raise RunError(f"{checkpoint}: not a whole checkpoint of this network ({reason})") from None
 

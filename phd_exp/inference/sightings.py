@@ -11,7 +11,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from phd_exp.data.crops import pillow_warnings, read_image
+from phd_exp.data.crops import read_image
 from phd_exp.data.folder import content_of
 from phd_exp.geometry.virtual import intrinsics
 from phd_exp.inference.predictor import BATCH, Predictor
@@ -19,6 +19,7 @@ from phd_exp.inference.views import View
 from phd_exp.models.heads import Prediction
 from phd_exp.records.detections import Detection
 from phd_exp.records.errors import RunError
+from phd_exp.records.images import pillow_warnings
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from typing import Annotated, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from phd_exp.records.errors import UserError
-from phd_exp.records.files import read_jsonl, write_atomic
+from phd_exp.records.files import read_jsonl, read_plain, require_plain, write_atomic
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.shards import Shard
 from phd_exp.records.spec import DatasetSpec, ImageFormat
@@ -102,7 +102,7 @@ class DatasetFolder:
             DatasetError: there is none, or it cannot be read.
         """
         try:
-            return Manifest.model_validate_json(self.manifest_path.read_bytes())
+            return Manifest.model_validate_json(read_plain(self.manifest_path))
         except FileNotFoundError:
             raise DatasetError(
                 f"{self.root}: no data set here (manifest.json is missing); render it first"
@@ -190,3 +190,10 @@ def image_name(index: int, image_format: ImageFormat = "png") -> str:
 def sha256(data: bytes) -> str:
     """Checksum as the records and the manifest write it."""
     return hashlib.sha256(data).hexdigest()
+
+
+def checksum(file: Path) -> str:
+    """The same of a plain file of any size. Raises OSError where it cannot be read."""
+    require_plain(file)
+    with open(file, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -6,23 +6,34 @@
     .cache/                   crops, decoded once
 """
 
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    ValidationError,
+    model_validator,
+)
 from pydantic_core import ErrorDetails
 
-from phd_exp.records.dataset import SPLITS, DatasetError, sha256
-from phd_exp.records.errors import in_our_words, nearest
+from phd_exp.records.dataset import SPLITS, DatasetError, checksum, sha256
+from phd_exp.records.errors import in_our_words, nearest, shown
 from phd_exp.records.files import read_jsonl
+from phd_exp.records.parsing import parse_json
 from phd_exp.records.scenes import Pose, SampleRecord, Split
 from phd_exp.records.spec import Number, Positive
 
 DISTORTION = re.compile(r"[kp][1-8]|.*distort.*|dist(_?coeff.*)?|.*fisheye.*", re.IGNORECASE)
+UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+SHORTEST = 0.01
+"""Focal length, px; what is shorter was meant in metres, or is none."""
 LARGEST_BOX = 3
 """Sides of a box over the longer side of its image; what lies outside the image is grey and tells nothing."""
 
@@ -33,7 +44,16 @@ def _name(value: Any) -> int | str:
     return value
 
 
+def _in_pixels(f: float) -> float:
+    if f < SHORTEST:
+        raise ValueError(f"expected a focal length in pixels, at least {SHORTEST}")
+    return f
+
+
 SceneName = Annotated[int | str, PlainValidator(_name)]
+Pixels = Annotated[Number, Field(ge=-1e6, le=1e6)]
+FocalLength = Annotated[Positive, Field(le=1e6), AfterValidator(_in_pixels)]
+Metres = Annotated[Number, Field(ge=-1e6, le=1e6)]
 
 
 class DetectionLine(BaseModel):
@@ -52,16 +72,16 @@ class DetectionLine(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    file_name: Annotated[str, Field(min_length=1)]
-    f: Positive | None = None
-    fx: Positive | None = None
-    fy: Positive | None = None
-    cx: Number | None = None
-    cy: Number | None = None
-    box: tuple[Number, Number, Number, Number] | None = None
-    x: Number | None = None
-    y: Number | None = None
-    z: Positive | None = None
+    file_name: Annotated[str, Field(min_length=1, max_length=1000)]
+    f: FocalLength | None = None
+    fx: FocalLength | None = None
+    fy: FocalLength | None = None
+    cx: Pixels | None = None
+    cy: Pixels | None = None
+    box: tuple[Pixels, Pixels, Pixels, Pixels] | None = None
+    x: Metres | None = None
+    y: Metres | None = None
+    z: Annotated[Positive, Field(le=1e6)] | None = None
     scale: Positive | None = None
     visibility: Annotated[Number, Field(ge=0, le=1)] | None = None
     scene: SceneName | None = None
@@ -117,6 +137,18 @@ class Detection:
         cy = height / 2 if line.cy is None else line.cy
         return fx, fy, cx, cy
 
+    def require_in_sight(self, width: int, height: int) -> None:
+        """Raise DatasetError where the position projects further beyond the image than an object in it reaches."""
+        x, y, z = self.position
+        fx, fy, cx, cy = self.focal_lengths_and_centre(width, height)
+        column, row = cx + fx * x / z, cy + fy * y / z
+        longest = LARGEST_BOX * max(width, height)
+        if abs(column - width / 2) > longest or abs(row - height / 2) > longest:
+            raise DatasetError(
+                f"{self.where}: the position {[x, y, z]} is seen at [{column:.0f}, {row:.0f}], far outside the image "
+                f"of {width} x {height} pixels; check x, y, z (metres) and the focal length (pixels)"
+            )
+
     def box(self, width: int, height: int) -> tuple[float, float, float, float]:
         """The box in an image of that size, px. Raises DatasetError where the image shows nothing of it."""
         if self.line.box is None:
@@ -163,7 +195,7 @@ class DetectionFolder:
         Raises:
             OSError: a `metadata.jsonl` cannot be read.
         """
-        return sha256("".join(sha256(self.metadata_path(split).read_bytes()) for split in SPLITS).encode())
+        return sha256("".join(checksum(self.metadata_path(split)) for split in SPLITS).encode())
 
 
 def detections_in(folder: Path, n: int | None = None, asked_by: str = "") -> list[Detection]:
@@ -194,8 +226,8 @@ def detection_of(file: Path, values: Mapping[str, Any]) -> Detection:
 
 def _detection(folder: Path, text: str, where: str) -> Detection:
     try:
-        values = json.loads(text)
-    except json.JSONDecodeError as error:
+        values = parse_json(text)
+    except ValueError as error:
         raise DatasetError(f"{where}: not JSON ({error}); expected one object a line") from None
     line = _line(values, where)
     return Detection(line, _inside(folder, line.file_name, where), where)
@@ -210,11 +242,15 @@ def _line(values: Any, where: str) -> DetectionLine:
 
 def _inside(folder: Path, name: str, where: str) -> Path:
     """The image file; a data set from somebody else must not read what lies elsewhere."""
+    if UNPRINTABLE.search(name):  # it would end the line of a message, or steer the terminal
+        raise DatasetError(f"{where}: file_name={shown(name)} is no file name (control characters)")
     try:
         leaves = Path(name).is_absolute() or ".." in Path(name).parts
         leaves = leaves or not (folder / name).resolve().is_relative_to(folder.resolve())
-    except (ValueError, OSError, RuntimeError) as error:  # a NUL byte, a link that leads to itself
-        raise DatasetError(f"{where}: file_name={name!r} is no file name ({error})") from None
+    except (ValueError, OSError, RuntimeError) as error:  # a link that leads to itself, a name without end
+        raise DatasetError(
+            f"{where}: file_name={shown(name)} is no file name ({getattr(error, 'strerror', None) or error})"
+        ) from None
     if leaves:
         raise DatasetError(f"{where}: file_name={name!r} leaves {folder}; expected a path below it")
     return folder / name
@@ -234,4 +270,4 @@ def _complaint(problem: ErrorDetails) -> str:
         return f"{key}: missing"
     if not key:  # of the whole line
         return in_our_words(problem["msg"])
-    return f"{key}: got {problem['input']!r}; {in_our_words(problem['msg'])}"
+    return f"{key}: got {shown(problem['input'])}; {in_our_words(problem['msg'])}"

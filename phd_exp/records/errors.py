@@ -3,6 +3,9 @@
 import difflib
 from collections.abc import Iterable
 
+LONGEST_VALUE = 120
+"""Characters of a value that a message repeats."""
+
 
 class UserError(Exception):
     """Something the user asked for cannot be done as asked; the command line prints it without a traceback."""
@@ -29,3 +32,12 @@ def in_our_words(message: str) -> str:
         .replace("Input should be", "expected to be")
         .replace("expected to be a valid", "expected a valid")
     )
+
+
+def shown(value: object) -> str:
+    """A value as it stands in a message: of a long one the beginning."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # a whole number of thousands of digits, nesting without end
+        return f"<{type(value).__name__}>"
+    return text if len(text) <= LONGEST_VALUE else f"{text[:LONGEST_VALUE]}..."

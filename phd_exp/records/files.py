@@ -1,22 +1,51 @@
 """Files that are whole or absent: atomic writing, and journals that survive being cut off."""
 
-import json
+import errno
 import os
+import stat
 import uuid
 from collections.abc import Callable
 from contextlib import suppress
+from itertools import count
 from pathlib import Path
 from typing import Any, TextIO, TypeVar
 
 from phd_exp.records.errors import UserError
+from phd_exp.records.parsing import parse_json
 
 Parsed = TypeVar("Parsed")
 
 TEMPORARY_SUFFIX = ".tmp"
+MB = 10**6
+LARGEST_RECORD = 16 * MB
+"""Bytes of a file that is read whole; the longest that are written here have a few thousand."""
+LONGEST_LINE = MB
+"""Bytes of a line of a journal; a sample's has about two thousand."""
 
 
 class CorruptFileError(UserError):
     """A file on disk does not hold what its schema promises; the message names file and line."""
+
+
+def require_plain(path: Path, largest: int | None = None) -> None:
+    """Raise OSError unless a path leads to a plain file, of at most so many bytes.
+
+    A pipe would be waited for without end, and a device has no end: files of somebody else may be either.
+    """
+    found = os.stat(path)
+    if stat.S_ISDIR(found.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(found.st_mode):
+        raise OSError(errno.EINVAL, "a pipe or a device; expected a plain file", str(path))
+    if largest is not None and found.st_size > largest:
+        size = f"{found.st_size / MB:.0f} MB; expected at most {largest / MB:.0f} MB"
+        raise OSError(errno.EFBIG, size, str(path))
+
+
+def read_plain(path: Path, largest: int = LARGEST_RECORD) -> bytes:
+    """The bytes of a plain file. Raises OSError as `require_plain` does, and where it cannot be read."""
+    require_plain(path, largest)
+    return path.read_bytes()
 
 
 def write_atomic(path: Path | str, data: bytes | str) -> None:
@@ -66,7 +95,11 @@ def open_journal(path: Path) -> TextIO:
 
 
 def read_jsonl(
-    path: Path, parse: Callable[[str], Parsed] = json.loads, *, limit: int | None = None, sealed: bool = False
+    path: Path,
+    parse: Callable[[str], Parsed] = parse_json,
+    *,
+    limit: int | None = None,
+    sealed: bool = False,
 ) -> list[Parsed]:
     """Read the first `limit` lines of a file of JSON lines (all of them by default), each through `parse`.
 
@@ -75,21 +108,25 @@ def read_jsonl(
 
     Raises:
         CorruptFileError: naming the file and the line.
-        OSError: the file cannot be read.
+        OSError: the file cannot be read, or is no plain file.
     """
-    lines = path.read_bytes().split(b"\n")
-    unfinished = lines.pop()
-    if unfinished and sealed:
-        lines.append(unfinished)
-    return [_parse_line(path, number, line, parse) for number, line in enumerate(lines[:limit], start=1)]
+    require_plain(path)
+    records: list[Parsed] = []
+    with open(path, "rb") as stream:
+        for number in count(1) if limit is None else range(1, limit + 1):
+            line = stream.readline(LONGEST_LINE + 1)
+            if len(line) > LONGEST_LINE:
+                raise CorruptFileError(f"{path}, line {number}: longer than {LONGEST_LINE} bytes")
+            if not line.endswith(b"\n") and not (line and sealed):
+                break
+            records.append(_parse_line(path, number, line.removesuffix(b"\n"), parse))
+    return records
 
 
 def _parse_line(path: Path, number: int, line: bytes, parse: Callable[[str], Any]) -> Any:
     try:
         return parse(line.decode())
-    except (
-        ValueError
-    ) as error:  # JSONDecodeError, UnicodeDecodeError and pydantic's ValidationError are all this
+    except ValueError as error:  # also UnicodeDecodeError and pydantic's ValidationError
         raise CorruptFileError(f"{path}, line {number}: not a valid record ({_brief(error)})") from error
 
 

@@ -1,28 +1,84 @@
-"""The images of a data set, held against their records."""
+"""Image files, which somebody else may have made: what is read of them, and what is refused in one line."""
 
 import io
+import struct
+import warnings
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from PIL import Image
+from PIL import Image, Jpeg2KImagePlugin, TiffImagePlugin, UnidentifiedImageError, WebPImagePlugin
 
 from phd_exp.records.dataset import DatasetError, sha256
+from phd_exp.records.files import MB, read_plain
+from phd_exp.records.scenes import SampleRecord
+
+# those that Pillow would not look at before all others have failed
+_LATER = (TiffImagePlugin, WebPImagePlugin, Jpeg2KImagePlugin)
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "JPEG2000")
+"""What is tried on a file, whatever its name. Pillow knows more; of an EPS it would have Ghostscript run the code."""
+RENDERED = ("PNG", "WEBP", "JPEG")
+LARGEST_IMAGE = 256 * MB
+"""Bytes of an image file."""
+BROKEN = (
+    OSError, SyntaxError, ValueError, LookupError, EOFError, OverflowError, MemoryError, struct.error, zlib.error,
+)  # fmt: skip
+"""What Pillow's decoders raise on broken files."""
 
 
-def recorded_image(path: Path, checksum: str) -> Image.Image:
-    """An image file, read once, checked and decoded.
+@contextmanager
+def pillow_warnings() -> Iterator[None]:
+    """Too many pixels are an error; oddities of metadata, of which Pillow warns too, are none. Outside of threads."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        warnings.simplefilter("error", Image.DecompressionBombWarning)
+        yield
+
+
+@contextmanager
+def decoding(file: Path) -> Iterator[None]:
+    """Let what goes wrong with an image be one line, a DatasetError, that names the file."""
+    try:
+        yield
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
+        raise DatasetError(
+            f"{file}: has more pixels than Pillow's limit of {Image.MAX_IMAGE_PIXELS} lets pass; shrink it, and with "
+            "it f, cx, cy and box"
+        ) from None
+    except UnidentifiedImageError:
+        kinds = ", ".join(FORMATS)
+        raise DatasetError(f"{file}: not an image of any kind that is read here ({kinds})") from None
+    except BROKEN as error:
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+        raise DatasetError(f"{file}: cannot be read as an image ({reason}); replace it") from None
+
+
+def recorded_image(path: Path, record: SampleRecord) -> Image.Image:
+    """The image file of a rendered sample, read once, checked and decoded.
 
     Raises:
-        DatasetError: it cannot be read, is not the one recorded, or is no image; what to do is the caller's to say.
+        DatasetError: it cannot be read, is not the one recorded, or is no RGB image of the recorded size; what to do
+            is the caller's to say.
     """
     try:
-        content = path.read_bytes()
+        content = read_plain(path, LARGEST_IMAGE)
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read ({error.strerror})") from None
-    if sha256(content) != checksum:
+    if sha256(content) != record.sha256:
         raise DatasetError(f"{path}: its checksum is not the recorded one")
     try:
-        image = Image.open(io.BytesIO(content))
+        image = Image.open(io.BytesIO(content), formats=RENDERED)
+        _require_recorded(path, image, record)  # before a small file unfolds to more pixels than memory holds
         image.load()
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be decoded ({error})") from None
+    except (*BROKEN, Image.DecompressionBombError) as error:
+        raise DatasetError(f"{path}: cannot be decoded ({' '.join(str(error).split())})") from None
     return image
+
+
+def _require_recorded(path: Path, image: Image.Image, record: SampleRecord) -> None:
+    if image.size != (record.S, record.S):
+        width, height = image.size
+        raise DatasetError(f"{path}: {width} x {height} pixels, {record.S} x {record.S} recorded")
+    if image.mode != "RGB":
+        raise DatasetError(f"{path}: its pixels are of the kind {image.mode!r}; expected RGB of 8 bits")

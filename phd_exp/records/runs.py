@@ -26,17 +26,26 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
 from filelock import FileLock, Timeout
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from phd_exp.records import provenance
 from phd_exp.records.errors import RunError
-from phd_exp.records.files import read_jsonl, write_atomic
+from phd_exp.records.files import MB, read_jsonl, read_plain, write_atomic
+from phd_exp.records.parsing import parse_json, parse_yaml
+
+LAST_EPOCH = 10**9
+LARGEST = MB
+"""Bytes of a configuration or of a run's numbers."""
 
 State = Literal["running", "finished", "failed", "interrupted"]
+
+
+# until the year 9999: what lies beyond has no date
+Moment = Annotated[float, Field(ge=0, lt=253402300800, allow_inf_nan=False)]
 
 
 class RunStatus(BaseModel):
@@ -45,8 +54,8 @@ class RunStatus(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     state: State
-    started: float
-    ended: float | None = None
+    started: Moment
+    ended: Moment | None = None
     error: str | None = None
     traceback: str | None = None
     versions: dict[str, str]
@@ -103,8 +112,8 @@ class RunFolder:
         if not self.status_file.exists():
             return None
         try:
-            return RunStatus.model_validate_json(self.status_file.read_text())
-        except (ValidationError, UnicodeDecodeError) as error:
+            return RunStatus.model_validate_json(read_plain(self.status_file))
+        except (ValidationError, OSError) as error:
             raise _unreadable(self.status_file, "not a run status", error) from None
 
     def is_finished(self) -> bool:
@@ -113,6 +122,12 @@ class RunFolder:
 
     def _lock(self) -> FileLock:
         return FileLock(self.path / ".lock", timeout=0)
+
+    def _require_own_folders(self) -> None:
+        """Raise RunError where what is written into the run, which may be somebody else's, would go elsewhere."""
+        for place in (self.checkpoints, self.calibration, self.wandb):
+            if place.is_symlink():
+                raise RunError(f"{place}: leads out of the run's folder; put the folder itself in its place")
 
     def is_held(self) -> bool:
         """Whether a process works on the run now."""
@@ -123,17 +138,20 @@ class RunFolder:
             return True
 
     def config(self) -> dict[str, Any]:
-        return _read_mapping(self.config_file, yaml.safe_load)
+        return _read_mapping(self.config_file, parse_yaml)
 
     def results(self) -> dict[str, Any]:
-        return _read_mapping(self.results_file, json.loads)
+        return _read_mapping(self.results_file, parse_json)
 
     def constants(self) -> dict[str, Any]:
-        return _read_mapping(self.constants_file, json.loads)
+        return _read_mapping(self.constants_file, parse_json)
 
     def metrics(self) -> list[dict[str, Any]]:
-        """One mapping an epoch, as logged; a last line torn by a kill is left out."""
-        return list(read_jsonl(self.metrics_file)) if self.metrics_file.exists() else []
+        """One mapping an epoch, as logged; a last line torn by a kill is left out.
+
+        Raises CorruptFileError for a line that is none, OSError where the file cannot be read.
+        """
+        return read_jsonl(self.metrics_file, _metrics_row) if self.metrics_file.exists() else []
 
     def write_config(self, config: Mapping[str, Any]) -> None:
         write_atomic(self.config_file, yaml.safe_dump(dict(config), sort_keys=False))
@@ -166,6 +184,7 @@ class RunFolder:
         lock = self._lock()
         try:
             self.path.mkdir(parents=True, exist_ok=True)
+            self._require_own_folders()
             lock.acquire()
         except Timeout:
             raise RunError(
@@ -216,16 +235,26 @@ def flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+def _metrics_row(text: str) -> dict[str, Any]:
+    row = parse_json(text)
+    if not isinstance(row, dict):
+        raise ValueError(f"expected a mapping, found {type(row).__name__}")
+    epoch = row.get("epoch")
+    if type(epoch) is not int or not -1 <= epoch <= LAST_EPOCH:
+        raise ValueError(f"epoch: expected a whole number from -1 to {LAST_EPOCH}")
+    return row
+
+
 def _is_infinite(value: Any) -> bool:
     return isinstance(value, float) and not math.isfinite(value)
 
 
 def _read_mapping(file: Path, parse: Any) -> dict[str, Any]:
     try:
-        content = parse(file.read_text())
+        content = parse(read_plain(file, LARGEST).decode())
     except FileNotFoundError:
         raise RunError(f"{file}: missing; the run has not written it yet") from None
-    except (ValueError, yaml.YAMLError) as error:
+    except (ValueError, OSError) as error:
         raise _unreadable(file, "cannot be read", error) from None
     if not isinstance(content, dict):
         raise RunError(f"{file}: expected a mapping, found {type(content).__name__}")
@@ -233,7 +262,7 @@ def _read_mapping(file: Path, parse: Any) -> dict[str, Any]:
 
 
 def _unreadable(file: Path, complaint: str, error: Exception) -> RunError:
-    reason = " ".join(str(error).split())[:200]
+    reason = " ".join(str(getattr(error, "strerror", None) or error).split())[:200]
     return RunError(f"{file}: {complaint} ({reason}); delete the folder to run again")
 
 

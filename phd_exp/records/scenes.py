@@ -129,7 +129,7 @@ class SampleRecord(_Described):
     """One line of `metadata.jsonl`: the image's name, what a network is asked for, how the image came to be.
 
     Attributes:
-        file_name: the image, relative to the line's own file (the name Hugging Face `imagefolder` asks for).
+        file_name: the image, beside the line's own file (the name Hugging Face `imagefolder` asks for).
         x, y, z: centre of the cylinder, camera frame, m.
         f, S: focal length and side of the image, px.
         scale: size factor of the cylinder.
@@ -140,7 +140,7 @@ class SampleRecord(_Described):
         sha256: of the image file.
     """
 
-    file_name: Annotated[str, Field(min_length=1)]
+    file_name: Annotated[str, Field(pattern=r"^[0-9]{6,12}\.(png|webp|jpg)$")]
     x: Finite
     y: Finite
     z: Positive

@@ -16,6 +16,7 @@ def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:
 
 
 Positive = Annotated[Number, Field(gt=0)]
+FocalLength = Annotated[Number, Field(ge=10, le=1e6)]
 # Half a metre keeps the camera outside the largest object (a cube of 0.2 m, scaled by 2, reaches 0.35 m).
 Distance = Annotated[Number, Field(ge=0.5, le=100)]
 Factor = Annotated[Number, Field(ge=0.1, le=2)]
@@ -58,7 +59,7 @@ class DatasetSpec(BaseModel):
     variant: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
     seed: Annotated[int, Field(strict=True, ge=0, lt=2**63)]
     sensor_size: Annotated[int, Field(strict=True, ge=16, le=4096)]
-    f_range: Annotated[tuple[Positive, Positive], Range]
+    f_range: Annotated[tuple[FocalLength, FocalLength], Range]
     z_range: Annotated[tuple[Distance, Distance], Range]
     xy_range: Annotated[Number, Field(ge=0, le=1)]
     scale_range: Annotated[tuple[Factor, Factor], Range]

@@ -4,7 +4,7 @@ import random
 from collections.abc import Iterator
 from pathlib import Path
 
-from phd_exp.records.dataset import SPLITS, DatasetError, DatasetFolder, Manifest, Seal, sha256
+from phd_exp.records.dataset import SPLITS, DatasetError, DatasetFolder, Manifest, Seal, checksum
 from phd_exp.records.errors import UserError
 from phd_exp.records.images import recorded_image
 from phd_exp.records.scenes import SampleRecord, Split
@@ -57,7 +57,7 @@ def _metadata(folder: DatasetFolder, split: Split, seal: Seal | None) -> tuple[l
     if seal is None or not seal.n:
         return [], []
     path, faults = folder.metadata_path(split), []
-    if path.exists() and sha256(path.read_bytes()) != seal.metadata_sha256:
+    if path.exists() and checksum(path) != seal.metadata_sha256:
         faults.append(
             f"{path}: its checksum is not that of the manifest; restore it, or render the data set anew"
         )
@@ -76,14 +76,12 @@ def _strangers(folder: DatasetFolder, split: Split, records: list[SampleRecord])
 
 
 def _fault(path: Path, record: SampleRecord) -> str | None:
-    advice = "delete it, and `render` makes it again"
     try:
-        width, height = recorded_image(path, record.sha256).size
+        recorded_image(path, record)
     except DatasetError as error:
-        return f"{error}; {advice if path.exists() else '`render` makes it again'}"
-    if (width, height) == (record.S, record.S):
-        return None
-    return f"{path}: {width} x {height} pixels, {record.S} x {record.S} recorded; {advice}"
+        advice = "delete it, and `render` makes it again" if path.exists() else "`render` makes it again"
+        return f"{error}; {advice}"
+    return None
 
 
 def _require_same_make(folder: DatasetFolder, manifest: Manifest) -> None:

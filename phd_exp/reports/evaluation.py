@@ -6,7 +6,6 @@ from functools import partial
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
@@ -21,6 +20,7 @@ from phd_exp.metrics.scores import DRAWS, energy_score
 from phd_exp.metrics.strata import strata
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder
+from phd_exp.reports.parquet import read_table
 
 Arrays = Mapping[str, np.ndarray]
 """Name of a column -> a value a sample."""
@@ -133,12 +133,7 @@ def held_out_temperature(folder: RunFolder) -> Temperature:
 
     Raises RunError where they cannot be read, and as `fit_temperature` does.
     """
-    try:
-        table = pq.read_table(folder.held_out)
-    except (pa.ArrowException, OSError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise RunError(f"{folder.held_out}: cannot be read ({reason})") from None
-    return fit_temperature(table)
+    return fit_temperature(read_table(folder.held_out))
 
 
 def recalibrated(table: pa.Table | Arrays, temperature: Temperature) -> dict[str, np.ndarray]:

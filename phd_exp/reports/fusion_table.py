@@ -92,7 +92,7 @@ def fusion_tables(records: Records) -> tuple[list[FusionTable], list[str]]:
         try:
             tables.append(fusion_table(run, fusion_scores(read_views(run.folder.views))))
         except RunError as error:
-            complaints.append(one_line(str(error)))
+            complaints.append(one_line(f"{run.folder.path}/{error}"))
     return tables, complaints
 
 

@@ -17,10 +17,10 @@ from typing import Literal
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from jaxtyping import Bool, Float64
 
 from phd_exp.records.errors import RunError
+from phd_exp.reports.parquet import read_table
 
 Estimate = Literal["mode", "mean", "median"]
 Reading = Literal["whole", "central"]
@@ -130,18 +130,8 @@ def _points(table: Mapping[str, PerSample], estimate: Estimate) -> Points:
 
 
 def _read(file: Path, names: Sequence[str]) -> dict[str, PerSample]:
-    try:
-        with pq.ParquetFile(file) as parquet:
-            lacking = [name for name in names if name not in parquet.schema_arrow.names]
-            if lacking:
-                raise RunError(f"{file.name}: has no column {', '.join(lacking)}")
-            content = parquet.read(columns=list(names))
-            table = {name: content.column(name).cast(pa.float64()).to_numpy() for name in names}
-    except FileNotFoundError:
-        raise RunError(f"{file.name}: missing, though the run says finished") from None
-    except (pa.ArrowException, OSError, KeyError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise RunError(f"{file.name}: cannot be read ({reason})") from None
+    content = read_table(file, names)
+    table = {name: content.column(name).cast(pa.float64()).to_numpy() for name in names}
     _require_numbers(file, table)
     return table
 

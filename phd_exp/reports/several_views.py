@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import pyarrow as pa
-import pyarrow.parquet as pq
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -17,6 +15,7 @@ from phd_exp.distributions.columns import PARAMETERS, from_columns
 from phd_exp.fusion import Plane, Pose
 from phd_exp.records import scenes
 from phd_exp.records.errors import RunError
+from phd_exp.reports.parquet import read_table
 
 XYZ = ("x", "y", "z")
 ROTATION = ("pose_w", "pose_x", "pose_y", "pose_z")
@@ -105,24 +104,18 @@ class SeveralViews:
 
 def read_views(file: Path) -> SeveralViews:
     """The record that a run left. Raises RunError where it cannot be read, or is none of several views."""
-    try:
-        table = pq.read_table(file)
-    except (pa.ArrowException, OSError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise RunError(f"{file}: cannot be read ({reason}); {AGAIN}") from None
-    if missing := [name for name in NEEDED if name not in table.column_names]:
-        raise RunError(f"{file}: column {', '.join(missing)} missing; {AGAIN}")
+    table = read_table(file, NEEDED)
     flat = {name: torch.from_numpy(table[name].to_numpy().astype(float)) for name in NEEDED}
     columns = {name: column.reshape(-1, _views(file, flat)) for name, column in flat.items()}
     finite = torch.stack(list(columns.values())).isfinite().all(0).all(-1)
     if not bool(finite.any()):
-        raise RunError(f"{file}: of no scene all predictions are finite; train longer")
+        raise RunError(f"{file.name}: of no scene all predictions are finite; train longer")
     found = SeveralViews(columns).subset(finite)
     try:
         _ = found.predictions, found.pose
     except ValueError as error:
         reason = " ".join(str(error).split())[:200]
-        raise RunError(f"{file}: no predictions with poses ({reason}); {AGAIN}") from None
+        raise RunError(f"{file.name}: no predictions with poses ({reason}); {AGAIN}") from None
     return found
 
 
@@ -131,5 +124,5 @@ def _views(file: Path, flat: Mapping[str, Tensor]) -> int:
     rows = torch.arange(len(flat["view"]), dtype=torch.float64)
     views = int(flat["view"].max()) + 1 if len(rows) else 0
     if views < 2 or len(rows) % views or not bool((flat["scene"] * views + flat["view"] == rows).all()):
-        raise RunError(f"{file}: not every view of every scene, two or more, in order; {AGAIN}")
+        raise RunError(f"{file.name}: not every view of every scene, two or more, in order; {AGAIN}")
     return views

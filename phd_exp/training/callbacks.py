@@ -84,6 +84,15 @@ class RecordBeforeCheckpoint(Checkpoint):
         self.record.log_metrics({"epoch": trainer.current_epoch} | values, step=step)
 
 
+class Begun(Callback):
+    """Tells whether the first epoch has begun: what goes wrong before lies in what was taken up."""
+
+    training = False
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.training = True
+
+
 class EpochLines(Callback):
     """One line an epoch, for where a progress bar would be noise: log files, pipes."""
 

@@ -8,6 +8,7 @@ import torch
 from lightning.pytorch.plugins.io import CheckpointIO
 
 from phd_exp.records.files import write_atomic
+from phd_exp.training.stored import load_checkpoint
 
 
 class AtomicCheckpoints(CheckpointIO):
@@ -26,8 +27,8 @@ class AtomicCheckpoints(CheckpointIO):
     def load_checkpoint(
         self, path: Any, map_location: Any = None, weights_only: bool | None = True
     ) -> dict[str, Any]:
-        checkpoint: dict[str, Any] = torch.load(path, map_location or "cpu", weights_only=True)
-        return checkpoint
+        # Lightning's callbacks have nothing to remember here, and would remove the file that it calls the best
+        return load_checkpoint(Path(path), map_location) | {"callbacks": {}}
 
     def remove_checkpoint(self, path: Any) -> None:
         Path(path).unlink(missing_ok=True)

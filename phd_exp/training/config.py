@@ -5,6 +5,7 @@ whose choices are closed (data, trainer, ...) is a model here. A group that is o
 loss, optimizer) names a `_target_`, and its keys are held against that target's own signature.
 """
 
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -19,14 +20,24 @@ from pydantic import (
     model_validator,
 )
 
-from phd_exp.records.errors import ConfigError
+from phd_exp.records.errors import ConfigError, shown
+from phd_exp.records.runs import flatten
 from phd_exp.records.shards import Shard
 from phd_exp.records.spec import Angle, DatasetSpec, Range
 from phd_exp.training.targets import Target, describe, locate
 
 Whole = Annotated[int, Field(strict=True)]
 Name = Annotated[str, Field(strict=True, pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
-Folder = Annotated[Path, Field(strict=False)]
+
+
+def _named(folder: Any) -> Any:
+    """An empty text would be the present folder, which nobody means."""
+    if not folder:
+        raise ValueError("expected the name of a folder")
+    return folder
+
+
+Folder = Annotated[Path, Field(strict=False), BeforeValidator(_named)]
 WITHOUT_INFLUENCE = (
     "runs",
     "logger",
@@ -39,6 +50,8 @@ WITHOUT_INFLUENCE = (
 its results: they change no number of it."""
 SMALLEST_IMAGE = 32
 """A ResNet halves the side five times."""
+LARGEST_IMAGE = 4096
+"""As the largest that are rendered."""
 SINGLE_VIEW, MULTIVIEW = "scale", "multiview"
 """The data set whose runs can be tried on several views, and the one that shows its scenes so."""
 
@@ -56,7 +69,7 @@ class SizesConfig(Section):
     n_train: Annotated[Whole, Field(ge=1)] | None
     n_held_out: Annotated[Whole, Field(ge=0)]
     n_test: Annotated[Whole, Field(ge=1)] | None
-    image_size: Annotated[Whole, Field(ge=SMALLEST_IMAGE)]
+    image_size: Annotated[Whole, Field(ge=SMALLEST_IMAGE, le=LARGEST_IMAGE)]
     batch_size: Annotated[Whole, Field(ge=1)]
 
     @model_validator(mode="after")
@@ -118,6 +131,8 @@ class FolderConfig(SizesConfig):
 
 def _kind(values: Any) -> str:
     """Which of the two a `data` section is: a rendered set has a specification, of which one stray key is none."""
+    if not isinstance(values, dict | BaseModel):
+        return "<rendered>"
     if isinstance(values, BaseModel):
         return "<rendered>" if isinstance(values, RenderedConfig) else "<folder>"
     specified = "spec" in values or len(DatasetSpec.model_fields.keys() & values.keys()) > 1
@@ -202,13 +217,12 @@ class RunConfig(Section):
     @property
     def prediction(self) -> type[Any]:
         """What the model predicts."""
-        kind: type[Any] = locate(self.model.head["_target_"]).prediction
-        return kind
+        return _prediction("model.head", self.model.head)
 
     @model_validator(mode="after")
-    def loss_fits_head(self) -> "RunConfig":
+    def parts_fit(self) -> "RunConfig":
         made = self.prediction
-        taken = locate(self.loss["_target_"]).prediction
+        taken = _prediction("loss", self.loss)
         if not issubclass(made, taken):
             raise ValueError(
                 f"loss: takes a {taken.__name__}, but model={self.model.name} predicts a {made.__name__}; "
@@ -237,6 +251,15 @@ class RunConfig(Section):
         return self
 
 
+def _prediction(key: str, node: dict[str, Any]) -> type:
+    """What kind of prediction a head makes or a loss takes."""
+    kind = getattr(locate(node["_target_"]), "prediction", None)
+    if not isinstance(kind, type) or node.get("_partial_"):
+        name = key.rpartition(".")[2]
+        raise ValueError(f"{key}._target_: {node['_target_']!r} is no {name}; expected one as in conf/model")
+    return kind
+
+
 def has_influence(key: str) -> bool:
     """Whether a key, with dots, can change what a run computes."""
     return not any(key == name or key.startswith(f"{name}.") for name in WITHOUT_INFLUENCE)
@@ -249,7 +272,7 @@ def check(config: dict[str, Any]) -> RunConfig:
 
 def check_render(config: dict[str, Any]) -> RenderConfig:
     """The same for what rendering looks at; the rest of the run, which comes along, is not its business."""
-    if _kind(config["data"]) == "<folder>":
+    if _kind(config.get("data")) == "<folder>":
         raise ConfigError(
             "data=folder: there is nothing to render, these are your own images; leave out `render` to train on them"
         )
@@ -258,8 +281,20 @@ def check_render(config: dict[str, Any]) -> RenderConfig:
 
 
 def _validated(model: type[Checked], config: dict[str, Any]) -> Checked:
+    _require_plain_values(config)
     try:
         return model.model_validate(config)
     except ValidationError as error:
         lines = [describe(problem, model) for problem in error.errors(include_url=False)]
         raise ConfigError("\n".join(dict.fromkeys(lines))) from None
+
+
+def _require_plain_values(config: dict[str, Any]) -> None:
+    for key, value in flatten(config).items():
+        # Hydra evaluates it where an object is built: it would tell of this machine, whoever wrote the configuration
+        if "${" in str(value):
+            raise ConfigError(
+                f"{key}: got {shown(value)}; expected a value, since no interpolation is evaluated here"
+            )
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigError(f"{key}: got {value}; expected to be a finite number")

@@ -10,6 +10,7 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 
 from phd_exp.geometry.charts import DepthScale
+from phd_exp.models.backbones import Backbone
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.errors import ConfigError
 from phd_exp.training.config import RunConfig, TrainerConfig
@@ -24,7 +25,12 @@ def build_regressor(config: RunConfig, depth: DepthScale, memory_format: torch.m
     with naming("model.head"):
         head = instantiate(config.model.head, _partial_=True)(depth=depth)
     with naming("backbone"):
-        return Regressor(instantiate(config.backbone), head, memory_format)
+        backbone = instantiate(config.backbone)
+        if not isinstance(backbone, Backbone):
+            raise ValueError(
+                f"_target_: {config.backbone['_target_']!r} makes no Backbone; see conf/backbone"
+            )
+        return Regressor(backbone, head, memory_format)
 
 
 @contextmanager

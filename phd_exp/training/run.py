@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
 
 import torch
@@ -16,9 +15,9 @@ from lightning import Trainer, seed_everything
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.sources import Part
 from phd_exp.distributions.columns import Columns
-from phd_exp.records.dataset import DatasetFolder, sha256
+from phd_exp.records.dataset import DatasetFolder, checksum
 from phd_exp.records.detections import DetectionFolder
-from phd_exp.records.errors import ConfigError, RunError
+from phd_exp.records.errors import ConfigError, RunError, shown
 from phd_exp.records.files import remove_temporaries
 from phd_exp.records.runs import RunFolder, flatten
 from phd_exp.training.build import (
@@ -27,11 +26,12 @@ from phd_exp.training.build import (
     build_module,
     build_trainer,
 )
-from phd_exp.training.callbacks import CalibrationRecorder, Draw, RecordLogger
+from phd_exp.training.callbacks import Begun, CalibrationRecorder, Draw, RecordLogger
 from phd_exp.training.config import FolderConfig, RunConfig, TrainerConfig, has_influence
 from phd_exp.training.module import PositionModule
 from phd_exp.training.predictions import gathered, joined, summary, write_parquet
 from phd_exp.training.ranks import train_together
+from phd_exp.training.stored import ADVICE, load_checkpoint
 from phd_exp.training.tracking import tracked
 
 UNTRAINED = -1
@@ -176,17 +176,44 @@ def _take_up(
     """
     checkpoint = record.folder.last_checkpoint
     if checkpoint.exists():
-        record.forget_after(_epoch_of(checkpoint))
+        record.forget_after(_epoch_of(checkpoint, trainer.max_epochs or 0))
+        _require_recorded(record, checkpoint)
         return checkpoint
     record.forget_after(UNTRAINED)
     record.log_metrics({"epoch": UNTRAINED} | summary(_evaluate(trainer, module, data, "test")), step=0)
     return None
 
 
+def _require_recorded(record: RecordLogger, checkpoint: Path) -> None:
+    """Raise RunError unless the epochs before a checkpoint are recorded with their numbers."""
+    untrained = record.rows.get(UNTRAINED, {})
+    numbers = [value for row in record.rows.values() for value in row.values()]
+    if not any(key.startswith("test/") for key in untrained) or not all(map(_is_number, numbers)):
+        raise RunError(
+            f"{record.folder.metrics_file}: not the record of the epochs before {checkpoint.name}; "
+            "delete both to begin the run again"
+        )
+
+
+def _is_number(value: Any) -> bool:
+    return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
+
+
 def _fit(trainer: Trainer, module: PositionModule, data: PositionData, checkpoint: Path | None) -> float:
-    """Train to the last epoch, from the checkpoint if there is one; returns the seconds it took now."""
+    """Train to the last epoch, from the checkpoint if there is one; returns the seconds it took now.
+
+    Raises RunError where the checkpoint is one of another run.
+    """
     start = time.monotonic()
-    trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+    begun = Begun()
+    trainer.callbacks.append(begun)  # type: ignore[attr-defined]  # set by Lightning
+    try:
+        trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+    except (KeyError, ValueError, TypeError, AttributeError, RuntimeError, IndexError) as error:
+        if checkpoint is None or begun.training:
+            raise
+        reason = " ".join(str(error).split())[:120]
+        raise RunError(f"{checkpoint}: not a checkpoint of this run ({reason}); {ADVICE}") from None
     return time.monotonic() - start
 
 
@@ -195,15 +222,14 @@ def _untrained(record: RecordLogger) -> dict[str, Any]:
     return {f"untrained/{key}": value for key, value in record.rows[UNTRAINED].items() if "test/" in key}
 
 
-def _epoch_of(checkpoint: Path) -> int:
-    """The last epoch that a checkpoint has seen whole. Raises RunError where it cannot be read."""
-    try:
-        return int(torch.load(checkpoint, map_location="cpu", weights_only=True)["epoch"])
-    except (RuntimeError, OSError, EOFError, KeyError, UnpicklingError) as error:
-        reason = " ".join(str(error).split())[:120]
+def _epoch_of(checkpoint: Path, epochs: int) -> int:
+    """The last epoch that a checkpoint has seen whole. Raises RunError where it is none of a run so long."""
+    epoch = load_checkpoint(checkpoint).get("epoch")
+    if type(epoch) is not int or not 0 <= epoch < epochs:
         raise RunError(
-            f"{checkpoint}: not a whole checkpoint ({reason}); delete it to begin the run again"
-        ) from None
+            f"{checkpoint}: not a checkpoint of this run (epoch {shown(epoch)} of {epochs}); {ADVICE}"
+        )
+    return epoch
 
 
 def _evaluate(trainer: Trainer, module: PositionModule, data: PositionData, part: Part) -> Columns:
@@ -238,7 +264,7 @@ def _manifest_hash(config: RunConfig) -> str | None:
         except OSError:  # the data of a finished run may have gone
             return None
     manifest = DatasetFolder(config.data.folder).manifest_path
-    return sha256(manifest.read_bytes()) if manifest.exists() else None
+    return checksum(manifest) if manifest.is_file() else None
 
 
 def _quiet_lightning() -> None:

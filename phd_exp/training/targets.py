@@ -16,12 +16,10 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from phd_exp.records.errors import in_our_words, nearest
+from phd_exp.records.errors import in_our_words, nearest, shown
 
-ALLOWED = (
-    *("phd_exp.models.", "phd_exp.losses.", "phd_exp.geometry."),
-    *("torch.optim.", "torch.nn.", "torchvision.models."),
-)
+OURS = ("phd_exp.models.", "phd_exp.losses.", "phd_exp.geometry.")
+ALLOWED = (*OURS, "torch.optim.", "torch.nn.", "torchvision.models.")
 """Where a `_target_` may point: a configuration from somebody else must not run whatever it likes.
 
 What is named must have been defined there too, since modules also hold what they import.
@@ -39,6 +37,10 @@ def check_target(node: dict[str, Any], where: str = "") -> dict[str, Any]:
     Raises PydanticCustomError naming the key, what was given, and what was expected.
     """
     target = locate(node.get("_target_"), where)
+    if not isinstance(node.get("_partial_", False), bool):
+        raise _error(
+            ".".join(filter(None, [where, "_partial_"])), f"got {shown(node['_partial_'])}; expected a bool"
+        )
     parameters = inspect.signature(target).parameters
     for key, value in node.items():
         if key in SPECIAL:
@@ -72,10 +74,10 @@ def _check_inner(path: str, value: Any) -> None:
 def locate(name: Any, where: str = "") -> Any:
     """What a `_target_` names. Raises PydanticCustomError where that is not allowed or does not exist."""
     path = f"{where}._target_" if where else "_target_"
-    if not isinstance(name, str) or not name.startswith(ALLOWED):
+    if not isinstance(name, str) or not name.startswith(ALLOWED) or "._" in name:
         raise _error(
             path,
-            f"{name!r} may not be built from a configuration; expected a name under {', '.join(ALLOWED)}",
+            f"{shown(name)} may not be built from a configuration; expected a name under {', '.join(ALLOWED)}",
         )
     module, _, attribute = name.rpartition(".")
     try:
@@ -85,7 +87,22 @@ def locate(name: Any, where: str = "") -> Any:
     defined = getattr(target, "__module__", None)
     if not (callable(target) and isinstance(defined, str) and f"{defined}.".startswith(ALLOWED)):
         raise _error(path, f"{name!r} is no class or function of its own; expected one defined there")
+    if not _makes_a_part(target, name):
+        raise _error(path, f"{name!r} is no part of a network; expected a module, a model or an optimizer")
     return target
+
+
+def _makes_a_part(target: Any, name: str) -> bool:
+    """Whether a call only makes an object: of a library, its tools, which do other things, are left out."""
+    if name.startswith(OURS):
+        return True
+    from torch import nn, optim  # seconds; `import_module` has loaded it before
+
+    if inspect.isclass(target):
+        return issubclass(target, (nn.Module, optim.Optimizer))
+    from torchvision.models import list_models
+
+    return target.__name__ in list_models()
 
 
 Target = Annotated[dict[str, Any], AfterValidator(check_target)]
@@ -100,11 +117,11 @@ def describe(problem: ErrorDetails, model: type[BaseModel]) -> str:
         return ".".join([key, context["path"]]) + f": {context['reason']}"
     if problem["type"] == "extra_forbidden":
         valid = valid_keys(model, place[:-1])
-        unknown = f"{key}: unknown key (value {problem['input']!r}){nearest(location[-1], valid)}"
+        unknown = f"{key}: unknown key (value {shown(problem['input'])}){nearest(location[-1], valid)}"
         return f"{unknown}; expected one of {_listed(valid)}"
     if problem["type"] == "missing":
         return f"{key}: missing; expected {key}=VALUE"
-    given = "" if isinstance(problem["input"], dict) else f"got {problem['input']!r}; "
+    given = "" if isinstance(problem["input"], dict) else f"got {shown(problem['input'])}; "
     return ": ".join(filter(None, [key, f"{given}{in_our_words(problem['msg'])}"]))
 
 
@@ -142,7 +159,7 @@ def _check_value(path: str, value: Any, annotation: Any) -> None:
     try:
         adapter.validate_python(value)
     except ValidationError as error:
-        raise _error(path, f"got {value!r}; {in_our_words(error.errors()[0]['msg'])}") from None
+        raise _error(path, f"got {shown(value)}; {in_our_words(error.errors()[0]['msg'])}") from None
 
 
 def _error(path: str, reason: str) -> PydanticCustomError:

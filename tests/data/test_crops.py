@@ -187,7 +187,7 @@ def test_bytes_turned_over_never_raise_anything_else() -> None:
 def test_no_image_is_one_line_at_first_sight(tmp_path: Path, content: bytes) -> None:
     file = tmp_path / "a.png"
     file.write_bytes(content)
-    with pytest.raises(DatasetError, match=r"a\.png: not an image of any kind that Pillow knows"):
+    with pytest.raises(DatasetError, match=r"a\.png: not an image of any kind that is read here"):
         image_size(file)
     with pytest.raises(DatasetError, match=r"b\.png: cannot be read as an image \(No such file"):
         image_size(tmp_path / "b.png")

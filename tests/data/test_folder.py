@@ -197,11 +197,16 @@ def turned(photos: DetectionFolder) -> None:
     Image.new("RGB", (160, 90)).save(photos.root / "train" / "wide.jpg", exif=exif)
 
 
+def beside_its_box(photos: DetectionFolder) -> None:
+    change_line(photos, box=[140, 60, 160, 90], fx=40.0, fy=40.0, x=-20.0)
+
+
 BAD: list[tuple[Callable[[DetectionFolder], None], str]] = [
     (lambda photos: change_line(photos, box=[200, 20, 250, 70]), "line 1: box=.* outside the image of 160 x 90"),
     (lambda photos: change_line(photos, file_name="no.jpg"), "line 1: .*no.jpg: cannot be read"),
     (lambda photos: (photos.root / "train" / "wide.jpg").write_bytes(b""), "line 1: .*wide.jpg: not an image"),
-    (lambda photos: change_line(photos, box=[140, 60, 160, 90], x=-90.0), "line 1: the position .* 90 degrees"),
+    (lambda photos: change_line(photos, x=-90.0), "line 1: the position .* far outside the image"),
+    (beside_its_box, "line 1: the position .* 90 degrees"),
     (lambda photos: change_line(photos, fx=0.1, fy=0.1), "line 1: box=.*: .* 90 degrees or more"),
     (lambda photos: change_line(photos, x=None, y=None, z=None), "line 1: x, y, z are missing"),
     (turned, r"wide\.jpg: has the EXIF orientation 6"),

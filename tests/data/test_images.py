@@ -1,14 +1,12 @@
 """Images decoded once: exact, found again, and never taken for others."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from PIL import Image
 
 from phd_exp.data import images
 from phd_exp.data.images import cached_images
-from phd_exp.records.dataset import DatasetError, DatasetFolder
+from phd_exp.records.dataset import DatasetError, DatasetFolder, sha256
 
 SIDE, N = 64, 5
 
@@ -77,13 +75,12 @@ def test_a_damaged_image_is_one_line_and_leaves_no_cache(
     assert not list(folder.cache.glob("*.npy"))
 
 
-def test_what_is_no_image_is_one_line(tmp_path: Path) -> None:
-    from phd_exp.records.dataset import sha256
-
-    file = tmp_path / "000000.png"
+def test_what_is_no_image_is_one_line(folder: DatasetFolder) -> None:
+    record = folder.records("train")[0].model_copy(update={"sha256": sha256(b"no image")})
+    file = folder.image_path("train", 0)
     file.write_bytes(b"no image")
     with pytest.raises(DatasetError, match="cannot be decoded"):
-        images.decode(file, sha256(b"no image"), 32)
+        images.decode(file, record, 32)
 
 
 def test_two_processes_may_decode_at_once(folder: DatasetFolder) -> None:

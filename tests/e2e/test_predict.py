@@ -227,7 +227,7 @@ def test_of_a_baseline_python_gets_points(baseline: RunFolder) -> None:
 
 MISTAKES = [
     (("image=no.png", "f=400"), "no.png: cannot be read (No such file or directory)"),
-    (("image=empty.png", "f=400"), "empty.png: not an image of any kind that Pillow knows"),
+    (("image=empty.png", "f=400"), "empty.png: not an image of any kind that is read here"),
     (("image=torn.png", "f=400"), "torn.png: cannot be read as an image"),
     (("image=text.png", "f=400"), "text.png: not an image"),
     (("image=huge.png", "f=400"), "huge.png: has more pixels than Pillow's limit"),
@@ -291,8 +291,8 @@ SPOILED: list[tuple[Callable[[RunFolder], Any], str]] = [
     (lambda it: it.config_file.unlink(), "no run; expected a folder with config.yaml"),
     (lambda it: it.config_file.write_text("!!python/object/apply:os.abort []"), "config.yaml: cannot be read"),
     (lambda it: it.last_checkpoint.unlink(), "last.ckpt: missing; the run has not trained a whole epoch yet"),
-    (lambda it: it.last_checkpoint.write_bytes(b"torn"), "last.ckpt: not a whole checkpoint of this network"),
-    (lambda it: torch.save({"state_dict": _Evil()}, it.last_checkpoint), "not a whole checkpoint"),
+    (lambda it: it.last_checkpoint.write_bytes(b"torn"), "last.ckpt: not a whole checkpoint (File is"),
+    (lambda it: torch.save({"state_dict": _Evil()}, it.last_checkpoint), "holds more than tensors and plain values"),
     (diverge, "000000.png: the network returns numbers that are not finite; train the run again"),
     (lambda it: torch.save({"state_dict": {}}, it.last_checkpoint), "not a whole checkpoint"),
     (

@@ -186,7 +186,7 @@ def test_a_scene_with_a_prediction_that_is_not_finite_is_left_out(calibrated: Pa
 
 
 BROKEN = [
-    (lambda t: t.drop(columns="pose_w"), "column pose_w missing"),
+    (lambda t: t.drop(columns="pose_w"), "has no column pose_w"),
     (lambda t: t[1:], "not every view of every scene, two or more, in order"),
     (lambda t: t[::-1], "not every view of every scene, two or more, in order"),
     (lambda t: t[t["view"] == 0], "not every view of every scene, two or more, in order"),

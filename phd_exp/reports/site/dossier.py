@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from phd_exp.records.errors import RunError, UserError
 from phd_exp.records.runs import RunFolder, RunStatus, flatten
 from phd_exp.reports.collect import Run
 from phd_exp.reports.fusion import FusionScores, fusion_scores
+from phd_exp.reports.parquet import read_table
 from phd_exp.reports.several_views import read_views
 from phd_exp.reports.site.assessment import Assessment, assess
 
@@ -50,7 +50,7 @@ def read_dossier(run: Run) -> Dossier:
     """Read everything of a run that is there; never fails on what a run left behind."""
     notes: list[str] = []
     folder = run.folder
-    rows = _sound(_attempt(folder.metrics, notes) or [])
+    rows = _attempt(folder.metrics, notes) or []
     predictions = None
     if folder.predictions.exists():
         predictions = _attempt(lambda: read_predictions(folder), notes)
@@ -100,18 +100,10 @@ def _attempt(read: Callable[[], Found], notes: list[str]) -> Found | None:
 def read_predictions(folder: RunFolder) -> pa.Table:
     """The table of a run's predictions. Raises RunError where it cannot be read or is empty."""
     file = folder.predictions
-    try:
-        table = pq.read_table(file)
-    except (pa.ArrowException, OSError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise RunError(f"{file}: cannot be read ({reason}); delete the folder to run again") from None
+    table = read_table(file)
     if table.num_rows == 0:
         raise RunError(f"{file}: holds no predictions; delete the folder to run again")
     return table
-
-
-def _sound(rows: list[Any]) -> list[dict[str, Any]]:
-    return [row for row in rows if isinstance(row, dict) and type(row.get(EPOCH)) is int]
 
 
 def _series(rows: list[dict[str, Any]]) -> dict[str, list[float | None]]:
@@ -120,5 +112,8 @@ def _series(rows: list[dict[str, Any]]) -> dict[str, list[float | None]]:
 
 
 def _number(value: Any) -> float | None:
-    sound = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    return float(value) if sound else None
+    try:
+        number = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
+    except OverflowError:  # JSON knows whole numbers without end
+        return None
+    return number if math.isfinite(number) else None

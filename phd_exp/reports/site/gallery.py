@@ -12,8 +12,9 @@ import torch
 from PIL import Image
 
 from phd_exp.distributions.columns import PARAMETERS, from_columns
-from phd_exp.records.errors import RunError
-from phd_exp.records.files import write_atomic
+from phd_exp.records.errors import RunError, UserError
+from phd_exp.records.files import require_plain, write_atomic
+from phd_exp.records.images import LARGEST_IMAGE, RENDERED, decoding, pillow_warnings
 from phd_exp.reports.level_curves import LEVELS, LevelCurves, level_curves, on_image
 from phd_exp.reports.site.assessment import is_distribution
 from phd_exp.reports.site.panels import BirdsEye, birds_eye_view, close_up, point, svg_path
@@ -167,13 +168,20 @@ def _facts(row: Mapping[str, Any], key: str) -> list[tuple[str, str]]:
 def load_image(source: Path, name: str) -> Image.Image | None:
     """A test image, shrunk where it is large; None where it is not there, no image, or outside its folder."""
     file = source / name
-    if not file.resolve().is_relative_to(source.resolve()):
-        return None
     try:
-        with Image.open(file, formats=("PNG", "WEBP", "JPEG")) as image:
-            image.thumbnail((LARGEST, LARGEST))
-            return image.convert("RGB")
-    except (OSError, ValueError, Image.DecompressionBombError):
+        if not file.resolve().is_relative_to(source.resolve()):
+            return None
+        with decoding(file), pillow_warnings():
+            require_plain(file, LARGEST_IMAGE)
+            with Image.open(file, formats=RENDERED) as image:
+                image.thumbnail((LARGEST, LARGEST))
+                return image.convert("RGB")
+    except (
+        UserError,
+        OSError,
+        ValueError,
+        RuntimeError,
+    ):  # also a name with a NUL byte, a link that leads to itself
         return None
 
 

@@ -1,0 +1,55 @@
+"""JSON and YAML from files that somebody else may have written: what cannot be meant is refused, not guessed."""
+
+import json
+from typing import Any
+
+import yaml
+
+
+def parse_json(text: str) -> Any:
+    """The content of a JSON text.
+
+    Raises ValueError for what is no JSON, for a key given twice in one object (of which a plain reader would keep the
+    last), and for nesting without end.
+    """
+    try:
+        return json.loads(text, object_pairs_hook=_once)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def parse_yaml(text: str) -> Any:
+    """The content of a YAML text: plain containers and values, never objects.
+
+    Raises ValueError for what is no YAML, for a key given twice, for nesting without end, and for an alias (`*name`):
+    a few of these stand for gigabytes, and this programme writes none.
+    """
+    try:
+        return yaml.load(text, _PlainLoader)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    except yaml.YAMLError as error:
+        raise ValueError(str(error)) from None
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """Of PyYAML's safe loader, what a record needs."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.events.AliasEvent):
+            raise ValueError(f"the alias *{self.peek_event().anchor} stands for another part; write it out")
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        _once([(key, None) for key in keys])
+        return super().construct_mapping(node, deep)
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"the key {twice!r} is given twice")
+    return content

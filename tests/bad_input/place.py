@@ -1,0 +1,163 @@
+"""What bad inputs are made from: a sound run, sound images and a sound data set, made without a renderer."""
+
+import json
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import hydra
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+import yaml
+from PIL import Image
+
+from phd_exp.__main__ import main
+from phd_exp.cli.paths import conf_folder
+from phd_exp.records.dataset import SPLITS, DatasetFolder, Manifest, Seal, sha256
+from phd_exp.records.runs import RunFolder, find_runs
+from phd_exp.records.spec import DatasetSpec
+from tests.data.conftest import picture, record
+
+TRAIN = (
+    "preset=smoke", "logger=none", "data=folder", "data.batch_size=4", "data.image_size=32", "data.n_held_out=0",
+    "trainer.threads=1", "trainer.precision=float32", "trainer.progress_bar=false", "trainer.max_epochs=1",
+    "trainer.accelerator=cpu",
+)  # fmt: skip
+HANDMADE = ("preset=smoke", "data.variant=handmade", "data.sensor_size=64", "data.f_range=[400,600]")
+
+
+@dataclass(frozen=True)
+class Place:
+    """A folder of one test: `photos/`, `renders/handmade/`, `runs/` with one run; where the command is given."""
+
+    root: Path
+
+    @property
+    def run(self) -> RunFolder:
+        (path,) = self.root.glob("runs/smoke/folder/probabilistic/seed0-*")
+        return RunFolder(path)
+
+    @property
+    def photo(self) -> Path:
+        return self.root / "photos/test/0.png"
+
+    @property
+    def metadata(self) -> Path:
+        return self.root / "photos/test/metadata.jsonl"
+
+    def put(self, file: Path | str, content: bytes | str) -> None:
+        """Write a file anew: the sound one may be shared with other tests."""
+        path = self.root / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+
+    @property
+    def handmade(self) -> DatasetFolder:
+        return DatasetFolder(self.root / "renders/handmade")
+
+    def put_record(self, image: bytes | None = None, **changes: Any) -> None:
+        """Change the first line of the handmade test split, and its image, as somebody who knows the format."""
+        folder = self.handmade
+        if image is not None:
+            folder.image_path("test", 0).write_bytes(image)
+            changes["sha256"] = sha256(image)
+        first, *rest = folder.metadata_path("test").read_text().splitlines()
+        text = "\n".join([json.dumps(json.loads(first) | changes), *rest]) + "\n"
+        folder.metadata_path("test").write_text(text)
+        seals = folder.manifest.splits | {"test": Seal(n=2, metadata_sha256=sha256(text.encode()))}
+        folder.write_manifest(folder.manifest.model_copy(update={"splits": seals}))
+
+    def put_line(self, **changes: Any) -> None:
+        """Change the first line of the metadata of the test images."""
+        first, *rest = self.metadata.read_text().splitlines()
+        self.put(self.metadata, "\n".join([json.dumps(json.loads(first) | changes), *rest]) + "\n")
+
+    def put_config(self, **changes: Any) -> None:
+        """Change what the run's configuration says; dots lead inside."""
+        config = self.run.config()
+        for path, value in changes.items():
+            *parents, leaf = path.split("__")
+            node = config
+            for parent in parents:
+                node = node[parent]
+            node[leaf] = value
+        self.put(self.run.config_file, yaml.safe_dump(config))
+
+    def put_json(self, file: Path, **changes: Any) -> None:
+        self.put(file, json.dumps(json.loads(file.read_text()) | changes))
+
+    def put_checkpoint(self, **changes: Any) -> None:
+        content = torch.load(self.run.last_checkpoint, weights_only=True) | changes
+        self.run.last_checkpoint.unlink()
+        torch.save(content, self.run.last_checkpoint)
+
+    def put_column(self, name: str, values: pa.Array | None) -> None:
+        """Replace a column of the predictions, or take it away."""
+        table = pq.read_table(self.run.predictions)
+        table = table.drop_columns([name])
+        if values is not None:
+            table = table.append_column(name, values)
+        self.run.predictions.unlink()
+        pq.write_table(table, self.run.predictions)
+
+
+def write_photos(folder: Path) -> None:
+    """Noise with boxes anywhere, and true positions that project into the boxes."""
+    draw = np.random.default_rng(0)
+    for split, n in (("train", 6), ("test", 3)):
+        (folder / split).mkdir(parents=True)
+        lines = []
+        for index in range(n):
+            noise = draw.integers(0, 256, (90, 120, 3), dtype=np.uint8)
+            Image.fromarray(noise).save(folder / split / f"{index}.png")
+            line = {"file_name": f"{index}.png", "f": 300.0, "box": [10 + index, 10, 60, 70]}
+            lines.append(line | {"x": -0.2, "y": -0.02, "z": 3.0 + 0.1 * index})
+        (folder / split / "metadata.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+
+
+def write_handmade(folder: DatasetFolder, spec: DatasetSpec) -> None:
+    """Noise as a rendered data set, sealed."""
+    seals = {}
+    for split in SPLITS:
+        folder.split_folder(split).mkdir(parents=True)
+        lines = ""
+        for index in range(2):
+            file = folder.image_path(split, index)
+            Image.fromarray(picture(index)).save(file)
+            lines += record(index, split, file.read_bytes()).model_dump_json() + "\n"
+        folder.metadata_path(split).write_text(lines)
+        seals[split] = Seal(n=2, metadata_sha256=sha256(lines.encode()))
+    folder.write_manifest(Manifest(generator=1, renderer="none", spec=spec, splits=seals))
+
+
+def handmade_spec() -> DatasetSpec:
+    with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
+        data = hydra.compose("config", list(HANDMADE)).data
+    return DatasetSpec(**{key: data[key] for key in DatasetSpec.model_fields})
+
+
+def make(root: Path) -> None:
+    """Everything sound; the run is trained for one epoch."""
+    write_photos(root / "photos")
+    write_handmade(DatasetFolder(root / "renders/handmade"), handmade_spec())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(root)
+        patch.setattr("sys.argv", ["phd_exp"])
+        assert main([*TRAIN, "data.folder=photos"]) == 0
+    assert len(find_runs(root / "runs")) == 1
+
+
+def copied(sound: Path, root: Path) -> Place:
+    """A copy to be spoiled; the checkpoint, the one large file, is shared until it is written anew."""
+
+    def copy(source: str, target: str) -> None:
+        (os.link if source.endswith(".ckpt") else shutil.copy2)(source, target)
+
+    shutil.copytree(sound, root, dirs_exist_ok=True, copy_function=copy)
+    return Place(root)

@@ -1,0 +1,420 @@
+"""Every named bad input: what is wrong, the command that meets it, and the one line that it says."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import torch
+from PIL import Image
+
+from tests.bad_input import images
+from tests.bad_input.place import HANDMADE, TRAIN, Place
+
+RUN = "run=RUN"
+"""The run of the place, whose name holds a hash."""
+PREDICT = ("predict", RUN, "folder=photos/test")
+ONE = ("predict", RUN, "image=photos/test/0.png", "f=300")
+EXPORT = ("export", RUN)
+REPORT = ("report", "runs=runs")
+LEARN = (*TRAIN, "data.folder=photos")
+VERIFY = ("render", *HANDMADE, "verify=true", "rerender=0")
+LEARN_HANDMADE = (
+    *HANDMADE, "logger=none", "data.n_train=1", "data.n_held_out=1", "data.n_test=2", "data.batch_size=1",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Bad:
+    """A bad input.
+
+    Attributes:
+        name: what is wrong.
+        spoil: makes it so.
+        words: of the command line.
+        said: the whole line after `error: `, or, of a report, a part of what it prints, as a regular expression.
+        status: the exit status; 0 of a report, which names a bad run and goes on.
+    """
+
+    name: str
+    spoil: Callable[[Place], Any]
+    words: tuple[str, ...]
+    said: str
+    status: int = 1
+
+
+def nothing(place: Place) -> None:
+    """The command line alone is wrong."""
+
+
+def configured(name: str, word: str, said: str) -> Bad:
+    return Bad(f"configuration: {name}", nothing, ("preset=smoke", "logger=none", word), said, 2)
+
+
+def photo(name: str, content: bytes | Callable[[], bytes], said: str) -> Bad:
+    def spoil(place: Place) -> None:
+        place.put(place.photo, content if isinstance(content, bytes) else content())
+
+    return Bad(f"image: {name}", spoil, PREDICT, rf"photos/test/0\.png: {said}")
+
+
+def line(name: str, text: str, said: str) -> Bad:
+    def spoil(place: Place) -> None:
+        place.put(place.metadata, text.encode(errors="surrogateescape"))
+
+    return Bad(f"metadata: {name}", spoil, PREDICT, rf"photos/test/metadata\.jsonl, line 1: {said}")
+
+
+def label(name: str, said: str, **changes: Any) -> Bad:
+    def spoil(place: Place) -> None:
+        file = place.root / "photos/train/metadata.jsonl"
+        first, *rest = file.read_text().splitlines()
+        place.put(file, "\n".join([json.dumps(json.loads(first) | changes), *rest]) + "\n")
+
+    where = r"photos/train/metadata\.jsonl, line 1: "
+    return Bad(f"label: {name}", spoil, (*LEARN, "runs=others"), where + said)
+
+
+def camera(name: str, words: tuple[str, ...], said: str) -> Bad:
+    return Bad(f"intrinsics: {name}", nothing, (*ONE[:3], *words), said)
+
+
+def checkpoint(name: str, spoil: Callable[[Place], Any], said: str) -> list[Bad]:
+    """The same checkpoint in each of the verbs that read it."""
+    said = rf"runs/.*/last\.ckpt: {said}"
+
+    def broken_off(place: Place) -> None:
+        spoil(place)
+        place.put_json(place.run.status_file, state="interrupted")
+
+    def resumed(place: Place) -> None:
+        broken_off(place)
+
+    return [
+        Bad(f"checkpoint: {name}, predicted with", spoil, ONE, said),
+        Bad(f"checkpoint: {name}, exported", spoil, EXPORT, said),
+        Bad(f"checkpoint: {name}, resumed", resumed, LEARN, said),
+    ]
+
+
+def stored(name: str, said: str, **changes: Any) -> list[Bad]:
+    """The same stored configuration in each of the verbs that build from it."""
+
+    def spoil(place: Place) -> None:
+        place.put_config(**changes)
+
+    return [Bad(f"stored configuration: {name}, {words[0]}", spoil, words, said) for words in (ONE, EXPORT)]
+
+
+def record(
+    name: str, said: str, image: bytes | Callable[[], bytes] | None = None, **changes: Any
+) -> list[Bad]:
+    """The same rendered data set, verified and trained on."""
+
+    def spoil(place: Place) -> None:
+        place.put_record(image() if callable(image) else image, **changes)
+
+    where = r"/.*/renders/handmade/test/"
+    return [
+        Bad(f"rendered: {name}, {kind}", spoil, words, where + said)
+        for kind, words in (("verified", VERIFY), ("trained on", LEARN_HANDMADE))
+    ]
+
+
+def reported(name: str, spoil: Callable[[Place], Any], said: str) -> Bad:
+    return Bad(f"run folder: {name}", spoil, REPORT, said, 0)
+
+
+def status(**changes: Any) -> Callable[[Place], None]:
+    return lambda place: place.put_json(place.run.status_file, **changes)
+
+
+def column(name: str, values: Callable[[int], Any]) -> Callable[[Place], None]:
+    return lambda place: place.put_column(name, pa.array(values(3)))
+
+
+GOOD = '"file_name": "0.png", "f": 300'
+DEEP = "[" * 100_000
+BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
+    f"{name}: &{name} [{','.join([f'*{before}'] * 9)}]\n"
+    for before, name in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+CONFIGURATIONS = [
+    configured("a flag that there is not", "--nonsense", r"unrecognized arguments: --nonsense; see `python -m phd_exp --help`"),
+    configured("a flag without its value", "-c", r"argument --cfg/-c: expected one argument; .*"),
+    configured("a group set to null", "model=null", r"Config group override must be a string or a list\..*"),
+    configured("a part set to null", "model.head=null", r"model\.head: got None; expected a valid dictionary"),
+    configured("a layer as a head", "model.head._target_=torch.nn.Linear", r"model\.head\._target_: 'torch\.nn\.Linear' is no head; .*"),
+    configured("a loss of others", "loss._target_=torch.nn.L1Loss", r"loss\._target_: 'torch\.nn\.L1Loss' is no loss; .*"),
+    configured("a tool of torch", "loss._target_=torch.nn.utils.clip_grad_norm_", r"loss\._target_: .* is no part of a network; .*"),
+    configured("a private name", "optimizer._target_=torch.optim._adamw.x", r"optimizer\._target_: .* may not be built .*"),
+    configured("a system call", "loss._target_=os.system", r"loss\._target_: 'os\.system' may not be built .*"),
+    configured("arguments by place", "+backbone._args_=[1]", r"backbone\._args_: unknown key; .* takes depth"),
+    configured("half a loss", "+loss._partial_=true", r"loss\._target_: .* is no loss; .*"),
+    configured("a partial that is no bool", "+loss._partial_=3", r"loss\._partial_: got 3; expected a bool"),
+    configured("an interpolation kept as text", r"model.name='a\${b}'", r"model\.name: got 'a\$\{b\}'; expected a value, since no interpolation .*"),
+    configured("an interpolation to nowhere", "seed=${nope}", r"Interpolation key 'nope' not found.*"),
+    configured("an interpolation of itself", "seed=${seed}", r"Recursive interpolation detected.*"),
+    configured("a variable that is not set", "seed=${oc.env:NO_SUCH}", r".*Environment variable 'NO_SUCH' not found.*"),
+    configured("an infinite learning rate", "optimizer.lr=inf", r"optimizer\.lr: got inf; expected to be a finite number"),
+    configured("a learning rate that is no number", "optimizer.lr=nan", r"optimizer\.lr: got nan; expected to be a finite number"),
+    configured("an image too large", "data.image_size=100000", r"data\.image_size: got 100000; expected to be less than or equal to 4096"),
+    configured("a focal length of nearly nothing", "data.f_range=[1e-300,2000]", r"data\.f_range\.0: got 1e-300; .* equal to 10"),
+    configured("a focal length without end", "data.f_range=[1200,1e300]", r"data\.f_range\.1: got 1e\+300; .*"),
+    configured("a range that is one number", "data.f_range=5", r"data\.f_range: got 5; expected a valid tuple"),
+    configured("a seed beyond all", "seed=99999999999999999999", r"seed: got 99999999999999999999; expected to be less than .*"),
+    configured("a folder without a name", "runs=''", r"runs: got ''; expected the name of a folder"),
+    configured("brackets without end", "+a=" + "[" * 2000, r"[^\n]{1,420}"),
+    configured("no key at all", "=5", r"Config group override .*"),
+    configured("an empty word", "", r".*mismatched input.*"),
+    configured("a zero byte", "runs=a\0b", r"LexerNoViableAltException.*"),
+    Bad("configuration: a billion jobs", nothing, ("-m", "preset=smoke", "seed=range(0,1e9)"), r"seed=range\(0,1e9\): more than 10000 jobs; .*", 2),
+    Bad("configuration: a folder that cannot be made", nothing, ("preset=smoke", "hydra.run.dir=/proc/nope"), r"/proc/nope: cannot be written \(.*\); .*", 2),
+]  # fmt: skip
+
+KINDS = r"not an image of any kind that is read here \(PNG, .*\)"
+PICTURES = [
+    photo("zero bytes", b"", KINDS),
+    photo("text", b"no image", KINDS),
+    photo("SVG", images.SVG, KINDS),
+    photo("PostScript", images.POSTSCRIPT, KINDS),
+    photo("a head alone", b"\x89PNG\r\n\x1a\n", KINDS),
+    photo("cut off", lambda: images.saved(images.noise(32, 32, 3))[:900], r"cannot be read as an image \(.*\); replace it"),
+    photo("damaged", images.damaged, r"cannot be read as an image \(.*\); replace it"),
+    photo("65535 x 65535 declared", images.declared_png(65535, 65535), r"has more pixels than Pillow's limit of .*"),
+    photo("10000 x 10000 declared", images.declared_png(10_000, 10_000), r"has more pixels than Pillow's limit of .*"),
+    photo("a bomb in a comment", images.text_bomb, r"cannot be read as an image \(Decompressed data too large.*\); replace it"),
+    photo("animated GIF", lambda: images.animated("gif"), r"holds several pictures; expected one, .*"),
+    photo("TIFF of several pages", lambda: images.animated("tiff"), r"holds several pictures; expected one, .*"),
+    photo("animated PNG", lambda: images.animated("png"), r"holds several pictures; expected one, .*"),
+    photo("turned by EXIF", images.turned, r"has the EXIF orientation 6, .*"),
+    photo("32 bits", lambda: images.saved(Image.fromarray(np.zeros((8, 8), dtype=np.int32)), "tiff"), r"has colours of the kind 'I'; .*"),
+    photo("floating point", lambda: images.saved(Image.fromarray(np.zeros((8, 8), dtype=np.float32)), "tiff"), r"has colours of the kind 'F'; .*"),
+    photo("Lab colours", lambda: images.saved(Image.new("LAB", (8, 8)), "tiff"), r"has colours of the kind 'LAB'; .*"),
+    Bad("image: a pipe", lambda place: images.pipe(place.photo), PREDICT, r"photos/test/0\.png: cannot be read \(a pipe or a device; .*\)"),
+    Bad("image: a pipe to train on", lambda place: images.pipe(place.root / "photos/train/0.png"), (*LEARN, "runs=others"), r".*line 1: .*0\.png: cannot be read as an image \(a pipe or a device; .*"),
+    Bad("image: a device", nothing, ("predict", RUN, "image=/dev/zero", "f=300"), r"/dev/zero: cannot be read \(a pipe or a device; expected a plain file\)"),
+    Bad("image: a folder", nothing, ("predict", RUN, "image=photos", "f=300"), r"photos: cannot be read \(Is a directory\)"),
+    Bad("image: gone", lambda place: place.photo.unlink(), PREDICT, r"photos/test/0\.png: cannot be read \(No such file or directory\)"),
+]  # fmt: skip
+
+LINES = [
+    line("not JSON", "{", r"not JSON \(.*\); expected one object a line"),
+    line("a list", "[1]\n", r"expected a valid dictionary or instance of DetectionLine"),
+    line("nesting without end", f'{{{GOOD}, "box": {DEEP}}}\n', r"not JSON \(nested too deeply\); .*"),
+    line("a number of 5000 digits", f'{{"file_name": "0.png", "f": {"9" * 5000}}}\n', r"not JSON \(Exceeds the limit .*\); .*"),
+    line("a number of 400 digits", f'{{"file_name": "0.png", "f": {"9" * 400}}}\n', r"f: got 9{50,}\.\.\.; expected .*"),
+    line("a key given twice", f'{{{GOOD}, "f": 301}}\n', r"not JSON \(the key 'f' is given twice\); .*"),
+    line("a line of 2 MB", f'{{{GOOD}, "x": "{"a" * 2_000_000}"}}\n', r"longer than 1000000 bytes"),
+    line("no text", '{"file_name": "\udcff"', r"not a valid record \(.*codec can't decode.*\)"),
+    line("a name that leads up", '{"file_name": "../../secret.png", "f": 300}\n', r"file_name='\.\./\.\./secret\.png' leaves .*"),
+    line("an absolute name", '{"file_name": "/etc/passwd", "f": 300}\n', r"file_name='/etc/passwd' leaves .*"),
+    line("a name with a zero byte", '{"file_name": "a\\u0000.png", "f": 300}\n', r"file_name='a\\x00\.png' is no file name .*"),
+    line("a name of two lines", '{"file_name": "a\\nerror: b.png", "f": 300}\n', r"file_name='a\\nerror: b\.png' is no file name .*"),
+    line("a name that steers the terminal", '{"file_name": "\\u001b[2J.png", "f": 300}\n', r"file_name='\\x1b\[2J\.png' is no file name .*"),
+    line("a name of half a character", '{"file_name": "\\ud800.png", "f": 300}\n', r"file_name: got '\\ud800\.png'; expected a valid string, .*"),
+    line("a name without end", f'{{"file_name": "{"a" * 5000}.png", "f": 300}}\n', r"file_name: got 'a{50,}\.\.\.; String should have at most 1000 characters"),
+    line("no name", '{"f": 300}\n', r"file_name: missing"),
+    line("an unknown key", f'{{{GOOD}, "bx": 1}}\n', r"bx: unknown key, did you mean 'box'\?; .*"),
+    line("distortion", f'{{{GOOD}, "k1": 0.1}}\n', r"k1: a distorted image is no pinhole image; .*"),
+    line("a box of text", f'{{{GOOD}, "box": "all"}}\n', r"box: got 'all'; expected a valid tuple"),
+    line("a box outside", f'{{{GOOD}, "box": [500, 0, 600, 9]}}\n', r"box=.* lies outside the image of 120 x 90 pixels"),
+    Bad("metadata: a link out", lambda place: (place.photo.rename(place.root / "secret.png"), images.link(place.photo, "../../secret.png")), PREDICT, r".*line 1: file_name='0\.png' leaves .*"),
+    Bad("metadata: a link to itself", lambda place: images.link(place.photo, "0.png"), PREDICT, r".*0\.png.*(no file name|cannot be read|leaves).*"),
+    Bad("metadata: a pipe", lambda place: images.pipe(place.metadata), PREDICT, r"photos/test/metadata\.jsonl: cannot be read \(a pipe or a device; .*\); .*"),
+    Bad("metadata: empty", lambda place: place.put(place.metadata, ""), PREDICT, r"photos/test/metadata\.jsonl: some detections asked for, 0 found"),
+    Bad("metadata: a folder", lambda place: (place.metadata.unlink(), place.metadata.mkdir()), PREDICT, r"photos/test/metadata\.jsonl: cannot be read \(Is a directory\); .*"),
+]  # fmt: skip
+
+LABELS = [
+    label("NaN", r"x: got nan; expected to be a finite number", x=float("nan")),
+    label("infinite", r"y: got inf; expected to be a finite number", y=float("inf")),
+    label("depth zero", r"z: got 0; expected to be greater than 0", z=0),
+    label("behind the camera", r"z: got -3\.5; expected to be greater than 0", z=-3.5),
+    label("focal length zero", r"f: got 0; expected to be greater than 0", f=0),
+    label(
+        "a focal length in metres",
+        r"f: got 0\.004; expected a focal length in pixels, at least 0\.01",
+        f=0.004,
+    ),
+    label("focal length negative", r"f: got -300; expected to be greater than 0", f=-300),
+    label("no position", r"x, y, z are missing; .*", x=None, y=None, z=None),
+    label("half a position", r"x, y is given alone; .*", z=None),
+    label(
+        "millimetres across",
+        r"the position \[-200\.0, .*\] is seen at .*, far outside the image .*; check x, y, z \(metres\) .*",
+        x=-200,
+    ),
+    label("a depth without end", r"z: got 1e\+300; .*", z=1e300),
+    label("text", r"z: got 'far'; expected a valid number", z="far"),
+    label("outside the field", r"the position .* is seen at .*, far outside the image .*", x=-9),
+]
+
+CAMERAS = [
+    camera("none", (), r"photos/test/0\.png: expected either f, or fx and fy \(focal length in pixels\)"),
+    camera("both", ("f=300", "fx=300", "fy=300"), r"photos/test/0\.png: expected either f, or fx and fy .*"),
+    camera("zero", ("f=0",), r"photos/test/0\.png: f: got 0\.0; expected to be greater than 0"),
+    camera("negative", ("f=-1",), r"photos/test/0\.png: f: got -1\.0; expected to be greater than 0"),
+    camera("NaN", ("f=nan",), r"photos/test/0\.png: f: got nan; expected to be a finite number"),
+    camera("beyond all numbers", ("f=1e400",), r"photos/test/0\.png: f: got inf; expected to be a finite number"),
+    camera("nearly infinite", ("f=1e300",), r"photos/test/0\.png: f: got 1e\+300; expected to be less .*"),
+    camera("nearly zero", ("f=1e-300",), r"photos/test/0\.png: f: got 1e-300; expected a focal length in pixels, at least 0\.01"),
+    camera("half a centre", ("f=300", "cx=3"), r"photos/test/0\.png: cx is given alone; expected all of cx, cy"),
+    camera("a centre far away", ("f=300", "cx=1e300", "cy=0"), r"photos/test/0\.png: cx: got 1e\+300; .*"),
+    camera("text", ("f=wide",), r"f: got 'wide'; expected a valid number, .*"),
+    camera("a box of three numbers", ("f=300", "box=1,2,3"), r"box: got '1,2,3'; expected box=LEFT,TOP,RIGHT,BOTTOM in pixels"),
+    camera("a box without size", ("f=300", "box=3,0,3,5"), r"photos/test/0\.png: box=.*of positive size"),
+    camera("a box without end", ("f=300", "box=0,0,1e300,9"), r"photos/test/0\.png: box\.2: got 1e\+300; .*|.*times as large.*"),
+]  # fmt: skip
+
+
+def trap(place: Place) -> None:
+    place.put_checkpoint(state_dict=Trap("owned"))
+
+
+class Trap:
+    """Unpickled by a careless reader, it writes a file."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return exec, (f"open({self.name!r}, 'w').close()",)
+
+
+def shrunk(place: Place) -> None:
+    """As a packed archive, which could unfold without end."""
+    import zipfile
+
+    file = place.run.last_checkpoint
+    with zipfile.ZipFile(file) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    file.unlink()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in entries.items():
+            archive.writestr(name, content[:1000])
+
+
+CHECKPOINTS = [
+    *checkpoint("code", trap, r"holds more than tensors and plain values, which is not read; .*"),
+    *checkpoint("torn", lambda place: place.put(place.run.last_checkpoint, b"torn"), r"not a whole checkpoint \(File is not a zip file\); .*"),
+    *checkpoint("zero bytes", lambda place: place.put(place.run.last_checkpoint, b""), r"not a whole checkpoint \(File is not a zip file\); .*"),
+    *checkpoint("a pickle", lambda place: place.put(place.run.last_checkpoint, b"\x80\x04cos\nsystem\n(S'touch owned'\ntR."), r"not a whole checkpoint \(.*\); .*"),
+    *checkpoint("packed", shrunk, r"not a whole checkpoint \(its content is compressed, .*\); .*"),
+    *checkpoint("a list", lambda place: (place.run.last_checkpoint.unlink(), torch.save([1], place.run.last_checkpoint)), r"not a checkpoint of a run; .*"),
+    *checkpoint("a pipe", lambda place: images.pipe(place.run.last_checkpoint), r"not a whole checkpoint \(a pipe or a device; .*\); .*"),
+    *checkpoint("weights of another network", lambda place: place.put_checkpoint(state_dict={"regressor.last.bias": torch.zeros(7)}), r"not a (whole )?checkpoint of this (network|run) \(.*"),
+    *checkpoint("weights that are none", lambda place: place.put_checkpoint(state_dict=[1, 2]), r"not a (whole )?checkpoint of this (network|run) \(.*"),
+    checkpoint("an epoch that never was", lambda place: place.put_checkpoint(epoch=10**12), r"not a checkpoint of this run \(epoch 1000000000000 of 1\); .*")[2],
+    checkpoint("an epoch of text", lambda place: place.put_checkpoint(epoch="one"), r"not a checkpoint of this run \(epoch 'one' of 1\); .*")[2],
+    checkpoint("loops of another trainer", lambda place: place.put_checkpoint(loops={"fit_loop": 3}), r"not a checkpoint of this run \(.*\); .*")[2],
+]  # fmt: skip
+
+REFUSED = r"may not be built from a configuration; expected a name under .*"
+STORED = [
+    *stored("a system call", rf"backbone\._target_: 'os\.system' {REFUSED}", backbone={"_target_": "os.system", "command": "touch owned"}),
+    *stored("eval", rf"loss\._target_: 'builtins\.eval' {REFUSED}", loss={"_target_": "builtins.eval", "_args_": ["open('owned','w')"]}),
+    *stored("a call deep inside", rf"model\.head\.chart\._target_: 'os\.system' {REFUSED}", model__head={"_target_": "phd_exp.models.heads.ChartHead", "chart": {"_target_": "os.system", "command": "touch owned"}}),
+    *stored("our own command line", rf"backbone\._target_: 'phd_exp\.cli\.train\.main' {REFUSED}", backbone={"_target_": "phd_exp.cli.train.main", "arguments": []}),
+    *stored("our own writer of files", rf"backbone\._target_: 'phd_exp\.records\.files\.write_atomic' {REFUSED}", backbone={"_target_": "phd_exp.records.files.write_atomic", "path": "owned", "data": ""}),
+    *stored("code from the network", rf"backbone\._target_: 'torch\.hub\.load' {REFUSED}", backbone={"_target_": "torch.hub.load", "repo_or_dir": "x", "model": "y"}),
+    *stored("what a module imports", r"backbone\._target_: .* is no class or function of its own; .*", backbone={"_target_": "torchvision.models._api.importlib.import_module"} | {"_target_": "phd_exp.models.backbones.partial"}),
+    *stored("a tool of torchvision", r"backbone\._target_: .* is no part of a network; .*", backbone={"_target_": "torchvision.models.get_model", "name": "resnet18"}),
+    *stored("a variable of the environment", r"data\.folder: got '\$\{oc\.env:HOME\}'; expected a value, .*", data__folder="${oc.env:HOME}"),
+    *stored("a resolver", r"backbone\.depth: got '\$\{oc\.decode:18\}'; expected a value, .*", backbone__depth="${oc.decode:18}"),
+    *stored("an image without end", r"data\.image_size: got 1000000; expected to be less than or equal to 4096", data__image_size=1_000_000),
+    *stored("a wrong type", r"data: got 'x'; expected a valid dictionary.*", data="x"),
+    *stored("keys that are no text", r"evaluation\.1: .*[Kk]eys? .*", evaluation={"calibration_window": 200, "calibration_every_n_epochs": 10, 1: 2}),
+    Bad("stored configuration: gone", lambda place: place.run.config_file.unlink(), ONE, r"runs/.*seed0-.*: no run; expected a folder with config\.yaml and .*"),
+    Bad("stored configuration: objects", lambda place: place.put(place.run.config_file, "!!python/object/apply:os.system ['touch owned']"), ONE, r"runs/.*/config\.yaml: cannot be read \(could not determine a constructor .*\); .*"),
+    Bad("stored configuration: a billion laughs", lambda place: place.put(place.run.config_file, BOMB), ONE, r"runs/.*/config\.yaml: cannot be read \(the alias \*a stands for another part; write it out\); .*"),
+    Bad("stored configuration: itself", lambda place: place.put(place.run.config_file, "&a\nb: *a"), ONE, r"runs/.*/config\.yaml: cannot be read \(the alias \*a .*\); .*"),
+    Bad("stored configuration: nesting without end", lambda place: place.put(place.run.config_file, "a: " + "[" * 20_000), ONE, r"runs/.*/config\.yaml: cannot be read \(nested too deeply\); .*"),
+    Bad("stored configuration: a key twice", lambda place: place.put(place.run.config_file, "a: 1\na: 2"), ONE, r"runs/.*/config\.yaml: cannot be read \(the key 'a' is given twice\); .*"),
+    Bad("stored configuration: 2 MB", lambda place: place.put(place.run.config_file, "a: " + "b" * 2_000_000), ONE, r"runs/.*/config\.yaml: cannot be read \(2 MB; expected at most 1 MB\); .*"),
+    Bad("stored configuration: a pipe", lambda place: images.pipe(place.run.config_file), ONE, r"runs/.*/config\.yaml: cannot be read \(a pipe or a device; .*\); .*"),
+    Bad("stored configuration: a list", lambda place: place.put(place.run.config_file, "[1]"), ONE, r"runs/.*/config\.yaml: expected a mapping, found list"),
+    Bad("constants: negative", lambda place: place.put_json(place.run.constants_file, mu_z0=-1), ONE, r"runs/.*/constants\.json: not the constants of a run \(mu_z0 must be positive .*\)"),
+    Bad("constants: no number", lambda place: place.put_json(place.run.constants_file, constant_f=[]), ONE, r"runs/.*/constants\.json: not the constants of a run \(.*\)"),
+    Bad("constants: an infinite camera", lambda place: place.put(place.run.constants_file, place.run.constants_file.read_text().replace('"constant_f": ', '"constant_f": 1e999, "was": ')), ONE, r"runs/.*/constants\.json: not the constants of a run \(constant_f must be .*\)"),
+    Bad("constants: gone", lambda place: place.run.constants_file.unlink(), ONE, r"runs/.*/constants\.json: missing, so that .*"),
+]  # fmt: skip
+
+RECORDS = [
+    *record("a name that leads up", r"metadata\.jsonl, line 1: not a valid record \(.*file_name.*\)", file_name="../../../secret.png"),
+    *record("an absolute name", r"metadata\.jsonl, line 1: not a valid record \(.*file_name.*\)", file_name="/etc/passwd"),
+    *record("NaN", r"metadata\.jsonl, line 1: not a valid record \(.*\)", x=float("nan")),
+    *record("behind the camera", r"metadata\.jsonl, line 1: not a valid record \(.* z .*greater than 0.*\)", z=-1.0),
+    *record("an image too small", r"000000\.png: 32 x 32 pixels, 64 x 64 recorded; .*", lambda: images.saved(images.noise(32, 32, 3))),
+    *record("an image too large", r"000000\.png: 65535 x 65535 pixels.*|.*000000\.png: cannot be decoded \(.*\); .*", images.declared_png(65535, 65535)),
+    *record("grey", r"000000\.png: its pixels are of the kind 'L'; expected RGB of 8 bits; .*", lambda: images.saved(images.noise(64, 64))),
+    *record("transparent", r"000000\.png: its pixels are of the kind 'RGBA'; .*", lambda: images.saved(images.noise(64, 64, 4))),
+    *record("16 bits", r"000000\.png: its pixels are of the kind 'I;16'; .*", lambda: images.saved(Image.fromarray(np.zeros((64, 64), dtype=np.uint16)))),
+    *record("PostScript", r"000000\.png: cannot be decoded \(.*\); .*", images.POSTSCRIPT),
+    Bad("rendered: a pipe", lambda place: images.pipe(place.handmade.image_path("test", 0)), VERIFY, r".*000000\.png: cannot be read \(a pipe or a device; .*"),
+    Bad("rendered: a manifest of nesting without end", lambda place: place.put("renders/handmade/manifest.json", DEEP), VERIFY, r".*manifest\.json: not a readable manifest \(.*\); .*"),
+    Bad("rendered: a manifest that is a pipe", lambda place: images.pipe(place.handmade.manifest_path), VERIFY, r".*manifest\.json: not a readable manifest \(.*a pipe or a device.*\); .*"),
+    Bad("rendered: a manifest of another place", lambda place: place.put("renders/handmade/manifest.json", place.handmade.manifest_path.read_text().replace('"handmade"', '"../../photos"')), VERIFY, r".*manifest\.json: not a readable manifest \(.*variant.*\); .*"),
+    Bad("rendered: a manifest of 20 MB", lambda place: place.put("renders/handmade/manifest.json", " " * 20_000_000), VERIFY, r".*manifest\.json: not a readable manifest \(.*20 MB; expected at most 16 MB.*\); .*"),
+]  # fmt: skip
+
+FOLDERS = [
+    reported("status: a pipe", lambda place: images.pipe(place.run.status_file), r"unreadable: .*status\.json: not a run status \(a pipe or a device; expected a plain file\)"),
+    reported("status: a folder", lambda place: (place.run.status_file.unlink(), place.run.status_file.mkdir()), r"unreadable: .*status\.json: not a run status \(Is a directory\)"),
+    reported("status: nesting without end", lambda place: place.put(place.run.status_file, DEEP), r"unreadable: .*status\.json: not a run status"),
+    reported("status: a date beyond all", status(started=1e300), r"unreadable: .*status\.json: not a run status .*started"),
+    reported("status: an unknown state", status(state="done"), r"unreadable: .*status\.json: not a run status .*state"),
+    reported("status: an unknown key", status(__class__="os.system"), r"unreadable: .*status\.json: not a run status .*__class__"),
+    reported("status: 20 MB", lambda place: place.put(place.run.status_file, " " * 20_000_000), r"unreadable: .*status\.json: not a run status \(20 MB; expected at most 16 MB\)"),
+    reported("predictions: gone", lambda place: place.run.predictions.unlink(), r"unreadable: predictions\.parquet: missing, though the run says finished"),
+    reported("predictions: a pipe", lambda place: images.pipe(place.run.predictions), r"unreadable: predictions\.parquet: cannot be read \(a pipe or a device; .*\)"),
+    reported("predictions: text", lambda place: place.put(place.run.predictions, "no parquet"), r"unreadable: predictions\.parquet: cannot be read \(.*\)"),
+    reported("predictions: a column less", lambda place: place.put_column("mode_x", None), r"unreadable: predictions\.parquet: has no column mode_x"),
+    reported("predictions: text for numbers", column("mode_x", lambda n: ["x"] * n), r"unreadable: predictions\.parquet: column 'mode_x' holds string; expected numbers"),
+    reported("predictions: lists for numbers", column("nll", lambda n: [[1.0]] * n), r"column 'nll' holds list<.*>; expected numbers"),
+    reported("predictions: numbers for names", column("file_name", lambda n: list(range(n))), r"column 'file_name' holds int64; expected text"),
+    reported("predictions: NaN", column("z", lambda n: [float("nan")] * n), r"unreadable: predictions\.parquet: column z is nan in row 0; .*"),
+    reported("predictions: two million rows", lambda place: place.run.predictions.write_bytes(many_rows()), r"unreadable: predictions\.parquet: says it holds 2000000 rows of .* MB together; expected at most .*"),
+    Bad("run folder: no numbers before the checkpoint", lambda place: (place.run.metrics_file.unlink(), status(state="interrupted")(place)), LEARN, r"runs/.*metrics\.jsonl: not the record of the epochs before last\.ckpt; .*"),
+    Bad("run folder: an epoch of text", lambda place: (place.put(place.run.metrics_file, '{"epoch": "x"}\n'), status(state="interrupted")(place)), LEARN, r"runs/.*metrics\.jsonl, line 1: not a valid record \(epoch: expected a whole number .*\)"),
+    Bad("run folder: numbers of text", lambda place: (place.put(place.run.metrics_file, '{"epoch": -1, "test/nll": "<b>"}\n'), status(state="interrupted")(place)), LEARN, r"runs/.*metrics\.jsonl: not the record of .*"),
+    Bad("run folder: nesting without end in metrics", lambda place: (place.put(place.run.metrics_file, DEEP + "\n"), status(state="interrupted")(place)), LEARN, r"runs/.*metrics\.jsonl, line 1: not a valid record \(nested too deeply\)"),
+    Bad("run folder: results that are none", lambda place: place.put(place.run.results_file, "[1]"), LEARN, r"runs/.*results\.json: expected a mapping, found list"),
+    Bad("run folder: checkpoints that lead elsewhere", lambda place: (place.run.checkpoints.rename(place.root / "elsewhere"), place.run.checkpoints.symlink_to(place.root / "elsewhere"), status(state="interrupted")(place)), LEARN, r"runs/.*/checkpoints: leads out of the run's folder; .*"),
+    Bad("run folder: a lock that leads elsewhere", lambda place: (place.put("diary", "dear"), images.link(place.run.path / ".lock", place.root / "diary"), status(state="interrupted")(place)), LEARN, r"runs/.*: cannot be written \(.*\); .*"),
+]  # fmt: skip
+
+
+def many_rows() -> bytes:
+    import io
+
+    import pyarrow.parquet as pq
+
+    zeros = pa.array(np.zeros(2_000_000))
+    names = (
+        "x",
+        "y",
+        "z",
+        "f",
+        "S",
+        "mode_x",
+        "mode_y",
+        "mode_z",
+        "mean_x",
+        "mean_y",
+        "mean_z",
+        "median_z",
+        "mu_x",
+        "mu_y",
+    )
+    buffer = io.BytesIO()
+    pq.write_table(pa.table(dict.fromkeys(names, zeros)), buffer)
+    return buffer.getvalue()
+
+
+TABLE = [
+    *CONFIGURATIONS, *PICTURES, *LINES, *LABELS, *CAMERAS, *CHECKPOINTS, *STORED, *RECORDS, *FOLDERS,
+]  # fmt: skip

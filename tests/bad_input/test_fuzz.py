@@ -1,0 +1,243 @@
+"""Whatever stands in a file or on the command line: a UserError or a result, never another exception."""
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from phd_exp.cli import train
+from phd_exp.cli.app import launch
+from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.detections import DetectionLine, detections_in
+from phd_exp.records.errors import UserError
+from phd_exp.records.runs import RunFolder, RunStatus
+from phd_exp.records.scenes import SampleRecord
+from phd_exp.reports.collect import collect
+from phd_exp.reports.site.dossier import read_dossier
+from phd_exp.training.config import RunConfig, check, check_render
+
+QUICK = settings(
+    max_examples=40, derandomize=True, deadline=None, database=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)  # fmt: skip
+LONG = settings(QUICK, max_examples=2000)
+
+SCALARS = (
+    st.none() | st.booleans() | st.integers() | st.integers(min_value=-(10**400), max_value=10**400)
+    | st.floats() | st.text(max_size=20)
+    | st.sampled_from(["", "nan", "../x", "/etc/passwd", "a\0b", "${oc.env:HOME}", "???", "null", "1e999", "\x1b[2J"])
+)  # fmt: skip
+VALUES = st.recursive(
+    SCALARS,
+    lambda inner: st.lists(inner, max_size=4)
+    | st.dictionaries(st.text(max_size=8) | SCALARS.map(str), inner, max_size=4),
+    max_leaves=8,
+)  # fmt: skip
+
+
+def objects(fields: Any) -> Any:
+    """Mappings with these keys, some others, and any values."""
+    return st.dictionaries(st.sampled_from(sorted(fields)) | st.text(max_size=8), VALUES, max_size=12)
+
+
+def spoiled(good: dict[str, Any]) -> Any:
+    """A good mapping of which a few values, at any depth, are replaced."""
+
+    def changed(node: Any) -> Any:
+        if not isinstance(node, dict) or not node:
+            return VALUES
+        return st.sampled_from(sorted(node, key=str)).flatmap(
+            lambda key: (changed(node[key]) | VALUES).map(lambda value: {**node, key: value})
+        )
+
+    return changed(good) | changed(good).flatmap(changed)
+
+
+def dumped(value: Any) -> str:
+    return json.dumps(value)
+
+
+LINE = {"file_name": "a.png", "f": 300.0, "box": [0, 0, 9, 9], "x": 0.0, "y": 0.0, "z": 3.0}
+TEXTS = (spoiled(LINE) | objects(DetectionLine.model_fields) | VALUES).map(dumped)
+BYTES = st.binary(max_size=200) | TEXTS.map(str.encode) | TEXTS.flatmap(
+    lambda text: st.integers(0, len(text)).map(lambda end: text[:end].encode())
+)  # fmt: skip
+
+
+def _metadata(folder: Path, content: bytes) -> None:
+    (folder / "metadata.jsonl").write_bytes(content)
+    with suppress(UserError):
+        for detection in detections_in(folder):
+            assert detection.file.resolve().is_relative_to(folder.resolve())
+            with suppress(UserError):
+                detection.require_in_sight(100, 100)
+                detection.box(100, 100)
+
+
+def _run_record(folder: RunFolder, contents: dict[str, bytes]) -> None:
+    for name, content in contents.items():
+        (folder.path / name).write_bytes(content)
+    for read in (folder.status, folder.config, folder.results, folder.constants, folder.metrics):
+        with suppress(UserError):
+            read()
+    (run,) = collect(folder.path.parents[3]).runs
+    read_dossier(run)
+    with suppress(UserError):
+        check(folder.config())
+
+
+STATUS = RunStatus(
+    state="finished", started=1.0, versions={}, git_commit=None, data_manifest=None, machine="x"
+)
+RECORDS = st.fixed_dictionaries(
+    {
+        "status.json": (spoiled(STATUS.model_dump()) | VALUES).map(dumped).map(str.encode) | BYTES,
+        "config.yaml": VALUES.map(lambda value: yaml.safe_dump(value).encode()) | BYTES,
+        "metrics.jsonl": st.lists(objects(["epoch", "step", "test/nll"]).map(dumped), max_size=3).map(
+            lambda lines: "".join(f"{line}\n" for line in lines).encode()
+        ),
+        "results.json": BYTES,
+        "constants.json": BYTES,
+        "predictions.parquet": st.binary(max_size=100),
+    }
+)
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunFolder:
+    folder = RunFolder(tmp_path / "runs/smoke/default/probabilistic/seed0")
+    folder.path.mkdir(parents=True)
+    return folder
+
+
+@QUICK
+@given(BYTES)
+def test_metadata(tmp_path: Path, content: bytes) -> None:
+    _metadata(tmp_path, content)
+
+
+@QUICK
+@given(RECORDS)
+def test_run_records(run: RunFolder, contents: dict[str, bytes]) -> None:
+    _run_record(run, contents)
+
+
+@QUICK
+@given(st.data())
+def test_configurations(composed: Any, data: st.DataObject) -> None:
+    _configuration(_composed(composed), data)
+
+
+@QUICK
+@given(st.lists(BYTES, max_size=2), BYTES)
+def test_data_sets(tmp_path: Path, lines: list[bytes], manifest: bytes) -> None:
+    _data_set(tmp_path, lines, manifest)
+
+
+def _composed(composed: Any) -> dict[str, Any]:
+    if not _KEPT:
+        _KEPT.update(composed("preset=smoke", "logger=none"))
+    return _KEPT
+
+
+_KEPT: dict[str, Any] = {}
+
+
+def _configuration(good: dict[str, Any], data: st.DataObject) -> None:
+    config = data.draw(spoiled(good) | objects(RunConfig.model_fields))
+    for checked in (check, check_render):
+        with suppress(UserError):
+            checked(config)
+
+
+def _data_set(folder: Path, lines: list[bytes], manifest: bytes) -> None:
+    data = DatasetFolder(folder)
+    data.split_folder("test").mkdir(exist_ok=True)
+    data.metadata_path("test").write_bytes(b"\n".join(lines))
+    data.manifest_path.write_bytes(manifest)
+    for read in (lambda: data.manifest, lambda: data.records("test")):
+        with suppress(UserError):
+            read()
+    for text in lines:
+        with suppress(ValueError):
+            SampleRecord.model_validate_json(text)
+
+
+WORDS = st.sampled_from(
+    ["seed", "data", "data.n_train", "data.f_range", "model", "model.head", "optimizer.lr", "+x", "~data", "++seed",
+     "loss._target_", "trainer", "hydra.job.name", "preset", "-m", "--cfg", "experiment", "data@x", "runs"]
+) | st.text(max_size=6)  # fmt: skip
+MEANINGS = st.sampled_from(
+    ["0", "null", "[1,2]", "{a:1}", "1,2", "range(0,3)", "glob(*)", "${x}", "${seed}", "${oc.env:NO}", "'", '"', "[",
+     "}", "choice(a,b)", "1e999", "nan", "job", "sort(3,2)", "interval(0,1)", "a\\,b", "", "os.system"]
+) | st.text(max_size=8)  # fmt: skip
+OVERRIDES = st.lists(
+    st.tuples(WORDS, st.sampled_from(["=", "", "=="]), MEANINGS).map("".join), max_size=3
+)  # fmt: skip
+
+
+@contextmanager
+def _in(folder: Path) -> Iterator[None]:
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        yield
+    finally:
+        os.chdir(before)
+
+
+def _command(folder: Path, words: list[str], capfd: pytest.CaptureFixture[str]) -> None:
+    """What is composed is checked, and no further."""
+
+    def task(config: dict[str, Any], overrides: list[str], cores: int) -> str:
+        train.run_name(check(config), overrides)
+        return "checked"
+
+    capfd.readouterr()
+    with _in(folder):
+        try:
+            status = launch(task, ["preset=smoke", "logger=none", *words], is_finished=train.is_finished)
+        except SystemExit as end:  # --version and the like
+            status = end.code
+    out, err = capfd.readouterr()
+    assert status in (0, 1, 2), words
+    assert "Traceback" not in out + err, (words, err)
+    if status:
+        assert all(line.startswith("error: ") for line in err.splitlines()), (words, err)
+        assert err
+
+
+@QUICK
+@given(OVERRIDES)
+def test_overrides(tmp_path: Path, capfd: pytest.CaptureFixture[str], words: list[str]) -> None:
+    _command(tmp_path, words, capfd)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@LONG
+@given(BYTES, RECORDS, st.lists(BYTES, max_size=2), BYTES, st.data())
+def test_records_at_length(
+    run: RunFolder, composed: Any, content: bytes, contents: dict[str, bytes], lines: list[bytes], manifest: bytes,
+    data: st.DataObject,
+) -> None:  # fmt: skip
+    place = run.path.parents[4]
+    _metadata(place, content)
+    _run_record(run, contents)
+    _data_set(place, lines, manifest)
+    _configuration(_composed(composed), data)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@settings(LONG, max_examples=500)
+@given(OVERRIDES)
+def test_overrides_at_length(tmp_path: Path, capfd: pytest.CaptureFixture[str], words: list[str]) -> None:
+    _command(tmp_path, words, capfd)

@@ -1,0 +1,114 @@
+"""A run of somebody who wants to run code in the reader's browser: every word of it is an attempt."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+
+from phd_exp.records.runs import RunFolder
+from phd_exp.reports.site.build import build_site
+from tests.reports.site.synthetic import write_run
+from tests.reports.site.test_browser import Visit
+
+OWNED = "window.owned=1"
+EVIL = (
+    f"'\"><img src=x onerror={OWNED}><svg onload={OWNED}></script><script>{OWNED}</script>"
+    f'<a href="javascript:{OWNED}">x</a>{{{{7*7}}}}\u2028&lt;b&gt;%3Cb%3E'
+)
+NAME = EVIL.replace("/", "")
+"""The same as a name of a folder or a file."""
+
+
+def rewrite(folder: RunFolder) -> None:
+    """Put it wherever a run record holds a text."""
+    folder.config_file.write_text(json.dumps(folder.config() | {EVIL: {EVIL: EVIL}, "model": {"name": EVIL}}))
+    status = json.loads(folder.status_file.read_text())
+    evil = {
+        "versions": {EVIL: EVIL},
+        "machine": EVIL,
+        "git_commit": EVIL,
+        "data_manifest": EVIL,
+        "traceback": EVIL,
+    }
+    folder.status_file.write_text(json.dumps(status | evil | {"error": EVIL}))
+    rows = [row | {EVIL: 1.0, f"test/{EVIL}": float(row["epoch"])} for row in folder.metrics()]
+    folder.write_metrics(rows)
+    if folder.predictions.exists():
+        table = pq.read_table(folder.predictions)
+        names = pa.array([NAME + ".png"] * len(table))
+        pq.write_table(
+            table.set_column(table.column_names.index("file_name"), "file_name", names), folder.predictions
+        )
+
+
+@pytest.fixture(scope="module")
+def hostile_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("hostile")
+    runs, images = place / "runs", place / "renders" / "default" / "test"
+    images.mkdir(parents=True)
+    noise = np.random.default_rng(0).integers(0, 255, (56, 56, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(images / (NAME.encode()[:200].decode(errors="ignore") + ".png"))
+    rewrite(write_run(runs, "default", n=40, epochs=2, root=place / "renders"))
+    rewrite(write_run(runs, NAME[:120], "mae_vz", preset="a<b>'\"&", n=40, epochs=2))
+    failed = write_run(runs, "occl", "mae_<script>alert(1)<script>", n=40, epochs=2)
+    rewrite(failed)
+    failed.status_file.write_text(failed.status_file.read_text().replace('"finished"', '"failed"'))
+    build_site(runs, place / "out")
+    return place / "out" / "site"
+
+
+@pytest.fixture
+def visit(chromium: Any, hostile_site: Path) -> Iterator[Visit]:
+    visited = Visit(chromium, hostile_site)
+    yield visited
+    visited.context.close()
+    assert visited.faults == []
+
+
+def addresses(site: Path) -> list[str]:
+    slugs = sorted(file.stem for file in (site / "runs").iterdir())
+    pages = [f"runs/{quote(slug)}.html" for slug in slugs]
+    return ["index.html", *pages, f"compare.html#a={quote(slugs[0])}&b={quote(slugs[1])}"]
+
+
+def test_nothing_of_it_is_run_in_a_browser(visit: Visit) -> None:
+    found = addresses(visit.site)
+    assert len(found) == 5
+    for address in found:
+        visit.open("about:blank" if visit.page.url == address else address)
+        visit.draw()
+        visit.page.evaluate(
+            "document.querySelectorAll('details').forEach(details => { details.open = true; })"
+        )
+        for axes in visit.page.locator(".plot .nsewdrag").all()[:3]:  # what is shown where the mouse is
+            axes.hover(force=True, timeout=2000)
+        assert visit.page.evaluate("window.owned === undefined"), address
+        assert visit.page.locator("main img[src=x], main svg[onload], a[href^='javascript']").count() == 0, (
+            address
+        )
+
+
+def test_it_can_be_read_as_it_was_written(visit: Visit) -> None:
+    (page,) = (
+        address
+        for address in addresses(visit.site)
+        if "small-default-probabilistic" in address and "runs/" in address
+    )
+    visit.open(page)
+    visit.page.evaluate("document.querySelectorAll('details').forEach(details => { details.open = true; })")
+    text = visit.page.locator("main").text_content() or ""
+    assert text.count(f"'\"><img src=x onerror={OWNED}>") > 5
+    assert "{{7*7}}" in text
+
+
+def test_files_of_the_site_have_plain_names(hostile_site: Path) -> None:
+    for file in hostile_site.rglob("*"):
+        assert file.name.isascii()
+        assert not set(file.name) & set("<>\"'&;\\ "), file
