@@ -88,6 +88,16 @@ def _opens_and_draws(visit: Visit, page: str) -> int:
     return charts
 
 
+def test_charts_out_of_sight_draw_themselves(visit: Visit) -> None:
+    """Whoever takes a picture of the whole page sees them too."""
+    visit.open("index.html")
+    visit.page.wait_for_function(
+        "[...document.querySelectorAll('figure.chart')].every(it => !it.clientWidth || it.matches('.drawn'))"
+    )
+    assert visit.page.locator("figure.drawn").count() > 5
+    assert visit.page.evaluate("window.scrollY") == 0
+
+
 @pytest.mark.parametrize("visit", [PHONE_DARK], ids=["phone, dark"], indirect=True)
 def test_pages_of_each_kind_open_and_draw_their_charts(visit: Visit) -> None:
     charts = [_opens_and_draws(visit, page) for page in ("index.html", RUN, COMPARISON, FAILED)]

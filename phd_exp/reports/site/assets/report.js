@@ -200,11 +200,18 @@ const phdExp = (() => {
     }
   }, { rootMargin: "300px" });
 
-  /** Draw the charts below an element when they come into view. */
-  function watch(parent = document) {
-    for (const figure of parent.querySelectorAll("figure.chart")) {
+  const idle = () => new Promise((resolve) => (window.requestIdleCallback ?? setTimeout)(resolve));
+
+  /** Draw the charts below an element: those in view at once, the others when nothing else is to be done. */
+  async function watch(parent = document) {
+    const figures = parent.querySelectorAll("figure.chart");
+    for (const figure of figures) {
       watcher.observe(figure);
       figure.querySelector("details").addEventListener("toggle", (event) => event.target.open && tabulate(figure));
+    }
+    for (const figure of figures) {
+      await idle();
+      if (figure.clientWidth && !drawn.has(figure)) await draw(figure);  // in what is folded it would have no width
     }
   }
 
