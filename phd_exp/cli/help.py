@@ -15,7 +15,7 @@ VERBS = {
 }
 OF_VERB = {
     "train": (
-        *("model", "data", "preset", "experiment"),
+        *("model", "data", "preset", "recipe", "experiment"),
         *("backbone", "camera", "loss", "optimizer", "trainer", "logger"),
     ),
     "render": ("data", "preset"),
@@ -30,6 +30,7 @@ EXAMPLES = {
     "train": [
         "python -m phd_exp model=mae_logz data=scale",
         "python -m phd_exp preset=small data=occl seed=1",
+        "python -m phd_exp preset=small recipe=strong data=occl",
         "python -m phd_exp data.n_train=256 data.n_test=64 trainer.max_epochs=1",
         "python -m phd_exp data=folder data.folder=photos preset=small",
         "python -m phd_exp -m preset=small model=probabilistic,mae_vz data=default,occl",

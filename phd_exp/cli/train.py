@@ -11,10 +11,10 @@ from phd_exp.cli.app import launch
 from phd_exp.cli.render import ensure_dataset
 from phd_exp.cli.several_views import Several
 from phd_exp.records.errors import RunError
-from phd_exp.records.runs import RunFolder, RunName
+from phd_exp.records.runs import RunFolder, RunName, setting
 from phd_exp.training.config import RenderedConfig, RunConfig, check, has_influence
 
-NAMED = ("preset", "data", "data.name", "model", "seed", "experiment")
+NAMED = ("preset", "recipe", "data", "data.name", "model", "seed", "experiment")
 """Choices that have a place of their own in a run's name, and the one that does nothing but name several runs."""
 SHOWN = (
     "test/projected_error_mm",
@@ -65,7 +65,12 @@ def is_finished(config: dict[str, Any], overrides: list[str]) -> bool:
     """Whether the run of a configuration is there; one that is not checked yet, since checking imports torch."""
     try:
         data = config["data"].get("variant") or config["data"]["name"]
-        choices = (config["preset"], data, config["model"]["name"], config["seed"])
+        choices = (
+            setting(config["preset"], config["recipe"]["name"]),
+            data,
+            config["model"]["name"],
+            config["seed"],
+        )
         folder = RunFolder(RunName(*choices, _telling(overrides)).folder(Path(config["runs"])))
         several = config["evaluation"]["multiview"]["scenes"] > 0
         return folder.is_finished() and (folder.views.exists() or not several)
@@ -75,7 +80,7 @@ def is_finished(config: dict[str, Any], overrides: list[str]) -> bool:
 
 def run_name(config: RunConfig, overrides: list[str]) -> RunName:
     """The choices that name a run; every other override that can change a number goes into its hash."""
-    return RunName(config.preset, config.data.name, config.model.name, config.seed, _telling(overrides))
+    return RunName(config.setting, config.data.name, config.model.name, config.seed, _telling(overrides))
 
 
 def _telling(overrides: list[str]) -> tuple[str, ...]:

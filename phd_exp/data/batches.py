@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -42,6 +43,18 @@ class Batch:
         return Batch(moved(self.image), moved(self.xyz), moved(self.f), self.S, moved(self.row))
 
 
+@runtime_checkable
+class Augment(Protocol):
+    """A random change of samples, of which the labels stay exact."""
+
+    n_numbers: ClassVar[int]
+    """How many random numbers decide over one sample."""
+
+    def __call__(self, batch: Batch, numbers: Float[Tensor, "batch n_numbers"]) -> Batch:
+        """The samples, changed as uniform numbers from -1 to 1 say."""
+        ...
+
+
 class BatchLoader:
     """Iterates over the batches of one epoch; each iteration is the next epoch.
 
@@ -51,6 +64,9 @@ class BatchLoader:
 
     Of several processes that train together each takes its share of every batch: rank r the rows r, r + world, ...
     No row is seen twice, and a last batch that has no row for a rank does not exist for it.
+
+    `augment` changes a batch as so many random numbers a row say. They are a function of (seed, epoch, batch) for the
+    whole batch, of which each process takes its share, so that they depend on neither what ran before nor `world`.
     """
 
     def __init__(
@@ -63,6 +79,7 @@ class BatchLoader:
         seed: int,
         rank: int = 0,
         world: int = 1,
+        augment: Augment | None = None,
     ) -> None:
         self.samples = samples
         self.batch_size = batch_size
@@ -71,6 +88,7 @@ class BatchLoader:
         self.seed = seed
         self.rank = rank
         self.world = world
+        self.augment = augment
         self.epoch = -1
         self.next_batch = 0
 
@@ -84,17 +102,26 @@ class BatchLoader:
             self.next_batch = 0
         order = self.order(self.epoch)
         while self.next_batch < len(self):
-            start = self.next_batch * self.batch_size
+            number, start = self.next_batch, self.next_batch * self.batch_size
             self.next_batch += 1
             rows = order[start : start + self.batch_size]
-            yield self.samples.select(rows[self.rank :: self.world])
+            batch = self.samples.select(rows[self.rank :: self.world])
+            yield self._augmented(batch, number) if self.augment else batch
 
     def order(self, epoch: int) -> Int[Tensor, " samples"]:
         """The rows in the order in which that epoch visits them."""
         if not self.shuffle:
             return torch.arange(len(self.samples))
-        generator = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(epoch,)))
-        return torch.from_numpy(generator.permutation(len(self.samples)))
+        return torch.from_numpy(self._random(epoch).permutation(len(self.samples)))
+
+    def _augmented(self, batch: Batch, number: int) -> Batch:
+        assert self.augment is not None
+        numbers = self._random(self.epoch, number).uniform(-1, 1, (self.batch_size, self.augment.n_numbers))
+        mine = torch.from_numpy(numbers[self.rank :: self.world][: len(batch)])
+        return self.augment(batch, mine)
+
+    def _random(self, *place: int) -> np.random.Generator:
+        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=place))
 
     @property
     def place(self) -> dict[str, int]:

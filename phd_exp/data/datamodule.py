@@ -2,7 +2,7 @@
 
 from lightning import LightningDataModule
 
-from phd_exp.data.batches import Batch, BatchLoader
+from phd_exp.data.batches import Augment, Batch, BatchLoader
 from phd_exp.data.sources import PARTS, Part, Source
 from phd_exp.records.errors import ConfigError
 
@@ -10,11 +10,22 @@ from phd_exp.records.errors import ConfigError
 class PositionData(LightningDataModule):
     """The samples of a source in batches; of several processes that train together (`world`), those of one (`rank`).
 
+    `augment` changes the batches that are trained on, and no others.
+
     Raises ConfigError where there are too few samples for one batch, or where processes could not share them; on
     `setup`, DatasetError where the source lacks samples or an image is damaged.
     """
 
-    def __init__(self, source: Source, *, batch_size: int, seed: int, rank: int = 0, world: int = 1) -> None:
+    def __init__(
+        self,
+        source: Source,
+        *,
+        batch_size: int,
+        seed: int,
+        rank: int = 0,
+        world: int = 1,
+        augment: Augment | None = None,
+    ) -> None:
         super().__init__()
         if batch_size > source.count("train"):
             raise ConfigError(
@@ -27,6 +38,7 @@ class PositionData(LightningDataModule):
         self.seed = seed
         self.rank = rank
         self.world = world
+        self.augment = augment
         self.samples: dict[Part, Batch] = {}
         self.train_batches: BatchLoader | None = None
 
@@ -62,6 +74,7 @@ class PositionData(LightningDataModule):
             seed=self.seed,
             rank=self.rank,
             world=self.world,
+            augment=self.augment if shuffle else None,
         )
 
     # Lightning restores the state of a loader in the middle of an epoch alone, that of a datamodule always

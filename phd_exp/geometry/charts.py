@@ -6,6 +6,7 @@ Source: paper, sections "Parameter remapping" (v_p, z_p) and "Experimental resul
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -118,7 +119,13 @@ def _log_abs_det_projected(xyz: Float[Tensor, "*#batch 3"], camera: Camera) -> F
 
 
 class Chart(ABC):
-    """Three coordinates for positions z > 0 in front of a camera, of order one over the data set."""
+    """Three coordinates for positions z > 0 in front of a camera, of order one over the data set.
+
+    Attributes:
+        has_projection: whether the first two are the projected position v_p.
+    """
+
+    has_projection: ClassVar[bool] = True
 
     @abstractmethod
     def coordinates(self, xyz: Float[Tensor, "*#batch 3"], camera: Camera) -> Float[Tensor, "*#batch 3"]:
@@ -193,6 +200,7 @@ class Cartesian(Chart):
     Source: paper, baseline "MAE x, y, z".
     """
 
+    has_projection: ClassVar[bool] = False
     depth: DepthScale
     xy_unit: float = 0.25
 

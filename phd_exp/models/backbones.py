@@ -1,7 +1,7 @@
 """The networks that turn an image into features: torchvision's ResNets, trained from scratch."""
 
 from functools import partial
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -15,21 +15,51 @@ BLOCKS: dict[int, tuple[type[BasicBlock | Bottleneck], list[int]]] = {
 }
 """Depth -> kind of block, and how many of them at each of the four resolutions."""
 
+Depth = Literal[10, 18, 34, 50]
+
+
+class Seen(NamedTuple):
+    """What a backbone makes of images.
+
+    A backbone that keeps where things are also says where the object is: `place`, its projected position v_p, and
+    `log_heat`, log probabilities of the cells of a grid over the image.
+    """
+
+    features: Float[Tensor, "batch n_features"]
+    place: Float[Tensor, "batch 2"] | None = None
+    log_heat: Float[Tensor, "batch rows columns"] | None = None
+
 
 class Backbone(nn.Module):
-    """An image (batch, 3, height, width) -> features (batch, n_features)."""
+    """An image (batch, 3, height, width) -> what is seen in it.
+
+    Attributes:
+        n_features: of each image.
+        locates: whether it says where the object is.
+    """
+
+    n_features: int
+    locates: bool
+
+    def forward(self, pixels: Float[Tensor, "batch 3 height width"]) -> Seen:
+        raise NotImplementedError
+
+
+class PooledFeatures(Backbone):
+    """The features of a network that averages them over the image, as ResNets do."""
+
+    locates = False
 
     def __init__(self, network: nn.Module, n_features: int) -> None:
         super().__init__()
         self.network = network
         self.n_features = n_features
 
-    def forward(self, pixels: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch n_features"]:
-        features: Tensor = self.network(pixels)
-        return features
+    def forward(self, pixels: Float[Tensor, "batch 3 height width"]) -> Seen:
+        return Seen(self.network(pixels))
 
 
-def resnet(depth: Literal[10, 18, 34, 50]) -> Backbone:
+def resnet(depth: Depth) -> PooledFeatures:
     """A ResNet of torchvision without its last layer, every BatchNorm replaced by GroupNorm(1, C).
 
     Source: the authors' training protocol.
@@ -37,4 +67,4 @@ def resnet(depth: Literal[10, 18, 34, 50]) -> Backbone:
     network = ResNet(*BLOCKS[depth], norm_layer=partial(nn.GroupNorm, 1))
     n_features = network.fc.in_features
     network.fc = nn.Identity()
-    return Backbone(network, n_features)
+    return PooledFeatures(network, n_features)

@@ -5,7 +5,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from phd_exp.geometry.camera import Camera
-from phd_exp.models.backbones import Backbone
+from phd_exp.models.backbones import Backbone, Seen
 from phd_exp.models.heads import Head, Prediction
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -39,9 +39,22 @@ class Regressor(nn.Module):
 
     def raw(self, image: UInt8[Tensor, "batch height width 3"]) -> Float[Tensor, "batch n_outputs"]:
         """The numbers before the head, in the precision of the last layer."""
+        return self.numbers(self.see(image))
+
+    def see(self, image: UInt8[Tensor, "batch height width 3"]) -> Seen:
+        """What the backbone makes of the images."""
         pixels = (image.permute(0, 3, 1, 2).to(self.mean.dtype) - self.mean) / self.std
-        pixels = pixels.contiguous(memory_format=self.memory_format)
-        features = self.backbone(pixels)
-        with torch.autocast(features.device.type, enabled=False):
-            raw: Tensor = self.last(features.to(self.last.weight.dtype))
-        return raw
+        seen: Seen = self.backbone(pixels.contiguous(memory_format=self.memory_format))
+        return seen
+
+    def numbers(self, seen: Seen) -> Float[Tensor, "batch n_outputs"]:
+        """The numbers before the head, of what was seen."""
+        with torch.autocast(seen.features.device.type, enabled=False):
+            raw: Tensor = self.last(seen.features.to(self.dtype))
+            return raw if seen.place is None else self.head.placed(raw, seen.place.to(self.dtype))
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The precision of the last layer."""
+        weight = next(self.last.parameters())
+        return weight.dtype

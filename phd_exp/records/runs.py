@@ -1,6 +1,6 @@
 """The run record: everything a run leaves on disk, readable without the model that made it.
 
-    runs/<preset>/<data>/<model>/seed<k>[-<hash of other overrides>]/
+    runs/<preset>[+<recipe>]/<data>/<model>/seed<k>[-<hash of other overrides>]/
         config.yaml          what was asked for, resolved
         constants.json       what the network was told of the data set: depth scale, constant focal length
         status.json          state, error, versions, git commit, hash of the data set
@@ -64,9 +64,30 @@ class RunStatus(BaseModel):
     machine: str
 
 
+PLAIN_RECIPE = "paper"
+"""The recipe that a run's folder does not name."""
+
+
+def setting(preset: str, recipe: str) -> str:
+    """Preset and recipe in one word, no part of which holds a plus sign."""
+    return preset if recipe == PLAIN_RECIPE else f"{preset}+{recipe}"
+
+
+def preset_and_recipe(setting: str) -> tuple[str, str]:
+    """The two that make a `setting`."""
+    preset, _, recipe = setting.partition("+")
+    return preset, recipe or PLAIN_RECIPE
+
+
+def in_words(setting: str) -> str:
+    """A `setting` as a heading says it."""
+    preset, recipe = preset_and_recipe(setting)
+    return f"preset {preset}" if recipe == PLAIN_RECIPE else f"preset {preset}, recipe {recipe}"
+
+
 @dataclass(frozen=True)
 class RunName:
-    """The choices that name a run, and the folder they give."""
+    """The choices that name a run, and the folder they give; `preset` with the recipe, as `setting` joins them."""
 
     preset: str
     data: str

@@ -3,6 +3,7 @@
 import shlex
 from collections.abc import Iterable, Sequence
 
+from phd_exp.records.runs import PLAIN_RECIPE, in_words, preset_and_recipe
 from phd_exp.reports.cells import Cell, Gap
 from phd_exp.reports.collect import Records
 from phd_exp.reports.paper import ASSUMED, Layout, TableName
@@ -35,7 +36,7 @@ OF_FEWER_SEEDS = f"{FEWER_SEEDS}: fewer seeds than other cells of this table hav
 
 
 def title(preset: str, layout: Layout, reading: Reading, cells: Sequence[Cell]) -> str:
-    return f"{layout.title}, preset {one_line(preset)}: {IN_WORDS[reading]}{_samples(cells)}"
+    return f"{layout.title}, {one_line(in_words(preset))}: {IN_WORDS[reading]}{_samples(cells)}"
 
 
 def notes(layout: Layout, reading: Reading, cells: Sequence[Cell]) -> tuple[str, ...]:
@@ -78,7 +79,10 @@ def _seeds_by_reason(gaps: Iterable[Gap]) -> dict[tuple[str, str, str], list[int
 
 def making_command(records: Records, preset: str, name: TableName, seeds: Iterable[int] = (0,)) -> str:
     """The command line that makes whatever a table lacks."""
+    preset, recipe = preset_and_recipe(preset)
     words = [f"experiment={name}", f"preset={preset}"]
+    if recipe != PLAIN_RECIPE:
+        words.append(f"recipe={recipe}")
     if list(seeds) != [0]:
         words.append(f"seed={','.join(map(str, seeds))}")
     if records.folder.as_posix() != DEFAULT_RUNS:

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from phd_exp.records.errors import RunError
+from phd_exp.records.runs import in_words
 from phd_exp.reports.captions import one_line
 from phd_exp.reports.cells import Gap
 from phd_exp.reports.collect import Records, Run
@@ -100,7 +101,7 @@ def fusion_table(run: Run, scores: FusionScores) -> FusionTable:
     """The table of a run's scores."""
     leaf = run.folder.path.name
     apart = "" if (run.data, run.model) == ("scale", "probabilistic") else f"{run.model} on {run.data}, "
-    title = f"Fusion, preset {run.preset}, {apart}{leaf}: {scores.n} scenes seen by {scores.views} cameras"
+    title = f"Fusion, {in_words(run.preset)}, {apart}{leaf}: {scores.n} scenes seen by {scores.views} cameras"
     return FusionTable(
         stem=f"fusion-{run.preset}-{run.data}-{run.model}-{leaf}",
         title=one_line(title),

@@ -1,6 +1,7 @@
 """The one place, with `network.py`, that turns a checked configuration into objects."""
 
 import sys
+from functools import partial
 
 from hydra.utils import instantiate
 from lightning import Trainer
@@ -8,12 +9,14 @@ from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar, TQDMProgressBar
 from lightning.pytorch.loggers import Logger
 
+from phd_exp.data.augmentation import Augmentation
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.folder import FolderSource
 from phd_exp.data.sources import Part, RenderedSource, Source
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.detections import DetectionFolder
+from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.callbacks import (
     CalibrationRecorder,
@@ -26,6 +29,7 @@ from phd_exp.training.checkpoints import AtomicCheckpoints
 from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig
 from phd_exp.training.module import PositionModule
 from phd_exp.training.network import build_regressor, memory_format, naming, precision
+from phd_exp.training.schedule import factor
 from phd_exp.training.tracking import Tracker
 
 
@@ -37,7 +41,13 @@ def build_data(config: RunConfig, rank: int = 0) -> PositionData:
         seed=config.seed,
         rank=rank,
         world=config.trainer.devices,
+        augment=_augmentation(config),
     )
+
+
+def _augmentation(config: RunConfig) -> Augmentation | None:
+    augmentation = Augmentation(**config.recipe.augmentation.model_dump())
+    return augmentation if augmentation.changes_anything else None
 
 
 def _source(data: RenderedConfig | FolderConfig) -> Source:
@@ -58,7 +68,20 @@ def build_module(config: RunConfig, data: PositionData) -> PositionModule:
         optimizer = instantiate(config.optimizer, _partial_=True)
         optimizer(regressor.parameters())  # refuses bad values now rather than after hours of rendering
     constant_f = data.source.constant_f if config.camera.focal_length == "constant" else None
-    return PositionModule(regressor, instantiate(config.loss), optimizer, constant_f)
+    recipe = config.recipe
+    if recipe.localisation and not regressor.backbone.locates:
+        raise ConfigError(
+            f"recipe.localisation: got {recipe.localisation}, but this backbone does not say where the object is; "
+            "expected 0, or a backbone that does, as in conf/recipe/strong.yaml"
+        )
+    return PositionModule(
+        regressor,
+        instantiate(config.loss),
+        optimizer,
+        constant_f,
+        recipe.localisation,
+        partial(factor, recipe.schedule, recipe.warmup_steps),
+    )
 
 
 def build_trainer(

@@ -21,9 +21,10 @@ from pydantic import (
 )
 
 from phd_exp.records.errors import ConfigError, shown
-from phd_exp.records.runs import flatten
+from phd_exp.records.runs import flatten, setting
 from phd_exp.records.shards import Shard
 from phd_exp.records.spec import Angle, DatasetSpec, Range
+from phd_exp.training.schedule import Schedule
 from phd_exp.training.targets import Target, describe, locate
 
 Whole = Annotated[int, Field(strict=True)]
@@ -163,6 +164,24 @@ class TrainerConfig(Section):
     progress_bar: Annotated[bool, Field(strict=True)]
 
 
+class AugmentationConfig(Section):
+    """As `Augmentation`, whose arguments these are."""
+
+    symmetries: Annotated[bool, Field(strict=True)]
+    largest_zoom: Annotated[float, Field(ge=1, le=2)]
+    colours: Annotated[bool, Field(strict=True)]
+
+
+class RecipeConfig(Section):
+    """How a network is trained, whatever it predicts."""
+
+    name: Name
+    schedule: Schedule
+    warmup_steps: Annotated[Whole, Field(ge=0)]
+    localisation: Annotated[float, Field(ge=0, le=1000)]
+    augmentation: AugmentationConfig
+
+
 class LoggerConfig(Section):
     kind: Literal["none", "wandb"]
     project: Name
@@ -207,12 +226,18 @@ class RunConfig(Section):
     data: DataConfig
     model: ModelConfig
     camera: CameraConfig
+    recipe: RecipeConfig
     backbone: Target
     loss: Target
     optimizer: Target
     trainer: TrainerConfig
     logger: LoggerConfig
     evaluation: EvaluationConfig
+
+    @property
+    def setting(self) -> str:
+        """Preset and recipe in one word, the first level of a run's folder."""
+        return setting(self.preset, self.recipe.name)
 
     @property
     def prediction(self) -> type[Any]:

@@ -5,12 +5,16 @@ from typing import Any
 
 import torch
 from lightning import LightningModule
+from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import LambdaLR
 
 from phd_exp.data.batches import Batch
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import Columns, calibration_columns
 from phd_exp.geometry.camera import Camera
+from phd_exp.geometry.charts import projected
+from phd_exp.losses.localisation import localisation_loss
 from phd_exp.metrics.binned import Calibration
 from phd_exp.metrics.means import Means
 from phd_exp.models.heads import Prediction
@@ -27,6 +31,8 @@ class PositionModule(LightningModule):
         loss: prediction and true position -> scalar.
         optimizer: parameters -> optimizer.
         constant_f: the focal length that the model is told for every sample, in pixels; None tells it the true one.
+        localisation: weight of the localisation loss; above 0 only with a backbone that locates.
+        schedule: number of steps -> factor of the learning rate at each; see `schedule.factor`.
     """
 
     def __init__(
@@ -35,12 +41,16 @@ class PositionModule(LightningModule):
         loss: nn.Module,
         optimizer: Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer],
         constant_f: float | None,
+        localisation: float,
+        schedule: Callable[[int], Callable[[int], float]],
     ) -> None:
         super().__init__()
         self.regressor = regressor
         self.loss = loss
         self.make_optimizer = optimizer
         self.constant_f = constant_f
+        self.localisation = localisation
+        self.schedule = schedule
         names = ("loss", *quantity_names(regressor.head.prediction))
         # "train" itself is taken: every module has a method of that name
         self.means = nn.ModuleDict({f"{split}_means": Means(names) for split in ("train", "test")})
@@ -78,21 +88,29 @@ class PositionModule(LightningModule):
             self.log_dict({f"test/calibration/{name}": score.float() for name, score in scores.items()})
             self.calibration.reset()
 
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        return self.make_optimizer(self.regressor.parameters())
+    def configure_optimizers(self) -> OptimizerLRScheduler:
+        optimizer = self.make_optimizer(self.regressor.parameters())
+        scheduler = LambdaLR(optimizer, self.schedule(int(self.trainer.estimated_stepping_batches)))
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def _step(self, batch: Batch, split: str) -> tuple[Tensor, Prediction]:
-        prediction = self(batch)
-        loss = self.loss(prediction, batch.xyz)
-        if not loss.isfinite():
+        """The loss to descend on and the prediction; what is recorded as `loss` is the model's own alone."""
+        seen = self.regressor.see(batch.image)
+        prediction = self.regressor.head(self.regressor.numbers(seen), self.told(batch.camera))
+        loss = total = self.loss(prediction, batch.xyz)
+        if split == "train" and self.localisation and seen.log_heat is not None:
+            total = total + self.localisation * localisation_loss(
+                seen.log_heat, projected(batch.xyz, batch.camera)
+            )
+        if not total.isfinite():
             raise RunError(
-                f"loss is {loss.item()} in epoch {self.current_epoch}, at {split} samples {batch.row.tolist()}; "
+                f"loss is {total.item()} in epoch {self.current_epoch}, at {split} samples {batch.row.tolist()}; "
                 "the last checkpoint is whole: lower optimizer.lr, or look at these images"
             )
         with torch.no_grad():
             losses = {"loss": loss.expand(len(batch))}
             self._means(split).update(losses | quantities(prediction, batch.xyz))
-        return loss, prediction
+        return total, prediction
 
     def _means(self, split: str) -> Any:
         return self.means[f"{split}_means"]

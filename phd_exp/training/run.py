@@ -242,6 +242,7 @@ def _evaluate(trainer: Trainer, module: PositionModule, data: PositionData, part
 def _circumstances(config: RunConfig, data: PositionData, trainer: Trainer, seconds: float) -> dict[str, Any]:
     return {
         "preset": config.preset,
+        "recipe": config.recipe.name,
         "data": config.data.name,
         "model": config.model.name,
         "seed": config.seed,

@@ -17,6 +17,12 @@ def test_choices_have_a_place_in_the_name(config: RunConfig) -> None:
     assert name.overrides == ()
 
 
+def test_a_recipe_has_a_place_beside_the_preset(composed) -> None:  # type: ignore[no-untyped-def]
+    name = run_name(check(composed("preset=smoke", "recipe=strong")), ["preset=smoke", "recipe=strong"])
+    assert (name.preset, name.overrides) == ("smoke+strong", ())
+    assert run_name(check(composed("recipe=paper")), ["recipe=paper"]).preset == "paper"
+
+
 @pytest.mark.parametrize(
     "override",
     [
@@ -41,6 +47,7 @@ def test_what_changes_no_number_is_left_out(config: RunConfig, override: str) ->
         "backbone=resnet50",
         "camera=constant",
         "optimizer.lr=0.1",
+        "recipe.localisation=0",
         "trainer.threads=1",
     ],
 )

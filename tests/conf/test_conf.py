@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from phd_exp.cli.paths import conf_folder
+from phd_exp.data.augmentation import Augmentation
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.training.config import RunConfig, check
 
@@ -44,6 +45,26 @@ def test_defaults_are_the_authors_protocol(checked: Callable) -> None:
     assert config.optimizer["_target_"] == "torch.optim.Adam"
     assert config.optimizer["lr"] == 1e-3
     assert config.camera.focal_length == "known"
+
+
+def test_the_authors_recipe_changes_neither_images_nor_learning_rate(checked: Callable) -> None:
+    recipe = checked().recipe
+    assert (recipe.name, recipe.schedule, recipe.warmup_steps, recipe.localisation) == (
+        "paper",
+        "constant",
+        0,
+        0,
+    )
+    assert not Augmentation(**recipe.augmentation.model_dump()).changes_anything
+
+
+@pytest.mark.parametrize(("preset", "depth"), [("paper", 50), ("small", 10)])
+def test_the_strong_recipe_keeps_the_depth_of_its_preset(checked: Callable, preset: str, depth: int) -> None:
+    config = checked("recipe=strong", f"preset={preset}")
+    assert config.backbone["_target_"].endswith("Locating")
+    assert config.backbone["depth"] == depth
+    assert config.data.image_size == checked(f"preset={preset}").data.image_size
+    assert config.trainer.max_epochs == checked(f"preset={preset}").trainer.max_epochs
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """The order of batches: a function of (seed, epoch), resumable at any batch."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -101,3 +103,36 @@ def test_shares_are_each_batch_without_gaps_and_repeats(samples: Batch, world: i
             assert sorted(row for part in parts for row in part) == sorted(rows([batch]))
             assert parts[0] == rows([batch])[::world]
     assert len({tuple(share.place.items()) for share in shares if drop_last}) <= 1
+
+
+class Shift:
+    """Adds one of the numbers to the positions, so that they can be seen."""
+
+    n_numbers = 2
+
+    def __call__(self, batch: Batch, numbers: torch.Tensor) -> Batch:
+        return replace(batch, xyz=batch.xyz + numbers[:, :1])
+
+
+def test_random_changes_depend_on_seed_epoch_and_batch_alone(samples: Batch) -> None:
+    def changing(seed: int = 0, **share: int) -> BatchLoader:
+        return BatchLoader(samples, 4, shuffle=True, drop_last=True, seed=seed, augment=Shift(), **share)
+
+    first, again = list(changing()), list(changing())
+    assert all(torch.equal(one.xyz, other.xyz) for one, other in zip(first, again, strict=True))
+    for batch in first:
+        shift = batch.xyz - samples.xyz[batch.row]
+        assert shift.abs().max() <= 1
+        assert len(shift[:, 0].unique()) == len(batch)
+    resumed = changing()
+    resumed.go_to({"epoch": 0, "next_batch": 1})
+    assert torch.equal(next(iter(resumed)).xyz, first[1].xyz)
+    later = changing()
+    later.go_to({"epoch": 3, "next_batch": 0})
+    order = later.order(4).tolist()
+    shifts = next(iter(later)).xyz[:, 0] - samples.xyz[order[:4], 0]
+    assert not torch.equal(shifts, first[0].xyz[:, 0] - samples.xyz[first[0].row, 0])
+    # of two processes that share each batch, one has the even and one the odd rows of it
+    for rank in range(2):
+        for mine, whole in zip(changing(rank=rank, world=2), first, strict=True):
+            assert torch.equal(mine.xyz, whole.xyz[rank::2])

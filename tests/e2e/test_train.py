@@ -178,12 +178,13 @@ def test_a_run_of_another_configuration_is_never_reused(train: Callable, tmp_pat
     assert "optimizer.lr=0.5, but optimizer.lr=0.001 is asked for" in outcome.err
 
 
+@pytest.mark.parametrize("recipe", ["paper", "strong"])
 def test_a_broken_run_goes_on_where_it_was(
-    train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: str
 ) -> None:
     from phd_exp.training.module import PositionModule
 
-    long = ("logger=none", "trainer.max_epochs=4")
+    long = ("logger=none", "trainer.max_epochs=4", f"recipe={recipe}")
     assert train(*long, "runs=whole").status == 0
     whole = only_run(tmp_path / "whole")
 

@@ -100,7 +100,7 @@ def test_the_layers_are_torchvisions(depth: int, torchvisions: Callable[..., tor
 def test_under_autocast_the_last_layer_stays_in_float32(image: torch.Tensor, camera: Camera) -> None:
     network = regressor(HEADS["probabilistic"])
     with torch.autocast("cpu", torch.bfloat16):
-        assert network.backbone(torch.rand(1, 3, 64, 64)).dtype == torch.bfloat16
+        assert network.backbone(torch.rand(1, 3, 64, 64)).features.dtype == torch.bfloat16
         assert network.raw(image).dtype == torch.float32
 
 

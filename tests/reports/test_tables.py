@@ -229,6 +229,18 @@ def test_a_small_interval_does_not_print_as_nothing(tmp_path: Path) -> None:
     assert place(table, "mae_logz", "occl", "depth").spread == "±0"  # two seeds that are equal
 
 
+def test_a_recipe_has_tables_of_its_own_and_a_command_that_makes_what_they_lack(tmp_path: Path) -> None:
+    record(tmp_path, "occl", "mae_vz", 0, predicted(0, n=30).frame, preset="small+strong")
+    record(tmp_path, "occl", "mae_vz", 0, predicted(0, n=30).frame)
+    found = tables(collect(tmp_path))
+    strong = one(found, "table1", preset="small+strong")
+    assert strong.title.startswith("Table 1, preset small, recipe strong: the whole field of view")
+    assert " experiment=table1 preset=small recipe=strong runs=" in strong.command
+    plain = one(found, "table1")
+    assert plain.title.startswith("Table 1, preset small: ")
+    assert " recipe=" not in plain.command
+
+
 def test_the_number_of_test_samples_is_said(tmp_path: Path) -> None:
     record(tmp_path, "occl", "mae_vz", 0, predicted(0, n=30).frame)
     (whole, *_) = tables(collect(tmp_path))

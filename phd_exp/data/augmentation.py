@@ -1,0 +1,74 @@
+"""Batches seen by other cameras at the same place: more to learn from, and every label exact."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from phd_exp.data.batches import Batch
+from phd_exp.geometry.motion import Motion, small_turns, symmetries
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """Which changes of a sample are drawn at random.
+
+    Args:
+        symmetries: one of the eight turns and mirrors that map pixels to pixels.
+        largest_zoom: a small turn and zoom of the camera, up to this factor; 1 for none.
+        colours: the three colour channels in any order, which tells nothing of where things are.
+    """
+
+    n_numbers: ClassVar[int] = 10
+    symmetries: bool
+    largest_zoom: float
+    colours: bool
+
+    @property
+    def changes_anything(self) -> bool:
+        return self.symmetries or self.largest_zoom > 1 or self.colours
+
+    def __call__(self, batch: Batch, numbers: Float[Tensor, "batch 10"]) -> Batch:
+        """The samples, changed as uniform numbers from -1 to 1 say.
+
+        One whose object would leave the image by a turn or zoom keeps its symmetry alone.
+        """
+        numbers = numbers.to(batch.f)
+        camera = batch.camera
+        motion = symmetry = symmetries(numbers[:, :3] if self.symmetries else torch.ones_like(numbers[:, :3]))
+        if self.largest_zoom > 1:
+            motion = small_turns(numbers[:, 3:7], self.largest_zoom, camera).after(symmetry)
+            motion = motion.where(motion.camera(camera).contains(motion.position(batch.xyz)), symmetry)
+        new = moved(batch, motion) if self.symmetries or self.largest_zoom > 1 else batch
+        return _recoloured(new, numbers[:, 7:].argsort(dim=-1)) if self.colours else new
+
+
+def _recoloured(batch: Batch, order: Int[Tensor, "batch 3"]) -> Batch:
+    image = batch.image.gather(-1, order[:, None, None, :].expand_as(batch.image))
+    return replace(batch, image=image)
+
+
+def moved(batch: Batch, motion: Motion) -> Batch:
+    """The samples as the cameras see them after a motion."""
+    return Batch(
+        warped(batch, motion), motion.position(batch.xyz), motion.camera(batch.camera).f, batch.S, batch.row
+    )
+
+
+def warped(batch: Batch, motion: Motion) -> UInt8[Tensor, "batch height width 3"]:
+    """The images after a motion, between pixels bilinearly; beyond its border an image goes on as its border is."""
+    origin = motion.origin(_pixels(batch), batch.camera)
+    images = batch.image.permute(0, 3, 1, 2).to(origin.dtype)
+    values = grid_sample(images, origin, mode="bilinear", padding_mode="border", align_corners=False)
+    return values.round().to(torch.uint8).permute(0, 2, 3, 1)
+
+
+def _pixels(batch: Batch) -> Float[Tensor, "height width 2"]:
+    """The middles of the pixels relative to that of the image, over S/2."""
+    side = batch.image.shape[1]
+    middles = (2 * torch.arange(side, dtype=batch.f.dtype, device=batch.f.device) + 1) / side - 1
+    y, x = torch.meshgrid(middles, middles, indexing="ij")
+    return torch.stack([x, y], dim=-1)

@@ -1,0 +1,115 @@
+"""The same scene from another camera at the same place: what it sees and where things are for it follow exactly.
+
+A turn, a mirror and a longer focal length change an image by a homography, whatever it shows.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from phd_exp.geometry.camera import Camera
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Cameras turned or mirrored about their centres, with other focal lengths: v' = R v and f' = zoom f.
+
+    Args:
+        R: orthogonal matrices from the frame of the old camera to that of the new one; a reflection mirrors.
+        zoom: the new focal length over the old one.
+
+    Source: own derivation; both cameras are pinholes with one centre and square images of one side.
+    """
+
+    R: Float[Tensor, "batch 3 3"]
+    zoom: Float[Tensor, " batch"]
+
+    def camera(self, camera: Camera) -> Camera:
+        """The new cameras."""
+        return Camera(self.zoom * camera.f, camera.S)
+
+    def position(self, xyz: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 3"]:
+        """Positions (metres) in the frames of the new cameras."""
+        return (self.R @ xyz[..., None]).squeeze(-1)
+
+    def origin(self, pixel: Float[Tensor, "*#places 2"], camera: Camera) -> Float[Tensor, "batch *places 2"]:
+        """Where in the old images lies what the new ones show in a pixel.
+
+        Pixels of either image relative to its middle, over S/2: from -1 to 1 within the image.
+        """
+        half = (camera.S / 2 / camera.f).reshape(-1, *[1] * pixel.ndim)
+        zoom = self.zoom.reshape(half.shape)
+        xy = pixel * half / zoom
+        ray = torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1)
+        old = torch.einsum("bji,b...j->b...i", self.R, ray)
+        return old[..., :2] / old[..., 2:] / half
+
+    def stays_inside(self, camera: Camera) -> Bool[Tensor, " batch"]:
+        """Whether the old image holds all that the new one shows."""
+        corners = torch.tensor([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
+        # a homography maps the square to a convex quadrilateral: its corners decide
+        return (self.origin(corners.to(camera.f), camera).abs() <= 1 + 1e-6).flatten(1).all(-1)
+
+    def where(self, chosen: Bool[Tensor, " batch"], other: "Motion") -> "Motion":
+        """This motion where chosen, the other one elsewhere."""
+        R = torch.where(chosen[:, None, None], self.R, other.R)
+        return Motion(R, torch.where(chosen, self.zoom, other.zoom))
+
+    def after(self, first: "Motion") -> "Motion":
+        """First the one motion, then this one."""
+        return Motion(self.R @ first.R, self.zoom * first.zoom)
+
+
+def symmetries(numbers: Float[Tensor, "batch 3"]) -> Motion:
+    """The eight turns and mirrors that map pixels to pixels, from three numbers of which the sign counts.
+
+    Two mirror the axes, the third exchanges them.
+    """
+    sign = torch.where(numbers < 0, -1.0, 1.0).to(numbers.dtype)
+    identity = torch.eye(3, dtype=numbers.dtype, device=numbers.device)
+    exchange = identity[[1, 0, 2]]
+    mirror = torch.diag_embed(torch.cat([sign[:, :2], torch.ones_like(sign[:, :1])], dim=-1))
+    R = mirror @ torch.where(numbers[:, 2, None, None] < 0, exchange, identity)
+    return Motion(R, torch.ones_like(numbers[:, 0]))
+
+
+def small_turns(numbers: Float[Tensor, "batch 4"], largest_zoom: float, camera: Camera) -> Motion:
+    """Turns and zooms after which the old image still holds all that the new one shows.
+
+    The zoom is between 1 and the largest. It leaves room for a roll about the optical axis, up to the angle theta at
+    which cos theta + sin theta = zoom, and what room is left after that for a turn of the axis.
+
+    Args:
+        numbers: from -1 to 1: of zoom, roll and the two turns of the axis; the first one's magnitude counts.
+        largest_zoom: at least 1; at sqrt(2) any roll has room.
+        camera: the old cameras.
+
+    Source: own derivation; the corner of a square turned by theta is cos theta + sin theta half sides away.
+    """
+    zoom = 1 + (largest_zoom - 1) * numbers[:, 0].abs()
+    most = (zoom.square() - 1).clamp(max=1).asin() / 2
+    roll = most * numbers[:, 1]
+    reach = (roll.cos() + roll.sin().abs()) / zoom
+    # perspective moves corners by the square of the half field, a few per cent, which is kept free
+    half = camera.S / 2 / camera.f
+    room = ((1 - reach) - 2 * half.square()).clamp(min=0)
+    tilt = (half * room)[:, None] * numbers[:, 2:]
+    return Motion(_rotation(roll, tilt), zoom)
+
+
+def _rotation(roll: Float[Tensor, " batch"], tilt: Float[Tensor, "batch 2"]) -> Float[Tensor, "batch 3 3"]:
+    """Roll about z after turning the axis by the tangents `tilt` towards x and y."""
+    z = torch.cat([tilt, torch.ones_like(tilt[:, :1])], dim=-1)
+    z = z / z.norm(dim=-1, keepdim=True)
+    a, b, c = z.unbind(-1)
+    # the rotation without roll that takes z to the axis; see `virtual.smallest_rotation`
+    rows = [
+        torch.stack([1 - a * a / (1 + c), -a * b / (1 + c), -a], dim=-1),
+        torch.stack([-a * b / (1 + c), 1 - b * b / (1 + c), -b], dim=-1),
+        z,
+    ]
+    cos, sin, zero = roll.cos(), roll.sin(), torch.zeros_like(roll)
+    turn = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1], dim=-1).unflatten(-1, (3, 3))
+    return turn @ torch.stack(rows, dim=-2)

@@ -1,0 +1,119 @@
+"""A backbone that keeps where things are: a narrow ResNet, a pyramid, and a map of where the object is."""
+
+from functools import partial
+from typing import Annotated
+
+import torch
+from annotated_types import Ge
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import interpolate, relu
+from torchvision.models.resnet import BasicBlock, Bottleneck
+
+from phd_exp.models.backbones import BLOCKS, Backbone, Depth, Seen
+
+_norm = partial(nn.GroupNorm, 1)
+
+
+class Locating(Backbone):
+    """A ResNet, its stages brought together at the second one's resolution, and read where the object is.
+
+    The ResNet has `width` channels where torchvision's have 64, and no max-pooling: with half the channels on four
+    times the pixels it costs the same and sees twice as sharply. A map over the finest level of the pyramid says
+    with what probability the object's middle lies in a cell, and how far from the cell's own middle; `place` is the
+    mean of that. The features are mixed from the level's, averaged with the same weights, and the last stage's mean.
+
+    What is read from the pyramid is computed in float32: in bfloat16 places would be rounded to a tenth of a pixel.
+
+    Args:
+        depth: of the ResNet.
+        width: channels of its first stage.
+        channels: of the pyramid.
+        hidden: features that are made of what is read.
+
+    Source: the pyramid is Lin et al., "Feature pyramid networks for object detection" (2017); the mean over a map,
+    Sun et al., "Integral human pose regression" (2018).
+    """
+
+    locates = True
+
+    def __init__(
+        self,
+        depth: Depth,
+        width: Annotated[int, Ge(1)],
+        channels: Annotated[int, Ge(1)],
+        hidden: Annotated[int, Ge(1)],
+    ) -> None:
+        super().__init__()
+        block, counts = BLOCKS[depth]
+        widths = [width * 2**stage for stage in range(len(counts))]
+        outputs = [n * block.expansion for n in widths]
+        self.stem = _stem(width)
+        self.stages = nn.ModuleList(
+            _stage(block, count, n_in, n, stride=1 if n == width else 2)
+            for count, n_in, n in zip(counts, [width, *outputs], widths, strict=False)
+        )
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(
+                    module.weight, mode="fan_out", nonlinearity="relu"
+                )  # as torchvision's
+        self.lateral = nn.ModuleList(nn.Conv2d(n, channels, 1) for n in outputs[1:])
+        self.smooth = nn.Conv2d(channels, channels, 3, padding=1)
+        self.map = nn.Conv2d(channels, 3, 1)
+        # every cell as likely as another: the object is in the middle, as for a network whose last layer is zero
+        nn.init.zeros_(self.map.weight)
+        nn.init.zeros_(self.map.bias)  # type: ignore[arg-type]  # it has one
+        self.mix = nn.Sequential(nn.Linear(channels + outputs[-1], hidden), nn.ReLU(inplace=True))
+        self.n_features = hidden
+
+    def forward(self, pixels: Float[Tensor, "batch 3 height width"]) -> Seen:
+        stages, level = [], self.stem(pixels)
+        for stage in self.stages:
+            level = stage(level)
+            stages.append(level)
+        finest = self._finest(stages[1:])
+        with torch.autocast(pixels.device.type, enabled=False):
+            return self._read(finest.float(), stages[-1].float())
+
+    def _finest(self, stages: list[Tensor]) -> Float[Tensor, "batch channels rows columns"]:
+        """The finest level of the pyramid: what is seen there, with what coarser stages say of it."""
+        levels = [lateral(stage) for lateral, stage in zip(self.lateral, stages, strict=True)]
+        finest = levels[-1]
+        for finer in reversed(levels[:-1]):
+            finest = finer + interpolate(finest, size=finer.shape[-2:], mode="nearest")
+        return relu(self.smooth(relu(finest)))
+
+    def _read(self, finest: Tensor, last: Tensor) -> Seen:
+        scores = self.map(finest)
+        log_heat = scores[:, 0].flatten(1).log_softmax(-1)
+        weight = log_heat.exp()[:, None]
+        places = cells(*scores.shape[-2:]).to(scores) + scores[:, 1:]
+        return Seen(
+            features=self.mix(torch.cat([(weight * finest.flatten(2)).sum(-1), last.mean((2, 3))], dim=-1)),
+            place=(weight * places.flatten(2)).sum(-1),
+            log_heat=log_heat.unflatten(-1, scores.shape[-2:]),
+        )
+
+
+def cells(rows: int, columns: int) -> Float[Tensor, "2 rows columns"]:
+    """The middles (x, y) of the cells of a grid over the image, which reaches from -1 to 1."""
+    y, x = ((2 * torch.arange(n) + 1) / n - 1 for n in (rows, columns))
+    return torch.stack([x.expand(rows, columns), y[:, None].expand(rows, columns)])
+
+
+def _stem(width: int) -> nn.Sequential:
+    convolution = nn.Conv2d(3, width, 7, stride=2, padding=3, bias=False)
+    return nn.Sequential(convolution, _norm(width), nn.ReLU(inplace=True))
+
+
+def _stage(
+    block: type[BasicBlock | Bottleneck], count: int, n_in: int, width: int, stride: int
+) -> nn.Sequential:
+    """So many blocks, the first of which changes resolution and channels."""
+    n_out = width * block.expansion
+    shortcut = None
+    if stride > 1 or n_in != n_out:
+        shortcut = nn.Sequential(nn.Conv2d(n_in, n_out, 1, stride, bias=False), _norm(n_out))
+    first = block(n_in, width, stride, shortcut, norm_layer=_norm)
+    return nn.Sequential(first, *(block(n_out, width, norm_layer=_norm) for _ in range(count - 1)))

@@ -1,0 +1,120 @@
+"""Augmented batches: pixels and labels belong together."""
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from phd_exp.data.augmentation import Augmentation, moved
+from phd_exp.data.batches import Batch
+from phd_exp.geometry import Camera
+from phd_exp.geometry.motion import Motion, symmetries
+
+SIDE = 48
+N = 64
+
+
+def spots(camera: Camera, xyz: torch.Tensor) -> torch.Tensor:
+    """Images that show a soft white spot where a position is seen."""
+    pixel = camera.project(xyz)
+    middles = torch.arange(SIDE) + 0.5
+    distance = (middles[None, :] - pixel[:, :1]).square()[:, None] + (
+        middles[None, :] - pixel[:, 1:]
+    ).square()[:, :, None]
+    return (255 * (-distance / 18).exp()).round().to(torch.uint8)[..., None].repeat(1, 1, 1, 3)
+
+
+def spot_of(image: torch.Tensor) -> torch.Tensor:
+    """The middle of the spot, by its brightness."""
+    weight = image[..., 0].double()
+    middles = torch.arange(SIDE) + 0.5
+    total = weight.sum((1, 2))
+    return (
+        torch.stack([(weight * middles).sum((1, 2)), (weight.mT * middles).sum((1, 2))], -1) / total[:, None]
+    )
+
+
+def augmented(batch: Batch, largest_zoom: float, seed: int) -> Batch:
+    augment = Augmentation(symmetries=True, largest_zoom=largest_zoom, colours=False)
+    return augment(batch, numbers(seed))
+
+
+def numbers(seed: int) -> torch.Tensor:
+    return 2 * torch.rand(N, Augmentation.n_numbers, generator=torch.Generator().manual_seed(seed)) - 1
+
+
+@pytest.fixture
+def batch() -> Batch:
+    torch.manual_seed(0)
+    f = torch.empty(N).uniform_(1200, 2000) * SIDE / 224
+    camera = Camera(f, float(SIDE))
+    # far enough from the border that the whole spot stays in view
+    xyz = camera.unproject(SIDE * torch.empty(N, 2).uniform_(0.35, 0.65), torch.empty(N).uniform_(3, 5))
+    return Batch(spots(camera, xyz), xyz, f, float(SIDE), torch.arange(N))
+
+
+@pytest.mark.parametrize("largest_zoom", [1.0, 1.3])
+def test_the_object_is_where_its_label_says(batch: Batch, largest_zoom: float) -> None:
+    new = augmented(batch, largest_zoom, seed=1)
+    assert_close(spot_of(new.image), new.camera.project(new.xyz).double(), rtol=0, atol=0.05)
+    assert not torch.equal(new.image, batch.image)
+    assert ((new.f > batch.f).any()) == (largest_zoom > 1)
+
+
+def test_symmetries_move_pixels_as_they_are(batch: Batch) -> None:
+    noise = torch.randint(0, 256, batch.image.shape, dtype=torch.uint8)
+    batch = Batch(noise, batch.xyz, batch.f, batch.S, batch.row)
+    expected = {
+        (1, 1, 1): noise,
+        (-1, 1, 1): noise.flip(2),
+        (1, -1, 1): noise.flip(1),
+        (1, 1, -1): noise.transpose(1, 2),
+        (-1, -1, -1): noise.transpose(1, 2).flip(1, 2),
+    }
+    for signs, image in expected.items():
+        new = moved(batch, symmetries(torch.tensor([signs], dtype=torch.float32).expand(N, 3)))
+        assert torch.equal(new.image, image), signs
+
+
+def test_objects_stay_in_view(batch: Batch) -> None:
+    border = batch.camera.unproject(torch.full((N, 2), SIDE - 0.5), torch.full((N,), 4.0))
+    batch = Batch(batch.image, border, batch.f, batch.S, batch.row)
+    new = augmented(batch, 1.4, seed=1)
+    assert new.camera.contains(new.xyz).all()
+
+
+def test_nothing_changes_without_a_motion(batch: Batch) -> None:
+    still = moved(batch, Motion(torch.eye(3).expand(N, 3, 3), torch.ones(N)))
+    assert torch.equal(still.image, batch.image)
+    assert torch.equal(still.xyz, batch.xyz)
+
+
+def test_the_same_seed_gives_the_same_batch(batch: Batch) -> None:
+    one, same, other = (augmented(batch, 1.3, seed) for seed in (1, 1, 2))
+    assert torch.equal(one.image, same.image)
+    assert not torch.equal(one.image, other.image)
+
+
+def test_colours_change_places_alone(batch: Batch) -> None:
+    noise = torch.randint(0, 256, batch.image.shape, dtype=torch.uint8)
+    batch = Batch(noise, batch.xyz, batch.f, batch.S, batch.row)
+    new = Augmentation(symmetries=False, largest_zoom=1.0, colours=True)(batch, numbers(1))
+    assert torch.equal(new.xyz, batch.xyz)
+    assert torch.equal(new.image.sort(-1).values, noise.sort(-1).values)
+    orders = {tuple(new.image[row, 0, 0].tolist()) == tuple(noise[row, 0, 0].tolist()) for row in range(N)}
+    assert orders == {True, False}
+    # one order for all pixels of an image
+    first = [noise[0, ..., channel] for channel in range(3)]
+    assert all(any(torch.equal(new.image[0, ..., channel], one) for one in first) for channel in range(3))
+
+
+@pytest.mark.parametrize("part", [{"symmetries": True}, {"largest_zoom": 1.2}, {"colours": True}])
+def test_each_part_is_there_by_itself(batch: Batch, part: dict) -> None:
+    nothing = {"symmetries": False, "largest_zoom": 1.0, "colours": False}
+    assert not Augmentation(**nothing).changes_anything
+    augment = Augmentation(**(nothing | part))
+    assert augment.changes_anything
+    noise = torch.randint(0, 256, batch.image.shape, dtype=torch.uint8)
+    new = augment(Batch(noise, batch.xyz, batch.f, batch.S, batch.row), numbers(1))
+    assert not torch.equal(new.image, noise)
+    assert torch.equal(new.f, batch.f) == ("largest_zoom" not in part)
+    assert torch.equal(new.xyz, batch.xyz) == ("colours" in part)

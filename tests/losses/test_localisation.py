@@ -1,0 +1,53 @@
+"""The localisation loss: least for the true place, finite everywhere, and what it says of cells."""
+
+import math
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from phd_exp.losses.localisation import localisation_loss
+from phd_exp.models.locating import cells
+
+
+def heat_at(place: tuple[float, float], rows: int = 5, columns: int = 8) -> torch.Tensor:
+    """A map that spreads a place over its four cells."""
+    x, y = cells(rows, columns)
+    share = (1 - (x - place[0]).abs() * columns / 2).clamp(0) * (1 - (y - place[1]).abs() * rows / 2).clamp(0)
+    return share[None]
+
+
+@pytest.mark.parametrize("place", [(0.1, -0.3), (0.125, 0.0), (-0.6, 0.55)])
+def test_it_is_the_cross_entropy_with_cells_whose_mean_is_the_place(place: tuple[float, float]) -> None:
+    share = heat_at(place)
+    mean = torch.einsum("bij,cij->c", share, cells(5, 8))
+    assert_close(mean, torch.tensor(place))
+    found = localisation_loss((share + 1e-9).log(), torch.tensor([place]))
+    entropy = -(share[share > 0] * share[share > 0].log()).sum()
+    assert_close(found, entropy, atol=1e-5, rtol=0)
+    elsewhere = localisation_loss((share + 1e-9).log(), torch.tensor([place]) + 0.3)
+    assert elsewhere > found + 1
+
+
+def test_a_map_that_knows_nothing_has_the_logarithm_of_the_cells() -> None:
+    uniform = torch.full((3, 5, 8), -math.log(40))
+    assert_close(localisation_loss(uniform, torch.zeros(3, 2)), torch.tensor(math.log(40)))
+
+
+def test_beyond_the_image_the_border_is_the_place() -> None:
+    scores = torch.randn(1, 5 * 8, generator=torch.Generator().manual_seed(0)).log_softmax(-1).view(1, 5, 8)
+    corner = localisation_loss(scores, torch.tensor([[1.0, 1.0]]))
+    assert_close(corner, -scores[0, -1, -1])
+    assert torch.equal(localisation_loss(scores, torch.tensor([[7.0, 1e6]])), corner)
+
+
+def test_descending_finds_the_place() -> None:
+    scores = torch.zeros(1, 40, requires_grad=True)
+    place = torch.tensor([[0.33, -0.21]])
+    optimizer = torch.optim.Adam([scores], lr=0.1)
+    for _ in range(300):
+        optimizer.zero_grad()
+        localisation_loss(scores.log_softmax(-1).view(1, 5, 8), place).backward()
+        optimizer.step()
+    heat = scores.detach().softmax(-1).view(1, 5, 8)
+    assert_close(torch.einsum("bij,cij->bc", heat, cells(5, 8)), place, atol=0.01, rtol=0)

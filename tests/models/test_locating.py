@@ -1,0 +1,110 @@
+"""The backbone that keeps where things are, and heads that take what it says."""
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from phd_exp.geometry import Camera, Cartesian, DepthScale, LogDepth, Projected
+from phd_exp.geometry.charts import projected
+from phd_exp.models.backbones import resnet
+from phd_exp.models.heads import ChartHead, DistributionHead, Head
+from phd_exp.models.locating import Locating, cells
+from phd_exp.models.regressor import Regressor
+
+DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
+CAMERA = Camera(torch.tensor([1200.0, 1500.0, 1800.0, 2000.0]), 224.0)
+PLACED: dict[str, Head] = {
+    "probabilistic": DistributionHead(DEPTH),
+    "mae_vz": ChartHead(DEPTH, Projected),
+    "mae_logz": ChartHead(DEPTH, LogDepth),
+}
+
+
+@pytest.fixture
+def images() -> torch.Tensor:
+    generator = torch.Generator().manual_seed(0)
+    return torch.randint(0, 256, (4, 64, 64, 3), generator=generator, dtype=torch.uint8)
+
+
+def locating(depth: int = 10) -> Locating:
+    torch.manual_seed(0)
+    return Locating(depth, width=8, channels=6, hidden=5)
+
+
+@pytest.mark.parametrize("depth", [10, 18, 50])
+def test_it_sees_the_middle_before_it_has_learned(depth: int) -> None:
+    seen = locating(depth)(torch.randn(2, 3, 64, 96))
+    assert seen.features.shape == (2, 5)
+    assert seen.log_heat is not None
+    assert seen.place is not None
+    # a quarter of the image's resolution: the second of the stages, of which the first has half
+    assert seen.log_heat.shape == (2, 16, 24)
+    assert_close(seen.log_heat.exp().sum((1, 2)), torch.ones(2))
+    assert_close(seen.place, torch.zeros(2, 2), atol=1e-6, rtol=0)
+
+
+def test_cells_lie_in_the_middles_of_equal_parts() -> None:
+    x, y = cells(2, 4)
+    assert_close(x[0], torch.tensor([-0.75, -0.25, 0.25, 0.75]))
+    assert_close(y[:, 0], torch.tensor([-0.5, 0.5]))
+
+
+def test_the_place_is_the_mean_of_the_map_and_its_offsets() -> None:
+    network = locating()
+    torch.nn.init.normal_(network.map.weight)
+    offset = torch.tensor([0.2, -0.1])
+    with torch.no_grad():
+        network.map.weight[1:] = 0
+        network.map.bias[1:] = offset
+    seen = network(torch.randn(3, 3, 64, 64))
+    assert seen.log_heat is not None
+    assert seen.place is not None
+    assert seen.place.std() > 1e-4
+    assert_close(seen.place, torch.einsum("bij,cij->bc", seen.log_heat.exp(), cells(16, 16)) + offset)
+
+
+def test_it_costs_no_more_than_the_resnet_of_its_depth() -> None:
+    from torch.utils.flop_counter import FlopCounterMode
+
+    def operations(network: torch.nn.Module) -> int:
+        with FlopCounterMode(display=False) as counter:
+            network(torch.zeros(1, 3, 64, 64))
+        return counter.get_total_flops()
+
+    for depth in (10, 50):
+        assert operations(Locating(depth, width=32, channels=64, hidden=128)) < 1.3 * operations(
+            resnet(depth)
+        )
+
+
+def test_what_it_reads_is_float32_under_autocast() -> None:
+    with torch.autocast("cpu", torch.bfloat16):
+        seen = locating()(torch.randn(1, 3, 64, 64))
+    assert {None if part is None else part.dtype for part in seen} == {torch.float32}
+
+
+@pytest.mark.parametrize("name", PLACED)
+def test_a_placed_prediction_lies_there(name: str) -> None:
+    """What is zero stays at any precision of the density in the middle; placed, it is in the place."""
+    head = PLACED[name]
+    raw = torch.randn(4, head.n_outputs, generator=torch.Generator().manual_seed(1))
+    raw[:, :2] = 0
+    place = torch.tensor([[0.0, 0.0], [0.9, -0.3], [-1.0, 1.0], [0.2, 0.5]])
+    mode = head(head.placed(raw, place), CAMERA).mode
+    assert_close(projected(mode, CAMERA), place, atol=1e-5, rtol=0)
+    assert_close(mode[:, 2], head(raw, CAMERA).mode[:, 2])
+
+
+def test_a_chart_without_a_projection_is_not_placed() -> None:
+    raw = torch.randn(4, 3)
+    assert torch.equal(ChartHead(DEPTH, Cartesian).placed(raw, torch.ones(4, 2)), raw)
+
+
+@pytest.mark.parametrize("name", PLACED)
+def test_the_network_predicts_where_it_sees_the_object(name: str, images: torch.Tensor) -> None:
+    network = Regressor(locating(), PLACED[name], torch.contiguous_format)
+    torch.nn.init.normal_(network.backbone.map.weight)
+    seen = network.see(images)
+    assert seen.place is not None
+    assert seen.place.std() > 1e-4
+    assert_close(projected(network(images, CAMERA).mode, CAMERA), seen.place, atol=1e-5, rtol=0)
