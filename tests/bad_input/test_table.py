@@ -12,8 +12,11 @@ from tests.bad_input.table import TABLE, Bad
 PROGRESS = ("verifying ", "decoding ")
 
 
+CASES = [pytest.param(bad, id=bad.name, marks=[pytest.mark.slow] * bad.again) for bad in TABLE]
+
+
 @pytest.mark.timeout(60)
-@pytest.mark.parametrize("bad", TABLE, ids=lambda bad: bad.name)
+@pytest.mark.parametrize("bad", CASES)
 def test_one_line(place: Place, phd_exp: Callable, monkeypatch: pytest.MonkeyPatch, bad: Bad) -> None:
     monkeypatch.setenv("COLUMNS", "1000")  # a report breaks no line
     bad.spoil(place)
