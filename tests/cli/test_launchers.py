@@ -83,7 +83,7 @@ def unsharded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     return contents(folder / "renders")
 
 
-@pytest.mark.parametrize("launcher", LAUNCHERS)
+@pytest.mark.parametrize("launcher", ["joblib", pytest.param("submitit", marks=pytest.mark.slow)])
 def test_shards_at_once_give_the_bytes_of_one_render(
     tmp_path: Path, unsharded: dict[str, bytes], launcher: str
 ) -> None:

@@ -92,6 +92,7 @@ def test_verifying_nothing_is_one_line(render: Callable) -> None:
     assert "no data set here" in outcome.err
 
 
+@pytest.mark.slow
 def test_the_gallery_is_drawn(phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gallery, "INDICES", (0, 3, 0, 0, 3))
     outcome = phd_exp("gallery", f"folder={tmp_path}")

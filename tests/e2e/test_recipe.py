@@ -28,6 +28,7 @@ def test_models_train_by_it(train: Callable, tmp_path: Path, model: str) -> None
     assert "finished already" in again.out
 
 
+@pytest.mark.slow
 def test_it_is_exported(train: Callable, phd_exp: Callable, tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime", reason="export needs `pip install 'phd_exp[export]'`")
     assert train(*STRONG).status == 0

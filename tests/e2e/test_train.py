@@ -19,7 +19,13 @@ from phd_exp.reports.collect import collect
 from phd_exp.reports.point_errors import QUANTITIES, ErrorKey
 
 MODELS = ("probabilistic", "mae_vz", "mae_logz", "mae_xyz", "mae_constf")
-DATA = ("default", "occl", "scale", "occl_scale")
+DATA = (
+    "default",
+    pytest.param("occl", marks=pytest.mark.slow),
+    pytest.param("scale", marks=pytest.mark.slow),
+    "occl_scale",
+)
+"""The last one is both of those before it."""
 ERRORS = {"loss", "projected_error_mm", "depth_error_mm"}
 OF_A_DISTRIBUTION = {"nll", "depth_precision", "projected_precision"}
 CALIBRATION = {"depth_ence", "projected_ence", "miscalibration_area", "depth_crps_mm", "left_out"}
@@ -178,7 +184,7 @@ def test_a_run_of_another_configuration_is_never_reused(train: Callable, tmp_pat
     assert "optimizer.lr=0.5, but optimizer.lr=0.001 is asked for" in outcome.err
 
 
-@pytest.mark.parametrize("recipe", ["paper", "strong"])
+@pytest.mark.parametrize("recipe", [pytest.param("paper", marks=pytest.mark.slow), "strong"])
 def test_a_broken_run_goes_on_where_it_was(
     train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: str
 ) -> None:

@@ -47,7 +47,8 @@ def from_middle(pixel: torch.Tensor) -> torch.Tensor:
 def test_a_position_is_seen_where_its_pixel_goes(motion: Motion, camera: Camera, xyz: torch.Tensor) -> None:
     """The map of pixels is the one that projection before and after the motion makes."""
     seen = from_middle(motion.camera(camera).project(motion.position(xyz)))
-    back = torch.stack([motion.origin(seen, camera)[i, i] for i in range(N)])
+    of_all = motion.origin(seen, camera)
+    back = of_all[torch.arange(N), torch.arange(N)]
     assert_close(back, from_middle(camera.project(xyz)))
 
 
