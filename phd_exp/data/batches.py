@@ -58,7 +58,7 @@ class Augment(Protocol):
 class BatchLoader:
     """Iterates over the batches of one epoch; each iteration is the next epoch.
 
-    The order is a function of (seed, epoch), never of what ran before, and `place` holds both the epoch and how far
+    The order is a function of (seed, epoch), never of what ran before, and the state holds both the epoch and how far
     it has come: a resumed epoch goes on with the batches that were left, where a DataLoader would replay its first
     ones.
 
@@ -123,11 +123,10 @@ class BatchLoader:
     def _random(self, *place: int) -> np.random.Generator:
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=place))
 
-    @property
-    def place(self) -> dict[str, int]:
+    def state_dict(self) -> dict[str, int]:
         """Where the iteration stands, for a checkpoint."""
         return {"epoch": self.epoch, "next_batch": self.next_batch}
 
-    def go_to(self, place: dict[str, int]) -> None:
-        """Let the next iteration go on from a `place`."""
-        self.epoch, self.next_batch = place["epoch"], place["next_batch"]
+    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+        """Let the next iteration go on from there."""
+        self.epoch, self.next_batch = state_dict["epoch"], state_dict["next_batch"]

@@ -79,10 +79,10 @@ class PositionData(LightningDataModule):
 
     # Lightning restores the state of a loader in the middle of an epoch alone, that of a datamodule always
     def state_dict(self) -> dict[str, int]:
-        return self.train_dataloader().place
+        return self.train_dataloader().state_dict()
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
-        self.train_dataloader().go_to(state_dict)
+        self.train_dataloader().load_state_dict(state_dict)
 
 
 def _require_shares(source: Source, batch_size: int, world: int) -> None:

@@ -11,7 +11,8 @@ from torchmetrics import Metric
 class Means(Metric):
     """The means of named quantities over all samples seen, whatever the sizes of their batches.
 
-    Its state is one sum a quantity and a count, in float64: thousands of float32 additions would cost digits.
+    Its state is one sum a quantity and a count, in float64: thousands of float32 additions would cost digits. A
+    checkpoint in the middle of an epoch holds it.
     """
 
     full_state_update = False
@@ -21,8 +22,10 @@ class Means(Metric):
     def __init__(self, names: Sequence[str]) -> None:
         super().__init__()
         self.names = tuple(names)
-        self.add_state("sums", torch.zeros(len(self.names), dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("count", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+        self.add_state(
+            "sums", torch.zeros(len(self.names), dtype=torch.float64), dist_reduce_fx="sum", persistent=True
+        )
+        self.add_state("count", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum", persistent=True)
 
     def update(self, values: Mapping[str, Float[Tensor, " batch"]]) -> None:
         rows = torch.stack([values[name] for name in self.names]).double()

@@ -30,6 +30,7 @@ from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig
 from phd_exp.training.module import PositionModule
 from phd_exp.training.network import build_regressor, memory_format, naming, precision
 from phd_exp.training.schedule import factor
+from phd_exp.training.stopping import StopBetweenBatches
 from phd_exp.training.tracking import Tracker
 
 
@@ -96,6 +97,8 @@ def build_trainer(
             folder.checkpoints, filename="last", enable_version_counter=False, save_on_train_epoch_end=True
         ),
     ]
+    if config.trainer.devices == 1:  # of several, each would stop at a batch of its own
+        callbacks.append(StopBetweenBatches(folder.last_checkpoint))
     callbacks += _progress(config)
     if calibration is not None:
         callbacks.append(calibration)

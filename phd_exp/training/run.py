@@ -1,7 +1,6 @@
 """One run from its configuration to its record."""
 
 import logging
-import time
 import warnings
 from collections.abc import Mapping
 from contextlib import nullcontext
@@ -41,7 +40,7 @@ UNTRAINED = -1
 def train(config: RunConfig, folder: RunFolder, draw: Draw | None, cores: int) -> dict[str, Any]:
     """Train, measure and record one run; returns its results. A finished run is not run again.
 
-    A run that was broken off goes on after its last whole epoch.
+    A run that was stopped goes on with its next batch, one that was killed after its last whole epoch.
 
     Args:
         config: what to run.
@@ -140,13 +139,11 @@ def run(
         checkpoint = _take_up(trainer, module, data, record)
         if tracker:
             tracker.send_epochs(record.rows.values())
-        seconds = _fit(trainer, module, data, checkpoint)
+        _fit(trainer, module, data, checkpoint)
         tables: dict[Part, Columns] = {
             part: _evaluate(trainer, module, data, part) for part in data.samples if part != "train"
         }
-        results = (
-            summary(tables["test"]) | _untrained(record) | _circumstances(config, data, trainer, seconds)
-        )
+        results = summary(tables["test"]) | _untrained(record) | _circumstances(config, data, trainer)
         if trainer.is_global_zero:
             _record(folder, tables, data, calibration)
         if tracker:
@@ -176,7 +173,9 @@ def _take_up(
     """
     checkpoint = record.folder.last_checkpoint
     if checkpoint.exists():
-        record.forget_after(_epoch_of(checkpoint, trainer.max_epochs or 0))
+        record.forget_after(
+            _last_whole_epoch(checkpoint, trainer.max_epochs or 0, len(data.train_dataloader()))
+        )
         _require_recorded(record, checkpoint)
         return checkpoint
     record.forget_after(UNTRAINED)
@@ -199,12 +198,11 @@ def _is_number(value: Any) -> bool:
     return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
 
 
-def _fit(trainer: Trainer, module: PositionModule, data: PositionData, checkpoint: Path | None) -> float:
-    """Train to the last epoch, from the checkpoint if there is one; returns the seconds it took now.
+def _fit(trainer: Trainer, module: PositionModule, data: PositionData, checkpoint: Path | None) -> None:
+    """Train to the last epoch, from the checkpoint if there is one.
 
     Raises RunError where the checkpoint is one of another run.
     """
-    start = time.monotonic()
     begun = Begun()
     trainer.callbacks.append(begun)  # type: ignore[attr-defined]  # set by Lightning
     try:
@@ -214,7 +212,6 @@ def _fit(trainer: Trainer, module: PositionModule, data: PositionData, checkpoin
             raise
         reason = " ".join(str(error).split())[:120]
         raise RunError(f"{checkpoint}: not a checkpoint of this run ({reason}); {ADVICE}") from None
-    return time.monotonic() - start
 
 
 def _untrained(record: RecordLogger) -> dict[str, Any]:
@@ -222,14 +219,17 @@ def _untrained(record: RecordLogger) -> dict[str, Any]:
     return {f"untrained/{key}": value for key, value in record.rows[UNTRAINED].items() if "test/" in key}
 
 
-def _epoch_of(checkpoint: Path, epochs: int) -> int:
+def _last_whole_epoch(checkpoint: Path, epochs: int, batches: int) -> int:
     """The last epoch that a checkpoint has seen whole. Raises RunError where it is none of a run so long."""
-    epoch = load_checkpoint(checkpoint).get("epoch")
+    content = load_checkpoint(checkpoint)
+    epoch = content.get("epoch")
     if type(epoch) is not int or not 0 <= epoch < epochs:
         raise RunError(
             f"{checkpoint}: not a checkpoint of this run (epoch {shown(epoch)} of {epochs}); {ADVICE}"
         )
-    return epoch
+    place = content.get(PositionData.__qualname__)
+    is_whole = not isinstance(place, dict) or place.get("next_batch") == batches
+    return epoch if is_whole else epoch - 1
 
 
 def _evaluate(trainer: Trainer, module: PositionModule, data: PositionData, part: Part) -> Columns:
@@ -239,7 +239,7 @@ def _evaluate(trainer: Trainer, module: PositionModule, data: PositionData, part
     return gathered(joined(batches))  # type: ignore[arg-type]
 
 
-def _circumstances(config: RunConfig, data: PositionData, trainer: Trainer, seconds: float) -> dict[str, Any]:
+def _circumstances(config: RunConfig, data: PositionData, trainer: Trainer) -> dict[str, Any]:
     return {
         "preset": config.preset,
         "recipe": config.recipe.name,
@@ -250,7 +250,6 @@ def _circumstances(config: RunConfig, data: PositionData, trainer: Trainer, seco
         "n_held_out": data.source.count("held_out"),
         "n_test": data.source.count("test"),
         "epochs": trainer.current_epoch,
-        "fit_seconds": seconds,
         "devices": trainer.world_size,
         "threads": torch.get_num_threads(),  # of each process
         "device": str(trainer.strategy.root_device),

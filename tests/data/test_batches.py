@@ -75,7 +75,7 @@ def test_resumes_with_the_batches_that_were_left(samples: Batch, done: int) -> N
     epoch = iter(broken)
     seen = [rows([next(epoch)]) for _ in range(done)]
     resumed = loader(samples)
-    resumed.go_to(broken.place)
+    resumed.load_state_dict(broken.state_dict())
     seen += [rows([batch]) for batch in resumed] if done < 4 else []
     seen += [rows([batch]) for batch in resumed]
     assert seen == expected[4:]
@@ -102,7 +102,7 @@ def test_shares_are_each_batch_without_gaps_and_repeats(samples: Batch, world: i
             parts = [rows([share[place]]) for share in of_ranks if place < len(share)]
             assert sorted(row for part in parts for row in part) == sorted(rows([batch]))
             assert parts[0] == rows([batch])[::world]
-    assert len({tuple(share.place.items()) for share in shares if drop_last}) <= 1
+    assert len({tuple(share.state_dict().items()) for share in shares if drop_last}) <= 1
 
 
 class Shift:
@@ -125,10 +125,10 @@ def test_random_changes_depend_on_seed_epoch_and_batch_alone(samples: Batch) -> 
         assert shift.abs().max() <= 1
         assert len(shift[:, 0].unique()) == len(batch)
     resumed = changing()
-    resumed.go_to({"epoch": 0, "next_batch": 1})
+    resumed.load_state_dict({"epoch": 0, "next_batch": 1})
     assert torch.equal(next(iter(resumed)).xyz, first[1].xyz)
     later = changing()
-    later.go_to({"epoch": 3, "next_batch": 0})
+    later.load_state_dict({"epoch": 3, "next_batch": 0})
     order = later.order(4).tolist()
     shifts = next(iter(later)).xyz[:, 0] - samples.xyz[order[:4], 0]
     assert not torch.equal(shifts, first[0].xyz[:, 0] - samples.xyz[first[0].row, 0])
