@@ -38,12 +38,25 @@ class Augmentation:
         """
         numbers = numbers.to(batch.f)
         camera = batch.camera
-        motion = symmetry = symmetries(numbers[:, :3] if self.symmetries else torch.ones_like(numbers[:, :3]))
+        signs = numbers[:, :3] if self.symmetries else torch.ones_like(numbers[:, :3])
+        symmetry = symmetries(signs)
         if self.largest_zoom > 1:
             motion = small_turns(numbers[:, 3:7], self.largest_zoom, camera).after(symmetry)
             motion = motion.where(motion.camera(camera).contains(motion.position(batch.xyz)), symmetry)
-        new = moved(batch, motion) if self.symmetries or self.largest_zoom > 1 else batch
+            new = moved(batch, motion)
+        else:
+            new = replace(batch, image=_mirrored(batch.image, signs), xyz=symmetry.position(batch.xyz))
         return _recoloured(new, numbers[:, 7:].argsort(dim=-1)) if self.colours else new
+
+
+def _mirrored(
+    image: UInt8[Tensor, "batch side side 3"], signs: Float[Tensor, "batch 3"]
+) -> UInt8[Tensor, "batch side side 3"]:
+    """As `warped` by `symmetries` of these signs, without looking between pixels."""
+    x, y, exchange = (signs < 0)[..., None, None, None].unbind(1)
+    image = torch.where(exchange, image.transpose(1, 2), image)
+    image = torch.where(x, image.flip(2), image)
+    return torch.where(y, image.flip(1), image)
 
 
 def _recoloured(batch: Batch, order: Int[Tensor, "batch 3"]) -> Batch:

@@ -75,6 +75,16 @@ def test_symmetries_move_pixels_as_they_are(batch: Batch) -> None:
         assert torch.equal(new.image, image), signs
 
 
+def test_symmetries_alone_are_those_of_the_camera(batch: Batch) -> None:
+    """Pixels are moved without a warp then; the two ways agree to the bit."""
+    noise = torch.randint(0, 256, batch.image.shape, dtype=torch.uint8)
+    batch = Batch(noise, batch.xyz, batch.f, batch.S, batch.row)
+    new, expected = augmented(batch, 1.0, seed=1), moved(batch, symmetries(numbers(1)[:, :3]))
+    assert torch.equal(new.image, expected.image)
+    assert_close(new.xyz, expected.xyz)
+    assert len((numbers(1)[:, :3] < 0).unique(dim=0)) == 8
+
+
 def test_objects_stay_in_view(batch: Batch) -> None:
     border = batch.camera.unproject(torch.full((N, 2), SIDE - 0.5), torch.full((N,), 4.0))
     batch = Batch(batch.image, border, batch.f, batch.S, batch.row)
