@@ -21,7 +21,7 @@ class Locating(Backbone):
     The ResNet has `width` channels where torchvision's have 64, and no max-pooling: with half the channels on four
     times the pixels it costs the same and sees twice as sharply. A map over the finest level of the pyramid says
     with what probability the object's middle lies in a cell, and how far from the cell's own middle; `place` is the
-    mean of that. The features are mixed from the level's, averaged with the same weights, and the last stage's mean.
+    mean of that. The features are the level's, averaged with the same weights, and the last stage's mean.
 
     What is read from the pyramid is computed in float32: in bfloat16 places would be rounded to a tenth of a pixel.
 
@@ -29,7 +29,6 @@ class Locating(Backbone):
         depth: of the ResNet.
         width: channels of its first stage.
         channels: of the pyramid.
-        hidden: features that are made of what is read.
 
     Source: the pyramid is Lin et al., "Feature pyramid networks for object detection" (2017); the mean over a map,
     Sun et al., "Integral human pose regression" (2018).
@@ -37,13 +36,7 @@ class Locating(Backbone):
 
     locates = True
 
-    def __init__(
-        self,
-        depth: Depth,
-        width: Annotated[int, Ge(1)],
-        channels: Annotated[int, Ge(1)],
-        hidden: Annotated[int, Ge(1)],
-    ) -> None:
+    def __init__(self, depth: Depth, width: Annotated[int, Ge(1)], channels: Annotated[int, Ge(1)]) -> None:
         super().__init__()
         block, counts = BLOCKS[depth]
         widths = [width * 2**stage for stage in range(len(counts))]
@@ -64,8 +57,7 @@ class Locating(Backbone):
         # every cell as likely as another: the object is in the middle, as for a network whose last layer is zero
         nn.init.zeros_(self.map.weight)
         nn.init.zeros_(self.map.bias)  # type: ignore[arg-type]  # it has one
-        self.mix = nn.Sequential(nn.Linear(channels + outputs[-1], hidden), nn.ReLU(inplace=True))
-        self.n_features = hidden
+        self.n_features = channels + outputs[-1]
 
     def forward(self, pixels: Float[Tensor, "batch 3 height width"]) -> Seen:
         stages, level = [], self.stem(pixels)
@@ -90,7 +82,7 @@ class Locating(Backbone):
         weight = log_heat.exp()[:, None]
         places = cells(*scores.shape[-2:]).to(scores) + scores[:, 1:]
         return Seen(
-            features=self.mix(torch.cat([(weight * finest.flatten(2)).sum(-1), last.mean((2, 3))], dim=-1)),
+            features=torch.cat([(weight * finest.flatten(2)).sum(-1), last.mean((2, 3))], dim=-1),
             place=(weight * places.flatten(2)).sum(-1),
             log_heat=log_heat.unflatten(-1, scores.shape[-2:]),
         )

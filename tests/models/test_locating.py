@@ -28,13 +28,13 @@ def images() -> torch.Tensor:
 
 def locating(depth: int = 10) -> Locating:
     torch.manual_seed(0)
-    return Locating(depth, width=8, channels=6, hidden=5)
+    return Locating(depth, width=8, channels=6)
 
 
 @pytest.mark.parametrize("depth", [10, 18, 50])
 def test_it_sees_the_middle_before_it_has_learned(depth: int) -> None:
     seen = locating(depth)(torch.randn(2, 3, 64, 96))
-    assert seen.features.shape == (2, 5)
+    assert seen.features.shape == (2, 6 + 64 * (4 if depth == 50 else 1))
     assert seen.log_heat is not None
     assert seen.place is not None
     # a quarter of the image's resolution: the second of the stages, of which the first has half
@@ -72,9 +72,7 @@ def test_it_costs_no_more_than_the_resnet_of_its_depth() -> None:
         return counter.get_total_flops()
 
     for depth in (10, 50):
-        assert operations(Locating(depth, width=32, channels=64, hidden=128)) < 1.3 * operations(
-            resnet(depth)
-        )
+        assert operations(Locating(depth, width=32, channels=64)) < 1.3 * operations(resnet(depth))
 
 
 def test_what_it_reads_is_float32_under_autocast() -> None:
