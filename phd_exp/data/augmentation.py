@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from phd_exp.data.batches import Batch
+from phd_exp.geometry.grid import middles
 from phd_exp.geometry.motion import Motion, small_turns, symmetries
 
 
@@ -73,15 +74,8 @@ def moved(batch: Batch, motion: Motion) -> Batch:
 
 def warped(batch: Batch, motion: Motion) -> UInt8[Tensor, "batch height width 3"]:
     """The images after a motion, between pixels bilinearly; beyond its border an image goes on as its border is."""
-    origin = motion.origin(_pixels(batch), batch.camera)
+    side = batch.image.shape[1]
+    origin = motion.origin(middles(side, side).to(batch.f), batch.camera)
     images = batch.image.permute(0, 3, 1, 2).to(origin.dtype)
     values = grid_sample(images, origin, mode="bilinear", padding_mode="border", align_corners=False)
     return values.round().to(torch.uint8).permute(0, 2, 3, 1)
-
-
-def _pixels(batch: Batch) -> Float[Tensor, "height width 2"]:
-    """The middles of the pixels relative to that of the image, over S/2."""
-    side = batch.image.shape[1]
-    middles = (2 * torch.arange(side, dtype=batch.f.dtype, device=batch.f.device) + 1) / side - 1
-    y, x = torch.meshgrid(middles, middles, indexing="ij")
-    return torch.stack([x, y], dim=-1)

@@ -131,13 +131,11 @@ def _answer(scene: Observed, fused: Fused, place: int) -> dict[str, Any]:
 
 def _errors(fused: Fused, truth: Float[Tensor, "scenes 3"], plane: Plane | None) -> dict[str, Tensor]:
     """Distance of the point from the truth, and that of the mean in units of the covariance, along a plane if any."""
-    off, covariance = truth - fused.mean, fused.covariance
-    if plane is not None:
-        along = plane.directions
-        off, covariance = (along.mT @ off[..., None]).squeeze(-1), along.mT @ covariance @ along
+    along = None if plane is None else plane.directions
+    distance = squared_mahalanobis(truth - fused.mean, fused.covariance, along)
     point = MILLIMETRES * (fused.point - truth).norm(dim=-1)
     known = truth.isfinite().all(-1)
-    return {"error_mm": point, "squared_mahalanobis": squared_mahalanobis(off, covariance), "known": known}
+    return {"error_mm": point, "squared_mahalanobis": distance, "known": known}
 
 
 def _errors_of(errors: dict[str, Tensor], place: int) -> dict[str, Any]:

@@ -9,10 +9,8 @@ from phd_exp.inference.predictor import BATCH, load
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.runs import RunFolder
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.reports.several_views import ROTATION, TRANSLATION
 from phd_exp.training.predictions import columns, joined, write_parquet
-
-POSE = ("pose_w", "pose_x", "pose_y", "pose_z", "pose_t_x", "pose_t_y", "pose_t_z")
-"""Columns of a camera's pose: the unit quaternion of R and the translation (m) of v_camera = R v_scene + t."""
 
 
 def record_views(folder: RunFolder, data: DatasetFolder, spec: DatasetSpec, scenes: int) -> bool:
@@ -45,7 +43,9 @@ def record_views(folder: RunFolder, data: DatasetFolder, spec: DatasetSpec, scen
             columns(predictor.predict(predictor.raw(part.image.numpy()), part.f), part) for part in parts
         ]
         poses = [(*record.pose.rotation, *record.pose.translation) for record in data.records("test", n)]
-        known = dict(source.known("test")) | dict(zip(POSE, map(list, zip(*poses, strict=True)), strict=True))
+        known = dict(source.known("test")) | dict(
+            zip((*ROTATION, *TRANSLATION), map(list, zip(*poses, strict=True)), strict=True)
+        )
         write_parquet(folder.views, joined(tables), known, said)
     return True
 

@@ -33,9 +33,16 @@ def depth_error(
 
 
 def squared_mahalanobis(
-    error: Float[Tensor, "*batch k"], covariance: Float[Tensor, "*batch k k"]
+    error: Float[Tensor, "*batch n"],
+    covariance: Float[Tensor, "*batch n n"],
+    along: Float[Tensor, "*#batch n k"] | None = None,
 ) -> Float[Tensor, "*batch"]:
-    """e^T C^(-1) e, of expectation k where C is the covariance of e; NaN where C is singular or not finite."""
+    """e^T C^(-1) e, of expectation n where C is the covariance of e; NaN where C is singular or not finite.
+
+    Along k directions, the columns of a matrix, that of their components, of expectation k.
+    """
+    if along is not None:
+        error, covariance = (along.mT @ error[..., None]).squeeze(-1), along.mT @ covariance @ along
     solution, info = torch.linalg.solve_ex(covariance, error[..., None])
     distance = (error[..., None] * solution).sum((-2, -1))
     return torch.where(info == 0, distance, torch.nan)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate, relu
 from torchvision.models.resnet import BasicBlock, Bottleneck
 
+from phd_exp.geometry.grid import middles
 from phd_exp.models.backbones import BLOCKS, Backbone, Depth, Seen
 
 _norm = partial(nn.GroupNorm, 1)
@@ -48,9 +49,8 @@ class Locating(Backbone):
         )
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
-                nn.init.kaiming_normal_(
-                    module.weight, mode="fan_out", nonlinearity="relu"
-                )  # as torchvision's
+                # as torchvision's
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
         self.lateral = nn.ModuleList(nn.Conv2d(n, channels, 1) for n in outputs[1:])
         self.smooth = nn.Conv2d(channels, channels, 3, padding=1)
         self.map = nn.Conv2d(channels, 3, 1)
@@ -80,18 +80,12 @@ class Locating(Backbone):
         scores = self.map(finest)
         log_heat = scores[:, 0].flatten(1).log_softmax(-1)
         weight = log_heat.exp()[:, None]
-        places = cells(*scores.shape[-2:]).to(scores) + scores[:, 1:]
+        places = middles(*scores.shape[-2:]).movedim(-1, 0).to(scores) + scores[:, 1:]
         return Seen(
             features=torch.cat([(weight * finest.flatten(2)).sum(-1), last.mean((2, 3))], dim=-1),
             place=(weight * places.flatten(2)).sum(-1),
             log_heat=log_heat.unflatten(-1, scores.shape[-2:]),
         )
-
-
-def cells(rows: int, columns: int) -> Float[Tensor, "2 rows columns"]:
-    """The middles (x, y) of the cells of a grid over the image, which reaches from -1 to 1."""
-    y, x = ((2 * torch.arange(n) + 1) / n - 1 for n in (rows, columns))
-    return torch.stack([x.expand(rows, columns), y[:, None].expand(rows, columns)])
 
 
 def _stem(width: int) -> nn.Sequential:

@@ -35,7 +35,11 @@ class Regressor(nn.Module):
         self.register_buffer("std", 255 * torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
 
     def forward(self, image: UInt8[Tensor, "batch height width 3"], camera: Camera) -> Prediction:
-        return self.head(self.raw(image), camera)
+        return self.prediction(self.see(image), camera)
+
+    def prediction(self, seen: Seen, camera: Camera) -> Prediction:
+        """What follows from what was seen."""
+        return self.head(self.numbers(seen), camera)
 
     def raw(self, image: UInt8[Tensor, "batch height width 3"]) -> Float[Tensor, "batch n_outputs"]:
         """The numbers before the head, in the precision of the last layer."""
@@ -49,12 +53,7 @@ class Regressor(nn.Module):
 
     def numbers(self, seen: Seen) -> Float[Tensor, "batch n_outputs"]:
         """The numbers before the head, of what was seen."""
+        dtype = self.last.weight.dtype
         with torch.autocast(seen.features.device.type, enabled=False):
-            raw: Tensor = self.last(seen.features.to(self.dtype))
-            return raw if seen.place is None else self.head.placed(raw, seen.place.to(self.dtype))
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """The precision of the last layer."""
-        weight = next(self.last.parameters())
-        return weight.dtype
+            raw: Tensor = self.last(seen.features.to(dtype))
+            return raw if seen.place is None else self.head.placed(raw, seen.place.to(dtype))

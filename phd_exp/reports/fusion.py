@@ -166,10 +166,10 @@ def _columns(
         columns["depth_error_mm", method] = MILLIMETRES * depth_error(xyz, seen)
         columns["distance_mm", method] = MILLIMETRES * (estimate.point - truth).norm(dim=-1)
         if estimate.covariance is not None:
-            along = views.ground.directions if on_plane else torch.eye(3, dtype=truth.dtype)
-            off = (along.mT @ (truth - estimate.point)[..., None]).squeeze(-1)
-            distance = squared_mahalanobis(off, along.mT @ estimate.covariance @ along)
-            columns |= {(name, method): column for name, column in _within(distance, off.shape[-1]).items()}
+            along = views.ground.directions if on_plane else None
+            distance = squared_mahalanobis(truth - estimate.point, estimate.covariance, along)
+            within = _within(distance, 2 if on_plane else 3)
+            columns |= {(name, method): column for name, column in within.items()}
     return columns
 
 

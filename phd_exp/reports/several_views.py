@@ -20,6 +20,7 @@ from phd_exp.reports.parquet import read_table
 XYZ = ("x", "y", "z")
 ROTATION = ("pose_w", "pose_x", "pose_y", "pose_z")
 TRANSLATION = ("pose_t_x", "pose_t_y", "pose_t_z")
+"""Columns of a camera's pose: the unit quaternion of R and the translation (m) of v_camera = R v_scene + t."""
 NEEDED = ("scene", "view", "scale", *XYZ, *ROTATION, *TRANSLATION, *PARAMETERS)
 TILT = math.radians(30)
 """How far the first camera looks down at the ground, on which planes are tried; see `ground`."""

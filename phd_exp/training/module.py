@@ -96,7 +96,7 @@ class PositionModule(LightningModule):
     def _step(self, batch: Batch, split: str) -> tuple[Tensor, Prediction]:
         """The loss to descend on and the prediction; what is recorded as `loss` is the model's own alone."""
         seen = self.regressor.see(batch.image)
-        prediction = self.regressor.head(self.regressor.numbers(seen), self.told(batch.camera))
+        prediction = self.regressor.prediction(seen, self.told(batch.camera))
         loss = total = self.loss(prediction, batch.xyz)
         if split == "train" and self.localisation and seen.log_heat is not None:
             total = total + self.localisation * localisation_loss(

@@ -6,8 +6,12 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from phd_exp.geometry.grid import middles
 from phd_exp.losses.localisation import localisation_loss
-from phd_exp.models.locating import cells
+
+
+def cells(rows: int, columns: int) -> torch.Tensor:
+    return middles(rows, columns).movedim(-1, 0)
 
 
 def heat_at(place: tuple[float, float], rows: int = 5, columns: int = 8) -> torch.Tensor:

@@ -6,9 +6,10 @@ from torch.testing import assert_close
 
 from phd_exp.geometry import Camera, Cartesian, DepthScale, LogDepth, Projected
 from phd_exp.geometry.charts import projected
+from phd_exp.geometry.grid import middles
 from phd_exp.models.backbones import resnet
 from phd_exp.models.heads import ChartHead, DistributionHead, Head
-from phd_exp.models.locating import Locating, cells
+from phd_exp.models.locating import Locating
 from phd_exp.models.regressor import Regressor
 
 DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
@@ -44,7 +45,7 @@ def test_it_sees_the_middle_before_it_has_learned(depth: int) -> None:
 
 
 def test_cells_lie_in_the_middles_of_equal_parts() -> None:
-    x, y = cells(2, 4)
+    x, y = middles(2, 4).movedim(-1, 0)
     assert_close(x[0], torch.tensor([-0.75, -0.25, 0.25, 0.75]))
     assert_close(y[:, 0], torch.tensor([-0.5, 0.5]))
 
@@ -60,7 +61,9 @@ def test_the_place_is_the_mean_of_the_map_and_its_offsets() -> None:
     assert seen.log_heat is not None
     assert seen.place is not None
     assert seen.place.std() > 1e-4
-    assert_close(seen.place, torch.einsum("bij,cij->bc", seen.log_heat.exp(), cells(16, 16)) + offset)
+    assert_close(
+        seen.place, torch.einsum("bij,cij->bc", seen.log_heat.exp(), middles(16, 16).movedim(-1, 0)) + offset
+    )
 
 
 def test_it_costs_no_more_than_the_resnet_of_its_depth() -> None:
