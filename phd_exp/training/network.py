@@ -52,7 +52,7 @@ def precision(config: TrainerConfig) -> Any:
         return {"float32": "32-true", "bfloat16": "bf16-mixed"}[config.precision]
     if config.accelerator != "cpu" and torch.cuda.is_available():
         return "bf16-mixed" if torch.cuda.is_bf16_supported(including_emulation=False) else "32-true"
-    return "bf16-mixed" if _cpu_has_bfloat16() else "32-true"
+    return "bf16-mixed" if cpu_has_bfloat16() else "32-true"
 
 
 def memory_format(config: TrainerConfig) -> torch.memory_format:
@@ -60,7 +60,7 @@ def memory_format(config: TrainerConfig) -> torch.memory_format:
     return torch.channels_last if precision(config) == "bf16-mixed" else torch.contiguous_format
 
 
-def _cpu_has_bfloat16() -> bool:
+def cpu_has_bfloat16() -> bool:
     flags = Path("/proc/cpuinfo")
     words = flags.read_text().split() if flags.exists() else []
     return "amx_bf16" in words or "avx512_bf16" in words

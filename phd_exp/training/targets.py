@@ -18,7 +18,7 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 
 from phd_exp.records.errors import in_our_words, nearest, shown
 
-OURS = ("phd_exp.models.", "phd_exp.losses.", "phd_exp.geometry.")
+OURS = ("phd_exp.models.", "phd_exp.losses.", "phd_exp.optimizers.", "phd_exp.geometry.")
 ALLOWED = (*OURS, "torch.optim.", "torch.nn.", "torchvision.models.")
 """Where a `_target_` may point: a configuration from somebody else must not run whatever it likes.
 

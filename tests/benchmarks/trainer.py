@@ -1,8 +1,8 @@
-"""A process that trains by the whole programme and, epoch by epoch between, by a bare loop of the same network.
+"""A process that trains by the whole programme and, epoch by epoch between, by another loop with the same network.
 
-`python trainer.py FOLDER EPOCHS OVERRIDE...` prints a JSON line for each epoch but the first: images a second of the
-programme's training and of the bare loop, and the share of the programme's epoch that evaluation and logging take.
-The images are noise and resident, so that nothing is measured but the training.
+`python trainer.py LOOP FOLDER EPOCHS OVERRIDE...` prints a JSON line for each epoch but the first: images a second by
+the programme and by the loop, and the share of the programme's epoch that evaluation and logging take. LOOP is `bare`,
+on resident noise, so that nothing is measured but the training; or `conventional`, on rendered images.
 """
 
 import copy
@@ -10,9 +10,11 @@ import json
 import sys
 import time
 from pathlib import Path
+from typing import Protocol
 
 import hydra
 import torch
+from conventional import Conventional
 from lightning import Callback, LightningModule, Trainer
 from omegaconf import OmegaConf
 
@@ -21,11 +23,13 @@ from phd_exp.data.batches import Batch
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.sources import Known, Part, Source
 from phd_exp.geometry.charts import DepthScale
+from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.build import build_calibration, build_module, build_trainer
+from phd_exp.training.build import build_calibration, build_data, build_module, build_trainer
 from phd_exp.training.callbacks import RecordLogger
 from phd_exp.training.config import RunConfig, check
 from phd_exp.training.module import PositionModule
+from phd_exp.training.network import precision
 
 
 class Noise(Source):
@@ -52,20 +56,32 @@ class Noise(Source):
         return sizes[part] or 0
 
 
-class Bare:
-    """The loop that every tutorial begins with: a batch, forward, backward, step; nothing is measured or written."""
+class Loop(Protocol):
+    """Another way to train the same network."""
 
-    def __init__(self, module: PositionModule, samples: Batch, batch_size: int) -> None:
-        self.regressor, self.loss = copy.deepcopy(module.regressor), module.loss
-        self.optimizer = module.make_optimizer(self.regressor.parameters())
-        self.samples = samples
-        self.batch_size = batch_size
+    name: str
 
     def epoch(self) -> int:
         """Train on every sample once; how many there were."""
+
+
+class Bare:
+    """The loop that every tutorial begins with: a batch, forward, backward, step; nothing is measured or written."""
+
+    name = "bare"
+
+    def __init__(self, module: PositionModule, samples: Batch, config: RunConfig) -> None:
+        self.regressor, self.loss = copy.deepcopy(module.regressor), module.loss
+        self.optimizer = module.make_optimizer(self.regressor.parameters())
+        self.samples = samples
+        self.batch_size = config.data.batch_size
+        self.mixed = precision(config.trainer) == "bf16-mixed"
+
+    def epoch(self) -> int:
         for rows in torch.randperm(len(self.samples)).split(self.batch_size):
             batch = self.samples.select(rows)
-            loss = self.loss(self.regressor(batch.image, batch.camera), batch.xyz)
+            with torch.autocast("cpu", enabled=self.mixed):
+                loss = self.loss(self.regressor(batch.image, batch.camera), batch.xyz)
             self.optimizer.zero_grad()
             loss.backward()
             self.optimizer.step()
@@ -73,10 +89,10 @@ class Bare:
 
 
 class Alternating(Callback):
-    """Times the programme's epochs, and a bare one after each."""
+    """Times the programme's epochs, and one of another loop after each."""
 
-    def __init__(self, bare: Bare) -> None:
-        self.bare = bare
+    def __init__(self, loop: Loop) -> None:
+        self.loop = loop
         self.begin = self.trained = 0.0
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -87,32 +103,43 @@ class Alternating(Callback):
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         end = time.perf_counter()
-        n = self.bare.epoch()
-        bare = n / (time.perf_counter() - end)
+        n = self.loop.epoch()
+        speed = n / (time.perf_counter() - end)
         if trainer.current_epoch:  # the first one warms up
             programme = n / (self.trained - self.begin)
             share = (end - self.trained) / (end - self.begin)
-            print(json.dumps({"programme": programme, "bare": bare, "evaluation": share}), flush=True)
+            print(
+                json.dumps({"programme": programme, self.loop.name: speed, "evaluation": share}), flush=True
+            )
 
 
-def main(folder: Path, epochs: int, overrides: list[str]) -> None:
+def main(kind: str, folder: Path, epochs: int, overrides: list[str]) -> None:
     with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
         composed = hydra.compose(
             "config",
             ["logger=none", "trainer.progress_bar=false", f"trainer.max_epochs={epochs}", *overrides],
         )
     config = check(OmegaConf.to_container(composed, resolve=True))  # type: ignore[arg-type]
-    data = PositionData(Noise(config), batch_size=config.data.batch_size, seed=0)
+    data = (
+        PositionData(Noise(config), config.data.batch_size, seed=0) if kind == "bare" else build_data(config)
+    )
     data.setup()
     module = build_module(config, data)
     folder.mkdir(parents=True, exist_ok=True)
     run = RunFolder(folder)
     calibration = build_calibration(config, run, module, None, None)
     trainer = build_trainer(config, RecordLogger(run), [], calibration)
-    bare = Bare(module, data.samples["train"], config.data.batch_size)
-    trainer.callbacks.append(Alternating(bare))  # type: ignore[attr-defined]  # set by Lightning
+    trainer.callbacks.append(Alternating(rival(kind, module, data, config)))  # type: ignore[attr-defined]
     trainer.fit(module, datamodule=data)
 
 
+def rival(kind: str, module: PositionModule, data: PositionData, config: RunConfig) -> Loop:
+    samples = data.samples["train"]
+    if kind == "bare":
+        return Bare(module, samples, config)
+    pictures = DatasetFolder(config.data.folder).split_folder("train")
+    return Conventional(module, pictures, samples, config.data.batch_size)
+
+
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3:])
+    main(sys.argv[1], Path(sys.argv[2]), int(sys.argv[3]), sys.argv[4:])

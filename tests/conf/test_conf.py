@@ -14,8 +14,10 @@ CHOICES = sorted(
     f"{file.parent.name}={file.stem}" for file in conf_folder().glob("*/*.yaml") if file.parent.name != "loss"
 )
 
-NEEDS = {"data=folder": ("data.folder=photos",)}
-"""What a choice leaves for the user to say."""
+NEEDS = {"data=folder": ("data.folder=photos",)} | {
+    choice: ("recipe=strong",) for choice in CHOICES if choice.startswith("size=")
+}
+"""What a choice leaves for the user to say, or is made for."""
 
 
 @pytest.fixture
@@ -58,13 +60,22 @@ def test_the_authors_recipe_changes_neither_images_nor_learning_rate(checked: Ca
     assert not Augmentation(**recipe.augmentation.model_dump()).changes_anything
 
 
-@pytest.mark.parametrize(("preset", "depth"), [("paper", 50), ("small", 10)])
-def test_the_strong_recipe_keeps_the_depth_of_its_preset(checked: Callable, preset: str, depth: int) -> None:
+@pytest.mark.parametrize(
+    ("preset", "depth", "width", "stride"), [("paper", 50, 32, 2), ("small", 10, 16, 4), ("smoke", 10, 16, 4)]
+)
+def test_the_strong_recipe_keeps_the_depth_and_length_of_its_preset(
+    checked: Callable, preset: str, depth: int, width: int, stride: int
+) -> None:
     config = checked("recipe=strong", f"preset={preset}")
     assert config.backbone["_target_"].endswith("Locating")
-    assert config.backbone["depth"] == depth
-    assert config.data.image_size == checked(f"preset={preset}").data.image_size
+    assert [config.backbone[key] for key in ("depth", "width", "stride")] == [depth, width, stride]
+    assert config.data.image_size == config.data.spec.sensor_size
     assert config.trainer.max_epochs == checked(f"preset={preset}").trainer.max_epochs
+
+
+def test_the_strong_recipe_leaves_the_images_of_a_preset_of_ones_own(checked: Callable) -> None:
+    small = "data.image_size=48"
+    assert checked("recipe=strong", "preset=small", small).data.image_size == 48
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,15 @@
 """The backbone that keeps where things are, and heads that take what it says."""
 
+from collections.abc import Callable
+
 import pytest
 import torch
+from hydra.utils import instantiate
 from torch.testing import assert_close
 
 from phd_exp.geometry import Camera, Cartesian, DepthScale, LogDepth, Projected
 from phd_exp.geometry.charts import projected
 from phd_exp.geometry.grid import middles
-from phd_exp.models.backbones import resnet
 from phd_exp.models.heads import ChartHead, DistributionHead, Head
 from phd_exp.models.locating import Locating
 from phd_exp.models.regressor import Regressor
@@ -29,7 +31,7 @@ def images() -> torch.Tensor:
 
 def locating(depth: int = 10) -> Locating:
     torch.manual_seed(0)
-    return Locating(depth, width=8, channels=6)
+    return Locating(depth, width=8, stride=2, channels=6)
 
 
 @pytest.mark.parametrize("depth", [10, 18, 50])
@@ -42,6 +44,14 @@ def test_it_sees_the_middle_before_it_has_learned(depth: int) -> None:
     assert seen.log_heat.shape == (2, 16, 24)
     assert_close(seen.log_heat.exp().sum((1, 2)), torch.ones(2))
     assert_close(seen.place, torch.zeros(2, 2), atol=1e-6, rtol=0)
+
+
+def test_a_larger_stride_sees_a_larger_image_as_often() -> None:
+    small, large = (Locating(10, width=8, stride=stride, channels=6) for stride in (2, 4))
+    for network, side in ((small, 64), (large, 128)):
+        heat = network(torch.randn(1, 3, side, side)).log_heat
+        assert heat is not None
+        assert heat.shape == (1, 16, 16)
 
 
 def test_cells_lie_in_the_middles_of_equal_parts() -> None:
@@ -66,16 +76,18 @@ def test_the_place_is_the_mean_of_the_map_and_its_offsets() -> None:
     )
 
 
-def test_it_costs_no_more_than_the_resnet_of_its_depth() -> None:
+@pytest.mark.parametrize("preset", ["paper", "small"])
+def test_the_recipe_costs_no_more_than_the_authors_network(preset: str, composed: Callable) -> None:
     from torch.utils.flop_counter import FlopCounterMode
 
-    def operations(network: torch.nn.Module) -> int:
+    def operations(recipe: str) -> int:
+        config = composed(f"preset={preset}", f"recipe={recipe}")
+        network, side = instantiate(config["backbone"]), config["data"]["image_size"]
         with FlopCounterMode(display=False) as counter:
-            network(torch.zeros(1, 3, 64, 64))
+            network(torch.zeros(1, 3, side, side))
         return counter.get_total_flops()
 
-    for depth in (10, 50):
-        assert operations(Locating(depth, width=32, channels=64)) < 1.3 * operations(resnet(depth))
+    assert operations("strong") < 1.3 * operations("paper")
 
 
 def test_what_it_reads_is_float32_under_autocast() -> None:

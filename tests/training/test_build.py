@@ -29,7 +29,7 @@ def test_a_named_precision_is_taken(named: str, lightning: str) -> None:
 def test_bfloat16_only_where_the_cpu_has_units_for_it(
     monkeypatch: pytest.MonkeyPatch, has_units: bool, lightning: str
 ) -> None:
-    monkeypatch.setattr(network, "_cpu_has_bfloat16", lambda: has_units)
+    monkeypatch.setattr(network, "cpu_has_bfloat16", lambda: has_units)
     assert network.precision(config("auto")) == lightning
 
 
