@@ -149,7 +149,7 @@ def load(run: Path, device: str = "auto", recalibrate: bool = False) -> Predicto
     config = check(folder.config())
     constants = _constants(folder, config)
     place = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)
-    regressor = build_regressor(config, constants.depth, torch.contiguous_format)
+    regressor = build_regressor(config, constants.depth)
     _load_weights(regressor, folder.last_checkpoint)
     status = folder.status()
     return Predictor(

@@ -17,16 +17,15 @@ class Regressor(nn.Module):
 
     The backbone runs in whatever precision is switched on around it; the linear layer and everything after it
     in float32, since nu_p = B v_p rounded to bf16 would be wrong by up to 0.2 pixels at the border of the image.
-    `memory_format` says in which order of dimensions images lie in memory; it changes speed alone.
+    Images lie in memory as they come, channels last: on CPUs and GPUs convolutions are as fast that way, or faster.
     """
 
     mean: Tensor
     std: Tensor
 
-    def __init__(self, backbone: Backbone, head: Head, memory_format: torch.memory_format) -> None:
+    def __init__(self, backbone: Backbone, head: Head) -> None:
         super().__init__()
-        self.memory_format = memory_format
-        self.backbone = backbone.to(memory_format=memory_format)
+        self.backbone = backbone.to(memory_format=torch.channels_last)
         self.head = head
         self.last = nn.Linear(backbone.n_features, head.n_outputs)
         nn.init.zeros_(self.last.weight)
@@ -47,9 +46,8 @@ class Regressor(nn.Module):
 
     def see(self, image: UInt8[Tensor, "batch height width 3"]) -> Seen:
         """What the backbone makes of the images."""
-        # bytes are put in order before they become four times as many, and what follows needs no new memory
-        ordered = image.permute(0, 3, 1, 2).contiguous(memory_format=self.memory_format)
-        seen: Seen = self.backbone(ordered.to(self.mean.dtype).sub_(self.mean).div_(self.std))
+        pixels = image.permute(0, 3, 1, 2).to(self.mean.dtype)
+        seen: Seen = self.backbone(pixels.sub_(self.mean).div_(self.std))
         return seen
 
     def numbers(self, seen: Seen) -> Float[Tensor, "batch n_outputs"]:

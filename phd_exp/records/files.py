@@ -65,9 +65,13 @@ def write_atomic(path: Path | str, data: bytes | str) -> None:
             stream.flush()
             os.fsync(stream.fileno())
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         with suppress(OSError):
             temporary.unlink()
+        if (
+            isinstance(error, OSError) and error.filename is None
+        ):  # a write into an open file does not say which
+            raise OSError(error.errno, error.strerror, str(path)) from error
         raise
 
 

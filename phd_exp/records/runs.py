@@ -23,7 +23,7 @@ import os
 import time
 import traceback
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -229,10 +229,12 @@ class RunFolder:
             yield
         except Exception as error:
             line = f"{type(error).__name__}: {error}"
-            self.write_status(_ended(status, "failed", error=line, trace=traceback.format_exc()))
+            with suppress(OSError):  # on a full disk, what is to be said is what was wrong first
+                self.write_status(_ended(status, "failed", error=line, trace=traceback.format_exc()))
             raise
         except BaseException as stop:
-            self.write_status(_ended(status, "interrupted", error=f"{type(stop).__name__}: {stop}"))
+            with suppress(OSError):
+                self.write_status(_ended(status, "interrupted", error=f"{type(stop).__name__}: {stop}"))
             raise
         self.write_status(_ended(status, "finished"))
 

@@ -28,7 +28,7 @@ from phd_exp.training.callbacks import (
 from phd_exp.training.checkpoints import AtomicCheckpoints
 from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig
 from phd_exp.training.module import PositionModule
-from phd_exp.training.network import build_regressor, memory_format, naming, precision
+from phd_exp.training.network import build_regressor, naming, precision
 from phd_exp.training.schedule import factor
 from phd_exp.training.stopping import StopBetweenBatches
 from phd_exp.training.tracking import Tracker
@@ -64,7 +64,7 @@ def build_module(config: RunConfig, data: PositionData) -> PositionModule:
 
     Raises ConfigError, naming the key, where a part refuses its values.
     """
-    regressor = build_regressor(config, data.source.depth, memory_format(config.trainer))
+    regressor = build_regressor(config, data.source.depth)
     with naming("optimizer"):
         optimizer = instantiate(config.optimizer, _partial_=True)
         optimizer(regressor.parameters())  # refuses bad values now rather than after hours of rendering

@@ -27,6 +27,7 @@ from phd_exp.training.build import (
 )
 from phd_exp.training.callbacks import Begun, CalibrationRecorder, Draw, RecordLogger
 from phd_exp.training.config import FolderConfig, RunConfig, TrainerConfig, has_influence
+from phd_exp.training.faults import told
 from phd_exp.training.module import PositionModule
 from phd_exp.training.predictions import gathered, joined, summary, write_parquet
 from phd_exp.training.ranks import train_together
@@ -48,10 +49,10 @@ def train(config: RunConfig, folder: RunFolder, draw: Draw | None, cores: int) -
         draw: draws calibration curves; None records them alone.
         cores: how many threads it has, unless trainer.threads says otherwise.
 
-    Raises RunError where the folder holds a run of another configuration or another process works on it,
-    DatasetError where the data set is incomplete.
+    Raises RunError where the folder holds a run of another configuration or another process works on it, and where
+    the disk or memory is full; DatasetError where the data set is incomplete.
     """
-    with folder.held():
+    with told(folder.path), folder.held():
         require_same_config(folder, config)
         if folder.is_finished():
             return folder.results()

@@ -1,8 +1,8 @@
 """A process that trains by the whole programme and, epoch by epoch between, by another loop with the same network.
 
 `python trainer.py LOOP FOLDER EPOCHS OVERRIDE...` prints a JSON line for each epoch but the first: images a second by
-the programme and by the loop, and the share of the programme's epoch that evaluation and logging take. LOOP is `bare`,
-on resident noise, so that nothing is measured but the training; or `conventional`, on rendered images.
+the programme and by the loop, and the share of the programme's epoch that evaluation and logging take. LOOP is
+`bare`, on resident noise, so that nothing is measured but the training, or `conventional`, on rendered images.
 """
 
 import copy

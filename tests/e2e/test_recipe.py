@@ -8,7 +8,7 @@ import torch
 
 from phd_exp.records.runs import find_runs
 
-STRONG = ("recipe=strong", "logger=none", "trainer.max_epochs=1")
+STRONG = ("recipe=strong", "data.image_size=64", "logger=none", "trainer.max_epochs=1")
 
 
 @pytest.mark.parametrize("model", ["probabilistic", "mae_xyz", "mae_constf"])

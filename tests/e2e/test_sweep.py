@@ -20,7 +20,7 @@ from phd_exp.records.runs import RunFolder, find_runs
 from phd_exp.training.module import PositionModule
 from tests.e2e.conftest import QUICK
 
-TWO = ("-m", "model=mae_vz", "recipe=strong", "seed=0,1", "logger=none")
+TWO = ("-m", "model=mae_vz", "recipe=strong", "data.image_size=64", "seed=0,1", "logger=none")
 FOUR = ("-m", "experiment=table2", "model=mae_xyz,mae_constf", "seed=0,1", "logger=none")
 
 
@@ -194,7 +194,9 @@ def test_neither_order_nor_launcher_changes_a_number(
 ) -> None:
     """At one number of threads, which the shared words set."""
     assert train(*TWO, "runs=here").status == 0
-    outcome = train("-m", "model=mae_vz", "recipe=strong", "logger=none", *words, "runs=there")
+    outcome = train(
+        "-m", "model=mae_vz", "recipe=strong", "data.image_size=64", "logger=none", *words, "runs=there"
+    )
     assert outcome.status == 0, outcome.err
     assert numbers(tmp_path / "here") == numbers(tmp_path / "there")
     assert len(find_runs(tmp_path / "here")) == 2

@@ -186,7 +186,7 @@ def test_a_broken_run_goes_on_where_it_was(
 ) -> None:
     from phd_exp.training.module import PositionModule
 
-    long = ("logger=none", "trainer.max_epochs=4", f"recipe={recipe}")
+    long = ("logger=none", "trainer.max_epochs=4", f"recipe={recipe}", "data.image_size=64")
     assert train(*long, "runs=whole").status == 0
     whole = only_run(tmp_path / "whole")
 
@@ -259,7 +259,13 @@ def test_a_signal_stops_after_the_batch_and_the_run_goes_on_with_the_next(
 ) -> None:
     from phd_exp.training.module import PositionModule
 
-    words = ("logger=none", "data.batch_size=4", "recipe=strong", "recipe.warmup_steps=2")
+    words = (
+        "logger=none",
+        "data.batch_size=4",
+        "recipe=strong",
+        "data.image_size=64",
+        "recipe.warmup_steps=2",
+    )
     assert train(*words, "runs=whole").status == 0
     whole = only_run(tmp_path / "whole")
     training_step, steps = PositionModule.training_step, []

@@ -115,7 +115,7 @@ def test_a_chart_without_a_projection_is_not_placed() -> None:
 
 @pytest.mark.parametrize("name", PLACED)
 def test_the_network_predicts_where_it_sees_the_object(name: str, images: torch.Tensor) -> None:
-    network = Regressor(locating(), PLACED[name], torch.contiguous_format)
+    network = Regressor(locating(), PLACED[name])
     torch.nn.init.normal_(network.backbone.map.weight)
     seen = network.see(images)
     assert seen.place is not None

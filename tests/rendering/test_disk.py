@@ -1,8 +1,6 @@
 """A disk that is full, turns read-only or goes away costs one line and nothing else: the same call goes on."""
 
 import os
-import shutil
-import subprocess
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,33 +14,16 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering import workers
 from phd_exp.rendering.errors import RenderError
 from phd_exp.rendering.workers import ensure_rendered
+from tests.disks import KIB, leave_room, make_room, remount, small_disk
 from tests.rendering.folders import contents, wait_until
 
 N_TRAIN, N_TEST = 12, 4
-KIB = 1024
 
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
-    """A disk of its own, of 1 MiB."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(place)]
-    if not shutil.which("mount") or subprocess.run(command, capture_output=True, check=False).returncode:
-        pytest.skip("mounting a small disk takes root, and a system that lets root mount")
-    try:
+    with small_disk(tmp_path / "disk", 1024) as place:
         yield place
-    finally:
-        subprocess.run(["umount", str(place)], check=True)
-
-
-def leave_room(disk: Path, room: int) -> None:
-    """Fill a disk up to some bytes, by a file that is easily removed."""
-    ballast = disk / "ballast"
-    ballast.unlink(missing_ok=True)
-    free = shutil.disk_usage(disk).free
-    ballast.write_bytes(bytes(free - room))
-    assert shutil.disk_usage(disk).free == room
 
 
 def finished(folder: DatasetFolder) -> dict[Path, int]:
@@ -89,7 +70,7 @@ def test_a_full_disk_is_one_line_and_nothing_is_lost(
     leave_room(disk, 28 * KIB)
     some = refused(folder, small_spec, "No space left on device")
     assert 0 < len(some) < N_TRAIN + N_TEST
-    (disk / "ballast").unlink()
+    make_room(disk)
     ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=1)
     assert contents(folder) == contents(small)
     assert all(path.stat().st_mtime_ns == moment for path, moment in some.items())
@@ -97,7 +78,7 @@ def test_a_full_disk_is_one_line_and_nothing_is_lost(
     unseal(folder)
     leave_room(disk, 8 * KIB)
     assert len(refused(folder, small_spec, "No space left on device")) == N_TRAIN + N_TEST
-    (disk / "ballast").unlink()
+    make_room(disk)
     ensure_rendered(folder, small_spec, N_TRAIN, N_TEST)
     assert contents(folder) == contents(small)
 
@@ -123,12 +104,12 @@ def test_a_disk_that_turns_read_only_serves_what_it_has(
     folder = DatasetFolder(disk / "default")
     ensure_rendered(folder, small_spec, 3, 1, workers=1)
     before = contents(folder)
-    subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
+    remount(disk, "ro")
     refused(folder, small_spec, "Read-only file system")
     ensure_rendered(folder, small_spec, 3, 1)
     assert folder.records("train") == small.records("train", 3)
     assert contents(folder) == before
-    subprocess.run(["mount", "-o", "remount,rw", str(disk)], check=True)
+    remount(disk, "rw")
     ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=1)
     assert contents(folder) == contents(small)
 

@@ -1,0 +1,148 @@
+"""What a machine refuses amid a training costs one line; later the same command ends as if nothing had happened."""
+
+import time
+from collections.abc import Callable, Iterator
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from phd_exp.records.runs import RunFolder, find_runs
+from phd_exp.training.module import PositionModule
+from tests.disks import KIB, leave_room, make_room, remount, small_disk
+
+QUIET = ("logger=none", "recipe=strong", "data.image_size=64", "backbone.width=8", "trainer.max_epochs=3")
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    with small_disk(tmp_path / "disk", 16 * KIB) as place:
+        yield place
+
+
+@pytest.fixture(scope="module")
+def unhindered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the run is kept that all others have to end as."""
+    return tmp_path_factory.mktemp("unhindered")
+
+
+def only_run(runs: Path) -> RunFolder:
+    (run,) = find_runs(runs)
+    return run
+
+
+@pytest.fixture
+def ends_as_unhindered(train: Callable, unhindered: Path) -> Callable[[Path], None]:
+    """The same command, once nothing hinders it any more, has to leave what a run in one piece leaves."""
+
+    def check(runs: Path) -> None:
+        assert train(*QUIET, f"runs={unhindered}").status == 0
+        assert train(*QUIET, f"runs={runs}").status == 0
+        mine, whole = only_run(runs), only_run(unhindered)
+        assert mine.results_file.read_bytes() == whole.results_file.read_bytes()
+        assert mine.metrics() == whole.metrics()
+        for one, other in zip(weights(mine), weights(whole), strict=True):
+            assert torch.equal(one, other)
+
+    return check
+
+
+def weights(run: RunFolder) -> list[torch.Tensor]:
+    return list(torch.load(run.last_checkpoint, weights_only=True)["state_dict"].values())
+
+
+def refused(outcome: Any) -> str:
+    assert outcome.status == 1
+    (line,) = [line for line in outcome.err.splitlines() if line.startswith("error: ")]
+    assert "Traceback" not in outcome.err
+    return str(line)
+
+
+def test_a_full_disk_is_one_line_and_nothing_is_lost(
+    train: Callable, disk: Path, ends_as_unhindered: Callable
+) -> None:
+    """Full before the first byte, and when the first checkpoint is written."""
+    runs = disk / "runs"
+    for room in (0, 200 * KIB):
+        leave_room(disk, room)
+        assert "No space left on device" in refused(train(*QUIET, f"runs={runs}"))
+    assert not list(runs.rglob("*.tmp"))
+    assert not list(runs.rglob("last.ckpt"))
+    make_room(disk)
+    ends_as_unhindered(runs)
+
+
+def test_a_disk_that_fails_after_an_epoch_is_one_line_and_nothing_is_lost(
+    train: Callable, disk: Path, monkeypatch: pytest.MonkeyPatch, ends_as_unhindered: Callable
+) -> None:
+    """Full when the second checkpoint is written, and read-only when the run is to go on."""
+    runs, epoch_ends = disk / "runs", PositionModule.on_train_epoch_end
+
+    def fill(self: PositionModule) -> None:
+        epoch_ends(self)
+        if self.current_epoch == 1:
+            leave_room(disk, 0)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PositionModule, "on_train_epoch_end", fill)
+        line = refused(train(*QUIET, f"runs={runs}"))
+    assert "No space left on device; mend that, and the same command goes on from the last checkpoint" in line
+    assert torch.load(only_run(runs).last_checkpoint, weights_only=True)["epoch"] == 0
+    make_room(disk)
+    remount(disk, "ro")
+    assert "is in the way or read-only" in refused(train(*QUIET, f"runs={runs}"))
+    remount(disk, "rw")
+    ends_as_unhindered(runs)
+
+
+def test_results_without_room_are_written_by_the_next_command(
+    train: Callable, disk: Path, monkeypatch: pytest.MonkeyPatch, ends_as_unhindered: Callable
+) -> None:
+    runs, write_results = disk / "runs", RunFolder.write_results
+
+    def fail(self: RunFolder, results: Any) -> None:
+        leave_room(disk, 0)
+        write_results(self, results)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RunFolder, "write_results", fail)
+        assert "results.json: No space left on device" in refused(train(*QUIET, f"runs={runs}"))
+    make_room(disk)
+    assert not only_run(runs).is_finished()
+    ends_as_unhindered(runs)
+
+
+def test_memory_that_runs_out_is_one_line(
+    train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends_as_unhindered: Callable
+) -> None:
+    training_step = PositionModule.training_step
+
+    def greedy(self: PositionModule, *arguments: Any) -> torch.Tensor:
+        if self.current_epoch == 1:
+            torch.empty(1 << 50)
+        return training_step(self, *arguments)
+
+    runs = tmp_path / "runs"
+    with monkeypatch.context() as patch:
+        patch.setattr(PositionModule, "training_step", greedy)
+        line = refused(train(*QUIET, f"runs={runs}"))
+    assert "memory ran out" in line
+    assert "data.batch_size" in line
+    status = only_run(runs).status()
+    assert status is not None
+    assert status.state == "failed"
+    ends_as_unhindered(runs)
+
+
+def test_a_clock_that_jumps_changes_nothing(
+    train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends_as_unhindered: Callable
+) -> None:
+    """A year back with every look at it, as a machine without a battery may find."""
+    now, looks = time.time(), count()
+    runs = tmp_path / "runs"
+    with monkeypatch.context() as patch:
+        patch.setattr(time, "time", lambda: now - 365 * 86400 * next(looks))
+        assert train(*QUIET, f"runs={runs}").status == 0
+    ends_as_unhindered(runs)
