@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from phd_exp.fusion.linear import solve, total
+from phd_exp.fusion.linear import factor, forward, total
 from phd_exp.fusion.polish import KINK
 from phd_exp.fusion.views import Seen, Unknown, Views
 
@@ -49,10 +49,16 @@ def certify(views: Views, u: Unknown, lam: Float[Tensor, "cameras problems"]) ->
     pull = total(views.a * views.slope[2].square().sum(0).sqrt(), 0)
     error = total(torch.where(kink, 3 * views.a * (seen[2] - 1).abs(), 0), 0)
     distance = torch.full_like(pull, torch.inf)
-    for radius in _RADII:
-        bound = _distance(views, seen, lam, kink, radius, G, error)
-        distance = torch.where(bound <= radius, torch.minimum(distance, bound), distance)
-    norm = G.norm(dim=0)
+    left = torch.arange(len(pull), device=pull.device)
+    for radius in _RADII:  # a larger ball has less curvature, and so a larger bound: the first to hold is the best
+        part = (views.subset(left), seen[..., left], lam[:, left], kink[:, left])
+        bound = _distance(*part, radius, G[:, left], error[left])
+        holds = bound <= radius
+        distance[left[holds]] = bound[holds]
+        left = left[~holds]
+        if len(left) == 0:
+            break
+    norm = G.square().sum(0).sqrt()
     return Certificate(norm, norm / pull, distance)
 
 
@@ -69,13 +75,10 @@ def _distance(
     views: Views, seen: Seen, lam: Tensor, kink: Tensor, radius: float, G: Unknown, error: Tensor
 ) -> Float[Tensor, " problems"]:
     """The bound for one radius; NaN or inf where H is not positive definite."""
-    H = views.hessian(_least_curvature(views, seen, lam, kink, radius))
-    columns = [
-        solve(H, axis[:, None].expand_as(G)) for axis in torch.eye(len(G), dtype=G.dtype, device=G.device)
-    ]
-    inverse = torch.stack(columns)
-    trace = total(inverse.diagonal().T, 0)
-    squared = total(G * total(inverse * G, 1), 0)
+    L = factor(views.hessian(_least_curvature(views, seen, lam, kink, radius)))
+    axes = torch.eye(len(G), dtype=G.dtype, device=G.device)[..., None].expand(-1, *G.shape)
+    trace = total(total(torch.stack([forward(L, axis).square() for axis in axes]), 0), 0)
+    squared = total(forward(L, G).square(), 0)
     return (trace.sqrt() * (squared.sqrt() + (squared + 2 * error).sqrt())).nan_to_num(nan=torch.inf)
 
 

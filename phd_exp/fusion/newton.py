@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from phd_exp.fusion.energy import extended_inverse, smooth_energy
+from phd_exp.fusion.energy import extended_inverse, huber, smooth_energy
 from phd_exp.fusion.linear import solve, total
 from phd_exp.fusion.views import Seen, Unknown, Views
 
@@ -86,7 +86,8 @@ def step(views: Views, at: Iterate, width: float, least: float) -> tuple[Iterate
     least_squares = torch.stack([weight, torch.zeros_like(a), weight, a])
     du = -solve(views.hessian(torch.stack(curvature) + _RIDGE * least_squares), gradient)
     moved = views.moved(du)
-    share = _line_search(seen, moved, a, (gradient * du).sum(0), width, least)
+    before = total(huber(seen) + a * ((t + inverse) / 2 + s), 0)
+    share = _line_search(before, seen, moved, a, (gradient * du).sum(0), width, least)
     lam = at.lam + (g - at.lam * s + (1 - at.lam * side) * g_slope * moved[2]) / s
     y = weight * (q + moved[:2] - at.y * (unit * moved[:2]).sum(0))
     y = y * (y[0].square() + y[1].square()).clamp_min(1).rsqrt()
@@ -95,6 +96,7 @@ def step(views: Views, at: Iterate, width: float, least: float) -> tuple[Iterate
 
 
 def _line_search(
+    before: Float[Tensor, " problems"],
     seen: Seen,
     moved: Seen,
     a: Float[Tensor, "cameras problems"],
@@ -102,12 +104,11 @@ def _line_search(
     width: float,
     least: float,
 ) -> Float[Tensor, " problems"]:
-    """The share of each step to take: halved until the energy falls by Armijo's rule."""
+    """The share of each step to take: halved until the energy falls from what it was before by Armijo's rule."""
 
     def value(seen: Seen, a: Tensor) -> Tensor:
         return total(smooth_energy(seen, a, width, least), 0)
 
-    before = value(seen, a)
     enough = before + 1e-12 * before.abs()  # what rounding may add where nothing is left to gain
     share = torch.ones_like(before)
     tried = (value(seen + moved, a) > enough + _ARMIJO * descent).nonzero().squeeze(-1)
