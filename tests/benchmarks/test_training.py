@@ -91,3 +91,22 @@ def test_evaluation_and_logging_are_a_twentieth_of_an_epoch(
     share = statistics.median(measured("bare", tmp_path, *words)["evaluation"])
     record(f"evaluation, recipe={recipe}", f"{100 * share:.1f} %", "an epoch", f"{100 * share:.1f} %", "5 %")
     assert share <= 0.05
+
+
+def test_all_samples_of_the_paper_take_two_gibibytes(tmp_path: Path, record: Callable) -> None:
+    """Beyond what the network and one batch take."""
+
+    def peak(loop: str, *overrides: str) -> float:
+        command = [sys.executable, str(HERE / "memory.py"), loop, str(tmp_path), "preset=paper", *overrides]
+        return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout) / 2**30
+
+    bare, programme = peak("bare", "data.n_train=64", "data.n_test=1"), peak("programme")
+    more = programme - bare
+    record(
+        "peak memory, preset=paper",
+        f"{programme:.1f} GiB",
+        f"{bare:.1f} GiB, bare loop",
+        f"+{more:.2f} GiB",
+        "2 GiB",
+    )
+    assert more <= 2

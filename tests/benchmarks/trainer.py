@@ -5,7 +5,6 @@ the programme and by the loop, and the share of the programme's epoch that evalu
 `bare`, on resident noise, so that nothing is measured but the training, or `conventional`, on rendered images.
 """
 
-import copy
 import json
 import sys
 import time
@@ -13,47 +12,20 @@ from pathlib import Path
 from typing import Protocol
 
 import hydra
-import torch
+from bare import Bare
 from conventional import Conventional
 from lightning import Callback, LightningModule, Trainer
+from noise import Noise
 from omegaconf import OmegaConf
 
 from phd_exp.cli.paths import conf_folder
-from phd_exp.data.batches import Batch
 from phd_exp.data.datamodule import PositionData
-from phd_exp.data.sources import Known, Part, Source
-from phd_exp.geometry.charts import DepthScale
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import build_calibration, build_data, build_module, build_trainer
 from phd_exp.training.callbacks import RecordLogger
 from phd_exp.training.config import RunConfig, check
 from phd_exp.training.module import PositionModule
-from phd_exp.training.network import precision
-
-
-class Noise(Source):
-    """As many samples as a configuration says, of its size; no picture of anything."""
-
-    def __init__(self, config: RunConfig) -> None:
-        self.data = config.data
-        zoom = config.data.image_size / 224
-        self.depth = DepthScale.from_ranges((1200, 2000), (3, 5)).scaled(zoom)
-        self.constant_f = 1550 * zoom
-
-    def samples(self, part: Part) -> Batch:
-        n, side = self.count(part), self.data.image_size
-        random = torch.Generator().manual_seed(0)
-        image = torch.randint(0, 256, (n, side, side, 3), dtype=torch.uint8, generator=random)
-        xyz = torch.tensor([0.0, 0.0, 4.0]).expand(n, 3).clone()
-        return Batch(image, xyz, torch.full((n,), self.constant_f), float(side), torch.arange(n))
-
-    def known(self, part: Part) -> Known:
-        return {}
-
-    def count(self, part: Part) -> int:
-        sizes = {"train": self.data.n_train, "held_out": 0, "test": self.data.n_test}
-        return sizes[part] or 0
 
 
 class Loop(Protocol):
@@ -63,29 +35,6 @@ class Loop(Protocol):
 
     def epoch(self) -> int:
         """Train on every sample once; how many there were."""
-
-
-class Bare:
-    """The loop that every tutorial begins with: a batch, forward, backward, step; nothing is measured or written."""
-
-    name = "bare"
-
-    def __init__(self, module: PositionModule, samples: Batch, config: RunConfig) -> None:
-        self.regressor, self.loss = copy.deepcopy(module.regressor), module.loss
-        self.optimizer = module.make_optimizer(self.regressor.parameters())
-        self.samples = samples
-        self.batch_size = config.data.batch_size
-        self.mixed = precision(config.trainer) == "bf16-mixed"
-
-    def epoch(self) -> int:
-        for rows in torch.randperm(len(self.samples)).split(self.batch_size):
-            batch = self.samples.select(rows)
-            with torch.autocast("cpu", enabled=self.mixed):
-                loss = self.loss(self.regressor(batch.image, batch.camera), batch.xyz)
-            self.optimizer.zero_grad()
-            loss.backward()
-            self.optimizer.step()
-        return len(self.samples)
 
 
 class Alternating(Callback):
@@ -113,15 +62,16 @@ class Alternating(Callback):
             )
 
 
-def main(kind: str, folder: Path, epochs: int, overrides: list[str]) -> None:
+def configured(*overrides: str) -> RunConfig:
     with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
-        composed = hydra.compose(
-            "config",
-            ["logger=none", "trainer.progress_bar=false", f"trainer.max_epochs={epochs}", *overrides],
-        )
-    config = check(OmegaConf.to_container(composed, resolve=True))  # type: ignore[arg-type]
+        composed = hydra.compose("config", ["logger=none", "trainer.progress_bar=false", *overrides])
+    return check(OmegaConf.to_container(composed, resolve=True))  # type: ignore[arg-type]
+
+
+def main(kind: str, folder: Path, epochs: int, overrides: list[str]) -> None:
+    config = configured(f"trainer.max_epochs={epochs}", *overrides)
     data = (
-        PositionData(Noise(config), config.data.batch_size, seed=0) if kind == "bare" else build_data(config)
+        PositionData(Noise(config), batch_size=config.data.batch_size, seed=0) if kind == "bare" else build_data(config)
     )
     data.setup()
     module = build_module(config, data)
