@@ -19,6 +19,7 @@ class ExportArguments(Arguments):
 
 
 def main(words: list[str]) -> int:
+    """Export as the words say; returns the exit status."""
     try:
         arguments = parsed("export", ExportArguments, words)
         _export(arguments, arguments.out or arguments.run / "network.onnx")

@@ -38,6 +38,7 @@ class FuseArguments(Arguments):
     @field_validator("plane", mode="before")
     @classmethod
     def plane_of_four_numbers(cls, text: Any) -> Any:
+        """Four finite numbers, and a normal that is not zero."""
         plane = four_numbers(text, "plane=NX,NY,NZ,OFFSET: the points v with normal . v = offset, metres")
         if not all(map(math.isfinite, plane)) or not any(plane[:3]):
             raise ValueError("expected finite numbers, and a normal that is not zero")
@@ -45,6 +46,7 @@ class FuseArguments(Arguments):
 
 
 def main(words: list[str]) -> int:
+    """Fuse as the words say; returns the exit status, which is not zero where a scene could not be fused."""
     try:
         arguments = parsed("fuse", FuseArguments, words)
         detections = detections_in(arguments.folder)

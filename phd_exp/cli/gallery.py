@@ -17,6 +17,7 @@ INDICES = (0, 3, 6, 8, 12, 14)
 
 
 def main(arguments: list[str]) -> int:
+    """Draw both pictures; returns the exit status."""
     try:
         folder = named_folders("gallery", {"folder": "renders"}, arguments)["folder"]
         require_folder("folder", folder, "make it, or name another")

@@ -46,6 +46,7 @@ class Ending(BaseModel):
 
     @classmethod
     def of(cls, overrides: list[str], error: BaseException) -> "Ending":
+        """The ending of a job that this error stopped."""
         if isinstance(error, Stopped):
             line = f"stopped by {error}; the same command goes on from here"
             return cls(overrides=overrides, state="stopped", exit_status=int(str(error.code)), lines=[line])
@@ -81,6 +82,7 @@ class JobRecords:
             yield
 
     def end(self, number: int, ending: Ending) -> None:
+        """Record how a job ended."""
         write_atomic(self.path / f"{number}.json", ending.model_dump_json() + "\n")
 
     def ending(self, number: int, overrides: list[str]) -> Ending:
@@ -99,6 +101,7 @@ class JobRecords:
         return Ending(overrides=overrides, exit_status=FAILED, lines=[reason])
 
     def remove(self) -> None:
+        """Delete the folder; nothing is said where that cannot be."""
         shutil.rmtree(self.path, ignore_errors=True)
 
 

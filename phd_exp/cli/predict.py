@@ -47,10 +47,12 @@ class PredictArguments(Arguments):
     @field_validator("box", mode="before")
     @classmethod
     def box_of_four_numbers(cls, text: Any) -> Any:
+        """A box as it is written on a command line."""
         return four_numbers(text, "box=LEFT,TOP,RIGHT,BOTTOM in pixels")
 
     @model_validator(mode="after")
     def one_source(self) -> "PredictArguments":
+        """Either an image with its camera, or a folder that says both."""
         if (self.image is None) == (self.folder is None):
             raise ValueError(
                 "predict: expected either image=FILE with f=PIXELS, or folder=DIR with a metadata.jsonl in it"
@@ -63,6 +65,7 @@ class PredictArguments(Arguments):
         return self
 
     def detections(self) -> list[Detection]:
+        """What is to be looked at. Raises DatasetError where it cannot be read."""
         if self.folder is not None:
             return detections_in(self.folder)
         assert self.image is not None
@@ -71,6 +74,7 @@ class PredictArguments(Arguments):
 
 
 def main(words: list[str]) -> int:
+    """Predict as the words say; returns the exit status."""
     try:
         arguments = parsed("predict", PredictArguments, words)
         detections = arguments.detections()

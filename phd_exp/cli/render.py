@@ -12,10 +12,12 @@ from phd_exp.training.config import RenderConfig, RenderedConfig, check_render
 
 
 def main(arguments: list[str]) -> int:
+    """Render as the words say, once or for every combination; returns the exit status."""
     return launch(task, arguments, config_name="render")
 
 
 def task(config: dict[str, Any], overrides: list[str], cores: int) -> str:
+    """What one job of rendering does; returns its state."""
     checked = check_render(config)
     data, folder = checked.data, DatasetFolder(checked.data.folder)
     if checked.masks is not None:

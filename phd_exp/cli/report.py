@@ -16,6 +16,7 @@ FOR_THE_SITE = ("matplotlib", "plotly", "jinja2")
 
 
 def main(arguments: list[str]) -> int:
+    """Print and write the tables and build the site; returns the exit status."""
     try:
         folders = named_folders("report", FOLDERS, arguments)
         require_folder("runs", folders["runs"], "train first, or say where the runs are")

@@ -19,6 +19,7 @@ class Several:
 
     @classmethod
     def of(cls, checked: RunConfig) -> "Several | None":
+        """What a configuration asks for; None where it asks for nothing."""
         asked = checked.evaluation.multiview
         if asked is None or asked.scenes == 0:
             return None
@@ -27,6 +28,7 @@ class Several:
 
     @property
     def folder(self) -> DatasetFolder:
+        """The data set of these scenes, beside the one that the run was trained on."""
         return DatasetFolder(self.data.root / self.spec.variant)
 
     def require_possible(self) -> None:

@@ -49,6 +49,7 @@ class Plan:
 
     @property
     def launcher(self) -> dict[str, Any]:
+        """The launcher's part of the configuration, as plain containers."""
         node = OmegaConf.to_container(self.config.hydra.launcher, resolve=True)
         assert isinstance(node, dict)
         return {str(key): value for key, value in node.items()}

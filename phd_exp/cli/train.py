@@ -28,10 +28,12 @@ SHOWN = (
 
 
 def main(arguments: list[str]) -> int:
+    """Train as the words say, once or for every combination; returns the exit status."""
     return launch(task, arguments, is_finished=is_finished)
 
 
 def task(config: dict[str, Any], overrides: list[str], cores: int) -> str:
+    """What one job of training does: render what is missing, train, print the numbers; returns its state."""
     checked = check(config)
     # seconds of imports, which a refused configuration need not wait for
     from phd_exp.training.run import require_possible, train

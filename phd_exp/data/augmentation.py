@@ -30,6 +30,7 @@ class Augmentation:
 
     @property
     def changes_anything(self) -> bool:
+        """Whether any change can be drawn."""
         return self.symmetries or self.largest_zoom > 1 or self.colours
 
     def __call__(self, batch: Batch, numbers: Float[Tensor, "batch 10"]) -> Batch:

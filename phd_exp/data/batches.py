@@ -28,15 +28,19 @@ class Batch:
 
     @property
     def camera(self) -> Camera:
+        """The true cameras of the samples, in the pixels of `image`."""
         return Camera(self.f, self.S)
 
     def __len__(self) -> int:
         return len(self.row)
 
     def select(self, rows: Int[Tensor, " rows"]) -> "Batch":
+        """The samples of these rows."""
         return Batch(self.image[rows], self.xyz[rows], self.f[rows], self.S, self.row[rows])
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> "Batch":
+        """The same samples on a device."""
+
         def moved(tensor: Tensor) -> Tensor:
             return tensor.to(device, non_blocking=non_blocking)
 

@@ -64,6 +64,7 @@ class Predictor:
 
     @property
     def is_probabilistic(self) -> bool:
+        """Whether it predicts densities; a baseline predicts points."""
         return issubclass(self.regressor.head.prediction, ProjectedHuber)
 
     def __call__(

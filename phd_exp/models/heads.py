@@ -31,7 +31,9 @@ class Head(Protocol):
 
     def placed(
         self, raw: Float[Tensor, "*batch n_outputs"], place: Float[Tensor, "*batch 2"]
-    ) -> Float[Tensor, "*batch n_outputs"]: ...
+    ) -> Float[Tensor, "*batch n_outputs"]:
+        """The raw numbers of the same prediction, moved by `place`, a projected position v_p."""
+        ...
 
 
 class DistributionHead:

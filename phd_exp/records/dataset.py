@@ -65,6 +65,7 @@ class DatasetFolder:
 
     @property
     def manifest_path(self) -> Path:
+        """The manifest."""
         return self.root / "manifest.json"
 
     @property
@@ -73,9 +74,11 @@ class DatasetFolder:
         return self.root / ".cache"
 
     def split_folder(self, split: Split) -> Path:
+        """Where the images of a split lie, and their metadata."""
         return self.root / split
 
     def metadata_path(self, split: Split) -> Path:
+        """The finished samples of a split."""
         return self.root / split / "metadata.jsonl"
 
     @property
@@ -84,6 +87,7 @@ class DatasetFolder:
         return self.cache / "render.lock"
 
     def journal_path(self, split: Split, shard: Shard | None = None) -> Path:
+        """The samples that are finished while a split, or a shard of it, is being rendered."""
         share = "" if shard is None else f"-{shard.slug}"
         return self.root / split / f"metadata.partial{share}.jsonl"
 
@@ -92,6 +96,7 @@ class DatasetFolder:
         return list(self.split_folder(split).glob("metadata.partial*.jsonl"))
 
     def image_path(self, split: Split, index: int, image_format: ImageFormat = "png") -> Path:
+        """The image of a sample."""
         return self.root / split / image_name(index, image_format)
 
     @property

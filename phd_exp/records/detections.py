@@ -98,6 +98,7 @@ class DetectionLine(BaseModel):
 
     @model_validator(mode="after")
     def belongs_together(self) -> "DetectionLine":
+        """Refuse half a camera, half a position, and a box without an inside."""
         if (self.f is None) == (self.fx is None and self.fy is None):
             raise ValueError("expected either f, or fx and fy (focal length in pixels)")
         for names in (("fx", "fy"), ("cx", "cy"), ("x", "y", "z")):
@@ -175,9 +176,11 @@ class DetectionFolder:
 
     @property
     def cache(self) -> Path:
+        """Where decoded crops are kept."""
         return self.root / ".cache"
 
     def metadata_path(self, split: Split) -> Path:
+        """The lines of a split."""
         return self.root / split / "metadata.jsonl"
 
     def detections(self, split: Split, n: int | None = None) -> list[Detection]:

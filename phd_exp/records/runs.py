@@ -96,6 +96,7 @@ class RunName:
     overrides: tuple[str, ...] = ()
 
     def folder(self, runs: Path) -> Path:
+        """The run's folder under `runs`; overrides beyond the choices become a hash of eight digits."""
         leaf = f"seed{self.seed}"
         if self.overrides:
             digest = hashlib.sha256("\n".join(sorted(self.overrides)).encode()).hexdigest()
@@ -126,6 +127,7 @@ class RunFolder:
 
     @property
     def last_checkpoint(self) -> Path:
+        """What a run goes on from."""
         return self.checkpoints / "last.ckpt"
 
     def status(self) -> RunStatus | None:
@@ -138,6 +140,7 @@ class RunFolder:
             raise _unreadable(self.status_file, "not a run status", error) from None
 
     def is_finished(self) -> bool:
+        """Whether the run has ended well. Raises RunError where its status cannot be read."""
         status = self.status()
         return status is not None and status.state == "finished"
 
@@ -159,12 +162,15 @@ class RunFolder:
             return True
 
     def config(self) -> dict[str, Any]:
+        """The configuration, resolved. Raises RunError where it is missing or cannot be read."""
         return _read_mapping(self.config_file, parse_yaml)
 
     def results(self) -> dict[str, Any]:
+        """The final numbers. Raises RunError where they are missing or cannot be read."""
         return _read_mapping(self.results_file, parse_json)
 
     def constants(self) -> dict[str, Any]:
+        """What the network was told of the data set. Raises RunError as `config` does."""
         return _read_mapping(self.constants_file, parse_json)
 
     def metrics(self) -> list[dict[str, Any]]:
@@ -175,9 +181,11 @@ class RunFolder:
         return read_jsonl(self.metrics_file, _metrics_row) if self.metrics_file.exists() else []
 
     def write_config(self, config: Mapping[str, Any]) -> None:
+        """Write the configuration, resolved."""
         write_atomic(self.config_file, yaml.safe_dump(dict(config), sort_keys=False))
 
     def write_constants(self, constants: Mapping[str, float]) -> None:
+        """Write what the network is told of the data set; all numbers are finite."""
         write_atomic(self.constants_file, json.dumps(dict(constants), indent=2, allow_nan=False) + "\n")
 
     def write_results(self, results: Mapping[str, Any]) -> None:
@@ -186,9 +194,11 @@ class RunFolder:
         write_atomic(self.results_file, json.dumps(finite, indent=2, allow_nan=False) + "\n")
 
     def write_status(self, status: RunStatus) -> None:
+        """Write how the run stands."""
         write_atomic(self.status_file, status.model_dump_json(indent=2) + "\n")
 
     def write_metrics(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Write all lines anew, one an epoch."""
         write_atomic(self.metrics_file, "".join(json.dumps(row) + "\n" for row in rows))
 
     def require_writable(self) -> None:

@@ -36,10 +36,12 @@ OF_FEWER_SEEDS = f"{FEWER_SEEDS}: fewer seeds than other cells of this table hav
 
 
 def title(preset: str, layout: Layout, reading: Reading, cells: Sequence[Cell]) -> str:
+    """What a table is headed by."""
     return f"{layout.title}, {one_line(in_words(preset))}: {IN_WORDS[reading]}{_samples(cells)}"
 
 
 def notes(layout: Layout, reading: Reading, cells: Sequence[Cell]) -> tuple[str, ...]:
+    """How to read a table: of what its cells hold, and of nothing else."""
     kinds = {cell.interval.kind for cell in cells if cell.interval}
     said = [OF_THE_READING[reading], OF_A_CELL]
     said += [text for kind, text in OF_AN_INTERVAL.items() if kind in kinds]

@@ -26,10 +26,12 @@ class Interval:
 
     @property
     def low(self) -> float | None:
+        """Lower end; None where there is no interval."""
         return None if self.half_width is None else self.mean - self.half_width
 
     @property
     def high(self) -> float | None:
+        """Upper end; None where there is no interval."""
         return None if self.half_width is None else self.mean + self.half_width
 
 
@@ -75,6 +77,7 @@ class Cell:
 
     @property
     def mean(self) -> float | None:
+        """Ours, mm; None where no run has finished."""
         return self.interval.mean if self.interval else None
 
     @property

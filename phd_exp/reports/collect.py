@@ -50,6 +50,7 @@ class Records:
 
     @property
     def presets(self) -> list[str]:
+        """All presets, with their recipes, in order."""
         return sorted({run.preset for run in self.runs})
 
     def at_defaults(self, preset: str, data: str, model: str) -> dict[int, Run]:

@@ -37,6 +37,7 @@ def write_figure(figure: Figure, stem: Path) -> list[Path]:
 
 
 def encoded(figure: Figure, kind: str, dpi: int) -> bytes:
+    """A figure as the bytes of a `png` or `pdf` file, which hold no date."""
     dateless = {"CreationDate": None} if kind == "pdf" else {}
     buffer = io.BytesIO()
     figure.savefig(buffer, format=kind, dpi=dpi, metadata=dateless)

@@ -81,6 +81,7 @@ class FusionTable:
 
     @property
     def caption(self) -> str:
+        """The title, which is a sentence of its own."""
         return self.title
 
 

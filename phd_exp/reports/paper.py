@@ -81,6 +81,7 @@ class Line:
     quantity: Quantity | None = None
 
     def quantity_in(self, column: Column) -> Quantity:
+        """The error that stands where this line meets a column."""
         quantity = self.quantity or column.quantity
         assert quantity is not None, "a layout gives the error to its lines or to its columns"
         return quantity

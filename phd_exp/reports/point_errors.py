@@ -59,6 +59,7 @@ class SampleMean:
 
     @classmethod
     def of(cls, values: PerSample) -> "SampleMean":
+        """The mean of these values, one a sample."""
         n = len(values)
         return cls(n, float(values.mean()), float(values.std(ddof=1) / np.sqrt(n)) if n > 1 else None)
 

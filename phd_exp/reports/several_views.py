@@ -41,10 +41,12 @@ class SeveralViews:
 
     @property
     def n(self) -> int:
+        """How many scenes there are."""
         return self.columns["view"].shape[0]
 
     @property
     def views(self) -> int:
+        """How many cameras look at each."""
         return self.columns["view"].shape[1]
 
     @cached_property

@@ -50,23 +50,49 @@ class Table(Protocol):
     """What every format draws; `PaperTable` says what it is. Its files are named by its stem."""
 
     @property
-    def stem(self) -> str: ...
+    def stem(self) -> str:
+        """Of its file names."""
+        ...
+
     @property
-    def title(self) -> str: ...
+    def title(self) -> str:
+        """What it is headed by."""
+        ...
+
     @property
-    def caption(self) -> str: ...
+    def caption(self) -> str:
+        """The title as a sentence of its own."""
+        ...
+
     @property
-    def stub(self) -> tuple[str, ...]: ...
+    def stub(self) -> tuple[str, ...]:
+        """Headings of the columns that say what a line is about."""
+        ...
+
     @property
-    def columns(self) -> tuple[str, ...]: ...
+    def columns(self) -> tuple[str, ...]:
+        """Headings of the columns of cells."""
+        ...
+
     @property
-    def groups(self) -> tuple[tuple[TableRow, ...], ...]: ...
+    def groups(self) -> tuple[tuple[TableRow, ...], ...]:
+        """Lines, with a rule between groups."""
+        ...
+
     @property
-    def gaps(self) -> tuple[Gap, ...]: ...
+    def gaps(self) -> tuple[Gap, ...]:
+        """Runs that are missing, unfinished or unreadable."""
+        ...
+
     @property
-    def command(self) -> str: ...
+    def command(self) -> str:
+        """What makes them; empty where no further run would help."""
+        ...
+
     @property
-    def notes(self) -> tuple[str, ...]: ...
+    def notes(self) -> tuple[str, ...]:
+        """How to read it, a sentence or two each."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -95,14 +121,17 @@ class PaperTable:
 
     @property
     def stem(self) -> str:
+        """Of its file names: table, preset and reading."""
         return f"{self.name}-{self.preset}-{self.reading}"
 
     @property
     def caption(self) -> str:
+        """The title as a sentence of its own."""
         return f"The paper's {self.title}"
 
     @property
     def rows(self) -> tuple[TableRow, ...]:
+        """The lines of all groups."""
         return tuple(row for group in self.groups for row in group)
 
     @property

@@ -129,6 +129,7 @@ def _progress(config: RunConfig) -> list[Callback]:
 
 
 def on_a_terminal() -> bool:
+    """Whether somebody can watch a progress bar."""
     return sys.stderr.isatty()
 
 

@@ -119,6 +119,7 @@ class CalibrationRecorder(Callback):
         self.parts: list[Columns] = []
 
     def is_due(self, trainer: Trainer) -> bool:
+        """Whether the present epoch is one whose curves are kept."""
         epoch = trainer.current_epoch + 1
         last = epoch == trainer.max_epochs
         return not trainer.sanity_checking and (last or epoch % self.every_n_epochs == 0)

@@ -61,6 +61,8 @@ Checked = TypeVar("Checked", bound=BaseModel)
 
 
 class Section(BaseModel):
+    """A part of the configuration: no key but its own, and none of them changes."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
@@ -75,6 +77,7 @@ class SizesConfig(Section):
 
     @model_validator(mode="after")
     def a_batch_is_full(self) -> "SizesConfig":
+        """Refuse a batch larger than the training samples."""
         if self.n_train is not None and self.batch_size > self.n_train:
             raise ValueError(
                 f"batch_size={self.batch_size} is larger than n_train={self.n_train}: not one batch is full"
@@ -102,6 +105,7 @@ class RenderedConfig(SizesConfig):
 
     @model_validator(mode="after")
     def images_shrink(self) -> "RenderedConfig":
+        """Refuse images larger than they were rendered."""
         if self.image_size > self.spec.sensor_size:
             raise ValueError(
                 f"image_size={self.image_size} is larger than sensor_size={self.spec.sensor_size}: "
@@ -116,10 +120,12 @@ class RenderedConfig(SizesConfig):
 
     @property
     def name(self) -> str:
+        """What its runs are named by: the variant."""
         return self.spec.variant
 
     @property
     def folder(self) -> Path:
+        """Where the data set lies."""
         return self.root / self.spec.variant
 
 
@@ -147,15 +153,21 @@ DataConfig = Annotated[
 
 
 class ModelConfig(Section):
+    """The head, which decides what is predicted, and the model's name in a run's folder."""
+
     name: Name
     head: Target
 
 
 class CameraConfig(Section):
+    """Whether the model is told each camera's focal length, or one constant for all."""
+
     focal_length: Literal["known", "constant"]
 
 
 class TrainerConfig(Section):
+    """How long is trained, on what, and in which arithmetic; None: as many threads as there are cores."""
+
     max_epochs: Annotated[Whole, Field(ge=1)]
     accelerator: Literal["auto", "cpu", "gpu"]
     precision: Literal["auto", "float32", "bfloat16"]
@@ -183,6 +195,8 @@ class RecipeConfig(Section):
 
 
 class LoggerConfig(Section):
+    """Where the run is logged besides its own record."""
+
     kind: Literal["none", "wandb"]
     project: Name
     offline: Annotated[bool, Field(strict=True)]
@@ -202,6 +216,8 @@ class MultiviewConfig(Section):
 
 
 class EvaluationConfig(Section):
+    """What is measured besides the metrics of every epoch."""
+
     calibration_window: Annotated[Whole, Field(ge=1)]
     calibration_every_n_epochs: Annotated[Whole, Field(ge=1)]
     multiview: MultiviewConfig | None = None  # so in records from before there was this
@@ -246,6 +262,7 @@ class RunConfig(Section):
 
     @model_validator(mode="after")
     def parts_fit(self) -> "RunConfig":
+        """Refuse a loss that cannot take what the model predicts."""
         made = self.prediction
         taken = _prediction("loss", self.loss)
         if not issubclass(made, taken):
@@ -257,6 +274,7 @@ class RunConfig(Section):
 
     @model_validator(mode="after")
     def several_views_fit(self) -> "RunConfig":
+        """Refuse several views of a model or a data set that knows none."""
         multiview = self.evaluation.multiview
         if multiview is None or multiview.scenes == 0:
             return self

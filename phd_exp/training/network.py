@@ -56,6 +56,7 @@ def precision(config: TrainerConfig) -> Any:
 
 
 def cpu_has_bfloat16() -> bool:
+    """Whether this CPU has units for bfloat16; false where it cannot be told."""
     flags = Path("/proc/cpuinfo")
     words = flags.read_text().split() if flags.exists() else []
     return "amx_bf16" in words or "avx512_bf16" in words

@@ -17,6 +17,7 @@ from phd_exp.training.run import run
 
 
 def main() -> None:
+    """Take a share of a training from the process that started this one, and report how it ended."""
     signal.signal(
         signal.SIGINT, signal.SIG_IGN
     )  # Ctrl-C reaches all processes; the one that started us decides

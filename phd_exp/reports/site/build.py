@@ -45,15 +45,19 @@ class SiteFolder:
     path: Path
 
     def page(self, slug: str) -> Path:
+        """The page of a run."""
         return self.path / "runs" / f"{slug}.html"
 
     def script(self, slug: str) -> Path:
+        """What the charts of a page show."""
         return self.path / "data" / f"{slug}.js"
 
     def images(self, slug: str) -> Path:
+        """The pictures of a run's gallery."""
         return self.path / "images" / slug
 
     def make(self) -> None:
+        """Make the folders that are missing. Raises OSError."""
         for name in ("runs", "data", "images", "assets"):
             (self.path / name).mkdir(parents=True, exist_ok=True)
 

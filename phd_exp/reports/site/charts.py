@@ -35,6 +35,7 @@ class Chart:
 
 
 def axis(title: str, log: bool = False, **more: Any) -> dict[str, Any]:
+    """An axis of a layout: its title, linear or logarithmic, and whatever else plotly knows of one."""
     return {"title": {"text": title}, "type": "log" if log else "linear", **more}
 
 

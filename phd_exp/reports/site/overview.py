@@ -62,6 +62,7 @@ class Colours:
         self.models = _places([model for model, _ in PUBLISHED], (run.model for run in runs))
 
     def of_data(self, runs: Iterable[RunData], dashed: bool) -> list[Key]:
+        """The keys of a legend of data sets, of those that have a calibration curve."""
         there = {run.data for run in runs if "depth_calibration" in run.charts}
         return [
             Key(name, self.colour(place), self.dash(place) if dashed else "solid")
@@ -70,19 +71,23 @@ class Colours:
         ]
 
     def of_models(self, runs: Iterable[RunData]) -> list[Key]:
+        """The keys of a legend of models."""
         there = {run.model for run in runs}
         return [Key(name, self.colour(place)) for name, place in self.models.items() if name in there]
 
     def dashes_of_data(self, runs: Iterable[RunData]) -> list[Key]:
+        """The keys of a legend in which data sets differ by their dashes alone."""
         there = {run.data for run in runs}
         return [Key(name, 0, self.dash(place)) for name, place in self.data.items() if name in there]
 
     @staticmethod
     def colour(place: int) -> int:
+        """The number of a colour of the style sheet, from 1."""
         return place % COLOURS + 1
 
     @staticmethod
     def dash(place: int) -> str:
+        """The dash of a place."""
         return DASHES[place % len(DASHES)]
 
 

@@ -68,6 +68,7 @@ def overview_page(
     groups: dict[str, Group],
     figures: Sequence[str],
 ) -> str:
+    """`index.html`: the tables, the charts of all runs, the list of runs."""
     measured = Counter(table.preset for table in tables for cell in table.sources if cell.mean is not None)
     presets = [preset for preset, _ in measured.most_common()]  # the fullest tables first
     return _ENVIRONMENT.get_template("overview.html").render(
@@ -84,6 +85,7 @@ def overview_page(
 
 
 def run_page(run: RunData, dossier: Dossier, gallery: Gallery | None) -> str:
+    """The page of one run."""
     context: dict[str, Any] = {
         "root": "../",
         "run": run,
@@ -100,6 +102,7 @@ def run_page(run: RunData, dossier: Dossier, gallery: Gallery | None) -> str:
 
 
 def comparison_page(runs: Sequence[RunData]) -> str:
+    """`compare.html`: any two runs side by side."""
     quantities = {key: asdict(score) for key, score in SCORES.items()}
     return _ENVIRONMENT.get_template("compare.html").render(root="", runs=runs, quantities=quantities)
 

@@ -24,9 +24,11 @@ class Quantity:
 
     @property
     def axis(self) -> str:
+        """Label and unit, for an axis or a heading."""
         return f"{self.label} ({self.unit})" if self.unit else self.label
 
     def text(self, value: float | None) -> str:
+        """A value with its digits; a dash for one that is missing or not finite."""
         if value is None or not math.isfinite(value):
             return "–"
         return f"{value:.{self.digits}f}".replace("-", "−")

@@ -95,6 +95,7 @@ def as_script(name: str, content: Any) -> str:
 
 
 def run_script(run: RunData) -> str:
+    """What the charts of a run show, as the script of its page."""
     return as_script(run.slug, asdict(run))
 
 
