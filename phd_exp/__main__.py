@@ -3,7 +3,8 @@
 import sys
 from importlib import import_module
 
-from phd_exp.cli.help import VERBS, show
+from phd_exp.cli.completion import FLAGS, take_verb_from_line
+from phd_exp.cli.help import OF_VERB, VERBS, show
 
 HELP = {"-h", "--help", "help"}
 
@@ -12,6 +13,10 @@ def main(arguments: list[str] | None = None) -> int:
     """Find the verb among the arguments and hand the rest to it; returns the exit status."""
     rest = list(sys.argv[1:] if arguments is None else arguments)
     verb = _take_verb(rest)
+    if set(FLAGS) & set(rest):
+        verb = take_verb_from_line(list(VERBS))
+        if verb and not OF_VERB[verb]:  # Hydra completes, and this verb takes no groups of it
+            return 0
     if HELP & set(rest):
         return show(verb)
     if verb is not None and verb not in VERBS:

@@ -26,6 +26,7 @@ OF_VERB = {
     "export": (),
 }
 """The groups whose choice a verb looks at."""
+COMPLETION = 'eval "$(phd-exp -sc install=bash)"'
 EXAMPLES = {
     "train": [
         "python -m phd_exp model=mae_logz data=scale",
@@ -94,7 +95,8 @@ def _programme_help() -> str:
             "examples",
             *examples,
             "",
-            "python -m phd_exp <verb> --help tells more.",
+            "python -m phd_exp <verb> --help tells more. An installed phd-exp is the same programme; the TAB key",
+            f"completes its words after {COMPLETION}.",
         ]
     )
 

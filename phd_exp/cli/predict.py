@@ -123,7 +123,7 @@ def _draw(sighting: "Sighting", file: Path) -> None:
 
 
 def _picture_names(detections: list[Detection]) -> list[str]:
-    """<name of the image>.png; a further detection in the same image, or one of the same name, has its number too."""
+    """`<name of the image>.png`; with its number for a further detection in an image, or in one of the same name."""
     seen: Counter[str] = Counter()
     names = []
     for detection in detections:

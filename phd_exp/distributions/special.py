@@ -101,7 +101,7 @@ def weighted_integral(
 ) -> Float[Tensor, "*batch"]:
     """int_0^inf e^(-s) F(s) ds by the Gauss rule, where F has its singularities at s <= -1; for the batch of `like`.
 
-    F takes nodes s of shape (nodes, 1, ..., 1) and returns (nodes, *batch).
+    F takes nodes s of shape `(nodes, 1, ..., 1)` and returns `(nodes, *batch)`.
     """
     s, w = (constant.view(-1, *[1] * like.ndim) for constant in _constants(like)[:2])
     return (w * F(s)).sum(0)

@@ -39,7 +39,9 @@ class Decoder:
     Args:
         side: of the network's square image, pixels.
         head: "ProjectedHuber", or the chart of a baseline: "Projected", "LogDepth" or "Cartesian".
-        mu_z0, D, z_centre: the constants of depth (metres per pixel, none, metres).
+        mu_z0: depth per focal length, metres per pixel.
+        D: half the range of depth per focal length, a factor.
+        z_centre: middle of the range of depth, metres.
         xy_unit: of a Cartesian chart, metres.
         constant_f: the focal length that the network was told for every image; None: the true one.
         temperature: (projected, depth), by which A and a are divided; (1, 1) as trained.

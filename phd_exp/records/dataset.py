@@ -1,12 +1,14 @@
 """The folder of one data set: where things lie in it, what is there, and whether it is what was asked for.
 
-renders/<variant>/
-    manifest.json                 what made the folder, and how many samples are finished
-    <split>/000123.png            images (.webp, .jpg)
-    <split>/metadata.jsonl        one line a sample, sorted by index
-    <split>/metadata.partial.jsonl    only while rendering: one line a finished image
-    <split>/metadata.partial-0-of-4.jsonl    the same for one of several shards
-    .cache/                       whatever programmes derive from the images
+    renders/<variant>/
+        manifest.json                 what made the folder, and how many samples are finished
+        <split>/000123.png            images (.webp, .jpg)
+        <split>/metadata.jsonl        one line a sample, sorted by index
+        <split>/metadata.partial.jsonl    only while rendering: one line a finished image
+        <split>/metadata.partial-0-of-4.jsonl    the same for one of several shards
+        .cache/                       whatever programmes derive from the images
+
+`SampleRecord` says what a line holds.
 """
 
 import hashlib

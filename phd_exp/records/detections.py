@@ -1,9 +1,11 @@
 """The user's own images: `metadata.jsonl` says of each detection which image shows it, by what camera, and where.
 
-<folder>/
-    <split>/metadata.jsonl    one JSON object a line
-    <split>/...               the images, beside it or in folders below
-    .cache/                   crops, decoded once
+    <folder>/
+        <split>/metadata.jsonl    one JSON object a line
+        <split>/...               the images, beside it or in folders below
+        .cache/                   crops, decoded once
+
+`DetectionLine` says what a line may hold.
 """
 
 import re

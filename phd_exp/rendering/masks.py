@@ -14,7 +14,7 @@ from phd_exp.rendering.visibility import cylinder_mask
 
 
 def write_masks(folder: DatasetFolder, masks: Path) -> int:
-    """Write `masks`/<split>/<index>.png, white where the cylinder shows, for all samples; returns their number.
+    """Write `<masks>/<split>/<index>.png`, white where the cylinder shows, for all samples; returns their number.
 
     Raises:
         DatasetError: there is no data set, or a broken one.

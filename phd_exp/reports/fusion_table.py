@@ -62,10 +62,9 @@ class FusionTable:
 
     Attributes:
         stem: of its file names.
-        caption: the title as a sentence of its own.
-        gaps, command: none; what the formats ask of any table.
-        place: the run's folder.
+        run: which one.
         scores: all its numbers.
+        gaps: none; what the formats ask of any table, as is `command`.
     """
 
     stem: str

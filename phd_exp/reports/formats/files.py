@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # torch, which tables on single views need not wait for
 
 
 def write_tables(tables: Sequence[PaperTable], out: Path) -> Path:
-    """Write <out>/tables/{table1,table2}-<preset>-{whole,central}.{md,tex} and tables.csv; returns that folder.
+    """Write `<out>/tables/{table1,table2}-<preset>-{whole,central}.{md,tex}` and `tables.csv`; returns that folder.
 
     Raises UserError where the folder cannot be written.
     """
@@ -28,7 +28,7 @@ def write_tables(tables: Sequence[PaperTable], out: Path) -> Path:
 
 
 def write_fusion_tables(tables: "Sequence[FusionTable]", out: Path) -> Path:
-    """Write <out>/tables/fusion-<run>.{md,tex} and fusion.csv; returns that folder.
+    """Write `<out>/tables/fusion-<run>.{md,tex}` and `fusion.csv`; returns that folder.
 
     Raises UserError where the folder cannot be written.
     """

@@ -34,12 +34,14 @@ _ASSETS = Path(__file__).parent / "assets"
 class SiteFolder:
     """Where things lie in a site.
 
-    site/
-        index.html  compare.html
-        runs/<slug>.html           a page a run
-        data/<slug>.js             what its charts show; data/overview.js those of the overview
-        images/<slug>/*.webp       of its gallery
-        assets/                    scripts and style, shared by all pages
+        site/
+            index.html  compare.html
+            runs/<slug>.html           a page a run
+            data/<slug>.js             what its charts show; data/overview.js those of the overview
+            images/<slug>/*.webp       of its gallery
+            assets/                    scripts and style, shared by all pages
+
+    Pages name each other by relative paths, so that the folder can be moved.
     """
 
     path: Path

@@ -1,0 +1,42 @@
+"""The pages of the documentation, taken apart."""
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGES = sorted(DOCS.rglob("*.md"))
+_BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+class Block(NamedTuple):
+    """A fenced block: its language, its text, and the line of the page on which the text begins."""
+
+    language: str
+    text: str
+    line: int
+
+
+def blocks(page: Path) -> list[Block]:
+    """The fenced blocks of a page, in order."""
+    text = page.read_text()
+    return [
+        Block(found[1], found[2], text[: found.start(2)].count("\n") + 1) for found in _BLOCK.finditer(text)
+    ]
+
+
+def commands(page: Path) -> list[list[str]]:
+    """The words of every command of this programme in the `sh` blocks of a page."""
+    lines = [
+        line.partition(" #")[0].split()
+        for block in blocks(page)
+        if block.language == "sh"
+        for line in block.text.replace("\\\n", " ").splitlines()
+    ]
+    return [line[3:] for line in lines if line[:3] == ["python", "-m", "phd_exp"]]
+
+
+def name(page: Path) -> str:
+    """A page as mkdocs.yml names it."""
+    return str(page.relative_to(DOCS))

@@ -1,0 +1,109 @@
+"""The documentation as `make docs` builds it: without a warning, and read from the disk without a network."""
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from shutil import which
+
+import pytest
+
+from tests.docs.pages import PAGES, ROOT
+
+pytestmark = pytest.mark.slow
+
+LOADED = {"script": "src", "img": "src", "iframe": "src", "source": "src", "link": "href"}
+"""Tags that make a browser fetch something, and the attribute that says what."""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("docs") / "site"
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+    )
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+class _Loaded(HTMLParser):
+    """What a page makes a browser fetch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        value = dict(attrs).get(LOADED.get(tag, ""))
+        if value:
+            self.addresses.append(value)
+
+
+def test_every_page_is_built_and_loads_nothing_from_elsewhere(site: Path) -> None:
+    pages = list(site.rglob("*.html"))
+    assert len(pages) == len(PAGES) + 1  # and 404.html
+    for page in pages:
+        loaded = _Loaded()
+        loaded.feed(page.read_text())
+        assert len(loaded.addresses) > 3
+        assert [address for address in loaded.addresses if re.match(r"(\w+:)?//", address)] == [], page
+
+
+def test_styles_load_nothing_from_elsewhere(site: Path) -> None:
+    for style in site.rglob("*.css"):
+        assert re.findall(r"(?:url\(|@import)\s*['\"]?(?:https?:)?//", style.read_text()) == [], style
+
+
+def test_shapes_stand_in_the_reference(site: Path) -> None:
+    text = _text((site / "api" / "distributions.html").read_text())
+    assert 'mu_xy: Float[Tensor, "*batch 2"]' in text
+    text = _text((site / "api" / "metrics.html").read_text())
+    assert 'levels: Float[Tensor, "samples"]' in text
+
+
+def _text(html: str) -> str:
+    return re.sub(r"<[^>]+>", "", html).replace("&#39;", "'").replace("&quot;", '"')
+
+
+@pytest.fixture
+def faults() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def page(faults: list[str]) -> Iterator[object]:
+    """A page of a real browser without a network; whatever goes wrong on it is a fault."""
+    executable = which("chromium") or which("chromium-browser") or which("google-chrome")
+    if executable is None:
+        pytest.skip("no Chromium is installed (apt-get install chromium)")
+    sync_api = pytest.importorskip("playwright.sync_api")
+    with sync_api.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=executable, args=["--no-sandbox", "--disable-gpu"])
+        opened = browser.new_context(offline=True).new_page()
+        opened.on("pageerror", lambda error: faults.append(str(error)))
+        opened.on("requestfailed", lambda request: faults.append(request.url))
+        opened.on("request", lambda request: _note_if_foreign(request.url, faults))
+        yield opened
+        browser.close()
+
+
+def _note_if_foreign(url: str, faults: list[str]) -> None:
+    if not url.startswith(("file:", "data:", "blob:")):
+        faults.append(url)
+
+
+def test_the_search_finds_a_name_from_the_file_system(site: Path, page: object, faults: list[str]) -> None:
+    page.goto((site / "index.html").as_uri())
+    page.click("input.md-search__input")
+    page.keyboard.type("quantiles_along")
+    page.wait_for_selector(".md-search-result__item")
+    page.click(".md-search-result__item a")
+    page.wait_for_url("**/api/distributions.html*")
+    assert faults == []

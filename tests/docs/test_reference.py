@@ -1,0 +1,106 @@
+"""The reference is complete, and every name in the pages is one of this programme."""
+
+import ast
+import importlib
+import re
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+import phd_exp.geometry
+from phd_exp.cli.paths import PACKAGE
+from tests.docs.pages import DOCS, PAGES, ROOT, name
+
+REFERENCE = sorted((DOCS / "api").glob("*.md"))
+PRIVATE = {"cli"}
+"""Packages that nobody imports but this programme itself."""
+_DIRECTIVE = re.compile(r"^::: (\S+)$", re.MULTILINE)
+_REFERENCE = re.compile(r"\]\[(phd_exp[\w.]*)\]")
+_LINK = re.compile(r"\]\(([^)#:]+)[^):]*\)")
+
+
+def test_every_page_is_in_the_contents_and_there() -> None:
+    contents = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]
+    assert sorted(_files(contents)) == sorted(map(name, PAGES))
+
+
+def test_every_package_has_a_page() -> None:
+    packages = {file.parent.name for file in PACKAGE.glob("*/__init__.py")}
+    assert {page.stem for page in REFERENCE} == packages - PRIVATE
+
+
+@pytest.mark.parametrize("page", REFERENCE, ids=name)
+def test_a_page_holds_every_module_of_its_package(page: Path) -> None:
+    folder = PACKAGE / page.stem
+    modules = {
+        f"phd_exp.{'.'.join(file.relative_to(PACKAGE).with_suffix('').parts)}"
+        for file in folder.rglob("*.py")
+        if file.stem != "__init__"
+    }
+    assert set(_DIRECTIVE.findall(page.read_text())) - {f"phd_exp.{page.stem}"} == modules
+
+
+def test_links_lead_somewhere() -> None:
+    for page in PAGES:
+        for link in _LINK.findall(page.read_text()):
+            assert (page.parent / link).is_file(), f"{name(page)}: {link}"
+        for reference in _REFERENCE.findall(page.read_text()):
+            assert _is_there(reference), f"{name(page)}: {reference}"
+
+
+def test_symbols_are_defined_where_the_glossary_says() -> None:
+    assert phd_exp.geometry.__doc__ is not None
+    rows = [line.strip("| ").split(" | ") for line in phd_exp.geometry.__doc__.splitlines() if "`" in line]
+    assert len(rows) > 20
+    for symbol, names, _, _, where in rows:
+        place = f"phd_exp.{where.strip('`')}"
+        assert _is_there(place), f"{symbol}: {place}"
+        for used in re.findall(r"`([A-Za-z_0-9]+)", names):
+            assert re.search(rf"\b{used}\b", _source(place)), f"{symbol}: no {used} in {place}"
+
+
+def test_no_word_of_a_docstring_is_taken_for_html() -> None:
+    for file in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+                text = re.sub(r"`[^`]*`", "", ast.get_docstring(node) or "")
+                tags = [line for line in text.splitlines() if re.match(r"(?! {4}).*<[A-Za-z/!]", line)]
+                assert tags == [], f"{file}: put it between backticks"
+
+
+def _files(contents: Any) -> list[str]:
+    if isinstance(contents, str):
+        return [contents]
+    values = contents.values() if isinstance(contents, dict) else contents
+    return [file for value in values for file in _files(value)]
+
+
+def _is_there(dotted: str) -> bool:
+    """Whether a dotted name is a module, or leads to something in one."""
+    module, rest = _module(dotted)
+    found = importlib.import_module(module)
+    for part in rest:
+        if not hasattr(found, part) and part not in getattr(found, "__annotations__", {}):
+            return False
+        found = getattr(found, part, None)
+    return True
+
+
+def _module(dotted: str) -> tuple[str, list[str]]:
+    parts = dotted.split(".")
+    length = next(n for n in range(len(parts), 0, -1) if _is_module(".".join(parts[:n])))
+    return ".".join(parts[:length]), parts[length:]
+
+
+def _is_module(dotted: str) -> bool:
+    try:
+        return find_spec(dotted) is not None
+    except ModuleNotFoundError:  # its parent is no package
+        return False
+
+
+def _source(dotted: str) -> str:
+    return Path(str(importlib.import_module(_module(dotted)[0]).__file__)).read_text()
