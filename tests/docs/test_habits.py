@@ -1,0 +1,55 @@
+"""What contributors are told is what is checked."""
+
+import re
+import tomllib
+from typing import Any
+
+import yaml
+
+from tests.docs.pages import ROOT
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text()
+
+
+def test_hooks_are_local_and_those_of_make_lint() -> None:
+    (repository,) = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
+    assert repository["repo"] == "local"
+    assert all(hook["language"] == "system" for hook in repository["hooks"])
+    lint = (ROOT / "Makefile").read_text().partition("\nlint:")[2].partition("\n\n")[0]
+    tools = {words.split()[0] for words in re.findall(r"\$\(BIN\)/(.*)", lint)} - {"python"}
+    assert {hook["entry"].split()[0] for hook in repository["hooks"]} == tools
+
+
+def test_the_floors_are_those_that_are_checked() -> None:
+    layers = next(c for c in PROJECT["tool"]["importlinter"]["contracts"] if c["type"] == "layers")["layers"]
+    checked = [_names(layer.replace("phd_exp.", "")) for layer in layers if "__main__" not in layer]
+    block = CONTRIBUTING.partition("## Floors")[2].partition("## ")[0]
+    drawn = [_names(re.split(r" {2,}", line.strip())[0]) for line in block.splitlines() if line[:4] == "    "]
+    assert drawn == checked
+
+
+def test_files_that_contributors_are_sent_to_are_there() -> None:
+    paths = re.findall(r"`([\w.-]+/[\w./-]*[\w/])`", CONTRIBUTING)
+    assert len(paths) > 10
+    for path in paths:
+        if path.isupper() or "NAME" in path or "VERB" in path:
+            continue
+        assert any((place / path).exists() for place in (ROOT, ROOT / "phd_exp")), path
+
+
+def test_examples_are_short() -> None:
+    files = list((ROOT / "tests" / "extending").glob("test_*.py"))
+    assert len(files) == 3
+    for file in files:
+        assert len(file.read_text().splitlines()) < 30, file
+        assert f"tests/extending/{file.name}" in CONTRIBUTING
+
+
+def test_the_changelog_has_the_version() -> None:
+    headings = re.findall(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert any(heading.startswith(f"{PROJECT['project']['version']} ") for heading in headings)
+
+
+def _names(layer: Any) -> set[str]:
+    return {name.strip() for name in layer.split("|")}
