@@ -103,9 +103,10 @@ def _programme_help() -> str:
 
 def _verb_help(verb: str) -> str:
     groups = ["", "groups", *_groups(OF_VERB[verb])] if OF_VERB[verb] else []
+    words = "[-m] [group=choice ...] [key=value ...]" if groups else "[key=value ...]"
     return "\n".join(
         [
-            f"usage: python -m phd_exp {verb} [group=choice ...] [key=value ...]",
+            f"usage: python -m phd_exp {verb} {words}",
             "",
             VERBS[verb],
             *groups,

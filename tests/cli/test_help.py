@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from phd_exp.cli.help import EXAMPLES, OF_VERB, VERBS
+from phd_exp.cli.help import COMPLETION, EXAMPLES, OF_VERB, VERBS
 from phd_exp.cli.paths import conf_folder
 
 
@@ -28,15 +28,15 @@ def test_help_within_a_second_and_without_torch() -> None:
 def test_help_lists_verbs_groups_and_choices(phd_exp: Callable) -> None:
     outcome = phd_exp("--help")
     assert outcome.status == 0
-    for word in [*VERBS, *(file.stem for file in conf_folder().glob("*/*.yaml"))]:
+    files = [file for group in OF_VERB["train"] for file in (conf_folder() / group).glob("*.yaml")]
+    for word in [*VERBS, *OF_VERB["train"], *(file.stem for file in files)]:
         assert word in outcome.out
 
 
 def test_no_group_is_forgotten() -> None:
     groups = {path.name for path in conf_folder().iterdir() if path.is_dir()}
-    assert set(OF_VERB["train"]) == groups - {"hydra"}, (
-        "whose groups say who runs the jobs, not what they are"
-    )
+    # hydra's say who runs the jobs, not what they are; size follows from preset and recipe
+    assert set(OF_VERB["train"]) == groups - {"hydra", "size"}
     assert OF_VERB.keys() == VERBS.keys() == EXAMPLES.keys()
 
 
@@ -46,3 +46,28 @@ def test_every_verb_has_help_with_examples(phd_exp: Callable, verb: str) -> None
     assert outcome.status == 0
     for example in EXAMPLES[verb]:
         assert example in outcome.out
+
+
+def test_help_says_how_a_shell_learns_the_words(phd_exp: Callable) -> None:
+    assert COMPLETION in phd_exp("--help").out
+    outcome = phd_exp("-sc", "install=bash")
+    assert outcome.status == 0
+    assert "complete -o nospace" in outcome.out
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("phd-exp model=mae_v", "model=mae_vz"),
+        ("phd-exp -m seed=0,1 experiment=table", "experiment=table1 experiment=table2"),
+        ("phd-exp render data=occl_", "data=occl_scale"),
+        ("phd-exp -m render shar", "shard="),
+        ("phd-exp predict ru", ""),
+    ],
+)
+def test_a_shell_asks_what_words_there_are(
+    phd_exp: Callable, monkeypatch: pytest.MonkeyPatch, line: str, offered: str
+) -> None:
+    monkeypatch.setenv("COMP_LINE", line)
+    outcome = phd_exp("-sc", "query=bash")
+    assert (outcome.status, outcome.out.strip(), outcome.err) == (0, offered, "")

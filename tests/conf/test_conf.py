@@ -31,7 +31,7 @@ def test_every_choice_of_every_group_is_a_valid_configuration(checked: Callable,
 
 
 @pytest.mark.parametrize(
-    "file", sorted(conf_folder().glob("*/*.yaml")), ids=lambda file: f"{file.parent.name}/{file.stem}"
+    "file", sorted(conf_folder().rglob("*.yaml")), ids=lambda file: f"{file.parent.name}/{file.stem}"
 )
 def test_every_file_opens_with_what_it_is(file: Any) -> None:
     lines = [line for line in file.read_text().splitlines() if line != "# @package _global_"]
