@@ -41,7 +41,7 @@ bench: $(INSTALLED)  ## quality and speed, each beside a named reference, in one
 	$(BIN)/python -m pytest tests/benchmarks -m bench
 
 docs: $(INSTALLED)  ## site/index.html: the ideas behind it, and the reference from docstrings
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict  # the variable keeps the theme from praising its successor
 
 clean:  ## forget .venv and caches; renders/ and runs/ stay
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

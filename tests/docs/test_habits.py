@@ -5,6 +5,7 @@ import tomllib
 from typing import Any
 
 import yaml
+from pre_commit.clientlib import load_config
 
 from tests.docs.pages import ROOT
 
@@ -13,7 +14,9 @@ CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text()
 
 
 def test_hooks_are_local_and_those_of_make_lint() -> None:
-    (repository,) = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
+    file = ROOT / ".pre-commit-config.yaml"
+    load_config(file)  # raises for what pre-commit would refuse
+    (repository,) = yaml.safe_load(file.read_text())["repos"]
     assert repository["repo"] == "local"
     assert all(hook["language"] == "system" for hook in repository["hooks"])
     lint = (ROOT / "Makefile").read_text().partition("\nlint:")[2].partition("\n\n")[0]

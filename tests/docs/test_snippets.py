@@ -15,6 +15,7 @@ from phd_exp.cli.sweep import plan
 from phd_exp.training.config import check, check_render
 from tests.docs.pages import PAGES, blocks, commands, name
 
+COMMANDS = {tuple(words): page for page in PAGES for words in commands(page)}
 CHECKS = {"train": ("config", check), "render": ("render", check_render)}
 
 
@@ -29,12 +30,9 @@ def test_python_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.Monke
             exec(compile("\n" * (block.line - 1) + block.text, str(page), "exec"), scope)
 
 
-@pytest.mark.parametrize(
-    ("page", "words"),
-    [pytest.param(page, words, id=" ".join(words)) for page in PAGES for words in commands(page)],
-)
+@pytest.mark.parametrize(("words", "page"), COMMANDS.items(), ids=map(" ".join, COMMANDS))
 def test_commands_are_those_of_this_programme(
-    page: Path, words: list[str], phd_exp: Callable, tmp_path: Path
+    words: tuple[str, ...], page: Path, phd_exp: Callable, tmp_path: Path
 ) -> None:
     verb = words[0] if words and words[0] in VERBS else "train"
     if any(word.startswith("--") for word in words):
