@@ -50,9 +50,8 @@ def certify(views: Views, u: Unknown, lam: Float[Tensor, "cameras problems"]) ->
     error = total(torch.where(kink, 3 * views.a * (seen[2] - 1).abs(), 0), 0)
     distance = torch.full_like(pull, torch.inf)
     left = torch.arange(len(pull), device=pull.device)
-    for (
-        radius
-    ) in _RADII:  # a larger ball has less curvature, and so a larger bound: the first to hold is the best
+    # a larger ball has less curvature, and so a larger bound: the first to hold is the best
+    for radius in _RADII:
         part = (views.subset(left), seen[..., left], lam[:, left], kink[:, left])
         bound = _distance(*part, radius, G[:, left], error[left])
         holds = bound <= radius
