@@ -40,7 +40,7 @@ class Decoder:
         side: of the network's square image, pixels.
         head: "ProjectedHuber", or the chart of a baseline: "Projected", "LogDepth" or "Cartesian".
         mu_z0: depth per focal length, metres per pixel.
-        D: half the range of depth per focal length, a factor.
+        D: the data set's depth range, a factor either way.
         z_centre: middle of the range of depth, metres.
         xy_unit: of a Cartesian chart, metres.
         constant_f: the focal length that the network was told for every image; None: the true one.

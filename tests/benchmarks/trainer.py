@@ -70,9 +70,8 @@ def configured(*overrides: str) -> RunConfig:
 
 def main(kind: str, folder: Path, epochs: int, overrides: list[str]) -> None:
     config = configured(f"trainer.max_epochs={epochs}", *overrides)
-    data = (
-        PositionData(Noise(config), batch_size=config.data.batch_size, seed=0) if kind == "bare" else build_data(config)
-    )
+    noise = PositionData(Noise(config), batch_size=config.data.batch_size, seed=0)
+    data = noise if kind == "bare" else build_data(config)
     data.setup()
     module = build_module(config, data)
     folder.mkdir(parents=True, exist_ok=True)
