@@ -19,8 +19,10 @@ from phd_exp.cli.arguments import (
     with_progress,
 )
 from phd_exp.records.detections import Detection, detection_of, detections_in
-from phd_exp.records.errors import ConfigError, UserError
-from phd_exp.records.files import write_atomic
+from phd_exp.records.errors import ConfigError, RunError, UserError
+from phd_exp.records.files import read_plain, write_atomic
+from phd_exp.records.parsing import parse_json
+from phd_exp.records.runs import RunFolder
 
 if TYPE_CHECKING:  # seconds of imports, which a mistake need not wait for
     from phd_exp.inference.predictor import Predictor
@@ -43,6 +45,7 @@ class PredictArguments(Arguments):
     box: tuple[float, float, float, float] | None = None
     out: Path | None = None
     recalibrate: bool = False
+    calibration: bool = False
 
     @field_validator("box", mode="before")
     @classmethod
@@ -62,6 +65,8 @@ class PredictArguments(Arguments):
             raise ValueError(
                 f"{given[0]}: belongs to image=FILE; of a folder each line of metadata.jsonl says it"
             )
+        if self.calibration and self.out is None:
+            raise ValueError("calibration: is drawn into the pictures; expected out=DIR too")
         return self
 
     def detections(self) -> list[Detection]:
@@ -94,7 +99,8 @@ def _predict(arguments: PredictArguments, detections: list[Detection]) -> None:
 
     predictor = load(arguments.run, recalibrate=arguments.recalibrate)
     say_if_unfinished(arguments.run, predictor.state)
-    lines = _answers(predictor, detections, arguments.out)
+    curve = _depth_curve(arguments.run) if arguments.calibration else None
+    lines = _answers(predictor, detections, arguments.out, curve)
     if arguments.out is None:
         for line in lines:
             print(line, flush=True)
@@ -104,7 +110,23 @@ def _predict(arguments: PredictArguments, detections: list[Detection]) -> None:
         print(f"{file}, and a picture beside it for each line", file=sys.stderr)
 
 
-def _answers(predictor: "Predictor", detections: list[Detection], out: Path | None) -> Iterator[str]:
+def _depth_curve(run: Path) -> dict[str, Any]:
+    """What the run recorded of its test samples. Raises RunError where there is none, as of a baseline."""
+    file = RunFolder(run).curves("final")
+    try:
+        curve = parse_json(read_plain(file).decode())["depth"]
+        if {"predicted", "empirical", "window", "left_out"} <= curve.keys():
+            return dict(curve)
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        pass
+    raise RunError(
+        f"{file}: no calibration curve of depth; expected a finished run of a model with a density"
+    )
+
+
+def _answers(
+    predictor: "Predictor", detections: list[Detection], out: Path | None, curve: dict[str, Any] | None
+) -> Iterator[str]:
     """The JSON lines; pictures are drawn on the way."""
     from phd_exp.inference.answers import answer
     from phd_exp.inference.sightings import sightings
@@ -112,14 +134,14 @@ def _answers(predictor: "Predictor", detections: list[Detection], out: Path | No
     names = iter(_picture_names(detections))
     for sighting in with_progress(sightings(predictor, detections), len(detections), "predicting"):
         if out is not None:
-            _draw(sighting, out / next(names))
+            _draw(sighting, out / next(names), curve)
         yield json.dumps(answer(sighting, predictor.temperature), allow_nan=False)
 
 
-def _draw(sighting: "Sighting", file: Path) -> None:
+def _draw(sighting: "Sighting", file: Path, curve: dict[str, Any] | None) -> None:
     from phd_exp.inference.pictures import picture
 
-    write_atomic(file, picture(sighting))
+    write_atomic(file, picture(sighting, curve))
 
 
 def _picture_names(detections: list[Detection]) -> list[str]:

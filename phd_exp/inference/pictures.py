@@ -1,5 +1,8 @@
 """The paper's first figure for one sighting: level curves on the image, and from above."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
@@ -8,7 +11,7 @@ from matplotlib.figure import Figure
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.inference.sightings import Sighting
 from phd_exp.inference.views import View
-from phd_exp.reports.figures import encoded
+from phd_exp.reports.figures import draw_curve, encoded
 from phd_exp.reports.level_curves import LevelCurves, draw_birds_eye, level_curves
 
 LARGEST = 1024
@@ -18,13 +21,19 @@ MARGIN = 0.5
 _AMBER = "#ffb000"
 
 
-def picture(sighting: Sighting) -> bytes:
-    """A PNG: the image with the curves of 50, 90 and 99 %, and the bird's-eye view; of a baseline the point alone."""
+def picture(sighting: Sighting, calibration: Mapping[str, Any] | None = None) -> bytes:
+    """A PNG: the image with the curves of 50, 90 and 99 %, and the bird's-eye view; of a baseline the point alone.
+
+    With the calibration curve of depth that the run recorded on its test samples, that comes third.
+    """
     curves = level_curves(sighting.prediction) if isinstance(sighting.prediction, ProjectedHuber) else None
-    figure = Figure(figsize=(9.0 if curves else 4.6, 4.4), layout="constrained")
-    _draw_image(figure.add_subplot(1, 2 if curves else 1, 1), sighting, curves)
+    panels = 1 + (curves is not None) + (calibration is not None)
+    figure = Figure(figsize=(4.6 if panels == 1 else 4.5 * panels, 4.4), layout="constrained")
+    _draw_image(figure.add_subplot(1, panels, 1), sighting, curves)
+    if calibration:
+        draw_curve(figure.add_subplot(1, panels, panels), "depth", calibration)
     if curves:
-        axes = figure.add_subplot(1, 2, 2)
+        axes = figure.add_subplot(1, panels, 2)
         draw_birds_eye(axes, curves, _truth(sighting))
         if sighting.view.is_turned:
             axes.set(xlabel="x (m), camera turned to the box", ylabel="z (m), camera turned to the box")

@@ -24,7 +24,7 @@ def draw_calibration(curves: Mapping[str, Mapping[str, Any]], file: Path) -> Non
     """
     figure = Figure(figsize=(4.2 * len(curves), 4.2), layout="constrained")
     for place, (name, curve) in enumerate(curves.items()):
-        _draw_curve(figure.add_subplot(1, len(curves), place + 1), name, curve)
+        draw_curve(figure.add_subplot(1, len(curves), place + 1), name, curve)
     write_atomic(file, encoded(figure, "png", dpi=120))
 
 
@@ -44,7 +44,8 @@ def encoded(figure: Figure, kind: str, dpi: int) -> bytes:
     return buffer.getvalue()
 
 
-def _draw_curve(axes: Axes, name: str, curve: Mapping[str, Any]) -> None:
+def draw_curve(axes: Axes, name: str, curve: Mapping[str, Any]) -> None:
+    """Draw one of them: of `depth` or of `projected`."""
     title, unit = LABELS[name]
     predicted, empirical = curve["predicted"], curve["empirical"]
     values = [value for value in (*predicted, *empirical) if value > 0]

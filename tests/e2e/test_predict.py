@@ -220,6 +220,19 @@ def test_from_python_arrays_of_any_size(run: RunFolder, renders: Path) -> None:
             predictor(images, f=f)
 
 
+def test_how_well_a_run_knows_itself_stands_beside_its_predictions(
+    phd_exp: Callable, own_run: RunFolder, baseline: RunFolder, photos: Path, tmp_path: Path
+) -> None:
+    folder = f"folder={photos / 'test'}"
+    for out, words, panels in (("plain", (), 2), ("more", ("calibration=true",), 3)):
+        assert phd_exp("predict", f"run={own_run.path}", folder, f"out={out}", *words).status == 0
+        with Image.open(tmp_path / out / "0.png") as picture:
+            assert picture.width == panels * 540
+    refused = phd_exp("predict", f"run={baseline.path}", folder, "out=more", "calibration=true")
+    assert refused.status == 1
+    assert "final.json: no calibration curve of depth" in refused.err
+
+
 def test_of_a_baseline_python_gets_points(baseline: RunFolder) -> None:
     prediction = package.load(baseline.path)(np.zeros((64, 64, 3), dtype=np.uint8), f=300.0)
     assert isinstance(prediction, PointEstimate)
@@ -246,6 +259,7 @@ MISTAKES = [
     (("imag=good.png",), "imag: unknown key, did you mean 'image'?"),
     (("good.png",), "good.png: expected key=value"),
     (("image=good.png", "f=400", "out=good.png/x"), "good.png/x: cannot be written"),
+    (("image=good.png", "f=400", "calibration=true"), "calibration: is drawn into the pictures; expected out="),
 ]
 
 
