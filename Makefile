@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all lint bench clean
+.PHONY: help install demo test test-all lint bench notebooks clean
 
 help:  ## what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -39,6 +39,9 @@ test-all: lint  ## the slow tests too
 
 bench: $(INSTALLED)  ## quality and speed, each beside a named reference, in one run
 	$(BIN)/python -m pytest tests/benchmarks -m bench
+
+notebooks: $(INSTALLED)  ## execute the notebooks, minutes; what runs and data sets are missing takes more
+	$(BIN)/python notebooks/execute.py
 
 clean:  ## forget .venv and caches; renders/ and runs/ stay
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
