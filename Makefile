@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all lint bench docs clean
+.PHONY: help install demo test test-all lint bench docs notebooks clean
 
 help:  ## what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -42,6 +42,9 @@ bench: $(INSTALLED)  ## quality and speed, each beside a named reference, in one
 
 docs: $(INSTALLED)  ## site/index.html: the ideas behind it, and the reference from docstrings
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict  # the variable keeps the theme from praising its successor
+
+notebooks: $(INSTALLED)  ## execute the notebooks, minutes; what runs and data sets are missing takes more
+	$(BIN)/python notebooks/execute.py
 
 clean:  ## forget .venv and caches; renders/ and runs/ stay
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

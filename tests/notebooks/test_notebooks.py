@@ -1,0 +1,112 @@
+"""The notebooks are what they say they are, prose and calls with their outputs, and they run."""
+
+import ast
+import json
+import re
+import runpy
+from pathlib import Path
+
+import nbformat
+import pytest
+
+ROOT = Path(__file__).parents[2]
+FILES = sorted((ROOT / "notebooks").glob("*.ipynb"))
+NAMES = [file.name for file in FILES]
+LARGEST = 1_500_000
+"""Bytes of all notebooks together, outputs included."""
+ABSOLUTE = re.compile(r"(?<![\w.~:/<>*-])/(?:home|root|tmp|usr|opt|work|mnt|var|Users)/|[A-Z]:\\\\")
+DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+
+
+def read(file: Path) -> nbformat.NotebookNode:
+    return nbformat.read(file, as_version=4)
+
+
+def code_of(file: Path) -> list[nbformat.NotebookNode]:
+    return [cell for cell in read(file).cells if cell.cell_type == "code"]
+
+
+def defines(source: str) -> bool:
+    nodes = list(ast.walk(ast.parse(source)))
+    assigned = [node.value for node in nodes if isinstance(node, ast.Assign | ast.AnnAssign | ast.NamedExpr)]
+    return any(isinstance(node, DEFINITIONS) for node in nodes) or any(
+        isinstance(value, ast.Lambda) for value in assigned
+    )
+
+
+def test_they_are_numbered() -> None:
+    assert [name[:3] for name in NAMES] == [f"{place:02d}_" for place in range(1, len(NAMES) + 1)] != []
+
+
+@pytest.mark.parametrize(
+    "source", ["def f(): pass", "class A: pass", "f = lambda: 1", "if 1:\n  def f(): pass"]
+)
+def test_a_definition_is_seen(source: str) -> None:
+    assert defines(source)
+
+
+def test_a_call_is_no_definition() -> None:
+    assert not defines("figure = draw(sorted([1], key=lambda x: -x))")
+
+
+@pytest.mark.parametrize("file", FILES, ids=NAMES)
+def test_a_notebook_is_valid_short_and_defines_nothing(file: Path) -> None:
+    notebook = read(file)
+    nbformat.validate(notebook)
+    assert 10 <= len(notebook.cells) <= 25
+    assert notebook.cells[0].cell_type == "markdown"
+    assert "At the end one will have understood" in notebook.cells[0].source
+    assert not [cell.source for cell in code_of(file) if defines(cell.source)]
+
+
+@pytest.mark.parametrize("file", FILES, ids=NAMES)
+def test_it_was_executed_from_top_to_bottom_without_an_error(file: Path) -> None:
+    cells = code_of(file)
+    assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
+    outputs = [output for cell in cells for output in cell.outputs]
+    assert sum("image/png" in output.get("data", {}) for output in outputs) >= 3
+    assert not [
+        output for output in outputs if output.output_type == "error" or output.get("name") == "stderr"
+    ]
+
+
+@pytest.mark.parametrize("file", FILES, ids=NAMES)
+def test_it_says_nothing_of_when_and_where(file: Path) -> None:
+    notebook = read(file)
+    assert set(notebook.metadata) == {"kernelspec", "language_info"}
+    assert notebook.metadata.kernelspec.name == "python3"
+    assert not any(cell.metadata for cell in notebook.cells)
+    for cell in notebook.cells:
+        for output in cell.get("outputs", []):
+            output.get("data", {}).pop("image/png", None)
+    assert not ABSOLUTE.search(json.dumps(notebook))
+
+
+def test_an_absolute_path_is_seen() -> None:
+    assert all(ABSOLUTE.search(text) for text in ("'/home/me/runs'", "at /tmp/x.png", "C:\\\\runs"))
+    assert not ABSOLUTE.search("runs/small, m/px and </td>")
+
+
+def test_all_together_are_light() -> None:
+    assert sum(file.stat().st_size for file in FILES) < LARGEST
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_they_run_on_nothing_at_smoke_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In an empty folder, one after the other, so that the data sets and runs they share are made once."""
+    monkeypatch.setenv("PHD_EXP_PRESET", "smoke")
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    execute = runpy.run_path(str(ROOT / "notebooks" / "execute.py"))["execute"]
+    for file in FILES:
+        notebook = read(file)
+        execute(notebook, tmp_path)
+        figures = [
+            output
+            for cell in notebook.cells
+            for output in cell.get("outputs", [])
+            if "image/png" in output.get("data", {})
+        ]
+        assert len(figures) >= 3, file.name
+    assert not [path for path in (ROOT / "notebooks").iterdir() if path.name in {"renders", "runs"}]
