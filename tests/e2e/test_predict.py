@@ -259,7 +259,10 @@ MISTAKES = [
     (("imag=good.png",), "imag: unknown key, did you mean 'image'?"),
     (("good.png",), "good.png: expected key=value"),
     (("image=good.png", "f=400", "out=good.png/x"), "good.png/x: cannot be written"),
-    (("image=good.png", "f=400", "calibration=true"), "calibration: is drawn into the pictures; expected out="),
+    (
+        ("image=good.png", "f=400", "calibration=true"),
+        "calibration: is drawn into the pictures; expected out=",
+    ),
 ]
 
 
