@@ -91,8 +91,15 @@ def test_calibration_as_data_and_as_pictures(train: Callable, tmp_path: Path) ->
             assert picture.size[0] > 500
 
 
-def test_wandb_beside_the_record(train: Callable, tmp_path: Path) -> None:
+def test_wandb_beside_the_record(
+    train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And nowhere else: neither at home nor in the environment of the next run."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    before = dict(os.environ)
     assert train("model=probabilistic").status == 0
+    assert not list((tmp_path / "home").rglob("*wandb*"))
+    assert {name for name in os.environ if name.startswith("WANDB_")} - before.keys() == set()
     run = only_run(tmp_path / "runs")
     (offline,) = (run.path / "wandb").glob("offline-run-*")
     assert list(offline.glob("run-*.wandb"))
