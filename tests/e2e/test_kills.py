@@ -60,6 +60,11 @@ def begun(verb: str) -> Callable[[list[str]], BaseProcess]:
     return begin
 
 
+def end(process: BaseProcess) -> None:
+    process.join()
+    assert process.exitcode == 0
+
+
 def contents(out: Path) -> dict[str, bytes]:
     """Every file, by its path, without those that have not their name yet."""
     files = [path for path in out.rglob("*") if path.is_file() and path.suffix != ".tmp"]
@@ -70,9 +75,9 @@ def leftovers(out: Path) -> list[Path]:
     return list(out.rglob(".*.tmp"))
 
 
-def kill_amid_writing(process: BaseProcess, out: Path, moments: random.Random) -> bool:
-    """After a few more files and a moment; False where it ended before."""
-    before, enough = written(out), moments.randint(1, 6)
+def kill_amid_writing(process: BaseProcess, out: Path, most: int, moments: random.Random) -> bool:
+    """After a few more files, at `most` so many, and a moment; False where it ended before."""
+    before, enough = written(out), moments.randint(1, most)
     deadline = time.monotonic() + PATIENCE
     while process.is_alive() and len(written(out) - before) < enough:
         assert time.monotonic() < deadline, "waited too long"
@@ -134,15 +139,16 @@ def test_killed_at_any_moment_it_leaves_whole_files_and_ends_as_undisturbed(
 ) -> None:
     """Each file that is there is, to the byte, the one that an undisturbed process writes."""
     undisturbed, out = tmp_path / "undisturbed", tmp_path / "out"
-    assert main(command(undisturbed)) == 0
+    end(begun(command(undisturbed)))
     whole = contents(undisturbed)
     for name in whole:
         require_whole(undisturbed / name)
     moments, kills, torn = random.Random(0), 0, 0
     before: dict[str, bytes] = {}
+    most = min(6, len(whole) + 1)  # a file is seen without its name, and with it
     while kills < KILLS:
         process = begun(command(out))
-        if kill_amid_writing(process, out, moments):
+        if kill_amid_writing(process, out, most, moments):
             kills += 1
             torn += len(leftovers(out)) > 0
             now = contents(out)
@@ -154,6 +160,6 @@ def test_killed_at_any_moment_it_leaves_whole_files_and_ends_as_undisturbed(
             shutil.rmtree(out)
             before = {}
     assert torn, "a kill has met a file that was being written"
-    assert main(command(out)) == 0
+    end(begun(command(out)))
     assert contents(out) == whole
     assert not leftovers(out)

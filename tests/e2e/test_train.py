@@ -91,9 +91,7 @@ def test_calibration_as_data_and_as_pictures(train: Callable, tmp_path: Path) ->
             assert picture.size[0] > 500
 
 
-def test_wandb_beside_the_record(
-    train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_wandb_beside_the_record(train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And nowhere else: neither at home nor in the environment of the next run."""
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     before = dict(os.environ)

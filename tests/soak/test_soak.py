@@ -1,7 +1,7 @@
 """One process renders 500 images and trains 200 runs, one render worker makes 500: neither grows, nothing is left.
 
-The whole takes about a quarter of an hour on one core of a busy machine; SOAK_SHARE=0.2 in the environment takes a
-fifth of it. `pytest -s` shows the figures.
+The first took 30 minutes on two cores that four times as many processes used; SOAK_SHARE=0.2 in the environment asks
+for a fifth of both. `pytest -s` shows the figures.
 """
 
 import json
