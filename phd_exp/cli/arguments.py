@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
 from phd_exp.records.errors import ConfigError, in_our_words, nearest
+from phd_exp.records.files import remove_temporaries
 
 Arguments_ = TypeVar("Arguments_", bound="Arguments")
 Item = TypeVar("Item")
@@ -50,6 +51,7 @@ def output_folder(out: Path) -> Path:
     """A folder to write into, made if missing. Raises ConfigError where that cannot be."""
     try:
         out.mkdir(parents=True, exist_ok=True)
+        remove_temporaries(out)  # of a process that was killed
     except OSError as error:
         raise ConfigError(f"{out}: cannot be written ({error.strerror}); choose another by out=") from None
     return out

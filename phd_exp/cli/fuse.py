@@ -18,12 +18,9 @@ from phd_exp.cli.arguments import (
     with_progress,
 )
 from phd_exp.records.detections import Detection, detections_in
-from phd_exp.records.errors import ConfigError, UserError
+from phd_exp.records.errors import ConfigError, UserError, listed
 from phd_exp.records.files import write_atomic
 from phd_exp.records.observed import Observed, observed
-
-NAMED = 5
-"""How many of the scenes that failed are named."""
 
 
 class FuseArguments(Arguments):
@@ -60,10 +57,9 @@ def main(words: list[str]) -> int:
         return 1
     failed = [str(answer["scene"]) for answer in answers if answer["status"] != "fused"]
     if failed:
-        rest = f" and {len(failed) - NAMED} more" if len(failed) > NAMED else ""
         print(
             f"error: {len(failed)} of {len(answers)} scenes have no fused position: "
-            f"{', '.join(failed[:NAMED])}{rest}; the line of each says why",
+            f"{listed(failed)}; the line of each says why",
             file=sys.stderr,
         )
     return 1 if failed else 0

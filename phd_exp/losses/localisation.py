@@ -22,7 +22,8 @@ def localisation_loss(
     """
     rows, columns = log_heat.shape[1:]
     y, x = _shares(v_p[:, 1], rows), _shares(v_p[:, 0], columns)
-    return -torch.einsum("bij,bi,bj->b", log_heat, y, x).mean()
+    # no einsum, which autocast would round to bfloat16
+    return -(log_heat * y[:, :, None] * x[:, None, :]).sum((1, 2)).mean()
 
 
 def _shares(place: Float[Tensor, " batch"], n: int) -> Float[Tensor, "batch n"]:

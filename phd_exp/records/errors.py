@@ -1,10 +1,12 @@
 """The errors a user can mend: each is one line that says what, where, what was expected and what to do."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 LONGEST_VALUE = 120
 """Characters of a value that a message repeats."""
+NAMED = 5
+"""Names that a message lists."""
 
 
 class UserError(Exception):
@@ -17,6 +19,12 @@ class ConfigError(UserError):
 
 class RunError(UserError):
     """A run folder that cannot be used: held by another process, made by another configuration, or broken."""
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names as they stand in a message: of many the first."""
+    rest = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return f"{', '.join(names[:NAMED])}{rest}"
 
 
 def nearest(key: str, valid: Iterable[str]) -> str:

@@ -1,7 +1,9 @@
 """Files that are whole or absent: atomic writing, and journals that survive being cut off."""
 
 import errno
+import fcntl
 import os
+import re
 import stat
 import uuid
 from collections.abc import Callable
@@ -15,7 +17,8 @@ from phd_exp.records.parsing import parse_json
 
 Parsed = TypeVar("Parsed")
 
-TEMPORARY_SUFFIX = ".tmp"
+_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{32}\.tmp", re.DOTALL)
+"""What `write_atomic` calls a file that has not its name yet."""
 MB = 10**6
 LARGEST_RECORD = 16 * MB
 """Bytes of a file that is read whole; the longest that are written here have a few thousand."""
@@ -52,19 +55,22 @@ def write_atomic(path: Path | str, data: bytes | str) -> None:
     """Write `data` to `path` so that a reader finds the old content or the new, never a part.
 
     The bytes go to a hidden temporary file in the same folder (a rename is atomic within one file system
-    only), reach the disk, and then take the name. The temporary file is removed if anything fails.
+    only), reach the disk, and then take the name. The temporary file is removed if anything fails. It is locked as
+    long as its writer lives, which tells `remove_temporaries` what a killed one left.
 
     Raises:
         OSError: the folder is missing or unwritable, or the disk is full; `path` is then unchanged.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}{TEMPORARY_SUFFIX}")
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
         with open(temporary, "xb") as stream:
+            with suppress(OSError):  # a file system without locks, where nothing is removed either
+                fcntl.flock(stream, fcntl.LOCK_SH)
             stream.write(data.encode() if isinstance(data, str) else data)
             stream.flush()
             os.fsync(stream.fileno())
-        os.replace(temporary, path)
+            os.replace(temporary, path)
     except BaseException as error:
         with suppress(OSError):
             temporary.unlink()
@@ -77,8 +83,16 @@ def write_atomic(path: Path | str, data: bytes | str) -> None:
 
 def remove_temporaries(folder: Path) -> None:
     """Remove what `write_atomic` left in `folder` when its process was killed half-way."""
-    for leftover in folder.glob(f".*{TEMPORARY_SUFFIX}"):
-        leftover.unlink(missing_ok=True)
+    for path in folder.glob(".*.tmp"):
+        if _TEMPORARY.fullmatch(path.name) and path.is_file() and not path.is_symlink():
+            with suppress(OSError):  # its writer lives, or has renamed it since
+                _remove_unless_locked(path)
+
+
+def _remove_unless_locked(path: Path) -> None:
+    with open(path, "r+b") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        path.unlink()
 
 
 def open_journal(path: Path) -> TextIO:

@@ -19,7 +19,7 @@ from phd_exp.metrics.binned import Calibration
 from phd_exp.metrics.means import Means
 from phd_exp.models.heads import Prediction
 from phd_exp.models.regressor import Regressor
-from phd_exp.records.errors import RunError
+from phd_exp.records.errors import RunError, listed
 from phd_exp.training.predictions import columns, quantities, quantity_names
 
 
@@ -103,14 +103,23 @@ class PositionModule(LightningModule):
                 seen.log_heat, projected(batch.xyz, batch.camera)
             )
         if not total.isfinite():
-            raise RunError(
-                f"loss is {total.item()} in epoch {self.current_epoch}, at {split} samples {batch.row.tolist()}; "
-                "the last checkpoint is whole: lower optimizer.lr, or look at these images"
-            )
+            raise self._not_finite(total, prediction, batch, split)
         with torch.no_grad():
             losses = {"loss": loss.expand(len(batch))}
             self._means(split).update(losses | quantities(prediction, batch.xyz))
         return total, prediction
+
+    def _not_finite(self, total: Tensor, prediction: Prediction, batch: Batch, split: str) -> RunError:
+        """What to say of a loss: whose numbers are not finite, or all samples where their sum alone is not."""
+        values = torch.stack(list(quantities(prediction, batch.xyz).values()))
+        is_bad = ~values.isfinite().all(dim=0)
+        rows = batch.row[is_bad if is_bad.any() else slice(None)].tolist()
+        files = self.trainer.datamodule.source.known(split)["file_name"]  # type: ignore[attr-defined]
+        return RunError(
+            f"loss is {total.item()} in epoch {self.current_epoch + 1}/{self.trainer.max_epochs}, at {split} samples "
+            f"{listed([files[row] for row in rows])}; the last checkpoint is whole: lower optimizer.lr, or look at "
+            "these images"
+        )
 
     def _means(self, split: str) -> Any:
         return self.means[f"{split}_means"]

@@ -5,10 +5,14 @@ import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import wandb
 from lightning.pytorch.loggers import WandbLogger
+from wandb.sdk.artifacts.artifact_instance_cache import (
+    artifact_instance_cache_by_client_id as tables_of_wandb,
+)
 
 from phd_exp.records.runs import RunFolder, epoch_name
 from phd_exp.training.config import RunConfig
@@ -23,13 +27,14 @@ def tracked(config: RunConfig, folder: RunFolder) -> Iterator["Tracker | None"]:
     if config.logger.kind == "none":
         yield None
         return
-    run = _begin(config, folder)
-    try:
-        yield Tracker(run, folder)
-    except BaseException:
-        run.finish(exit_code=1)
-        raise
-    run.finish()
+    with _everything_in(folder.wandb):
+        run = _begin(config, folder)
+        try:
+            yield Tracker(run, folder)
+        except BaseException:
+            run.finish(exit_code=1)
+            raise
+        run.finish()
 
 
 class Tracker:
@@ -69,6 +74,31 @@ class Tracker:
     def send_results(self, results: Mapping[str, Any]) -> None:
         """Let the final numbers stand in the summary of the run."""
         self.run.summary.update(dict(results))
+
+
+@contextmanager
+def _everything_in(place: Path) -> Iterator[None]:
+    """Have wandb keep in `place` what it would leave at home: tables that `wandb sync` sends, logs of its service.
+
+    The service is told when it starts. So each run has one of its own, which is ended, and what it holds in memory.
+    """
+    told = [name for name in ("WANDB_DATA_DIR", "WANDB_CACHE_DIR") if name not in os.environ]
+    os.environ.update(dict.fromkeys(told, str(place.absolute())))
+    try:
+        yield
+    finally:
+        wandb.teardown()
+        _remove_temporary_tables()
+        for name in told:
+            del os.environ[name]
+
+
+def _remove_temporary_tables() -> None:
+    """Remove the files from which wandb copied its tables; it would keep the last hundred till the process ends."""
+    for table in tables_of_wandb.values():
+        if table._tmp_dir is not None:
+            table._tmp_dir.cleanup()
+    tables_of_wandb.clear()
 
 
 def _begin(config: RunConfig, folder: RunFolder) -> wandb.Run:

@@ -123,6 +123,34 @@ def test_float32_is_near_float64(scale: float) -> None:
         torch.testing.assert_close(near_slope.double(), slope, rtol=1e-3, atol=1e-4)
 
 
+def of_any_size(n: int, equal_eigenvalues: bool) -> torch.Tensor:
+    """Raw numbers of any sign from 1e-4 to 1e4, in float32, as the network's last layer gives them."""
+    random = torch.Generator().manual_seed(12)
+    size = 10 ** (8 * torch.rand(n, 7, generator=random) - 4)
+    raw = size * torch.randn(n, 7, generator=random).sign()
+    if equal_eigenvalues:
+        raw[:, 3], raw[:, 4] = 0, raw[:, 2]
+    return raw
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [EXTREMES, of_any_size(2000, equal_eigenvalues=False), of_any_size(2000, equal_eigenvalues=True)],
+    ids=["extremes", "any size", "equal eigenvalues"],
+)
+def test_bfloat16_autocast_rounds_nothing_of_the_loss_and_its_gradient(raw: torch.Tensor) -> None:
+    """At positions on the edge of the field; as in training, where the backbone alone may be rounded."""
+    raw = raw.clone().requires_grad_()
+    for xyz in data_set_positions().float():
+        with torch.autocast("cpu", torch.bfloat16):
+            value = loss(raw, xyz)
+        (gradient,) = torch.autograd.grad(value.sum(), raw)
+        assert value.isfinite().all()
+        assert gradient.isfinite().all()
+        (plain,) = torch.autograd.grad(loss(raw, xyz).sum(), raw)
+        torch.testing.assert_close(gradient, plain, rtol=0, atol=0)
+
+
 def data_set_positions() -> torch.Tensor:
     """Positions with |v_p| <= 1 in each coordinate and z_p in [1/D, D] for D = 5/3, all of them at their extremes."""
     corners = torch.tensor(

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -90,8 +91,13 @@ def test_calibration_as_data_and_as_pictures(train: Callable, tmp_path: Path) ->
             assert picture.size[0] > 500
 
 
-def test_wandb_beside_the_record(train: Callable, tmp_path: Path) -> None:
+def test_wandb_beside_the_record(train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And nowhere else: neither at home nor in the environment of the next run."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    before = dict(os.environ)
     assert train("model=probabilistic").status == 0
+    assert not list((tmp_path / "home").rglob("*wandb*"))
+    assert {name for name in os.environ if name.startswith("WANDB_")} - before.keys() == set()
     run = only_run(tmp_path / "runs")
     (offline,) = (run.path / "wandb").glob("offline-run-*")
     assert list(offline.glob("run-*.wandb"))
@@ -312,7 +318,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_with_the_samples(train: Callabl
     assert outcome.status == 1
     (line,) = [line for line in outcome.err.splitlines() if line.startswith("error: ")]
     assert "loss is " in line
-    assert "samples [" in line
+    assert re.search(r"in epoch 1/2, at (train|test) samples 0000\d\d\.png, .* and \d more; the last", line)
     assert "lower optimizer.lr" in line
 
 

@@ -55,3 +55,14 @@ def test_descending_finds_the_place() -> None:
         optimizer.step()
     heat = scores.detach().softmax(-1).view(1, 5, 8)
     assert_close(torch.einsum("bij,cij->bc", heat, cells(5, 8)), place, atol=0.01, rtol=0)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e4])
+def test_bfloat16_autocast_rounds_nothing(scale: float) -> None:
+    random = torch.Generator().manual_seed(0)
+    log_heat = (scale * torch.randn(4, 40, generator=random)).log_softmax(-1).unflatten(1, (5, 8))
+    v_p = 2 * torch.rand(4, 2, generator=random) - 1
+    with torch.autocast("cpu", torch.bfloat16):
+        value = localisation_loss(log_heat, v_p)
+    assert value.isfinite()
+    assert_close(value, localisation_loss(log_heat, v_p), rtol=0, atol=0)

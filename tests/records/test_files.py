@@ -53,10 +53,18 @@ def test_leftovers_of_killed_writers_are_removed_and_nothing_else(tmp_path: Path
     )
     subprocess.run([sys.executable, "-c", script], cwd=Path(__file__).parents[2], check=False)
     (leftover,) = tmp_path.iterdir()
-    (tmp_path / "kept").write_text("")
+    kept = [tmp_path / "kept", tmp_path / ".of-another.tmp"]
+    for path in kept:
+        path.write_text("")
     remove_temporaries(tmp_path)
     assert not leftover.exists()
-    assert (tmp_path / "kept").exists()
+    assert all(path.exists() for path in kept)
+
+
+def test_what_is_being_written_is_no_leftover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "fsync", lambda _: remove_temporaries(tmp_path))
+    write_atomic(tmp_path / "file", "new")
+    assert (tmp_path / "file").read_text() == "new"
 
 
 def test_a_journal_goes_on_after_a_torn_line(tmp_path: Path) -> None:

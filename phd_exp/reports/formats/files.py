@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from phd_exp.records.errors import UserError
-from phd_exp.records.files import write_atomic
+from phd_exp.records.files import remove_temporaries, write_atomic
 from phd_exp.reports.formats.latex import latex
 from phd_exp.reports.formats.markdown import markdown
 from phd_exp.reports.formats.tidy import tidy
@@ -51,6 +51,7 @@ def _folder(out: Path) -> Iterator[Path]:
     folder = out / "tables"
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        remove_temporaries(folder)  # of a process that was killed
         yield folder
     except OSError as error:
         raise UserError(

@@ -10,7 +10,7 @@ import torch
 from plotly.offline import get_plotlyjs
 
 from phd_exp.records.errors import RunError, UserError
-from phd_exp.records.files import write_atomic
+from phd_exp.records.files import remove_temporaries, write_atomic
 from phd_exp.reports.collect import Records, Run, collect
 from phd_exp.reports.site.dossier import Dossier, read_dossier, read_predictions, slug_of
 from phd_exp.reports.site.figures import (
@@ -62,6 +62,8 @@ class SiteFolder:
         """Make the folders that are missing. Raises OSError."""
         for name in ("runs", "data", "images", "assets"):
             (self.path / name).mkdir(parents=True, exist_ok=True)
+        for folder in (self.path, *filter(Path.is_dir, self.path.rglob("*"))):
+            remove_temporaries(folder)  # of a process that was killed
 
 
 def build_site(runs: Path, out: Path) -> Path:
@@ -140,6 +142,7 @@ def _gallery(dossier: Dossier, images: Path) -> Gallery | None:
 
 def _write_figures(site: SiteFolder, records: Records, found: Sequence[RunData], figures: Path) -> list[str]:
     """Draw the figures of every preset in which a run has changed since; names of all that are there."""
+    remove_temporaries(figures)
     folders = {slug_of(run): run.folder for run in records.runs}
     names: list[str] = []
     for preset, group in groupby(first_seeds(found), key=lambda run: run.preset):

@@ -39,9 +39,12 @@ def first_seeds(runs: Iterable[RunData]) -> list[RunData]:
 
 
 def write_figures(preset: str, runs: Sequence[RunData], folder: Path) -> list[Path]:
-    """Calibration and precision of a preset, a line a run: `{calibration,precision}-<preset>.{png,pdf}`."""
+    """Precision and calibration of a preset, a line a run: `{precision,calibration}-<preset>.{png,pdf}`.
+
+    The calibration as PDF comes last, because it says that the others are there.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    drawn = {CALIBRATION: _calibration(runs), PRECISION: _precision(runs)}
+    drawn = {PRECISION: _precision(runs), CALIBRATION: _calibration(runs)}
     return [
         file
         for name, figure in drawn.items()

@@ -10,6 +10,8 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 from phd_exp.records.errors import UserError
+from phd_exp.records.files import write_atomic
+from phd_exp.reports import figures
 from phd_exp.reports.collect import collect
 from phd_exp.reports.site import build
 from phd_exp.reports.site.build import build_site
@@ -193,6 +195,29 @@ def test_a_report_that_is_killed_leaves_the_old_pages(own: Path, monkeypatch: py
     assert _pages(site) == sorted(before)
 
 
+def test_figures_that_a_kill_prevented_are_drawn_by_the_next_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_run(tmp_path / "runs", n=40, epochs=2)
+    files: list[str] = []
+
+    def killed(file: Path, data: bytes) -> None:
+        files.append(file.name)
+        if len(files) > 2:  # the first figure is there as PNG and PDF, the second is not
+            raise KeyboardInterrupt
+        write_atomic(file, data)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(figures, "write_atomic", killed)
+        with pytest.raises(KeyboardInterrupt):
+            build_site(tmp_path / "runs", tmp_path / "out")
+    build_site(tmp_path / "runs", tmp_path / "out")
+    drawn = {file.name for file in (tmp_path / "out" / "figures").iterdir()}
+    assert drawn == {
+        f"{name}-small.{kind}" for name in ("calibration", "precision") for kind in ("png", "pdf")
+    }
+
+
 def test_no_runs_are_a_page_too(tmp_path: Path) -> None:
     assert "No runs are recorded yet" in build_site(tmp_path, tmp_path / "out").read_text()
 
@@ -204,6 +229,6 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
 
 
 def test_figures_for_a_paper(shared: Path) -> None:
-    figures = {file.name for file in (shared / "out" / "figures").iterdir()}
+    drawn = {file.name for file in (shared / "out" / "figures").iterdir()}
     names = ("calibration-small", "precision-small", "level_curves-small-default")
-    assert figures == {f"{name}.{kind}" for name in names for kind in ("png", "pdf")}
+    assert drawn == {f"{name}.{kind}" for name in names for kind in ("png", "pdf")}

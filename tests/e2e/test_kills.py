@@ -1,0 +1,165 @@
+"""Report, predict and export, killed at any moment: they leave whole files, and in the end the same bytes."""
+
+import multiprocessing
+import random
+import shutil
+import time
+from collections.abc import Callable
+from html.parser import HTMLParser
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from phd_exp.__main__ import main
+from phd_exp.records.runs import RunFolder
+from tests.reports.site.conftest import write_runs
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
+
+KILLS = 20
+PATIENCE = 300.0  # s
+VERBS = {
+    "report": ["phd_exp.cli.report", "phd_exp.reports.site.build"],
+    "predict": ["phd_exp.cli.predict", "phd_exp.inference.predictor", "phd_exp.inference.pictures"],
+    "export": ["phd_exp.cli.export", "phd_exp.inference.predictor", "phd_exp.inference.onnx"],
+}
+"""What a process that is started to be killed has imported before."""
+
+
+@pytest.fixture(params=VERBS)
+def verb(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def command(verb: str, request: pytest.FixtureRequest, tmp_path: Path) -> Callable[[Path], list[str]]:
+    """The words with which a verb writes into a folder."""
+    if verb == "report":
+        runs = write_runs(tmp_path)
+        return lambda out: [verb, f"runs={runs}", f"out={out}"]
+    run: RunFolder = request.getfixturevalue("run")
+    if verb == "export":
+        return lambda out: [verb, f"run={run.path}", f"out={out / 'network.onnx'}"]
+    images = request.getfixturevalue("renders") / "default" / "test"
+    return lambda out: [verb, f"run={run.path}", f"folder={images}", f"out={out}"]
+
+
+@pytest.fixture
+def begun(verb: str) -> Callable[[list[str]], BaseProcess]:
+    """A command in a process of its own, forked from one that has imported what it needs already."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(VERBS[verb])
+
+    def begin(words: list[str]) -> BaseProcess:
+        process = context.Process(target=main, args=(words,))
+        process.start()
+        return process
+
+    return begin
+
+
+def end(process: BaseProcess) -> None:
+    process.join()
+    assert process.exitcode == 0
+
+
+def contents(out: Path) -> dict[str, bytes]:
+    """Every file, by its path, without those that have not their name yet."""
+    files = [path for path in out.rglob("*") if path.is_file() and path.suffix != ".tmp"]
+    return {path.relative_to(out).as_posix(): path.read_bytes() for path in files}
+
+
+def leftovers(out: Path) -> list[Path]:
+    return list(out.rglob(".*.tmp"))
+
+
+def kill_amid_writing(process: BaseProcess, out: Path, most: int, moments: random.Random) -> bool:
+    """After a few more files, at `most` so many, and a moment; False where it ended before."""
+    before, enough = written(out), moments.randint(1, most)
+    deadline = time.monotonic() + PATIENCE
+    while process.is_alive() and len(written(out) - before) < enough:
+        assert time.monotonic() < deadline, "waited too long"
+        time.sleep(0.001)
+    time.sleep(moments.uniform(0.0, 0.05))
+    process.kill()
+    process.join()
+    return process.exitcode != 0
+
+
+def written(out: Path) -> set[tuple[Path, int]]:
+    """The files and when they were written, those without their name among them."""
+    found = set()
+    for path in out.rglob("*"):
+        try:
+            found.add((path, path.stat().st_mtime_ns))
+        except FileNotFoundError:  # it has its name now
+            continue
+    return found
+
+
+class Page(HTMLParser):
+    """Which tags are open at the end of a page."""
+
+    VOID = ("meta", "link", "input", "img", "br", "hr")
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: object) -> None:
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag in self.open:
+            del self.open[len(self.open) - 1 - self.open[::-1].index(tag) :]
+
+
+def require_whole(file: Path) -> None:
+    """What the reader of a kind of file would miss first in one that is cut off."""
+    if file.suffix in (".png", ".webp"):
+        with Image.open(file) as image:
+            image.load()
+        return
+    content = file.read_bytes()
+    ends = {".pdf": b"%%EOF", ".tex": b"\\end{table}", ".html": b"</html>", ".js": b"", ".onnx": b""}
+    assert content.rstrip().endswith(ends.get(file.suffix, b"")), file
+    if file.suffix == ".html":
+        assert not Page(content.decode()).open, file
+    if file.suffix in (".csv", ".md", ".jsonl"):
+        assert content.endswith(b"\n"), file
+
+
+def test_killed_at_any_moment_it_leaves_whole_files_and_ends_as_undisturbed(
+    begun: Callable, command: Callable, tmp_path: Path
+) -> None:
+    """Each file that is there is, to the byte, the one that an undisturbed process writes."""
+    undisturbed, out = tmp_path / "undisturbed", tmp_path / "out"
+    end(begun(command(undisturbed)))
+    whole = contents(undisturbed)
+    for name in whole:
+        require_whole(undisturbed / name)
+    moments, kills, torn = random.Random(0), 0, 0
+    before: dict[str, bytes] = {}
+    most = min(6, len(whole) + 1)  # a file is seen without its name, and with it
+    while kills < KILLS:
+        process = begun(command(out))
+        if kill_amid_writing(process, out, most, moments):
+            kills += 1
+            torn += len(leftovers(out)) > 0
+            now = contents(out)
+            assert before.keys() <= now.keys(), "nothing that was there is lost"
+            assert now.items() <= whole.items()
+            before = now
+        else:
+            assert contents(out) == whole
+            shutil.rmtree(out)
+            before = {}
+    assert torn, "a kill has met a file that was being written"
+    end(begun(command(out)))
+    assert contents(out) == whole
+    assert not leftovers(out)
