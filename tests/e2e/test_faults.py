@@ -100,6 +100,7 @@ def test_a_disk_that_fails_after_an_epoch_is_one_line_and_nothing_is_lost(
     ends_as_unhindered(runs)
 
 
+@pytest.mark.slow
 def test_results_without_room_are_written_by_the_next_command(
     train: Callable, disk: Path, monkeypatch: pytest.MonkeyPatch, ends_as_unhindered: Callable
 ) -> None:
@@ -165,6 +166,7 @@ def test_an_image_on_which_the_network_fails_is_named_and_the_run_goes_on_from_t
     ends_as_unhindered(runs)
 
 
+@pytest.mark.slow
 def test_a_clock_that_jumps_changes_nothing(
     train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends_as_unhindered: Callable
 ) -> None:

@@ -83,9 +83,11 @@ def test_a_killed_parent_leaves_no_workers_and_no_half_files(
     folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec
 ) -> None:
     with rendering_elsewhere(folder, small_spec) as process:
+        wait_until(lambda: len(render_workers(process.pid)) == 2)
+        orphans = render_workers(
+            process.pid
+        )  # before there are images: to look takes as long as some of them
         wait_until(lambda: journaled(folder) >= 2)
-        orphans = render_workers(process.pid)
-        assert len(orphans) == 2
         process.kill()
         process.wait()
         done = journaled(folder)
@@ -105,8 +107,11 @@ def test_an_interrupt_ends_all_processes_after_the_samples_in_flight(
     folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec
 ) -> None:
     with rendering_elsewhere(folder, small_spec) as process:
+        wait_until(lambda: len(render_workers(process.pid)) == 2)
+        workers = render_workers(
+            process.pid
+        )  # before there are images: to look takes as long as some of them
         wait_until(lambda: journaled(folder) >= 2)
-        workers = render_workers(process.pid)
         process.send_signal(signal.SIGINT)
         process.wait(timeout=PATIENCE)
         assert not any(alive(worker) for worker in workers)
