@@ -34,6 +34,9 @@ def in_a_process(
 ) -> Iterator[subprocess.Popen[Any]]:
     """A call, in terms of `folder` and `spec`, in a process of its own, which is killed at the end."""
     script = (
+        # a shell lets what it runs in the background ignore interrupts, and so would this
+        "import signal\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from phd_exp.records.dataset import DatasetFolder\n"
         "from phd_exp.records.shards import Shard\n"
         "from phd_exp.records.spec import DatasetSpec\n"
