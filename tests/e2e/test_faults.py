@@ -63,6 +63,7 @@ def refused(outcome: Any) -> str:
     return str(line)
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_line_and_nothing_is_lost(
     train: Callable, disk: Path, ends_as_unhindered: Callable
 ) -> None:

@@ -259,7 +259,10 @@ def weights(run: RunFolder) -> dict[str, torch.Tensor]:
     return state
 
 
-@pytest.mark.parametrize(("name", "status", "batch"), [("SIGTERM", 143, 1), ("SIGINT", 130, 0)])
+@pytest.mark.parametrize(
+    ("name", "status", "batch"),
+    [("SIGTERM", 143, 1), pytest.param("SIGINT", 130, 0, marks=pytest.mark.slow)],
+)
 def test_a_signal_stops_after_the_batch_and_the_run_goes_on_with_the_next(
     train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, status: int, batch: int
 ) -> None:
