@@ -74,9 +74,8 @@ def write_atomic(path: Path | str, data: bytes | str) -> None:
     except BaseException as error:
         with suppress(OSError):
             temporary.unlink()
-        if (
-            isinstance(error, OSError) and error.filename is None
-        ):  # a write into an open file does not say which
+        # a write into an open file does not say which
+        if isinstance(error, OSError) and error.filename is None:
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
 

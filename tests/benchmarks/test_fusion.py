@@ -1,6 +1,6 @@
 """How fast a batch of fusion problems is solved, beside a conic solver that gets them one by one.
 
-`make bench` prints the medians; CPU times are processor seconds of one core, so that other work does not count.
+CPU times are processor seconds of one core, so that other work does not count.
 """
 
 import time
@@ -9,7 +9,6 @@ from statistics import median
 
 import pytest
 import torch
-from jaxtyping import config as jaxtyping_config
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion import Pose, fuse
@@ -52,13 +51,12 @@ def one_by_one() -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
-def test_a_batch_is_far_faster_than_one_by_one(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_batch_is_far_faster_than_one_by_one(
+    device: str, unchecked: None, record: Callable[..., None]
+) -> None:
     if device == "cuda" and not torch.cuda.is_available():
         pytest.skip("no CUDA device")
     n = BATCH[device]
-    monkeypatch.setattr(
-        jaxtyping_config, "jaxtyping_disable", True
-    )  # users do not check shapes in every call
     predictions, pose, _ = random_problems(n, CAMERAS, seed=2)
     predictions = ProjectedHuber(*(column.to(device) for column in columns_of(predictions)))
     pose = Pose(pose.R.to(device), pose.t.to(device))
@@ -70,9 +68,11 @@ def test_a_batch_is_far_faster_than_one_by_one(device: str, monkeypatch: pytest.
     point = median(seconds(solve, device) for _ in range(ROUNDS)) / n
     moments = median(seconds(lambda: fuse(predictions, pose).covariance, device) for _ in range(ROUNDS)) / n
     whole, solving = one_by_one()
-    print(
-        f"\n{n} problems of {CAMERAS} cameras on {device}: {1e6 * point:.1f} us a problem with certificate, "
-        f"{1e6 * moments:.1f} us with covariance; Clarabel {1e6 * whole:.0f} us, {1e6 * solving:.0f} us of it set-up "
-        f"and solution: {whole / point:.0f} and {solving / point:.0f} times faster"
+    record(
+        f"fuse with certificate, {n} problems of {CAMERAS} cameras, {device}",
+        f"{1e6 * point:.1f} us a problem, {1e6 * moments:.1f} us with covariance",
+        f"{1e6 * whole:.0f} us, Clarabel, {1e6 * solving:.0f} us of it set-up and solution",
+        f"{whole / point:.0f} and {solving / point:.0f} times",
+        str(LEAST_RATIO[device]),
     )
     assert whole / point >= LEAST_RATIO[device]

@@ -12,9 +12,10 @@ import torch
 from phd_exp.data.batches import Batch
 from phd_exp.models.backbones import Seen
 from phd_exp.models.regressor import Regressor
-from phd_exp.records.runs import RunFolder, find_runs
+from phd_exp.records.runs import RunFolder
 from phd_exp.training.module import PositionModule
 from tests.disks import KIB, leave_room, make_room, remount, small_disk
+from tests.e2e.runs import only_run, weights
 
 QUIET = ("logger=none", "recipe=strong", "data.image_size=64", "backbone.width=8", "trainer.max_epochs=3")
 
@@ -31,11 +32,6 @@ def unhindered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("unhindered")
 
 
-def only_run(runs: Path) -> RunFolder:
-    (run,) = find_runs(runs)
-    return run
-
-
 @pytest.fixture
 def ends_as_unhindered(train: Callable, unhindered: Path) -> Callable[[Path], None]:
     """The same command, once nothing hinders it any more, has to leave what a run in one piece leaves."""
@@ -46,14 +42,10 @@ def ends_as_unhindered(train: Callable, unhindered: Path) -> Callable[[Path], No
         mine, whole = only_run(runs), only_run(unhindered)
         assert mine.results_file.read_bytes() == whole.results_file.read_bytes()
         assert mine.metrics() == whole.metrics()
-        for one, other in zip(weights(mine), weights(whole), strict=True):
+        for one, other in zip(weights(mine).values(), weights(whole).values(), strict=True):
             assert torch.equal(one, other)
 
     return check
-
-
-def weights(run: RunFolder) -> list[torch.Tensor]:
-    return list(torch.load(run.last_checkpoint, weights_only=True)["state_dict"].values())
 
 
 def refused(outcome: Any) -> str:
@@ -163,7 +155,7 @@ def test_an_image_on_which_the_network_fails_is_named_and_the_run_goes_on_from_t
         line = refused(train(*QUIET, f"runs={runs}"))
     assert "loss is nan in epoch 2/3, at train samples 000003.png; the last checkpoint is whole" in line
     assert torch.load(only_run(runs).last_checkpoint, weights_only=True)["epoch"] == 0
-    assert all(weight.isfinite().all() for weight in weights(only_run(runs)))
+    assert all(weight.isfinite().all() for weight in weights(only_run(runs)).values())
     ends_as_unhindered(runs)
 
 

@@ -17,7 +17,6 @@ from phd_exp.data.sources import RenderedSource
 from phd_exp.geometry.virtual import Box, VirtualCamera, intrinsics
 from phd_exp.records.dataset import DatasetFolder, sha256
 from phd_exp.records.detections import DetectionFolder
-from phd_exp.records.runs import RunFolder, find_runs
 from phd_exp.records.scenes import SampleRecord, Scene
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.colour import encoded
@@ -26,6 +25,7 @@ from phd_exp.rendering.rays import trace_pixels
 from phd_exp.rendering.rotations import rotation_matrix
 from phd_exp.rendering.visibility import silhouettes
 from phd_exp.rendering.workers import ensure_rendered
+from tests.e2e.runs import only_run
 
 N = {"train": 14, "held_out": 0, "test": 2}
 SIDE = 96
@@ -138,11 +138,6 @@ def test_a_rendered_image_seen_in_a_box_shows_the_object_where_the_virtual_camer
         off.append(centroid(shown(rendered, record, camera)) - expected)
     assert len(off) >= 4
     assert np.abs(off).max() < 0.1
-
-
-def only_run(runs: Path) -> RunFolder:
-    (run,) = find_runs(runs)
-    return run
 
 
 @pytest.fixture

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from phd_exp.__main__ import main
 from phd_exp.records.runs import RunFolder, find_runs
 from phd_exp.training.module import PositionModule
 from tests.e2e.conftest import QUICK
+from tests.e2e.runs import weights
 
 TWO = ("-m", "model=mae_vz", "recipe=strong", "data.image_size=64", "seed=0,1", "logger=none")
 FOUR = ("-m", "experiment=table2", "model=mae_xyz,mae_constf", "seed=0,1", "logger=none")
@@ -39,14 +39,17 @@ def finished(runs: Path) -> dict[Path, dict[str, tuple[int, bytes]]]:
 def numbers(runs: Path) -> dict[str, Any]:
     """What the runs of a folder came to, to the bit."""
     return {
-        run.path.relative_to(runs).as_posix(): (run.results_file.read_bytes(), run.metrics(), weights(run))
+        run.path.relative_to(runs).as_posix(): (
+            run.results_file.read_bytes(),
+            run.metrics(),
+            weight_bytes(run),
+        )
         for run in find_runs(runs)
     }
 
 
-def weights(run: RunFolder) -> dict[str, bytes]:
-    state: dict[str, torch.Tensor] = torch.load(run.last_checkpoint, weights_only=True)["state_dict"]
-    return {name: weight.numpy().tobytes() for name, weight in state.items()}
+def weight_bytes(run: RunFolder) -> dict[str, bytes]:
+    return {name: weight.numpy().tobytes() for name, weight in weights(run).items()}
 
 
 @pytest.fixture

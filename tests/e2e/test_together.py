@@ -13,8 +13,9 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from phd_exp.records.runs import RunFolder, find_runs
+from phd_exp.records.runs import find_runs
 from tests.e2e.conftest import QUICK
+from tests.e2e.runs import only_run
 
 THREE_EPOCHS = (
     "logger=none",
@@ -23,11 +24,6 @@ THREE_EPOCHS = (
     "data.n_test=7",
 )
 TOGETHER = ("trainer=ddp", "trainer.accelerator=cpu")
-
-
-def only_run(runs: Path) -> RunFolder:
-    (run,) = find_runs(runs)
-    return run
 
 
 def errors(text: str) -> list[str]:

@@ -19,6 +19,7 @@ from PIL import Image
 from phd_exp.records.runs import RunFolder, find_runs
 from phd_exp.reports.collect import collect
 from phd_exp.reports.point_errors import QUANTITIES, ErrorKey
+from tests.e2e.runs import only_run, weights
 
 MODELS = ("probabilistic", "mae_vz", "mae_logz", "mae_xyz", "mae_constf")
 DATA = (
@@ -31,11 +32,6 @@ DATA = (
 ERRORS = {"loss", "projected_error_mm", "depth_error_mm"}
 OF_A_DISTRIBUTION = {"nll", "depth_precision", "projected_precision"}
 CALIBRATION = {"depth_ence", "projected_ence", "miscalibration_area", "depth_crps_mm", "left_out"}
-
-
-def only_run(runs: Path) -> RunFolder:
-    (run,) = find_runs(runs)
-    return run
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -252,11 +248,6 @@ def test_the_untrained_network_gives_the_middle_of_the_data_set(train: Callable,
     assert run.results()["untrained/test/depth_error_mm"] == pytest.approx(
         1000 * depth_error.mean(), rel=1e-4
     )
-
-
-def weights(run: RunFolder) -> dict[str, torch.Tensor]:
-    state: dict[str, torch.Tensor] = torch.load(run.last_checkpoint, weights_only=True)["state_dict"]
-    return state
 
 
 @pytest.mark.parametrize(
