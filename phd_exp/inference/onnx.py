@@ -1,7 +1,8 @@
 """A run's network as an ONNX file: uint8 images in, the numbers before the head out; checked against torch.
 
-The graph takes `image`, (batch, side, side, 3) of 8 bits, RGB, and returns `raw`, (batch, 7) or (batch, 3) in
-float32; normalisation is inside. What the numbers mean is in the file's metadata, for `decoder.py`.
+The graph takes `image`, (batch, side, side, 3) of 8 bits, RGB, and of a network that is shown it `f`, (batch,), the
+focal lengths in pixels of these images. It returns `raw`, (batch, 7) or (batch, 3) in float32; normalisation is
+inside. What the numbers mean is in the file's metadata, for `decoder.py`.
 """
 
 import json
@@ -33,8 +34,8 @@ SMALL = 0.01
 """Size of an output of the network below which its relative deviation says nothing."""
 CHECKED = (1, 7, 56)
 """Batches of images in which the exported network is held against torch."""
-FOCAL_LENGTH = 7.0
-"""Of the check, in sides of the image."""
+FOCAL_LENGTHS = (5.0, 9.0)
+"""Of the check, from and to, in sides of the image."""
 QUANTILES = (0.005, 0.05, 0.25, 0.5, 0.75, 0.95, 0.995)
 
 
@@ -43,14 +44,16 @@ class ParityError(UserError):
 
 
 class _Raw(nn.Module):
-    """The regressor without its head."""
+    """The regressor without its head; what is shown no focal length takes none."""
 
     def __init__(self, regressor: Regressor) -> None:
         super().__init__()
         self.regressor = regressor
 
-    def forward(self, image: UInt8[Tensor, "batch S S 3"]) -> Float[Tensor, "batch n_outputs"]:
-        return self.regressor.raw(image)
+    def forward(
+        self, image: UInt8[Tensor, "batch S S 3"], f: Float[Tensor, " batch"] | None = None
+    ) -> Float[Tensor, "batch n_outputs"]:
+        return self.regressor.raw(image, f)
 
 
 def export(predictor: Predictor, file: Path) -> float:
@@ -75,16 +78,19 @@ def export(predictor: Predictor, file: Path) -> float:
 def _exported(predictor: Predictor) -> Any:
     """The graph, for batches of any size."""
     side = predictor.preparation.side
-    example = torch.zeros(2, side, side, 3, dtype=torch.uint8)
+    examples = {"image": torch.zeros(2, side, side, 3, dtype=torch.uint8)}
+    if predictor.regressor.shown is not None:
+        examples["f"] = torch.tensor(FOCAL_LENGTHS) * side
+    batch = torch.export.Dim("batch", min=1)
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of torch and onnxscript about their own old names
         program = torch.onnx.export(
             _Raw(predictor.regressor).cpu().eval(),
-            (example,),
-            input_names=["image"],
+            tuple(examples.values()),
+            input_names=list(examples),
             output_names=["raw"],
-            dynamic_shapes=({0: torch.export.Dim("batch", min=1)},),
+            dynamic_shapes={name: {0: batch} for name in examples},
             opset_version=OPSET,
             dynamo=True,
             verbose=False,
@@ -123,20 +129,26 @@ def largest_deviation(predictor: Predictor, content: bytes) -> float:
     """
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     decoder = Decoder.of(session.get_modelmeta().custom_metadata_map)
-    images = pictures(sum(CHECKED), predictor.preparation.side)
-    batches = np.split(images, np.cumsum(CHECKED)[:-1])
-    here = np.concatenate([session.run(["raw"], {"image": batch})[0] for batch in batches])
-    there = torch.cat([predictor.raw(batch) for batch in batches])
+    n, side = sum(CHECKED), predictor.preparation.side
+    images = pictures(n, side)
+    f = (side * np.linspace(*FOCAL_LENGTHS, n)).astype(np.float32)
+    taken = {given.name for given in session.get_inputs()}
+    batches = [
+        {"image": images[rows], "f": f[rows]} for rows in np.split(np.arange(n), np.cumsum(CHECKED)[:-1])
+    ]
+    here = np.concatenate(
+        [session.run(["raw"], {name: batch[name] for name in taken})[0] for batch in batches]
+    )
+    there = torch.cat([predictor.raw(batch["image"], torch.from_numpy(batch["f"])) for batch in batches])
     size = np.maximum(np.abs(there.numpy()).max(axis=0), SMALL)
-    f = FOCAL_LENGTH * predictor.preparation.side
     decoded = _decoded(predictor, decoder, here, there.double(), f)
     return max(float((np.abs(here - there.numpy()) / size).max()), *decoded)
 
 
 def _decoded(
-    predictor: Predictor, decoder: Decoder, here: np.ndarray, there: Tensor, f: float
+    predictor: Predictor, decoder: Decoder, here: np.ndarray, there: Tensor, f: np.ndarray
 ) -> list[float]:
-    prediction = predictor.predict(there, torch.full((len(there),), f, dtype=torch.float64))
+    prediction = predictor.predict(there, torch.from_numpy(f).double())
     position = decoder(here, f)
     if not (isinstance(prediction, ProjectedHuber) and isinstance(position, Position)):
         return [_relative(np.asarray(position), prediction.mode)]

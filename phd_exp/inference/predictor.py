@@ -113,24 +113,34 @@ class Predictor:
         """Predictions for views, each in the frame of its own virtual camera; for one view, one without a batch."""
         one = isinstance(views, View)
         sequence = [views] if isinstance(views, View) else views
+        f = torch.tensor([view.camera.f for view in sequence], dtype=torch.float32)
         parts = [
-            self.raw(np.stack([view.image for view in sequence[start : start + BATCH]]))
+            self.raw(
+                np.stack([view.image for view in sequence[start : start + BATCH]]), f[start : start + BATCH]
+            )
             for start in range(0, len(sequence), BATCH)
         ]
-        raw, f = torch.cat(parts), torch.tensor([view.camera.f for view in sequence], dtype=torch.float32)
+        raw = torch.cat(parts)
         return self.predict(raw[0], f[0]) if one else self.predict(raw, f)
 
-    def raw(self, images: UInt8[np.ndarray, "batch S S 3"]) -> Float[Tensor, "batch n_outputs"]:
-        """The network's numbers before the head, on the CPU."""
-        return self.regressor.raw(torch.from_numpy(images).to(self.device)).cpu()
+    def raw(
+        self, images: UInt8[np.ndarray, "batch S S 3"], f: Float[Tensor, " batch"]
+    ) -> Float[Tensor, "batch n_outputs"]:
+        """The network's numbers before the head, on the CPU; f in pixels of its images."""
+        told = self._told(f.float().to(self.device)).f
+        return self.regressor.raw(torch.from_numpy(images).to(self.device), told).cpu()
 
     def predict(self, raw: Float[Tensor, "*batch n_outputs"], f: Float[Tensor, "*batch"]) -> Prediction:
         """From the network's numbers, and focal lengths in pixels of its images, to predictions."""
-        told = f if self.constant_f is None else torch.full_like(f, self.constant_f)
-        prediction = self.regressor.head(raw, Camera(told, float(self.preparation.side)))
+        prediction = self.regressor.head(raw, self._told(f))
         if self.temperature is not None and isinstance(prediction, ProjectedHuber):
             return self.temperature.apply(prediction)
         return prediction
+
+    def _told(self, f: Float[Tensor, "*batch"]) -> Camera:
+        """The camera as the network knows it."""
+        told = f if self.constant_f is None else torch.full_like(f, self.constant_f)
+        return Camera(told, float(self.preparation.side))
 
 
 def load(run: Path, device: str = "auto", recalibrate: bool = False) -> Predictor:

@@ -40,7 +40,8 @@ def record_views(folder: RunFolder, data: DatasetFolder, spec: DatasetSpec, scen
         samples = source.samples("test")
         parts = [samples.select(rows) for rows in torch.arange(n).split(BATCH)]
         tables = [
-            columns(predictor.predict(predictor.raw(part.image.numpy()), part.f), part) for part in parts
+            columns(predictor.predict(predictor.raw(part.image.numpy(), part.f), part.f), part)
+            for part in parts
         ]
         poses = [(*record.pose.rotation, *record.pose.translation) for record in data.records("test", n)]
         known = dict(source.known("test")) | dict(

@@ -44,14 +44,14 @@ def sightings(predictor: Predictor, detections: Sequence[Detection]) -> Iterator
     """
     seen = _seen(predictor, detections)
     while batch := list(islice(seen, BATCH)):
-        raw = predictor.raw(np.stack([view.image for _, _, view in batch])).double()
+        f = torch.tensor([view.camera.f for _, _, view in batch], dtype=torch.float64)
+        raw = predictor.raw(np.stack([view.image for _, _, view in batch]), f).double()
         for row, (detection, image, view) in enumerate(batch):
             if not bool(raw[row].isfinite().all()):
                 raise RunError(
                     f"{detection.where}: the network returns numbers that are not finite; train the run again"
                 )
-            f = torch.tensor(view.camera.f, dtype=torch.float64)
-            yield Sighting(detection, image, view, raw[row], predictor.predict(raw[row], f))
+            yield Sighting(detection, image, view, raw[row], predictor.predict(raw[row], f[row]))
 
 
 def _seen(

@@ -7,13 +7,14 @@ from torch import Tensor, nn
 from phd_exp.geometry.camera import Camera
 from phd_exp.models.backbones import Backbone, Seen
 from phd_exp.models.heads import Head, Prediction
+from phd_exp.models.shown import ShownFocalLength
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 class Regressor(nn.Module):
-    """backbone -> one linear layer, zero at the start -> head.
+    """backbone -> one linear layer, zero at the start -> what the focal length adds, if it is shown -> head.
 
     The backbone runs in whatever precision is switched on around it; the linear layer and everything after it
     in float32, since nu_p = B v_p rounded to bf16 would be wrong by up to 0.2 pixels at the border of the image.
@@ -23,13 +24,14 @@ class Regressor(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, backbone: Backbone, head: Head) -> None:
+    def __init__(self, backbone: Backbone, head: Head, shown: ShownFocalLength | None = None) -> None:
         super().__init__()
         self.backbone = backbone.to(memory_format=torch.channels_last)
         self.head = head
         self.last = nn.Linear(backbone.n_features, head.n_outputs)
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)
+        self.shown = shown
         self.register_buffer("mean", 255 * torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", 255 * torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
 
@@ -38,11 +40,13 @@ class Regressor(nn.Module):
 
     def prediction(self, seen: Seen, camera: Camera) -> Prediction:
         """What follows from what was seen."""
-        return self.head(self.numbers(seen), camera)
+        return self.head(self.numbers(seen, camera.f), camera)
 
-    def raw(self, image: UInt8[Tensor, "batch height width 3"]) -> Float[Tensor, "batch n_outputs"]:
-        """The numbers before the head, in the precision of the last layer."""
-        return self.numbers(self.see(image))
+    def raw(
+        self, image: UInt8[Tensor, "batch height width 3"], f: Float[Tensor, " batch"] | None = None
+    ) -> Float[Tensor, "batch n_outputs"]:
+        """The numbers before the head, in the precision of the last layer; f (px) is wanted where it is shown."""
+        return self.numbers(self.see(image), f)
 
     def see(self, image: UInt8[Tensor, "batch height width 3"]) -> Seen:
         """What the backbone makes of the images."""
@@ -50,9 +54,11 @@ class Regressor(nn.Module):
         seen: Seen = self.backbone(pixels.sub_(self.mean).div_(self.std))
         return seen
 
-    def numbers(self, seen: Seen) -> Float[Tensor, "batch n_outputs"]:
-        """The numbers before the head, of what was seen."""
+    def numbers(self, seen: Seen, f: Float[Tensor, " batch"] | None) -> Float[Tensor, "batch n_outputs"]:
+        """The numbers before the head, of what was seen, and of f where it is shown."""
         dtype = self.last.weight.dtype
         with torch.autocast(seen.features.device.type, enabled=False):
             raw: Tensor = self.last(seen.features.to(dtype))
+            if self.shown is not None:
+                raw = self.shown(raw, f)
             return raw if seen.place is None else self.head.placed(raw, seen.place.to(dtype))

@@ -160,9 +160,11 @@ class ModelConfig(Section):
 
 
 class CameraConfig(Section):
-    """Whether the model is told each camera's focal length, or one constant for all."""
+    """What the model knows of each camera's focal length: how to compute with it; besides, what it says of depth; or
+    one constant for all.
+    """
 
-    focal_length: Literal["known", "constant"]
+    focal_length: Literal["known", "shown", "constant"]
 
 
 class TrainerConfig(Section):

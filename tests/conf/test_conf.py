@@ -95,6 +95,17 @@ def test_a_model_picks_its_loss_and_camera(checked: Callable, model: str, loss: 
     assert config.camera.focal_length == camera
 
 
+@pytest.mark.parametrize(
+    ("model", "camera"),
+    [("probabilistic", "shown"), ("mae_logz", "shown"), ("mae_xyz", "known"), ("mae_constf", "constant")],
+)
+def test_the_strong_recipe_shows_the_focal_length_to_models_that_may_know_it(
+    checked: Callable, model: str, camera: str
+) -> None:
+    assert checked("recipe=strong", f"model={model}").camera.focal_length == camera
+    assert checked("recipe=strong", f"model={model}", "camera=known").camera.focal_length == "known"
+
+
 def test_the_command_line_has_the_last_word(checked: Callable) -> None:
     config = checked(
         "preset=smoke", "backbone=resnet50", "model=mae_vz", "camera=constant", "data.n_train=48"
