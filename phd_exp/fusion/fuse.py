@@ -11,10 +11,9 @@ from phd_exp.distributions.level import credible_level
 from phd_exp.fusion.certificate import certify
 from phd_exp.fusion.energy import energy
 from phd_exp.fusion.fused import Fused
-from phd_exp.fusion.newton import minimise
-from phd_exp.fusion.polish import polish
 from phd_exp.fusion.pose import Plane, Pose
 from phd_exp.fusion.problems import Problems
+from phd_exp.fusion.solver import minimise, polish
 from phd_exp.fusion.status import Status
 from phd_exp.fusion.views import Unknown, Views
 

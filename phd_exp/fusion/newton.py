@@ -20,11 +20,11 @@ from phd_exp.fusion.linear import solve, total
 from phd_exp.fusion.views import Seen, Unknown, Views
 
 WIDTH_FLOOR = 1e-9
-_FIRST_WIDTH, _SHRINK = 1.0, 0.05
-_MOST_STEPS, _MOST_HALVINGS = 80, 40
-_SETTLED = 1e-9  # relative change of what is seen
-_RIDGE = 1e-9  # share of the curvature of least squares: a flat direction must not stop the rest
-_ARMIJO = 1e-4
+FIRST_WIDTH, SHRINK = 1.0, 0.05
+MOST_STEPS, MOST_HALVINGS = 80, 40
+SETTLED = 1e-9  # relative change of what is seen
+RIDGE = 1e-9  # share of the curvature of least squares: a flat direction must not stop the rest
+ARMIJO = 1e-4
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ def minimise(views: Views, u: Unknown, least: float) -> tuple[Unknown, Float[Ten
     A problem that has settled leaves the batch. What has not settled after 80 steps is returned as it is: the
     certificate judges it.
     """
-    at, width = Iterate.start(views, u), _FIRST_WIDTH
+    at, width = Iterate.start(views, u), FIRST_WIDTH
     result, working = Iterate(u.clone(), at.y, at.lam.clone()), torch.arange(u.shape[1], device=u.device)
-    for _ in range(_MOST_STEPS):
+    for _ in range(MOST_STEPS):
         at, settled = step(views, at, width, least)
         result.u[:, working], result.lam[:, working] = at.u, at.lam
         if width == WIDTH_FLOOR and bool(settled.any()):
@@ -61,7 +61,7 @@ def minimise(views: Views, u: Unknown, least: float) -> tuple[Unknown, Float[Ten
             if len(left) == 0:
                 break
             views, at, working = views.subset(left), at.subset(left), working[left]
-        width = max(width * _SHRINK, WIDTH_FLOOR)
+        width = max(width * SHRINK, WIDTH_FLOOR)
     return result.u, result.lam
 
 
@@ -84,14 +84,14 @@ def step(views: Views, at: Iterate, width: float, least: float) -> tuple[Iterate
         a * ((1 - side) * second / 2 + g_slope.square() * (1 - at.lam * side) / s),
     )
     least_squares = torch.stack([weight, torch.zeros_like(a), weight, a])
-    du = -solve(views.hessian(torch.stack(curvature) + _RIDGE * least_squares), gradient)
+    du = -solve(views.hessian(torch.stack(curvature) + RIDGE * least_squares), gradient)
     moved = views.moved(du)
     before = total(huber(seen) + a * ((t + inverse) / 2 + s), 0)
     share = _line_search(before, seen, moved, a, (gradient * du).sum(0), width, least)
     lam = at.lam + (g - at.lam * s + (1 - at.lam * side) * g_slope * moved[2]) / s
     y = weight * (q + moved[:2] - at.y * (unit * moved[:2]).sum(0))
     y = y * (y[0].square() + y[1].square()).clamp_min(1).rsqrt()
-    still = (share * moved).abs() <= _SETTLED * (1 + seen.abs())
+    still = (share * moved).abs() <= SETTLED * (1 + seen.abs())
     return Iterate(at.u + share * du, y, lam.clamp(-1, 1)), still.all(0).all(0)
 
 
@@ -111,11 +111,11 @@ def _line_search(
 
     enough = before + 1e-12 * before.abs()  # what rounding may add where nothing is left to gain
     share = torch.ones_like(before)
-    tried = (value(seen + moved, a) > enough + _ARMIJO * descent).nonzero().squeeze(-1)
-    for _ in range(_MOST_HALVINGS):
+    tried = (value(seen + moved, a) > enough + ARMIJO * descent).nonzero().squeeze(-1)
+    for _ in range(MOST_HALVINGS):
         if len(tried) == 0:
             break
         share[tried] /= 2
         after = value(seen[..., tried] + share[tried] * moved[..., tried], a[:, tried])
-        tried = tried[after > enough[tried] + _ARMIJO * share[tried] * descent[tried]]
+        tried = tried[after > enough[tried] + ARMIJO * share[tried] * descent[tried]]
     return share

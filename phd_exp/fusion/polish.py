@@ -9,10 +9,10 @@ from phd_exp.fusion.views import Seen, Unknown, Views
 
 KINK = 1e-6
 """|t - 1| within which a kink may be what holds the optimum; the smoothed optimum is about 1e-9 from one that is."""
-_ROUNDS = 4
-_PENALTY = 1e7
-_RIDGE = 1e-12
-_FARTHEST = 1e-4  # metres; a correction beyond is no polish
+ROUNDS = 4
+PENALTY = 1e7
+RIDGE = 1e-12
+FARTHEST = 1e-4  # metres; a correction beyond is no polish
 
 
 def polish(
@@ -27,16 +27,16 @@ def polish(
     Source: own derivation; checked against a conic solver in tests/fusion/test_conic.py.
     """
     start, first = u, lam
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         seen = views.seen(u)
         near = (seen[2] - 1).abs() <= KINK
         side = torch.where(near, lam, seen[2] - 1).sign()
         kink = near & (lam.abs() < 1)
         du = -_newton_step(views, seen, lam, side, kink)
         u = u + du
-        lam = torch.where(kink, lam + _PENALTY * (views.seen(u)[2] - 1), side)
+        lam = torch.where(kink, lam + PENALTY * (views.seen(u)[2] - 1), side)
     moved = (u - start).abs().amax(0)
-    good = moved <= _FARTHEST  # false for NaN
+    good = moved <= FARTHEST  # false for NaN
     return torch.where(good, u, start), torch.where(good, lam, first).clamp(-1, 1)
 
 
@@ -52,13 +52,13 @@ def _newton_step(
     weight = (q[0].square() + q[1].square()).clamp_min(1).rsqrt()
     unit = torch.where(weight < 1, q * weight, 0)
     slope = torch.where(side > 0, 1, -t.square().reciprocal())
-    slope = torch.where(kink, lam + _PENALTY * (t - 1), slope)
-    bend = torch.where(kink, _PENALTY, torch.where(side > 0, 0, 2 / t**3))
+    slope = torch.where(kink, lam + PENALTY * (t - 1), slope)
+    bend = torch.where(kink, PENALTY, torch.where(side > 0, 0, 2 / t**3))
     curvature = (
-        weight * (1 + _RIDGE - unit[0].square()),
+        weight * (1 + RIDGE - unit[0].square()),
         -weight * unit[0] * unit[1],
-        weight * (1 + _RIDGE - unit[1].square()),
-        views.a * (bend + _RIDGE),
+        weight * (1 + RIDGE - unit[1].square()),
+        views.a * (bend + RIDGE),
     )
     gradient = views.gradient(torch.stack([*(weight * q), views.a * slope]))
     return solve(views.hessian(torch.stack(curvature)), gradient)
