@@ -11,14 +11,14 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit, prange
 
-from phd_exp.fusion import newton, polish
+from phd_exp.fusion import newton
+from phd_exp.fusion import polish as polishing
 
 FIRST_WIDTH, SHRINK, WIDTH_FLOOR = newton.FIRST_WIDTH, newton.SHRINK, newton.WIDTH_FLOOR
 MOST_STEPS, MOST_HALVINGS = newton.MOST_STEPS, newton.MOST_HALVINGS
 SETTLED, RIDGE, ARMIJO = newton.SETTLED, newton.RIDGE, newton.ARMIJO
-ROUNDS, PENALTY, FARTHEST, KINK, POLISH_RIDGE = (
-    polish.ROUNDS, polish.PENALTY, polish.FARTHEST, polish.KINK, polish.RIDGE
-)  # fmt: skip
+ROUNDS, PENALTY, FARTHEST = polishing.ROUNDS, polishing.PENALTY, polishing.FARTHEST
+KINK, POLISH_RIDGE = polishing.KINK, polishing.RIDGE
 
 Slope = Float[np.ndarray, "problems cameras 3 k"]
 AtOrigin = Float[np.ndarray, "problems cameras 3"]
@@ -26,24 +26,32 @@ OfCameras = Float[np.ndarray, "problems cameras"]
 Unknowns = Float[np.ndarray, "problems k"]
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
 def minimise(slope: Slope, at_origin: AtOrigin, a: OfCameras, u: Unknowns, least: float) -> OfCameras:
     """As `newton.minimise`: moves each u to its minimum, in place, and returns the multipliers of the kinks."""
     lam = np.zeros_like(a)
-    for i in prange(len(a)):
-        _minimise(slope[i], at_origin[i], a[i], u[i], lam[i], least)
+    _minimise_all(slope, at_origin, a, u, lam, least)
     return lam
 
 
+def polish(slope: Slope, at_origin: AtOrigin, a: OfCameras, u: Unknowns, lam: OfCameras) -> None:
+    """As `polish.polish`: moves each u to its optimum, and lam to its multipliers, in place."""
+    _polish_all(slope, at_origin, a, u, lam)
+
+
 @njit(parallel=True, cache=True, error_model="numpy")
-def polished(slope: Slope, at_origin: AtOrigin, a: OfCameras, u: Unknowns, lam: OfCameras) -> None:
-    """As `polish.polish`, in place."""
+def _minimise_all(slope, at_origin, a, u, lam, least):  # type: ignore[no-untyped-def]  # compiled for what it gets
+    for i in prange(len(a)):
+        _minimise(slope[i], at_origin[i], a[i], u[i], lam[i], least)
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _polish_all(slope, at_origin, a, u, lam):  # type: ignore[no-untyped-def]
     for i in prange(len(a)):
         _polish(slope[i], at_origin[i], a[i], u[i], lam[i])
 
 
 @njit(cache=True, error_model="numpy")
-def _minimise(slope, at_origin, a, u, lam, least):  # type: ignore[no-untyped-def]  # compiled for what it gets
+def _minimise(slope, at_origin, a, u, lam, least):  # type: ignore[no-untyped-def]
     cameras, _, k = slope.shape
     seen, moved = np.empty((cameras, 3)), np.empty((cameras, 3))
     y, du, gradient, H = np.zeros((cameras, 2)), np.empty(k), np.empty(k), np.empty((k, k))

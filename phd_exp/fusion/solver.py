@@ -16,7 +16,9 @@ def minimise(views: Views, u: Unknown, least: float) -> tuple[Unknown, Multiplie
     """See `newton.minimise`."""
     if views.a.device.type != "cpu":
         return newton.minimise(views, u, least)
-    from phd_exp.fusion import scalar  # a second of imports, and compilation where nothing was compiled before
+    from phd_exp.fusion import (
+        scalar,
+    )  # a second of imports, and compilation where nothing was compiled before
 
     result = _rows(u)
     lam = scalar.minimise(*_problems(views), result, least)
@@ -30,7 +32,7 @@ def polish(views: Views, u: Unknown, lam: Multipliers) -> tuple[Unknown, Multipl
     from phd_exp.fusion import scalar
 
     result, multipliers = _rows(u), _rows(lam)
-    scalar.polished(*_problems(views), result, multipliers)
+    scalar.polish(*_problems(views), result, multipliers)
     return torch.from_numpy(result).T, torch.from_numpy(multipliers).T
 
 
