@@ -1,4 +1,4 @@
-"""The methods of `newton` and `polish` for one problem after the other, compiled, on all cores: what a CPU is best at.
+"""The methods of `newton` and `polish`, compiled, one problem after the other on each core: what a CPU is best at.
 
 Operations on whole batches spend a CPU's time on launching themselves and on moving what lies between them; a problem
 of a few cameras fits into its registers. With a GPU it is the other way round: there `newton` and `polish` serve.
@@ -167,40 +167,39 @@ def _polish(slope, at_origin, a, u, lam):  # type: ignore[no-untyped-def]
     gradient, du, H = np.empty(k), np.empty(k), np.empty((k, k))
     kink = np.zeros(cameras, dtype=np.bool_)
     for _ in range(ROUNDS):
-        gradient[:] = 0.0
-        H[:] = 0.0
-        for c in range(cameras):
-            q_x, q_y, t = _seen(slope[c], at_origin[c], u)
-            near = abs(t - 1) <= KINK
-            side = np.sign(lam[c] if near else t - 1)
-            kink[c] = near and abs(lam[c]) < 1
-            squared = q_x * q_x + q_y * q_y
-            weight = 1 / math.sqrt(max(squared, 1.0))
-            unit_x, unit_y = (q_x * weight, q_y * weight) if weight < 1 else (0.0, 0.0)
-            if kink[c]:
-                by_t, bend = lam[c] + PENALTY * (t - 1), PENALTY
-            else:
-                by_t, bend = (1.0, 0.0) if side > 0 else (-1 / (t * t), 2 / t**3)
-                lam[c] = side
-            xx = weight * (1 + POLISH_RIDGE - unit_x * unit_x)
-            yy = weight * (1 + POLISH_RIDGE - unit_y * unit_y)
-            _add(
-                slope[c], weight * q_x, weight * q_y, a[c] * by_t,
-                xx, -weight * unit_x * unit_y, yy, a[c] * (bend + POLISH_RIDGE), gradient, H,
-            )  # fmt: skip
+        _linearise_kinks(slope, at_origin, a, u, lam, kink, gradient, H)
         _solve(H, gradient, du)
         u += du
         for c in range(cameras):
             if kink[c]:
                 lam[c] += PENALTY * (_seen(slope[c], at_origin[c], u)[2] - 1)
-    good = True
-    for j in range(k):
-        good &= abs(u[j] - start[j]) <= FARTHEST  # false for NaN
-    if not good:
+    if not np.all(np.abs(u - start) <= FARTHEST):  # NaN too
         u[:] = start
         lam[:] = first
     for c in range(cameras):
         lam[c] = min(max(lam[c], -1.0), 1.0)
+
+
+@njit(cache=True, error_model="numpy")
+def _linearise_kinks(slope, at_origin, a, u, lam, kink, gradient, H):  # type: ignore[no-untyped-def]
+    """Gradient and Hessian of what `polish.polish` describes; which cameras are at a kink, and lam of the others."""
+    gradient[:] = 0.0
+    H[:] = 0.0
+    for c in range(len(a)):
+        q_x, q_y, t = _seen(slope[c], at_origin[c], u)
+        near = abs(t - 1) <= KINK
+        side = np.sign(lam[c] if near else t - 1)
+        kink[c] = near and abs(lam[c]) < 1
+        by_t, bend = (1.0, 0.0) if side > 0 else (-1 / (t * t), 2 / t**3)
+        if kink[c]:
+            by_t, bend = lam[c] + PENALTY * (t - 1), PENALTY
+        else:
+            lam[c] = side
+        weight = 1 / math.sqrt(max(q_x * q_x + q_y * q_y, 1.0))
+        unit_x, unit_y = (q_x * weight, q_y * weight) if weight < 1 else (0.0, 0.0)
+        xx, xy = weight * (1 + POLISH_RIDGE - unit_x * unit_x), -weight * unit_x * unit_y
+        yy, tt = weight * (1 + POLISH_RIDGE - unit_y * unit_y), a[c] * (bend + POLISH_RIDGE)
+        _add(slope[c], weight * q_x, weight * q_y, a[c] * by_t, xx, xy, yy, tt, gradient, H)
 
 
 @njit(cache=True, error_model="numpy")
