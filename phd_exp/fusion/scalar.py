@@ -2,10 +2,12 @@
 
 Operations on whole batches spend a CPU's time on launching themselves and on moving what lies between them; a problem
 of a few cameras fits into its registers. With a GPU it is the other way round: there `newton` and `polish` serve.
-Steps, constants and stopping rules are theirs; tests/fusion/test_scalar.py holds the two against each other.
+Steps, constants and stopping rules are theirs; tests/fusion/test_scalar.py holds the two against each other. What is
+compiled takes its types from what it is given, and checks of annotations would keep it from being compiled.
 """
 
 import math
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -39,19 +41,22 @@ def polish(slope: Slope, at_origin: AtOrigin, a: OfCameras, u: Unknowns, lam: Of
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _minimise_all(slope, at_origin, a, u, lam, least):  # type: ignore[no-untyped-def]  # compiled for what it gets
+@no_type_check
+def _minimise_all(slope, at_origin, a, u, lam, least):
     for i in prange(len(a)):
         _minimise(slope[i], at_origin[i], a[i], u[i], lam[i], least)
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _polish_all(slope, at_origin, a, u, lam):  # type: ignore[no-untyped-def]
+@no_type_check
+def _polish_all(slope, at_origin, a, u, lam):
     for i in prange(len(a)):
         _polish(slope[i], at_origin[i], a[i], u[i], lam[i])
 
 
 @njit(cache=True, error_model="numpy")
-def _minimise(slope, at_origin, a, u, lam, least):  # type: ignore[no-untyped-def]
+@no_type_check
+def _minimise(slope, at_origin, a, u, lam, least):
     cameras, _, k = slope.shape
     seen, moved = np.empty((cameras, 3)), np.empty((cameras, 3))
     y, du, gradient, H = np.zeros((cameras, 2)), np.empty(k), np.empty(k), np.empty((k, k))
@@ -77,7 +82,8 @@ def _minimise(slope, at_origin, a, u, lam, least):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, error_model="numpy")
-def _linearise(slope, at_origin, a, u, y, lam, width, least, seen, gradient, H):  # type: ignore[no-untyped-def]
+@no_type_check
+def _linearise(slope, at_origin, a, u, y, lam, width, least, seen, gradient, H):
     """Gradient and Hessian at u, what is seen there, and the smooth energy."""
     cameras, _, k = slope.shape
     gradient[:] = 0.0
@@ -107,7 +113,8 @@ def _linearise(slope, at_origin, a, u, y, lam, width, least, seen, gradient, H):
 
 
 @njit(cache=True, error_model="numpy")
-def _add(slope, by_x, by_y, by_t, xx, xy, yy, tt, gradient, H):  # type: ignore[no-untyped-def]
+@no_type_check
+def _add(slope, by_x, by_y, by_t, xx, xy, yy, tt, gradient, H):
     """What one camera adds to gradient and Hessian."""
     x, y, t = slope
     for i in range(len(gradient)):
@@ -118,7 +125,8 @@ def _add(slope, by_x, by_y, by_t, xx, xy, yy, tt, gradient, H):  # type: ignore[
 
 
 @njit(cache=True, error_model="numpy")
-def _line_search(before, seen, moved, a, descent, width, least):  # type: ignore[no-untyped-def]
+@no_type_check
+def _line_search(before, seen, moved, a, descent, width, least):
     """The share of the step to take: halved until the energy falls by Armijo's rule."""
     enough = before + 1e-12 * abs(before)
     share = 1.0
@@ -138,7 +146,8 @@ def _line_search(before, seen, moved, a, descent, width, least):  # type: ignore
 
 
 @njit(cache=True, error_model="numpy")
-def _step(seen, moved, y, lam, share, width, least):  # type: ignore[no-untyped-def]
+@no_type_check
+def _step(seen, moved, y, lam, share, width, least):
     """The duals after a step; whether what is seen hardly moved."""
     settled = True
     for c in range(len(lam)):
@@ -161,7 +170,8 @@ def _step(seen, moved, y, lam, share, width, least):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, error_model="numpy")
-def _polish(slope, at_origin, a, u, lam):  # type: ignore[no-untyped-def]
+@no_type_check
+def _polish(slope, at_origin, a, u, lam):
     cameras, _, k = slope.shape
     start, first = u.copy(), lam.copy()
     gradient, du, H = np.empty(k), np.empty(k), np.empty((k, k))
@@ -181,7 +191,8 @@ def _polish(slope, at_origin, a, u, lam):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _linearise_kinks(slope, at_origin, a, u, lam, kink, gradient, H):  # type: ignore[no-untyped-def]
+@no_type_check
+def _linearise_kinks(slope, at_origin, a, u, lam, kink, gradient, H):
     """Gradient and Hessian of what `polish.polish` describes; which cameras are at a kink, and lam of the others."""
     gradient[:] = 0.0
     H[:] = 0.0
@@ -203,7 +214,8 @@ def _linearise_kinks(slope, at_origin, a, u, lam, kink, gradient, H):  # type: i
 
 
 @njit(cache=True, error_model="numpy")
-def _seen(slope, at_origin, u):  # type: ignore[no-untyped-def]
+@no_type_check
+def _seen(slope, at_origin, u):
     q_x, q_y, t = at_origin
     for j in range(len(u)):
         q_x += slope[0, j] * u[j]
@@ -213,7 +225,8 @@ def _seen(slope, at_origin, u):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _solve(H, gradient, du):  # type: ignore[no-untyped-def]
+@no_type_check
+def _solve(H, gradient, du):
     """du with H du = -gradient by Cholesky's factors, which take H's place; NaN where it is not positive definite."""
     k = len(du)
     for i in range(k):
@@ -234,12 +247,14 @@ def _solve(H, gradient, du):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _huber(squared):  # type: ignore[no-untyped-def]
+@no_type_check
+def _huber(squared):
     return math.sqrt(squared) - 0.5 if squared > 1 else squared / 2
 
 
 @njit(cache=True, error_model="numpy")
-def _extended_inverse(t, least):  # type: ignore[no-untyped-def]
+@no_type_check
+def _extended_inverse(t, least):
     """As `energy.extended_inverse`."""
     inverse = 1 / max(t, least)
     short = min(t - least, 0.0) / least
