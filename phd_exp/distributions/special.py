@@ -6,7 +6,7 @@ Everything rests on two schemes that meet at a = 1 and lose no digits to cancell
 - a > 1: one Gauss rule sum_i w_i F(s_i) for int_0^inf e^(-s) F(s) ds with F(s) = s^k (1 + s/a)^(-n). All w_i are
   positive.
 
-Source: DLMF 6.6 and 8.19 for the series; the rule is an own derivation, see `_GAUSS_RULE`.
+Source: DLMF 6.6 and 8.19 for the series; the rule is an own derivation, see `GAUSS_RULE`.
 """
 
 import math
@@ -21,7 +21,7 @@ from torch import Tensor
 # p(s) / prod_j (1 + s/a_j) with deg p <= 25 and 19 poles a_j spaced evenly in log a from 0.9 to 8. For k = 0 its
 # relative error is below 2e-16 at n = 2, 3e-14 at n = 4 and 2e-13 at n = 5, for all a >= 1, infinity included.
 # tests/distributions/test_special.py derives it anew with mpmath.
-_GAUSS_RULE = (
+GAUSS_RULE = (
     (0.020171831813756392, 0.051009036140987848),
     (0.10875679026524802, 0.11371716148653708),
     (0.27834286810847623, 0.16305456419243933),
@@ -37,7 +37,9 @@ _GAUSS_RULE = (
     (18.622310304378326, 0.000000057703163267050501),
 )
 _EULER_GAMMA = 0.5772156649015328606
-_SERIES_TERMS = 19  # the first term left out is below 2e-17 for a <= 1
+_DIGAMMA = [math.fsum([-_EULER_GAMMA, *(1 / j for j in range(1, k + 1))]) for k in range(19)]
+SERIES = tuple(psi / math.factorial(k) for k, psi in enumerate(_DIGAMMA))
+"""psi(k + 1)/k! of the series; the first term left out is below 2e-17 for a <= 1."""
 _CHUNK = 1 << 13
 _LARGEST_N = 5  # the highest order for which the Gauss rule was built
 
@@ -214,10 +216,8 @@ def _constants(a: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
 
 
 def _build_constants(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-    s, w = torch.tensor(_GAUSS_RULE, dtype=dtype, device=device).unbind(-1)
-    digamma = [math.fsum([-_EULER_GAMMA, *(1 / j for j in range(1, k + 1))]) for k in range(_SERIES_TERMS)]
-    series = [psi / math.factorial(k) for k, psi in enumerate(digamma)]
-    return s.contiguous(), w.contiguous(), torch.tensor(series, dtype=dtype, device=device).unbind()
+    s, w = torch.tensor(GAUSS_RULE, dtype=dtype, device=device).unbind(-1)
+    return s.contiguous(), w.contiguous(), torch.tensor(SERIES, dtype=dtype, device=device).unbind()
 
 
 _kept_constants = cache(_build_constants)  # copying them to a GPU in every call would make it wait

@@ -10,7 +10,8 @@ from phd_exp.fusion.linear import factor, forward, total
 from phd_exp.fusion.polish import KINK
 from phd_exp.fusion.views import Seen, Unknown, Views
 
-_RADII = (1e-8, 1e-6, 1e-4, 1e-2)  # metres; balls in which the curvature is bounded from below
+RADII = (1e-8, 1e-6, 1e-4, 1e-2)  # metres; balls in which the curvature is bounded from below
+TINY = torch.finfo(torch.float64).tiny
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ def certify(views: Views, u: Unknown, lam: Float[Tensor, "cameras problems"]) ->
     distance = torch.full_like(pull, torch.inf)
     left = torch.arange(len(pull), device=pull.device)
     # a larger ball has less curvature, and so a larger bound: the first to hold is the best
-    for radius in _RADII:
+    for radius in RADII:
         part = (views.subset(left), seen[..., left], lam[:, left], kink[:, left])
         bound = _distance(*part, radius, G[:, left], error[left])
         holds = bound <= radius
@@ -104,7 +105,7 @@ def _least_curvature(
     reach = squares[2].sqrt() * radius
     far = seen[2] + reach
     depth = torch.where(far < 1, 2 / far**3, 0)
-    depth = torch.where(kink, 2 * (1 - lam.abs()) / reach.clamp_min(torch.finfo(far.dtype).tiny), depth)
+    depth = torch.where(kink, 2 * (1 - lam.abs()) / reach.clamp_min(TINY), depth)
     ones = torch.ones_like(length)
     return torch.stack(
         [

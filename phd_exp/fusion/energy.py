@@ -4,6 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from phd_exp.distributions.level import credible_level
+from phd_exp.fusion.views import Unknown, Views
+
 
 def energy(seen: Float[Tensor, "3 *#batch"], a: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
     """h(|q|) + a max(t, 1/t) of each camera; infinite for t <= 0.
@@ -45,3 +48,8 @@ def smooth_energy(
     t = seen[2]
     inverse = extended_inverse(t, least)[0]
     return huber(seen) + a * ((t + inverse) / 2 + (((t - inverse) / 2).square() + width**2).sqrt())
+
+
+def surprise(views: Views, u: Unknown) -> Float[Tensor, "cameras problems"]:
+    """Credible level of u in each view: how much probability lies closer to what the view says."""
+    return credible_level(energy(views.seen(u), views.a) - views.a, views.a)

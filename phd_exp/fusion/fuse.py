@@ -7,13 +7,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.level import credible_level
-from phd_exp.fusion.certificate import certify
-from phd_exp.fusion.energy import energy
+from phd_exp.fusion import solver
 from phd_exp.fusion.fused import Fused
 from phd_exp.fusion.pose import Plane, Pose
 from phd_exp.fusion.problems import Problems
-from phd_exp.fusion.solver import minimise, polish
 from phd_exp.fusion.status import Status
 from phd_exp.fusion.views import Unknown, Views
 
@@ -53,12 +50,12 @@ def fuse(
     status = problems.status()
     sound = (status == Status.FUSED).nonzero().squeeze(-1)
     part = problems.subset(sound)
-    views = part.views()
+    views = solver.views(part)
     u, lam, seen = find_optimum(views)
     unseen, seen = (~seen).nonzero().squeeze(-1), seen.nonzero().squeeze(-1)
     status[sound[unseen]] = _why_unseen(part.subset(unseen))
     part, views = part.subset(seen), views.subset(seen)
-    optima = Optima(part, views, *polish(views, u[:, seen], lam[:, seen]))
+    optima = Optima(part, views, *solver.polish(views, u[:, seen], lam[:, seen]))
     return _judged(optima, sound[seen], status, predictions.batch_shape[:-1], contradiction)
 
 
@@ -76,7 +73,7 @@ def find_optimum(
         if len(rest) == 0:
             break
         part = views.subset(rest)
-        u[:, rest], lam[:, rest] = minimise(part, u[:, rest], least)
+        u[:, rest], lam[:, rest] = solver.minimise(part, u[:, rest], least)
         seen[rest] = (part.seen(u[:, rest])[2] >= least).all(0)
     return u, lam, seen
 
@@ -85,7 +82,7 @@ def _why_unseen(problems: Problems) -> Int[Tensor, " problems"]:
     """Is it the plane, or have the cameras nothing in common anyway?"""
     status = torch.full_like(problems.mask[:, 0], int(Status.NO_COMMON_VIEW), dtype=torch.long)
     if problems.plane is not None and len(status) > 0:
-        seen = find_optimum(problems.without_plane().views())[2]
+        seen = find_optimum(solver.views(problems.without_plane()))[2]
         status[seen] = Status.PLANE_BEHIND_CAMERA
     return status
 
@@ -109,8 +106,8 @@ def _judged(
 ) -> Fused:
     """The optima certified, and those that stand entered among all problems, which have this shape."""
     problems, views, u = optima.problems, optima.views, optima.u
-    certificate = certify(views, u, optima.lam)
-    surprise = _surprise(views, u).T
+    certificate = solver.certify(views, u, optima.lam)
+    surprise = solver.surprise(views, u).T
     ruled_out = ((surprise > 1 - contradiction) & problems.mask).sum(-1)
     status[where[2 * ruled_out >= problems.mask.sum(-1)]] = Status.CONTRADICTION
     status[where[~(certificate.relative <= CONVERGED)]] = Status.NOT_CONVERGED
@@ -131,8 +128,3 @@ def _judged(
         solved,
         u,
     )
-
-
-def _surprise(views: Views, u: Unknown) -> Float[Tensor, "cameras problems"]:
-    """Credible level of u in each view."""
-    return credible_level(energy(views.seen(u), views.a) - views.a, views.a)

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from phd_exp.fusion import solver
 from phd_exp.fusion.linear import product
-from phd_exp.fusion.moments import moments
 from phd_exp.fusion.problems import Problems
 from phd_exp.fusion.status import FusionError, Status
 
@@ -53,7 +53,7 @@ class Fused:
         covariance = mean[..., None].repeat(*[1] * mean.ndim, 3)
         found = self.status == Status.FUSED
         if bool(found.any()):
-            u_mean, u_covariance = moments(self.solved.views(), self.optimum)
+            u_mean, u_covariance = solver.moments(solver.views(self.solved), self.optimum)
             D = self.solved.directions
             mean[found] = self.solved.in_world(u_mean)
             covariance[found] = product(product(D, u_covariance.permute(2, 0, 1)), D.mT)

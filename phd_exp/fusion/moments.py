@@ -17,9 +17,9 @@ from phd_exp.fusion.energy import energy
 from phd_exp.fusion.linear import Triangle, backward, factor, forward, total
 from phd_exp.fusion.views import Unknown, Views
 
-_POINTS, _PASSES = 256, 3
+_POINTS, PASSES = 256, 3
 _FREEDOM = 5.0  # of Student's law, whose tails cover the exponential ones of the density
-_FIXED_POINT_STEPS = 6
+FIXED_POINT_STEPS = 6
 _AT_ONCE = {"cpu": 1 << 17, "cuda": 1 << 24}
 """Cameras times points times problems: what stays in a processor's cache, and what keeps a GPU busy."""
 
@@ -42,11 +42,11 @@ def moments(views: Views, u: Unknown) -> tuple[Unknown, Float[Tensor, "k k probl
 
 
 def _moments(views: Views, u: Unknown) -> tuple[Tensor, Tensor]:
-    points, log_proposal = (part.to(u.device) for part in _rule(len(u)))
+    points, log_proposal = (part.to(u.device) for part in student_points(len(u)))
     precision = factor(averaged_precision(views, u))
     offset = backward([[entry[:, None] for entry in row] for row in precision], points[:, None])
     mean, covariance = _weighted(views, u, offset, log_proposal)
-    for _ in range(_PASSES - 1):
+    for _ in range(PASSES - 1):
         root = factor([[covariance[i, j] for j in range(i + 1)] for i in range(len(u))])
         offset = _product(root, points)
         mean, covariance = _weighted(views, mean, offset, log_proposal)
@@ -89,7 +89,7 @@ def averaged_precision(views: Views, u: Unknown) -> Triangle:
     squared, t = seen[0].square() + seen[1].square(), seen[2]
     zero = torch.zeros_like(t)
     weight, bend = (1 + squared).rsqrt(), views.a
-    for _ in range(_FIXED_POINT_STEPS):
+    for _ in range(FIXED_POINT_STEPS):
         H = views.hessian(torch.stack([weight, zero, weight, bend]))
         variance = forward(factor(H), views.slope.transpose(0, 1)).square().sum(0)  # 3 cameras problems
         weight = (1 + squared + variance[0] + variance[1]).rsqrt()
@@ -101,7 +101,7 @@ def averaged_precision(views: Views, u: Unknown) -> Triangle:
 
 
 @cache
-def _rule(k: int) -> tuple[Float[Tensor, "k points"], Float[Tensor, " points"]]:
+def student_points(k: int) -> tuple[Float[Tensor, "k points"], Float[Tensor, " points"]]:
     """Points of Student's law in k = 2 or 3 dimensions, and the log of its density there up to a constant."""
     uniform = torch.from_numpy(stats.qmc.Sobol(k, scramble=True, seed=0).random(_POINTS))
     radius = torch.from_numpy(k * stats.f.ppf(uniform[:, 0].numpy(), k, _FREEDOM)).sqrt()

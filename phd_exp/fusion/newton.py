@@ -20,7 +20,7 @@ from phd_exp.fusion.linear import solve, total
 from phd_exp.fusion.views import Seen, Unknown, Views
 
 WIDTH_FLOOR = 1e-9
-FIRST_WIDTH, SHRINK = 1.0, 0.05
+FIRST_WIDTH, SHRINK = 1.0, 0.01
 MOST_STEPS, MOST_HALVINGS = 80, 40
 SETTLED = 1e-9  # relative change of what is seen
 RIDGE = 1e-9  # share of the curvature of least squares: a flat direction must not stop the rest

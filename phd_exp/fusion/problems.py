@@ -25,6 +25,9 @@ class Problems:
         pose: of the cameras.
         mask: which cameras take part.
         plane: on which the position lies, if any.
+        origin: where a search starts, world, metres: the average of the predicted positions, or the point of the
+            plane that is nearest to it.
+        directions: in which it goes, orthonormal columns.
     """
 
     to_seen: Float[Tensor, "problems cameras 3 3"]
@@ -33,6 +36,8 @@ class Problems:
     pose: Pose
     mask: Bool[Tensor, "problems cameras"]
     plane: Plane | None
+    origin: Float[Tensor, "problems 3"]
+    directions: Float[Tensor, "problems 3 k"]
 
     @classmethod
     def posed(
@@ -49,20 +54,27 @@ class Problems:
                 f"predictions have the batch shape (*problems, cameras), but theirs is {tuple(shape)}"
             )
         everyone = torch.ones(shape, dtype=torch.bool, device=predictions.a.device)
+        pose = Pose(
+            _flat("pose.R", pose.R.double(), shape, 1, event=2),
+            _flat("pose.t", pose.t.double(), shape, 1, event=1),
+        )
+        mode = _flat("predictions", predictions.mode.double(), shape, 1, event=1)
+        mask = _flat("mask", everyone if mask is None else mask, shape, 1)
+        plane = plane and _flat_plane(plane, shape[:-1])
         return cls(
             _flat("predictions", _linear_map(predictions), shape, 1, event=2),
             _flat("predictions", predictions.a.double(), shape, 1),
-            _flat("predictions", predictions.mode.double(), shape, 1, event=1),
-            Pose(
-                _flat("pose.R", pose.R.double(), shape, 1, event=2),
-                _flat("pose.t", pose.t.double(), shape, 1, event=1),
-            ),
-            _flat("mask", everyone if mask is None else mask, shape, 1),
-            plane and _flat_plane(plane, shape[:-1]),
+            mode,
+            pose,
+            mask,
+            plane,
+            *_frame(average(pose.into_world(mode), mask), plane),
         )
 
     def subset(self, problems: Int[Tensor, " some"]) -> "Problems":
-        """Some of the problems."""
+        """Some of the problems, in order."""
+        if len(problems) == len(self.a):
+            return self
         return Problems(
             self.to_seen[problems],
             self.a[problems],
@@ -70,11 +82,14 @@ class Problems:
             Pose(self.pose.R[problems], self.pose.t[problems]),
             self.mask[problems],
             self.plane and Plane(self.plane.normal[problems], self.plane.offset[problems]),
+            self.origin[problems],
+            self.directions[problems],
         )
 
     def without_plane(self) -> "Problems":
         """The same problems in all of space."""
-        return Problems(self.to_seen, self.a, self.mode, self.pose, self.mask, None)
+        frame = _frame(average(self.pose.into_world(self.mode), self.mask), None)
+        return Problems(self.to_seen, self.a, self.mode, self.pose, self.mask, None, *frame)
 
     def status(self) -> Int[Tensor, " problems"]:
         """What is wrong with each problem before anything is computed; FUSED where nothing is."""
@@ -90,20 +105,6 @@ class Problems:
         status[(~(sound & posed) & self.mask).any(-1)] = Status.NOT_FINITE
         status[~self.mask.any(-1)] = Status.NO_CAMERA
         return status
-
-    @property
-    def origin(self) -> Float[Tensor, "problems 3"]:
-        """Where a search starts: the average of the predicted positions, or the point of the plane nearest to it."""
-        middle = average(self.pose.into_world(self.mode), self.mask)
-        return middle if self.plane is None else self.plane.nearest(middle)
-
-    @property
-    def directions(self) -> Float[Tensor, "problems 3 k"]:
-        """In which it goes, orthonormal columns."""
-        if self.plane is not None:
-            return self.plane.directions
-        identity = torch.eye(3, dtype=self.a.dtype, device=self.a.device)
-        return identity.expand(len(self.a), 3, 3)
 
     def views(self) -> Views:
         """What the cameras see of origin + directions u."""
@@ -122,6 +123,16 @@ class Problems:
     def in_world(self, u: Unknown) -> Float[Tensor, "problems 3"]:
         """origin + directions u."""
         return self.origin + apply(self.directions, u.T)
+
+
+def _frame(
+    middle: Float[Tensor, "problems 3"], plane: Plane | None
+) -> tuple[Float[Tensor, "problems 3"], Float[Tensor, "problems 3 k"]]:
+    """Where a search starts and in which directions it goes."""
+    if plane is not None:
+        return plane.nearest(middle), plane.directions
+    identity = torch.eye(3, dtype=middle.dtype, device=middle.device)
+    return middle, identity.expand(len(middle), 3, 3)
 
 
 def _linear_map(predictions: ProjectedHuber) -> Float[Tensor, "*batch 3 3"]:

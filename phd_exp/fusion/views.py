@@ -32,7 +32,9 @@ class Views:
     a: Float[Tensor, "cameras problems"]
 
     def subset(self, problems: Int[Tensor, " some"]) -> "Views":
-        """Some of the problems."""
+        """Some of the problems, in order."""
+        if len(problems) == self.a.shape[-1]:
+            return self
         return Views(self.slope[..., problems], self.at_origin[..., problems], self.a[..., problems])
 
     def chunks(self, size: int) -> "list[Views]":

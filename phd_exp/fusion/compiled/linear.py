@@ -1,0 +1,107 @@
+"""Linear algebra of one problem: three unknowns, written out, so that everything stays in registers.
+
+A gradient and a symmetric matrix are one tuple of nine numbers, (g_0, g_1, g_2, H_00, H_10, H_11, H_20, H_21, H_22).
+On a plane there are two unknowns, and nothing depends on the third: H_22 = 0, and it stays.
+"""
+
+import math
+from typing import no_type_check
+
+from phd_exp.fusion.compiled import compiled
+
+NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@compiled
+@no_type_check
+def seen_of(slope, at_origin, u):
+    """(q_x, q_y, t) of one camera at u."""
+    return (
+        at_origin[0] + slope[0, 0] * u[0] + slope[0, 1] * u[1] + slope[0, 2] * u[2],
+        at_origin[1] + slope[1, 0] * u[0] + slope[1, 1] * u[1] + slope[1, 2] * u[2],
+        at_origin[2] + slope[2, 0] * u[0] + slope[2, 1] * u[1] + slope[2, 2] * u[2],
+    )
+
+
+@compiled
+@no_type_check
+def moved_of(slope, du):
+    """The change of (q_x, q_y, t) of one camera with a change of u."""
+    return (
+        slope[0, 0] * du[0] + slope[0, 1] * du[1] + slope[0, 2] * du[2],
+        slope[1, 0] * du[0] + slope[1, 1] * du[1] + slope[1, 2] * du[2],
+        slope[2, 0] * du[0] + slope[2, 1] * du[1] + slope[2, 2] * du[2],
+    )
+
+
+@compiled
+@no_type_check
+def add(sums, slope, by_x, by_y, by_t, xx, xy, yy, tt):
+    """Gradient and Hessian with those of one more camera, which come with respect to what it sees."""
+    g_0, g_1, g_2, h_00, h_10, h_11, h_20, h_21, h_22 = sums
+    x_0, x_1, x_2 = slope[0, 0], slope[0, 1], slope[0, 2]
+    y_0, y_1, y_2 = slope[1, 0], slope[1, 1], slope[1, 2]
+    t_0, t_1, t_2 = slope[2, 0], slope[2, 1], slope[2, 2]
+    a_0, b_0, c_0 = xx * x_0 + xy * y_0, xy * x_0 + yy * y_0, tt * t_0
+    a_1, b_1, c_1 = xx * x_1 + xy * y_1, xy * x_1 + yy * y_1, tt * t_1
+    a_2, b_2, c_2 = xx * x_2 + xy * y_2, xy * x_2 + yy * y_2, tt * t_2
+    return (
+        g_0 + x_0 * by_x + y_0 * by_y + t_0 * by_t,
+        g_1 + x_1 * by_x + y_1 * by_y + t_1 * by_t,
+        g_2 + x_2 * by_x + y_2 * by_y + t_2 * by_t,
+        h_00 + a_0 * x_0 + b_0 * y_0 + c_0 * t_0,
+        h_10 + a_1 * x_0 + b_1 * y_0 + c_1 * t_0,
+        h_11 + a_1 * x_1 + b_1 * y_1 + c_1 * t_1,
+        h_20 + a_2 * x_0 + b_2 * y_0 + c_2 * t_0,
+        h_21 + a_2 * x_1 + b_2 * y_1 + c_2 * t_1,
+        h_22 + a_2 * x_2 + b_2 * y_2 + c_2 * t_2,
+    )
+
+
+@compiled
+@no_type_check
+def factor(sums):
+    """(L_00, L_10, L_11, L_20, L_21, L_22) with L L^T = H; NaN where H is not positive definite."""
+    _, _, _, h_00, h_10, h_11, h_20, h_21, h_22 = sums
+    if h_22 == 0:
+        h_22 = 1.0
+    l_00 = math.sqrt(h_00)
+    l_10, l_20 = h_10 / l_00, h_20 / l_00
+    l_11 = math.sqrt(h_11 - l_10 * l_10)
+    l_21 = (h_21 - l_20 * l_10) / l_11
+    return l_00, l_10, l_11, l_20, l_21, math.sqrt(h_22 - l_20 * l_20 - l_21 * l_21)
+
+
+@compiled
+@no_type_check
+def forward(L, b):
+    """The x with L x = b."""
+    l_00, l_10, l_11, l_20, l_21, l_22 = L
+    x_0 = b[0] / l_00
+    x_1 = (b[1] - l_10 * x_0) / l_11
+    return x_0, x_1, (b[2] - l_20 * x_0 - l_21 * x_1) / l_22
+
+
+@compiled
+@no_type_check
+def backward(L, b):
+    """The x with L^T x = b."""
+    l_00, l_10, l_11, l_20, l_21, l_22 = L
+    x_2 = b[2] / l_22
+    x_1 = (b[1] - l_21 * x_2) / l_11
+    return (b[0] - l_10 * x_1 - l_20 * x_2) / l_00, x_1, x_2
+
+
+@compiled
+@no_type_check
+def newton_step(sums):
+    """-H^(-1) g."""
+    L = factor(sums)
+    return backward(L, forward(L, (-sums[0], -sums[1], -sums[2])))
+
+
+@compiled
+@no_type_check
+def squared(x):
+    """|x|^2."""
+    return x[0] * x[0] + x[1] * x[1] + x[2] * x[2]

@@ -1,0 +1,120 @@
+"""The compiled steps of a CPU against the batched ones of a GPU, on the same problems."""
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from phd_exp.fusion import Plane, certificate, compiled, energy, moments, newton, solver
+from phd_exp.fusion import polish as polishing
+from phd_exp.fusion.problems import Problems
+from phd_exp.fusion.views import Views
+from tests.fusion.random_problems import random_problems
+
+N = 300
+LEAST = 1e-2
+
+
+def problems_of(cameras: int, on_a_plane: bool, masked: bool) -> Problems:
+    predictions, pose, truth = random_problems(N, cameras, seed=cameras)
+    random = torch.Generator().manual_seed(1)
+    mask = torch.rand(N, cameras, generator=random) < 0.7 if masked else None
+    if mask is not None:
+        mask[:, 0] = True
+    normal = torch.randn(N, 3, generator=random, dtype=torch.float64)
+    plane = Plane(normal, (normal * truth).sum(-1)) if on_a_plane else None
+    return Problems.posed(predictions, pose, plane, mask)
+
+
+def views_of(cameras: int, on_a_plane: bool, masked: bool) -> Views:
+    return problems_of(cameras, on_a_plane, masked).views()
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("on_a_plane", [False, True])
+@pytest.mark.parametrize("cameras", [1, 2, 5])
+def test_both_find_the_same(cameras: int, on_a_plane: bool, masked: bool) -> None:
+    views = views_of(cameras, on_a_plane, masked)
+    start = torch.zeros_like(views.slope[0, :, 0])
+    u, lam = newton.minimise(views, start, LEAST)
+    mine_u, mine_lam = solver.minimise(views, start, LEAST)
+    assert_close(mine_u, u, rtol=0, atol=1e-9)
+    polished, multipliers = polishing.polish(views, u, lam)
+    mine_u, mine_multipliers = solver.polish(views, mine_u, mine_lam)
+    assert_close(mine_u, polished, rtol=0, atol=1e-12)
+    assert_close(mine_multipliers, multipliers, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("on_a_plane", [False, True])
+@pytest.mark.parametrize("cameras", [1, 2, 5])
+def test_both_say_the_same_of_an_optimum(cameras: int, on_a_plane: bool, masked: bool) -> None:
+    problems = problems_of(cameras, on_a_plane, masked)
+    views, mine = problems.views(), solver.views(problems)
+    for name in ("slope", "at_origin", "a"):
+        assert_close(getattr(mine, name), getattr(views, name), rtol=1e-12, atol=1e-12)
+    u, lam = solver.polish(views, *solver.minimise(views, torch.zeros_like(views.slope[0, :, 0]), LEAST))
+    u = u + 1e-7 * torch.randn(u.shape, generator=torch.Generator().manual_seed(2), dtype=u.dtype)
+    here, there = solver.certify(views, u, lam), certificate.certify(views, u, lam)
+    for name in ("subgradient", "relative", "distance"):
+        assert_close(getattr(here, name), getattr(there, name), rtol=1e-6, atol=1e-12)
+    takes_part = views.a > 0
+    expected = energy.surprise(views, u)[takes_part]
+    assert_close(solver.surprise(views, u)[takes_part], expected, rtol=0, atol=1e-12)
+    for ours, theirs in zip(solver.moments(views, u), moments.moments(views, u), strict=True):
+        assert_close(ours, theirs, rtol=1e-9, atol=1e-12)
+
+
+def test_levels_agree_where_depth_is_nearly_unknown_or_nearly_known() -> None:
+    views = views_of(1, on_a_plane=False, masked=False)
+    precise = torch.logspace(-12, 12, N, dtype=torch.float64)[None]
+    views = Views(views.slope, views.at_origin, precise)
+    u = torch.zeros_like(views.slope[0, :, 0])
+    assert_close(solver.surprise(views, u), energy.surprise(views, u), rtol=0, atol=1e-12)
+
+
+def test_what_it_is_given_stays() -> None:
+    views = views_of(3, on_a_plane=False, masked=False)
+    start = torch.ones_like(views.slope[0, :, 0]) / 10
+    before, lam = start.clone(), torch.zeros_like(views.a)
+    solver.minimise(views, start, LEAST)
+    solver.polish(views, start, lam)
+    assert torch.equal(start, before)
+    assert not lam.any()
+
+
+def test_no_problem_depends_on_its_neighbours() -> None:
+    views = views_of(4, on_a_plane=False, masked=False)
+    start = torch.zeros_like(views.slope[0, :, 0])
+    some = torch.arange(5, N, 7)
+    together, alone = (
+        solver.minimise(views, start, LEAST),
+        solver.minimise(views.subset(some), start[:, some], LEAST),
+    )
+    assert torch.equal(together[0][:, some], alone[0])
+    assert torch.equal(together[1][:, some], alone[1])
+
+
+def test_what_was_compiled_of_older_sources_is_forgotten(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By numba's own rule a function stays as it is while another file changes, on which it depends."""
+    package, source = (
+        tmp_path / "phd_exp" / "fusion" / "compiled",
+        tmp_path / "phd_exp" / "fusion" / "newton.py",
+    )
+    (package / "__pycache__").mkdir(parents=True)
+    source.touch()
+    stale, fresh = (package / "__pycache__" / name for name in ("stale.nbi", "fresh.nbi"))
+    stale.touch()
+    fresh.touch()
+    hour = 3600
+    os.utime(stale, (time.time() - hour, time.time() - hour))
+    os.utime(fresh, (time.time() + hour, time.time() + hour))
+    monkeypatch.setattr(compiled, "__file__", str(package / "__init__.py"))
+    compiled._forget_what_is_stale()
+    assert not stale.exists()
+    assert fresh.exists()
