@@ -10,6 +10,10 @@ from torch.testing import assert_close
 
 from phd_exp.fusion import Plane, certificate, compiled, energy, moments, newton, solver
 from phd_exp.fusion import polish as polishing
+from phd_exp.fusion.compiled import moments as moments_compiled
+from phd_exp.fusion.compiled import newton as newton_compiled
+from phd_exp.fusion.compiled import posing
+from phd_exp.fusion.compiled.__main__ import main
 from phd_exp.fusion.problems import Problems
 from phd_exp.fusion.views import Views
 from tests.fusion.random_problems import random_problems
@@ -96,6 +100,12 @@ def test_no_problem_depends_on_its_neighbours() -> None:
     )
     assert torch.equal(together[0][:, some], alone[0])
     assert torch.equal(together[1][:, some], alone[1])
+
+
+def test_everything_is_compiled_ahead_on_request() -> None:
+    main()
+    for module in (posing.views, newton_compiled.minimise, moments_compiled.moments):
+        assert module.signatures
 
 
 def test_what_was_compiled_of_older_sources_is_forgotten(
