@@ -7,9 +7,10 @@ from pathlib import Path
 from phd_exp.cli.folders import named_folders, require_folder
 from phd_exp.records.errors import UserError
 from phd_exp.reports.collect import Records, collect
-from phd_exp.reports.formats.files import write_fusion_tables, write_tables
-from phd_exp.reports.formats.terminal import print_fusion, print_report
+from phd_exp.reports.formats.files import write_fusion_tables, write_tables, write_variation_tables
+from phd_exp.reports.formats.terminal import print_complaints, print_report, print_tables
 from phd_exp.reports.tables import tables
+from phd_exp.reports.variations import variation_tables
 
 FOLDERS = {"runs": "runs", "out": "report"}
 FOR_THE_SITE = ("matplotlib", "plotly", "jinja2")
@@ -25,6 +26,9 @@ def main(arguments: list[str]) -> int:
         print_report(records, drawn)
         if drawn:
             print(f"tables: {write_tables(drawn, folders['out'])}")
+        if varied := variation_tables(records):
+            print_tables(varied)
+            print(f"tables of variations: {write_variation_tables(varied, folders['out'])}")
         if any(run.folder.views.exists() for run in records.runs):
             _fusion(records, folders["out"])
         if records.runs:
@@ -40,7 +44,8 @@ def _fusion(records: Records, out: Path) -> None:
     from phd_exp.reports.fusion_table import fusion_tables
 
     drawn, complaints = fusion_tables(records)
-    print_fusion(drawn, complaints)
+    print_tables(drawn)
+    print_complaints(complaints)
     if drawn:
         print(f"tables of fusion: {write_fusion_tables(drawn, out)}")
 

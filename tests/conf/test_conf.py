@@ -7,6 +7,7 @@ import pytest
 
 from phd_exp.cli.paths import conf_folder
 from phd_exp.data.augmentation import Augmentation
+from phd_exp.records.runs import flatten
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.training.config import RunConfig, check
 
@@ -15,7 +16,9 @@ CHOICES = sorted(
 )
 
 NEEDS = {"data=folder": ("data.folder=photos",)} | {
-    choice: ("recipe=strong",) for choice in CHOICES if choice.startswith("size=")
+    choice: ("recipe=strong", "preset=small")
+    for choice in CHOICES
+    if choice.startswith(("size=", "without="))
 }
 """What a choice leaves for the user to say, or is made for."""
 
@@ -104,6 +107,25 @@ def test_the_strong_recipe_shows_the_focal_length_to_models_that_may_know_it(
 ) -> None:
     assert checked("recipe=strong", f"model={model}").camera.focal_length == camera
     assert checked("recipe=strong", f"model={model}", "camera=known").camera.focal_length == "known"
+
+
+@pytest.mark.parametrize(
+    ("part", "keys"),
+    [
+        ("muon", {"optimizer._target_", "optimizer.orthogonal_lr", "optimizer.momentum", "optimizer.fused"}),
+        ("schedule", {"recipe.schedule", "recipe.warmup_steps"}),
+        ("localisation", {"recipe.localisation"}),
+        ("symmetries", {"recipe.augmentation.symmetries"}),
+        ("colours", {"recipe.augmentation.colours"}),
+        ("focal_length", {"camera.focal_length"}),
+        ("fine_images", {"data.image_size", "backbone.width", "backbone.stride", "backbone.channels"}),
+    ],
+)
+def test_what_is_left_out_of_the_strong_recipe_is_one_thing(composed: Callable, part: str, keys: set) -> None:
+    strong = ("recipe=strong", "preset=small")
+    whole, without = flatten(composed(*strong)), flatten(composed(*strong, f"without={part}"))
+    changed = {key for key in whole | without if whole.get(key, "none") != without.get(key, "none")}
+    assert changed == keys
 
 
 def test_the_command_line_has_the_last_word(checked: Callable) -> None:

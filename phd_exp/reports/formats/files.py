@@ -11,6 +11,7 @@ from phd_exp.reports.formats.latex import latex
 from phd_exp.reports.formats.markdown import markdown
 from phd_exp.reports.formats.tidy import tidy
 from phd_exp.reports.tables import PaperTable, Table
+from phd_exp.reports.variations import VariationTable
 
 if TYPE_CHECKING:  # torch, which tables on single views need not wait for
     from phd_exp.reports.fusion_table import FusionTable
@@ -37,6 +38,16 @@ def write_fusion_tables(tables: "Sequence[FusionTable]", out: Path) -> Path:
     with _folder(out) as folder:
         _write_each(tables, folder)
         write_atomic(folder / "fusion.csv", tidy_fusion(tables))
+    return folder
+
+
+def write_variation_tables(tables: Sequence[VariationTable], out: Path) -> Path:
+    """Write `<out>/tables/variations-<preset>-<data>-<model>.{md,tex}`; returns that folder.
+
+    Raises UserError where the folder cannot be written.
+    """
+    with _folder(out) as folder:
+        _write_each(tables, folder)
     return folder
 
 

@@ -34,8 +34,8 @@ def print_report(records: Records, tables: Sequence[PaperTable]) -> None:
         _say_command(console, f"{what}; begin by", making_command(records, "paper", "table1"))
 
 
-def print_fusion(tables: Sequence[Table], complaints: Sequence[str]) -> None:
-    """Print the tables of several views, and what cannot be used of them."""
+def print_tables(tables: Sequence[Table]) -> None:
+    """Print tables that lack nothing, then how to read them, once."""
     console = _console()
     for table in tables:
         _say(console, table.title, style="bold")
@@ -43,10 +43,15 @@ def print_fusion(tables: Sequence[Table], complaints: Sequence[str]) -> None:
         console.print()
     for note in dict.fromkeys(note for table in tables for note in table.notes):
         _say(console, note)
+    if tables and not console.is_terminal:
+        _say(console, OF_A_STAR)
+    console.print()
+
+
+def print_complaints(complaints: Sequence[str]) -> None:
+    """Print what cannot be used of several views."""
     for complaint in complaints:
-        _say(console, f"Not fused: {complaint}")
-    if tables:
-        _say(console, "" if console.is_terminal else OF_A_STAR)
+        _say(_console(), f"Not fused: {complaint}")
 
 
 def _console() -> Console:
@@ -71,7 +76,7 @@ def _print_readings(console: Console, readings: Sequence[PaperTable]) -> None:
 def _print_runs(console: Console, runs: Sequence[Run]) -> None:
     plain = [run for run in runs if run.overrides is None]
     apart = [run for run in runs if run.overrides is not None]
-    for title, chosen in (("Runs", plain), ("Runs with other overrides, in no table", apart)):
+    for title, chosen in (("Runs", plain), ("Runs with other overrides, in no table of the paper", apart)):
         if chosen:
             _say(console, f"{title}; projected and depth error in mm, NLL in nats", style="bold")
             console.print(_run_list(chosen))

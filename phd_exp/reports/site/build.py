@@ -26,6 +26,7 @@ from phd_exp.reports.site.overview import overview_groups
 from phd_exp.reports.site.pages import comparison_page, overview_page, run_page
 from phd_exp.reports.site.run_data import RunData, as_script, gather, key_of, read_script, run_script
 from phd_exp.reports.tables import tables
+from phd_exp.reports.variations import variation_tables
 
 _ASSETS = Path(__file__).parent / "assets"
 
@@ -111,7 +112,7 @@ def _write(site: SiteFolder, records: Records, figures: Path) -> Path:
     write_atomic(site.script("overview"), as_script("overview", flat))
     write_atomic(site.path / "compare.html", comparison_page(found))
     index = site.path / "index.html"
-    write_atomic(index, overview_page(found, tables(records), groups, drawn))
+    write_atomic(index, overview_page(found, tables(records), variation_tables(records), groups, drawn))
     _forget(site, [run.slug for run in found])
     return index
 

@@ -20,6 +20,7 @@ from phd_exp.reports.site.overview import Group
 from phd_exp.reports.site.quantities import SCORES, Quantity, quantity
 from phd_exp.reports.site.run_data import RunData
 from phd_exp.reports.tables import PaperTable
+from phd_exp.reports.variations import VariationTable
 
 _HERE = Path(__file__).parent
 
@@ -65,6 +66,7 @@ _ENVIRONMENT = _environment()
 def overview_page(
     runs: Sequence[RunData],
     tables: Sequence[PaperTable],
+    varied: Sequence[VariationTable],
     groups: dict[str, Group],
     figures: Sequence[str],
 ) -> str:
@@ -76,6 +78,7 @@ def overview_page(
         runs=runs,
         fused=[run for run in runs if run.fusion],
         tables=[[table for table in tables if table.preset == preset] for preset in presets],
+        varied=varied,
         groups=groups,
         figures=figures,
         finished=sum(run.state == "finished" for run in runs),

@@ -203,7 +203,7 @@ def test_runs_with_overrides_are_listed_apart(tmp_path: Path, capsys: pytest.Cap
     other.write_config({"optimizer": {"lr": 0.5}})
     records = collect(tmp_path)
     print_report(records, tables(records))
-    before, after = capsys.readouterr().out.split("Runs with other overrides, in no table")
+    before, after = capsys.readouterr().out.split("Runs with other overrides, in no table of the paper")
     assert "small/occl/mae_vz/seed0 " in before
     assert other.path.name in after
     assert "overrides: optimizer.lr=0.5" in after

@@ -1,0 +1,110 @@
+"""What single choices contribute: every number by hand, and what enters no table of it."""
+
+from pathlib import Path
+
+import pytest
+
+from phd_exp.reports.collect import collect
+from phd_exp.reports.formats.files import write_variation_tables
+from phd_exp.reports.variations import VariationTable, variation_tables
+from tests.reports.recorded import Predicted, by_hand, predicted, record
+
+PLAIN = {"optimizer": {"lr": 0.1}, "recipe": {"localisation": 1}}
+VARIED = {"optimizer": {"lr": 0.5}, "recipe": {"localisation": 1}}
+SEEDS = (0, 1)
+
+
+def held_out(
+    runs: Path, config: dict, seed: int, number: int, noise: float, model: str = "probabilistic"
+) -> Predicted:
+    """A finished run with these predictions of its held-out images; those of its test images are others."""
+    overrides = () if config == PLAIN else ("optimizer.lr=0.5",)
+    probabilistic = model == "probabilistic"
+    tested = predicted(1000 + number, noise=1, probabilistic=probabilistic).frame
+    folder = record(runs, "occl", model, seed, tested, overrides=overrides)
+    folder.write_config(config)
+    drawn = predicted(number, noise=noise, probabilistic=probabilistic)
+    drawn.frame.to_parquet(folder.held_out)
+    return drawn
+
+
+@pytest.fixture
+def drawn(tmp_path: Path) -> dict[tuple[float, int], Predicted]:
+    plain = {(0.1, seed): held_out(tmp_path, PLAIN, seed, seed, noise=0.02) for seed in SEEDS}
+    return plain | {(0.5, seed): held_out(tmp_path, VARIED, seed, 10 + seed, noise=0.04) for seed in SEEDS}
+
+
+def only(runs: Path) -> VariationTable:
+    (table,) = variation_tables(collect(runs))
+    return table
+
+
+def test_numbers_are_of_the_held_out_images(drawn: dict, tmp_path: Path) -> None:
+    (plain,), (varied,) = only(tmp_path).groups
+    assert plain.stub == ("as it is", "0, 1")
+    assert varied.stub == ("optimizer.lr=0.5", "0, 1")
+    for row, lr in ((plain, 0.1), (varied, 0.5)):
+        nll = [drawn[lr, seed].frame["nll"].mean() for seed in SEEDS]
+        projected = [by_hand(drawn[lr, seed], "mode", "projected").mean() for seed in SEEDS]
+        depth = [by_hand(drawn[lr, seed], "mode", "depth").mean() for seed in SEEDS]
+        for cell, values, digits in zip(row.cells, (nll, projected, depth), (2, 1, 0), strict=False):
+            assert cell.ours == f"{sum(values) / 2:.{digits}f}"
+            assert cell.spread == f"({min(values):.{digits}f} to {max(values):.{digits}f})"
+
+
+def test_a_difference_is_between_runs_of_one_seed(drawn: dict, tmp_path: Path) -> None:
+    (plain,), (varied,) = only(tmp_path).groups
+    nll = {key: table.frame["nll"].mean() for key, table in drawn.items()}
+    differences = [nll[0.5, seed] - nll[0.1, seed] for seed in SEEDS]
+    assert varied.cells[3].ours == f"{sum(differences) / 2:+.2f}"
+    assert varied.cells[3].spread == f"({min(differences):+.2f} to {max(differences):+.2f})"
+    assert plain.cells[3].ours == ""
+
+
+def test_a_seed_that_has_no_counterpart_enters_no_difference(drawn: dict, tmp_path: Path) -> None:
+    held_out(tmp_path, VARIED, 2, 12, noise=0.3)
+    (_,), (varied,) = only(tmp_path).groups
+    assert varied.stub[1] == "0, 1, 2"
+    nll = {key: table.frame["nll"].mean() for key, table in drawn.items()}
+    assert varied.cells[3].ours == f"{sum(nll[0.5, seed] - nll[0.1, seed] for seed in SEEDS) / 2:+.2f}"
+
+
+def test_of_points_the_depth_error_is_compared(tmp_path: Path) -> None:
+    plain, varied = (
+        held_out(tmp_path, config, 0, number, noise, model="mae_vz")
+        for number, (config, noise) in enumerate([(PLAIN, 0.02), (VARIED, 0.04)])
+    )
+    cells = only(tmp_path).groups[1][0].cells
+    before, now = (by_hand(table, "mode", "depth").mean() for table in (plain, varied))
+    assert (cells[0].ours, cells[3].ours) == ("–", f"{100 * (now / before - 1):+.0f}")
+
+
+def test_the_best_comes_first(drawn: dict, tmp_path: Path) -> None:
+    better = {"optimizer": {"lr": 0.1}, "recipe": {"localisation": 2}}
+    folder = record(
+        tmp_path, "occl", "probabilistic", 0, predicted(5).frame, overrides=("recipe.localisation=2",)
+    )
+    folder.write_config(better)
+    frame = predicted(20).frame
+    frame["nll"] = -9.0
+    frame.to_parquet(folder.held_out)
+    assert [row.stub[0] for row in only(tmp_path).groups[1]] == ["recipe.localisation=2", "optimizer.lr=0.5"]
+
+
+@pytest.mark.parametrize("broken", ["held_out", "state"])
+def test_what_is_not_finished_or_cannot_be_read_is_left_out(drawn: dict, tmp_path: Path, broken: str) -> None:
+    for run in collect(tmp_path).runs:
+        if run.overrides:
+            file = run.folder.held_out if broken == "held_out" else run.folder.status_file
+            file.write_bytes(b"torn")
+    assert variation_tables(collect(tmp_path)) == []
+
+
+def test_files_are_named_by_what_they_are_about(drawn: dict, tmp_path: Path) -> None:
+    folder = write_variation_tables([only(tmp_path)], tmp_path / "report")
+    assert {file.name for file in folder.iterdir()} == {
+        "variations-small-occl-probabilistic.md",
+        "variations-small-occl-probabilistic.tex",
+    }
+    text = (folder / "variations-small-occl-probabilistic.md").read_text()
+    assert "| optimizer.lr=0.5 | 0, 1 |" in text
