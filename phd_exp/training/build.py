@@ -113,6 +113,7 @@ def build_trainer(
         logger=[record, *loggers],
         callbacks=callbacks,
         enable_progress_bar=any(isinstance(callback, ProgressBar) for callback in callbacks),
+        check_val_every_n_epoch=config.evaluation.every_n_epochs,
         log_every_n_steps=1,  # metrics are logged once an epoch; this only keeps Lightning from remarking on it
         enable_model_summary=False,
         num_sanity_val_steps=0,

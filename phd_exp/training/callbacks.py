@@ -79,7 +79,12 @@ class RecordBeforeCheckpoint(Checkpoint):
         self.record = record
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        values = {key: float(value) for key, value in trainer.callback_metrics.items()}
+        evaluated = (trainer.current_epoch + 1) % (trainer.check_val_every_n_epoch or 1) == 0
+        values = {
+            key: float(value)
+            for key, value in trainer.callback_metrics.items()
+            if evaluated or not key.startswith("test/")  # Lightning keeps what was measured epochs ago
+        }
         step = trainer.global_step - 1  # as Lightning counts when it logs
         self.record.log_metrics({"epoch": trainer.current_epoch} | values, step=step)
 

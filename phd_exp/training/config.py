@@ -45,6 +45,7 @@ WITHOUT_INFLUENCE = (
     "data.root",
     "data.workers",
     "trainer.progress_bar",
+    "evaluation.every_n_epochs",
     "evaluation.multiview",
 )
 """Keys, or sections, that say where and how a run is made and recorded, or what is measured of it afterwards besides
@@ -222,7 +223,18 @@ class EvaluationConfig(Section):
 
     calibration_window: Annotated[Whole, Field(ge=1)]
     calibration_every_n_epochs: Annotated[Whole, Field(ge=1)]
-    multiview: MultiviewConfig | None = None  # so in records from before there was this
+    every_n_epochs: Annotated[Whole, Field(ge=1)] = 1  # so in records from before there was this
+    multiview: MultiviewConfig | None = None  # and this
+
+    @model_validator(mode="after")
+    def calibration_is_evaluated(self) -> "EvaluationConfig":
+        """Refuse calibration curves in epochs that are not evaluated."""
+        if self.calibration_every_n_epochs % self.every_n_epochs:
+            raise ValueError(
+                f"calibration_every_n_epochs={self.calibration_every_n_epochs} is no multiple of "
+                f"every_n_epochs={self.every_n_epochs}: curves are drawn where the test samples are evaluated"
+            )
+        return self
 
 
 class RenderConfig(Section):

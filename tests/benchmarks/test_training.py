@@ -1,5 +1,6 @@
 """How near the whole programme comes to the arithmetic of its network; ratios within one process, medians of five."""
 
+import itertools
 import json
 import statistics
 import subprocess
@@ -88,7 +89,9 @@ def test_evaluation_and_logging_are_a_twentieth_of_an_epoch(
 ) -> None:
     """Of preset=small, whose training and test samples are as many to one another as here."""
     words = ("preset=small", f"recipe={recipe}", "data.n_train=1600", "data.n_test=250")
-    share = statistics.median(measured("bare", tmp_path, *words)["evaluation"])
+    of_epochs = measured("bare", tmp_path, *words)["evaluation"]
+    # every other epoch is evaluated
+    share = statistics.median(statistics.fmean(pair) for pair in itertools.pairwise(of_epochs))
     record(f"evaluation, recipe={recipe}", f"{100 * share:.1f} %", "an epoch", f"{100 * share:.1f} %", "5 %")
     assert share <= 0.05
 

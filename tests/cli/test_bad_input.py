@@ -37,6 +37,7 @@ BAD = [
     (["trainer.max_epochs=0"], ["trainer.max_epochs", "got 0"]),
     (["trainer.threads=0"], ["trainer.threads", "got 0"]),
     (["evaluation.calibration_window=0"], ["evaluation.calibration_window"]),
+    (["evaluation.every_n_epochs=3"], ["evaluation", "calibration_every_n_epochs=10 is no multiple"]),
     (["evaluation.multiview.scenes=-1"], ["evaluation.multiview.scenes", "got -1"]),
     (["evaluation.multiview.views=1"], ["evaluation.multiview.views", "got 1"]),
     (["evaluation.multiview.angle_range=[60,20]"], ["evaluation.multiview.angle_range", "lower bound"]),

@@ -87,6 +87,25 @@ def test_calibration_as_data_and_as_pictures(train: Callable, tmp_path: Path) ->
             assert picture.size[0] > 500
 
 
+def test_evaluating_less_often_changes_no_number_but_leaves_some_out(train: Callable, tmp_path: Path) -> None:
+    for every in (1, 2):
+        outcome = train(
+            "logger=none", f"runs={tmp_path / str(every)}", "trainer.max_epochs=3",
+            f"evaluation.every_n_epochs={every}",
+        )  # fmt: skip
+        assert outcome.status == 0, outcome.err
+    each, other = (only_run(tmp_path / name) for name in "12")
+    for (name, weight), (_, same) in zip(weights(each).items(), weights(other).items(), strict=True):
+        assert torch.equal(weight, same), name
+    of_each, of_other = list(each.metrics()), list(other.metrics())
+    assert [any(key.startswith("test/") for key in row) for row in of_other] == [True, False, True, False]
+    for row, same in zip(of_each, of_other, strict=True):
+        assert same.items() <= row.items()
+    assert {
+        key: value for key, value in each.results().items() if "test/" in key
+    }.items() <= other.results().items()
+
+
 def test_wandb_beside_the_record(train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And nowhere else: neither at home nor in the environment of the next run."""
     monkeypatch.setenv("HOME", str(tmp_path / "home"))

@@ -45,6 +45,7 @@ def line(name: str, x: Numbers, y: Numbers, colour: int, *, dash: str = "solid",
     return {
         "type": "scatter",
         "mode": "lines" if points > 1 else "markers",  # one point makes no line
+        "connectgaps": True,  # not every epoch is evaluated
         "name": name,
         "x": _rounded(x),
         "y": _rounded(y),
