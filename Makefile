@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all lint bench docs notebooks clean
+.PHONY: help install demo tables test test-all lint bench docs notebooks clean
 
 help:  ## what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -23,6 +23,17 @@ install: $(INSTALLED)  ## .venv with everything in it
 
 demo: $(INSTALLED)  ## render, train the probabilistic model, draw its calibration, print its row of the table
 	$(BIN)/python -m phd_exp preset=demo
+	$(BIN)/python -m phd_exp report
+
+PRESET ?= paper
+RECIPE ?= strong
+JOBS ?= 4
+MORE ?=
+TABLES := preset=$(PRESET) recipe=$(RECIPE) $(MORE)
+
+tables: $(INSTALLED)  ## both tables, JOBS runs at once; wants a GPU at PRESET=paper, and goes on where it was stopped
+	$(BIN)/python -m phd_exp -m render data=default,occl,scale,occl_scale $(TABLES)
+	$(BIN)/python -m phd_exp -m experiment=table1,table2 $(TABLES) hydra/launcher=joblib hydra.launcher.n_jobs=$(JOBS)
 	$(BIN)/python -m phd_exp report
 
 lint: $(INSTALLED)  ## ruff, mypy, the import floors, and no release that is known to be bad

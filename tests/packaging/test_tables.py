@@ -1,0 +1,50 @@
+"""`make tables`, as it is written in the Makefile, at the smallest size."""
+
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+RUNS = 14
+
+
+def commands(*variables: str) -> list[list[str]]:
+    """What make would run once everything is installed."""
+    done = subprocess.run(
+        ["make", "--dry-run", "tables", "INSTALLED=Makefile", "BIN=bin", *variables],
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    words = [shlex.split(line) for line in done.stdout.splitlines()]
+    assert all(command[0] == "bin/python" for command in words)
+    return [[sys.executable, *command[1:]] for command in words]
+
+
+def test_it_asks_for_the_authors_protocol_on_a_gpu_unless_told_otherwise() -> None:
+    render, train, _ = commands()
+    assert {"preset=paper", "recipe=strong"} < set(render) & set(train)
+    assert {"experiment=table1,table2", "hydra/launcher=joblib"} < set(train)
+
+
+@pytest.mark.slow
+def test_both_tables_are_made_and_made_only_once(tmp_path: Path) -> None:
+    pytest.importorskip(
+        "hydra_plugins.hydra_joblib_launcher", reason="needs `pip install 'phd_exp[launchers]'`"
+    )
+    render, train, report = commands("PRESET=smoke", "RECIPE=strong", "JOBS=2", "MORE=logger=none")
+
+    def said(command: list[str]) -> str:
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        done = subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    said(render)
+    assert f"{RUNS} jobs, 0 of them finished already" in said(train)
+    assert "Not there" not in said(report)
+    assert f"{RUNS} jobs, {RUNS} of them finished already" in said(train)
