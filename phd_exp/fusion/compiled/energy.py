@@ -11,6 +11,7 @@ from phd_exp.fusion.compiled import compiled
 @compiled
 @no_type_check
 def huber(squared):
+    """h(|q|) of |q|^2."""
     return math.sqrt(squared) - 0.5 if squared > 1 else squared / 2
 
 

@@ -32,6 +32,7 @@ def surprise(slope, at_origin, a, u, level):
 @compiled
 @no_type_check
 def credible_level(energy, a):
+    """Of an energy above the mode's."""
     a = max(a, _FLATTEST)
     W = min(energy, _HIGHEST)
     X = max(W - 0.5, 0.0)

@@ -24,6 +24,7 @@ from phd_exp.fusion.newton import (
 @on_all_cores
 @no_type_check
 def minimise(slope, at_origin, a, u, lam, least):
+    """Moves each u to its minimum, and fills lam with the multipliers of the kinks."""
     for i in prange(len(a)):
         _minimise(slope[i], at_origin[i], a[i], u[i], lam[i], least)
 

@@ -16,6 +16,7 @@ STILL = 1e-16  # metres; a batch makes all its rounds, one problem may leave off
 @on_all_cores
 @no_type_check
 def polish(slope, at_origin, a, u, lam):
+    """Moves each u to its optimum, and lam to its multipliers."""
     for i in prange(len(a)):
         _polish(slope[i], at_origin[i], a[i], u[i], lam[i])
 
