@@ -1,7 +1,5 @@
 """The compiled steps of a CPU against the batched ones of a GPU, on the same problems."""
 
-import os
-import time
 from pathlib import Path
 
 import pytest
@@ -108,23 +106,15 @@ def test_everything_is_compiled_ahead_on_request() -> None:
         assert module.signatures
 
 
-def test_what_was_compiled_of_older_sources_is_forgotten(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_was_compiled_of_other_sources_is_forgotten(tmp_path: Path) -> None:
     """By numba's own rule a function stays as it is while another file changes, on which it depends."""
-    package, source = (
-        tmp_path / "phd_exp" / "fusion" / "compiled",
-        tmp_path / "phd_exp" / "fusion" / "newton.py",
-    )
-    (package / "__pycache__").mkdir(parents=True)
-    source.touch()
-    stale, fresh = (package / "__pycache__" / name for name in ("stale.nbi", "fresh.nbi"))
-    stale.touch()
-    fresh.touch()
-    hour = 3600
-    os.utime(stale, (time.time() - hour, time.time() - hour))
-    os.utime(fresh, (time.time() + hour, time.time() + hour))
-    monkeypatch.setattr(compiled, "__file__", str(package / "__init__.py"))
-    compiled._forget_what_is_stale()
-    assert not stale.exists()
-    assert fresh.exists()
+    index = tmp_path / "fusion" / "compiled" / "__pycache__" / "step.nbi"
+    index.parent.mkdir(parents=True)
+    source = tmp_path / "distributions" / "level.py"
+    source.parent.mkdir()
+    source.write_text("KINK = 1")
+    for change, stays in (("KINK = 1", False), ("KINK = 1", True), ("KINK = 2", False), ("KINK = 2", True)):
+        source.write_text(change)
+        index.touch()
+        compiled._forget_what_is_stale(tmp_path)
+        assert index.exists() is stays

@@ -7,25 +7,33 @@ its own; tests/fusion/test_compiled.py holds the two against each other.
 
 Arrays have the problems first: slope (problems, cameras, 3, 3), at_origin (problems, cameras, 3), a (problems,
 cameras), u (problems, 3); on a plane nothing depends on the third unknown. What is compiled takes its types from what
-it is given; checks of annotations would keep it from being compiled. Divisions by zero are
-infinite, as they are elsewhere.
+it is given; checks of annotations would keep it from being compiled. Divisions by zero are infinite, as elsewhere.
 """
 
+import hashlib
+from contextlib import suppress
 from pathlib import Path
 
 from numba import njit
 
+from phd_exp.records.files import write_atomic
 
-def _forget_what_is_stale() -> None:
-    """Let nothing be used that was compiled before a source changed; numba looks at a function's own file alone."""
-    here = Path(__file__).parent
-    sources = [*here.parent.rglob("*.py"), *here.parents[1].glob("distributions/*.py")]
-    changed = max(source.stat().st_mtime for source in sources)
-    for index in (here / "__pycache__").glob("*.nbi"):
-        if index.stat().st_mtime < changed:
+
+def _forget_what_is_stale(package: Path) -> None:
+    """Let nothing be used that was compiled of other sources; numba looks at a function's own file alone."""
+    here = package / "fusion" / "compiled"
+    sources = sorted([*(package / "fusion").rglob("*.py"), *(package / "distributions").rglob("*.py")])
+    digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
+    stamp = here / "__pycache__" / "sources.sha256"
+    if stamp.exists() and stamp.read_text() == digest:
+        return
+    with suppress(OSError):  # in a folder that cannot be written numba keeps nothing either
+        for index in stamp.parent.glob("*.nbi"):
             index.unlink(missing_ok=True)
+        stamp.parent.mkdir(exist_ok=True)
+        write_atomic(stamp, digest)
 
 
-_forget_what_is_stale()
+_forget_what_is_stale(Path(__file__).parents[2])
 compiled = njit(cache=True, error_model="numpy")
 on_all_cores = njit(cache=True, error_model="numpy", parallel=True)
