@@ -52,6 +52,13 @@ def test_defaults_are_the_authors_protocol(checked: Callable) -> None:
     assert config.camera.focal_length == "known"
 
 
+@pytest.mark.parametrize(("preset", "every"), [("paper", 1), ("small", 2), ("demo", 1), ("smoke", 1)])
+def test_a_preset_says_how_often_the_test_samples_are_evaluated(
+    checked: Callable, preset: str, every: int
+) -> None:
+    assert checked(f"preset={preset}").evaluation.every_n_epochs == every
+
+
 def test_the_authors_recipe_changes_neither_images_nor_learning_rate(checked: Callable) -> None:
     recipe = checked().recipe
     assert (recipe.name, recipe.schedule, recipe.warmup_steps, recipe.localisation) == (
