@@ -15,7 +15,7 @@ VERBS = {
 }
 OF_VERB = {
     "train": (
-        *("model", "data", "preset", "recipe", "experiment"),
+        *("model", "data", "preset", "recipe", "without", "experiment"),
         *("backbone", "camera", "loss", "optimizer", "trainer", "logger"),
     ),
     "render": ("data", "preset"),

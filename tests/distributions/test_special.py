@@ -179,4 +179,4 @@ def test_gauss_rule_is_the_one_its_comment_describes() -> None:
             (float(s), float(total * vectors[0, i] ** 2 * mp.fprod(1 + s / p for p in poles)))
             for i, s in enumerate(eigenvalues)
         ]
-    np.testing.assert_allclose(special._GAUSS_RULE, rule, rtol=1e-14)
+    np.testing.assert_allclose(special.GAUSS_RULE, rule, rtol=1e-14)

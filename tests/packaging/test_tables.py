@@ -12,19 +12,20 @@ ROOT = Path(__file__).parents[2]
 RUNS = 14
 
 
-def commands(*variables: str) -> list[list[str]]:
-    """What make would run once everything is installed."""
+def commands(environment: Path, *variables: str) -> list[list[str]]:
+    """What make would run once everything is installed, in this folder."""
+    (environment / ".installed").touch()
     done = subprocess.run(
-        ["make", "--dry-run", "tables", "INSTALLED=Makefile", "BIN=bin", *variables],
+        ["make", "--dry-run", "--no-print-directory", "tables", f"VENV={environment}", *variables],
         cwd=ROOT, capture_output=True, text=True, check=True,
     )  # fmt: skip
     words = [shlex.split(line) for line in done.stdout.splitlines()]
-    assert all(command[0] == "bin/python" for command in words)
+    assert all(command[0] == f"{environment}/bin/python" for command in words)
     return [[sys.executable, *command[1:]] for command in words]
 
 
-def test_it_asks_for_the_authors_protocol_on_a_gpu_unless_told_otherwise() -> None:
-    render, train, _ = commands()
+def test_it_asks_for_the_authors_protocol_on_a_gpu_unless_told_otherwise(tmp_path: Path) -> None:
+    render, train, _ = commands(tmp_path)
     assert {"preset=paper", "recipe=strong"} < set(render) & set(train)
     assert {"experiment=table1,table2", "hydra/launcher=joblib"} < set(train)
 
@@ -34,7 +35,7 @@ def test_both_tables_are_made_and_made_only_once(tmp_path: Path) -> None:
     pytest.importorskip(
         "hydra_plugins.hydra_joblib_launcher", reason="needs `pip install 'phd_exp[launchers]'`"
     )
-    render, train, report = commands("PRESET=smoke", "RECIPE=strong", "JOBS=2", "MORE=logger=none")
+    render, train, report = commands(tmp_path, "PRESET=smoke", "RECIPE=strong", "JOBS=2", "MORE=logger=none")
 
     def said(command: list[str]) -> str:
         environment = os.environ | {"PYTHONPATH": str(ROOT)}
