@@ -1,5 +1,6 @@
 """`python -m phd_exp [verb] [group=choice ...] [key=value ...]`; imports nothing heavy before it knows what to do."""
 
+import os
 import sys
 from importlib import import_module
 
@@ -9,8 +10,24 @@ from phd_exp.cli.help import OF_VERB, VERBS, show
 HELP = {"-h", "--help", "help"}
 
 
+NOBODY_READS = 128 + 13
+"""What a shell says of a programme that SIGPIPE ended."""
+
+
 def main(arguments: list[str] | None = None) -> int:
-    """Find the verb among the arguments and hand the rest to it; returns the exit status."""
+    """Do what the arguments say, until it is done or nobody reads on (`| head`); returns the exit status."""
+    try:
+        status = _do(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Python flushes once more when it ends, and would complain
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return NOBODY_READS
+    return status
+
+
+def _do(arguments: list[str] | None) -> int:
+    """Find the verb among the arguments and hand the rest to it."""
     rest = list(sys.argv[1:] if arguments is None else arguments)
     verb = _take_verb(rest)
     if set(FLAGS) & set(rest):

@@ -71,3 +71,13 @@ def test_a_shell_asks_what_words_there_are(
     monkeypatch.setenv("COMP_LINE", line)
     outcome = phd_exp("-sc", "query=bash")
     assert (outcome.status, outcome.out.strip(), outcome.err) == (0, offered, "")
+
+
+def test_whoever_reads_no_further_is_told_nothing() -> None:
+    """As `| head` does; a pipe without a reader ends a programme with SIGPIPE, and a shell says 141 of that."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "phd_exp", "--help"]
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (141, "")
