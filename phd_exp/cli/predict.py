@@ -99,7 +99,7 @@ def _predict(arguments: PredictArguments, detections: list[Detection]) -> None:
 
     predictor = load(arguments.run, recalibrate=arguments.recalibrate)
     say_if_unfinished(arguments.run, predictor.state)
-    curve = _depth_curve(arguments.run) if arguments.calibration else None
+    curve = _depth_curve(arguments.run, predictor) if arguments.calibration else None
     lines = _answers(predictor, detections, arguments.out, curve)
     if arguments.out is None:
         for line in lines:
@@ -110,8 +110,16 @@ def _predict(arguments: PredictArguments, detections: list[Detection]) -> None:
         print(f"{file}, and a picture beside it for each line", file=sys.stderr)
 
 
-def _depth_curve(run: Path) -> dict[str, Any]:
-    """What the run recorded of its test samples. Raises RunError where there is none, as of a baseline."""
+def _depth_curve(run: Path, predictor: "Predictor") -> dict[str, Any]:
+    """Of the run's test samples, as it predicted them or recalibrated, whichever is asked for now.
+
+    Raises RunError where there is none, as of a baseline.
+    """
+    if predictor.temperature is not None:
+        from phd_exp.reports.evaluation import recalibrated_depth_curve
+
+        window = predictor.config.evaluation.calibration_window
+        return recalibrated_depth_curve(RunFolder(run), predictor.temperature, window).as_data()
     file = RunFolder(run).curves("final")
     try:
         curve = parse_json(read_plain(file).decode())["depth"]

@@ -4,7 +4,8 @@ Credible levels and probability integral transforms (PIT: the predicted probabil
 [0, 1] over the samples of a calibrated model, so both are held against the uniform law here.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -26,6 +27,10 @@ class CalibrationCurve:
     window: int
     left_out: int
     """Samples whose variance or error was not finite, as an untrained network may predict."""
+
+    def as_data(self) -> dict[str, Any]:
+        """For JSON and for drawing: lists of numbers."""
+        return asdict(self) | {"predicted": self.predicted.tolist(), "empirical": self.empirical.tolist()}
 
 
 def calibration_curve(

@@ -13,6 +13,7 @@ from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import PARAMETERS, distribution_columns, draws, from_columns
 from phd_exp.distributions.temperature import Temperature
 from phd_exp.metrics.bootstrap import Interval, Statistic, bands
+from phd_exp.metrics.calibration import CalibrationCurve, calibration_curve
 from phd_exp.metrics.calibration_scores import COLUMNS, calibration_scores, ordered
 from phd_exp.metrics.curves import abscissae, curves
 from phd_exp.metrics.errors import MILLIMETRES
@@ -150,6 +151,16 @@ def recalibrated(table: pa.Table | Arrays, temperature: Temperature) -> dict[str
     changed["energy_score"] = energy_score(draws(distribution, DRAWS, SEED), xyz)
     kept = {name: array[finite.numpy()] for name, array in arrays.items()}
     return kept | {name: column.numpy() for name, column in changed.items()}
+
+
+def recalibrated_depth_curve(folder: RunFolder, temperature: Temperature, window: int) -> CalibrationCurve:
+    """Of a run's test samples, predicted at these temperatures; square metres.
+
+    Raises RunError where they cannot be read.
+    """
+    table = recalibrated(read_table(folder.predictions), temperature)
+    variance, squared_error = (_tensor(table[f"depth_{name}"]) for name in ("variance", "squared_error"))
+    return calibration_curve(variance, squared_error, window)
 
 
 def _distribution_scores(columns: Mapping[str, Tensor], weight: Tensor) -> dict[str, Tensor]:

@@ -14,7 +14,6 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from phd_exp.data.batches import Batch
 from phd_exp.distributions.columns import Columns
-from phd_exp.metrics.calibration import CalibrationCurve
 from phd_exp.models.heads import Prediction
 from phd_exp.records.files import write_atomic
 from phd_exp.records.runs import RunFolder, epoch_name
@@ -155,18 +154,9 @@ class CalibrationRecorder(Callback):
     @rank_zero_only
     def write(self, name: str, table: Columns) -> None:
         """Write the curves of a table of predictions into the record, and draw them."""
-        curves = {key: _as_data(curve) for key, curve in calibration_curves(table, self.window).items()}
+        curves = {key: curve.as_data() for key, curve in calibration_curves(table, self.window).items()}
         self.folder.calibration.mkdir(parents=True, exist_ok=True)
         file = self.folder.curves(name)
         write_atomic(file, json.dumps(curves) + "\n")
         if self.draw is not None:
             self.draw(curves, file.with_suffix(".png"))
-
-
-def _as_data(curve: CalibrationCurve) -> dict[str, Any]:
-    return {
-        "window": curve.window,
-        "left_out": curve.left_out,
-        "predicted": curve.predicted.tolist(),
-        "empirical": curve.empirical.tolist(),
-    }

@@ -20,6 +20,7 @@ import phd_exp as package
 from phd_exp.__main__ import main
 from phd_exp.distributions import PointEstimate, ProjectedHuber
 from phd_exp.geometry import VirtualCamera, intrinsics
+from phd_exp.inference import pictures
 from phd_exp.records.dataset import DatasetError
 from phd_exp.records.runs import RunFolder
 from tests.e2e.conftest import SIDE, trained
@@ -231,6 +232,28 @@ def test_how_well_a_run_knows_itself_stands_beside_its_predictions(
     refused = phd_exp("predict", f"run={baseline.path}", folder, "out=more", "calibration=true")
     assert refused.status == 1
     assert "final.json: no calibration curve of depth" in refused.err
+
+
+def test_what_is_recalibrated_is_shown_with_its_own_calibration(
+    phd_exp: Callable, run: RunFolder, renders: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[dict] = []
+    monkeypatch.setattr(pictures, "draw_curve", lambda axes, name, curve: drawn.append(curve))
+    asked = (
+        f"run={run.path}",
+        f"image={renders / 'default' / 'test' / '000000.png'}",
+        "f=400",
+        "calibration=true",
+    )
+    for words in (("out=trained",), ("out=fitted", "recalibrate=true")):
+        assert phd_exp("predict", *asked, *words).status == 0
+    trained, fitted = drawn
+    temperature = package.load(run.path, recalibrate=True).temperature
+    assert temperature is not None
+    ratio = np.array(fitted["predicted"]) / trained["predicted"]
+    assert ((ratio > 1) == (temperature.depth > 1)).all()
+    assert np.abs(ratio - 1).max() > 0.01
+    assert fitted["window"] == trained["window"]
 
 
 def test_of_a_baseline_python_gets_points(baseline: RunFolder) -> None:
