@@ -47,7 +47,7 @@ def fuse(
     Source: paper, section "Multi-view fusion and ground plane constraints".
     """
     problems = Problems.posed(predictions, pose, plane, mask)
-    status = problems.status()
+    status = problems.status(*solver.soundness(problems))
     sound = (status == Status.FUSED).nonzero().squeeze(-1)
     part = problems.subset(sound)
     views = solver.views(part)

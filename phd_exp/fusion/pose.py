@@ -10,7 +10,7 @@ from torch import Tensor
 from phd_exp.fusion.linear import apply, total
 from phd_exp.records import scenes
 
-_RIGID_WITHIN = 1e-6  # float32 keeps a rotation to 1e-7
+RIGID_WITHIN = 1e-6  # float32 keeps a rotation to 1e-7
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Pose:
         R = self.R.double()
         error = (R @ R.mT - torch.eye(3, dtype=R.dtype, device=R.device)).abs().amax((-2, -1))
         handed = (R[..., 0, :] * torch.linalg.cross(R[..., 1, :], R[..., 2, :])).sum(-1) > 0
-        return (error <= _RIGID_WITHIN) & handed
+        return (error <= RIGID_WITHIN) & handed
 
     def into_camera(self, v: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
         """World to camera frame, R v + t."""

@@ -91,18 +91,29 @@ class Problems:
         frame = _frame(average(self.pose.into_world(self.mode), self.mask), None)
         return Problems(self.to_seen, self.a, self.mode, self.pose, self.mask, None, *frame)
 
-    def status(self) -> Int[Tensor, " problems"]:
-        """What is wrong with each problem before anything is computed; FUSED where nothing is."""
+    @property
+    def sound(self) -> Bool[Tensor, "problems cameras"]:
+        """Whether each camera's numbers are finite, and its precision and depth positive."""
         finite = self.to_seen.isfinite().all(-1).all(-1) & self.mode.isfinite().all(-1) & self.a.isfinite()
-        sound = finite & (self.a > 0) & (self.mode[..., 2] > 0)
         posed = self.pose.R.isfinite().all(-1).all(-1) & self.pose.t.isfinite().all(-1)
+        return finite & (self.a > 0) & (self.mode[..., 2] > 0) & posed
+
+    def status(
+        self, sound: Bool[Tensor, "problems cameras"], rigid: Bool[Tensor, "problems cameras"]
+    ) -> Int[Tensor, " problems"]:
+        """What is wrong with each problem before anything is computed; FUSED where nothing is.
+
+        Args:
+            sound: see the property of that name.
+            rigid: see `Pose.is_rigid`.
+        """
         status = torch.full_like(self.mask[:, 0], int(Status.FUSED), dtype=torch.long)
         if self.plane is not None:
             length = self.plane.normal.norm(dim=-1)
             status[length == 0] = Status.NOT_A_PLANE
             status[~(length.isfinite() & self.plane.offset.isfinite())] = Status.NOT_FINITE
-        status[(~self.pose.is_rigid & self.mask).any(-1)] = Status.NOT_A_ROTATION
-        status[(~(sound & posed) & self.mask).any(-1)] = Status.NOT_FINITE
+        status[(~rigid & self.mask).any(-1)] = Status.NOT_A_ROTATION
+        status[(~sound & self.mask).any(-1)] = Status.NOT_FINITE
         status[~self.mask.any(-1)] = Status.NO_CAMERA
         return status
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from phd_exp.fusion import certificate, newton
@@ -16,6 +16,27 @@ from phd_exp.fusion.views import Unknown, Views
 # `phd_exp.fusion.compiled` is imported where it is used: numba takes a second, or more where nothing is compiled yet
 
 Multipliers = Float[Tensor, "cameras problems"]
+
+
+def soundness(
+    problems: Problems,
+) -> tuple[Bool[Tensor, "problems cameras"], Bool[Tensor, "problems cameras"]]:
+    """See `Problems.sound` and `Pose.is_rigid`."""
+    if problems.a.device.type != "cpu":
+        return problems.sound, problems.pose.is_rigid
+    from phd_exp.fusion.compiled import posing
+
+    sound, rigid = np.empty((2, *problems.a.shape), dtype=bool)
+    posing.soundness(
+        problems.to_seen.contiguous().numpy(),
+        problems.mode.contiguous().numpy(),
+        problems.a.contiguous().numpy(),
+        problems.pose.R.contiguous().numpy(),
+        problems.pose.t.contiguous().numpy(),
+        sound,
+        rigid,
+    )
+    return torch.from_numpy(sound), torch.from_numpy(rigid)
 
 
 def views(problems: Problems) -> Views:

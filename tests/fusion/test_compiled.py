@@ -1,12 +1,13 @@
 """The compiled steps of a CPU against the batched ones of a GPU, on the same problems."""
 
+import dataclasses
 from pathlib import Path
 
 import pytest
 import torch
 from torch.testing import assert_close
 
-from phd_exp.fusion import Plane, certificate, compiled, energy, moments, newton, solver
+from phd_exp.fusion import Plane, Pose, certificate, compiled, energy, moments, newton, solver
 from phd_exp.fusion import polish as polishing
 from phd_exp.fusion.compiled import moments as moments_compiled
 from phd_exp.fusion.compiled import newton as newton_compiled
@@ -68,6 +69,26 @@ def test_both_say_the_same_of_an_optimum(cameras: int, on_a_plane: bool, masked:
     assert_close(solver.surprise(views, u)[takes_part], expected, rtol=0, atol=1e-12)
     for ours, theirs in zip(solver.moments(views, u), moments.moments(views, u), strict=True):
         assert_close(ours, theirs, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["to_seen", "mode", "a", "R", "t"])
+def test_both_find_the_same_faults(name: str) -> None:
+    problems = problems_of(3, on_a_plane=False, masked=False)
+    pose = Pose(problems.pose.R.contiguous(), problems.pose.t.contiguous())
+    problems = dataclasses.replace(problems, pose=pose)
+    spoilt = getattr(problems if hasattr(problems, name) else problems.pose, name)
+    entries = spoilt.view(N, 3, -1)
+    for row, value in enumerate(
+        (torch.nan, torch.inf, -torch.inf, 0.0, -1.0, 1e308, -1e308, 1 + 1e-5, 1 + 1e-8)
+    ):
+        for entry in range(entries.shape[-1]):
+            entries[9 * row + entry, row % 3, entry] = value
+    problems.pose.R[200:, 1] *= -1  # mirrors
+    sound, rigid = solver.soundness(problems)
+    assert torch.equal(sound, problems.sound)
+    assert torch.equal(rigid, problems.pose.is_rigid)
+    assert not sound.all() or not rigid.all()
+    assert sound[100:].all()
 
 
 def test_levels_agree_where_depth_is_nearly_unknown_or_nearly_known() -> None:
