@@ -13,6 +13,7 @@ from phd_exp.fusion.pose import Plane, Pose
 from phd_exp.fusion.problems import Problems
 from phd_exp.fusion.status import Status
 from phd_exp.fusion.views import Unknown, Views
+from phd_exp.threads import one_thread
 
 LEAST_DEPTHS = (1e-2, 1e-4, 1e-6)
 """Shares of the predicted depth below which 1/t is continued, one after the other till the optimum lies beyond."""
@@ -46,7 +47,14 @@ def fuse(
 
     Source: paper, section "Multi-view fusion and ground plane constraints".
     """
-    problems = Problems.posed(predictions, pose, plane, mask)
+    with one_thread():
+        return _fuse(
+            Problems.posed(predictions, pose, plane, mask), predictions.batch_shape[:-1], contradiction
+        )
+
+
+def _fuse(problems: Problems, shape: torch.Size, contradiction: float) -> Fused:
+    """The problems, which were posed in this shape, solved and judged."""
     status = problems.status(*solver.soundness(problems))
     sound = (status == Status.FUSED).nonzero().squeeze(-1)
     part = problems.subset(sound)
@@ -56,7 +64,7 @@ def fuse(
     status[sound[unseen]] = _why_unseen(part.subset(unseen))
     part, views = part.subset(seen), views.subset(seen)
     optima = Optima(part, views, *solver.polish(views, u[:, seen], lam[:, seen]))
-    return _judged(optima, sound[seen], status, predictions.batch_shape[:-1], contradiction)
+    return _judged(optima, sound[seen], status, shape, contradiction)
 
 
 def find_optimum(

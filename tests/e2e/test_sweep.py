@@ -125,6 +125,7 @@ def jobs_of_submitit(runs: Path) -> list[int]:
     return found
 
 
+@pytest.mark.slow
 def test_a_failing_run_among_others(train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is named with its error and stops no other; the same command takes it up where it failed, and no other."""
     words = ("-m", "model=mae_vz", "seed=0,1,2", "logger=none")

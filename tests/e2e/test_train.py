@@ -133,6 +133,7 @@ def in_wandb_viewer(run: RunFolder, *words: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
+@pytest.mark.slow
 def test_wandb_ends_as_the_run_ended(
     train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -165,6 +166,7 @@ def power_cut_in_epoch_1(self: Any) -> None:
     self._log_epoch("train")
 
 
+@pytest.mark.slow
 def test_without_a_logger_no_trace_of_wandb(train: Callable, tmp_path: Path) -> None:
     assert train("logger=none").status == 0
     assert not list(tmp_path.rglob("*wandb*"))

@@ -86,6 +86,7 @@ def test_a_killed_shard_loses_what_is_in_flight_and_no_more(
     assert sum(path.stat().st_mtime_ns == then for path, then in kept.items()) >= done
 
 
+@pytest.mark.slow
 def test_another_count_goes_on_with_what_is_there(
     folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -111,6 +112,7 @@ def test_an_unsharded_render_waits_for_shards_and_repeats_nothing(
     assert "rendering the remaining 8 images" in said
 
 
+@pytest.mark.slow
 def test_who_renders_more_than_others_seals_no_gap(
     folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec
 ) -> None:

@@ -1,12 +1,10 @@
 """The site of all runs: written file by file, each whole, so that a report that is killed leaves pages that open."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
 
-import torch
 from plotly.offline import get_plotlyjs
 
 from phd_exp.records.errors import RunError, UserError
@@ -27,6 +25,7 @@ from phd_exp.reports.site.pages import comparison_page, overview_page, run_page
 from phd_exp.reports.site.run_data import RunData, as_script, gather, key_of, read_script, run_script
 from phd_exp.reports.tables import tables
 from phd_exp.reports.variations import variation_tables
+from phd_exp.threads import one_thread
 
 _ASSETS = Path(__file__).parent / "assets"
 
@@ -77,26 +76,12 @@ def build_site(runs: Path, out: Path) -> Path:
     site = SiteFolder(out / "site")
     try:
         site.make()
-        with _one_thread():
+        with one_thread():  # tables of a few thousand rows are too small to share
             return _write(site, collect(runs), out / "figures")
     except OSError as error:
         raise UserError(
             f"{site.path}: cannot be written ({error.strerror}); choose another folder by out=DIR"
         ) from None
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Torch on one thread: tables of a few thousand rows are too small to share, and threads wait for each other.
-
-    The evaluation of 20 runs took 5 s so and 89 s on two threads, on two cores that other programmes used as well.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _write(site: SiteFolder, records: Records, figures: Path) -> Path:

@@ -195,6 +195,7 @@ def test_a_report_that_is_killed_leaves_the_old_pages(own: Path, monkeypatch: py
     assert _pages(site) == sorted(before)
 
 
+@pytest.mark.slow
 def test_figures_that_a_kill_prevented_are_drawn_by_the_next_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
