@@ -70,6 +70,7 @@ def test_a_full_disk_is_one_line_and_nothing_is_lost(
     ends_as_unhindered(runs)
 
 
+@pytest.mark.slow
 def test_a_disk_that_fails_after_an_epoch_is_one_line_and_nothing_is_lost(
     train: Callable, disk: Path, monkeypatch: pytest.MonkeyPatch, ends_as_unhindered: Callable
 ) -> None:

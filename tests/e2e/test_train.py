@@ -23,12 +23,12 @@ from tests.e2e.runs import only_run, weights
 
 MODELS = ("probabilistic", "mae_vz", "mae_logz", "mae_xyz", "mae_constf")
 DATA = (
-    "default",
+    pytest.param("default", marks=pytest.mark.slow),
     pytest.param("occl", marks=pytest.mark.slow),
     pytest.param("scale", marks=pytest.mark.slow),
     "occl_scale",
 )
-"""The last one is both of those before it."""
+"""The last one is both of those before it, and every other test is on the first."""
 ERRORS = {"loss", "projected_error_mm", "depth_error_mm"}
 OF_A_DISTRIBUTION = {"nll", "depth_precision", "projected_precision"}
 CALIBRATION = {"depth_ence", "projected_ence", "miscalibration_area", "depth_crps_mm", "left_out"}

@@ -68,6 +68,7 @@ def test_four_at_once_in_an_empty_folder(
     assert sum("images of" in line for line in began) == 2, "each shard is rendered once"
 
 
+@pytest.mark.slow
 def test_a_killed_shard_loses_what_is_in_flight_and_no_more(
     folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec
 ) -> None:

@@ -88,6 +88,7 @@ def _opens_and_draws(visit: Visit, page: str) -> int:
     return charts
 
 
+@pytest.mark.slow
 def test_charts_out_of_sight_draw_themselves(visit: Visit) -> None:
     """Whoever takes a picture of the whole page sees them too."""
     visit.open("index.html")
