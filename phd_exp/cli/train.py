@@ -11,8 +11,8 @@ from phd_exp.cli.app import launch
 from phd_exp.cli.render import ensure_dataset
 from phd_exp.cli.several_views import Several
 from phd_exp.records.errors import RunError
-from phd_exp.records.runs import RunFolder, RunName, setting
-from phd_exp.training.config import RenderedConfig, RunConfig, check, has_influence
+from phd_exp.records.runs import RunFolder, RunName, has_influence, setting
+from phd_exp.training.config import RenderedConfig, RunConfig, check
 
 NAMED = ("preset", "recipe", "data", "data.name", "model", "seed", "experiment")
 """Choices that have a place of their own in a run's name, and the one that does nothing but name several runs."""

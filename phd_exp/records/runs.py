@@ -64,6 +64,17 @@ class RunStatus(BaseModel):
     machine: str
 
 
+WITHOUT_INFLUENCE = (
+    "runs",
+    "logger",
+    "data.root",
+    "data.workers",
+    "trainer.progress_bar",
+    "evaluation.every_n_epochs",
+    "evaluation.multiview",
+)
+"""Keys, or sections, that say where and how a run is made and recorded, or what is measured of it afterwards besides
+its results: they change no number of it."""
 PLAIN_RECIPE = "paper"
 """The recipe that a run's folder does not name."""
 
@@ -257,6 +268,11 @@ def epoch_name(epoch: int) -> str:
 def find_runs(runs: Path) -> list[RunFolder]:
     """Every run recorded under a folder, in the order of their paths."""
     return [RunFolder(file.parent) for file in sorted(runs.glob("*/*/*/seed*/status.json"))]
+
+
+def has_influence(key: str) -> bool:
+    """Whether a key, with dots, can change what a run computes."""
+    return not any(key == name or key.startswith(f"{name}.") for name in WITHOUT_INFLUENCE)
 
 
 def flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from phd_exp.records.errors import RunError
-from phd_exp.records.runs import RunFolder, RunStatus, find_runs
+from phd_exp.records.runs import RunFolder, RunStatus, find_runs, has_influence
 from phd_exp.reports.point_errors import COLUMNS, Estimate, MeanErrors, mean_errors, mean_nll
 
 RunState = Literal["finished", "running", "broken off", "failed", "unreadable"]
 PROBABILISTIC = "probabilistic"
 LEAF = re.compile(r"seed(0|[1-9][0-9]*)(-[0-9a-f]{8})?")
-_NAMED = ("seed", "runs")
-"""Keys of a configuration that a run's place says already."""
 
 
 @dataclass(frozen=True)
@@ -132,13 +130,17 @@ def _overrides(folder: RunFolder) -> str:
 
 
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """By their keys with dots. Of a part made by another class its name, and what both classes take."""
     changes: dict[str, Any] = {}
+    is_other = before.get("_target_") != now.get("_target_")
+    if is_other:
+        changes[prefix.rstrip(".")] = str(now.get("_target_")).rpartition(".")[2]
     for key in dict.fromkeys([*before, *now]):
-        if not prefix and key in _NAMED:
+        name, old, new = f"{prefix}{key}", before.get(key, "nothing"), now.get(key, "nothing")
+        if name == "seed" or not has_influence(name) or (is_other and not (key in before and key in now)):
             continue
-        old, new = before.get(key, "nothing"), now.get(key, "nothing")
         if isinstance(old, Mapping) and isinstance(new, Mapping):
-            changes |= _changes(old, new, f"{prefix}{key}.")
-        elif old != new:
-            changes[f"{prefix}{key}"] = new
+            changes |= _changes(old, new, f"{name}.")
+        elif old != new and key != "_target_":
+            changes[name] = new
     return changes

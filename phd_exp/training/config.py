@@ -39,17 +39,6 @@ def _named(folder: Any) -> Any:
 
 
 Folder = Annotated[Path, Field(strict=False), BeforeValidator(_named)]
-WITHOUT_INFLUENCE = (
-    "runs",
-    "logger",
-    "data.root",
-    "data.workers",
-    "trainer.progress_bar",
-    "evaluation.every_n_epochs",
-    "evaluation.multiview",
-)
-"""Keys, or sections, that say where and how a run is made and recorded, or what is measured of it afterwards besides
-its results: they change no number of it."""
 SMALLEST_IMAGE = 32
 """A ResNet halves the side five times."""
 LARGEST_IMAGE = 4096
@@ -315,11 +304,6 @@ def _prediction(key: str, node: dict[str, Any]) -> type:
         name = key.rpartition(".")[2]
         raise ValueError(f"{key}._target_: {node['_target_']!r} is no {name}; expected one as in conf/model")
     return kind
-
-
-def has_influence(key: str) -> bool:
-    """Whether a key, with dots, can change what a run computes."""
-    return not any(key == name or key.startswith(f"{name}.") for name in WITHOUT_INFLUENCE)
 
 
 def check(config: dict[str, Any]) -> RunConfig:

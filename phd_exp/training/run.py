@@ -18,7 +18,7 @@ from phd_exp.records.dataset import DatasetFolder, checksum
 from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError, RunError, shown
 from phd_exp.records.files import remove_temporaries
-from phd_exp.records.runs import RunFolder, flatten
+from phd_exp.records.runs import RunFolder, flatten, has_influence
 from phd_exp.training.build import (
     build_calibration,
     build_data,
@@ -26,7 +26,7 @@ from phd_exp.training.build import (
     build_trainer,
 )
 from phd_exp.training.callbacks import Begun, CalibrationRecorder, Draw, RecordLogger
-from phd_exp.training.config import FolderConfig, RunConfig, TrainerConfig, has_influence
+from phd_exp.training.config import FolderConfig, RunConfig, TrainerConfig
 from phd_exp.training.faults import told
 from phd_exp.training.module import PositionModule
 from phd_exp.training.predictions import gathered, joined, summary, write_parquet

@@ -117,6 +117,16 @@ def test_runs_with_other_overrides_are_apart_and_say_which(tmp_path: Path) -> No
     assert chosen[0].folder.path == plain.path
 
 
+def test_of_another_class_the_name_is_told_and_what_both_take(tmp_path: Path) -> None:
+    plain = {"_target_": "here.Muon", "lr": 0.1, "momentum": 0.9}
+    other = {"_target_": "torch.optim.Adam", "lr": 0.2, "fused": True}
+    for overrides, optimizer, often in (((), plain, 1), (("optimizer=adam",), other, 2)):
+        run = record(tmp_path, "occl", "mae_vz", 0, predicted(0).frame, overrides=overrides)
+        # how often is measured changes no number
+        run.write_config({"optimizer": optimizer, "evaluation": {"every_n_epochs": often}})
+    assert [run.overrides for run in collect(tmp_path).runs] == [None, "optimizer=Adam, optimizer.lr=0.2"]
+
+
 def test_overrides_without_a_run_to_compare_with_are_not_guessed(tmp_path: Path) -> None:
     record(tmp_path, "occl", "mae_vz", 0, predicted(1).frame, overrides=("optimizer.lr=0.5",))
     assert only(tmp_path).overrides == "not told: no run without overrides to compare with"

@@ -96,7 +96,7 @@ def _drawn(table: Table, *, starred: bool) -> Grid:
     """As rich draws it; the best are bold, and starred where the output shows no bold."""
     drawn = Grid(box=box.SIMPLE_HEAD, show_edge=False)
     for heading in table.stub:
-        drawn.add_column(heading, no_wrap=True)
+        drawn.add_column(heading, overflow="fold")
     for heading in table.columns:
         drawn.add_column(heading, justify="right", no_wrap=True)
     for group in table.groups:
