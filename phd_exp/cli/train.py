@@ -10,8 +10,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from phd_exp.cli.app import launch
 from phd_exp.cli.render import ensure_dataset
 from phd_exp.cli.several_views import Several
+from phd_exp.records.choices import RunName, has_influence, setting
 from phd_exp.records.errors import RunError
-from phd_exp.records.runs import RunFolder, RunName, has_influence, setting
+from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import RenderedConfig, RunConfig, check
 
 NAMED = ("preset", "recipe", "data", "data.name", "model", "seed", "experiment")

@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Iterable, Sequence
 
-from phd_exp.records.runs import PLAIN_RECIPE, in_words, preset_and_recipe
+from phd_exp.records.choices import PLAIN_RECIPE, in_words, preset_and_recipe
 from phd_exp.reports.cells import Cell, Gap
 from phd_exp.reports.collect import Records
 from phd_exp.reports.paper import ASSUMED, Layout, TableName

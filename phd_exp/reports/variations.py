@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
+from phd_exp.records.choices import in_words
 from phd_exp.records.errors import RunError
-from phd_exp.records.runs import in_words
 from phd_exp.reports.captions import one_line
 from phd_exp.reports.cells import Gap
 from phd_exp.reports.collect import Records, Run

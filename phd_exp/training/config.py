@@ -20,8 +20,8 @@ from pydantic import (
     model_validator,
 )
 
+from phd_exp.records.choices import flatten, setting
 from phd_exp.records.errors import ConfigError, shown
-from phd_exp.records.runs import flatten, setting
 from phd_exp.records.shards import Shard
 from phd_exp.records.spec import Angle, DatasetSpec, Range
 from phd_exp.training.schedule import Schedule

@@ -14,11 +14,12 @@ from lightning import Trainer, seed_everything
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.sources import Part
 from phd_exp.distributions.columns import Columns
+from phd_exp.records.choices import flatten, has_influence
 from phd_exp.records.dataset import DatasetFolder, checksum
 from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError, RunError, shown
 from phd_exp.records.files import remove_temporaries
-from phd_exp.records.runs import RunFolder, flatten, has_influence
+from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import (
     build_calibration,
     build_data,

@@ -7,7 +7,7 @@ import pytest
 
 from phd_exp.cli.paths import conf_folder
 from phd_exp.data.augmentation import Augmentation
-from phd_exp.records.runs import flatten
+from phd_exp.records.choices import flatten
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.training.config import RunConfig, check
 

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from phd_exp.records.choices import RunName
 from phd_exp.records.errors import RunError
-from phd_exp.records.runs import RunFolder, RunName, find_runs
+from phd_exp.records.runs import RunFolder, find_runs
 
 
 @pytest.fixture

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from phd_exp.records.runs import RunFolder, RunName
+from phd_exp.records.choices import RunName
+from phd_exp.records.runs import RunFolder
 
 COORDINATES = ("x", "y", "z")
 DATA = ("default", "occl", "scale", "occl_scale")

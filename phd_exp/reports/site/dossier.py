@@ -9,8 +9,9 @@ from typing import Any, TypeVar
 
 import pyarrow as pa
 
+from phd_exp.records.choices import flatten
 from phd_exp.records.errors import RunError, UserError
-from phd_exp.records.runs import RunFolder, RunStatus, flatten
+from phd_exp.records.runs import RunFolder, RunStatus
 from phd_exp.reports.collect import Run
 from phd_exp.reports.fusion import FusionScores, fusion_scores
 from phd_exp.reports.parquet import read_table

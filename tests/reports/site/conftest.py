@@ -10,7 +10,8 @@ import pytest
 from filelock import FileLock
 from PIL import Image
 
-from phd_exp.records.runs import RunFolder, RunName
+from phd_exp.records.choices import RunName
+from phd_exp.records.runs import RunFolder
 from phd_exp.reports.site.build import build_site
 from tests.reports.several import write_views
 from tests.reports.site.synthetic import write_run

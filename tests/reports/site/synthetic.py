@@ -10,7 +10,8 @@ from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.huber import sample_whitened
 from phd_exp.distributions.point_estimate import PointEstimate
 from phd_exp.geometry.charts import Cartesian, DepthScale
-from phd_exp.records.runs import RunFolder, RunName
+from phd_exp.records.choices import RunName
+from phd_exp.records.runs import RunFolder
 from phd_exp.training.predictions import columns, summary, write_parquet
 
 PRECISION = {
