@@ -11,7 +11,6 @@ from phd_exp.fusion.polish import KINK
 from phd_exp.fusion.views import Seen, Unknown, Views
 
 RADII = (1e-8, 1e-6, 1e-4, 1e-2)  # metres; balls in which the curvature is bounded from below
-TINY = torch.finfo(torch.float64).tiny
 
 
 @dataclass(frozen=True)
@@ -105,7 +104,7 @@ def _least_curvature(
     reach = squares[2].sqrt() * radius
     far = seen[2] + reach
     depth = torch.where(far < 1, 2 / far**3, 0)
-    depth = torch.where(kink, 2 * (1 - lam.abs()) / reach.clamp_min(TINY), depth)
+    depth = torch.where(kink, 2 * (1 - lam.abs()) / reach.clamp_min(torch.finfo(far.dtype).tiny), depth)
     ones = torch.ones_like(length)
     return torch.stack(
         [

@@ -28,11 +28,11 @@ def soundness(
 
     sound, rigid = np.empty((2, *problems.a.shape), dtype=bool)
     posing.soundness(
-        problems.to_seen.contiguous().numpy(),
-        problems.mode.contiguous().numpy(),
-        problems.a.contiguous().numpy(),
-        problems.pose.R.contiguous().numpy(),
-        problems.pose.t.contiguous().numpy(),
+        _array(problems.to_seen),
+        _array(problems.mode),
+        _array(problems.a),
+        _array(problems.pose.R),
+        _array(problems.pose.t),
         sound,
         rigid,
     )
@@ -47,12 +47,12 @@ def views(problems: Problems) -> Views:
 
     slope, at_origin = np.empty((*problems.a.shape, 3, 3)), np.empty((*problems.a.shape, 3))
     posing.views(
-        problems.to_seen.contiguous().numpy(),
-        problems.pose.R.contiguous().numpy(),
-        problems.pose.t.contiguous().numpy(),
-        problems.mask.contiguous().numpy(),
-        problems.origin.contiguous().numpy(),
-        problems.directions.contiguous().numpy(),
+        _array(problems.to_seen),
+        _array(problems.pose.R),
+        _array(problems.pose.t),
+        _array(problems.mask),
+        _array(problems.origin),
+        _array(problems.directions),
         slope,
         at_origin,
     )
@@ -125,13 +125,18 @@ def moments(views: Views, u: Unknown) -> tuple[Unknown, Float[Tensor, "k k probl
 def _arrays(views: Views) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Slope, by three unknowns, view of the origin and precision, the problems first."""
     slope, at_origin = _of_three(views.slope.permute(3, 2, 0, 1)), views.at_origin.permute(2, 1, 0)
-    return slope.contiguous().numpy(), at_origin.contiguous().numpy(), _rows(views.a)
+    return _array(slope), _array(at_origin), _rows(views.a)
+
+
+def _array(values: Tensor) -> np.ndarray:
+    """Without gaps, as what is compiled expects it."""
+    array: np.ndarray = values.contiguous().numpy()
+    return array
 
 
 def _rows(columns: Float[Tensor, "n problems"]) -> Float[np.ndarray, "problems n"]:
     """The problems first."""
-    rows: np.ndarray = columns.T.contiguous().numpy()
-    return rows
+    return _array(columns.T)
 
 
 def _unknowns(columns: Unknown) -> Float[np.ndarray, "problems 3"]:

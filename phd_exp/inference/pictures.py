@@ -24,7 +24,7 @@ _AMBER = "#ffb000"
 def picture(sighting: Sighting, calibration: Mapping[str, Any] | None = None) -> bytes:
     """A PNG: the image with the curves of 50, 90 and 99 %, and the bird's-eye view; of a baseline the point alone.
 
-    With the calibration curve of depth that the run recorded on its test samples, that comes third.
+    With the calibration curve of depth on the run's test samples, that comes third.
     """
     curves = level_curves(sighting.prediction) if isinstance(sighting.prediction, ProjectedHuber) else None
     panels = 1 + (curves is not None) + (calibration is not None)

@@ -63,7 +63,7 @@ class VariationTable:
 
 def variation_tables(records: Records) -> list[VariationTable]:
     """A table for every preset, data set and model of which there are runs with other overrides and without."""
-    choices = dict.fromkeys((run.preset, run.data, run.model) for run in records.runs)
+    choices = dict.fromkeys((run.preset, run.data, run.model) for run in records.runs if run.overrides)
     found = ((choice, list(_variations(records, choice))) for choice in choices)
     return [
         _table(choice, variations)

@@ -2,8 +2,8 @@
 
 Operations on whole batches spend a CPU's time on launching themselves and on moving what lies between them; a problem
 of a few cameras fits into a core's cache. With a GPU it is the other way round: there the modules of `phd_exp.fusion`
-serve. Each module here has the formulas, constants and stopping rules of the one there of the same name, and none of
-its own; tests/fusion/test_compiled.py holds the two against each other.
+serve. Each module here has the formulas, constants and stopping rules of the one there of the same name, but that
+`polish` leaves off where nothing moves; tests/fusion/test_compiled.py holds the two against each other.
 
 Arrays have the problems first: slope (problems, cameras, 3, 3), at_origin (problems, cameras, 3), a (problems,
 cameras), u (problems, 3); on a plane nothing depends on the third unknown. What is compiled takes its types from what
@@ -14,6 +14,7 @@ import hashlib
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 from numba import njit
 
 from phd_exp.records.files import write_atomic
@@ -34,6 +35,7 @@ def _forget_what_is_stale(package: Path) -> None:
         write_atomic(stamp, digest)
 
 
+TINY = float(np.finfo(np.float64).tiny)
 _forget_what_is_stale(Path(__file__).parents[2])
 compiled = njit(cache=True, error_model="numpy")
 on_all_cores = njit(cache=True, error_model="numpy", parallel=True)

@@ -6,8 +6,8 @@ from typing import no_type_check
 import numpy as np
 from numba import prange
 
-from phd_exp.fusion.certificate import RADII, TINY
-from phd_exp.fusion.compiled import compiled, on_all_cores
+from phd_exp.fusion.certificate import RADII
+from phd_exp.fusion.compiled import TINY, compiled, on_all_cores
 from phd_exp.fusion.compiled.linear import NOTHING, add, factor, forward, seen_of, squared
 from phd_exp.fusion.polish import KINK
 

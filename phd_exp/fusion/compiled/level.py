@@ -8,13 +8,12 @@ from numba import prange
 
 from phd_exp.distributions.huber import RADIAL_NORMALISER
 from phd_exp.distributions.special import GAUSS_RULE, SERIES
-from phd_exp.fusion.compiled import compiled, on_all_cores
+from phd_exp.fusion.compiled import TINY, compiled, on_all_cores
 from phd_exp.fusion.compiled.energy import energy
 from phd_exp.fusion.compiled.linear import seen_of
 
 _RULE, _SERIES = np.array(GAUSS_RULE), np.array(SERIES)
-_TINY = float(np.finfo(np.float64).tiny)
-_FLATTEST, _HIGHEST = math.sqrt(_TINY), -2 * math.log(_TINY)
+_FLATTEST, _HIGHEST = math.sqrt(TINY), -2 * math.log(TINY)
 
 
 @on_all_cores
@@ -74,4 +73,4 @@ def tail_moment(a):
         return total
     for k in range(len(_SERIES) - 1, -1, -1):
         total = total * a + _SERIES[k]
-    return a * (1 - a * (total - math.log(max(a, _TINY)) * math.exp(a)))
+    return a * (1 - a * (total - math.log(max(a, TINY)) * math.exp(a)))

@@ -6,11 +6,9 @@ from typing import no_type_check
 import numpy as np
 from numba import prange
 
-from phd_exp.fusion.compiled import compiled, on_all_cores
+from phd_exp.fusion.compiled import TINY, compiled, on_all_cores
 from phd_exp.fusion.compiled.linear import NOTHING, add, backward, factor, forward, moved_of, seen_of, squared
 from phd_exp.fusion.moments import FIXED_POINT_STEPS, PASSES
-
-_TINY = float(np.finfo(np.float64).tiny)
 
 
 @on_all_cores
@@ -105,7 +103,7 @@ def _averaged_precision(slope, at_origin, a, u):
         for c in range(cameras):
             q_x, q_y, t = seen[c]
             across = squared(forward(L, slope[c, 0])) + squared(forward(L, slope[c, 1]))
-            deviation = max(math.sqrt(squared(forward(L, slope[c, 2]))), _TINY)
+            deviation = max(math.sqrt(squared(forward(L, slope[c, 2]))), TINY)
             standard = (1 - t) / deviation
             at_kink = math.exp(-standard * standard / 2) / (deviation * math.sqrt(2 * math.pi))
             weight[c] = 1 / math.sqrt(1 + q_x * q_x + q_y * q_y + across)
