@@ -1,12 +1,11 @@
 """Every recorded run under a folder, with its state and, once it has finished, its mean errors."""
 
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from phd_exp.records.choices import has_influence
+from phd_exp.records.choices import flatten, has_influence
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder, RunStatus, find_runs
 from phd_exp.reports.point_errors import COLUMNS, Estimate, MeanErrors, mean_errors, mean_nll
@@ -130,18 +129,17 @@ def _overrides(folder: RunFolder) -> str:
     return "not told: no run without overrides to compare with"
 
 
-def _changes(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def _changes(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
     """By their keys with dots. Of a part made by another class its name, and what both classes take."""
+    old, new = flatten(before), flatten(now)
     changes: dict[str, Any] = {}
-    is_other = before.get("_target_") != now.get("_target_")
-    if is_other:
-        changes[prefix.rstrip(".")] = str(now.get("_target_")).rpartition(".")[2]
-    for key in dict.fromkeys([*before, *now]):
-        name, old, new = f"{prefix}{key}", before.get(key, "nothing"), now.get(key, "nothing")
-        if name == "seed" or not has_influence(name) or (is_other and not (key in before and key in now)):
+    for key in dict.fromkeys([*old, *new]):
+        if key == "seed" or not has_influence(key) or old.get(key, "nothing") == new.get(key, "nothing"):
             continue
-        if isinstance(old, Mapping) and isinstance(new, Mapping):
-            changes |= _changes(old, new, f"{name}.")
-        elif old != new and key != "_target_":
-            changes[name] = new
+        part, _, leaf = key.rpartition(".")
+        made_by = f"{part}._target_"
+        if leaf == "_target_":
+            changes[part] = str(new.get(key)).rpartition(".")[2]
+        elif old.get(made_by) == new.get(made_by) or (key in old and key in new):
+            changes[key] = new.get(key, "nothing")
     return changes

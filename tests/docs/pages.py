@@ -4,6 +4,8 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
+from phd_exp.cli.paths import PACKAGE
+
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
@@ -35,6 +37,11 @@ def commands(page: Path) -> list[list[str]]:
         for line in block.text.replace("\\\n", " ").splitlines()
     ]
     return [line[3:] for line in lines if line[:3] == ["python", "-m", "phd_exp"]]
+
+
+def module(file: Path) -> str:
+    """A source file's dotted name."""
+    return ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")
 
 
 def name(page: Path) -> str:

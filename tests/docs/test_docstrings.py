@@ -3,9 +3,9 @@
 import ast
 from collections.abc import Iterator
 from importlib import import_module
-from pathlib import Path
 
 from phd_exp.cli.paths import PACKAGE
+from tests.docs.pages import module
 
 Definition = ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -13,11 +13,9 @@ Definition = ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
 def test_every_public_name_says_what_it_is() -> None:
     silent = []
     for file in sorted(PACKAGE.rglob("*.py")):
-        tree, module = ast.parse(file.read_text()), _module(file)
-        silent += [module] * (ast.get_docstring(tree) is None)
-        silent += [
-            f"{module}.{name}" for name in _undocumented(tree) if not _is_said_by_a_parent(module, name)
-        ]
+        tree, place = ast.parse(file.read_text()), module(file)
+        silent += [place] * (ast.get_docstring(tree) is None)
+        silent += [f"{place}.{name}" for name in _undocumented(tree) if not _is_said_by_a_parent(place, name)]
     assert not silent, "\n".join(["without a docstring:", *silent])
 
 
@@ -39,13 +37,9 @@ def _undocumented(node: ast.AST, prefix: str = "") -> Iterator[str]:
                 yield from _undocumented(child, f"{prefix}{child.name}.")
 
 
-def _is_said_by_a_parent(module: str, name: str) -> bool:
+def _is_said_by_a_parent(place: str, name: str) -> bool:
     """Whether a method overrides one that has a docstring."""
     owner, _, method = name.rpartition(".")
-    kind = getattr(import_module(module), owner, None)
+    kind = getattr(import_module(place), owner, None)
     parents = kind.__mro__[1:-1] if isinstance(kind, type) else ()  # the last is object
     return any(vars(parent)[method].__doc__ for parent in parents if method in vars(parent))
-
-
-def _module(file: Path) -> str:
-    return ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")

@@ -12,7 +12,7 @@ import yaml
 
 import phd_exp.geometry
 from phd_exp.cli.paths import PACKAGE
-from tests.docs.pages import DOCS, PAGES, ROOT, name
+from tests.docs.pages import DOCS, PAGES, ROOT, module, name
 
 REFERENCE = sorted((DOCS / "api").glob("*.md"))
 PRIVATE = {"cli"}
@@ -35,11 +35,7 @@ def test_every_package_has_a_page() -> None:
 @pytest.mark.parametrize("page", REFERENCE, ids=name)
 def test_a_page_holds_every_module_of_its_package(page: Path) -> None:
     folder = PACKAGE / page.stem
-    modules = {
-        f"phd_exp.{'.'.join(file.relative_to(PACKAGE).with_suffix('').parts)}"
-        for file in folder.rglob("*.py")
-        if file.stem != "__init__"
-    }
+    modules = {module(file) for file in folder.rglob("*.py") if file.stem != "__init__"}
     named = set(_DIRECTIVE.findall(page.read_text()))
     assert modules <= named
     assert all(map(_is_there, named - modules))
@@ -82,8 +78,8 @@ def _files(contents: Any) -> list[str]:
 
 def _is_there(dotted: str) -> bool:
     """Whether a dotted name is a module, or leads to something in one."""
-    module, rest = _module(dotted)
-    found = importlib.import_module(module)
+    place, rest = _module(dotted)
+    found = importlib.import_module(place)
     for part in rest:
         if not hasattr(found, part) and part not in getattr(found, "__annotations__", {}):
             return False
