@@ -73,3 +73,14 @@ class Camera:
         if not (math.isfinite(factor) and factor > 0):
             raise ValueError(f"factor must be positive and finite, but is {factor}")
         return Camera(self.f * factor, self.S * factor)
+
+    def with_constant_f(self, constant_f: float | None) -> "Camera":
+        """The cameras as a network knows them that is told one focal length for all; None tells it the true ones.
+
+        Args:
+            constant_f: pixels.
+
+        Raises:
+            ValueError: the focal length is not positive or not finite.
+        """
+        return self if constant_f is None else Camera(torch.full_like(self.f, constant_f), self.S)

@@ -139,8 +139,7 @@ class Predictor:
 
     def _told(self, f: Float[Tensor, "*batch"]) -> Camera:
         """The camera as the network knows it."""
-        told = f if self.constant_f is None else torch.full_like(f, self.constant_f)
-        return Camera(told, float(self.preparation.side))
+        return Camera(f, float(self.preparation.side)).with_constant_f(self.constant_f)
 
 
 def load(run: Path, device: str = "auto", recalibrate: bool = False) -> Predictor:

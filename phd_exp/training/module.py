@@ -62,9 +62,7 @@ class PositionModule(LightningModule):
 
     def told(self, camera: Camera) -> Camera:
         """The camera as the model knows it."""
-        if self.constant_f is None:
-            return camera
-        return Camera(torch.full_like(camera.f, self.constant_f), camera.S)
+        return camera.with_constant_f(self.constant_f)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         return self._step(batch, "train")[0]

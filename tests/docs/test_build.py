@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
-from shutil import which
+from typing import Any
 
 import pytest
 
@@ -78,20 +78,14 @@ def faults() -> list[str]:
 
 
 @pytest.fixture
-def page(faults: list[str]) -> Iterator[object]:
+def page(chromium: Any, faults: list[str]) -> Iterator[Any]:
     """A page of a real browser without a network; whatever goes wrong on it is a fault."""
-    executable = which("chromium") or which("chromium-browser") or which("google-chrome")
-    if executable is None:
-        pytest.skip("no Chromium is installed (apt-get install chromium)")
-    sync_api = pytest.importorskip("playwright.sync_api")
-    with sync_api.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=executable, args=["--no-sandbox", "--disable-gpu"])
-        opened = browser.new_context(offline=True).new_page()
-        opened.on("pageerror", lambda error: faults.append(str(error)))
-        opened.on("requestfailed", lambda request: faults.append(request.url))
-        opened.on("request", lambda request: _note_if_foreign(request.url, faults))
-        yield opened
-        browser.close()
+    opened = chromium.new_context(offline=True).new_page()
+    opened.on("pageerror", lambda error: faults.append(str(error)))
+    opened.on("requestfailed", lambda request: faults.append(request.url))
+    opened.on("request", lambda request: _note_if_foreign(request.url, faults))
+    yield opened
+    opened.context.close()
 
 
 def _note_if_foreign(url: str, faults: list[str]) -> None:
@@ -99,7 +93,7 @@ def _note_if_foreign(url: str, faults: list[str]) -> None:
         faults.append(url)
 
 
-def test_the_search_finds_a_name_from_the_file_system(site: Path, page: object, faults: list[str]) -> None:
+def test_the_search_finds_a_name_from_the_file_system(site: Path, page: Any, faults: list[str]) -> None:
     page.goto((site / "index.html").as_uri())
     page.click("input.md-search__input")
     page.keyboard.type("quantiles_along")

@@ -59,6 +59,13 @@ def test_scaled_moves_pixels_in_proportion(factor: float) -> None:
     assert torch.equal(resized.contains(XYZ), CAMERA.contains(XYZ))
 
 
+def test_who_is_told_one_focal_length_takes_it_for_all_cameras() -> None:
+    told = CAMERA.with_constant_f(1300.0)
+    assert told.f.tolist() == [1300.0] * 3
+    assert told.S == CAMERA.S
+    assert CAMERA.with_constant_f(None) is CAMERA
+
+
 def test_several_points_for_each_camera() -> None:
     points = XYZ.expand(2, 3, 3)
     pair = Camera(torch.tensor([[1200.0], [1500.0]], dtype=torch.float64), 224.0)
