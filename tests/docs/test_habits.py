@@ -54,5 +54,9 @@ def test_the_changelog_has_the_version() -> None:
     assert any(heading.startswith(f"{PROJECT['project']['version']} ") for heading in headings)
 
 
+def test_who_cites_the_package_cites_its_version() -> None:
+    assert f"version = {{{PROJECT['project']['version']}}}" in (ROOT / "README.md").read_text()
+
+
 def _names(layer: Any) -> set[str]:
     return {name.strip() for name in layer.split("|")}
