@@ -15,6 +15,8 @@ LABELS = {
     "depth": ("Depth", "m²"),
     "projected": ("Projected position", "no unit"),
 }
+_CELL, _LEFT, _RIGHT, _BOTTOM, _TOP = 4.2, 0.8, 0.2, 0.6, 0.4
+"""Side of the square in which one curve is drawn, and its margins, inches."""
 
 
 def draw_calibration(curves: Mapping[str, Mapping[str, Any]], file: Path) -> None:
@@ -22,10 +24,22 @@ def draw_calibration(curves: Mapping[str, Mapping[str, Any]], file: Path) -> Non
 
     Source: paper, Figure "correlation between predicted variance and empirical variance".
     """
-    figure = Figure(figsize=(4.2 * len(curves), 4.2), layout="constrained")
+    figure = Figure(figsize=(_CELL * len(curves), _CELL))
+    _leave_margins(figure, len(curves))
     for place, (name, curve) in enumerate(curves.items()):
         draw_curve(figure.add_subplot(1, len(curves), place + 1), name, curve)
     write_atomic(file, encoded(figure, "png", dpi=120))
+
+
+def _leave_margins(figure: Figure, columns: int) -> None:
+    """The same around every curve: to find what its labels need (`layout="constrained"`) is half of the drawing."""
+    figure.subplots_adjust(
+        left=_LEFT / (_CELL * columns),
+        right=1 - _RIGHT / (_CELL * columns),
+        bottom=_BOTTOM / _CELL,
+        top=1 - _TOP / _CELL,
+        wspace=(_LEFT + _RIGHT) / (_CELL - _LEFT - _RIGHT),
+    )
 
 
 def write_figure(figure: Figure, stem: Path) -> list[Path]:
@@ -57,7 +71,7 @@ def draw_curve(axes: Axes, name: str, curve: Mapping[str, Any]) -> None:
     axes.set_xlabel(f"predicted variance ({unit})")
     axes.set_ylabel(f"mean squared error ({unit})")
     axes.grid(which="both", alpha=0.25)
-    axes.legend(loc="upper left", frameon=False)
+    axes.legend(frameon=False)  # where no curve is
 
 
 def _words(curve: Mapping[str, Any]) -> str:
