@@ -110,7 +110,7 @@ class EpochLines(Callback):
 
 
 class CalibrationRecorder(Callback):
-    """Every n epochs, and after the last, the calibration curves of the test split, as data and as pictures."""
+    """Every n epochs, and at the end, the calibration curves of the test split, as data and as pictures."""
 
     def __init__(
         self, folder: RunFolder, window: int, every_n_epochs: int, draw: Draw | None, tracker: Tracker | None
@@ -124,9 +124,7 @@ class CalibrationRecorder(Callback):
 
     def is_due(self, trainer: Trainer) -> bool:
         """Whether the present epoch is one whose curves are kept."""
-        epoch = trainer.current_epoch + 1
-        last = epoch == trainer.max_epochs
-        return not trainer.sanity_checking and (last or epoch % self.every_n_epochs == 0)
+        return not trainer.sanity_checking and (trainer.current_epoch + 1) % self.every_n_epochs == 0
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.parts = []
@@ -146,17 +144,16 @@ class CalibrationRecorder(Callback):
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not self.parts:
             return
-        name, table = epoch_name(trainer.current_epoch), gathered(joined(self.parts))
-        self.write(name, table)
-        if self.tracker is not None:
-            self.tracker.send_calibration(name, trainer.global_step)
+        self.write(epoch_name(trainer.current_epoch), gathered(joined(self.parts)), trainer.global_step)
 
     @rank_zero_only
-    def write(self, name: str, table: Columns) -> None:
-        """Write the curves of a table of predictions into the record, and draw them."""
+    def write(self, name: str, table: Columns, step: int) -> None:
+        """Write the curves of a table of predictions into the record, draw them and send them."""
         curves = {key: curve.as_data() for key, curve in calibration_curves(table, self.window).items()}
         self.folder.calibration.mkdir(parents=True, exist_ok=True)
         file = self.folder.curves(name)
         write_atomic(file, json.dumps(curves) + "\n")
         if self.draw is not None:
             self.draw(curves, file.with_suffix(".png"))
+        if self.tracker is not None:
+            self.tracker.send_calibration(name, step)

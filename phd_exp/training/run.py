@@ -26,7 +26,7 @@ from phd_exp.training.build import (
     build_module,
     build_trainer,
 )
-from phd_exp.training.callbacks import Begun, CalibrationRecorder, Draw, RecordLogger
+from phd_exp.training.callbacks import Begun, Draw, RecordLogger
 from phd_exp.training.config import FolderConfig, RunConfig, TrainerConfig
 from phd_exp.training.faults import told
 from phd_exp.training.module import PositionModule
@@ -147,20 +147,15 @@ def run(
         }
         results = summary(tables["test"]) | _untrained(record) | _circumstances(config, data, trainer)
         if trainer.is_global_zero:
-            _record(folder, tables, data, calibration)
+            if calibration is not None:
+                calibration.write("final", tables["test"], trainer.global_step)
+            _write_tables(folder, tables, data)
         if tracker:
             tracker.send_results(results)
     return results
 
 
-def _record(
-    folder: RunFolder,
-    tables: Mapping[Part, Columns],
-    data: PositionData,
-    calibration: CalibrationRecorder | None,
-) -> None:
-    if calibration is not None:
-        calibration.write("final", tables["test"])
+def _write_tables(folder: RunFolder, tables: Mapping[Part, Columns], data: PositionData) -> None:
     for part, table in tables.items():
         file = folder.held_out if part == "held_out" else folder.predictions
         write_parquet(file, table, data.source.known(part))

@@ -119,7 +119,7 @@ def test_wandb_beside_the_record(train: Callable, tmp_path: Path, monkeypatch: p
     assert list(offline.glob("files/media/images/test/calibration*.png"))
     (file,) = offline.glob("files/media/table/test/calibration_curves*.json")
     table = json.loads(file.read_text())
-    curves = json.loads((run.calibration / "epoch-0001.json").read_text())
+    curves = json.loads((run.calibration / "final.json").read_text())
     assert table["columns"] == ["curve", "predicted", "empirical"]
     depth = [row[1:] for row in table["data"] if row[0] == "depth"]
     expected = list(zip(curves["depth"]["predicted"], curves["depth"]["empirical"], strict=True))
