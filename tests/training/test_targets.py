@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from pydantic_core import PydanticCustomError
 
-from phd_exp.training.targets import check_target, locate
+from phd_exp.training.config.targets import check_target, locate
 
 ADAM = "torch.optim.Adam"
 CHART = {"_target_": "phd_exp.geometry.charts.Cartesian", "_partial_": True}
