@@ -10,6 +10,7 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
 _BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_INDENTED = re.compile(r"(?:^ {4}.*\n)+", re.MULTILINE)
 
 
 class Block(NamedTuple):
@@ -29,12 +30,13 @@ def blocks(page: Path) -> list[Block]:
 
 
 def commands(page: Path) -> list[list[str]]:
-    """The words of every command of this programme in the `sh` blocks of a page."""
+    """The words of every command of this programme in the `sh` blocks and the indented lines of a page."""
+    fenced = [block.text for block in blocks(page) if block.language == "sh"]
+    indented = _INDENTED.findall(_BLOCK.sub("", page.read_text()))
     lines = [
         line.partition(" #")[0].split()
-        for block in blocks(page)
-        if block.language == "sh"
-        for line in block.text.replace("\\\n", " ").splitlines()
+        for text in (*fenced, *indented)
+        for line in text.replace("\\\n", " ").splitlines()
     ]
     return [line[3:] for line in lines if line[:3] == ["python", "-m", "phd_exp"]]
 

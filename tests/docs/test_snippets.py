@@ -13,9 +13,9 @@ from phd_exp.cli.help import OF_VERB, VERBS
 from phd_exp.cli.paths import conf_folder
 from phd_exp.cli.sweep import plan
 from phd_exp.training.config import check, check_render
-from tests.docs.pages import PAGES, blocks, commands, name
+from tests.docs.pages import PAGES, ROOT, blocks, commands, name
 
-COMMANDS = {tuple(words): page for page in PAGES for words in commands(page)}
+COMMANDS = {tuple(words): page for page in (*PAGES, ROOT / "README.md") for words in commands(page)}
 CHECKS = {"train": ("config", check), "render": ("render", check_render)}
 
 
@@ -34,7 +34,7 @@ def test_python_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.Monke
 def test_commands_are_those_of_this_programme(
     words: tuple[str, ...], page: Path, phd_exp: Callable, tmp_path: Path
 ) -> None:
-    verb = words[0] if words and words[0] in VERBS else "train"
+    verb = next((word for word in words[:2] if word in VERBS), "train")
     if any(word.startswith("--") for word in words):
         _write_files(page, tmp_path)
         assert phd_exp(*words).status == 0
