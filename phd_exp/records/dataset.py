@@ -18,7 +18,7 @@ from typing import Annotated, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from phd_exp.records.errors import UserError
+from phd_exp.records.errors import UserError, gist
 from phd_exp.records.files import read_jsonl, read_plain, require_plain, write_atomic
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.shards import Shard
@@ -115,9 +115,8 @@ class DatasetFolder:
                 f"{self.root}: no data set here (manifest.json is missing); render it first"
             ) from None
         except (OSError, ValidationError) as error:
-            reason = " ".join(str(error).split())[:200]
             raise DatasetError(
-                f"{self.manifest_path}: not a readable manifest ({reason}); restore it, or move the folder "
+                f"{self.manifest_path}: not a readable manifest ({gist(error)}); restore it, or move the folder "
                 "away and render anew"
             ) from None
 

@@ -3,6 +3,10 @@
 import difflib
 from collections.abc import Iterable, Sequence
 
+from pydantic import ValidationError
+
+LONGEST_GIST = 200
+"""Characters of an error that a message repeats."""
 LONGEST_VALUE = 120
 """Characters of a value that a message repeats."""
 NAMED = 5
@@ -40,6 +44,18 @@ def in_our_words(message: str) -> str:
         .replace("Input should be", "expected to be")
         .replace("expected to be a valid", "expected a valid")
     )
+
+
+def gist(error: Exception) -> str:
+    """Why something cannot be read, on one line: of a validation the first complaint, of a system call its reason."""
+    if isinstance(error, ValidationError):
+        problem = error.errors(include_url=False)[0]
+        key = ".".join(map(str, problem["loc"]))
+        given = f"got {shown(problem['input'])}; " if key and not isinstance(problem["input"], dict) else ""
+        text = ": ".join(filter(None, [key, given + in_our_words(problem["msg"])]))
+    else:
+        text = str(getattr(error, "strerror", None) or error)
+    return " ".join(text.split())[:LONGEST_GIST]
 
 
 def shown(value: object) -> str:

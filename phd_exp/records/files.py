@@ -12,7 +12,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any, TextIO, TypeVar
 
-from phd_exp.records.errors import UserError
+from phd_exp.records.errors import UserError, gist
 from phd_exp.records.parsing import parse_json
 
 Parsed = TypeVar("Parsed")
@@ -144,9 +144,4 @@ def _parse_line(path: Path, number: int, line: bytes, parse: Callable[[str], Any
     try:
         return parse(line.decode())
     except ValueError as error:  # also UnicodeDecodeError and pydantic's ValidationError
-        raise CorruptFileError(f"{path}, line {number}: not a valid record ({_brief(error)})") from error
-
-
-def _brief(error: ValueError) -> str:
-    """The gist of an error on one line: pydantic prints a heading, the key, the complaint and a link."""
-    return " ".join(line.strip() for line in str(error).splitlines()[:3])[:200]
+        raise CorruptFileError(f"{path}, line {number}: not a valid record ({gist(error)})") from error

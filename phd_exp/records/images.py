@@ -11,6 +11,7 @@ from pathlib import Path
 from PIL import Image, Jpeg2KImagePlugin, TiffImagePlugin, UnidentifiedImageError, WebPImagePlugin
 
 from phd_exp.records.dataset import DatasetError, sha256
+from phd_exp.records.errors import gist
 from phd_exp.records.files import MB, read_plain
 from phd_exp.records.scenes import SampleRecord
 
@@ -50,8 +51,7 @@ def decoding(file: Path) -> Iterator[None]:
         kinds = ", ".join(FORMATS)
         raise DatasetError(f"{file}: not an image of any kind that is read here ({kinds})") from None
     except BROKEN as error:
-        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
-        raise DatasetError(f"{file}: cannot be read as an image ({reason}); replace it") from None
+        raise DatasetError(f"{file}: cannot be read as an image ({gist(error)}); replace it") from None
 
 
 def recorded_image(path: Path, record: SampleRecord) -> Image.Image:

@@ -31,7 +31,7 @@ from filelock import FileLock, Timeout
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from phd_exp.records import provenance
-from phd_exp.records.errors import RunError
+from phd_exp.records.errors import RunError, gist
 from phd_exp.records.files import MB, read_jsonl, read_plain, write_atomic
 from phd_exp.records.parsing import parse_json, parse_yaml
 
@@ -244,8 +244,7 @@ def _read_mapping(file: Path, parse: Any) -> dict[str, Any]:
 
 
 def _unreadable(file: Path, complaint: str, error: Exception) -> RunError:
-    reason = " ".join(str(getattr(error, "strerror", None) or error).split())[:200]
-    return RunError(f"{file}: {complaint} ({reason}); delete the folder to run again")
+    return RunError(f"{file}: {complaint} ({gist(error)}); delete the folder to run again")
 
 
 def _new_status(data_manifest: str | None) -> RunStatus:

@@ -140,12 +140,12 @@ def held_out_temperature(folder: RunFolder) -> Temperature:
 def recalibrated(table: pa.Table | Arrays, temperature: Temperature) -> dict[str, np.ndarray]:
     """The same columns for A / projected and a / depth: estimates of the mode stay, all that is uncertain changes.
 
-    Samples whose parameters are not finite are dropped. Raises RunError where a column is missing.
+    Samples whose parameters are not finite are dropped. Raises RunError where a column is missing, or where no sample
+    has all of them finite.
     """
     arrays = _arrays(table, (*PARAMETERS, *XYZ))
-    columns = {name: _tensor(arrays[name]) for name in (*PARAMETERS, *XYZ)}
-    finite = torch.stack(list(columns.values())).isfinite().all(dim=0)
-    columns = {name: column[finite] for name, column in columns.items()}
+    finite = _all_finite(arrays, (*PARAMETERS, *XYZ))
+    columns = {name: _tensor(arrays[name])[finite] for name in (*PARAMETERS, *XYZ)}
     distribution, xyz = temperature.apply(_distribution(columns)), _positions(columns)
     changed = distribution_columns(distribution, xyz)
     changed["energy_score"] = energy_score(draws(distribution, DRAWS, SEED), xyz)
@@ -205,13 +205,19 @@ def _finite(table: pa.Table | Arrays, names: tuple[str, ...]) -> tuple[Columns, 
     """The columns asked for and those of the strata, of the samples where the former are finite; how many are not."""
     arrays = _arrays(table, names)
     of_strata = [column for column, _, _ in QUANTITIES.values() if column in arrays]
-    columns = {name: _tensor(arrays[name]) for name in dict.fromkeys((*names, *of_strata))}
-    finite = torch.stack([columns[name] for name in names]).isfinite().all(dim=0)
+    finite = _all_finite(arrays, names)
+    columns = {name: _tensor(arrays[name])[finite] for name in dict.fromkeys((*names, *of_strata))}
+    return columns, int((~finite).sum())
+
+
+def _all_finite(arrays: Arrays, names: tuple[str, ...]) -> Tensor:
+    """Which samples have these numbers finite. Raises RunError where none has."""
+    finite = torch.stack([_tensor(arrays[name]) for name in names]).isfinite().all(dim=0)
     if not bool(finite.any()):
         raise RunError(
             f"predictions: none of {len(finite)} samples has finite {', '.join(names)}; train longer, or look at nll"
         )
-    return {name: column[finite] for name, column in columns.items()}, int((~finite).sum())
+    return finite
 
 
 def _arrays(table: pa.Table | Arrays, names: tuple[str, ...]) -> dict[str, np.ndarray]:

@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from phd_exp.records.errors import RunError
+from phd_exp.records.errors import RunError, gist
 from phd_exp.records.files import MB, require_plain
 
 LARGEST = 1000 * MB
@@ -14,6 +15,8 @@ LARGEST = 1000 * MB
 MOST_ROWS = 10**6
 MOST_COLUMNS = 200
 TEXTS = ("file_name",)
+EXTREMES = (1e-100, 1e100)
+"""What is finite and not zero lies between: farther out squares and ratios leave what a float holds."""
 
 
 def read_table(file: Path, names: Sequence[str] | None = None) -> pa.Table:
@@ -31,12 +34,13 @@ def read_table(file: Path, names: Sequence[str] | None = None) -> pa.Table:
         # one long text, said to stand in every row, is kept once
         texts = [name for name in TEXTS if name in schema.names]
         with pq.ParquetFile(file, metadata=metadata, read_dictionary=texts) as parquet:
-            return parquet.read(columns=None if names is None else list(names))
+            table = parquet.read(columns=None if names is None else list(names))
+        _require_moderate(file, table)
+        return table
     except FileNotFoundError:
         raise RunError(f"{file.name}: missing, though the run says finished") from None
     except (pa.ArrowException, OSError, KeyError) as error:
-        reason = " ".join(str(getattr(error, "strerror", None) or error).split())[:200]
-        raise RunError(f"{file.name}: cannot be read ({reason})") from None
+        raise RunError(f"{file.name}: cannot be read ({gist(error)})") from None
 
 
 def _require_small(file: Path, metadata: pq.FileMetaData) -> None:
@@ -47,6 +51,21 @@ def _require_small(file: Path, metadata: pq.FileMetaData) -> None:
             f"{file.name}: says it holds {metadata.num_rows} rows of {size / MB:.0f} MB together; expected at most "
             f"{MOST_ROWS} rows of {LARGEST / MB:.0f} MB"
         )
+
+
+def _require_moderate(file: Path, table: pa.Table) -> None:
+    least, most = EXTREMES
+    for name in table.column_names:
+        if name in TEXTS:
+            continue
+        sizes = np.abs(np.asarray(table[name].to_numpy(), dtype=np.float64))
+        extreme = np.isfinite(sizes) & (sizes != 0) & ((sizes < least) | (sizes > most))
+        if extreme.any():
+            row = int(extreme.argmax())
+            raise RunError(
+                f"{file.name}: column {name} is {table[name][row]} in row {row}; expected 0, or a size from "
+                f"{least:g} to {most:g}"
+            )
 
 
 def _require_columns(file: Path, schema: pa.Schema, names: Sequence[str] | None) -> None:

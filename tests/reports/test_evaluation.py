@@ -195,6 +195,8 @@ def test_what_cannot_be_measured_is_one_line(table: Callable) -> None:
     columns = table()
     with pytest.raises(RunError, match="none of 1000 samples has finite"):
         evaluate(columns | {"nll": np.full(N, np.nan)})
+    with pytest.raises(RunError, match="none of 1000 samples has finite"):
+        recalibrated(columns | {"a": np.full(N, np.nan)}, fit_temperature(columns))
     with pytest.raises(RunError, match="parameters are of no distribution"):
         recalibrated(columns | {"a": -columns["a"]}, fit_temperature(columns))
     with pytest.raises(RunError, match="no temperature fits"):

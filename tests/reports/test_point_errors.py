@@ -102,7 +102,8 @@ BAD: dict[str, tuple[Callable[[pd.DataFrame], pd.DataFrame], str]] = {
     "infinite": (lambda frame: frame.assign(mean_z=np.inf), "mean_z is inf in row 0"),
     "no depth": (lambda frame: frame.assign(z=0.0), "z is 0 in row 0; expected more than 0"),
     "no sensor": (lambda frame: frame.assign(S=-frame["S"]), "S is -224 in row 0"),
-    "far off": (lambda frame: frame.assign(mean_x=1e200), "no finite number"),
+    "far off": (lambda frame: frame.assign(mean_x=1e200), "mean_x is 1e+200 in row 0"),
+    "a median far off": (lambda frame: frame.assign(mu_x=1e99, median_z=1e99), "no finite number"),
     "words": (lambda frame: frame.assign(mu_x="far left"), "column 'mu_x' holds"),
     "lists": (lambda frame: frame.assign(mu_y=[[1.0]] * len(frame)), "column 'mu_y' holds"),
 }

@@ -93,7 +93,7 @@ def slug_of(run: Run) -> str:
 def _attempt(read: Callable[[], Found], notes: list[str]) -> Found | None:
     try:
         return read()
-    except (UserError, OSError) as error:
+    except (UserError, OSError, ValueError) as error:  # the last from measures, of what cannot be measured
         notes.append(" ".join(str(error).split()))
         return None
 
