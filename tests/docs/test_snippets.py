@@ -15,7 +15,8 @@ from phd_exp.cli.sweep import plan
 from phd_exp.training.config import check, check_render
 from tests.docs.pages import PAGES, ROOT, blocks, commands, name
 
-COMMANDS = {tuple(words): page for page in (*PAGES, ROOT / "README.md") for words in commands(page)}
+README = ROOT / "README.md"
+COMMANDS = {tuple(words): page for page in (*PAGES, README) for words in commands(page)}
 CHECKS = {"train": ("config", check), "render": ("render", check_render)}
 
 
@@ -30,7 +31,13 @@ def test_python_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.Monke
             exec(compile("\n" * (block.line - 1) + block.text, str(page), "exec"), scope)
 
 
-@pytest.mark.parametrize(("words", "page"), COMMANDS.items(), ids=map(" ".join, COMMANDS))
+@pytest.mark.parametrize(
+    ("words", "page"),
+    [
+        pytest.param(words, page, id=" ".join(words), marks=pytest.mark.slow if page == README else ())
+        for words, page in COMMANDS.items()
+    ],
+)
 def test_commands_are_those_of_this_programme(
     words: tuple[str, ...], page: Path, phd_exp: Callable, tmp_path: Path
 ) -> None:

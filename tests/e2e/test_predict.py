@@ -221,6 +221,7 @@ def test_from_python_arrays_of_any_size(run: RunFolder, renders: Path) -> None:
             predictor(images, f=f)
 
 
+@pytest.mark.slow
 def test_how_well_a_run_knows_itself_stands_beside_its_predictions(
     phd_exp: Callable, own_run: RunFolder, baseline: RunFolder, photos: Path, tmp_path: Path
 ) -> None:

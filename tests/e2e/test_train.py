@@ -87,6 +87,7 @@ def test_calibration_as_data_and_as_pictures(train: Callable, tmp_path: Path) ->
             assert picture.size[0] > 500
 
 
+@pytest.mark.slow
 def test_evaluating_less_often_changes_no_number_but_leaves_some_out(train: Callable, tmp_path: Path) -> None:
     for every in (1, 2):
         outcome = train(
