@@ -18,7 +18,7 @@ from phd_exp.cli.jobs import BAD_CONFIGURATION, Ending, JobRecords, Launch, Task
 from phd_exp.cli.paths import conf_folder
 from phd_exp.cli.signals import Stopped, stopping_on_signals
 from phd_exp.cli.sweep import IsFinished, sweep
-from phd_exp.records.errors import ConfigError, UserError, nearest
+from phd_exp.records.errors import ConfigError, UserError, nearest, one_line
 
 LONGEST = 400
 """Characters of what Hydra says."""
@@ -88,7 +88,7 @@ def _require_known_flags(words: list[str]) -> None:
     """Raise ConfigError for what Hydra's parser would refuse with its usage, over several lines."""
 
     def refuse(message: str) -> NoReturn:
-        raise ConfigError(f"{message}; see `python -m phd_exp --help`")
+        raise ConfigError(f"{one_line(message)}; see `python -m phd_exp --help`")
 
     parser = get_args_parser()
     parser.error = refuse  # type: ignore[method-assign]

@@ -58,6 +58,11 @@ def gist(error: Exception) -> str:
     return " ".join(text.split())[:LONGEST_GIST]
 
 
+def one_line(text: str) -> str:
+    """Text from outside as one line of visible characters: a terminal would obey the others."""
+    return "".join(letter if letter.isprintable() else "?" for letter in " ".join(text.split()))
+
+
 def shown(value: object) -> str:
     """A value as it stands in a message: of a long one the beginning."""
     try:

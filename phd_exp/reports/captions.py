@@ -4,6 +4,7 @@ import shlex
 from collections.abc import Iterable, Sequence
 
 from phd_exp.records.choices import PLAIN_RECIPE, in_words, preset_and_recipe
+from phd_exp.records.errors import one_line
 from phd_exp.reports.cells import Cell, Gap
 from phd_exp.reports.collect import Records
 from phd_exp.reports.paper import ASSUMED, Layout, TableName
@@ -90,8 +91,3 @@ def making_command(records: Records, preset: str, name: TableName, seeds: Iterab
     if records.folder.as_posix() != DEFAULT_RUNS:
         words.append(f"runs={records.folder}")
     return one_line(shlex.join(["python", "-m", "phd_exp", "-m", *words]))
-
-
-def one_line(text: str) -> str:
-    """Text from outside as one line of visible characters: a terminal would obey the others."""
-    return "".join(letter if letter.isprintable() else "?" for letter in " ".join(text.split()))

@@ -5,8 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from phd_exp.records.choices import in_words
-from phd_exp.records.errors import RunError
-from phd_exp.reports.captions import one_line
+from phd_exp.records.errors import RunError, one_line
 from phd_exp.reports.cells import Gap
 from phd_exp.reports.collect import Records, Run
 from phd_exp.reports.evaluation import Band

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from statistics import fmean
 
 from phd_exp.records.choices import in_words
-from phd_exp.records.errors import RunError
-from phd_exp.reports.captions import one_line
+from phd_exp.records.errors import RunError, one_line
 from phd_exp.reports.cells import Gap
 from phd_exp.reports.collect import Records, Run
 from phd_exp.reports.point_errors import ErrorKey, mean_errors, mean_nll

@@ -148,6 +148,7 @@ BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
 )
 
 CONFIGURATIONS = [
+    configured("a flag that returns the carriage", "--cfg\r", r"unrecognized arguments: --cfg; see `python -m phd_exp --help`"),
     configured("a flag that there is not", "--nonsense", r"unrecognized arguments: --nonsense; see `python -m phd_exp --help`"),
     configured("a flag without its value", "-c", r"argument --cfg/-c: expected one argument; .*"),
     configured("a group set to null", "model=null", r"Config group override must be a string or a list\..*"),
