@@ -18,7 +18,7 @@ from phd_exp.cli.jobs import BAD_CONFIGURATION, Ending, JobRecords, Launch, Task
 from phd_exp.cli.paths import conf_folder
 from phd_exp.cli.signals import Stopped, stopping_on_signals
 from phd_exp.cli.sweep import IsFinished, sweep
-from phd_exp.records.errors import ConfigError, UserError, nearest, one_line
+from phd_exp.records.errors import UNPRINTABLE, ConfigError, UserError, nearest, one_line
 
 LONGEST = 400
 """Characters of what Hydra says."""
@@ -45,6 +45,7 @@ def launch(
     arguments = sorted(arguments, key=lambda word: word not in MULTIRUN)
     sys.argv = [sys.argv[0], *arguments]
     try:
+        _require_visible(arguments)
         with stopping_on_signals():
             endings = _run_all(task, arguments, config_name, is_finished)
     except Stopped as stop:
@@ -84,11 +85,20 @@ def _run_all(
         return [records.ending(0, [])] if any(records.path.iterdir()) else []
 
 
+def _require_visible(words: list[str]) -> None:
+    """Raise ConfigError for a word that a message could not repeat on its line."""
+    for word in words:
+        if UNPRINTABLE.search(word):
+            raise ConfigError(
+                f"{one_line(word)}: holds control characters; expected KEY=VALUE in visible ones"
+            )
+
+
 def _require_known_flags(words: list[str]) -> None:
     """Raise ConfigError for what Hydra's parser would refuse with its usage, over several lines."""
 
     def refuse(message: str) -> NoReturn:
-        raise ConfigError(f"{one_line(message)}; see `python -m phd_exp --help`")
+        raise ConfigError(f"{message}; see `python -m phd_exp --help`")
 
     parser = get_args_parser()
     parser.error = refuse  # type: ignore[method-assign]

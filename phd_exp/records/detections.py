@@ -26,14 +26,13 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 from phd_exp.records.dataset import SPLITS, DatasetError, checksum, sha256
-from phd_exp.records.errors import in_our_words, nearest, shown
+from phd_exp.records.errors import UNPRINTABLE, in_our_words, nearest, shown
 from phd_exp.records.files import read_jsonl
 from phd_exp.records.parsing import parse_json
 from phd_exp.records.scenes import Pose, SampleRecord, Split
 from phd_exp.records.spec import Number, Positive
 
 DISTORTION = re.compile(r"[kp][1-8]|.*distort.*|dist(_?coeff.*)?|.*fisheye.*", re.IGNORECASE)
-UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 SHORTEST = 0.01
 """Focal length, px; what is shorter was meant in metres, or is none."""
 LARGEST_BOX = 3

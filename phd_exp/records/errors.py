@@ -1,6 +1,7 @@
 """The errors a user can mend: each is one line that says what, where, what was expected and what to do."""
 
 import difflib
+import re
 from collections.abc import Iterable, Sequence
 
 from pydantic import ValidationError
@@ -9,6 +10,8 @@ LONGEST_GIST = 200
 """Characters of an error that a message repeats."""
 LONGEST_VALUE = 120
 """Characters of a value that a message repeats."""
+UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+"""Characters that would end the line of a message, or steer the terminal."""
 NAMED = 5
 """Names that a message lists."""
 
