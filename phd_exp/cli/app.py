@@ -18,7 +18,8 @@ from phd_exp.cli.jobs import BAD_CONFIGURATION, Ending, JobRecords, Launch, Task
 from phd_exp.cli.paths import conf_folder
 from phd_exp.cli.signals import Stopped, stopping_on_signals
 from phd_exp.cli.sweep import IsFinished, sweep
-from phd_exp.records.errors import UNPRINTABLE, ConfigError, UserError, nearest, one_line
+from phd_exp.cli.words import require_visible
+from phd_exp.records.errors import ConfigError, UserError, nearest
 
 LONGEST = 400
 """Characters of what Hydra says."""
@@ -45,7 +46,7 @@ def launch(
     arguments = sorted(arguments, key=lambda word: word not in MULTIRUN)
     sys.argv = [sys.argv[0], *arguments]
     try:
-        _require_visible(arguments)
+        require_visible(arguments)
         with stopping_on_signals():
             endings = _run_all(task, arguments, config_name, is_finished)
     except Stopped as stop:
@@ -83,15 +84,6 @@ def _run_all(
         hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=config_name)(job)()
         # a flag like --cfg runs no job
         return [records.ending(0, [])] if any(records.path.iterdir()) else []
-
-
-def _require_visible(words: list[str]) -> None:
-    """Raise ConfigError for a word that a message could not repeat on its line."""
-    for word in words:
-        if UNPRINTABLE.search(word):
-            raise ConfigError(
-                f"{one_line(word)}: holds control characters; expected KEY=VALUE in visible ones"
-            )
 
 
 def _require_known_flags(words: list[str]) -> None:

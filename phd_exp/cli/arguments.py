@@ -8,7 +8,8 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
-from phd_exp.records.errors import ConfigError, in_our_words, nearest
+from phd_exp.cli.words import require_visible
+from phd_exp.records.errors import ConfigError, complaint, nearest
 from phd_exp.records.files import remove_temporaries
 
 Arguments_ = TypeVar("Arguments_", bound="Arguments")
@@ -23,6 +24,7 @@ class Arguments(BaseModel):
 
 def parsed(verb: str, model: type[Arguments_], words: Sequence[str]) -> Arguments_:
     """The arguments of `key=value` words. Raises ConfigError, in one line, for the first that is none."""
+    require_visible(words)
     values: dict[str, str] = {}
     for word in words:
         key, equals, value = word.partition("=")
@@ -80,9 +82,7 @@ def _complaint(verb: str, model: type[Arguments], problem: ErrorDetails) -> str:
         return f"{key}: unknown key{nearest(key, model.model_fields)}; {_takes(verb, model)}"
     if problem["type"] == "missing":
         return f"{key}: missing; {_takes(verb, model)}"
-    if not key:  # of all arguments together
-        return in_our_words(problem["msg"])
-    return f"{key}: got {problem['input']!r}; {in_our_words(problem['msg'])}"
+    return complaint(key, problem)
 
 
 def _takes(verb: str, model: type[Arguments]) -> str:

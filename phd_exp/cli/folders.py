@@ -3,11 +3,13 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from phd_exp.cli.words import require_visible
 from phd_exp.records.errors import UserError, nearest
 
 
 def named_folders(verb: str, defaults: Mapping[str, str], arguments: Sequence[str]) -> dict[str, Path]:
     """The folders named by `key=DIR`, or their defaults. Raises UserError for an unknown key and anything else."""
+    require_visible(arguments)
     folders = {key: Path(default) for key, default in defaults.items()}
     for argument in arguments:
         key, _, value = argument.partition("=")

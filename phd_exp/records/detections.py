@@ -26,7 +26,7 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 from phd_exp.records.dataset import SPLITS, DatasetError, checksum, sha256
-from phd_exp.records.errors import UNPRINTABLE, in_our_words, nearest, shown
+from phd_exp.records.errors import UNPRINTABLE, gist, in_our_words, nearest, shown
 from phd_exp.records.files import read_jsonl
 from phd_exp.records.parsing import parse_json
 from phd_exp.records.scenes import Pose, SampleRecord, Split
@@ -252,9 +252,7 @@ def _inside(folder: Path, name: str, where: str) -> Path:
         leaves = Path(name).is_absolute() or ".." in Path(name).parts
         leaves = leaves or not (folder / name).resolve().is_relative_to(folder.resolve())
     except (ValueError, OSError, RuntimeError) as error:  # a link that leads to itself, a name without end
-        raise DatasetError(
-            f"{where}: file_name={shown(name)} is no file name ({getattr(error, 'strerror', None) or error})"
-        ) from None
+        raise DatasetError(f"{where}: file_name={shown(name)} is no file name ({gist(error)})") from None
     if leaves:
         raise DatasetError(f"{where}: file_name={name!r} leaves {folder}; expected a path below it")
     return folder / name

@@ -5,6 +5,7 @@ import re
 from collections.abc import Iterable, Sequence
 
 from pydantic import ValidationError
+from pydantic_core import ErrorDetails
 
 LONGEST_GIST = 200
 """Characters of an error that a message repeats."""
@@ -49,13 +50,17 @@ def in_our_words(message: str) -> str:
     )
 
 
+def complaint(key: str, problem: ErrorDetails) -> str:
+    """What pydantic says of a key: its value, unless that is a whole section, and what was expected."""
+    given = f"got {shown(problem['input'])}; " if key and not isinstance(problem["input"], dict) else ""
+    return ": ".join(filter(None, [key, given + in_our_words(problem["msg"])]))
+
+
 def gist(error: Exception) -> str:
     """Why something cannot be read, on one line: of a validation the first complaint, of a system call its reason."""
     if isinstance(error, ValidationError):
         problem = error.errors(include_url=False)[0]
-        key = ".".join(map(str, problem["loc"]))
-        given = f"got {shown(problem['input'])}; " if key and not isinstance(problem["input"], dict) else ""
-        text = ": ".join(filter(None, [key, given + in_our_words(problem["msg"])]))
+        text = complaint(".".join(map(str, problem["loc"])), problem)
     else:
         text = str(getattr(error, "strerror", None) or error)
     return " ".join(text.split())[:LONGEST_GIST]

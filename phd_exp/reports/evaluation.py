@@ -144,8 +144,9 @@ def recalibrated(table: pa.Table | Arrays, temperature: Temperature) -> dict[str
     has all of them finite.
     """
     arrays = _arrays(table, (*PARAMETERS, *XYZ))
-    finite = _all_finite(arrays, (*PARAMETERS, *XYZ))
-    columns = {name: _tensor(arrays[name])[finite] for name in (*PARAMETERS, *XYZ)}
+    columns = {name: _tensor(arrays[name]) for name in (*PARAMETERS, *XYZ)}
+    finite = _all_finite(columns, tuple(columns))
+    columns = {name: column[finite] for name, column in columns.items()}
     distribution, xyz = temperature.apply(_distribution(columns)), _positions(columns)
     changed = distribution_columns(distribution, xyz)
     changed["energy_score"] = energy_score(draws(distribution, DRAWS, SEED), xyz)
@@ -205,14 +206,14 @@ def _finite(table: pa.Table | Arrays, names: tuple[str, ...]) -> tuple[Columns, 
     """The columns asked for and those of the strata, of the samples where the former are finite; how many are not."""
     arrays = _arrays(table, names)
     of_strata = [column for column, _, _ in QUANTITIES.values() if column in arrays]
-    finite = _all_finite(arrays, names)
-    columns = {name: _tensor(arrays[name])[finite] for name in dict.fromkeys((*names, *of_strata))}
-    return columns, int((~finite).sum())
+    columns = {name: _tensor(arrays[name]) for name in dict.fromkeys((*names, *of_strata))}
+    finite = _all_finite(columns, names)
+    return {name: column[finite] for name, column in columns.items()}, int((~finite).sum())
 
 
-def _all_finite(arrays: Arrays, names: tuple[str, ...]) -> Tensor:
+def _all_finite(columns: Columns, names: tuple[str, ...]) -> Tensor:
     """Which samples have these numbers finite. Raises RunError where none has."""
-    finite = torch.stack([_tensor(arrays[name]) for name in names]).isfinite().all(dim=0)
+    finite = torch.stack([columns[name] for name in names]).isfinite().all(dim=0)
     if not bool(finite.any()):
         raise RunError(
             f"predictions: none of {len(finite)} samples has finite {', '.join(names)}; train longer, or look at nll"

@@ -16,7 +16,7 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from phd_exp.records.errors import in_our_words, nearest, shown
+from phd_exp.records.errors import complaint, in_our_words, nearest, shown
 
 OURS = ("phd_exp.models.", "phd_exp.losses.", "phd_exp.optimizers.", "phd_exp.geometry.")
 ALLOWED = (*OURS, "torch.optim.", "torch.nn.", "torchvision.models.")
@@ -121,8 +121,7 @@ def describe(problem: ErrorDetails, model: type[BaseModel]) -> str:
         return f"{unknown}; expected one of {_listed(valid)}"
     if problem["type"] == "missing":
         return f"{key}: missing; expected {key}=VALUE"
-    given = "" if isinstance(problem["input"], dict) else f"got {shown(problem['input'])}; "
-    return ": ".join(filter(None, [key, f"{given}{in_our_words(problem['msg'])}"]))
+    return complaint(key, problem)
 
 
 def valid_keys(model: type[BaseModel], location: list[str]) -> list[str]:
