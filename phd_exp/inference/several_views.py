@@ -6,11 +6,12 @@ import torch
 
 from phd_exp.data.sources import RenderedSource
 from phd_exp.inference.predictor import BATCH, load
+from phd_exp.metrics.rows import Rows
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.runs import RunFolder
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.reports.several_views import ROTATION, TRANSLATION
-from phd_exp.training.predictions import columns, joined, write_parquet
+from phd_exp.training.predictions import columns, write_parquet
 
 
 def record_views(folder: RunFolder, data: DatasetFolder, spec: DatasetSpec, scenes: int) -> bool:
@@ -38,16 +39,15 @@ def record_views(folder: RunFolder, data: DatasetFolder, spec: DatasetSpec, scen
             data, spec, {"train": 0, "held_out": 0, "test": n}, predictor.preparation.side
         )
         samples = source.samples("test")
-        parts = [samples.select(rows) for rows in torch.arange(n).split(BATCH)]
-        tables = [
-            columns(predictor.predict(predictor.raw(part.image.numpy(), part.f), part.f), part)
-            for part in parts
-        ]
+        table = Rows()
+        for rows in torch.arange(n).split(BATCH):
+            part = samples.select(rows)
+            table.update(columns(predictor.predict(predictor.raw(part.image.numpy(), part.f), part.f), part))
         poses = [(*record.pose.rotation, *record.pose.translation) for record in data.records("test", n)]
         known = dict(source.known("test")) | dict(
             zip((*ROTATION, *TRANSLATION), map(list, zip(*poses, strict=True)), strict=True)
         )
-        write_parquet(folder.views, joined(tables), known, said)
+        write_parquet(folder.views, table.compute(), known, said)
     return True
 
 

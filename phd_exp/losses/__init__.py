@@ -1,4 +1,4 @@
-"""What training minimises, each a function of a prediction and the true position."""
+"""Losses: a prediction and the true positions -> one number a sample, of which training minimises the mean."""
 
 from phd_exp.losses.mae import MeanAbsoluteError
 from phd_exp.losses.nll import NegativeLogLikelihood

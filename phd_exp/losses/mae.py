@@ -7,12 +7,12 @@ from phd_exp.distributions import PointEstimate
 
 
 class MeanAbsoluteError(nn.Module):
-    """The mean Euclidean norm of the residual in the coordinates in which the network regresses (no unit).
+    """The Euclidean norm of each residual, in the coordinates in which the network regresses (no unit).
 
     Source: what the paper's tables call MAE.
     """
 
     prediction = PointEstimate
 
-    def forward(self, prediction: PointEstimate, xyz: Float[Tensor, "batch 3"]) -> Float[Tensor, ""]:
-        return prediction.residual(xyz).norm(dim=-1).mean()
+    def forward(self, prediction: PointEstimate, xyz: Float[Tensor, "batch 3"]) -> Float[Tensor, " batch"]:
+        return prediction.residual(xyz).norm(dim=-1)

@@ -7,7 +7,7 @@ from phd_exp.distributions import ProjectedHuber
 
 
 class NegativeLogLikelihood(nn.Module):
-    """The mean of -log p(v) over a batch, in nats, of the full density in the camera frame.
+    """-log p(v) of each sample, in nats, of the full density in the camera frame.
 
     Source: paper, eq. "loss after basis change"; the constants it drops are kept here, so that models and
     data sets compare. They do not move gradients.
@@ -15,5 +15,5 @@ class NegativeLogLikelihood(nn.Module):
 
     prediction = ProjectedHuber
 
-    def forward(self, prediction: ProjectedHuber, xyz: Float[Tensor, "batch 3"]) -> Float[Tensor, ""]:
-        return -prediction.log_prob(xyz).mean()
+    def forward(self, prediction: ProjectedHuber, xyz: Float[Tensor, "batch 3"]) -> Float[Tensor, " batch"]:
+        return -prediction.log_prob(xyz)

@@ -7,31 +7,22 @@ from hydra.utils import instantiate
 from lightning import Trainer
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar, TQDMProgressBar
-from lightning.pytorch.loggers import Logger
 
 from phd_exp.data.augmentation import Augmentation
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.folder import FolderSource
 from phd_exp.data.sources import Part, RenderedSource, Source
-from phd_exp.distributions import ProjectedHuber
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError
-from phd_exp.records.runs import RunFolder
-from phd_exp.training.callbacks import (
-    CalibrationRecorder,
-    Draw,
-    EpochLines,
-    RecordBeforeCheckpoint,
-    RecordLogger,
-)
+from phd_exp.training.callbacks import EpochLines
 from phd_exp.training.checkpoints import AtomicCheckpoints
 from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig
 from phd_exp.training.module import PositionModule
 from phd_exp.training.network import build_regressor, naming, precision
+from phd_exp.training.recorder import Recorder
 from phd_exp.training.schedule import factor
 from phd_exp.training.stopping import StopBetweenBatches
-from phd_exp.training.tracking import Tracker
 
 
 def build_data(config: RunConfig, rank: int = 0) -> PositionData:
@@ -85,13 +76,11 @@ def build_module(config: RunConfig, data: PositionData) -> PositionModule:
     )
 
 
-def build_trainer(
-    config: RunConfig, record: RecordLogger, loggers: list[Logger], calibration: CalibrationRecorder | None
-) -> Trainer:
+def build_trainer(config: RunConfig, recorder: Recorder) -> Trainer:
     """Lightning's Trainer with what a run records."""
-    folder = record.folder
+    folder = recorder.folder
     callbacks: list[Callback] = [
-        RecordBeforeCheckpoint(record),
+        recorder,
         # after the whole epoch: a checkpoint taken after its validation would leave the epoch half-counted
         ModelCheckpoint(
             folder.checkpoints, filename="last", enable_version_counter=False, save_on_train_epoch_end=True
@@ -100,8 +89,6 @@ def build_trainer(
     if config.trainer.devices == 1:  # of several, each would stop at a batch of its own
         callbacks.append(StopBetweenBatches(folder.last_checkpoint))
     callbacks += _progress(config)
-    if calibration is not None:
-        callbacks.append(calibration)
     return Trainer(
         accelerator=config.trainer.accelerator,
         devices=config.trainer.devices,
@@ -110,7 +97,7 @@ def build_trainer(
         plugins=[LightningEnvironment(), AtomicCheckpoints()],
         precision=precision(config.trainer),
         max_epochs=config.trainer.max_epochs,
-        logger=[record, *loggers],
+        logger=list(recorder.loggers),
         callbacks=callbacks,
         enable_progress_bar=any(isinstance(callback, ProgressBar) for callback in callbacks),
         check_val_every_n_epoch=config.evaluation.every_n_epochs,
@@ -132,15 +119,3 @@ def _progress(config: RunConfig) -> list[Callback]:
 def on_a_terminal() -> bool:
     """Whether somebody can watch a progress bar."""
     return sys.stderr.isatty()
-
-
-def build_calibration(
-    config: RunConfig, folder: RunFolder, module: PositionModule, draw: Draw | None, tracker: Tracker | None
-) -> CalibrationRecorder | None:
-    """The recorder of calibration curves; None for a baseline, which predicts no uncertainty."""
-    if not issubclass(module.regressor.head.prediction, ProjectedHuber):
-        return None
-    evaluation = config.evaluation
-    return CalibrationRecorder(
-        folder, evaluation.calibration_window, evaluation.calibration_every_n_epochs, draw, tracker
-    )

@@ -1,13 +1,13 @@
-"""A prediction spread out into columns: one row a sample, the same for figures, calibration and the record."""
+"""A prediction as columns, one row a sample: the same for logged metrics, calibration curves and the record."""
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
-import torch.distributed as dist
+from jaxtyping import Float
 from torch import Tensor
 
 from phd_exp.data.batches import Batch
@@ -21,25 +21,30 @@ from phd_exp.metrics.scores import DRAWS, energy_score
 from phd_exp.models.heads import Prediction
 from phd_exp.records.files import write_atomic
 
-ERRORS = ("projected_error_mm", "depth_error_mm")
-OF_A_DISTRIBUTION = ("nll", "depth_precision", "projected_precision")
+MEANS = {
+    "loss": "loss",
+    "projected_error_mm": "projected_error_mm",
+    "depth_error_mm": "depth_error_mm",
+    "nll": "nll",
+    "a": "depth_precision",
+    "projected_precision": "projected_precision",
+}
+"""Column -> the metric that is its mean."""
+UNRECORDED = ("row", "loss")
 
 
-def quantity_names(prediction: type[Prediction]) -> tuple[str, ...]:
-    """What `quantities` measures of a kind of prediction."""
-    return ERRORS + (OF_A_DISTRIBUTION if issubclass(prediction, ProjectedHuber) else ())
-
-
-def quantities(prediction: Prediction, xyz: Tensor) -> Columns:
-    """The metrics of a batch, a number a sample: errors in millimetres; of a distribution also `nll`, in nats of the
-    density per cubic metre, and the precisions a and |A|.
+def training_columns(
+    prediction: Prediction, xyz: Float[Tensor, "batch 3"], nll: Float[Tensor, " batch"] | None
+) -> Columns:
+    """The metrics of a training batch, a number a sample: errors in millimetres; of a distribution also its NLL
+    (nats; computed unless given) and the precisions a and |A|.
     """
-    values = _errors(prediction, xyz)
+    table = _errors(prediction, xyz)
     if isinstance(prediction, ProjectedHuber):
-        values["nll"] = -prediction.log_prob(xyz)
-        values["depth_precision"] = prediction.a
-        values["projected_precision"] = prediction.log_det_A.exp()
-    return values
+        table["nll"] = -prediction.log_prob(xyz) if nll is None else nll
+        table["depth_precision"] = prediction.a
+        table["projected_precision"] = prediction.log_det_A.exp()
+    return table
 
 
 def _errors(prediction: Prediction, xyz: Tensor) -> Columns:
@@ -63,52 +68,34 @@ def columns(prediction: Prediction, batch: Batch) -> Columns:
         # seeded by the sample: the score depends neither on the epoch nor on what ran before
         drawn = draws(prediction, DRAWS, seed=int(batch.row[0]))
         table["energy_score"] = energy_score(drawn, batch.xyz)
-    return {name: column.double().cpu() for name, column in table.items()}
-
-
-def joined(parts: Sequence[Columns]) -> Columns:
-    """The rows of several batches, one after the other."""
-    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-
-
-def gathered(table: Columns) -> Columns:
-    """The rows of all processes that train together, in the order of the data set; each of them has to call this."""
-    if not dist.is_initialized():
-        return table
-    tables: list[Columns] = [{} for _ in range(dist.get_world_size())]
-    dist.all_gather_object(tables, table)
-    whole = joined(tables)
-    order = whole["row"].argsort()
-    return {name: column[order] for name, column in whole.items()}
+    return {name: column.double() for name, column in table.items()}
 
 
 def calibration_curves(table: Columns, window: int) -> dict[str, CalibrationCurve]:
-    """The paper's two curves: of the depth, and of the projected position."""
+    """The paper's two curves, of depth and of the projected position; none for a point estimate."""
     return {
         name: calibration_curve(table[f"{name}_variance"], table[f"{name}_squared_error"], window)
         for name in ("depth", "projected")
+        if f"{name}_variance" in table
     }
 
 
 def summary(table: Columns) -> dict[str, float]:
-    """The final numbers of a run, by their metric keys: means over the rows, and scores of calibration."""
-    if "a" not in table:
-        return {f"test/{name}": float(table[name].mean()) for name in ERRORS}
-    means = {
-        name: table["a" if name == "depth_precision" else name].mean() for name in ERRORS + OF_A_DISTRIBUTION
+    """The numbers of an evaluation, by their metric keys: means over the rows, and scores of calibration."""
+    means = {metric: float(table[column].mean()) for column, metric in MEANS.items() if column in table}
+    scores = exact_scores(table) if "a" in table else {}
+    return {f"test/{name}": value for name, value in means.items()} | {
+        f"test/calibration/{name}": score for name, score in scores.items()
     }
-    scores = {f"calibration/{name}": score for name, score in exact_scores(table).items()}
-    return {f"test/{name}": float(value) for name, value in (means | scores).items()}
 
 
 def write_parquet(file: Path, table: Columns, known: Known, said: Mapping[str, str] | None = None) -> None:
-    """Write the columns beside what is known of each sample, in the order of the data set.
+    """Write the columns and what the source knows of each sample, in the order of the data set.
 
-    What is `said` of the table as a whole goes into the metadata of its schema.
+    `said` goes into the metadata of the schema.
     """
-    order = table["row"].argsort()
     arrays = {name: pa.array(values) for name, values in known.items()}
-    arrays |= {name: pa.array(column[order].numpy()) for name, column in table.items() if name != "row"}
+    arrays |= {name: pa.array(column.numpy()) for name, column in table.items() if name not in UNRECORDED}
     buffer = io.BytesIO()
     pq.write_table(pa.table(arrays, metadata=dict(said or {})), buffer)
     write_atomic(file, buffer.getvalue())

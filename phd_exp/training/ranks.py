@@ -20,8 +20,8 @@ from types import TracebackType
 from typing import Any
 
 from phd_exp.records.errors import RunError, UserError
-from phd_exp.training.callbacks import Draw
 from phd_exp.training.config import RunConfig
+from phd_exp.training.recorder import Draw
 
 
 @dataclass(frozen=True)

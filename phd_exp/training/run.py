@@ -20,18 +20,13 @@ from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError, RunError, shown
 from phd_exp.records.files import remove_temporaries
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.build import (
-    build_calibration,
-    build_data,
-    build_module,
-    build_trainer,
-)
-from phd_exp.training.callbacks import Begun, Draw, RecordLogger
+from phd_exp.training.build import build_data, build_module, build_trainer
 from phd_exp.training.config import FolderConfig, RunConfig, TrainerConfig
 from phd_exp.training.faults import told
 from phd_exp.training.module import PositionModule
-from phd_exp.training.predictions import gathered, joined, summary, write_parquet
+from phd_exp.training.predictions import summary, write_parquet
 from phd_exp.training.ranks import train_together
+from phd_exp.training.recorder import Draw, Recorder
 from phd_exp.training.stored import ADVICE, load_checkpoint
 from phd_exp.training.tracking import tracked
 
@@ -134,24 +129,21 @@ def run(
     if rank == 0:
         folder.write_constants(asdict(data.source.depth) | {"constant_f": data.source.constant_f})
     module = build_module(config, data)
-    record = RecordLogger(folder)
-    with tracked(config, folder) if rank == 0 else nullcontext() as tracker:
-        calibration = build_calibration(config, folder, module, draw, tracker)
-        trainer = build_trainer(config, record, [tracker.logger] if tracker else [], calibration)
-        checkpoint = _take_up(trainer, module, data, record)
-        if tracker:
-            tracker.send_epochs(record.rows.values())
-        _fit(trainer, module, data, checkpoint)
+    with tracked(config, folder) if rank == 0 else nullcontext() as logger:
+        recorder = Recorder(folder, config.evaluation, draw, [logger] if logger else [])
+        trainer = build_trainer(config, recorder)
+        checkpoint = _take_up(trainer, module, data, recorder)
+        recorder.send_recorded()
+        _fit(trainer, module, data, checkpoint, recorder)
         tables: dict[Part, Columns] = {
             part: _evaluate(trainer, module, data, part) for part in data.samples if part != "train"
         }
-        results = summary(tables["test"]) | _untrained(record) | _circumstances(config, data, trainer)
+        results = summary(tables["test"]) | _untrained(recorder) | _circumstances(config, data, trainer)
         if trainer.is_global_zero:
-            if calibration is not None:
-                calibration.write("final", tables["test"], trainer.global_step)
+            recorder.record_curves("final", tables["test"], trainer.global_step)
             _write_tables(folder, tables, data)
-        if tracker:
-            tracker.send_results(results)
+        if logger:
+            logger.experiment.summary.update(results)
     return results
 
 
@@ -161,32 +153,30 @@ def _write_tables(folder: RunFolder, tables: Mapping[Part, Columns], data: Posit
         write_parquet(file, table, data.source.known(part))
 
 
-def _take_up(
-    trainer: Trainer, module: PositionModule, data: PositionData, record: RecordLogger
-) -> Path | None:
+def _take_up(trainer: Trainer, module: PositionModule, data: PositionData, recorder: Recorder) -> Path | None:
     """Leave in the record what was done before: the epochs up to the last checkpoint, which is returned.
 
     A new run has none; what its untrained network gives is recorded.
     """
-    checkpoint = record.folder.last_checkpoint
+    checkpoint = recorder.folder.last_checkpoint
     if checkpoint.exists():
-        record.forget_after(
+        recorder.forget_after(
             _last_whole_epoch(checkpoint, trainer.max_epochs or 0, len(data.train_dataloader()))
         )
-        _require_recorded(record, checkpoint)
+        _require_recorded(recorder, checkpoint)
         return checkpoint
-    record.forget_after(UNTRAINED)
-    record.log_metrics({"epoch": UNTRAINED} | summary(_evaluate(trainer, module, data, "test")), step=0)
+    recorder.forget_after(UNTRAINED)
+    recorder.record(UNTRAINED, summary(_evaluate(trainer, module, data, "test")), step=0)
     return None
 
 
-def _require_recorded(record: RecordLogger, checkpoint: Path) -> None:
+def _require_recorded(recorder: Recorder, checkpoint: Path) -> None:
     """Raise RunError unless the epochs before a checkpoint are recorded with their numbers."""
-    untrained = record.rows.get(UNTRAINED, {})
-    numbers = [value for row in record.rows.values() for value in row.values()]
+    untrained = recorder.rows.get(UNTRAINED, {})
+    numbers = [value for row in recorder.rows.values() for value in row.values()]
     if not any(key.startswith("test/") for key in untrained) or not all(map(_is_number, numbers)):
         raise RunError(
-            f"{record.folder.metrics_file}: not the record of the epochs before {checkpoint.name}; "
+            f"{recorder.folder.metrics_file}: not the record of the epochs before {checkpoint.name}; "
             "delete both to begin the run again"
         )
 
@@ -195,25 +185,25 @@ def _is_number(value: Any) -> bool:
     return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
 
 
-def _fit(trainer: Trainer, module: PositionModule, data: PositionData, checkpoint: Path | None) -> None:
+def _fit(
+    trainer: Trainer, module: PositionModule, data: PositionData, checkpoint: Path | None, recorder: Recorder
+) -> None:
     """Train to the last epoch, from the checkpoint if there is one.
 
-    Raises RunError where the checkpoint is one of another run.
+    Raises RunError if the checkpoint is one of another run.
     """
-    begun = Begun()
-    trainer.callbacks.append(begun)  # type: ignore[attr-defined]  # set by Lightning
     try:
         trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     except (KeyError, ValueError, TypeError, AttributeError, RuntimeError, IndexError) as error:
-        if checkpoint is None or begun.training:
+        if checkpoint is None or recorder.begun:
             raise
         reason = " ".join(str(error).split())[:120]
         raise RunError(f"{checkpoint}: not a checkpoint of this run ({reason}); {ADVICE}") from None
 
 
-def _untrained(record: RecordLogger) -> dict[str, Any]:
+def _untrained(recorder: Recorder) -> dict[str, Any]:
     """The numbers of the untrained network, for comparison."""
-    return {f"untrained/{key}": value for key, value in record.rows[UNTRAINED].items() if "test/" in key}
+    return {f"untrained/{key}": value for key, value in recorder.rows[UNTRAINED].items() if "test/" in key}
 
 
 def _last_whole_epoch(checkpoint: Path, epochs: int, batches: int) -> int:
@@ -230,10 +220,9 @@ def _last_whole_epoch(checkpoint: Path, epochs: int, batches: int) -> int:
 
 
 def _evaluate(trainer: Trainer, module: PositionModule, data: PositionData, part: Part) -> Columns:
-    """Predictions of the present weights, a row a sample, whichever process made them."""
-    batches = trainer.predict(module, dataloaders=data.in_order(part))
-    assert batches is not None
-    return gathered(joined(batches))  # type: ignore[arg-type]
+    """Predictions of the present weights, a row a sample, from all processes."""
+    trainer.predict(module, dataloaders=data.in_order(part), return_predictions=False)
+    return module.table
 
 
 def _circumstances(config: RunConfig, data: PositionData, trainer: Trainer) -> dict[str, Any]:

@@ -15,8 +15,8 @@ from trainer import configured
 
 from phd_exp.data.datamodule import PositionData
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.build import build_calibration, build_module, build_trainer
-from phd_exp.training.callbacks import RecordLogger
+from phd_exp.training.build import build_module, build_trainer
+from phd_exp.training.recorder import Recorder
 
 
 class Enough(Callback):
@@ -44,7 +44,7 @@ def main(kind: str, folder: Path, overrides: list[str]) -> None:
         print(peak())
         return
     run = RunFolder(folder)
-    trainer = build_trainer(config, RecordLogger(run), [], build_calibration(config, run, module, None, None))
+    trainer = build_trainer(config, Recorder(run, config.evaluation, None, []))
     trainer.callbacks.append(Enough())  # type: ignore[attr-defined]  # set by Lightning
     trainer.fit(module, datamodule=data)
 

@@ -22,10 +22,10 @@ from phd_exp.cli.paths import conf_folder
 from phd_exp.data.datamodule import PositionData
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.build import build_calibration, build_data, build_module, build_trainer
-from phd_exp.training.callbacks import RecordLogger
+from phd_exp.training.build import build_data, build_module, build_trainer
 from phd_exp.training.config import RunConfig, check
 from phd_exp.training.module import PositionModule
+from phd_exp.training.recorder import Recorder
 
 
 class Loop(Protocol):
@@ -78,8 +78,7 @@ def main(kind: str, folder: Path, epochs: int, overrides: list[str]) -> None:
     module = build_module(config, data)
     folder.mkdir(parents=True, exist_ok=True)
     run = RunFolder(folder)
-    calibration = build_calibration(config, run, module, None, None)
-    trainer = build_trainer(config, RecordLogger(run), [], calibration)
+    trainer = build_trainer(config, Recorder(run, config.evaluation, None, []))
     trainer.callbacks.append(Alternating(rival(kind, module, data, config)))  # type: ignore[attr-defined]
     trainer.fit(module, datamodule=data)
 

@@ -14,6 +14,6 @@ def only_run(runs: Path) -> RunFolder:
 
 
 def weights(run: RunFolder) -> dict[str, torch.Tensor]:
-    """Of its last checkpoint."""
-    state: dict[str, torch.Tensor] = torch.load(run.last_checkpoint, weights_only=True)["state_dict"]
-    return state
+    """The network's weights in its last checkpoint."""
+    state = torch.load(run.last_checkpoint, weights_only=True)["state_dict"]
+    return {name: weight for name, weight in state.items() if name.startswith("regressor.")}

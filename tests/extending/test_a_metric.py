@@ -1,12 +1,13 @@
-"""A metric is a pure function of tensors, a number a sample; `Means` adds it up, whatever the batches and processes.
+"""A metric is a pure function of tensors that returns one number a sample.
 
-It would stay in `metrics/errors.py`, and a line of `quantities` in `training/predictions.py` would record it.
+It would stand in `metrics/errors.py`. In `training/predictions.py`, a line of `columns` records it for each
+test sample, and a line of `MEANS` logs its mean.
 """
 
 import torch
 from torch import Tensor
 
-from phd_exp.metrics.means import Means
+from phd_exp.metrics.rows import Rows
 
 
 def angle(xyz: Tensor, estimate: Tensor) -> Tensor:
@@ -19,7 +20,7 @@ def test_a_function_makes_a_metric() -> None:
     reference = torch.nn.functional.cosine_similarity(xyz, estimate, dim=-1).acos()
     torch.testing.assert_close(angle(xyz, estimate), reference)
 
-    means = Means(["angle"])
+    table = Rows()
     for rows in (slice(0, 3), slice(3, 50)):
-        means.update({"angle": angle(xyz[rows], estimate[rows])})
-    torch.testing.assert_close(means.compute()["angle"], reference.mean())
+        table.update({"angle": angle(xyz[rows], estimate[rows])})
+    torch.testing.assert_close(table.compute()["angle"], reference)

@@ -10,7 +10,8 @@ from phd_exp.data.batches import Batch
 from phd_exp.distributions import PointEstimate, ProjectedHuber
 from phd_exp.distributions.columns import calibration_columns
 from phd_exp.geometry import DepthScale, Projected
-from phd_exp.training.predictions import calibration_curves, columns, joined, summary
+from phd_exp.metrics.rows import Rows
+from phd_exp.training.predictions import calibration_curves, columns, summary, write_parquet
 
 DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
 
@@ -107,14 +108,13 @@ def test_curves_of_samples_of_the_distribution_itself_are_calibrated() -> None:
 def test_the_record_is_in_the_order_of_the_data_set(
     batch: Batch, distribution: ProjectedHuber, tmp_path: Path
 ) -> None:
-    from phd_exp.training.predictions import write_parquet
-
     known = {
         "file_name": [f"{i:06d}.png" for i in range(len(batch))],
         "f": [1500.0 + i for i in range(len(batch))],
     }
-    table = joined([columns(distribution, batch)])
-    write_parquet(tmp_path / "predictions.parquet", table, known)
+    rows = Rows()
+    rows.update(columns(distribution, batch))
+    write_parquet(tmp_path / "predictions.parquet", rows.compute(), known)
     frame = pd.read_parquet(tmp_path / "predictions.parquet")
     assert frame["file_name"].tolist() == [f"{i:06d}.png" for i in range(len(batch))]
     assert frame["f"].tolist() == known["f"]

@@ -1,0 +1,48 @@
+"""The rows of an evaluation, kept whole: every score of a split is computed from one table."""
+
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Float, Real
+from torch import Tensor
+from torchmetrics import Metric
+from torchmetrics.utilities import dim_zero_cat
+
+
+class Rows(Metric):
+    """Collects named columns, one row a sample, over batches and processes.
+
+    `compute` returns the columns in float64 on the CPU, sorted by the column `row` where there is one, so that the
+    result does not depend on how the samples were dealt out. A checkpoint in the middle of an epoch holds the rows so
+    far. Two thousand rows of thirty columns take 0.5 MB.
+
+    Example:
+        >>> rows = Rows()
+        >>> rows.update({"row": torch.tensor([1, 0]), "error": torch.tensor([0.5, 0.25])})
+        >>> rows.compute()["error"].tolist()
+        [0.25, 0.5]
+    """
+
+    full_state_update = False
+    parts: list[Tensor]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: tuple[str, ...] = ()
+        self.add_state("parts", [], dist_reduce_fx="cat", persistent=True)
+
+    def update(self, columns: Mapping[str, Real[Tensor, " rows"]]) -> None:
+        """Add rows. Raises ValueError if the columns are not those of the rows before."""
+        if self.names and self.names != tuple(columns):
+            raise ValueError(f"expected columns {self.names}, got {tuple(columns)}")
+        self.names = tuple(columns)
+        self.parts.append(torch.stack([column.detach().double() for column in columns.values()], dim=-1))
+
+    def compute(self) -> dict[str, Float[Tensor, " rows"]]:
+        """All rows, column by column."""
+        table = dim_zero_cat(self.parts).cpu()
+        columns = dict(zip(self.names, table.unbind(-1), strict=True))
+        if "row" not in columns:
+            return columns
+        order = columns["row"].argsort()
+        return {name: column[order] for name, column in columns.items()}

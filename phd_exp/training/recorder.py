@@ -1,0 +1,106 @@
+"""What a run writes while it trains: one line of metrics an epoch, and calibration curves every few epochs."""
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import Checkpoint
+from lightning.pytorch.loggers import Logger
+from lightning.pytorch.utilities import rank_zero_only
+
+from phd_exp.distributions.columns import Columns
+from phd_exp.records.files import write_atomic
+from phd_exp.records.runs import RunFolder, epoch_name
+from phd_exp.training.config.sections import EvaluationConfig
+from phd_exp.training.predictions import calibration_curves
+
+CalibrationData = dict[str, dict[str, Any]]
+Draw = Callable[[CalibrationData, Path], None]
+"""Draws calibration curves into a picture file."""
+
+
+class Recorder(Checkpoint):
+    """Keeps the run record up to date, and sends loggers what Lightning does not.
+
+    `metrics.jsonl` is written whole after every epoch: a resumed run replaces the epochs it repeats, and no reader
+    sees half a line. A Checkpoint callback runs after the module's own hooks, and this one before Lightning's
+    ModelCheckpoint, so an epoch is recorded before its checkpoint exists.
+
+    Args:
+        folder: the run's record.
+        evaluation: how often calibration curves are kept, and their window.
+        draw: draws the curves; None records them as data alone.
+        loggers: Lightning's loggers; those with `log_image` receive the pictures.
+
+    Attributes:
+        begun: whether this process has begun to train; an error before that lies in the checkpoint.
+    """
+
+    def __init__(
+        self, folder: RunFolder, evaluation: EvaluationConfig, draw: Draw | None, loggers: Sequence[Logger]
+    ) -> None:
+        self.folder = folder
+        self.evaluation = evaluation
+        self.draw = draw
+        self.loggers = loggers
+        self.rows = {row["epoch"]: row for row in folder.metrics()}
+        self.begun = False
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.begun = True
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if (trainer.current_epoch + 1) % self.evaluation.calibration_every_n_epochs == 0:
+            table: Columns = pl_module.table  # type: ignore[assignment]  # a PositionModule's
+            self.record_curves(epoch_name(trainer.current_epoch), table, trainer.global_step)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        evaluated = (trainer.current_epoch + 1) % (trainer.check_val_every_n_epoch or 1) == 0
+        metrics = {
+            key: float(value)
+            for key, value in trainer.callback_metrics.items()
+            if evaluated or not key.startswith("test/")  # Lightning keeps the metrics of earlier epochs
+        }
+        self.record(trainer.current_epoch, metrics, step=trainer.global_step - 1)  # as Lightning counts
+
+    @rank_zero_only
+    def record(self, epoch: int, metrics: Mapping[str, float], step: int) -> None:
+        """Write the metrics of an epoch; null stands for a number that is not finite."""
+        finite = {key: value if math.isfinite(value) else None for key, value in metrics.items()}
+        self.rows[epoch] = {"epoch": epoch, "step": step} | finite
+        self.folder.write_metrics(self.rows[key] for key in sorted(self.rows))
+
+    def forget_after(self, epoch: int) -> None:
+        """Drop the epochs that a resumed run trains again."""
+        self.rows = {key: row for key, row in self.rows.items() if key <= epoch}
+
+    @rank_zero_only
+    def record_curves(self, name: str, table: Columns, step: int) -> None:
+        """Write the calibration curves of a table of predictions, draw them and send them; none of a baseline."""
+        curves = calibration_curves(table, self.evaluation.calibration_window)
+        if not curves:
+            return
+        self.folder.calibration.mkdir(parents=True, exist_ok=True)
+        file = self.folder.curves(name)
+        content = {key: curve.as_data() for key, curve in curves.items()}
+        write_atomic(file, json.dumps(content) + "\n")
+        if self.draw is not None:
+            self.draw(content, file.with_suffix(".png"))
+        self._send_picture(name, step)
+
+    def send_recorded(self) -> None:
+        """Send the loggers the epochs of the record that were trained before this process began."""
+        for epoch, row in self.rows.items():
+            metrics = {key: value for key, value in row.items() if key != "step" and value is not None}
+            for logger in self.loggers:
+                logger.log_metrics(metrics, step=row["step"])
+            self._send_picture(epoch_name(epoch), row["step"])
+
+    def _send_picture(self, name: str, step: int) -> None:
+        picture = self.folder.curves(name).with_suffix(".png")
+        for logger in self.loggers:
+            if picture.exists() and hasattr(logger, "log_image"):
+                logger.log_image("test/calibration", [str(picture)], step=step)
