@@ -5,9 +5,8 @@ from typing import Any
 from phd_exp.cli.app import launch
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.rendering.masks import require_elsewhere, write_masks
-from phd_exp.rendering.shards import render_shard
+from phd_exp.rendering.render import ensure_rendered, render_shard
 from phd_exp.rendering.verify import verify
-from phd_exp.rendering.workers import ensure_rendered
 from phd_exp.training.config import RenderConfig, RenderedConfig, check_render
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.runs import RunFolder
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.workers import ensure_rendered
+from phd_exp.rendering.render import ensure_rendered
 from phd_exp.training.config import RenderedConfig, RunConfig
 
 

@@ -12,7 +12,7 @@ from filelock import FileLock
 from rich.console import Console
 from rich.progress import track
 
-from phd_exp.records.dataset import DatasetError
+from phd_exp.records.errors import DatasetError
 from phd_exp.records.files import read_plain, require_plain, write_atomic
 from phd_exp.records.parsing import parse_json
 

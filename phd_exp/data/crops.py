@@ -10,7 +10,7 @@ from PIL import ExifTags, Image
 
 from phd_exp.data.images import shrunk
 from phd_exp.geometry.virtual import VirtualCamera
-from phd_exp.records.dataset import DatasetError
+from phd_exp.records.errors import DatasetError
 from phd_exp.records.files import require_plain
 from phd_exp.records.images import FORMATS, LARGEST_IMAGE, decoding, pillow_warnings
 

@@ -17,9 +17,9 @@ from phd_exp.data.crops import cut, image_size, read_image
 from phd_exp.data.sources import Known, Part, Source
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.geometry.virtual import VirtualCamera, intrinsics
-from phd_exp.records.dataset import DatasetError, sha256
+from phd_exp.records.dataset import sha256
 from phd_exp.records.detections import Detection, DetectionFolder
-from phd_exp.records.errors import ConfigError
+from phd_exp.records.errors import ConfigError, DatasetError
 from phd_exp.records.files import read_plain
 from phd_exp.records.images import LARGEST_IMAGE, pillow_warnings
 from phd_exp.records.scenes import Split

@@ -7,7 +7,8 @@ import numpy as np
 from PIL import Image
 
 from phd_exp.data.cache import cached
-from phd_exp.records.dataset import DatasetError, DatasetFolder, sha256
+from phd_exp.records.dataset import DatasetFolder, sha256
+from phd_exp.records.errors import DatasetError
 from phd_exp.records.images import recorded_image
 from phd_exp.records.scenes import SampleRecord, Split
 

@@ -20,8 +20,8 @@ from phd_exp.geometry.virtual import intrinsics
 from phd_exp.inference.views import Preparation, View
 from phd_exp.models.heads import Prediction
 from phd_exp.models.regressor import Regressor
-from phd_exp.records.dataset import DatasetError, DatasetFolder
-from phd_exp.records.errors import ConfigError, RunError
+from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.errors import ConfigError, DatasetError, RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import FolderConfig, RunConfig, check
 from phd_exp.training.network import build_regressor

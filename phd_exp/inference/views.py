@@ -9,7 +9,7 @@ from PIL import Image
 from phd_exp.data.crops import cut
 from phd_exp.data.images import shrunk
 from phd_exp.geometry.virtual import Box, VirtualCamera
-from phd_exp.records.dataset import DatasetError
+from phd_exp.records.errors import DatasetError
 
 
 @dataclass(frozen=True, eq=False)

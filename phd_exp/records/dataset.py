@@ -18,7 +18,7 @@ from typing import Annotated, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from phd_exp.records.errors import UserError, gist
+from phd_exp.records.errors import DatasetError, gist
 from phd_exp.records.files import read_jsonl, read_plain, require_plain, write_atomic
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.shards import Shard
@@ -26,10 +26,6 @@ from phd_exp.records.spec import DatasetSpec, ImageFormat
 
 SPLITS: tuple[Split, ...] = get_args(Split)
 SUFFIXES: dict[ImageFormat, str] = {"png": ".png", "webp": ".webp", "jpeg": ".jpg"}
-
-
-class DatasetError(UserError):
-    """A data set that is missing, broken or another one than asked for: one line, with what to do."""
 
 
 class Seal(BaseModel):

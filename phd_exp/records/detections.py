@@ -25,8 +25,8 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails
 
-from phd_exp.records.dataset import SPLITS, DatasetError, checksum, sha256
-from phd_exp.records.errors import UNPRINTABLE, gist, in_our_words, nearest, shown
+from phd_exp.records.dataset import SPLITS, checksum, sha256
+from phd_exp.records.errors import UNPRINTABLE, DatasetError, gist, in_our_words, nearest, shown
 from phd_exp.records.files import read_jsonl
 from phd_exp.records.parsing import parse_json
 from phd_exp.records.scenes import Pose, SampleRecord, Split

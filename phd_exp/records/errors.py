@@ -2,7 +2,9 @@
 
 import difflib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
@@ -27,6 +29,35 @@ class ConfigError(UserError):
 
 class RunError(UserError):
     """A run folder that cannot be used: held by another process, made by another configuration, or broken."""
+
+
+class DatasetError(UserError):
+    """A data set that cannot be used as asked: incomplete, of another specification, or damaged."""
+
+
+class RenderError(UserError):
+    """Rendering cannot start or continue."""
+
+
+class CorruptFileError(UserError):
+    """A line of a file cannot be read."""
+
+
+def unwritable(error: OSError, folder: Path, instead: str = "data.root") -> RenderError:
+    """The RenderError of a folder without permission or a full disk; `instead` names the key of another folder."""
+    return RenderError(
+        f"{error.filename or folder}: cannot be written ({error.strerror or error}); make room, allow writing, "
+        f"or choose another {instead}"
+    )
+
+
+@contextmanager
+def writing(folder: Path, instead: str = "data.root") -> Iterator[None]:
+    """Raise `unwritable` for an OSError in the body."""
+    try:
+        yield
+    except OSError as error:
+        raise unwritable(error, folder, instead) from error
 
 
 def listed(names: Sequence[str]) -> str:

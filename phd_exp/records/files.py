@@ -12,7 +12,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any, TextIO, TypeVar
 
-from phd_exp.records.errors import UserError, gist
+from phd_exp.records.errors import CorruptFileError, gist
 from phd_exp.records.parsing import parse_json
 
 Parsed = TypeVar("Parsed")
@@ -24,10 +24,6 @@ LARGEST_RECORD = 16 * MB
 """Bytes of a file that is read whole; the longest that are written here have a few thousand."""
 LONGEST_LINE = MB
 """Bytes of a line of a journal; a sample's has about two thousand."""
-
-
-class CorruptFileError(UserError):
-    """A file on disk does not hold what its schema promises; the message names file and line."""
 
 
 def require_plain(path: Path, largest: int | None = None) -> None:

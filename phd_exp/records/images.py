@@ -10,8 +10,8 @@ from pathlib import Path
 
 from PIL import Image, Jpeg2KImagePlugin, TiffImagePlugin, UnidentifiedImageError, WebPImagePlugin
 
-from phd_exp.records.dataset import DatasetError, sha256
-from phd_exp.records.errors import gist
+from phd_exp.records.dataset import sha256
+from phd_exp.records.errors import DatasetError, gist
 from phd_exp.records.files import MB, read_plain
 from phd_exp.records.scenes import SampleRecord
 

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from phd_exp.records.dataset import DatasetError
 from phd_exp.records.detections import Detection
+from phd_exp.records.errors import DatasetError
 from phd_exp.records.scenes import Pose
 
 

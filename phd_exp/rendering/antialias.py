@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phd_exp.records.scenes import Scene
-from phd_exp.rendering.colour import Light
-from phd_exp.rendering.rays import Labels, trace_points
-from phd_exp.rendering.visibility import Mask
+from phd_exp.rendering.pixels import Light
+from phd_exp.rendering.rays import Labels, Mask, trace_points
 
 FILTER_WIDTH = 3.0  # px
 REACH = 2  # px from a pixel to the farthest one that its filter touches

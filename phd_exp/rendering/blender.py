@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from phd_exp.records.errors import RenderError
 from phd_exp.records.scenes import Scene
-from phd_exp.rendering.colour import Light
-from phd_exp.rendering.errors import RenderError
-from phd_exp.rendering.exr import read_light
+from phd_exp.rendering.pixels import Light, read_light
 from phd_exp.rendering.stage import build_stage
 
 X_LIBRARIES = "libx11-6 libxext6 libxfixes3 libxi6 libxrender1 libxkbcommon0 libsm6 libice6 libgl1"
@@ -81,10 +80,6 @@ class Settings:
     samples: int
     denoised: bool
     at_middles: bool
-
-
-REFERENCE = Settings(samples=1024, denoised=False, at_middles=False)
-"""Blender's own picture, as good as converged: what pictures are measured against."""
 
 
 class Renderer:

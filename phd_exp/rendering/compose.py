@@ -9,9 +9,8 @@ import numpy as np
 from phd_exp.records.scenes import Backdrop, Scene
 from phd_exp.rendering.antialias import smoothed
 from phd_exp.rendering.blender import Box, Renderer
-from phd_exp.rendering.colour import Light, Pixels, encoded
-from phd_exp.rendering.rays import NOTHING, Hits
-from phd_exp.rendering.visibility import Mask
+from phd_exp.rendering.pixels import Light, Pixels, encoded
+from phd_exp.rendering.rays import NOTHING, Hits, Mask
 
 MARGIN = 4  # px around the objects that the denoiser sees, for what it does along the rim of its image
 

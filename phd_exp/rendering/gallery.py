@@ -11,9 +11,8 @@ from phd_exp.records.files import write_atomic
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer
-from phd_exp.rendering.encoding import file_of
-from phd_exp.rendering.rays import trace_pixels
-from phd_exp.rendering.visibility import cylinder_mask
+from phd_exp.rendering.pixels import file_of
+from phd_exp.rendering.rays import cylinder_mask, trace_pixels
 from phd_exp.rendering.worker import fast_settings, make_sample
 
 GAP = 4  # px of white between pictures

@@ -5,12 +5,11 @@ from pathlib import Path
 from PIL import Image
 
 from phd_exp.records.dataset import SPLITS, DatasetFolder
+from phd_exp.records.errors import RenderError, writing
 from phd_exp.records.files import write_atomic
-from phd_exp.rendering.encoding import file_of
-from phd_exp.rendering.errors import RenderError, writing
+from phd_exp.rendering.pixels import file_of
 from phd_exp.rendering.progress import shown_progress
-from phd_exp.rendering.rays import trace_pixels
-from phd_exp.rendering.visibility import cylinder_mask
+from phd_exp.rendering.rays import cylinder_mask, trace_pixels
 
 
 def write_masks(folder: DatasetFolder, masks: Path) -> int:

@@ -15,9 +15,9 @@ from types import TracebackType
 from pydantic import ValidationError
 
 from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.errors import RenderError
 from phd_exp.records.scenes import SampleRecord
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.errors import RenderError
 from phd_exp.rendering.worker import Answer, Job, Task
 
 PATIENCE = 10.0  # s that a worker gets to finish its sample before it is ended

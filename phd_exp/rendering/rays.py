@@ -1,4 +1,4 @@
-"""Analytic ray casting: which surface a ray of the camera meets first, and how far away.
+"""Analytic ray casting: which surface a ray meets first, how far away, and how much of the cylinder shows.
 
 A pinhole ray is v = z (u, w, 1). In an object's own frame, stretched so that the object fills [-1, 1]^3, it
 is still a straight line with the same parameter z: every object is one of three unit solids, and its depth is
@@ -16,6 +16,7 @@ from phd_exp.rendering.rotations import rotation_matrix
 
 Image = NDArray[np.float64]
 Labels = NDArray[np.int8]
+Mask = NDArray[np.bool_]
 
 FACES = 8  # at most that many smooth faces on one object
 NOTHING = 0  # the label of a ray that meets no object
@@ -62,6 +63,28 @@ def trace_points(scene: Scene, x: Image, y: Image) -> Hits:
         near = (x >= columns.start) & (x <= columns.stop) & (y >= rows.start) & (y <= rows.stop)
         hits.depths[number, near], hits.surfaces[number, near] = _cast(scene, number, x[near], y[near])
     return hits
+
+
+def cylinder_mask(hits: Hits) -> Mask:
+    """Pixels (S, S) that show the first object, the cylinder, rows from the top."""
+    return (hits.surfaces[0] != NOTHING) & (hits.depths[0] <= hits.depths.min(axis=0))
+
+
+def visibility(hits: Hits) -> float:
+    """Visible pixels of the cylinder over those it would show alone; 0 if it would show none."""
+    alone = (hits.surfaces[0] != NOTHING).sum()
+    return float(cylinder_mask(hits).sum() / alone) if alone else 0.0
+
+
+def truncation(scene: Scene, hits: Hits) -> float:
+    """Share of the pixels that the cylinder, alone, would take in an image without borders and that this one lacks.
+
+    1 if it would take none anywhere.
+    """
+    cylinder = scene.model_copy(update={"objects": scene.objects[:1]})
+    everywhere = trace_points(cylinder, *pixel_middles(*window(scene, scene.objects[0])))
+    whole = (everywhere.surfaces[0] != NOTHING).sum()
+    return float(1 - (hits.surfaces[0] != NOTHING).sum() / whole) if whole else 1.0
 
 
 def pixel_middles(rows: range, columns: range) -> tuple[Image, Image]:

@@ -6,8 +6,9 @@ whoever goes on. Only one who holds the folder alone seals it, so that no journa
 
 from contextlib import suppress
 
-from phd_exp.records.dataset import SPLITS, DatasetError, DatasetFolder, Manifest, Seal, sha256
-from phd_exp.records.files import CorruptFileError, read_jsonl, remove_temporaries, write_atomic
+from phd_exp.records.dataset import SPLITS, DatasetFolder, Manifest, Seal, sha256
+from phd_exp.records.errors import CorruptFileError, DatasetError
+from phd_exp.records.files import read_jsonl, remove_temporaries, write_atomic
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import renderer_version

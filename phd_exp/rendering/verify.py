@@ -4,8 +4,8 @@ import random
 from collections.abc import Iterator
 from pathlib import Path
 
-from phd_exp.records.dataset import SPLITS, DatasetError, DatasetFolder, Manifest, Seal, checksum
-from phd_exp.records.errors import UserError
+from phd_exp.records.dataset import SPLITS, DatasetFolder, Manifest, Seal, checksum
+from phd_exp.records.errors import DatasetError, UserError
 from phd_exp.records.images import recorded_image
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec

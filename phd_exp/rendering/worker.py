@@ -16,17 +16,15 @@ import numpy as np
 from pydantic import BaseModel
 
 from phd_exp.records.dataset import DatasetFolder, image_name, sha256
-from phd_exp.records.errors import UserError
+from phd_exp.records.errors import UserError, unwritable
 from phd_exp.records.files import write_atomic
 from phd_exp.records.scenes import SampleRecord, Scene, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer, Settings
 from phd_exp.rendering.compose import take_picture
-from phd_exp.rendering.encoding import encode
-from phd_exp.rendering.errors import unwritable
-from phd_exp.rendering.rays import Hits, in_camera_frame, trace_pixels
+from phd_exp.rendering.pixels import encode
+from phd_exp.rendering.rays import Hits, in_camera_frame, trace_pixels, truncation, visibility
 from phd_exp.rendering.sampling import sample_scene, scene_and_view
-from phd_exp.rendering.visibility import truncation, visibility
 
 
 class Job(BaseModel):

@@ -22,8 +22,8 @@ from PIL import Image
 
 from phd_exp.records.scenes import Scene
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.blender import REFERENCE, Renderer, load_bpy, silence
-from phd_exp.rendering.colour import encoded
+from phd_exp.rendering.blender import Renderer, Settings, load_bpy, silence
+from phd_exp.rendering.pixels import encoded
 from phd_exp.rendering.sampling import sample_scene
 from phd_exp.rendering.stage import MATERIALS, SHAPES, Stage, build_stage
 from phd_exp.rendering.worker import fast_settings, make_sample
@@ -32,7 +32,8 @@ Paint = Callable[[Scene, int, Path], None]
 
 
 def reference(spec: DatasetSpec, folder: Path, samples: int) -> Paint:
-    renderer = Renderer(REFERENCE)
+    # Blender's own picture, as good as converged
+    renderer = Renderer(Settings(samples=1024, denoised=False, at_middles=False))
     return lambda scene, index, path: Image.fromarray(encoded(renderer.render(scene))).save(path)
 
 

@@ -23,9 +23,9 @@ from PIL import Image
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.pool import render_all
+from phd_exp.rendering.render import worker_count
 from phd_exp.rendering.sampling import GENERATOR_VERSION
 from phd_exp.rendering.worker import Task
-from phd_exp.rendering.workers import worker_count
 
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(7200)]
 

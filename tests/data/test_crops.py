@@ -14,7 +14,7 @@ from phd_exp.data import crops
 from phd_exp.data.crops import GREY, cut, image_size, pillow_warnings, read_image
 from phd_exp.geometry import Camera
 from phd_exp.geometry.virtual import Box, VirtualCamera, intrinsics, rays
-from phd_exp.records.dataset import DatasetError
+from phd_exp.records.errors import DatasetError
 
 K = intrinsics(400.0, 520.0, 120.3, 140.8)  # pixels not square, the principal point off the middle
 WIDTH, HEIGHT = 301, 220

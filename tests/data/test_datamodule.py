@@ -7,7 +7,8 @@ import torch
 
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.sources import Part, RenderedSource
-from phd_exp.records.dataset import DatasetError, DatasetFolder
+from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.errors import DatasetError
 from phd_exp.records.spec import DatasetSpec
 
 

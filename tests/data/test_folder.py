@@ -16,9 +16,9 @@ from phd_exp.data.datamodule import PositionData
 from phd_exp.data.folder import FolderSource
 from phd_exp.data.sources import RenderedSource
 from phd_exp.geometry import projected
-from phd_exp.records.dataset import DatasetError, DatasetFolder
+from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.detections import DetectionFolder
-from phd_exp.records.errors import ConfigError
+from phd_exp.records.errors import ConfigError, DatasetError
 from phd_exp.records.spec import DatasetSpec
 
 BOXED: dict[str, Any] = {"file_name": "wide.jpg", "fx": 300.0, "fy": 320.0, "cx": 70.0, "cy": 40.0, "z": 2.0}

@@ -6,7 +6,8 @@ from PIL import Image
 
 from phd_exp.data import images
 from phd_exp.data.images import cached_images
-from phd_exp.records.dataset import DatasetError, DatasetFolder, sha256
+from phd_exp.records.dataset import DatasetFolder, sha256
+from phd_exp.records.errors import DatasetError
 
 SIDE, N = 64, 5
 

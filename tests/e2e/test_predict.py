@@ -21,7 +21,7 @@ from phd_exp.__main__ import main
 from phd_exp.distributions import PointEstimate, ProjectedHuber
 from phd_exp.geometry import VirtualCamera, intrinsics
 from phd_exp.inference import pictures
-from phd_exp.records.dataset import DatasetError
+from phd_exp.records.errors import DatasetError
 from phd_exp.records.runs import RunFolder
 from tests.e2e.conftest import SIDE, trained
 

@@ -8,8 +8,8 @@ import pandas
 import pytest
 from PIL import Image
 
-from phd_exp.records.dataset import DatasetError, DatasetFolder
-from phd_exp.records.files import CorruptFileError
+from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.errors import CorruptFileError, DatasetError
 from phd_exp.records.spec import DatasetSpec
 
 MakeSpec = Callable[..., DatasetSpec]

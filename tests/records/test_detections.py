@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from phd_exp.records.dataset import DatasetError, DatasetFolder
+from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.detections import Detection, DetectionFolder
-from phd_exp.records.errors import UserError
+from phd_exp.records.errors import DatasetError, UserError
 
 GOOD: dict[str, Any] = {"file_name": "a.png", "f": 900.0, "x": 0.1, "y": -0.2, "z": 4.0}
 PLACED = {"x": 0.1, "y": -0.2, "z": 4.0}

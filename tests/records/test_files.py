@@ -7,13 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from phd_exp.records.files import (
-    CorruptFileError,
-    open_journal,
-    read_jsonl,
-    remove_temporaries,
-    write_atomic,
-)
+from phd_exp.records.errors import CorruptFileError
+from phd_exp.records.files import open_journal, read_jsonl, remove_temporaries, write_atomic
 
 
 @pytest.mark.parametrize("content", ["grün\n", b"\x00\xff", ""])

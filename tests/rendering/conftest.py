@@ -7,7 +7,7 @@ import pytest
 
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.workers import ensure_rendered
+from phd_exp.rendering.render import ensure_rendered
 
 VARIANTS = ("default", "occl", "scale", "occl_scale")
 # A quarter of the sensor and of the focal length: the same pictures, in a moment.

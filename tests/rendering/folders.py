@@ -8,8 +8,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.rays import NOTHING, Hits, Mask
 
 HOME = Path(__file__).parents[2]
 PATIENCE = 60.0  # s
@@ -40,8 +43,8 @@ def in_a_process(
         "from phd_exp.records.dataset import DatasetFolder\n"
         "from phd_exp.records.shards import Shard\n"
         "from phd_exp.records.spec import DatasetSpec\n"
-        "from phd_exp.rendering.shards import render_shard\n"
-        "from phd_exp.rendering.workers import ensure_rendered\n"
+        "from phd_exp.rendering.render import render_shard\n"
+        "from phd_exp.rendering.render import ensure_rendered\n"
         f"spec = DatasetSpec.model_validate_json({spec.model_dump_json()!r})\n"
         f"folder = DatasetFolder({str(folder.root)!r})\n"
         f"{call}\n"
@@ -51,3 +54,8 @@ def in_a_process(
             yield process
         finally:
             process.kill()
+
+
+def silhouettes(hits: Hits) -> Mask:
+    """Pixels (S, S) that show any object, rows from the top."""
+    return np.asarray((hits.surfaces != NOTHING).any(axis=0))

@@ -11,11 +11,11 @@ from phd_exp.records.scenes import Backdrop, SampleRecord
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.antialias import REACH, edges
 from phd_exp.rendering.blender import Box
-from phd_exp.rendering.colour import encoded
 from phd_exp.rendering.compose import backdrop_light, box_around
-from phd_exp.rendering.rays import trace_pixels
-from phd_exp.rendering.visibility import cylinder_mask, silhouettes
-from phd_exp.rendering.workers import ensure_rendered
+from phd_exp.rendering.pixels import encoded
+from phd_exp.rendering.rays import cylinder_mask, trace_pixels
+from phd_exp.rendering.render import ensure_rendered
+from tests.rendering.folders import silhouettes
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,10 @@ import pytest
 from PIL import Image
 
 from phd_exp.records.dataset import SPLITS, DatasetFolder
+from phd_exp.records.errors import RenderError
 from phd_exp.records.files import read_jsonl
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering import workers
-from phd_exp.rendering.errors import RenderError
-from phd_exp.rendering.workers import ensure_rendered
+from phd_exp.rendering.render import ensure_rendered
 from tests.disks import KIB, leave_room, make_room, remount, small_disk
 from tests.rendering.folders import contents, wait_until
 
@@ -90,7 +89,8 @@ def test_a_journal_without_room_is_one_line(
     folder = DatasetFolder(tmp_path / "default")
     with monkeypatch.context() as patch:
         patch.setattr(
-            workers, "open_journal", lambda _: os.fdopen(os.open("/dev/full", os.O_WRONLY), "w", buffering=1)
+            "phd_exp.rendering.render.open_journal",
+            lambda _: os.fdopen(os.open("/dev/full", os.O_WRONLY), "w", buffering=1),
         )
         assert refused(folder, small_spec, "No space left on device") == {}
     assert 0 < len(folder.images("train")) < N_TRAIN, "no further image is begun"

@@ -10,10 +10,11 @@ from PIL import Image
 
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.sources import RenderedSource
-from phd_exp.records.dataset import SPLITS, DatasetError, DatasetFolder
+from phd_exp.records.dataset import SPLITS, DatasetFolder
+from phd_exp.records.errors import DatasetError
 from phd_exp.records.spec import DatasetSpec, ImageFormat
-from phd_exp.rendering.encoding import encode
-from phd_exp.rendering.workers import ensure_rendered
+from phd_exp.rendering.pixels import encode
+from phd_exp.rendering.render import ensure_rendered
 
 MakeSpec = Callable[..., DatasetSpec]
 LOSSY: tuple[ImageFormat, ...] = ("webp", "jpeg")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from phd_exp.rendering.exr import read_light
+from phd_exp.rendering.pixels import read_light
 
 
 def written(light: np.ndarray) -> bytes:

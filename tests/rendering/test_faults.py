@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from phd_exp.records.dataset import SPLITS, DatasetError, DatasetFolder
+from phd_exp.records.dataset import SPLITS, DatasetFolder
+from phd_exp.records.errors import DatasetError, RenderError
 from phd_exp.records.scenes import Split
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.errors import RenderError
-from phd_exp.rendering.workers import ensure_rendered
+from phd_exp.rendering.render import ensure_rendered
 from tests.rendering.folders import PATIENCE, contents, in_a_process, wait_until
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self").exists(), reason="finds processes through /proc")

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from phd_exp.records.dataset import DatasetError, DatasetFolder
-from phd_exp.rendering.errors import RenderError
+from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.errors import DatasetError, RenderError
 from phd_exp.rendering.masks import write_masks
-from phd_exp.rendering.rays import trace_pixels
-from phd_exp.rendering.visibility import cylinder_mask
+from phd_exp.rendering.rays import cylinder_mask, trace_pixels
 
 
 def test_a_mask_for_every_sample(rendered: dict[str, DatasetFolder], tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.antialias import edges
 from phd_exp.rendering.rays import trace_pixels
 from phd_exp.rendering.sampling import sample_scene
-from phd_exp.rendering.visibility import silhouettes
+from tests.rendering.folders import silhouettes
 
 HOME = Path(__file__).parents[2]
 RIM = 3  # px around silhouettes, which bilinear interpolation blurs

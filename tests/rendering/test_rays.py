@@ -8,10 +8,10 @@ import pytest
 
 from phd_exp.records.scenes import Scene, SceneObject
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.rays import NOTHING, trace_pixels, trace_points
+from phd_exp.rendering.rays import NOTHING, cylinder_mask, trace_pixels, trace_points
 from phd_exp.rendering.rotations import rotation_matrix
 from phd_exp.rendering.sampling import sample_scene
-from phd_exp.rendering.visibility import cylinder_mask, silhouettes
+from tests.rendering.folders import silhouettes
 
 MakeSpec = Callable[..., DatasetSpec]
 STEP = 2e-3  # m

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from phd_exp.records.dataset import SPLITS, DatasetError, DatasetFolder
+from phd_exp.records.dataset import SPLITS, DatasetFolder
+from phd_exp.records.errors import DatasetError
 from phd_exp.records.shards import Shard
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering import sealing, workers
+from phd_exp.rendering import render, sealing
 from phd_exp.rendering.locks import held, held_if_free
-from phd_exp.rendering.shards import render_shard
-from phd_exp.rendering.workers import ensure_rendered
+from phd_exp.rendering.render import ensure_rendered, render_shard
 from tests.rendering.folders import PATIENCE, contents, in_a_process, wait_until
 
 N_TRAIN, N_TEST = 12, 4
@@ -132,10 +132,10 @@ def test_a_kill_while_sealing_loses_nothing(
     render_shard(folder, small_spec, N_TRAIN, N_TEST, FIRST, workers=1)
     render_shard(folder, small_spec, 1, 1, SECOND, workers=1)
     # all is known from here on, and nothing is sealed
-    monkeypatch.setattr("phd_exp.rendering.shards.held_if_free", lambda _: held_by_another())
+    monkeypatch.setattr("phd_exp.rendering.render.held_if_free", lambda _: held_by_another())
     assert not render_shard(folder, small_spec, N_TRAIN, N_TEST, SECOND, workers=1)
     monkeypatch.undo()
-    monkeypatch.setattr(workers, "render_all", None)
+    monkeypatch.setattr(render, "render_all", None)
     whole = sealing.write_atomic
     for survived in range(2):
         written: list[Path] = []
@@ -167,7 +167,7 @@ def test_another_data_set_begun_a_moment_ago_is_refused(
         folder.cache.mkdir(parents=True, exist_ok=True)
         sealing.begin(folder, small_spec.model_copy(update={"seed": 7}))
 
-    monkeypatch.setattr("phd_exp.rendering.shards.require_bpy", begin_another)
+    monkeypatch.setattr("phd_exp.rendering.render.require_bpy", begin_another)
     with pytest.raises(DatasetError, match="seed=7, but seed=0 is asked for"):
         render_shard(folder, small_spec, N_TRAIN, N_TEST, FIRST)
     assert not any(folder.images(split) for split in SPLITS)

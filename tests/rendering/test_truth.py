@@ -9,10 +9,9 @@ import pytest
 from phd_exp.records.scenes import Scene, SceneObject, Shape
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer, Settings, load_bpy
-from phd_exp.rendering.rays import FACES, NOTHING, in_camera_frame, trace_pixels
+from phd_exp.rendering.rays import FACES, NOTHING, cylinder_mask, in_camera_frame, trace_pixels, visibility
 from phd_exp.rendering.rotations import uniform_rotation
 from phd_exp.rendering.sampling import sample_scene
-from phd_exp.rendering.visibility import cylinder_mask, visibility
 
 MakeSpec = Callable[..., DatasetSpec]
 SHAPES = get_args(Shape)

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from phd_exp.records.dataset import DatasetError, DatasetFolder, Seal, sha256
+from phd_exp.records.dataset import DatasetFolder, Seal, sha256
+from phd_exp.records.errors import DatasetError, RenderError
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering import verify as module
-from phd_exp.rendering.errors import RenderError
 from phd_exp.rendering.verify import verify
 
 

@@ -8,9 +8,9 @@ import pytest
 
 from phd_exp.records.scenes import Scene, SceneObject
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.rays import trace_pixels
+from phd_exp.rendering.rays import trace_pixels, truncation, visibility
 from phd_exp.rendering.sampling import sample_scene
-from phd_exp.rendering.visibility import silhouettes, truncation, visibility
+from tests.rendering.folders import silhouettes
 
 MakeSpec = Callable[..., DatasetSpec]
 

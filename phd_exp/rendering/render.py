@@ -1,8 +1,18 @@
-"""Make sure that a data set is on disk: render what is missing, resume what was killed, then seal the folder.
+"""Make sure that a data set is on disk: render what is missing, resume what was interrupted, then seal the folder.
 
 Order of writing, so that a kill at any moment leaves a folder that the same call completes: the manifest (what
-is being made); then for every image the image itself and its line in the journal; at the end `metadata.jsonl` out
-of the journals, the journals' removal, and the manifest again, which now counts the samples (`sealing.py`).
+is being made); then for every image the image itself and its line in the journal; at the end `metadata.jsonl` from
+the journals, the journals' removal, and the manifest again, which now counts the samples (`sealing.py`).
+
+Several processes, on one machine or many, may render shares (shards) of one folder at once. Locks, in its `.cache`:
+
+    render.lock              held together by all shards, alone by an unsharded render and by the process that seals
+    shard-<i>-of-<n>.lock    held alone by the process that renders this share
+    begin.lock               held alone while the manifest is begun
+
+A shard that has finished releases its locks and then tries to take `render.lock` alone. That fails while another
+shard renders, which tries in its turn; so the last one to finish succeeds, and seals. If it is killed before, any
+later render finds all work done and seals.
 """
 
 import math
@@ -10,16 +20,16 @@ import time
 from contextlib import ExitStack, closing
 
 from phd_exp.records.dataset import SPLITS, DatasetFolder
+from phd_exp.records.errors import RenderError, writing
 from phd_exp.records.files import open_journal, remove_temporaries
 from phd_exp.records.provenance import usable_cores
 from phd_exp.records.shards import Shard
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import require_bpy
-from phd_exp.rendering.errors import RenderError, writing
-from phd_exp.rendering.locks import held
+from phd_exp.rendering.locks import held, held_if_free
 from phd_exp.rendering.pool import render_all
 from phd_exp.rendering.progress import announce, shown_progress
-from phd_exp.rendering.sealing import Known, Wanted, begin, known_samples, seal
+from phd_exp.rendering.sealing import Known, Wanted, begin, known_samples, missing, seal
 from phd_exp.rendering.worker import Task
 
 FEWEST_PER_WORKER = 8  # starting one more process costs about as much as rendering this many images
@@ -36,9 +46,9 @@ def ensure_rendered(
 ) -> None:
     """Return when the first `n_train` and `n_test` samples are on disk, rendering those that are not.
 
-    One process, or the shards of one data set (`shards.py`), render a folder at a time; others wait. What is
-    rendered stays, whatever happens; the same call goes on from there, and the finished folder has the same
-    bytes as one rendered without interruption.
+    One process, or the shards of one data set, render a folder at a time; others wait. Rendered images are kept,
+    whatever happens: the same call resumes, and the finished folder has the same bytes as one rendered without
+    interruption.
 
     Args:
         workers: number of processes; by default one a core, fewer where there is little to do.
@@ -65,6 +75,61 @@ def ensure_rendered(
             known = known_samples(folder)
             render_missing(folder, spec, {"train": n_train, "test": n_test}, known, workers, cores=cores)
             seal(folder, known)
+
+
+def render_shard(
+    folder: DatasetFolder,
+    spec: DatasetSpec,
+    n_train: int,
+    n_test: int,
+    shard: Shard,
+    workers: int | None = None,
+    cores: int | None = None,
+) -> bool:
+    """Render what is missing of one share, and seal the folder if that was the last; whether all of it is there.
+
+    Shares of different counts may overlap; work done by one is not done again by another that starts later.
+
+    Raises:
+        DatasetError: the folder holds another data set, or a broken one.
+        RenderError: bpy is missing, a worker died, the folder cannot be written.
+    """
+    if not any(folder.missing(spec, n_train, n_test).values()):
+        return True
+    require_bpy()
+    wanted: Wanted = {"train": n_train, "test": n_test}
+    with writing(folder.root):
+        folder.cache.mkdir(parents=True, exist_ok=True)
+        with ExitStack() as stack:
+            _enter(stack, folder, shard)
+            with held(folder.cache / "begin.lock", waiting=f"{folder.root}: waiting for the manifest"):
+                folder.missing(spec, n_train, n_test)  # refuses another data set, begun a moment ago
+                begin(folder, spec)
+            if not render_missing(folder, spec, wanted, known_samples(folder), workers, shard, cores):
+                announce(f"{folder.root}: nothing left to render in shard {shard}")
+        return _seal_if_last(folder, wanted, shard)
+
+
+def _enter(stack: ExitStack, folder: DatasetFolder, shard: Shard) -> None:
+    whole = f"{folder.root}: another process renders all of it; shard {shard} waits for it to finish"
+    twin = f"{folder.root}: another process renders shard {shard}; waiting for it to finish"
+    stack.enter_context(held(folder.render_lock, shared=True, waiting=whole))
+    stack.enter_context(held(folder.cache / f"shard-{shard.slug}.lock", waiting=twin))
+
+
+def _seal_if_last(folder: DatasetFolder, wanted: Wanted, shard: Shard) -> bool:
+    with held_if_free(folder.render_lock) as alone:
+        known = known_samples(folder)
+        left = missing(known, wanted)
+        if alone and not left:
+            seal(folder, known)
+            announce(f"{folder.root}: shard {shard} was the last; the data set is sealed")
+            return True
+    if left:
+        announce(f"{folder.root}: shard {shard} is done; {left} samples of other shards are missing")
+    else:
+        announce(f"{folder.root}: shard {shard} is done; another process is still at work here, and seals")
+    return False
 
 
 def render_missing(

@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from phd_exp.records.dataset import DatasetError, DatasetFolder, sha256
+from phd_exp.records.dataset import DatasetFolder, sha256
+from phd_exp.records.errors import DatasetError, RenderError
 from phd_exp.records.scenes import Split
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering import blender, workers
-from phd_exp.rendering.errors import RenderError
+from phd_exp.rendering import blender
 from phd_exp.rendering.pool import render_all
+from phd_exp.rendering.render import ensure_rendered, worker_count
 from phd_exp.rendering.worker import Task
-from phd_exp.rendering.workers import ensure_rendered
 from tests.rendering.folders import contents
 
 MakeSpec = Callable[..., DatasetSpec]
@@ -155,6 +155,6 @@ def test_no_workers_is_refused(small_spec: DatasetSpec, tmp_path: Path, count: i
 
 
 def test_few_samples_take_few_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "usable_cores", lambda: 16)
-    assert [workers.worker_count(tasks) for tasks in (1, 8, 9, 64, 10_000)] == [1, 1, 2, 8, 16]
-    assert [workers.worker_count(tasks, cores=4) for tasks in (1, 9, 10_000)] == [1, 2, 4]
+    monkeypatch.setattr("phd_exp.rendering.render.usable_cores", lambda: 16)
+    assert [worker_count(tasks) for tasks in (1, 8, 9, 64, 10_000)] == [1, 1, 2, 8, 16]
+    assert [worker_count(tasks, cores=4) for tasks in (1, 9, 10_000)] == [1, 2, 4]
