@@ -19,7 +19,7 @@ from phd_exp.records.spec import DatasetSpec
 # before anything is imported: every annotated function of these folders checks its shapes while tests run
 HOOKED = [
     f"phd_exp.{folder}"
-    for folder in ("geometry", "distributions", "losses", "metrics", "fusion", "models", "data")
+    for folder in ("geometry", "distributions", "losses", "metrics", "fusion", "models", "data", "evaluation")
 ]
 install_import_hook(HOOKED, "beartype.beartype")
 

@@ -116,7 +116,7 @@ def _depth_curve(run: Path, predictor: "Predictor") -> dict[str, Any]:
     Raises RunError where there is none, as of a baseline.
     """
     if predictor.temperature is not None:
-        from phd_exp.reports.evaluation import recalibrated_depth_curve
+        from phd_exp.evaluation.predictions import recalibrated_depth_curve
 
         window = predictor.config.evaluation.calibration_window
         return recalibrated_depth_curve(RunFolder(run), predictor.temperature, window).as_data()

@@ -9,10 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions.level_curves import LevelCurves, level_curves
 from phd_exp.inference.sightings import Sighting
 from phd_exp.inference.views import View
-from phd_exp.reports.figures import draw_curve, encoded
-from phd_exp.reports.level_curves import LevelCurves, draw_birds_eye, level_curves
+from phd_exp.reports.figures import draw_birds_eye, draw_curve, encoded
 
 LARGEST = 1024
 """Pixels along the longer side beyond which an image is shrunk for the picture."""

@@ -218,7 +218,7 @@ def _temperature(folder: RunFolder, regressor: Regressor) -> Temperature:
         raise RunError(
             f"{folder.held_out}: missing; recalibration is fitted on held-out samples: train with data.n_held_out > 0"
         )
-    from phd_exp.reports.evaluation import (
+    from phd_exp.evaluation.predictions import (
         held_out_temperature,
     )  # recalibration alone needs it, and pyarrow with it
 

@@ -5,12 +5,12 @@ import pyarrow.parquet as pq
 import torch
 
 from phd_exp.data.sources import RenderedSource
+from phd_exp.evaluation.several_views import ROTATION, TRANSLATION
 from phd_exp.inference.predictor import BATCH, load
 from phd_exp.metrics.rows import Rows
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.runs import RunFolder
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.reports.several_views import ROTATION, TRANSLATION
 from phd_exp.training.predictions import columns, write_parquet
 
 

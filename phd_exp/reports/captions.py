@@ -3,12 +3,12 @@
 import shlex
 from collections.abc import Iterable, Sequence
 
+from phd_exp.evaluation.point_errors import Reading
 from phd_exp.records.choices import PLAIN_RECIPE, in_words, preset_and_recipe
 from phd_exp.records.errors import one_line
 from phd_exp.reports.cells import Cell, Gap
 from phd_exp.reports.collect import Records
 from phd_exp.reports.paper import ASSUMED, Layout, TableName
-from phd_exp.reports.point_errors import Reading
 
 ONE_SEED = "†"
 FEWER_SEEDS = "‡"

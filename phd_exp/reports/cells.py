@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 from scipy import stats
 
+from phd_exp.evaluation.point_errors import ErrorKey, SampleMean
 from phd_exp.reports.collect import Records, Run, RunState
 from phd_exp.reports.paper import floor_mm, published_mm
-from phd_exp.reports.point_errors import ErrorKey, SampleMean
 
 IntervalKind = Literal["student_t_over_seeds", "normal_over_samples", "none"]
 GapState = RunState | Literal["missing", "no sample"]

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from phd_exp.evaluation.point_errors import COLUMNS, Estimate, MeanErrors, mean_errors, mean_nll
 from phd_exp.records.choices import flatten, has_influence
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder, RunStatus, find_runs
-from phd_exp.reports.point_errors import COLUMNS, Estimate, MeanErrors, mean_errors, mean_nll
 
 RunState = Literal["finished", "running", "broken off", "failed", "unreadable"]
 PROBABILISTIC = "probabilistic"

@@ -6,9 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure  # not pyplot: no global state, no window, no leak over a long sweep
 
+from phd_exp.distributions.level_curves import LevelCurves, on_image
 from phd_exp.records.files import write_atomic
 
 LABELS = {
@@ -77,3 +79,32 @@ def draw_curve(axes: Axes, name: str, curve: Mapping[str, Any]) -> None:
 def _words(curve: Mapping[str, Any]) -> str:
     left_out = f", {curve['left_out']} samples left out" if curve["left_out"] else ""
     return f"window of {curve['window']}{left_out}"
+
+
+def draw_on_image(
+    axes: Axes, curves: LevelCurves, image: np.ndarray | None, f: float, S: float, truth: np.ndarray | None
+) -> None:
+    """The image with the curves of (x, y)/z, the mode as a cross and the projected truth as a dot."""
+    if image is not None:
+        axes.imshow(image, extent=(0, S, S, 0))
+    for width, points in zip((1.6, 1.1, 0.7), curves.projected, strict=False):
+        axes.plot(*on_image(points, f, S).T, color="#ffb000", linewidth=width)
+    axes.plot(*on_image(curves.mode[:2] / curves.mode[2], f, S), "x", color="#ffb000", markersize=6)
+    if truth is not None:
+        axes.plot(
+            *on_image(truth[:2] / truth[2], f, S), "o", color="white", markeredgecolor="black", markersize=4
+        )
+    axes.set(xlim=(0, S), ylim=(S, 0), aspect="equal", xlabel="column (px)", ylabel="row (px)")
+
+
+def draw_birds_eye(axes: Axes, curves: LevelCurves, truth: np.ndarray | None) -> None:
+    """The curves of (x, z), the mode as a cross and the truth as a dot; the axes have scales of their own."""
+    for width, level, points in zip((1.6, 1.1, 0.7), curves.levels, curves.birds_eye, strict=False):
+        axes.plot(*points.T, color="#0072b2", linewidth=width, label=f"{100 * level:g} %")
+    axes.plot(curves.mode[0], curves.mode[2], "x", color="#0072b2", markersize=6, label="mode")
+    if truth is not None:
+        axes.plot(truth[0], truth[2], "o", color="black", markersize=4, label="truth")
+    axes.set(xlabel="x (m)", ylabel="z (m)")
+    axes.locator_params(axis="x", nbins=5)  # more labels would run into each other
+    axes.grid(alpha=0.25)
+    axes.legend(frameon=False, fontsize="small")

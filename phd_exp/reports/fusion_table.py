@@ -4,12 +4,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from phd_exp.records.choices import in_words
-from phd_exp.records.errors import RunError, one_line
-from phd_exp.reports.cells import Gap
-from phd_exp.reports.collect import Records, Run
-from phd_exp.reports.evaluation import Band
-from phd_exp.reports.fusion import (
+from phd_exp.evaluation.fusion import (
     CALIBRATION,
     ERRORS,
     LEVELS,
@@ -19,7 +14,12 @@ from phd_exp.reports.fusion import (
     Place,
     fusion_scores,
 )
-from phd_exp.reports.several_views import read_views
+from phd_exp.evaluation.predictions import Band
+from phd_exp.evaluation.several_views import read_views
+from phd_exp.records.choices import in_words
+from phd_exp.records.errors import RunError, one_line
+from phd_exp.reports.cells import Gap
+from phd_exp.reports.collect import Records, Run
 from phd_exp.reports.tables import TableCell, TableRow
 
 NAMES: dict[Method, str] = {

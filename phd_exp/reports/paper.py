@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from phd_exp.reports.point_errors import Estimate, Quantity
+from phd_exp.evaluation.point_errors import Estimate, Quantity
 
 TableName = Literal["table1", "table2"]
 

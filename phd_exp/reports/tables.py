@@ -7,11 +7,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from phd_exp.evaluation.point_errors import READINGS, ErrorKey, Quantity, Reading
 from phd_exp.reports.captions import FEWER_SEEDS, ONE_SEED, making_command, notes, title
 from phd_exp.reports.cells import Cell, Gap, Interval, make_cell, seeds_of
 from phd_exp.reports.collect import PROBABILISTIC, Records
 from phd_exp.reports.paper import LAYOUTS, Floor, Layout, Line, TableName
-from phd_exp.reports.point_errors import READINGS, ErrorKey, Quantity, Reading
 
 DIGITS: dict[Quantity, int] = {"projected": 1, "depth": 0}
 """Decimals of a millimetre, the paper's."""

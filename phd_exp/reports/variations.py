@@ -8,11 +8,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
+from phd_exp.evaluation.point_errors import ErrorKey, mean_errors, mean_nll
 from phd_exp.records.choices import in_words
 from phd_exp.records.errors import RunError, one_line
 from phd_exp.reports.cells import Gap
 from phd_exp.reports.collect import Records, Run
-from phd_exp.reports.point_errors import ErrorKey, mean_errors, mean_nll
 from phd_exp.reports.tables import NOTHING, TableCell, TableRow
 
 AS_IT_IS = "as it is"

@@ -8,10 +8,10 @@ import torch
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import Columns, distribution_columns, draws
+from phd_exp.evaluation.predictions import evaluate
 from phd_exp.metrics.bootstrap import bands
 from phd_exp.metrics.calibration_scores import calibration_scores, ordered
 from phd_exp.metrics.rows import Rows
-from phd_exp.reports.evaluation import evaluate
 
 pytestmark = pytest.mark.bench
 N, BATCH = 2000, 64

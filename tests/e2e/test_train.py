@@ -16,9 +16,9 @@ import pytest
 import torch
 from PIL import Image
 
+from phd_exp.evaluation.point_errors import QUANTITIES, ErrorKey
 from phd_exp.records.runs import RunFolder, find_runs
 from phd_exp.reports.collect import collect
-from phd_exp.reports.point_errors import QUANTITIES, ErrorKey
 from tests.e2e.runs import only_run, weights
 
 MODELS = ("probabilistic", "mae_vz", "mae_logz", "mae_xyz", "mae_constf")

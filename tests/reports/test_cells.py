@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from phd_exp.evaluation.point_errors import ErrorKey, SampleMean
 from phd_exp.reports.cells import Cell, interval, make_cell, seeds_of
 from phd_exp.reports.collect import collect
-from phd_exp.reports.point_errors import ErrorKey, SampleMean
 from tests.reports.recorded import by_hand, predicted, record
 
 KEY = ErrorKey("median", "central", "depth")

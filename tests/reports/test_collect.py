@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from phd_exp.evaluation.point_errors import ErrorKey
 from phd_exp.records.choices import RunName
 from phd_exp.records.runs import RunFolder
 from phd_exp.reports.collect import Run, collect
-from phd_exp.reports.point_errors import ErrorKey
 from tests.reports.recorded import predicted, record
 
 DEPTH = ErrorKey("mode", "whole", "depth")

@@ -9,10 +9,10 @@ from rich.padding import Padding
 from rich.table import Table as Grid
 from rich.text import Text
 
+from phd_exp.evaluation.point_errors import ErrorKey, Quantity
 from phd_exp.records.errors import one_line
 from phd_exp.reports.captions import gap_lines, making_command
 from phd_exp.reports.collect import Records, Run
-from phd_exp.reports.point_errors import ErrorKey, Quantity
 from phd_exp.reports.tables import DIGITS, NOTHING, PaperTable, Table, TableCell
 
 WIDTH = 118

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import pyarrow as pa
 
 from phd_exp.distributions.temperature import Temperature
-from phd_exp.records.runs import RunFolder
-from phd_exp.reports.evaluation import (
+from phd_exp.evaluation.predictions import (
     Evaluation,
     evaluate,
     evaluate_points,
     held_out_temperature,
     recalibrated,
 )
+from phd_exp.records.runs import RunFolder
 
 
 @dataclass(frozen=True)

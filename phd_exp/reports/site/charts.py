@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from phd_exp.reports.evaluation import Curve
+from phd_exp.evaluation.predictions import Curve
 
 Trace = dict[str, Any]
 Numbers = Sequence[float | None]

@@ -9,13 +9,13 @@ from typing import Any, TypeVar
 
 import pyarrow as pa
 
+from phd_exp.evaluation.fusion import FusionScores, fusion_scores
+from phd_exp.evaluation.parquet import read_table
+from phd_exp.evaluation.several_views import read_views
 from phd_exp.records.choices import flatten
 from phd_exp.records.errors import RunError, UserError
 from phd_exp.records.runs import RunFolder, RunStatus
 from phd_exp.reports.collect import Run
-from phd_exp.reports.fusion import FusionScores, fusion_scores
-from phd_exp.reports.parquet import read_table
-from phd_exp.reports.several_views import read_views
 from phd_exp.reports.site.assessment import Assessment, assess
 
 Found = TypeVar("Found")

@@ -9,8 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from phd_exp.reports.collect import LEAF, PROBABILISTIC
-from phd_exp.reports.figures import write_figure
-from phd_exp.reports.level_curves import draw_birds_eye, draw_on_image
+from phd_exp.reports.figures import draw_birds_eye, draw_on_image, write_figure
 from phd_exp.reports.paper import PUBLISHED
 from phd_exp.reports.site.charts import Trace
 from phd_exp.reports.site.gallery import curves_of, images_folder, load_image
@@ -126,7 +125,7 @@ def write_level_curves(table: pa.Table, config: Mapping[str, str], stem: Path) -
     truth = np.array([row[axis] for axis in "xyz"], dtype=float)
     figure = Figure(figsize=(6.8, 3.3), layout="constrained")
     left, right = figure.subplots(1, 2)
-    draw_on_image(left, curves, np.asarray(image), row["f"], row["S"], truth)
+    draw_on_image(left, curves, np.asarray(image), float(row["f"]), float(row["S"]), truth)
     draw_birds_eye(right, curves, truth)
     stem.parent.mkdir(parents=True, exist_ok=True)
     return write_figure(figure, stem)

@@ -1,7 +1,7 @@
 """The charts of several views: does the error fall with the cameras, is the fused calibrated, who is surprised?"""
 
-from phd_exp.reports.evaluation import Band
-from phd_exp.reports.fusion import BINS, LEVELS, METHODS, PROBABILISTIC, FusionScores, Method, Place
+from phd_exp.evaluation.fusion import BINS, LEVELS, METHODS, PROBABILISTIC, FusionScores, Method, Place
+from phd_exp.evaluation.predictions import Band
 from phd_exp.reports.fusion_table import NAMES
 from phd_exp.reports.site.charts import Chart, Trace, axis, identity, line, square
 

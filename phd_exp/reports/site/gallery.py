@@ -12,10 +12,10 @@ import torch
 from PIL import Image
 
 from phd_exp.distributions.columns import PARAMETERS, from_columns
+from phd_exp.distributions.level_curves import LEVELS, LevelCurves, level_curves, on_image
 from phd_exp.records.errors import RunError, UserError
 from phd_exp.records.files import require_plain, write_atomic
 from phd_exp.records.images import LARGEST_IMAGE, RENDERED, decoding, pillow_warnings
-from phd_exp.reports.level_curves import LEVELS, LevelCurves, level_curves, on_image
 from phd_exp.reports.site.assessment import is_distribution
 from phd_exp.reports.site.panels import BirdsEye, birds_eye_view, close_up, point, svg_path
 from phd_exp.reports.site.quantities import SCORES

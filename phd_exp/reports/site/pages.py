@@ -9,8 +9,8 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from phd_exp.evaluation.predictions import Band
 from phd_exp.reports.captions import gap_lines
-from phd_exp.reports.evaluation import Band
 from phd_exp.reports.fusion_table import fusion_table
 from phd_exp.reports.paper import PUBLISHED
 from phd_exp.reports.site.charts import Chart

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from phd_exp.reports.level_curves import LevelCurves
+from phd_exp.distributions.level_curves import LevelCurves
 
 _CLOSE = 0.25  # a share of the image below which curves deserve a close-up
 _SMALLEST = 0.1  # the same for the side of a close-up

@@ -4,7 +4,7 @@ import re
 from collections import Counter
 from dataclasses import dataclass
 
-from phd_exp.reports.evaluation import Curve, Evaluation
+from phd_exp.evaluation.predictions import Curve, Evaluation
 from phd_exp.reports.site.charts import (
     DASHES,
     Chart,

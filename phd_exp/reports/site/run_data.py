@@ -10,9 +10,9 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from phd_exp.evaluation.predictions import Band
 from phd_exp.records.errors import RunError
 from phd_exp.reports.collect import Run
-from phd_exp.reports.evaluation import Band
 from phd_exp.reports.fusion_table import headline
 from phd_exp.reports.site.charts import Chart
 from phd_exp.reports.site.dossier import Dossier, read_config, slug_of

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from markdown_it import MarkdownIt
 
+from phd_exp.evaluation.fusion import Place
 from phd_exp.records.errors import UserError
 from phd_exp.reports.collect import collect
 from phd_exp.reports.formats.files import write_fusion_tables
@@ -15,7 +16,6 @@ from phd_exp.reports.formats.latex import latex
 from phd_exp.reports.formats.markdown import markdown
 from phd_exp.reports.formats.terminal import WIDTH, print_complaints, print_tables
 from phd_exp.reports.formats.tidy_fusion import COLUMNS, tidy_fusion
-from phd_exp.reports.fusion import Place
 from phd_exp.reports.fusion_table import FusionTable, fusion_tables, headline
 from tests.reports.recorded import predicted, record
 from tests.reports.several import write_views

@@ -7,8 +7,8 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
+from phd_exp.distributions.level_curves import on_image
 from phd_exp.records.errors import RunError
-from phd_exp.reports.level_curves import on_image
 from phd_exp.reports.site.gallery import EACH, LARGEST, curves_of, load_image, make_gallery
 from phd_exp.reports.site.panels import birds_eye_view, close_up
 from tests.reports.site.synthetic import write_run

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from phd_exp.reports.evaluation import Band
+from phd_exp.evaluation.predictions import Band
 from phd_exp.reports.site.charts import POINTS, Chart, decades, line, thinned
 from phd_exp.reports.site.run_data import RunData, as_script, read_script, run_script
 

@@ -11,14 +11,13 @@ from functools import cache
 import numpy as np
 import torch
 from jaxtyping import Float
-from matplotlib.axes import Axes
 from scipy import integrate, optimize
 
-from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.along import FURTHEST, whitened_marginal
 from phd_exp.distributions.huber import radial_cdf
+from phd_exp.distributions.projected_huber import ProjectedHuber
 
-Points = Float[np.ndarray, "points 2"]
+Points = Float[np.ndarray, "_ 2"]
 
 LEVELS = (0.5, 0.9, 0.99)
 _POINTS = 73  # of a curve, and of half an outline
@@ -62,7 +61,7 @@ def level_curves(distribution: ProjectedHuber, levels: tuple[float, ...] = LEVEL
     )
 
 
-def on_image(projected: Points, f: float, S: float) -> Points:
+def on_image(projected: Float[np.ndarray, "*points 2"], f: float, S: float) -> Float[np.ndarray, "*points 2"]:
     """Pixels of (x, y)/z in an image of S pixels a side and focal length f (pixels): S/2 + f (x, y)/z."""
     return S / 2 + f * projected
 
@@ -141,32 +140,3 @@ def _outline(distribution: ProjectedHuber, excess: float) -> Points:
     right = np.stack([middle + reach * half_width, z], axis=-1)
     left = np.stack([middle - reach * half_width, z], axis=-1)
     return np.concatenate([right, left[::-1], right[:1]])
-
-
-def draw_on_image(
-    axes: Axes, curves: LevelCurves, image: np.ndarray | None, f: float, S: float, truth: np.ndarray | None
-) -> None:
-    """The image with the curves of (x, y)/z, the mode as a cross and the projected truth as a dot."""
-    if image is not None:
-        axes.imshow(image, extent=(0, S, S, 0))
-    for width, points in zip((1.6, 1.1, 0.7), curves.projected, strict=False):
-        axes.plot(*on_image(points, f, S).T, color="#ffb000", linewidth=width)
-    axes.plot(*on_image(curves.mode[:2] / curves.mode[2], f, S), "x", color="#ffb000", markersize=6)
-    if truth is not None:
-        axes.plot(
-            *on_image(truth[:2] / truth[2], f, S), "o", color="white", markeredgecolor="black", markersize=4
-        )
-    axes.set(xlim=(0, S), ylim=(S, 0), aspect="equal", xlabel="column (px)", ylabel="row (px)")
-
-
-def draw_birds_eye(axes: Axes, curves: LevelCurves, truth: np.ndarray | None) -> None:
-    """The curves of (x, z), the mode as a cross and the truth as a dot; the axes have scales of their own."""
-    for width, level, points in zip((1.6, 1.1, 0.7), curves.levels, curves.birds_eye, strict=False):
-        axes.plot(*points.T, color="#0072b2", linewidth=width, label=f"{100 * level:g} %")
-    axes.plot(curves.mode[0], curves.mode[2], "x", color="#0072b2", markersize=6, label="mode")
-    if truth is not None:
-        axes.plot(truth[0], truth[2], "o", color="black", markersize=4, label="truth")
-    axes.set(xlabel="x (m)", ylabel="z (m)")
-    axes.locator_params(axis="x", nbins=5)  # more labels would run into each other
-    axes.grid(alpha=0.25)
-    axes.legend(frameon=False, fontsize="small")

@@ -8,9 +8,7 @@ import pytest
 import torch
 from scipy import stats
 
-from phd_exp.fusion import Plane, average, gaussian_fusion
-from phd_exp.records.errors import RunError
-from phd_exp.reports.fusion import (
+from phd_exp.evaluation.fusion import (
     BINS,
     METHODS,
     FusionScores,
@@ -20,7 +18,9 @@ from phd_exp.reports.fusion import (
     fusion_scores,
     world_moments,
 )
-from phd_exp.reports.several_views import read_views
+from phd_exp.evaluation.several_views import read_views
+from phd_exp.fusion import Plane, average, gaussian_fusion
+from phd_exp.records.errors import RunError
 from tests.reports.several import write_views
 
 N = 300

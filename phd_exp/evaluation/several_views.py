@@ -12,10 +12,10 @@ from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import PARAMETERS, from_columns
+from phd_exp.evaluation.parquet import read_table
 from phd_exp.fusion import Plane, Pose
 from phd_exp.records import scenes
 from phd_exp.records.errors import RunError
-from phd_exp.reports.parquet import read_table
 
 XYZ = ("x", "y", "z")
 ROTATION = ("pose_w", "pose_x", "pose_y", "pose_z")

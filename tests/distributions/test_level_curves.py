@@ -5,14 +5,13 @@ import math
 import numpy as np
 import pytest
 import torch
-from matplotlib.figure import Figure
 from matplotlib.path import Path as Outline
 from scipy import integrate
 
 from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions.level_curves import LEVELS, level_curves, on_image
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import DepthScale, Projected
-from phd_exp.reports.level_curves import LEVELS, draw_birds_eye, draw_on_image, level_curves, on_image
 
 SAMPLES = 100_000
 
@@ -96,16 +95,3 @@ def test_one_distribution_and_levels_between_none_and_all() -> None:
         level_curves(_distribution(3.0).expand([2]))
     with pytest.raises(ValueError, match="between 0 and 1"):
         level_curves(_distribution(3.0), (0.5, 1.0))
-
-
-def test_the_figure_shows_curves_mode_and_truth() -> None:
-    curves, truth = level_curves(_distribution(20.0)), np.array([0.25, -0.1, 4.2])
-    left, right = Figure().subplots(1, 2)
-    draw_on_image(left, curves, np.zeros((224, 224, 3), dtype=np.uint8), 1500.0, 224.0, truth)
-    draw_birds_eye(right, curves, truth)
-    assert len(left.images) == 1
-    for axes, dot in ((left, on_image(truth[:2] / truth[2], 1500.0, 224.0)), (right, truth[::2])):
-        *outlines, mode, last = axes.lines
-        assert [len(line.get_xdata()) > 10 for line in outlines] == [True] * 3
-        assert mode.get_marker() == "x"
-        np.testing.assert_allclose(np.ravel(last.get_data()), dot)

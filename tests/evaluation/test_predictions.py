@@ -10,12 +10,18 @@ import torch
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import coordinates, distribution_columns, draws
+from phd_exp.evaluation.predictions import (
+    Evaluation,
+    evaluate,
+    evaluate_points,
+    fit_temperature,
+    recalibrated,
+)
 from phd_exp.metrics.calibration import calibration_curve
 from phd_exp.metrics.calibration_scores import exact_scores
 from phd_exp.metrics.errors import depth_error, projected_error
 from phd_exp.metrics.scores import energy_score
 from phd_exp.records.errors import RunError
-from phd_exp.reports.evaluation import Evaluation, evaluate, evaluate_points, fit_temperature, recalibrated
 
 N = 1000
 SCORES = {

@@ -8,9 +8,7 @@ import pandas as pd
 import pytest
 import torch
 
-from phd_exp.metrics.errors import depth_error, projected_error
-from phd_exp.records.errors import RunError
-from phd_exp.reports.point_errors import (
+from phd_exp.evaluation.point_errors import (
     READINGS,
     ErrorKey,
     errors_mm,
@@ -18,6 +16,8 @@ from phd_exp.reports.point_errors import (
     mean_errors,
     mean_nll,
 )
+from phd_exp.metrics.errors import depth_error, projected_error
+from phd_exp.records.errors import RunError
 from tests.reports.recorded import Predicted, by_hand, predicted
 
 ALL = ("mode", "mean", "median")

@@ -19,8 +19,8 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Bool, Float64
 
+from phd_exp.evaluation.parquet import read_table
 from phd_exp.records.errors import RunError
-from phd_exp.reports.parquet import read_table
 
 Estimate = Literal["mode", "mean", "median"]
 Reading = Literal["whole", "central"]

@@ -10,12 +10,12 @@ from scipy import stats
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
+from phd_exp.evaluation.predictions import SEED, Band
+from phd_exp.evaluation.several_views import SeveralViews
 from phd_exp.fusion import Fused, Plane, Pose, Status, average, fuse, gaussian_fusion
 from phd_exp.metrics.bootstrap import Interval, bands
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, squared_mahalanobis
 from phd_exp.records.errors import RunError
-from phd_exp.reports.evaluation import SEED, Band
-from phd_exp.reports.several_views import SeveralViews
 
 Method = Literal["mode", "mean", "average", "gaussian"]
 """Projected Huber fusion, its mode and its mean; the average of the modes; inverse-covariance fusion."""
@@ -146,7 +146,7 @@ def conditioned(
     """A Gaussian given that n . v = c: v - C n (n . v - c) / (n . C n) and C - C n n^T C / (n . C n).
 
     Source: conditioning of a Gaussian on a linear observation without noise; checked against a narrow one in
-    tests/reports/test_fusion.py.
+    tests/evaluation/test_fusion.py.
     """
     Cn = (covariance @ plane.normal[..., None]).squeeze(-1)
     variance = (plane.normal * Cn).sum(-1)[..., None]
@@ -210,7 +210,7 @@ def _correlations(columns: Mapping[str, Tensor], counts: Tensor) -> dict[str, Te
     """The intraclass correlation between / (between + within), and Pearson's with log size.
 
     Of scenes with k views each, within is the mean of their variances, and between the variance of their means
-    less within / k. Source: Fisher's one-way analysis of variance; checked in tests/reports/test_fusion.py.
+    less within / k. Source: Fisher's one-way analysis of variance; checked in tests/evaluation/test_fusion.py.
     """
     share = counts / counts.sum(-1, keepdim=True)
     mean, size = columns["mean"], columns["size"]

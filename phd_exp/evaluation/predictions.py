@@ -12,6 +12,7 @@ from torch import Tensor
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import PARAMETERS, distribution_columns, draws, from_columns
 from phd_exp.distributions.temperature import Temperature
+from phd_exp.evaluation.parquet import read_table
 from phd_exp.metrics.bootstrap import Interval, Statistic, bands
 from phd_exp.metrics.calibration import CalibrationCurve, calibration_curve
 from phd_exp.metrics.calibration_scores import COLUMNS, calibration_scores, ordered
@@ -21,7 +22,6 @@ from phd_exp.metrics.scores import DRAWS, energy_score
 from phd_exp.metrics.strata import strata
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder
-from phd_exp.reports.parquet import read_table
 
 Arrays = Mapping[str, np.ndarray]
 """Name of a column -> a value a sample."""

@@ -1,0 +1,1 @@
+"""Measures recorded predictions: scores, strata, temperatures, fusion. Knows no network."""
