@@ -16,7 +16,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
 	$(BIN)/pip install --quiet --editable '.[render,report,export,launchers,dev]' --constraint constraints.txt
-	$(BIN)/python -m phd_exp.fusion.compiled  # else the first call to fuse waits for it
+	$(BIN)/python -m phd_exp.fusion  # else the first call to fuse waits for it
 	@touch $@
 
 install: $(INSTALLED)  ## .venv with everything in it

@@ -324,6 +324,8 @@ def _wants_validation(validate_args: bool | None) -> bool:
 def _require(name: str, value: Tensor, constraint: Constraint) -> None:
     """Raise a ValueError that names the parameter, its shape, its constraint and an offending value."""
     # a constraint on vectors or matrices answers once for each of them
+    if value.numel() == 0:  # which torch's constraints cannot check
+        return
     batch = value.shape[: value.ndim - constraint.event_dim]
     invalid = ~(constraint.check(value) & value.isfinite().reshape((*batch, -1)).all(-1))
     if bool(invalid.any()):

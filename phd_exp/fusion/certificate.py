@@ -1,116 +1,100 @@
 """How good an optimum is, from the subgradients alone: whoever found it, and however."""
 
-from dataclasses import dataclass
+import math
+from typing import no_type_check
 
-import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
+import numpy as np
 
-from phd_exp.fusion.linear import factor, forward, total
+from phd_exp.fusion.arithmetic import (
+    TINY,
+    ZERO,
+    add,
+    compiled,
+    factor,
+    forward,
+    huber_weight,
+    measured,
+    squared_norm,
+)
 from phd_exp.fusion.polish import KINK
-from phd_exp.fusion.views import Seen, Unknown, Views
 
 RADII = (1e-8, 1e-6, 1e-4, 1e-2)  # metres; balls in which the curvature is bounded from below
 
 
-@dataclass(frozen=True)
-class Certificate:
-    """What is known of a point without knowing the optimum.
+@compiled
+@no_type_check
+def certify(slope, at_origin, a, u, lam):
+    """The norm of a subgradient at u, nats per metre; its ratio to sum a |dt/du|; the distance to the optimum, m.
 
-    Args:
-        subgradient: norm of a subgradient of the summed energy, nats per metre; 0 proves the optimum.
-        relative: the same over sum a |dt/du|, the pull of depth alone; without unit.
-        distance: the optimum is no farther than this, metres; inf where the energy is too flat to tell.
-    """
-
-    subgradient: Float[Tensor, " problems"]
-    relative: Float[Tensor, " problems"]
-    distance: Float[Tensor, " problems"]
-
-
-def certify(views: Views, u: Unknown, lam: Float[Tensor, "cameras problems"]) -> Certificate:
-    """The certificate of a point, for subgradients lam in [-1, 1] at kinks.
-
-    Let G be the subgradient. At any other point u + d the energy is larger by at least
+    A subgradient of 0 proves the optimum. The distance is an upper bound for any lam in [-1, 1], infinite where the
+    energy is too flat. Let G be the subgradient. At any other point u + d the energy is larger by at least
 
         G.d + d.H d/2 - e    while |d| <= rho,
 
     where H bounds the curvature from below within that radius. To it a kink adds 2 a (1 - |lam|)/(|r| rho) r r^T with
-    r = dt/du, because its energy grows by a (1 - |lam|) |r.d|; and e = sum 3 a |t - 1| covers what kinks are off.
+    r = dt/du, because its energy grows by a (1 - |lam|) |r.d|; and e = sum 3 a |t - 1| covers how far kinks are off.
     An optimum is no higher, so its d has |d| <= sqrt(tr H^(-1)) (|G| + sqrt(|G|^2 + 2 e)) with |G|^2 = G.H^(-1) G.
-    If that is at most rho, it bounds the distance; by convexity no optimum lies outside the ball either.
+    If that is at most rho, it bounds the distance; by convexity no optimum lies outside the ball either. A larger
+    ball has less curvature, hence a larger bound: the first radius that holds gives the best one.
 
     Source: own derivation; checked against a conic solver in tests/fusion/test_conic.py.
     """
-    seen = views.seen(u)
-    kink = ((seen[2] - 1).abs() <= KINK) & (lam.abs() < 1)
-    by_seen = _subgradient(seen, views.a, lam, kink)
-    G = views.gradient(by_seen)
-    pull = total(views.a * views.slope[2].square().sum(0).sqrt(), 0)
-    error = total(torch.where(kink, 3 * views.a * (seen[2] - 1).abs(), 0), 0)
-    distance = torch.full_like(pull, torch.inf)
-    left = torch.arange(len(pull), device=pull.device)
-    # a larger ball has less curvature, and so a larger bound: the first to hold is the best
+    cameras = len(a)
+    at, kink = np.empty((cameras, 3)), np.zeros(cameras, dtype=np.bool_)
+    sums = ZERO
+    pull = error = 0.0
+    for c in range(cameras):
+        q_x, q_y, t = at[c] = measured(slope[c], at_origin[c], u)
+        kink[c] = abs(t - 1) <= KINK and abs(lam[c]) < 1
+        weight, _, _ = huber_weight(q_x, q_y)
+        by_t = lam[c] if kink[c] else 1.0 if t >= 1 else -1 / (t * t)
+        sums = add(sums, slope[c], weight * q_x, weight * q_y, a[c] * by_t, 0.0, 0.0, 0.0, 0.0)
+        pull += a[c] * math.sqrt(squared_norm(slope[c, 2]))
+        error += 3 * a[c] * abs(t - 1) if kink[c] else 0.0
+    distance = np.inf
     for radius in RADII:
-        part = (views.subset(left), seen[..., left], lam[:, left], kink[:, left])
-        bound = _distance(*part, radius, G[:, left], error[left])
-        holds = bound <= radius
-        distance[left[holds]] = bound[holds]
-        left = left[~holds]
-        if len(left) == 0:
+        bound = _distance(_least_curvature(slope, at, a, lam, kink, radius), sums, error)
+        if bound <= radius:
+            distance = bound
             break
-    norm = G.square().sum(0).sqrt()
-    return Certificate(norm, norm / pull, distance)
+    norm = math.sqrt(squared_norm(sums))
+    return norm, norm / pull, distance
 
 
-def _subgradient(
-    seen: Seen, a: Tensor, lam: Tensor, kink: Bool[Tensor, "cameras problems"]
-) -> Float[Tensor, "3 cameras problems"]:
-    """With respect to what is seen."""
-    weight = (seen[0].square() + seen[1].square()).clamp_min(1).rsqrt()
-    depth = torch.where(seen[2] >= 1, 1, -seen[2].square().reciprocal())
-    return torch.stack([seen[0] * weight, seen[1] * weight, a * torch.where(kink, lam, depth)])
+@compiled
+@no_type_check
+def _distance(curvature, G, error):
+    """The bound from curvature, subgradient and error; NaN where the curvature is not positive definite."""
+    L = factor(curvature)
+    trace = squared_norm(forward(L, (1.0, 0.0, 0.0))) + squared_norm(forward(L, (0.0, 1.0, 0.0)))
+    if curvature[8] != 0:  # three unknowns
+        trace += squared_norm(forward(L, (0.0, 0.0, 1.0)))
+    drop = squared_norm(forward(L, G))
+    return math.sqrt(trace) * (math.sqrt(drop) + math.sqrt(drop + 2 * error))
 
 
-def _distance(
-    views: Views, seen: Seen, lam: Tensor, kink: Tensor, radius: float, G: Unknown, error: Tensor
-) -> Float[Tensor, " problems"]:
-    """The bound for one radius; NaN or inf where H is not positive definite."""
-    L = factor(views.hessian(_least_curvature(views, seen, lam, kink, radius)))
-    axes = torch.eye(len(G), dtype=G.dtype, device=G.device)[..., None].expand(-1, *G.shape)
-    trace = total(total(torch.stack([forward(L, axis).square() for axis in axes]), 0), 0)
-    squared = total(forward(L, G).square(), 0)
-    return (trace.sqrt() * (squared.sqrt() + (squared + 2 * error).sqrt())).nan_to_num(nan=torch.inf)
-
-
-def _least_curvature(
-    views: Views, seen: Seen, lam: Tensor, kink: Tensor, radius: float
-) -> Float[Tensor, "4 cameras problems"]:
-    """A lower bound of the curvature within a radius of u, with respect to what is seen.
+@compiled
+@no_type_check
+def _least_curvature(slope, at, a, lam, kink, radius):
+    """A lower bound of the curvature within a radius of u.
 
     |q| changes by at most delta. Below 1 - delta, h has curvature 1; else at least (P - delta/|q|)/(|q| + delta).
     P projects across q, whose direction turns by at most asin(delta/|q|), and projectors differ in norm by the sine.
     """
-    squares = views.slope.square().sum(1)
-    delta = (squares[0] + squares[1]).sqrt() * radius
-    length = (seen[0].square() + seen[1].square()).sqrt()
-    inside = length + delta < 1
-    unit = seen[:2] / length.clamp_min(0.5)
-    turn = delta / length.clamp_min(0.5)
-    scale = torch.where(turn < 1, 1 / (length + delta), 0)
-    xx, xy, yy = (
-        scale * (1 - turn - unit[0].square()), -scale * unit[0] * unit[1], scale * (1 - turn - unit[1].square())
-    )  # fmt: skip
-    reach = squares[2].sqrt() * radius
-    far = seen[2] + reach
-    depth = torch.where(far < 1, 2 / far**3, 0)
-    depth = torch.where(kink, 2 * (1 - lam.abs()) / reach.clamp_min(torch.finfo(far.dtype).tiny), depth)
-    ones = torch.ones_like(length)
-    return torch.stack(
-        [
-            torch.where(inside, ones, xx),
-            torch.where(inside, 0, xy),
-            torch.where(inside, ones, yy),
-            views.a * depth,
-        ]
-    )
+    sums = ZERO
+    for c in range(len(a)):
+        q_x, q_y, t = at[c]
+        delta = radius * math.sqrt(squared_norm(slope[c, 0]) + squared_norm(slope[c, 1]))
+        length = math.sqrt(q_x * q_x + q_y * q_y)
+        xx, xy, yy = 1.0, 0.0, 1.0
+        if length + delta >= 1:
+            x, y, turn = q_x / max(length, 0.5), q_y / max(length, 0.5), delta / max(length, 0.5)
+            scale = 1 / (length + delta) if turn < 1 else 0.0
+            xx, xy, yy = scale * (1 - turn - x * x), -scale * x * y, scale * (1 - turn - y * y)
+        reach = radius * math.sqrt(squared_norm(slope[c, 2]))
+        far = t + reach
+        depth = 2 / (far * far * far) if far < 1 else 0.0
+        if kink[c]:
+            depth = 2 * (1 - abs(lam[c])) / max(reach, TINY)
+        sums = add(sums, slope[c], 0.0, 0.0, 0.0, xx, xy, yy, a[c] * depth)
+    return sums

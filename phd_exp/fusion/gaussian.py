@@ -1,20 +1,18 @@
-"""What fusion is compared with: the average of the views' positions, and their best Gaussian combination."""
+"""References for fusion: the average of the positions, and inverse-covariance weighting."""
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from phd_exp.fusion.linear import total
-
 
 def average(
     positions: Float[Tensor, "*batch cameras 3"], mask: Bool[Tensor, "*batch cameras"] | None = None
 ) -> Float[Tensor, "*batch 3"]:
-    """The mean over the cameras of positions in the world, in their unit; NaN where no camera takes part."""
+    """The mean over the cameras of positions in the world, in the same unit; NaN where all cameras are masked out."""
     if mask is None:
-        return total(positions, -2) / positions.shape[-2]
-    # a camera that takes no part may hold NaN
-    return total(torch.where(mask[..., None], positions, 0), -2) / mask.sum(-1, keepdim=True)
+        return positions.mean(-2)
+    # the position of a camera that is masked out may be NaN
+    return torch.where(mask[..., None], positions, 0).sum(-2) / mask.sum(-1, keepdim=True)
 
 
 def gaussian_fusion(
@@ -25,7 +23,7 @@ def gaussian_fusion(
     """Position and covariance of a product of Gaussians in the world: precisions add, means weighted by them.
 
     C = (sum C_i^(-1))^(-1) and v = C sum C_i^(-1) v_i, in the units of the means. Raises torch.linalg.LinAlgError
-    where a covariance is singular or no camera takes part.
+    where a covariance is singular or all cameras are masked out.
 
     Source: inverse-covariance weighting; checked in tests/fusion/test_gaussian.py.
     """

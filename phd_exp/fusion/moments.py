@@ -1,83 +1,175 @@
-"""Mean and covariance of a position whose density is the product of the cameras' densities.
+"""Mean and covariance of a position whose density is the product of the densities of several cameras.
 
-A second derivative at the optimum misses the kinks of depth, which hold the optimum more often than not, and the
-straight tails. So the Gaussian of second derivatives averaged over itself (`averaged_precision`) only places the
-points at which the density is evaluated, and the moments follow from the values.
+A second derivative at the optimum misses the kinks of depth, which usually hold the optimum, and the linear tails. So
+the Gaussian of second derivatives averaged over itself (`_averaged_precision`) only places the points at which the
+density is evaluated, and the moments follow from the values.
 """
 
 import math
 from functools import cache
+from typing import no_type_check
 
-import torch
+import numpy as np
 from jaxtyping import Float
+from numba import njit
 from scipy import stats
-from torch import Tensor
 
-from phd_exp.fusion.energy import energy
-from phd_exp.fusion.linear import Triangle, backward, factor, forward, total
-from phd_exp.fusion.views import Unknown, Views
+from phd_exp.fusion.arithmetic import (
+    TINY,
+    ZERO,
+    add,
+    backward,
+    change,
+    compiled,
+    factor,
+    forward,
+    measured,
+    squared_norm,
+)
 
-_POINTS, PASSES = 256, 3
-_FREEDOM = 5.0  # of Student's law, whose tails cover the exponential ones of the density
+PILOT, POINTS = 256, 2048  # of the two passes that find the proposal, and of the last one
 FIXED_POINT_STEPS = 6
-_AT_ONCE = {"cpu": 1 << 17, "cuda": 1 << 24}
-"""Cameras times points times problems: what stays in a processor's cache, and what keeps a GPU busy."""
+_ONE, _HALF, _SIXTH, _24TH = (np.float32(1 / math.factorial(k)) for k in (1, 2, 3, 4))
+_FREEDOM = 5.0  # of Student's law, whose tails cover the exponential ones of the density
 
 
-def moments(views: Views, u: Unknown) -> tuple[Unknown, Float[Tensor, "k k problems"]]:
-    """Mean (metres) and covariance (square metres) of u with density exp(-energy), of which u is the mode.
+@cache
+def student_points(k: int) -> tuple[Float[np.ndarray, "3 points"], Float[np.ndarray, " points"]]:
+    """Points of Student's law in k = 2 or 3 dimensions, and the log of its density there up to a constant."""
+    uniform = stats.qmc.Sobol(k, scramble=True, seed=0).random(POINTS)
+    radius = np.sqrt(k * stats.f.ppf(uniform[:, 0], k, _FREEDOM))
+    height = 2 * uniform[:, 2] - 1 if k == 3 else np.zeros(POINTS)
+    turn, across = 2 * np.pi * uniform[:, 1], np.sqrt(1 - height**2)
+    points = radius * np.stack([across * np.cos(turn), across * np.sin(turn), height])
+    log_density = -(_FREEDOM + k) / 2 * np.log1p(radius**2 / _FREEDOM)
+    return points.astype(np.float32), log_density.astype(np.float32)
 
-    Self-normalised importance sampling with a fixed set of 256 points of low discrepancy, which follow Student's law
-    with 5 degrees of freedom: first about the mode, then twice more with the mean and covariance found so far. The
-    same numbers every time. Of variances along axes 99 in 100 are within 15 %; 90 where one camera is alone, whose
-    tails are the heaviest.
 
-    Source: own derivation; checked against exact moments and Markov chains in tests/fusion/test_moments.py.
+@compiled
+@no_type_check
+def moments(views, u, points, log_density, radii, mean, covariance, inside):
+    """Fills `mean` (metres) and `covariance` (square metres) of u with density exp(-energy), of which u is the mode.
+
+    `inside` gets the probability of the ellipsoids of mean and covariance with these squared radii.
+
+    Self-normalised importance sampling with fixed points of low discrepancy that follow Student's law with 5 degrees
+    of freedom: 256 points about the mode, 256 with the mean and covariance found so far, then 2048 in the same way.
+    The points are a fixed set, so that the same problem gives the same numbers. Relative error of the eigenvalues of
+    the covariance, for two to eight cameras: median 0.3 %, 99 in 100 within 2 %, on a plane within 0.6 %. Where a
+    tenth of the predictions contradicts the others, 97 in 100 are within 2 %.
+
+    Source: own derivation; checked against closed forms and Markov chains in tests/fusion/test_moments.py.
     """
-    at_once = _AT_ONCE.get(u.device.type, _AT_ONCE["cuda"])
-    size = max(1, at_once // (_POINTS * len(views.a)))
-    parts = [_moments(*part) for part in zip(views.chunks(size), u.split(size, dim=-1), strict=True)]
-    means, covariances = zip(*parts, strict=True)
-    return torch.cat(means, dim=-1), torch.cat(covariances, dim=-1)
+    slope, at_origin, a = views
+    root, value = np.eye(3), np.empty(len(log_density), dtype=np.float32)
+    L = factor(_averaged_precision(slope, at_origin, a, u))
+    for j in range(3):
+        root[:, j] = backward(L, root[:, j])
+    mean[:] = u
+    for points_used in (PILOT, PILOT, len(value)):
+        first, second, total = _weighted(
+            slope, at_origin, a, mean, root, points, log_density, value[:points_used]
+        )
+        if points_used == len(value):
+            _probabilities(points, value, total, first, second, radii, inside)
+        _move(mean, root, covariance, first, second)
 
 
-def _moments(views: Views, u: Unknown) -> tuple[Tensor, Tensor]:
-    points, log_proposal = (part.to(u.device) for part in student_points(len(u)))
-    precision = factor(averaged_precision(views, u))
-    offset = backward([[entry[:, None] for entry in row] for row in precision], points[:, None])
-    mean, covariance = _weighted(views, u, offset, log_proposal)
-    for _ in range(PASSES - 1):
-        root = factor([[covariance[i, j] for j in range(i + 1)] for i in range(len(u))])
-        offset = _product(root, points)
-        mean, covariance = _weighted(views, mean, offset, log_proposal)
-    return mean, covariance
+@compiled
+@no_type_check
+def _weighted(slope, at_origin, a, centre, root, points, log_density, value):
+    """Mean and covariance of the points x, weighted by the density at centre + root x; fills `value` with weights.
+
+    In float32, for twice the speed: what is rounded is the change of the energy with x, not the energy.
+    """
+    for p in range(len(value)):
+        value[p] = -log_density[p]
+    for c in range(len(a)):
+        x, y, t = measured(slope[c], at_origin[c], centre)
+        columns = change(slope[c], root[:, 0]), change(slope[c], root[:, 1]), change(slope[c], root[:, 2])
+        _subtract_energy(x, y, t, columns, a[c], points, value)
+    highest = value.max()
+    for p in range(len(value)):
+        # e^x = (e^(x/64))^64 by a polynomial, which vector units can do; to 1e-5 where the weight is not negligible
+        x = max(value[p] - highest, np.float32(-80)) * np.float32(1 / 64)
+        power = _ONE + x * (_ONE + x * (_HALF + x * (_SIXTH + x * _24TH)))
+        for _ in range(6):
+            power *= power
+        value[p] = power
+    total, m_0, m_1, m_2, c_00, c_10, c_11, c_20, c_21, c_22 = _sums(points, value)
+    total = float(total)
+    m_0, m_1, m_2 = m_0 / total, m_1 / total, m_2 / total
+    c_00, c_10, c_11 = c_00 / total - m_0 * m_0, c_10 / total - m_1 * m_0, c_11 / total - m_1 * m_1
+    c_20, c_21, c_22 = c_20 / total - m_2 * m_0, c_21 / total - m_2 * m_1, c_22 / total - m_2 * m_2
+    return (m_0, m_1, m_2), (0.0, 0.0, 0.0, c_00, c_10, c_11, c_20, c_21, c_22), total
 
 
-def _product(L: Triangle, points: Float[Tensor, "k points"]) -> Float[Tensor, "k problems points"]:
-    """L times each point."""
-    return torch.stack(
-        [total(torch.stack([entry[:, None] * points[j] for j, entry in enumerate(row)]), 0) for row in L]
-    )
+@njit(error_model="numpy", fastmath={"reassoc"})  # in any order: on all lanes of a vector unit
+@no_type_check
+def _sums(points, weight):
+    """The sums over the points of weight times 1, x and x x^T."""
+    total = m_0 = m_1 = m_2 = c_00 = c_10 = c_11 = c_20 = c_21 = c_22 = np.float32(0)
+    for p in range(len(weight)):
+        x_0, x_1, x_2 = points[0, p], points[1, p], points[2, p]
+        w_0, w_1, w_2 = weight[p] * x_0, weight[p] * x_1, weight[p] * x_2
+        total += weight[p]
+        m_0, m_1, m_2 = m_0 + w_0, m_1 + w_1, m_2 + w_2
+        c_00, c_10, c_11 = c_00 + w_0 * x_0, c_10 + w_1 * x_0, c_11 + w_1 * x_1
+        c_20, c_21, c_22 = c_20 + w_2 * x_0, c_21 + w_2 * x_1, c_22 + w_2 * x_2
+    return total, m_0, m_1, m_2, c_00, c_10, c_11, c_20, c_21, c_22
 
 
-def _weighted(
-    views: Views,
-    centre: Unknown,
-    offset: Float[Tensor, "k problems points"],
-    log_proposal: Float[Tensor, " points"],
-) -> tuple[Unknown, Float[Tensor, "k k problems"]]:
-    """Mean and covariance from the density at centre + offset, the points having been drawn from a proposal."""
-    seen = views.seen(centre)[..., None]
-    for j, component in enumerate(offset):
-        seen = seen + views.slope[:, j, ..., None] * component
-    value = total(energy(seen, views.a[..., None]), 0)
-    weight = torch.softmax(-value - log_proposal, dim=-1)
-    mean = (weight * offset).sum(-1)
-    centred = offset - mean[..., None]
-    return centre + mean, (weight * centred[:, None] * centred).sum(-1)
+@compiled
+@no_type_check
+def _subtract_energy(x, y, t, columns, a, points, value):
+    """Subtracts the energy of one camera at each point from its value; without a branch, for vector units."""
+    (x_0, y_0, t_0), (x_1, y_1, t_1), (x_2, y_2, t_2) = columns
+    x_0, x_1, x_2 = np.float32(x_0), np.float32(x_1), np.float32(x_2)
+    y_0, y_1, y_2 = np.float32(y_0), np.float32(y_1), np.float32(y_2)
+    t_0, t_1, t_2 = np.float32(t_0), np.float32(t_1), np.float32(t_2)
+    x, y, beyond, a = np.float32(x), np.float32(y), np.float32(t - 1), np.float32(a)
+    for p in range(len(value)):
+        p_0, p_1, p_2 = points[0, p], points[1, p], points[2, p]
+        q_x = x + x_0 * p_0 + x_1 * p_1 + x_2 * p_2
+        q_y = y + y_0 * p_0 + y_1 * p_1 + y_2 * p_2
+        s = beyond + t_0 * p_0 + t_1 * p_1 + t_2 * p_2  # t - 1
+        squared = q_x * q_x + q_y * q_y
+        huber = math.sqrt(squared) - _HALF if squared > _ONE else _HALF * squared
+        depth = max(s, -s / (_ONE + s)) if s > -_ONE else np.float32(np.inf)
+        value[p] -= huber + a * depth
 
 
-def averaged_precision(views: Views, u: Unknown) -> Triangle:
+@compiled
+@no_type_check
+def _probabilities(points, weight, total, first, second, radii, inside):
+    """The weighted share of the points in each ellipsoid."""
+    inside[:] = 0.0
+    L = factor(second)
+    for p in range(len(weight) if len(radii) else 0):
+        offset = points[0, p] - first[0], points[1, p] - first[1], points[2, p] - first[2]
+        squared = squared_norm(forward(L, offset))
+        for level in range(len(radii)):
+            if squared <= radii[level]:
+                inside[level] += weight[p] / total
+
+
+@compiled
+@no_type_check
+def _move(mean, root, covariance, first, second):
+    """Moves the mean to that of the points, and root to a root of their covariance; fills in that covariance."""
+    l_00, l_10, l_11, l_20, l_21, l_22 = factor(second)
+    for i in range(3):
+        r_0, r_1, r_2 = root[i]
+        mean[i] += r_0 * first[0] + r_1 * first[1] + r_2 * first[2]
+        root[i] = r_0 * l_00 + r_1 * l_10 + r_2 * l_20, r_1 * l_11 + r_2 * l_21, r_2 * l_22
+        for j in range(i + 1):
+            product = root[i, 0] * root[j, 0] + root[i, 1] * root[j, 1] + root[i, 2] * root[j, 2]
+            covariance[i, j] = covariance[j, i] = product
+
+
+@compiled
+@no_type_check
+def _averaged_precision(slope, at_origin, a, u):
     """About the second derivative of the energy averaged over N(u, its inverse), a fixed point; 1/square metres.
 
     For h the weight 1/sqrt(1 + E|q|^2); for a max(t, 1/t), t Gaussian with deviation s, its jump of slope at the kink
@@ -85,29 +177,24 @@ def averaged_precision(views: Views, u: Unknown) -> Triangle:
 
     Source: own derivation.
     """
-    seen = views.seen(u)
-    squared, t = seen[0].square() + seen[1].square(), seen[2]
-    zero = torch.zeros_like(t)
-    weight, bend = (1 + squared).rsqrt(), views.a
-    for _ in range(FIXED_POINT_STEPS):
-        H = views.hessian(torch.stack([weight, zero, weight, bend]))
-        variance = forward(factor(H), views.slope.transpose(0, 1)).square().sum(0)  # 3 cameras problems
-        weight = (1 + squared + variance[0] + variance[1]).rsqrt()
-        deviation = variance[2].sqrt().clamp_min(torch.finfo(t.dtype).tiny)
-        standard = (1 - t) / deviation
-        at_kink = torch.exp(-standard.square() / 2) / (deviation * math.sqrt(2 * math.pi))
-        bend = views.a * (2 * at_kink + 2 * torch.special.ndtr(standard) / t**3)
-    return views.hessian(torch.stack([weight, zero, weight, bend]))
-
-
-@cache
-def student_points(k: int) -> tuple[Float[Tensor, "k points"], Float[Tensor, " points"]]:
-    """Points of Student's law in k = 2 or 3 dimensions, and the log of its density there up to a constant."""
-    uniform = torch.from_numpy(stats.qmc.Sobol(k, scramble=True, seed=0).random(_POINTS))
-    radius = torch.from_numpy(k * stats.f.ppf(uniform[:, 0].numpy(), k, _FREEDOM)).sqrt()
-    turn = 2 * math.pi * uniform[:, 1]
-    direction = torch.stack([turn.cos(), turn.sin()])
-    if k == 3:
-        height = 2 * uniform[:, 2:].T - 1
-        direction = torch.cat([(1 - height.square()).sqrt() * direction, height])
-    return radius * direction, -(_FREEDOM + k) / 2 * torch.log1p(radius.square() / _FREEDOM)
+    cameras = len(a)
+    at, weight, bend = np.empty((cameras, 3)), np.empty(cameras), a.copy()
+    for c in range(cameras):
+        q_x, q_y, _ = at[c] = measured(slope[c], at_origin[c], u)
+        weight[c] = 1 / math.sqrt(1 + q_x * q_x + q_y * q_y)
+    for step in range(FIXED_POINT_STEPS + 1):
+        H = ZERO
+        for c in range(cameras):
+            H = add(H, slope[c], 0.0, 0.0, 0.0, weight[c], 0.0, weight[c], bend[c])
+        if step == FIXED_POINT_STEPS:
+            break
+        L = factor(H)
+        for c in range(cameras):
+            q_x, q_y, t = at[c]
+            across = squared_norm(forward(L, slope[c, 0])) + squared_norm(forward(L, slope[c, 1]))
+            deviation = max(math.sqrt(squared_norm(forward(L, slope[c, 2]))), TINY)
+            standard = (1 - t) / deviation
+            at_kink = math.exp(-standard * standard / 2) / (deviation * math.sqrt(2 * math.pi))
+            weight[c] = 1 / math.sqrt(1 + q_x * q_x + q_y * q_y + across)
+            bend[c] = a[c] * (2 * at_kink + math.erfc(-standard / math.sqrt(2)) / (t * t * t))
+    return H

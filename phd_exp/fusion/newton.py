@@ -1,121 +1,158 @@
-"""The smoothed problem by a primal-dual Newton method, the whole batch at once.
+"""The smoothed problem by a primal-dual Newton method.
 
-Plain Newton steps see no curvature where h or max(t, 1/t) is straight and overshoot. So, as in total-variation
-denoising (Chan, Golub and Mulet, 1999), the directions of both are unknowns of their own:
+The energy of a camera is h(|q|) + a max(t, 1/t). With g = (t - 1/t)/2 the maximum is (t + 1/t)/2 + |g|, and |g| is
+smoothed to s = sqrt(g^2 + width^2). This is the w of the epigraph's barrier, (w - t)(w - 1/t) = width^2. It is convex
+in t, because its second derivative is (1 - g/s)/t^3 + width^2 g'^2/s^3, and at most `width` too large.
 
-    y max(1, |q|) = q,    lam sqrt(g^2 + width^2) = g    with |y| <= 1, |lam| <= 1,
+Plain Newton steps see no curvature where h or max(t, 1/t) is linear and overshoot. So, as in total-variation
+denoising (Chan, Golub and Mulet, 1999), the directions of both are unknowns too:
 
-each linearised with the stationarity in u. From y = 0, lam = 0 the first steps are those of reweighted least squares,
-the last ones quadratic. The width falls to its floor meanwhile; a line search keeps every step a descent.
+    y max(1, |q|) = q,    lam s = g    with |y| <= 1, |lam| <= 1,
+
+each linearised together with the stationarity in u. From y = 0, lam = 0 the first steps are those of reweighted least
+squares, the last ones quadratic. The width falls to its floor meanwhile; a line search keeps every step a descent.
+
+Source: own derivation; optima checked against a conic solver in tests/fusion/test_conic.py.
 """
 
-from dataclasses import dataclass
+import math
+from typing import no_type_check
 
-import torch
-from jaxtyping import Bool, Float, Int
-from torch import Tensor
+import numpy as np
 
-from phd_exp.fusion.energy import extended_inverse, huber, smooth_energy
-from phd_exp.fusion.linear import solve, total
-from phd_exp.fusion.views import Seen, Unknown, Views
+from phd_exp.fusion.arithmetic import ZERO, add, change, compiled, huber, huber_weight, measured, newton_step
 
 WIDTH_FLOOR = 1e-9
 FIRST_WIDTH, SHRINK = 1.0, 0.01
 MOST_STEPS, MOST_HALVINGS = 80, 40
-SETTLED = 1e-9  # relative change of what is seen
+SETTLED = 1e-9  # relative change of (q_x, q_y, t)
 RIDGE = 1e-9  # share of the curvature of least squares: a flat direction must not stop the rest
 ARMIJO = 1e-4
+LEAST_DEPTHS = (1e-2, 1e-4, 1e-6)
+"""Shares of the predicted depth below which 1/t is continued, tried in turn until the optimum lies beyond."""
 
 
-@dataclass(frozen=True)
-class Iterate:
-    """The unknowns and the two duals."""
+@compiled
+@no_type_check
+def optimum(slope, at_origin, a, u, lam):
+    """Moves u to the optimum and lam to its multipliers; returns whether one has t >= 1e-6 in every camera.
 
-    u: Unknown
-    y: Float[Tensor, "2 cameras problems"]
-    lam: Float[Tensor, "cameras problems"]
-
-    @classmethod
-    def start(cls, views: Views, u: Unknown) -> "Iterate":
-        """No curvature is known yet."""
-        return cls(u, torch.zeros_like(views.at_origin[:2]), torch.zeros_like(views.a))
-
-    def subset(self, problems: Int[Tensor, " some"]) -> "Iterate":
-        """Some of the problems."""
-        return Iterate(self.u[:, problems], self.y[..., problems], self.lam[:, problems])
-
-
-def minimise(views: Views, u: Unknown, least: float) -> tuple[Unknown, Float[Tensor, "cameras problems"]]:
-    """The minimum over u and the multipliers lam of the kinks; 1/t is continued below t = least.
-
-    A problem that has settled leaves the batch. What has not settled after 80 steps is returned as it is: the
-    certificate judges it.
+    If not, every position in front of all cameras is worse than what 1/t = 1e6 costs in one of them.
     """
-    at, width = Iterate.start(views, u), FIRST_WIDTH
-    result, working = Iterate(u.clone(), at.y, at.lam.clone()), torch.arange(u.shape[1], device=u.device)
+    for least in LEAST_DEPTHS:
+        lam[:] = 0.0
+        minimise(slope, at_origin, a, u, lam, least)
+        nearest = np.inf
+        for c in range(len(a)):
+            nearest = min(nearest, measured(slope[c], at_origin[c], u)[2])
+        if nearest >= least:
+            return True
+    return False
+
+
+@compiled
+@no_type_check
+def minimise(slope, at_origin, a, u, lam, least):
+    """Moves u to the minimum with 1/t continued below t = least, and lam to the multipliers of the kinks.
+
+    After 80 steps u is left where it is: the certificate judges it.
+    """
+    cameras = len(a)
+    at, moved = np.empty((cameras, 3)), np.empty((cameras, 3))
+    y, terms = np.zeros((cameras, 2)), np.empty((cameras, 6))
+    width = FIRST_WIDTH
     for _ in range(MOST_STEPS):
-        at, settled = step(views, at, width, least)
-        result.u[:, working], result.lam[:, working] = at.u, at.lam
-        if width == WIDTH_FLOOR and bool(settled.any()):
-            left = (~settled).nonzero().squeeze(-1)
-            if len(left) == 0:
-                break
-            views, at, working = views.subset(left), at.subset(left), working[left]
-        width = max(width * SHRINK, WIDTH_FLOOR)
-    return result.u, result.lam
-
-
-def step(views: Views, at: Iterate, width: float, least: float) -> tuple[Iterate, Bool[Tensor, " problems"]]:
-    """One Newton step with its line search, and which problems it hardly moved."""
-    seen, a = views.seen(at.u), views.a
-    q, t = seen[:2], seen[2]
-    weight = (q[0].square() + q[1].square()).clamp_min(1).rsqrt()
-    unit = torch.where(weight < 1, q * weight, 0)  # q/|q| where h is straight
-    inverse, first, second = extended_inverse(t, least)
-    g, g_slope = (t - inverse) / 2, (1 - first) / 2
-    s = (g.square() + width**2).sqrt()
-    side = g / s
-    gradient = views.gradient(torch.stack([*(weight * q), a * ((1 + first) / 2 + side * g_slope)]))
-    y_x, y_y = at.y
-    curvature = (
-        weight * (1 - y_x * unit[0]),
-        -weight * (y_x * unit[1] + y_y * unit[0]) / 2,
-        weight * (1 - y_y * unit[1]),
-        a * ((1 - side) * second / 2 + g_slope.square() * (1 - at.lam * side) / s),
-    )
-    least_squares = torch.stack([weight, torch.zeros_like(a), weight, a])
-    du = -solve(views.hessian(torch.stack(curvature) + RIDGE * least_squares), gradient)
-    moved = views.moved(du)
-    before = total(huber(seen) + a * ((t + inverse) / 2 + s), 0)
-    share = _line_search(before, seen, moved, a, (gradient * du).sum(0), width, least)
-    lam = at.lam + (g - at.lam * s + (1 - at.lam * side) * g_slope * moved[2]) / s
-    y = weight * (q + moved[:2] - at.y * (unit * moved[:2]).sum(0))
-    y = y * (y[0].square() + y[1].square()).clamp_min(1).rsqrt()
-    still = (share * moved).abs() <= SETTLED * (1 + seen.abs())
-    return Iterate(at.u + share * du, y, lam.clamp(-1, 1)), still.all(0).all(0)
-
-
-def _line_search(
-    before: Float[Tensor, " problems"],
-    seen: Seen,
-    moved: Seen,
-    a: Float[Tensor, "cameras problems"],
-    descent: Float[Tensor, " problems"],
-    width: float,
-    least: float,
-) -> Float[Tensor, " problems"]:
-    """The share of each step to take: halved until the energy falls from what it was before by Armijo's rule."""
-
-    def value(seen: Seen, a: Tensor) -> Tensor:
-        return total(smooth_energy(seen, a, width, least), 0)
-
-    enough = before + 1e-12 * before.abs()  # what rounding may add where nothing is left to gain
-    share = torch.ones_like(before)
-    tried = (value(seen + moved, a) > enough + ARMIJO * descent).nonzero().squeeze(-1)
-    for _ in range(MOST_HALVINGS):
-        if len(tried) == 0:
+        before, sums = _linearise(slope, at_origin, a, u, y, lam, width, least, at, terms)
+        du = newton_step(sums)
+        for c in range(cameras):
+            moved[c] = change(slope[c], du)
+        descent = sums[0] * du[0] + sums[1] * du[1] + sums[2] * du[2]
+        share = _line_search(before, at, moved, a, descent, width, least)
+        settled = _step(at, terms, moved, y, lam, share)
+        for j in range(3):
+            u[j] += share * du[j]
+        if width == WIDTH_FLOOR and settled:
             break
-        share[tried] /= 2
-        after = value(seen[..., tried] + share[tried] * moved[..., tried], a[:, tried])
-        tried = tried[after > enough[tried] + ARMIJO * share[tried] * descent[tried]]
+        width = max(width * SHRINK, WIDTH_FLOOR)
+
+
+@compiled
+@no_type_check
+def extended_inverse(t, least):
+    """1/t with its first two derivatives, continued below t = least > 0 by its second-order Taylor polynomial.
+
+    The continuation is convex and finite everywhere, so that a search may start behind a camera. A minimum of the
+    continued problem that has t >= least in every camera is the minimum of the problem itself, by convexity.
+    """
+    inverse = 1 / max(t, least)
+    short = min(t - least, 0.0) / least
+    return inverse * (1 - short + short * short), inverse * inverse * (2 * short - 1), 2 * inverse**3
+
+
+@compiled
+@no_type_check
+def smooth_depth_energy(t, inverse, width):
+    """(t + 1/t)/2 + s, which is max(t, 1/t) at width 0; and g and s."""
+    g = (t - inverse) / 2
+    s = math.sqrt(g * g + width * width)
+    return (t + inverse) / 2 + s, g, s
+
+
+@compiled
+@no_type_check
+def _linearise(slope, at_origin, a, u, y, lam, width, least, at, terms):
+    """The smoothed energy, its gradient and Hessian; fills `at` with (q_x, q_y, t) and `terms` for `_step`."""
+    value, sums = 0.0, ZERO
+    for c in range(len(a)):
+        q_x, q_y, t = at[c] = measured(slope[c], at_origin[c], u)
+        inverse, first, second = extended_inverse(t, least)
+        depth, g, s = smooth_depth_energy(t, inverse, width)
+        value += huber(q_x * q_x + q_y * q_y) + a[c] * depth
+        weight, unit_x, unit_y = huber_weight(q_x, q_y)
+        g_slope, side = (1 - first) / 2, g / s
+        terms[c] = weight, unit_x, unit_y, g, g_slope, s
+        xx = weight * (1 - y[c, 0] * unit_x) + RIDGE * weight
+        xy = -weight * (y[c, 0] * unit_y + y[c, 1] * unit_x) / 2
+        yy = weight * (1 - y[c, 1] * unit_y) + RIDGE * weight
+        bend = (1 - side) * second / 2 + g_slope * g_slope * (1 - lam[c] * side) / s
+        by_t = a[c] * ((1 + first) / 2 + side * g_slope)
+        sums = add(sums, slope[c], weight * q_x, weight * q_y, by_t, xx, xy, yy, a[c] * (bend + RIDGE))
+    return value, sums
+
+
+@compiled
+@no_type_check
+def _line_search(before, at, moved, a, descent, width, least):
+    """The share of the step to take: halved until the energy falls by Armijo's rule."""
+    enough = before + 1e-12 * abs(before)  # rounding may add this much where nothing is left to gain
+    share = 1.0
+    for _ in range(MOST_HALVINGS):
+        value = 0.0
+        for c in range(len(a)):
+            q_x, q_y = at[c, 0] + share * moved[c, 0], at[c, 1] + share * moved[c, 1]
+            t = at[c, 2] + share * moved[c, 2]
+            depth, _, _ = smooth_depth_energy(t, extended_inverse(t, least)[0], width)
+            value += huber(q_x * q_x + q_y * q_y) + a[c] * depth
+        if not value > enough + ARMIJO * share * descent:
+            break
+        share /= 2
     return share
+
+
+@compiled
+@no_type_check
+def _step(at, terms, moved, y, lam, share):
+    """Moves the duals; returns whether (q_x, q_y, t) hardly moved in any camera."""
+    settled = True
+    for c in range(len(lam)):
+        weight, unit_x, unit_y, g, g_slope, s = terms[c]
+        lam[c] += (g - lam[c] * s + (1 - lam[c] * g / s) * g_slope * moved[c, 2]) / s
+        lam[c] = min(max(lam[c], -1.0), 1.0)
+        along = unit_x * moved[c, 0] + unit_y * moved[c, 1]
+        y_x = weight * (at[c, 0] + moved[c, 0] - y[c, 0] * along)
+        y_y = weight * (at[c, 1] + moved[c, 1] - y[c, 1] * along)
+        length = math.sqrt(max(y_x * y_x + y_y * y_y, 1.0))
+        y[c, 0], y[c, 1] = y_x / length, y_y / length
+        for m in range(3):
+            settled &= abs(share * moved[c, m]) <= SETTLED * (1 + abs(at[c, m]))
+    return settled

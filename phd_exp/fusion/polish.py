@@ -1,64 +1,67 @@
-"""The exact problem from the smoothed one: kinks at which the optimum lies become equalities t = 1."""
+"""The exact problem from the smoothed one: the kinks at which the optimum lies become equalities t = 1."""
 
-import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
+from typing import no_type_check
 
-from phd_exp.fusion.linear import solve
-from phd_exp.fusion.views import Seen, Unknown, Views
+import numpy as np
+
+from phd_exp.fusion.arithmetic import ZERO, add, compiled, huber_weight, measured, newton_step
 
 KINK = 1e-6
-"""|t - 1| within which a kink may be what holds the optimum; the smoothed optimum is about 1e-9 from one that is."""
+"""|t - 1| within which a kink may hold the optimum; the smoothed optimum is about 1e-9 from such a kink."""
 ROUNDS = 4
 PENALTY = 1e7
 RIDGE = 1e-12
 FARTHEST = 1e-4  # metres; a correction beyond is no polish
+STILL = 1e-16  # metres
 
 
-def polish(
-    views: Views, u: Unknown, lam: Float[Tensor, "cameras problems"]
-) -> tuple[Unknown, Float[Tensor, "cameras problems"]]:
-    """The optimum to rounding, and the subgradients lam of max(t, 1/t) at kinks.
+@compiled
+@no_type_check
+def polish(slope, at_origin, a, u, lam):
+    """Moves u to the optimum, to rounding, and lam to the subgradients of max(t, 1/t) at kinks.
 
     The method of multipliers: at a kink the energy is a (lam (t - 1) + penalty (t - 1)^2 / 2), and lam moves by the
-    penalty times what is left of t - 1. A lam that leaves [-1, 1] was none: its camera goes to that side.
-    Where a problem was farther from its optimum than that, it is returned as it came.
+    penalty times the remaining t - 1. A kink whose lam leaves [-1, 1] does not hold the optimum: its camera goes to
+    that side. An optimum farther away than 0.1 mm is none of this problem's: u and lam stay as they were.
 
     Source: own derivation; checked against a conic solver in tests/fusion/test_conic.py.
     """
-    start, first = u, lam
+    cameras = len(a)
+    start, first = u.copy(), lam.copy()
+    kink = np.zeros(cameras, dtype=np.bool_)
     for _ in range(ROUNDS):
-        seen = views.seen(u)
-        near = (seen[2] - 1).abs() <= KINK
-        side = torch.where(near, lam, seen[2] - 1).sign()
-        kink = near & (lam.abs() < 1)
-        du = -_newton_step(views, seen, lam, side, kink)
-        u = u + du
-        lam = torch.where(kink, lam + PENALTY * (views.seen(u)[2] - 1), side)
-    moved = (u - start).abs().amax(0)
-    good = moved <= FARTHEST  # false for NaN
-    return torch.where(good, u, start), torch.where(good, lam, first).clamp(-1, 1)
+        du = newton_step(_linearise(slope, at_origin, a, u, lam, kink))
+        for j in range(3):
+            u[j] += du[j]
+        for c in range(cameras):
+            if kink[c]:
+                lam[c] += PENALTY * (measured(slope[c], at_origin[c], u)[2] - 1)
+        if max(abs(du[0]), abs(du[1]), abs(du[2])) <= STILL:
+            break
+    if not np.all(np.abs(u - start) <= FARTHEST):  # NaN too
+        u[:] = start
+        lam[:] = first
+    for c in range(cameras):
+        lam[c] = min(max(lam[c], -1.0), 1.0)
 
 
-def _newton_step(
-    views: Views,
-    seen: Seen,
-    lam: Float[Tensor, "cameras problems"],
-    side: Float[Tensor, "cameras problems"],
-    kink: Bool[Tensor, "cameras problems"],
-) -> Unknown:
-    """H^(-1) times the gradient of what `polish` describes, h by its second derivative."""
-    q, t = seen[:2], seen[2]
-    weight = (q[0].square() + q[1].square()).clamp_min(1).rsqrt()
-    unit = torch.where(weight < 1, q * weight, 0)
-    slope = torch.where(side > 0, 1, -t.square().reciprocal())
-    slope = torch.where(kink, lam + PENALTY * (t - 1), slope)
-    bend = torch.where(kink, PENALTY, torch.where(side > 0, 0, 2 / t**3))
-    curvature = (
-        weight * (1 + RIDGE - unit[0].square()),
-        -weight * unit[0] * unit[1],
-        weight * (1 + RIDGE - unit[1].square()),
-        views.a * (bend + RIDGE),
-    )
-    gradient = views.gradient(torch.stack([*(weight * q), views.a * slope]))
-    return solve(views.hessian(torch.stack(curvature)), gradient)
+@compiled
+@no_type_check
+def _linearise(slope, at_origin, a, u, lam, kink):
+    """Gradient and Hessian; fills `kink` with the cameras at one, and lam of the others with their side."""
+    sums = ZERO
+    for c in range(len(a)):
+        q_x, q_y, t = measured(slope[c], at_origin[c], u)
+        near = abs(t - 1) <= KINK
+        side = np.sign(lam[c] if near else t - 1)
+        kink[c] = near and abs(lam[c]) < 1
+        by_t, bend = (1.0, 0.0) if side > 0 else (-1 / (t * t), 2 / (t * t * t))
+        if kink[c]:
+            by_t, bend = lam[c] + PENALTY * (t - 1), PENALTY
+        else:
+            lam[c] = side
+        weight, unit_x, unit_y = huber_weight(q_x, q_y)
+        xx, xy = weight * (1 + RIDGE - unit_x * unit_x), -weight * unit_x * unit_y
+        yy, tt = weight * (1 + RIDGE - unit_y * unit_y), a[c] * (bend + RIDGE)
+        sums = add(sums, slope[c], weight * q_x, weight * q_y, a[c] * by_t, xx, xy, yy, tt)
+    return sums

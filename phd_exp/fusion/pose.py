@@ -1,4 +1,4 @@
-"""Where cameras and a plane stand in the world."""
+"""The poses of cameras, and a plane, in the world."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,7 +7,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from phd_exp.fusion.linear import apply, total
 from phd_exp.records import scenes
 
 RIGID_WITHIN = 1e-6  # float32 keeps a rotation to 1e-7
@@ -21,7 +20,7 @@ class Pose:
 
     Args:
         R: rotations from the world's axes to the camera's.
-        t: where the world's origin lies in the camera frame, metres.
+        t: the world's origin in the camera frame, metres.
     """
 
     R: Float[Tensor, "*#batch 3 3"]
@@ -34,7 +33,7 @@ class Pose:
         Source: R = (w^2 - |u|^2) I + 2 u u^T + 2 w [u]_x for the unit quaternion (w, u).
         """
         quaternion = torch.tensor([pose.rotation for pose in poses], dtype=torch.float64).reshape(-1, 4)
-        # a record's are of unit length to 1e-6, of which R has the square
+        # records keep unit length to 1e-6, and R is quadratic in the quaternion
         quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
         w, u = quaternion[:, :1, None], quaternion[:, 1:]
         x, y, z = u.unbind(-1)
@@ -54,11 +53,17 @@ class Pose:
 
     def into_camera(self, v: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
         """World to camera frame, R v + t."""
-        return apply(self.R, v) + self.t
+        return _product(self.R, v) + self.t
 
     def into_world(self, v: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
         """Camera frame to world, R^T (v - t)."""
-        return apply(self.R.mT, v - self.t)
+        return _product(self.R.mT, v - self.t)
+
+
+def _product(A: Float[Tensor, "*#batch 3 3"], b: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
+    """A b, in the wider of the two types."""
+    dtype = torch.promote_types(A.dtype, b.dtype)
+    return (A.to(dtype) @ b.to(dtype)[..., None]).squeeze(-1)
 
 
 @dataclass(frozen=True)
@@ -75,7 +80,7 @@ class Plane:
 
     def nearest(self, v: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
         """The point of the plane that is nearest to v."""
-        excess = (total(self.normal * v, -1) - self.offset) / total(self.normal.square(), -1)
+        excess = ((self.normal * v).sum(-1) - self.offset) / self.normal.square().sum(-1)
         return v - excess[..., None] * self.normal
 
     @property

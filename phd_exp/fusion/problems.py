@@ -1,43 +1,86 @@
-"""A batch of fusion problems as it was posed: checked, and laid out in one dimension."""
+"""A batch of fusion problems: checked, flattened, and written as affine functions of the unknowns."""
 
 from dataclasses import dataclass
+from enum import IntEnum
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion.gaussian import average
-from phd_exp.fusion.linear import apply, product
 from phd_exp.fusion.pose import Plane, Pose
-from phd_exp.fusion.status import Status
-from phd_exp.fusion.views import Unknown, Views
+
+
+class Status(IntEnum):
+    """How a problem ended; all but FUSED are failures, with NaN in place of numbers."""
+
+    FUSED = 0
+    NO_CAMERA = 1
+    NOT_FINITE = 2
+    NOT_A_ROTATION = 3
+    NOT_A_PLANE = 4
+    NO_COMMON_VIEW = 5
+    PLANE_BEHIND_CAMERA = 6
+    CONTRADICTION = 7
+    NOT_CONVERGED = 8
+
+    @property
+    def reason(self) -> str:
+        """What is wrong, what was expected and how to fix it, in one line."""
+        return _REASONS[self]
+
+
+_REASONS = {
+    Status.FUSED: "fused",
+    Status.NO_CAMERA: "all cameras are masked out; expected at least one",
+    Status.NOT_FINITE: "a prediction, pose or plane is not finite; mask out that camera or correct its numbers",
+    Status.NOT_A_ROTATION: "the R of a pose is not a rotation to 1e-6; expected R R^T = I and |R| = 1",
+    Status.NOT_A_PLANE: "the normal of the plane is zero; expected a direction",
+    Status.NO_COMMON_VIEW: "no position is in front of every camera; check that poses map world to camera, R v + t",
+    Status.PLANE_BEHIND_CAMERA: "no point of the plane is in front of every camera; check its normal and offset",
+    Status.CONTRADICTION: (
+        "at least half of the views rule out every common position; check the poses, the plane, and that all "
+        "cameras see the same object"
+    ),
+    Status.NOT_CONVERGED: "the optimum was not found to machine precision; check whether the numbers are extreme",
+}
 
 
 @dataclass(frozen=True)
 class Problems:
-    """What is known of each problem, in float64.
+    """The (q_x, q_y, t) of every camera as an affine function of the unknowns u; in float64, on the CPU.
+
+    A camera that is masked out measures q = 0 and t = 1 of every position and has a = 0: it adds a constant.
 
     Args:
-        to_seen: the matrix from a position in the camera frame to (q_x, q_y, t).
-        a: precision of the depth.
-        mode: of each prediction, camera frame, metres.
+        predictions: as given to `fuse`.
         pose: of the cameras.
         mask: which cameras take part.
-        plane: on which the position lies, if any.
-        origin: where a search starts, world, metres: the average of the predicted positions, or the point of the
-            plane that is nearest to it.
-        directions: in which it goes, orthonormal columns.
+        origin: the world position of u = 0, where the search starts, metres: the average of the predicted positions,
+            or the point of the plane nearest to it.
+        directions: the world position is origin + directions u; on a plane the third column is zero.
+        unknowns: how many there are, 3, or 2 on a plane.
+        slope: d(q_x, q_y, t)/du, 1/metres.
+        free_slope: the same with respect to the world position.
+        at_origin: (q_x, q_y, t) at u = 0.
+        a: precision of the depth.
+        status: FUSED where the input is valid.
     """
 
-    to_seen: Float[Tensor, "problems cameras 3 3"]
-    a: Float[Tensor, "problems cameras"]
-    mode: Float[Tensor, "problems cameras 3"]
+    predictions: ProjectedHuber
     pose: Pose
     mask: Bool[Tensor, "problems cameras"]
-    plane: Plane | None
     origin: Float[Tensor, "problems 3"]
-    directions: Float[Tensor, "problems 3 k"]
+    directions: Float[Tensor, "problems 3 3"]
+    unknowns: int
+    slope: Float[Tensor, "problems cameras 3 3"]
+    free_slope: Float[Tensor, "problems cameras 3 3"]
+    at_origin: Float[Tensor, "problems cameras 3"]
+    a: Float[Tensor, "problems cameras"]
+    status: Int[Tensor, " problems"]
 
     @classmethod
     def posed(
@@ -47,125 +90,96 @@ class Problems:
         plane: Plane | None,
         mask: Bool[Tensor, "*problems cameras"] | None,
     ) -> "Problems":
-        """The problems of the arguments of `fuse`. Raises ValueError where their shapes do not fit one another."""
+        """The problems of the arguments of `fuse`. Raises ValueError where shapes do not broadcast."""
         shape = predictions.batch_shape
         if len(shape) == 0 or shape[-1] == 0:
-            raise ValueError(
-                f"predictions have the batch shape (*problems, cameras), but theirs is {tuple(shape)}"
+            raise ValueError(f"predictions: got batch shape {tuple(shape)}; expected (*problems, cameras)")
+        pose = Pose(_flat("pose.R", pose.R, shape, event=2), _flat("pose.t", pose.t, shape, event=1))
+        if mask is None:
+            mask = torch.ones(shape, dtype=torch.bool)
+        mask = _flat("mask", mask, shape) > 0
+        measure = _flat("predictions", _measure(predictions), shape, event=2)
+        mode = _flat("predictions", predictions.mode, shape, event=1)
+        a = _flat("predictions", predictions.a, shape)
+        origin = average(pose.into_world(mode), mask)
+        directions = torch.eye(3, dtype=torch.float64).expand(len(origin), 3, 3)
+        if plane is not None:
+            plane = Plane(
+                _flat("plane.normal", plane.normal, shape[:-1], event=1, cameras=0),
+                _flat("plane.offset", plane.offset, shape[:-1], cameras=0),
             )
-        everyone = torch.ones(shape, dtype=torch.bool, device=predictions.a.device)
-        pose = Pose(
-            _flat("pose.R", pose.R.double(), shape, 1, event=2),
-            _flat("pose.t", pose.t.double(), shape, 1, event=1),
-        )
-        mode = _flat("predictions", predictions.mode.double(), shape, 1, event=1)
-        mask = _flat("mask", everyone if mask is None else mask, shape, 1)
-        plane = plane and _flat_plane(plane, shape[:-1])
+            origin, directions = plane.nearest(origin), pad(plane.directions, (0, 1))
+        at_origin = (measure @ pose.into_camera(origin[:, None])[..., None]).squeeze(-1)
+        free_slope = measure @ pose.R
+        # 0, or NaN where one of the numbers that these are products of is not finite
+        finite = 0 * (free_slope.sum((-2, -1)) + at_origin.sum(-1) + a) == 0
+        valid = finite & (a > 0) & (mode[..., 2] > 0)
+        free_slope = torch.where(mask[..., None, None], free_slope, 0)
         return cls(
-            _flat("predictions", _linear_map(predictions), shape, 1, event=2),
-            _flat("predictions", predictions.a.double(), shape, 1),
-            mode,
+            predictions,
             pose,
             mask,
-            plane,
-            *_frame(average(pose.into_world(mode), mask), plane),
+            origin,
+            directions,
+            3 if plane is None else 2,
+            free_slope if plane is None else free_slope @ directions[:, None],
+            free_slope,
+            torch.where(mask[..., None], at_origin, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)),
+            torch.where(mask, a, 0),
+            _status(mask, valid, pose.is_rigid, plane),
         )
-
-    def subset(self, problems: Int[Tensor, " some"]) -> "Problems":
-        """Some of the problems, in order."""
-        if len(problems) == len(self.a):
-            return self
-        return Problems(
-            self.to_seen[problems],
-            self.a[problems],
-            self.mode[problems],
-            Pose(self.pose.R[problems], self.pose.t[problems]),
-            self.mask[problems],
-            self.plane and Plane(self.plane.normal[problems], self.plane.offset[problems]),
-            self.origin[problems],
-            self.directions[problems],
-        )
-
-    def without_plane(self) -> "Problems":
-        """The same problems in all of space."""
-        frame = _frame(average(self.pose.into_world(self.mode), self.mask), None)
-        return Problems(self.to_seen, self.a, self.mode, self.pose, self.mask, None, *frame)
 
     @property
-    def sound(self) -> Bool[Tensor, "problems cameras"]:
-        """Whether each camera's numbers are finite, and its precision and depth positive."""
-        finite = self.to_seen.isfinite().all(-1).all(-1) & self.mode.isfinite().all(-1) & self.a.isfinite()
-        posed = self.pose.R.isfinite().all(-1).all(-1) & self.pose.t.isfinite().all(-1)
-        return finite & (self.a > 0) & (self.mode[..., 2] > 0) & posed
+    def views(self) -> list[Float[np.ndarray, "problems ..."]]:
+        """Slope, value at the origin and precision, as the compiled functions take them."""
+        return [values.numpy() for values in (self.slope, self.at_origin, self.a)]
 
-    def status(
-        self, sound: Bool[Tensor, "problems cameras"], rigid: Bool[Tensor, "problems cameras"]
-    ) -> Int[Tensor, " problems"]:
-        """What is wrong with each problem before anything is computed; FUSED where nothing is.
-
-        Args:
-            sound: see the property of that name.
-            rigid: see `Pose.is_rigid`.
-        """
-        status = torch.full_like(self.mask[:, 0], int(Status.FUSED), dtype=torch.long)
-        if self.plane is not None:
-            length = self.plane.normal.norm(dim=-1)
-            status[length == 0] = Status.NOT_A_PLANE
-            status[~(length.isfinite() & self.plane.offset.isfinite())] = Status.NOT_FINITE
-        status[(~rigid & self.mask).any(-1)] = Status.NOT_A_ROTATION
-        status[(~sound & self.mask).any(-1)] = Status.NOT_FINITE
-        status[~self.mask.any(-1)] = Status.NO_CAMERA
-        return status
-
-    def views(self) -> Views:
-        """What the cameras see of origin + directions u."""
-        slope = product(self.to_seen, self.pose.R)
-        if self.plane is not None:
-            slope = product(slope, self.directions[:, None])
-        at_origin = apply(self.to_seen, self.pose.into_camera(self.origin[:, None]))
-        nothing = torch.tensor([0.0, 0.0, 1.0], dtype=self.a.dtype, device=self.a.device)
-        slope = torch.where(self.mask[..., None, None], slope, 0)
-        at_origin = torch.where(self.mask[..., None], at_origin, nothing)
-        a = torch.where(self.mask, self.a, 0)
-        return Views(
-            slope.permute(2, 3, 1, 0).contiguous(), at_origin.permute(2, 1, 0).contiguous(), a.T.contiguous()
-        )
-
-    def in_world(self, u: Unknown) -> Float[Tensor, "problems 3"]:
+    def in_world(self, u: Float[Tensor, "problems 3"]) -> Float[Tensor, "problems 3"]:
         """origin + directions u."""
-        return self.origin + apply(self.directions, u.T)
+        return self.origin + (self.directions @ u[..., None]).squeeze(-1)
+
+    def alone(self) -> tuple[Bool[Tensor, " problems"], Float[Tensor, "alone 3"], Float[Tensor, "alone 3 3"]]:
+        """Which problems have one camera and no plane; mean (metres) and covariance of its density, in the world."""
+        alone = (self.mask.sum(-1) == 1) & (self.unknowns == 3)
+        camera = alone[:, None] & self.mask
+        shape = self.predictions.batch_shape
+        mean = _flat("mean", self.predictions.mean, shape, event=1)[camera]
+        covariance = _flat("covariance", self.predictions.covariance_matrix, shape, event=2)[camera]
+        pose = Pose(self.pose.R[camera], self.pose.t[camera])
+        return alone, pose.into_world(mean), pose.R.mT @ covariance @ pose.R
 
 
-def _frame(
-    middle: Float[Tensor, "problems 3"], plane: Plane | None
-) -> tuple[Float[Tensor, "problems 3"], Float[Tensor, "problems 3 k"]]:
-    """Where a search starts and in which directions it goes."""
+def _status(
+    mask: Bool[Tensor, "problems cameras"],
+    valid: Bool[Tensor, "problems cameras"],
+    rigid: Bool[Tensor, "problems cameras"],
+    plane: Plane | None,
+) -> Int[Tensor, " problems"]:
+    status = torch.full(mask.shape[:1], int(Status.FUSED))
+    status[(~rigid & mask).any(-1)] = Status.NOT_A_ROTATION
+    status[(~valid & mask).any(-1)] = Status.NOT_FINITE
     if plane is not None:
-        return plane.nearest(middle), plane.directions
-    identity = torch.eye(3, dtype=middle.dtype, device=middle.device)
-    return middle, identity.expand(len(middle), 3, 3)
+        status[(plane.normal == 0).all(-1)] = Status.NOT_A_PLANE
+    status[~mask.any(-1)] = Status.NO_CAMERA
+    return status
 
 
-def _linear_map(predictions: ProjectedHuber) -> Float[Tensor, "*batch 3 3"]:
+def _measure(predictions: ProjectedHuber) -> Float[Tensor, "*batch 3 3"]:
     """The matrix from a position in the camera frame to (q_x, q_y, t)."""
     axes = torch.eye(3, dtype=predictions.a.dtype, device=predictions.a.device)
-    q = torch.stack([predictions.whiten(axis) for axis in axes], dim=-1).double()
-    t = axes[2].double() / predictions.mu_z.double()[..., None]
+    q = torch.stack([predictions.whiten(axis) for axis in axes], dim=-1)
+    t = axes[2] / predictions.mu_z[..., None]
     return torch.cat([q, t[..., None, :]], dim=-2)
 
 
-def _flat_plane(plane: Plane, shape: torch.Size) -> Plane:
-    normal = _flat("plane.normal", plane.normal.double(), shape, 0, event=1)
-    return Plane(normal, _flat("plane.offset", plane.offset.double(), shape, 0))
-
-
-def _flat(name: str, value: Tensor, shape: torch.Size, kept: int, event: int = 0) -> Tensor:
-    """The value for each problem in one dimension; the last `kept` dimensions of the batch and the event's stay."""
+def _flat(name: str, value: Tensor, shape: torch.Size, event: int = 0, cameras: int = 1) -> Tensor:
+    """The values in one dimension of problems, before those of cameras and event; float64, on the CPU."""
     batch, own = value.shape[: value.ndim - event], value.shape[value.ndim - event :]
     try:
-        expanded = value.expand(shape + own)
+        expanded = value.double().cpu().expand(shape + own)
     except RuntimeError:
         raise ValueError(
-            f"{name} has the batch shape {tuple(batch)}, which does not broadcast to {tuple(shape)}"
+            f"{name}: got batch shape {tuple(batch)}; expected one that broadcasts to {tuple(shape)}"
         ) from None
-    return expanded.reshape(shape[: len(shape) - kept].numel(), *shape[len(shape) - kept :], *own)
+    problems = shape[: len(shape) - cameras].numel()
+    return expanded.reshape(problems, *shape[len(shape) - cameras :], *own).contiguous()

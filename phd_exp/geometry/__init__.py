@@ -27,7 +27,7 @@ from the top left corner of the image; the centre of the pixel in column c and r
 | E_n | `scaled_expint` | generalised exponential integral E_n(a) = int_1^inf e^(-a u) u^(-n) du | - | `distributions.special.scaled_expint` |
 | N | `log_normaliser` | normaliser of the depth law, e^(-a)/a + E_2(a) | - | `distributions.special.log_normaliser` |
 | g | `tail_moment(0, a)` | a e^a E_2(a), in (0, 1): the odds of t < 1 | - | `distributions.special.tail_moment` |
-| u | `u` | unknowns of a fusion: the position itself, or its place on a plane | metres | `fusion.views` |
+| u | `u` | unknowns of a fusion: the position itself, or its place on a plane | metres | `fusion.problems` |
 | lam | `lam` | subgradient of max(t, 1/t) at its kink t = 1, in [-1, 1] | - | `fusion.certificate.certify` |
 | 7 outputs | `raw` | (n_1, n_2, b_1, b_2, b_3, w_1, w_2): what a network returns | - | `models.heads.DistributionHead` |
 """

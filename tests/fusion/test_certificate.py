@@ -1,11 +1,32 @@
-"""The certificate is a bound, and it is not fooled."""
+"""The certificate: its subgradient is that of the densities, and its bound holds."""
 
+import pytest
 import torch
+from torch import Tensor
 
 from phd_exp.fusion import fuse
 from phd_exp.fusion.certificate import certify
 from phd_exp.fusion.problems import Problems
 from tests.fusion.random_problems import random_problems
+
+
+def certified(problems: Problems, v: Tensor, lam: Tensor) -> Tensor:
+    """What `certify` returns for each problem at a world position."""
+    u = (v - problems.origin).numpy()
+    rows = [certify(*row) for row in zip(*problems.views, u, lam.numpy(), strict=True)]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("cameras", [1, 3])
+def test_the_subgradient_is_that_of_the_densities(cameras: int) -> None:
+    """Against autograd of sum_i -log p_i(R_i v + t_i)."""
+    predictions, pose, truth = random_problems(200, cameras, seed=5, outliers=0.5)
+    v = truth.clone().requires_grad_()
+    value = -predictions.log_prob(pose.into_camera(v[:, None])).sum(-1)
+    (gradient,) = torch.autograd.grad(value.sum(), v)
+    problems = Problems.posed(predictions, pose, None, None)
+    subgradient = certified(problems, truth, torch.ones(200, cameras))[:, 0]
+    torch.testing.assert_close(subgradient, gradient.norm(dim=-1))
 
 
 def test_every_optimum_is_proven_within_a_micrometre() -> None:
@@ -16,19 +37,17 @@ def test_every_optimum_is_proven_within_a_micrometre() -> None:
 
 
 def test_the_bound_holds_for_points_that_are_moved_off_the_optimum() -> None:
-    """Whatever the multipliers: they only have to be allowed."""
+    """For any multipliers in [-1, 1]."""
     predictions, pose, _ = random_problems(1000, 4, seed=8)
     fused = fuse(predictions, pose, contradiction=0.0)
     problems = Problems.posed(predictions, pose, None, None)
-    views = problems.views()
     generator = torch.Generator().manual_seed(0)
     bounded = 0
     for step in (1e-9, 1e-7, 1e-5, 1e-3):
-        moved = fused.point + step * torch.nn.functional.normalize(
-            torch.randn(1000, 3, generator=generator, dtype=torch.float64), dim=-1
-        )
-        lam = 2 * torch.rand(views.a.shape, generator=generator, dtype=torch.float64) - 1
-        distance = certify(views, (moved - problems.origin).T, lam).distance
+        direction = torch.randn(1000, 3, generator=generator, dtype=torch.float64)
+        moved = fused.point + step * torch.nn.functional.normalize(direction, dim=-1)
+        lam = 2 * torch.rand(1000, 4, generator=generator, dtype=torch.float64) - 1
+        distance = certified(problems, moved, lam)[:, 2]
         bounded += int(distance.isfinite().sum())
         assert (distance >= step - 1e-6 - 1e-9 * step).all()
         assert (distance >= step - fused.certificate).all()

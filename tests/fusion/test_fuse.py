@@ -8,7 +8,7 @@ from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion import Fused, FusionError, Plane, Pose, Status, fuse
-from phd_exp.fusion.fuse import LEAST_DEPTHS
+from phd_exp.fusion.newton import LEAST_DEPTHS
 from tests.fusion.random_problems import columns_of, random_problems, rotations
 
 
@@ -263,6 +263,18 @@ def test_one_problem_is_the_same_alone() -> None:
     same_bits(fuse(ProjectedHuber(*columns), pose), alone, kept)
 
 
+@pytest.mark.parametrize("shape", [(0,), (2, 0)])
+def test_an_empty_batch_gives_empty_results(shape: tuple[int, ...]) -> None:
+    predictions, pose, _ = random_problems(1, 3, seed=16)
+    none = ProjectedHuber(*(c.expand(*shape, *c.shape[1:]) for c in columns_of(predictions)))
+    for plane in (None, Plane(tensor(0, 1, 0), tensor(1).squeeze())):
+        fused = fuse(none, Pose(pose.R[0], pose.t[0]), plane)
+        assert fused.point.shape == fused.mean.shape == (*shape, 3)
+        assert fused.covariance.shape == (*shape, 3, 3)
+        assert fused.surprise.shape == (*shape, 3)
+        assert fused.errors() == []
+
+
 def test_float32_is_taken_and_batches_have_any_shape() -> None:
     predictions, pose, _ = random_problems(6, 3, seed=11, outliers=0.0)
     columns = [column.float().unflatten(0, (2, 3)) for column in (*columns_of(predictions), pose.R, pose.t)]
@@ -305,9 +317,9 @@ def test_an_optimum_may_be_just_in_front_of_a_camera(gap: float) -> None:
 
 def test_shapes_that_do_not_fit_are_refused() -> None:
     predictions, pose, _ = random_problems(4, 3, seed=12)
-    with pytest.raises(ValueError, match=r"pose.R has the batch shape \(3, 3\), .* to \(4, 3\)"):
+    with pytest.raises(ValueError, match=r"pose.R: got batch shape \(3, 3\); .* to \(4, 3\)"):
         fuse(predictions, Pose(pose.R[:3], pose.t[:3]))
-    with pytest.raises(ValueError, match=r"\(\*problems, cameras\), but theirs is \(\)"):
+    with pytest.raises(ValueError, match=r"got batch shape \(\); expected \(\*problems, cameras\)"):
         fuse(
             predicting(looking(tensor(0, 0, 1), tensor(0, 0, 0)), tensor(0, 0, 4)),
             Pose(pose.R[0, 0], pose.t[0, 0]),

@@ -1,31 +1,36 @@
-"""Linear algebra of one problem: three unknowns, written out, so that everything stays in registers.
+"""The arithmetic of one problem: what a camera measures of a position, the energy, and systems of three unknowns.
 
-A gradient and a symmetric matrix are one tuple of nine numbers, (g_0, g_1, g_2, H_00, H_10, H_11, H_20, H_21, H_22).
-On a plane there are two unknowns, and nothing depends on the third: H_22 = 0, and it stays.
+Every camera measures (q_x, q_y, t) of a position, q = A ((x, y)/z - mu_xy) z/mu_z and t = z/mu_z, which is affine in
+the unknowns u: `at_origin` (3) plus `slope` (3 x 3) times u. On a plane there are two unknowns; the third column of
+each slope is zero, and so is H_22 below. A camera that takes no part has slope 0, q = 0, t = 1 and a = 0.
+
+A gradient and a symmetric matrix are one tuple (g_0, g_1, g_2, H_00, H_10, H_11, H_20, H_21, H_22), which stays in
+registers. Arguments of compiled functions have no annotations: the types are those of the values. Division by zero
+gives infinity.
 """
 
 import math
 from typing import no_type_check
 
-from phd_exp.fusion.compiled import compiled
+import numpy as np
+from numba import njit
 
-NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+compiled = njit(error_model="numpy")
+TINY = float(np.finfo(np.float64).tiny)
+ZERO = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @compiled
 @no_type_check
-def seen_of(slope, at_origin, u):
+def measured(slope, at_origin, u):
     """(q_x, q_y, t) of one camera at u."""
-    return (
-        at_origin[0] + slope[0, 0] * u[0] + slope[0, 1] * u[1] + slope[0, 2] * u[2],
-        at_origin[1] + slope[1, 0] * u[0] + slope[1, 1] * u[1] + slope[1, 2] * u[2],
-        at_origin[2] + slope[2, 0] * u[0] + slope[2, 1] * u[1] + slope[2, 2] * u[2],
-    )
+    x, y, t = change(slope, u)
+    return at_origin[0] + x, at_origin[1] + y, at_origin[2] + t
 
 
 @compiled
 @no_type_check
-def moved_of(slope, du):
+def change(slope, du):
     """The change of (q_x, q_y, t) of one camera with a change of u."""
     return (
         slope[0, 0] * du[0] + slope[0, 1] * du[1] + slope[0, 2] * du[2],
@@ -36,8 +41,25 @@ def moved_of(slope, du):
 
 @compiled
 @no_type_check
+def huber(squared):
+    """h(|q|) of |q|^2."""
+    return math.sqrt(squared) - 0.5 if squared > 1 else squared / 2
+
+
+@compiled
+@no_type_check
+def huber_weight(q_x, q_y):
+    """h'(|q|)/|q|, and q/|q| where h is linear, else 0."""
+    weight = 1 / math.sqrt(max(q_x * q_x + q_y * q_y, 1.0))
+    if weight < 1:
+        return weight, q_x * weight, q_y * weight
+    return weight, 0.0, 0.0
+
+
+@compiled
+@no_type_check
 def add(sums, slope, by_x, by_y, by_t, xx, xy, yy, tt):
-    """Gradient and Hessian with those of one more camera, which come with respect to what it sees."""
+    """Gradient and Hessian plus those of one more camera, which are given with respect to (q_x, q_y, t)."""
     g_0, g_1, g_2, h_00, h_10, h_11, h_20, h_21, h_22 = sums
     x_0, x_1, x_2 = slope[0, 0], slope[0, 1], slope[0, 2]
     y_0, y_1, y_2 = slope[1, 0], slope[1, 1], slope[1, 2]
@@ -102,6 +124,6 @@ def newton_step(sums):
 
 @compiled
 @no_type_check
-def squared(x):
+def squared_norm(x):
     """|x|^2."""
     return x[0] * x[0] + x[1] * x[1] + x[2] * x[2]

@@ -1,0 +1,73 @@
+"""The compiled loops over the problems of a batch, each problem on one core."""
+
+import hashlib
+from pathlib import Path
+from typing import no_type_check
+
+import numpy as np
+from numba import njit, prange
+
+from phd_exp.fusion.arithmetic import compiled, huber, measured
+from phd_exp.fusion.certificate import certify
+from phd_exp.fusion.moments import moments
+from phd_exp.fusion.newton import optimum
+from phd_exp.fusion.polish import polish
+from phd_exp.fusion.problems import Status
+
+CONVERGED = 1e-6
+"""The largest relative subgradient at which a problem counts as solved."""
+_FUSED, _NOT_CONVERGED = int(Status.FUSED), int(Status.NOT_CONVERGED)
+_NO_COMMON_VIEW, _PLANE_BEHIND_CAMERA = int(Status.NO_COMMON_VIEW), int(Status.PLANE_BEHIND_CAMERA)
+
+
+@compiled
+@no_type_check
+def _solve(slope, at_origin, a, free_slope, u, certificate, excess):
+    """Moves u to the optimum of one problem; returns its status."""
+    lam = np.zeros(len(a))
+    if not optimum(slope, at_origin, a, u, lam):
+        visible = optimum(free_slope, at_origin, a, np.zeros(3), lam)
+        return _PLANE_BEHIND_CAMERA if visible else _NO_COMMON_VIEW
+    polish(slope, at_origin, a, u, lam)
+    certificate[:] = certify(slope, at_origin, a, u, lam)
+    for c in range(len(a)):
+        q_x, q_y, t = measured(slope[c], at_origin[c], u)
+        excess[c] = huber(q_x * q_x + q_y * q_y) + a[c] * (max(t, 1 / t) - 1)
+    return _FUSED if certificate[1] <= CONVERGED else _NOT_CONVERGED
+
+
+@no_type_check
+def _loops(sources):
+    """The two loops, compiled from these sources.
+
+    numba keeps what it compiles beside this file, and looks at this file alone to see whether it is up to date. It
+    also looks at the variables that a function closes over: hence the digest of all sources is one.
+    """
+
+    @njit(cache=True, error_model="numpy", parallel=True)
+    def solve(slope, at_origin, a, free_slope, status, u, certificate, excess):
+        """Solves the problems whose status is FUSED, from u, and sets their status.
+
+        `free_slope` is the slope without the plane. Fills `certificate` with the values of `certify`, and `excess`
+        with the energy of u in each camera above the camera's lowest.
+        """
+        assert len(sources) > 0
+        for i in prange(len(a)):
+            if status[i] == _FUSED:
+                views = slope[i], at_origin[i], a[i]
+                status[i] = _solve(*views, free_slope[i], u[i], certificate[i], excess[i])
+
+    @njit(cache=True, error_model="numpy", parallel=True)
+    def all_moments(chosen, slope, at_origin, a, u, points, log_density, radii, mean, covariance, inside):
+        """Calls `moments` for the chosen problems."""
+        assert len(sources) > 0
+        for i in prange(len(a)):
+            if chosen[i]:
+                views = slope[i], at_origin[i], a[i]
+                moments(views, u[i], points, log_density, radii, mean[i], covariance[i], inside[i])
+
+    return solve, all_moments
+
+
+_SOURCES = b"".join(source.read_bytes() for source in sorted(Path(__file__).parent.glob("*.py")))
+solve, all_moments = _loops(hashlib.sha256(_SOURCES).hexdigest())
