@@ -17,6 +17,8 @@ from phd_exp.records.files import read_plain, require_plain, write_atomic
 from phd_exp.records.parsing import parse_json
 
 DECODERS = 4
+LARGEST_AT_ONCE = 1 << 26
+"""Pixels of the images that are decoded at the same time."""
 
 Job = TypeVar("Job")
 Fill = Callable[[np.ndarray, Job], None]
@@ -28,9 +30,17 @@ class CacheError(DatasetError):
 
 
 def cached(
-    file: Path, key: dict[str, Any], shape: tuple[int, ...], jobs: Sequence[Job], fill: Fill, words: str
+    file: Path,
+    key: dict[str, Any],
+    shape: tuple[int, ...],
+    jobs: Sequence[Job],
+    fill: Fill,
+    words: str,
+    largest: int = 1,
 ) -> np.ndarray:
     """The array of this key, memory-mapped from the file; filled first unless the file holds precisely that.
+
+    `largest` is the number of pixels of the largest image, which bounds how many are decoded at the same time.
 
     Raises CacheError where the file's folder cannot be written, and whatever `fill` raises.
     """
@@ -42,7 +52,7 @@ def cached(
                 missing_ok=True
             )  # a link there, of somebody else, would have its target written
             array = np.lib.format.open_memmap(unfinished, mode="w+", dtype=np.uint8, shape=shape)
-            fill_all(array, jobs, fill, words)
+            fill_all(array, jobs, fill, words, largest)
             array.flush()
             unfinished.replace(file)
             write_atomic(key_file, json.dumps(key) + "\n")
@@ -50,9 +60,9 @@ def cached(
     return kept
 
 
-def fill_all(array: np.ndarray, jobs: Sequence[Job], fill: Fill, words: str) -> None:
-    """Do all jobs in several threads, with a bar on a terminal."""
-    with ThreadPoolExecutor(DECODERS) as pool:
+def fill_all(array: np.ndarray, jobs: Sequence[Job], fill: Fill, words: str, largest: int = 1) -> None:
+    """Do all jobs in several threads, with a progress bar on a terminal; the larger the images, the fewer threads."""
+    with ThreadPoolExecutor(max(1, min(DECODERS, LARGEST_AT_ONCE // largest))) as pool:
         done = pool.map(lambda job: fill(array, job), jobs)
         console = Console(stderr=True)
         quiet = not console.is_terminal

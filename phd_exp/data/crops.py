@@ -1,7 +1,8 @@
-"""The user's own images: read with care, and seen by virtual cameras."""
+"""The user's own images: read, and seen by virtual cameras."""
 
 import io
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,16 +16,20 @@ from phd_exp.records.files import require_plain
 from phd_exp.records.images import FORMATS, LARGEST_IMAGE, decoding, pillow_warnings
 
 GREY = (128, 128, 128)
-"""What a virtual camera sees where the image has nothing: beyond its edges, and where it is transparent."""
+"""The colour beyond the edges of an image and where it is transparent."""
 PLAIN = ("1", "L", "RGB", "YCbCr", "CMYK")
 WITH_ALPHA = ("P", "PA", "LA", "La", "RGBA", "RGBa")  # a palette may hold a transparent colour
 SIXTEEN_BITS = ("I;16", "I;16L", "I;16B", "I;16N")
 ONE_PICTURE = ("JPEG", "MPO")
-"""Kinds whose further frames, where there are any, are previews and depth maps of the first."""
+"""Formats whose further frames are previews and depth maps of the first."""
 MARGIN = 2
-"""Pixels about a place that bicubic interpolation looks at."""
-FINEST = 2
-"""An image is enlarged to this multiple of its longer side at most, before its areas are averaged."""
+"""Pixels around a position that bicubic interpolation reads."""
+FINE = 4
+"""Samples along a pixel of the view where the image is sparsest."""
+FINEST = 16
+"""Samples along a pixel of the view, at most; near 90 degrees from the axis of its camera an image has no end."""
+LARGEST_STRIPE = 1 << 22
+"""Samples that are in memory at once."""
 
 
 def image_size(file: Path) -> tuple[int, int]:
@@ -57,38 +62,73 @@ def read_image(file: Path, content: bytes) -> Image.Image:
 
 
 def cut(image: Image.Image, camera: VirtualCamera) -> UInt8[np.ndarray, "S S 3"]:
-    """What the virtual camera sees of the image of its real camera; grey beyond that image's edges.
+    """The virtual camera's view of an RGB image of its real camera; grey beyond the edges of that image.
 
-    Bicubic at the middles of a whole multiple of S pixels a side, fine enough that no pixel of the image is skipped,
-    then averaged over areas.
+    A square image seen as a whole is `shrunk`. Any other view averages bicubic samples over the area of each pixel.
+    Where an image has many pixels for each pixel of the view, blocks of them are averaged first. Memory does not grow
+    with the density of the samples.
     """
     S = int(camera.S)
-    finest = FINEST * max(image.size) / S
-    multiple = max(1, math.ceil(min(camera.density, finest) - 1e-6))  # 2.0000000001 is two
-    side = S * multiple
-    back = np.linalg.inv(camera.homography) @ np.diag([1 / multiple, 1 / multiple, 1.0])
-    return shrunk(_transformed(image, back, side), S)
+    if _is_whole(image, camera) and image.width >= S:
+        return shrunk(np.asarray(image), S)
+    fewest, most = camera.densities
+    block = max(1, int(fewest / FINE))
+    left, top, right, bottom = _reach(image, camera)
+    across, down = -(-(right - left) // block), -(-(bottom - top) // block)
+    finest = min(FINEST, 2 * max(across, down) / S)
+    multiple = max(1, math.ceil(min(most / block, finest) - 1e-6))  # 2.0000000001 is two
+    seen = Image.new("RGB", (block * across, block * down), GREY)
+    seen.paste(image.crop((left, top, right, bottom)))
+    bands = [band.convert("F") for band in seen.reduce(block).split()]
+    back = np.diag([1 / block, 1 / block, 1.0]) @ np.array([[1, 0, -left], [0, 1, -top], [0, 0, 1]])
+    back = back @ np.linalg.inv(camera.homography) @ np.diag([1 / multiple, 1 / multiple, 1.0])
+    view = np.empty((S, S, 3), dtype=np.uint8)
+    step = max(1, LARGEST_STRIPE // (S * multiple**2))
+    for first in range(0, S, step):
+        rows = min(step, S - first)
+        stripe = back @ np.array([[1, 0, 0], [0, 1, first * multiple], [0, 0, 1]])
+        samples = _sampled(bands, stripe, S * multiple, rows * multiple)
+        means = samples.reshape(rows, multiple, S, multiple, 3).mean(axis=(1, 3), dtype=np.float64)
+        view[first : first + rows] = means.round().clip(0, 255)
+    return view
 
 
-def _transformed(image: Image.Image, back: Float[np.ndarray, "3 3"], side: int) -> Image.Image:
-    """The square image whose pixel p shows what the given one has at back p, bicubic and rounded; grey beyond."""
-    corners = back @ np.array([[0, side, 0, side], [0, 0, side, side], [1, 1, 1, 1]])
-    size = np.array(image.size)[:, None]
-    reached = (corners[:2] / corners[2]).clip(-MARGIN, size + MARGIN)
-    left, top = np.floor(reached.min(axis=1) - MARGIN).clip(0).astype(int).tolist()
-    right, bottom = np.ceil(reached.max(axis=1) + MARGIN).clip(None, size[:, 0]).astype(int).tolist()
-    shifted = np.array([[1, 0, -left], [0, 1, -top], [0, 0, 1]]) @ back
-    # Pillow takes the middle of an output pixel, (column + 1/2, row + 1/2), to input pixels counted in the same way
-    coefficients = (shifted / shifted[2, 2]).flatten()[:8].tolist()
-    # band by band in floating point: of whole bytes Pillow would cut off what lies behind the point
-    bands = [
-        band.convert("F").transform(
-            (side, side), Image.Transform.PERSPECTIVE, coefficients, Image.Resampling.BICUBIC, fillcolor=grey
+def _is_whole(image: Image.Image, camera: VirtualCamera) -> bool:
+    """Whether the view is all of a square image, on fewer or more pixels."""
+    zoom = camera.S / image.width
+    whole = image.width == image.height and np.array_equal(camera.R, np.eye(3))
+    return whole and np.allclose(camera.homography, np.diag([zoom, zoom, 1]), rtol=0, atol=1e-9)
+
+
+def _reach(image: Image.Image, camera: VirtualCamera) -> tuple[int, int, int, int]:
+    """Left, top, right and bottom of the part of the image that the view needs; never empty."""
+    S = camera.S
+    corners = np.linalg.inv(camera.homography) @ np.array([[0, S, 0, S], [0, 0, S, S], [1, 1, 1, 1]])
+    size = np.array(image.size)
+    reached = (corners[:2] / corners[2]).T.clip(-MARGIN, size + MARGIN)
+    left, top = np.floor(reached.min(axis=0) - MARGIN).clip(0, size - 1).astype(int).tolist()
+    right, bottom = np.ceil(reached.max(axis=0) + MARGIN).clip(1, size).astype(int).tolist()
+    return left, top, right, bottom
+
+
+def _sampled(
+    bands: Sequence[Image.Image], back: Float[np.ndarray, "3 3"], width: int, height: int
+) -> Float[np.ndarray, "height width 3"]:
+    """Bicubic samples at the pixels to which `back` maps those of a `width` x `height` image."""
+    # Pillow maps the middle of an output pixel, (column + 1/2, row + 1/2), to input pixels counted in the same way
+    coefficients = (back / back[2, 2]).flatten()[:8].tolist()
+    # band by band in floating point: of whole bytes Pillow would cut off the fraction
+    levels = [
+        band.transform(
+            (width, height),
+            Image.Transform.PERSPECTIVE,
+            coefficients,
+            Image.Resampling.BICUBIC,
+            fillcolor=grey,
         )
-        for band, grey in zip(image.crop((left, top, right, bottom)).split(), GREY, strict=True)
+        for band, grey in zip(bands, GREY, strict=True)
     ]
-    levels = np.stack([np.asarray(band) for band in bands], axis=-1)
-    return Image.fromarray(levels.round().clip(0, 255).astype(np.uint8))
+    return np.stack([np.asarray(band) for band in levels], axis=-1)
 
 
 def _require_one_picture(file: Path, image: Image.Image) -> None:
@@ -102,8 +142,9 @@ def _as_rgb(file: Path, image: Image.Image) -> Image.Image:
     if image.mode in SIXTEEN_BITS:
         return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8)).convert("RGB")
     if image.mode in WITH_ALPHA:
-        over = image.convert("RGBA")
-        return Image.alpha_composite(Image.new("RGBA", image.size, (*GREY, 255)), over).convert("RGB")
+        over, ground = image.convert("RGBA"), Image.new("RGB", image.size, GREY)
+        ground.paste(over, mask=over)
+        return ground
     if image.mode in PLAIN:
         return image.convert("RGB")
     raise DatasetError(f"{file}: has colours of the kind {image.mode!r}; save it as RGB of 8 bits")

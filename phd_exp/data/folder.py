@@ -1,6 +1,7 @@
 """Samples from a folder of the user's own images: each detection seen by its own virtual camera."""
 
 import hashlib
+import math
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,8 +25,8 @@ from phd_exp.records.files import read_plain
 from phd_exp.records.images import LARGEST_IMAGE, pillow_warnings
 from phd_exp.records.scenes import Split
 
-CROP_LAYOUT = 1
-"""Raised whenever the meaning of a cached array of crops changes, so that no old one is taken for a new one."""
+CROP_LAYOUT = 2
+"""Version of `cut`, recorded with each cache."""
 
 
 @dataclass(frozen=True)
@@ -52,10 +53,10 @@ class FolderSource(Source):
     ) -> None:
         self.folder = folder
         self.side = side
-        sizes: dict[Path, tuple[int, int]] = {}
+        self.sizes: dict[Path, tuple[int, int]] = {}
 
         def crops(split: Split, n: int | None) -> list[Crop]:
-            return [_crop(detection, side, sizes) for detection in folder.detections(split, n)]
+            return [_crop(detection, side, self.sizes) for detection in folder.detections(split, n)]
 
         training = crops("train", None if n_train is None else n_train + n_held_out)
         n_train = len(training) - n_held_out
@@ -118,13 +119,14 @@ class FolderSource(Source):
                 array[row] = cut(image, crops[row].camera)
 
         kept = self.folder.cache / f"crops-{part}-{len(crops)}x{self.side}.npy"
+        largest = max((math.prod(self.sizes[file]) for file in rows), default=1)
         shape, words = (len(crops), self.side, self.side, 3), f"decoding {part.replace('_', '-')} images once"
         try:
-            return cached(kept, _key(crops, checksums), shape, list(rows), fill, words)
+            return cached(kept, _key(crops, checksums), shape, list(rows), fill, words, largest)
         except CacheError as error:
             print(f"{error}; they are decoded into memory, each run anew", file=sys.stderr)
             array = np.empty(shape, dtype=np.uint8)
-            fill_all(array, list(rows), fill, words)
+            fill_all(array, list(rows), fill, words, largest)
             return array
 
 

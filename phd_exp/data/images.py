@@ -1,10 +1,12 @@
-"""The images of a rendered data set: as recorded, or refused."""
+"""The images of a rendered data set, checked, and their exact shrinking."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from jaxtyping import UInt8
+from scipy.sparse import csr_array
 
 from phd_exp.data.cache import cached
 from phd_exp.records.dataset import DatasetFolder, sha256
@@ -12,8 +14,10 @@ from phd_exp.records.errors import DatasetError
 from phd_exp.records.images import recorded_image
 from phd_exp.records.scenes import SampleRecord, Split
 
-CACHE_LAYOUT = 1
-"""Raised whenever the meaning of a cached array changes, so that no old one is taken for a new one."""
+SHRINKING = 2
+"""Version of `shrunk`, recorded with each run and each cache. Version 1 was exact for integer factors only."""
+_LARGEST_STRIPE = 1 << 22
+"""Values that `shrunk` converts to float64 at once."""
 
 
 def cached_images(
@@ -33,7 +37,7 @@ def cached_images(
 
     return cached(
         folder.cache / f"{split}-{len(records)}x{image_size}.npy",
-        {"layout": CACHE_LAYOUT, "images": sha256("".join(record.sha256 for record in records).encode())},
+        {"shrinking": SHRINKING, "images": sha256("".join(record.sha256 for record in records).encode())},
         (len(records), image_size, image_size, 3),
         range(len(records)),
         fill,
@@ -49,11 +53,39 @@ def decode(file: Path, record: SampleRecord, image_size: int) -> np.ndarray:
         raise DatasetError(
             f"{error}; delete the file and run `python -m phd_exp render` to make it again"
         ) from None
-    return shrunk(image, image_size)
+    return shrunk(np.asarray(image), image_size)
 
 
-def shrunk(image: Image.Image, side: int) -> np.ndarray:
-    """The image as (side, side, 3), each pixel the mean of the area that it stands for."""
-    if image.size != (side, side):
-        image = image.resize((side, side), Image.Resampling.BOX)
-    return np.asarray(image)
+def shrunk(pixels: UInt8[np.ndarray, "height width 3"], side: int) -> UInt8[np.ndarray, "side side 3"]:
+    """The image with `side` x `side` pixels, each the mean of the area that it covers, rounded.
+
+        out[i, j] = sum_(y, x) H[i, y] W[j, x] pixels[y, x] / (height width)
+
+    H and W are the overlaps of `_overlaps`. The sums are exact integers, so mirrored images give mirrored results.
+    """
+    height, width, _ = pixels.shape
+    if (height, width) == (side, side):
+        return pixels
+    H, W = _overlaps(height, side), _overlaps(width, side)
+    step = max(1, side * _LARGEST_STRIPE // pixels.size)  # rows of the result at once: bounds the memory
+    out = np.empty((side, side, 3), dtype=np.uint8)
+    for first in range(0, side, step):
+        last = min(first + step, side)
+        top, bottom = first * height // side, -(-last * height // side)
+        across = H[first:last, top:bottom] @ pixels[top:bottom].reshape(bottom - top, -1)
+        across = across.reshape(-1, width, 3).swapaxes(0, 1).reshape(width, -1)
+        sums = (W @ across).reshape(side, -1, 3).swapaxes(0, 1)
+        out[first:last] = np.rint(sums / (height * width))
+    return out
+
+
+@lru_cache(maxsize=16)
+def _overlaps(n: int, side: int) -> csr_array:
+    """Overlap of pixel i of `side` with pixel x of n, in units of 1/side of a pixel x; each row sums to n."""
+    first = np.arange(side) * n // side
+    x = first[:, None] + np.arange(n // side + 2)
+    i = np.arange(side)[:, None]
+    length = np.minimum((i + 1) * n, (x + 1) * side) - np.maximum(i * n, x * side)
+    kept = length > 0
+    rows = np.broadcast_to(i, x.shape)[kept]
+    return csr_array((length[kept].astype(float), (rows, x[kept])), shape=(side, n))

@@ -70,11 +70,11 @@ class VirtualCamera:
         return intrinsics(self.f, self.f, self.S / 2, self.S / 2) @ self.R @ np.linalg.inv(self.K)
 
     @property
-    def density(self) -> float:
-        """Pixels of the real image along one pixel of the virtual one, where they are densest among five places.
+    def densities(self) -> tuple[float, float]:
+        """The fewest and the most pixels of the real image along one pixel of the virtual image.
 
-        The largest singular value of the Jacobian of the map (u, v) -> (p, q) = (X, Y)/W that H^-1 is; the places
-        are the middle and the corners of the virtual image.
+        The extreme singular values of the Jacobian of the map (u, v) -> (p, q) = (X, Y)/W that H^-1 is, over the
+        middle and the corners of the virtual image.
         """
         back = np.linalg.inv(self.homography)
         places = [(0.5, 0.5), (0, 0), (0, 1), (1, 0), (1, 1)]
@@ -82,8 +82,8 @@ class VirtualCamera:
         for u, v in places:
             X = back @ np.array([u * self.S, v * self.S, 1.0])
             jacobian = (back[:2, :2] - np.outer(X[:2] / X[2], back[2, :2])) / X[2]
-            densities.append(np.linalg.norm(jacobian, ord=2))
-        return float(max(densities))
+            densities.extend(np.linalg.svd(jacobian, compute_uv=False).tolist())
+        return min(densities), max(densities)
 
 
 def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:

@@ -77,7 +77,7 @@ def export(predictor: Predictor, file: Path) -> float:
 
 def _exported(predictor: Predictor) -> Any:
     """The graph, for batches of any size."""
-    side = predictor.preparation.side
+    side = predictor.side
     examples = {"image": torch.zeros(2, side, side, 3, dtype=torch.uint8)}
     if predictor.regressor.shown is not None:
         examples["f"] = torch.tensor(FOCAL_LENGTHS) * side
@@ -111,7 +111,7 @@ def decoder_of(predictor: Predictor) -> Decoder:
     head, temperature = predictor.regressor.head, predictor.temperature
     chart = head.chart if isinstance(head, ChartHead) else None
     return Decoder(
-        side=predictor.preparation.side,
+        side=predictor.side,
         head="ProjectedHuber" if chart is None else type(chart).__name__,
         **asdict(predictor.depth),
         xy_unit=chart.xy_unit if isinstance(chart, Cartesian) else 1.0,
@@ -129,7 +129,7 @@ def largest_deviation(predictor: Predictor, content: bytes) -> float:
     """
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     decoder = Decoder.of(session.get_modelmeta().custom_metadata_map)
-    n, side = sum(CHECKED), predictor.preparation.side
+    n, side = sum(CHECKED), predictor.side
     images = pictures(n, side)
     f = (side * np.linspace(*FOCAL_LENGTHS, n)).astype(np.float32)
     taken = {given.name for given in session.get_inputs()}

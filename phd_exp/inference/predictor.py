@@ -17,7 +17,7 @@ from phd_exp.distributions import ProjectedHuber, Temperature
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.geometry.virtual import intrinsics
-from phd_exp.inference.views import Preparation, View
+from phd_exp.inference.views import View
 from phd_exp.models.heads import Prediction
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.dataset import DatasetFolder
@@ -25,7 +25,7 @@ from phd_exp.records.errors import ConfigError, DatasetError, RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import FolderConfig, RunConfig, check
 from phd_exp.training.network import build_regressor
-from phd_exp.training.stored import load_checkpoint
+from phd_exp.training.stored import load_checkpoint, require_same_shrinking
 
 WEIGHTS = "regressor."
 """What the names of the network's weights begin with in a checkpoint."""
@@ -46,7 +46,7 @@ class Predictor:
 
     Args:
         config: of the run.
-        preparation: from images to what the network sees.
+        side: of the network's image, pixels.
         depth: the constants that normalise depth.
         constant_f: the focal length that it is told for every image, px; None: the true one.
         temperature: of recalibrated predictions; None: as trained.
@@ -55,7 +55,7 @@ class Predictor:
 
     config: RunConfig
     regressor: Regressor
-    preparation: Preparation
+    side: int
     depth: DepthScale
     constant_f: float | None
     device: torch.device
@@ -86,8 +86,8 @@ class Predictor:
         height, width = array.shape[1:3]
         centre, box = (width / 2, height / 2), (0.0, 0.0, float(width), float(height))
         views = [
-            self.preparation.view(
-                Image.fromarray(image), intrinsics(value, value, *centre), box, f"image {row}"
+            View.of_box(
+                Image.fromarray(image), intrinsics(value, value, *centre), box, self.side, f"image {row}"
             )
             for row, (image, value) in enumerate(zip(array, _focal_lengths(f, len(array)), strict=True))
         ]
@@ -107,7 +107,7 @@ class Predictor:
         (array,) = _images(image[None])
         height, width = array.shape[:2]
         left, top, right, bottom = map(float, (0, 0, width, height) if box is None else box)
-        return self.preparation.view(Image.fromarray(array), K, (left, top, right, bottom), "image")
+        return View.of_box(Image.fromarray(array), K, (left, top, right, bottom), self.side, "image")
 
     def see(self, views: View | Sequence[View]) -> Prediction:
         """Predictions for views, each in the frame of its own virtual camera; for one view, one without a batch."""
@@ -139,7 +139,7 @@ class Predictor:
 
     def _told(self, f: Float[Tensor, "*batch"]) -> Camera:
         """The camera as the network knows it."""
-        return Camera(f, float(self.preparation.side)).with_constant_f(self.constant_f)
+        return Camera(f, float(self.side)).with_constant_f(self.constant_f)
 
 
 def load(run: Path, device: str = "auto", recalibrate: bool = False) -> Predictor:
@@ -157,6 +157,7 @@ def load(run: Path, device: str = "auto", recalibrate: bool = False) -> Predicto
     if not folder.config_file.exists():
         raise RunError(f"{folder.path}: no run; expected a folder with config.yaml and checkpoints/last.ckpt")
     config = check(folder.config())
+    require_same_shrinking(folder, config)
     constants = _constants(folder, config)
     place = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)
     regressor = build_regressor(config, constants.depth)
@@ -165,7 +166,7 @@ def load(run: Path, device: str = "auto", recalibrate: bool = False) -> Predicto
     return Predictor(
         config=config,
         regressor=regressor.requires_grad_(False).eval().to(place),
-        preparation=Preparation(config.data.image_size, shrinks=not isinstance(config.data, FolderConfig)),
+        side=config.data.image_size,
         depth=constants.depth,
         constant_f=constants.constant_f if config.camera.focal_length == "constant" else None,
         device=place,

@@ -35,9 +35,7 @@ def record_views(folder: RunFolder, data: DatasetFolder, spec: DatasetSpec, scen
         data.require(spec)
         predictor = load(folder.path)
         n = scenes * spec.views
-        source = RenderedSource(
-            data, spec, {"train": 0, "held_out": 0, "test": n}, predictor.preparation.side
-        )
+        source = RenderedSource(data, spec, {"train": 0, "held_out": 0, "test": n}, predictor.side)
         samples = source.samples("test")
         table = Rows()
         for rows in torch.arange(n).split(BATCH):

@@ -1,8 +1,7 @@
-"""Detections in image files, each seen by a network: read in the order of their lines, predicted in batches."""
+"""Detections in image files, each predicted by a network, in batches."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from phd_exp.data.cache import LARGEST_AT_ONCE
 from phd_exp.data.crops import read_image
 from phd_exp.data.folder import content_of
 from phd_exp.geometry.virtual import intrinsics
@@ -24,9 +24,9 @@ from phd_exp.records.images import pillow_warnings
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """A detection, its image, and what a network says of it in the frame of the view's virtual camera (float64).
+    """A detection, its image, and its prediction in the frame of the view's virtual camera (float64).
 
-    `raw` are the network's numbers, of which `Predictor.predict` makes the prediction.
+    `raw` holds the outputs of the network, from which `Predictor.predict` makes the prediction.
     """
 
     detection: Detection
@@ -37,13 +37,11 @@ class Sighting:
 
 
 def sightings(predictor: Predictor, detections: Sequence[Detection]) -> Iterator[Sighting]:
-    """What the network says of each detection.
+    """The prediction for each detection, in their order.
 
-    Raises DatasetError, naming the file, where an image is none, and RunError where the network's numbers are not
-    finite.
+    Raises DatasetError, naming the file, for an invalid image, and RunError if a network output is not finite.
     """
-    seen = _seen(predictor, detections)
-    while batch := list(islice(seen, BATCH)):
+    for batch in _batches(predictor, detections):
         f = torch.tensor([view.camera.f for _, _, view in batch], dtype=torch.float64)
         raw = predictor.raw(np.stack([view.image for _, _, view in batch]), f).double()
         for row, (detection, image, view) in enumerate(batch):
@@ -54,16 +52,27 @@ def sightings(predictor: Predictor, detections: Sequence[Detection]) -> Iterator
             yield Sighting(detection, image, view, raw[row], predictor.predict(raw[row], f[row]))
 
 
-def _seen(
+def _batches(
     predictor: Predictor, detections: Sequence[Detection]
-) -> Iterator[tuple[Detection, Image.Image, View]]:
-    """The detections with what is seen of them; neighbours in one file share its image."""
+) -> Iterator[list[tuple[Detection, Image.Image, View]]]:
+    """Detections with image and view; consecutive detections in one file share its image.
+
+    A batch ends at `BATCH` detections, or when its images exceed `LARGEST_AT_ONCE` pixels.
+    """
+    batch: list[tuple[Detection, Image.Image, View]] = []
+    pixels = 0
     last: tuple[Path, Image.Image] | None = None
     for detection in detections:
         if last is None or last[0] != detection.file:
             with pillow_warnings():
                 last = detection.file, read_image(detection.file, content_of(detection.file))
+            pixels += last[1].width * last[1].height
         image = last[1]
         K = intrinsics(*detection.focal_lengths_and_centre(*image.size))
-        view = predictor.preparation.view(image, K, detection.box(*image.size), detection.where)
-        yield detection, image, view
+        view = View.of_box(image, K, detection.box(*image.size), predictor.side, detection.where)
+        batch.append((detection, image, view))
+        if len(batch) == BATCH or pixels > LARGEST_AT_ONCE:
+            yield batch
+            batch, pixels = [], 0
+    if batch:
+        yield batch

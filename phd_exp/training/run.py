@@ -12,6 +12,7 @@ import torch
 from lightning import Trainer, seed_everything
 
 from phd_exp.data.datamodule import PositionData
+from phd_exp.data.images import SHRINKING
 from phd_exp.data.sources import Part
 from phd_exp.distributions.columns import Columns
 from phd_exp.records.choices import flatten, has_influence
@@ -27,7 +28,7 @@ from phd_exp.training.module import PositionModule
 from phd_exp.training.predictions import summary, write_parquet
 from phd_exp.training.ranks import train_together
 from phd_exp.training.recorder import Draw, Recorder
-from phd_exp.training.stored import ADVICE, load_checkpoint
+from phd_exp.training.stored import ADVICE, load_checkpoint, require_same_shrinking
 from phd_exp.training.tracking import tracked
 
 UNTRAINED = -1
@@ -91,6 +92,7 @@ def require_same_config(folder: RunFolder, config: RunConfig) -> None:
     """Raise RunError where the folder holds a run that computes something else, naming the first key."""
     if not folder.config_file.exists():
         return
+    require_same_shrinking(folder, config)
     recorded, asked = flatten(folder.config()), flatten(config.model_dump(mode="json"))
     for key in sorted(recorded.keys() | asked.keys()):
         before, now = recorded.get(key, "nothing"), asked.get(key, "nothing")
@@ -127,7 +129,8 @@ def run(
     data = build_data(config, rank)
     data.setup()
     if rank == 0:
-        folder.write_constants(asdict(data.source.depth) | {"constant_f": data.source.constant_f})
+        constants = asdict(data.source.depth) | {"constant_f": data.source.constant_f}
+        folder.write_constants(constants | {"shrinking": SHRINKING})
     module = build_module(config, data)
     with tracked(config, folder) if rank == 0 else nullcontext() as logger:
         recorder = Recorder(folder, config.evaluation, draw, [logger] if logger else [])

@@ -1,4 +1,4 @@
-"""Checkpoints, which somebody else may have written: of them nothing but numbers is read."""
+"""What a run folder holds for later use, whoever wrote it: checkpoints are read as numbers alone."""
 
 from pathlib import Path
 from pickle import UnpicklingError
@@ -7,10 +7,27 @@ from zipfile import ZIP_STORED, ZipFile
 
 import torch
 
+from phd_exp.data.images import SHRINKING
 from phd_exp.records.errors import RunError
 from phd_exp.records.files import require_plain
+from phd_exp.records.runs import RunFolder
+from phd_exp.training.config import RenderedConfig, RunConfig
 
 ADVICE = "delete it to begin the run again"
+
+
+def require_same_shrinking(folder: RunFolder, config: RunConfig) -> None:
+    """Raise RunError if the run was trained on images that another version of `shrunk` made differently."""
+    data = config.data
+    if not isinstance(data, RenderedConfig) or not folder.last_checkpoint.exists():
+        return
+    constants = folder.constants() if folder.constants_file.exists() else {}
+    before, after = data.spec.sensor_size, data.image_size
+    if before % after and constants.get("shrinking") != SHRINKING:
+        raise RunError(
+            f"{folder.path}: trained with images shrunk from {before} to {after} pixels by an earlier version, which "
+            "shifted them; move the folder away and train again"
+        )
 
 
 def load_checkpoint(file: Path, map_location: Any = None) -> dict[str, Any]:

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from phd_exp.data import images
-from phd_exp.data.images import cached_images
+from phd_exp.data.images import cached_images, shrunk
 from phd_exp.records.dataset import DatasetFolder, sha256
 from phd_exp.records.errors import DatasetError
 
@@ -25,10 +25,63 @@ def test_at_full_size_the_pixels_are_the_files(folder: DatasetFolder) -> None:
         np.testing.assert_array_equal(array[index], picture(folder, index))
 
 
-def test_shrinking_averages_areas(folder: DatasetFolder) -> None:
-    array = cached_images(folder, "train", folder.records("train"), SIDE // 2)
-    means = picture(folder, 0).reshape(SIDE // 2, 2, SIDE // 2, 2, 3).mean(axis=(1, 3))
-    assert np.abs(array[0] - means).max() <= 1  # rounded twice: along rows, then along columns
+def area_means(image: np.ndarray, side: int) -> np.ndarray:
+    """The mean of each cell of a side x side grid over an image whose pixels are unit squares, in float64."""
+    for axis in (0, 1):
+        n = image.shape[axis]
+        edges, left = np.arange(side + 1) * n / side, np.arange(n)
+        overlap = np.minimum(edges[1:, None], left + 1) - np.maximum(edges[:-1, None], left)
+        image = np.moveaxis(np.tensordot(overlap.clip(0) * side / n, image, (1, axis)), 0, axis)
+    return image
+
+
+def test_rendered_images_are_shrunk(folder: DatasetFolder) -> None:
+    for side in (SIDE // 2, 37):
+        array = cached_images(folder, "train", folder.records("train"), side)
+        np.testing.assert_array_equal(array[0], shrunk(picture(folder, 0), side))
+
+
+SIZES = [
+    (224, 224, 64),
+    (224, 224, 112),
+    (301, 220, 64),
+    (100, 37, 33),
+    (97, 97, 96),
+    (40, 30, 64),
+    (1, 5000, 7),
+]
+
+
+@pytest.mark.parametrize(("height", "width", "side"), SIZES)
+def test_shrinking_is_the_mean_of_areas_and_commutes_with_mirrors(height: int, width: int, side: int) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    small = shrunk(noise, side)
+    assert np.abs(small - area_means(noise, side)).max() <= 0.5 + 1e-9
+    for mirrored in (np.flipud, np.fliplr):
+        np.testing.assert_array_equal(shrunk(mirrored(noise), side), mirrored(small))
+    np.testing.assert_array_equal(shrunk(noise.swapaxes(0, 1), side), small.swapaxes(0, 1))
+
+
+@pytest.mark.parametrize("stripe", [1, 1000, 20_000])
+def test_stripes_change_nothing(monkeypatch: pytest.MonkeyPatch, stripe: int) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (150, 90, 3), dtype=np.uint8)
+    whole = shrunk(noise, 64)
+    monkeypatch.setattr(images, "_LARGEST_STRIPE", stripe)
+    np.testing.assert_array_equal(shrunk(noise, 64), whole)
+
+
+@pytest.mark.parametrize(("n", "side"), [(224, 64), (224, 100), (223, 64), (640, 96)])
+def test_shrinking_moves_nothing(n: int, side: int) -> None:
+    """The centroid of a wide blob at any place, in pixels of the small image."""
+    u, v = np.meshgrid(np.arange(n) + 0.5, np.arange(n) + 0.5)
+    for x, y in n * np.array([[0.4, 0.5], [0.613, 0.42], [0.5, 0.5]]):
+        blob = np.round(250 * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * (n / 14) ** 2)))
+        small = shrunk(np.stack([blob.astype(np.uint8)] * 3, axis=-1), side)[..., 0].astype(float)
+        here, there = (
+            np.array([light.sum(0), light.sum(1)]) @ np.arange(0.5, len(light)) / light.sum()
+            for light in (small, blob)
+        )
+        assert np.abs(here - there * side / n).max() < 0.005
 
 
 def test_decodes_once(folder: DatasetFolder, monkeypatch: pytest.MonkeyPatch) -> None:
