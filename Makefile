@@ -22,7 +22,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 install: $(INSTALLED)  ## .venv with everything in it
 
 demo: $(INSTALLED)  ## render, train the probabilistic model, draw its calibration, print its row of the table
-	$(BIN)/python -m phd_exp preset=demo
+	$(BIN)/python -m phd_exp preset=demo recipe=strong
 	$(BIN)/python -m phd_exp report
 
 PRESET ?= paper

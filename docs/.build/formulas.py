@@ -1,8 +1,8 @@
-"""Formulas between dollar signs as MathML: browsers draw it themselves, so the pages need no script and no network."""
+"""Formulas between dollar signs as MathML, which browsers draw: the pages need no script and no network."""
 
 import re
-import xml.etree.ElementTree as etree
 from typing import Any
+from xml.etree.ElementTree import fromstring
 
 from latex2mathml.converter import convert
 from markdown import Extension, Markdown
@@ -17,7 +17,7 @@ class _Formula(InlineProcessor):
         mathml = convert(m[2].strip(), display=display).replace(
             'xmlns="http://www.w3.org/1998/Math/MathML" ', ""
         )
-        return etree.fromstring(mathml), m.start(), m.end()
+        return fromstring(mathml), m.start(), m.end()
 
 
 class Formulas(Extension):
