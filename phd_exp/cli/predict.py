@@ -1,9 +1,8 @@
-"""`python -m phd_exp predict`: where the object in an image is, and how sure a run is of it, as JSON lines."""
+"""`python -m phd_exp predict`: positions of objects in images with their uncertainty, as JSON lines."""
 
 import json
 import sys
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,10 +28,12 @@ if TYPE_CHECKING:  # seconds of imports, which a mistake need not wait for
     from phd_exp.inference.sightings import Sighting
 
 OF_A_CAMERA = ("f", "fx", "fy", "cx", "cy", "box")
+LONGEST_STEM = 50
+"""Characters of an image's name in the name of its picture."""
 
 
 class PredictArguments(Arguments):
-    """What to look at and with which run; lengths in pixels of the image file."""
+    """The run, the images and their cameras; lengths in pixels of the image file."""
 
     run: Path
     image: Path | None = None
@@ -55,7 +56,7 @@ class PredictArguments(Arguments):
 
     @model_validator(mode="after")
     def one_source(self) -> "PredictArguments":
-        """Either an image with its camera, or a folder that says both."""
+        """Require either an image with its camera, or a folder with both."""
         if (self.image is None) == (self.folder is None):
             raise ValueError(
                 "predict: expected either image=FILE with f=PIXELS, or folder=DIR with a metadata.jsonl in it"
@@ -63,14 +64,14 @@ class PredictArguments(Arguments):
         given = [key for key in OF_A_CAMERA if getattr(self, key) is not None]
         if self.folder is not None and given:
             raise ValueError(
-                f"{given[0]}: belongs to image=FILE; of a folder each line of metadata.jsonl says it"
+                f"{given[0]}: belongs to image=FILE; for a folder, write it into each line of metadata.jsonl"
             )
         if self.calibration and self.out is None:
             raise ValueError("calibration: is drawn into the pictures; expected out=DIR too")
         return self
 
     def detections(self) -> list[Detection]:
-        """What is to be looked at. Raises DatasetError where it cannot be read."""
+        """The detections to predict. Raises DatasetError if they cannot be read."""
         if self.folder is not None:
             return detections_in(self.folder)
         assert self.image is not None
@@ -100,20 +101,43 @@ def _predict(arguments: PredictArguments, detections: list[Detection]) -> None:
     predictor = load(arguments.run, recalibrate=arguments.recalibrate)
     say_if_unfinished(arguments.run, predictor.state)
     curve = _depth_curve(arguments.run, predictor) if arguments.calibration else None
-    lines = _answers(predictor, detections, arguments.out, curve)
-    if arguments.out is None:
-        for line in lines:
-            print(line, flush=True)
-    else:
-        file = arguments.out / "predictions.jsonl"
-        write_atomic(file, "".join(f"{line}\n" for line in lines))
-        print(f"{file}, and a picture beside it for each line", file=sys.stderr)
+    from phd_exp.inference.answers import answer
+    from phd_exp.inference.sightings import sightings
+
+    seen = with_progress(sightings(predictor, detections), len(detections), "predicting")
+    answers = ((sighting, answer(sighting, predictor.temperature)) for sighting in seen)
+    if arguments.out is not None:
+        _write(answers, len(detections), arguments.out, predictor.temperature is not None, curve)
+        return
+    for _, said in answers:
+        print(json.dumps(said, allow_nan=False), flush=True)
+
+
+def _write(
+    answers: Iterable[tuple["Sighting", dict[str, Any]]],
+    n: int,
+    out: Path,
+    recalibrated: bool,
+    curve: dict[str, Any] | None,
+) -> None:
+    """Write each line of `predictions.jsonl` before its picture, which is named by the number of the line."""
+    from phd_exp.inference.pictures import picture
+
+    file = out / "predictions.jsonl"
+    file.unlink(missing_ok=True)
+    with open(file, "x", buffering=1) as lines:
+        for number, (sighting, said) in enumerate(answers, start=1):
+            stem = Path(sighting.detection.line.file_name).stem[:LONGEST_STEM]
+            name = f"{number:0{len(str(n))}}-{stem}.png"
+            lines.write(json.dumps(said | {"picture": name}, allow_nan=False) + "\n")
+            write_atomic(out / name, picture(sighting, recalibrated, curve))
+    print(f"{file}, and a picture for each line", file=sys.stderr)
 
 
 def _depth_curve(run: Path, predictor: "Predictor") -> dict[str, Any]:
-    """Of the run's test samples, as it predicted them or recalibrated, whichever is asked for now.
+    """The calibration curve of depth on the run's test samples, recalibrated like the predictions.
 
-    Raises RunError where there is none, as of a baseline.
+    Raises RunError if there is none, as for a baseline.
     """
     if predictor.temperature is not None:
         from phd_exp.evaluation.predictions import recalibrated_depth_curve
@@ -132,42 +156,9 @@ def _depth_curve(run: Path, predictor: "Predictor") -> dict[str, Any]:
     )
 
 
-def _answers(
-    predictor: "Predictor", detections: list[Detection], out: Path | None, curve: dict[str, Any] | None
-) -> Iterator[str]:
-    """The JSON lines; pictures are drawn on the way."""
-    from phd_exp.inference.answers import answer
-    from phd_exp.inference.sightings import sightings
-
-    names = iter(_picture_names(detections))
-    for sighting in with_progress(sightings(predictor, detections), len(detections), "predicting"):
-        if out is not None:
-            _draw(sighting, out / next(names), curve)
-        yield json.dumps(answer(sighting, predictor.temperature), allow_nan=False)
-
-
-def _draw(sighting: "Sighting", file: Path, curve: dict[str, Any] | None) -> None:
-    from phd_exp.inference.pictures import picture
-
-    write_atomic(file, picture(sighting, curve))
-
-
-def _picture_names(detections: list[Detection]) -> list[str]:
-    """`<name of the image>.png`; with its number for a further detection in an image, or in one of the same name."""
-    seen: Counter[str] = Counter()
-    names = []
-    for detection in detections:
-        name = "-".join(Path(detection.line.file_name).with_suffix("").parts)
-        seen[name] += 1
-        names.append(f"{name}.png" if seen[name] == 1 else f"{name}-{seen[name]}.png")
-    return names
-
-
 def _require_no_image_lost(detections: list[Detection], out: Path) -> None:
-    images = {detection.file.resolve() for detection in detections}
-    for name in _picture_names(detections):
-        if (out / name).resolve() in images:
-            raise ConfigError(f"out={out}: {out / name} is one of the images; choose another folder")
+    if out.resolve() in {detection.file.resolve().parent for detection in detections}:
+        raise ConfigError(f"out={out}: holds the images themselves; choose another folder")
 
 
 def _require_drawing() -> None:

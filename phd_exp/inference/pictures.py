@@ -1,5 +1,7 @@
 """The paper's first figure for one sighting: level curves on the image, and from above."""
 
+import math
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,23 +14,30 @@ from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.level_curves import LevelCurves, level_curves
 from phd_exp.inference.sightings import Sighting
 from phd_exp.inference.views import View
+from phd_exp.records.errors import one_line
 from phd_exp.reports.figures import draw_birds_eye, draw_curve, encoded
 
 LARGEST = 1024
-"""Pixels along the longer side beyond which an image is shrunk for the picture."""
+"""Pixels along the longer side of the image in the picture."""
+LONGEST_NAME = 60
+"""Characters of a file name in the title."""
 MARGIN = 0.5
-"""Of a box's size, shown about it."""
+"""Width of the margin around a box, in sizes of the box."""
 _AMBER = "#ffb000"
 
 
-def picture(sighting: Sighting, calibration: Mapping[str, Any] | None = None) -> bytes:
-    """A PNG: the image with the curves of 50, 90 and 99 %, and the bird's-eye view; of a baseline the point alone.
+def picture(
+    sighting: Sighting, recalibrated: bool = False, calibration: Mapping[str, Any] | None = None
+) -> bytes:
+    """A PNG of the image and the bird's-eye view with level curves of 50, 90 and 99 %; of a baseline's point alone.
 
-    With the calibration curve of depth on the run's test samples, that comes third.
+    A third panel shows the calibration curve of depth, if given. The title holds the file name, the focal length and
+    whether the prediction is recalibrated.
     """
     curves = level_curves(sighting.prediction) if isinstance(sighting.prediction, ProjectedHuber) else None
     panels = 1 + (curves is not None) + (calibration is not None)
     figure = Figure(figsize=(4.6 if panels == 1 else 4.5 * panels, 4.4), layout="constrained")
+    figure.suptitle(_title(sighting, recalibrated), fontsize=9, parse_math=False)
     _draw_image(figure.add_subplot(1, panels, 1), sighting, curves)
     if calibration:
         draw_curve(figure.add_subplot(1, panels, panels), "depth", calibration)
@@ -37,15 +46,33 @@ def picture(sighting: Sighting, calibration: Mapping[str, Any] | None = None) ->
         draw_birds_eye(axes, curves, _truth(sighting))
         if sighting.view.is_turned:
             axes.set(xlabel="x (m), camera turned to the box", ylabel="z (m), camera turned to the box")
-    return encoded(figure, "png", dpi=120)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph", UserWarning)  # letters that the font lacks
+        return encoded(figure, "png", dpi=120)
+
+
+def _title(sighting: Sighting, recalibrated: bool) -> str:
+    line = sighting.detection.line
+    name = one_line(line.file_name)
+    name = name if len(name) <= LONGEST_NAME else f"...{name[-LONGEST_NAME:]}"
+    f = f"f = {line.f:g} px" if line.f else f"f = {line.fx:g}, {line.fy:g} px"
+    return ", ".join([name, f, *(["recalibrated"] if recalibrated else [])])
 
 
 def _draw_image(axes: Axes, sighting: Sighting, curves: LevelCurves | None) -> None:
     view, image = sighting.view, sighting.image
-    width, height = image.size
-    shown = image.copy()
+    left, top, right, bottom = sighting.detection.box(*image.size)
+    across, down = MARGIN * (right - left), MARGIN * (bottom - top)
+    region = (
+        max(0, math.floor(left - across)),
+        max(0, math.floor(top - down)),
+        min(image.width, math.ceil(right + across)),
+        min(image.height, math.ceil(bottom + down)),
+    )
+    shown = image.crop(region)
     shown.thumbnail((LARGEST, LARGEST))
-    axes.imshow(np.asarray(shown), extent=(0, width, height, 0))
+    left, top, right, bottom = region
+    axes.imshow(np.asarray(shown), extent=(left, right, bottom, top))
     for thickness, points in zip((1.6, 1.1, 0.7), curves.projected if curves else (), strict=False):
         axes.plot(*pixels(view, points).T, color=_AMBER, linewidth=thickness)
     mode = sighting.prediction.mode.numpy()
@@ -54,17 +81,11 @@ def _draw_image(axes: Axes, sighting: Sighting, curves: LevelCurves | None) -> N
     if truth is not None:
         on = pixels(view, truth[:2] / truth[2])
         axes.plot(*on, "o", color="white", markeredgecolor="black", markersize=4)
-    left, top, right, bottom = sighting.detection.box(width, height)
-    across, down = MARGIN * (right - left), MARGIN * (bottom - top)
-    axes.set(
-        xlim=(max(0, left - across), min(width, right + across)),
-        ylim=(min(height, bottom + down), max(0, top - down)),
-        aspect="equal", xlabel="column (px)", ylabel="row (px)",
-    )  # fmt: skip
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="column (px)", ylabel="row (px)")
 
 
 def pixels(view: View, xy_over_z: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*points 2"]:
-    """Pixels of the real image in which (x, y)/z of the virtual camera is seen; NaN behind the real camera."""
+    """Pixels of the real image at (x, y)/z of the virtual camera; NaN behind the real camera."""
     rays = np.concatenate([xy_over_z, np.ones_like(xy_over_z[..., :1])], axis=-1)
     seen = view.camera.to_real(rays) @ view.camera.K.T
     return np.where(seen[..., 2:] > 0, seen[..., :2] / seen[..., 2:], np.nan)

@@ -21,7 +21,7 @@ from phd_exp.inference.views import View
 from phd_exp.models.heads import Prediction
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.dataset import DatasetFolder
-from phd_exp.records.errors import ConfigError, DatasetError, RunError
+from phd_exp.records.errors import ConfigError, DatasetError, RunError, shown
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import FolderConfig, RunConfig, check
 from phd_exp.training.network import build_regressor
@@ -237,9 +237,13 @@ def _images(images: Any) -> UInt8[np.ndarray, "batch height width 3"]:
 
 
 def _focal_lengths(f: Any, n: int) -> list[float]:
-    values = np.broadcast_to(np.asarray(f, dtype=float), (n,)) if np.size(f) in (1, n) else None
-    if values is None or not (np.isfinite(values).all() and (values > 0).all()):
+    try:
+        values = np.asarray(f.detach().cpu() if isinstance(f, Tensor) else f, dtype=float).ravel()
+        values = np.broadcast_to(values, (n,))
+    except (ValueError, TypeError):
+        values = np.full(1, np.nan)
+    if not (np.isfinite(values).all() and (values > 0).all()):
         raise DatasetError(
-            f"f: got {f}; expected a focal length in pixels, positive: one, or one for each of {n}"
+            f"f: got {shown(f)}; expected a focal length in pixels, positive: one, or one for each of {n} images"
         )
     return [float(value) for value in values]

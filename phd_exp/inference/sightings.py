@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -18,7 +17,7 @@ from phd_exp.inference.predictor import BATCH, Predictor
 from phd_exp.inference.views import View
 from phd_exp.models.heads import Prediction
 from phd_exp.records.detections import Detection
-from phd_exp.records.errors import RunError
+from phd_exp.records.errors import DatasetError, RunError
 from phd_exp.records.images import pillow_warnings
 
 
@@ -61,15 +60,20 @@ def _batches(
     """
     batch: list[tuple[Detection, Image.Image, View]] = []
     pixels = 0
-    last: tuple[Path, Image.Image] | None = None
     for detection in detections:
-        if last is None or last[0] != detection.file:
-            with pillow_warnings():
-                last = detection.file, read_image(detection.file, content_of(detection.file))
-            pixels += last[1].width * last[1].height
-        image = last[1]
-        K = intrinsics(*detection.focal_lengths_and_centre(*image.size))
-        view = View.of_box(image, K, detection.box(*image.size), predictor.side, detection.where)
+        try:
+            if batch and batch[-1][0].file == detection.file:
+                image = batch[-1][1]
+            else:
+                with pillow_warnings():
+                    image = read_image(detection.file, content_of(detection.file))
+                pixels += image.width * image.height
+            K = intrinsics(*detection.focal_lengths_and_centre(*image.size))
+            view = View.of_box(image, K, detection.box(*image.size), predictor.side, detection.where)
+        except DatasetError:
+            if batch:
+                yield batch  # the predictions before the invalid image are not lost
+            raise
         batch.append((detection, image, view))
         if len(batch) == BATCH or pixels > LARGEST_AT_ONCE:
             yield batch

@@ -82,7 +82,7 @@ class DetectionLine(BaseModel):
     box: tuple[Pixels, Pixels, Pixels, Pixels] | None = None
     x: Metres | None = None
     y: Metres | None = None
-    z: Annotated[Positive, Field(le=1e6)] | None = None
+    z: Annotated[Number, Field(ge=1e-6, le=1e6)] | None = None
     scale: Positive | None = None
     visibility: Annotated[Number, Field(ge=0, le=1)] | None = None
     scene: SceneName | None = None

@@ -157,7 +157,8 @@ def test_a_baseline_says_that_it_knows_no_uncertainty(
     assert outcome.status == 0, outcome.err
     rows = lines((tmp_path / "drawn" / "predictions.jsonl").read_text())
     errors = {"projected_error_mm", "depth_error_mm"}
-    assert rows[0].keys() == {"file_name", "box", "position", "uncertainty", "out_of_field"} | errors
+    said = {"file_name", "box", "position", "uncertainty", "out_of_field", "picture"}
+    assert rows[0].keys() == said | errors
     assert rows[0]["uncertainty"].startswith("none")
     pairs = zip(cameras(photos), columns(pd.read_parquet(baseline.predictions), "mode_"), strict=True)
     expected = [camera.to_real(row) for camera, row in pairs]
@@ -176,17 +177,47 @@ def test_one_image_is_the_line_of_a_folder_and_is_drawn(
     assert (outcome.status, outcome.out) == (0, "")
     (row,) = lines((tmp_path / "drawn" / "predictions.jsonl").read_text())
     there = lines(phd_exp("predict", f"run={own_run.path}", f"folder={photos / 'test'}").out)[0]
-    assert row.keys() <= there.keys()
+    assert row.keys() - {"picture"} <= there.keys()
     for key in ("mode", "covariance", "median_depth"):
         np.testing.assert_allclose(row[key], there[key], rtol=1e-5, atol=1e-6)
-    with Image.open(tmp_path / "drawn" / "0.png") as picture:
+    with Image.open(tmp_path / "drawn" / row["picture"]) as picture:
         assert picture.format == "PNG"
         assert picture.width > 2 * picture.height * 0.9
     before = (photos / "test" / "0.png").read_bytes()
     lost = phd_exp("predict", f"run={own_run.path}", image, *camera, f"out={photos / 'test'}")
     assert lost.status == 1
-    assert "0.png is one of the images" in lost.err
+    assert "holds the images themselves" in lost.err
     assert (photos / "test" / "0.png").read_bytes() == before
+
+
+def test_every_line_has_a_picture_of_its_own(
+    phd_exp: Callable, own_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the images are called; where one cannot be drawn, the lines before it are whole."""
+    titles: list[str] = []
+    suptitle = pictures.Figure.suptitle
+    monkeypatch.setattr(
+        pictures.Figure,
+        "suptitle",
+        lambda self, text, **how: titles.append(text) or suptitle(self, text, **how),
+    )
+    names = ["a.png", "a.jpg", "a-2.png", "a.png", "$x_$.png", f"{'l' * 240}.png", "\u4e2d.png"]
+    (tmp_path / "in").mkdir()
+    for name in names:
+        Image.new("RGB", (64, 64)).save(tmp_path / "in" / name)
+    text = "".join(json.dumps({"file_name": name, "f": 400.5}) + "\n" for name in names)
+    (tmp_path / "in" / "metadata.jsonl").write_text(text)
+    outcome = phd_exp("predict", f"run={own_run.path}", "folder=in", "out=drawn")
+    assert outcome.status == 0, outcome.err
+    rows = lines((tmp_path / "drawn" / "predictions.jsonl").read_text())
+    assert [row["file_name"] for row in rows] == names
+    files = {row["picture"] for row in rows}
+    assert len(files) == len(names)
+    assert {file.name for file in (tmp_path / "drawn").iterdir()} == files | {"predictions.jsonl"}
+    assert titles[0] == "a.png, f = 400.5 px"
+    (tmp_path / "in" / names[2]).write_bytes(b"no image")
+    assert phd_exp("predict", f"run={own_run.path}", "folder=in", "out=broken").status == 1
+    assert len(lines((tmp_path / "broken" / "predictions.jsonl").read_text())) == 2
 
 
 def test_recalibration_changes_the_uncertainty_alone_and_says_so(
@@ -211,12 +242,17 @@ def test_from_python_arrays_of_any_size(run: RunFolder, renders: Path) -> None:
     one = predictor(torch.from_numpy(images[2]), f=float(table["f"][2]))
     assert one.mode.shape == (3,)
     torch.testing.assert_close(one.mode, prediction.mode[2], rtol=1e-5, atol=1e-5)
+    f = table["f"]
+    for same in (f.tolist(), torch.tensor(f, requires_grad=True), [torch.tensor(value) for value in f]):
+        torch.testing.assert_close(predictor(images, f=same).mode, prediction.mode)
+    for same in (float(f[2]), [f[2]], torch.tensor(f[2]), torch.tensor([f[2]]), np.float32(f[2])):
+        torch.testing.assert_close(predictor(images[2], f=same).mode, one.mode)
     wide = predictor(np.zeros((2, 90, 160, 3), dtype=np.uint8), f=400.0)
     assert wide.mode.shape == (2, 3)
     for wrong in (images[0, :, :, 0], images.astype(np.float32), images[:, :, :, :2]):
         with pytest.raises(DatasetError, match=r"^images: got .* expected uint8 of shape"):
             predictor(wrong, f=400.0)
-    for f in (0.0, -1.0, float("nan"), [1.0, 2.0]):
+    for f in (0.0, -1.0, float("nan"), [1.0, 2.0], "wide", None, [[1.0], 2.0]):
         with pytest.raises(DatasetError, match=r"^f: got"):
             predictor(images, f=f)
 
@@ -228,7 +264,7 @@ def test_how_well_a_run_knows_itself_stands_beside_its_predictions(
     folder = f"folder={photos / 'test'}"
     for out, words, panels in (("plain", (), 2), ("more", ("calibration=true",), 3)):
         assert phd_exp("predict", f"run={own_run.path}", folder, f"out={out}", *words).status == 0
-        with Image.open(tmp_path / out / "0.png") as picture:
+        with Image.open(tmp_path / out / "1-0.png") as picture:
             assert picture.width == panels * 540
     refused = phd_exp("predict", f"run={baseline.path}", folder, "out=more", "calibration=true")
     assert refused.status == 1
@@ -277,6 +313,7 @@ MISTAKES = [
     (("image=good.png", "f=400", "cx=3"), "good.png: cx is given alone"),
     (("image=good.png", "f=400", "folder=."), "predict: expected either image=FILE"),
     (("folder=.", "f=400"), "f: belongs to image=FILE"),
+    (("folder=dot",), "dot: cannot be read (Is a directory)"),
     (("folder=.",), "metadata.jsonl, line 2: expected either f, or fx and fy"),
     (("folder=nowhere",), "nowhere/metadata.jsonl: cannot be read"),
     (("image=good.png", "f=400", "run=nowhere"), "run: given twice"),
@@ -302,6 +339,8 @@ def test_a_mistake_is_one_line(
     (tmp_path / "text.png").write_text("no image")
     Image.new("L", (600, 600)).save(tmp_path / "huge.png")
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100_000)
+    (tmp_path / "dot").mkdir()
+    (tmp_path / "dot" / "metadata.jsonl").write_text('{"file_name": ".", "f": 400}')
     good = json.dumps({"file_name": "good.png", "f": 400})
     (tmp_path / "metadata.jsonl").write_text(f"{good}\n{json.dumps({'file_name': 'good.png'})}\n")
     outcome = phd_exp("predict", f"run={run.path}", *words)
