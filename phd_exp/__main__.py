@@ -1,47 +1,56 @@
-"""`python -m phd_exp [verb] [group=choice ...] [key=value ...]`; imports nothing heavy before it knows what to do."""
+"""`python -m phd_exp [verb] [group=choice ...] [key=value ...]`; imports nothing heavy before the verb is known."""
 
 import os
+import re
 import sys
 from importlib import import_module
 
-from phd_exp.cli.completion import FLAGS, take_verb_from_line
+from phd_exp import __version__
 from phd_exp.cli.help import OF_VERB, VERBS, show
 
 HELP = {"-h", "--help", "help"}
-
-
+COMPLETION = {"-sc", "--shell-completion"}
+TYPED = "COMP_LINE"
+"""The line so far, where a shell asks how it may continue."""
 NOBODY_READS = 128 + 13
-"""What a shell says of a programme that SIGPIPE ended."""
+"""The exit status that a shell gives to a programme ended by SIGPIPE."""
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Do what the arguments say, until it is done or nobody reads on (`| head`); returns the exit status."""
+    """Run the verb that the arguments name; returns the exit status."""
+    status = 0
     try:
-        status = _do(arguments)
-        sys.stdout.flush()
-    except BrokenPipeError:
-        # Python flushes once more when it ends, and would complain
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return NOBODY_READS
+        status = _run(list(sys.argv[1:] if arguments is None else arguments))
+        print(end="", flush=True)
+        return status
+    except BrokenPipeError:  # `| head`
+        status = NOBODY_READS
+    except OSError as error:
+        if not status:
+            print(f"error: standard output: {error.strerror}", file=sys.stderr)
+        status = 1
+    # Python flushes once more when it ends, and would complain
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return status
 
 
-def _do(arguments: list[str] | None) -> int:
-    """Find the verb among the arguments and hand the rest to it."""
-    rest = list(sys.argv[1:] if arguments is None else arguments)
-    verb = _take_verb(rest)
-    if set(FLAGS) & set(rest):
-        verb = take_verb_from_line(list(VERBS))
-        if verb and not OF_VERB[verb]:  # Hydra completes, and this verb takes no groups of it
+def _run(words: list[str]) -> int:
+    verb = _take_verb(words)
+    if COMPLETION & set(words):
+        verb = _take_verb_from_line()
+        if verb and not OF_VERB[verb]:  # Hydra completes, and this verb takes none of its groups
             return 0
-    if HELP & set(rest):
+    if HELP & set(words):
         return show(verb)
+    if "--version" in words:
+        print(f"phd_exp {__version__}")
+        return 0
     if verb is not None and verb not in VERBS:
         print(f"error: no verb {verb!r}; expected one of {', '.join(VERBS)}, or key=value", file=sys.stderr)
         return 2
-    module = import_module(f"phd_exp.cli.{verb or 'train'}")
-    status: int = module.main(rest)
-    return status
+    from phd_exp.cli.frame import run_verb
+
+    return run_verb(lambda rest: import_module(f"phd_exp.cli.{verb or 'train'}").main(rest), words)
 
 
 def _take_verb(words: list[str]) -> str | None:
@@ -51,6 +60,16 @@ def _take_verb(words: list[str]) -> str | None:
     if not word or word in HELP or "=" in word or word.startswith(("-", "~", "+")):
         return None
     return words.pop(place)
+
+
+def _take_verb_from_line() -> str | None:
+    """Remove the verb from the line that a shell wants completed, since Hydra knows no verbs, and return it."""
+    line = os.environ.get(TYPED, "")
+    found = re.match(rf"(\S+(?: -m| --multirun)?) ({'|'.join(VERBS)})(?= )", line)
+    if found is None:
+        return None
+    os.environ[TYPED] = found[1] + line[found.end() :]
+    return found[2]
 
 
 if __name__ == "__main__":

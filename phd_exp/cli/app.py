@@ -1,11 +1,9 @@
-"""Hydra as this programme uses it: compose, check, run; every mistake of the user is one line."""
+"""Hydra as the verbs `train` and `render` use it: one run, or with -m a sweep."""
 
 import os
 import re
 import sys
-import tempfile
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
@@ -14,95 +12,59 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from phd_exp.cli.jobs import BAD_CONFIGURATION, Ending, JobRecords, Launch, Task
+from phd_exp.cli.frame import print_errors
+from phd_exp.cli.jobs import Job, Standing, Task, refusal
 from phd_exp.cli.paths import conf_folder
-from phd_exp.cli.signals import Stopped, stopping_on_signals
-from phd_exp.cli.sweep import IsFinished, sweep
-from phd_exp.cli.words import require_visible
-from phd_exp.records.errors import ConfigError, UserError, nearest
+from phd_exp.records.errors import ConfigError, nearest
 
 LONGEST = 400
-"""Characters of what Hydra says."""
-MULTIRUN = ("-m", "--multirun")
+"""Characters of Hydra's messages that are repeated."""
+REFUSED = (HydraException, OmegaConfBaseException, ValueError, ArithmeticError, RecursionError)
+"""What composing raises for a bad override; ValueError for a group set to null."""
 
 
 def launch(
-    task: Task, arguments: list[str], config_name: str = "config", is_finished: IsFinished | None = None
+    task: Task, words: list[str], config_name: str = "config", standing: Standing | None = None
 ) -> int:
     """Run a task through Hydra, once or (-m) for every combination; returns the exit status.
 
-    In a sweep one failing job does not stop the others, whatever launcher runs them and wherever; at the end
-    every failure is named, and so is every job that died without a word.
-
     Args:
         task: what a job does.
-        arguments: the words of the command line after the verb.
+        words: the words of the command line after the verb.
         config_name: the file under conf/ that they change.
-        is_finished: which jobs of a sweep need not do it again, for what is said when it begins.
+        standing: how a job stands on disk.
+
+    Raises RunError where a launcher fails.
     """
-    # Hydra would print errors its own way, over several lines, and exit; we want them as exceptions
+    # Hydra would print errors its own way, over several lines, and exit
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    # argparse takes the overrides in one piece alone: flags to the front, wherever the user put them
-    arguments = sorted(arguments, key=lambda word: word not in MULTIRUN)
-    sys.argv = [sys.argv[0], *arguments]
+    job = Job(task, standing)
     try:
-        require_visible(arguments)
-        with stopping_on_signals():
-            endings = _run_all(task, arguments, config_name, is_finished)
-    except Stopped as stop:
-        print(f"error: stopped by {stop}; the same command goes on from here", file=sys.stderr)
-        return int(str(stop.code))
-    except (HydraException, OmegaConfBaseException, ValueError) as error:  # ValueError: a group set to null
-        print(f"error: {explain(error, config_name)}", file=sys.stderr)
-        return BAD_CONFIGURATION
-    except OSError as error:  # what goes wrong within a job is the job's to record
-        print(
-            f"error: {error.filename}: cannot be written ({error.strerror}); check hydra.*.dir",
-            file=sys.stderr,
-        )
-        return BAD_CONFIGURATION
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return Ending.of([], error).exit_status
-    _print_failures(endings)
-    return max((ending.exit_status for ending in endings), default=0)
-
-
-def _run_all(
-    task: Task, arguments: list[str], config_name: str, is_finished: IsFinished | None
-) -> list[Ending]:
-    """Run the jobs and collect how they ended."""
-    _require_known_flags(arguments)
-    flags = [word for word in arguments if word.startswith("-")]
-    if len(flags) == 1 and flags[0] in MULTIRUN:
-        return sweep(task, arguments[1:], config_name, is_finished)
-    if not flags:
-        _require_one_run(arguments)
-    with tempfile.TemporaryDirectory(prefix="phd_exp-") as folder:
-        records = JobRecords(Path(folder))
-        job = Launch(records).function(task)
+        sys.argv = [sys.argv[0], *_options_last(words)]
         hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=config_name)(job)()
-        # a flag like --cfg runs no job
-        return [records.ending(0, [])] if any(records.path.iterdir()) else []
+    except (*REFUSED, ConfigError) as error:
+        refused = error if isinstance(error, ConfigError) else ConfigError(explain(error, config_name))
+        job.endings.append(refusal(refused))
+        print_errors(job.endings[-1].lines)
+    return max((ending.exit_status for ending in job.endings), default=0)
 
 
-def _require_known_flags(words: list[str]) -> None:
-    """Raise ConfigError for what Hydra's parser would refuse with its usage, over several lines."""
+def _options_last(words: list[str]) -> list[str]:
+    """The words with Hydra's options after the overrides; its parser wants the overrides in one piece.
+
+    Raises ConfigError for what it would refuse with its usage, over several lines.
+    """
 
     def refuse(message: str) -> NoReturn:
         raise ConfigError(f"{message}; see `python -m phd_exp --help`")
 
     parser = get_args_parser()
     parser.error = refuse  # type: ignore[method-assign]
-    parser.parse_args(words)
-
-
-def _require_one_run(words: list[str]) -> None:
-    for word in words:
-        if word.partition("=")[0].lstrip("+") == "experiment":
-            raise ConfigError(
-                f"{word}: an experiment is several runs; write -m before it: -m {' '.join(words)}"
-            )
+    overrides = parser.parse_intermixed_args(words).overrides
+    options = list(words)
+    for word in overrides:
+        options.remove(word)
+    return [*overrides, *options]
 
 
 def explain(error: Exception, config_name: str) -> str:
@@ -124,16 +86,6 @@ def explain(error: Exception, config_name: str) -> str:
         return f"{group}={name}: no such choice{nearest(name, options)}; expected one of {', '.join(options)}"
     text = re.sub(r" Set the environment variable.*| Config search path:.*", "", text)
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
-
-
-def _print_failures(endings: list[Ending]) -> None:
-    failures = [ending for ending in endings if ending.exit_status]
-    if len(failures) > 1:
-        print(f"error: {len(failures)} runs failed", file=sys.stderr)
-    for failure in failures:
-        run = f"{' '.join(failure.overrides)}: " if len(endings) > 1 else ""
-        for line in failure.lines:
-            print(f"error: {run}{line}", file=sys.stderr)
 
 
 def _known_keys(config_name: str) -> list[str]:

@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
-from phd_exp.cli.words import require_visible
 from phd_exp.records.errors import ConfigError, complaint, nearest
 from phd_exp.records.files import remove_temporaries
 
@@ -24,7 +23,6 @@ class Arguments(BaseModel):
 
 def parsed(verb: str, model: type[Arguments_], words: Sequence[str]) -> Arguments_:
     """The arguments of `key=value` words. Raises ConfigError, in one line, for the first that is none."""
-    require_visible(words)
     values: dict[str, str] = {}
     for word in words:
         key, equals, value = word.partition("=")

@@ -1,11 +1,10 @@
 """`python -m phd_exp export`: a run's network as an ONNX file, checked against torch."""
 
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 
 from phd_exp.cli.arguments import Arguments, output_folder, parsed, say_if_unfinished
-from phd_exp.records.errors import ConfigError, UserError
+from phd_exp.records.errors import ConfigError
 
 NEEDED = ("onnx", "onnxscript", "onnxruntime")
 
@@ -20,12 +19,8 @@ class ExportArguments(Arguments):
 
 def main(words: list[str]) -> int:
     """Export as the words say; returns the exit status."""
-    try:
-        arguments = parsed("export", ExportArguments, words)
-        _export(arguments, arguments.out or arguments.run / "network.onnx")
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    arguments = parsed("export", ExportArguments, words)
+    _export(arguments, arguments.out or arguments.run / "network.onnx")
     return 0
 
 

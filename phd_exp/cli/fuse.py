@@ -18,7 +18,7 @@ from phd_exp.cli.arguments import (
     with_progress,
 )
 from phd_exp.records.detections import Detection, detections_in
-from phd_exp.records.errors import ConfigError, UserError, listed
+from phd_exp.records.errors import ConfigError, listed
 from phd_exp.records.files import write_atomic
 from phd_exp.records.observed import Observed, observed
 
@@ -44,17 +44,13 @@ class FuseArguments(Arguments):
 
 def main(words: list[str]) -> int:
     """Fuse as the words say; returns the exit status, which is not zero where a scene could not be fused."""
-    try:
-        arguments = parsed("fuse", FuseArguments, words)
-        detections = detections_in(arguments.folder)
-        scenes = observed(detections)
-        if arguments.out is not None:
-            _require_file(arguments.out, arguments.folder, detections)
-        answers = _answers(arguments, scenes)
-        _write(answers, arguments.out)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    arguments = parsed("fuse", FuseArguments, words)
+    detections = detections_in(arguments.folder)
+    scenes = observed(detections)
+    if arguments.out is not None:
+        _require_file(arguments.out, arguments.folder, detections)
+    answers = _answers(arguments, scenes)
+    _write(answers, arguments.out)
     failed = [str(answer["scene"]) for answer in answers if answer["status"] != "fused"]
     if failed:
         print(

@@ -7,7 +7,6 @@ from phd_exp.cli.paths import conf_folder
 VERBS = {
     "train": "render what is missing, train, measure and record a run (the default)",
     "render": "render a data set, or what is missing of it",
-    "gallery": "draw the pictures of renders/README.md: paired data sets, the camera's axes",
     "report": "the paper's tables, the dashboard and the figures of all recorded runs",
     "predict": "where the object in an image is and how sure a run is of it: JSON lines, and pictures with out=",
     "fuse": "one position from the predictions of several cameras, and/or on a ground plane: a JSON line a scene",
@@ -19,7 +18,6 @@ OF_VERB = {
         *("backbone", "camera", "loss", "optimizer", "trainer", "logger"),
     ),
     "render": ("data", "preset"),
-    "gallery": (),
     "report": (),
     "predict": (),
     "fuse": (),
@@ -46,7 +44,6 @@ EXAMPLES = {
         "python -m phd_exp render data=scale verify=true",
         "python -m phd_exp render data=occl masks=masks/occl",
     ],
-    "gallery": ["python -m phd_exp gallery", "python -m phd_exp gallery folder=some/folder"],
     "report": ["python -m phd_exp report", "python -m phd_exp report runs=some/folder out=another"],
     "predict": [
         "python -m phd_exp predict run=runs/small/default/probabilistic/seed0 image=photo.jpg f=1550",

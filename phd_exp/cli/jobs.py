@@ -1,167 +1,100 @@
-"""What the jobs of one launch tell their launcher, wherever they run: a small file for each begun and each ended.
+"""A job: the task of a verb as Hydra, its launchers and its sweepers call it."""
 
-A launcher may run jobs in this process, in others, or on other machines. A job holds a lock while it runs, which
-the system drops however it dies: so a job that ended without a word is told from one that still runs.
-"""
-
-import fcntl
-import shutil
-import traceback
 import uuid
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from pydantic import BaseModel
 
+from phd_exp.cli.frame import Ending, failure, print_errors
 from phd_exp.cli.signals import Stopped, ending_with, stopping_on_signals
-from phd_exp.records.errors import ConfigError, RunError, UserError
-from phd_exp.records.files import write_atomic
+from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.provenance import usable_cores
 
-BAD_CONFIGURATION = 2
-FAILED = 1
 HOME = uuid.uuid4().hex
 """This process: another one that imports this module has another."""
 
-Task = Callable[[dict[str, Any], list[str], int], str]
-"""Takes the resolved configuration, the overrides that led to it, and how many cores it may use.
-
-Returns, if it ends well, its state in a word or two.
+Task = Callable[[dict[str, Any], list[str], int], float | None]
+"""Takes the resolved configuration, its overrides and the number of cores it may use; returns its score, if any."""
+Standing = Callable[[dict[str, Any], list[str]], str | None]
+"""How the job of a configuration, given its overrides, stands on disk: "finished", "running" in some process, what
+ended it otherwise, or None if nothing is recorded.
 """
 
 
-class Ending(BaseModel):
-    """How a job ended: what was asked for, its state, the exit status, and what is wrong, one thing a line."""
-
-    overrides: list[str]
-    state: str = "failed"
-    exit_status: int = 0
-    lines: list[str] = []
-
-    @classmethod
-    def of(cls, overrides: list[str], error: BaseException) -> "Ending":
-        """The ending of a job that this error stopped."""
-        if isinstance(error, Stopped):
-            line = f"stopped by {error}; the same command goes on from here"
-            return cls(overrides=overrides, state="stopped", exit_status=int(str(error.code)), lines=[line])
-        if isinstance(error, UserError):
-            status = BAD_CONFIGURATION if isinstance(error, ConfigError) else FAILED
-            return cls(overrides=overrides, exit_status=status, lines=str(error).splitlines())
-        line = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        return cls(overrides=overrides, exit_status=FAILED, lines=[line])
-
-
 @dataclass(frozen=True)
-class JobRecords:
-    """The folder of one launch; every machine that runs a job sees it."""
-
-    path: Path
-
-    @classmethod
-    def begin(cls, path: Path) -> "JobRecords":
-        """A new folder. Raises RunError where it cannot be written."""
-        try:
-            path.mkdir(parents=True)
-        except OSError as error:
-            raise RunError(
-                f"{path}: cannot be written ({error.strerror}); choose another runs=DIR"
-            ) from error
-        return cls(path)
-
-    @contextmanager
-    def running(self, number: int) -> Iterator[None]:
-        """Mark a job as begun, and as alive while the body runs."""
-        with open(self.path / f"{number}.begun", "a+b") as stream:
-            fcntl.flock(stream, fcntl.LOCK_SH)  # shared: a queue may give one job several processes
-            yield
-
-    def end(self, number: int, ending: Ending) -> None:
-        """Record how a job ended."""
-        write_atomic(self.path / f"{number}.json", ending.model_dump_json() + "\n")
-
-    def ending(self, number: int, overrides: list[str]) -> Ending:
-        """How a job ended; waits for one that still runs."""
-        begun, ended = self.path / f"{number}.begun", self.path / f"{number}.json"
-        if begun.exists():
-            with open(begun, "a+b") as stream:
-                fcntl.flock(stream, fcntl.LOCK_EX)
-        if ended.exists():
-            return Ending.model_validate_json(ended.read_bytes())
-        reason = (
-            "ended without a word: it was killed, or memory ran out; the same command goes on from there"
-            if begun.exists()
-            else "did not start before its launcher gave up; give the same command again"
-        )
-        return Ending(overrides=overrides, exit_status=FAILED, lines=[reason])
-
-    def remove(self) -> None:
-        """Delete the folder; nothing is said where that cannot be."""
-        shutil.rmtree(self.path, ignore_errors=True)
-
-
-@dataclass(frozen=True)
-class Launch:
-    """What all jobs of one launch are told, wherever they run.
+class Job:
+    """A verb as Hydra and its launchers call it; a launcher may pickle it and run it on another machine.
 
     Attributes:
-        records: where they say how they ended.
+        task: what a job does.
+        standing: how a job stands on disk; None if the verb records nothing.
+        endings: of all jobs, in the launcher's own process.
+        n_jobs: how many jobs the sweep has.
         cores: how many each may use; None: all that its process may use.
-        parent: the process whose children they are and with which they end; None: they outlive the launcher.
+        parent: the process with which a job ends; None: jobs outlive the launcher.
         home: the launcher's own process.
     """
 
-    records: JobRecords
+    task: Task
+    standing: Standing | None = None
+    endings: list[Ending] = field(default_factory=list)
+    n_jobs: int = 1
     cores: int | None = None
     parent: int | None = None
     home: str = HOME
 
-    def function(self, task: Task) -> Callable[[DictConfig], None]:
-        """The task as Hydra calls it; a launcher may pickle this function with what it holds."""
+    def __call__(self, config: DictConfig) -> float | None:
+        """Run the job; a single run keeps its ending, a sweeper of others gets the score or an error."""
+        ending = self.end(config)
+        if HydraConfig.get().mode == RunMode.RUN:
+            print_errors(ending.lines)
+            self.endings.append(ending)
+        elif ending.exit_status:
+            raise RunError("\n".join(ending.lines))
+        return ending.value
 
-        def job(config: DictConfig) -> None:
-            run_job(task, self, config)
-
-        return job
-
-
-def run_job(task: Task, launch: Launch, config: DictConfig) -> None:
-    """Run one job and record how it ended; a failure is recorded and not raised, so that a sweep goes on.
-
-    A stop goes up in the launcher's own process, where it ends everything. In another process it ends that job.
-    """
-    hydra = HydraConfig.get()
-    overrides = OmegaConf.to_container(hydra.overrides.task)
-    assert isinstance(overrides, list)
-    number = 0 if OmegaConf.is_missing(hydra.job, "num") else hydra.job.num  # a single run has none
-    at_home = launch.home == HOME
-    with launch.records.running(number):
+    def end(self, config: DictConfig) -> Ending:
+        """Run the job and say how it ended. A stop ends everything in the launcher's own process, else this job."""
+        at_home = self.home == HOME
         try:
-            # hydra's launchers put signal handlers of their own into their processes, or none
-            with stopping_on_signals(), ending_with(None if at_home else launch.parent):
-                # as they read once interpolations are resolved: what they say has its part in the run's name
-                state = task(plain(config), list(hydra.overrides.task), launch.cores or usable_cores())
-            ending = Ending(overrides=overrides, state=state)
+            # launchers install signal handlers of their own, or none
+            with stopping_on_signals(), ending_with(None if at_home else self.parent):
+                return Ending("finished", value=self._run(config))
         except Stopped as stop:
             if at_home:
                 raise
-            ending = Ending.of(overrides, stop)
+            return failure(stop)
         except OmegaConfBaseException as error:  # an interpolation that leads nowhere
-            ending = Ending.of(overrides, ConfigError(" ".join(str(error).split())))
+            return refusal(ConfigError(" ".join(str(error).split())))
+        except ConfigError as error:
+            return refusal(error)
         except Exception as error:
-            if not isinstance(error, UserError):
-                traceback.print_exc()  # a fault of the programme, not of its user
-            ending = Ending.of(overrides, error)
-        launch.records.end(number, ending)
+            return failure(error)
+
+    def _run(self, config: DictConfig) -> float | None:
+        composed = HydraConfig.get()
+        # as they read once interpolations are resolved: their values are part of the run's name
+        overrides = list(composed.overrides.task)
+        if composed.mode == RunMode.MULTIRUN:
+            print(f"job {composed.job.num + 1}/{self.n_jobs}: {' '.join(overrides)}", flush=True)
+        elif experiment := composed.runtime.choices.get("experiment"):
+            words = " ".join(map(str, overrides))
+            raise ConfigError(f"experiment={experiment}: names several runs; write -m before it: -m {words}")
+        return self.task(plain(config), overrides, self.cores or usable_cores())
+
+
+def refusal(error: ConfigError) -> Ending:
+    """The ending of what a wrong configuration keeps from running."""
+    return failure(error)._replace(exit_status=2)
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
-    """The configuration as plain containers, every interpolation resolved; what is missing is left for the check."""
+    """The configuration as plain containers, interpolations resolved; missing values are left out for the check."""
     values = _without_missing(OmegaConf.to_container(config, resolve=True))
     return {str(key): value for key, value in values.items()}
 

@@ -18,7 +18,7 @@ from phd_exp.cli.arguments import (
     with_progress,
 )
 from phd_exp.records.detections import Detection, detection_of, detections_in
-from phd_exp.records.errors import ConfigError, RunError, UserError
+from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import read_plain, write_atomic
 from phd_exp.records.parsing import parse_json
 from phd_exp.records.runs import RunFolder
@@ -81,17 +81,13 @@ class PredictArguments(Arguments):
 
 def main(words: list[str]) -> int:
     """Predict as the words say; returns the exit status."""
-    try:
-        arguments = parsed("predict", PredictArguments, words)
-        detections = arguments.detections()
-        if arguments.out is not None:
-            _require_drawing()
-            _require_no_image_lost(detections, arguments.out)
-            output_folder(arguments.out)
-        _predict(arguments, detections)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    arguments = parsed("predict", PredictArguments, words)
+    detections = arguments.detections()
+    if arguments.out is not None:
+        _require_drawing()
+        _require_no_image_lost(detections, arguments.out)
+        output_folder(arguments.out)
+    _predict(arguments, detections)
     return 0
 
 

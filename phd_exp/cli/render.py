@@ -11,12 +11,12 @@ from phd_exp.training.config import RenderConfig, RenderedConfig, check_render
 
 
 def main(arguments: list[str]) -> int:
-    """Render as the words say, once or for every combination; returns the exit status."""
+    """Render as the words of the command line ask, once or for every combination; returns the exit status."""
     return launch(task, arguments, config_name="render")
 
 
-def task(config: dict[str, Any], overrides: list[str], cores: int) -> str:
-    """What one job of rendering does; returns its state."""
+def task(config: dict[str, Any], overrides: list[str], cores: int) -> None:
+    """What one job of rendering does."""
     checked = check_render(config)
     data, folder = checked.data, DatasetFolder(checked.data.folder)
     if checked.masks is not None:
@@ -24,13 +24,12 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> str:
     if checked.verify:
         n = verify(folder, data.spec, checked.rerender)
         print(f"{folder.root}: all {n} samples are as they were rendered")
-        return "sound"
+        return
     if not _render(checked, folder, cores):
-        return "done"  # other shards are not
+        return  # other shards are missing
     print(f"{folder.root}: {data.n_training_split} training and {data.n_test} test samples are there")
     if checked.masks is not None:
         print(f"{checked.masks}: {write_masks(folder, checked.masks)} masks")
-    return "done"
 
 
 def _render(checked: RenderConfig, folder: DatasetFolder, cores: int) -> bool:

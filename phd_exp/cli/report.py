@@ -1,10 +1,9 @@
 """`python -m phd_exp report`: the paper's tables from all recorded runs, printed and written, and their site."""
 
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-from phd_exp.cli.folders import named_folders, require_folder
+from phd_exp.cli.arguments import Arguments, parsed
 from phd_exp.records.errors import UserError
 from phd_exp.reports.collect import Records, collect
 from phd_exp.reports.formats.files import write_fusion_tables, write_tables, write_variation_tables
@@ -12,30 +11,33 @@ from phd_exp.reports.formats.terminal import print_complaints, print_report, pri
 from phd_exp.reports.tables import tables
 from phd_exp.reports.variations import variation_tables
 
-FOLDERS = {"runs": "runs", "out": "report"}
 FOR_THE_SITE = ("matplotlib", "plotly", "jinja2")
 
 
-def main(arguments: list[str]) -> int:
+class ReportArguments(Arguments):
+    """Where the runs are and where the report goes."""
+
+    runs: Path = Path("runs")
+    out: Path = Path("report")
+
+
+def main(words: list[str]) -> int:
     """Print and write the tables and build the site; returns the exit status."""
-    try:
-        folders = named_folders("report", FOLDERS, arguments)
-        require_folder("runs", folders["runs"], "train first, or say where the runs are")
-        records = collect(folders["runs"])
-        drawn = tables(records)
-        print_report(records, drawn)
-        if drawn:
-            print(f"tables: {write_tables(drawn, folders['out'])}")
-        if varied := variation_tables(records):
-            print_tables(varied)
-            print(f"tables of variations: {write_variation_tables(varied, folders['out'])}")
-        if any(run.folder.views.exists() for run in records.runs):
-            _fusion(records, folders["out"])
-        if records.runs:
-            _build_site(folders["runs"], folders["out"])
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    folders = parsed("report", ReportArguments, words)
+    if not folders.runs.is_dir():
+        raise UserError(f"{folders.runs}: no such folder; train first, or name another by runs=DIR")
+    records = collect(folders.runs)
+    drawn = tables(records)
+    print_report(records, drawn)
+    if drawn:
+        print(f"tables: {write_tables(drawn, folders.out)}")
+    if varied := variation_tables(records):
+        print_tables(varied)
+        print(f"tables of variations: {write_variation_tables(varied, folders.out)}")
+    if any(run.folder.views.exists() for run in records.runs):
+        _fusion(records, folders.out)
+    if records.runs:
+        _build_site(folders.runs, folders.out)
     return 0
 
 

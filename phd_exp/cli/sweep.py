@@ -1,17 +1,18 @@
-"""A sweep: what its jobs are, known before any begins; who runs them; how all of them ended."""
+"""A sweep: every combination once, finished runs skipped, each outcome named at the end.
 
+Hydra calls it through its plugin `hydra_plugins/phd_exp_sweeper.py`; `hydra/sweeper=NAME` chooses another sweeper.
+"""
+
+import itertools
 import json
+import math
 import os
-import uuid
+import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
-import hydra
-from hydra._internal.callbacks import Callbacks
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -19,22 +20,21 @@ from hydra.core.override_parser.types import Override, RangeSweep
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
 from hydra.types import HydraContext, RunMode
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from phd_exp.cli.cores import cores_a_job
-from phd_exp.cli.jobs import Ending, JobRecords, Launch, Task, plain
-from phd_exp.cli.paths import conf_folder
+from phd_exp.cli.frame import RESUMES, Ending, print_errors
+from phd_exp.cli.jobs import Job, plain
 from phd_exp.records.errors import ConfigError, RunError
+from phd_exp.records.provenance import usable_cores
 
 MOST_JOBS = 10_000
-IsFinished = Callable[[dict[str, Any], list[str]], bool]
-"""Whether the job of a configuration, reached by these overrides, has been done before."""
+SECONDS_BETWEEN_LOOKS = 1.0
 
 
 @dataclass(frozen=True)
-class Job:
-    """One combination: the overrides that lead to it, and the whole configuration, not checked yet."""
+class Combination:
+    """One job to be: the overrides that lead to it, and the whole configuration, not checked yet."""
 
     overrides: list[str]
     config: dict[str, Any]
@@ -45,48 +45,79 @@ class Plan:
     """All jobs of a sweep, no two of them the same, and the configuration that its launcher takes."""
 
     config: DictConfig
-    jobs: list[Job]
+    jobs: list[Combination]
 
     @property
     def launcher(self) -> dict[str, Any]:
         """The launcher's part of the configuration, as plain containers."""
-        node = OmegaConf.to_container(self.config.hydra.launcher, resolve=True)
-        assert isinstance(node, dict)
-        return {str(key): value for key, value in node.items()}
+        return plain(self.config.hydra.launcher)
 
 
-def sweep(task: Task, words: list[str], config_name: str, is_finished: IsFinished | None) -> list[Ending]:
-    """Run every combination and collect how the jobs ended, in the order of the combinations.
+def sweep(job: Job, config: DictConfig, context: HydraContext, arguments: list[str]) -> list[float | None]:
+    """Run every combination, with the launcher that `config` names; returns the scores.
 
-    A launcher may run the jobs in other processes, on other machines: they share a folder of records. It is removed
-    where no job needs it any more and none failed. It stays when this process is stopped: jobs in a queue outlive it.
+    A failing job stops no other, whatever launcher runs the jobs and wherever. `job` keeps the endings.
     """
-    with hydra.initialize_config_dir(str(conf_folder()), job_name="phd_exp", version_base="1.3"):
-        planned = plan(words, config_name)
-        _announce(planned.jobs, is_finished)
-        folder = Path(planned.config.hydra.sweep.dir).absolute() / f"launch-{uuid.uuid4().hex[:8]}"
-        records = JobRecords.begin(folder)
-        gave_up = _run(task, planned, records)
-    endings = [records.ending(number, job.overrides) for number, job in enumerate(planned.jobs)]
-    if not any(ending.exit_status for ending in endings):
-        if gave_up is not None:
-            raise gave_up
-        records.remove()
-    _print_states(endings)
-    return endings
+    planned = plan([*config.hydra.overrides.hydra, *arguments], config.hydra.job.config_name)
+    finished = [_standing(job, combination) == "finished" for combination in planned.jobs]
+    tail = f", {sum(finished)} of them finished already" if job.standing else ""
+    print(f"{_counted(len(finished))}{tail}", flush=True)
+    endings = [
+        ending._replace(state="finished already") if before and ending.exit_status == 0 else ending
+        for before, ending in zip(finished, _run(job, planned, context), strict=True)
+    ]
+    _print_outcome(planned.jobs, endings)
+    job.endings.extend(endings)
+    return [ending.value for ending in endings]
+
+
+def _standing(job: Job, combination: Combination) -> str | None:
+    return job.standing(combination.config, combination.overrides) if job.standing else None
+
+
+def _run(job: Job, planned: Plan, context: HydraContext) -> list[Ending]:
+    """Let the launcher run the jobs; returns their endings in the order of the jobs."""
+    n, is_joblib = len(planned.jobs), planned.launcher["_target_"].endswith(".JoblibLauncher")
+    cores, parent = cores_a_job(planned.launcher, n), os.getpid() if is_joblib else None
+    try:
+        launcher = Plugins.instance().instantiate_launcher(
+            context, replace(job, n_jobs=n, cores=cores, parent=parent).end, planned.config
+        )
+        returns = launcher.launch([combination.overrides for combination in planned.jobs], initial_job_idx=0)
+        return [done.return_value for done in returns]
+    except (HydraException, OmegaConfBaseException, OSError):
+        raise
+    except Exception as error:  # how joblib, Ray and submitit say that a job has died
+        found = [_recorded(job, combination) for combination in planned.jobs]
+        if any(ending and ending.exit_status for ending in found):
+            missing = Ending("not started", (f"did not start; {RESUMES}",), 1)
+            return [ending or missing for ending in found]
+        reason = " ".join(str(error).split())
+        raise RunError(
+            f"the launcher failed ({type(error).__name__}: {reason}); choose another by hydra/launcher=NAME"
+        ) from error
+
+
+def _recorded(job: Job, combination: Combination) -> Ending | None:
+    """How a job ended according to its record; waits for one that still runs. None if there is no record."""
+    while (standing := _standing(job, combination)) == "running":
+        time.sleep(SECONDS_BETWEEN_LOOKS)
+    if standing is None:
+        return None
+    return Ending("finished") if standing == "finished" else Ending("failed", (f"{standing}; {RESUMES}",), 1)
 
 
 def plan(words: list[str], config_name: str) -> Plan:
-    """What the words of a command line stand for; Hydra has to be initialised.
+    """The jobs that the words of a command line stand for; Hydra has to be initialised.
 
-    A word has precedence over what an experiment says of the same key. Combinations that come to the same
-    configuration, as those that two experiments have in common, are one job.
+    The command line overrides an experiment. Combinations with the same configuration, as those that two experiments
+    have in common, are one job.
 
     Raises HydraException or OmegaConfBaseException where any combination cannot be composed, ConfigError where there
-    is none.
+    is none or there are too many.
     """
     loader = GlobalHydra.instance().config_loader()
-    jobs: dict[str, Job] = {}
+    jobs: dict[str, Combination] = {}
     for chosen in _one_experiment_each(words, loader):
         master = loader.load_configuration(config_name, chosen, RunMode.MULTIRUN)
         for overrides in _combinations(chosen, master, loader):
@@ -94,9 +125,9 @@ def plan(words: list[str], config_name: str) -> Plan:
             with open_dict(composed):
                 del composed["hydra"]
             config = plain(composed)
-            jobs.setdefault(json.dumps(config, sort_keys=True), Job(overrides, config))
+            jobs.setdefault(json.dumps(config, sort_keys=True), Combination(overrides, config))
     if not jobs:
-        raise ConfigError(f"{' '.join(words)}: not one combination; does a glob(...) match nothing?")
+        raise ConfigError(f"{_given(words)}: not one combination; does a glob(...) match nothing?")
     return Plan(master, list(jobs.values()))
 
 
@@ -114,70 +145,76 @@ def _one_experiment_each(words: list[str], loader: ConfigLoader) -> Iterator[lis
 
 def _combinations(words: list[str], master: DictConfig, loader: ConfigLoader) -> list[list[str]]:
     parse = OverridesParser.create(loader).parse_overrides
-    said = [item for item in parse(words) if not item.is_hydra_override()]
-    keys = {item.key_or_group for item in said}
+    given = [item for item in parse(words) if not item.is_hydra_override()]
+    keys = {item.key_or_group for item in given}
     params = parse([f"{key}={value}" for key, value in (master.hydra.sweeper.params or {}).items()])
-    unsaid = [item for item in params if item.key_or_group not in keys]
-    _require_countable([*unsaid, *said])
-    (combinations,) = BasicSweeper.split_arguments([*unsaid, *said], max_batch_size=None)
-    return combinations
+    values: dict[str, list[str]] = {}
+    for item in [*(item for item in params if item.key_or_group not in keys), *given]:
+        key = item.get_key_element()
+        values[key] = [f"{key}={value}" for value in _values(item)]
+    if math.prod(map(len, values.values())) > MOST_JOBS:
+        raise ConfigError(f"{_given(words)}: more than {MOST_JOBS} jobs; expected fewer values")
+    return [list(combination) for combination in itertools.product(*values.values())]
 
 
-def _require_countable(overrides: list[Override]) -> None:
-    """Raise ConfigError for a range that would be counted out in memory, number by number, without end."""
-    for item in overrides:
-        value = item.value()
-        if isinstance(value, RangeSweep) and _span(value) > MOST_JOBS * abs(value.step):
-            raise ConfigError(f"{item.input_line}: more than {MOST_JOBS} jobs; expected a shorter range")
+def _given(words: list[str]) -> str:
+    return " ".join(word for word in words if not word.startswith("hydra."))
+
+
+def _values(item: Override) -> list[str]:
+    """The values of an override as text. Raises ConfigError for a range too long to be expanded."""
+    if not item.is_sweep_override():
+        return [item.get_value_element_as_str()]
+    value = item.value()
+    # a comparison with NaN is false
+    if isinstance(value, RangeSweep) and not _span(value) <= MOST_JOBS * abs(value.step):
+        raise ConfigError(f"{item.input_line}: more than {MOST_JOBS} jobs; expected a shorter range")
+    return list(item.sweep_string_iterator())
 
 
 def _span(values: RangeSweep) -> float:
-    return abs(float(values.stop or 0) - float(values.start or 0))
+    return abs((values.stop or 0) - (values.start or 0))
 
 
-def _run(task: Task, planned: Plan, records: JobRecords) -> Exception | None:
-    """Let the launcher run the jobs; returns the error with which it gave up, if it did so on the way."""
-    parent = os.getpid() if planned.launcher["_target_"].endswith(".JoblibLauncher") else None
-    launch = Launch(records, cores_a_job(planned.launcher, len(planned.jobs)), parent)
-    context = HydraContext(
-        config_loader=GlobalHydra.instance().config_loader(), callbacks=Callbacks(planned.config)
-    )
-    try:
-        launcher = Plugins.instance().instantiate_launcher(
-            hydra_context=context, task_function=launch.function(task), config=planned.config
-        )
-        for done in launcher.launch([job.overrides for job in planned.jobs], initial_job_idx=0):
-            _ = done.return_value  # raises what went wrong around the job
-    except (HydraException, OmegaConfBaseException):
-        records.remove()
-        raise
-    except Exception as error:  # joblib's, Ray's and submitit's way to say that a job has died
-        if any(records.path.iterdir()):
-            return error
-        records.remove()
-        reason = " ".join(str(error).split())
-        raise RunError(
-            f"the launcher failed before any job began ({type(error).__name__}: {reason}); "
-            "choose another by hydra/launcher=NAME"
-        ) from error
+def cores_a_job(launcher: Mapping[str, Any], jobs: int) -> int | None:
+    """The share of each job where a launcher runs several at once on this machine, at least one core.
+
+    None where a job has all cores that its process may use: with Hydra's basic launcher, in a queue.
+
+    Args:
+        launcher: its section of the configuration.
+        jobs: how many there are to run.
+    """
+    match str(launcher["_target_"]).rpartition(".")[2]:
+        case "JoblibLauncher":
+            n = launcher["n_jobs"]
+            return _share(
+                min(jobs, n if n > 0 else max(1, usable_cores() + 1 + n))
+            )  # -1 stands for all cores
+        case "LocalLauncher":  # submitit without a queue starts all jobs at once
+            return _share(jobs)
+        case "RayLauncher":  # starts as many jobs as their cores allow, one each by default
+            return int(launcher["ray"]["remote"].get("num_cpus") or 1)
     return None
 
 
-def _announce(jobs: list[Job], is_finished: IsFinished | None) -> None:
-    line = _counted(len(jobs))
-    if is_finished is not None:
-        line += f", {sum(is_finished(job.config, job.overrides) for job in jobs)} of them finished already"
-    print(line, flush=True)
+def _share(jobs_at_once: int) -> int:
+    return max(1, usable_cores() // jobs_at_once)
 
 
-def _print_states(endings: list[Ending]) -> None:
-    shared = set.intersection(*(set(ending.overrides) for ending in endings))
-    for ending in endings:
-        own = [override for override in ending.overrides if override not in shared]
-        print(f"{' '.join(own or ending.overrides)}: {ending.state}")
+def _print_outcome(jobs: list[Combination], endings: list[Ending]) -> None:
+    """Print the outcome of each job by the overrides that set it apart, then every error by all its overrides."""
+    shared = set.intersection(*(set(job.overrides) for job in jobs))
+    for job, ending in zip(jobs, endings, strict=True):
+        own = [override for override in job.overrides if override not in shared]
+        print(f"{' '.join(own or job.overrides)}: {ending.state}")
     states = Counter(ending.state for ending in endings)
-    summary = ", ".join(f"{count} {state}" for state, count in states.items())
-    print(f"{_counted(len(endings))}: {summary}", flush=True)
+    print(f"{_counted(len(jobs))}: {', '.join(f'{n} {state}' for state, n in states.items())}", flush=True)
+    failed = sum(ending.exit_status > 0 for ending in endings)
+    if failed > 1:
+        print_errors([f"{failed} jobs failed"])
+    for job, ending in zip(jobs, endings, strict=True):
+        print_errors(f"{' '.join(job.overrides)}: {line}" for line in ending.lines)
 
 
 def _counted(jobs: int) -> str:

@@ -26,15 +26,17 @@ SHOWN = (
     "test/calibration/miscalibration_area",
 )
 """What is printed at the end of a run; results.json holds more."""
+SCORES = ("test/nll", "test/depth_error_mm")
+"""The number that a sweeper takes: of a baseline, which has no likelihood, the depth error."""
 
 
-def main(arguments: list[str]) -> int:
-    """Train as the words say, once or for every combination; returns the exit status."""
-    return launch(task, arguments, is_finished=is_finished)
+def main(words: list[str]) -> int:
+    """Train once or for every combination; returns the exit status."""
+    return launch(task, words, standing=standing)
 
 
-def task(config: dict[str, Any], overrides: list[str], cores: int) -> str:
-    """What one job of training does: render what is missing, train, print the numbers; returns its state."""
+def task(config: dict[str, Any], overrides: list[str], cores: int) -> float | None:
+    """Render what is missing, train and print the numbers of one run; returns the first of SCORES that it has."""
     checked = check(config)
     # seconds of imports, which a refused configuration need not wait for
     from phd_exp.training.run import require_possible, train
@@ -57,28 +59,30 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> str:
         print(f"  {key} {_number(results[key])} (untrained {_number(results.get(f'untrained/{key}'))})")
     if (folder.calibration / "final.png").exists():
         print(f"  calibration curves: {folder.calibration / 'final.png'}")
-    return state
+    return next((results[key] for key in SCORES if results.get(key) is not None), None)
 
 
 def _number(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, int | float) else "not finite"
 
 
-def is_finished(config: dict[str, Any], overrides: list[str]) -> bool:
-    """Whether the run of a configuration is there; one that is not checked yet, since checking imports torch."""
+def standing(config: dict[str, Any], overrides: list[str]) -> str | None:
+    """How the run of a configuration stands; the configuration is not checked yet, since checking imports torch."""
     try:
         data = config["data"].get("variant") or config["data"]["name"]
-        choices = (
-            setting(config["preset"], config["recipe"]["name"]),
-            data,
-            config["model"]["name"],
-            config["seed"],
-        )
-        folder = RunFolder(RunName(*choices, _telling(overrides)).folder(Path(config["runs"])))
+        preset = setting(config["preset"], config["recipe"]["name"])
+        name = RunName(preset, data, config["model"]["name"], config["seed"], _telling(overrides))
+        folder = RunFolder(name.folder(Path(config["runs"])))
+        status = folder.status()
+        if status is None:
+            return None
+        if status.state == "running":
+            return "running" if folder.is_held() else "exited without a result (killed or out of memory)"
         several = config["evaluation"]["multiview"]["scenes"] > 0
-        return folder.is_finished() and (folder.views.exists() or not several)
-    except (KeyError, TypeError, AttributeError, RunError):  # the run itself will say what is wrong
-        return False
+        is_whole = status.state == "finished" and (folder.views.exists() or not several)
+        return "finished" if is_whole else status.error or "interrupted"
+    except (KeyError, TypeError, AttributeError, OSError, RunError):  # the run itself will say what is wrong
+        return None
 
 
 def run_name(config: RunConfig, overrides: list[str]) -> RunName:

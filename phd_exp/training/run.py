@@ -23,7 +23,6 @@ from phd_exp.records.files import remove_temporaries
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import build_data, build_module, build_trainer
 from phd_exp.training.config import FolderConfig, RunConfig, TrainerConfig
-from phd_exp.training.faults import told
 from phd_exp.training.module import PositionModule
 from phd_exp.training.predictions import summary, write_parquet
 from phd_exp.training.ranks import train_together
@@ -46,10 +45,10 @@ def train(config: RunConfig, folder: RunFolder, draw: Draw | None, cores: int) -
         draw: draws calibration curves; None records them alone.
         cores: how many threads it has, unless trainer.threads says otherwise.
 
-    Raises RunError where the folder holds a run of another configuration or another process works on it, and where
-    the disk or memory is full; DatasetError where the data set is incomplete.
+    Raises RunError where the folder holds a run of another configuration or another process works on it, DatasetError
+    where the data set is incomplete.
     """
-    with told(folder.path), folder.held():
+    with folder.held():
         require_same_config(folder, config)
         if folder.is_finished():
             return folder.results()

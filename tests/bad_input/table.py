@@ -148,7 +148,7 @@ BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
 )
 
 CONFIGURATIONS = [
-    configured("a flag that returns the carriage", "--cfg\r", r"--cfg: holds control characters; expected KEY=VALUE in visible ones"),
+    Bad("configuration: a flag that returns the carriage", nothing, ("preset=smoke", "--cfg\r"), r"--cfg: holds control characters; expected printable KEY=VALUE"),
     configured("a flag that there is not", "--nonsense", r"unrecognized arguments: --nonsense; see `python -m phd_exp --help`"),
     configured("a flag without its value", "-c", r"argument --cfg/-c: expected one argument; .*"),
     configured("a group set to null", "model=null", r"Config group override must be a string or a list\..*"),
@@ -176,9 +176,11 @@ CONFIGURATIONS = [
     configured("brackets without end", "+a=" + "[" * 2000, r"[^\n]{1,420}"),
     configured("no key at all", "=5", r"Config group override .*"),
     configured("an empty word", "", r".*mismatched input.*"),
-    configured("a zero byte", "runs=a\0b", r"runs=a\?b: holds control characters; .*"),
-    Bad("configuration: a billion jobs", nothing, ("-m", "preset=smoke", "seed=range(0,1e9)"), r"seed=range\(0,1e9\): more than 10000 jobs; .*", 2),
-    Bad("configuration: a folder that cannot be made", nothing, ("preset=smoke", "hydra.run.dir=/proc/nope"), r"/proc/nope: cannot be written \(.*\); .*", 2),
+    Bad("configuration: a zero byte", nothing, ("preset=smoke", "runs=a\0b"), r"runs=a\?b: holds control characters; .*"),
+    *(Bad(f"configuration: {word}", nothing, ("-m", "preset=smoke", word), r"seed=range\(0,.*\): more than 10000 jobs; .*", 2) for word in ("seed=range(0,1e9)", "seed=range(0,nan)", "seed=range(0,inf)")),
+    Bad("configuration: two long ranges", nothing, ("-m", "preset=smoke", "seed=range(0,9999)", "data.seed=range(0,9999)"), r"preset=smoke seed=.*: more than 10000 jobs; .*", 2),
+    Bad("configuration: a folder with a long name", nothing, ("preset=smoke", "logger=none", f"runs={'a' * 300}"), r"a{300}.*: File name too long; .*"),
+    Bad("configuration: a folder that cannot be made", nothing, ("preset=smoke", "hydra.run.dir=/proc/nope"), r"/proc/nope: No such file or directory; .*"),
 ]  # fmt: skip
 
 KINDS = r"not an image of any kind that is read here \(PNG, .*\)"

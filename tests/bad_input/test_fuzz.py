@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from phd_exp.cli import train
 from phd_exp.cli.app import launch
+from phd_exp.cli.frame import run_verb
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.detections import DetectionLine, detections_in
 from phd_exp.records.errors import UserError
@@ -196,14 +197,16 @@ def _in(folder: Path) -> Iterator[None]:
 def _command(folder: Path, words: list[str], capfd: pytest.CaptureFixture[str]) -> None:
     """What is composed is checked, and no further."""
 
-    def task(config: dict[str, Any], overrides: list[str], cores: int) -> str:
+    def task(config: dict[str, Any], overrides: list[str], cores: int) -> None:
         train.run_name(check(config), overrides)
-        return "checked"
+
+    def verb(words: list[str]) -> int:
+        return launch(task, words, standing=train.standing)
 
     capfd.readouterr()
     with _in(folder):
         try:
-            status = launch(task, ["preset=smoke", "logger=none", *words], is_finished=train.is_finished)
+            status = run_verb(verb, ["preset=smoke", "logger=none", *words])
         except SystemExit as end:  # --version and the like
             status = end.code
     out, err = capfd.readouterr()

@@ -131,9 +131,9 @@ def test_an_unwritable_folder_of_a_sweep(phd_exp: Callable, tmp_path: Path) -> N
     (tmp_path / "file").write_text("in the way")
     outcome = phd_exp("-m", "preset=smoke", "seed=0,1", "runs=file/runs")
     assert outcome.status == 1
-    (line,) = outcome.err.splitlines()
-    assert "cannot be written" in line
-    assert "runs=DIR" in line
+    assert (
+        outcome.err == "error: file/runs/.sweep: Not a directory; mend that, and the same command resumes\n"
+    )
 
 
 def test_each_thing_wrong_gets_its_own_line(phd_exp: Callable) -> None:
@@ -148,13 +148,13 @@ def test_unknown_verb(phd_exp: Callable) -> None:
     outcome = phd_exp("trian")
     assert outcome.status == 2
     assert "no verb 'trian'" in outcome.err
-    assert "train, render, gallery, report" in outcome.err
+    assert "train, render, report" in outcome.err
 
 
 def test_report_without_runs(phd_exp: Callable) -> None:
     outcome = phd_exp("report")
     assert outcome.status == 1
-    assert outcome.err == "error: runs: no such folder; train first, or say where the runs are by runs=DIR\n"
+    assert outcome.err == "error: runs: no such folder; train first, or name another by runs=DIR\n"
 
 
 def test_unwritable_folder(phd_exp: Callable, tmp_path: Path) -> None:

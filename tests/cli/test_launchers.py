@@ -29,10 +29,12 @@ TASK = """
 import os, signal, sys, time
 from pathlib import Path
 from phd_exp.cli.app import launch
+from phd_exp.cli.frame import run_verb
 from phd_exp.records.errors import UserError
 
 def task(config, overrides, cores):
     seed = config["seed"]
+    Path(f"{seed}.begun").touch()
     if seed == 1:
         raise UserError("a mistake")
     if seed == 2:
@@ -42,12 +44,30 @@ def task(config, overrides, cores):
         time.sleep(60)
     if seed == 4:
         os.kill(os.getpid(), signal.SIGKILL)
-    time.sleep(60 if seed == 6 else 1)
+    if seed == 6:
+        Path(f"{config['preset']}.asleep").touch()
+        try:
+            time.sleep(60)
+        finally:
+            Path(f"{config['preset']}.awake").touch()
+    time.sleep(1)
     Path(f"{seed}.done").write_text(str(cores))
-    return "done"
+    return seed / 2
+
+def standing(config, overrides):
+    done, begun = (Path(f"{config['seed']}.{state}") for state in ("done", "begun"))
+    return "finished" if done.exists() else "killed" if begun.exists() else None
 
 if __name__ == "__main__":
-    sys.exit(launch(task, sys.argv[1:]))
+    sys.exit(run_verb(lambda words: launch(task, words, standing=standing), sys.argv[1:]))
+"""
+
+SCORES = """
+from hydra.experimental.callback import Callback
+
+class Scores(Callback):
+    def on_job_end(self, config, job_return, **rest):
+        print("score", job_return.return_value)
 """
 
 
@@ -94,7 +114,6 @@ def test_shards_at_once_give_the_bytes_of_one_render(
     (line,) = errors(done)
     assert "shard=2/2: shard: got '2/2'; expected INDEX/COUNT" in line
     assert contents(tmp_path / "renders") == unsharded
-    assert {path.name for path in tmp_path.iterdir()} == {"renders", "runs"}
 
 
 @pytest.mark.parametrize("launcher", LAUNCHERS)
@@ -102,49 +121,58 @@ def test_failures_come_back_and_stop_no_other_job(sweep, tmp_path: Path, launche
     done = sweep(launcher, "0,1,2,3,5")
     assert done.returncode == 143
     heading, user, fault, stopped = errors(done)
-    assert heading == "error: 3 runs failed"
+    assert heading == "error: 3 jobs failed"
     assert user == "error: seed=1 preset=smoke: a mistake"
     assert fault == "error: seed=2 preset=smoke: ValueError: a fault"
     assert "seed=3" in stopped
     assert "stopped by SIGTERM" in stopped
     assert {path.name for path in tmp_path.glob("*.done")} == {"0.done", "5.done"}
-    assert len(list((tmp_path / "runs" / ".sweep").glob("launch-*/*.json"))) == 5
 
 
 @pytest.mark.parametrize("launcher", ["joblib", pytest.param("submitit", marks=pytest.mark.slow)])
 def test_a_job_that_is_killed_is_named(sweep, tmp_path: Path, launcher: str) -> None:  # type: ignore[no-untyped-def]
     done = sweep(launcher, "4,0")
     assert done.returncode == 1
-    assert "seed=4 preset=smoke: ended without a word: it was killed" in "\n".join(errors(done))
+    assert "error: seed=4 preset=smoke: killed; the same command resumes" in errors(done)
     if launcher == "submitit":  # joblib ends all its processes when one of them dies
         assert len(errors(done)) == 1
-        assert (tmp_path / "0.done").exists(), "jobs that still run are waited for"
 
 
-def test_nothing_stays_of_a_launch_without_failures(sweep, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_jobs_at_once_share_the_cores_and_say_who_they_are(sweep, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     done = sweep("joblib", "0,5")
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines() == ["2 jobs", "seed=0: done", "seed=5: done", "2 jobs: 2 done"]
+    first, *headers, zero, five, total = done.stdout.splitlines()
+    assert first == "2 jobs, 0 of them finished already"
+    assert sorted(headers) == ["job 1/2: seed=0 preset=smoke", "job 2/2: seed=5 preset=smoke"]
+    assert (zero, five, total) == ("seed=0: finished", "seed=5: finished", "2 jobs: 2 finished")
     cores = max(1, len(os.sched_getaffinity(0)) // 2)
     assert [(tmp_path / f"{seed}.done").read_text() for seed in (0, 5)] == [str(cores)] * 2
     assert errors(done) == []
-    assert not list((tmp_path / "runs" / ".sweep").glob("launch-*"))
+
+
+def test_a_sweeper_of_others_gets_the_number_of_each_job_and_stops_at_an_error(tmp_path: Path) -> None:
+    """Hydra's own; a job returns what a sweeper minimizes."""
+    (tmp_path / "task.py").write_text(TASK)
+    (tmp_path / "scores.py").write_text(SCORES)
+    words = ("task.py", "-m", "preset=smoke", "hydra/sweeper=basic")
+    done = call(tmp_path, *words, "seed=5,0", "+hydra.callbacks.scores._target_=scores.Scores")
+    assert [line for line in done.stdout.splitlines() if "score" in line] == ["score 2.5", "score 0.0"]
+    failed = call(tmp_path, *words, "seed=1,0")
+    assert (failed.returncode, errors(failed)) == (1, ["error: a mistake"])
 
 
 @pytest.mark.slow
 def test_jobs_of_a_queue_outlive_a_stopped_launcher(tmp_path: Path) -> None:
-    """Stopped before its jobs begin, it leaves them the folder of their records."""
     (tmp_path / "task.py").write_text(TASK)
     words = [sys.executable, "task.py", "-m", "seed=0,5", "preset=smoke", *LAUNCHERS["submitit"]]
     environment = os.environ | {"PYTHONPATH": str(HOME)}
     launches = tmp_path / "runs" / ".sweep"
     with subprocess.Popen(words, cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL) as launcher:
         wait_for(lambda: len(list(launches.glob(".submitit/*/*_submitted.pkl"))) == 2)
-        assert not list(launches.glob("launch-*/*")), "no job has begun"
+        assert not list(tmp_path.glob("*.begun")), "no job has begun"
         launcher.send_signal(signal.SIGTERM)
         assert launcher.wait(60) == 143
-    wait_for(lambda: len(list(launches.glob("launch-*/*.json"))) == 2)
-    assert {path.name for path in tmp_path.glob("*.done")} == {"0.done", "5.done"}
+    wait_for(lambda: {path.name for path in tmp_path.glob("*.done")} == {"0.done", "5.done"})
 
 
 def test_jobs_of_joblib_end_with_a_killed_launcher(tmp_path: Path) -> None:
@@ -153,13 +181,11 @@ def test_jobs_of_joblib_end_with_a_killed_launcher(tmp_path: Path) -> None:
     words = [sys.executable, "task.py", "-m", "seed=6", "preset=smoke,small,paper,demo", *LAUNCHERS["joblib"]]
     environment = os.environ | {"PYTHONPATH": str(HOME)}
     with subprocess.Popen(words, cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL) as launcher:
-        wait_for(lambda: len(list(tmp_path.glob("runs/.sweep/launch-*/*.begun"))) == 2)
+        wait_for(lambda: len(list(tmp_path.glob("*.asleep"))) == 2)
         launcher.kill()
-    (records,) = tmp_path.glob("runs/.sweep/launch-*")
-    wait_for(lambda: {"0.json", "1.json"} <= {file.name for file in records.glob("*.json")})
+    wait_for(lambda: len(list(tmp_path.glob("*.awake"))) >= 2)
     time.sleep(0.5)
-    for file in records.glob("*.json"):
-        assert "stopped by SIGTERM" in file.read_text()
+    assert len(list(tmp_path.glob("*.awake"))) == len(list(tmp_path.glob("*.asleep")))
     assert not list(tmp_path.glob("*.done"))
 
 
@@ -175,5 +201,4 @@ def test_a_launcher_that_cannot_begin_is_one_line(phd_exp: Callable, tmp_path: P
     outcome = phd_exp("-m", "render", *TINY, "shard=0/2,1/2", "hydra/launcher=submitit_slurm")
     assert outcome.status == 1
     (line,) = outcome.err.splitlines()
-    assert line.startswith("error: the launcher failed before any job began (RuntimeError: Could not detect")
-    assert not list(tmp_path.glob("runs/.sweep/launch-*"))
+    assert line.startswith("error: the launcher failed (RuntimeError: Could not detect")

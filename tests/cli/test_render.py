@@ -1,12 +1,9 @@
-"""`render` and `gallery` as a user types them, on a real data set of a few images."""
+"""`render` as a user types it, on a real data set of a few images."""
 
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from PIL import Image
-
-from phd_exp.cli import gallery
 
 TINY = (
     "data.sensor_size=56",
@@ -90,22 +87,3 @@ def test_verifying_nothing_is_one_line(render: Callable) -> None:
     assert outcome.status == 1
     assert outcome.err.startswith("error: ")
     assert "no data set here" in outcome.err
-
-
-@pytest.mark.slow
-def test_the_gallery_is_drawn(phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gallery, "INDICES", (0, 3, 0, 0, 3))
-    outcome = phd_exp("gallery", f"folder={tmp_path}")
-    assert outcome.status == 0, outcome.err
-    with Image.open(tmp_path / "gallery.jpg") as picture:
-        assert picture.size == (5 * 228 - 4, 4 * 228 - 4)
-    with Image.open(tmp_path / "camera.png") as picture:
-        assert picture.height == 4 * 224
-
-
-@pytest.mark.parametrize("argument", ["folder=nowhere", "folder=", "x=1"])
-def test_the_gallery_refuses_what_it_does_not_know(phd_exp: Callable, argument: str) -> None:
-    outcome = phd_exp("gallery", argument)
-    assert outcome.status == 1
-    assert outcome.err.startswith(f"error: {argument.removeprefix('folder=') or argument}")
-    assert len(outcome.err.splitlines()) == 1

@@ -70,16 +70,17 @@ def test_nothing_is_written_where_nothing_is_recorded(phd_exp: Callable, tmp_pat
 @pytest.mark.parametrize(
     ("argument", "said"),
     [
-        ("rnus=x", "rnus=x: report takes runs=DIR and out=DIR and nothing else, did you mean 'runs'?"),
-        ("out=", "out=: report takes runs=DIR and out=DIR and nothing else"),
-        ("runs", "runs: report takes runs=DIR and out=DIR and nothing else"),
-        ("runs=x", "x: no such folder; train first, or say where the runs are by runs=DIR"),
+        ("rnus=x", "rnus: unknown key, did you mean 'runs'?; report takes runs=, out= (see "),
+        ("out=", "out=: expected key=value; report takes runs=, out= (see "),
+        ("runs", "runs: expected key=value; report takes runs=, out= (see "),
+        ("runs=x", "x: no such folder; train first, or name another by runs=DIR"),
     ],
 )
 def test_a_mistake_is_one_line(phd_exp: Callable, runs: Path, argument: str, said: str) -> None:
     outcome = phd_exp("report", argument)
     assert (outcome.status, outcome.out) == (1, "")
-    assert outcome.err == f"error: {said}\n"
+    (line,) = outcome.err.splitlines()
+    assert line.startswith(f"error: {said}")
 
 
 def test_a_folder_in_the_way_is_one_line(phd_exp: Callable, runs: Path, tmp_path: Path) -> None:

@@ -2,17 +2,17 @@
 
 import os
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import hydra
 import pytest
 
-from phd_exp.cli import cores
-from phd_exp.cli.cores import cores_a_job
+from phd_exp.cli import sweep
 from phd_exp.cli.paths import conf_folder
-from phd_exp.cli.sweep import Job, plan
-from phd_exp.cli.train import is_finished, run_name
+from phd_exp.cli.sweep import Combination, cores_a_job, plan
+from phd_exp.cli.train import run_name, standing
 from phd_exp.records.provenance import usable_cores
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import check
@@ -21,13 +21,13 @@ HYDRA = "hydra_plugins"
 
 
 @pytest.fixture
-def jobs() -> Iterator[Callable[..., list[Job]]]:
+def jobs() -> Iterator[Callable[..., list[Combination]]]:
     """The jobs that the words of a command line stand for."""
     with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
         yield lambda *words: plan(list(words), "config").jobs
 
 
-def folder(job: Job) -> Path:
+def folder(job: Combination) -> Path:
     config = check(job.config)
     return run_name(config, job.overrides).folder(config.runs)
 
@@ -87,9 +87,8 @@ def test_what_the_user_says_counts(jobs: Callable) -> None:
     [
         (
             ["experiment=table1"],
-            "experiment=table1: an experiment is several runs; write -m before it: -m exp",
+            "experiment=table1: names several runs; write -m before it: -m experiment=table1",
         ),
-        (["+experiment=table2", "seed=1"], "write -m before it: -m +experiment=table2 seed=1"),
         (["-m", "experiment=tabel1"], "experiment=tabel1: no such choice, did you mean 'table1'?"),
         (["-m", "experiment=table1,tabel2"], "experiment=tabel2: no such choice, did you mean 'table2'?"),
         (["-m", "experiment=glob(nothing*)"], "experiment=glob(nothing*): not one combination"),
@@ -108,23 +107,33 @@ def test_mistakes_are_one_line(phd_exp: Callable, tmp_path: Path, words: list[st
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_finished_run_is_seen_before_the_sweep_begins(
+def test_how_a_run_stands_is_read_before_the_configuration_is_checked(
     jobs: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     planned = jobs("experiment=table2", "preset=smoke", "optimizer.lr=0.01", "data.xy_range=0.5")
-    assert not any(is_finished(job.config, job.overrides) for job in planned)
-    run = RunFolder(folder(planned[1]))
-    run.path.mkdir(parents=True)
-    with run.recording(data_manifest=None):
-        pass
-    assert [is_finished(job.config, job.overrides) for job in planned] == [False, True, False]
+    runs = [RunFolder(folder(job)) for job in planned]
+    for run in runs[1:]:
+        run.path.mkdir(parents=True)
+    with runs[2].held(), runs[2].recording(data_manifest=None):
+        assert [standing(job.config, job.overrides) for job in planned] == [None, None, "running"]
+    with suppress(ValueError), runs[1].recording(data_manifest=None):
+        raise ValueError("planted")
+    found = [standing(job.config, job.overrides) for job in planned]
+    assert found == [None, "ValueError: planted", "finished"]
+    status = runs[1].status()
+    assert status is not None
+    runs[1].write_status(status.model_copy(update={"state": "running"}))
+    assert (
+        standing(planned[1].config, planned[1].overrides)
+        == "exited without a result (killed or out of memory)"
+    )
 
 
 @pytest.mark.parametrize("change", [{"data": 3}, {"model": {}}, {"runs": None}, {"seed": [1]}])
-def test_a_configuration_that_makes_no_sense_is_not_finished(jobs: Callable, change: dict[str, Any]) -> None:
+def test_a_configuration_that_makes_no_sense_has_no_run(jobs: Callable, change: dict[str, Any]) -> None:
     (job,) = jobs("preset=smoke")
-    assert not is_finished(job.config | change, job.overrides)
+    assert standing(job.config | change, job.overrides) is None
 
 
 @pytest.mark.parametrize(
@@ -147,7 +156,7 @@ def test_a_configuration_that_makes_no_sense_is_not_finished(jobs: Callable, cha
 def test_jobs_at_once_share_the_cores(
     monkeypatch: pytest.MonkeyPatch, launcher: dict[str, Any], jobs_: int, expected: int | None
 ) -> None:
-    monkeypatch.setattr(cores, "usable_cores", lambda: 12)
+    monkeypatch.setattr(sweep, "usable_cores", lambda: 12)
     assert cores_a_job(launcher, jobs_) == expected
 
 

@@ -85,7 +85,7 @@ def test_a_disk_that_fails_after_an_epoch_is_one_line_and_nothing_is_lost(
     with monkeypatch.context() as patch:
         patch.setattr(PositionModule, "on_train_epoch_end", fill)
         line = refused(train(*QUIET, f"runs={runs}"))
-    assert "No space left on device; mend that, and the same command goes on from the last checkpoint" in line
+    assert "No space left on device; mend that, and the same command resumes" in line
     assert torch.load(only_run(runs).last_checkpoint, weights_only=True)["epoch"] == 0
     make_room(disk)
     remount(disk, "ro")

@@ -1,6 +1,7 @@
 """The pictures of the README show what a data set would hold."""
 
 import io
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -8,13 +9,15 @@ from PIL import Image
 
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.gallery import GAP, MARK, ZOOM, draw_camera, draw_gallery
+
+DRAW = runpy.run_path(str(Path(__file__).parents[2] / "renders" / "draw.py"))
+GAP, MARK, ZOOM = DRAW["GAP"], DRAW["MARK"], DRAW["ZOOM"]
 
 
 def test_samples_stand_in_rows_and_columns(
     small: DatasetFolder, small_spec: DatasetSpec, tmp_path: Path
 ) -> None:
-    draw_gallery(tmp_path / "gallery.jpg", [small_spec, small_spec], [4, 2, 0])
+    DRAW["draw_gallery"](tmp_path / "gallery.jpg", [small_spec, small_spec], [4, 2, 0])
     with Image.open(tmp_path / "gallery.jpg") as picture:
         sheet = np.asarray(picture).astype(int)
     side = 56
@@ -27,7 +30,7 @@ def test_samples_stand_in_rows_and_columns(
 def test_the_centre_is_marked_where_the_record_says(
     small: DatasetFolder, small_spec: DatasetSpec, tmp_path: Path
 ) -> None:
-    draw_camera(tmp_path / "camera.png", small_spec, 4)
+    DRAW["draw_camera"](tmp_path / "camera.png", small_spec, 4)
     record = small.records("train")[4]
     u, v = (int(ZOOM * (record.f * place / record.z + record.S / 2)) for place in (record.x, record.y))
     with Image.open(io.BytesIO((tmp_path / "camera.png").read_bytes())) as picture:

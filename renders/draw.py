@@ -1,12 +1,19 @@
-"""The two pictures of `renders/README.md`: paired data sets side by side, and where things are in an image."""
+"""`python renders/draw.py [FOLDER]`: the two pictures of `renders/README.md`, into `renders/` or another folder.
+
+`gallery.jpg` shows paired data sets side by side, `camera.png` the camera's axes and where things are in an image.
+"""
 
 import io
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import hydra
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from phd_exp.cli.jobs import plain
+from phd_exp.cli.paths import conf_folder
 from phd_exp.records.files import write_atomic
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
@@ -14,6 +21,10 @@ from phd_exp.rendering.blender import Renderer
 from phd_exp.rendering.pixels import file_of
 from phd_exp.rendering.rays import cylinder_mask, trace_pixels
 from phd_exp.rendering.worker import fast_settings, make_sample
+from phd_exp.training.config import check_render
+
+VARIANTS = ("default", "occl", "scale", "occl_scale")
+INDICES = (0, 3, 6, 8, 12, 14)
 
 GAP = 4  # px of white between pictures
 QUALITY = 88
@@ -119,3 +130,16 @@ def _dot(draw: ImageDraw.ImageDraw, x: float, y: float, colour: tuple[int, int, 
 
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(size)
+
+
+def _spec(variant: str) -> DatasetSpec:
+    with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
+        config = hydra.compose("render", [f"data={variant}"])
+    return check_render(plain(config)).data.spec
+
+
+if __name__ == "__main__":
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
+    specs = [_spec(variant) for variant in VARIANTS]
+    draw_gallery(folder / "gallery.jpg", specs, INDICES)
+    draw_camera(folder / "camera.png", specs[0], INDICES[4])

@@ -1,0 +1,27 @@
+"""The sweeper of phd_exp, where Hydra looks for plugins; other programmes that use Hydra load this file too."""
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+from hydra.plugins.sweeper import Sweeper
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig
+
+
+class EveryCombination(Sweeper):
+    """Runs every combination of the values on the command line and in an experiment: `phd_exp.cli.sweep`."""
+
+    def __init__(self, params: Mapping[str, Any] | None = None) -> None:
+        self.params = params  # of conf/experiment; `sweep` reads them for each experiment
+
+    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
+        from phd_exp.cli.jobs import Job
+        from phd_exp.cli.sweep import sweep
+
+        assert isinstance(task_function, Job)
+        self.run = partial(sweep, task_function, config, hydra_context)
+
+    def sweep(self, arguments: list[str]) -> list[float | None]:
+        """Run all jobs; returns their scores."""
+        return self.run(arguments)
