@@ -21,10 +21,11 @@ from phd_exp.records.scenes import SampleRecord, Scene
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.compose import backdrop_light
 from phd_exp.rendering.pixels import encoded
-from phd_exp.rendering.rays import silhouettes, trace_pixels
+from phd_exp.rendering.rays import trace_pixels
 from phd_exp.rendering.render import ensure_rendered
 from phd_exp.rendering.rotations import rotation_matrix
 from tests.e2e.runs import only_run
+from tests.rendering.folders import silhouettes
 
 N = {"train": 14, "held_out": 0, "test": 2}
 SIDE = 96

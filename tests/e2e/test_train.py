@@ -344,7 +344,7 @@ def test_a_sweep_survives_its_failures(train: Callable, tmp_path: Path) -> None:
     assert outcome.status == 2
     assert sum(run.is_finished() for run in find_runs(tmp_path / "runs")) == 2
     lines = [line for line in outcome.err.splitlines() if line.startswith("error: ")]
-    assert lines[0] == "error: 2 runs failed"
+    assert lines[0] == "error: 2 jobs failed"
     assert "model=probabilistic camera=known" in lines[1]
     assert "model=probabilistic camera=constant" in lines[2]
 
