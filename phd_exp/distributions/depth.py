@@ -56,7 +56,7 @@ def depth_cdf(log_t: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]) 
 
 
 def depth_icdf(p: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
-    """The log t with P(z/mu_z <= t) = p, for p in (0, 1); differentiable once, in p and in log a.
+    """The log t with P(z/mu_z <= t) = p, for p in [0, 1]; differentiable once for p in (0, 1), in p and log a.
 
     Above the mode t = 1 + w/a with e^(-w) = (1 - p)(1 + g(a)). Below it l = -log t solves
     a (e^l - 1) + 2 l - log g(a e^l) = -log(p (1 + g(a))). The left side is increasing and convex: its derivative is
@@ -69,12 +69,15 @@ def depth_icdf(p: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]) -> 
     p, log_a = torch.broadcast_tensors(p, log_a)
     a = log_a.exp()
     g = tail_moment(0, a)
+    zero = p == 0
+    p = p.masked_fill(zero, 0.5)  # whose result is replaced below
     below = p * (1 + g) < g
     w = -torch.log1p(-p.masked_fill(below, 0.5)) - torch.log1p(g)
     upper = signed_log1p(w.masked_fill(below, 1), log_a)
     log_e_2 = scaled_expint(2, a).log()
     drop = log_a + log_e_2 - torch.log1p(g) - p.masked_fill(~below, 0.5).log()  # log(P(t < 1) / p)
-    return torch.where(below, -_solve_lower(drop.masked_fill(~below, 1), log_a, log_e_2), upper)
+    log_t = torch.where(below, -_solve_lower(drop.masked_fill(~below, 1), log_a, log_e_2), upper)
+    return log_t.masked_fill(zero, -torch.inf)
 
 
 def _solve_lower(drop: Tensor, log_a: Tensor, log_e_2: Tensor) -> Tensor:

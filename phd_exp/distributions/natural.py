@@ -88,7 +88,8 @@ class Natural:
     @property
     def batch_shape(self) -> torch.Size:
         """The common batch shape of the parameters."""
-        return torch.broadcast_shapes(*(self._batch_shape_of(field.name) for field in fields(self)))
+        shapes = {self._batch_shape_of(field.name) for field in fields(self)}
+        return shapes.pop() if len(shapes) == 1 else torch.broadcast_shapes(*shapes)  # which takes 50 us
 
     def expand(self, batch_shape: torch.Size) -> "Natural":
         """The same parameters with a larger batch shape; nothing is copied."""

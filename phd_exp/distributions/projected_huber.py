@@ -22,6 +22,9 @@ from phd_exp.distributions.level import credible_level
 from phd_exp.distributions.natural import Natural
 from phd_exp.distributions.special import log_scaled_normaliser
 
+LARGEST_RAW = 1e9
+"""Squares of larger raw numbers, and of what they are multiplied with, would overflow in float32."""
+
 
 class _InFrontOfCamera(Constraint):
     """Positions with z > 0."""
@@ -40,10 +43,11 @@ class ProjectedHuber(Distribution):
         mu_z: centre of z, metres; the mode is mu_z (mu_xy, 1).
         A: precision of (x, y)/z, symmetric positive definite; (x, y)/z has covariance 3.0765 A^(-2).
         a: precision of z; Var[z] is about 2 mu_z^2/a^2 where a is large.
-        validate_args: check parameters here and positions later (on by default; each check makes a GPU wait).
+        validate_args: check parameters here and positions later (default: True). Each check makes a GPU wait, and
+            `torch.func.vmap` cannot check: pass False there.
 
     Raises:
-        ValueError: a parameter violates its constraint.
+        ValueError: a parameter violates its constraint, or mode or covariance overflow.
 
     Source: paper, section "Projected Huber distribution".
     """
@@ -69,6 +73,8 @@ class ProjectedHuber(Distribution):
             for name, value in (("mu_xy", mu_xy), ("mu_z", mu_z), ("A", A), ("a", a)):
                 _require(name, value, self.arg_constraints[name])
         self._adopt(Natural.from_camera_frame(mu_xy, mu_z, A, a), validate_args)
+        if self._validate_args:
+            self._require_representable()
 
     @classmethod
     def from_raw(
@@ -80,7 +86,7 @@ class ProjectedHuber(Distribution):
         mu_z0: float,
         validate_args: bool | None = None,
     ) -> "ProjectedHuber":
-        """The distribution of seven raw numbers (n_1, n_2, b_1, b_2, b_3, w_1, w_2) of a network, any finite ones.
+        """The distribution of the raw numbers (n_1, n_2, b_1, b_2, b_3, w_1, w_2) of a network.
 
         Args:
             raw: the raw numbers.
@@ -90,24 +96,38 @@ class ProjectedHuber(Distribution):
             validate_args: as for the constructor.
 
         Raises:
-            ValueError: a raw number is not finite, or f, S or mu_z0 is not positive and finite.
+            ValueError: a raw number is beyond +-1e9; f, S or mu_z0 is not positive and finite; or mode or covariance
+                overflow. Without validation `log_prob` and its gradient are finite for raw numbers up to 1e9.
 
         Source: paper, section "Enforcing constraints on distribution parameters"; formulas in `Natural.from_raw`.
         """
         f = torch.as_tensor(f, dtype=raw.dtype, device=raw.device)
         if _wants_validation(validate_args):
-            _require("raw", raw, constraints.real_vector)
+            _require("raw", raw, constraints.independent(constraints.interval(-LARGEST_RAW, LARGEST_RAW), 1))
             for name, value in (("f", f), ("S", torch.tensor(S)), ("mu_z0", torch.tensor(mu_z0))):
                 _require(name, value, constraints.positive)
         distribution = cls.__new__(cls)
         distribution._adopt(Natural.from_raw(raw, f, S, mu_z0), validate_args)
+        if distribution._validate_args:
+            distribution._require_representable()
         return distribution
 
     def _adopt(self, natural: Natural, validate_args: bool | None) -> None:
         """Become the distribution of these parameters, which are not checked again."""
-        self._natural = natural.expand(natural.batch_shape)
-        super().__init__(natural.batch_shape, torch.Size([3]), validate_args=False)
+        batch_shape = natural.batch_shape
+        self._natural = natural.expand(batch_shape)
+        super().__init__(batch_shape, torch.Size([3]), validate_args=False)
         self._validate_args = _wants_validation(validate_args)
+
+    def _require_representable(self) -> None:
+        """Raise a ValueError where mode or covariances are too large for the data type."""
+        parts = self.mode, self.covariance_matrix.flatten(-2), self.projected_covariance.flatten(-2)
+        overflow = ~torch.cat(parts, dim=-1).isfinite().all(-1)
+        if bool(overflow.any()):
+            raise ValueError(
+                f"parameters: mode or covariance of {int(overflow.sum())} of {overflow.numel()} distributions "
+                f"overflow in {self._natural.log_a.dtype}; expected parameters nearer to 1"
+            )
 
     def expand(self, batch_shape: Sequence[int], _instance: Distribution | None = None) -> "ProjectedHuber":
         """The same distribution with a larger batch shape; nothing is copied."""
@@ -175,6 +195,9 @@ class ProjectedHuber(Distribution):
     def log_prob(self, value: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch"]:
         """Log density of a position (metres), in nats per cubic metre; -inf, with a zero gradient, for z <= 0.
 
+        It is -inf at infinity too. The transforms of `torch.func` work through it, with one exception: torch cannot
+        differentiate an autograd.Function in forward mode twice, so jacfwd of jacfwd is wrong; use hessian.
+
         Raises:
             ValueError: the shape does not fit the batch shape, or a coordinate is NaN (if arguments are validated).
 
@@ -190,12 +213,13 @@ class ProjectedHuber(Distribution):
         return (log_mode - energy).masked_fill(~visible, -torch.inf)
 
     def _excess_energy(self, xyz: Tensor) -> tuple[Tensor, Tensor]:
-        """Log density at the mode minus log density at a position with z > 0, and whether z > 0."""
+        """Log density at the mode minus log density at a position, and whether that is finite with z > 0."""
         if self._validate_args:
             self._check_positions(xyz)
-        visible = xyz[..., 2] > 0
-        # positions that are not visible are moved, so that no NaN is computed and then multiplied by a zero gradient
-        log_t = xyz[..., 2].masked_fill(~visible, 1).log() - self._natural.log_mu_z
+        visible = (xyz[..., 2] > 0) & (xyz.abs().amax(-1) != torch.inf)
+        # other positions are moved, so that no NaN is computed and then multiplied by a zero gradient
+        xyz = xyz.masked_fill(~visible[..., None], 1)
+        log_t = xyz[..., 2].log() - self._natural.log_mu_z
         return huber.huber_energy(self.whiten(xyz)) + depth.depth_energy(log_t, self._natural.log_a), visible
 
     def _check_positions(self, xyz: Tensor) -> None:
@@ -287,7 +311,7 @@ class ProjectedHuber(Distribution):
         return (z - self.mu_z).abs() + width * crps_beyond_distance(log_t, self._natural.log_a)
 
     def depth_icdf(self, p: Float[Tensor, "*#batch"] | float) -> Float[Tensor, "*#batch"]:
-        """The depth z, metres, with P(depth <= z) = p, for p in (0, 1)."""
+        """The depth z, metres, with P(depth <= z) = p, for p in [0, 1]; 0 at p = 0, inf at p = 1."""
         p = torch.as_tensor(p, dtype=self._natural.log_a.dtype, device=self._natural.log_a.device)
         return torch.exp(self._natural.log_mu_z + depth.depth_icdf(p, self._natural.log_a))
 

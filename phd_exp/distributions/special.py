@@ -9,9 +9,11 @@ Everything rests on two schemes that meet at a = 1 and lose no digits to cancell
 Source: DLMF 6.6 and 8.19 for the series; the rule is an own derivation, see `GAUSS_RULE`.
 """
 
+import inspect
 import math
 from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -73,7 +75,8 @@ def tail_moment(k: int, a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     Source: own derivation (differentiate under the integral); checked against mpmath in
     tests/distributions/test_special.py.
     """
-    value: Tensor = _TailMoment.apply(a, k)
+    function = _TailMoment if torch.compiler.is_compiling() else _DualTailMoment
+    value: Tensor = function.apply(a, k)[0]
     return value
 
 
@@ -117,45 +120,99 @@ def signed_log1p(x: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]) -
     Source: own derivation (log nu_z as a function of w_2, one formula for both branches of the paper's activation);
     checked in tests/distributions/test_special.py.
     """
-    value: Tensor = _SignedLog1p.apply(x, log_a)
+    function = _SignedLog1p if torch.compiler.is_compiling() else _DualSignedLog1p
+    value: Tensor = function.apply(*torch.broadcast_tensors(x, log_a))
     return value
 
 
 class _SignedLog1p(torch.autograd.Function):
     """sign(x) log(1 + |x|/a): autograd would differentiate |x| and log|x| at 0, and get 0 or NaN instead of 1/a."""
 
+    generate_vmap_rule = True
+
     @staticmethod
-    def forward(ctx: torch.autograd.function.FunctionCtx, x: Tensor, log_a: Tensor) -> Tensor:
-        ctx.save_for_backward(x, log_a)
+    def forward(x: Tensor, log_a: Tensor) -> Tensor:
         log_ratio = x.abs().log() - log_a
         return x.sign() * torch.logaddexp(torch.zeros_like(log_ratio), log_ratio)
 
     @staticmethod
-    def backward(ctx: torch.autograd.function.FunctionCtx, grad: Tensor) -> tuple[Tensor, Tensor]:
-        x, log_a = ctx.saved_tensors  # type: ignore[attr-defined]
-        slope = 1 / (log_a.exp() + x.abs()).clamp_min(torch.finfo(x.dtype).eps)
-        return (grad * slope).sum_to_size(x.shape), (-grad * x * slope).sum_to_size(log_a.shape)
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
+        ctx.save_for_forward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:
+        x, log_a = ctx.saved_tensors
+        by_x = grad * _SignedLog1p.slope(x, log_a)
+        return by_x, -by_x * x
+
+    @staticmethod
+    def slope(x: Tensor, log_a: Tensor) -> Tensor:
+        return 1 / (log_a.exp() + x.abs()).clamp_min(torch.finfo(x.dtype).eps)
+
+
+class _DualSignedLog1p(_SignedLog1p):
+    """With forward mode, which torch.compile refuses."""
+
+    @staticmethod
+    def jvp(ctx: Any, x_dot: Tensor, log_a_dot: Tensor) -> Tensor:
+        x, log_a = ctx.saved_tensors
+        return (x_dot - x * log_a_dot) * _SignedLog1p.slope(x, log_a)
 
 
 class _TailMoment(torch.autograd.Function):
-    """J_k with the derivative (k + 2) J_(k+1) / a^2, where autograd would differentiate both schemes and is slow."""
+    """J_k and the derivative (k + 2) J_(k+1) / a^2, where autograd would differentiate both schemes and is slow."""
 
     @staticmethod
-    def forward(ctx: torch.autograd.function.FunctionCtx, a: Tensor, k: int) -> Tensor:
+    def forward(a: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        if a.numel() <= _CHUNK:
+            return _tail_moment_and_derivative(k, a)
         # piecewise, so that the arrays of a chunk fit into a processor's cache
         chunks = [_tail_moment_and_derivative(k, chunk) for chunk in a.reshape(-1).split(_CHUNK)]
         value, derivative = (torch.cat(parts).reshape(a.shape) for parts in zip(*chunks, strict=True))
-        ctx.save_for_backward(a, derivative)
-        ctx.k = k  # type: ignore[attr-defined]
-        return value
+        return value, derivative
 
     @staticmethod
-    def backward(ctx: torch.autograd.function.FunctionCtx, grad: Tensor) -> tuple[Tensor, None]:
-        a, derivative = ctx.saved_tensors  # type: ignore[attr-defined]
-        if torch.is_grad_enabled():  # a derivative of this derivative is wanted: climb the ladder
-            k = ctx.k  # type: ignore[attr-defined]
-            derivative = (k + 2) * tail_moment(k + 1, a) / a.square().clamp_min(torch.finfo(a.dtype).tiny)
+    def setup_context(ctx: Any, inputs: tuple[Tensor, int], output: tuple[Tensor, Tensor]) -> None:
+        (a, ctx.k), (_, derivative) = inputs, output
+        ctx.mark_non_differentiable(derivative)
+        ctx.save_for_backward(a, derivative)
+        ctx.save_for_forward(a)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor, _: Tensor) -> tuple[Tensor, None]:
+        a, derivative = ctx.saved_tensors
+        if torch.is_grad_enabled():  # a derivative of this derivative is wanted
+            derivative = _TailMoment.derivative(a, ctx.k)
         return grad * derivative, None
+
+    @staticmethod
+    def vmap(
+        _: Any, in_dims: tuple[int, None], a: Tensor, k: int
+    ) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
+        value, derivative = _DualTailMoment.apply(a, k)
+        return (value, derivative), (in_dims[0], in_dims[0])
+
+    @staticmethod
+    def derivative(a: Tensor, k: int) -> Tensor:
+        return (k + 2) * tail_moment(k + 1, a) / a.square().clamp_min(torch.finfo(a.dtype).tiny)
+
+
+class _DualTailMoment(_TailMoment):
+    """With forward mode, which torch.compile refuses."""
+
+    @staticmethod
+    def jvp(ctx: Any, a_dot: Tensor, _: None) -> tuple[Tensor, None]:
+        (a,) = ctx.saved_tensors
+        return a_dot * _TailMoment.derivative(a, ctx.k), None
+
+
+def _keep_signature(forward: Any) -> None:
+    forward.__signature__ = inspect.signature(forward)  # torch asks for it in every call, which takes 15 us
+
+
+_keep_signature(_SignedLog1p.forward)
+_keep_signature(_TailMoment.forward)
 
 
 def _tail_moment_and_derivative(k: int, a: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,11 +1,14 @@
 """The laws of a distribution, each over the list of instances in conftest.py."""
 
+import contextlib
 import itertools
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
 from scipy import stats
+from torch import func
 from torch.autograd import gradcheck
 
 from phd_exp.distributions import ProjectedHuber
@@ -147,6 +150,8 @@ def test_depth_icdf_inverts_depth_cdf(distribution: ProjectedHuber) -> None:
     assert distribution.depth_cdf(distribution.depth_median).item() == pytest.approx(0.5, abs=1e-9)
     zero = torch.tensor([0.0, -1.0, -torch.inf], dtype=torch.float64)
     assert torch.equal(distribution.depth_cdf(zero), torch.zeros_like(zero))
+    assert distribution.depth_icdf(0.0) == 0
+    assert distribution.depth_icdf(1.0) == torch.inf
 
 
 def test_gradients_of_positions(distribution: ProjectedHuber) -> None:
@@ -216,6 +221,71 @@ def test_shapes_of_a_batch(sample_shape: tuple[int, ...]) -> None:
     torch.testing.assert_close(batch.log_prob(xyz)[..., 1, 2], one.log_prob(xyz[..., 1, 2, :]))
 
 
+VALUES = {
+    "log_prob": lambda p, xyz: p.log_prob(xyz),
+    "level": lambda p, xyz: p.level(xyz),
+    "mode": lambda p, xyz: p.mode,
+    "mean": lambda p, xyz: p.mean,
+    "covariance": lambda p, xyz: p.covariance_matrix,
+    "projected covariance": lambda p, xyz: p.projected_covariance,
+    "entropy": lambda p, xyz: p.entropy(),
+    "depth_icdf": lambda p, xyz: p.depth_icdf(0.3),
+    "depth_cdf": lambda p, xyz: p.depth_cdf(xyz[..., 2]),
+    "depth_crps": lambda p, xyz: p.depth_crps(xyz[..., 2]),
+    "samples": lambda p, xyz: p.rsample((3,), torch.Generator().manual_seed(0)),
+}
+
+
+@pytest.mark.parametrize("value", VALUES.values(), ids=VALUES.keys())
+def test_an_empty_batch_gives_empty_values(
+    value: Callable[[ProjectedHuber, torch.Tensor], torch.Tensor],
+) -> None:
+    empty = ProjectedHuber.from_raw(torch.zeros(0, 7), f=1500.0, S=224.0, mu_z0=2.5e-3)
+    one = ProjectedHuber.from_raw(torch.zeros(1, 7), f=1500.0, S=224.0, mu_z0=2.5e-3)
+    shape = value(one, torch.ones(1, 3)).shape
+    nothing = value(empty, torch.ones(0, 3))
+    assert nothing.shape == torch.Size([0 if size == 1 else size for size in shape])
+    again = ProjectedHuber(empty.mu_xy, empty.mu_z, empty.A, empty.a)
+    assert again.batch_shape == (0,)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [10.0, 30.0, 90.0, 1e3, 1e6, 1e9])
+def test_what_passes_validation_gives_finite_values(size: float, dtype: torch.dtype) -> None:
+    """Each combination of seven numbers of this size: refused, or everything is finite."""
+    raw = torch.tensor(list(itertools.product((-size, 0.0, size), repeat=7)), dtype=dtype)
+    passed = []
+    for numbers in raw[torch.randperm(len(raw), generator=torch.Generator().manual_seed(1))[:200]]:
+        with contextlib.suppress(ValueError):
+            ProjectedHuber.from_raw(numbers, f=1500.0, S=224.0, mu_z0=2.5e-3)
+            passed.append(numbers)
+    distribution = ProjectedHuber.from_raw(torch.stack(passed), f=1500.0, S=224.0, mu_z0=2.5e-3)
+    xyz = torch.tensor([0.1, -0.2, 4.0], dtype=dtype)
+    for name, value in VALUES.items():
+        assert value(distribution, xyz).isfinite().all(), name
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:FutureWarning")  # of jacfwd itself
+@pytest.mark.parametrize("raw", [torch.zeros(7), torch.tensor([0.4, -0.8, 1.3, 0.7, 2.1, -3.0, -0.9])])
+def test_function_transforms_work_through_the_loss(raw: torch.Tensor) -> None:
+    """vmap, forward and reverse mode, once and twice; on the seams of the map too. Against plain autograd."""
+    xyz = torch.tensor([[0.1, -0.2, 4.0], [0.0, 0.1, 3.0]], dtype=torch.float64)
+    raw = raw.double()
+
+    def loss(raw: torch.Tensor, xyz: torch.Tensor) -> torch.Tensor:
+        distribution = ProjectedHuber.from_raw(raw, f=1500.0, S=224.0, mu_z0=2.5e-3, validate_args=False)
+        return -distribution.log_prob(xyz)
+
+    expected = torch.autograd.functional.jacobian(lambda raw: loss(raw, xyz), raw)
+    torch.testing.assert_close(func.vmap(loss, (None, 0))(raw, xyz), loss(raw, xyz))
+    for transform in (func.grad, func.jacfwd, func.jacrev):
+        torch.testing.assert_close(func.vmap(transform(loss), (None, 0))(raw, xyz), expected)
+    curvature = torch.autograd.functional.hessian(lambda raw: loss(raw, xyz).sum(), raw)
+    for outer, inner in ((func.jacfwd, func.jacrev), (func.jacrev, func.jacfwd), (func.jacrev, func.jacrev)):
+        found = func.vmap(outer(inner(loss)), (None, 0))(raw, xyz)
+        torch.testing.assert_close(found.sum(0), curvature)
+
+
 def test_expand(distribution: ProjectedHuber) -> None:
     larger = distribution.expand((4, 5))
     assert larger.batch_shape == (4, 5)
@@ -233,12 +303,16 @@ def test_parameters_come_back(distribution: ProjectedHuber) -> None:
     torch.testing.assert_close(again.log_prob(again.mean), distribution.log_prob(again.mean))
 
 
-def test_positions_behind_the_camera_have_no_density_and_no_gradient() -> None:
-    xyz = torch.tensor([[0.0, 0.0, -1.0], [0.1, 0.2, 0.0], [0.0, 0.0, 1.0]], requires_grad=True)
+def test_positions_behind_the_camera_or_at_infinity_have_no_density_and_no_gradient() -> None:
+    inf = math.inf
+    nowhere = [[0.0, 0.0, -1.0], [0.1, 0.2, 0.0], [0.0, 0.0, inf], [0.1, -inf, 2.0], [inf, inf, inf]]
+    xyz = torch.tensor([*nowhere, [0.0, 0.0, 1.0]], requires_grad=True)
     raw = torch.zeros(7, requires_grad=True)
-    log_prob = ProjectedHuber.from_raw(raw, f=1500.0, S=224.0, mu_z0=2.5e-3).log_prob(xyz)
-    assert log_prob.tolist()[:2] == [-math.inf, -math.inf]
-    log_prob[:2].sum().backward()
+    distribution = ProjectedHuber.from_raw(raw, f=1500.0, S=224.0, mu_z0=2.5e-3)
+    log_prob = distribution.log_prob(xyz)
+    assert log_prob.tolist()[:-1] == [-inf] * len(nowhere)
+    assert distribution.level(xyz).tolist()[:-1] == [1] * len(nowhere)
+    log_prob[:-1].sum().backward()
     for gradient in (xyz.grad, raw.grad):
         assert gradient is not None
         assert torch.equal(gradient, torch.zeros_like(gradient))
@@ -268,6 +342,8 @@ def test_refuses_bad_parameters(name: str, value: torch.Tensor, message: str) ->
     ("arguments", "message"),
     [
         ({"raw": torch.full((2, 7), torch.nan)}, r"raw of shape \(2, 7\) must be finite"),
+        ({"raw": torch.full((7,), 1e30)}, r"raw of shape \(7,\) must be .*upper_bound=1000000000.0"),
+        ({"raw": torch.full((7,), -100.0)}, r"covariance of 1 of 1 distributions overflow in torch.float32"),
         ({"f": torch.tensor([1500.0, -1.0])}, r"f of shape \(2,\) must be .* -1.0"),
         ({"f": 0.0}, r"f of shape \(\) must be .* 0.0"),
         ({"S": -224.0}, "S of shape"),
@@ -287,3 +363,17 @@ def test_refuses_positions_of_a_wrong_shape_or_kind() -> None:
         distribution.log_prob(torch.tensor([[0.0, 0.0, math.nan], [0.0, 0.0, 4.0]])[:, None])
     with pytest.raises(ValueError, match=r"positions is \(3,\), the distribution's is \(4,\)"):
         distribution.log_prob(torch.zeros(3, 3))
+
+
+@pytest.mark.slow
+def test_the_loss_compiles_in_one_piece() -> None:
+    xyz = torch.tensor([0.1, -0.2, 4.0])
+
+    def loss(raw: torch.Tensor) -> torch.Tensor:
+        distribution = ProjectedHuber.from_raw(raw, f=1500.0, S=224.0, mu_z0=2.5e-3, validate_args=False)
+        return -distribution.log_prob(xyz).mean()
+
+    raw = torch.randn(8, 7, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    compiled = torch.compile(loss, backend="aot_eager", fullgraph=True)
+    (expected,), (slope,) = (torch.autograd.grad(function(raw), raw) for function in (loss, compiled))
+    torch.testing.assert_close(slope, expected)
