@@ -156,7 +156,7 @@ def load(run: Path, device: str = "auto", recalibrate: bool = False) -> Predicto
     folder = RunFolder(Path(run))
     if not folder.config_file.exists():
         raise RunError(f"{folder.path}: no run; expected a folder with config.yaml and checkpoints/last.ckpt")
-    config = check(folder.config())
+    config = check(folder.config(), "stored")
     require_same_shrinking(folder, config)
     constants = _constants(folder, config)
     place = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)

@@ -321,7 +321,7 @@ CHECKPOINTS = [
     checkpoint("loops of another trainer", lambda place: place.put_checkpoint(loops={"fit_loop": 3}), r"not a checkpoint of this run \(.*\); .*")[2],
 ]  # fmt: skip
 
-REFUSED = r"may not be built from a configuration; expected a name under .*"
+REFUSED = r"may not be built from a stored configuration; expected a name under .*"
 STORED = [
     *stored("a system call", rf"backbone\._target_: 'os\.system' {REFUSED}", backbone={"_target_": "os.system", "command": "touch owned"}),
     *stored("eval", rf"loss\._target_: 'builtins\.eval' {REFUSED}", loss={"_target_": "builtins.eval", "_args_": ["open('owned','w')"]}),
@@ -330,7 +330,7 @@ STORED = [
     *stored("our own writer of files", rf"backbone\._target_: 'phd_exp\.records\.files\.write_atomic' {REFUSED}", backbone={"_target_": "phd_exp.records.files.write_atomic", "path": "owned", "data": ""}),
     *stored("code from the network", rf"backbone\._target_: 'torch\.hub\.load' {REFUSED}", backbone={"_target_": "torch.hub.load", "repo_or_dir": "x", "model": "y"}),
     *stored("what a module imports", r"backbone\._target_: .* is no class or function of its own; .*", backbone={"_target_": "torchvision.models._api.importlib.import_module"} | {"_target_": "phd_exp.models.backbones.partial"}),
-    *stored("a tool of torchvision", r"backbone\._target_: .* is no part of a network; .*", backbone={"_target_": "torchvision.models.get_model", "name": "resnet18"}),
+    *stored("a network that downloads its weights", rf"backbone\.network\._target_: 'torchvision\.models\.segmentation\.fcn_resnet50' {REFUSED}", backbone={"_target_": "phd_exp.models.backbones.PooledFeatures", "n_features": 1, "network": {"_target_": "torchvision.models.segmentation.fcn_resnet50"}}),
     *stored("a variable of the environment", r"data\.folder: got '\$\{oc\.env:HOME\}'; expected a value, .*", data__folder="${oc.env:HOME}"),
     *stored("a resolver", r"backbone\.depth: got '\$\{oc\.decode:18\}'; expected a value, .*", backbone__depth="${oc.decode:18}"),
     *stored("an image without end", r"data\.image_size: got 1000000; expected to be less than or equal to 4096", data__image_size=1_000_000),

@@ -9,14 +9,17 @@ from phd_exp.records.choices import flatten
 from phd_exp.records.errors import ConfigError, shown
 from phd_exp.training.config.data import is_folder
 from phd_exp.training.config.run import RenderConfig, RunConfig
-from phd_exp.training.config.targets import describe
+from phd_exp.training.config.targets import Origin, describe
 
 Checked = TypeVar("Checked", bound=BaseModel)
 
 
-def check(config: dict[str, Any]) -> RunConfig:
-    """The configuration with its types; raises ConfigError with one line for each thing that is wrong."""
-    return _validated(RunConfig, config)
+def check(config: dict[str, Any], origin: Origin = "typed") -> RunConfig:
+    """The configuration with its types. Raises ConfigError with one line for each error.
+
+    Its origin decides what it may build, see `targets.ALLOWED`.
+    """
+    return _validated(RunConfig, config, origin)
 
 
 def check_render(config: dict[str, Any]) -> RenderConfig:
@@ -26,13 +29,15 @@ def check_render(config: dict[str, Any]) -> RenderConfig:
             "data=folder: there is nothing to render, these are your own images; leave out `render` to train on them"
         )
     others = RunConfig.model_fields.keys() - RenderConfig.model_fields.keys()
-    return _validated(RenderConfig, {key: value for key, value in config.items() if key not in others})
+    return _validated(
+        RenderConfig, {key: value for key, value in config.items() if key not in others}, "typed"
+    )
 
 
-def _validated(model: type[Checked], config: dict[str, Any]) -> Checked:
+def _validated(model: type[Checked], config: dict[str, Any], origin: Origin) -> Checked:
     _require_plain_values(config)
     try:
-        return model.model_validate(config)
+        return model.model_validate(config, context={"origin": origin})
     except ValidationError as error:
         lines = [describe(problem, model) for problem in error.errors(include_url=False)]
         raise ConfigError("\n".join(dict.fromkeys(lines))) from None

@@ -95,7 +95,7 @@ class RunConfig(Section):
 
 def _prediction(key: str, node: dict[str, Any]) -> type:
     """What kind of prediction a head makes or a loss takes."""
-    kind = getattr(locate(node["_target_"]), "prediction", None)
+    kind = getattr(locate(node["_target_"], "typed"), "prediction", None)
     if not isinstance(kind, type) or node.get("_partial_"):
         name = key.rpartition(".")[2]
         raise ValueError(f"{key}._target_: {node['_target_']!r} is no {name}; expected one as in conf/model")

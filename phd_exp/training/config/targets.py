@@ -1,9 +1,9 @@
-"""Config nodes that name a class by `_target_`: what they may name, and whether their keys fit it."""
+"""Config nodes that name a class by `_target_`: the names that are allowed, and the keys that the class takes."""
 
 import inspect
 from collections.abc import Iterable
 from importlib import import_module
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import (
     AfterValidator,
@@ -13,30 +13,36 @@ from pydantic import (
     Tag,
     TypeAdapter,
     ValidationError,
+    ValidationInfo,
 )
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from phd_exp.records.errors import complaint, in_our_words, nearest, shown
 
 OURS = ("phd_exp.models.", "phd_exp.losses.", "phd_exp.optimizers.", "phd_exp.geometry.")
-ALLOWED = (*OURS, "torch.optim.", "torch.nn.", "torchvision.models.")
-"""Where a `_target_` may point: a configuration from somebody else must not run whatever it likes.
+Origin = Literal["typed", "stored"]
+"""Where a configuration comes from: the user's command line and files, or a run folder, whoever wrote it."""
+ALLOWED: dict[Origin, tuple[str, ...]] = {
+    "typed": (*OURS, "torch.optim.", "torch.nn.", "torchvision.models."),
+    "stored": (*OURS, "torch.optim."),
+}
+"""Prefixes of the names that a `_target_` may have. The object must also be defined there, not only imported.
 
-What is named must have been defined there too, since modules also hold what they import.
+Nothing that a stored configuration can build uses the network, as torchvision's models do for their weights.
 """
 
 SPECIAL = {"_target_", "_partial_"}
 
 
-def check_target(node: dict[str, Any], where: str = "") -> dict[str, Any]:
-    """Hold a node's keys and values against the signature of what it names, all the way down.
+def check_target(node: dict[str, Any], origin: Origin, where: str = "") -> dict[str, Any]:
+    """Check the keys and values of a node, and of all nodes in it, against the signature of what it names.
 
-    Parameters without a default may be missing: the programme passes those that it alone knows (the network's
-    parameters to an optimizer, the data set's depth scale to a head).
+    Parameters without a default may be missing: the programme passes them (the network's parameters to an optimizer,
+    the depth scale of the data set to a head).
 
-    Raises PydanticCustomError naming the key, what was given, and what was expected.
+    Raises PydanticCustomError naming the key, the value, and what was expected.
     """
-    target = locate(node.get("_target_"), where)
+    target = locate(node.get("_target_"), origin, where)
     if not isinstance(node.get("_partial_", False), bool):
         raise _error(
             ".".join(filter(None, [where, "_partial_"])), f"got {shown(node['_partial_'])}; expected a bool"
@@ -51,41 +57,39 @@ def check_target(node: dict[str, Any], where: str = "") -> dict[str, Any]:
                 path, f"unknown key{nearest(key, parameters)}; {node['_target_']} takes {_listed(parameters)}"
             )
         if isinstance(value, dict) and "_target_" in value:
-            check_target(value, path)
+            check_target(value, origin, path)
         else:
-            _check_inner(path, value)
+            _check_inner(path, value, origin)
             _check_value(path, value, parameters[key].annotation)
     return node
 
 
-def _check_inner(path: str, value: Any) -> None:
-    """Check the targets deep inside lists and mappings, which would be built as well."""
+def _check_inner(path: str, value: Any, origin: Origin) -> None:
+    """Check the nodes inside lists and mappings, which would be built as well."""
     children = (
         value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     )
     for key, child in children:
         inner = f"{path}.{key}"
         if isinstance(child, dict) and "_target_" in child:
-            check_target(child, inner)
+            check_target(child, origin, inner)
         else:
-            _check_inner(inner, child)
+            _check_inner(inner, child, origin)
 
 
-def locate(name: Any, where: str = "") -> Any:
-    """What a `_target_` names. Raises PydanticCustomError where that is not allowed or does not exist."""
-    path = f"{where}._target_" if where else "_target_"
-    if not isinstance(name, str) or not name.startswith(ALLOWED) or "._" in name:
-        raise _error(
-            path,
-            f"{shown(name)} may not be built from a configuration; expected a name under {', '.join(ALLOWED)}",
-        )
+def locate(name: Any, origin: Origin, where: str = "") -> Any:
+    """The object that a `_target_` names. Raises PydanticCustomError if it is not allowed or does not exist."""
+    path, allowed = f"{where}._target_" if where else "_target_", ALLOWED[origin]
+    if not isinstance(name, str) or not name.startswith(allowed) or "._" in name:
+        expected = f"expected a name under {', '.join(allowed)}"
+        raise _error(path, f"{shown(name)} may not be built from a {origin} configuration; {expected}")
     module, _, attribute = name.rpartition(".")
     try:
         target = getattr(import_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise _error(path, f"{name!r} does not exist ({error})") from None
     defined = getattr(target, "__module__", None)
-    if not (callable(target) and isinstance(defined, str) and f"{defined}.".startswith(ALLOWED)):
+    if not (callable(target) and isinstance(defined, str) and f"{defined}.".startswith(allowed)):
         raise _error(path, f"{name!r} is no class or function of its own; expected one defined there")
     if not _makes_a_part(target, name):
         raise _error(path, f"{name!r} is no part of a network; expected a module, a model or an optimizer")
@@ -93,7 +97,7 @@ def locate(name: Any, where: str = "") -> Any:
 
 
 def _makes_a_part(target: Any, name: str) -> bool:
-    """Whether a call only makes an object: of a library, its tools, which do other things, are left out."""
+    """Whether a call only makes an object, unlike the tools of a library."""
     if name.startswith(OURS):
         return True
     from torch import nn, optim  # seconds; `import_module` has loaded it before
@@ -105,7 +109,11 @@ def _makes_a_part(target: Any, name: str) -> bool:
     return target.__name__ in list_models()
 
 
-Target = Annotated[dict[str, Any], AfterValidator(check_target)]
+def _checked(node: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+    return check_target(node, info.context["origin"] if info.context else "stored")
+
+
+Target = Annotated[dict[str, Any], AfterValidator(_checked)]
 
 
 def describe(problem: ErrorDetails, model: type[BaseModel]) -> str:
