@@ -1,8 +1,8 @@
-"""The seven constraints that the paper asks of a predicted density, each as a measurement on a family of densities.
+"""The paper's seven constraints on a predicted density, each as a measurement on a family of densities.
 
-A family turns raw numbers of a network and a camera into densities. Each measurement returns how far the worst case
-is from the constraint, and whether that is near enough. What theory says of each family is held against it in
-tests/distributions/test_constraint_table.py.
+A family turns inputs and a camera into densities. The inputs are the raw numbers of a head, or the images of a whole
+network. Each measurement returns by how much the worst case violates the constraint, and whether that counts.
+tests/distributions/test_constraint_table.py compares the findings with theory.
 
 Source: paper, section "Desired constraints for estimated distribution".
 """
@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from phd_exp.distributions.huber import huber_energy
 from phd_exp.distributions.point_density import PointDensity
 from phd_exp.distributions.point_estimate import PointEstimate
 from phd_exp.distributions.projected_huber import ProjectedHuber
@@ -26,15 +27,38 @@ SCALE = 0.1
 _PAIRS = 20_000
 
 
-Density = ProjectedHuber | PointDensity
+@dataclass(frozen=True)
+class Decomposed:
+    """The density p(x/z, y/z) p(z)/z^2 of an independent ray and depth, each with the law that it has in `law`.
+
+    The paper's Proposition 1: no density that decomposes in this way satisfies all seven constraints.
+    """
+
+    law: ProjectedHuber
+
+    def log_prob(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch"]:
+        """Log density of a position (metres), nats per cubic metre: the energy of q does not grow with z."""
+        q = self.law.whiten(xyz)
+        ratio = self.law.mu_z / xyz[..., 2].abs().clamp_min(torch.finfo(xyz.dtype).tiny)
+        change = huber_energy(q) - huber_energy(ratio[..., None] * q)
+        return self.law.log_prob(xyz) + change + 2 * ratio.log()
+
+    def rsample(self, shape: tuple[int, ...], generator: torch.Generator) -> Float[Tensor, "*shape 3"]:
+        """Exact samples: the offset from the centre is that of the law, times z/mu_z."""
+        xy, z = self.law.rsample(shape, generator).split((2, 1), dim=-1)
+        centre = z * self.law.mu_xy
+        return torch.cat([centre + (xy - centre) * z / self.law.mu_z[..., None], z], dim=-1)
+
+
+Density = ProjectedHuber | PointDensity | Decomposed
 
 
 @dataclass(frozen=True)
 class Family:
-    """A model's densities: `predict` makes them of raw numbers and a camera, `raws` gives raw numbers to try."""
+    """The densities of a model: `predict` returns those of inputs and a camera, `inputs` returns inputs to try."""
 
     predict: Callable[[Tensor, Camera], Density]
-    raws: Callable[[int, torch.Generator], Tensor]
+    inputs: Callable[[int, torch.Generator], Tensor]
 
 
 @dataclass(frozen=True)
@@ -46,18 +70,22 @@ class Finding:
 
 
 def families() -> dict[str, Family]:
-    """The probabilistic model and the four baselines, these as densities of constant scale in their charts."""
-    constant = torch.tensor((F_RANGE[0] * F_RANGE[1]) ** 0.5, dtype=torch.float64)
+    """The heads: the probabilistic one, a decomposed one, and the four baselines with constant scale in their charts.
 
-    def told(camera: Camera) -> Camera:
-        return Camera(constant.expand_as(camera.f), camera.S)
+    A head does not contain the network in front of it. With camera=shown that network depends on f, so that the whole
+    model breaks constraint 2 though its head satisfies it: measure the whole model.
+    """
+
+    def constant(camera: Camera) -> Camera:
+        return Camera(torch.full_like(camera.f, _middle_f()), camera.S)
 
     return {
         "probabilistic": Family(_projected_huber, _seven_numbers),
+        "decomposed": Family(lambda raw, camera: Decomposed(_projected_huber(raw, camera)), _seven_numbers),
         "mae_vz": _baseline(Projected(DEPTH)),
         "mae_logz": _baseline(LogDepth(DEPTH)),
         "mae_xyz": _baseline(Cartesian(DEPTH)),
-        "mae_constf": _baseline(Projected(DEPTH), told),
+        "mae_constf": _baseline(Projected(DEPTH), constant),
     }
 
 
@@ -75,15 +103,15 @@ def _seven_numbers(n: int, generator: torch.Generator) -> Tensor:
     return torch.stack([*nu_p.T, b_raw, torch.zeros_like(b), b_raw, w_1, w_2], dim=-1)
 
 
-def _baseline(chart: Chart, told: Callable[[Camera], Camera] = lambda camera: camera) -> Family:
+def _baseline(chart: Chart, used: Callable[[Camera], Camera] = lambda camera: camera) -> Family:
     def predict(raw: Tensor, camera: Camera) -> PointDensity:
-        return PointDensity(PointEstimate(raw, chart, told(camera)), SCALE)
+        return PointDensity(PointEstimate(raw, chart, used(camera)), SCALE)
 
-    def raws(n: int, generator: torch.Generator) -> Tensor:
+    def inputs(n: int, generator: torch.Generator) -> Tensor:
         camera = _camera(_middle_f(), n)
         return chart.coordinates(_in_view(n, camera, generator), camera)
 
-    return Family(predict, raws)
+    return Family(predict, inputs)
 
 
 def _middle_f() -> float:
@@ -107,7 +135,7 @@ def variances_are_free(family: Family, generator: torch.Generator) -> Finding:
     100 % in depth with 0.001, 0.01 and 0.1 in x/z; free means below 1.5, a step of the search.
     """
     n = 2000
-    density = family.predict(family.raws(n, generator), _camera(_middle_f(), n))
+    density = family.predict(family.inputs(n, generator), _camera(_middle_f(), n))
     samples = density.rsample((100,), generator)
     z, ray = samples[..., 2], samples[..., 0] / samples[..., 2]
     # by the quartiles: x/z has no variance where a density has mass on both sides of z = 0
@@ -126,19 +154,19 @@ def _interquartile(values: Tensor) -> Tensor:
 
 
 def focal_length_enters_through_the_ray_and_z_over_f(family: Family, generator: torch.Generator) -> Finding:
-    """2: for the same raw numbers, the density over (v_p, z/f) is the same whatever f is.
+    """2: for the same inputs, the density over (v_p, z/f) does not depend on f.
 
-    Measured: its largest change in nats between the ends of the data set's range of f.
+    Measured: its largest relative change between the ends of the data set's range of f.
     """
     n, chart = 500, Projected(DEPTH)
-    raw = family.raws(n, generator)
+    inputs = family.inputs(n, generator)
     middle = _camera(_middle_f(), n)
     coordinates = chart.coordinates(_in_view(n, middle, generator), middle)
     values = []
     for f in F_RANGE:
         camera = _camera(f, n)
         xyz = chart.position(coordinates, camera)
-        values.append(family.predict(raw, camera).log_prob(xyz) - chart.log_abs_det_jacobian(xyz, camera))
+        values.append(family.predict(inputs, camera).log_prob(xyz) - chart.log_abs_det_jacobian(xyz, camera))
     worst = _largest((values[0] - values[1]).abs() / values[0].abs().clamp_min(1))
     return Finding(worst < 1e-6, worst)
 
@@ -147,7 +175,7 @@ def nothing_is_behind(family: Family, generator: torch.Generator) -> Finding:
     """3: p = 0 for z < 0. Measured: the largest density behind the camera over that at the same place in front."""
     n = 500
     camera = _camera(_middle_f(), n)
-    raw, xyz = family.raws(n, generator), _in_view(n, camera, generator)
+    raw, xyz = family.inputs(n, generator), _in_view(n, camera, generator)
     density = family.predict(raw, camera)
     behind = density.log_prob(xyz * torch.tensor([1.0, 1.0, -1.0], dtype=xyz.dtype))
     worst = float((behind - density.log_prob(xyz)).exp().max())
@@ -158,7 +186,7 @@ def everything_in_view_is_possible(family: Family, generator: torch.Generator) -
     """4: p > 0 in the field of view. Measured: the share of its positions where -log p is infinite."""
     n = 5000
     camera = _camera(_middle_f(), n)
-    value = family.predict(family.raws(n, generator), camera).log_prob(_in_view(n, camera, generator))
+    value = family.predict(family.inputs(n, generator), camera).log_prob(_in_view(n, camera, generator))
     share = float((~value.isfinite()).double().mean())
     return Finding(share == 0, share)
 
@@ -166,7 +194,7 @@ def everything_in_view_is_possible(family: Family, generator: torch.Generator) -
 def minus_log_is_convex(family: Family, generator: torch.Generator) -> Finding:
     """5: -log p is convex in v. Measured: the largest excess over a chord between positions in view, nats."""
     camera = _camera(_middle_f(), _PAIRS)
-    density = family.predict(family.raws(_PAIRS, generator), camera)
+    density = family.predict(family.inputs(_PAIRS, generator), camera)
     one, other = _in_view(_PAIRS, camera, generator), _in_view(_PAIRS, camera, generator)
     share = torch.rand(_PAIRS, 1, generator=generator, dtype=torch.float64)
     ends = density.log_prob(one), density.log_prob(other)
@@ -184,7 +212,7 @@ def it_vanishes_far_away_and_at_the_camera(family: Family, generator: torch.Gene
     """
     n = 500
     camera = _camera(_middle_f(), n)
-    density = family.predict(family.raws(n, generator), camera)
+    density = family.predict(family.inputs(n, generator), camera)
     xyz = _in_view(n, camera, generator)
     falls = []
     for near, far in (
@@ -205,7 +233,7 @@ def it_is_continuous(family: Family, generator: torch.Generator) -> Finding:
     """
     n = 2000
     camera = _camera(_middle_f(), n)
-    density = family.predict(family.raws(n, generator), camera)
+    density = family.predict(family.inputs(n, generator), camera)
     one, other = _in_view(n, camera, generator), _in_view(n, camera, generator)
     for _ in range(60):
         middle = (one + other) / 2

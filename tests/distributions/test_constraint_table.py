@@ -6,14 +6,27 @@ import pytest
 import torch
 from numpy.polynomial.legendre import leggauss
 
-from phd_exp.distributions import PointEstimate
-from phd_exp.distributions.constraints import CONSTRAINTS, DEPTH, families
+from phd_exp.distributions import PointEstimate, ProjectedHuber
+from phd_exp.distributions.constraints import (
+    CONSTRAINTS,
+    DEPTH,
+    Decomposed,
+    Family,
+    families,
+    minus_log_is_convex,
+)
 from phd_exp.distributions.point_density import PointDensity
 from phd_exp.geometry import Camera, Cartesian, LogDepth, Projected
+from phd_exp.models.backbones import resnet
+from phd_exp.models.heads import DistributionHead
+from phd_exp.models.regressor import Regressor
+from phd_exp.models.shown import ShownFocalLength
 
 KEPT = {
     # every one of them, by construction
     "probabilistic": {1, 2, 3, 4, 5, 6, 7},
+    # Proposition 1 of the paper: -log p is not convex in v
+    "decomposed": {1, 2, 3, 4, 6, 7},
     # one spread for all; z_p may be negative; a ray's density is spread over z^2, so it is infinite at the camera;
     # distances in projection are not convex in v
     "mae_vz": {2, 4, 7},
@@ -57,3 +70,55 @@ def test_a_point_read_as_a_density_has_the_mass_of_its_samples(
     volume = torch.einsum("i,j,k->ijk", weight, weight, weight) * half.prod()
     mass = float((density.log_prob(grid).exp() * volume).sum())
     assert mass == pytest.approx(share, abs=5 * math.sqrt(share / 200_000))
+
+
+def test_a_decomposed_density_has_the_mass_of_its_samples() -> None:
+    """The mean of p/p' over samples of p' is 1 for every density p; ray and depth are independent."""
+    law = ProjectedHuber(
+        torch.tensor([0.05, -0.03]).double(),
+        torch.tensor(4.0).double(),
+        30 * torch.eye(2).double(),
+        torch.tensor(5.0).double(),
+    )
+    decomposed, generator = Decomposed(law), torch.Generator().manual_seed(0)
+    samples = decomposed.rsample((100_000,), generator)
+    ratio = (law.log_prob(samples) - decomposed.log_prob(samples)).exp()
+    assert float(ratio.mean()) == pytest.approx(1, abs=5 * float(ratio.std()) / math.sqrt(len(ratio)))
+    rays = samples[:, :2] / samples[:, 2:]
+    torch.testing.assert_close(rays.T.cov(), law.projected_covariance, rtol=0.05, atol=1e-4)
+    correlation = torch.stack([rays.norm(dim=-1), samples[:, 2]]).corrcoef()[0, 1]
+    assert abs(float(correlation)) < 0.02
+
+
+@pytest.mark.parametrize(("depth_deviation", "holds"), [(0.2, True), (1.0, False)])
+def test_a_decomposed_density_is_convex_only_where_depth_is_as_certain_as_the_ray(
+    depth_deviation: float, holds: bool
+) -> None:
+    """The proof of Proposition 1: for Gaussian parts of deviations s and d, |H| > 0 needs d < s z/|x/z|, or 0.3 m."""
+
+    class Gaussian:
+        def log_prob(self, xyz: torch.Tensor) -> torch.Tensor:
+            ray = xyz[..., :2] / xyz[..., 2:]
+            return -(ray / 0.01).square().sum(-1) / 2 - ((xyz[..., 2] - 4) / depth_deviation).square() / 2
+
+    family = Family(lambda raw, camera: Gaussian(), families()["probabilistic"].inputs)  # type: ignore[arg-type,return-value]
+    assert minus_log_is_convex(family, torch.Generator().manual_seed(0)).holds is holds
+
+
+@pytest.mark.parametrize("shown", [False, True])
+def test_a_whole_network_to_which_f_is_shown_breaks_the_second_constraint(shown: bool) -> None:
+    """Of random weights, last layers included; the head is the same."""
+    torch.manual_seed(0)
+    network = Regressor(resnet(10), DistributionHead(DEPTH), ShownFocalLength(7, DEPTH) if shown else None)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    network = network.double().eval()
+
+    def images(n: int, generator: torch.Generator) -> torch.Tensor:
+        return torch.randint(0, 256, (n, 16, 16, 3), dtype=torch.uint8, generator=generator)
+
+    with torch.no_grad():
+        finding = CONSTRAINTS["2 f enters only through (v_p, z/f)"](
+            Family(network, images), torch.Generator().manual_seed(0)
+        )
+    assert finding.holds is not shown, finding

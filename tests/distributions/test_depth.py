@@ -76,6 +76,16 @@ def test_variance_is_two_over_a_squared_where_a_is_large() -> None:
     assert depth.depth_mean_and_variance(log(1e6))[1].item() == pytest.approx(2e-12, rel=1e-4)
 
 
+def test_normaliser_and_mean_keep_their_bounds(a: float) -> None:
+    """The paper's for K_depth/mu_z = N(a), tighter ones from x + 1 < 1/(e^x E_2(x)) < x + 2, and E[t] > 1."""
+    scaled_N = log_scaled_normaliser(log(a)).exp().item()
+    assert 1 / a < scaled_N < 1 / a + 1
+    assert 1 / a + 1 / (a + 2) < scaled_N < 1 / a + 1 / (a + 1)
+    mean, further = (depth.depth_mean_and_variance(log(x))[0].item() for x in (a, 1.1 * a))
+    assert 1 < further < mean
+    assert a < 1 or mean < 1.7
+
+
 def test_entropy_is_the_papers_formula(a: float) -> None:
     with mp.workdps(40):
         x = mp.mpf(a)
