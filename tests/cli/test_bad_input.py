@@ -7,7 +7,8 @@ import pytest
 
 BAD = [
     # (arguments, what the line must say)
-    (["data.ntrain=3"], ["data.ntrain", "did you mean 'data.n_train'"]),
+    (["data.ntrain=3"], ["data.ntrain: unknown key, did you mean 'n_train'?; expected one of n_train, "]),
+    (["trainer.fast_dev_run=1"], ["trainer.fast_dev_run: unknown key; expected one of max_epochs, accel"]),
     (["modle=mae_vz"], ["modle", "did you mean 'model'"]),
     (["model=mae_log"], ["model=mae_log", "did you mean 'mae_logz'", "probabilistic"]),
     (["data=scal"], ["data=scal", "did you mean 'scale'"]),
