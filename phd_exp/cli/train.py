@@ -49,7 +49,7 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> float | No
         require_possible(checked, folder)
         if several:
             several.require_possible()
-        _announce(checked, folder, overrides)
+        announce(checked, folder, overrides)
         if isinstance(checked.data, RenderedConfig):
             ensure_dataset(checked.data, cores)
     results = train(checked, folder, draw=_draw(), cores=cores)
@@ -64,7 +64,7 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> float | No
     return next((results[key] for key in SCORES if results.get(key) is not None), None)
 
 
-def _announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> None:
+def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> None:
     """Say what the run is going to do and, where that takes long, what would not."""
     from phd_exp.training.network import has_gpu
 

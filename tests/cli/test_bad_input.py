@@ -137,6 +137,18 @@ def test_an_unwritable_folder_of_a_sweep(phd_exp: Callable, tmp_path: Path) -> N
     )
 
 
+def test_wandb_without_a_key_is_refused_before_anything_is_rendered(
+    phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NETRC", str(tmp_path / "none"))
+    monkeypatch.delenv("WANDB_API_KEY", raising=False)
+    outcome = phd_exp("preset=smoke", "logger.offline=false")
+    assert outcome.status == 2
+    (line,) = outcome.err.splitlines()
+    assert line.startswith("error: logger.offline: got false, but wandb has no API key")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_each_thing_wrong_gets_its_own_line(phd_exp: Callable) -> None:
     outcome = phd_exp("preset=smoke", "seed=-1", "data.n_test=0")
     assert outcome.err.splitlines() == [
