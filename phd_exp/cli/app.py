@@ -3,13 +3,12 @@
 import os
 import re
 import sys
-from collections.abc import Iterator
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.errors import HydraException
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from phd_exp.cli.frame import print_errors
@@ -75,9 +74,13 @@ def explain(error: Exception, config_name: str) -> str:
         key = unknown[1].lstrip("+~")
         if owners := _choices_with(key):
             return f"{key}: not a key of this choice, but of {' or '.join(owners)}; name that choice too"
+        section, _, leaf = key.rpartition(".")
+        valid = _keys_of(section, config_name)
         verb = "" if config_name == "config" else f" {config_name}"
-        close = nearest(key, _known_keys(config_name))
-        return f"{key}: unknown key{close}; see `python -m phd_exp{verb} --cfg job`"
+        keys = (
+            f"expected one of {', '.join(valid)}" if section else f"see `python -m phd_exp{verb} --cfg job`"
+        )
+        return f"{key}: unknown key{nearest(leaf, valid)}; {keys}"
     choice = re.search(
         r"Could not find '([^']+)/([^']+)' Available options in '[^']+': (.*?) Config search path", text
     )
@@ -88,12 +91,13 @@ def explain(error: Exception, config_name: str) -> str:
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
 
-def _known_keys(config_name: str) -> list[str]:
-    """Every key and group of the default configuration, with dots."""
+def _keys_of(section: str, config_name: str) -> list[str]:
+    """The keys of a section of the default configuration; of none, its groups and sections."""
     with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
         config = hydra.compose(config_name)
-    groups = [path.name for path in conf_folder().iterdir() if path.is_dir()]
-    return groups + list(_dotted(OmegaConf.to_container(config)))
+    node = OmegaConf.select(config, section) if section else config
+    groups = [] if section else [path.name for path in conf_folder().iterdir() if path.is_dir()]
+    return groups + [str(key) for key in (node if isinstance(node, DictConfig) else ())]
 
 
 def _choices_with(key: str) -> list[str]:
@@ -102,9 +106,3 @@ def _choices_with(key: str) -> list[str]:
     files = sorted((conf_folder() / group).glob("*.yaml")) if leaf else []
     # a list, since a DictConfig denies to hold what is ???
     return [f"{group}={file.stem}" for file in files if leaf in list(OmegaConf.load(file))]
-
-
-def _dotted(node: Any, prefix: str = "") -> Iterator[str]:
-    for key, value in node.items() if isinstance(node, dict) else ():
-        yield f"{prefix}{key}"
-        yield from _dotted(value, f"{prefix}{key}.")

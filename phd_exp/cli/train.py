@@ -11,6 +11,7 @@ from phd_exp.cli.app import launch
 from phd_exp.cli.render import ensure_dataset
 from phd_exp.cli.several_views import Several
 from phd_exp.records.choices import RunName, has_influence, setting
+from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import RenderedConfig, RunConfig, check
@@ -48,6 +49,7 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> float | No
         require_possible(checked, folder)
         if several:
             several.require_possible()
+        announce(checked, folder, overrides)
         if isinstance(checked.data, RenderedConfig):
             ensure_dataset(checked.data, cores)
     results = train(checked, folder, draw=_draw(), cores=cores)
@@ -60,6 +62,31 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> float | No
     if (folder.calibration / "final.png").exists():
         print(f"  calibration curves: {folder.calibration / 'final.png'}")
     return next((results[key] for key in SCORES if results.get(key) is not None), None)
+
+
+def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> None:
+    """Say what the run is going to do and, where that takes long, what would not."""
+    from phd_exp.training.network import has_gpu
+
+    data, epochs = checked.data, checked.trainer.max_epochs
+    network = f"{checked.backbone['_target_'].rpartition('.')[2]}{checked.backbone.get('depth', '')}"
+    device = "a GPU" if has_gpu(checked.trainer) else "the CPU"
+    images = "all" if data.n_train is None else data.n_train
+    print(f"{folder.path}: {_to_render(checked)}{epochs} epochs of {network} on {images} images of", end=" ")
+    print(f"{data.image_size} px, on {device}", flush=True)
+    if checked.preset == "paper" and not has_gpu(checked.trainer):
+        words = " ".join([*(word for word in overrides if not word.startswith("preset=")), "preset=small"])
+        print("  the authors' protocol takes many hours without a GPU: an estimate follows the first batches")
+        print(f"  in about ten minutes: python -m phd_exp {words}", flush=True)
+
+
+def _to_render(checked: RunConfig) -> str:
+    data = checked.data
+    if not isinstance(data, RenderedConfig):
+        return ""
+    missing = DatasetFolder(data.folder).missing(data.spec, data.n_training_split, data.n_test)
+    n = sum(map(len, missing.values()))
+    return f"{n} images to render, then " if n else ""
 
 
 def _number(value: Any) -> str:

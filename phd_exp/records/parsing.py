@@ -5,15 +5,18 @@ from typing import Any
 
 import yaml
 
+MOST_DIGITS = 300
+"""Of a whole number; a float holds 308."""
+
 
 def parse_json(text: str) -> Any:
     """The content of a JSON text.
 
     Raises ValueError for what is no JSON, for a key given twice in one object (of which a plain reader would keep the
-    last), and for nesting without end.
+    last), for nesting without end, and for a whole number beyond the range of floating point.
     """
     try:
-        return json.loads(text, object_pairs_hook=_once)
+        return json.loads(text, object_pairs_hook=_once, parse_int=_whole)
     except RecursionError:
         raise ValueError("nested too deeply") from None
 
@@ -44,6 +47,12 @@ class _PlainLoader(yaml.SafeLoader):
         keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
         _once([(key, None) for key in keys])
         return super().construct_mapping(node, deep)
+
+
+def _whole(digits: str) -> int:
+    if len(digits) > MOST_DIGITS:
+        raise ValueError(f"a whole number of {len(digits)} digits")
+    return int(digits)
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

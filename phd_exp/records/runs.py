@@ -19,16 +19,16 @@ A run is named by its choices, never by a date, so that the same command resumes
 import json
 import math
 import os
-import time
 import traceback
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import yaml
 from filelock import FileLock, Timeout
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AwareDatetime, BaseModel, ConfigDict, ValidationError
 
 from phd_exp.records import provenance
 from phd_exp.records.errors import RunError, gist
@@ -42,18 +42,14 @@ LARGEST = MB
 State = Literal["running", "finished", "failed", "interrupted"]
 
 
-# until the year 9999: what lies beyond has no date
-Moment = Annotated[float, Field(ge=0, lt=253402300800, allow_inf_nan=False)]
-
-
 class RunStatus(BaseModel):
-    """How a run stands, and what it ran on."""
+    """How a run stands, and what it ran on; times in UTC."""
 
     model_config = ConfigDict(extra="forbid")
 
     state: State
-    started: Moment
-    ended: Moment | None = None
+    started: AwareDatetime
+    ended: AwareDatetime | None = None
     error: str | None = None
     traceback: str | None = None
     versions: dict[str, str]
@@ -250,7 +246,7 @@ def _unreadable(file: Path, complaint: str, error: Exception) -> RunError:
 def _new_status(data_manifest: str | None) -> RunStatus:
     return RunStatus(
         state="running",
-        started=time.time(),
+        started=datetime.now(UTC),
         versions=provenance.versions(),
         git_commit=provenance.git_commit(),
         data_manifest=data_manifest,
@@ -260,5 +256,5 @@ def _new_status(data_manifest: str | None) -> RunStatus:
 
 def _ended(status: RunStatus, state: State, error: str | None = None, trace: str | None = None) -> RunStatus:
     return status.model_copy(
-        update={"state": state, "ended": time.time(), "error": error, "traceback": trace}
+        update={"state": state, "ended": datetime.now(UTC), "error": error, "traceback": trace}
     )

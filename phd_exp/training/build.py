@@ -15,11 +15,11 @@ from phd_exp.data.sources import Part, RenderedSource, Source
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError
-from phd_exp.training.callbacks import EpochLines
 from phd_exp.training.checkpoints import AtomicCheckpoints
 from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig
 from phd_exp.training.module import PositionModule
 from phd_exp.training.network import build_regressor, naming, precision
+from phd_exp.training.progress import Progress
 from phd_exp.training.recorder import Recorder
 from phd_exp.training.schedule import factor
 from phd_exp.training.stopping import StopBetweenBatches
@@ -110,12 +110,13 @@ def build_trainer(config: RunConfig, recorder: Recorder) -> Trainer:
 
 
 def _progress(config: RunConfig) -> list[Callback]:
-    """A bar on a terminal, lines elsewhere, nothing where nothing is wanted."""
+    """A bar on a terminal, lines elsewhere, nothing with trainer.progress_bar=false."""
     if not config.trainer.progress_bar:
         return []
-    return [TQDMProgressBar() if on_a_terminal() else EpochLines()]
+    bar = TQDMProgressBar() if on_a_terminal() else None
+    return [bar, Progress(bar)] if bar else [Progress()]
 
 
 def on_a_terminal() -> bool:
-    """Whether somebody can watch a progress bar."""
+    """Whether a progress bar can be drawn."""
     return sys.stderr.isatty()

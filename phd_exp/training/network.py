@@ -45,6 +45,11 @@ def naming(key: str) -> Iterator[None]:
         raise ConfigError(f"{key}: {reason}") from None
 
 
+def has_gpu(config: TrainerConfig) -> bool:
+    """Whether a run is trained on a GPU."""
+    return config.accelerator != "cpu" and torch.cuda.is_available()
+
+
 def precision(config: TrainerConfig) -> Any:
     """Lightning's name of the arithmetic: bfloat16 autocast where the hardware has units for it.
 
@@ -52,7 +57,7 @@ def precision(config: TrainerConfig) -> Any:
     """
     if config.precision != "auto":
         return {"float32": "32-true", "bfloat16": "bf16-mixed"}[config.precision]
-    if config.accelerator != "cpu" and torch.cuda.is_available():
+    if has_gpu(config):
         return "bf16-mixed" if torch.cuda.is_bf16_supported(including_emulation=False) else "32-true"
     return "bf16-mixed" if cpu_has_bfloat16() else "32-true"
 

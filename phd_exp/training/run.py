@@ -28,7 +28,7 @@ from phd_exp.training.predictions import summary, write_parquet
 from phd_exp.training.ranks import train_together
 from phd_exp.training.recorder import Draw, Recorder
 from phd_exp.training.stored import ADVICE, load_checkpoint, require_same_shrinking
-from phd_exp.training.tracking import tracked
+from phd_exp.training.tracking import require_key, tracked
 
 UNTRAINED = -1
 """The epoch before the first: what the untrained network gives."""
@@ -68,11 +68,12 @@ def train(config: RunConfig, folder: RunFolder, draw: Draw | None, cores: int) -
 def require_possible(config: RunConfig, folder: RunFolder) -> None:
     """Raise, before anything is rendered or written, what would stop the run later.
 
-    RunError: the folder holds a run of another configuration, or cannot be written. ConfigError: there is no GPU, or
-    a part of the model refuses its values.
+    RunError: the folder holds a run of another configuration, or cannot be written. ConfigError: there is no GPU, no
+    key of wandb, or a part of the model refuses its values.
     """
     require_same_config(folder, config)
     folder.require_writable()
+    require_key(config.logger)
     if config.trainer.accelerator == "gpu" and not torch.cuda.is_available():
         raise ConfigError(
             "trainer.accelerator: got 'gpu', but torch sees none here; expected 'cpu' or 'auto'"
@@ -162,10 +163,12 @@ def _take_up(trainer: Trainer, module: PositionModule, data: PositionData, recor
     """
     checkpoint = recorder.folder.last_checkpoint
     if checkpoint.exists():
-        recorder.forget_after(
-            _last_whole_epoch(checkpoint, trainer.max_epochs or 0, len(data.train_dataloader()))
-        )
+        epochs = trainer.max_epochs or 0
+        last = _last_whole_epoch(checkpoint, epochs, len(data.train_dataloader()))
+        recorder.forget_after(last)
         _require_recorded(recorder, checkpoint)
+        if trainer.is_global_zero and last + 1 < epochs:
+            print(f"{recorder.folder.path}: resuming at epoch {last + 2} of {epochs}", flush=True)
         return checkpoint
     recorder.forget_after(UNTRAINED)
     recorder.record(UNTRAINED, summary(_evaluate(trainer, module, data, "test")), step=0)

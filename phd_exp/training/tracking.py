@@ -9,8 +9,22 @@ from pathlib import Path
 import wandb
 from lightning.pytorch.loggers import WandbLogger
 
+from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import RunConfig
+from phd_exp.training.config.sections import LoggerConfig
+
+
+def require_key(logger: LoggerConfig) -> None:
+    """Raise ConfigError where wandb has no key to send a run with; on a terminal it asks for one."""
+    if logger.kind == "none" or logger.offline:
+        return
+    try:
+        wandb.login()
+    except wandb.errors.UsageError:
+        raise ConfigError(
+            "logger.offline: got false, but wandb has no API key; run `wandb login`, or keep logger.offline=true"
+        ) from None
 
 
 @contextmanager

@@ -99,7 +99,7 @@ STATUS = RunStatus(
 )
 RECORDS = st.fixed_dictionaries(
     {
-        "status.json": (spoiled(STATUS.model_dump()) | VALUES).map(dumped).map(str.encode) | BYTES,
+        "status.json": (spoiled(STATUS.model_dump(mode="json")) | VALUES).map(dumped).map(str.encode) | BYTES,
         "config.yaml": VALUES.map(lambda value: yaml.safe_dump(value).encode()) | BYTES,
         "metrics.jsonl": st.lists(objects(["epoch", "step", "test/nll"]).map(dumped), max_size=3).map(
             lambda lines: "".join(f"{line}\n" for line in lines).encode()

@@ -7,7 +7,8 @@ import pytest
 
 BAD = [
     # (arguments, what the line must say)
-    (["data.ntrain=3"], ["data.ntrain", "did you mean 'data.n_train'"]),
+    (["data.ntrain=3"], ["data.ntrain: unknown key, did you mean 'n_train'?; expected one of n_train, "]),
+    (["trainer.fast_dev_run=1"], ["trainer.fast_dev_run: unknown key; expected one of max_epochs, accel"]),
     (["modle=mae_vz"], ["modle", "did you mean 'model'"]),
     (["model=mae_log"], ["model=mae_log", "did you mean 'mae_logz'", "probabilistic"]),
     (["data=scal"], ["data=scal", "did you mean 'scale'"]),
@@ -134,6 +135,18 @@ def test_an_unwritable_folder_of_a_sweep(phd_exp: Callable, tmp_path: Path) -> N
     assert (
         outcome.err == "error: file/runs/.sweep: Not a directory; mend that, and the same command resumes\n"
     )
+
+
+def test_wandb_without_a_key_is_refused_before_anything_is_rendered(
+    phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NETRC", str(tmp_path / "none"))
+    monkeypatch.delenv("WANDB_API_KEY", raising=False)
+    outcome = phd_exp("preset=smoke", "logger.offline=false")
+    assert outcome.status == 2
+    (line,) = outcome.err.splitlines()
+    assert line.startswith("error: logger.offline: got false, but wandb has no API key")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_each_thing_wrong_gets_its_own_line(phd_exp: Callable) -> None:

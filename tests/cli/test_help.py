@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
+from phd_exp import __version__ as phd_exp_version
 from phd_exp.cli.help import COMPLETION, EXAMPLES, OF_VERB, VERBS
 from phd_exp.cli.paths import conf_folder
 
@@ -35,8 +36,8 @@ def test_help_lists_verbs_groups_and_choices(phd_exp: Callable) -> None:
 
 def test_no_group_is_forgotten() -> None:
     groups = {path.name for path in conf_folder().iterdir() if path.is_dir()}
-    # hydra's say who runs the jobs, not what they are; size follows from preset and recipe
-    assert set(OF_VERB["train"]) == groups - {"hydra", "size"}
+    # hydra's choose launcher and sweeper; recipe_at_preset follows from the recipe and the preset
+    assert set(OF_VERB["train"]) == groups - {"hydra", "recipe_at_preset"}
     assert OF_VERB.keys() == VERBS.keys() == EXAMPLES.keys()
 
 
@@ -73,11 +74,27 @@ def test_a_shell_asks_what_words_there_are(
     assert (outcome.status, outcome.out.strip(), outcome.err) == (0, offered, "")
 
 
-def test_whoever_reads_no_further_is_told_nothing() -> None:
-    """As `| head` does; a pipe without a reader ends a programme with SIGPIPE, and a shell says 141 of that."""
-    reader, writer = os.pipe()
-    os.close(reader)
-    command = [sys.executable, "-m", "phd_exp", "--help"]
-    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
-    os.close(writer)
-    assert (done.returncode, done.stderr) == (141, "")
+@pytest.mark.parametrize("verb", [[], ["render"]])
+@pytest.mark.parametrize("place", range(3))
+def test_options_of_hydra_stand_anywhere(phd_exp: Callable, verb: list[str], place: int) -> None:
+    words = ["data.n_test=7", "preset=smoke"]
+    words[place:place] = ["--package", "data.n_test", "--cfg", "job"]
+    assert phd_exp(*verb, *words).out.strip() == "7"
+
+
+def test_the_version_is_that_of_the_package(phd_exp: Callable) -> None:
+    assert phd_exp("--version").out == f"phd_exp {phd_exp_version}\n"
+
+
+@pytest.mark.parametrize(
+    ("redirection", "status", "said"),
+    [
+        ("| true", 141, ""),  # what a shell gives to a programme ended by SIGPIPE, as by `| head`
+        ("> /dev/full", 1, "error: standard output: No space left on device\n"),
+        (">&-", 0, ""),
+    ],
+)
+def test_output_that_nobody_takes_is_at_most_one_line(redirection: str, status: int, said: str) -> None:
+    command = f"(sleep 0.2; {sys.executable} -m phd_exp --help) {redirection}; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (status, said)

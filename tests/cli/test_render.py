@@ -13,7 +13,6 @@ TINY = (
     "data.n_train=3",
     "data.n_held_out=1",
     "data.n_test=2",
-    "data.batch_size=2",
     "data.samples_per_pixel=1",
 )
 
@@ -68,6 +67,7 @@ def test_masks_lie_where_they_are_asked_for(render: Callable, tmp_path: Path) ->
     [
         ("verify=perhaps", "verify: got 'perhaps'"),
         ("rerender=-1", "rerender: got -1"),
+        ("masks=true", "masks: got True; expected the name of a folder"),
         ("data.image_format=gif", "data.image_format: got 'gif'"),
         ("data.image_quality=0", "data.image_quality: got 0"),
         ("data.views=0", "data.views: got 0"),

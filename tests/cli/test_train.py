@@ -1,8 +1,11 @@
-"""A run's name: every override that can change a number is in it, and no other."""
+"""A run's name: every override that can change a number is in it, and no other; what a run says before it begins."""
+
+from pathlib import Path
 
 import pytest
 
-from phd_exp.cli.train import run_name
+from phd_exp.cli.train import announce, run_name
+from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import RunConfig, check
 
 
@@ -68,3 +71,30 @@ def test_everything_else_is_in_it(config: RunConfig, override: str) -> None:
 def test_one_value_has_one_name(config: RunConfig, one: str, other: str) -> None:
     """A sweep writes values anew before it hands them to its runs."""
     assert run_name(config, [one]) == run_name(config, [other])
+
+
+@pytest.mark.parametrize(
+    ("gpu", "words", "lines"),
+    [
+        (True, ["model=mae_logz", "data=scale"], 1),
+        (False, ["model=mae_logz", "data=scale"], 3),
+        (False, ["preset=small"], 1),
+    ],
+)
+def test_what_a_run_costs_is_said_at_once(
+    composed, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path,
+    gpu: bool, words: list[str], lines: int,
+) -> None:  # type: ignore[no-untyped-def]  # fmt: skip
+    monkeypatch.setattr("phd_exp.training.network.has_gpu", lambda trainer: gpu)
+    announce(check(composed(*words, f"data.root={tmp_path}")), RunFolder(Path("runs/x")), words)
+    first, *rest = capsys.readouterr().out.splitlines()
+    if "preset=small" in words:
+        assert (
+            first
+            == "runs/x: 4200 images to render, then 30 epochs of resnet10 on 3200 images of 64 px, on the CPU"
+        )
+    else:
+        assert "runs/x: 11000 images to render, then 50 epochs of resnet50 on 8000 images of 224 px" in first
+    assert len(rest) == lines - 1
+    if rest:
+        assert rest[-1].endswith("python -m phd_exp model=mae_logz data=scale preset=small")

@@ -18,7 +18,7 @@ CHOICES = sorted(
 NEEDS = {"data=folder": ("data.folder=photos",)} | {
     choice: ("recipe=strong", "preset=small")
     for choice in CHOICES
-    if choice.startswith(("size=", "without="))
+    if choice.startswith(("recipe_at_preset=", "without="))
 }
 """What a choice leaves for the user to say, or is made for."""
 

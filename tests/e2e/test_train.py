@@ -223,7 +223,8 @@ def test_a_broken_run_goes_on_where_it_was(
     assert status is not None
     assert (status.state, status.error) == ("failed", "RuntimeError: power cut")
 
-    assert train(*long, "runs=broken").status == 0
+    resumed = train(*long, "runs=broken")
+    assert (resumed.status, "resuming at epoch 3 of 4" in resumed.out) == (0, True)
     assert [row["epoch"] for row in run.metrics()] == [-1, 0, 1, 2, 3]
     assert run.metrics() == whole.metrics()
     assert run.results_file.read_bytes() == whole.results_file.read_bytes()

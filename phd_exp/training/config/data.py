@@ -23,15 +23,6 @@ class SizesConfig(Section):
     image_size: Annotated[Whole, Field(ge=SMALLEST_IMAGE, le=LARGEST_IMAGE)]
     batch_size: Annotated[Whole, Field(ge=1)]
 
-    @model_validator(mode="after")
-    def a_batch_is_full(self) -> "SizesConfig":
-        """Refuse a batch larger than the training samples."""
-        if self.n_train is not None and self.batch_size > self.n_train:
-            raise ValueError(
-                f"batch_size={self.batch_size} is larger than n_train={self.n_train}: not one batch is full"
-            )
-        return self
-
 
 class RenderedConfig(SizesConfig):
     """A rendered data set (the keys of `DatasetSpec`) and how much of it a run uses."""
@@ -50,16 +41,6 @@ class RenderedConfig(SizesConfig):
             return values
         spec = {key: value for key, value in values.items() if key in DatasetSpec.model_fields}
         return {key: value for key, value in values.items() if key not in spec} | {"spec": spec}
-
-    @model_validator(mode="after")
-    def images_shrink(self) -> "RenderedConfig":
-        """Refuse images larger than they were rendered."""
-        if self.image_size > self.spec.sensor_size:
-            raise ValueError(
-                f"image_size={self.image_size} is larger than sensor_size={self.spec.sensor_size}: "
-                "images are only ever shrunk"
-            )
-        return self
 
     @property
     def n_training_split(self) -> int:

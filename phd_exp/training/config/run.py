@@ -72,6 +72,21 @@ class RunConfig(Section):
         return self
 
     @model_validator(mode="after")
+    def sizes_fit(self) -> "RunConfig":
+        """Refuse a batch larger than the training set, and images larger than they were rendered."""
+        data = self.data
+        if data.n_train is not None and data.batch_size > data.n_train:
+            raise ValueError(
+                f"data: batch_size={data.batch_size} is larger than n_train={data.n_train}: not one batch is full"
+            )
+        if isinstance(data, RenderedConfig) and data.image_size > data.spec.sensor_size:
+            raise ValueError(
+                f"data: image_size={data.image_size} is larger than sensor_size={data.spec.sensor_size}: "
+                "images are only ever shrunk"
+            )
+        return self
+
+    @model_validator(mode="after")
     def several_views_fit(self) -> "RunConfig":
         """Refuse several views of a model or a data set that knows none."""
         multiview = self.evaluation.multiview

@@ -10,8 +10,8 @@ Name = Annotated[str, Field(strict=True, pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
 
 
 def _named(folder: Any) -> Any:
-    """An empty text would be the present folder, which nobody means."""
-    if not folder:
+    """Refuse an empty text, which would be the current folder, and what is no name at all."""
+    if not folder or not isinstance(folder, (str, Path)):
         raise ValueError("expected the name of a folder")
     return folder
 

@@ -1,0 +1,93 @@
+"""What a training prints: how long it will take, and lines where a progress bar cannot be drawn."""
+
+import math
+import time
+from functools import partial
+from typing import Any
+
+from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import ProgressBar
+from lightning.pytorch.utilities import rank_zero_only
+
+FIRST_LINE = 5.0  # s after the first batch
+BETWEEN_LINES = 30.0  # s
+SHOWN = ("test/loss", "test/projected_error_mm", "test/depth_error_mm")
+
+
+class Progress(Callback):
+    """Prints the time left once the first batches are timed; without a bar also every half minute and every epoch.
+
+    Args:
+        bar: the progress bar of the same training, above which lines are printed.
+    """
+
+    def __init__(self, bar: ProgressBar | None = None) -> None:
+        self.has_bar = bar is not None
+        self.say = bar.print if bar else partial(print, flush=True)
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._begin()
+
+    def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._begin()
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        n = int(trainer.num_training_batches)
+        done = trainer.current_epoch * n + batch_idx + 1
+        self._count(done, (trainer.max_epochs or 1) * n, f"{_epoch(trainer)}, batch {batch_idx + 1}/{n}")
+
+    def on_predict_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        *rest: Any,
+    ) -> None:
+        if not self.has_bar:
+            n = int(trainer.num_predict_batches[0])
+            self._count(batch_idx + 1, n, f"evaluation, batch {batch_idx + 1}/{n}")
+
+    @rank_zero_only
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self.has_bar:
+            return
+        evaluated = (trainer.current_epoch + 1) % (trainer.check_val_every_n_epoch or 1) == 0
+        metrics = trainer.callback_metrics if evaluated else {}  # Lightning keeps those of earlier epochs
+        words = [f"{key} {float(metrics[key]):.4g}" for key in SHOWN if key in metrics]
+        n, epochs = int(trainer.num_training_batches), trainer.max_epochs or 1
+        left = self._left((trainer.current_epoch + 1) * n, epochs * n)
+        self.say(f"{_epoch(trainer)}: {', '.join([*words, left])}")
+        self.due = time.monotonic() + BETWEEN_LINES
+
+    def _begin(self) -> None:
+        self.first: tuple[float, int] | None = None
+        self.due = math.inf
+
+    @rank_zero_only
+    def _count(self, done: int, total: int, place: str) -> None:
+        now = time.monotonic()
+        if self.first is None:  # the first batch also pays for what is allocated and compiled
+            self.first, self.due = (now, done), now + FIRST_LINE
+        elif now >= self.due:
+            self.due = math.inf if self.has_bar else now + BETWEEN_LINES
+            self.say(f"{place}: {self._left(done, total)}")
+
+    def _left(self, done: int, total: int) -> str:
+        """The time that the remaining batches take at the mean speed so far, evaluations included."""
+        since, before = self.first or (time.monotonic(), done)
+        return f"about {duration((time.monotonic() - since) / max(done - before, 1) * (total - done))} left"
+
+
+def duration(seconds: float) -> str:
+    """Seconds in the unit in which they are read best."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def _epoch(trainer: Trainer) -> str:
+    return f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}"
