@@ -1,17 +1,14 @@
-"""`python -m phd_exp report`: the paper's tables from all recorded runs, printed and written, and their site."""
+"""`python -m phd_exp report`: every recorded run, read once; tables in the terminal and as files, figures, pages."""
 
+import sys
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 
 from phd_exp.cli.arguments import Arguments, parsed
 from phd_exp.records.errors import UserError
-from phd_exp.reports.collect import Records, collect
-from phd_exp.reports.formats.files import write_fusion_tables, write_tables, write_variation_tables
-from phd_exp.reports.formats.terminal import print_complaints, print_report, print_tables
-from phd_exp.reports.tables import tables
-from phd_exp.reports.variations import variation_tables
 
-FOR_THE_SITE = ("matplotlib", "plotly", "jinja2")
+FOR_PICTURES = ("matplotlib", "plotly", "jinja2")
 
 
 class ReportArguments(Arguments):
@@ -22,42 +19,47 @@ class ReportArguments(Arguments):
 
 
 def main(words: list[str]) -> int:
-    """Print and write the tables and build the site; returns the exit status."""
+    """Print and write the tables, figures and pages; returns the exit status."""
     folders = parsed("report", ReportArguments, words)
     if not folders.runs.is_dir():
         raise UserError(f"{folders.runs}: no such folder; train first, or name another by runs=DIR")
-    records = collect(folders.runs)
-    drawn = tables(records)
-    print_report(records, drawn)
-    if drawn:
-        print(f"tables: {write_tables(drawn, folders.out)}")
-    if varied := variation_tables(records):
-        print_tables(varied)
-        print(f"tables of variations: {write_variation_tables(varied, folders.out)}")
-    if any(run.folder.views.exists() for run in records.runs):
-        _fusion(records, folders.out)
-    if records.runs:
-        _build_site(folders.runs, folders.out)
+    try:
+        _report(folders.runs, folders.out)
+    except OSError as error:
+        raise UserError(
+            f"{error.filename or folders.out}: cannot be written ({error.strerror}); choose another folder by out=DIR"
+        ) from None
     return 0
 
 
-def _fusion(records: Records, out: Path) -> None:
-    # torch, which a report on single views gets its tables without
-    from phd_exp.reports.fusion_table import fusion_tables
+def _report(runs: Path, out: Path) -> None:
+    # seconds of imports, torch among them, which a mistake in the command need not wait for
+    from phd_exp.reports.formats.files import all_tables, write_tables
+    from phd_exp.reports.formats.terminal import print_report
+    from phd_exp.reports.runs import read_report
+    from phd_exp.threads import one_thread
 
-    drawn, complaints = fusion_tables(records)
-    print_tables(drawn)
-    print_complaints(complaints)
-    if drawn:
-        print(f"tables of fusion: {write_fusion_tables(drawn, out)}")
+    with one_thread():  # tables of a few thousand rows are too small to share
+        report = read_report(runs, out / "measured", _progress())
+        tables = all_tables(report)
+        print_report(report, tables)
+        if not report.runs:
+            return
+        if tables:
+            print(f"tables: {write_tables(tables, out)}")
+        if not all(map(find_spec, FOR_PICTURES)):
+            print("figures and site were not made: they need `pip install 'phd_exp[report]'`")
+            return
+        from phd_exp.reports.paper_figures import write_figures
+        from phd_exp.reports.site.build import write_site
+
+        figures = write_figures(report, out / "figures")
+        print(f"figures: {out / 'figures'}")
+        print(f"site: {write_site(report, tables, figures, out / 'site')}, to be opened in a browser")
 
 
-def _build_site(runs: Path, out: Path) -> None:
-    if not all(map(find_spec, FOR_THE_SITE)):
-        print("the site was not built: that needs `pip install 'phd_exp[report]'`")
-        return
-    # seconds of imports, torch among them, which the tables need not wait for
-    from phd_exp.reports.site.build import build_site
-
-    print(f"site: {build_site(runs, out)}, to be opened in a browser")
-    print(f"figures: {out / 'figures'}")
+def _progress() -> Callable[[str], None]:
+    """On a terminal, one line that says which run is being measured."""
+    if not sys.stderr.isatty():
+        return lambda run: None
+    return lambda run: print(f"\r\x1b[Kmeasuring {run}", end="\r", file=sys.stderr, flush=True)

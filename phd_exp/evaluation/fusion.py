@@ -10,10 +10,12 @@ from scipy import stats
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.evaluation.predictions import SEED, Band
+from phd_exp.evaluation.point_errors import SEED
+from phd_exp.evaluation.predictions import band_of
+from phd_exp.evaluation.reference import Band
 from phd_exp.evaluation.several_views import SeveralViews
 from phd_exp.fusion import Fused, Plane, Pose, Status, average, fuse, gaussian_fusion
-from phd_exp.metrics.bootstrap import Interval, bands
+from phd_exp.metrics.bootstrap import bands
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, squared_mahalanobis
 from phd_exp.records.errors import RunError
 
@@ -31,26 +33,16 @@ DRAWS = 32
 
 
 @dataclass(frozen=True)
-class Place:
-    """What a number is of: the first so many cameras, on the ground or not, fused by a method."""
-
-    quantity: str
-    method: Method
-    cameras: int
-    on_plane: bool
-
-
-@dataclass(frozen=True)
 class FusionScores:
     """What the first 1, 2, ... cameras of each scene give together.
 
     Attributes:
         n, views: scenes and cameras of each.
         left_out: further scenes with something that is not finite or cannot be fused.
-        bands: means over scenes with their 95 % bootstrap intervals. `depth_error_mm` is along the first camera's
-            true viewing ray, `distance_mm` in space; `coverage_50` is the share (per cent) of true positions within
-            the ellipsoid of mean and covariance that holds so much of a Gaussian; `normalised_squared_error` the
-            squared Mahalanobis distance over the number of dimensions, 1 on average where calibrated.
+        bands: by `place`, means over scenes with their 95 % bootstrap intervals. `depth_error_mm` is along the first
+            camera's true viewing ray, `distance_mm` in space; `coverage_50` is the share (per cent) of true positions
+            within the ellipsoid of mean and covariance that holds so much of a Gaussian; `normalised_squared_error`
+            the squared Mahalanobis distance over the number of dimensions, 1 on average where calibrated.
         surprise: counts of the views in which the fused position of all cameras has a credible level in each of
             `BINS` equal parts of [0, 1].
         correlation: between the errors of log depth of two views of a scene (intraclass).
@@ -61,11 +53,20 @@ class FusionScores:
     n: int
     views: int
     left_out: int
-    bands: dict[Place, Band]
+    bands: dict[str, Band]
     surprise: list[int]
     correlation: Band
     with_size: Band
     calibrated_coverage: tuple[float, ...]
+
+    def band(self, quantity: str, method: Method, cameras: int, on_plane: bool = False) -> Band:
+        """What the first so many cameras give, fused by a method, on the ground or not."""
+        return self.bands[place(quantity, method, cameras, on_plane)]
+
+
+def place(quantity: str, method: str, cameras: int, on_plane: bool) -> str:
+    """The key of a number."""
+    return f"{quantity}/{method}/{cameras}/{'ground' if on_plane else 'free'}"
 
 
 @dataclass(frozen=True)
@@ -78,18 +79,18 @@ class Estimate:
 
 def fusion_scores(views: SeveralViews, resamples: int = 200) -> FusionScores:
     """Fuse and measure. Raises RunError where no scene can be fused by every method."""
-    fused = {place: _fused(views, *place) for place in _places(views.views)}
+    fused = {(k, on_plane): _fused(views, k, on_plane) for k, on_plane in _places(views.views)}
     sound = torch.stack([found.status == Status.FUSED for found in fused.values()]).all(0)
     sound &= torch.stack([found.covariance.isfinite().all(-1).all(-1) for found in fused.values()]).all(0)
     if not bool(sound.any()):
         raise RunError("several views: not one scene can be fused; train longer")
     kept = views.subset(sound)
-    found: dict[Place, Band] = {}
+    found: dict[str, Band] = {}
     for (k, on_plane), result in fused.items():
         estimates = _estimates(kept.cameras(k), kept.ground if on_plane else None, result, sound)
         columns = _columns(kept, estimates, on_plane)
         for (quantity, method), band in _bands(columns, resamples).items():
-            found[Place(quantity, method, k, on_plane)] = band
+            found[place(quantity, method, k, on_plane)] = band
     correlation, with_size = _common_cause(kept, resamples)
     surprise = fused[views.views, False].surprise[sound].flatten()
     return FusionScores(
@@ -182,15 +183,11 @@ def _within(distance: Float[Tensor, " scenes"], dimensions: int) -> dict[str, Te
 def _bands(columns: Mapping[tuple[str, Method], Tensor], resamples: int) -> dict[tuple[str, Method], Band]:
     named = {"/".join(key): column for key, column in columns.items()}
     found = bands(_means, named, resamples, SEED)
-    return {key: _band(found["/".join(key)]) for key in columns}
+    return {key: band_of(found["/".join(key)]) for key in columns}
 
 
 def _means(columns: Mapping[str, Tensor], counts: Tensor) -> dict[str, Tensor]:
     return {name: (counts @ column.double()) / counts.sum(-1) for name, column in columns.items()}
-
-
-def _band(interval: Interval) -> Band:
-    return Band(float(interval.value), float(interval.low), float(interval.high))
 
 
 def _common_cause(views: SeveralViews, resamples: int) -> tuple[Band, Band]:
@@ -203,7 +200,7 @@ def _common_cause(views: SeveralViews, resamples: int) -> tuple[Band, Band]:
         "views": torch.full((views.n,), views.views, dtype=torch.float64),
     }
     found = bands(_correlations, columns, resamples, SEED)
-    return _band(found["of_views"]), _band(found["with_size"])
+    return band_of(found["of_views"]), band_of(found["with_size"])
 
 
 def _correlations(columns: Mapping[str, Tensor], counts: Tensor) -> dict[str, Tensor]:

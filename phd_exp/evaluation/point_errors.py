@@ -1,4 +1,4 @@
-"""Mean errors of a run's point estimates, from its `predictions.parquet` alone.
+"""Mean errors of a run's point estimates, from its table of predictions.
 
 The columns used, a row a test sample; positions are metres in the camera frame:
 
@@ -7,19 +7,21 @@ The columns used, a row a test sample; positions are metres in the camera frame:
     mode_x, mode_y, mode_z   the estimate of every model
     mean_x, mean_y, mean_z   of a distribution: its mean
     median_z, mu_x, mu_y     of a distribution: the median of depth, and the projected centre
-    nll                      of a distribution: -log p(truth), nats; not needed
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-import pyarrow as pa
+import torch
 from jaxtyping import Bool, Float64
+from scipy import stats
+from torch import Tensor
 
-from phd_exp.evaluation.parquet import read_table
+from phd_exp.evaluation.parquet import Columns
+from phd_exp.metrics.bootstrap import resampled
+from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
 from phd_exp.records.errors import RunError
 
 Estimate = Literal["mode", "mean", "median"]
@@ -35,9 +37,10 @@ COLUMNS: Mapping[Estimate, tuple[str, str, str]] = {
 }
 CENTRAL = 0.5
 """Largest |v_p| of either coordinate in the central half of the field of view."""
-
-Points = Float64[np.ndarray, "n 3"]
-PerSample = Float64[np.ndarray, " n"]
+RESAMPLES = 200
+SEED = 0
+"""Of all bootstraps: runs that were tested on the same images are resampled alike, and can be compared in pairs."""
+_ERRORS = {"projected": projected_error, "depth": depth_error}
 
 
 @dataclass(frozen=True)
@@ -51,103 +54,108 @@ class ErrorKey:
 
 @dataclass(frozen=True)
 class SampleMean:
-    """A mean over n test samples, and its standard error (none of a single sample)."""
+    """A mean over n test samples.
+
+    Attributes:
+        standard_error: None for a single sample.
+        resampled: the mean over resampled test images; the same images for all runs with as many of them.
+    """
 
     n: int
     value: float
     standard_error: float | None
-
-    @classmethod
-    def of(cls, values: PerSample) -> "SampleMean":
-        """The mean of these values, one a sample."""
-        n = len(values)
-        return cls(n, float(values.mean()), float(values.std(ddof=1) / np.sqrt(n)) if n > 1 else None)
+    resampled: np.ndarray = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
 
 
 MeanErrors = Mapping[ErrorKey, SampleMean]
 """Millimetres; a reading without a test sample has no key."""
 
 
-def mean_errors(file: Path, estimates: Sequence[Estimate]) -> MeanErrors:
-    """The mean errors of the asked estimates, in both readings.
+def mean_errors(table: Columns, estimates: Sequence[Estimate]) -> MeanErrors:
+    """The mean errors of these estimates, in both readings.
 
-    Raises RunError, one line, where the file cannot be read, lacks a column or a row, or holds what is no number.
+    Raises RunError, one line, where the table lacks a column or a mean is not finite.
     """
-    names = ["x", "y", "z", "f", "S", *(name for estimate in estimates for name in COLUMNS[estimate])]
-    table = _read(file, names)
-    truth = np.stack([table["x"], table["y"], table["z"]], axis=-1)
-    central = in_central_half(truth, table["f"], table["S"])
-    with np.errstate(over="ignore", invalid="ignore"):  # told below, with the file's name
-        means = dict(_means(truth, central, {name: _points(table, name) for name in estimates}))
+    needed = ["x", "y", "z", "f", "S", *(name for estimate in estimates for name in COLUMNS[estimate])]
+    if lacking := [name for name in needed if name not in table]:
+        raise RunError(f"predictions: have no column {', '.join(lacking)}; run the model again")
+    for name in needed:
+        if not (np.isfinite(table[name]).all() and (name not in ("z", "f", "S") or (table[name] > 0).all())):
+            raise RunError(f"predictions: column {name} is not finite everywhere, or not positive")
+    truth = _stacked(table, ("x", "y", "z"))
+    central = in_central_half(truth, _stacked(table, ("f",)), _stacked(table, ("S",)))
+    means = dict(_means(truth, central, {name: _points(table, name) for name in estimates}))
     if not all(np.isfinite(mean.value) for mean in means.values()):
-        raise RunError(f"{file.name}: holds estimates so far off that their mean error is no finite number")
+        raise RunError("predictions: are so far off that a mean error is not finite")
     return means
 
 
-def mean_nll(file: Path) -> float | None:
-    """The mean of the column `nll`, nats; None where a point estimate left none, or it cannot be read."""
-    try:
-        return float(_read(file, ["nll"])["nll"].mean())
-    except RunError:
-        return None
-
-
-def in_central_half(truth: Points, f: PerSample, S: PerSample) -> Bool[np.ndarray, " n"]:
+def in_central_half(
+    truth: Float64[Tensor, "n 3"], f: Float64[Tensor, "n 1"], S: Float64[Tensor, "n 1"]
+) -> Bool[Tensor, " n"]:
     """Whether a position lies in the central half of the field of view, |v_p| <= 1/2 in both coordinates.
 
-    v_p = 2 f (x, y) / (S z), where the authors' generator places its objects.
+    v_p = 2 f (x, y) / (S z). The authors' generator places its objects there.
     """
-    projected = 2 * f[:, None] * truth[:, :2] / (S * truth[:, 2])[:, None]
-    return (np.abs(projected) <= CENTRAL).all(axis=-1)
-
-
-def errors_mm(truth: Points, estimate: Points) -> dict[Quantity, PerSample]:
-    """The two columns of the paper's tables, millimetres a sample.
-
-    With v_par = (v . v^ / |v|^2) v: projected = |v^ - v_par|, depth = | |v_par| - |v| |.
-
-    Source: the paper's section on experiments; `phd_exp.metrics.errors` has it for a network's tensors.
-    """
-    along = (truth * estimate).sum(axis=-1, keepdims=True) / np.square(truth).sum(axis=-1, keepdims=True)
-    on_ray = along * truth
-    depth = np.abs(np.linalg.norm(on_ray, axis=-1) - np.linalg.norm(truth, axis=-1))
-    return {"projected": 1000 * np.linalg.norm(estimate - on_ray, axis=-1), "depth": 1000 * depth}
+    return ((2 * f * truth[:, :2] / (S * truth[:, 2:])).abs() <= CENTRAL).all(dim=-1)
 
 
 def _means(
-    truth: Points, central: Bool[np.ndarray, " n"], estimates: Mapping[Estimate, Points]
+    truth: Tensor, central: Tensor, estimates: Mapping[Estimate, Tensor]
 ) -> Iterator[tuple[ErrorKey, SampleMean]]:
-    for estimate, points in estimates.items():
-        for quantity, values in errors_mm(truth, points).items():
-            yield ErrorKey(estimate, "whole", quantity), SampleMean.of(values)
-            if central.any():
-                yield ErrorKey(estimate, "central", quantity), SampleMean.of(values[central])
+    for reading, chosen in (("whole", torch.ones_like(central)), ("central", central)):
+        if not bool(chosen.any()):
+            continue
+        columns = {
+            f"{estimate} {quantity}": MILLIMETRES * error(truth, points)[chosen]
+            for estimate, points in estimates.items()
+            for quantity, error in _ERRORS.items()
+        }
+        _, drawn = resampled(_column_means, columns, RESAMPLES, SEED)
+        for name, values in columns.items():
+            estimate, quantity = name.split()
+            n = len(values)
+            error = float(values.std() / n**0.5) if n > 1 else None
+            mean = SampleMean(n, float(values.mean()), error, drawn[name].numpy())
+            yield ErrorKey(estimate, reading, quantity), mean  # type: ignore[arg-type]
 
 
-def _points(table: Mapping[str, PerSample], estimate: Estimate) -> Points:
+def _column_means(columns: Mapping[str, Tensor], counts: Tensor) -> dict[str, Tensor]:
+    return {name: (counts @ column) / counts.sum(-1) for name, column in columns.items()}
+
+
+def _stacked(table: Columns, names: Sequence[str]) -> Tensor:
+    return torch.from_numpy(np.stack([table[name] for name in names], axis=-1))
+
+
+def _points(table: Columns, estimate: Estimate) -> Tensor:
     """The estimate's coordinates; the median is median_z (mu_x, mu_y, 1), on the ray of the projected centre."""
-    x, y, z = (table[name] for name in COLUMNS[estimate])
-    return np.stack([z * x, z * y, z] if estimate == "median" else [x, y, z], axis=-1)
+    points = _stacked(table, COLUMNS[estimate])
+    if estimate == "median":
+        points[:, :2] *= points[:, 2:]
+    return points
 
 
-def _read(file: Path, names: Sequence[str]) -> dict[str, PerSample]:
-    content = read_table(file, names)
-    table = {name: content.column(name).cast(pa.float64()).to_numpy() for name in names}
-    _require_numbers(file, table)
-    return table
+def difference(one: Sequence[SampleMean], other: Sequence[SampleMean]) -> tuple[float, float]:
+    """Mean of `one` minus mean of `other`, each a mean a seed, and the half width of its 95 % interval.
+
+    The standard error is that of a bootstrap over seeds of each model and over the test images that they share;
+    deviations of seeds are scaled by sqrt(k / (k - 1)), since k seeds are few, and the interval uses Student's law
+    with the seeds' degrees of freedom. One seed says nothing of another training: the half width is then infinite.
+
+    Source: Davison and Hinkley, "Bootstrap methods and their application" (1997), section 2.3 (small samples).
+    """
+    gap = float(np.mean([mean.value for mean in one]) - np.mean([mean.value for mean in other]))
+    if min(len(one), len(other)) < 2:
+        return gap, float("inf")
+    random = np.random.default_rng(SEED)
+    drawn = _over_seeds(one, random) - _over_seeds(other, random)
+    freedom = len(one) + len(other) - 2
+    return gap, float(stats.t.ppf(0.975, freedom) * drawn.std(ddof=1))
 
 
-def _require_numbers(file: Path, table: Mapping[str, PerSample]) -> None:
-    for name, values in table.items():
-        if not len(values):
-            raise RunError(f"{file.name}: has no rows")
-        if not np.isfinite(values).all():
-            row = int(np.flatnonzero(~np.isfinite(values))[0])
-            raise RunError(
-                f"{file.name}: column {name} is {values[row]} in row {row}; expected a finite number"
-            )
-        if name in ("z", "f", "S") and values.min() <= 0:
-            row = int(values.argmin())
-            raise RunError(
-                f"{file.name}: column {name} is {values[row]:g} in row {row}; expected more than 0"
-            )
+def _over_seeds(means: Sequence[SampleMean], random: np.random.Generator) -> np.ndarray:
+    """Resampled means: seeds and images are drawn anew each time."""
+    values, k = np.stack([mean.resampled for mean in means]), len(means)
+    weights = random.multinomial(k, [1 / k] * k, values.shape[1]).T / k
+    return np.asarray((values * (1 / k + np.sqrt(k / (k - 1)) * (weights - 1 / k))).sum(0))

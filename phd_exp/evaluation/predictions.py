@@ -1,7 +1,7 @@
-"""What one table of predictions says of its model: scores, curves and strata, all with bootstrap bands."""
+"""Measures a table of predictions: scores, curves and strata with bootstrap intervals; recalibrates it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -12,8 +12,10 @@ from torch import Tensor
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import PARAMETERS, distribution_columns, draws, from_columns
 from phd_exp.distributions.temperature import Temperature
-from phd_exp.evaluation.parquet import read_table
-from phd_exp.metrics.bootstrap import Interval, Statistic, bands
+from phd_exp.evaluation.parquet import Columns, arrays, read_table
+from phd_exp.evaluation.point_errors import SEED
+from phd_exp.evaluation.reference import Band, calibrated_reference
+from phd_exp.metrics.bootstrap import Interval, Statistic, bands, interval, resampled
 from phd_exp.metrics.calibration import CalibrationCurve, calibration_curve
 from phd_exp.metrics.calibration_scores import COLUMNS, calibration_scores, ordered
 from phd_exp.metrics.curves import abscissae, curves
@@ -23,11 +25,6 @@ from phd_exp.metrics.strata import strata
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder
 
-Arrays = Mapping[str, np.ndarray]
-"""Name of a column -> a value a sample."""
-Columns = dict[str, Tensor]
-
-SEED = 0
 ERRORS = ("projected_error_mm", "depth_error_mm")
 OF_A_DISTRIBUTION = (*COLUMNS, *ERRORS, "nll", "energy_score")
 XYZ = ("x", "y", "z")
@@ -41,15 +38,6 @@ QUANTITIES: Mapping[str, tuple[str, str, tuple[float, ...] | int]] = {
 
 The true depth is what is predicted: even calibrated predictions are not calibrated among samples chosen by it.
 """
-
-
-@dataclass(frozen=True)
-class Band:
-    """A number and its 95 % bootstrap interval."""
-
-    value: float
-    low: float
-    high: float
 
 
 @dataclass(frozen=True)
@@ -76,9 +64,13 @@ class Stratum:
 class Evaluation:
     """A table of predictions, measured; `left_out` further samples had a number that is not finite.
 
-    Scores of a distribution are `calibration_scores` and the means of `nll` (nats) and `energy_score_mm`; of a point
-    estimate too those of `projected_error_mm` and `depth_error_mm`. Curves are those of `metrics.curves.curves`: x is
-    predicted variance, credible level, PIT, or share of samples kept.
+    Attributes:
+        scores: of a distribution `calibration_scores` and the means of `nll` (nats) and `energy_score_mm`; of a point
+            estimate too the means of `projected_error_mm` and `depth_error_mm`.
+        reference: of each score that is a distance from calibration, the median and the 95 % interval that calibrated
+            predictions with the same uncertainties have (`calibrated_reference`): such a distance is never zero.
+        curves: `metrics.curves.curves`; x is the predicted variance, credible level, PIT, or share of samples kept.
+        resampled: each score on the same resampled test images for every run that has as many of them.
     """
 
     n: int
@@ -86,38 +78,46 @@ class Evaluation:
     curves: dict[str, Curve]
     strata: list[Stratum]
     left_out: int
+    reference: dict[str, Band] = field(default_factory=dict)
+    resampled: dict[str, list[float]] = field(default_factory=dict)
 
 
-def evaluate(table: pa.Table | Arrays, window: int = 200, resamples: int = 200) -> Evaluation:
+def evaluate(table: pa.Table | Columns, window: int = 200, resamples: int = 200) -> Evaluation:
     """Measure predictions of a distribution.
 
     Raises RunError where a column is missing, or where no sample has all of them finite.
     """
-    columns, left_out = _finite(table, OF_A_DISTRIBUTION)
+    columns, left_out = _finite(table, OF_A_DISTRIBUTION, PARAMETERS)
+    parameters = set(PARAMETERS) <= columns.keys()
     x = abscissae(columns, window)
     intervals = bands(partial(curves, window=window), columns, resamples, SEED)
+    scores, drawn = _scores(_distribution_scores, columns, resamples)
     return Evaluation(
         n=len(columns["nll"]),
-        scores=_scores(_distribution_scores, columns, resamples),
+        scores=scores,
         curves={name: _curve(x[name], interval) for name, interval in intervals.items()},
         strata=_strata(_distribution_scores, columns, resamples),
         left_out=left_out,
+        reference=calibrated_reference(_distribution(columns)) if parameters else {},
+        resampled=drawn,
     )
 
 
-def evaluate_points(table: pa.Table | Arrays, resamples: int = 200) -> Evaluation:
+def evaluate_points(table: pa.Table | Columns, resamples: int = 200) -> Evaluation:
     """Measure predictions of a point alone: its errors, no curves. Raises RunError as `evaluate` does."""
     columns, left_out = _finite(table, ERRORS)
+    scores, drawn = _scores(_point_scores, columns, resamples)
     return Evaluation(
         n=len(columns[ERRORS[0]]),
-        scores=_scores(_point_scores, columns, resamples),
+        scores=scores,
         curves={},
         strata=_strata(_point_scores, columns, resamples),
         left_out=left_out,
+        resampled=drawn,
     )
 
 
-def fit_temperature(held_out_table: pa.Table | Arrays) -> Temperature:
+def fit_temperature(held_out_table: pa.Table | Columns) -> Temperature:
     """The temperatures that fit predictions of samples that were held out of training.
 
     Raises RunError where a column is missing, or where none fits.
@@ -137,7 +137,7 @@ def held_out_temperature(folder: RunFolder) -> Temperature:
     return fit_temperature(read_table(folder.held_out))
 
 
-def recalibrated(table: pa.Table | Arrays, temperature: Temperature) -> dict[str, np.ndarray]:
+def recalibrated(table: pa.Table | Columns, temperature: Temperature) -> dict[str, np.ndarray]:
     """The same columns for A / projected and a / depth: estimates of the mode stay, all that is uncertain changes.
 
     Samples whose parameters are not finite are dropped. Raises RunError where a column is missing, or where no sample
@@ -178,40 +178,48 @@ def _mean(column: Tensor, weight: Tensor) -> Tensor:
     return (weight * column).sum(-1) / weight.sum(-1)
 
 
-def _scores(statistic: Statistic, columns: Columns, resamples: int) -> dict[str, Band]:
-    intervals = bands(statistic, columns, resamples, SEED)
-    return {
-        name: Band(float(interval.value), float(interval.low), float(interval.high))
-        for name, interval in intervals.items()
-    }
+def _scores(
+    statistic: Statistic, columns: Mapping[str, Tensor], resamples: int
+) -> tuple[dict[str, Band], dict[str, list[float]]]:
+    values, drawn = resampled(statistic, columns, resamples, SEED)
+    scores = {name: band_of(interval(value, drawn[name])) for name, value in values.items()}
+    return scores, {name: values.tolist() for name, values in drawn.items()}
+
+
+def band_of(found: Interval) -> Band:
+    """An interval of one number."""
+    return Band(float(found.value), float(found.low), float(found.high))
 
 
 def _curve(x: Tensor, interval: Interval) -> Curve:
     return Curve(x.tolist(), interval.value.tolist(), interval.low.tolist(), interval.high.tolist())
 
 
-def _strata(statistic: Statistic, columns: Columns, resamples: int) -> list[Stratum]:
+def _strata(statistic: Statistic, columns: Mapping[str, Tensor], resamples: int) -> list[Stratum]:
     found = []
     for quantity, (column, unit, edges) in QUANTITIES.items():
         if column not in columns:
             continue
         for stratum in strata(quantity, columns[column], edges, unit):
             part = {name: values[stratum.mask] for name, values in columns.items()}
-            scores = _scores(statistic, part, resamples)
+            scores, _ = _scores(statistic, part, resamples)
             found.append(Stratum(quantity, stratum.label, int(stratum.mask.sum()), scores))
     return found
 
 
-def _finite(table: pa.Table | Arrays, names: tuple[str, ...]) -> tuple[Columns, int]:
-    """The columns asked for and those of the strata, of the samples where the former are finite; how many are not."""
-    arrays = _arrays(table, names)
-    of_strata = [column for column, _, _ in QUANTITIES.values() if column in arrays]
-    columns = {name: _tensor(arrays[name]) for name in dict.fromkeys((*names, *of_strata))}
-    finite = _all_finite(columns, names)
-    return {name: column[finite] for name, column in columns.items()}, int((~finite).sum())
+def _finite(
+    table: pa.Table | Columns, names: tuple[str, ...], welcome: tuple[str, ...] = ()
+) -> tuple[dict[str, Tensor], int]:
+    """These columns and the welcome ones, of samples where they are finite, with the strata; how many are not."""
+    columns = _arrays(table, names)
+    names += tuple(name for name in welcome if name in columns)
+    of_strata = [column for column, _, _ in QUANTITIES.values() if column in columns]
+    tensors = {name: _tensor(columns[name]) for name in dict.fromkeys((*names, *of_strata))}
+    finite = _all_finite(tensors, names)
+    return {name: column[finite] for name, column in tensors.items()}, int((~finite).sum())
 
 
-def _all_finite(columns: Columns, names: tuple[str, ...]) -> Tensor:
+def _all_finite(columns: Mapping[str, Tensor], names: tuple[str, ...]) -> Tensor:
     """Which samples have these numbers finite. Raises RunError where none has."""
     finite = torch.stack([columns[name] for name in names]).isfinite().all(dim=0)
     if not bool(finite.any()):
@@ -221,16 +229,14 @@ def _all_finite(columns: Columns, names: tuple[str, ...]) -> Tensor:
     return finite
 
 
-def _arrays(table: pa.Table | Arrays, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    if isinstance(table, pa.Table):
-        table = {name: table[name].to_numpy() for name in table.column_names}
-    missing = [name for name in names if name not in table]
-    if missing:
+def _arrays(table: pa.Table | Columns, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    columns = arrays(table)
+    if missing := [name for name in names if name not in columns]:
         raise RunError(
             f"predictions: column {', '.join(missing)} missing, which an older version may not have written; "
             "run the model again"
         )
-    return dict(table)
+    return columns
 
 
 def _tensor(array: np.ndarray) -> Tensor:

@@ -108,7 +108,7 @@ class SeveralViews:
 def read_views(file: Path) -> SeveralViews:
     """The record that a run left. Raises RunError where it cannot be read, or is none of several views."""
     table = read_table(file, NEEDED)
-    flat = {name: torch.from_numpy(table[name].to_numpy().astype(float)) for name in NEEDED}
+    flat = {name: torch.from_numpy(table[name]) for name in NEEDED}
     columns = {name: column.reshape(-1, _views(file, flat)) for name, column in flat.items()}
     finite = torch.stack(list(columns.values())).isfinite().all(0).all(-1)
     if not bool(finite.any()):

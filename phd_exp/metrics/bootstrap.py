@@ -1,7 +1,7 @@
 """How far a number would move with another test set: percentile bootstrap over samples.
 
 A resample is a row of counts, how often each sample was drawn. A statistic that takes counts sorts its samples once
-and sees all resamples in one go.
+and measures many resamples at a time.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,6 +13,8 @@ from torch import Tensor
 
 Statistic = Callable[[Mapping[str, Tensor], Tensor], Mapping[str, Tensor]]
 """Columns of shape (samples,) and counts (resamples, samples) -> name -> (resamples, *points)."""
+_AT_ONCE = 10**6
+"""Counts that are held in memory at a time."""
 
 
 @dataclass(frozen=True)
@@ -31,34 +33,52 @@ def bands(
     seed: int,
     confidence: float = 0.95,
 ) -> dict[str, Interval]:
-    """Percentile intervals of scalars, and of curves at each of their points alone; the same for the same seed.
+    """Percentile intervals of scalars, and of curves at each of their points; the same for the same seed.
 
-    A distance from calibration cannot be negative, and drawing with replacement adds noise to it: near perfect
-    calibration all resamples may lie above the value. The interval is then stretched to hold it.
+    They say how far a number would move with another test set. They are no test of calibration: a distance from
+    calibration cannot be negative and drawing with replacement adds noise to it, so near perfect calibration all
+    resamples may lie above the value. The interval is then stretched to hold it.
 
     Raises ValueError without samples, with fewer than one resample, or for a confidence outside (0, 1).
     Source: Efron and Tibshirani, "An introduction to the bootstrap" (1993), chapter 13.
     """
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence: got {confidence}; expected a number between 0 and 1")
+    values, drawn = resampled(statistic, columns, resamples, seed)
+    return {name: interval(value, drawn[name], confidence) for name, value in values.items()}
+
+
+def resampled(
+    statistic: Statistic, columns: Mapping[str, Float[Tensor, " samples"]], resamples: int, seed: int
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """The statistic of the samples, and of each resample (along the first dimension).
+
+    Tables of equally many rows are resampled alike. Raises ValueError without samples or resamples.
+    """
     n = len(next(iter(columns.values()), ()))
-    if n == 0 or resamples < 1 or not 0 < confidence < 1:
-        raise ValueError(
-            f"a bootstrap needs samples and resamples, not {n} and {resamples}; {confidence=} in (0, 1)"
-        )
+    if n == 0 or resamples < 1:
+        raise ValueError(f"a bootstrap needs samples and resamples, not {n} and {resamples}")
     values = statistic(columns, torch.ones(1, n, dtype=torch.float64))
-    drawn = statistic(columns, resample_counts(n, resamples, seed))
-    tails = torch.tensor([(1 - confidence) / 2, (1 + confidence) / 2], dtype=torch.float64)
-    return {name: _interval(value[0], drawn[name], tails) for name, value in values.items()}
-
-
-def resample_counts(n: int, resamples: int, seed: int) -> Float[Tensor, "resamples n"]:
-    """How often each of n samples is drawn when n are drawn with replacement, once a row."""
     generator = torch.Generator().manual_seed(seed)
+    drawn: dict[str, list[Tensor]] = {name: [] for name in values}
+    each = max(1, _AT_ONCE // n)
+    for start in range(0, resamples, each):
+        counts = _counts(n, min(each, resamples - start), generator)
+        for name, found in statistic(columns, counts).items():
+            drawn[name].append(found.double())
+    return {name: value[0] for name, value in values.items()}, {k: torch.cat(v) for k, v in drawn.items()}
+
+
+def _counts(n: int, resamples: int, generator: torch.Generator) -> Float[Tensor, "resamples n"]:
+    """How often each of n samples is drawn when n are drawn with replacement, once a row."""
     drawn = torch.randint(n, (resamples, n), generator=generator)
     zeros = torch.zeros(resamples, n, dtype=torch.float64)
     return zeros.scatter_add_(1, drawn, torch.ones_like(zeros))
 
 
-def _interval(value: Tensor, drawn: Tensor, tails: Tensor) -> Interval:
+def interval(value: Tensor, drawn: Tensor, confidence: float = 0.95) -> Interval:
+    """The percentile interval of resampled values, which holds the value itself."""
+    tails = torch.tensor([(1 - confidence) / 2, (1 + confidence) / 2], dtype=torch.float64)
     # a resample may lack every sample that a point needs
-    low, high = torch.nanquantile(drawn.double(), tails, dim=0)
+    low, high = torch.nanquantile(drawn, tails, dim=0)
     return Interval(value, torch.minimum(low, value), torch.maximum(high, value))

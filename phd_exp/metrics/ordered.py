@@ -60,10 +60,12 @@ class Ordered:
 
 def in_order_of(
     quantity: Float[Tensor, " samples"],
-    columns: Mapping[str, Float[Tensor, " samples"]],
+    columns: Mapping[str, Float[Tensor, "... samples"]],
     weight: Float[Tensor, "*batch samples"] | None = None,
 ) -> Ordered:
     """Samples by a quantity, each counted `weight` times (once if None), with the sums of columns.
+
+    A column may have the leading dimensions of `weight`, as one that is simulated several times.
 
     Raises ValueError where there are no samples or a number is not finite.
     """
@@ -81,7 +83,7 @@ def in_order_of(
     return Ordered(points, added(weight), sums)
 
 
-def require_finite(*columns: Float[Tensor, " samples"]) -> None:
+def require_finite(*columns: Float[Tensor, "... samples"]) -> None:
     """Raise ValueError where there are no samples or a number is not finite."""
     for column in columns:
         finite = column.isfinite()

@@ -1,4 +1,4 @@
-"""What tells one run from another: its choices, and of all other keys those that can change a number of it."""
+"""What distinguishes runs: their choices, and every other key that changes the law of their results."""
 
 import hashlib
 from dataclasses import dataclass
@@ -31,12 +31,14 @@ WITHOUT_INFLUENCE = (
     "logger",
     "data.root",
     "data.workers",
+    "trainer.accelerator",
     "trainer.progress_bar",
+    "trainer.threads",
+    "evaluation.calibration_every_n_epochs",
     "evaluation.every_n_epochs",
     "evaluation.multiview",
 )
-"""Keys, or sections, that say where and how a run is made and recorded, or what is measured of it afterwards besides
-its results: they change no number of it."""
+"""Keys, or sections, of how a run is computed, recorded and measured: they do not change the law of its results."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class RunName:
 
 
 def has_influence(key: str) -> bool:
-    """Whether a key, with dots, can change what a run computes."""
+    """Whether a dotted key changes the law of a run's results, and not only how they are computed."""
     return not any(key == name or key.startswith(f"{name}.") for name in WITHOUT_INFLUENCE)
 
 

@@ -1,15 +1,15 @@
 """One number of a table: the errors of a model's runs, averaged over seeds, with an interval."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy import stats
 
-from phd_exp.evaluation.point_errors import ErrorKey, SampleMean
-from phd_exp.reports.collect import Records, Run, RunState
-from phd_exp.reports.paper import floor_mm, published_mm
+from phd_exp.evaluation.point_errors import ErrorKey, SampleMean, difference
+from phd_exp.reports.paper import bound_mm, published_mm
+from phd_exp.reports.runs import Report, Run, RunState
 
 IntervalKind = Literal["student_t_over_seeds", "normal_over_samples", "none"]
 GapState = RunState | Literal["missing", "no sample"]
@@ -18,26 +18,23 @@ COVERAGE = 0.95
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean and its 95 % interval, mean ± half_width."""
+    """A mean and its 95 % interval, mean ± half_width; None where there is no interval."""
 
     mean: float
     half_width: float | None
     kind: IntervalKind
 
     @property
-    def low(self) -> float | None:
-        """Lower end; None where there is no interval."""
-        return None if self.half_width is None else self.mean - self.half_width
-
-    @property
-    def high(self) -> float | None:
-        """Upper end; None where there is no interval."""
-        return None if self.half_width is None else self.mean + self.half_width
+    def ends(self) -> tuple[float, float] | tuple[None, None]:
+        """Lower and upper end."""
+        if self.half_width is None:
+            return None, None
+        return self.mean - self.half_width, self.mean + self.half_width
 
 
 @dataclass(frozen=True)
 class Gap:
-    """A run that a table wants and has not, with the reason."""
+    """A run that a table wants and lacks, with the reason."""
 
     data: str
     model: str
@@ -48,32 +45,28 @@ class Gap:
 
 @dataclass(frozen=True)
 class Cell:
-    """One number of a table, millimetres, and what stands behind it.
+    """One number of a table, millimetres, and its sources.
 
     Attributes:
-        seeds: of the finished runs that it averages.
-        interval: None where no run has finished.
-        n_test: test samples that count in this reading, a number a seed.
-        gaps: the seeds that other cells of the table have, or at least were begun, and this one lacks.
+        means: seed -> mean error, of the finished runs.
+        images: digests of the test images; one where all runs were tested on the same.
+        sees_f: whether the networks see the focal length.
+        gaps: the seeds that other cells of the table have, or that were begun, and this one lacks.
     """
 
     preset: str
     data: str
     model: str
     key: ErrorKey
-    seeds: tuple[int, ...]
-    n_test: tuple[int, ...]
-    interval: Interval | None
+    means: dict[int, SampleMean]
+    images: frozenset[str]
+    sees_f: bool
     gaps: tuple[Gap, ...]
 
     @property
-    def state(self) -> str:
-        """`finished`; why there is no number; or how many of the seeds there are."""
-        if not self.gaps:
-            return "finished"
-        if self.interval is None:
-            return self.gaps[0].state
-        return f"{len(self.seeds)} of {len(self.seeds) + len(self.gaps)} seeds"
+    def interval(self) -> Interval | None:
+        """Of the mean over seeds; None where no run has finished."""
+        return interval(list(self.means.values())) if self.means else None
 
     @property
     def mean(self) -> float | None:
@@ -81,36 +74,65 @@ class Cell:
         return self.interval.mean if self.interval else None
 
     @property
+    def state(self) -> str:
+        """`finished`; why there is no number; or how many of the seeds there are."""
+        if not self.gaps:
+            return "finished"
+        if not self.means:
+            return self.gaps[0].state
+        return f"{len(self.means)} of {len(self.means) + len(self.gaps)} seeds"
+
+    @property
     def published(self) -> float | None:
         """The paper's figure, mm."""
         return published_mm(self.model, self.data, self.key.estimate, self.key.quantity)
 
     @property
-    def floor(self) -> float | None:
-        """What no estimator can beat, mm."""
-        return floor_mm(self.model, self.data, self.key.quantity)
+    def bound(self) -> float | None:
+        """The bound on its mean, mm, that applies to these runs."""
+        return bound_mm(self.model, self.data, self.key.quantity, self.sees_f)
 
     @property
     def ratio(self) -> float | None:
         """Ours over the paper's."""
         return self.mean / self.published if self.mean is not None and self.published else None
 
+    def beats(self, other: "Cell") -> bool:
+        """Whether a paired bootstrap over seeds and the shared test images separates this smaller mean."""
+        if len(self.images | other.images) != 1:
+            return False
+        gap, half_width = difference(list(self.means.values()), list(other.means.values()))
+        return gap < -half_width
+
+    def numbers(self, table: str, bold: bool) -> dict[str, Any]:
+        """A line of CSV."""
+        low, high = self.interval.ends if self.interval else (None, None)
+        return {
+            "preset": self.preset, "table": table, "data": self.data, "model": self.model,
+            "estimate": self.key.estimate, "reading": self.key.reading,
+            "quantity": f"{self.key.quantity}_error_mm", "n_seeds": len(self.means),
+            "mean": self.mean, "low": low, "high": high, "interval": self.interval.kind if self.interval else "none",
+            "published": self.published, "ratio": self.ratio, "bound": self.bound, "best": bold,
+            # of runs that were tested on different numbers of samples, the least
+            "n_test": min((mean.n for mean in self.means.values()), default=0), "state": self.state,
+        }  # fmt: skip
+
 
 def make_cell(
-    records: Records, preset: str, data: str, model: str, key: ErrorKey, seeds: Sequence[int]
+    report: Report, preset: str, data: str, model: str, key: ErrorKey, seeds: Sequence[int]
 ) -> Cell:
     """The cell of one preset, data set, model and error, which should have these seeds."""
-    runs = records.at_defaults(preset, data, model)
+    runs = report.at_defaults(preset, data, model)
     gaps = [gap for seed in seeds if (gap := _gap(runs.get(seed), data, model, seed, key)) is not None]
-    measured = {seed: run.errors[key] for seed, run in sorted(runs.items()) if key in run.errors}
+    measured = {seed: run for seed, run in sorted(runs.items()) if key in run.errors}
     return Cell(
         preset=preset,
         data=data,
         model=model,
         key=key,
-        seeds=tuple(measured),
-        n_test=tuple(mean.n for mean in measured.values()),
-        interval=interval(list(measured.values())) if measured else None,
+        means={seed: run.errors[key] for seed, run in measured.items()},
+        images=frozenset(run.measured.images for run in measured.values()),
+        sees_f=any(run.config.get("camera.focal_length") == "shown" for run in measured.values()),
         gaps=tuple(gaps),
     )
 
@@ -132,11 +154,6 @@ def interval(means: Sequence[SampleMean]) -> Interval:
     if error is None:
         return Interval(means[0].value, None, "none")
     return Interval(means[0].value, float(stats.norm.ppf(tail)) * error, "normal_over_samples")
-
-
-def seeds_of(records: Records, preset: str, choices: Iterable[tuple[str, str]]) -> list[int]:
-    """Every seed with which any (data set, model) of a table was begun."""
-    return sorted({seed for data, model in choices for seed in records.at_defaults(preset, data, model)})
 
 
 def _gap(run: Run | None, data: str, model: str, seed: int, key: ErrorKey) -> Gap | None:

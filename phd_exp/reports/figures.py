@@ -2,7 +2,7 @@
 
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -44,14 +44,6 @@ def _leave_margins(figure: Figure, columns: int) -> None:
     )
 
 
-def write_figure(figure: Figure, stem: Path) -> list[Path]:
-    """Write `<stem>.png` and `<stem>.pdf` for a paper, the same bytes for the same figure, and say where."""
-    files = {kind: stem.with_name(f"{stem.name}.{kind}") for kind in ("png", "pdf")}
-    for kind, file in files.items():
-        write_atomic(file, encoded(figure, kind, dpi=250))
-    return list(files.values())
-
-
 def encoded(figure: Figure, kind: str, dpi: int) -> bytes:
     """A figure as the bytes of a `png` or `pdf` file, which hold no date."""
     dateless = {"CreationDate": None} if kind == "pdf" else {}
@@ -64,9 +56,7 @@ def draw_curve(axes: Axes, name: str, curve: Mapping[str, Any]) -> None:
     """Draw one of them: of `depth` or of `projected`."""
     title, unit = LABELS[name]
     predicted, empirical = curve["predicted"], curve["empirical"]
-    values = [value for value in (*predicted, *empirical) if value > 0]
-    # whole decades: the labels between them would run into each other
-    bounds = (10 ** math.floor(math.log10(min(values))), 10 ** math.ceil(math.log10(max(values))))
+    bounds = decades((*predicted, *empirical)) or (0.1, 1.0)
     axes.plot(bounds, bounds, "--", color="tab:red", linewidth=1, label="calibrated")
     axes.plot(predicted, empirical, color="tab:blue", label=_words(curve))
     axes.set(xscale="log", yscale="log", xlim=bounds, ylim=bounds, aspect="equal", title=title)
@@ -108,3 +98,13 @@ def draw_birds_eye(axes: Axes, curves: LevelCurves, truth: np.ndarray | None) ->
     axes.locator_params(axis="x", nbins=5)  # more labels would run into each other
     axes.grid(alpha=0.25)
     axes.legend(frameon=False, fontsize="small")
+
+
+def decades(values: Iterable[float]) -> tuple[float, float] | None:
+    """The powers of ten around the positive ones of some values; None where there is none."""
+    positive = [value for value in values if 0 < value < math.inf]
+    if not positive:
+        return None
+    # whole decades: the labels between them would run into each other
+    low, high = math.floor(math.log10(min(positive))), math.ceil(math.log10(max(positive)))
+    return 10.0**low, 10.0 ** max(high, low + 1)

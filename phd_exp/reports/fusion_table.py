@@ -1,27 +1,25 @@
-"""What fusion gives, as a table in the manner of the paper's: a column a number of cameras, a line a method."""
+"""Fusion of several cameras as a table: a column a number of cameras, a line a method."""
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 from phd_exp.evaluation.fusion import (
     CALIBRATION,
     ERRORS,
     LEVELS,
     METHODS,
+    PROBABILISTIC,
     FusionScores,
     Method,
-    Place,
-    fusion_scores,
 )
-from phd_exp.evaluation.predictions import Band
-from phd_exp.evaluation.several_views import read_views
+from phd_exp.evaluation.reference import Band
 from phd_exp.records.choices import in_words
-from phd_exp.records.errors import RunError, one_line
-from phd_exp.reports.cells import Gap
-from phd_exp.reports.collect import Records, Run
-from phd_exp.reports.tables import TableCell, TableRow
+from phd_exp.reports.runs import Report, Run
+from phd_exp.reports.table import Table, TableCell, TableRow, file_stem
 
+ELLIPSOID_90 = {1: 87.8, 4: 88.8}
+"""Cameras -> per cent of the truths of exact densities in the moment-matched 90 % ellipsoid: their tails are longer
+than a Gaussian's. By sampling fused Projected Huber densities."""
 NAMES: dict[Method, str] = {
     "mode": "Huber, mode",
     "mean": "Huber, mean",
@@ -42,74 +40,42 @@ STRONG = 0.5
 OF_A_LINE = (
     "Columns: how many cameras of each scene are fused, beginning with the first. Depth: the error along the first "
     "camera's true viewing ray, as in the paper's tables; distance: in space; both means over scenes. In brackets: "
-    "95 % bootstrap intervals over scenes. Bold: the smallest of a group and column as printed."
+    "95 % bootstrap intervals over scenes."
 )
 OF_METHODS = (
     "Huber: the most likely position under the product of the views' Projected Huber densities, and the mean of that "
     "product. Average: of the views' modes. Gaussian: the views' means weighted by their inverse covariances."
 )
 OF_THE_GROUND = (
-    "Ground: besides, every position is known to lie on a plane through the true one with the normal (0, cos 30°, "
+    "Ground: every position is also known to lie on a plane through the true one with the normal (0, cos 30°, "
     "sin 30°) in the first camera's frame, the ground before a camera that looks down by 30°; a level camera would "
     "see its ground edge-on. The average is moved to the nearest point of the plane, the Gaussian conditioned on it."
 )
 
 
-@dataclass(frozen=True)
-class FusionTable:
-    """The table of one run.
-
-    Attributes:
-        stem: of its file names.
-        run: which one.
-        scores: all its numbers.
-        gaps: none; what the formats ask of any table, as is `command`.
-    """
-
-    stem: str
-    title: str
-    stub: tuple[str, ...]
-    columns: tuple[str, ...]
-    groups: tuple[tuple[TableRow, ...], ...]
-    notes: tuple[str, ...]
-    run: Run
-    scores: FusionScores
-    gaps: tuple[Gap, ...] = ()
-    command: str = ""
-
-    @property
-    def caption(self) -> str:
-        """The title, which is a sentence of its own."""
-        return self.title
+def fusion_tables(report: Report) -> list[Table]:
+    """The tables of all runs that recorded several views."""
+    return [fusion_table(run, run.measured.fusion) for run in report.runs if run.measured.fusion]
 
 
-def fusion_tables(records: Records) -> tuple[list[FusionTable], list[str]]:
-    """The tables of all runs that recorded several views, and a line for each record that cannot be used."""
-    tables, complaints = [], []
-    for run in records.runs:
-        if not run.folder.views.exists():
-            continue
-        try:
-            tables.append(fusion_table(run, fusion_scores(read_views(run.folder.views))))
-        except RunError as error:
-            complaints.append(one_line(f"{run.folder.path}/{error}"))
-    return tables, complaints
-
-
-def fusion_table(run: Run, scores: FusionScores) -> FusionTable:
+def fusion_table(run: Run, scores: FusionScores) -> Table:
     """The table of a run's scores."""
-    leaf = run.folder.path.name
-    apart = "" if (run.data, run.model) == ("scale", "probabilistic") else f"{run.model} on {run.data}, "
-    title = f"Fusion, {in_words(run.preset)}, {apart}{leaf}: {scores.n} scenes seen by {scores.views} cameras"
-    return FusionTable(
-        stem=f"fusion-{run.preset}-{run.data}-{run.model}-{leaf}",
-        title=one_line(title),
+    apart = "" if (run.data, run.model) == ("scale", "probabilistic") else f"{run.title}, "
+    return Table(
+        stem=file_stem("fusion", run.preset, run.data, run.model, run.name),
+        kind="fusion",
+        title=f"Fusion, {in_words(run.preset)}, {apart}{run.name}: {scores.n} scenes seen by {scores.views} cameras",
         stub=("quantity", "method"),
         columns=tuple(f"{k} camera{'s' if k > 1 else ''}" for k in _cameras(scores)),
         groups=tuple(_groups(scores)),
         notes=(OF_A_LINE, OF_METHODS, OF_THE_GROUND, *_measured(scores)),
-        run=run,
-        scores=scores,
+        preset=run.preset,
+        numbers=tuple(
+            {"preset": run.preset, "data": run.data, "model": run.model, "run": run.name}
+            | dict(zip(("quantity", "method", "cameras", "ground"), place.split("/"), strict=True))
+            | {"mean": band.value, "low": band.low, "high": band.high, "n_scenes": scores.n}
+            for place, band in scores.bands.items()
+        ),
     )
 
 
@@ -120,29 +86,22 @@ def _cameras(scores: FusionScores) -> range:
 def _groups(scores: FusionScores) -> Iterator[tuple[TableRow, ...]]:
     for on_plane in (False, True):
         for quantity in ERRORS:
-            yield tuple(_rows(scores, quantity, on_plane, bold=True))
+            yield tuple(_rows(scores, quantity, on_plane))
     for on_plane in (False, True):
-        yield tuple(row for name in CALIBRATION for row in _rows(scores, name, on_plane, bold=False))
+        yield tuple(row for name in CALIBRATION for row in _rows(scores, name, on_plane))
 
 
-def _rows(scores: FusionScores, quantity: str, on_plane: bool, bold: bool) -> Iterator[TableRow]:
-    lines = {
-        method: [scores.bands[Place(quantity, method, k, on_plane)] for k in _cameras(scores)]
-        for method in METHODS
-        if Place(quantity, method, 1, on_plane) in scores.bands
-    }
-    columns = zip(*lines.values(), strict=True)
-    best = [_number(quantity, min(band.value for band in column)) if bold else "" for column in columns]
+def _rows(scores: FusionScores, quantity: str, on_plane: bool) -> Iterator[TableRow]:
     label = QUANTITIES[quantity] + (ON_GROUND if on_plane else "")
-    for method, line in lines.items():
-        name = NAMES[method] if bold else NAMES[method].removesuffix(", mean")
-        cells = (_cell(quantity, band, least) for band, least in zip(line, best, strict=True))
-        yield TableRow((label, name), tuple(cells))
+    for method in METHODS if quantity in ERRORS else PROBABILISTIC:
+        name = NAMES[method] if quantity in ERRORS else NAMES[method].removesuffix(", mean")
+        bands = [scores.band(quantity, method, k, on_plane) for k in _cameras(scores)]
+        yield TableRow((label, name), tuple(_cell(quantity, band) for band in bands))
 
 
-def _cell(quantity: str, band: Band, best: str) -> TableCell:
+def _cell(quantity: str, band: Band) -> TableCell:
     value, low, high = (_number(quantity, number) for number in (band.value, band.low, band.high))
-    return TableCell(value, f"({low}–{high})", bold=value == best)
+    return TableCell(value, f"({low}–{high})")
 
 
 def _number(quantity: str, value: float) -> str:
@@ -152,13 +111,14 @@ def _number(quantity: str, value: float) -> str:
 
 
 def _measured(scores: FusionScores) -> list[str]:
-    covered = ", ".join(f"{share:.0f}" for share in scores.calibrated_coverage)
     levels = ", ".join(map(str, LEVELS))
     said = [
-        f"Inside {levels} %: per cent of true positions in the ellipsoids of mean and covariance that hold so much "
-        f"of a Gaussian; the densities have longer tails, and of one camera {covered} would be inside if they were "
-        "exact. Squared error: the squared Mahalanobis distance per dimension, 1 on average where calibrated, above "
-        "1 where overconfident."
+        f"Inside {levels} %: per cent of true positions in the ellipsoids of mean and covariance that hold so "
+        "much of a Gaussian. The densities have longer tails: exact ones put "
+        f"{', '.join(f'{share:.0f}' for share in scores.calibrated_coverage)} % of the truths there for one camera "
+        f"of these, and in general {ELLIPSOID_90[1]} % (one camera) and {ELLIPSOID_90[4]} % (four) into the 90 % "
+        "ellipsoid. Squared error: the squared Mahalanobis distance per dimension, 1 on average where calibrated, "
+        "above 1 where overconfident."
     ]
     said.append(_common_cause(scores))
     if scores.left_out:
@@ -179,7 +139,7 @@ def _common_cause(scores: FusionScores) -> str:
         said += f", and their average has {size.value:.2f} with log size"
         if abs(size.value) > STRONG:
             said += ": the size of an object, common to its views, shifts all of them"
-    last = scores.bands[Place("normalised_squared_error", "mean", scores.views, False)]
+    last = scores.band("normalised_squared_error", "mean", scores.views)
     if last.low > 1:
         said += f"; the fused squared error of {last.value:.2f} says that they are overconfident together"
     elif last.high < 1:
@@ -191,7 +151,7 @@ def _common_cause(scores: FusionScores) -> str:
 
 def headline(scores: FusionScores) -> str:
     """The depth error of one camera and of all, in words."""
-    one, all_ = (scores.bands[Place("depth_error_mm", "mode", k, False)] for k in (1, scores.views))
+    one, all_ = (scores.band("depth_error_mm", "mode", k) for k in (1, scores.views))
     return (
         f"depth error {_number('depth_error_mm', one.value)} mm with one camera, "
         f"{_number('depth_error_mm', all_.value)} mm with {scores.views}"

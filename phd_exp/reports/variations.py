@@ -4,32 +4,23 @@ Held-out images are of the training split and were never trained on. What is cho
 samples, which all other tables are about.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
-from phd_exp.evaluation.point_errors import ErrorKey, mean_errors, mean_nll
+from phd_exp.evaluation.point_errors import ErrorKey
 from phd_exp.records.choices import in_words
-from phd_exp.records.errors import RunError, one_line
-from phd_exp.reports.cells import Gap
-from phd_exp.reports.collect import Records, Run
-from phd_exp.reports.tables import NOTHING, TableCell, TableRow
+from phd_exp.records.errors import one_line
+from phd_exp.reports.runs import Report, Run
+from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem
 
-AS_IT_IS = "as it is"
+AS_IT_IS = "none"
 OF_A_LINE = (
     "Held-out images: of the training split, never trained on, over the whole field of view. A number is the mean "
-    "over seeds, in brackets the least and the largest. Errors: of the mode. Difference: of the NLL, or of a model "
-    "without one of the depth error in per cent, to the run of the same seed as it is; positive where that is better."
+    "over seeds, in brackets the smallest and the largest. Errors: of the mode. Difference: of the NLL, or of a "
+    "model without one of the depth error in per cent, to the run of the same seed without overrides; negative is "
+    "better."
 )
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """What a run reaches on its held-out images: nats (None of a model without a density), and millimetres."""
-
-    nll: float | None
-    projected: float
-    depth: float
 
 
 @dataclass(frozen=True)
@@ -37,33 +28,22 @@ class Variation:
     """Runs that differ in their seed alone."""
 
     overrides: str | None
-    seeds: Mapping[int, HeldOut]
+    seeds: Mapping[int, Run]
+
+    def values(self, quantity: str) -> dict[int, float]:
+        """Seed -> `nll` (nats, none of a model without a density), `projected` or `depth` error (mm)."""
+        if quantity == "nll":
+            return {
+                seed: run.held_out_nll for seed, run in self.seeds.items() if run.held_out_nll is not None
+            }
+        key = ErrorKey("mode", "whole", quantity)  # type: ignore[arg-type]
+        return {seed: run.held_out_errors[key].value for seed, run in self.seeds.items()}
 
 
-@dataclass(frozen=True)
-class VariationTable:
-    """The table of a preset with its recipe, a data set and a model; see `phd_exp.reports.tables.Table`."""
-
-    stem: str
-    title: str
-    preset: str
-    columns: tuple[str, ...]
-    groups: tuple[tuple[TableRow, ...], ...]
-    notes: tuple[str, ...] = (OF_A_LINE,)
-    stub: tuple[str, ...] = ("overrides", "seeds")
-    gaps: tuple[Gap, ...] = ()
-    command: str = ""
-
-    @property
-    def caption(self) -> str:
-        """The title, which is a sentence of its own."""
-        return self.title
-
-
-def variation_tables(records: Records) -> list[VariationTable]:
+def variation_tables(report: Report) -> list[Table]:
     """A table for every preset, data set and model of which there are runs with other overrides and without."""
-    choices = dict.fromkeys((run.preset, run.data, run.model) for run in records.runs if run.overrides)
-    found = ((choice, list(_variations(records, choice))) for choice in choices)
+    choices = dict.fromkeys((run.preset, run.data, run.model) for run in report.runs if run.overrides)
+    found = ((choice, _variations(report, choice)) for choice in choices)
     return [
         _table(choice, variations)
         for choice, variations in found
@@ -71,73 +51,65 @@ def variation_tables(records: Records) -> list[VariationTable]:
     ]
 
 
-def _variations(records: Records, choice: tuple[str, str, str]) -> Iterator[Variation]:
-    """The runs as they are, if there are any, and then the others, the best first."""
-    runs = [run for run in records.runs if (run.preset, run.data, run.model) == choice]
-    found: dict[str | None, dict[int, HeldOut]] = {}
-    for run in runs:
-        if run.seed is not None and (reached := _reached(run)) is not None:
-            found.setdefault(run.overrides, {})[run.seed] = reached
+def _variations(report: Report, choice: tuple[str, str, str]) -> list[Variation]:
+    """The runs without overrides, if there are any, and then the others, the best first."""
+    found: dict[str | None, dict[int, Run]] = {}
+    for run in report.runs:
+        is_one = (run.preset, run.data, run.model) == choice and run.state == "finished"
+        if is_one and run.seed is not None and run.held_out_errors:
+            found.setdefault(run.overrides, {})[run.seed] = run
     variations = [Variation(overrides, seeds) for overrides, seeds in found.items()]
-    yield from sorted(variations, key=lambda one: (one.overrides is not None, _order(one)))
-
-
-def _reached(run: Run) -> HeldOut | None:
-    """None of a run that is not finished, or that recorded no held-out images that can be read."""
-    if run.state != "finished":
-        return None
-    try:
-        errors = mean_errors(run.folder.held_out, ["mode"])
-    except RunError:
-        return None
-    projected, depth = (errors[ErrorKey("mode", "whole", name)].value for name in ("projected", "depth"))
-    return HeldOut(mean_nll(run.folder.held_out), projected, depth)
+    return sorted(variations, key=lambda one: (one.overrides is not None, _order(one)))
 
 
 def _order(variation: Variation) -> float:
-    reached = variation.seeds.values()
-    return fmean(one.depth if one.nll is None else one.nll for one in reached)
+    return fmean((variation.values("nll") or variation.values("depth")).values())
 
 
-def _table(choice: tuple[str, str, str], variations: Sequence[Variation]) -> VariationTable:
+def _table(choice: tuple[str, str, str], variations: Sequence[Variation]) -> Table:
     preset, data, model = choice
     plain = variations[0]
-    return VariationTable(
-        stem=f"variations-{preset}-{data}-{model}",
+    rows = [_row(one, plain) for one in variations]
+    return Table(
+        stem=file_stem("variations", preset, data, model),
+        kind="variations",
         title=one_line(f"Variations of {in_words(preset)}: {model} on {data}, held-out images"),
-        preset=preset,
+        stub=("overrides", "seeds"),
         columns=("NLL (nats)", "projected (mm)", "depth (mm)", "difference"),
-        groups=((_row(plain, plain),), tuple(_row(one, plain) for one in variations[1:])),
+        groups=((rows[0],), tuple(rows[1:])),
+        notes=(OF_A_LINE,),
+        preset=preset,
+        numbers=tuple(
+            {"preset": preset, "data": data, "model": model, "overrides": one.overrides or "", "seed": seed}
+            | {"quantity": quantity, "value": value}
+            for one in variations
+            for quantity in ("nll", "projected", "depth")
+            for seed, value in one.values(quantity).items()
+        ),
     )
 
 
 def _row(variation: Variation, plain: Variation) -> TableRow:
-    reached = list(variation.seeds.values())
-    nll = [one.nll for one in reached if one.nll is not None]
-    cells = (
-        _cell(nll, 2),
-        _cell([one.projected for one in reached], 1),
-        _cell([one.depth for one in reached], 0),
-        TableCell("") if variation is plain else _difference(variation, plain),
-    )
+    cells = [
+        _cell(variation.values(quantity).values(), digits)
+        for quantity, digits in (("nll", 2), ("projected", 1), ("depth", 0))
+    ]
     seeds = ", ".join(map(str, sorted(variation.seeds)))
-    return TableRow((one_line(variation.overrides or AS_IT_IS), seeds), cells)
+    difference = TableCell("") if variation is plain else _difference(variation, plain)
+    return TableRow((one_line(variation.overrides or AS_IT_IS), seeds), (*cells, difference))
 
 
 def _difference(variation: Variation, plain: Variation) -> TableCell:
-    pairs = [
-        (variation.seeds[seed], plain.seeds[seed]) for seed in variation.seeds.keys() & plain.seeds.keys()
-    ]
-    nll = [now.nll - before.nll for now, before in pairs if now.nll is not None and before.nll is not None]
-    if nll:
-        return _cell(nll, 2, sign="+")
-    return _cell([100 * (now.depth / before.depth - 1) for now, before in pairs], 0, sign="+")
+    now, before = variation.values("nll"), plain.values("nll")
+    if shared := now.keys() & before.keys():
+        return _cell([now[seed] - before[seed] for seed in shared], 2, sign="+")
+    now, before = variation.values("depth"), plain.values("depth")
+    return _cell([100 * (now[seed] / before[seed] - 1) for seed in now.keys() & before.keys()], 0, sign="+")
 
 
-def _cell(values: Sequence[float], digits: int, sign: str = "") -> TableCell:
-    if not values:
+def _cell(values: Iterable[float], digits: int, sign: str = "") -> TableCell:
+    numbers = list(values)
+    if not numbers:
         return TableCell(NOTHING)
-    mean, least, largest = (
-        f"{value:{sign}.{digits}f}" for value in (fmean(values), min(values), max(values))
-    )
-    return TableCell(mean, f"({least} to {largest})" if len(values) > 1 else "")
+    mean, least, largest = (f"{x:{sign}.{digits}f}" for x in (fmean(numbers), min(numbers), max(numbers)))
+    return TableCell(mean, f"({least} to {largest})" if len(numbers) > 1 else "")

@@ -20,8 +20,7 @@ from phd_exp.records.detections import DetectionLine, detections_in
 from phd_exp.records.errors import UserError
 from phd_exp.records.runs import RunFolder, RunStatus
 from phd_exp.records.scenes import SampleRecord
-from phd_exp.reports.collect import collect
-from phd_exp.reports.site.dossier import read_dossier
+from phd_exp.reports.runs import read_report
 from phd_exp.training.config import RunConfig, check, check_render
 
 QUICK = settings(
@@ -88,8 +87,7 @@ def _run_record(folder: RunFolder, contents: dict[str, bytes]) -> None:
     for read in (folder.status, folder.config, folder.results, folder.constants, folder.metrics):
         with suppress(UserError):
             read()
-    (run,) = collect(folder.path.parents[3]).runs
-    read_dossier(run)
+    assert len(read_report(folder.path.parents[3]).runs) == 1
     with suppress(UserError):
         check(folder.config())
 

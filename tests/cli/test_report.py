@@ -18,7 +18,7 @@ def runs(tmp_path: Path) -> Path:
 def test_tables_are_printed_and_written(phd_exp: Callable, runs: Path, tmp_path: Path) -> None:
     outcome = phd_exp("report")
     assert (outcome.status, outcome.err) == (0, "")
-    assert "Table 1, preset small: the whole field of view" in outcome.out
+    assert "The paper's Table 1, preset small: the whole field of view" in outcome.out
     assert "Table 1, preset small: the central half of the field of view" in outcome.out
     assert "Made by: python -m phd_exp -m experiment=table1 preset=small\n" in outcome.out
     assert "tables: report/tables\n" in outcome.out
@@ -29,6 +29,7 @@ def test_tables_are_printed_and_written(phd_exp: Callable, runs: Path, tmp_path:
         "table1-small-central.tex",
         "tables.csv",
     }
+    assert not list((tmp_path / "report" / "site" / "runs").glob("*.tmp"))
 
 
 def test_several_views_are_printed_and_written_where_they_are_recorded(
@@ -40,13 +41,13 @@ def test_several_views_are_printed_and_written_where_they_are_recorded(
     outcome = phd_exp("report")
     assert (outcome.status, outcome.err) == (0, "")
     assert "Fusion, preset small, probabilistic on occl, seed0: 20 scenes seen by 4 cameras" in outcome.out
-    assert "tables of fusion: report/tables\n" in outcome.out
     assert (tmp_path / "report" / "tables" / "fusion-small-occl-probabilistic-seed0.tex").exists()
-    assert 'id="several-views"' in (tmp_path / "report" / "site" / "index.html").read_text()
+    assert 'id="of-fusion"' in (tmp_path / "report" / "site" / "index.html").read_text()
     (runs / "small" / "occl" / "probabilistic" / "seed0" / "views.parquet").write_bytes(b"torn")
     torn = phd_exp("report")
     assert torn.status == 0
-    assert "Not fused: runs/small/occl/probabilistic/seed0/views.parquet: cannot be read" in torn.out
+    page = tmp_path / "report" / "site" / "runs" / "small-occl-probabilistic-seed0.html"
+    assert "views.parquet: cannot be read" in page.read_text()
     assert "tables: report/tables\n" in torn.out
 
 
@@ -88,4 +89,4 @@ def test_a_folder_in_the_way_is_one_line(phd_exp: Callable, runs: Path, tmp_path
     outcome = phd_exp("report")
     assert outcome.status == 1
     (line,) = outcome.err.splitlines()
-    assert line.startswith("error: report/tables: cannot be written (")
+    assert line.startswith("error: report/measured: cannot be written (")

@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 KILLS = 20
 PATIENCE = 300.0  # s
 VERBS = {
-    "report": ["phd_exp.cli.report", "phd_exp.reports.site.build"],
+    "report": ["phd_exp.cli.report", "phd_exp.reports.paper_figures", "phd_exp.reports.site.build"],
     "predict": ["phd_exp.cli.predict", "phd_exp.inference.predictor", "phd_exp.inference.pictures"],
     "export": ["phd_exp.cli.export", "phd_exp.inference.predictor", "phd_exp.inference.onnx"],
 }

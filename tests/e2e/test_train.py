@@ -18,7 +18,7 @@ from PIL import Image
 
 from phd_exp.evaluation.point_errors import QUANTITIES, ErrorKey
 from phd_exp.records.runs import RunFolder, find_runs
-from phd_exp.reports.collect import collect
+from phd_exp.reports.runs import read_report
 from tests.e2e.runs import only_run, weights
 
 MODELS = ("probabilistic", "mae_vz", "mae_logz", "mae_xyz", "mae_constf")
@@ -354,7 +354,7 @@ def test_the_report_computes_what_training_recorded(
     train: Callable, phd_exp: Callable, tmp_path: Path
 ) -> None:
     assert train("model=probabilistic", "logger=none").status == 0
-    (run,) = collect(tmp_path / "runs").runs
+    (run,) = read_report(tmp_path / "runs").runs
     assert (run.state, run.seed) == ("finished", 0)
     assert run.overrides is not None
     results = run.folder.results()
@@ -362,6 +362,7 @@ def test_the_report_computes_what_training_recorded(
         mean = run.errors[ErrorKey("mode", "whole", quantity)]
         assert mean.n == 6
         assert mean.value == pytest.approx(results[f"test/{quantity}_error_mm"], rel=1e-4)
+    assert run.notes == []
     assert run.nll == pytest.approx(results["test/nll"])
     outcome = phd_exp("report")
     assert outcome.status == 0

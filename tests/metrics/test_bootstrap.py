@@ -5,7 +5,8 @@ from collections.abc import Mapping
 import pytest
 import torch
 
-from phd_exp.metrics.bootstrap import bands, resample_counts
+from phd_exp.metrics import bootstrap
+from phd_exp.metrics.bootstrap import bands, resampled
 
 
 def means(columns: Mapping[str, torch.Tensor], weight: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -18,7 +19,8 @@ def numbers(n: int, seed: int) -> torch.Tensor:
 
 
 def test_a_resample_draws_as_many_with_replacement() -> None:
-    counts = resample_counts(50, 4000, seed=0)
+    _, drawn = resampled(lambda columns, counts: {"counts": counts}, {"x": torch.zeros(50)}, 4000, seed=0)
+    counts = drawn["counts"]
     assert (counts.sum(-1) == 50).all()
     assert counts.mean(0).sub(1).abs().max() < 0.08
     assert (counts == 0).double().mean().item() == pytest.approx((1 - 1 / 50) ** 50, abs=0.01)
@@ -49,6 +51,14 @@ def test_curves_have_an_interval_at_each_point() -> None:
     )
 
 
+def test_the_memory_is_bounded_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    columns = {"x": numbers(100, seed=1)}
+    whole = resampled(means, columns, 50, seed=0)[1]
+    monkeypatch.setattr(bootstrap, "_AT_ONCE", 700)
+    parts = resampled(means, columns, 50, seed=0)[1]
+    torch.testing.assert_close(parts, whole)
+
+
 def test_the_same_seed_gives_the_same_interval() -> None:
     one, same, other = (bands(means, {"x": numbers(100, seed=1)}, 50, seed)["mean"] for seed in (0, 0, 1))
     assert (one.low, one.high) == (same.low, same.high)
@@ -70,5 +80,5 @@ def test_an_interval_holds_its_value_where_resampling_adds_noise() -> None:
 
 @pytest.mark.parametrize(("n", "resamples", "confidence"), [(0, 10, 0.9), (5, 0, 0.9), (5, 10, 1.0)])
 def test_refuses_what_has_no_interval(n: int, resamples: int, confidence: float) -> None:
-    with pytest.raises(ValueError, match="a bootstrap needs"):
+    with pytest.raises(ValueError, match=r"a bootstrap needs|confidence: got 1\.0"):
         bands(means, {"x": torch.ones(n)}, resamples, 0, confidence)

@@ -1,15 +1,16 @@
-"""What the paper prints, and the floors recomputed."""
+"""What the paper prints, and the bounds recomputed."""
 
 import math
 
+import numpy as np
 import pytest
 from scipy.integrate import dblquad
 
 from phd_exp.reports import paper
-from phd_exp.reports.paper import LAYOUTS, PUBLISHED, floor_mm, published_mm
+from phd_exp.reports.paper import LAYOUTS, PUBLISHED, bound_mm, published_mm
 
 
-def floor_of_a_ratio(low: float, high: float) -> float:
+def bound_of_a_ratio(low: float, high: float) -> float:
     """Least expected |z - z^|, mm, for z ~ U(3, 5) of which r = s / z alone is seen, s ~ U(low, high).
 
     Given r, z has a density proportional to z between max(3, low / r) and min(5, high / r): its median is the root
@@ -26,34 +27,51 @@ def floor_of_a_ratio(low: float, high: float) -> float:
     return 1000 * value
 
 
-def test_the_floor_where_size_is_unknown() -> None:
-    assert pytest.approx(floor_of_a_ratio(0.8, 1.2), abs=0.5) == paper.FLOOR_OF_SCALE
+def test_the_bound_where_size_is_unknown() -> None:
+    assert pytest.approx(bound_of_a_ratio(0.8, 1.2), abs=0.5) == paper.UNKNOWN_SIZE
 
 
-def test_the_floor_where_focal_length_is_unknown() -> None:
-    assert pytest.approx(floor_of_a_ratio(1200, 2000), abs=0.5) == paper.FLOOR_WITHOUT_F
+def test_the_bound_where_focal_length_is_unknown() -> None:
+    assert pytest.approx(bound_of_a_ratio(1200, 2000), abs=0.5) == paper.UNKNOWN_F
 
 
-def test_the_floor_of_knowing_nothing() -> None:
+def test_the_bound_of_knowing_nothing() -> None:
     # z ~ U(3, 5): the mean distance to its median 4 is a quarter of its range
-    assert paper.FLOOR_OF_NOTHING == 1000 * (5 - 3) / 4
+    assert paper.GUESS == 1000 * (5 - 3) / 4
 
 
-def test_floors_bind_those_alone_that_know_no_more() -> None:
+def test_the_bound_where_size_and_focal_length_are_unknown() -> None:
+    """The network estimates z / f from the apparent size s f / z; the true f multiplies its answer. By simulation."""
+    random = np.random.default_rng(0)
+    z, s, f = (random.uniform(low, high, 1_000_000) for low, high in ((3, 5), (0.8, 1.2), (1200, 2000)))
+    parts = np.array_split(np.argsort(s * f / z), 300)  # in each the network sees one size
+    absolute = [
+        f[part] * np.abs(z[part] / f[part] - _weighted_median(z[part] / f[part], f[part])) for part in parts
+    ]
+    errors = np.concatenate(absolute)
+    assert 1000 * errors.mean() == pytest.approx(paper.UNKNOWN_SIZE_AND_F, abs=2)
+
+
+def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    order = np.argsort(values)
+    total = weights[order].cumsum()
+    return float(values[order][np.searchsorted(total, total[-1] / 2)])
+
+
+def test_bounds_bind_those_alone_that_know_no_more() -> None:
+    models, sets = ("mae_vz", "probabilistic", "mae_xyz"), ("default", "occl", "scale", "occl_scale")
     bound = {
-        (model, data): floor_mm(model, data, "depth")
-        for model in ("mae_vz", "probabilistic", "mae_xyz", "mae_constf")
-        for data in ("default", "occl", "scale", "occl_scale")
+        (model, data, sees_f): value
+        for model in models
+        for data in sets
+        for sees_f in (False, True)
+        if (value := bound_mm(model, data, "depth", sees_f))
     }
-    assert {key: value for key, value in bound.items() if value} == {
-        ("mae_vz", "scale"): 291,
-        ("mae_vz", "occl_scale"): 291,
-        ("probabilistic", "scale"): 291,
-        ("probabilistic", "occl_scale"): 291,
-        ("mae_xyz", "default"): 331,
-        ("mae_constf", "default"): 331,
+    on_scale = {
+        (model, "scale", sees_f): 291 if sees_f else 336 for model in models for sees_f in (False, True)
     }
-    assert floor_mm("probabilistic", "scale", "projected") is None
+    assert bound == on_scale | {("mae_xyz", "default", sees_f): 331 for sees_f in (False, True)}
+    assert bound_mm("probabilistic", "scale", "projected", True) is None
 
 
 def test_every_published_figure_has_its_place() -> None:

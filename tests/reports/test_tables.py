@@ -1,4 +1,4 @@
-"""The paper's tables: every number against a hand computation, what is best, what is not there."""
+"""The paper's tables: every number against a hand computation, what is best, what is missing."""
 
 from pathlib import Path
 
@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from phd_exp.reports.cells import Cell
-from phd_exp.reports.collect import collect
-from phd_exp.reports.tables import PaperTable, TableCell, tables
+from phd_exp.evaluation.point_errors import ErrorKey
+from phd_exp.reports.cells import make_cell
+from phd_exp.reports.paper_tables import paper_tables
+from phd_exp.reports.runs import Report, read_report
+from phd_exp.reports.table import Table, TableCell
 from tests.reports.recorded import DATA, ODD_PRESET, Predicted, both_tables, by_hand, fail, predicted, record
 
 PAPER = {
@@ -21,89 +23,96 @@ PAPER = {
 """Some of the paper's figures, typed once more."""
 
 
-def one(found: list[PaperTable], name: str, reading: str = "whole", preset: str = "small") -> PaperTable:
-    (table,) = [t for t in found if (t.name, t.reading, t.preset) == (name, reading, preset)]
+def one(found: list[Table], name: str, reading: str = "whole", preset: str = "small") -> Table:
+    (table,) = [t for t in found if (t.numbers[0]["table"], t.reading, t.preset) == (name, reading, preset)]
     return table
 
 
-def place(table: PaperTable, model: str, data: str, quantity: str, estimate: str = "mode") -> TableCell:
-    (found,) = [
-        cell
-        for row in table.rows
-        for cell in row.cells
-        if cell.source
-        and (cell.source.model, cell.source.data) == (model, data)
-        and (cell.source.key.quantity, cell.source.key.estimate) == (quantity, estimate)
-    ]
-    return found
+def place(table: Table, model: str, data: str, quantity: str) -> TableCell:
+    label = "probabilistic (mode)" if model == "probabilistic" else model
+    if table.stub == ("model",):
+        column, stub = table.columns.index(f"{quantity} error (mm)"), (label,)
+    else:
+        column, stub = table.columns.index(data), (label, quantity)
+    (row,) = [row for row in table.rows if row.stub == stub]
+    return row.cells[column]
+
+
+Drawn = dict[tuple[str, str, int], Predicted]
 
 
 @pytest.fixture(scope="module")
-def drawn_and_found(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> tuple[dict[tuple[str, str, int], Predicted], list[PaperTable]]:
+def drawn_and_report(tmp_path_factory: pytest.TempPathFactory) -> tuple[Drawn, Report]:
     runs = tmp_path_factory.mktemp("runs")
-    return both_tables(runs), tables(collect(runs))
+    return both_tables(runs), read_report(runs)
 
 
-def expected(drawn: dict[tuple[str, str, int], Predicted], cell: Cell) -> list[float]:
-    """Mean errors of a cell's seeds, by hand."""
+@pytest.fixture(scope="module")
+def found(drawn_and_report: tuple[Drawn, Report]) -> list[Table]:
+    return paper_tables(drawn_and_report[1])
+
+
+def expected(drawn: Drawn, line: dict) -> list[float]:
+    """Mean errors of the seeds of a number, by hand."""
     means = []
     for seed in (0, 1):
-        if (cell.model, cell.data, seed) in drawn:
-            table = drawn[cell.model, cell.data, seed]
-            inside = np.abs(table.v_p).max(axis=1) <= (1 if cell.key.reading == "whole" else 0.5)
-            means.append(float(by_hand(table, cell.key.estimate, cell.key.quantity)[inside].mean()))
+        if (line["model"], line["data"], seed) in drawn:
+            table = drawn[line["model"], line["data"], seed]
+            inside = np.abs(table.v_p).max(axis=1) <= (1 if line["reading"] == "whole" else 0.5)
+            quantity = line["quantity"].removesuffix("_error_mm")
+            means.append(float(by_hand(table, line["estimate"], quantity)[inside].mean()))
     return means
 
 
-def test_every_number_is_the_one_computed_by_hand(drawn_and_found: tuple) -> None:
-    drawn, found = drawn_and_found
+def test_every_number_is_the_one_computed_by_hand(drawn_and_report: tuple, found: list[Table]) -> None:
+    drawn, _ = drawn_and_report
     checked = 0
-    for table in (table for table in found if table.preset == "small"):
-        for cell in table.sources:
-            means = expected(drawn, cell)
-            if not means:
-                assert cell.mean is None
-                continue
-            checked += 1
-            assert cell.mean == pytest.approx(np.mean(means), rel=1e-9)
-            assert cell.interval is not None
-            if len(means) == 2:
-                half_width = stats.t.ppf(0.975, 1) * abs(means[0] - means[1]) / 2
-                assert cell.interval.half_width == pytest.approx(half_width, rel=1e-6)
-            if cell.published:
-                assert cell.ratio == pytest.approx(np.mean(means) / cell.published, rel=1e-9)
+    for line in (line for table in found if table.preset == "small" for line in table.numbers):
+        means = expected(drawn, line)
+        if not means:
+            assert line["mean"] is None
+            continue
+        checked += 1
+        assert line["mean"] == pytest.approx(np.mean(means), rel=1e-9)
+        if len(means) == 2:
+            half_width = stats.t.ppf(0.975, 1) * abs(means[0] - means[1]) / 2
+            assert (line["high"] - line["low"]) / 2 == pytest.approx(half_width, rel=1e-6)
+        if line["published"]:
+            assert line["ratio"] == pytest.approx(np.mean(means) / line["published"], rel=1e-9)
     # Table 1: 5 estimates on 4 data sets but one missing; Table 2: 5 on one; 2 errors in 2 readings
     assert checked == 2 * 2 * (5 * 4 - 1 + 5)
 
 
 @pytest.mark.parametrize(("choice", "figure"), PAPER.items())
-def test_the_papers_figures_stand_beside(
-    drawn_and_found: tuple, choice: tuple[str, str, str], figure: float
+def test_the_papers_figures_stand_below(
+    drawn_and_report: tuple, found: list[Table], choice: tuple[str, str, str], figure: float
 ) -> None:
-    drawn, found = drawn_and_found
-    name = "table2" if choice[0] in ("mae_xyz", "mae_constf") else "table1"
-    cell = place(one(found, name), *choice)
-    assert cell.source is not None
-    ratio = np.mean(expected(drawn, cell.source)) / figure
-    digits = 1 if choice[2] == "projected" else 0
-    assert cell.paper == f"{figure:.{digits}f} (×{ratio:.2f})"
+    model, data, quantity = choice
+    drawn, _ = drawn_and_report
+    line = {"model": model, "data": data, "reading": "whole", "quantity": quantity, "estimate": "mode"}
+    table = one(found, "table2" if model in ("mae_xyz", "mae_constf") else "table1")
+    digits = 1 if quantity == "projected" else 0
+    assert (
+        place(table, *choice).below == f"{figure:.{digits}f} (×{np.mean(expected(drawn, line)) / figure:.2f})"
+    )
 
 
-def test_the_layout_is_the_papers(drawn_and_found: tuple) -> None:
-    _, found = drawn_and_found
+def test_the_layout_is_the_papers(found: list[Table]) -> None:
     first, second = one(found, "table1"), one(found, "table2", "central")
     assert first.columns == DATA
     assert second.columns == ("projected error (mm)", "depth error (mm)")
-    models, others, floors = first.groups
+    models, others, bounds = first.groups
     assert [row.stub for row in models] == [
         (model, quantity)
         for model in ("mae_vz", "mae_logz", "probabilistic (mode)")
         for quantity in ("projected", "depth")
     ]
     assert [row.stub[0] for row in others[::2]] == ["probabilistic (mean)", "probabilistic (median)"]
-    assert [cell.ours for cell in floors[0].cells] == ["–", "–", "291", "≥ 291"]
+    assert [[cell.ours for cell in row.cells] for row in bounds] == [
+        ["–", "–", "291", "–"],  # no bound is known on occl_scale
+        ["–", "–", "336", "–"],
+        ["500"] * 4,
+    ]
     assert [row.stub for row in second.groups[0]] == [
         ("mae_xyz",),
         ("mae_constf",),
@@ -115,9 +124,8 @@ def test_the_layout_is_the_papers(drawn_and_found: tuple) -> None:
         assert all(len(row.stub) == len(table.stub) for row in table.rows)
 
 
-def test_presets_have_tables_of_their_own(drawn_and_found: tuple) -> None:
-    _, found = drawn_and_found
-    assert [(table.preset, table.name, table.reading) for table in found] == [
+def test_presets_have_tables_of_their_own(found: list[Table]) -> None:
+    assert [(table.preset, table.numbers[0]["table"], table.reading) for table in found] == [
         (ODD_PRESET, "table2", "whole"),  # of Table 1 it has nothing
         (ODD_PRESET, "table2", "central"),
         ("small", "table1", "whole"),
@@ -127,54 +135,65 @@ def test_presets_have_tables_of_their_own(drawn_and_found: tuple) -> None:
     ]
 
 
-def test_the_best_of_a_column_is_bold(drawn_and_found: tuple) -> None:
-    _, found = drawn_and_found
-    for table in (table for table in found if table.preset == "small"):
-        for data in {cell.data for cell in table.sources}:
-            for quantity in ("projected", "depth"):
-                column = [
-                    place
-                    for row in table.rows
-                    for place in row.cells
-                    if place.source
-                    and (place.source.data, place.source.key.quantity) == (data, quantity)
-                    and place.source.mean is not None
-                ]
-                least = min(float(place.ours) for place in column)
-                assert [place.bold for place in column] == [float(place.ours) == least for place in column]
-                assert any(place.bold for place in column)
-
-
-def test_what_prints_alike_is_bold_alike_and_no_more(tmp_path: Path) -> None:
-    frame = predicted(0, probabilistic=False).frame
-    record(tmp_path, "occl", "mae_vz", 0, frame)
-    record(tmp_path, "occl", "mae_logz", 0, frame.assign(mode_z=frame["mode_z"] * (1 + 1e-9)))
-    worse = predicted(0, noise=0.2)
-    record(tmp_path, "occl", "probabilistic", 0, worse.frame)
-    table = one(tables(collect(tmp_path)), "table1")
+def test_bold_is_what_a_paired_test_separates_from_every_other_model(tmp_path: Path) -> None:
+    """Three seeds a model on the same images; the third model is worse by far, the first two are alike."""
+    drawn = [predicted(0, noise=noise, probabilistic=False) for noise in (0.02, 0.02, 0.2)]
+    for model, table in zip(("mae_vz", "mae_logz", "probabilistic"), drawn, strict=True):
+        for seed in range(3):
+            scatter = np.random.default_rng([seed, len(model)]).normal(1, 1e-3, len(table.frame))
+            columns = {name: table.frame[name] * scatter for name in ("mode_x", "mode_y", "mode_z")}
+            record(tmp_path, "occl", model, seed, table.frame.assign(**columns, **EXTRA))
+            if model != "mae_logz":
+                record(tmp_path, "scale", model, seed, table.frame.assign(**columns, **EXTRA))
+    table = one(paper_tables(read_report(tmp_path)), "table1")
     for quantity in ("projected", "depth"):
-        cells = [place(table, model, "occl", quantity) for model in ("mae_vz", "mae_logz", "probabilistic")]
-        assert cells[0].source != cells[1].source
-        assert [cell.bold for cell in cells] == [True, True, False]
+        assert place(table, "mae_vz", "scale", quantity).bold
+        assert not any(cell.bold for cell in (place(table, model, "occl", quantity) for model in MODELS))
 
 
-def test_one_model_alone_is_not_the_best(tmp_path: Path) -> None:
+MODELS = ("mae_vz", "mae_logz", "probabilistic")
+EXTRA = dict.fromkeys(("mean_x", "mean_y", "mean_z", "mu_x", "mu_y", "median_z"), 4.0)
+
+
+def test_one_seed_is_never_bold(tmp_path: Path) -> None:
+    for model, noise in (("mae_vz", 0.001), ("mae_logz", 0.5)):
+        record(tmp_path, "occl", model, 0, predicted(0, noise=noise, probabilistic=False).frame)
+    assert not any(
+        cell.bold for row in one(paper_tables(read_report(tmp_path)), "table1").rows for cell in row.cells
+    )
+
+
+def test_what_has_no_run_is_left_out_and_named(tmp_path: Path) -> None:
     record(tmp_path, "occl", "probabilistic", 0, predicted(0).frame)
-    (table, *_) = tables(collect(tmp_path))
-    assert sum(cell.ours not in ("missing", "–") for row in table.groups[0] for cell in row.cells) == 2
-    assert not any(cell.bold for row in table.rows for cell in row.cells)
+    table = one(paper_tables(read_report(tmp_path)), "table1")
+    assert table.columns == ("occl",)
+    assert {row.stub[0].split()[0] for group in table.groups[:2] for row in group} == {"probabilistic"}
+    assert "Left out of Table 1, without a run: default, scale, occl_scale, mae_vz, mae_logz." in table.notes
+    assert table.gaps == ()
+    assert table.command.startswith("python -m phd_exp -m experiment=table1")
 
 
-def test_what_is_not_there_is_named_with_the_command_that_makes_it(drawn_and_found: tuple) -> None:
-    _, found = drawn_and_found
+@pytest.mark.parametrize(("focal_length", "bound"), [("known", 336), ("shown", 291)])
+def test_what_lies_below_its_bound_is_marked(tmp_path: Path, focal_length: str, bound: int) -> None:
+    drawn = predicted(0, noise=0.001)
+    run = record(tmp_path, "scale", "probabilistic", 0, drawn.frame)
+    run.write_config({"camera": {"focal_length": focal_length}})
+    report = read_report(tmp_path)
+    cell = make_cell(report, "small", "scale", "probabilistic", ErrorKey("mode", "whole", "depth"), [0])
+    assert cell.bound == bound
+    table = one(paper_tables(report), "table1")
+    assert place(table, "probabilistic", "scale", "depth").spread.endswith("†§")
+    assert any(note.startswith("§") for note in table.notes)
+
+
+def test_what_is_missing_is_named_with_the_command_that_makes_it(found: list[Table]) -> None:
     table = one(found, "table1")
-    assert [(gap.model, gap.data, gap.seed, gap.state) for gap in table.gaps] == [
-        ("mae_vz", "scale", 1, "failed"),
-        ("mae_logz", "occl", 0, "missing"),
-        ("mae_logz", "occl", 1, "missing"),
+    assert [line.split(":")[0] for line in table.gaps] == [
+        "mae_vz on scale (seed 1)",
+        "mae_logz on occl (seeds 0, 1)",
     ]
     assert place(table, "mae_logz", "occl", "depth").ours == "missing"
-    assert place(table, "mae_vz", "scale", "depth").spread.endswith("†‡")
+    assert place(table, "mae_vz", "scale", "depth").spread.endswith("†§‡")
     assert table.command.startswith("python -m phd_exp -m experiment=table1 preset=small seed=0,1 runs=")
     assert one(found, "table2").gaps == ()
     assert one(found, "table2").command == ""
@@ -190,10 +209,10 @@ def test_every_state_is_named_in_its_cell(tmp_path: Path) -> None:
     drawn = predicted(0)
     record(tmp_path, "scale", "mae_logz", 0, drawn.frame[(np.abs(drawn.v_p) > 0.5).any(axis=1)])
     with running.held():
-        found = tables(collect(tmp_path))
+        found = paper_tables(read_report(tmp_path))
     row = one(found, "table1").rows[0]
-    assert [cell.ours for cell in row.cells] == ["unreadable", "failed", "running", "missing"]
-    assert one(tables(collect(tmp_path)), "table1").rows[0].cells[2].ours == "broken off"
+    assert [cell.ours for cell in row.cells] == ["unreadable", "failed", "running"]
+    assert one(paper_tables(read_report(tmp_path)), "table1").rows[0].cells[2].ours == "interrupted"
     assert place(one(found, "table1", "central"), "mae_logz", "scale", "depth").ours == "no sample"
 
 
@@ -202,19 +221,17 @@ def test_no_run_helps_where_no_sample_is_central(tmp_path: Path) -> None:
     frame = drawn.frame[(np.abs(drawn.v_p) > 0.5).any(axis=1)]
     for model in ("mae_xyz", "mae_constf", "probabilistic"):
         record(tmp_path, "default", model, 0, frame)
-    table = one(tables(collect(tmp_path)), "table2", "central")
-    assert {gap.state for gap in table.gaps} == {"no sample"}
+    table = one(paper_tables(read_report(tmp_path)), "table2", "central")
+    assert all("none of its test samples lies in the central half" in line for line in table.gaps)
     assert table.command == ""
 
 
 def test_overrides_never_enter(tmp_path: Path) -> None:
     record(tmp_path, "occl", "mae_vz", 0, predicted(0).frame, overrides=("optimizer.lr=0.5",))
-    assert tables(collect(tmp_path)) == []
+    assert paper_tables(read_report(tmp_path)) == []
     record(tmp_path, "occl", "mae_vz", 1, predicted(1).frame)
-    table = one(tables(collect(tmp_path)), "table1")
-    cell = place(table, "mae_vz", "occl", "depth").source
-    assert cell is not None
-    assert cell.seeds == (1,)
+    table = one(paper_tables(read_report(tmp_path)), "table1")
+    assert [line["n_seeds"] for line in table.numbers if line["model"] == "mae_vz"] == [1, 1]
 
 
 def test_a_small_interval_does_not_print_as_nothing(tmp_path: Path) -> None:
@@ -223,7 +240,7 @@ def test_a_small_interval_does_not_print_as_nothing(tmp_path: Path) -> None:
     record(tmp_path, "occl", "mae_vz", 1, frame.assign(mode_z=frame["mode_z"] * (1 + 1e-6)))
     record(tmp_path, "occl", "mae_logz", 0, frame)
     record(tmp_path, "occl", "mae_logz", 1, frame)
-    table = one(tables(collect(tmp_path)), "table1")
+    table = one(paper_tables(read_report(tmp_path)), "table1")
     spread = place(table, "mae_vz", "occl", "depth").spread
     assert float(spread.removeprefix("±")) > 0
     assert place(table, "mae_logz", "occl", "depth").spread == "±0"  # two seeds that are equal
@@ -232,32 +249,34 @@ def test_a_small_interval_does_not_print_as_nothing(tmp_path: Path) -> None:
 def test_a_recipe_has_tables_of_its_own_and_a_command_that_makes_what_they_lack(tmp_path: Path) -> None:
     record(tmp_path, "occl", "mae_vz", 0, predicted(0, n=30).frame, preset="small+strong")
     record(tmp_path, "occl", "mae_vz", 0, predicted(0, n=30).frame)
-    found = tables(collect(tmp_path))
+    found = paper_tables(read_report(tmp_path))
     strong = one(found, "table1", preset="small+strong")
-    assert strong.title.startswith("Table 1, preset small, recipe strong: the whole field of view")
+    assert strong.title.startswith(
+        "The paper's Table 1, preset small, recipe strong: the whole field of view"
+    )
     assert " experiment=table1 preset=small recipe=strong runs=" in strong.command
     plain = one(found, "table1")
-    assert plain.title.startswith("Table 1, preset small: ")
+    assert plain.title.startswith("The paper's Table 1, preset small: ")
     assert " recipe=" not in plain.command
 
 
 def test_the_number_of_test_samples_is_said(tmp_path: Path) -> None:
     record(tmp_path, "occl", "mae_vz", 0, predicted(0, n=30).frame)
-    (whole, *_) = tables(collect(tmp_path))
-    assert whole.title == "Table 1, preset small: the whole field of view, 30 test samples"
+    (whole, *_) = paper_tables(read_report(tmp_path))
+    assert whole.title == "The paper's Table 1, preset small: the whole field of view, 30 test samples"
     record(tmp_path, "occl", "mae_logz", 0, predicted(0, n=50).frame)
-    (whole, *_) = tables(collect(tmp_path))
+    (whole, *_) = paper_tables(read_report(tmp_path))
     assert whole.title.endswith(", 30 to 50 test samples")
 
 
 def test_only_the_kinds_of_interval_that_occur_are_explained(tmp_path: Path) -> None:
     record(tmp_path, "occl", "mae_vz", 0, predicted(0).frame)
-    (table, *_) = tables(collect(tmp_path))
+    (table, *_) = paper_tables(read_report(tmp_path))
     said = " ".join(table.notes)
     assert "standard errors" in said
     assert "Student" not in said
     record(tmp_path, "occl", "mae_vz", 1, predicted(1).frame)
-    (table, *_) = tables(collect(tmp_path))
+    (table, *_) = paper_tables(read_report(tmp_path))
     said = " ".join(table.notes)
     assert "standard errors" not in said
     assert "Student" in said

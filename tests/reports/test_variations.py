@@ -4,9 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from phd_exp.reports.collect import collect
-from phd_exp.reports.formats.files import write_variation_tables
-from phd_exp.reports.variations import VariationTable, variation_tables
+from phd_exp.reports.formats.files import write_tables
+from phd_exp.reports.runs import read_report
+from phd_exp.reports.table import Table
+from phd_exp.reports.variations import variation_tables
 from tests.reports.recorded import Predicted, by_hand, predicted, record
 
 PLAIN = {"optimizer": {"lr": 0.1}, "recipe": {"localisation": 1}}
@@ -34,14 +35,14 @@ def drawn(tmp_path: Path) -> dict[tuple[float, int], Predicted]:
     return plain | {(0.5, seed): held_out(tmp_path, VARIED, seed, 10 + seed, noise=0.04) for seed in SEEDS}
 
 
-def only(runs: Path) -> VariationTable:
-    (table,) = variation_tables(collect(runs))
+def only(runs: Path) -> Table:
+    (table,) = variation_tables(read_report(runs))
     return table
 
 
 def test_numbers_are_of_the_held_out_images(drawn: dict, tmp_path: Path) -> None:
     (plain,), (varied,) = only(tmp_path).groups
-    assert plain.stub == ("as it is", "0, 1")
+    assert plain.stub == ("none", "0, 1")
     assert varied.stub == ("optimizer.lr=0.5", "0, 1")
     for row, lr in ((plain, 0.1), (varied, 0.5)):
         nll = [drawn[lr, seed].frame["nll"].mean() for seed in SEEDS]
@@ -93,18 +94,19 @@ def test_the_best_comes_first(drawn: dict, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("broken", ["held_out", "state"])
 def test_what_is_not_finished_or_cannot_be_read_is_left_out(drawn: dict, tmp_path: Path, broken: str) -> None:
-    for run in collect(tmp_path).runs:
+    for run in read_report(tmp_path).runs:
         if run.overrides:
             file = run.folder.held_out if broken == "held_out" else run.folder.status_file
             file.write_bytes(b"torn")
-    assert variation_tables(collect(tmp_path)) == []
+    assert variation_tables(read_report(tmp_path)) == []
 
 
 def test_files_are_named_by_what_they_are_about(drawn: dict, tmp_path: Path) -> None:
-    folder = write_variation_tables([only(tmp_path)], tmp_path / "report")
+    folder = write_tables([only(tmp_path)], tmp_path / "report")
     assert {file.name for file in folder.iterdir()} == {
         "variations-small-occl-probabilistic.md",
         "variations-small-occl-probabilistic.tex",
+        "variations.csv",
     }
     text = (folder / "variations-small-occl-probabilistic.md").read_text()
     assert "| optimizer.lr=0.5 | 0, 1 |" in text

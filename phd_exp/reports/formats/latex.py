@@ -3,8 +3,7 @@
 import re
 from collections.abc import Sequence
 
-from phd_exp.reports.captions import gap_lines
-from phd_exp.reports.tables import Table, TableCell, TableRow
+from phd_exp.reports.table import Table, TableCell, TableRow
 
 SYMBOLS = {
     "\\": r"\textbackslash{}",
@@ -38,7 +37,7 @@ def latex(table: Table) -> str:
             f"% {escaped(table.title)}; needs \\usepackage{{booktabs}}",
             r"\begin{table}",
             r"\centering",
-            f"\\caption{{{escaped(table.caption)}}}",
+            f"\\caption{{{escaped(table.title)}}}",
             f"\\label{{tab:{_label(table)}}}",
             r"\footnotesize\setlength{\tabcolsep}{2.5pt}",
             f"\\begin{{tabular}}{{@{{}}{'l' * stub}{'r' * columns}@{{}}}}",
@@ -79,9 +78,9 @@ def _group(rows: Sequence[TableRow]) -> str:
 def _lines(stub: Sequence[str], row: TableRow) -> str:
     """Ours, and below it the paper's figures where a cell has one."""
     lines = [[*(escaped(text) for text in stub), *(_ours(cell) for cell in row.cells)]]
-    if any(cell.paper for cell in row.cells):
+    if any(cell.below for cell in row.cells):
         left = [""] * (len(stub) - 1)
-        lines.append([*left, r"\quad paper (ratio)", *(escaped(cell.paper) for cell in row.cells)])
+        lines.append([*left, r"\quad paper (ratio)", *(escaped(cell.below) for cell in row.cells)])
     return "\n".join(f"{' & '.join(line)} \\\\" for line in lines)
 
 
@@ -93,7 +92,7 @@ def _ours(cell: TableCell) -> str:
 def _below(table: Table) -> list[str]:
     lines = [escaped(note) for note in table.notes]
     if table.gaps:
-        lines += ["Not there:", *(escaped(line) for line in gap_lines(table.gaps))]
+        lines += ["Missing:", *(escaped(line) for line in table.gaps)]
     if table.command:
         lines.append(f"Made by {_code(table.command)}")
     return [

@@ -3,8 +3,7 @@
 import re
 from collections.abc import Sequence
 
-from phd_exp.reports.captions import gap_lines
-from phd_exp.reports.tables import Table, TableCell, TableRow
+from phd_exp.reports.table import Table, TableCell, TableRow
 
 SPECIAL = re.compile(r"([\\`*_\[\]<>#|~&@$])")
 """What GitHub may read as markup, a mention, an issue or mathematics."""
@@ -21,8 +20,8 @@ def markdown(table: Table) -> str:
         "\n".join([_joined([escaped(text) for text in headings]), _joined(aligned), body]),
     ]
     if table.gaps:
-        gaps = [f"- {escaped(line)}" for line in gap_lines(table.gaps)]
-        parts.append("\n".join(["Not there:", "", *gaps]))
+        gaps = [f"- {escaped(line)}" for line in table.gaps]
+        parts.append("\n".join(["Missing:", "", *gaps]))
     if table.command:
         parts.append(f"Made by {_code(table.command)}")
     parts.append("\n".join(f"- {escaped(note)}" for note in table.notes))
@@ -41,7 +40,7 @@ def _line(row: TableRow) -> str:
 def _cell(cell: TableCell) -> str:
     ours = f"**{escaped(cell.ours)}**" if cell.bold else escaped(cell.ours)
     first = f"{ours} {escaped(cell.spread)}".rstrip()
-    return f"{first}<br>{escaped(cell.paper)}" if cell.paper else first
+    return f"{first}<br>{escaped(cell.below)}" if cell.below else first
 
 
 def _joined(texts: Sequence[str]) -> str:

@@ -11,67 +11,40 @@ from rich.text import Text
 
 from phd_exp.evaluation.point_errors import ErrorKey, Quantity
 from phd_exp.records.errors import one_line
-from phd_exp.reports.captions import gap_lines, making_command
-from phd_exp.reports.collect import Records, Run
-from phd_exp.reports.tables import DIGITS, NOTHING, PaperTable, Table, TableCell
+from phd_exp.reports.paper_tables import DIGITS, making_command
+from phd_exp.reports.runs import Report, Run
+from phd_exp.reports.table import NOTHING, Table, TableCell
 
 WIDTH = 118
 """Columns, also where the output is no terminal and rich would fall back to 80."""
 OF_A_STAR = "*: bold."
 
 
-def print_report(records: Records, tables: Sequence[PaperTable]) -> None:
-    """Print both tables of every preset in both readings, then every run with its state."""
-    console = _console()
-    for _, readings in groupby(tables, key=lambda table: (table.preset, table.name)):
-        _print_readings(console, list(readings))
-    for note in dict.fromkeys(note for table in tables for note in table.notes):
-        _say(console, note)
-    if tables:
-        _say(console, "" if console.is_terminal else OF_A_STAR)
-    _print_runs(console, records.runs)
-    if not tables:
-        what = "no run of a table yet" if records.runs else "no runs recorded yet"
-        _say_command(console, f"{what}; begin by", making_command(records, "paper", "table1"))
-
-
-def print_tables(tables: Sequence[Table]) -> None:
-    """Print tables that lack nothing, then how to read them, once."""
+def print_report(report: Report, tables: Sequence[Table]) -> None:
+    """Print all tables, what they lack, how to read them, and every run with its state."""
     console = _console()
     for table in tables:
         _say(console, table.title, style="bold")
         console.print(_drawn(table, starred=not console.is_terminal))
         console.print()
+    for command, alike in groupby(
+        (table for table in tables if table.command), key=lambda table: table.command
+    ):
+        for line in dict.fromkeys(line for table in alike for line in table.gaps):
+            _say(console, f"Missing: {line}")
+        _say_command(console, "Made by", command)
     for note in dict.fromkeys(note for table in tables for note in table.notes):
         _say(console, note)
     if tables and not console.is_terminal:
-        _say(console, OF_A_STAR)
-    console.print()
-
-
-def print_complaints(complaints: Sequence[str]) -> None:
-    """Print what cannot be used of several views."""
-    for complaint in complaints:
-        _say(_console(), f"Not fused: {complaint}")
+        _say(console, f"{OF_A_STAR}\n")
+    _print_runs(console, report.runs)
+    if not any(table.kind == "tables" for table in tables):
+        what = "no run of a table yet" if report.runs else "no runs recorded yet"
+        _say_command(console, f"{what}; begin by", making_command(report, "paper", "table1"))
 
 
 def _console() -> Console:
     return Console(width=max(WIDTH, Console().width), highlight=False)
-
-
-def _print_readings(console: Console, readings: Sequence[PaperTable]) -> None:
-    """The readings of one table below each other, then what they lack, once."""
-    for table in readings:
-        _say(console, table.title, style="bold")
-        console.print(_drawn(table, starred=not console.is_terminal))
-        console.print()
-    if gaps := dict.fromkeys(gap for table in readings for gap in table.gaps):
-        _say(console, "Not there:")
-        for line in gap_lines(gaps):
-            _say(console, line, left=2)
-        if command := readings[0].command:
-            _say_command(console, "Made by", command)
-        console.print()
 
 
 def _print_runs(console: Console, runs: Sequence[Run]) -> None:
@@ -97,7 +70,7 @@ def _drawn(table: Table, *, starred: bool) -> Grid:
     """As rich draws it; the best are bold, and starred where the output shows no bold."""
     drawn = Grid(box=box.SIMPLE_HEAD, show_edge=False)
     for heading in table.stub:
-        drawn.add_column(heading, overflow="fold")
+        drawn.add_column(heading, overflow="fold", min_width=12)
     for heading in table.columns:
         drawn.add_column(heading, justify="right", no_wrap=True)
     for group in table.groups:
@@ -112,8 +85,8 @@ def _cell(cell: TableCell, starred: bool) -> Text:
     text.append(cell.ours, style="bold" if cell.bold else "")
     if cell.spread:
         text.append(f" {cell.spread}")
-    if cell.paper:
-        text.append(f"\n{cell.paper}", style="dim")
+    if cell.below:
+        text.append(f"\n{cell.below}", style="dim")
     return text
 
 
@@ -125,7 +98,7 @@ def _run_list(runs: Sequence[Run]) -> Grid:
     drawn.add_column("state", overflow="fold")
     for run in runs:
         drawn.add_row(
-            Text(one_line("/".join((run.preset, run.data, run.model, run.folder.path.name)))),
+            Text(run.path),
             _error(run, "projected"),
             _error(run, "depth"),
             NOTHING if run.nll is None else f"{run.nll:.2f}",

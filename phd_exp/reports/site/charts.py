@@ -102,10 +102,3 @@ def thinned(n: int, points: int = POINTS) -> list[int]:
     if n <= points:
         return list(range(n))
     return [round(i * (n - 1) / (points - 1)) for i in range(points)]
-
-
-def decades(values: Numbers) -> tuple[float, float]:
-    """The powers of ten between which the positive ones of some values lie, at least one decade apart."""
-    positive = [value for value in values if value and value > 0 and math.isfinite(value)] or [1.0]
-    low, high = math.floor(math.log10(min(positive))), math.ceil(math.log10(max(positive)))
-    return 10.0**low, 10.0 ** max(high, low + 1)

@@ -1,7 +1,7 @@
 """The charts of several views: does the error fall with the cameras, is the fused calibrated, who is surprised?"""
 
-from phd_exp.evaluation.fusion import BINS, LEVELS, METHODS, PROBABILISTIC, FusionScores, Method, Place
-from phd_exp.evaluation.predictions import Band
+from phd_exp.evaluation.fusion import BINS, LEVELS, METHODS, PROBABILISTIC, FusionScores, Method
+from phd_exp.evaluation.reference import Band
 from phd_exp.reports.fusion_table import NAMES
 from phd_exp.reports.site.charts import Chart, Trace, axis, identity, line, square
 
@@ -54,7 +54,7 @@ def _coverage(scores: FusionScores) -> Chart:
     traces = [identity(0.0, 1.0, "Gaussian")]
     for k in (1, scores.views):
         for method in PROBABILISTIC:
-            bands = [scores.bands[Place(f"coverage_{level}", method, k, False)] for level in LEVELS]
+            bands = [scores.band(f"coverage_{level}", method, k) for level in LEVELS]
             name = f"{_name(method)}, {k} camera{'s' if k > 1 else ''}"
             shown = [Band(band.value / 100, band.low / 100, band.high / 100) for band in bands]
             role = MAIN if (k, method) == (scores.views, "mean") else ASIDE
@@ -87,7 +87,7 @@ def _surprise(scores: FusionScores) -> Chart:
 
 def _over_cameras(scores: FusionScores, quantity: str, method: Method, on_plane: bool) -> Trace:
     cameras = range(1, scores.views + 1)
-    bands = [scores.bands[Place(quantity, method, k, on_plane)] for k in cameras]
+    bands = [scores.band(quantity, method, k, on_plane) for k in cameras]
     name = NAMES[method] if quantity != "normalised_squared_error" else _name(method)
     role = MAIN if method == "mean" and not on_plane else ASIDE
     x = [float(k) for k in cameras]

@@ -1,7 +1,7 @@
 """HTML of the pages; whatever comes from files is escaped."""
 
-from collections import Counter
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -9,18 +9,13 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from phd_exp.evaluation.predictions import Band
-from phd_exp.reports.captions import gap_lines
-from phd_exp.reports.fusion_table import fusion_table
+from phd_exp.evaluation.reference import Band
+from phd_exp.reports.fusion_table import fusion_table, headline
 from phd_exp.reports.paper import PUBLISHED
-from phd_exp.reports.site.charts import Chart
-from phd_exp.reports.site.dossier import Dossier
-from phd_exp.reports.site.gallery import Gallery
-from phd_exp.reports.site.overview import Group
-from phd_exp.reports.site.quantities import SCORES, Quantity, quantity
-from phd_exp.reports.site.run_data import RunData
-from phd_exp.reports.tables import PaperTable
-from phd_exp.reports.variations import VariationTable
+from phd_exp.reports.quantities import SCORES, Quantity, quantity
+from phd_exp.reports.runs import Run
+from phd_exp.reports.site.overview import Drawn, Group
+from phd_exp.reports.table import Table
 
 _HERE = Path(__file__).parent
 
@@ -32,6 +27,7 @@ class ScoreRow:
     quantity: Quantity
     before: Band
     after: Band | None
+    reference: Band | None
     paper: float | None
 
 
@@ -45,7 +41,8 @@ def _environment() -> Environment:
     )
     environment.filters["moment"] = _moment
     environment.filters["duration"] = _duration
-    environment.globals["gap_lines"] = gap_lines
+    environment.globals["score"] = quantity
+    environment.globals["headline"] = headline
     return environment
 
 
@@ -64,80 +61,106 @@ _ENVIRONMENT = _environment()
 
 
 def overview_page(
-    runs: Sequence[RunData],
-    tables: Sequence[PaperTable],
-    varied: Sequence[VariationTable],
-    groups: dict[str, Group],
-    figures: Sequence[str],
+    runs: Sequence[Run], tables: Sequence[Table], groups: Mapping[str, Group], figures: Sequence[str]
 ) -> str:
-    """`index.html`: the tables, the charts of all runs, the list of runs."""
-    measured = Counter(table.preset for table in tables for cell in table.sources if cell.mean is not None)
-    presets = [preset for preset, _ in measured.most_common()]  # the fullest tables first
+    """`index.html`: the list of runs, the tables, the charts of all runs."""
+    kinds: dict[str, list[Table]] = {}
+    for table in tables:
+        kinds.setdefault(table.kind, []).append(table)
+    paper = kinds.get("tables", [])
+    presets = sorted({table.preset for table in paper}, key=lambda name: -_runs_of(runs, name))
     return _ENVIRONMENT.get_template("overview.html").render(
         root="",
+        several=len(runs) > 1,
         runs=runs,
-        fused=[run for run in runs if run.fusion],
-        tables=[[table for table in tables if table.preset == preset] for preset in presets],
-        varied=varied,
+        papers=[[table for table in paper if table.preset == preset] for preset in presets],
+        kinds=kinds,
         groups=groups,
         figures=figures,
+        overrides=any(run.overrides for run in runs),
         finished=sum(run.state == "finished" for run in runs),
         choices={"preset": sorted({run.preset for run in runs}), "data": sorted({run.data for run in runs})},
-        score=quantity,
     )
 
 
-def run_page(run: RunData, dossier: Dossier, gallery: Gallery | None) -> str:
+def _runs_of(runs: Sequence[Run], preset: str) -> int:
+    return sum(run.preset == preset and run.state == "finished" for run in runs)
+
+
+def run_page(drawn: Drawn, several: bool) -> str:
     """The page of one run."""
-    context: dict[str, Any] = {
-        "root": "../",
-        "run": run,
-        "dossier": dossier,
-        "status": dossier.status,
-        "gallery": gallery,
-        "scores": _score_rows(run),
-        "strata": _strata(dossier),
-        "charts": {group: _chosen(run, prefix) for group, prefix in _GROUPS.items()},
-        "fusion": fusion_table(dossier.run, dossier.fusion) if dossier.fusion else None,
-        "temperature": dossier.assessment.temperature if dossier.assessment else None,
-    }
-    return _ENVIRONMENT.get_template("run.html").render(**context)
+    run = drawn.run
+    return _ENVIRONMENT.get_template("run.html").render(
+        root="../",
+        several=several,
+        run=run,
+        measured=run.measured,
+        scores=_score_rows(run),
+        environment=_ran_on(run),
+        charts=drawn.charts,
+        fusion=fusion_table(run, run.measured.fusion) if run.measured.fusion else None,
+    )
 
 
-def comparison_page(runs: Sequence[RunData]) -> str:
+def _ran_on(run: Run) -> dict[str, str]:
+    """Machine, commit, data set and versions."""
+    status = run.status
+    if status is None:
+        return {}
+    known = {"machine": status.machine, "git commit": status.git_commit, "data set": status.data_manifest}
+    return {name: value or "unknown" for name, value in known.items()} | status.versions
+
+
+def comparison_page(runs: Sequence[Run]) -> str:
     """`compare.html`: any two runs side by side."""
     quantities = {key: asdict(score) for key, score in SCORES.items()}
-    return _ENVIRONMENT.get_template("compare.html").render(root="", runs=runs, quantities=quantities)
+    template = _ENVIRONMENT.get_template("compare.html")
+    return template.render(root="", several=True, runs=runs, quantities=quantities)
 
 
-_GROUPS = {"learning": "learning_", "strata": "strata_", "fusion": "fusion_", "calibration": ""}
-
-
-def _chosen(run: RunData, prefix: str) -> dict[str, Chart]:
-    others = tuple(other for other in _GROUPS.values() if other)
-    return {
-        key: chart
-        for key, chart in run.charts.items()
-        if (key.startswith(prefix) if prefix else not key.startswith(others))
-    }
-
-
-def _score_rows(run: RunData) -> list[ScoreRow]:
-    published = PUBLISHED.get((run.model, run.data))
-    return [
-        ScoreRow(quantity(key), band, run.recalibrated.get(key), getattr(published, key, None))
-        for key, band in run.scores.items()
-    ]
-
-
-def _strata(dossier: Dossier) -> list[tuple[str, int, list[tuple[Quantity, Band]]]]:
-    if not dossier.assessment:
+def _score_rows(run: Run) -> list[ScoreRow]:
+    """In the order of `SCORES`; numbers that these pages do not know come last."""
+    before, after = run.measured.before, run.measured.after
+    if before is None:
         return []
+    published = PUBLISHED.get((run.model, run.data))
+    names = [*(name for name in SCORES if name in before.scores), *(before.scores.keys() - SCORES.keys())]
     return [
-        (
-            f"{stratum.quantity} {stratum.label}",
-            stratum.n,
-            [(quantity(k), b) for k, b in stratum.scores.items()],
+        ScoreRow(
+            quantity(name),
+            before.scores[name],
+            after.scores.get(name) if after else None,
+            before.reference.get(name),
+            getattr(published, name, None),
         )
-        for stratum in dossier.assessment.before.strata
+        for name in names
     ]
+
+
+def run_script(drawn: Drawn) -> str:
+    """What the charts of a run and the comparison show."""
+    run, before = drawn.run, drawn.run.measured.before
+    content = {
+        "preset": run.preset, "data": run.data, "model": run.model, "run": run.name, "title": run.title,
+        "images": run.measured.images, "config": dict(run.config),
+        "scores": {name: asdict(band) for name, band in before.scores.items()} if before else {},
+        "resampled": _short(before.resampled) if before else {},
+        "charts": {key: asdict(chart) for charts in drawn.charts.values() for key, chart in charts.items()},
+    }  # fmt: skip
+    return as_script(run.slug, content)
+
+
+def _short(resampled: Mapping[str, Sequence[float]]) -> dict[str, list[float]]:
+    return {name: [float(f"{value:.6g}") for value in values] for name, values in resampled.items()}
+
+
+def as_script(name: str, content: Any) -> str:
+    """`phdExp.receive("<name>", {...});`, a script because pages opened as files may not fetch.
+
+    Safe in HTML and JavaScript: without <, >, & and line separators. NaN and infinity become null.
+    """
+    finite = json.loads(json.dumps(content), parse_constant=lambda _: None)
+    text = f"phdExp.receive({json.dumps(name)}, {json.dumps(finite, separators=(',', ':'))});\n"
+    for character in "<>&\u2028\u2029":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return text

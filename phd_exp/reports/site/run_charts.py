@@ -5,6 +5,9 @@ from collections import Counter
 from dataclasses import dataclass
 
 from phd_exp.evaluation.predictions import Curve, Evaluation
+from phd_exp.reports.figures import decades
+from phd_exp.reports.quantities import METRICS, Quantity, quantity
+from phd_exp.reports.runs import Run
 from phd_exp.reports.site.charts import (
     DASHES,
     Chart,
@@ -12,26 +15,34 @@ from phd_exp.reports.site.charts import (
     axis,
     bars,
     curve_line,
-    decades,
     identity,
     line,
     square,
 )
-from phd_exp.reports.site.dossier import Dossier
-from phd_exp.reports.site.quantities import METRICS, Quantity, quantity
+from phd_exp.reports.site.fusion_charts import fusion_charts
+
+
+def run_charts(run: Run) -> dict[str, dict[str, Chart]]:
+    """The charts of a run by the section of its page; a section that would be empty is left out."""
+    before, after, fusion = run.measured.before, run.measured.after, run.measured.fusion
+    sections = {
+        "calibration": calibration_charts(before, after) if before else {},
+        "learning": learning_charts(run),
+        "strata": strata_charts(before) if before else {},
+        "fusion": fusion_charts(fusion) if fusion else {},
+    }
+    return {name: charts for name, charts in sections.items() if charts}
 
 
 def calibration_charts(evaluation: Evaluation, after: Evaluation | None) -> dict[str, Chart]:
     """The six charts of a distribution, of the predictions as they are and after recalibration."""
+    recalibrated = after.curves if after else {}
     return {
-        key: chart
+        key: _calibration_chart(
+            kind, evaluation.curves[key], recalibrated.get(key) if kind.diagonal else None
+        )
         for key, kind in _KINDS.items()
         if key in evaluation.curves
-        for chart in [
-            _calibration_chart(
-                kind, evaluation.curves[key], after.curves.get(key) if after and kind.diagonal else None
-            )
-        ]
     }
 
 
@@ -73,7 +84,7 @@ _KINDS = {
 def _calibration_chart(kind: _Kind, before: Curve, after: Curve | None) -> Chart:
     traces = []
     if kind.diagonal:
-        ends = decades([*before.x, *before.y]) if kind.log else (0.0, 1.0)
+        ends = (decades([*before.x, *before.y]) or (0.1, 1.0)) if kind.log else (0.0, 1.0)
         traces.append(identity(*ends, kind.diagonal))
     traces.append(curve_line("as predicted" if after else "predictions", before, 1, "solid", "before"))
     if after:
@@ -105,21 +116,21 @@ def _in_words(kind: _Kind, curve: Curve) -> str:
     return f"The surer half has {curve.y[half]:.3g}, all predictions have {curve.y[-1]:.3g}."
 
 
-def learning_charts(dossier: Dossier) -> dict[str, Chart]:
+def learning_charts(run: Run) -> dict[str, Chart]:
     """A chart a metric, training and test split over the epochs."""
     charts = {
         f"learning_{key}": chart
         for key, metric in METRICS.items()
-        if (chart := _learning_chart(dossier, key, metric)) is not None
+        if (chart := _learning_chart(run, key, metric)) is not None
     }
-    calibration = _calibration_over_epochs(dossier)
+    calibration = _calibration_over_epochs(run)
     return charts | ({"learning_calibration": calibration} if calibration else {})
 
 
-def _learning_chart(dossier: Dossier, key: str, metric: Quantity) -> Chart | None:
-    splits = {split: dossier.metrics.get(f"{split}/{key}") for split in ("test", "train")}
+def _learning_chart(run: Run, key: str, metric: Quantity) -> Chart | None:
+    splits = {split: run.metrics.get(f"{split}/{key}") for split in ("test", "train")}
     traces = [
-        line(split, dossier.epochs, values, colour, dash=dash, role=split)
+        line(split, run.epochs, values, colour, dash=dash, role=split)
         for (split, values), colour, dash in zip(splits.items(), (1, 2), ("solid", "dot"), strict=True)
         if values is not None
     ]
@@ -142,13 +153,13 @@ def _course(trace: Trace, metric: Quantity) -> str:
 _OVER_EPOCHS = ("depth_ence", "projected_ence", "miscalibration_area", "depth_pit_area")
 
 
-def _calibration_over_epochs(dossier: Dossier) -> Chart | None:
-    known = [key for key in _OVER_EPOCHS if f"test/calibration/{key}" in dossier.metrics]
+def _calibration_over_epochs(run: Run) -> Chart | None:
+    known = [key for key in _OVER_EPOCHS if f"test/calibration/{key}" in run.metrics]
     traces = [
         line(
             quantity(key).label,
-            dossier.epochs,
-            dossier.metrics[f"test/calibration/{key}"],
+            run.epochs,
+            run.metrics[f"test/calibration/{key}"],
             i + 1,
             dash=DASHES[i],
         )

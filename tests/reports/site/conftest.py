@@ -8,9 +8,9 @@ import pytest
 from filelock import FileLock
 from PIL import Image
 
+from phd_exp.cli import report
 from phd_exp.records.choices import RunName
 from phd_exp.records.runs import RunFolder
-from phd_exp.reports.site.build import build_site
 from tests.reports.several import write_views
 from tests.reports.site.synthetic import write_run
 
@@ -66,7 +66,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with FileLock(folder.with_suffix(".lock")):
         if not folder.exists():
             folder.mkdir()
-            build_site(write_runs(folder), folder / "out")
+            assert report.main([f"runs={write_runs(folder)}", f"out={folder / 'out'}"]) == 0
     return folder
 
 

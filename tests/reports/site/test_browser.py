@@ -1,5 +1,6 @@
 """The site as people meet it: in a real browser, from the file system, without a network."""
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -142,6 +143,42 @@ def test_the_comparison_is_in_its_address(visit: Visit) -> None:
     assert "data.spec.variant" in visit.page.locator("#config").inner_text()
 
 
+def test_the_paired_difference_has_its_interval(visit: Visit) -> None:
+    """Runs on the same test images are compared image by image; others are not."""
+    visit.open("compare.html#a=small-default-probabilistic-seed0&b=small-default-mae_logz-seed0")
+    row = visit.page.locator("#scores tbody tr").first
+    row.wait_for()
+    assert re.fullmatch(r"−?\d+\.\d \[−?\d+\.\d, −?\d+\.\d\]", row.inner_text().split("\t")[3])
+    assert "tested on the same images" in visit.page.locator("#paired").inner_text()
+
+
+def test_overlays_name_their_runs(visit: Visit) -> None:
+    visit.open(COMPARISON)
+    legend = visit.page.locator("#curves figure[data-chart=coverage] .legend li")
+    legend.first.wait_for()
+    texts = legend.all_inner_texts()
+    assert [text[:2] for text in texts if text[1] == ":"] == ["A:", "B:"]
+    assert "probabilistic on default seed0" in texts[1]
+    visit.open("index.html")
+    names = visit.page.locator("#learning .legend.runs li").all_inner_texts()
+    assert "small/default/probabilistic/seed0" in [name.strip() for name in names]
+
+
+def test_runs_are_sorted_by_any_column(visit: Visit) -> None:
+    visit.open("index.html")
+    assert visit.page.locator("main section").first.get_attribute("id") == "runs"
+    column = (
+        "[...document.querySelectorAll('table.runs tbody tr')].map(row => Number(row.cells[3].dataset.value))"
+    )
+    button = visit.page.locator("table.runs thead button").nth(3)
+    for sign in (1, -1):
+        button.click()
+        values = [value for value in visit.page.evaluate(column) if value is not None]
+        assert len(values) > 2
+        assert values == sorted(values, key=lambda value: sign * value)
+    assert button.locator("..").get_attribute("aria-sort") == "descending"
+
+
 def test_charts_can_be_read_as_numbers(visit: Visit) -> None:
     visit.open(RUN)
     figure = visit.page.locator("figure[data-chart=coverage]")
@@ -188,10 +225,10 @@ def test_filters_choose_lines(visit: Visit) -> None:
 
 def test_several_cameras_have_their_charts_and_table(visit: Visit) -> None:
     visit.open("index.html")
-    visit.page.locator("#several-views a").click()
-    visit.page.wait_for_url(f"**/runs/{OTHER}.html#several-views")
+    visit.page.locator("#of-fusion a").click()
+    visit.page.wait_for_url(f"**/runs/{OTHER}.html#fusion")
     visit.draw()
-    section = visit.page.locator("section[aria-labelledby=several-views-title]")
+    section = visit.page.locator("section[aria-labelledby=fusion-title]")
     assert section.locator("figure.drawn").count() == SEVERAL
     names = section.locator(
         "[data-chart=fusion_depth_error_mm] .legend text, [data-chart=fusion_depth_error_mm] .legend li"

@@ -1,5 +1,6 @@
-"""Files of a site: whole, small, escaped, linked; rebuilt only where something changed."""
+"""Files of a site: whole, small, escaped, linked."""
 
+import json
 import re
 import shutil
 from html.parser import HTMLParser
@@ -9,14 +10,9 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
-from phd_exp.records.errors import UserError
-from phd_exp.records.files import write_atomic
-from phd_exp.reports import figures
-from phd_exp.reports.collect import collect
+from phd_exp.cli import report
+from phd_exp.reports.runs import Run, read_report
 from phd_exp.reports.site import build
-from phd_exp.reports.site.build import build_site
-from phd_exp.reports.site.dossier import slug_of
-from phd_exp.reports.site.run_data import read_script
 from tests.reports.site.conftest import HOSTILE
 from tests.reports.site.synthetic import write_run
 
@@ -103,32 +99,49 @@ def test_what_runs_say_is_text(site: Path) -> None:
 
 
 def test_a_page_for_every_run_whatever_its_state(shared: Path, site: Path) -> None:
-    runs = collect(shared / "runs").runs
-    assert {run.state for run in runs} == {"finished", "failed", "broken off", "unreadable"}
+    runs = read_report(shared / "runs").runs
+    assert {run.state for run in runs} == {"finished", "failed", "interrupted", "unreadable"}
     for run in runs:
-        page = (site / "runs" / f"{slug_of(run)}.html").read_text()
+        page = (site / "runs" / f"{run.slug}.html").read_text()
         assert f">{run.state}</span>" in page
     failed = (site / "runs" / "small-occl-mae_vz-seed0.html").read_text()
     assert "Traceback (most recent call last)" in failed
-    assert "same command goes on" in (site / "runs" / "small-scale-probabilistic-seed0.html").read_text()
+    assert (
+        "the same command resumes it" in (site / "runs" / "small-scale-probabilistic-seed0.html").read_text()
+    )
 
 
-def test_the_numbers_are_those_of_the_evaluation(shared: Path, site: Path) -> None:
-    run = read_script(site / "data" / "small-default-probabilistic-seed0.js")
-    assert run is not None
-    (recorded,) = (r for r in collect(shared / "runs").runs if slug_of(r) == run.slug)
-    assert recorded.nll is not None
-    assert run.scores["nll"].value == pytest.approx(recorded.nll)
+def script(site: Path, slug: str) -> dict:
+    """What the charts of a page show."""
+    text = (site / "data" / f"{slug}.js").read_text()
+    return json.loads(text[text.index(", ") + 2 : -3])
+
+
+def test_the_numbers_are_those_of_the_records(shared: Path, site: Path) -> None:
+    (run,) = (
+        run for run in read_report(shared / "runs").runs if run.slug == "small-default-probabilistic-seed0"
+    )
+    assert run.nll is not None
+    assert script(site, run.slug)["scores"]["nll"]["value"] == pytest.approx(run.nll)
     page = (site / "runs" / f"{run.slug}.html").read_text()
-    assert f"{recorded.nll:.2f}".replace("-", "−") in page
+    assert f"{run.nll:.2f}".replace("-", "−") in page
 
 
 def test_recalibration_is_shown_where_samples_were_held_out(site: Path) -> None:
-    certain = read_script(site / "data" / "small-occl-probabilistic-seed0.js")
-    assert certain is not None
-    assert certain.recalibrated["miscalibration_area"].value < certain.scores["miscalibration_area"].value / 2
-    names = [trace["name"] for trace in certain.charts["depth_calibration"].data]
+    certain = script(site, "small-occl-probabilistic-seed0")
+    names = [trace["name"] for trace in certain["charts"]["depth_calibration"]["data"]]
     assert names == ["calibrated", "as predicted", "recalibrated"]
+    page = (site / "runs" / "small-occl-probabilistic-seed0.html").read_text()
+    assert "Recalibrated</th>" in page
+    assert "Calibrated</th>" in page
+
+
+def test_a_run_page_shows_pictures_and_plots_before_the_table(site: Path) -> None:
+    page = (site / "runs" / "small-default-probabilistic-seed0.html").read_text()
+    places = [
+        page.index(f'id="{name}"') for name in ("gallery", "calibration", "learning", "strata", "numbers")
+    ]
+    assert places == sorted(places)
 
 
 def test_slugs_differ_wherever_runs_do(tmp_path: Path) -> None:
@@ -142,7 +155,7 @@ def test_slugs_differ_wherever_runs_do(tmp_path: Path) -> None:
         folder = tmp_path.joinpath(*names, "seed0")
         folder.mkdir(parents=True)
         (folder / "status.json").write_text("{")
-    slugs = [slug_of(run) for run in collect(tmp_path).runs]
+    slugs = [run.slug for run in read_report(tmp_path).runs]
     assert len(slugs) == 5
     assert all(a.lower() != b.lower() for a, b in combinations(slugs, 2))
     assert all(re.fullmatch(r"[A-Za-z0-9_-]+", slug) for slug in slugs)
@@ -153,80 +166,58 @@ def own(tmp_path: Path) -> Path:
     """Two runs and their site, to be changed."""
     write_run(tmp_path / "runs", "default", "mae_vz", n=40, epochs=2)
     write_run(tmp_path / "runs", "occl", "mae_vz", n=40, epochs=2)
-    build_site(tmp_path / "runs", tmp_path / "out")
+    reported(tmp_path)
     return tmp_path
 
 
-def _times(site: Path) -> dict[str, int]:
-    return {file.name: file.stat().st_mtime_ns for file in (site / "runs").iterdir()}
+def reported(folder: Path) -> Path:
+    assert report.main([f"runs={folder / 'runs'}", f"out={folder / 'out'}"]) == 0
+    return folder / "out" / "site" / "index.html"
 
 
-def test_only_runs_that_changed_are_read_again(own: Path) -> None:
+def test_runs_that_are_gone_leave_nothing_and_one_alone_is_not_compared(own: Path) -> None:
     site = own / "out" / "site"
-    before = _times(site)
-    changed = own / "runs" / "small" / "occl" / "mae_vz" / "seed0"
-    (changed / "metrics.jsonl").write_text('{"epoch": 0, "test/loss": 1.0}\n')
-    build_site(own / "runs", own / "out")
-    after = _times(site)
-    assert {name for name in before if before[name] != after[name]} == {"small-occl-mae_vz-seed0.html"}
-
-
-def test_runs_that_are_gone_leave_nothing(own: Path) -> None:
+    assert "compare.html" in (site / "index.html").read_text()
     shutil.rmtree(own / "runs" / "small" / "occl")
-    index = build_site(own / "runs", own / "out")
-    assert not [file for file in index.parent.rglob("*occl*") if file.suffix != ".png"]
-    assert "occl-mae_vz" not in index.read_text()
+    reported(own)
+    assert not list(site.rglob("*occl*"))
+    assert "occl-mae_vz" not in (site / "index.html").read_text()
+    assert not [
+        page
+        for page in site.rglob("*.html")
+        if page.name != "compare.html" and "compare.html" in page.read_text()
+    ]
 
 
 def test_a_report_that_is_killed_leaves_the_old_pages(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     site = own / "out" / "site"
     before = {file: file.read_bytes() for file in _pages(site)}
-    (own / "runs" / "small" / "occl" / "mae_vz" / "seed0" / "metrics.jsonl").write_text("")
 
     def killed(*_: object) -> str:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(build, "run_page", killed)
     with pytest.raises(KeyboardInterrupt):
-        build_site(own / "runs", own / "out")
+        reported(own)
     assert {file: file.read_bytes() for file in _pages(site)} == before
     monkeypatch.undo()
-    build_site(own / "runs", own / "out")
-    assert _pages(site) == sorted(before)
+    reported(own)
+    assert {file: file.read_bytes() for file in _pages(site)} == before
 
 
-@pytest.mark.slow
-def test_figures_that_a_kill_prevented_are_drawn_by_the_next_report(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_run(tmp_path / "runs", n=40, epochs=2)
-    files: list[str] = []
+def test_a_run_that_cannot_be_drawn_says_so_alone(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = build.run_charts
 
-    def killed(file: Path, data: bytes) -> None:
-        files.append(file.name)
-        if len(files) > 2:  # the first figure is there as PNG and PDF, the second is not
-            raise KeyboardInterrupt
-        write_atomic(file, data)
+    def faulty(run: Run) -> dict:
+        if run.data == "occl":
+            raise ZeroDivisionError("of nothing")
+        return real(run)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(figures, "write_atomic", killed)
-        with pytest.raises(KeyboardInterrupt):
-            build_site(tmp_path / "runs", tmp_path / "out")
-    build_site(tmp_path / "runs", tmp_path / "out")
-    drawn = {file.name for file in (tmp_path / "out" / "figures").iterdir()}
-    assert drawn == {
-        f"{name}-small.{kind}" for name in ("calibration", "precision") for kind in ("png", "pdf")
-    }
-
-
-def test_no_runs_are_a_page_too(tmp_path: Path) -> None:
-    assert "No runs are recorded yet" in build_site(tmp_path, tmp_path / "out").read_text()
-
-
-def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "out").write_text("in the way")
-    with pytest.raises(UserError, match="choose another folder by out=DIR"):
-        build_site(tmp_path, tmp_path / "out")
+    monkeypatch.setattr(build, "run_charts", faulty)
+    reported(own)
+    pages = own / "out" / "site" / "runs"
+    assert "ZeroDivisionError: of nothing" in (pages / "small-occl-mae_vz-seed0.html").read_text()
+    assert "Learning curves" in (pages / "small-default-mae_vz-seed0.html").read_text()
 
 
 def test_figures_for_a_paper(shared: Path) -> None:

@@ -20,26 +20,31 @@
 
   const label = (run) => [run.preset, run.data, run.model, run.run].join(" / ");
 
-  /** Values as run pages print them; differences and ratios to three digits. */
-  const signed = (text) => text.replace("-", "−");
-  const brief = (value) => (value === null ? "–" : signed(String(Number(value.toPrecision(3)))));
-  const band = (score, digits) => (score ? `${signed(score.value.toFixed(digits))} [${signed(score.low.toFixed(digits))}, ${signed(score.high.toFixed(digits))}]` : "–");
+  /** Values as run pages print them. */
+  const fixed = (value, digits) => (value === null ? "–" : value.toFixed(digits).replace("-", "−"));
+  const band = (score, digits) => (score ? `${fixed(score.value, digits)} [${fixed(score.low, digits)}, ${fixed(score.high, digits)}]` : "–");
+
+  /** B − A with the 95 % interval of its resamples: both runs were resampled on the same test images. */
+  function paired(a, b, key, digits) {
+    const difference = b.scores[key].value - a.scores[key].value;
+    const draws = a.resampled[key].map((value, i) => b.resampled[key][i] - value).filter(Number.isFinite).sort((x, y) => x - y);
+    const at = (share) => draws[Math.round(share * (draws.length - 1))];
+    return draws.length ? band({ value: difference, low: at(0.025), high: at(0.975) }, digits) : "–";
+  }
 
   function scores(a, b) {
     const known = JSON.parse(document.getElementById("scores").dataset.quantities);
     const keys = [...new Set([...Object.keys(a.scores), ...Object.keys(b.scores)])];
+    const same = a.images && a.images === b.images;
+    document.getElementById("paired").textContent = same
+      ? "Both runs were tested on the same images: B − A is paired, with its 95 % bootstrap interval over these images. It does not say how another training would differ."
+      : "The runs were not tested on the same images: there is no paired difference.";
     const rows = keys.map((key) => {
       const { label, unit, digits } = known[key] ?? { label: key.replaceAll("_", " "), unit: "", digits: 3 };
       const [of_a, of_b] = [a.scores[key], b.scores[key]];
-      const both = of_a && of_b;
-      const ratio = both && of_a.value > 0 && of_b.value > 0 ? of_b.value / of_a.value : null;
-      const apart = both && (of_a.high < of_b.low || of_b.high < of_a.low);
-      return [
-        unit ? `${label} (${unit})` : label, band(of_a, digits), band(of_b, digits),
-        brief(both ? of_b.value - of_a.value : null), brief(ratio), both ? (apart ? "apart" : "overlap") : "",
-      ];
+      return [unit ? `${label} (${unit})` : label, band(of_a, digits), band(of_b, digits), same && of_a && of_b ? paired(a, b, key, digits) : "–"];
     });
-    return phdExp.table(["Quantity", "A", "B", "B − A", "B / A", "Intervals"], rows);
+    return phdExp.table(["Quantity", "A", "B", "B − A, paired"], rows);
   }
 
   function configuration(a, b) {
@@ -73,7 +78,8 @@
       if (!chart) return;
       const traces = main(chart);
       for (const trace of traces) {
-        const name = traces.length > 1 ? `${NAMES[place].toUpperCase()}, ${trace.name}` : NAMES[place].toUpperCase();
+        const letter = `${NAMES[place].toUpperCase()}: ${runs[place].title} ${runs[place].run}`;
+        const name = traces.length > 1 ? `${letter}, ${trace.name}` : letter;
         const colour = `var(--series-${place + 1})`;
         data.push({
           ...trace, name, text: label(runs[place]),

@@ -219,10 +219,38 @@ const phdExp = (() => {
   const drawAll = () => Promise.all(all().map(draw));
   const redraw = () => Promise.all(all().filter((figure) => drawn.has(figure)).map(draw));
 
+  /** Sort the lines of a table by the column of a heading, numbers as numbers; again the other way round. */
+  function sortBy(heading) {
+    const table = heading.closest("table");
+    const down = heading.getAttribute("aria-sort") === "ascending";
+    const value = (row) => {
+      const cell = row.cells[heading.cellIndex];
+      const number = Number(cell.dataset.value ?? NaN);
+      return Number.isNaN(number) ? cell.innerText.trim() : number;
+    };
+    const before = (x, y) => (typeof x === typeof y ? (typeof x === "number" ? x - y : x.localeCompare(y)) : typeof x === "number" ? -1 : 1);
+    const rows = [...table.tBodies[0].rows].sort((a, b) => (down ? -1 : 1) * before(value(a), value(b)));
+    table.tBodies[0].append(...rows);
+    table.querySelectorAll("[aria-sort]").forEach((other) => other.removeAttribute("aria-sort"));
+    heading.setAttribute("aria-sort", down ? "descending" : "ascending");
+  }
+
+  /** The legend of all runs names those that the charts show. */
+  function filterLegends() {
+    const chosen = filters();
+    for (const item of document.querySelectorAll(".legend.runs li")) {
+      item.hidden = Object.entries(chosen).some(([key, value]) => item.dataset[key] !== value);
+    }
+  }
+
   document.addEventListener("DOMContentLoaded", () => {
     watch();
+    for (const button of document.querySelectorAll("table.sortable thead button")) {
+      button.addEventListener("click", () => sortBy(button.parentElement));
+    }
     for (const select of document.querySelectorAll("select[data-filter]")) {
       select.addEventListener("change", () => {
+        filterLegends();
         redraw();
         all().filter((figure) => figure.querySelector("details").open).forEach(tabulate);
       });

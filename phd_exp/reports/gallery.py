@@ -1,0 +1,234 @@
+"""The best and the worst test images of a run: the level curves on the image and from above, as SVG."""
+
+import base64
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from phd_exp.distributions.columns import PARAMETERS, from_columns
+from phd_exp.distributions.level_curves import LEVELS, LevelCurves, level_curves, on_image
+from phd_exp.evaluation.parquet import Columns
+from phd_exp.records.errors import RunError, UserError
+from phd_exp.records.files import require_plain
+from phd_exp.records.images import LARGEST_IMAGE, RENDERED, decoding, pillow_warnings
+from phd_exp.reports.quantities import SCORES
+
+EACH = 6
+NEEDED = ("file_name", "f", "S", "x", "y", "z", "mode_x", "mode_y", "mode_z")
+LARGEST = 448  # pixels; larger test images are shrunk for the page
+_CLOSE = 0.25  # a share of the image below which curves deserve a close-up
+_SMALLEST = 0.1  # the same for the side of a close-up
+_PANEL, _LEFT, _BOTTOM, _EDGE = 200.0, 44.0, 30.0, 6.0  # of the bird's-eye view, in its own units
+_FACTS = {
+    "level": ("credible level of the truth", "", 2),
+    "visibility": ("visibility", "", 2),
+    "truncation": ("truncation", "", 2),
+    "f": ("focal length", "px", 0),
+    "z": ("true depth", "m", 2),
+    "mode_z": ("estimated depth", "m", 2),
+}
+
+
+@dataclass(frozen=True)
+class BirdsEye:
+    """The curves of (x, z) in a square of `_PANEL` units, with ticks in metres."""
+
+    paths: list[str]
+    mode: tuple[float, float]
+    truth: tuple[float, float]
+    x_ticks: list[tuple[float, str]]
+    z_ticks: list[tuple[float, str]]
+    size: float = _PANEL
+    left: float = _LEFT
+    bottom: float = _PANEL - _BOTTOM
+    edge: float = _EDGE
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One test sample.
+
+    Attributes:
+        image: as a `data:` address; None where the image is not at hand.
+        side: of the image, pixels, in which `paths`, `mode` and `truth` are given.
+        close_up: left, top and side of the part worth enlarging; None where the curves fill the image.
+        facts: pairs of a name and a value.
+    """
+
+    name: str
+    alt: str
+    image: str | None
+    side: float
+    paths: list[str]
+    mode: tuple[float, float]
+    truth: tuple[float, float]
+    close_up: tuple[float, float, float] | None
+    birds_eye: BirdsEye | None
+    facts: list[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """The pictures of a run, the best first and the worst first; `ranked_by` names the measure of both."""
+
+    ranked_by: str
+    best: list[Picture]
+    worst: list[Picture]
+    note: str = ""
+    levels: tuple[float, ...] = LEVELS
+
+
+def images_folder(config: Mapping[str, str]) -> Path | None:
+    """Where the test images of a run on a rendered data set lie; None for other images. `config` has dotted keys."""
+    root, variant = config.get("data.root"), config.get("data.spec.variant")
+    return Path(root) / variant / "test" if root and variant else None
+
+
+def make_gallery(table: Columns, config: Mapping[str, str]) -> Gallery:
+    """Choose and draw the pictures. Raises RunError where the table lacks a column."""
+    if missing := [name for name in NEEDED if name not in table]:
+        raise RunError(f"no gallery: predictions lack the column {', '.join(missing)}; run the model again")
+    if "nll" in table:
+        key, ranked_by, error = "nll", "negative log density at the truth", table["nll"]
+    else:
+        key, ranked_by = "", "distance from the truth"
+        error = np.linalg.norm([table[f"mode_{axis}"] - table[axis] for axis in "xyz"], axis=0)
+    order = np.argsort(error, kind="stable")  # NaN comes last: a prediction that is none is the worst
+    each = min(EACH, len(order) // 2) or 1
+    source = images_folder(config)
+
+    def pictures(rows: np.ndarray) -> list[Picture]:
+        return [_picture({name: table[name][row] for name in table}, key, source) for row in rows]
+
+    return Gallery(ranked_by, pictures(order[:each]), pictures(order[::-1][:each]), _why_no_images(source))
+
+
+def _why_no_images(source: Path | None) -> str:
+    if source is None:
+        return "These images are your own and are not kept with the run: the panels show positions alone."
+    return "" if source.is_dir() else f"{source}: no images here any more; the panels show positions alone."
+
+
+def _picture(row: Mapping[str, Any], key: str, source: Path | None) -> Picture:
+    truth, mode = (np.array([row[prefix + axis] for axis in "xyz"]) for prefix in ("", "mode_"))
+    f, S = float(row["f"]), float(row["S"])
+    curves = curves_of(row)
+    outlines = [on_image(points, f, S) for points in curves.projected] if curves else []
+    with np.errstate(all="ignore"):  # whatever a record holds
+        on = [on_image(at[:2] / at[2], f, S) for at in (truth, mode)]
+    facts = _facts(row, key)
+    image = load_image(source, str(row["file_name"])) if source else None
+    return Picture(
+        name=str(row["file_name"]),
+        alt=f"Test image {row['file_name']}: " + ", ".join(f"{name} {value}" for name, value in facts),
+        image=_as_address(image) if image else None,
+        side=S,
+        paths=[_svg_path(points) for points in outlines],
+        truth=_point(on[0]),
+        mode=_point(on[1]),
+        close_up=close_up(np.concatenate([*outlines, on[0][None], on[1][None]]), S),
+        birds_eye=birds_eye_view(curves, truth) if curves and np.isfinite(truth).all() else None,
+        facts=facts,
+    )
+
+
+def curves_of(row: Mapping[str, Any]) -> LevelCurves | None:
+    """The level curves of a row; None for a baseline, and for numbers that are no distribution."""
+    if any(name not in row for name in PARAMETERS):
+        return None
+    numbers = {name: torch.tensor(float(row[name]), dtype=torch.float64) for name in PARAMETERS}
+    try:
+        return level_curves(from_columns(numbers))
+    except ValueError:
+        return None
+
+
+def _facts(row: Mapping[str, Any], key: str) -> list[tuple[str, str]]:
+    errors = [name for name in (key, "projected_error_mm", "depth_error_mm") if name in row]
+    facts = [(SCORES[name].label, f"{SCORES[name].text(row[name])} {SCORES[name].unit}") for name in errors]
+    known = [(name, *_FACTS[name]) for name in _FACTS if name in row]
+    return facts + [(label, f"{row[name]:.{digits}f} {unit}".strip()) for name, label, unit, digits in known]
+
+
+def load_image(source: Path, name: str) -> Image.Image | None:
+    """A test image, shrunk where it is large; None where it is not there, no image, or outside its folder."""
+    file = source / name
+    try:
+        if not file.resolve().is_relative_to(source.resolve()):
+            return None
+        with decoding(file), pillow_warnings():
+            require_plain(file, LARGEST_IMAGE)
+            with Image.open(file, formats=RENDERED) as image:
+                image.thumbnail((LARGEST, LARGEST))
+                return image.convert("RGB")
+    except (UserError, OSError, ValueError, RuntimeError):  # also a NUL byte, a link that leads to itself
+        return None
+
+
+def _as_address(image: Image.Image) -> str:
+    """The image itself as an address, so that a page is one file."""
+    buffer = io.BytesIO()
+    image.save(buffer, "WEBP", quality=90)
+    return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode()}"
+
+
+def close_up(points: np.ndarray, S: float) -> tuple[float, float, float] | None:
+    """Left, top and side of a square around points that lie close together in an image of S pixels; else None."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    extent = float((high - low).max())
+    if not np.isfinite(extent) or extent > _CLOSE * S:
+        return None
+    side = max(1.6 * extent, _SMALLEST * S)
+    left, top = (low + high) / 2 - side / 2
+    return _round(left), _round(top), _round(side)
+
+
+def birds_eye_view(curves: LevelCurves, truth: np.ndarray) -> BirdsEye:
+    """The view from above: x to the right, z upwards, scaled so that the curves and the truth are visible."""
+    seen = np.concatenate([*curves.birds_eye, curves.mode[None, ::2], truth[None, ::2]])
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    margin = np.maximum(0.06 * (high - low), 1e-9)
+    low, high = low - margin, high + margin
+    width, height = _PANEL - _LEFT - _EDGE, _PANEL - _BOTTOM - _EDGE
+
+    def place(points: np.ndarray) -> np.ndarray:
+        share = (points - low) / (high - low)
+        return np.stack([_LEFT + width * share[..., 0], _PANEL - _BOTTOM - height * share[..., 1]], axis=-1)
+
+    return BirdsEye(
+        paths=[_svg_path(place(points)) for points in curves.birds_eye],
+        mode=_point(place(curves.mode[::2])),
+        truth=_point(place(truth[::2])),
+        x_ticks=[(_round(place(np.array([x, low[1]]))[0]), text) for x, text in _ticks(low[0], high[0])],
+        z_ticks=[(_round(place(np.array([low[0], z]))[1]), text) for z, text in _ticks(low[1], high[1])],
+    )
+
+
+def _ticks(low: float, high: float) -> list[tuple[float, str]]:
+    """Two to five round numbers between two, with as many digits as tell them apart."""
+    power = 10.0 ** np.floor(np.log10(high - low))
+    step = next(power * k for k in (0.2, 0.5, 1, 2, 5) if (high - low) / (power * k) <= 5)
+    digits = max(0, int(np.ceil(-np.log10(step) - 1e-9)))
+    values = step * np.arange(np.ceil(low / step), np.floor(high / step) + 1)
+    return [(float(v), f"{v:.{digits}f}".replace("-", "−")) for v in values]
+
+
+def _round(value: float) -> float:
+    return round(float(value), 2)
+
+
+def _svg_path(points: np.ndarray) -> str:
+    """Points as an SVG path; what lies far outside a picture is brought nearer, or renderers would lose digits."""
+    return "M" + " ".join(f"{x:.2f},{y:.2f}" for x, y in np.clip(points, -1e4, 1e4)) + "Z"
+
+
+def _point(xy: np.ndarray) -> tuple[float, float]:
+    """A place as SVG takes it; one that is no number lies far outside."""
+    x, y = np.clip(np.nan_to_num(xy, nan=-1e4), -1e4, 1e4)
+    return _round(x), _round(y)

@@ -1,0 +1,143 @@
+"""The paper's figures from recorded runs, as PDF and PNG."""
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import cycle
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from phd_exp.evaluation.parquet import read_table
+from phd_exp.records.files import remove_temporaries, write_atomic
+from phd_exp.reports.figures import LABELS, decades, draw_birds_eye, draw_on_image, encoded
+from phd_exp.reports.gallery import curves_of, images_folder, load_image
+from phd_exp.reports.measured import Notes
+from phd_exp.reports.paper import PUBLISHED
+from phd_exp.reports.runs import PROBABILISTIC, Report, Run
+from phd_exp.reports.table import file_stem
+
+LONGEST_NAME = 30
+
+
+def write_figures(report: Report, folder: Path) -> list[str]:
+    """The paper's figures for every preset and data set, as PDF and PNG; returns their names.
+
+    Of each preset and data set the finished probabilistic run without overrides that has the lowest seed is shown.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    remove_temporaries(folder)
+    names = []
+    for preset in report.presets:
+        runs = _first_seeds(report, preset)
+        plans: dict[str, Callable[[], Figure | None]] = {
+            file_stem("calibration", preset): partial(_calibration, runs),
+            file_stem("precision", preset): partial(_precision, runs),
+        }
+        plans |= {file_stem("level_curves", preset, run.data): partial(_level_curves, run) for run in runs}
+        for name, draw in plans.items():
+            # what a hostile run makes of a figure is its own affair: the other figures are drawn
+            files = Notes().attempt(partial(_files, draw)) or {}
+            for kind, content in files.items():
+                write_atomic(folder / f"{name}.{kind}", content)
+            names += [name] if files else []
+    return names
+
+
+def _files(draw: Callable[[], Figure | None]) -> dict[str, bytes]:
+    """A figure as the bytes of its files; none where there is nothing to draw."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of letters that the font lacks, of numbers out of all proportion
+        figure = draw()
+        return {kind: encoded(figure, kind, dpi=250) for kind in ("png", "pdf")} if figure else {}
+
+
+def _first_seeds(report: Report, preset: str) -> list[Run]:
+    order = list(dict.fromkeys(data for _, data in PUBLISHED))
+    data = sorted({run.data for run in report.runs}, key=lambda name: (name not in order, name))
+    data.sort(key=lambda name: order.index(name) if name in order else len(order))
+    found = [report.at_defaults(preset, name, PROBABILISTIC) for name in data]
+    measured = [[run for _, run in sorted(runs.items()) if run.measured.before] for runs in found]
+    return [runs[0] for runs in measured if runs]
+
+
+def _calibration(runs: Sequence[Run]) -> Figure | None:
+    """Mean squared error against predicted variance: depth on the left, projection on the right.
+
+    Source: paper, figure "correlation between predicted variance and empirical variance".
+    """
+    figure = Figure(figsize=(7.2, 3.5), layout="constrained")
+    for axes, name in zip(figure.subplots(1, 2), LABELS, strict=True):
+        curves = [
+            (run, run.measured.before.curves[f"{name}_calibration"]) for run in runs if run.measured.before
+        ]
+        bounds = decades([value for _, curve in curves for value in (*curve.x, *curve.y)])
+        if bounds is None:
+            return None
+        axes.plot(bounds, bounds, "--", color="tab:red", linewidth=1)
+        for (run, curve), style in zip(curves, _styles(), strict=False):
+            axes.plot(curve.x, curve.y, linewidth=1.3, label=_plain(run.data), **style)
+        title, unit = LABELS[name]
+        axes.set(xscale="log", yscale="log", xlim=bounds, ylim=bounds, aspect="equal", title=title)
+        axes.set(xlabel=f"predicted variance ({unit})", ylabel=f"mean squared error ({unit})")
+    figure.axes[0].legend(frameon=False, fontsize="small")
+    return figure
+
+
+def _precision(runs: Sequence[Run]) -> Figure | None:
+    """Mean a and mean |A| over the epochs, solid on the test and faint on the training split.
+
+    Source: paper, figure "average precision parameters increase during the training".
+    """
+    figure = Figure(figsize=(7.2, 3.1), layout="constrained")
+    panels = (("depth_precision", "mean a"), ("projected_precision", "mean |A|"))
+    for axes, (key, label) in zip(figure.subplots(1, 2), panels, strict=True):
+        for run, style in zip(runs, _styles(), strict=False):
+            for split, alpha, name in (("train", 0.4, None), ("test", 1.0, _plain(run.data))):
+                series = run.metrics.get(f"{split}/{key}", ())
+                known = [(x, y) for x, y in zip(run.epochs, series, strict=False) if y is not None and y > 0]
+                if known:
+                    axes.plot(*zip(*known, strict=True), linewidth=1.3, alpha=alpha, label=name, **style)
+        if not axes.lines:
+            return None
+        axes.set(yscale="log", xlabel="epochs of training", ylabel=label)
+    figure.axes[0].legend(frameon=False, fontsize="small")
+    return figure
+
+
+def _level_curves(run: Run) -> Figure | None:
+    """Level curves on the test image whose negative log density is the median, and from above; None without images.
+
+    Source: paper, its first figure.
+    """
+    source = images_folder(run.config)
+    table = Notes().attempt(lambda: read_table(run.folder.predictions, ["nll", "file_name"]))
+    if source is None or table is None:
+        return None
+    place = int(np.argsort(table["nll"])[len(table["nll"]) // 2])
+    row = {name: column[place] for name, column in table.items()}
+    image, curves = load_image(source, str(row["file_name"])), curves_of(row)
+    if image is None or curves is None:
+        return None
+    truth = np.array([row[axis] for axis in "xyz"])
+    figure = Figure(figsize=(6.8, 3.3), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    draw_on_image(left, curves, np.asarray(image), float(row["f"]), float(row["S"]), truth)
+    draw_birds_eye(right, curves, truth)
+    return figure
+
+
+def _styles() -> Iterator[dict[str, str]]:
+    """Colours that everybody can tell apart, and dashes."""
+    colours = ("#0072b2", "#c44e00", "#007d5a", "#a3487c", "#8a6200")
+    return cycle(
+        {"color": colour, "linestyle": dash}
+        for colour, dash in zip(colours, ("-", "--", ":", "-.", "-"), strict=True)
+    )
+
+
+def _plain(name: str) -> str:
+    """A name as a legend holds it: matplotlib would read dollar signs as mathematics."""
+    short = name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}…"
+    return short.replace("$", r"\$")

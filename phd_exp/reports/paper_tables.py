@@ -1,0 +1,226 @@
+"""The paper's two tables, for every preset with a run of theirs, in both readings."""
+
+import shlex
+from collections.abc import Iterable, Sequence
+
+from phd_exp.evaluation.point_errors import READINGS, ErrorKey, Quantity, Reading
+from phd_exp.records.choices import PLAIN_RECIPE, in_words, preset_and_recipe
+from phd_exp.records.errors import one_line
+from phd_exp.reports.cells import Cell, Gap, make_cell
+from phd_exp.reports.paper import (
+    ASSUMED,
+    BELOW_BOUND,
+    LAYOUTS,
+    OF_A_BOUND,
+    Bound,
+    Column,
+    Layout,
+    Line,
+    TableName,
+)
+from phd_exp.reports.runs import PROBABILISTIC, Report
+from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem
+
+DIGITS: dict[Quantity, int] = {"projected": 1, "depth": 0}
+"""Decimals of a millimetre, the paper's."""
+MOST_DIGITS = 4
+ONE_SEED = "†"
+FEWER_SEEDS = "‡"
+DEFAULT_RUNS = "runs"
+
+IN_WORDS: dict[Reading, str] = {
+    "whole": "the whole field of view",
+    "central": "the central half of the field of view",
+}
+OF_THE_READING: dict[Reading, str] = {
+    "whole": "Test samples: all, over the whole field of view, as in the paper's text.",
+    "central": "Test samples: those in the central half of the field of view, |v_p| ≤ 1/2 in both coordinates, where "
+    "the authors' generator places all objects. The networks were trained on the whole field of view.",
+}
+OF_A_CELL = (
+    "A cell: our mean error in mm; below it the paper's figure and (× ours / paper). Bold: smaller than every other "
+    "model of its column by a 95 % paired test, a bootstrap over seeds and the shared test images; never one seed."
+)
+OF_THE_SPLITS = (
+    "Held-out training samples chose the recipe and fitted the temperatures. Test samples chose nothing."
+)
+OF_AN_INTERVAL = {
+    "student_t_over_seeds": "±: 95 % interval of the mean over seeds, Student's t.",
+    "normal_over_samples": f"±{ONE_SEED}: one seed; 1.96 standard errors over its test samples. It does not say how "
+    "another training would differ.",
+    "none": "No ±: one seed, one test sample.",
+}
+OF_FEWER_SEEDS = f"{FEWER_SEEDS}: fewer seeds than other cells of this table have."
+
+
+def paper_tables(report: Report) -> list[Table]:
+    """Both tables in both readings, for every preset that has any of a table's runs."""
+    return [
+        _table(report, preset, layout, reading, seeds)
+        for preset in report.presets
+        for layout in LAYOUTS
+        if (seeds := _seeds(report, preset, layout))
+        for reading in READINGS
+    ]
+
+
+def _seeds(report: Report, preset: str, layout: Layout) -> list[int]:
+    """Every seed with which any run of a table was begun."""
+    return sorted({seed for choice in layout.choices for seed in report.at_defaults(preset, *choice)})
+
+
+def _table(report: Report, preset: str, layout: Layout, reading: Reading, seeds: Sequence[int]) -> Table:
+    begun = {choice for choice in layout.choices if report.at_defaults(preset, *choice)}
+    columns = [column for column in layout.columns if column.data in {data for data, _ in begun}]
+    models = {model for _, model in begun}
+    groups = [lines for group in layout.groups if (lines := [line for line in group if line.model in models])]
+
+    def cell(line: Line, column: Column) -> Cell:
+        quantity = line.quantity or column.quantity
+        assert quantity is not None, "a layout gives the error to its lines or to its columns"
+        key = ErrorKey(line.estimate, reading, quantity)
+        return make_cell(report, preset, column.data, line.model, key, seeds)
+
+    measured = [[[cell(line, column) for column in columns] for line in group] for group in groups]
+    cells = [one for group in measured for line in group for one in line]
+    best = {id(one) for one in _best([one for line in measured[0] for one in line])}
+    gaps = dict.fromkeys(gap for one in cells for gap in one.gaps)
+    left_out = _left_out(layout, columns, models)
+    can_be_made = left_out or any(gap.state != "no sample" for gap in gaps)
+    by_line = layout.columns[0].quantity is None
+    bounds = [row for bound in layout.bounds if (row := _bound_row(bound, columns, by_line))]
+    rows = [
+        tuple(_row(line, found, best) for line, found in zip(group, part, strict=True))
+        for group, part in zip(groups, measured, strict=True)
+    ]
+    return Table(
+        stem=file_stem(layout.name, preset, reading),
+        kind="tables",
+        title=f"The paper's {layout.title}, {one_line(in_words(preset))}: {IN_WORDS[reading]}{_samples(cells)}",
+        stub=("model", "error (mm)") if by_line else ("model",),
+        columns=tuple(f"{c.quantity} error (mm)" if c.quantity else c.data for c in columns),
+        groups=(*rows, tuple(bounds)),
+        notes=(*_notes(layout, reading, cells), *left_out),
+        gaps=tuple(gap_lines(gaps)),
+        command=making_command(report, preset, layout.name, seeds) if can_be_made else "",
+        numbers=tuple(one.numbers(layout.name, id(one) in best) for one in cells),
+        preset=preset,
+        reading=reading,
+    )
+
+
+def _left_out(layout: Layout, columns: Sequence[Column], models: set[str]) -> list[str]:
+    """One line that names the rows and columns without a run."""
+    data = dict.fromkeys(column.data for column in layout.columns if column not in columns)
+    lacking = dict.fromkeys(
+        line.model for group in layout.groups for line in group if line.model not in models
+    )
+    names = ", ".join([*data, *lacking])
+    return [f"Left out of {layout.title}, without a run: {names}."] if names else []
+
+
+def _best(cells: Sequence[Cell]) -> list[Cell]:
+    """Of each data set and error, the cell that every rival is separated from, where there is one."""
+    columns: dict[tuple[str, Quantity], list[Cell]] = {}
+    for cell in cells:
+        if cell.means:
+            columns.setdefault((cell.data, cell.key.quantity), []).append(cell)
+    return [
+        cell
+        for column in columns.values()
+        for cell in column
+        if len(column) > 1 and all(cell.beats(other) for other in column if other is not cell)
+    ]
+
+
+def _row(line: Line, cells: Sequence[Cell], best: set[int]) -> TableRow:
+    label = f"{line.model} ({line.estimate})" if line.model == PROBABILISTIC else line.model
+    stub = (label, line.quantity) if line.quantity else (label,)
+    return TableRow(stub, tuple(_table_cell(cell, id(cell) in best) for cell in cells))
+
+
+def _table_cell(cell: Cell, bold: bool) -> TableCell:
+    paper = "" if cell.published is None else _number(cell.published, cell.key.quantity)
+    if cell.mean is None:
+        return TableCell(cell.state, below=paper)
+    if cell.ratio is not None:
+        paper += f" (×{cell.ratio:.2f})"
+    return TableCell(_number(cell.mean, cell.key.quantity), _spread(cell), paper, bold)
+
+
+def _spread(cell: Cell) -> str:
+    marks = BELOW_BOUND if _is_below(cell) else ""
+    marks += FEWER_SEEDS if cell.gaps else ""
+    half_width = cell.interval.half_width if cell.interval else None
+    if half_width is None:
+        return marks
+    if len(cell.means) == 1:
+        marks = ONE_SEED + marks
+    digits = DIGITS[cell.key.quantity]
+    while digits < MOST_DIGITS and 0 < half_width < 0.5 * 10.0**-digits:
+        digits += 1  # a small interval is not an exact number
+    return f"±{half_width:.{digits}f}{marks}"
+
+
+def _is_below(cell: Cell) -> bool:
+    return cell.mean is not None and cell.bound is not None and cell.mean < cell.bound
+
+
+def _number(value: float, quantity: Quantity) -> str:
+    return f"{value:.{DIGITS[quantity]}f}"
+
+
+def _bound_row(bound: Bound, columns: Sequence[Column], by_line: bool) -> TableRow | None:
+    """None where no column has this bound."""
+    texts = [NOTHING if c.quantity == "projected" else bound.depth.get(c.data, NOTHING) for c in columns]
+    stub = (bound.label, "depth") if by_line else (bound.label,)
+    return TableRow(stub, tuple(map(TableCell, texts))) if set(texts) != {NOTHING} else None
+
+
+def _notes(layout: Layout, reading: Reading, cells: Sequence[Cell]) -> list[str]:
+    """How to read what a table holds."""
+    kinds = {cell.interval.kind for cell in cells if cell.interval}
+    notes = [OF_THE_READING[reading], OF_A_CELL]
+    notes += [text for kind, text in OF_AN_INTERVAL.items() if kind in kinds]
+    if any(cell.means and cell.gaps for cell in cells):
+        notes.append(OF_FEWER_SEEDS)
+    if any(map(_is_below, cells)):
+        notes.append(OF_A_BOUND)
+    return [*notes, ASSUMED, layout.note, OF_THE_SPLITS]
+
+
+def _samples(cells: Sequence[Cell]) -> str:
+    """How many test samples count; a range where runs were tested on different numbers of them."""
+    counts = sorted({mean.n for cell in cells for mean in cell.means.values()})
+    if not counts:
+        return ""
+    return f", {counts[0]} to {counts[-1]} test samples" if len(counts) > 1 else f", {counts[0]} test samples"
+
+
+def gap_lines(gaps: Iterable[Gap]) -> list[str]:
+    """A line for each reason and model: which runs a table lacks."""
+    seeds: dict[tuple[str, str, str], list[int]] = {}
+    for gap in gaps:
+        reason = f"{gap.state}: {one_line(gap.detail)}" if gap.detail else gap.state
+        seeds.setdefault((reason, gap.model, gap.data), []).append(gap.seed)
+    lacking: dict[tuple[str, str, str], list[str]] = {}
+    for (reason, model, data), found in seeds.items():
+        numbers = f"seed{'s' if len(found) > 1 else ''} {', '.join(map(str, found))}"
+        lacking.setdefault((reason, model, numbers), []).append(data)
+    return [
+        f"{model} on {', '.join(data)} ({numbers}): {reason}"
+        for (reason, model, numbers), data in lacking.items()
+    ]
+
+
+def making_command(report: Report, preset: str, name: TableName, seeds: Iterable[int] = (0,)) -> str:
+    """The command line that makes the runs that a table lacks."""
+    preset, recipe = preset_and_recipe(preset)
+    words = [f"experiment={name}", f"preset={preset}"]
+    if recipe != PLAIN_RECIPE:
+        words.append(f"recipe={recipe}")
+    if list(seeds) != [0]:
+        words.append(f"seed={','.join(map(str, seeds))}")
+    if report.folder.as_posix() != DEFAULT_RUNS:
+        words.append(f"runs={report.folder}")
+    return one_line(shlex.join(["python", "-m", "phd_exp", "-m", *words]))

@@ -1,0 +1,43 @@
+"""What charts show: safe to put into a page, and no more than a screen holds."""
+
+import json
+
+import numpy as np
+import pytest
+
+from phd_exp.reports.figures import decades
+from phd_exp.reports.site.charts import POINTS, thinned
+from phd_exp.reports.site.pages import as_script
+
+
+@pytest.mark.parametrize(
+    "text", ["</script><script>", "<!--", "a & b", "line\u2028separator\u2029", '"quote\\', "é"]
+)
+def test_a_script_holds_any_text(text: str) -> None:
+    script = as_script(text, {text: [text]})
+    assert not set("<>&\u2028\u2029") & set(script)
+    arguments = script.removeprefix("phdExp.receive(").removesuffix(");\n")
+    name, content = json.loads(f"[{arguments}]")
+    assert (name, content) == (text, {text: [text]})
+
+
+def test_what_json_does_not_know_is_null() -> None:
+    script = as_script("a", {"x": [float("nan"), float("inf"), -float("inf"), 1.5]})
+    assert script == 'phdExp.receive("a", {"x":[null,null,null,1.5]});\n'
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, POINTS, POINTS + 1, 5 * POINTS + 3])
+def test_a_thinned_curve_keeps_its_ends(n: int) -> None:
+    kept = thinned(n)
+    assert len(kept) == min(n, POINTS)
+    assert kept == sorted(set(kept))
+    assert kept[:1] == list(range(n))[:1]
+    assert kept[-1:] == list(range(n))[-1:]
+
+
+def test_decades_hold_all_that_is_positive() -> None:
+    for values in ([3e-4, 0.2], [1.0], [0.1, 0.1], [0.0, -1.0, float("nan"), 2.0]):
+        low, high = decades(values) or (0, 0)
+        assert np.log10(high / low) >= 1 - 1e-9
+        assert all(low <= value <= high for value in values if value > 0)
+    assert decades([0.0, -1.0, float("nan"), float("inf")]) is None

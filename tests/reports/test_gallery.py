@@ -1,0 +1,109 @@
+"""Which pictures a gallery shows, where things lie in them, and what it never opens."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from phd_exp.distributions.level_curves import on_image
+from phd_exp.evaluation.parquet import Columns, read_table
+from phd_exp.records.errors import RunError
+from phd_exp.reports.gallery import (
+    EACH,
+    LARGEST,
+    _ticks,
+    birds_eye_view,
+    close_up,
+    curves_of,
+    load_image,
+    make_gallery,
+)
+from tests.reports.site.synthetic import write_run
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory: pytest.TempPathFactory) -> Columns:
+    return read_table(write_run(tmp_path_factory.mktemp("distribution"), n=60).predictions)
+
+
+@pytest.fixture(scope="module")
+def row(table: Columns) -> dict:
+    return {name: column[0] for name, column in table.items()}
+
+
+def test_the_best_and_the_worst_by_their_density(table: Columns) -> None:
+    gallery = make_gallery(table, {})
+    names = table["file_name"][np.argsort(table["nll"])].tolist()
+    assert [picture.name for picture in gallery.best] == names[:EACH]
+    assert [picture.name for picture in gallery.worst] == names[::-1][:EACH]
+    assert "images are your own" in gallery.note
+
+
+def test_a_baseline_is_ranked_by_distance_and_has_no_curves(tmp_path: Path) -> None:
+    table = read_table(write_run(tmp_path, model="mae_vz", n=30).predictions)
+    off = np.linalg.norm([table[f"mode_{axis}"] - table[axis] for axis in "xyz"], axis=0)
+    picture = make_gallery(table, {"data.root": "gone", "data.spec.variant": "default"}).worst[0]
+    assert picture.name == table["file_name"][off.argmax()]
+    assert (picture.paths, picture.birds_eye, picture.image) == ([], None, None)
+
+
+def test_marks_lie_where_the_camera_sees_them(table: Columns) -> None:
+    picture = make_gallery(table, {}).best[0]
+    (place,) = np.flatnonzero(table["file_name"] == picture.name)
+    for mark, prefix in ((picture.truth, ""), (picture.mode, "mode_")):
+        u = np.array([table[f"{prefix}x"][place], table[f"{prefix}y"][place]]) / table[f"{prefix}z"][place]
+        np.testing.assert_allclose(mark, on_image(u, float(table["f"][place]), 224.0), atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(0, 1), (-0.3, 0.31), (2.9, 17.3), (1e-4, 1.3e-4), (-900, 40), (3, 3.5)]
+)
+def test_ticks_are_few_and_round(low: float, high: float) -> None:
+    places, texts = zip(*_ticks(low, high), strict=True)
+    assert 2 <= len(places) <= 6
+    assert all(low <= place <= high for place in places)
+    assert [float(text.replace("−", "-")) for text in texts] == pytest.approx(places)
+    assert len(set(texts)) == len(texts)
+
+
+def test_the_birds_eye_view_places_ticks_and_marks_on_one_scale(row: dict) -> None:
+    curves = curves_of(row)
+    assert curves is not None
+    view = birds_eye_view(curves, np.array([row["x"], row["y"], row["z"]]))
+    for place, ticks, value in ((0, view.x_ticks, row["x"]), (1, view.z_ticks, row["z"])):
+        at, text = zip(*ticks, strict=True)
+        values = [float(label.replace("−", "-")) for label in text]
+        slope, offset = np.polyfit(values, at, 1)
+        assert view.truth[place] == pytest.approx(slope * value + offset, abs=0.05)
+
+
+def test_only_what_lies_close_together_is_enlarged() -> None:
+    near = np.array([[100.0, 50.0], [110.0, 52.0]])
+    left, top, side = close_up(near, 224.0) or (0, 0, 0)
+    assert (near >= (left, top)).all()
+    assert (near <= (left + side, top + side)).all()
+    assert close_up(np.array([[0.0, 0.0], [200.0, 10.0]]), 224.0) is None
+    assert close_up(np.array([[np.nan, 0.0], [1.0, 1.0]]), 224.0) is None
+
+
+def test_images_are_read_from_their_folder_alone(tmp_path: Path) -> None:
+    folder = tmp_path / "test"
+    folder.mkdir()
+    Image.new("RGB", (1000, 500)).save(folder / "large.png")
+    Image.new("RGB", (10, 10)).save(tmp_path / "secret.png")
+    Image.new("RGB", (10, 10)).save(folder / "other.gif")
+    (folder / "no.png").write_text("no image")
+    assert load_image(folder, "large.png").size == (LARGEST, LARGEST // 2)  # type: ignore[union-attr]
+    for name in ("../secret.png", str(tmp_path / "secret.png"), "other.gif", "no.png", "missing.png", "."):
+        assert load_image(folder, name) is None, name
+
+
+def test_a_table_without_its_columns_is_one_line(table: Columns) -> None:
+    with pytest.raises(RunError, match="lack the column file_name, f; run the model again"):
+        make_gallery({name: table[name] for name in table if name not in ("file_name", "f")}, {})
+
+
+def test_numbers_that_are_no_distribution_have_no_curves(row: dict) -> None:
+    assert curves_of(row | {"a": -1.0}) is None
+    assert curves_of(row | {"A_xx": float("nan")}) is None
