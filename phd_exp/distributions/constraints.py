@@ -15,8 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from phd_exp.distributions.huber import huber_energy
-from phd_exp.distributions.point_density import PointDensity
-from phd_exp.distributions.point_estimate import PointEstimate
+from phd_exp.distributions.point_estimate import PointDensity, PointEstimate
 from phd_exp.distributions.projected_huber import ProjectedHuber
 from phd_exp.geometry import Camera, Cartesian, Chart, DepthScale, LogDepth, Projected
 

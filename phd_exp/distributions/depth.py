@@ -31,13 +31,6 @@ def _energy_of_distance(distance: Tensor, log_a: Tensor) -> Tensor:
     return torch.exp(log_a + distance) * -torch.expm1(-distance)
 
 
-def depth_log_density(
-    log_t: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]
-) -> Float[Tensor, "*#batch"]:
-    """Log density of t, -a max(t, 1/t) - log N(a)."""
-    return -depth_energy(log_t, log_a) - log_scaled_normaliser(log_a)
-
-
 def depth_cdf(log_t: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
     """The probability of depths up to t.
 

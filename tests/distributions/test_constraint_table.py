@@ -15,7 +15,7 @@ from phd_exp.distributions.constraints import (
     families,
     minus_log_is_convex,
 )
-from phd_exp.distributions.point_density import PointDensity
+from phd_exp.distributions.point_estimate import PointDensity
 from phd_exp.geometry import Camera, Cartesian, LogDepth, Projected
 from phd_exp.models.backbones import resnet
 from phd_exp.models.heads import DistributionHead
