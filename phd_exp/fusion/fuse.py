@@ -87,7 +87,7 @@ class Fused:
         camera, 0.888 in that of four. This is the share of true positions to expect there if the predictions are
         calibrated. From the quadrature of `moments`, accurate to 0.01 for one problem and to 0.001 on average.
         """
-        radii = stats.chi2.ppf(np.array(levels), self.problems.unknowns)
+        radii = stats.chi2.ppf(np.array(levels), self.problems.dimensions)
         fused = self.status.cpu().flatten() == Status.FUSED
         return _entered(self._quadrature(fused, radii)[2], self.status)
 
@@ -100,7 +100,7 @@ class Fused:
 
         shapes = ((3,), (3, 3), radii.shape)
         results = [np.full((len(chosen), *shape), np.nan) for shape in shapes]
-        views = (*self.problems.views, self.unknowns.numpy(), *student_points(self.problems.unknowns))
+        views = (*self.problems.views, self.unknowns.numpy(), *student_points(self.problems.dimensions))
         all_moments(chosen.numpy(), *views, radii, *results)
         mean, covariance, inside = map(torch.from_numpy, results)
         return mean, covariance, inside

@@ -62,7 +62,7 @@ class Problems:
         origin: the world position of u = 0, where the search starts, metres: the average of the predicted positions,
             or the point of the plane nearest to it.
         directions: the world position is origin + directions u; on a plane the third column is zero.
-        unknowns: how many there are, 3, or 2 on a plane.
+        dimensions: the number of unknowns, 3, or 2 on a plane.
         slope: d(q_x, q_y, t)/du, 1/metres.
         free_slope: the same with respect to the world position.
         at_origin: (q_x, q_y, t) at u = 0.
@@ -75,7 +75,7 @@ class Problems:
     mask: Bool[Tensor, "problems cameras"]
     origin: Float[Tensor, "problems 3"]
     directions: Float[Tensor, "problems 3 3"]
-    unknowns: int
+    dimensions: int
     slope: Float[Tensor, "problems cameras 3 3"]
     free_slope: Float[Tensor, "problems cameras 3 3"]
     at_origin: Float[Tensor, "problems cameras 3"]
@@ -140,7 +140,7 @@ class Problems:
 
     def alone(self) -> tuple[Bool[Tensor, " problems"], Float[Tensor, "alone 3"], Float[Tensor, "alone 3 3"]]:
         """Which problems have one camera and no plane; mean (metres) and covariance of its density, in the world."""
-        alone = (self.mask.sum(-1) == 1) & (self.unknowns == 3)
+        alone = (self.mask.sum(-1) == 1) & (self.dimensions == 3)
         camera = alone[:, None] & self.mask
         shape = self.predictions.batch_shape
         mean = _flat("mean", self.predictions.mean, shape, event=1)[camera]
