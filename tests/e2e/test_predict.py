@@ -14,7 +14,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-import yaml
 from PIL import Image
 
 import phd_exp as package
@@ -314,22 +313,10 @@ def test_of_a_baseline_python_gets_points(baseline: RunFolder) -> None:
 
 
 MISTAKES = [
-    (("image=no.png", "f=400"), "no.png: cannot be read (No such file or directory)"),
-    (("image=empty.png", "f=400"), "empty.png: not an image of any kind that is read here"),
-    (("image=torn.png", "f=400"), "torn.png: cannot be read as an image"),
-    (("image=text.png", "f=400"), "text.png: not an image"),
-    (("image=huge.png", "f=400"), "huge.png: has more pixels than Pillow's limit"),
-    (("image=good.png",), "good.png: expected either f, or fx and fy (focal length in pixels)"),
-    (("image=good.png", "f=0"), "good.png: f: got 0.0; expected to be greater than 0"),
-    (("image=good.png", "f=wide"), "f: got 'wide'; expected a valid number"),
-    (("image=good.png", "f=400", "fx=400"), "good.png: expected either f, or fx and fy"),
-    (("image=good.png", "f=400", "box=90,90,99,99"), "good.png: box=[90.0, 90.0, 99.0, 99.0] lies outside"),
-    (("image=good.png", "f=400", "box=9,9"), "box: got '9,9'; expected box=LEFT,TOP,RIGHT,BOTTOM in pixels"),
-    (("image=good.png", "f=400", "cx=3"), "good.png: cx is given alone"),
     (("image=good.png", "f=400", "folder=."), "predict: expected either image=FILE"),
     (("folder=.", "f=400"), "f: belongs to image=FILE"),
-    (("folder=dot",), "dot: cannot be read (Is a directory)"),
     (("folder=.",), "metadata.jsonl, line 2: expected either f, or fx and fy"),
+    (("folder=dot",), "dot: cannot be read (Is a directory)"),
     (("folder=nowhere",), "nowhere/metadata.jsonl: cannot be read"),
     (("image=good.png", "f=400", "run=nowhere"), "run: given twice"),
     (("imag=good.png",), "imag: unknown key, did you mean 'image'?"),
@@ -340,20 +327,14 @@ MISTAKES = [
         "calibration: is drawn into the pictures; expected out=",
     ),
 ]
+"""Of this verb alone; what images, cameras and folders can have wrong stands in tests/bad_input."""
 
 
 @pytest.mark.parametrize(("words", "said"), MISTAKES, ids=[" ".join(words) for words, _ in MISTAKES])
 def test_a_mistake_is_one_line(
-    phd_exp: Callable, run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    words: tuple[str, ...], said: str,
-) -> None:  # fmt: skip
+    phd_exp: Callable, run: RunFolder, tmp_path: Path, words: tuple[str, ...], said: str
+) -> None:
     Image.new("RGB", (64, 64)).save(tmp_path / "good.png")
-    content = (tmp_path / "good.png").read_bytes()
-    (tmp_path / "torn.png").write_bytes(content[:60])
-    (tmp_path / "empty.png").write_bytes(b"")
-    (tmp_path / "text.png").write_text("no image")
-    Image.new("L", (600, 600)).save(tmp_path / "huge.png")
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100_000)
     (tmp_path / "dot").mkdir()
     (tmp_path / "dot" / "metadata.jsonl").write_text('{"file_name": ".", "f": 400}')
     good = json.dumps({"file_name": "good.png", "f": 400})
@@ -365,17 +346,6 @@ def test_a_mistake_is_one_line(
     assert said in line
 
 
-class _Evil:
-    """Code of somebody else in a checkpoint."""
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return exec, ("raise SystemExit('code of a checkpoint was run')",)
-
-
-def change_config(folder: RunFolder, **changes: Any) -> None:
-    folder.config_file.write_text(yaml.safe_dump(folder.config() | changes))
-
-
 def diverge(folder: RunFolder) -> None:
     checkpoint = torch.load(folder.last_checkpoint, weights_only=True)
     checkpoint["state_dict"]["regressor.last.bias"][0] = torch.nan
@@ -383,28 +353,15 @@ def diverge(folder: RunFolder) -> None:
 
 
 SPOILED: list[tuple[Callable[[RunFolder], Any], str]] = [
-    (lambda it: it.config_file.unlink(), "no run; expected a folder with config.yaml"),
-    (lambda it: it.config_file.write_text("!!python/object/apply:os.abort []"), "config.yaml: cannot be read"),
     (lambda it: it.last_checkpoint.unlink(), "last.ckpt: missing; the run has not trained a whole epoch yet"),
-    (lambda it: it.last_checkpoint.write_bytes(b"torn"), "last.ckpt: not a whole checkpoint (File is"),
-    (lambda it: torch.save({"state_dict": _Evil()}, it.last_checkpoint), "holds more than tensors and plain values"),
     (lambda it: it.constants_file.unlink(), "trained with images shrunk from 64 to 48 pixels by an earlier version"),
     (diverge, "000000.png: the network returns numbers that are not finite; train the run again"),
-    (lambda it: torch.save({"state_dict": {}}, it.last_checkpoint), "not a whole checkpoint"),
-    (
-        lambda it: change_config(it, backbone={"_target_": "os.system", "command": "touch owned"}),
-        "backbone._target_: 'os.system' may not be built",
-    ),
-    (
-        lambda it: change_config(it, backbone={"_target_": "torch.hub.load", "repo_or_dir": "x", "model": "y"}),
-        "backbone._target_: 'torch.hub.load' may not be built",
-    ),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("spoil", "said"), SPOILED, ids=[said for _, said in SPOILED])
 def test_a_folder_that_holds_no_usable_run_is_one_line(
-    phd_exp: Callable, spoiled: RunFolder, renders: Path, tmp_path: Path, spoil: Callable, said: str
+    phd_exp: Callable, spoiled: RunFolder, renders: Path, spoil: Callable, said: str
 ) -> None:
     spoil(spoiled)
     image = f"image={renders / 'default' / 'test' / '000000.png'}"
@@ -412,7 +369,6 @@ def test_a_folder_that_holds_no_usable_run_is_one_line(
     assert outcome.status == 1
     (line,) = outcome.err.splitlines()
     assert said in line
-    assert not (tmp_path / "owned").exists()
 
 
 def test_an_unfinished_run_is_used_and_said_so(phd_exp: Callable, spoiled: RunFolder, renders: Path) -> None:
