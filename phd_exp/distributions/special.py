@@ -165,7 +165,7 @@ class _TailMoment(torch.autograd.Function):
 
     @staticmethod
     def forward(a: Tensor, k: int) -> tuple[Tensor, Tensor]:
-        if a.numel() <= _CHUNK:
+        if torch.compiler.is_compiling() or a.numel() <= _CHUNK:  # a graph is for batches of any size
             return _tail_moment_and_derivative(k, a)
         # piecewise, so that the arrays of a chunk fit into a processor's cache
         chunks = [_tail_moment_and_derivative(k, chunk) for chunk in a.reshape(-1).split(_CHUNK)]

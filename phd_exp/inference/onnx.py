@@ -1,8 +1,7 @@
-"""A run's network as an ONNX file: uint8 images in, the numbers before the head out; checked against torch.
+"""A run as an ONNX file that answers by itself: uint8 images in, positions with their uncertainty out.
 
-The graph takes `image`, (batch, side, side, 3) of 8 bits, RGB, and of a network that is shown it `f`, (batch,), the
-focal lengths in pixels of these images. It returns `raw`, (batch, 7) or (batch, 3) in float32; normalisation is
-inside. What the numbers mean is in the file's metadata, for `decoder.py`.
+The graph is traced from the classes that `predict` uses, so no formula has a second copy. The network computes in
+float32, all after it in float64; outputs are float32. `DESCRIPTIONS` says what inputs and outputs are.
 """
 
 import json
@@ -20,50 +19,76 @@ from torch import Tensor, nn
 
 import phd_exp
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.geometry.charts import Cartesian
-from phd_exp.inference.decoder import METADATA, Decoder, Position
+from phd_exp.inference.answers import LEVELS
 from phd_exp.inference.predictor import Predictor
-from phd_exp.models.heads import ChartHead
-from phd_exp.models.regressor import Regressor
+from phd_exp.models.heads import Prediction
 from phd_exp.records.errors import UserError
 from phd_exp.records.files import write_atomic
 
+METADATA = "phd_exp"
+"""The key of the file's metadata: JSON with the run, the image size and `DESCRIPTIONS`."""
+DESCRIPTIONS = {
+    "image": "(batch, side, side, 3) uint8: RGB images of side x side pixels, principal point in the middle",
+    "f": "(batch,) float32: focal length, pixels of these images",
+    "raw": "(batch, n) float32: the outputs of the network",
+    "mode": "(batch, 3) float32: position of highest density, m; camera frame: x right, y down, z forward",
+    "mean": "(batch, 3) float32: expected position, m",
+    "covariance": "(batch, 3, 3) float32: covariance of the position, m^2",
+    "median_depth": "(batch,) float32: median of z, m",
+    "depth_interval": "(batch, 3, 2) float32: lower and upper end of the central 50, 90 and 99 % intervals of z, m",
+    "position": "(batch, 3) float32: estimated position of a baseline, m; camera frame as above",
+}
 OPSET = 18
 TOLERANCE = 1e-5
 SMALL = 0.01
-"""Size of an output of the network below which its relative deviation says nothing."""
+"""Size of an output of the network below which it is compared absolutely."""
 CHECKED = (1, 7, 56)
-"""Batches of images in which the exported network is held against torch."""
+"""Batches of images on which the file is compared with torch."""
 FOCAL_LENGTHS = (5.0, 9.0)
-"""Of the check, from and to, in sides of the image."""
-QUANTILES = (0.005, 0.05, 0.25, 0.5, 0.75, 0.95, 0.995)
+"""Range for the comparison, in sides of the image."""
 
 
 class ParityError(UserError):
-    """The exported network, or its decoder, says something else than torch."""
+    """The exported file and torch disagree."""
 
 
-class _Raw(nn.Module):
-    """The regressor without its head; what is shown no focal length takes none."""
+class _Deployed(nn.Module):
+    """The whole predictor, from images to answers."""
 
-    def __init__(self, regressor: Regressor) -> None:
+    def __init__(self, predictor: Predictor) -> None:
         super().__init__()
-        self.regressor = regressor
+        self.predictor = predictor
+        self.regressor = predictor.regressor
 
-    def forward(
-        self, image: UInt8[Tensor, "batch S S 3"], f: Float[Tensor, " batch"] | None = None
-    ) -> Float[Tensor, "batch n_outputs"]:
-        return self.regressor.raw(image, f)
+    def forward(self, image: UInt8[Tensor, "batch S S 3"], f: Float[Tensor, " batch"]) -> tuple[Tensor, ...]:
+        raw = self.regressor.raw(image, self.predictor.camera(f).f)
+        answered = outputs(self.predictor.predict(raw.double(), f.double()))
+        return (raw, *(value.float() for value in answered.values()))
+
+
+def outputs(prediction: Prediction) -> dict[str, Tensor]:
+    """What the graph returns for a batch of predictions, beside `raw`."""
+    if not isinstance(prediction, ProjectedHuber):
+        return {"position": prediction.mode}
+    tails = torch.tensor([(1 - level / 100) / 2 for level in LEVELS], dtype=torch.float64)
+    p = torch.cat([tails.new_tensor([0.5]), tails, 1 - tails])
+    z = prediction.depth_icdf(p[:, None])  # all at once, for a small graph
+    return {
+        "mode": prediction.mode,
+        "mean": prediction.mean,
+        "covariance": prediction.covariance_matrix,
+        "median_depth": z[0],
+        "depth_interval": torch.stack([z[1 : 1 + len(LEVELS)], z[1 + len(LEVELS) :]]).permute(2, 1, 0),
+    }
 
 
 def export(predictor: Predictor, file: Path) -> float:
-    """Write the network and check the file; returns the largest relative deviation from torch.
+    """Write the file after comparing it with torch; returns the largest relative deviation.
 
-    Raises ParityError, and leaves no file, where that exceeds 1e-5.
+    Raises ParityError, and writes no file, if that exceeds 1e-5.
     """
     model = _exported(predictor)
-    for key, value in _metadata(predictor).items():
-        model.metadata_props.add(key=key, value=value)
+    model.metadata_props.add(key=METADATA, value=json.dumps(_metadata(predictor)))
     content = model.SerializeToString()
     deviation = largest_deviation(predictor, content)
     if not deviation <= TOLERANCE:
@@ -78,87 +103,69 @@ def export(predictor: Predictor, file: Path) -> float:
 def _exported(predictor: Predictor) -> Any:
     """The graph, for batches of any size."""
     side = predictor.side
-    examples = {"image": torch.zeros(2, side, side, 3, dtype=torch.uint8)}
-    if predictor.regressor.shown is not None:
-        examples["f"] = torch.tensor(FOCAL_LENGTHS) * side
+    examples = torch.zeros(2, side, side, 3, dtype=torch.uint8), torch.tensor(FOCAL_LENGTHS) * side
     batch = torch.export.Dim("batch", min=1)
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of torch and onnxscript about their own old names
         program = torch.onnx.export(
-            _Raw(predictor.regressor).cpu().eval(),
-            tuple(examples.values()),
-            input_names=list(examples),
-            output_names=["raw"],
-            dynamic_shapes={name: {0: batch} for name in examples},
+            _Deployed(predictor).eval(),
+            examples,
+            input_names=["image", "f"],
+            output_names=["raw", *_names(predictor)],
+            dynamic_shapes={"image": {0: batch}, "f": {0: batch}},
             opset_version=OPSET,
             dynamo=True,
             verbose=False,
         )
     assert program is not None
+    results = program.model.graph.outputs
+    for value in (value for node in program.model.graph for value in node.outputs if value not in results):
+        value.name = f"inner_{value.name}"  # the exporter names a mean within the network "mean" too
     return program.model_proto
 
 
-def _metadata(predictor: Predictor) -> dict[str, str]:
-    config = predictor.config
-    run = {"preset": config.preset, "data": config.data.name, "model": config.model.name, "seed": config.seed}
-    about = {"version": phd_exp.__version__, "run": run, "decoder": asdict(decoder_of(predictor))}
-    return {METADATA: json.dumps(about)}
+def _names(predictor: Predictor) -> list[str]:
+    """Of the outputs after `raw`."""
+    head = predictor.regressor.head
+    return list(outputs(predictor.predict(torch.zeros(1, head.n_outputs).double(), torch.ones(1).double())))
 
 
-def decoder_of(predictor: Predictor) -> Decoder:
-    """What decodes the network's numbers as `predictor` does."""
-    head, temperature = predictor.regressor.head, predictor.temperature
-    chart = head.chart if isinstance(head, ChartHead) else None
-    return Decoder(
-        side=predictor.side,
-        head="ProjectedHuber" if chart is None else type(chart).__name__,
-        **asdict(predictor.depth),
-        xy_unit=chart.xy_unit if isinstance(chart, Cartesian) else 1.0,
-        constant_f=predictor.constant_f,
-        temperature=(temperature.projected, temperature.depth) if temperature else (1.0, 1.0),
-    )
+def _metadata(predictor: Predictor) -> dict[str, Any]:
+    config, temperature = predictor.config, predictor.temperature
+    known = ("image", "f", "raw", *_names(predictor))
+    return {
+        "version": phd_exp.__version__,
+        "run": {
+            "preset": config.preset,
+            "data": config.data.name,
+            "model": config.model.name,
+            "seed": config.seed,
+        },
+        "side": predictor.side,
+        "temperature": asdict(temperature) if temperature else None,
+        **{name: DESCRIPTIONS[name] for name in known},
+    }
 
 
 def largest_deviation(predictor: Predictor, content: bytes) -> float:
-    """The largest relative deviation of the file and its decoder from torch, over 64 images in three batches.
+    """The largest relative deviation of the file from torch, over 64 images in three batches.
 
-    Relative to the size of each output of the network over all images, and to that of each decoded vector or matrix.
-    Outputs are of order one by design; of one that is near zero on all images, since the network is hardly trained,
-    the digits are rounding, and it is held against `SMALL`.
+    Relative to the largest value of each output of the network over all images, at least `SMALL`, and to the largest
+    element of each vector or matrix that follows.
     """
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    decoder = Decoder.of(session.get_modelmeta().custom_metadata_map)
     n, side = sum(CHECKED), predictor.side
     images = pictures(n, side)
     f = (side * np.linspace(*FOCAL_LENGTHS, n)).astype(np.float32)
-    taken = {given.name for given in session.get_inputs()}
-    batches = [
-        {"image": images[rows], "f": f[rows]} for rows in np.split(np.arange(n), np.cumsum(CHECKED)[:-1])
-    ]
-    here = np.concatenate(
-        [session.run(["raw"], {name: batch[name] for name in taken})[0] for batch in batches]
-    )
-    there = torch.cat([predictor.raw(batch["image"], torch.from_numpy(batch["f"])) for batch in batches])
-    size = np.maximum(np.abs(there.numpy()).max(axis=0), SMALL)
-    decoded = _decoded(predictor, decoder, here, there.double(), f)
-    return max(float((np.abs(here - there.numpy()) / size).max()), *decoded)
-
-
-def _decoded(
-    predictor: Predictor, decoder: Decoder, here: np.ndarray, there: Tensor, f: np.ndarray
-) -> list[float]:
-    prediction = predictor.predict(there, torch.from_numpy(f).double())
-    position = decoder(here, f)
-    if not (isinstance(prediction, ProjectedHuber) and isinstance(position, Position)):
-        return [_relative(np.asarray(position), prediction.mode)]
-    quantiles = torch.stack([prediction.depth_icdf(p) for p in QUANTILES], dim=-1)
-    return [
-        _relative(position.mode, prediction.mode),
-        _relative(position.mean, prediction.mean),
-        _relative(position.covariance, prediction.covariance_matrix),
-        _relative(position.depth_quantile(QUANTILES), quantiles),
-    ]
+    parts = np.split(np.arange(n), np.cumsum(CHECKED)[:-1])
+    runs = [session.run(None, {"image": images[rows], "f": f[rows]}) for rows in parts]
+    raw, *answered = (np.concatenate(values) for values in zip(*runs, strict=True))
+    expected = torch.cat([predictor.raw(images[rows], torch.from_numpy(f[rows])) for rows in parts])
+    size = np.maximum(np.abs(expected.numpy()).max(axis=0), SMALL)
+    there = outputs(predictor.predict(expected.double(), torch.from_numpy(f).double()))
+    deviations = [_relative(here, value) for here, value in zip(answered, there.values(), strict=True)]
+    return max(float((np.abs(raw - expected.numpy()) / size).max()), *deviations)
 
 
 def _relative(here: np.ndarray, there: Tensor) -> float:

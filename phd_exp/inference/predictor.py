@@ -127,17 +127,17 @@ class Predictor:
         self, images: UInt8[np.ndarray, "batch S S 3"], f: Float[Tensor, " batch"]
     ) -> Float[Tensor, "batch n_outputs"]:
         """The network's numbers before the head, on the CPU; f in pixels of its images."""
-        told = self._told(f.float().to(self.device)).f
-        return self.regressor.raw(torch.from_numpy(images).to(self.device), told).cpu()
+        known = self.camera(f.float().to(self.device)).f
+        return self.regressor.raw(torch.from_numpy(images).to(self.device), known).cpu()
 
     def predict(self, raw: Float[Tensor, "*batch n_outputs"], f: Float[Tensor, "*batch"]) -> Prediction:
         """From the network's numbers, and focal lengths in pixels of its images, to predictions."""
-        prediction = self.regressor.head(raw, self._told(f))
+        prediction = self.regressor.head(raw, self.camera(f))
         if self.temperature is not None and isinstance(prediction, ProjectedHuber):
             return self.temperature.apply(prediction)
         return prediction
 
-    def _told(self, f: Float[Tensor, "*batch"]) -> Camera:
+    def camera(self, f: Float[Tensor, "*batch"]) -> Camera:
         """The camera as the network knows it."""
         return Camera(f, float(self.side)).with_constant_f(self.constant_f)
 
