@@ -29,7 +29,6 @@ LEVELS = (50, 90, 99)
 ERRORS = ("depth_error_mm", "distance_mm")
 CALIBRATION = (*(f"coverage_{level}" for level in LEVELS), "normalised_squared_error")
 BINS = 20
-DRAWS = 32
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class FusionScores:
             `BINS` equal parts of [0, 1].
         correlation: between the errors of log depth of two views of a scene (intraclass).
         with_size: correlation of that error, averaged over views, with log size.
-        calibrated_coverage: per cent, which the ellipsoids of one camera would cover if its density were exact.
+        exact: by `place`, the coverage that exact densities have: their tails are longer than a Gaussian's.
     """
 
     n: int
@@ -57,7 +56,7 @@ class FusionScores:
     surprise: list[int]
     correlation: Band
     with_size: Band
-    calibrated_coverage: tuple[float, ...]
+    exact: dict[str, float]
 
     def band(self, quantity: str, method: Method, cameras: int, on_plane: bool = False) -> Band:
         """What the first so many cameras give, fused by a method, on the ground or not."""
@@ -86,11 +85,15 @@ def fusion_scores(views: SeveralViews, resamples: int = 200) -> FusionScores:
         raise RunError("several views: not one scene can be fused; train longer")
     kept = views.subset(sound)
     found: dict[str, Band] = {}
+    exact: dict[str, float] = {}
     for (k, on_plane), result in fused.items():
         estimates = _estimates(kept.cameras(k), kept.ground if on_plane else None, result, sound)
         columns = _columns(kept, estimates, on_plane)
         for (quantity, method), band in _bands(columns, resamples).items():
             found[place(quantity, method, k, on_plane)] = band
+        shares = result.coverage([level / 100 for level in LEVELS])[sound].mean(0)
+        for level, share in zip(LEVELS, shares.tolist(), strict=True):
+            exact[place(f"coverage_{level}", "mean", k, on_plane)] = 100 * share
     correlation, with_size = _common_cause(kept, resamples)
     surprise = fused[views.views, False].surprise[sound].flatten()
     return FusionScores(
@@ -101,7 +104,7 @@ def fusion_scores(views: SeveralViews, resamples: int = 200) -> FusionScores:
         surprise=[int(count) for count in torch.histc(surprise, BINS, 0, 1)],
         correlation=correlation,
         with_size=with_size,
-        calibrated_coverage=_calibrated_coverage(kept),
+        exact=exact,
     )
 
 
@@ -219,12 +222,3 @@ def _correlations(columns: Mapping[str, Tensor], counts: Tensor) -> dict[str, Te
     between = covariance(mean, mean) - within / columns["views"][0]
     pearson = covariance(mean, size) / (covariance(mean, mean) * covariance(size, size)).sqrt()
     return {"of_views": between / (between + within), "with_size": pearson}
-
-
-def _calibrated_coverage(views: SeveralViews) -> tuple[float, ...]:
-    """By draws from the first camera's densities themselves."""
-    first = views.cameras(1).predictions
-    drawn = first.rsample((DRAWS,), torch.Generator().manual_seed(SEED))
-    distance = squared_mahalanobis(drawn - first.mean, first.covariance_matrix.expand(*drawn.shape, 3))
-    within = _within(distance.flatten(), 3)
-    return tuple(float(within[f"coverage_{level}"].mean()) for level in LEVELS)

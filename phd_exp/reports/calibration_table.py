@@ -36,6 +36,7 @@ def _table(preset: str, runs: Sequence[Run]) -> Table:
         columns=tuple(SCORES[name].label for name in DISTANCES),
         groups=tuple(tuple(_rows(run)) for run in runs),
         notes=(OF_A_CELL,),
+        below="calibrated",
         preset=preset,
         numbers=tuple(
             {"preset": preset, "data": run.data, "model": run.model, "run": run.name, "predictions": kind}

@@ -11,15 +11,13 @@ from phd_exp.evaluation.fusion import (
     PROBABILISTIC,
     FusionScores,
     Method,
+    place,
 )
 from phd_exp.evaluation.reference import Band
 from phd_exp.records.choices import in_words
 from phd_exp.reports.runs import Report, Run
 from phd_exp.reports.table import Table, TableCell, TableRow, file_stem
 
-ELLIPSOID_90 = {1: 87.8, 4: 88.8}
-"""Cameras -> per cent of the truths of exact densities in the moment-matched 90 % ellipsoid: their tails are longer
-than a Gaussian's. By sampling fused Projected Huber densities."""
 NAMES: dict[Method, str] = {
     "mode": "Huber, mode",
     "mean": "Huber, mean",
@@ -68,13 +66,20 @@ def fusion_table(run: Run, scores: FusionScores) -> Table:
         stub=("quantity", "method"),
         columns=tuple(f"{k} camera{'s' if k > 1 else ''}" for k in _cameras(scores)),
         groups=tuple(_groups(scores)),
+        below="exact densities",
         notes=(OF_A_LINE, OF_METHODS, OF_THE_GROUND, *_measured(scores)),
         preset=run.preset,
         numbers=tuple(
             {"preset": run.preset, "data": run.data, "model": run.model, "run": run.name}
-            | dict(zip(("quantity", "method", "cameras", "ground"), place.split("/"), strict=True))
-            | {"mean": band.value, "low": band.low, "high": band.high, "n_scenes": scores.n}
-            for place, band in scores.bands.items()
+            | dict(zip(("quantity", "method", "cameras", "ground"), at.split("/"), strict=True))
+            | {
+                "mean": band.value,
+                "low": band.low,
+                "high": band.high,
+                "exact": scores.exact.get(at),
+                "n_scenes": scores.n,
+            }
+            for at, band in scores.bands.items()
         ),
     )
 
@@ -95,13 +100,14 @@ def _rows(scores: FusionScores, quantity: str, on_plane: bool) -> Iterator[Table
     label = QUANTITIES[quantity] + (ON_GROUND if on_plane else "")
     for method in METHODS if quantity in ERRORS else PROBABILISTIC:
         name = NAMES[method] if quantity in ERRORS else NAMES[method].removesuffix(", mean")
-        bands = [scores.band(quantity, method, k, on_plane) for k in _cameras(scores)]
-        yield TableRow((label, name), tuple(_cell(quantity, band) for band in bands))
+        places = [place(quantity, method, k, on_plane) for k in _cameras(scores)]
+        cells = (_cell(quantity, scores.bands[at], scores.exact.get(at)) for at in places)
+        yield TableRow((label, name), tuple(cells))
 
 
-def _cell(quantity: str, band: Band) -> TableCell:
+def _cell(quantity: str, band: Band, exact: float | None) -> TableCell:
     value, low, high = (_number(quantity, number) for number in (band.value, band.low, band.high))
-    return TableCell(value, f"({low}–{high})")
+    return TableCell(value, f"({low}–{high})", below="" if exact is None else f"{exact:.1f}")
 
 
 def _number(quantity: str, value: float) -> str:
@@ -114,11 +120,9 @@ def _measured(scores: FusionScores) -> list[str]:
     levels = ", ".join(map(str, LEVELS))
     said = [
         f"Inside {levels} %: per cent of true positions in the ellipsoids of mean and covariance that hold so "
-        "much of a Gaussian. The densities have longer tails: exact ones put "
-        f"{', '.join(f'{share:.0f}' for share in scores.calibrated_coverage)} % of the truths there for one camera "
-        f"of these, and in general {ELLIPSOID_90[1]} % (one camera) and {ELLIPSOID_90[4]} % (four) into the 90 % "
-        "ellipsoid. Squared error: the squared Mahalanobis distance per dimension, 1 on average where calibrated, "
-        "above 1 where overconfident."
+        "much of a Gaussian; below it the share that exact densities have there, whose tails are longer. "
+        "Squared error: the squared Mahalanobis distance per dimension, 1 on average where calibrated, above 1 where "
+        "overconfident."
     ]
     said.append(_common_cause(scores))
     if scores.left_out:

@@ -101,6 +101,7 @@ def _table(report: Report, preset: str, layout: Layout, reading: Reading, seeds:
         columns=tuple(f"{c.quantity} error (mm)" if c.quantity else c.data for c in columns),
         groups=(*rows, tuple(bounds)),
         notes=(*_notes(layout, reading, cells), *left_out),
+        below="paper (ratio)",
         gaps=tuple(gap_lines(gaps)),
         command=making_command(report, preset, layout.name, seeds) if can_be_made else "",
         numbers=tuple(one.numbers(layout.name, id(one) in best) for one in cells),

@@ -49,6 +49,7 @@ class Table:
         kind: of its CSV file, which holds the numbers of all tables of a kind.
         stub: headings of the columns that say what a line is about; `columns` those of the cells.
         groups: lines, with a rule between groups.
+        below: what the second lines of cells are.
         notes: how to read it, a sentence or two each.
         gaps: which runs are missing, a line each; `command` makes them.
         numbers: a mapping a number, at full precision.
@@ -61,6 +62,7 @@ class Table:
     columns: tuple[str, ...]
     groups: tuple[tuple[TableRow, ...], ...]
     notes: tuple[str, ...]
+    below: str = ""
     gaps: tuple[str, ...] = ()
     command: str = ""
     numbers: tuple[Mapping[str, Any], ...] = ()

@@ -31,7 +31,7 @@ def latex(table: Table) -> str:
     """The environment, to be read by \\input: caption, tabular, what it lacks, how to read it."""
     stub, columns = len(table.stub), len(table.columns)
     headings = " & ".join(escaped(text) for text in (*table.stub, *table.columns))
-    body = "\n\\midrule\n".join(_group(group) for group in table.groups)
+    body = "\n\\midrule\n".join(_group(group, table.below) for group in table.groups)
     return "\n".join(
         [
             f"% {escaped(table.title)}; needs \\usepackage{{booktabs}}",
@@ -65,22 +65,22 @@ def _number(letter: str) -> str:
     return f"U+{ord(letter):04X}"
 
 
-def _group(rows: Sequence[TableRow]) -> str:
+def _group(rows: Sequence[TableRow], below: str) -> str:
     lines: list[list[str]] = []
     above = ""
     for row in rows:
         label, *rest = row.stub
         lines.append(["" if label == above else label, *rest])
         above = label
-    return "\n".join(_lines(stub, row) for stub, row in zip(lines, rows, strict=True))
+    return "\n".join(_lines(stub, row, below) for stub, row in zip(lines, rows, strict=True))
 
 
-def _lines(stub: Sequence[str], row: TableRow) -> str:
-    """Ours, and below it the paper's figures where a cell has one."""
+def _lines(stub: Sequence[str], row: TableRow, below: str) -> str:
+    """Ours, and below it the second lines where a cell has one."""
     lines = [[*(escaped(text) for text in stub), *(_ours(cell) for cell in row.cells)]]
     if any(cell.below for cell in row.cells):
         left = [""] * (len(stub) - 1)
-        lines.append([*left, r"\quad paper (ratio)", *(escaped(cell.below) for cell in row.cells)])
+        lines.append([*left, f"\\quad {escaped(below)}", *(escaped(cell.below) for cell in row.cells)])
     return "\n".join(f"{' & '.join(line)} \\\\" for line in lines)
 
 

@@ -61,7 +61,7 @@ def test_what_was_measured_is_said_below(table: Table, run: Run) -> None:
     )
     assert "the size of an object, common to its views, shifts all of them" in notes
     assert "the fused squared error of" in notes
-    assert "87.8 % (one camera) and 88.8 % (four) into the 90 % ellipsoid" in notes
+    assert re.fullmatch(r"8[78]\.\d", table.groups[4][2].cells[0].below)
     assert headline(run.measured.fusion).startswith("depth error ")
     assert headline(run.measured.fusion).endswith("mm with 4")
 
@@ -69,7 +69,10 @@ def test_what_was_measured_is_said_below(table: Table, run: Run) -> None:
 def test_markdown_parses_to_the_same_cells(table: Table) -> None:
     tokens = MarkdownIt("commonmark").enable("table").parse(markdown(table))
     cells = [
-        "".join(child.content for child in tokens[place + 1].children or [])
+        "".join(
+            " " if child.type == "html_inline" else child.content
+            for child in tokens[place + 1].children or []
+        )
         for place, token in enumerate(tokens)
         if token.type == "td_open"
     ]
@@ -77,7 +80,7 @@ def test_markdown_parses_to_the_same_cells(table: Table) -> None:
         text
         for group in table.groups
         for row in group
-        for text in (*row.stub, *(f"{cell.ours} {cell.spread}" for cell in row.cells))
+        for text in (*row.stub, *(f"{cell.ours} {cell.spread} {cell.below}".strip() for cell in row.cells))
     ]
     assert [cell for cell in cells if cell] == expected
 
@@ -89,7 +92,7 @@ def test_latex_has_every_cell_and_no_letter_that_a_font_may_lack(table: Table) -
     assert r"\label{tab:fusion-small-scale-probabilistic-seed0}" in text
     body = text.split(r"\midrule", 1)[1].split(r"\bottomrule")[0]
     lines = [line for line in body.splitlines() if "&" in line]
-    assert len(lines) == sum(map(len, table.groups))
+    assert len(lines) == len(table.rows) + sum(any(cell.below for cell in row.cells) for row in table.rows)
     assert {line.count("&") for line in lines} == {5}
 
 
