@@ -36,6 +36,7 @@ def test_a_recipe_has_a_place_beside_the_preset(composed) -> None:  # type: igno
         "data.root=/data",
         "data.workers=1",
         "trainer.progress_bar=false",
+        "trainer.threads=1",
     ],
 )
 def test_what_changes_no_number_is_left_out(config: RunConfig, override: str) -> None:
@@ -51,7 +52,7 @@ def test_what_changes_no_number_is_left_out(config: RunConfig, override: str) ->
         "camera=constant",
         "optimizer.lr=0.1",
         "recipe.localisation=0",
-        "trainer.threads=1",
+        "trainer.precision=float32",
     ],
 )
 def test_everything_else_is_in_it(config: RunConfig, override: str) -> None:
