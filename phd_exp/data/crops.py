@@ -33,7 +33,7 @@ LARGEST_STRIPE = 1 << 22
 
 
 def image_size(file: Path) -> tuple[int, int]:
-    """Width and height, from the head of the file. Raises DatasetError where that is no image."""
+    """Width and height, from the header of the file. Raises DatasetError if it is not an image."""
     with decoding(file), pillow_warnings():
         require_plain(file, LARGEST_IMAGE)
         with Image.open(file, formats=FORMATS) as image:
@@ -43,9 +43,8 @@ def image_size(file: Path) -> tuple[int, int]:
 def read_image(file: Path, content: bytes) -> Image.Image:
     """The image as RGB: grey, palette and 16 bits (the upper 8 of them) converted, transparency laid over grey.
 
-    Raises DatasetError, naming the file, for what is no whole image or holds several, exceeds Pillow's limit of
-    pixels, has an EXIF orientation (it is then unclear to which pixels the intrinsics refer), or has colours that are
-    no RGB.
+    Raises DatasetError, naming the file, if it is not one whole image, exceeds Pillow's limit of pixels, has an EXIF
+    orientation (the pixels of the intrinsics are then ambiguous), or its colours cannot be converted to RGB.
     """
     with decoding(file), Image.open(io.BytesIO(content), formats=FORMATS) as image:
         orientation = image.getexif().get(

@@ -1,4 +1,4 @@
-"""Samples from a folder of the user's own images: each detection seen by its own virtual camera."""
+"""Samples from a folder of the user's own images, one virtual camera for each detection."""
 
 import hashlib
 import math
@@ -31,7 +31,7 @@ CROP_LAYOUT = 2
 
 @dataclass(frozen=True)
 class Crop:
-    """A detection as a virtual camera sees it, `xyz` (metres) in the frame of that camera."""
+    """A detection and its virtual camera; `xyz` (metres) is in the frame of that camera."""
 
     detection: Detection
     camera: VirtualCamera
@@ -39,13 +39,12 @@ class Crop:
 
 
 class FolderSource(Source):
-    """The first n detections (None: all) of each split of a folder, each seen by its own virtual camera.
+    """The first n detections (None: all) of each split of a folder.
 
-    Those held out follow those trained on: without a number for these, they are the last of the training split. The
-    constants follow from the detections trained on. Everything but the images themselves is read and checked here.
+    Held-out detections follow the training detections; if `n_train` is None, they are the last of the training split.
+    The constants are computed from the training detections. Everything but the images is checked here.
 
-    Raises DatasetError, naming file and line, for what cannot be a sample; ConfigError where nothing is left to
-    train on.
+    Raises DatasetError, naming file and line, for an invalid sample; ConfigError if no training sample is left.
     """
 
     def __init__(
@@ -102,7 +101,7 @@ class FolderSource(Source):
         return len(self.crops[part])
 
     def _images(self, part: Part) -> np.ndarray:
-        """The crops, from the cache, or decoded into memory where the folder cannot be written."""
+        """The crops, from the cache, or decoded into memory if the folder is read-only."""
         crops = self.crops[part]
         rows: dict[Path, list[int]] = {}
         for row, crop in enumerate(crops):
@@ -131,7 +130,7 @@ class FolderSource(Source):
 
 
 def _key(crops: list[Crop], checksums: Mapping[Path, str]) -> dict[str, Any]:
-    """What the pixels of crops depend on: the content of the files, and cameras, boxes and side, all in H."""
+    """What the pixels of crops depend on: the files, and camera, box and side, which are all in the homography."""
     digest = hashlib.sha256()
     for crop in crops:
         digest.update(checksums[crop.detection.file].encode() + crop.camera.homography.tobytes())
@@ -139,7 +138,7 @@ def _key(crops: list[Crop], checksums: Mapping[Path, str]) -> dict[str, Any]:
 
 
 def _crop(detection: Detection, side: int, sizes: dict[Path, tuple[int, int]]) -> Crop:
-    """The virtual camera and the position of one detection; `sizes` remembers those of the images."""
+    """The virtual camera and the position of one detection; `sizes` caches the sizes of the images."""
     try:
         if detection.file not in sizes:
             sizes[detection.file] = image_size(detection.file)
@@ -164,7 +163,7 @@ def _crop(detection: Detection, side: int, sizes: dict[Path, tuple[int, int]]) -
 
 
 def content_of(file: Path) -> bytes:
-    """The bytes of a file. Raises DatasetError where it cannot be read."""
+    """The bytes of a file. Raises DatasetError if it cannot be read."""
     try:
         return read_plain(file, LARGEST_IMAGE)
     except OSError as error:

@@ -19,11 +19,11 @@ DIGITS = 8
 
 
 def answer(sighting: Sighting, temperature: Temperature | None) -> dict[str, Any]:
-    """What is predicted of a detection; of one whose true position is known, the errors too.
+    """The prediction for a detection, with its errors if the true position is known.
 
-    Lengths are in metres, in the frame of the real camera: x right, y down, z (depth) forward along its axis. All of
-    it is exact for a turned virtual camera as well: points and covariance turn with it, and the quantiles of depth
-    are those of the density along the real camera's axis (`quantiles_along`).
+    Lengths are in metres, in the frame of the real camera: x right, y down, z (depth) forward along its axis. This is
+    exact for a turned virtual camera too: points and covariance are rotated, and depth quantiles are integrated along
+    the axis of the real camera (`quantiles_along`).
     """
     prediction, view, line = sighting.prediction, sighting.view, sighting.detection.line
     named: dict[str, Any] = {"file_name": line.file_name}
@@ -68,14 +68,14 @@ def _depth_quantiles(distribution: ProjectedHuber, view: View) -> Float[np.ndarr
 
 
 def uncertainty(temperature: Temperature | None) -> str:
-    """Whose uncertainty it is: the run's own, or recalibrated."""
+    """The origin of the uncertainty: as trained, or recalibrated."""
     if temperature is None:
         return "as trained"
     return f"recalibrated: A / {temperature.projected:.4g}, a / {temperature.depth:.4g}"
 
 
 def _errors(sighting: Sighting) -> dict[str, Any]:
-    """What the tables measure, which turning the camera does not change; of a distribution its scores too."""
+    """The errors of the tables, which rotating the camera does not change, and the scores of a distribution."""
     prediction = sighting.prediction
     truth = torch.from_numpy(sighting.view.camera.to_virtual(np.array(sighting.detection.position)))
     errors = {
@@ -93,7 +93,7 @@ def _array(tensor: torch.Tensor) -> Float[np.ndarray, "..."]:
 
 
 def rounded(values: Float[np.ndarray, "..."]) -> Any:
-    """As lists of numbers; null for one that is not finite, which JSON does not know."""
+    """Lists of numbers for JSON; None for a number that is not finite."""
     if np.ndim(values):
         return [rounded(value) for value in values]
     return float(f"{values:.{DIGITS}g}") if np.isfinite(values) else None

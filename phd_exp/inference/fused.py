@@ -1,4 +1,4 @@
-"""Scenes as JSON objects: one position of an object that several cameras saw, or one camera above a known plane."""
+"""Scenes as JSON objects: one position from several cameras, or from one camera and a known plane."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ from phd_exp.records.errors import DatasetError
 from phd_exp.records.observed import Observed
 
 AGREE = 0.01
-"""How far apart a scene's true positions may be that its lines give, over their distance from the camera."""
+"""Largest distance between the true positions that lines of a scene give, relative to that from the camera."""
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What a network says of views, one after the other, and the poses of their virtual cameras in the world."""
+    """Network outputs for a sequence of views, and the poses of their virtual cameras in the world."""
 
     raw: Float[Tensor, "views 7"]
     f: Float[Tensor, " views"]
@@ -31,7 +31,7 @@ class Seen:
 
     @classmethod
     def of(cls, scenes: Sequence[Observed], sightings: Iterable[Sighting]) -> "Seen":
-        """Of the sightings of the scenes' detections, in their order; no image is kept.
+        """From the sightings of the scenes' detections, in their order; no image is kept.
 
         A virtual camera is the real one turned: v_virtual = R_v v_camera, so that its pose is (R_v R, R_v t).
         """
@@ -48,17 +48,17 @@ class Seen:
 def fused_answers(
     scenes: Sequence[Observed], sightings: Iterable[Sighting], predictor: Predictor, plane: Plane | None
 ) -> list[dict[str, Any]]:
-    """What the cameras of each scene say together; of a scene whose true position is known, the errors too.
+    """The fused position of each scene, with its errors if the true position is known.
 
     Lengths are in metres, in the world of the poses. A scene that fails has null for numbers and its `reason`.
 
     Args:
-        scenes: of which to answer.
-        sightings: of their detections, one scene after the other.
-        predictor: of a distribution, which made the sightings.
-        plane: on which every position lies, if any.
+        scenes: the scenes to fuse.
+        sightings: those of their detections, one scene after the other.
+        predictor: the probabilistic predictor that made the sightings.
+        plane: contains every position, if given.
 
-    Raises DatasetError, before the first sighting is asked for, where lines of a scene give different true positions.
+    Raises DatasetError, before the first sighting is computed, if lines of a scene give different true positions.
     """
     truth = true_positions(scenes)
     seen = Seen.of(scenes, sightings)
@@ -76,7 +76,7 @@ def fused_answers(
 def layout(
     counts: Sequence[int],
 ) -> tuple[Int[Tensor, "scenes cameras"], Bool[Tensor, "scenes cameras"]]:
-    """Which view is which camera of which scene, and which cameras there are, where the views are in one row."""
+    """The index of each scene's cameras in a sequence of views, padded, and the mask of cameras that exist."""
     n = torch.tensor(counts)
     place = torch.arange(int(n.max()))
     mask = place < n[:, None]
@@ -87,7 +87,7 @@ def layout(
 def true_positions(scenes: Sequence[Observed]) -> Float[Tensor, "scenes 3"]:
     """The true position of each scene's object in the world, metres; NaN where no line gives it.
 
-    Raises DatasetError where two lines disagree by more than 1 % of its distance: poses or scenes are wrong then.
+    Raises DatasetError if two lines disagree by more than 1 % of its distance; poses or scenes are wrong then.
     """
     return torch.stack([_true_position(scene) for scene in scenes])
 
@@ -130,7 +130,7 @@ def _answer(scene: Observed, fused: Fused, place: int) -> dict[str, Any]:
 
 
 def _errors(fused: Fused, truth: Float[Tensor, "scenes 3"], plane: Plane | None) -> dict[str, Tensor]:
-    """Distance of the point from the truth, and that of the mean in units of the covariance, along a plane if any."""
+    """Distance of the point from the truth, and of the mean in units of the covariance, within the plane if given."""
     along = None if plane is None else plane.directions
     distance = squared_mahalanobis(truth - fused.mean, fused.covariance, along)
     point = MILLIMETRES * (fused.point - truth).norm(dim=-1)
@@ -139,7 +139,7 @@ def _errors(fused: Fused, truth: Float[Tensor, "scenes 3"], plane: Plane | None)
 
 
 def _errors_of(errors: dict[str, Tensor], place: int) -> dict[str, Any]:
-    """Those of one scene; none where its true position is unknown."""
+    """The errors of one scene; empty if its true position is unknown."""
     if not bool(errors["known"][place]):
         return {}
     return {name: rounded(errors[name][place].numpy()) for name in ("error_mm", "squared_mahalanobis")}

@@ -1,4 +1,4 @@
-"""What a run says of each view of scenes that several cameras see: `views.parquet` in its folder."""
+"""Predictions of a run for each view of scenes with several cameras: `views.parquet` in its folder."""
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -15,7 +15,7 @@ from phd_exp.training.predictions import columns, write_parquet
 
 
 def record_views(folder: RunFolder, data: DatasetFolder, spec: DatasetSpec, scenes: int) -> bool:
-    """Predict every view of the first test scenes and record it; whether there was anything left to do.
+    """Predict every view of the first test scenes and record them. Returns False if they were recorded already.
 
     The file holds a row a view, as `predictions.parquet` has them, with `scene`, `view` and the pose.
 

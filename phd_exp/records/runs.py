@@ -2,7 +2,7 @@
 
     runs/<preset>[+<recipe>]/<data>/<model>/seed<k>[-<hash of other overrides>]/
         config.yaml          what was asked for, resolved
-        constants.json       what the network was told of the data set: depth scale, constant focal length
+        constants.json       constants of the data set (depth scale, focal length) and the version of shrinking
         status.json          state, error, versions, git commit, hash of the data set
         metrics.jsonl        one line an epoch
         results.json         the final numbers
