@@ -18,7 +18,7 @@ BLOCKS: dict[int, tuple[type[BasicBlock | Bottleneck], list[int]]] = {
 Depth = Literal[10, 18, 34, 50]
 
 
-class Seen(NamedTuple):
+class BackboneOutput(NamedTuple):
     """What a backbone makes of images.
 
     A backbone that keeps where things are also says where the object is: `place`, its projected position v_p, and
@@ -41,7 +41,7 @@ class Backbone(nn.Module):
     n_features: int
     locates: bool
 
-    def forward(self, pixels: Float[Tensor, "batch 3 height width"]) -> Seen:
+    def forward(self, pixels: Float[Tensor, "batch 3 height width"]) -> BackboneOutput:
         raise NotImplementedError
 
 
@@ -55,8 +55,8 @@ class PooledFeatures(Backbone):
         self.network = network
         self.n_features = n_features
 
-    def forward(self, pixels: Float[Tensor, "batch 3 height width"]) -> Seen:
-        return Seen(self.network(pixels))
+    def forward(self, pixels: Float[Tensor, "batch 3 height width"]) -> BackboneOutput:
+        return BackboneOutput(self.network(pixels))
 
 
 def resnet(depth: Depth) -> PooledFeatures:

@@ -11,7 +11,7 @@ from torch.nn.functional import interpolate, relu
 from torchvision.models.resnet import BasicBlock, Bottleneck
 
 from phd_exp.geometry.grid import middles
-from phd_exp.models.backbones import BLOCKS, Backbone, Depth, Seen
+from phd_exp.models.backbones import BLOCKS, Backbone, BackboneOutput, Depth
 
 _norm = partial(nn.GroupNorm, 1)
 
@@ -69,7 +69,7 @@ class Locating(Backbone):
         nn.init.zeros_(self.map.bias)  # type: ignore[arg-type]  # it has one
         self.n_features = channels + outputs[-1]
 
-    def forward(self, pixels: Float[Tensor, "batch 3 height width"]) -> Seen:
+    def forward(self, pixels: Float[Tensor, "batch 3 height width"]) -> BackboneOutput:
         stages, level = [], self.stem(pixels)
         for stage in self.stages:
             level = stage(level)
@@ -86,12 +86,12 @@ class Locating(Backbone):
             finest = finer + interpolate(finest, size=finer.shape[-2:], mode="nearest")
         return relu(self.smooth(relu(finest)))
 
-    def _read(self, finest: Tensor, last: Tensor) -> Seen:
+    def _read(self, finest: Tensor, last: Tensor) -> BackboneOutput:
         scores = self.map(finest)
         log_heat = scores[:, 0].flatten(1).log_softmax(-1)
         weight = log_heat.exp()[:, None]
         places = middles(*scores.shape[-2:]).movedim(-1, 0).to(scores) + scores[:, 1:]
-        return Seen(
+        return BackboneOutput(
             features=torch.cat([(weight * finest.flatten(2)).sum(-1), last.mean((2, 3))], dim=-1),
             place=(weight * places.flatten(2)).sum(-1),
             log_heat=log_heat.unflatten(-1, scores.shape[-2:]),

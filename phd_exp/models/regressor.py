@@ -5,9 +5,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from phd_exp.geometry.camera import Camera
-from phd_exp.models.backbones import Backbone, Seen
+from phd_exp.models.backbones import Backbone, BackboneOutput
+from phd_exp.models.focal_length import FocalLengthInput
 from phd_exp.models.heads import Head, Prediction
-from phd_exp.models.shown import ShownFocalLength
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -24,7 +24,7 @@ class Regressor(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, backbone: Backbone, head: Head, shown: ShownFocalLength | None = None) -> None:
+    def __init__(self, backbone: Backbone, head: Head, shown: FocalLengthInput | None = None) -> None:
         super().__init__()
         self.backbone = backbone.to(memory_format=torch.channels_last)
         self.head = head
@@ -38,7 +38,7 @@ class Regressor(nn.Module):
     def forward(self, image: UInt8[Tensor, "batch height width 3"], camera: Camera) -> Prediction:
         return self.prediction(self.see(image), camera)
 
-    def prediction(self, seen: Seen, camera: Camera) -> Prediction:
+    def prediction(self, seen: BackboneOutput, camera: Camera) -> Prediction:
         """What follows from what was seen."""
         return self.head(self.numbers(seen, camera.f), camera)
 
@@ -48,15 +48,17 @@ class Regressor(nn.Module):
         """The numbers before the head, in the precision of the last layer; f (px) is wanted where it is shown."""
         return self.numbers(self.see(image), f)
 
-    def see(self, image: UInt8[Tensor, "batch height width 3"]) -> Seen:
+    def see(self, image: UInt8[Tensor, "batch height width 3"]) -> BackboneOutput:
         """What the backbone makes of the images."""
         width = image.shape[2]
         # by whole rows, which fill vector units where the three colours of a pixel do not: four times faster
         rows = image.flatten(2).to(self.mean.dtype).sub_(self.mean.repeat(width)).div_(self.std.repeat(width))
-        seen: Seen = self.backbone(rows.unflatten(2, (width, 3)).permute(0, 3, 1, 2))
+        seen: BackboneOutput = self.backbone(rows.unflatten(2, (width, 3)).permute(0, 3, 1, 2))
         return seen
 
-    def numbers(self, seen: Seen, f: Float[Tensor, " batch"] | None) -> Float[Tensor, "batch n_outputs"]:
+    def numbers(
+        self, seen: BackboneOutput, f: Float[Tensor, " batch"] | None
+    ) -> Float[Tensor, "batch n_outputs"]:
         """The numbers before the head, of what was seen, and of f where it is shown."""
         dtype = self.last.weight.dtype
         with torch.autocast(seen.features.device.type, enabled=False):

@@ -11,8 +11,8 @@ from hydra.utils import instantiate
 
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.models.backbones import Backbone
+from phd_exp.models.focal_length import FocalLengthInput
 from phd_exp.models.regressor import Regressor
-from phd_exp.models.shown import ShownFocalLength
 from phd_exp.records.errors import ConfigError
 from phd_exp.training.config import RunConfig, TrainerConfig
 
@@ -31,7 +31,7 @@ def build_regressor(config: RunConfig, depth: DepthScale) -> Regressor:
             raise ValueError(
                 f"_target_: {config.backbone['_target_']!r} makes no Backbone; see conf/backbone"
             )
-        shown = ShownFocalLength(head.n_outputs, depth) if config.camera.focal_length == "shown" else None
+        shown = FocalLengthInput(head.n_outputs, depth) if config.camera.focal_length == "shown" else None
         return Regressor(backbone, head, shown)
 
 

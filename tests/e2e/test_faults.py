@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from phd_exp.data.batches import Batch
-from phd_exp.models.backbones import Seen
+from phd_exp.models.backbones import BackboneOutput
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.module import PositionModule
@@ -142,7 +142,7 @@ def test_an_image_on_which_the_network_fails_is_named_and_the_run_goes_on_from_t
     def blind_to_one(self: PositionModule, batch: Batch, batch_idx: int) -> torch.Tensor:
         lost = (batch.row == 3) & (self.current_epoch == 1)
 
-        def seen(regressor: Regressor, image: torch.Tensor) -> Seen:
+        def seen(regressor: Regressor, image: torch.Tensor) -> BackboneOutput:
             whole = see(regressor, image)
             return whole._replace(features=whole.features.masked_fill(lost[:, None], torch.nan))
 

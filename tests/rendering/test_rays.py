@@ -97,7 +97,7 @@ def test_axes_and_pixel_middles(scenes: list[Scene]) -> None:
 
 
 def test_the_axis_of_a_cylinder_is_its_local_z(scenes: list[Scene]) -> None:
-    """Seen along its axis a cylinder is a disc, seen from the side a square."""
+    """BackboneOutput along its axis a cylinder is a disc, seen from the side a square."""
     area = (2 * 0.1 * scenes[0].f / 4.0) ** 2
     along = placed(scenes[0], position=(0.0, 0.0, 4.1))
     aside = placed(scenes[0], position=(0.0, 0.0, 4.1), rotation=(0.5**0.5, 0.5**0.5, 0.0, 0.0))

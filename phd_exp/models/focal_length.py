@@ -1,4 +1,4 @@
-"""What the focal length adds to what an image says: which depths objects are at, whatever their size."""
+"""The focal length as an input of the network, so that it can learn the range of depths in its data set."""
 
 import math
 
@@ -11,16 +11,15 @@ from phd_exp.geometry.charts import DepthScale
 WIDTH = 64
 
 
-class ShownFocalLength(nn.Module):
-    """From a head's raw numbers, and the focal length, to raw numbers; the same ones at the start of training.
+class FocalLengthInput(nn.Module):
+    """Corrects a head's raw numbers given the focal length; the identity at the start of training.
 
-    An image alone shows v_p and z/f. Where objects differ in size it shows z/f within a factor only, of which much
-    is ruled out by where objects are: if all are between 3 and 5 m, what seems to be at 6 m is larger than it seems.
-    That a network can only learn where it is shown f. It then takes for granted that objects are where those of its
-    data set were; one that is to serve elsewhere should not be shown f (camera=known).
+    An image alone shows v_p and z/f. If objects differ in size, it shows z/f only within a factor, part of which the
+    range of depths rules out: if all objects are between 3 and 5 m, one that appears to be at 6 m is larger than it
+    appears. A network can learn that only if f is an input. It then assumes that objects are where those of its
+    training data were; for use elsewhere, train with camera=known.
 
-    Two hidden layers, on the raw numbers and the logarithm of f, which is kept within log D of its middle: far from
-    the focal lengths of the data set nothing was learnt, and nothing is extrapolated.
+    Two hidden layers take the raw numbers and log f, clamped to the range of the data set: nothing is extrapolated.
 
     Args:
         n_outputs: raw numbers of the head.
