@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -53,7 +54,7 @@ class Measured:
     Attributes:
         before: of the predictions as recorded.
         after: of the same predictions recalibrated; None where nothing was held out.
-        images: a digest of the true positions: runs with the same one were tested on the same images.
+        images: a digest of data set and true positions: runs with the same one were tested on the same images.
     """
 
     before: Evaluation | None = None
@@ -70,7 +71,7 @@ def measure(folder: RunFolder, config: Mapping[str, str]) -> Measured:
     notes = Notes()
     found: dict[str, Any] = {}
     if folder.predictions.exists() and (table := notes.attempt(lambda: read_table(folder.predictions))):
-        found["images"] = _images(table)
+        found["images"] = _images(folder, table)
         if "a" in table:
             found["before"] = notes.attempt(lambda: evaluate(table))
         else:
@@ -90,8 +91,11 @@ def _recalibrated(folder: RunFolder, table: Columns) -> dict[str, Any]:
     return {"temperature": temperature, "after": evaluate(recalibrated(table, temperature))}
 
 
-def _images(table: Columns) -> str:
-    return hashlib.sha256(b"".join(table[name].tobytes() for name in "xyz" if name in table)).hexdigest()[:16]
+def _images(folder: RunFolder, table: Columns) -> str:
+    """Of the data set's name too: its variants show the same positions in other images."""
+    name = os.fsencode(folder.path.parts[-3])
+    positions = b"".join(table[axis].tobytes() for axis in "xyz" if axis in table)
+    return hashlib.sha256(name + positions).hexdigest()[:16]
 
 
 _ADAPTER: TypeAdapter[Measured] = TypeAdapter(Measured)

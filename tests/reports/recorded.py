@@ -1,11 +1,16 @@
 """Run folders as a training would leave them, with predictions that a test has drawn itself."""
 
+import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
+from filelock import FileLock
 
+from phd_exp.cli import report
 from phd_exp.records.choices import RunName
 from phd_exp.records.runs import RunFolder
 
@@ -109,3 +114,19 @@ def both_tables(runs: Path) -> dict[tuple[str, str, int], Predicted]:
     fail(runs, "scale", "mae_vz", 1)
     record(runs, "default", "mae_xyz", 0, predicted(99, probabilistic=False).frame, preset=ODD_PRESET)
     return drawn
+
+
+def reported(runs: Path, out: Path) -> None:
+    """The report of these runs, as the command makes it."""
+    assert report.main([f"runs={runs}", f"out={out}"]) == 0
+
+
+def once(factory: pytest.TempPathFactory, name: str, build: Callable[[Path], None]) -> Path:
+    """A folder that the first of all test processes builds for the others."""
+    base = factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    with FileLock(folder.with_suffix(".lock")):
+        if not folder.exists():
+            folder.mkdir()
+            build(folder)
+    return folder

@@ -12,10 +12,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from phd_exp.cli import report
 from phd_exp.evaluation.parquet import read_table
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder
+from phd_exp.reports.table import file_stem
+from tests.reports.recorded import once, reported
 from tests.reports.site.synthetic import write_run
 
 Spoil = Callable[[RunFolder], None]
@@ -46,12 +47,20 @@ def config(content: str) -> Spoil:
     return lambda run: run.config_file.write_text(content) and None  # type: ignore[return-value]
 
 
-def renamed(name: bytes | str) -> Spoil:
+RENAMED: dict[str, bytes | str] = {
+    "mathematics in a name": "$x_$",
+    "no UTF-8 in a name": b"d\xff\xfe",
+    "a name of 250 characters": "d" * 250,
+    "a name of another script": "数据 é",
+}
+
+
+def renamed(name: str) -> Spoil:
     """Give the data set's folder another name."""
 
     def spoil(run: RunFolder) -> None:
         folder = run.path.parents[1]
-        os.rename(os.fsencode(folder), os.path.join(os.fsencode(folder.parent), os.fsencode(name)))
+        os.rename(os.fsencode(folder), os.path.join(os.fsencode(folder.parent), os.fsencode(RENAMED[name])))
 
     return spoil
 
@@ -66,10 +75,10 @@ HARMLESS: dict[str, Spoil] = {
     "two test samples": rows(lambda frame: frame.head(2)),
     "one variance of zero": rows(one_zero),
     "all rows equal": rows(lambda frame: frame.loc[[0] * 50].reset_index(drop=True)),
-    "mathematics in a name": renamed("$x_$"),
-    "no UTF-8 in a name": renamed(b"d\xff\xfe"),
-    "a name of 250 characters": renamed("d" * 250),
-    "a name of another script": renamed("数据 é"),
+    "mathematics in a name": renamed("mathematics in a name"),
+    "no UTF-8 in a name": renamed("no UTF-8 in a name"),
+    "a name of 250 characters": renamed("a name of 250 characters"),
+    "a name of another script": renamed("a name of another script"),
     "a config with a lone surrogate": config('a: "\\ud800"\ndata: {root: "\\ud800", spec: {variant: x}}\n'),
     "long texts": column(file_name="x" * 100_000),
 }
@@ -98,40 +107,56 @@ BROKEN: dict[str, tuple[Spoil, str]] = {
 """What must be said on the page, in one line; empty where it may be measured all the same."""
 
 
+GOOD = "good"
+
+
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two runs, one of them to be spoiled."""
-    runs = tmp_path_factory.mktemp("whole") / "runs"
-    run = write_run(runs, "occl", n=50, epochs=2)
-    write_run(runs.parent / "elsewhere", "occl", seed=1, n=50).predictions.rename(run.held_out)
-    write_run(runs, "scale", "mae_vz", n=50, epochs=2)
-    return runs
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One report of a good run and all these."""
+    return once(tmp_path_factory, "hostile_runs", _report) / "report" / "site"
 
 
-@pytest.mark.parametrize("name", [*HARMLESS, *BROKEN])
-def test_a_run_spoils_no_report(
-    whole: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    runs, out = tmp_path / "runs", tmp_path / "report"
-    shutil.copytree(whole, runs)
-    spoil, said = BROKEN.get(name) or (HARMLESS[name], None)
-    spoil(RunFolder(runs / "small" / "occl" / "probabilistic" / "seed0"))
-    assert report.main([f"runs={runs}", f"out={out}"]) == 0
-    assert "small/scale/mae_vz/seed0" in capsys.readouterr().out
-    pages = {file.name: file.read_text() for file in (out / "site" / "runs").iterdir()}
-    good = pages.pop("small-scale-mae_vz-seed0.html")
-    assert 'class="note error"' not in good
-    assert "Learning curves" in good
-    (page,) = pages.values()
-    if said is None:
-        assert 'class="note error"' not in page, page[page.index('class="note error"') :][:300]
-        assert 'id="numbers"' in page
-    elif said:
-        assert said in page
-    for file in (out / "site" / "data").iterdir():
+def _report(folder: Path) -> None:
+    runs = folder / "runs"
+    good = write_run(runs, GOOD, n=50, epochs=2)
+    write_run(folder / "elsewhere", GOOD, seed=1, n=50).predictions.rename(good.held_out)
+    for place, spoil in enumerate([*HARMLESS.values(), *(spoil for spoil, _ in BROKEN.values())]):
+        copy = runs / "small" / f"data{place}" / "probabilistic" / "seed0"
+        shutil.copytree(good.path, copy)
+        spoil(RunFolder(copy))
+    reported(runs, folder / "report")
+
+
+def page_of(site: Path, name: str) -> str:
+    place = [*HARMLESS, *BROKEN].index(name)
+    data = RENAMED.get(name, f"data{place}")
+    return (
+        site / "runs" / f"{file_stem('small', os.fsdecode(data), 'probabilistic', 'seed0')}.html"
+    ).read_text()
+
+
+@pytest.mark.parametrize("name", HARMLESS)
+def test_what_is_only_odd_is_shown_like_any_other(site: Path, name: str) -> None:
+    page = page_of(site, name)
+    assert 'class="note error"' not in page, page[page.index('class="note error"') :][:300]
+    assert 'id="numbers"' in page
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_what_is_broken_says_so_on_its_page(site: Path, name: str) -> None:
+    said = BROKEN[name][1]
+    assert said in page_of(site, name)
+
+
+def test_all_others_are_whole(site: Path) -> None:
+    page = (site / "runs" / f"small-{GOOD}-probabilistic-seed0.html").read_text()
+    assert 'class="note error"' not in page
+    assert all(f'id="{name}"' in page for name in ("gallery", "calibration", "learning", "strata", "numbers"))
+    assert len(list((site / "runs").iterdir())) == 1 + len(HARMLESS) + len(BROKEN)
+    for file in (site / "data").iterdir():
         script = file.read_text()
-        content = script[script.index(", ") + 2 : -3]
-        json.loads(content, parse_constant=pytest.fail)  # NaN and infinity are not JSON
+        # NaN and infinity are not JSON
+        json.loads(script[script.index(", ") + 2 : -3], parse_constant=pytest.fail)
 
 
 def test_rows_are_bounded_before_they_are_read(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ _HERE = Path(__file__).parent
 class ScoreRow:
     """One line of a run's table of numbers."""
 
+    key: str
     quantity: Quantity
     before: Band
     after: Band | None
@@ -119,15 +120,16 @@ def comparison_page(runs: Sequence[Run]) -> str:
 
 
 def _score_rows(run: Run) -> list[ScoreRow]:
-    """In the order of `SCORES`; numbers that these pages do not know come last."""
+    """In the order of `SCORES`."""
     before, after = run.measured.before, run.measured.after
     if before is None:
         return []
     published = PUBLISHED.get((run.model, run.data))
-    names = [*(name for name in SCORES if name in before.scores), *(before.scores.keys() - SCORES.keys())]
+    names = [name for name in SCORES if name in before.scores]
     return [
         ScoreRow(
-            quantity(name),
+            name,
+            SCORES[name],
             before.scores[name],
             after.scores.get(name) if after else None,
             before.reference.get(name),
@@ -143,7 +145,7 @@ def run_script(drawn: Drawn) -> str:
     content = {
         "preset": run.preset, "data": run.data, "model": run.model, "run": run.name, "title": run.title,
         "images": run.measured.images, "config": dict(run.config),
-        "scores": {name: asdict(band) for name, band in before.scores.items()} if before else {},
+        "scores": {row.key: asdict(row.before) for row in _score_rows(run)},
         "resampled": _short(before.resampled) if before else {},
         "charts": {key: asdict(chart) for charts in drawn.charts.values() for key, chart in charts.items()},
     }  # fmt: skip

@@ -1,16 +1,14 @@
 """One site for all tests, from one run of each kind: good, bad and hostile."""
 
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
-from filelock import FileLock
 from PIL import Image
 
-from phd_exp.cli import report
 from phd_exp.records.choices import RunName
 from phd_exp.records.runs import RunFolder
+from tests.reports.recorded import once, reported
 from tests.reports.several import write_views
 from tests.reports.site.synthetic import write_run
 
@@ -60,14 +58,8 @@ def _folder(runs: Path, data: str, model: str) -> RunFolder:
 
 @pytest.fixture(scope="session")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder that all test processes share, with `runs/`, `renders/` and `out/site/`; nobody changes it."""
-    base = tmp_path_factory.getbasetemp()
-    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared_site"
-    with FileLock(folder.with_suffix(".lock")):
-        if not folder.exists():
-            folder.mkdir()
-            assert report.main([f"runs={write_runs(folder)}", f"out={folder / 'out'}"]) == 0
-    return folder
+    """A folder with `runs/`, `renders/` and `out/site/`; no test changes it."""
+    return once(tmp_path_factory, "shared_site", lambda folder: reported(write_runs(folder), folder / "out"))
 
 
 @pytest.fixture(scope="session")

@@ -10,9 +10,9 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
-from phd_exp.cli import report
 from phd_exp.reports.runs import Run, read_report
 from phd_exp.reports.site import build
+from tests.reports.recorded import reported
 from tests.reports.site.conftest import HOSTILE
 from tests.reports.site.synthetic import write_run
 
@@ -166,20 +166,15 @@ def own(tmp_path: Path) -> Path:
     """Two runs and their site, to be changed."""
     write_run(tmp_path / "runs", "default", "mae_vz", n=40, epochs=2)
     write_run(tmp_path / "runs", "occl", "mae_vz", n=40, epochs=2)
-    reported(tmp_path)
+    reported(tmp_path / "runs", tmp_path / "out")
     return tmp_path
-
-
-def reported(folder: Path) -> Path:
-    assert report.main([f"runs={folder / 'runs'}", f"out={folder / 'out'}"]) == 0
-    return folder / "out" / "site" / "index.html"
 
 
 def test_runs_that_are_gone_leave_nothing_and_one_alone_is_not_compared(own: Path) -> None:
     site = own / "out" / "site"
     assert "compare.html" in (site / "index.html").read_text()
     shutil.rmtree(own / "runs" / "small" / "occl")
-    reported(own)
+    reported(own / "runs", own / "out")
     assert not list(site.rglob("*occl*"))
     assert "occl-mae_vz" not in (site / "index.html").read_text()
     assert not [
@@ -198,10 +193,10 @@ def test_a_report_that_is_killed_leaves_the_old_pages(own: Path, monkeypatch: py
 
     monkeypatch.setattr(build, "run_page", killed)
     with pytest.raises(KeyboardInterrupt):
-        reported(own)
+        reported(own / "runs", own / "out")
     assert {file: file.read_bytes() for file in _pages(site)} == before
     monkeypatch.undo()
-    reported(own)
+    reported(own / "runs", own / "out")
     assert {file: file.read_bytes() for file in _pages(site)} == before
 
 
@@ -214,7 +209,7 @@ def test_a_run_that_cannot_be_drawn_says_so_alone(own: Path, monkeypatch: pytest
         return real(run)
 
     monkeypatch.setattr(build, "run_charts", faulty)
-    reported(own)
+    reported(own / "runs", own / "out")
     pages = own / "out" / "site" / "runs"
     assert "ZeroDivisionError: of nothing" in (pages / "small-occl-mae_vz-seed0.html").read_text()
     assert "Learning curves" in (pages / "small-default-mae_vz-seed0.html").read_text()

@@ -12,8 +12,8 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from phd_exp.cli import report
 from phd_exp.records.runs import RunFolder
+from tests.reports.recorded import reported
 from tests.reports.site.synthetic import write_run
 from tests.reports.site.test_browser import Visit
 
@@ -60,7 +60,7 @@ def hostile_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     failed = write_run(runs, "occl", "mae_<script>alert(1)<script>", n=40, epochs=2)
     rewrite(failed)
     failed.status_file.write_text(failed.status_file.read_text().replace('"finished"', '"failed"'))
-    assert report.main([f"runs={runs}", f"out={place / 'out'}"]) == 0
+    reported(runs, place / "out")
     return place / "out" / "site"
 
 
