@@ -65,6 +65,6 @@ def _require_small(file: Path, metadata: pq.FileMetaData) -> None:
         raise RunError(f"{file.name}: has no rows")
     if values > MOST_VALUES or size > LARGEST:
         raise RunError(
-            f"{file.name}: has {metadata.num_rows} rows of {metadata.num_columns} columns, {size / MB:.0f} MB; "
-            f"expected at most {MOST_VALUES} values and {LARGEST / MB:.0f} MB"
+            f"{file.name}: has {metadata.num_rows} rows of {metadata.num_columns} columns; expected at most "
+            f"{MOST_VALUES} values and {LARGEST / MB:.0f} MB"
         )

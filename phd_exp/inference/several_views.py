@@ -45,7 +45,7 @@ def record_views(folder: RunFolder, data: DatasetFolder, spec: DatasetSpec, scen
         known = dict(source.known("test")) | dict(
             zip((*ROTATION, *TRANSLATION), map(list, zip(*poses, strict=True)), strict=True)
         )
-        write_parquet(folder.views, table.compute(), known, said)
+        write_parquet(folder.views, table.columns(), known, said)
     return True
 
 

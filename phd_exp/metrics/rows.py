@@ -12,14 +12,14 @@ from torchmetrics.utilities import dim_zero_cat
 class Rows(Metric):
     """Collects named columns, one row a sample, over batches and processes.
 
-    `compute` returns the columns in float64 on the CPU, sorted by the column `row` where there is one, so that the
+    `columns` returns them in float64 on the CPU, sorted by the column `row` where there is one, so that the
     result does not depend on how the samples were dealt out. A checkpoint in the middle of an epoch holds the rows so
     far. Two thousand rows of thirty columns take 0.5 MB.
 
     Example:
         >>> rows = Rows()
         >>> rows.update({"row": torch.tensor([1, 0]), "error": torch.tensor([0.5, 0.25])})
-        >>> rows.compute()["error"].tolist()
+        >>> rows.columns()["error"].tolist()
         [0.25, 0.5]
     """
 
@@ -38,9 +38,13 @@ class Rows(Metric):
         self.names = tuple(columns)
         self.parts.append(torch.stack([column.detach().double() for column in columns.values()], dim=-1))
 
-    def compute(self) -> dict[str, Float[Tensor, " rows"]]:
-        """All rows, column by column."""
-        table = dim_zero_cat(self.parts).cpu()
+    def compute(self) -> Float[Tensor, "rows columns"]:
+        """The whole table, in the order of `names`."""
+        return dim_zero_cat(self.parts).cpu()
+
+    def columns(self) -> dict[str, Float[Tensor, " rows"]]:
+        """All rows of all processes, column by column; torchmetrics alone would make scalars of a single row."""
+        table = self.compute().reshape(-1, len(self.names))
         columns = dict(zip(self.names, table.unbind(-1), strict=True))
         if "row" not in columns:
             return columns

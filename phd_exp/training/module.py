@@ -87,7 +87,7 @@ class PositionModule(LightningModule):
         return total
 
     def on_train_epoch_end(self) -> None:
-        table = self.training_rows.compute()
+        table = self.training_rows.columns()
         self.training_rows.reset()
         self.log_dict({f"train/{name}": column.mean().float() for name, column in table.items()})
 
@@ -114,7 +114,7 @@ class PositionModule(LightningModule):
         return losses
 
     def _finish_evaluation(self) -> None:
-        self.table = self.evaluation_rows.compute()
+        self.table = self.evaluation_rows.columns()
         self.evaluation_rows.reset()
 
     def _require_finite(self, total: Tensor, losses: Tensor, batch: Batch, split: str) -> None:

@@ -23,4 +23,4 @@ def test_a_function_makes_a_metric() -> None:
     table = Rows()
     for rows in (slice(0, 3), slice(3, 50)):
         table.update({"angle": angle(xyz[rows], estimate[rows])})
-    torch.testing.assert_close(table.compute()["angle"], reference)
+    torch.testing.assert_close(table.columns()["angle"], reference)

@@ -24,18 +24,23 @@ def collected(parts: Sequence[torch.Tensor]) -> Rows:
 @pytest.mark.parametrize("sizes", [[N], [1, N - 1], [8, 8, 7]])
 def test_batches_do_not_matter(sizes: list[int]) -> None:
     shuffled = torch.randperm(N, generator=torch.Generator().manual_seed(0))
-    found = collected(shuffled.split(sizes)).compute()
+    found = collected(shuffled.split(sizes)).columns()
     assert found["row"].tolist() == list(range(N))
     torch.testing.assert_close(found["error"], torch.arange(N).float().double() / 7, rtol=1e-6, atol=0)
     assert {column.dtype for column in found.values()} == {torch.float64}
+
+
+def test_one_row_is_a_table_too() -> None:
+    found = collected([torch.tensor([0])]).columns()
+    assert {name: column.shape for name, column in found.items()} == {"row": (1,), "error": (1,)}
 
 
 def test_processes_do_not_matter() -> None:
     """Each takes every second row; merged as torchmetrics merges their states."""
     ranks = [collected(torch.arange(N)[rank::2].split(4)) for rank in range(2)]
     ranks[0].merge_state(ranks[1])
-    whole = collected([torch.arange(N)]).compute()
-    for name, column in ranks[0].compute().items():
+    whole = collected([torch.arange(N)]).columns()
+    for name, column in ranks[0].columns().items():
         assert torch.equal(column, whole[name]), name
 
 
@@ -44,7 +49,7 @@ def test_a_checkpoint_in_the_middle_of_an_epoch_holds_the_rows_so_far() -> None:
     resumed = Rows()
     resumed.load_state_dict(collected([first]).state_dict())
     resumed.update(table(second))
-    assert torch.equal(resumed.compute()["error"], collected([first, second]).compute()["error"])
+    assert torch.equal(resumed.columns()["error"], collected([first, second]).columns()["error"])
 
 
 def test_other_columns_are_refused() -> None:

@@ -1,7 +1,6 @@
 """Runs and how they stand, from records alone."""
 
 import json
-import os
 from dataclasses import asdict
 from pathlib import Path
 
@@ -85,30 +84,6 @@ def test_a_lock_that_cannot_be_tried_is_said(tmp_path: Path, monkeypatch: pytest
     assert run.state == "running"
     assert "interrupted" in run.detail
     assert "Permission denied" in run.detail
-
-
-@pytest.mark.parametrize("content", ["{", "[]", "\udcff"], ids=["torn", "no status", "no text"])
-def test_a_broken_status_is_named_and_the_others_live(tmp_path: Path, content: str) -> None:
-    broken = record(tmp_path, "default", "mae_vz", 0)
-    broken.status_file.write_bytes(os.fsencode(content))
-    record(tmp_path, "occl", "probabilistic", 0, predicted(0).frame)
-    bad, good = read_report(tmp_path).runs
-    assert bad.state == "unreadable"
-    assert "status.json" in bad.detail
-    assert "\n" not in bad.detail
-    assert good.state == "finished"
-
-
-def test_predictions_that_cannot_be_used_are_named_and_the_others_live(tmp_path: Path) -> None:
-    record(tmp_path, "default", "mae_vz", 0)
-    record(tmp_path, "default", "mae_vz", 1, predicted(0).frame.drop(columns="mode_x"))
-    record(tmp_path, "default", "mae_vz", 2, predicted(0).frame)
-    missing, lacking, good = read_report(tmp_path).runs
-    assert [run.state for run in (missing, lacking, good)] == ["unreadable", "unreadable", "finished"]
-    assert missing.detail == (
-        "predictions.parquet: missing, though the run has finished; delete the folder to run again"
-    )
-    assert "have no column mode_x" in lacking.detail
 
 
 def test_runs_with_other_overrides_are_apart_and_say_which(tmp_path: Path) -> None:

@@ -114,7 +114,7 @@ def test_the_record_is_in_the_order_of_the_data_set(
     }
     rows = Rows()
     rows.update(columns(distribution, batch))
-    write_parquet(tmp_path / "predictions.parquet", rows.compute(), known)
+    write_parquet(tmp_path / "predictions.parquet", rows.columns(), known)
     frame = pd.read_parquet(tmp_path / "predictions.parquet")
     assert frame["file_name"].tolist() == [f"{i:06d}.png" for i in range(len(batch))]
     assert frame["f"].tolist() == known["f"]

@@ -36,7 +36,8 @@ def print_report(report: Report, tables: Sequence[Table]) -> None:
     for note in dict.fromkeys(note for table in tables for note in table.notes):
         _say(console, note)
     if tables and not console.is_terminal:
-        _say(console, f"{OF_A_STAR}\n")
+        _say(console, OF_A_STAR)
+        console.print()
     _print_runs(console, report.runs)
     if not any(table.kind == "tables" for table in tables):
         what = "no run of a table yet" if report.runs else "no runs recorded yet"
