@@ -366,7 +366,7 @@ def test_the_report_computes_what_training_recorded(
     assert run.nll == pytest.approx(results["test/nll"])
     outcome = phd_exp("report")
     assert outcome.status == 0
-    (line,) = [line for line in outcome.out.splitlines() if run.folder.path.name in line]
+    (line,) = [line for line in outcome.out.splitlines() if run.path in line]
     assert f"{results['test/nll']:.2f}" in line.split()
     assert "finished" in line
 
