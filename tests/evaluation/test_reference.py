@@ -12,7 +12,7 @@ from tests.reports.site.synthetic import calibrated, truths
 TIMES = 150
 
 
-@pytest.mark.parametrize("n", [60, 250])
+@pytest.mark.parametrize("n", [60, pytest.param(250, marks=pytest.mark.slow)])
 def test_calibrated_models_lie_in_the_interval_95_times_of_100(n: int) -> None:
     prediction = calibrated(truths(n, seed=1)[0], a=20.0, A=600.0, overconfidence=1.0, seed=3)
     reference = calibrated_reference(prediction, simulations=400)

@@ -68,6 +68,7 @@ def worst(made: Predictor, images: np.ndarray, f: np.ndarray) -> dict[str, np.nd
     return deviations
 
 
+@pytest.mark.slow
 def test_the_distribution_is_that_of_torch(composed: Callable[..., Any]) -> None:
     made = predictor(composed, DistributionHead(DEPTH), temperature=Temperature(1.3, 0.7))
     draw = np.random.default_rng(0)
