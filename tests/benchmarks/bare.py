@@ -26,7 +26,7 @@ class Bare:
         for rows in torch.randperm(len(self.samples)).split(self.batch_size):
             batch = self.samples.select(rows)
             with torch.autocast("cpu", enabled=self.mixed):
-                loss = self.loss(self.regressor(batch.image, batch.camera), batch.xyz)
+                loss = self.loss(self.regressor(batch.image, batch.camera), batch.xyz).mean()
             self.optimizer.zero_grad()
             loss.backward()
             self.optimizer.step()

@@ -61,7 +61,7 @@ class Conventional:
         for pixels, xyz, f in self.loader:
             camera = Camera(f, self.S)
             prediction = self.regressor.prediction(self.regressor.backbone(pixels), camera)
-            loss = self.loss(prediction, xyz)
+            loss = self.loss(prediction, xyz).mean()
             self.optimizer.zero_grad()
             loss.backward()
             self.optimizer.step()

@@ -58,15 +58,19 @@ def test_nothing_but_arithmetic(
 @pytest.mark.parametrize(
     ("name", "least", "overrides"),
     [
-        ("resnet50, 224 px", 3.5 if BFLOAT16 else 1, ("preset=paper", "data.n_train=48", "data.batch_size=16")),
-        ("preset=small", 3.5 if BFLOAT16 else 1, ("preset=small", "data.n_train=480")),
+        ("resnet50, 224 px", 2 if BFLOAT16 else 1, ("preset=paper", "data.n_train=48", "data.batch_size=16")),
+        ("preset=small", 1.5 if BFLOAT16 else 1, ("preset=small", "data.n_train=480")),
     ],
     ids=["resnet50", "small"],
 )  # fmt: skip
 def test_faster_than_the_conventional_loop(
     tmp_path: Path, renders: Path, record: Callable, name: str, least: float, overrides: tuple[str, ...]
 ) -> None:
-    """Without units for bfloat16 the arithmetic, which is most of it, takes as long in either."""
+    """The programme is as fast as a bare loop, so this ratio is that of the arithmetic: bfloat16 against float32.
+
+    It depends on the CPU: 2.6 to 3.2 (resnet50) and 1.9 to 2.6 (small) on CPUs with bfloat16 units, 1.2 and 1.3 on one
+    without. Convolutions take two thirds of a bfloat16 step; what is left, casts and Adam, is the bare loop's too.
+    """
     words = (f"data.root={renders}", "data.n_held_out=0", "data.n_test=8", *overrides)
     found = measured("conventional", tmp_path, *words)
     ratio = compared(found, "conventional", f"programme, {name}", str(least), record)

@@ -17,7 +17,7 @@ from phd_exp.reports.table import NOTHING, Table, TableCell
 
 WIDTH = 118
 """Columns, also where the output is no terminal and rich would fall back to 80."""
-OF_A_STAR = "*: bold."
+OF_A_STAR = "* marks what a terminal shows in bold."
 
 
 def print_report(report: Report, tables: Sequence[Table]) -> None:
@@ -35,9 +35,10 @@ def print_report(report: Report, tables: Sequence[Table]) -> None:
         _say_command(console, "Made by", command)
     for note in dict.fromkeys(note for table in tables for note in table.notes):
         _say(console, note)
-    if tables and not console.is_terminal:
+    cells = (cell for table in tables for group in table.groups for row in group for cell in row.cells)
+    if not console.is_terminal and any(cell.bold for cell in cells):
         _say(console, OF_A_STAR)
-        console.print()
+    console.print()
     _print_runs(console, report.runs)
     if not any(table.kind == "tables" for table in tables):
         what = "no run of a table yet" if report.runs else "no runs recorded yet"
