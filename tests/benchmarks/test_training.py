@@ -69,7 +69,7 @@ def test_faster_than_the_conventional_loop(
     """The programme is as fast as a bare loop, so this ratio is that of the arithmetic: bfloat16 against float32.
 
     It depends on the CPU: 2.6 to 3.2 (resnet50) and 1.9 to 2.6 (small) on CPUs with bfloat16 units, 1.2 and 1.3
-    on one without. Convolutions take two thirds of a bfloat16 step; what is left, casts and Adam, is the bare loop's too.
+    on one without. Convolutions take two thirds of a bfloat16 step; the rest, casts and Adam, is the bare loop's too.
     """
     words = (f"data.root={renders}", "data.n_held_out=0", "data.n_test=8", *overrides)
     found = measured("conventional", tmp_path, *words)
