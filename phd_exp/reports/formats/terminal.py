@@ -38,7 +38,8 @@ def print_report(report: Report, tables: Sequence[Table]) -> None:
     cells = (cell for table in tables for group in table.groups for row in group for cell in row.cells)
     if not console.is_terminal and any(cell.bold for cell in cells):
         _say(console, OF_A_STAR)
-    console.print()
+    if tables:
+        console.print()
     _print_runs(console, report.runs)
     if not any(table.kind == "tables" for table in tables):
         what = "no run of a table yet" if report.runs else "no runs recorded yet"
