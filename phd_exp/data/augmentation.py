@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from phd_exp.data.batches import Batch
+from phd_exp.data.photometry import Photometry
 from phd_exp.geometry.grid import middles
 from phd_exp.geometry.motion import Motion, small_turns, symmetries
 
@@ -21,27 +22,31 @@ class Augmentation:
         symmetries: one of the eight turns and mirrors that map pixels to pixels.
         largest_zoom: a small turn and zoom of the camera, up to this factor; 1 for none.
         colours: the three colour channels in any order, which tells nothing of where things are.
+        photometry: changes of light and image quality.
     """
 
-    n_numbers: ClassVar[int] = 10
+    n_numbers: ClassVar[int] = 10 + Photometry.n_numbers
     symmetries: bool
     largest_zoom: float
     colours: bool
+    photometry: Photometry
 
     @property
     def changes_anything(self) -> bool:
         """Whether any change can be drawn."""
-        return self.symmetries or self.largest_zoom > 1 or self.colours
+        return self.symmetries or self.largest_zoom > 1 or self.colours or self.photometry.changes_anything
 
-    def __call__(self, batch: Batch, numbers: Float[Tensor, "batch 10"]) -> Batch:
-        """The samples, changed as uniform numbers from -1 to 1 say.
+    def __call__(self, batch: Batch, numbers: Float[Tensor, "batch 22"]) -> Batch:
+        """The samples, changed given uniform numbers from -1 to 1.
 
         One whose object would leave the image by a turn or zoom keeps its symmetry alone.
         """
+        if self.photometry.changes_anything:
+            batch = replace(batch, image=self.photometry(batch.image, numbers[:, 10:]))
         numbers = numbers.to(batch.f)
         camera = batch.camera
         signs = numbers[:, :3] if self.symmetries else torch.ones_like(numbers[:, :3])
-        colours = numbers[:, 7:].argsort(dim=-1) if self.colours else torch.arange(3).expand(len(batch), 3)
+        colours = numbers[:, 7:10].argsort(dim=-1) if self.colours else torch.arange(3).expand(len(batch), 3)
         symmetry = symmetries(signs)
         if self.largest_zoom > 1:
             motion = small_turns(numbers[:, 3:7], self.largest_zoom, camera).after(symmetry)

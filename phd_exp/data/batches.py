@@ -7,9 +7,13 @@ from typing import ClassVar, Protocol, runtime_checkable
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
+from numpy.typing import NDArray
 from torch import Tensor
 
 from phd_exp.geometry.camera import Camera
+
+OCTANTS = 8
+"""Combinations of three signs."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +73,9 @@ class BatchLoader:
     Of several processes that train together each takes its share of every batch: rank r the rows r, r + world, ...
     No row is seen twice, and a last batch that has no row for a rank does not exist for it.
 
-    `augment` changes a batch as so many random numbers a row say. They are a function of (seed, epoch, batch) for the
-    whole batch, of which each process takes its share, so that they depend on neither what ran before nor `world`.
+    `augment` changes a batch given random numbers, `n_numbers` a row. They are a function of (seed, epoch, batch) for
+    the whole batch, of which each process takes its share, so they depend neither on what ran before nor on `world`.
+    The signs of a row's first three numbers are stratified: within eight epochs each row gets all eight combinations.
     """
 
     def __init__(
@@ -105,12 +110,13 @@ class BatchLoader:
             self.epoch += 1  # at the start, since an iterator is not always exhausted
             self.next_batch = 0
         order = self.order(self.epoch)
+        signs = self.signs(self.epoch) if self.augment else np.empty(0)
         while self.next_batch < len(self):
             number, start = self.next_batch, self.next_batch * self.batch_size
             self.next_batch += 1
             rows = order[start : start + self.batch_size]
             batch = self.samples.select(rows[self.rank :: self.world])
-            yield self._augmented(batch, number) if self.augment else batch
+            yield self.augment(batch, self._numbers(signs[rows], number)) if self.augment else batch
 
     def order(self, epoch: int) -> Int[Tensor, " samples"]:
         """The rows in the order in which that epoch visits them."""
@@ -118,11 +124,19 @@ class BatchLoader:
             return torch.arange(len(self.samples))
         return torch.from_numpy(self._random(epoch).permutation(len(self.samples)))
 
-    def _augmented(self, batch: Batch, number: int) -> Batch:
+    def _numbers(self, signs: NDArray[np.int64], number: int) -> Float[Tensor, "share n_numbers"]:
+        """This process's share of a batch's random numbers, uniform from -1 to 1, given the signs of the first."""
         assert self.augment is not None
-        numbers = self._random(self.epoch, number).uniform(-1, 1, (self.batch_size, self.augment.n_numbers))
-        mine = torch.from_numpy(numbers[self.rank :: self.world][: len(batch)])
-        return self.augment(batch, mine)
+        numbers = self._random(self.epoch, number).uniform(-1, 1, (len(signs), self.augment.n_numbers))
+        numbers[:, :3] = signs * np.abs(numbers[:, :3])
+        return torch.from_numpy(numbers[self.rank :: self.world])
+
+    def signs(self, epoch: int) -> NDArray[np.int64]:
+        """The signs (samples, 3) of an epoch: a random order of all eight for each sample in every eight epochs."""
+        block, place = divmod(epoch, OCTANTS)
+        orders = np.tile(np.arange(OCTANTS), (len(self.samples), 1))
+        octant = self._random(block, 0, 0).permuted(orders, axis=1)[:, place]
+        return 1 - 2 * ((octant[:, None] >> np.arange(3)) & 1)
 
     def _random(self, *place: int) -> np.random.Generator:
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=place))

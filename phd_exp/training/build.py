@@ -1,6 +1,7 @@
 """The one place, with `network.py`, that turns a checked configuration into objects."""
 
 import sys
+from dataclasses import fields
 from functools import partial
 
 from hydra.utils import instantiate
@@ -11,12 +12,14 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar, 
 from phd_exp.data.augmentation import Augmentation
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.folder import FolderSource
+from phd_exp.data.photometry import Photometry
 from phd_exp.data.sources import Part, RenderedSource, Source
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError
 from phd_exp.training.checkpoints import AtomicCheckpoints
 from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig
+from phd_exp.training.config.sections import RecipeConfig
 from phd_exp.training.module import PositionModule
 from phd_exp.training.network import build_regressor, naming, precision
 from phd_exp.training.progress import Progress
@@ -33,12 +36,15 @@ def build_data(config: RunConfig, rank: int = 0) -> PositionData:
         seed=config.seed,
         rank=rank,
         world=config.trainer.devices,
-        augment=_augmentation(config),
+        augment=build_augmentation(config.recipe),
     )
 
 
-def _augmentation(config: RunConfig) -> Augmentation | None:
-    augmentation = Augmentation(**config.recipe.augmentation.model_dump())
+def build_augmentation(recipe: RecipeConfig) -> Augmentation | None:
+    """The augmentation of a recipe; None if it changes nothing."""
+    keys = recipe.augmentation.model_dump()
+    photometry = Photometry(**{field.name: keys.pop(field.name) for field in fields(Photometry)})
+    augmentation = Augmentation(**keys, photometry=photometry)
     return augmentation if augmentation.changes_anything else None
 
 

@@ -6,11 +6,13 @@ from torch.testing import assert_close
 
 from phd_exp.data.augmentation import Augmentation, moved
 from phd_exp.data.batches import Batch
+from phd_exp.data.photometry import Photometry
 from phd_exp.geometry import Camera
 from phd_exp.geometry.motion import Motion, symmetries
 
 SIDE = 48
 N = 64
+PLAIN = Photometry()
 
 
 def spots(camera: Camera, xyz: torch.Tensor) -> torch.Tensor:
@@ -34,7 +36,7 @@ def spot_of(image: torch.Tensor) -> torch.Tensor:
 
 
 def augmented(batch: Batch, largest_zoom: float, seed: int) -> Batch:
-    augment = Augmentation(symmetries=True, largest_zoom=largest_zoom, colours=False)
+    augment = Augmentation(symmetries=True, largest_zoom=largest_zoom, colours=False, photometry=PLAIN)
     return augment(batch, numbers(seed))
 
 
@@ -107,7 +109,7 @@ def test_the_same_seed_gives_the_same_batch(batch: Batch) -> None:
 def test_colours_change_places_alone(batch: Batch) -> None:
     noise = torch.randint(0, 256, batch.image.shape, dtype=torch.uint8)
     batch = Batch(noise, batch.xyz, batch.f, batch.S, batch.row)
-    new = Augmentation(symmetries=False, largest_zoom=1.0, colours=True)(batch, numbers(1))
+    new = Augmentation(symmetries=False, largest_zoom=1.0, colours=True, photometry=PLAIN)(batch, numbers(1))
     assert torch.equal(new.xyz, batch.xyz)
     assert torch.equal(new.image.sort(-1).values, noise.sort(-1).values)
     orders = {tuple(new.image[row, 0, 0].tolist()) == tuple(noise[row, 0, 0].tolist()) for row in range(N)}
@@ -117,9 +119,17 @@ def test_colours_change_places_alone(batch: Batch) -> None:
     assert all(any(torch.equal(new.image[0, ..., channel], one) for one in first) for channel in range(3))
 
 
-@pytest.mark.parametrize("part", [{"symmetries": True}, {"largest_zoom": 1.2}, {"colours": True}])
+@pytest.mark.parametrize(
+    "part",
+    [
+        {"symmetries": True},
+        {"largest_zoom": 1.2},
+        {"colours": True},
+        {"photometry": Photometry(brightness=2.0)},
+    ],
+)
 def test_each_part_is_there_by_itself(batch: Batch, part: dict) -> None:
-    nothing = {"symmetries": False, "largest_zoom": 1.0, "colours": False}
+    nothing = {"symmetries": False, "largest_zoom": 1.0, "colours": False, "photometry": PLAIN}
     assert not Augmentation(**nothing).changes_anything
     augment = Augmentation(**(nothing | part))
     assert augment.changes_anything
@@ -127,4 +137,4 @@ def test_each_part_is_there_by_itself(batch: Batch, part: dict) -> None:
     new = augment(Batch(noise, batch.xyz, batch.f, batch.S, batch.row), numbers(1))
     assert not torch.equal(new.image, noise)
     assert torch.equal(new.f, batch.f) == ("largest_zoom" not in part)
-    assert torch.equal(new.xyz, batch.xyz) == ("colours" in part)
+    assert torch.equal(new.xyz, batch.xyz) == (part.keys() <= {"colours", "photometry"})

@@ -108,7 +108,7 @@ def test_shares_are_each_batch_without_gaps_and_repeats(samples: Batch, world: i
 class Shift:
     """Adds one of the numbers to the positions, so that they can be seen."""
 
-    n_numbers = 2
+    n_numbers = 3
 
     def __call__(self, batch: Batch, numbers: torch.Tensor) -> Batch:
         return replace(batch, xyz=batch.xyz + numbers[:, :1])
@@ -136,3 +136,23 @@ def test_random_changes_depend_on_seed_epoch_and_batch_alone(samples: Batch) -> 
     for rank in range(2):
         for mine, whole in zip(changing(rank=rank, world=2), first, strict=True):
             assert torch.equal(mine.xyz, whole.xyz[rank::2])
+
+
+def test_every_row_gets_all_eight_signs_in_eight_epochs(samples: Batch) -> None:
+    class Signs:
+        """Records the signs of the first three numbers as positions."""
+
+        n_numbers = 3
+
+        def __call__(self, batch: Batch, numbers: torch.Tensor) -> Batch:
+            assert numbers.abs().max() <= 1
+            return replace(batch, xyz=numbers.sign())
+
+    batches = BatchLoader(samples, 5, shuffle=True, drop_last=True, seed=0, augment=Signs())
+    for _ in range(2):
+        seen: dict[int, list[tuple[float, ...]]] = {row: [] for row in range(N)}
+        for batch in (batch for _ in range(8) for batch in batches):
+            for row, signs in zip(batch.row.tolist(), batch.xyz.tolist(), strict=True):
+                seen[row].append(tuple(signs))
+        assert all(len(set(signs)) == 8 for signs in seen.values())
+    assert len({tuple(signs) for signs in seen.values()}) > N // 2  # each in an order of its own

@@ -39,12 +39,22 @@ class TrainerConfig(Section):
     progress_bar: Annotated[bool, Field(strict=True)]
 
 
+Factor = Annotated[float, Field(ge=1, le=10)]
+
+
 class AugmentationConfig(Section):
-    """As `Augmentation`, whose arguments these are."""
+    """The arguments of `Augmentation` and of its `Photometry`."""
 
     symmetries: Annotated[bool, Field(strict=True)]
     largest_zoom: Annotated[float, Field(ge=1, le=2)]
     colours: Annotated[bool, Field(strict=True)]
+    brightness: Factor
+    contrast: Factor
+    gamma: Factor
+    white_balance: Factor
+    blur: Annotated[float, Field(ge=0, le=20)]
+    noise: Annotated[float, Field(ge=0, le=100)]
+    jpeg: Annotated[Whole, Field(ge=1, le=100)]
 
 
 class RecipeConfig(Section):

@@ -1,0 +1,76 @@
+"""Photometric changes: each does what it is named after, to the share of images that it is drawn for, and no more."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+
+from phd_exp.data.photometry import Photometry
+
+N, SIDE = 400, 32
+
+
+def numbers(n: int = N) -> torch.Tensor:
+    return 2 * torch.rand(n, Photometry.n_numbers, generator=torch.Generator().manual_seed(0)) - 1
+
+
+def images(n: int = N) -> torch.Tensor:
+    """Smooth gradients between 60 and 160, other in each channel."""
+    ramp = torch.linspace(60, 160, SIDE)
+    one = torch.stack(
+        [ramp.expand(SIDE, SIDE), ramp[:, None].expand(SIDE, SIDE), ramp.flip(0).expand(SIDE, SIDE)], -1
+    )
+    return one.round().to(torch.uint8).expand(n, SIDE, SIDE, 3).contiguous()
+
+
+@pytest.mark.parametrize(
+    ("limits", "share"),
+    [
+        ({"brightness": 2.0}, 1 / 2), ({"contrast": 2.0}, 1 / 2), ({"gamma": 2.0}, 1 / 2),
+        ({"white_balance": 1.5}, 1 / 2), ({"blur": 3.0}, 1 / 4), ({"noise": 20.0}, 1 / 4), ({"jpeg": 20}, 1 / 4),
+    ],
+    ids=lambda value: "" if isinstance(value, float) else next(iter(value)),
+)  # fmt: skip
+def test_each_change_is_drawn_for_its_share_of_images(limits: dict, share: float) -> None:
+    changed = Photometry(**limits)(images(), numbers()).ne(images()).flatten(1).any(1)
+    assert changed.float().mean().item() == pytest.approx(share, abs=0.08)
+    assert not Photometry().changes_anything
+    assert Photometry(**limits).changes_anything
+
+
+def drawn(number: float, place: int) -> torch.Tensor:
+    """Numbers of one image that draw one change, at this strength, and no other."""
+    row = torch.zeros(1, Photometry.n_numbers)
+    row[0, 0], row[0, place] = 1.0, number
+    return row
+
+
+def value(image: torch.Tensor) -> np.ndarray:
+    return image[0].double().numpy() / 255
+
+
+@pytest.mark.parametrize("number", [-1.0, -0.4, 0.7, 1.0])
+def test_tones_follow_their_formulas(number: float) -> None:
+    before = value(images(1))
+    expected = {
+        1: (Photometry(brightness=1.5), before * 1.5**number),
+        2: (Photometry(contrast=1.5), 0.5 + (before - 0.5) * 1.5**number),
+        3: (Photometry(gamma=2.0), before ** (2**number)),
+        5: (Photometry(white_balance=1.5), before * np.array([1, 1.5**number, 1])),
+    }
+    for place, (photometry, after) in expected.items():
+        found = value(photometry(images(1), drawn(number, place)))
+        np.testing.assert_allclose(found, after.clip(0, 1), atol=0.51 / 255)
+
+
+def test_blur_noise_and_compression() -> None:
+    edge = images(1)
+    edge[:, :, SIDE // 2 :] = 255
+    blurred = value(Photometry(blur=2.0)(edge, drawn(1.0, 7)))
+    reference = gaussian_filter(value(edge), (2, 2, 0), mode="nearest")
+    np.testing.assert_allclose(blurred, reference, atol=0.03)
+    noisy = value(Photometry(noise=10.0)(images(1), drawn(1.0, 8))) - value(images(1))
+    assert noisy.std() * 255 == pytest.approx(10, rel=0.05)
+    assert abs(noisy.mean()) * 255 < 1
+    lossy = [value(Photometry(jpeg=20)(edge, drawn(strength, 11))) - value(edge) for strength in (0.8, 1.0)]
+    assert 0 < lossy[0].std() < lossy[1].std() < 0.2
