@@ -15,7 +15,7 @@ class Ending(NamedTuple):
     """How a verb or a job ended.
 
     Attributes:
-        state: in a word or two.
+        state: one or two words.
         lines: what is wrong, one thing a line.
         exit_status: 0 if it ended well.
         value: the number that a sweeper minimizes.

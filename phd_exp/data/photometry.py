@@ -68,9 +68,9 @@ class Photometry:
 
     def _tone(self, numbers: list[float]) -> list[int]:
         """What each of the 256 levels of the three channels becomes."""
+        limits = (self.brightness, self.contrast, self.gamma)
         brightness, contrast, gamma = (
-            limit**number
-            for limit, number in zip((self.brightness, self.contrast, self.gamma), numbers, strict=False)
+            limit**number for limit, number in zip(limits, numbers[:3], strict=True)
         )
         gain = brightness * self.white_balance ** np.array(numbers[3:])
         value = (gain[:, None] * np.arange(256) / 255).clip(0, 1)

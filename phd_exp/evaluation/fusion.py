@@ -15,7 +15,7 @@ from phd_exp.evaluation.predictions import band_of
 from phd_exp.evaluation.reference import Band
 from phd_exp.evaluation.several_views import SeveralViews
 from phd_exp.fusion import Fused, Plane, Pose, Status, average, fuse, gaussian_fusion
-from phd_exp.metrics.bootstrap import bands
+from phd_exp.metrics.bootstrap import bands, means
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, squared_mahalanobis
 from phd_exp.records.errors import RunError
 
@@ -185,12 +185,8 @@ def _within(distance: Float[Tensor, " scenes"], dimensions: int) -> dict[str, Te
 
 def _bands(columns: Mapping[tuple[str, Method], Tensor], resamples: int) -> dict[tuple[str, Method], Band]:
     named = {"/".join(key): column for key, column in columns.items()}
-    found = bands(_means, named, resamples, SEED)
+    found = bands(means, named, resamples, SEED)
     return {key: band_of(found["/".join(key)]) for key in columns}
-
-
-def _means(columns: Mapping[str, Tensor], counts: Tensor) -> dict[str, Tensor]:
-    return {name: (counts @ column.double()) / counts.sum(-1) for name, column in columns.items()}
 
 
 def _common_cause(views: SeveralViews, resamples: int) -> tuple[Band, Band]:

@@ -20,7 +20,7 @@ from scipy import stats
 from torch import Tensor
 
 from phd_exp.evaluation.parquet import Columns
-from phd_exp.metrics.bootstrap import resampled
+from phd_exp.metrics.bootstrap import means, resampled
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
 from phd_exp.records.errors import RunError
 
@@ -84,10 +84,10 @@ def mean_errors(table: Columns, estimates: Sequence[Estimate]) -> MeanErrors:
             raise RunError(f"predictions: column {name} is not finite everywhere, or not positive")
     truth = _stacked(table, ("x", "y", "z"))
     central = in_central_half(truth, _stacked(table, ("f",)), _stacked(table, ("S",)))
-    means = dict(_means(truth, central, {name: _points(table, name) for name in estimates}))
-    if not all(np.isfinite(mean.value) for mean in means.values()):
+    found = dict(_means(truth, central, {name: _points(table, name) for name in estimates}))
+    if not all(np.isfinite(mean.value) for mean in found.values()):
         raise RunError("predictions: are so far off that a mean error is not finite")
-    return means
+    return found
 
 
 def in_central_half(
@@ -111,17 +111,13 @@ def _means(
             for estimate, points in estimates.items()
             for quantity, error in _ERRORS.items()
         }
-        _, drawn = resampled(_column_means, columns, RESAMPLES, SEED)
+        _, drawn = resampled(means, columns, RESAMPLES, SEED)
         for name, values in columns.items():
             estimate, quantity = name.split()
             n = len(values)
             error = float(values.std() / n**0.5) if n > 1 else None
             mean = SampleMean(n, float(values.mean()), error, drawn[name].numpy())
             yield ErrorKey(estimate, reading, quantity), mean  # type: ignore[arg-type]
-
-
-def _column_means(columns: Mapping[str, Tensor], counts: Tensor) -> dict[str, Tensor]:
-    return {name: (counts @ column) / counts.sum(-1) for name, column in columns.items()}
 
 
 def _stacked(table: Columns, names: Sequence[str]) -> Tensor:

@@ -22,7 +22,7 @@ AGREE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class BackboneOutput:
+class Outputs:
     """Network outputs for a sequence of views, and the poses of their virtual cameras in the world."""
 
     raw: Float[Tensor, "views 7"]
@@ -30,7 +30,7 @@ class BackboneOutput:
     pose: Pose
 
     @classmethod
-    def of(cls, scenes: Sequence[Observed], sightings: Iterable[Sighting]) -> "BackboneOutput":
+    def of(cls, scenes: Sequence[Observed], sightings: Iterable[Sighting]) -> "Outputs":
         """From the sightings of the scenes' detections, in their order; no image is kept.
 
         A virtual camera is the real one turned: v_virtual = R_v v_camera, so that its pose is (R_v R, R_v t).
@@ -61,7 +61,7 @@ def fused_answers(
     Raises DatasetError, before the first sighting is computed, if lines of a scene give different true positions.
     """
     truth = true_positions(scenes)
-    seen = BackboneOutput.of(scenes, sightings)
+    seen = Outputs.of(scenes, sightings)
     rows, mask = layout([len(scene.detections) for scene in scenes])
     predictions = predictor.predict(seen.raw[rows], seen.f[rows])
     assert isinstance(predictions, ProjectedHuber)

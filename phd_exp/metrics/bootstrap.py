@@ -82,3 +82,8 @@ def interval(value: Tensor, drawn: Tensor, confidence: float = 0.95) -> Interval
     # a resample may lack every sample that a point needs
     low, high = torch.nanquantile(drawn, tails, dim=0)
     return Interval(value, torch.minimum(low, value), torch.maximum(high, value))
+
+
+def means(columns: Mapping[str, Tensor], counts: Tensor) -> dict[str, Tensor]:
+    """The statistic of which each number is the mean of a column."""
+    return {name: (counts @ column.double()) / counts.sum(-1) for name, column in columns.items()}

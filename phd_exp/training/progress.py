@@ -9,6 +9,8 @@ from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.utilities import rank_zero_only
 
+from phd_exp.training.recorder import epoch_metrics
+
 FIRST_LINE = 5.0  # s after the first batch
 BETWEEN_LINES = 30.0  # s
 SHOWN = ("test/loss", "test/projected_error_mm", "test/depth_error_mm")
@@ -55,9 +57,8 @@ class Progress(Callback):
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self.has_bar:
             return
-        evaluated = (trainer.current_epoch + 1) % (trainer.check_val_every_n_epoch or 1) == 0
-        metrics = trainer.callback_metrics if evaluated else {}  # Lightning keeps those of earlier epochs
-        words = [f"{key} {float(metrics[key]):.4g}" for key in SHOWN if key in metrics]
+        metrics = epoch_metrics(trainer)
+        words = [f"{key} {metrics[key]:.4g}" for key in SHOWN if key in metrics]
         n, epochs = int(trainer.num_training_batches), trainer.max_epochs or 1
         left = self._left((trainer.current_epoch + 1) * n, epochs * n)
         self.say(f"{_epoch(trainer)}: {', '.join([*words, left])}")

@@ -58,13 +58,8 @@ class Recorder(Checkpoint):
             self.record_curves(epoch_name(trainer.current_epoch), table, trainer.global_step)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        evaluated = (trainer.current_epoch + 1) % (trainer.check_val_every_n_epoch or 1) == 0
-        metrics = {
-            key: float(value)
-            for key, value in trainer.callback_metrics.items()
-            if evaluated or not key.startswith("test/")  # Lightning keeps the metrics of earlier epochs
-        }
-        self.record(trainer.current_epoch, metrics, step=trainer.global_step - 1)  # as Lightning counts
+        step = trainer.global_step - 1  # as Lightning counts
+        self.record(trainer.current_epoch, epoch_metrics(trainer), step)
 
     @rank_zero_only
     def record(self, epoch: int, metrics: Mapping[str, float], step: int) -> None:
@@ -104,3 +99,13 @@ class Recorder(Checkpoint):
         for logger in self.loggers:
             if picture.exists() and hasattr(logger, "log_image"):
                 logger.log_image("test/calibration", [str(picture)], step=step)
+
+
+def epoch_metrics(trainer: Trainer) -> dict[str, float]:
+    """The metrics of the current epoch; without those of the test split in an epoch that is not evaluated."""
+    evaluated = (trainer.current_epoch + 1) % (trainer.check_val_every_n_epoch or 1) == 0
+    return {
+        key: float(value)
+        for key, value in trainer.callback_metrics.items()
+        if evaluated or not key.startswith("test/")  # Lightning keeps the metrics of earlier epochs
+    }

@@ -1,4 +1,4 @@
-"""What a run folder holds for later use, whoever wrote it: checkpoints are read as numbers alone."""
+"""Reading a run folder that may come from someone else: checkpoints are read as numbers only."""
 
 from pathlib import Path
 from pickle import UnpicklingError

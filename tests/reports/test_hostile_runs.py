@@ -112,7 +112,7 @@ ALL: dict[str, Spoil] = HARMLESS | {name: spoil for name, (spoil, _) in BROKEN.i
 LONG = [
     name for name in HARMLESS if name not in ("one test sample", "all rows equal", "mathematics in a name")
 ]
-"""What is measured whole, seconds each, and stands for itself: in a report of its own."""
+"""Runs that are measured completely, which takes seconds each; a separate, slow report."""
 
 
 @pytest.fixture(scope="module")

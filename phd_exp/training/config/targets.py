@@ -21,7 +21,7 @@ from phd_exp.records.errors import complaint, in_our_words, nearest, shown
 
 OURS = ("phd_exp.models.", "phd_exp.losses.", "phd_exp.optimizers.", "phd_exp.geometry.")
 Origin = Literal["typed", "stored"]
-"""Where a configuration comes from: the user's command line and files, or a run folder, whoever wrote it."""
+"""Where a configuration comes from: the user's command line and files, or a run folder."""
 ALLOWED: dict[Origin, tuple[str, ...]] = {
     "typed": (*OURS, "torch.optim.", "torch.nn.", "torchvision.models."),
     "stored": (*OURS, "torch.optim."),
