@@ -34,9 +34,9 @@ def main(words: list[str]) -> int:
 
 def _report(runs: Path, out: Path) -> None:
     # seconds of imports, torch among them, which a mistake in the command need not wait for
-    from phd_exp.reports.formats.files import all_tables, write_tables
-    from phd_exp.reports.formats.terminal import print_report
+    from phd_exp.reports.files import all_tables, write_tables
     from phd_exp.reports.runs import read_report
+    from phd_exp.reports.terminal import print_report
     from phd_exp.threads import one_thread
 
     with one_thread():  # tables of a few thousand rows are too small to share

@@ -9,7 +9,7 @@ from scipy import stats
 from phd_exp.evaluation.point_errors import ErrorKey, SampleMean, difference
 from phd_exp.reports.cells import Cell, interval, make_cell
 from phd_exp.reports.runs import read_report
-from tests.reports.recorded import by_hand, predicted, record
+from tests.support.recorded import by_hand, predicted, record
 
 KEY = ErrorKey("median", "central", "depth")
 

@@ -19,7 +19,7 @@ from phd_exp.reports.gallery import (
     load_image,
     make_gallery,
 )
-from tests.reports.site.synthetic import write_run
+from tests.support.synthetic import write_run
 
 
 @pytest.fixture(scope="module")

@@ -16,8 +16,8 @@ from phd_exp.evaluation.parquet import read_table
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.reports.table import file_stem
-from tests.reports.recorded import once, reported
-from tests.reports.site.synthetic import write_run
+from tests.support.recorded import once, reported
+from tests.support.synthetic import write_run
 
 Spoil = Callable[[RunFolder], None]
 

@@ -13,8 +13,8 @@ from phd_exp.records.runs import RunFolder
 from phd_exp.reports import measured as measured_module
 from phd_exp.reports.measured import Measured
 from phd_exp.reports.runs import Run, read_report
-from tests.reports.recorded import predicted, record
-from tests.reports.site.synthetic import write_run
+from tests.support.recorded import predicted, record
+from tests.support.synthetic import write_run
 
 DEPTH = ErrorKey("mode", "whole", "depth")
 

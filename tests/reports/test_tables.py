@@ -11,7 +11,7 @@ from phd_exp.reports.cells import make_cell
 from phd_exp.reports.paper_tables import paper_tables
 from phd_exp.reports.runs import Report, read_report
 from phd_exp.reports.table import Table, TableCell
-from tests.reports.recorded import DATA, ODD_PRESET, Predicted, both_tables, by_hand, fail, predicted, record
+from tests.support.recorded import DATA, ODD_PRESET, Predicted, both_tables, by_hand, fail, predicted, record
 
 PAPER = {
     ("mae_vz", "occl", "projected"): 22.8,

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from phd_exp.reports.formats.files import write_tables
+from phd_exp.reports.files import write_tables
 from phd_exp.reports.runs import read_report
 from phd_exp.reports.table import Table
 from phd_exp.reports.variations import variation_tables
-from tests.reports.recorded import Predicted, by_hand, predicted, record
+from tests.support.recorded import Predicted, by_hand, predicted, record
 
 PLAIN = {"optimizer": {"lr": 0.1}, "recipe": {"localisation": 1}}
 VARIED = {"optimizer": {"lr": 0.5}, "recipe": {"localisation": 1}}

@@ -12,9 +12,9 @@ import pytest
 
 from phd_exp.reports.runs import Run, read_report
 from phd_exp.reports.site import build
-from tests.reports.recorded import reported
 from tests.reports.site.conftest import HOSTILE
-from tests.reports.site.synthetic import write_run
+from tests.support.recorded import reported
+from tests.support.synthetic import write_run
 
 MEGABYTE = 1_000_000
 
