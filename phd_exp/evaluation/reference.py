@@ -12,7 +12,6 @@ from phd_exp.metrics.calibration import ence_of, miscalibration_area, uniform_di
 from phd_exp.metrics.calibration_scores import ence_bins
 from phd_exp.metrics.ordered import in_order_of
 
-SIMULATIONS = 200
 SEED = 1
 _AT_ONCE = 10**6
 """Positions drawn at a time."""
@@ -28,9 +27,7 @@ class Band:
     high: float
 
 
-def calibrated_reference(
-    distribution: ProjectedHuber, simulations: int = SIMULATIONS, seed: int = SEED
-) -> dict[str, Band]:
+def calibrated_reference(distribution: ProjectedHuber, simulations: int = 200) -> dict[str, Band]:
     """Median and 95 % interval of the `DISTANCES` if the truths were drawn from the predictions themselves.
 
     ENCE depends on the predicted densities, so positions are drawn from them. Credible levels and PITs of a
@@ -39,12 +36,12 @@ def calibrated_reference(
     Source: the simulated null distribution of a test statistic; coverage in tests/evaluation/test_reference.py.
     """
     (n,) = distribution.batch_shape
-    areas, distances = _uniform(n, simulations, seed)
+    areas, distances = _uniform(n, simulations)
     found: dict[str, list[float]] = {"depth_ence": [], "projected_ence": []}
     found |= {"miscalibration_area": areas, "depth_pit_area": areas, "depth_pit_ks": distances}
     each = max(1, _AT_ONCE // n)
     for start in range(0, simulations, each):
-        for name, values in _ence(distribution, min(each, simulations - start), seed + start).items():
+        for name, values in _ence(distribution, min(each, simulations - start), SEED + start).items():
             found[name] += values.tolist()
     return {name: _band(found[name]) for name in DISTANCES}
 
@@ -68,9 +65,9 @@ def _ence(distribution: ProjectedHuber, simulations: int, seed: int) -> dict[str
 
 
 @cache
-def _uniform(n: int, simulations: int, seed: int) -> tuple[list[float], list[float]]:
+def _uniform(n: int, simulations: int) -> tuple[list[float], list[float]]:
     """Miscalibration areas and Kolmogorov-Smirnov distances of n uniform levels."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(SEED)
     areas, distances = [], []
     for _ in range(simulations):
         order = in_order_of(torch.rand(n, generator=generator, dtype=torch.float64), {})

@@ -132,8 +132,8 @@ TABLE_1 = Layout(
     columns=tuple(Column(data) for data in _DATA),
     groups=_groups(("mae_vz", "mae_logz", "probabilistic"), ("projected", "depth")),
     bounds=(
-        Bound("bound, f seen", {"scale": f"{UNKNOWN_SIZE:.0f}"}),
-        Bound("apparent size, f not seen", {"scale": f"{UNKNOWN_SIZE_AND_F:.0f}"}),
+        Bound("bound, with f", {"scale": f"{UNKNOWN_SIZE:.0f}"}),
+        Bound("apparent size, without f", {"scale": f"{UNKNOWN_SIZE_AND_F:.0f}"}),
         Bound("guess without the image", dict.fromkeys(_DATA, f"{GUESS:.0f}")),
     ),
     note="On scale the size factor ~ U(0.8, 1.2) is unknown and the image gives size / z: 291 mm is nearly exact for "

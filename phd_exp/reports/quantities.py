@@ -39,45 +39,39 @@ class Quantity:
 
 _RISK = "mean error of the predictions kept when the least certain are dropped first, averaged over the share kept"
 _EXCESS = "0 if predicted variance ranks the errors perfectly, 1 if no better than chance"
-
-SCORES = {
-    "projected_error_mm": Quantity(
-        "Projected error", "mm", 1, "distance of the estimate from the true viewing ray"
-    ),
-    "depth_error_mm": Quantity("Depth error", "mm", 1, "error along the true viewing ray"),
-    "nll": Quantity("NLL", "nats", 2, "mean negative log density at the truth, per cubic metre"),
-    "depth_crps_mm": Quantity(
-        "CRPS of depth", "mm", 1, "continuous ranked probability score of the depth’s law"
-    ),
-    "energy_score_mm": Quantity("Energy score", "mm", 1, "the same of the position in space"),
-    "depth_ence": Quantity(
-        "Depth ENCE", "", 3, "expected normalised calibration error of the depth’s variance"
-    ),
-    "projected_ence": Quantity("Projected ENCE", "", 3, "the same of the variance of (x, y)/z"),
-    "miscalibration_area": Quantity(
-        "Miscalibration area", "", 3, "between the coverage of credible regions and the diagonal"
-    ),
-    "overconfidence": Quantity(
-        "Overconfidence",
+_OVERCONFIDENCE = "mean credible level of the truths minus 1/2; negative if underconfident"
+_ROWS: tuple[tuple[str, str, str, int, str], ...] = (
+    ("projected_error_mm", "Projected error", "mm", 1, "distance of the estimate from the true viewing ray"),
+    ("depth_error_mm", "Depth error", "mm", 1, "error along the true viewing ray"),
+    ("nll", "NLL", "nats", 2, "mean negative log density at the truth, per cubic metre"),
+    ("depth_crps_mm", "CRPS of depth", "mm", 1, "continuous ranked probability score of the depth’s law"),
+    ("energy_score_mm", "Energy score", "mm", 1, "the same of the position in space"),
+    ("depth_ence", "Depth ENCE", "", 3, "expected normalised calibration error of the depth’s variance"),
+    ("projected_ence", "Projected ENCE", "", 3, "the same of the variance of (x, y)/z"),
+    (
+        "miscalibration_area",
+        "Miscalibration area",
         "",
         3,
-        "mean credible level of the truths minus 1/2; negative if underconfident",
+        "between coverage of credible regions and diagonal",
     ),
-    "depth_pit_area": Quantity(
-        "Depth PIT area", "", 3, "between the distribution of the depth’s PIT and the diagonal"
+    ("overconfidence", "Overconfidence", "", 3, _OVERCONFIDENCE),
+    (
+        "depth_pit_area",
+        "Depth PIT area",
+        "",
+        3,
+        "between the distribution of the depth’s PIT and the diagonal",
     ),
-    "depth_pit_ks": Quantity(
-        "Depth PIT distance", "", 3, "the largest gap between those two (Kolmogorov–Smirnov)"
-    ),
-    "depth_sharpness_mm": Quantity(
-        "Depth sharpness", "mm", 1, "root mean square of the predicted standard deviation of z"
-    ),
-    "projected_sharpness_mrad": Quantity("Projected sharpness", "mrad", 2, "the same of x/z and y/z"),
-    "depth_risk_coverage_area": Quantity("Depth risk–coverage area", "mm", 1, _RISK),
-    "projected_risk_coverage_area": Quantity("Projected risk–coverage area", "mrad", 2, _RISK),
-    "depth_risk_coverage_excess": Quantity("Depth risk–coverage excess", "", 3, _EXCESS),
-    "projected_risk_coverage_excess": Quantity("Projected risk–coverage excess", "", 3, _EXCESS),
-}
+    ("depth_pit_ks", "Depth PIT distance", "", 3, "the largest gap between those two (Kolmogorov–Smirnov)"),
+    ("depth_sharpness_mm", "Depth sharpness", "mm", 1, "root mean square of the predicted deviation of z"),
+    ("projected_sharpness_mrad", "Projected sharpness", "mrad", 2, "the same of x/z and y/z"),
+    ("depth_risk_coverage_area", "Depth risk–coverage area", "mm", 1, _RISK),
+    ("projected_risk_coverage_area", "Projected risk–coverage area", "mrad", 2, _RISK),
+    ("depth_risk_coverage_excess", "Depth risk–coverage excess", "", 3, _EXCESS),
+    ("projected_risk_coverage_excess", "Projected risk–coverage excess", "", 3, _EXCESS),
+)
+SCORES = {key: Quantity(label, unit, digits, means) for key, label, unit, digits, means in _ROWS}
 """Key of `Evaluation.scores` -> quantity, in the order of a page."""
 
 METRICS = {

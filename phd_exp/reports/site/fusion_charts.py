@@ -62,7 +62,7 @@ def _over_cameras(scores: FusionScores, quantity: str, method: Method, name: str
 
 def _curve(x: Iterable[float], bands: list[Band], unit: float = 1.0) -> Curve:
     ends = ([getattr(band, end) / unit for band in bands] for end in ("value", "low", "high"))
-    return Curve(list(x), *ends)
+    return Curve([float(value) for value in x], *ends)
 
 
 def _courses(traces: list[Trace]) -> str:
