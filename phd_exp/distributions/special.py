@@ -1,6 +1,6 @@
 """The special functions of the depth law: exponential integrals, their tail moments and the log normaliser.
 
-Everything rests on two schemes that meet at a = 1 and lose no digits to cancellation, in any precision.
+All use two schemes that meet at a = 1. Neither loses digits to cancellation, in any precision.
 
 - a <= 1: the series e^a E_1(a) = sum_k (psi(k + 1) - log a) a^k / k!, then n E_(n+1)(a) = e^(-a) - a E_n(a) upwards.
 - a > 1: one Gauss rule sum_i w_i F(s_i) for int_0^inf e^(-s) F(s) ds with F(s) = s^k (1 + s/a)^(-n). All w_i are
@@ -11,6 +11,7 @@ Source: DLMF 6.6 and 8.19 for the series; the rule is an own derivation, see `GA
 
 import inspect
 import math
+import sys
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -61,7 +62,7 @@ def scaled_expint(n: int, a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]
     if n <= 0:
         return _elementary(-n, a)
     small = a <= 1
-    # each scheme sees only what it is for; a clamp would have no gradient at a = 1, where a network starts
+    # masked, because a clamp has no gradient at a = 1, where a network starts
     below, above = a.masked_fill(~small, 1), a.masked_fill(small, 1)
     return torch.where(small, _series(n, below)[-1], _by_rule(above, (0, n))[0] / above)
 
@@ -156,6 +157,7 @@ class _DualSignedLog1p(_SignedLog1p):
 
     @staticmethod
     def jvp(ctx: Any, x_dot: Tensor, log_a_dot: Tensor) -> Tensor:
+        _refuse_nested_forward_mode()
         x, log_a = ctx.saved_tensors
         return (x_dot - x * log_a_dot) * _SignedLog1p.slope(x, log_a)
 
@@ -203,8 +205,18 @@ class _DualTailMoment(_TailMoment):
 
     @staticmethod
     def jvp(ctx: Any, a_dot: Tensor, _: None) -> tuple[Tensor, None]:
+        _refuse_nested_forward_mode()
         (a,) = ctx.saved_tensors
         return a_dot * _TailMoment.derivative(a, ctx.k), None
+
+
+def _refuse_nested_forward_mode() -> None:
+    """Raise NotImplementedError where torch would return a derivative of zero instead of a second derivative."""
+    if getattr(sys.modules.get("torch._functorch.eager_transforms"), "JVP_NESTING", 1) > 1:
+        raise NotImplementedError(
+            "derivatives: got forward mode within forward mode, of which torch ignores one in an autograd.Function; "
+            "expected one of them at most; use torch.func.hessian"
+        )
 
 
 def _keep_signature(forward: Any) -> None:

@@ -1,8 +1,8 @@
 """The compiled loops over the problems of a batch, each problem on one core."""
+# mypy: no-check-untyped-defs, allow-untyped-defs
 
 import hashlib
 from pathlib import Path
-from typing import no_type_check
 
 import numpy as np
 from numba import njit, prange
@@ -10,8 +10,7 @@ from numba import njit, prange
 from phd_exp.fusion.arithmetic import compiled, huber, measured
 from phd_exp.fusion.certificate import certify
 from phd_exp.fusion.moments import moments
-from phd_exp.fusion.newton import optimum
-from phd_exp.fusion.polish import polish
+from phd_exp.fusion.newton import optimum, polish
 from phd_exp.fusion.problems import Status
 
 CONVERGED = 1e-6
@@ -21,7 +20,6 @@ _NO_COMMON_VIEW, _PLANE_BEHIND_CAMERA = int(Status.NO_COMMON_VIEW), int(Status.P
 
 
 @compiled
-@no_type_check
 def _solve(slope, at_origin, a, free_slope, u, certificate, excess):
     """Moves u to the optimum of one problem; returns its status."""
     lam = np.zeros(len(a))
@@ -36,7 +34,6 @@ def _solve(slope, at_origin, a, free_slope, u, certificate, excess):
     return _FUSED if certificate[1] <= CONVERGED else _NOT_CONVERGED
 
 
-@no_type_check
 def _loops(sources):
     """The two loops, compiled from these sources.
 

@@ -53,14 +53,14 @@ _REASONS = {
 class Problems:
     """The (q_x, q_y, t) of every camera as an affine function of the unknowns u; in float64, on the CPU.
 
-    A camera that is masked out measures q = 0 and t = 1 of every position and has a = 0: it adds a constant.
+    A masked camera has q = 0 and t = 1 at every position, and a = 0: it adds a constant to the energy.
 
     Args:
         predictions: as given to `fuse`.
         pose: of the cameras.
         mask: which cameras take part.
         origin: the world position of u = 0, where the search starts, metres: the average of the predicted positions,
-            or the point of the plane nearest to it.
+            or the nearest point of the plane.
         directions: the world position is origin + directions u; on a plane the third column is zero.
         dimensions: the number of unknowns, 3, or 2 on a plane.
         slope: d(q_x, q_y, t)/du, 1/metres.
@@ -95,9 +95,7 @@ class Problems:
         if len(shape) == 0 or shape[-1] == 0:
             raise ValueError(f"predictions: got batch shape {tuple(shape)}; expected (*problems, cameras)")
         pose = Pose(_flat("pose.R", pose.R, shape, event=2), _flat("pose.t", pose.t, shape, event=1))
-        if mask is None:
-            mask = torch.ones(shape, dtype=torch.bool)
-        mask = _flat("mask", mask, shape) > 0
+        mask = _flat("mask", torch.ones(shape) if mask is None else mask, shape) > 0
         measure = _flat("predictions", _measure(predictions), shape, event=2)
         mode = _flat("predictions", predictions.mode, shape, event=1)
         a = _flat("predictions", predictions.a, shape)
@@ -149,12 +147,8 @@ class Problems:
         return alone, pose.into_world(mean), pose.R.mT @ covariance @ pose.R
 
 
-def _status(
-    mask: Bool[Tensor, "problems cameras"],
-    valid: Bool[Tensor, "problems cameras"],
-    rigid: Bool[Tensor, "problems cameras"],
-    plane: Plane | None,
-) -> Int[Tensor, " problems"]:
+def _status(mask: Tensor, valid: Tensor, rigid: Tensor, plane: Plane | None) -> Int[Tensor, " problems"]:
+    """The status of each problem, from three masks over its cameras."""
     status = torch.full(mask.shape[:1], int(Status.FUSED))
     status[(~rigid & mask).any(-1)] = Status.NOT_A_ROTATION
     status[(~valid & mask).any(-1)] = Status.NOT_FINITE

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.level_curves import LevelCurves, level_curves
-from phd_exp.inference.sightings import Sighting
-from phd_exp.inference.views import View
+from phd_exp.inference.answers import Sighting
+from phd_exp.inference.predictor import View
 from phd_exp.records.errors import one_line
 from phd_exp.reports.figures import draw_birds_eye, draw_curve, encoded
 

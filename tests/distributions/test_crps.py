@@ -9,7 +9,7 @@ import torch
 from torch.autograd import gradcheck
 
 from phd_exp.distributions import ProjectedHuber, depth
-from phd_exp.distributions.crps import crps_beyond_distance, half_mean_difference
+from phd_exp.distributions.depth import crps_beyond_distance, half_mean_difference
 
 PRECISIONS = [1e-3, 1e-2, 0.3, 0.999, 1.0, 1.001, 3.0, 30.0, 1e3, 1e4, 1e6]
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(40)
