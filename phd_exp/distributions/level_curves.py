@@ -26,25 +26,24 @@ _STRATA = 500  # equally probable values that stand for a one-dimensional law
 
 @dataclass(frozen=True)
 class LevelCurves:
-    """Closed curves of one distribution, one for each level.
-
-    Attributes:
-        levels: the probability inside each curve.
-        projected: (x, y)/z along each curve, without unit.
-        birds_eye: (x, z) along each curve, metres.
-        mode: position of highest density, metres.
-    """
+    """Closed curves of one distribution: (x, y)/z and (x, z) (metres) along each, for the probability inside it."""
 
     levels: tuple[float, ...]
     projected: tuple[Points, ...]
     birds_eye: tuple[Points, ...]
     mode: Float[np.ndarray, " 3"]
+    """Position of highest density, metres."""
 
 
 def level_curves(distribution: ProjectedHuber, levels: tuple[float, ...] = LEVELS) -> LevelCurves:
     """The curves of a distribution with an empty batch shape, computed in float64.
 
     Raises ValueError for a batch of distributions, or a level outside (0, 1).
+
+    Example:
+        >>> p = ProjectedHuber(torch.zeros(2), torch.tensor(4.0), 100 * torch.eye(2), torch.tensor(20.0))
+        >>> [curve.shape for curve in level_curves(p, (0.5, 0.9)).projected]
+        [(73, 2), (73, 2)]
     """
     if distribution.batch_shape != torch.Size([]):
         raise ValueError(
@@ -108,16 +107,12 @@ def _marginal() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _excess(distribution: ProjectedHuber, t: np.ndarray, level: float) -> float:
     """The c with P(a (max(t, 1/t) - 1) + e(q_1) <= c) = level."""
     _, energy, cumulative = _marginal()
-    of_depth = _depth_energy(distribution, t)
+    of_depth = float(distribution.a) * (np.maximum(t, 1 / t) - 1)
 
     def surplus(c: float) -> float:
         return float(np.interp(c - of_depth, energy, cumulative, left=0).mean()) - level
 
     return float(optimize.brentq(surplus, 0, of_depth.max() + energy[-1], xtol=1e-10))
-
-
-def _depth_energy(distribution: ProjectedHuber, t: np.ndarray) -> np.ndarray:
-    return float(distribution.a) * (np.maximum(t, 1 / t) - 1)
 
 
 def _outline(distribution: ProjectedHuber, excess: float) -> Points:
@@ -129,14 +124,15 @@ def _outline(distribution: ProjectedHuber, excess: float) -> Points:
     Source: own derivation; the law of (x, z) is constant along the curve, checked by quadrature.
     """
     s, energy, _ = _marginal()
-    furthest = 1 + excess / float(distribution.a)
+    a, mu_z = float(distribution.a), float(distribution.mu_z)
+    furthest = 1 + excess / a
     bend = np.linspace(0, np.pi / 2, (_POINTS + 1) // 2)
     above = 1 + (furthest - 1) * np.sin(bend)  # dense where the curve closes
     t = np.concatenate([1 / above[:0:-1], above])
-    half_width = np.interp(np.clip(excess - _depth_energy(distribution, t), 0, None), energy, s)
-    z = float(distribution.mu_z) * t
-    reach = float(distribution.mu_z) * np.linalg.norm(np.linalg.inv(_float64(distribution.A))[0])
+    of_depth = a * (np.maximum(t, 1 / t) - 1)
+    half_width = mu_z * np.linalg.norm(np.linalg.inv(_float64(distribution.A))[0])
+    half_width = half_width * np.interp(np.clip(excess - of_depth, 0, None), energy, s)
+    z = mu_z * t
     middle = z * float(distribution.mu_xy[0])
-    right = np.stack([middle + reach * half_width, z], axis=-1)
-    left = np.stack([middle - reach * half_width, z], axis=-1)
+    right, left = (np.stack([x, z], axis=-1) for x in (middle + half_width, middle - half_width))
     return np.concatenate([right, left[::-1], right[:1]])

@@ -5,9 +5,9 @@ covariance. All three are compiled for one problem of a few cameras, which fits 
 runs them on a batch, and `fuse.py` is the interface.
 """
 
-from phd_exp.fusion.fuse import Fused, FusionError, fuse
+from phd_exp.fusion.fuse import Fused, fuse
 from phd_exp.fusion.gaussian import average, gaussian_fusion
 from phd_exp.fusion.pose import Plane, Pose
 from phd_exp.fusion.problems import Status
 
-__all__ = ["Fused", "FusionError", "Plane", "Pose", "Status", "average", "fuse", "gaussian_fusion"]
+__all__ = ["Fused", "Plane", "Pose", "Status", "average", "fuse", "gaussian_fusion"]

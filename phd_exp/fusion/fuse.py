@@ -15,15 +15,10 @@ from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.level import credible_level
 from phd_exp.fusion.pose import Plane, Pose
 from phd_exp.fusion.problems import Problems, Status
-from phd_exp.records.errors import UserError
 from phd_exp.threads import one_thread
 
 _NO_LEVELS = np.empty(0)
 # `kernels` and `moments` are imported in the functions that use them: importing numba takes a second
-
-
-class FusionError(UserError):
-    """Problems that have no fused position, with the reason for each."""
 
 
 @dataclass(frozen=True)
@@ -110,11 +105,6 @@ class Fused:
             f"problem {', '.join(map(str, index)) or 0}: {Status(int(self.status[tuple(index)])).reason}"
             for index in failed
         ]
-
-    def raise_if_failed(self) -> None:
-        """Raises FusionError with the `errors`, if there are any."""
-        if lines := self.errors():
-            raise FusionError("\n".join(lines))
 
 
 @torch.no_grad()

@@ -15,38 +15,31 @@ from phd_exp.fusion.pose import Plane, Pose
 
 
 class Status(IntEnum):
-    """How a problem ended; all but FUSED are failures, with NaN in place of numbers."""
+    """How a problem ended, with the `reason` in one line; all but FUSED are failures, with NaN instead of numbers."""
 
-    FUSED = 0
-    NO_CAMERA = 1
-    NOT_FINITE = 2
-    NOT_A_ROTATION = 3
-    NOT_A_PLANE = 4
-    NO_COMMON_VIEW = 5
-    PLANE_BEHIND_CAMERA = 6
-    CONTRADICTION = 7
-    NOT_CONVERGED = 8
+    reason: str
 
-    @property
-    def reason(self) -> str:
-        """What is wrong, what was expected and how to fix it, in one line."""
-        return _REASONS[self]
-
-
-_REASONS = {
-    Status.FUSED: "fused",
-    Status.NO_CAMERA: "all cameras are masked out; expected at least one",
-    Status.NOT_FINITE: "a prediction, pose or plane is not finite; mask out that camera or correct its numbers",
-    Status.NOT_A_ROTATION: "the R of a pose is not a rotation to 1e-6; expected R R^T = I and |R| = 1",
-    Status.NOT_A_PLANE: "the normal of the plane is zero; expected a direction",
-    Status.NO_COMMON_VIEW: "no position is in front of every camera; check that poses map world to camera, R v + t",
-    Status.PLANE_BEHIND_CAMERA: "no point of the plane is in front of every camera; check its normal and offset",
-    Status.CONTRADICTION: (
+    FUSED = 0, "fused"
+    NO_CAMERA = 1, "all cameras are masked out; expected at least one"
+    NOT_FINITE = 2, "a prediction, pose or plane is not finite; mask out that camera or correct its numbers"
+    NOT_A_ROTATION = 3, "the R of a pose is not a rotation to 1e-6; expected R R^T = I and |R| = 1"
+    NOT_A_PLANE = 4, "the normal of the plane is zero; expected a direction"
+    NO_COMMON_VIEW = (
+        5,
+        "no position is in front of every camera; check that poses map world to camera, R v + t",
+    )
+    PLANE_BEHIND_CAMERA = 6, "no point of the plane is in front of every camera; check its normal and offset"
+    CONTRADICTION = (
+        7,
         "at least half of the views rule out every common position; check the poses, the plane, and that all "
-        "cameras see the same object"
-    ),
-    Status.NOT_CONVERGED: "the optimum was not found to machine precision; check whether the numbers are extreme",
-}
+        "cameras see the same object",
+    )
+    NOT_CONVERGED = 8, "the optimum was not found to machine precision; check whether the numbers are extreme"
+
+    def __new__(cls, code: int, reason: str = "") -> "Status":
+        status = int.__new__(cls, code)
+        status._value_, status.reason = code, reason
+        return status
 
 
 @dataclass(frozen=True)

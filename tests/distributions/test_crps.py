@@ -50,11 +50,8 @@ def test_mean_difference_is_that_of_the_integral(log_a: torch.Tensor) -> None:
     """E CRPS(T) = E|T - T'|/2: the law scored by itself."""
     p = torch.from_numpy((NODES + 1) / 2)
     log_t = depth.depth_icdf(p, log_a)
-    own = (
-        (log_t.expm1().abs() * log_a.exp() + crps_beyond_distance(log_t, log_a))
-        @ torch.from_numpy(WEIGHTS)
-        / 2
-    )
+    score = log_t.expm1().abs() * log_a.exp() + crps_beyond_distance(log_t, log_a)
+    own = score @ torch.from_numpy(WEIGHTS) / 2
     assert half_mean_difference(log_a).item() == pytest.approx(own.item(), rel=0.002)
 
 
