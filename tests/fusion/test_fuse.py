@@ -61,15 +61,6 @@ def test_cameras_that_agree_are_right(cameras: int) -> None:
     assert (fused.certificate < 1e-7).all()
 
 
-def test_a_symmetric_pair_meets_in_the_middle() -> None:
-    """Two cameras side by side, mirror images in the plane x = 0."""
-    pose = looking(tensor(0, 0, 1).expand(2, 3), torch.stack([tensor(-1, 0, 0), tensor(1, 0, 0)]))
-    predictions = predicting(pose, torch.stack([tensor(-0.1, 0.2, 4), tensor(0.1, 0.2, 4)]))
-    fused = fuse(predictions, pose)
-    assert fused.point[0].abs() < 1e-9
-    torch.testing.assert_close(fused.surprise[0], fused.surprise[1])
-
-
 def test_the_optimum_and_its_covariance_lie_in_the_plane() -> None:
     predictions, pose, truth = random_problems(100, 3, seed=4)
     normal = tensor(0, 3, 4)
