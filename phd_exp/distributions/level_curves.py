@@ -21,7 +21,7 @@ Points = Float[np.ndarray, "_ 2"]
 
 LEVELS = (0.5, 0.9, 0.99)
 _POINTS = 73  # of a curve, and of half an outline
-_STRATA = 500  # equally probable values that stand for a one-dimensional law
+_STRATA = 500  # equally probable values of t that represent its law
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,8 @@ def level_curves(distribution: ProjectedHuber, levels: tuple[float, ...] = LEVEL
         )
     if not all(0 < level < 1 for level in levels):
         raise ValueError(f"levels lie between 0 and 1, exclusive; these are {levels}")
-    t = _depth_strata(distribution)
+    middles = (torch.arange(_STRATA, dtype=torch.float64) + 0.5) / _STRATA  # of equally probable strata
+    t = _float64(distribution.depth_icdf(middles) / distribution.mu_z)
     return LevelCurves(
         levels=levels,
         projected=tuple(_ellipse(distribution, _radius(t, level)) for level in levels),
@@ -69,12 +70,6 @@ def _float64(values: torch.Tensor) -> np.ndarray:
     return values.detach().cpu().double().numpy()
 
 
-def _depth_strata(distribution: ProjectedHuber) -> Float[np.ndarray, " strata"]:
-    """Equally probable values of t = z / mu_z, the middles of strata."""
-    middles = (torch.arange(_STRATA, dtype=torch.float64) + 0.5) / _STRATA
-    return _float64(distribution.depth_icdf(middles) / distribution.mu_z)
-
-
 def _radius(t: Float[np.ndarray, " strata"], level: float) -> float:
     """The rho with P(|A (u - mu_xy)| <= rho) = level for u = (x, y)/z, where A (u - mu_xy) = q/t.
 
@@ -84,7 +79,7 @@ def _radius(t: Float[np.ndarray, " strata"], level: float) -> float:
     def excess(log_rho: float) -> float:
         return float(radial_cdf(torch.from_numpy(np.exp(log_rho) * t)).mean()) - level
 
-    # |q| lies in [1e-6, 60] at any level that is asked for
+    # |q| lies in [1e-6, 60] at any reasonable level
     return float(np.exp(optimize.brentq(excess, np.log(1e-6 / t.max()), np.log(60 / t.min()), xtol=1e-10)))
 
 

@@ -122,13 +122,14 @@ def require(name: str, value: Tensor, constraint: Constraint) -> None:
         )
 
 
-def require_representable(statistics: Float[Tensor, "*batch values"]) -> None:
+def require_representable(mode: Float[Tensor, "*batch 3"], *covariances: Tensor) -> None:
     """Raise ValueError if a mode or covariance is not finite."""
-    overflow = ~statistics.isfinite().all(-1)
+    parts = [mode, *(covariance.flatten(-2) for covariance in covariances)]
+    overflow = ~torch.cat(parts, dim=-1).isfinite().all(-1)
     if bool(overflow.any()):
         raise ValueError(
             f"parameters: mode or covariance of {int(overflow.sum())} of {overflow.numel()} distributions "
-            f"overflow in {statistics.dtype}; expected parameters nearer to 1"
+            f"overflow in {mode.dtype}; expected parameters nearer to 1"
         )
 
 

@@ -45,9 +45,6 @@ class ProjectedHuber(Distribution):
         tensor([0., 0., 4.])
         >>> p.log_prob(torch.tensor([0.1, 0.0, 4.2])) < p.log_prob(p.mode)  # nats per cubic metre
         tensor(True)
-        >>> low, high = p.depth_icdf(torch.tensor([0.05, 0.95]))  # a 90 % interval of depth, metres
-        >>> bool(low < p.depth_median < high)
-        True
 
     Source: paper, section "Projected Huber distribution".
     """
@@ -94,11 +91,12 @@ class ProjectedHuber(Distribution):
             f: focal length, pixels, for each element of the batch; of shape (*, 1) for several points per camera.
             S: side of the image, pixels.
             mu_z0: the data set's depth per focal length, metres per pixel.
-            validate_args: as for the constructor.
+            validate_args: as for the constructor; without validation `log_prob` and its gradient are finite for raw
+                numbers up to 1e9.
 
         Raises:
             ValueError: a raw number is beyond +-1e9; f, S or mu_z0 is not positive and finite; or mode or covariance
-                overflow. Without validation `log_prob` and its gradient are finite for raw numbers up to 1e9.
+                overflow.
 
         Source: paper, section "Enforcing constraints on distribution parameters"; formulas in `Natural.from_raw`.
         """
@@ -127,8 +125,7 @@ class ProjectedHuber(Distribution):
     def _require_representable(self) -> None:
         """Raise ValueError if mode or covariances overflow in the data type, unless validation is off."""
         if self._validate_args:
-            parts = self.mode, self.covariance_matrix.flatten(-2), self.projected_covariance.flatten(-2)
-            require_representable(torch.cat(parts, dim=-1))
+            require_representable(self.mode, self.covariance_matrix, self.projected_covariance)
 
     def expand(self, batch_shape: Sequence[int], _instance: Distribution | None = None) -> "ProjectedHuber":
         """The same distribution with a larger batch shape; nothing is copied."""
@@ -291,8 +288,6 @@ class ProjectedHuber(Distribution):
         self, sample_shape: torch.Size | Sequence[int] = (), generator: torch.Generator | None = None
     ) -> Float[Tensor, "*shape 3"]:
         """Exact samples, differentiable in the parameters: (x, y) = z mu_xy + A_xy^(-1) q.
-
-        Random numbers come from the generator, or from torch's global one.
 
         Source: own derivation (q and t are independent); gradients by the implicit function theorem.
         """

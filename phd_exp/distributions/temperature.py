@@ -51,25 +51,20 @@ class Temperature:
                     "temperatures are fitted to finite predictions and positions with z > 0, at least one, but "
                     f"{int((~values.isfinite()).sum())} of {values.numel()} numbers are not finite"
                 )
-        return cls(
-            projected=_temperature(lambda r: _projected_slope(radius, r)),
-            depth=_temperature(lambda r: _depth_slope(energy, log_a, r)),
-        )
+
+        def projected_slope(r: Tensor) -> Tensor:  # r d/dr of the mean of h(r |q|) - 2 log r
+            return torch.minimum(r * radius, (r * radius).square()).mean() - 2
+
+        def depth_slope(
+            r: Tensor,
+        ) -> Tensor:  # of r a max(t, 1/t) + log N(r a): actual minus predicted energies
+            return (r * energy - depth_mean_energy(log_a + r.log())).mean()
+
+        return cls(projected=_temperature(projected_slope), depth=_temperature(depth_slope))
 
     def apply(self, distribution: ProjectedHuber) -> ProjectedHuber:
         """The same predictions at these temperatures; mu_xy and mu_z stay."""
         return distribution.tempered(self.projected, self.depth)
-
-
-def _projected_slope(radius: Tensor, r: Tensor) -> Tensor:
-    """r d/dr of the mean of h(r |q|) - 2 log r."""
-    scaled = r * radius
-    return torch.minimum(scaled, scaled.square()).mean() - 2
-
-
-def _depth_slope(energy: Tensor, log_a: Tensor, r: Tensor) -> Tensor:
-    """r d/dr of the mean of r a max(t, 1/t) + log N(r a): actual minus predicted energies."""
-    return (r * energy - depth_mean_energy(log_a + r.log())).mean()
 
 
 def _temperature(slope: Callable[[Tensor], Tensor]) -> float:

@@ -37,8 +37,8 @@ def _solve(slope, at_origin, a, free_slope, u, certificate, excess):
 def _loops(sources):
     """The two loops, compiled from these sources.
 
-    numba keeps what it compiles beside this file, and looks at this file alone to see whether it is up to date. It
-    also looks at the variables that a function closes over: hence the digest of all sources is one.
+    numba's cache depends on this file and on the variables that a function closes over. The digest of all sources is
+    therefore one of them.
     """
 
     @njit(cache=True, error_model="numpy", parallel=True)

@@ -34,9 +34,12 @@ BATCH = 64
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The input image of a network, prepared as in training, and its virtual camera.
+    """The input image of a network, prepared as in training, and its virtual camera, whose frame predictions have.
 
-    Predictions are in the frame of that camera.
+    Example:
+        >>> photo, K = Image.new("RGB", (90, 60)), intrinsics(300.0, 300.0, 45.0, 30.0)
+        >>> View.of_box(photo, K, (50.0, 10.0, 80.0, 50.0), side=32, where="photo").image.shape
+        (32, 32, 3)
     """
 
     image: UInt8[np.ndarray, "S S 3"]
@@ -44,16 +47,17 @@ class View:
 
     @classmethod
     def of_box(
-        cls, image: Image.Image, K: Float[np.ndarray, "3 3"], box: Box, side: int, where: str
+        cls, image: Image.Image, K: Float[np.ndarray, "3 3"], box: Box | None, side: int, where: str
     ) -> "View":
-        """The view of a box in an RGB image, `side` pixels a side.
+        """The view of a box in an RGB image (None: all of it), `side` pixels a side.
 
         Raises DatasetError, naming `where`, if the box is too wide.
         """
+        left, top, right, bottom = map(float, (0, 0, *image.size) if box is None else box)
         try:
-            camera = VirtualCamera.of_box(K, box, float(side))
+            camera = VirtualCamera.of_box(K, (left, top, right, bottom), float(side))
         except ValueError as error:
-            raise DatasetError(f"{where}: box={list(box)}: {error}") from None
+            raise DatasetError(f"{where}: box={[left, top, right, bottom]}: {error}") from None
         return cls(cut(image, camera), camera)
 
     @property
@@ -106,20 +110,15 @@ class Predictor:
         """
         array = _images(images)
         height, width = array.shape[1:3]
-        centre, box = (width / 2, height / 2), (0.0, 0.0, float(width), float(height))
+        cameras = [intrinsics(value, value, width / 2, height / 2) for value in _focal_lengths(f, len(array))]
         views = [
-            View.of_box(
-                Image.fromarray(image), intrinsics(value, value, *centre), box, self.side, f"image {row}"
-            )
-            for row, (image, value) in enumerate(zip(array, _focal_lengths(f, len(array)), strict=True))
+            View.of_box(Image.fromarray(image), K, None, self.side, f"image {row}")
+            for row, (image, K) in enumerate(zip(array, cameras, strict=True))
         ]
         return self.see(views if images.ndim == 4 else views[0])
 
     def view(
-        self,
-        image: UInt8[np.ndarray, "height width 3"],
-        K: Float[np.ndarray, "3 3"],
-        box: tuple[float, float, float, float] | None = None,
+        self, image: UInt8[np.ndarray, "height width 3"], K: Float[np.ndarray, "3 3"], box: Box | None = None
     ) -> View:
         """The network's input for a box (left, top, right, bottom, px; None: all) in an image of a camera K.
 
@@ -127,9 +126,7 @@ class Predictor:
         Raises DatasetError if the image is invalid or the box is outside the field of every pinhole camera.
         """
         (array,) = _images(image[None])
-        height, width = array.shape[:2]
-        left, top, right, bottom = map(float, (0, 0, width, height) if box is None else box)
-        return View.of_box(Image.fromarray(array), K, (left, top, right, bottom), self.side, "image")
+        return View.of_box(Image.fromarray(array), K, box, self.side, "image")
 
     def see(self, views: View | Sequence[View]) -> Prediction:
         """Predictions for views, each in the frame of its own virtual camera; for one view, one without a batch."""
@@ -198,9 +195,10 @@ def _constants(folder: RunFolder, config: RunConfig) -> tuple[DepthScale, float]
         data = config.data
         source = RenderedSource(DatasetFolder(data.folder), data.spec, {}, data.image_size)
         return source.depth, source.constant_f
-    if not folder.constants_file.exists():
+    file = folder.constants_file
+    if not file.exists():
         raise RunError(
-            f"{folder.constants_file}: missing, so that the depth scale of its data is unknown; train the run again"
+            f"{file}: missing, so that the depth scale of its data is unknown; train the run again"
         )
     values = folder.constants()
     try:
@@ -209,7 +207,7 @@ def _constants(folder: RunFolder, config: RunConfig) -> tuple[DepthScale, float]
             raise ValueError(f"constant_f must be positive and finite, but is {constant_f}")
         return DepthScale(*(float(values[name]) for name in ("mu_z0", "D", "z_centre"))), constant_f
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise RunError(f"{folder.constants_file}: not the constants of a run ({error})") from None
+        raise RunError(f"{file}: not the constants of a run ({error})") from None
 
 
 def _load_weights(regressor: Regressor, checkpoint: Path) -> None:

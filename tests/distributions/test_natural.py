@@ -66,22 +66,18 @@ def test_camera_frame_parameters_are_the_printed_ones() -> None:
         torch.testing.assert_close(distribution.a, a)
 
 
-def on_a_seam(**numbers: float) -> list[float]:
-    """The generic raw numbers with some replaced, by position."""
-    return [numbers.get(f"at_{i}", x) for i, x in enumerate(GENERIC)]
-
-
+n_1, n_2, b_1, b_2, b_3, w_1, w_2 = GENERIC
 SEAMS = {
     "generic": GENERIC,
     "zero": [0.0] * 7,
-    "equal eigenvalues": on_a_seam(at_2=1.3, at_3=0.0, at_4=1.3),
-    "equal negative eigenvalues": on_a_seam(at_2=-0.7, at_3=0.0, at_4=-0.7),
-    "an eigenvalue of zero": on_a_seam(at_2=1.0, at_3=math.sqrt(2), at_4=1.0),
-    "both eigenvalues zero": on_a_seam(at_2=0.0, at_3=0.0, at_4=0.0),
-    "w_1 = 0": on_a_seam(at_5=0.0),
-    "w_2 = 0": on_a_seam(at_6=0.0),
-    "w_1 = w_2 = 0": on_a_seam(at_5=0.0, at_6=0.0),
-    "w_2 = 0, a < 1": on_a_seam(at_5=-1.0, at_6=0.0),
+    "equal eigenvalues": [n_1, n_2, 1.3, 0.0, 1.3, w_1, w_2],
+    "equal negative eigenvalues": [n_1, n_2, -0.7, 0.0, -0.7, w_1, w_2],
+    "an eigenvalue of zero": [n_1, n_2, 1.0, math.sqrt(2), 1.0, w_1, w_2],
+    "both eigenvalues zero": [n_1, n_2, 0.0, 0.0, 0.0, w_1, w_2],
+    "w_1 = 0": [n_1, n_2, b_1, b_2, b_3, 0.0, w_2],
+    "w_2 = 0": [n_1, n_2, b_1, b_2, b_3, w_1, 0.0],
+    "w_1 = w_2 = 0": [n_1, n_2, b_1, b_2, b_3, 0.0, 0.0],
+    "w_2 = 0, a < 1": [n_1, n_2, b_1, b_2, b_3, -1.0, 0.0],
 }
 
 

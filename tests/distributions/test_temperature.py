@@ -59,12 +59,6 @@ def test_mean_nll_is_convex_in_both_reciprocals(truth: ProjectedHuber, xyz: torc
         assert (nll.diff().diff() > 0).all()
 
 
-def test_separates_into_two_problems(truth: ProjectedHuber, xyz: torch.Tensor) -> None:
-    once, other = (Temperature.fit(truth.tempered(projected, 0.5), xyz) for projected in (0.5, 4.0))
-    assert once.depth == pytest.approx(other.depth, rel=1e-9)
-    assert once.projected * 0.5 == pytest.approx(other.projected * 4.0, rel=1e-9)
-
-
 def test_leaves_mode_and_batch(distribution: ProjectedHuber) -> None:
     hotter = Temperature(2.0, 3.0).apply(distribution.expand((2, 3)))
     assert hotter.batch_shape == (2, 3)

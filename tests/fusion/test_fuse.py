@@ -234,7 +234,8 @@ def test_failures_do_not_change_a_bit_of_the_others() -> None:
 def test_one_problem_is_the_same_alone() -> None:
     predictions, pose, _ = random_problems(50, 3, seed=10, outliers=0.0)
     kept = torch.tensor([17])
-    same_bits(fuse(predictions, pose), fuse(*chosen(predictions, pose, kept)), kept)
+    every = slice(None)  # rebuilt from its columns, as the one is
+    same_bits(fuse(*chosen(predictions, pose, every)), fuse(*chosen(predictions, pose, kept)), kept)
 
 
 @pytest.mark.parametrize("shape", [(0,), (2, 0)])
