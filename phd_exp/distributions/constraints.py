@@ -54,9 +54,13 @@ class Decomposed:
 class Density(Protocol):
     """A density over positions (metres) with samples: `ProjectedHuber`, `PointDensity` or `Decomposed`."""
 
-    def log_prob(self, xyz: Tensor, /) -> Tensor: ...
+    def log_prob(self, xyz: Tensor, /) -> Tensor:
+        """Log density of positions, nats per cubic metre."""
+        ...
 
-    def rsample(self, shape: tuple[int, ...], generator: torch.Generator, /) -> Tensor: ...
+    def rsample(self, shape: tuple[int, ...], generator: torch.Generator, /) -> Tensor:
+        """Exact samples."""
+        ...
 
 
 @dataclass(frozen=True)
