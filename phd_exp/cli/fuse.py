@@ -66,9 +66,9 @@ def _answers(arguments: FuseArguments, scenes: Sequence[Observed]) -> list[dict[
     import torch
 
     from phd_exp.fusion import Plane
+    from phd_exp.inference.answers import sightings
     from phd_exp.inference.fused import fused_answers
     from phd_exp.inference.predictor import load
-    from phd_exp.inference.sightings import sightings
 
     predictor = load(arguments.run, recalibrate=arguments.recalibrate)
     if not predictor.is_probabilistic:

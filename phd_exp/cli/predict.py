@@ -24,8 +24,8 @@ from phd_exp.records.parsing import parse_json
 from phd_exp.records.runs import RunFolder
 
 if TYPE_CHECKING:  # seconds of imports, which a mistake need not wait for
+    from phd_exp.inference.answers import Sighting
     from phd_exp.inference.predictor import Predictor
-    from phd_exp.inference.sightings import Sighting
 
 OF_A_CAMERA = ("f", "fx", "fy", "cx", "cy", "box")
 LONGEST_STEM = 50
@@ -97,8 +97,7 @@ def _predict(arguments: PredictArguments, detections: list[Detection]) -> None:
     predictor = load(arguments.run, recalibrate=arguments.recalibrate)
     say_if_unfinished(arguments.run, predictor.state)
     curve = _depth_curve(arguments.run, predictor) if arguments.calibration else None
-    from phd_exp.inference.answers import answer
-    from phd_exp.inference.sightings import sightings
+    from phd_exp.inference.answers import answer, sightings
 
     seen = with_progress(sightings(predictor, detections), len(detections), "predicting")
     answers = ((sighting, answer(sighting, predictor.temperature)) for sighting in seen)
