@@ -18,7 +18,7 @@ from lightning import Callback, LightningModule, Trainer
 from noise import Noise
 from omegaconf import OmegaConf
 
-from phd_exp.cli.paths import conf_folder
+from phd_exp.cli import conf_folder
 from phd_exp.data.datamodule import PositionData
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.runs import RunFolder

@@ -4,7 +4,7 @@ import ast
 from collections.abc import Iterator
 from importlib import import_module
 
-from phd_exp.cli.paths import PACKAGE
+from phd_exp.cli import PACKAGE
 from tests.docs.pages import module
 
 Definition = ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 import phd_exp.geometry
-from phd_exp.cli.paths import PACKAGE
+from phd_exp.cli import PACKAGE
 from tests.docs.pages import DOCS, PAGES, ROOT, module, name
 
 REFERENCE = sorted((DOCS / "api").glob("*.md"))

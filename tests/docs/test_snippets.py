@@ -9,8 +9,8 @@ from pathlib import Path
 import hydra
 import pytest
 
+from phd_exp.cli import conf_folder
 from phd_exp.cli.help import OF_VERB, VERBS
-from phd_exp.cli.paths import conf_folder
 from phd_exp.cli.sweep import plan
 from phd_exp.training.config import check, check_render
 from tests.docs.pages import PAGES, ROOT, blocks, commands, name
@@ -45,11 +45,11 @@ def test_commands_are_those_of_this_programme(
     if any(word.startswith("--") for word in words):
         _write_files(page, tmp_path)
         assert phd_exp(*words).status == 0
-    elif OF_VERB[verb]:
+    elif verb in OF_VERB:
         config_name, checked = CHECKS[verb]
         overrides = [word for word in words if word not in (verb, "-m")]
         with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
-            jobs = plan(overrides, config_name).jobs
+            _, jobs = plan(overrides, config_name)
         assert jobs
         for job in jobs:
             checked(job.config)
