@@ -1,4 +1,4 @@
-"""The sweeper of phd_exp, in the package where Hydra finds plugins. Other programmes with Hydra load this file too."""
+"""The sweeper of phd_exp, where Hydra finds plugins. Other programmes that use Hydra load this file too."""
 
 from collections.abc import Mapping
 from functools import partial
