@@ -1,8 +1,8 @@
 """A process that compares the programme's training with another loop around the same network.
 
 `python loops.py LOOP FOLDER EPOCHS OVERRIDE...` alternates between both, epoch by epoch. For each epoch but the first
-it prints a JSON line: images a second of the programme and of the loop, and the share of evaluation and logging in the
-programme's epoch. LOOP is `bare`, on noise in memory, so that only training is measured, or `conventional`, on
+it prints a JSON line: images a second of the programme and of the loop, and the share of evaluation and logging in
+the programme's epoch. LOOP is `bare`, on noise in memory, so that only training is measured, or `conventional`, on
 rendered images. With 0 EPOCHS it prints the peak memory in bytes after two steps: of the bare loop, or of the
 programme if LOOP is `programme`.
 """
