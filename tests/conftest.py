@@ -13,7 +13,7 @@ import torch
 from jaxtyping import install_import_hook
 from omegaconf import OmegaConf
 
-from phd_exp.cli.paths import conf_folder
+from phd_exp.cli import conf_folder
 from phd_exp.records.spec import DatasetSpec
 
 # before anything is imported: every annotated function of these modules checks its shapes while tests run; numba
