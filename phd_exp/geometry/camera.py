@@ -19,8 +19,7 @@ class Camera:
         f: focal lengths, pixels; one per element of the batch (no dimensions for a single camera).
         S: side of the image, pixels; the same for the whole batch.
 
-    Raises:
-        ValueError: f or S is not positive or not finite.
+    Raises ValueError if f or S is not positive or not finite.
 
     Example:
         >>> Camera(torch.tensor(1500.0), S=224.0).project(torch.tensor([0.28, 0.0, 4.0]))
@@ -58,10 +57,6 @@ class Camera:
         """Position at depth z (metres) that projects to a pixel: ((u, v) - S/2) z/f, z."""
         return at_depth((pixel - self.S / 2) / self.f[..., None], z)
 
-    def ray(self, pixel: Float[Tensor, "*#batch 2"]) -> Float[Tensor, "*#batch 3"]:
-        """Unit vector along the ray through a pixel."""
-        return torch.nn.functional.normalize(self.unproject(pixel, torch.ones_like(pixel[..., 0])), dim=-1)
-
     def contains(self, xyz: Float[Tensor, "*#batch 3"]) -> Bool[Tensor, "*#batch"]:
         """Whether a position lies in the field of view: in front of the camera and inside the image."""
         # |f x| <= z S/2 avoids the division by a depth that may be zero
@@ -71,8 +66,7 @@ class Camera:
     def scaled(self, factor: float) -> "Camera":
         """The camera of the same image resized by a factor, which multiplies f and S.
 
-        Raises:
-            ValueError: the factor is not positive or not finite.
+        Raises ValueError if the factor is not positive or not finite.
         """
         if not (math.isfinite(factor) and factor > 0):
             raise ValueError(f"factor must be positive and finite, but is {factor}")
@@ -81,8 +75,7 @@ class Camera:
     def with_constant_f(self, constant_f: float | None) -> "Camera":
         """The cameras with one focal length (pixels) for all; None keeps their own.
 
-        Raises:
-            ValueError: the focal length is not positive or not finite.
+        Raises ValueError if the focal length is not positive or not finite.
         """
         return self if constant_f is None else Camera(torch.full_like(self.f, constant_f), self.S)
 

@@ -24,8 +24,7 @@ class DepthScale:
         D: half the range of z/f, sqrt(max(z/f) / min(z/f)); at least 1.
         z_centre: middle of the range of z, metres.
 
-    Raises:
-        ValueError: mu_z0 or z_centre is not positive and finite, or D not in [1, inf).
+    Raises ValueError if mu_z0 or z_centre is not positive and finite, or D not in [1, inf).
 
     Source: paper, section "Parameter remapping".
 
@@ -51,8 +50,7 @@ class DepthScale:
     def from_ranges(cls, f_range: tuple[float, float], z_range: tuple[float, float]) -> "DepthScale":
         """The constants of a data set whose f (pixels) and z (metres) fill two independent ranges.
 
-        Raises:
-            ValueError: a range is not (low, high) with 0 < low <= high < inf.
+        Raises ValueError if a range is not (low, high) with 0 < low <= high < inf.
         """
         for name, (low, high) in (("f_range", f_range), ("z_range", z_range)):
             if not 0 < low <= high < math.inf:
@@ -65,8 +63,7 @@ class DepthScale:
     def from_samples(cls, z: Float[Tensor, " samples"], f: Float[Tensor, " samples"]) -> "DepthScale":
         """The constants of a data set with these depths (metres) and focal lengths (pixels).
 
-        Raises:
-            ValueError: there are no samples, or some z or f is not positive.
+        Raises ValueError if there are no samples, or some z or f is not positive.
         """
         if z.numel() == 0:
             raise ValueError("z and f must hold at least one sample, but are empty")

@@ -46,12 +46,6 @@ class Motion:
         old = torch.einsum("bji,b...j->b...i", self.R, ray)
         return old[..., :2] / old[..., 2:] / half
 
-    def stays_inside(self, camera: Camera) -> Bool[Tensor, " batch"]:
-        """Whether the old image contains the whole new one."""
-        corners = torch.tensor([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
-        # a homography maps the square to a convex quadrilateral: its corners decide
-        return (self.origin(corners.to(camera.f), camera).abs() <= 1 + 1e-6).flatten(1).all(-1)
-
     def where(self, chosen: Bool[Tensor, " batch"], other: "Motion") -> "Motion":
         """This motion for the chosen elements, the other one for the rest."""
         R = torch.where(chosen[:, None, None], self.R, other.R)

@@ -136,8 +136,7 @@ class DatasetFolder:
     def missing(self, spec: DatasetSpec, n_train: int, n_test: int) -> dict[Split, list[int]]:
         """Indices of the wanted samples that are not finished, or whose image or line has gone, by split.
 
-        Raises:
-            DatasetError: the folder holds a data set with another specification.
+        Raises DatasetError if the folder holds a data set with another specification.
         """
         wanted: dict[Split, int] = {"train": n_train, "test": n_test}
         manifest = self.require(spec) if self.manifest_path.exists() else None
@@ -153,8 +152,7 @@ class DatasetFolder:
     def require(self, spec: DatasetSpec) -> Manifest:
         """The manifest, if the folder holds a data set with this specification.
 
-        Raises:
-            DatasetError: it holds none, or one with another specification; names the first key that differs.
+        Raises DatasetError if it holds none, or one with another specification; names the first key that differs.
         """
         manifest = self.manifest
         for (key, here), (_, asked) in zip(manifest.spec, spec, strict=True):

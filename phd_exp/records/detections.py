@@ -221,8 +221,7 @@ def detections_in(folder: Path, n: int | None = None, asked_by: str = "") -> lis
 def detection_of(file: Path, values: Mapping[str, Any]) -> Detection:
     """A detection in an image file, with values as in a line of `metadata.jsonl`.
 
-    Raises:
-        DatasetError: the values are not a detection.
+    Raises DatasetError if the values are not a detection.
 
     Example:
         >>> detection_of(Path("photo.jpg"), {"f": 900.0}).focal_lengths_and_centre(640, 480)
@@ -243,8 +242,7 @@ class Observed:
 def observed(detections: Sequence[Detection]) -> list[Observed]:
     """The scenes of detections, in the order in which they first appear.
 
-    Raises:
-        DatasetError: a line has no scene, or no pose.
+    Raises DatasetError if a line has no scene, or no pose.
     """
     views: dict[int | str, list[tuple[Detection, Pose]]] = {}
     for detection in detections:

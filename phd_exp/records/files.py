@@ -54,8 +54,7 @@ def write_atomic(path: Path | str, data: bytes | str) -> None:
     only), flushed to the disk, and renamed. The temporary file is removed on any failure. It is locked while its
     writer lives, so that `remove_temporaries` recognises those of killed writers.
 
-    Raises:
-        OSError: the folder is missing or unwritable, or the disk is full; `path` is then unchanged.
+    Raises OSError if the folder is missing or unwritable, or the disk is full; `path` is then unchanged.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -98,8 +97,7 @@ def open_journal(path: Path) -> TextIO:
 
     An incomplete last line, left by a killed writer, is removed first; the next line would otherwise continue it.
 
-    Raises:
-        OSError: the file cannot be created, read or written.
+    Raises OSError if the file cannot be created, read or written.
     """
     with open(path, "a+b") as stream:
         stream.seek(0)

@@ -74,11 +74,6 @@ class DatasetSpec(BaseModel):
     image_format: ImageFormat
     image_quality: Annotated[int, Field(strict=True, ge=1, le=100)]
 
-    @property
-    def z_over_f_range(self) -> tuple[float, float]:
-        """Smallest and largest possible z / f (m/px), which determine mu_z0 and D."""
-        return self.z_range[0] / self.f_range[1], self.z_range[1] / self.f_range[0]
-
     def fingerprint(self) -> str:
         """Sixteen hexadecimal digits that identify the values, the same on every machine."""
         canonical = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
@@ -89,8 +84,7 @@ class DatasetSpec(BaseModel):
 class Shard:
     """The samples of each split whose index is `index` modulo `count`: shares of equal cost.
 
-    Raises:
-        ValueError: index is not in [0, count).
+    Raises ValueError if index is not in [0, count).
 
     Example:
         >>> shard = Shard.parse("1/4")

@@ -42,8 +42,7 @@ def renderer_version() -> str:
 def load_bpy() -> Any:
     """Blender's Python module, which takes about a second to load.
 
-    Raises:
-        RenderError: the module, or a system library that it needs, is not installed.
+    Raises RenderError if the module, or a system library that it needs, is not installed.
     """
     require_bpy()
     try:
@@ -83,8 +82,7 @@ class Renderer:
 
     Blender has one state per process: a second renderer in the same process replaces the first one's scene.
 
-    Raises:
-        RenderError: bpy or a library it needs is missing.
+    Raises RenderError if bpy or a library it needs is missing.
     """
 
     def __init__(self, settings: Settings) -> None:

@@ -54,8 +54,7 @@ def read_light(content: bytes, height: int, width: int) -> NDArray[np.float64]:
     The file has three channels of half floats in uncompressed blocks of one row. In background mode, Blender returns
     pixels through files only, and only OpenEXR keeps the light of an overexposed pixel.
 
-    Raises:
-        ValueError: the file has another format or size.
+    Raises ValueError if the file has another format or size.
 
     Source: "OpenEXR file layout" in the OpenEXR documentation. The rows are at the end of the file; each has its
     number and length (int32), then blue, green and red.

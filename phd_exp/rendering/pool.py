@@ -24,8 +24,7 @@ def render_all(
     that a kill loses at most one sample per worker. If the consumer stops early or a worker fails, no further sample
     begins, the samples in progress are finished, and all processes end before the error is raised.
 
-    Raises:
-        RenderError: a worker failed or died.
+    Raises RenderError if a worker failed or died.
     """
     log, todo = folder.cache / "render.log", iter(samples)
     busy: dict[Connection, Child] = {}

@@ -7,8 +7,7 @@ used. The box therefore leaves no seam that could reveal where the objects are.
 
 import numpy as np
 
-from phd_exp.records.dataset import DatasetFolder, image_name, sha256
-from phd_exp.records.files import write_atomic
+from phd_exp.records.dataset import image_name, sha256
 from phd_exp.records.scenes import Backdrop, SampleRecord, Scene, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.antialias import smoothed
@@ -23,15 +22,6 @@ MARGIN = 4  # px around the objects: the denoiser is less accurate along the bor
 def fast_settings(spec: DatasetSpec) -> Settings:
     """Settings of the tracer for the images of a data set."""
     return Settings(samples=spec.samples_per_pixel, denoised=True, at_middles=True)
-
-
-def render_sample(
-    renderer: Renderer, folder: DatasetFolder, spec: DatasetSpec, split: Split, index: int
-) -> SampleRecord:
-    """Render one sample, write its image, and return its record. Raises OSError if the image cannot be written."""
-    image, record = make_sample(renderer, spec, split, index)
-    write_atomic(folder.image_path(split, index, spec.image_format), image)
-    return record
 
 
 def make_sample(

@@ -12,7 +12,6 @@ from phd_exp.records.scenes import (
     Backdrop,
     Lamp,
     LampName,
-    Material,
     Pose,
     Quaternion,
     Scene,
@@ -31,6 +30,7 @@ GENERATOR_VERSION = 2
 SIZE = 0.2  # m: height and diameter of the cylinder, side of the cube, diameter of the sphere
 CLEARANCE = 0.5  # m: least depth of an object in a further view
 MOST_TRIES = 10_000
+Stream = np.random.Generator
 
 
 class Purpose(IntEnum):
@@ -72,7 +72,7 @@ def sample_scene(spec: DatasetSpec, split: Split, index: int) -> Scene:
     """
     number, view = scene_and_view(spec, index)
 
-    def stream(purpose: int) -> np.random.Generator:
+    def stream(purpose: int) -> Stream:
         return _stream(spec, split, number, purpose)
 
     f = _uniform(stream(Purpose.CAMERA), spec.f_range)
@@ -98,7 +98,7 @@ def about_axis(axis: Vector, angle: float) -> Quaternion:
     return math.cos(angle / 2), x, y, z
 
 
-def uniform_rotation(rng: np.random.Generator) -> Quaternion:
+def uniform_rotation(rng: Stream) -> Quaternion:
     """Unit quaternion of a random rotation with the uniform distribution (the Haar measure of SO(3)).
 
     Source: K. Shoemake, "Uniform random rotations", Graphics Gems III (1992).
@@ -113,12 +113,12 @@ def uniform_rotation(rng: np.random.Generator) -> Quaternion:
     )
 
 
-def _stream(spec: DatasetSpec, split: Split, scene: int, *purpose: int) -> np.random.Generator:
+def _stream(spec: DatasetSpec, split: Split, scene: int, *purpose: int) -> Stream:
     key = (get_args(Split).index(split), scene, *map(int, purpose))
     return np.random.default_rng(np.random.SeedSequence(entropy=spec.seed, spawn_key=key))
 
 
-def _seen_again(scene: Scene, spec: DatasetSpec, rng: np.random.Generator) -> Scene:
+def _seen_again(scene: Scene, spec: DatasetSpec, rng: Stream) -> Scene:
     """The same scene in front of another camera, turned about an axis orthogonal to the first one's line of sight.
 
     The focal length and the cylinder's position in the camera frame have the distribution of the first view. The
@@ -129,7 +129,7 @@ def _seen_again(scene: Scene, spec: DatasetSpec, rng: np.random.Generator) -> Sc
     return scene.model_copy(update=changes | {"noise_seed": _seed(rng)})
 
 
-def _pose(objects: tuple[SceneObject, ...], spec: DatasetSpec, f: float, rng: np.random.Generator) -> Pose:
+def _pose(objects: tuple[SceneObject, ...], spec: DatasetSpec, f: float, rng: Stream) -> Pose:
     """The pose of a further camera that has all objects in front of it."""
     places = np.array([item.position for item in objects])
     for _ in range(MOST_TRIES):
@@ -145,12 +145,7 @@ def _pose(objects: tuple[SceneObject, ...], spec: DatasetSpec, f: float, rng: np
 
 
 def _object(
-    spec: DatasetSpec,
-    shape: Shape,
-    f: float,
-    pose: np.random.Generator,
-    look: np.random.Generator,
-    size: np.random.Generator,
+    spec: DatasetSpec, shape: Shape, f: float, pose: Stream, look: Stream, size: Stream
 ) -> SceneObject:
     return SceneObject(
         shape=shape,
@@ -159,11 +154,11 @@ def _object(
         dimensions=(SIZE, SIZE, SIZE),
         scale=_uniform(size, spec.scale_range),
         colour=_colour(look),
-        material=_material(look),
+        material="metal" if look.random() < 0.5 else "rubber",
     )
 
 
-def _position(spec: DatasetSpec, f: float, rng: np.random.Generator) -> tuple[float, float, float]:
+def _position(spec: DatasetSpec, f: float, rng: Stream) -> tuple[float, float, float]:
     """A position in the camera frame; z is drawn first, because x and y span the field of view at that depth."""
     z = _uniform(rng, spec.z_range)
     half_width = 0.5 * spec.xy_range * spec.sensor_size * z / f
@@ -171,18 +166,14 @@ def _position(spec: DatasetSpec, f: float, rng: np.random.Generator) -> tuple[fl
     return x, y, z
 
 
-def _colour(rng: np.random.Generator) -> tuple[float, float, float]:
+def _colour(rng: Stream) -> tuple[float, float, float]:
     """sRGB of any hue; not too grey, which would merge with the backdrop, and not too dark to show shading."""
     hue, saturation, value = rng.random(), _uniform(rng, (0.45, 0.95)), _uniform(rng, (0.45, 0.95))
     r, g, b = colorsys.hsv_to_rgb(hue, saturation, value)
     return r, g, b
 
 
-def _material(rng: np.random.Generator) -> Material:
-    return "metal" if rng.random() < 0.5 else "rubber"
-
-
-def _lamps(spec: DatasetSpec, rng: np.random.Generator) -> tuple[Lamp, ...]:
+def _lamps(spec: DatasetSpec, rng: Stream) -> tuple[Lamp, ...]:
     """The three lamps around the middle of the scene, with jitter in place and power."""
     middle = (0.0, 0.0, sum(spec.z_range) / 2)
     jitter = (-spec.lamp_jitter, spec.lamp_jitter)
@@ -195,15 +186,15 @@ def _lamps(spec: DatasetSpec, rng: np.random.Generator) -> tuple[Lamp, ...]:
     return tuple(lamps)
 
 
-def _backdrop(rng: np.random.Generator) -> Backdrop:
+def _backdrop(rng: Stream) -> Backdrop:
     """Brightest near the upper middle of the image, as under a studio lamp."""
     centre = (_uniform(rng, (0.25, 0.75)), _uniform(rng, (0.0, 0.5)))
     return Backdrop(level=_uniform(rng, (0.52, 0.68)), falloff=_uniform(rng, (0.15, 0.45)), centre=centre)
 
 
-def _seed(rng: np.random.Generator) -> int:
+def _seed(rng: Stream) -> int:
     return int(rng.integers(2**31))
 
 
-def _uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
+def _uniform(rng: Stream, bounds: tuple[float, float]) -> float:
     return bounds[0] + (bounds[1] - bounds[0]) * rng.random()

@@ -33,32 +33,28 @@ class Stage:
     """The parts of Blender's open file that change from scene to scene, found by name."""
 
     def __init__(self, bpy: Any) -> None:
-        data = bpy.data
-        self._camera = data.objects["camera"]
-        self._objects = {shape: data.objects[shape] for shape in SHAPES}
-        self._lamps = {name: data.objects[name] for name in LAMP_NAMES}
-        self._materials = {name: data.materials[name] for name in MATERIALS}
-        self._backdrop = data.worlds["world"].node_tree.nodes
+        self._data = bpy.data
 
     def show(self, scene: Scene) -> None:
         """Arrange everything as in a scene."""
-        self._camera.data.lens = scene.f * SENSOR_WIDTH / scene.S
-        self._camera.matrix_world = _camera_matrix(scene.pose)
-        shown = {item.shape: item for item in scene.objects}
-        for shape, handle in self._objects.items():
-            handle.hide_render = shape not in shown
-            if shape in shown:
-                self._place_object(handle, shown[shape])
+        objects = self._data.objects
+        objects["camera"].data.lens = scene.f * SENSOR_WIDTH / scene.S
+        objects["camera"].matrix_world = _camera_matrix(scene.pose)
+        for shape in SHAPES:
+            objects[shape].hide_render = True
+        for item in scene.objects:
+            self._place_object(objects[item.shape], item)
         for lamp in scene.lamps:
-            _place_lamp(self._lamps[lamp.name], lamp)
-        show_backdrop(self._backdrop, scene.backdrop)
+            _place_lamp(objects[lamp.name], lamp)
+        show_backdrop(self._data.worlds["world"].node_tree.nodes, scene.backdrop)
 
     def _place_object(self, handle: Any, item: SceneObject) -> None:
+        handle.hide_render = False
         stretch = 0.5 * item.scale * np.array(item.dimensions)
         handle.matrix_world = _matrix(rotation_matrix(item.rotation) * stretch, np.array(item.position))
         handle.color = (*(linear(channel) for channel in item.colour), 1.0)
         handle.material_slots[0].link = "OBJECT"
-        handle.material_slots[0].material = self._materials[item.material]
+        handle.material_slots[0].material = self._data.materials[item.material]
 
 
 def build_stage(bpy: Any) -> Stage:

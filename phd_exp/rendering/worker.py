@@ -5,10 +5,11 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 
 from phd_exp.records.errors import RenderError, UserError, unwritable
+from phd_exp.records.files import write_atomic
 from phd_exp.records.processes import parent
 from phd_exp.records.scenes import SampleRecord
 from phd_exp.rendering.blender import Renderer
-from phd_exp.rendering.samples import fast_settings, render_sample
+from phd_exp.rendering.samples import fast_settings, make_sample
 
 
 def serve(connection: Connection) -> None:
@@ -23,7 +24,8 @@ def serve(connection: Connection) -> None:
         answer: SampleRecord | UserError
         try:
             renderer = renderer or Renderer(fast_settings(spec))
-            answer = render_sample(renderer, folder, spec, split, index)
+            image, answer = make_sample(renderer, spec, split, index)
+            write_atomic(folder.image_path(split, index, spec.image_format), image)
         except UserError as error:
             answer = error
         except OSError as error:

@@ -31,10 +31,6 @@ def test_unproject_inverts_project() -> None:
     torch.testing.assert_close(CAMERA.unproject(CAMERA.project(XYZ), XYZ[:, 2]), XYZ)
 
 
-def test_ray_is_the_unit_vector_towards_the_position() -> None:
-    torch.testing.assert_close(CAMERA.ray(CAMERA.project(XYZ)), XYZ / XYZ.norm(dim=-1, keepdim=True))
-
-
 @pytest.mark.parametrize(
     ("xyz", "inside"),
     [

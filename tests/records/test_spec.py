@@ -65,13 +65,6 @@ def test_what_configuration_files_hold_is_taken(make_spec: MakeSpec) -> None:
     assert make_spec(f_range=[1200, 2000], z_range=[3, 5], xy_range=1, scale_range=[1, 1]) == make_spec()
 
 
-def test_the_papers_constants_follow(make_spec: MakeSpec) -> None:
-    """mu_z0 = 2.5e-3 and D = 5/3 (section "Dataset")."""
-    low, high = make_spec().z_over_f_range
-    assert (low * high) ** 0.5 == pytest.approx(2.5e-3)
-    assert (high / low) ** 0.5 == pytest.approx(5 / 3)
-
-
 def test_a_fingerprint_depends_on_every_value_and_on_nothing_else(make_spec: MakeSpec) -> None:
     changes = {
         "variant": "other",
