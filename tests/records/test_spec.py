@@ -1,4 +1,4 @@
-"""A specification refuses what makes no sense, and says what its data set spans."""
+"""A specification refuses invalid values; its shards are a partition."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from phd_exp.records.spec import DatasetSpec
+from phd_exp.records.spec import DatasetSpec, Shard
 
 MakeSpec = Callable[..., DatasetSpec]
 
@@ -89,6 +89,17 @@ def test_a_fingerprint_depends_on_every_value_and_on_nothing_else(make_spec: Mak
     assert make_spec().fingerprint() == "1933c9582b94b54b", "the same on every machine, for ever"
 
 
-def test_a_specification_cannot_be_changed(make_spec: MakeSpec) -> None:
-    with pytest.raises(ValidationError):
-        make_spec().seed = 3
+@pytest.mark.parametrize("count", [1, 2, 3, 7])
+def test_shares_are_a_partition_of_equal_sizes(count: int) -> None:
+    shards = [Shard.parse(f"{index}/{count}") for index in range(count)]
+    sizes = [sum(shard.holds(index) for index in range(20)) for shard in shards]
+    assert max(sizes) - min(sizes) <= 1
+    for index in range(20):
+        assert sum(shard.holds(index) for shard in shards) == 1
+    assert [str(shard) for shard in shards] == [f"{index}/{count}" for index in range(count)]
+
+
+@pytest.mark.parametrize("text", ["4/4", "-1/2", "1/0", "0/0", "a", "1", "", "1/2/3", " 1/2", 1, 0.5, None])
+def test_what_is_no_shard_is_refused(text: object) -> None:
+    with pytest.raises(ValueError, match="expected INDEX/COUNT with 0 <= INDEX < COUNT"):
+        Shard.parse(text)
