@@ -17,19 +17,23 @@ finds all work done and seals.
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
+from itertools import islice
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
 
 from phd_exp.records.dataset import SPLITS, DatasetFolder
-from phd_exp.records.errors import RenderError, writing
+from phd_exp.records.errors import RenderError, UserError, writing
 from phd_exp.records.files import open_journal
-from phd_exp.records.processes import announce, duration, held, usable_cores
+from phd_exp.records.processes import Child, announce, duration, held, usable_cores
+from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec, Shard
 from phd_exp.rendering.blender import require_bpy
-from phd_exp.rendering.pool import render_all
 from phd_exp.rendering.progress import shown_progress
 from phd_exp.rendering.sealing import Known, Wanted, begin, known_samples, missing, seal
 
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # of each worker
 FEWEST_PER_WORKER = 8  # starting one more process costs about as much as rendering this many images
 WAITING = "waiting for it to finish"
 SECONDS_PER_OBJECT = 0.085  # one core, 224 px, 3 samples a pixel: for the announcement only
@@ -151,6 +155,48 @@ def render_missing(
     seconds = time.monotonic() - begun
     announce(f"rendered {len(samples)} images in {duration(seconds)}, {len(samples) / seconds:.1f} a second")
     return len(samples)
+
+
+def render_all(
+    folder: DatasetFolder, spec: DatasetSpec, samples: Sequence[tuple[Split, int]], workers: int
+) -> Generator[SampleRecord, None, None]:
+    """Render samples, given by split and index, and yield each record as soon as its image is on disk.
+
+    Each worker renders one sample at a time and gets the next after the consumer has processed its last record, so
+    that a kill loses at most one sample per worker. If the consumer stops early or a worker fails, no further sample
+    begins, the samples in progress are finished, and all processes end before the error is raised.
+
+    Raises RenderError if a worker failed or died.
+    """
+    log, todo = folder.cache / "render.log", iter(samples)
+    busy: dict[Connection, Child] = {}
+    with ExitStack() as stack:
+        for sample in islice(todo, workers):
+            child = stack.enter_context(Child("phd_exp.rendering.worker", ONE_THREAD, log))
+            child.send((folder, spec))
+            child.send(sample)
+            busy[child.connection] = child
+        while busy:
+            for connection in wait(list(busy)):
+                assert isinstance(connection, Connection)
+                yield _answer(busy[connection], log)
+                if (following := next(todo, None)) is None:
+                    del busy[connection]
+                else:
+                    busy[connection].send(following)
+
+
+def _answer(child: Child, log: Path) -> SampleRecord:
+    try:
+        answer: SampleRecord | UserError = child.receive()
+    except EOFError as death:
+        raise RenderError(
+            f"a render worker: {death}; finished images are kept, and the same command resumes "
+            f"(its last words: {log})"
+        ) from None
+    if isinstance(answer, UserError):
+        raise answer
+    return answer
 
 
 def worker_count(samples: int, cores: int | None = None) -> int:

@@ -129,12 +129,13 @@ def test_run_records(tmp_path: Path, examples: int) -> None:
 def test_configurations(composed: Any, examples: int) -> None:
     good = composed("preset=smoke", "logger=none")
 
-    def law(config: Any) -> None:
+    def law(data: st.DataObject) -> None:
+        config = data.draw(spoiled(good) | objects(RunConfig.model_fields))
         for checked in (check, check_render):
             with suppress(UserError):
                 checked(config)
 
-    holds_for(examples, law, spoiled(good) | objects(RunConfig.model_fields))
+    holds_for(examples, law, st.data())
 
 
 @each_number_of_examples

@@ -22,8 +22,7 @@ from PIL import Image
 
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.pool import render_all
-from phd_exp.rendering.render import worker_count
+from phd_exp.rendering.render import render_all, worker_count
 from phd_exp.rendering.sampling import GENERATOR_VERSION
 
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(7200)]

@@ -9,8 +9,7 @@ from phd_exp.records.errors import DatasetError, RenderError
 from phd_exp.records.scenes import Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering import blender
-from phd_exp.rendering.pool import render_all
-from phd_exp.rendering.render import ensure_rendered, worker_count
+from phd_exp.rendering.render import ensure_rendered, render_all, worker_count
 from tests.support.renders import contents
 
 
