@@ -18,10 +18,9 @@ from phd_exp.cli.arguments import (
     predicted,
     require_file,
 )
-from phd_exp.records.detections import detections_in
+from phd_exp.records.detections import Detection, Observed, detections_in, observed
 from phd_exp.records.errors import ConfigError, listed
 from phd_exp.records.files import write_atomic
-from phd_exp.records.observed import Observed, observed
 
 PLANE = four_numbers("plane=NX,NY,NZ,OFFSET: the points v with normal . v = offset, metres")
 

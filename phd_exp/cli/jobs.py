@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from phd_exp.cli import conf_folder
 from phd_exp.cli.frame import Ending, Stopped, ending_with, failure, print_errors, stopping_on_signals
 from phd_exp.records.errors import ConfigError, RunError, nearest
-from phd_exp.records.provenance import usable_cores
+from phd_exp.records.processes import usable_cores
 
 LONGEST = 400
 """Characters of Hydra's messages that are repeated."""

@@ -4,9 +4,8 @@ from typing import Any
 
 from phd_exp.cli.jobs import launch
 from phd_exp.records.dataset import DatasetFolder
-from phd_exp.rendering.masks import require_elsewhere, write_masks
-from phd_exp.rendering.render import ensure_rendered, render_shard
-from phd_exp.rendering.verify import verify
+from phd_exp.rendering.finished import require_elsewhere, verify, write_masks
+from phd_exp.rendering.render import ensure_rendered
 from phd_exp.training.config import check_render
 
 
@@ -25,11 +24,9 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> None:
         n = verify(folder, data.spec, checked.rerender)
         print(f"{folder.root}: all {n} samples are as they were rendered")
         return
-    wanted = folder, data.spec, data.n_training_split, data.n_test
-    if checked.shard is None:
-        ensure_rendered(*wanted, data.workers, cores)
-    elif not render_shard(*wanted, checked.shard, data.workers, cores):
+    n_train, n_test = data.n_training_split, data.n_test
+    if not ensure_rendered(folder, data.spec, n_train, n_test, data.workers, cores, checked.shard):
         return  # other shards are missing
-    print(f"{folder.root}: {data.n_training_split} training and {data.n_test} test samples are there")
+    print(f"{folder.root}: {n_train} training and {n_test} test samples are there")
     if checked.masks is not None:
         print(f"{checked.masks}: {write_masks(folder, checked.masks)} masks")

@@ -157,7 +157,6 @@ CONFIGURATIONS = [
     configured("a loss of others", "loss._target_=torch.nn.L1Loss", r"loss\._target_: 'torch\.nn\.L1Loss' is no loss; .*"),
     configured("a tool of torch", "loss._target_=torch.nn.utils.clip_grad_norm_", r"loss\._target_: .* is no part of a network; .*"),
     configured("a private name", "optimizer._target_=torch.optim._adamw.x", r"optimizer\._target_: .* may not be built .*"),
-    configured("a system call", "loss._target_=os.system", r"loss\._target_: 'os\.system' may not be built .*"),
     configured("arguments by place", "+backbone._args_=[1]", r"backbone\._args_: unknown key; .* takes depth"),
     configured("half a loss", "+loss._partial_=true", r"loss\._target_: .* is no loss; .*"),
     configured("a partial that is no bool", "+loss._partial_=3", r"loss\._partial_: got 3; expected a bool"),
@@ -211,7 +210,6 @@ PICTURES = [
 
 LINES = [
     line("not JSON", "{", r"not JSON \(.*\); expected one object a line"),
-    line("a list", "[1]\n", r"expected a valid dictionary or instance of DetectionLine"),
     line("nesting without end", f'{{{GOOD}, "box": {DEEP}}}\n', r"not JSON \(nested too deeply\); .*"),
     line("a number of 5000 digits", f'{{"file_name": "0.png", "f": {"9" * 5000}}}\n', r"not JSON \(a whole number of 5000 digits\); .*"),
     line("a number of 400 digits", f'{{"file_name": "0.png", "f": {"9" * 400}}}\n', r"not JSON \(a whole number of 400 digits\); .*"),
@@ -219,17 +217,10 @@ LINES = [
     line("a line of 2 MB", f'{{{GOOD}, "x": "{"a" * 2_000_000}"}}\n', r"longer than 1000000 bytes"),
     line("no text", '{"file_name": "\udcff"', r"not a valid record \(.*codec can't decode.*\)"),
     line("a name that leads up", '{"file_name": "../../secret.png", "f": 300}\n', r"file_name='\.\./\.\./secret\.png' leaves .*"),
-    line("an absolute name", '{"file_name": "/etc/passwd", "f": 300}\n', r"file_name='/etc/passwd' leaves .*"),
-    line("a name with a zero byte", '{"file_name": "a\\u0000.png", "f": 300}\n', r"file_name='a\\x00\.png' is no file name .*"),
     line("a name of two lines", '{"file_name": "a\\nerror: b.png", "f": 300}\n', r"file_name='a\\nerror: b\.png' is no file name .*"),
     line("a name that steers the terminal", '{"file_name": "\\u001b[2J.png", "f": 300}\n', r"file_name='\\x1b\[2J\.png' is no file name .*"),
     line("a name of half a character", '{"file_name": "\\ud800.png", "f": 300}\n', r"file_name: got '\\ud800\.png'; expected a valid string, .*"),
     line("a name without end", f'{{"file_name": "{"a" * 5000}.png", "f": 300}}\n', r"file_name: got 'a{50,}\.\.\.; String should have at most 1000 characters"),
-    line("no name", '{"f": 300}\n', r"file_name: missing"),
-    line("an unknown key", f'{{{GOOD}, "bx": 1}}\n', r"bx: unknown key, did you mean 'box'\?; .*"),
-    line("distortion", f'{{{GOOD}, "k1": 0.1}}\n', r"k1: a distorted image is no pinhole image; .*"),
-    line("a box of text", f'{{{GOOD}, "box": "all"}}\n', r"box: got 'all'; expected a valid tuple"),
-    line("a box outside", f'{{{GOOD}, "box": [500, 0, 600, 9]}}\n', r"box=.* lies outside the image of 120 x 90 pixels"),
     Bad("metadata: a link out", lambda place: (place.photo.rename(place.root / "secret.png"), images.link(place.photo, "../../secret.png")), PREDICT, r".*line 1: file_name='0\.png' leaves .*"),
     Bad("metadata: a link to itself", lambda place: images.link(place.photo, "0.png"), PREDICT, r".*0\.png.*(no file name|cannot be read|leaves).*"),
     Bad("metadata: a pipe", lambda place: images.pipe(place.metadata), PREDICT, r"photos/test/metadata\.jsonl: cannot be read \(a pipe or a device; .*\); .*"),
@@ -239,43 +230,17 @@ LINES = [
 
 LABELS = [
     label("NaN", r"x: got nan; expected to be a finite number", x=float("nan")),
-    label("infinite", r"y: got inf; expected to be a finite number", y=float("inf")),
-    label("depth zero", r"z: got 0; expected to be greater than .*", z=0),
-    label("behind the camera", r"z: got -3\.5; expected to be greater than .*", z=-3.5),
-    label("focal length zero", r"f: got 0; expected to be greater than 0", f=0),
-    label(
-        "a focal length in metres",
-        r"f: got 0\.004; expected a focal length in pixels, at least 0\.01",
-        f=0.004,
-    ),
-    label("focal length negative", r"f: got -300; expected to be greater than 0", f=-300),
+    label("a focal length in metres", r"f: got 0\.004; expected a focal length in pixels, at least 0\.01", f=0.004),
     label("no position", r"x, y, z are missing; .*", x=None, y=None, z=None),
-    label("half a position", r"x, y is given alone; .*", z=None),
-    label(
-        "millimetres across",
-        r"the position \[-200\.0, .*\] is seen at .*, far outside the image .*; check x, y, z \(metres\) .*",
-        x=-200,
-    ),
-    label("a depth without end", r"z: got 1e\+300; .*", z=1e300),
-    label("text", r"z: got 'far'; expected a valid number", z="far"),
-    label("outside the field", r"the position .* is seen at .*, far outside the image .*", x=-9),
-]
+    label("millimetres across", r"the position \[-200\.0, .*\] is seen at .*, far outside the image .*; check x, y, z \(metres\) .*", x=-200),
+]  # fmt: skip
 
 CAMERAS = [
     camera("none", (), r"photos/test/0\.png: expected either f, or fx and fy \(focal length in pixels\)"),
-    camera("both", ("f=300", "fx=300", "fy=300"), r"photos/test/0\.png: expected either f, or fx and fy .*"),
-    camera("zero", ("f=0",), r"photos/test/0\.png: f: got 0\.0; expected to be greater than 0"),
-    camera("negative", ("f=-1",), r"photos/test/0\.png: f: got -1\.0; expected to be greater than 0"),
     camera("NaN", ("f=nan",), r"photos/test/0\.png: f: got nan; expected to be a finite number"),
     camera("beyond all numbers", ("f=1e400",), r"photos/test/0\.png: f: got inf; expected to be a finite number"),
-    camera("nearly infinite", ("f=1e300",), r"photos/test/0\.png: f: got 1e\+300; expected to be less .*"),
-    camera("nearly zero", ("f=1e-300",), r"photos/test/0\.png: f: got 1e-300; expected a focal length in pixels, at least 0\.01"),
-    camera("half a centre", ("f=300", "cx=3"), r"photos/test/0\.png: cx is given alone; expected all of cx, cy"),
-    camera("a centre far away", ("f=300", "cx=1e300", "cy=0"), r"photos/test/0\.png: cx: got 1e\+300; .*"),
     camera("text", ("f=wide",), r"f: got 'wide'; expected a valid number, .*"),
     camera("a box of three numbers", ("f=300", "box=1,2,3"), r"box: got '1,2,3'; expected box=LEFT,TOP,RIGHT,BOTTOM in pixels"),
-    camera("a box without size", ("f=300", "box=3,0,3,5"), r"photos/test/0\.png: box=.*of positive size"),
-    camera("a box without end", ("f=300", "box=0,0,1e300,9"), r"photos/test/0\.png: box\.2: got 1e\+300; .*|.*times as large.*"),
 ]  # fmt: skip
 
 
@@ -324,11 +289,7 @@ CHECKPOINTS = [
 REFUSED = r"may not be built from a stored configuration; expected a name under .*"
 STORED = [
     *stored("a system call", rf"backbone\._target_: 'os\.system' {REFUSED}", backbone={"_target_": "os.system", "command": "touch owned"}),
-    *stored("eval", rf"loss\._target_: 'builtins\.eval' {REFUSED}", loss={"_target_": "builtins.eval", "_args_": ["open('owned','w')"]}),
-    *stored("a call deep inside", rf"model\.head\.chart\._target_: 'os\.system' {REFUSED}", model__head={"_target_": "phd_exp.models.heads.ChartHead", "chart": {"_target_": "os.system", "command": "touch owned"}}),
     *stored("our own command line", rf"backbone\._target_: 'phd_exp\.cli\.train\.main' {REFUSED}", backbone={"_target_": "phd_exp.cli.train.main", "arguments": []}),
-    *stored("our own writer of files", rf"backbone\._target_: 'phd_exp\.records\.files\.write_atomic' {REFUSED}", backbone={"_target_": "phd_exp.records.files.write_atomic", "path": "owned", "data": ""}),
-    *stored("code from the network", rf"backbone\._target_: 'torch\.hub\.load' {REFUSED}", backbone={"_target_": "torch.hub.load", "repo_or_dir": "x", "model": "y"}),
     *stored("what a module imports", r"backbone\._target_: .* is no class or function of its own; .*", backbone={"_target_": "torchvision.models._api.importlib.import_module"} | {"_target_": "phd_exp.models.backbones.partial"}),
     *stored("a network that downloads its weights", rf"backbone\.network\._target_: 'torchvision\.models\.segmentation\.fcn_resnet50' {REFUSED}", backbone={"_target_": "phd_exp.models.backbones.PooledFeatures", "n_features": 1, "network": {"_target_": "torchvision.models.segmentation.fcn_resnet50"}}),
     *stored("a variable of the environment", r"data\.folder: got '\$\{oc\.env:HOME\}'; expected a value, .*", data__folder="${oc.env:HOME}"),
@@ -402,7 +363,7 @@ def many_rows() -> bytes:
     import pyarrow.parquet as pq
 
     zeros = pa.array(np.zeros(2_000_000))
-    names = (
+    names = [
         "x",
         "y",
         "z",
@@ -417,7 +378,7 @@ def many_rows() -> bytes:
         "median_z",
         "mu_x",
         "mu_y",
-    )
+    ]
     buffer = io.BytesIO()
     pq.write_table(pa.table(dict.fromkeys(names, zeros)), buffer)
     return buffer.getvalue()

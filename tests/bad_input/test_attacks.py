@@ -51,16 +51,8 @@ def test_a_resumed_checkpoint_removes_nothing(
     outcome = command(*LONGER)
     assert outcome.status == 0, outcome.err
     assert len(names) == 1
+    assert [row["epoch"] for row in place.run.metrics()] == [-1, 0, 1], "the run was resumed"
     assert (place.root / "diary").read_text() == "dear"
-
-
-def test_a_sound_run_goes_on(
-    place: Place, command: Callable, composed: Callable[..., dict[str, Any]]
-) -> None:
-    go_on(place, composed)
-    outcome = command(*LONGER)
-    assert outcome.status == 0, outcome.err
-    assert [row["epoch"] for row in place.run.metrics()] == [-1, 0, 1]
 
 
 def test_a_report_neither_opens_checkpoints_nor_writes_through_links(place: Place, command: Callable) -> None:

@@ -1,9 +1,8 @@
-"""Whatever stands in a file or on the command line: a UserError or a result, never another exception."""
+"""Any content of a file or of the command line causes a UserError or a result, never another exception."""
 
 import json
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +22,17 @@ from phd_exp.records.scenes import SampleRecord
 from phd_exp.reports.runs import read_report
 from phd_exp.training.config import RunConfig, check, check_render
 
-QUICK = settings(
-    max_examples=40, derandomize=True, deadline=None, database=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-)  # fmt: skip
-LONG = settings(QUICK, max_examples=2000)
+EXAMPLES = [20, pytest.param(2000, marks=[pytest.mark.slow, pytest.mark.timeout(1200)])]
+each_number_of_examples = pytest.mark.parametrize("examples", EXAMPLES)
+
+
+def holds_for(examples: int, law: Callable[..., None], *strategies: Any) -> None:
+    """Check a law on so many examples."""
+    settings(
+        max_examples=examples, derandomize=True, deadline=None, database=None,
+        suppress_health_check=[HealthCheck.too_slow],
+    )(given(*strategies)(law))()  # fmt: skip
+
 
 SCALARS = (
     st.none() | st.booleans() | st.integers() | st.integers(min_value=-(10**400), max_value=10**400)
@@ -71,27 +76,6 @@ BYTES = st.binary(max_size=200) | TEXTS.map(str.encode) | TEXTS.flatmap(
 )  # fmt: skip
 
 
-def _metadata(folder: Path, content: bytes) -> None:
-    (folder / "metadata.jsonl").write_bytes(content)
-    with suppress(UserError):
-        for detection in detections_in(folder):
-            assert detection.file.resolve().is_relative_to(folder.resolve())
-            with suppress(UserError):
-                detection.require_in_sight(100, 100)
-                detection.box(100, 100)
-
-
-def _run_record(folder: RunFolder, contents: dict[str, bytes]) -> None:
-    for name, content in contents.items():
-        (folder.path / name).write_bytes(content)
-    for read in (folder.status, folder.config, folder.results, folder.constants, folder.metrics):
-        with suppress(UserError):
-            read()
-    assert len(read_report(folder.path.parents[3]).runs) == 1
-    with suppress(UserError):
-        check(folder.config())
-
-
 STATUS = RunStatus(
     state="finished", started=1.0, versions={}, git_commit=None, data_manifest=None, machine="x"
 )
@@ -109,64 +93,67 @@ RECORDS = st.fixed_dictionaries(
 )
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> RunFolder:
+@each_number_of_examples
+def test_metadata(tmp_path: Path, examples: int) -> None:
+    def law(content: bytes) -> None:
+        (tmp_path / "metadata.jsonl").write_bytes(content)
+        with suppress(UserError):
+            for detection in detections_in(tmp_path):
+                assert detection.file.resolve().is_relative_to(tmp_path.resolve())
+                with suppress(UserError):
+                    detection.require_in_sight(100, 100)
+                    detection.box(100, 100)
+
+    holds_for(examples, law, BYTES)
+
+
+@each_number_of_examples
+def test_run_records(tmp_path: Path, examples: int) -> None:
     folder = RunFolder(tmp_path / "runs/smoke/default/probabilistic/seed0")
     folder.path.mkdir(parents=True)
-    return folder
 
-
-@QUICK
-@given(BYTES)
-def test_metadata(tmp_path: Path, content: bytes) -> None:
-    _metadata(tmp_path, content)
-
-
-@QUICK
-@given(RECORDS)
-def test_run_records(run: RunFolder, contents: dict[str, bytes]) -> None:
-    _run_record(run, contents)
-
-
-@QUICK
-@given(st.data())
-def test_configurations(composed: Any, data: st.DataObject) -> None:
-    _configuration(_composed(composed), data)
-
-
-@QUICK
-@given(st.lists(BYTES, max_size=2), BYTES)
-def test_data_sets(tmp_path: Path, lines: list[bytes], manifest: bytes) -> None:
-    _data_set(tmp_path, lines, manifest)
-
-
-def _composed(composed: Any) -> dict[str, Any]:
-    if not _KEPT:
-        _KEPT.update(composed("preset=smoke", "logger=none"))
-    return _KEPT
-
-
-_KEPT: dict[str, Any] = {}
-
-
-def _configuration(good: dict[str, Any], data: st.DataObject) -> None:
-    config = data.draw(spoiled(good) | objects(RunConfig.model_fields))
-    for checked in (check, check_render):
+    def law(contents: dict[str, bytes]) -> None:
+        for name, content in contents.items():
+            (folder.path / name).write_bytes(content)
+        for read in (folder.status, folder.config, folder.results, folder.constants, folder.metrics):
+            with suppress(UserError):
+                read()
+        assert len(read_report(tmp_path / "runs").runs) == 1
         with suppress(UserError):
-            checked(config)
+            check(folder.config())
+
+    holds_for(examples, law, RECORDS)
 
 
-def _data_set(folder: Path, lines: list[bytes], manifest: bytes) -> None:
-    data = DatasetFolder(folder)
-    data.split_folder("test").mkdir(exist_ok=True)
-    data.metadata_path("test").write_bytes(b"\n".join(lines))
-    data.manifest_path.write_bytes(manifest)
-    for read in (lambda: data.manifest, lambda: data.records("test")):
-        with suppress(UserError):
-            read()
-    for text in lines:
-        with suppress(ValueError):
-            SampleRecord.model_validate_json(text)
+@each_number_of_examples
+def test_configurations(composed: Any, examples: int) -> None:
+    good = composed("preset=smoke", "logger=none")
+
+    def law(data: st.DataObject) -> None:
+        config = data.draw(spoiled(good) | objects(RunConfig.model_fields))
+        for checked in (check, check_render):
+            with suppress(UserError):
+                checked(config)
+
+    holds_for(examples, law, st.data())
+
+
+@each_number_of_examples
+def test_data_sets(tmp_path: Path, examples: int) -> None:
+    folder = DatasetFolder(tmp_path)
+    folder.split_folder("test").mkdir()
+
+    def law(lines: list[bytes], manifest: bytes) -> None:
+        folder.metadata_path("test").write_bytes(b"\n".join(lines))
+        folder.manifest_path.write_bytes(manifest)
+        for read in (lambda: folder.manifest, lambda: folder.records("test")):
+            with suppress(UserError):
+                read()
+        for text in lines:
+            with suppress(ValueError):
+                SampleRecord.model_validate_json(text)
+
+    holds_for(examples, law, st.lists(BYTES, max_size=2), BYTES)
 
 
 WORDS = st.sampled_from(
@@ -182,18 +169,12 @@ OVERRIDES = st.lists(
 )  # fmt: skip
 
 
-@contextmanager
-def _in(folder: Path) -> Iterator[None]:
-    before = Path.cwd()
-    os.chdir(folder)
-    try:
-        yield
-    finally:
-        os.chdir(before)
-
-
-def _command(folder: Path, words: list[str], capfd: pytest.CaptureFixture[str]) -> None:
-    """What is composed is checked, and no further."""
+@each_number_of_examples
+def test_overrides(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, examples: int
+) -> None:
+    """The configuration is composed and checked, but nothing is run."""
+    monkeypatch.chdir(tmp_path)
 
     def task(config: dict[str, Any], overrides: list[str], cores: int) -> None:
         train.run_name(check(config), overrides)
@@ -201,44 +182,17 @@ def _command(folder: Path, words: list[str], capfd: pytest.CaptureFixture[str]) 
     def verb(words: list[str]) -> int:
         return launch(task, words, standing=train.standing)
 
-    capfd.readouterr()
-    with _in(folder):
+    def law(words: list[str]) -> None:
+        capfd.readouterr()
         try:
             status = run_verb(verb, ["preset=smoke", "logger=none", *words])
         except SystemExit as end:  # --version and the like
             status = end.code
-    out, err = capfd.readouterr()
-    assert status in (0, 1, 2), words
-    assert "Traceback" not in out + err, (words, err)
-    if status:
-        assert all(line.startswith("error: ") for line in err.splitlines()), (words, err)
-        assert err
+        out, err = capfd.readouterr()
+        assert status in (0, 1, 2), words
+        assert "Traceback" not in out + err, (words, err)
+        if status:
+            assert all(line.startswith("error: ") for line in err.splitlines()), (words, err)
+            assert err
 
-
-@QUICK
-@given(OVERRIDES)
-def test_overrides(tmp_path: Path, capfd: pytest.CaptureFixture[str], words: list[str]) -> None:
-    _command(tmp_path, words, capfd)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-@LONG
-@given(BYTES, RECORDS, st.lists(BYTES, max_size=2), BYTES, st.data())
-def test_records_at_length(
-    run: RunFolder, composed: Any, content: bytes, contents: dict[str, bytes], lines: list[bytes], manifest: bytes,
-    data: st.DataObject,
-) -> None:  # fmt: skip
-    place = run.path.parents[4]
-    _metadata(place, content)
-    _run_record(run, contents)
-    _data_set(place, lines, manifest)
-    _configuration(_composed(composed), data)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-@settings(LONG, max_examples=500)
-@given(OVERRIDES)
-def test_overrides_at_length(tmp_path: Path, capfd: pytest.CaptureFixture[str], words: list[str]) -> None:
-    _command(tmp_path, words, capfd)
+    holds_for(min(examples, 500), law, OVERRIDES)

@@ -12,7 +12,7 @@ import pytest
 from phd_exp.cli import conf_folder, sweep
 from phd_exp.cli.sweep import Combination, cores_a_job, plan
 from phd_exp.cli.train import run_name, standing
-from phd_exp.records.provenance import usable_cores
+from phd_exp.records.processes import usable_cores
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import check
 

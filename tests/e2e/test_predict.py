@@ -19,8 +19,8 @@ import phd_exp as package
 from phd_exp.__main__ import main
 from phd_exp.inference import pictures
 from phd_exp.records.runs import RunFolder
-from tests.disks import small_disk
 from tests.e2e.conftest import SIDE
+from tests.support.disks import small_disk
 from tests.support.untrained import read_lines
 
 GUIDE = Path(__file__).parents[2] / "docs" / "guides" / "predict.md"

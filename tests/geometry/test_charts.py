@@ -110,14 +110,11 @@ def test_depth_scale_refuses_impossible_constants(arguments: tuple[float, ...], 
 
 
 @pytest.mark.parametrize("bad", [(0.0, 5.0), (5.0, 3.0), (1.0, float("inf"))])
-def test_depth_scale_refuses_impossible_ranges(bad: tuple[float, float]) -> None:
+def test_depth_scale_refuses_impossible_ranges_and_samples(bad: tuple[float, float]) -> None:
     with pytest.raises(ValueError, match="f_range must be"):
         DepthScale.from_ranges(f_range=bad, z_range=(3.0, 5.0))
     with pytest.raises(ValueError, match="z_range must be"):
         DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=bad)
-
-
-def test_depth_scale_refuses_impossible_samples() -> None:
     with pytest.raises(ValueError, match="at least one sample"):
         DepthScale.from_samples(torch.ones(0), torch.ones(0))
     with pytest.raises(ValueError, match="z must be positive, but its smallest value is -1"):

@@ -57,24 +57,24 @@ def test_distances_stay(motion: Motion, xyz: torch.Tensor) -> None:
     assert_close(motion.position(xyz).norm(dim=-1), xyz.norm(dim=-1))
 
 
+def farthest(motion: Motion, camera: Camera) -> torch.Tensor:
+    """Place of the corners of the new image in the old one: a homography maps a square to a convex quadrilateral."""
+    corners = torch.tensor([[-1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [1.0, -1.0]], dtype=torch.float64)
+    return motion.origin(corners, camera).abs().amax((1, 2))
+
+
 @pytest.mark.parametrize("largest_zoom", [1.0, 1.05, 1.3, 1.5, 3.0])
 def test_the_old_image_holds_what_the_new_one_shows(largest_zoom: float, camera: Camera) -> None:
     turns = small_turns(numbers(4), largest_zoom, camera)
-    assert turns.stays_inside(camera).all()
+    assert (farthest(turns, camera) <= 1 + 1e-6).all()
     assert (turns.zoom <= largest_zoom).all()
-
-
-def test_what_does_not_stay_inside_is_known(camera: Camera) -> None:
-    out = small_turns(torch.ones(N, 4, dtype=torch.float64), 1.3, camera)
-    assert not Motion(out.R, torch.ones_like(out.zoom)).stays_inside(camera).any()
 
 
 def test_roll_and_turns_use_the_room_that_a_zoom_leaves(camera: Camera) -> None:
     extremes = torch.tensor([[1.0, 1.0, 0.0, 0.0], [1.0, 0.0, 1.0, 0.0]], dtype=torch.float64)
     rolled, tilted = (small_turns(row.expand(N, 4), 1.3, camera) for row in extremes)
-    corners = torch.tensor([[-1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [1.0, -1.0]], dtype=torch.float64)
-    assert_close(rolled.origin(corners, camera).abs().amax((1, 2)), torch.ones(N, dtype=torch.float64))
-    assert (tilted.origin(corners, camera).abs().amax((1, 2)) > 0.95).all()
+    assert_close(farthest(rolled, camera), torch.ones(N, dtype=torch.float64))
+    assert (farthest(tilted, camera) > 0.95).all()
 
 
 def test_there_are_eight_symmetries() -> None:

@@ -104,6 +104,13 @@ BAD: list[tuple[Any, str]] = [
     (GOOD | {"file_name": "/etc/passwd"}, "leaves"),
     (GOOD | {"file_name": ""}, "file_name: got ''"),
     (GOOD | {"file_name": "a\0.png"}, "is no file name"),
+    (GOOD | {"cx": 1e300, "cy": 0}, "cx: got 1e+300"),
+    (GOOD | {"z": 1e300}, "z: got 1e+300"),
+    (GOOD | {"z": "far"}, "z: got 'far'; expected a valid number"),
+    (GOOD | {"f": 1e300}, "f: got 1e+300; expected to be less"),
+    (GOOD | {"f": 1e-300}, "f: got 1e-300; expected a focal length in pixels, at least 0.01"),
+    (GOOD | {"box": "all"}, "box: got 'all'; expected a valid tuple"),
+    (GOOD | {"box": [0, 0, 1e300, 9]}, "box.2: got 1e+300"),
 ]
 
 

@@ -10,6 +10,8 @@ from phd_exp.records.choices import RunName
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder, find_runs
 
+NO_STATUS = ("", "{", "[]", '{"state": "done"}', "\x00")
+
 
 @pytest.fixture
 def folder(tmp_path: Path) -> RunFolder:
@@ -21,10 +23,9 @@ def folder(tmp_path: Path) -> RunFolder:
 def test_a_run_is_named_by_its_choices(tmp_path: Path) -> None:
     plain = RunName("paper", "scale", "mae_logz", 3).folder(tmp_path)
     assert plain.relative_to(tmp_path).as_posix() == "paper/scale/mae_logz/seed3"
-    one = RunName("paper", "scale", "mae_logz", 3, ("data.n_train=256", "optimizer.lr=0.1")).folder(tmp_path)
-    same = RunName("paper", "scale", "mae_logz", 3, ("optimizer.lr=0.1", "data.n_train=256")).folder(tmp_path)
-    other = RunName("paper", "scale", "mae_logz", 3, ("optimizer.lr=0.2", "data.n_train=256")).folder(
-        tmp_path
+    overrides = (("n=256", "lr=0.1"), ("lr=0.1", "n=256"), ("lr=0.2", "n=256"))
+    one, same, other = (
+        RunName("paper", "scale", "mae_logz", 3, words).folder(tmp_path) for words in overrides
     )
     assert one == same != other
     assert one.name.startswith("seed3-")
@@ -60,44 +61,38 @@ def test_a_run_that_is_stopped_says_so(folder: RunFolder, stop: BaseException, s
 
 
 def test_two_processes_cannot_hold_one_run(folder: RunFolder) -> None:
-    with (
-        folder.held(),
-        pytest.raises(RunError, match="another process is working on this run"),
-        RunFolder(folder.path).held(),
-    ):
-        pass
-    with folder.held():
-        pass
+    for _ in range(2):  # the lock is released at the end
+        with folder.held():
+            assert folder.is_held()
+            with pytest.raises(RunError, match="another process is working"), RunFolder(folder.path).held():
+                pass
+        assert not folder.is_held()
 
 
 def test_an_unwritable_run_folder_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with (
-        pytest.raises(RunError, match=r"cannot be written .*runs=DIR"),
-        RunFolder(tmp_path / "file" / "run").held(),
-    ):
+    run = RunFolder(tmp_path / "file" / "run")
+    with pytest.raises(RunError, match=r"cannot be written .*runs=DIR"), run.held():
         pass
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"state": "done"}', "\x00"])
-def test_a_broken_status_is_named(folder: RunFolder, content: str) -> None:
-    folder.status_file.write_text(content)
-    with pytest.raises(RunError, match=r"status\.json: not a run status .*delete the folder"):
-        folder.status()
-
-
 @pytest.mark.parametrize(
-    ("content", "said"), [("{", "cannot be read"), ("[1]", "expected a mapping, found list")]
+    ("read", "content", "said"),
+    [
+        *(
+            ("status", content, r"status\.json: not a run status .*delete the folder")
+            for content in NO_STATUS
+        ),
+        ("results", "{", "results.json: cannot be read"),
+        ("results", "[1]", "results.json: expected a mapping, found list"),
+        ("results", None, r"results\.json: missing"),
+    ],
 )
-def test_broken_results_are_named(folder: RunFolder, content: str, said: str) -> None:
-    folder.results_file.write_text(content)
+def test_a_broken_record_is_named(folder: RunFolder, read: str, content: str | None, said: str) -> None:
+    if content is not None:
+        (folder.path / f"{read}.json").write_text(content)
     with pytest.raises(RunError, match=said):
-        folder.results()
-
-
-def test_missing_results_are_named(folder: RunFolder) -> None:
-    with pytest.raises(RunError, match=r"results\.json: missing"):
-        folder.results()
+        getattr(folder, read)()
 
 
 def test_metrics_survive_a_torn_last_line(folder: RunFolder) -> None:

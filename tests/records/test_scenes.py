@@ -16,19 +16,10 @@ def record(dataset: DatasetFolder) -> SampleRecord:
 
 def test_a_record_survives_the_disk_to_the_last_bit(record: SampleRecord) -> None:
     line = record.model_dump_json()
+    assert line.startswith('{"file_name":')
     assert "\n" not in line
     assert SampleRecord.model_validate_json(line) == record
     assert SampleRecord.model_validate_json(line).model_dump_json() == line
-
-
-def test_the_image_comes_first(record: SampleRecord) -> None:
-    assert list(record.model_dump())[:5] == ["file_name", "x", "y", "z", "f"]
-
-
-def test_position_is_that_of_the_cylinder(record: SampleRecord) -> None:
-    cylinder = record.shown.objects[0]
-    assert cylinder.shape == "cylinder"
-    assert (record.x, record.y, record.z, record.scale) == (*cylinder.position, cylinder.scale)
 
 
 @pytest.mark.parametrize(
@@ -59,10 +50,5 @@ def test_a_scene_is_one_cylinder_and_at_most_one_of_each_other_shape(record: Sam
     for objects in ([cylinder, cylinder], [cylinder | {"shape": "cube"}]):
         with pytest.raises(ValidationError, match="a cylinder first, then other shapes, each once"):
             SampleRecord.model_validate(fields | {"objects": objects})
-
-
-def test_a_rotation_has_norm_one(record: SampleRecord) -> None:
-    fields = record.model_dump()
-    fields["objects"][0]["rotation"] = (1.0, 1.0, 0.0, 0.0)
     with pytest.raises(ValidationError, match="unit quaternion"):
-        SampleRecord.model_validate(fields)
+        SampleRecord.model_validate(fields | {"objects": [cylinder | {"rotation": (1.0, 1.0, 0.0, 0.0)}]})

@@ -23,32 +23,24 @@ def directed_edges(mesh: Mesh) -> Counter[tuple[tuple[float, ...], tuple[float, 
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_a_mesh_is_closed(shape: Shape) -> None:
-    """Every edge is walked once in each direction."""
-    edges = directed_edges(build_mesh(shape))
-    assert set(edges.values()) == {1}
+def test_a_mesh_is_closed_faces_outward_and_is_its_solid(shape: Shape) -> None:
+    mesh = build_mesh(shape)
+    edges = directed_edges(mesh)
+    assert set(edges.values()) == {1}, "every edge is walked once in each direction"
     assert all((b, a) in edges for a, b in edges)
 
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_a_mesh_has_the_volume_of_its_solid(shape: Shape) -> None:
-    """The signed volume is positive: faces look outward."""
-    mesh = build_mesh(shape)
     points = np.array(mesh.vertices)
     volume = sum(
         np.linalg.det(points[[face[0], face[k], face[k + 1]]]) / 6
         for face in mesh.faces
         for k in range(1, len(face) - 1)
     )
-    assert volume == pytest.approx(VOLUME[shape], rel=1e-3)
+    assert volume == pytest.approx(VOLUME[shape], rel=1e-3), "positive, since faces look outward"
 
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_every_vertex_lies_on_the_surface(shape: Shape) -> None:
-    x, y, z = np.array(build_mesh(shape).vertices).T
+    x, y, z = points.T
     distance = {
         "cylinder": np.maximum(np.hypot(x, y), np.abs(z)),
-        "cube": np.maximum(np.maximum(np.abs(x), np.abs(y)), np.abs(z)),
-        "sphere": np.sqrt(x * x + y * y + z * z),
+        "cube": np.abs(points).max(axis=1),
+        "sphere": np.linalg.norm(points, axis=1),
     }[shape]
-    assert distance == pytest.approx(1.0)
+    assert distance == pytest.approx(1.0), "every vertex lies on the surface"

@@ -8,7 +8,7 @@ from scipy import stats
 
 from phd_exp.records.scenes import Scene
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.rotations import rotation_matrix
+from phd_exp.rendering.rays import rotation_matrix
 from phd_exp.rendering.sampling import sample_scene
 
 MakeSpec = Callable[..., DatasetSpec]
@@ -95,15 +95,16 @@ def unscaled(scene: Scene) -> Scene:
     return scene.model_copy(update={"objects": objects})
 
 
-def test_a_scene_depends_on_seed_split_and_index_and_on_nothing_else(make_spec: MakeSpec) -> None:
-    spec = make_spec("occl_scale")
-    scene = sample_scene(spec, "train", 5)
-    sample_scene(spec, "train", 4)
+@pytest.mark.parametrize(("variant", "index"), [("occl_scale", 5), ("multiview", 6)])
+def test_a_scene_depends_only_on_seed_split_and_index(make_spec: MakeSpec, variant: str, index: int) -> None:
+    spec = make_spec(variant)
+    scene = sample_scene(spec, "train", index)
+    sample_scene(spec, "train", index - 1)
     np.random.seed(3)
-    assert sample_scene(spec, "train", 5) == scene
-    assert sample_scene(spec, "test", 5).f != scene.f
-    assert sample_scene(spec, "train", 6).f != scene.f
-    assert sample_scene(make_spec("occl_scale", seed=1), "train", 5).f != scene.f
+    assert sample_scene(spec, "train", index) == scene
+    others = ((spec, "test", index), (spec, "train", index + 1), (make_spec(variant, seed=1), "train", index))
+    for other in others:
+        assert sample_scene(*other).f != scene.f
 
 
 def test_a_scene_is_the_same_for_ever(make_spec: MakeSpec) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from phd_exp.evaluation.reference import Band
+from phd_exp.records.processes import duration
 from phd_exp.reports.fusion_table import fusion_table, headline
 from phd_exp.reports.paper import PUBLISHED
 from phd_exp.reports.quantities import SCORES, Quantity, quantity
@@ -35,13 +36,6 @@ def _moment(moment: datetime) -> str:
     return f"{moment.astimezone(UTC):%Y-%m-%d %H:%M} UTC"
 
 
-def _duration(seconds: float) -> str:
-    if seconds < 120:
-        return f"{seconds:.0f} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
-
-
 _ENVIRONMENT = Environment(
     loader=FileSystemLoader(Path(__file__).parent / "templates"),
     autoescape=True,
@@ -49,7 +43,7 @@ _ENVIRONMENT = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_ENVIRONMENT.filters |= {"moment": _moment, "duration": _duration}
+_ENVIRONMENT.filters |= {"moment": _moment, "duration": duration}
 _ENVIRONMENT.globals |= {"score": quantity, "headline": headline}
 
 

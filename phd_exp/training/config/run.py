@@ -5,7 +5,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field, model_validator
 
 from phd_exp.records.choices import setting
-from phd_exp.records.shards import Shard
+from phd_exp.records.spec import Shard
 from phd_exp.training.config.data import DataConfig, RenderedConfig
 from phd_exp.training.config.section import Folder, Name, Section, Whole
 from phd_exp.training.config.sections import (
