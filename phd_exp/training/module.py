@@ -1,5 +1,6 @@
-"""The one LightningModule: every model of the tables trains through it."""
+"""The LightningModule with which all models are trained."""
 
+import math
 from collections.abc import Callable, Iterable
 
 import torch
@@ -13,9 +14,9 @@ from phd_exp.distributions.columns import Columns
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import projected
 from phd_exp.losses import NegativeLogLikelihood
-from phd_exp.losses.localisation import localisation_loss
 from phd_exp.metrics.rows import Rows
 from phd_exp.models.heads import Prediction
+from phd_exp.models.locating import localisation_loss
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.errors import RunError, listed
 from phd_exp.training.predictions import columns, summary, training_columns
@@ -33,7 +34,7 @@ class PositionModule(LightningModule):
         optimizer: parameters -> optimizer.
         constant_f: focal length in pixels that the model uses for every sample; None: the true one.
         localisation: weight of the localisation loss; above 0 only with a backbone that locates.
-        schedule: number of steps -> factor of the learning rate at each; see `schedule.factor`.
+        schedule: number of steps -> factor of the learning rate at each; see `factor`.
 
     Attributes:
         table: the rows of the last evaluation, see `training.predictions.columns`.
@@ -129,3 +130,22 @@ class PositionModule(LightningModule):
             f"{listed([files[row] for row in rows])}; the last checkpoint is whole: lower optimizer.lr, or look at "
             "these images"
         )
+
+
+def factor(schedule: str, warmup_steps: int, steps: int) -> Callable[[int], float]:
+    """Step -> factor of the optimizer's learning rate, in a run of `steps` steps.
+
+    It rises linearly over the first `warmup_steps`. Then "constant" stays; "cosine" falls to zero as half a wave.
+
+    Example:
+        >>> at = factor("cosine", warmup_steps=1, steps=100)
+        >>> [round(at(step), 3) for step in (0, 50, 100)]
+        [0.5, 0.5, 0.0]
+    """
+
+    def at(step: int) -> float:
+        rise = min(1.0, (step + 1) / (warmup_steps + 1))
+        fall = (1 + math.cos(math.pi * min(step / steps, 1.0))) / 2 if schedule == "cosine" else 1.0
+        return rise * fall
+
+    return at

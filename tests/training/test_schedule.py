@@ -2,7 +2,7 @@
 
 import pytest
 
-from phd_exp.training.schedule import factor
+from phd_exp.training.module import factor
 
 
 def test_constant_is_one_throughout() -> None:

@@ -11,7 +11,7 @@ from phd_exp.data.images import SHRINKING
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import check
-from phd_exp.training.stored import require_same_shrinking
+from phd_exp.training.network import require_same_shrinking
 
 
 @pytest.mark.parametrize("side", [64, 112])
