@@ -1,7 +1,7 @@
 """Batches of a data set in memory, in an order that depends on (seed, epoch) alone."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -63,11 +63,13 @@ class Augment(Protocol):
         ...
 
 
+@dataclass(eq=False)
 class BatchLoader:
     """Iterates over the batches of one epoch; each iteration is the next epoch.
 
-    The order is a function of (seed, epoch). The state holds the epoch and the next batch, so a resumed epoch
-    continues with its remaining batches; a DataLoader would repeat its first ones.
+    `shuffle` is for training: a random order, without the last batch if it is not full. The order is a function of
+    (seed, epoch). The state holds the epoch and the next batch, so a resumed epoch continues with its remaining
+    batches; a DataLoader would repeat its first ones.
 
     With several processes, rank r takes the rows r, r + world, ... of every batch. No row is repeated; a rank skips a
     last batch without a row for it.
@@ -80,37 +82,24 @@ class BatchLoader:
         >>> n = 4
         >>> samples = Batch(torch.zeros(n, 8, 8, 3, dtype=torch.uint8), torch.ones(n, 3), torch.ones(n), 8.0,
         ...                 torch.arange(n))
-        >>> loader = BatchLoader(samples, 3, shuffle=True, drop_last=False, seed=0)
+        >>> loader = BatchLoader(samples, 3, shuffle=True, seed=0)
         >>> [batch.row.tolist() for batch in loader]
-        [[2, 3, 0], [1]]
+        [[1, 0, 3]]
     """
 
-    def __init__(
-        self,
-        samples: Batch,
-        batch_size: int,
-        *,
-        shuffle: bool,
-        drop_last: bool,
-        seed: int,
-        rank: int = 0,
-        world: int = 1,
-        augment: Augment | None = None,
-    ) -> None:
-        self.samples = samples
-        self.batch_size = batch_size
-        self.shuffle = shuffle
-        self.drop_last = drop_last
-        self.seed = seed
-        self.rank = rank
-        self.world = world
-        self.augment = augment
-        self.epoch = -1
-        self.next_batch = 0
+    samples: Batch
+    batch_size: int
+    shuffle: bool
+    seed: int
+    rank: int = 0
+    world: int = 1
+    augment: Augment | None = None
+    epoch: int = field(default=-1, init=False)
+    next_batch: int = field(default=0, init=False)
 
     def __len__(self) -> int:
         whole, rest = divmod(len(self.samples), self.batch_size)
-        return whole + (rest > self.rank and not self.drop_last)
+        return whole + (rest > self.rank and not self.shuffle)
 
     def __iter__(self) -> Iterator[Batch]:
         if self.next_batch in (0, len(self)):  # else: resumed in the middle of an epoch

@@ -1,5 +1,7 @@
 """A data set as a LightningDataModule."""
 
+from functools import partial
+
 from lightning import LightningDataModule
 
 from phd_exp.data.batches import Augment, Batch, BatchLoader
@@ -34,11 +36,8 @@ class PositionData(LightningDataModule):
             )
         _require_shares(source, batch_size, world)
         self.source = source
-        self.batch_size = batch_size
-        self.seed = seed
-        self.rank = rank
-        self.world = world
         self.augment = augment
+        self.batches = partial(BatchLoader, batch_size=batch_size, seed=seed, rank=rank, world=world)
         self.samples: dict[Part, Batch] = {}
         self.train_batches: BatchLoader | None = None
 
@@ -48,7 +47,7 @@ class PositionData(LightningDataModule):
             if part not in self.samples and self.source.count(part):
                 self.samples[part] = self.source.samples(part)
         if self.train_batches is None:
-            self.train_batches = self._batches("train", shuffle=True, drop_last=True)
+            self.train_batches = self.batches(self.samples["train"], shuffle=True, augment=self.augment)
 
     def train_dataloader(self) -> BatchLoader:
         assert self.train_batches is not None, "setup comes first"
@@ -60,19 +59,7 @@ class PositionData(LightningDataModule):
 
     def in_order(self, part: Part) -> BatchLoader:
         """Every sample of a part once, in the order of the data set."""
-        return self._batches(part, shuffle=False, drop_last=False)
-
-    def _batches(self, part: Part, *, shuffle: bool, drop_last: bool) -> BatchLoader:
-        return BatchLoader(
-            self.samples[part],
-            self.batch_size,
-            shuffle=shuffle,
-            drop_last=drop_last,
-            seed=self.seed,
-            rank=self.rank,
-            world=self.world,
-            augment=self.augment if shuffle else None,
-        )
+        return self.batches(self.samples[part], shuffle=False)
 
     # Lightning restores the state of a datamodule always, that of a loader in the middle of an epoch only
     def state_dict(self) -> dict[str, int]:

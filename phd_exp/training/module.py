@@ -23,17 +23,17 @@ from phd_exp.training.predictions import columns, summary, training_columns
 
 
 class PositionModule(LightningModule):
-    """Image and camera -> prediction -> loss; metrics of both splits, logged once an epoch.
+    """Image and camera -> prediction -> loss, with the metrics of both splits logged once per epoch.
 
-    Training runs in the Trainer's precision. Evaluation always runs in float32, so that logged metrics, recorded
+    Training runs in the precision of the Trainer. Evaluation always runs in float32, so that logged metrics, recorded
     predictions, `predict` and an exported network agree.
 
     Args:
         regressor: image and camera -> prediction.
-        loss: prediction and true positions -> one number a sample, or their mean.
+        loss: prediction and true positions -> one number per sample, or their mean.
         optimizer: parameters -> optimizer.
         constant_f: focal length in pixels that the model uses for every sample; None: the true one.
-        localisation: weight of the localisation loss; above 0 only with a backbone that locates.
+        localisation: weight of the localisation loss; 0 for a backbone that does not locate the object.
         schedule: number of steps -> factor of the learning rate at each; see `factor`.
 
     Attributes:
@@ -63,7 +63,7 @@ class PositionModule(LightningModule):
         return self.regressor(batch.image, self.camera(batch))
 
     def camera(self, batch: Batch) -> Camera:
-        """The cameras that the model uses for a batch."""
+        """The cameras of a batch as the model knows them."""
         return batch.camera.with_constant_f(self.constant_f)
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
@@ -97,7 +97,7 @@ class PositionModule(LightningModule):
         self._require_finite(losses.mean(), losses, batch, "test")
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        return self._evaluate(batch)  # Lightning warns of a step without a result
+        return self._evaluate(batch)  # Lightning warns about None
 
     def on_validation_epoch_end(self) -> None:
         self._finish_evaluation()
@@ -107,7 +107,7 @@ class PositionModule(LightningModule):
         self._finish_evaluation()
 
     def _evaluate(self, batch: Batch) -> Tensor:
-        """Predict a batch in float32 and keep its rows; returns the losses."""
+        """Predict a batch in float32 and record its rows; returns the losses."""
         with torch.autocast(self.device.type, enabled=False):
             prediction = self(batch)
             losses = self.loss(prediction, batch.xyz)
@@ -119,7 +119,7 @@ class PositionModule(LightningModule):
         self.evaluation_rows.reset()
 
     def _require_finite(self, total: Tensor, losses: Tensor, batch: Batch, split: str) -> None:
-        """Raise RunError that names the samples whose loss is not finite; all of them if only the total is not."""
+        """Raise RunError naming the samples whose loss is not finite, or all if only the total is not."""
         if total.isfinite():
             return
         is_bad = ~losses.detach().expand(len(batch)).isfinite()
