@@ -20,7 +20,7 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer
 from phd_exp.rendering.pixels import file_of
 from phd_exp.rendering.rays import cylinder_mask, trace_pixels
-from phd_exp.rendering.worker import fast_settings, make_sample
+from phd_exp.rendering.samples import fast_settings, make_sample
 from phd_exp.training.config import check_render
 
 VARIANTS = ("default", "occl", "scale", "occl_scale")

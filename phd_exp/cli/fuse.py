@@ -17,10 +17,9 @@ from phd_exp.cli.arguments import (
     say_if_unfinished,
     with_progress,
 )
-from phd_exp.records.detections import Detection, detections_in
+from phd_exp.records.detections import Detection, Observed, detections_in, observed
 from phd_exp.records.errors import ConfigError, listed
 from phd_exp.records.files import write_atomic
-from phd_exp.records.observed import Observed, observed
 
 
 class FuseArguments(Arguments):

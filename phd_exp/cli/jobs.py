@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 from phd_exp.cli.frame import Ending, failure, print_errors
 from phd_exp.cli.signals import Stopped, ending_with, stopping_on_signals
 from phd_exp.records.errors import ConfigError, RunError
-from phd_exp.records.provenance import usable_cores
+from phd_exp.records.processes import usable_cores
 
 HOME = uuid.uuid4().hex
 """This process: another one that imports this module has another."""

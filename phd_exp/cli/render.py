@@ -4,10 +4,10 @@ from typing import Any
 
 from phd_exp.cli.app import launch
 from phd_exp.records.dataset import DatasetFolder
-from phd_exp.rendering.masks import require_elsewhere, write_masks
-from phd_exp.rendering.render import ensure_rendered, render_shard
-from phd_exp.rendering.verify import verify
-from phd_exp.training.config import RenderConfig, RenderedConfig, check_render
+from phd_exp.records.spec import Shard
+from phd_exp.rendering.finished import require_elsewhere, verify, write_masks
+from phd_exp.rendering.render import ensure_rendered
+from phd_exp.training.config import RenderedConfig, check_render
 
 
 def main(arguments: list[str]) -> int:
@@ -25,26 +25,14 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> None:
         n = verify(folder, data.spec, checked.rerender)
         print(f"{folder.root}: all {n} samples are as they were rendered")
         return
-    if not _render(checked, folder, cores):
+    if not ensure_dataset(data, cores, checked.shard):
         return  # other shards are missing
     print(f"{folder.root}: {data.n_training_split} training and {data.n_test} test samples are there")
     if checked.masks is not None:
         print(f"{checked.masks}: {write_masks(folder, checked.masks)} masks")
 
 
-def _render(checked: RenderConfig, folder: DatasetFolder, cores: int) -> bool:
-    """Render all of a data set, or one share of it; whether all of it is there."""
-    data = checked.data
-    if checked.shard is None:
-        ensure_dataset(data, cores)
-        return True
-    return render_shard(
-        folder, data.spec, data.n_training_split, data.n_test, checked.shard, data.workers, cores
-    )
-
-
-def ensure_dataset(data: RenderedConfig, cores: int) -> None:
-    """Render what a run needs and the folder lacks."""
-    ensure_rendered(
-        DatasetFolder(data.folder), data.spec, data.n_training_split, data.n_test, data.workers, cores
-    )
+def ensure_dataset(data: RenderedConfig, cores: int, shard: Shard | None = None) -> bool:
+    """Render what the folder lacks of a data set, or of one shard of it; returns whether all of it is there."""
+    folder, n_train = DatasetFolder(data.folder), data.n_training_split
+    return ensure_rendered(folder, data.spec, n_train, data.n_test, data.workers, cores, shard)

@@ -26,7 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 from phd_exp.cli.frame import RESUMES, Ending, print_errors
 from phd_exp.cli.jobs import Job, plain
 from phd_exp.records.errors import ConfigError, RunError
-from phd_exp.records.provenance import usable_cores
+from phd_exp.records.processes import usable_cores
 
 MOST_JOBS = 10_000
 SECONDS_BETWEEN_LOOKS = 1.0

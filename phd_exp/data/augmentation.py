@@ -10,7 +10,7 @@ from torch.nn.functional import grid_sample
 
 from phd_exp.data.batches import Batch
 from phd_exp.data.photometry import Photometry
-from phd_exp.geometry.grid import middles
+from phd_exp.geometry.camera import middles
 from phd_exp.geometry.motion import Motion, small_turns, symmetries
 
 

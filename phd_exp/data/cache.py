@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from filelock import FileLock
 from rich.console import Console
 from rich.progress import track
 
 from phd_exp.records.errors import DatasetError
 from phd_exp.records.files import read_plain, require_plain, write_atomic
 from phd_exp.records.parsing import parse_json
+from phd_exp.records.processes import held
 
 DECODERS = 4
 LARGEST_AT_ONCE = 1 << 26
@@ -79,7 +79,9 @@ def fill_all(array: np.ndarray, jobs: Sequence[Job], fill: Fill, words: str, lar
 def _locked(cache: Path) -> Iterator[None]:
     try:
         cache.mkdir(parents=True, exist_ok=True)
-        with FileLock(cache / "decoding.lock"):
+        with held(
+            cache / "decoding.lock", waiting=f"{cache}: another process decodes images; waiting for it"
+        ):
             yield
     except OSError as error:
         raise CacheError(f"{cache}: decoded images cannot be kept here ({error.strerror})") from None

@@ -1,4 +1,4 @@
-"""The pinhole camera: positions in the camera frame <-> pixels of a square image."""
+"""The pinhole camera: positions in the camera frame <-> pixels of a square image, and grids over an image."""
 
 import math
 from dataclasses import dataclass
@@ -12,22 +12,26 @@ from torch import Tensor
 class Camera:
     """A batch of pinhole cameras with square images, the principal point in the middle and no distortion.
 
+    Positions and pixels may have any batch shape that broadcasts with that of f. For several points per camera,
+    f needs a trailing dimension of one.
+
     Args:
         f: focal lengths, pixels; one per element of the batch (no dimensions for a single camera).
         S: side of the image, pixels; the same for the whole batch.
 
-    Positions and pixels may have any batch shape that broadcasts with that of f. For several points per camera,
-    give f a trailing dimension of one.
-
     Raises:
         ValueError: f or S is not positive or not finite.
+
+    Example:
+        >>> Camera(torch.tensor(1500.0), S=224.0).project(torch.tensor([0.28, 0.0, 4.0]))
+        tensor([217., 112.])
     """
 
     f: Float[Tensor, "*batch"]
     S: float
 
     def __post_init__(self) -> None:
-        """Refuse a camera that cannot form an image."""
+        """Check f and S."""
         if not (math.isfinite(self.S) and self.S > 0):
             raise ValueError(
                 f"S, the side of the image in pixels, must be positive and finite, but is {self.S}"
@@ -42,7 +46,7 @@ class Camera:
             )
 
     def project(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 2"]:
-        """Pixel in which a position is seen: (u, v) = f (x, y)/z + S/2; meaningless for z <= 0.
+        """Pixel of a position: (u, v) = f (x, y)/z + S/2; meaningless for z <= 0.
 
         Source: the pinhole model; pixel centres at (column + 0.5, row + 0.5).
         """
@@ -51,23 +55,21 @@ class Camera:
     def unproject(
         self, pixel: Float[Tensor, "*#batch 2"], z: Float[Tensor, "*#batch"]
     ) -> Float[Tensor, "*#batch 3"]:
-        """Position at depth z (metres) that is seen in a pixel: ((u, v) - S/2) z/f, z."""
-        xy_over_z = (pixel - self.S / 2) / self.f[..., None]
-        direction = torch.cat([xy_over_z, torch.ones_like(xy_over_z[..., :1])], dim=-1)
-        return direction * z[..., None]
+        """Position at depth z (metres) that projects to a pixel: ((u, v) - S/2) z/f, z."""
+        return at_depth((pixel - self.S / 2) / self.f[..., None], z)
 
     def ray(self, pixel: Float[Tensor, "*#batch 2"]) -> Float[Tensor, "*#batch 3"]:
-        """Unit vector from the camera towards what is seen in a pixel."""
+        """Unit vector along the ray through a pixel."""
         return torch.nn.functional.normalize(self.unproject(pixel, torch.ones_like(pixel[..., 0])), dim=-1)
 
     def contains(self, xyz: Float[Tensor, "*#batch 3"]) -> Bool[Tensor, "*#batch"]:
         """Whether a position lies in the field of view: in front of the camera and inside the image."""
-        # |f x| <= z S/2 says both at once, and needs no division by a depth that may be zero
+        # |f x| <= z S/2 avoids the division by a depth that may be zero
         inside = (self.f[..., None] * xyz[..., :2]).abs() <= xyz[..., 2:] * (self.S / 2)
         return inside.all(dim=-1) & (xyz[..., 2] > 0)
 
     def scaled(self, factor: float) -> "Camera":
-        """The camera of the same image resized by a factor: f and S grow together.
+        """The camera of the same image resized by a factor, which multiplies f and S.
 
         Raises:
             ValueError: the factor is not positive or not finite.
@@ -77,12 +79,22 @@ class Camera:
         return Camera(self.f * factor, self.S * factor)
 
     def with_constant_f(self, constant_f: float | None) -> "Camera":
-        """The cameras as a network knows them that is told one focal length for all; None tells it the true ones.
-
-        Args:
-            constant_f: pixels.
+        """The cameras with one focal length (pixels) for all; None keeps their own.
 
         Raises:
             ValueError: the focal length is not positive or not finite.
         """
         return self if constant_f is None else Camera(torch.full_like(self.f, constant_f), self.S)
+
+
+def at_depth(
+    xy_over_z: Float[Tensor, "*#batch 2"], z: Float[Tensor, "*#batch"]
+) -> Float[Tensor, "*#batch 3"]:
+    """Position (x, y, z) at depth z (metres), given (x, y)/z."""
+    return torch.cat([xy_over_z, torch.ones_like(xy_over_z[..., :1])], dim=-1) * z[..., None]
+
+
+def middles(rows: int, columns: int) -> Float[Tensor, "rows columns 2"]:
+    """Middles (x, y) of the cells of a grid over an image, from -1 to 1 as the projected position."""
+    y, x = ((2 * torch.arange(n) + 1) / n - 1 for n in (rows, columns))
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)

@@ -1,4 +1,4 @@
-"""Charts: one-to-one smooth maps between positions in front of a camera and the coordinates a network regresses.
+"""Charts: smooth one-to-one maps from positions in front of a camera to the coordinates that a network regresses.
 
 Source: paper, sections "Parameter remapping" (v_p, z_p) and "Experimental result" (the baselines).
 """
@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from phd_exp.geometry.camera import Camera
+from phd_exp.geometry.camera import Camera, at_depth
 
 
 @dataclass(frozen=True)
 class DepthScale:
-    """The constants of a data set that bring its depths to order one.
+    """The constants of a data set that scale its depths to order one.
 
     Args:
         mu_z0: geometric middle of z/f over the data set, sqrt(max(z/f) min(z/f)); metres per pixel.
@@ -28,6 +28,10 @@ class DepthScale:
         ValueError: mu_z0 or z_centre is not positive and finite, or D not in [1, inf).
 
     Source: paper, section "Parameter remapping".
+
+    Example:
+        >>> DepthScale.from_ranges(f_range=(1000.0, 2000.0), z_range=(2.0, 4.0))
+        DepthScale(mu_z0=0.002, D=2.0, z_centre=3.0)
     """
 
     mu_z0: float
@@ -35,7 +39,7 @@ class DepthScale:
     z_centre: float
 
     def __post_init__(self) -> None:
-        """Refuse constants that no data set in front of a camera has."""
+        """Check the constants."""
         for name in ("mu_z0", "z_centre"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
@@ -45,7 +49,7 @@ class DepthScale:
 
     @classmethod
     def from_ranges(cls, f_range: tuple[float, float], z_range: tuple[float, float]) -> "DepthScale":
-        """The constants of a data set with all f (pixels) and z (metres) of two independent ranges.
+        """The constants of a data set whose f (pixels) and z (metres) fill two independent ranges.
 
         Raises:
             ValueError: a range is not (low, high) with 0 < low <= high < inf.
@@ -55,16 +59,11 @@ class DepthScale:
                 raise ValueError(
                     f"{name} must be (low, high) with 0 < low <= high < inf, but is {(low, high)}"
                 )
-        nearest, farthest = z_range[0] / f_range[1], z_range[1] / f_range[0]
-        return cls(
-            mu_z0=math.sqrt(farthest * nearest),
-            D=math.sqrt(farthest / nearest),
-            z_centre=(z_range[0] + z_range[1]) / 2,
-        )
+        return cls._from_extremes(z_range[0] / f_range[1], z_range[1] / f_range[0], *z_range)
 
     @classmethod
     def from_samples(cls, z: Float[Tensor, " samples"], f: Float[Tensor, " samples"]) -> "DepthScale":
-        """The constants of a data set given by its depths (metres) and focal lengths (pixels).
+        """The constants of a data set with these depths (metres) and focal lengths (pixels).
 
         Raises:
             ValueError: there are no samples, or some z or f is not positive.
@@ -74,15 +73,16 @@ class DepthScale:
         for name, value in (("z", z), ("f", f)):
             if not bool((value > 0).all()):
                 raise ValueError(f"{name} must be positive, but its smallest value is {value.min().item()}")
-        nearest, farthest = torch.aminmax((z / f).double())
-        return cls(
-            mu_z0=math.sqrt(farthest.item() * nearest.item()),
-            D=math.sqrt(farthest.item() / nearest.item()),
-            z_centre=(z.min().item() + z.max().item()) / 2,
-        )
+        extremes = (*torch.aminmax((z / f).double()), *torch.aminmax(z))
+        return cls._from_extremes(*(value.item() for value in extremes))
+
+    @classmethod
+    def _from_extremes(cls, nearest: float, farthest: float, low: float, high: float) -> "DepthScale":
+        """From the extremes of z/f and of z."""
+        return cls(math.sqrt(farthest * nearest), math.sqrt(farthest / nearest), z_centre=(low + high) / 2)
 
     def scaled(self, factor: float) -> "DepthScale":
-        """The constants of the same data set with its images resized by a factor: f grows, z/f shrinks."""
+        """The constants of the same data set with images resized by a factor, which divides z/f."""
         return DepthScale(self.mu_z0 / factor, self.D, self.z_centre)
 
 
@@ -108,9 +108,7 @@ def _position(
     v_p: Float[Tensor, "*#batch 2"], z: Float[Tensor, "*#batch"], camera: Camera
 ) -> Float[Tensor, "*#batch 3"]:
     """Position at depth z with the given projected position, (x, y) = v_p S z / (2 f)."""
-    xy_over_z = v_p * camera.S / (2 * camera.f[..., None])
-    direction = torch.cat([xy_over_z, torch.ones_like(xy_over_z[..., :1])], dim=-1)
-    return direction * z[..., None]
+    return at_depth(v_p * camera.S / (2 * camera.f[..., None]), z)
 
 
 def _log_abs_det_projected(xyz: Float[Tensor, "*#batch 3"], camera: Camera) -> Float[Tensor, "*#batch"]:
@@ -119,10 +117,10 @@ def _log_abs_det_projected(xyz: Float[Tensor, "*#batch 3"], camera: Camera) -> F
 
 
 class Chart(ABC):
-    """Three coordinates for positions z > 0 in front of a camera, of order one over the data set.
+    """Three coordinates of positions z > 0 in front of a camera, of order one over the data set.
 
     Attributes:
-        has_projection: whether the first two are the projected position v_p.
+        has_projection: whether the first two coordinates are the projected position v_p.
     """
 
     has_projection: ClassVar[bool] = True
@@ -139,7 +137,7 @@ class Chart(ABC):
     def log_abs_det_jacobian(
         self, xyz: Float[Tensor, "*#batch 3"], camera: Camera
     ) -> Float[Tensor, "*#batch"]:
-        """log|det d coordinates / d xyz| at a position, by which log densities in the two frames differ."""
+        """log|det d coordinates / d xyz| at a position, the difference of log densities in the two frames."""
 
 
 @dataclass(frozen=True)
@@ -191,10 +189,10 @@ class LogDepth(Chart):
 
 @dataclass(frozen=True)
 class Cartesian(Chart):
-    """The position itself, shifted and scaled: (x / xy_unit, y / xy_unit, z - z_centre); it ignores f.
+    """The shifted and scaled position (x / xy_unit, y / xy_unit, z - z_centre), which does not depend on f.
 
     Args:
-        depth: the data set's constants, of which z_centre is used.
+        depth: the data set's constants, which provide z_centre.
         xy_unit: length of the unit of x and y, metres.
 
     Source: paper, baseline "MAE x, y, z".

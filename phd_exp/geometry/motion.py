@@ -1,6 +1,6 @@
-"""The same scene from another camera at the same place: what it sees and where things are for it follow exactly.
+"""The same scene from another camera at the same place: its image and its labels follow exactly.
 
-A turn, a mirror and a longer focal length change an image by a homography, whatever it shows.
+A turn, a mirror and a longer focal length change any image by a homography.
 """
 
 from dataclasses import dataclass
@@ -35,9 +35,9 @@ class Motion:
         return (self.R @ xyz[..., None]).squeeze(-1)
 
     def origin(self, pixel: Float[Tensor, "*#places 2"], camera: Camera) -> Float[Tensor, "batch *places 2"]:
-        """Where in the old images lies what the new ones show in a pixel.
+        """The place in the old images of a pixel of the new ones.
 
-        Pixels of either image relative to its middle, over S/2: from -1 to 1 within the image.
+        Both are relative to the middle of the image, in units of S/2: from -1 to 1 inside the image.
         """
         half = (camera.S / 2 / camera.f).reshape(-1, *[1] * pixel.ndim)
         zoom = self.zoom.reshape(half.shape)
@@ -47,25 +47,25 @@ class Motion:
         return old[..., :2] / old[..., 2:] / half
 
     def stays_inside(self, camera: Camera) -> Bool[Tensor, " batch"]:
-        """Whether the old image holds all that the new one shows."""
+        """Whether the old image contains the whole new one."""
         corners = torch.tensor([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
         # a homography maps the square to a convex quadrilateral: its corners decide
         return (self.origin(corners.to(camera.f), camera).abs() <= 1 + 1e-6).flatten(1).all(-1)
 
     def where(self, chosen: Bool[Tensor, " batch"], other: "Motion") -> "Motion":
-        """This motion where chosen, the other one elsewhere."""
+        """This motion for the chosen elements, the other one for the rest."""
         R = torch.where(chosen[:, None, None], self.R, other.R)
         return Motion(R, torch.where(chosen, self.zoom, other.zoom))
 
     def after(self, first: "Motion") -> "Motion":
-        """First the one motion, then this one."""
+        """The composition of the first motion and then this one."""
         return Motion(self.R @ first.R, self.zoom * first.zoom)
 
 
 def symmetries(numbers: Float[Tensor, "batch 3"]) -> Motion:
-    """The eight turns and mirrors that map pixels to pixels, from three numbers of which the sign counts.
+    """The eight turns and mirrors that map pixels to pixels, from the signs of three numbers.
 
-    Two mirror the axes, the third exchanges them.
+    The first two mirror the axes, the third exchanges them.
     """
     sign = torch.where(numbers < 0, -1.0, 1.0).to(numbers.dtype)
     identity = torch.eye(3, dtype=numbers.dtype, device=numbers.device)
@@ -76,23 +76,23 @@ def symmetries(numbers: Float[Tensor, "batch 3"]) -> Motion:
 
 
 def small_turns(numbers: Float[Tensor, "batch 4"], largest_zoom: float, camera: Camera) -> Motion:
-    """Turns and zooms after which the old image still holds all that the new one shows.
+    """Turns and zooms after which the old image still contains the whole new one.
 
-    The zoom is between 1 and the largest. It leaves room for a roll about the optical axis, up to the angle theta at
-    which cos theta + sin theta = zoom, and what room is left after that for a turn of the axis.
+    The zoom lies between 1 and `largest_zoom`. It allows a roll about the optical axis up to the angle theta with
+    cos theta + sin theta = zoom; the remaining room allows a turn of the axis.
 
     Args:
-        numbers: from -1 to 1: of zoom, roll and the two turns of the axis; the first one's magnitude counts.
-        largest_zoom: at least 1; at sqrt(2) any roll has room.
+        numbers: from -1 to 1, for zoom (magnitude only), roll and the two turns of the axis.
+        largest_zoom: at least 1; sqrt(2) allows any roll.
         camera: the old cameras.
 
-    Source: own derivation; the corner of a square turned by theta is cos theta + sin theta half sides away.
+    Source: own derivation; a corner of a square turned by theta is cos theta + sin theta half sides from its middle.
     """
     zoom = 1 + (largest_zoom - 1) * numbers[:, 0].abs()
     most = (zoom.square() - 1).clamp(max=1).asin() / 2
     roll = most * numbers[:, 1]
     reach = (roll.cos() + roll.sin().abs()) / zoom
-    # perspective moves corners by the square of the half field, a few per cent, which is kept free
+    # perspective moves corners by the square of the half field, a few per cent; this room stays free
     half = camera.S / 2 / camera.f
     room = ((1 - reach) - 2 * half.square()).clamp(min=0)
     tilt = (half * room)[:, None] * numbers[:, 2:]
@@ -100,11 +100,11 @@ def small_turns(numbers: Float[Tensor, "batch 4"], largest_zoom: float, camera: 
 
 
 def _rotation(roll: Float[Tensor, " batch"], tilt: Float[Tensor, "batch 2"]) -> Float[Tensor, "batch 3 3"]:
-    """Roll about z after turning the axis by the tangents `tilt` towards x and y."""
+    """Roll about z after a turn of the axis by the tangents `tilt` towards x and y."""
     z = torch.cat([tilt, torch.ones_like(tilt[:, :1])], dim=-1)
     z = z / z.norm(dim=-1, keepdim=True)
     a, b, c = z.unbind(-1)
-    # the rotation without roll that takes z to the axis; see `virtual.smallest_rotation`
+    # the rotation without roll that maps z to the axis, as in `virtual.smallest_rotation`
     rows = [
         torch.stack([1 - a * a / (1 + c), -a * b / (1 + c), -a], dim=-1),
         torch.stack([-a * b / (1 + c), 1 - b * b / (1 + c), -b], dim=-1),

@@ -1,7 +1,7 @@
-"""Virtual cameras: any box in the image of a real camera, seen by a square camera that looks straight at it.
+"""Virtual cameras: square cameras that face a box in the image of a real camera.
 
-The principal point of a crop lies anywhere. Turning the camera about its centre towards the box mends that, and a
-turn changes an image by a homography whatever the scene holds, so that the labels of the turned camera are exact.
+The principal point of a crop may lie anywhere. A turn of the camera about its centre towards the box moves it to the
+middle. A turn changes any image by a homography, so that the labels of the turned camera are exact.
 """
 
 from dataclasses import dataclass
@@ -24,6 +24,12 @@ class VirtualCamera:
         S: side of the virtual image, pixels.
 
     Source: own derivation; both cameras are pinholes with one centre.
+
+    Example:
+        >>> K = intrinsics(900.0, 900.0, 320.0, 240.0)
+        >>> camera = VirtualCamera.of_box(K, (270.0, 190.0, 370.0, 290.0), S=200.0)
+        >>> camera.f, camera.to_virtual(np.array([0.0, 0.0, 4.0]))
+        (1800.0, array([0., 0., 4.]))
     """
 
     K: Float[np.ndarray, "3 3"]
@@ -33,14 +39,14 @@ class VirtualCamera:
 
     @classmethod
     def of_box(cls, K: Float[np.ndarray, "3 3"], box: Box, S: float) -> "VirtualCamera":
-        """The virtual camera that looks at the middle of a box and just sees all four corners of it.
+        """The virtual camera that faces the middle of a box and whose image just contains its four corners.
 
-        R is the smallest rotation that takes the ray through the middle of the box to the optical axis, and
+        R is the smallest rotation that maps the ray through the middle of the box to the optical axis, and
         f = S / (2 max(|x|, |y|) / z) over the corners (x, y, z) of the box in the virtual frame.
 
         Raises:
-            ValueError: the box is so wide that some of what the virtual image shows lies 90 degrees or more from
-                the optical axis of either camera, where there is no pinhole image.
+            ValueError: the box is so wide that a part of the virtual image is 90 degrees or more from the optical
+                axis of either camera, where there is no pinhole image.
         """
         left, top, right, bottom = box
         middle = rays(K, np.array([(left + right) / 2, (top + bottom) / 2]))
@@ -73,8 +79,8 @@ class VirtualCamera:
     def densities(self) -> tuple[float, float]:
         """The fewest and the most pixels of the real image along one pixel of the virtual image.
 
-        The extreme singular values of the Jacobian of the map (u, v) -> (p, q) = (X, Y)/W that H^-1 is, over the
-        middle and the corners of the virtual image.
+        These are the extreme singular values of the Jacobian of the map H^-1: (u, v) -> (p, q) = (X, Y)/W, over
+        the middle and the corners of the virtual image.
         """
         back = np.linalg.inv(self.homography)
         places = [(0.5, 0.5), (0, 0), (0, 1), (1, 0), (1, 1)]
@@ -92,13 +98,13 @@ def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, 
 
 
 def rays(K: Float[np.ndarray, "3 3"], pixel: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
-    """What is seen in a pixel, at depth one: ((u - cx)/fx, (v - cy)/fy, 1)."""
+    """Position at depth one that projects to a pixel: ((u - cx)/fx, (v - cy)/fy, 1)."""
     xy = (pixel - K[:2, 2]) / np.diagonal(K)[:2]
     return np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
 
 
 def smallest_rotation(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation without roll, about an axis in the image plane, that takes a unit vector (z > 0) to (0, 0, 1).
+    """The rotation about an axis in the image plane (no roll) that maps a unit vector (z > 0) to (0, 0, 1).
 
     For (a, b, c) it is [[1 - a^2/(1+c), -ab/(1+c), -a], [-ab/(1+c), 1 - b^2/(1+c), -b], [a, b, c]].
 

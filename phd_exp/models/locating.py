@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate, relu
 from torchvision.models.resnet import BasicBlock, Bottleneck
 
-from phd_exp.geometry.grid import middles
+from phd_exp.geometry.camera import middles
 from phd_exp.models.backbones import BLOCKS, Backbone, BackboneOutput, Depth
 
 _norm = partial(nn.GroupNorm, 1)

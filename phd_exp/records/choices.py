@@ -1,4 +1,4 @@
-"""What distinguishes runs: their choices, and every other key that changes the law of their results."""
+"""What distinguishes runs: their choices, and all other keys that change the distribution of their results."""
 
 import hashlib
 from dataclasses import dataclass
@@ -10,18 +10,18 @@ PLAIN_RECIPE = "paper"
 
 
 def setting(preset: str, recipe: str) -> str:
-    """Preset and recipe in one word, no part of which holds a plus sign."""
+    """Preset and recipe in one word; neither contains a plus sign."""
     return preset if recipe == PLAIN_RECIPE else f"{preset}+{recipe}"
 
 
 def preset_and_recipe(setting: str) -> tuple[str, str]:
-    """The two that make a `setting`."""
+    """Preset and recipe of a `setting`."""
     preset, _, recipe = setting.partition("+")
     return preset, recipe or PLAIN_RECIPE
 
 
 def in_words(setting: str) -> str:
-    """A `setting` as a heading says it."""
+    """A `setting` as part of a heading."""
     preset, recipe = preset_and_recipe(setting)
     return f"preset {preset}" if recipe == PLAIN_RECIPE else f"preset {preset}, recipe {recipe}"
 
@@ -38,12 +38,17 @@ WITHOUT_INFLUENCE = (
     "evaluation.every_n_epochs",
     "evaluation.multiview",
 )
-"""Keys, or sections, of how a run is computed, recorded and measured: they do not change the law of its results."""
+"""Keys or sections that define how a run is computed, recorded and measured, but not its results' distribution."""
 
 
 @dataclass(frozen=True)
 class RunName:
-    """The choices that name a run, and the folder they give; `preset` with the recipe, as `setting` joins them."""
+    """The choices that name a run and its folder; `preset` is a `setting`, which may include the recipe.
+
+    Example:
+        >>> RunName("paper", "scale", "mae_logz", seed=3).folder(Path("runs")).as_posix()
+        'runs/paper/scale/mae_logz/seed3'
+    """
 
     preset: str
     data: str
@@ -52,7 +57,7 @@ class RunName:
     overrides: tuple[str, ...] = ()
 
     def folder(self, runs: Path) -> Path:
-        """The run's folder under `runs`; overrides beyond the choices become a hash of eight digits."""
+        """The run's folder under `runs`; other overrides become a hash of eight digits."""
         leaf = f"seed{self.seed}"
         if self.overrides:
             digest = hashlib.sha256("\n".join(sorted(self.overrides)).encode()).hexdigest()
@@ -61,7 +66,7 @@ class RunName:
 
 
 def has_influence(key: str) -> bool:
-    """Whether a dotted key changes the law of a run's results, and not only how they are computed."""
+    """Whether a dotted key changes the distribution of a run's results, not only their computation."""
     return not any(key == name or key.startswith(f"{name}.") for name in WITHOUT_INFLUENCE)
 
 

@@ -1,18 +1,17 @@
-"""The folder of one data set: where things lie in it, what is there, and whether it is what was asked for.
+"""The folder of one data set: its files, their contents, and whether it holds what was asked for.
 
     renders/<variant>/
         manifest.json                 what made the folder, and how many samples are finished
         <split>/000123.png            images (.webp, .jpg)
-        <split>/metadata.jsonl        one line a sample, sorted by index
-        <split>/metadata.partial.jsonl    only while rendering: one line a finished image
+        <split>/metadata.jsonl        one line per sample, sorted by index
+        <split>/metadata.partial.jsonl    only while rendering: one line per finished image
         <split>/metadata.partial-0-of-4.jsonl    the same for one of several shards
-        .cache/                       whatever programmes derive from the images
+        .cache/                       data that programs derive from the images
 
-`SampleRecord` says what a line holds.
+`SampleRecord` describes a line.
 """
 
 import hashlib
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, get_args
 
@@ -21,15 +20,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from phd_exp.records.errors import DatasetError, gist
 from phd_exp.records.files import read_jsonl, read_plain, require_plain, write_atomic
 from phd_exp.records.scenes import SampleRecord, Split
-from phd_exp.records.shards import Shard
-from phd_exp.records.spec import DatasetSpec, ImageFormat
+from phd_exp.records.spec import DatasetSpec, ImageFormat, Shard
 
 SPLITS: tuple[Split, ...] = get_args(Split)
 SUFFIXES: dict[ImageFormat, str] = {"png": ".png", "webp": ".webp", "jpeg": ".jpg"}
 
 
 class Seal(BaseModel):
-    """How many samples of a split are finished, and the checksum of its `metadata.jsonl`."""
+    """Number of finished samples of a split, and the checksum of its `metadata.jsonl`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -52,58 +50,49 @@ class Manifest(BaseModel):
         return self.splits[split].n if split in self.splits else 0
 
 
-@dataclass(frozen=True)
 class DatasetFolder:
-    """One data set on disk; `root` is its own folder, `renders/<variant>`."""
+    """One data set on disk; `root` is its folder, `renders/<variant>`.
 
-    root: Path
+    Example:
+        >>> folder = DatasetFolder(Path("/data/renders/scale"))
+        >>> folder.image_path("train", 7).relative_to(folder.root).as_posix()
+        'train/000007.png'
+    """
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "root", Path(self.root).absolute())
-
-    @property
-    def manifest_path(self) -> Path:
-        """The manifest."""
-        return self.root / "manifest.json"
-
-    @property
-    def cache(self) -> Path:
-        """Hidden, so that loaders which look for images do not look in here."""
-        return self.root / ".cache"
+    def __init__(self, root: Path) -> None:
+        self.root = Path(root).absolute()
+        self.manifest_path = self.root / "manifest.json"
+        self.cache = self.root / ".cache"  # hidden from loaders that search for images
+        self.render_lock = self.cache / "render.lock"
 
     def split_folder(self, split: Split) -> Path:
-        """Where the images of a split lie, and their metadata."""
+        """The folder of the images of a split and of their metadata."""
         return self.root / split
 
     def metadata_path(self, split: Split) -> Path:
         """The finished samples of a split."""
         return self.root / split / "metadata.jsonl"
 
-    @property
-    def render_lock(self) -> Path:
-        """Held by whoever writes here: alone by one, together by shards."""
-        return self.cache / "render.lock"
-
     def journal_path(self, split: Split, shard: Shard | None = None) -> Path:
-        """The samples that are finished while a split, or a shard of it, is being rendered."""
+        """The finished samples of a split, or of a shard of it, while it is rendered."""
         share = "" if shard is None else f"-{shard.slug}"
         return self.root / split / f"metadata.partial{share}.jsonl"
 
     def journals(self, split: Split) -> list[Path]:
-        """Journals that are there, of whatever shards."""
+        """The journals on disk, of all shards."""
         return list(self.split_folder(split).glob("metadata.partial*.jsonl"))
 
     def image_path(self, split: Split, index: int, image_format: ImageFormat = "png") -> Path:
         """The image of a sample."""
         return self.root / split / image_name(index, image_format)
 
+    def images(self, split: Split) -> set[str]:
+        """Names of the images on disk."""
+        return {entry.name for entry in self.split_folder(split).glob("[0-9]*.*")}
+
     @property
     def manifest(self) -> Manifest:
-        """What made this folder.
-
-        Raises:
-            DatasetError: there is none, or it cannot be read.
-        """
+        """The manifest. Raises DatasetError if there is none, or if it cannot be read."""
         try:
             return Manifest.model_validate_json(read_plain(self.manifest_path))
         except FileNotFoundError:
@@ -121,13 +110,13 @@ class DatasetFolder:
         write_atomic(self.manifest_path, manifest.model_dump_json(indent=2) + "\n")
 
     def records(self, split: Split, n: int | None = None) -> list[SampleRecord]:
-        """The first `n` finished samples of a split (all by default), in the order of their indices.
+        """The first `n` finished samples of a split, all by default, in the order of their indices.
 
         Raises:
             DatasetError: fewer than `n` are finished, or there is no data set.
             CorruptFileError: a line is not a record.
         """
-        finished = self.manifest.count(split)
+        path, finished = self.metadata_path(split), self.manifest.count(split)
         wanted = finished if n is None else n
         if wanted > finished:
             raise DatasetError(
@@ -135,7 +124,6 @@ class DatasetFolder:
             )
         if wanted == 0:
             return []
-        path = self.metadata_path(split)
         if not path.exists():
             raise DatasetError(f"{path}: missing though the manifest counts {finished} samples; render again")
         records = read_jsonl(path, SampleRecord.model_validate_json, limit=wanted, sealed=True)
@@ -146,36 +134,30 @@ class DatasetFolder:
         return records
 
     def missing(self, spec: DatasetSpec, n_train: int, n_test: int) -> dict[Split, list[int]]:
-        """Indices of the samples asked for that are not finished, or whose image or line has gone, by split.
+        """Indices of the wanted samples that are not finished, or whose image or line has gone, by split.
 
         Raises:
-            DatasetError: the folder holds a data set of another specification.
+            DatasetError: the folder holds a data set with another specification.
         """
         wanted: dict[Split, int] = {"train": n_train, "test": n_test}
-        if not self.manifest_path.exists():
-            return {split: list(range(n)) for split, n in wanted.items()}
-        manifest = self.require(spec)
-        return {split: self._unfinished(split, n, manifest) for split, n in wanted.items()}
-
-    def images(self, split: Split) -> set[str]:
-        """Names of the images that are there."""
-        folder = self.split_folder(split)
-        return {entry.name for entry in folder.glob("[0-9]*.*")} if folder.is_dir() else set()
-
-    def _unfinished(self, split: Split, n: int, manifest: Manifest) -> list[int]:
-        there = self.images(split) if self.metadata_path(split).exists() else set()
-        finished, kind = manifest.count(split), manifest.spec.image_format
-        return [index for index in range(n) if index >= finished or image_name(index, kind) not in there]
+        manifest = self.require(spec) if self.manifest_path.exists() else None
+        missing = {}
+        for split, n in wanted.items():
+            there = self.images(split) if self.metadata_path(split).exists() else set()
+            finished = manifest.count(split) if manifest else 0
+            missing[split] = [
+                i for i in range(n) if i >= finished or image_name(i, spec.image_format) not in there
+            ]
+        return missing
 
     def require(self, spec: DatasetSpec) -> Manifest:
-        """The manifest, of a folder that holds a data set of this specification.
+        """The manifest, if the folder holds a data set with this specification.
 
         Raises:
-            DatasetError: it holds another one, naming the first key that differs, or none.
+            DatasetError: it holds none, or one with another specification; names the first key that differs.
         """
         manifest = self.manifest
-        for key in DatasetSpec.model_fields:
-            here, asked = getattr(manifest.spec, key), getattr(spec, key)
+        for (key, here), (_, asked) in zip(manifest.spec, spec, strict=True):
             if here != asked:
                 raise DatasetError(
                     f"{self.root}: holds a data set with {key}={here}, but {key}={asked} is asked for; "
@@ -190,12 +172,12 @@ def image_name(index: int, image_format: ImageFormat = "png") -> str:
 
 
 def sha256(data: bytes) -> str:
-    """Checksum as the records and the manifest write it."""
+    """Checksum, as records and manifests hold it."""
     return hashlib.sha256(data).hexdigest()
 
 
 def checksum(file: Path) -> str:
-    """The same of a plain file of any size. Raises OSError where it cannot be read."""
+    """The same for a plain file of any size. Raises OSError if it cannot be read."""
     require_plain(file)
     with open(file, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -1,15 +1,15 @@
-"""The user's own images: `metadata.jsonl` says of each detection which image shows it, by what camera, and where.
+"""The user's own images: `metadata.jsonl` lists detections, each with its image, camera and true position.
 
     <folder>/
-        <split>/metadata.jsonl    one JSON object a line
-        <split>/...               the images, beside it or in folders below
+        <split>/metadata.jsonl    one JSON object per line
+        <split>/...               the images, next to it or in subfolders
         .cache/                   crops, decoded once
 
-`DetectionLine` says what a line may hold.
+`DetectionLine` describes a line. Lines with the same `scene` form one `Observed`.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,7 +26,7 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 from phd_exp.records.dataset import SPLITS, checksum, sha256
-from phd_exp.records.errors import UNPRINTABLE, DatasetError, gist, in_our_words, nearest, shown
+from phd_exp.records.errors import UNPRINTABLE, DatasetError, complaint, gist, nearest, shown
 from phd_exp.records.files import read_jsonl
 from phd_exp.records.parsing import parse_json
 from phd_exp.records.scenes import Pose, SampleRecord, Split
@@ -34,9 +34,9 @@ from phd_exp.records.spec import Number, Positive
 
 DISTORTION = re.compile(r"[kp][1-8]|.*distort.*|dist(_?coeff.*)?|.*fisheye.*", re.IGNORECASE)
 SHORTEST = 0.01
-"""Focal length, px; what is shorter was meant in metres, or is none."""
+"""Focal length, px; a shorter one is probably in metres."""
 LARGEST_BOX = 3
-"""Sides of a box over the longer side of its image; what lies outside the image is grey and tells nothing."""
+"""Sides of a box over the longer side of its image; the part outside the image is grey and holds no information."""
 
 
 def _name(value: Any) -> int | str:
@@ -58,17 +58,17 @@ Metres = Annotated[Number, Field(ge=-1e6, le=1e6)]
 
 
 class DetectionLine(BaseModel):
-    """One line of `metadata.jsonl`; pixels count from the top left corner of the image file as it is stored.
+    """One line of `metadata.jsonl`; pixels count from the top left corner of the stored image.
 
     Attributes:
-        file_name: the image, relative to the folder of the line's own file.
-        f: focal length, px; or fx and fy where a pixel is not square.
-        cx, cy: principal point, px; the middle of the image by default.
-        box: left, top, right, bottom of the detection, px; the whole image by default.
-        x, y, z: true position in the frame of the camera (x right, y down, z forward), m.
-        scale, visibility: as in a rendered data set; recorded beside the predictions.
-        scene: lines of one scene show the same object at the same time.
-        pose: of the camera in the world that the scene's cameras share.
+        file_name: the image, relative to the folder of the line's file.
+        f: focal length, px; or fx and fy if pixels are not square.
+        cx, cy: principal point, px; by default the middle of the image.
+        box: left, top, right, bottom of the detection, px; by default the whole image.
+        x, y, z: true position in the camera frame (x right, y down, z forward), m.
+        scale, visibility: as in a rendered data set; recorded with the predictions.
+        scene: lines with the same scene show the same object at the same time.
+        pose: of the camera, in the world that the cameras of a scene share.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -91,7 +91,7 @@ class DetectionLine(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def leave_out_what_a_renderer_adds(cls, values: Any) -> Any:
-        """A rendered data set can be read as it is; of all other keys, each must mean something."""
+        """Ignore the other keys of a rendered data set; any other unknown key is an error."""
         if not isinstance(values, dict):
             return values
         ignored = SampleRecord.model_fields.keys() - cls.model_fields.keys()
@@ -99,7 +99,7 @@ class DetectionLine(BaseModel):
 
     @model_validator(mode="after")
     def belongs_together(self) -> "DetectionLine":
-        """Refuse half a camera, half a position, and a box without an inside."""
+        """Refuse half a camera, half a position, and an empty box."""
         if (self.f is None) == (self.fx is None and self.fy is None):
             raise ValueError("expected either f, or fx and fy (focal length in pixels)")
         for names in (("fx", "fy"), ("cx", "cy"), ("x", "y", "z")):
@@ -113,7 +113,7 @@ class DetectionLine(BaseModel):
 
 @dataclass(frozen=True)
 class Detection:
-    """One line, the image that it names, and where the line itself stands, for messages."""
+    """One line, the image that it names, and the place of the line, for messages."""
 
     line: DetectionLine
     file: Path
@@ -121,7 +121,7 @@ class Detection:
 
     @property
     def position(self) -> tuple[float, float, float]:
-        """True position, frame of the real camera, m. Raises DatasetError where the line has none."""
+        """True position in the frame of the real camera, m. Raises DatasetError if the line has none."""
         x, y, z = self.line.x, self.line.y, self.line.z
         if x is None or y is None or z is None:
             raise DatasetError(
@@ -130,17 +130,15 @@ class Detection:
         return x, y, z
 
     def focal_lengths_and_centre(self, width: int, height: int) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy of an image of that size, px."""
+        """fx, fy, cx, cy for an image of that size, px."""
         line = self.line
-        fx, fy = (
-            value for value in (line.f or line.fx, line.f or line.fy) if value
-        )  # never zero nor missing
+        fx, fy = (value for value in (line.f or line.fx, line.f or line.fy) if value)  # a line has f or both
         cx = width / 2 if line.cx is None else line.cx
         cy = height / 2 if line.cy is None else line.cy
         return fx, fy, cx, cy
 
     def require_in_sight(self, width: int, height: int) -> None:
-        """Raise DatasetError where the position projects further beyond the image than an object in it reaches."""
+        """Raise DatasetError if the position projects so far outside the image that the image cannot show it."""
         x, y, z = self.position
         fx, fy, cx, cy = self.focal_lengths_and_centre(width, height)
         column, row = cx + fx * x / z, cy + fy * y / z
@@ -152,32 +150,31 @@ class Detection:
             )
 
     def box(self, width: int, height: int) -> tuple[float, float, float, float]:
-        """The box in an image of that size, px. Raises DatasetError where the image shows nothing of it."""
+        """The box in an image of that size, px. Raises DatasetError if it lies outside the image or is too large."""
         if self.line.box is None:
             return 0.0, 0.0, float(width), float(height)
         left, top, right, bottom = self.line.box
+        fault = None
         if left >= width or top >= height or right <= 0 or bottom <= 0:
+            fault = "lies outside"
+        elif max(right - left, bottom - top) > LARGEST_BOX * max(width, height):
+            fault = f"is more than {LARGEST_BOX} times as large as"
+        if fault:
             raise DatasetError(
-                f"{self.where}: box={list(self.line.box)} lies outside the image of {width} x {height} pixels"
-            )
-        longest = LARGEST_BOX * max(width, height)
-        if right - left > longest or bottom - top > longest:
-            raise DatasetError(
-                f"{self.where}: box={list(self.line.box)} is more than {LARGEST_BOX} times as large as "
-                f"the image of {width} x {height} pixels"
+                f"{self.where}: box={list(self.line.box)} {fault} the image of {width} x {height} pixels"
             )
         return left, top, right, bottom
 
 
 @dataclass(frozen=True)
 class DetectionFolder:
-    """A folder of the user's own images, with a sub-folder for each split."""
+    """A folder of the user's own images, with a subfolder for each split."""
 
     root: Path
 
     @property
     def cache(self) -> Path:
-        """Where decoded crops are kept."""
+        """The folder of decoded crops."""
         return self.root / ".cache"
 
     def metadata_path(self, split: Split) -> Path:
@@ -185,25 +182,16 @@ class DetectionFolder:
         return self.root / split / "metadata.jsonl"
 
     def detections(self, split: Split, n: int | None = None) -> list[Detection]:
-        """The first n detections of a split (all by default), in the order of the lines.
-
-        Raises:
-            DatasetError: the file cannot be read, a line is not a detection, or there are fewer than n.
-            CorruptFileError: a line is not text.
-        """
+        """The detections of a split, as `detections_in` reads them."""
         return detections_in(self.root / split, n, f" (data.n_{split})")
 
     def fingerprint(self) -> str:
-        """Checksum of what is said of all images, though not of the images themselves.
-
-        Raises:
-            OSError: a `metadata.jsonl` cannot be read.
-        """
+        """Checksum of both `metadata.jsonl`, without the images. Raises OSError if one cannot be read."""
         return sha256("".join(checksum(self.metadata_path(split)) for split in SPLITS).encode())
 
 
 def detections_in(folder: Path, n: int | None = None, asked_by: str = "") -> list[Detection]:
-    """The first n detections (all by default) of one folder's `metadata.jsonl`, in the order of the lines.
+    """The first n detections of a folder's `metadata.jsonl`, all by default, in the order of the lines.
 
     Raises:
         DatasetError: the file cannot be read, a line is not a detection, or there are fewer than n.
@@ -217,24 +205,62 @@ def detections_in(folder: Path, n: int | None = None, asked_by: str = "") -> lis
             f"{path}: cannot be read ({error.strerror}); expected one JSON object a line, "
             "see `Your own images` in README.md"
         ) from None
-    numbered = [(number, text) for number, text in enumerate(lines, start=1) if text][:n]
+    numbered = [(f"{path}, line {number}", text) for number, text in enumerate(lines, start=1) if text][:n]
     if not numbered or len(numbered) < (n or 0):
         raise DatasetError(f"{path}: {n or 'some'} detections asked for{asked_by}, {len(numbered)} found")
-    return [_detection(folder, text, f"{path}, line {number}") for number, text in numbered]
+    found = []
+    for where, text in numbered:
+        try:
+            line = _line(parse_json(text), where)
+        except ValueError as error:
+            raise DatasetError(f"{where}: not JSON ({error}); expected one object a line") from None
+        found.append(Detection(line, _inside(folder, line.file_name, where), where))
+    return found
 
 
 def detection_of(file: Path, values: Mapping[str, Any]) -> Detection:
-    """A detection in one image file, from values as a line of `metadata.jsonl` has them. Raises DatasetError."""
+    """A detection in an image file, with values as in a line of `metadata.jsonl`.
+
+    Raises:
+        DatasetError: the values are not a detection.
+
+    Example:
+        >>> detection_of(Path("photo.jpg"), {"f": 900.0}).focal_lengths_and_centre(640, 480)
+        (900.0, 900.0, 320.0, 240.0)
+    """
     return Detection(_line({"file_name": file.name, **values}, str(file)), file, str(file))
 
 
-def _detection(folder: Path, text: str, where: str) -> Detection:
-    try:
-        values = parse_json(text)
-    except ValueError as error:
-        raise DatasetError(f"{where}: not JSON ({error}); expected one object a line") from None
-    line = _line(values, where)
-    return Detection(line, _inside(folder, line.file_name, where), where)
+@dataclass(frozen=True)
+class Observed:
+    """One scene: at least one detection of its object, and the pose of each detection's camera."""
+
+    scene: int | str
+    detections: tuple[Detection, ...]
+    poses: tuple[Pose, ...]
+
+
+def observed(detections: Sequence[Detection]) -> list[Observed]:
+    """The scenes of detections, in the order in which they first appear.
+
+    Raises:
+        DatasetError: a line has no scene, or no pose.
+    """
+    views: dict[int | str, list[tuple[Detection, Pose]]] = {}
+    for detection in detections:
+        scene, pose = detection.line.scene, detection.line.pose
+        if scene is None:
+            raise DatasetError(
+                f"{detection.where}: scene is missing; expected the same number or name on all lines that show the "
+                "same object at the same time"
+            )
+        if pose is None:
+            raise DatasetError(
+                f"{detection.where}: pose is missing; expected the rotation [w, x, y, z] and translation of its "
+                "camera, R v + t from the world to the camera"
+            )
+        views.setdefault(scene, []).append((detection, pose))
+    return [Observed(scene, *map(tuple, zip(*pairs, strict=True))) for scene, pairs in views.items()]
 
 
 def _line(values: Any, where: str) -> DetectionLine:
@@ -245,13 +271,13 @@ def _line(values: Any, where: str) -> DetectionLine:
 
 
 def _inside(folder: Path, name: str, where: str) -> Path:
-    """The image file; a data set from somebody else must not read what lies elsewhere."""
-    if UNPRINTABLE.search(name):  # it would end the line of a message, or steer the terminal
-        raise DatasetError(f"{where}: file_name={shown(name)} is no file name (control characters)")
+    """The image file; a stranger's data set must not read files outside its folder."""
     try:
+        if UNPRINTABLE.search(name):
+            raise ValueError("control characters")
         leaves = Path(name).is_absolute() or ".." in Path(name).parts
         leaves = leaves or not (folder / name).resolve().is_relative_to(folder.resolve())
-    except (ValueError, OSError, RuntimeError) as error:  # a link that leads to itself, a name without end
+    except (ValueError, OSError, RuntimeError) as error:  # also a link to itself, or too long a name
         raise DatasetError(f"{where}: file_name={shown(name)} is no file name ({gist(error)})") from None
     if leaves:
         raise DatasetError(f"{where}: file_name={name!r} leaves {folder}; expected a path below it")
@@ -259,7 +285,7 @@ def _inside(folder: Path, name: str, where: str) -> Path:
 
 
 def _complaint(problem: ErrorDetails) -> str:
-    """What is wrong with a line: the key, the value, what was expected."""
+    """The fault of a line: the key, the value, and what was expected."""
     key = ".".join(str(part) for part in problem["loc"])
     if problem["type"] == "extra_forbidden" and DISTORTION.fullmatch(key):
         return (
@@ -268,8 +294,4 @@ def _complaint(problem: ErrorDetails) -> str:
     if problem["type"] == "extra_forbidden":
         known = (Pose if key.startswith("pose.") else DetectionLine).model_fields
         return f"{key}: unknown key{nearest(key, known)}; expected one of {', '.join(known)}"
-    if problem["type"] == "missing":
-        return f"{key}: missing"
-    if not key:  # of the whole line
-        return in_our_words(problem["msg"])
-    return f"{key}: got {shown(problem['input'])}; {in_our_words(problem['msg'])}"
+    return f"{key}: missing" if problem["type"] == "missing" else complaint(key, problem)

@@ -1,4 +1,4 @@
-"""Files that are whole or absent: atomic writing, and journals that survive being cut off."""
+"""Files that are whole or absent: atomic writing, and journals that survive a kill."""
 
 import errno
 import fcntl
@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
-from typing import Any, TextIO, TypeVar
+from typing import TextIO, TypeVar
 
 from phd_exp.records.errors import CorruptFileError, gist
 from phd_exp.records.parsing import parse_json
@@ -18,18 +18,18 @@ from phd_exp.records.parsing import parse_json
 Parsed = TypeVar("Parsed")
 
 _TEMPORARY = re.compile(r"\..+\.[0-9a-f]{32}\.tmp", re.DOTALL)
-"""What `write_atomic` calls a file that has not its name yet."""
+"""Names of the temporary files of `write_atomic`."""
 MB = 10**6
 LARGEST_RECORD = 16 * MB
-"""Bytes of a file that is read whole; the longest that are written here have a few thousand."""
+"""Bytes of a file that is read as a whole; the project's own files have a few thousand."""
 LONGEST_LINE = MB
-"""Bytes of a line of a journal; a sample's has about two thousand."""
+"""Bytes of a line of a journal; the line of a sample has about two thousand."""
 
 
 def require_plain(path: Path, largest: int | None = None) -> None:
-    """Raise OSError unless a path leads to a plain file, of at most so many bytes.
+    """Raise OSError unless a path leads to a plain file of at most `largest` bytes.
 
-    A pipe would be waited for without end, and a device has no end: files of somebody else may be either.
+    Reading a pipe could wait for ever, and a device may never end; a stranger's file may be either.
     """
     found = os.stat(path)
     if stat.S_ISDIR(found.st_mode):
@@ -42,26 +42,33 @@ def require_plain(path: Path, largest: int | None = None) -> None:
 
 
 def read_plain(path: Path, largest: int = LARGEST_RECORD) -> bytes:
-    """The bytes of a plain file. Raises OSError as `require_plain` does, and where it cannot be read."""
+    """The bytes of a plain file. Raises OSError if it cannot be read, or as `require_plain` does."""
     require_plain(path, largest)
     return path.read_bytes()
 
 
 def write_atomic(path: Path | str, data: bytes | str) -> None:
-    """Write `data` to `path` so that a reader finds the old content or the new, never a part.
+    """Write `data` to `path` so that a reader finds either the old content or the new.
 
-    The bytes go to a hidden temporary file in the same folder (a rename is atomic within one file system
-    only), reach the disk, and then take the name. The temporary file is removed if anything fails. It is locked as
-    long as its writer lives, which tells `remove_temporaries` what a killed one left.
+    The bytes are written to a hidden temporary file in the same folder (a rename is atomic within one file system
+    only), flushed to the disk, and renamed. The temporary file is removed on any failure. It is locked while its
+    writer lives, so that `remove_temporaries` recognises those of killed writers.
 
     Raises:
         OSError: the folder is missing or unwritable, or the disk is full; `path` is then unchanged.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     write_atomic(Path(folder, "notes"), "whole or absent")
+        ...     Path(folder, "notes").read_text()
+        'whole or absent'
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
         with open(temporary, "xb") as stream:
-            with suppress(OSError):  # a file system without locks, where nothing is removed either
+            with suppress(OSError):  # on a file system without locks, nothing is removed later either
                 fcntl.flock(stream, fcntl.LOCK_SH)
             stream.write(data.encode() if isinstance(data, str) else data)
             stream.flush()
@@ -70,30 +77,26 @@ def write_atomic(path: Path | str, data: bytes | str) -> None:
     except BaseException as error:
         with suppress(OSError):
             temporary.unlink()
-        # a write into an open file does not say which
+        # an error of an open file does not name it
         if isinstance(error, OSError) and error.filename is None:
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
 
 
 def remove_temporaries(folder: Path) -> None:
-    """Remove what `write_atomic` left in `folder` when its process was killed half-way."""
+    """Remove the temporary files in `folder` that killed calls of `write_atomic` left."""
     for path in folder.glob(".*.tmp"):
         if _TEMPORARY.fullmatch(path.name) and path.is_file() and not path.is_symlink():
-            with suppress(OSError):  # its writer lives, or has renamed it since
-                _remove_unless_locked(path)
-
-
-def _remove_unless_locked(path: Path) -> None:
-    with open(path, "r+b") as stream:
-        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        path.unlink()
+            # OSError: its writer lives, or has renamed it since
+            with suppress(OSError), open(path, "r+b") as stream:
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                path.unlink()
 
 
 def open_journal(path: Path) -> TextIO:
-    """Open an append-only file of lines; each line written reaches the system at once.
+    """Open an append-only file of lines, each of which is passed to the system at once.
 
-    A torn last line, left by a killed writer, is cut off first: the next line would otherwise be glued to it.
+    An incomplete last line, left by a killed writer, is removed first; the next line would otherwise continue it.
 
     Raises:
         OSError: the file cannot be created, read or written.
@@ -114,13 +117,13 @@ def read_jsonl(
     limit: int | None = None,
     sealed: bool = False,
 ) -> list[Parsed]:
-    """Read the first `limit` lines of a file of JSON lines (all of them by default), each through `parse`.
+    """Parse the first `limit` lines of a file of JSON lines, all by default.
 
-    A last line without its line end is what a killed writer left, and is ignored. A `sealed` file was written
-    in one piece, so that there, and on any other line anywhere, what does not parse is an error.
+    A last line without a line end is ignored: a killed writer left it. A `sealed` file was written as a whole; its
+    last line is parsed too.
 
     Raises:
-        CorruptFileError: naming the file and the line.
+        CorruptFileError: a line cannot be parsed; names the file and the line.
         OSError: the file cannot be read, or is no plain file.
     """
     require_plain(path)
@@ -132,12 +135,10 @@ def read_jsonl(
                 raise CorruptFileError(f"{path}, line {number}: longer than {LONGEST_LINE} bytes")
             if not line.endswith(b"\n") and not (line and sealed):
                 break
-            records.append(_parse_line(path, number, line.removesuffix(b"\n"), parse))
+            try:
+                records.append(parse(line.removesuffix(b"\n").decode()))
+            except ValueError as error:  # also UnicodeDecodeError and pydantic's ValidationError
+                raise CorruptFileError(
+                    f"{path}, line {number}: not a valid record ({gist(error)})"
+                ) from error
     return records
-
-
-def _parse_line(path: Path, number: int, line: bytes, parse: Callable[[str], Any]) -> Any:
-    try:
-        return parse(line.decode())
-    except ValueError as error:  # also UnicodeDecodeError and pydantic's ValidationError
-        raise CorruptFileError(f"{path}, line {number}: not a valid record ({gist(error)})") from error

@@ -1,4 +1,4 @@
-"""Image files, which somebody else may have made: what is read of them, and what is refused in one line."""
+"""Image files, possibly made by a stranger: decoded within limits, or refused in one line."""
 
 import io
 import struct
@@ -15,22 +15,22 @@ from phd_exp.records.errors import DatasetError, gist
 from phd_exp.records.files import MB, read_plain
 from phd_exp.records.scenes import SampleRecord
 
-# those that Pillow would not look at before all others have failed
+# plugins that Pillow loads only after all others have failed
 _LATER = (TiffImagePlugin, WebPImagePlugin, Jpeg2KImagePlugin)
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "JPEG2000")
-"""What is tried on a file, whatever its name. Pillow knows more; of an EPS it would have Ghostscript run the code."""
+"""Formats that are tried on a file, whatever its name. Pillow has more, such as EPS, whose code Ghostscript runs."""
 RENDERED = ("PNG", "WEBP", "JPEG")
 LARGEST_IMAGE = 256 * MB
 """Bytes of an image file."""
 BROKEN = (
     OSError, SyntaxError, ValueError, LookupError, EOFError, OverflowError, MemoryError, struct.error, zlib.error,
 )  # fmt: skip
-"""What Pillow's decoders raise on broken files."""
+"""Exceptions of Pillow's decoders on broken files."""
 
 
 @contextmanager
 def pillow_warnings() -> Iterator[None]:
-    """Too many pixels are an error; oddities of metadata, of which Pillow warns too, are none. Outside of threads."""
+    """Make too many pixels an error, and ignore warnings about odd metadata. Not for use in threads."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         warnings.simplefilter("error", Image.DecompressionBombWarning)
@@ -39,7 +39,7 @@ def pillow_warnings() -> Iterator[None]:
 
 @contextmanager
 def decoding(file: Path) -> Iterator[None]:
-    """Let what goes wrong with an image be one line, a DatasetError, that names the file."""
+    """Turn the errors of decoding an image into a DatasetError, one line that names the file."""
     try:
         yield
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
@@ -55,11 +55,11 @@ def decoding(file: Path) -> Iterator[None]:
 
 
 def recorded_image(path: Path, record: SampleRecord) -> Image.Image:
-    """The image file of a rendered sample, read once, checked and decoded.
+    """The image of a rendered sample, checked against its record and decoded.
 
     Raises:
-        DatasetError: it cannot be read, is not the one recorded, or is no RGB image of the recorded size; what to do
-            is the caller's to say.
+        DatasetError: it cannot be read, has another checksum, or is no RGB image of the recorded size; the caller
+            adds the remedy.
     """
     try:
         content = read_plain(path, LARGEST_IMAGE)
@@ -69,16 +69,13 @@ def recorded_image(path: Path, record: SampleRecord) -> Image.Image:
         raise DatasetError(f"{path}: its checksum is not the recorded one")
     try:
         image = Image.open(io.BytesIO(content), formats=RENDERED)
-        _require_recorded(path, image, record)  # before a small file unfolds to more pixels than memory holds
+        # before decoding, because a small file may expand to more pixels than memory holds
+        if image.size != (record.S, record.S):
+            width, height = image.size
+            raise DatasetError(f"{path}: {width} x {height} pixels, {record.S} x {record.S} recorded")
+        if image.mode != "RGB":
+            raise DatasetError(f"{path}: its pixels are of the kind {image.mode!r}; expected RGB of 8 bits")
         image.load()
     except (*BROKEN, Image.DecompressionBombError) as error:
         raise DatasetError(f"{path}: cannot be decoded ({' '.join(str(error).split())})") from None
     return image
-
-
-def _require_recorded(path: Path, image: Image.Image, record: SampleRecord) -> None:
-    if image.size != (record.S, record.S):
-        width, height = image.size
-        raise DatasetError(f"{path}: {width} x {height} pixels, {record.S} x {record.S} recorded")
-    if image.mode != "RGB":
-        raise DatasetError(f"{path}: its pixels are of the kind {image.mode!r}; expected RGB of 8 bits")

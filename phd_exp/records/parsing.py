@@ -1,4 +1,4 @@
-"""JSON and YAML from files that somebody else may have written: what cannot be meant is refused, not guessed."""
+"""JSON and YAML from files that a stranger may have written: ambiguous content is refused."""
 
 import json
 from typing import Any
@@ -6,14 +6,14 @@ from typing import Any
 import yaml
 
 MOST_DIGITS = 300
-"""Of a whole number; a float holds 308."""
+"""Digits of an integer; a float holds 308."""
 
 
 def parse_json(text: str) -> Any:
     """The content of a JSON text.
 
-    Raises ValueError for what is no JSON, for a key given twice in one object (of which a plain reader would keep the
-    last), for nesting without end, and for a whole number beyond the range of floating point.
+    Raises ValueError for invalid JSON, a key given twice in one object (of which Python keeps the last), too deep
+    nesting, and an integer beyond the range of floating point.
     """
     try:
         return json.loads(text, object_pairs_hook=_once, parse_int=_whole)
@@ -24,8 +24,8 @@ def parse_json(text: str) -> Any:
 def parse_yaml(text: str) -> Any:
     """The content of a YAML text: plain containers and values, never objects.
 
-    Raises ValueError for what is no YAML, for a key given twice, for nesting without end, and for an alias (`*name`):
-    a few of these stand for gigabytes, and this programme writes none.
+    Raises ValueError for invalid YAML, a key given twice, too deep nesting, and an alias (`*name`): a few aliases can
+    expand to gigabytes, and this project writes none.
     """
     try:
         return yaml.load(text, _PlainLoader)
@@ -36,7 +36,7 @@ def parse_yaml(text: str) -> Any:
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """Of PyYAML's safe loader, what a record needs."""
+    """PyYAML's safe loader without aliases and repeated keys."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.events.AliasEvent):

@@ -1,49 +1,53 @@
-"""The run record: everything a run leaves on disk, readable without the model that made it.
+"""The run record: all files of a run, readable without the model that made them.
 
     runs/<preset>[+<recipe>]/<data>/<model>/seed<k>[-<hash of other overrides>]/
-        config.yaml          what was asked for, resolved
+        config.yaml          the configuration, resolved
         constants.json       constants of the data set (depth scale, focal length) and the version of shrinking
         status.json          state, error, versions, git commit, hash of the data set
-        metrics.jsonl        one line an epoch
+        metrics.jsonl        one line per epoch
         results.json         the final numbers
         predictions.parquet  per test sample: truth, parameters, estimate, errors
-        held_out.parquet     the same of training samples that were held out, for recalibration
-        views.parquet        the same of scenes that several cameras see, with their poses, where that was asked for
+        held_out.parquet     the same for held-out training samples, for recalibration
+        views.parquet        the same for scenes with several cameras, and their poses, if asked for
         calibration/         the calibration curves, as data (JSON) and as pictures (PNG)
         checkpoints/         last.ckpt
         wandb/               the same for wandb, ready for `wandb sync`
 
-A run is named by its choices, never by a date, so that the same command resumes it or finds it finished.
+The name of a run encodes its choices, never a date: the same command resumes the run or finds it finished.
 """
 
 import json
 import math
 import os
+import platform
+import subprocess
 import traceback
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from filelock import FileLock, Timeout
 from pydantic import AwareDatetime, BaseModel, ConfigDict, ValidationError
 
-from phd_exp.records import provenance
 from phd_exp.records.errors import RunError, gist
 from phd_exp.records.files import MB, read_jsonl, read_plain, write_atomic
 from phd_exp.records.parsing import parse_json, parse_yaml
+from phd_exp.records.processes import held
 
 LAST_EPOCH = 10**9
 LARGEST = MB
 """Bytes of a configuration or of a run's numbers."""
+PACKAGES = ("phd_exp", "torch", "torchvision", "lightning", "hydra-core", "numpy")
+"""Packages on which numbers depend, whose versions are recorded."""
 
 State = Literal["running", "finished", "failed", "interrupted"]
 
 
 class RunStatus(BaseModel):
-    """How a run stands, and what it ran on; times in UTC."""
+    """State of a run, and the software and machine it ran on; times in UTC."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -59,7 +63,16 @@ class RunStatus(BaseModel):
 
 
 class RunFolder:
-    """One run's folder: typed access to its files, each written beside itself and renamed into place."""
+    """One run's folder: typed access to its files, each written to a temporary name and renamed into place.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as place:
+        ...     run = RunFolder(Path(place))
+        ...     run.write_results({"test/nll": -1.5})
+        ...     run.results()
+        {'test/nll': -1.5}
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -76,16 +89,16 @@ class RunFolder:
         self.constants_file = path / "constants.json"
 
     def curves(self, name: str) -> Path:
-        """Calibration curves, of an epoch or "final"; their picture, if there is one, differs in the suffix."""
+        """Calibration curves, of an epoch or "final"; the picture, if there is one, has another suffix."""
         return self.calibration / f"{name}.json"
 
     @property
     def last_checkpoint(self) -> Path:
-        """What a run goes on from."""
+        """The checkpoint from which a run resumes."""
         return self.checkpoints / "last.ckpt"
 
     def status(self) -> RunStatus | None:
-        """The recorded status; None where there is none. Raises RunError where it cannot be read."""
+        """The recorded status, or None. Raises RunError if it cannot be read."""
         if not self.status_file.exists():
             return None
         try:
@@ -94,43 +107,31 @@ class RunFolder:
             raise _unreadable(self.status_file, "not a run status", error) from None
 
     def is_finished(self) -> bool:
-        """Whether the run has ended well. Raises RunError where its status cannot be read."""
+        """Whether the run ended without an error. Raises RunError if its status cannot be read."""
         status = self.status()
         return status is not None and status.state == "finished"
 
-    def _lock(self) -> FileLock:
-        return FileLock(self.path / ".lock", timeout=0)
-
-    def _require_own_folders(self) -> None:
-        """Raise RunError where what is written into the run, which may be somebody else's, would go elsewhere."""
-        for place in (self.checkpoints, self.calibration, self.wandb):
-            if place.is_symlink():
-                raise RunError(f"{place}: leads out of the run's folder; put the folder itself in its place")
-
     def is_held(self) -> bool:
-        """Whether a process works on the run now."""
-        try:
-            with self._lock():
-                return False
-        except Timeout:
-            return True
+        """Whether a process works on the run now. Raises OSError if the lock cannot be tried."""
+        with held(self.path / ".lock") as free:
+            return not free
 
     def config(self) -> dict[str, Any]:
-        """The configuration, resolved. Raises RunError where it is missing or cannot be read."""
+        """The configuration, resolved. Raises RunError if it is missing or cannot be read."""
         return _read_mapping(self.config_file, parse_yaml)
 
     def results(self) -> dict[str, Any]:
-        """The final numbers. Raises RunError where they are missing or cannot be read."""
+        """The final numbers. Raises RunError as `config` does."""
         return _read_mapping(self.results_file, parse_json)
 
     def constants(self) -> dict[str, Any]:
-        """What the network was told of the data set. Raises RunError as `config` does."""
+        """The network's constants of the data set. Raises RunError as `config` does."""
         return _read_mapping(self.constants_file, parse_json)
 
     def metrics(self) -> list[dict[str, Any]]:
-        """One mapping an epoch, as logged; a last line torn by a kill is left out.
+        """One mapping per epoch, as logged, without a last line that a kill left incomplete.
 
-        Raises CorruptFileError for a line that is none, OSError where the file cannot be read.
+        Raises CorruptFileError for an invalid line, OSError if the file cannot be read.
         """
         return read_jsonl(self.metrics_file, _metrics_row) if self.metrics_file.exists() else []
 
@@ -139,24 +140,27 @@ class RunFolder:
         write_atomic(self.config_file, yaml.safe_dump(dict(config), sort_keys=False))
 
     def write_constants(self, constants: Mapping[str, float]) -> None:
-        """Write what the network is told of the data set; all numbers are finite."""
+        """Write the network's constants of the data set; all numbers are finite."""
         write_atomic(self.constants_file, json.dumps(dict(constants), indent=2, allow_nan=False) + "\n")
 
     def write_results(self, results: Mapping[str, Any]) -> None:
-        """Write the final numbers; null stands for one that is not finite, which JSON does not know."""
-        finite = {key: None if _is_infinite(value) else value for key, value in results.items()}
+        """Write the final numbers, with null for those that are not finite, which JSON lacks."""
+        finite = {
+            key: None if isinstance(value, float) and not math.isfinite(value) else value
+            for key, value in results.items()
+        }
         write_atomic(self.results_file, json.dumps(finite, indent=2, allow_nan=False) + "\n")
 
     def write_status(self, status: RunStatus) -> None:
-        """Write how the run stands."""
+        """Write the status."""
         write_atomic(self.status_file, status.model_dump_json(indent=2) + "\n")
 
     def write_metrics(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Write all lines anew, one an epoch."""
+        """Replace all lines, one per epoch."""
         write_atomic(self.metrics_file, "".join(json.dumps(row) + "\n" for row in rows))
 
     def require_writable(self) -> None:
-        """Raise RunError where the folder could not be made, before hours are spent on what goes into it."""
+        """Raise RunError if the folder could not be made, before hours of computation."""
         nearest = next(path for path in (self.path, *self.path.absolute().parents) if path.exists())
         if not (nearest.is_dir() and os.access(nearest, os.W_OK)):
             raise RunError(
@@ -165,51 +169,63 @@ class RunFolder:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Hold the folder for this process alone. Raises RunError where another process has it."""
-        lock = self._lock()
+        """Hold the folder exclusively. Raises RunError if another process holds it, or it cannot be written."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            self._require_own_folders()
-            lock.acquire()
-        except Timeout:
-            raise RunError(
-                f"{self.path}: another process is working on this run; wait for it or stop it"
-            ) from None
+            for place in (self.checkpoints, self.calibration, self.wandb):
+                if place.is_symlink():  # in a stranger's run, it would redirect what is written
+                    raise RunError(
+                        f"{place}: leads out of the run's folder; put the folder itself in its place"
+                    )
+            lock = ExitStack()
+            free = lock.enter_context(held(self.path / ".lock"))
         except OSError as error:
             raise RunError(
                 f"{self.path}: cannot be written ({error.strerror}); choose another folder by runs=DIR"
             ) from None
-        try:
+        with lock:
+            if not free:
+                raise RunError(f"{self.path}: another process is working on this run; wait for it or stop it")
             yield
-        finally:
-            lock.release()
 
     @contextmanager
     def recording(self, data_manifest: str | None) -> Iterator[None]:
         """Record how the enclosed work ends: finished, failed with its traceback, or interrupted."""
-        status = _new_status(data_manifest)
+        status = RunStatus(
+            state="running",
+            started=datetime.now(UTC),
+            versions=versions(),
+            git_commit=git_commit(),
+            data_manifest=data_manifest,
+            machine=f"{platform.machine()}, {os.cpu_count()} cores",
+        )
+
+        def ended(state: State, **details: str) -> None:
+            self.write_status(
+                status.model_copy(update={"state": state, "ended": datetime.now(UTC), **details})
+            )
+
         self.write_status(status)
         try:
             yield
-        except Exception as error:
+        except BaseException as error:
             line = f"{type(error).__name__}: {error}"
-            with suppress(OSError):  # on a full disk, what is to be said is what was wrong first
-                self.write_status(_ended(status, "failed", error=line, trace=traceback.format_exc()))
+            with suppress(OSError):  # on a full disk, the first error is the one to raise
+                if isinstance(error, Exception):
+                    ended("failed", error=line, traceback=traceback.format_exc())
+                else:
+                    ended("interrupted", error=line)
             raise
-        except BaseException as stop:
-            with suppress(OSError):
-                self.write_status(_ended(status, "interrupted", error=f"{type(stop).__name__}: {stop}"))
-            raise
-        self.write_status(_ended(status, "finished"))
+        ended("finished")
 
 
 def epoch_name(epoch: int) -> str:
-    """What files of an epoch are called."""
+    """Name of the files of an epoch."""
     return f"epoch-{epoch:04d}"
 
 
 def find_runs(runs: Path) -> list[RunFolder]:
-    """Every run recorded under a folder, in the order of their paths."""
+    """All runs recorded under a folder, in the order of their paths."""
     return [RunFolder(file.parent) for file in sorted(runs.glob("*/*/*/seed*/status.json"))]
 
 
@@ -221,10 +237,6 @@ def _metrics_row(text: str) -> dict[str, Any]:
     if type(epoch) is not int or not -1 <= epoch <= LAST_EPOCH:
         raise ValueError(f"epoch: expected a whole number from -1 to {LAST_EPOCH}")
     return row
-
-
-def _is_infinite(value: Any) -> bool:
-    return isinstance(value, float) and not math.isfinite(value)
 
 
 def _read_mapping(file: Path, parse: Any) -> dict[str, Any]:
@@ -243,18 +255,20 @@ def _unreadable(file: Path, complaint: str, error: Exception) -> RunError:
     return RunError(f"{file}: {complaint} ({gist(error)}); delete the folder to run again")
 
 
-def _new_status(data_manifest: str | None) -> RunStatus:
-    return RunStatus(
-        state="running",
-        started=datetime.now(UTC),
-        versions=provenance.versions(),
-        git_commit=provenance.git_commit(),
-        data_manifest=data_manifest,
-        machine=provenance.machine(),
-    )
+def versions() -> dict[str, str]:
+    """Installed versions of Python and of the packages on which numbers depend."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        with suppress(PackageNotFoundError):  # phd_exp may run from a checkout that is not installed
+            found[name] = version(name)
+    return found
 
 
-def _ended(status: RunStatus, state: State, error: str | None = None, trace: str | None = None) -> RunStatus:
-    return status.model_copy(
-        update={"state": state, "ended": datetime.now(UTC), "error": error, "traceback": trace}
-    )
+def git_commit() -> str | None:
+    """The commit of this package's checkout, or None outside one or without git."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
+    try:
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=10)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return answer.stdout.strip() if answer.returncode == 0 else None

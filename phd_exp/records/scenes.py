@@ -1,4 +1,4 @@
-"""A scene as data, and the line of `metadata.jsonl` that says what an image shows.
+"""A scene as data, and a line of `metadata.jsonl`, which describes an image.
 
 Camera frame: x right, y down, z forward, metres. A scene's own frame is the camera frame of its first view. An
 object's local frame has its origin at the object's centre; a cylinder's axis is the local z axis.
@@ -33,7 +33,7 @@ Quaternion = Annotated[tuple[Finite, Finite, Finite, Finite], AfterValidator(_un
 
 
 class _Described(BaseModel):
-    """Immutable and exact: an unknown or missing key in a file is an error, not a surprise later."""
+    """Immutable; an unknown or missing key in a file is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -43,7 +43,7 @@ class SceneObject(_Described):
 
     Attributes:
         position: centre, scene frame, m.
-        rotation: unit quaternion (w, x, y, z) turning local axes into the scene's.
+        rotation: unit quaternion (w, x, y, z) from local axes to the scene's.
         dimensions: extent along the local axes at scale 1, m.
         scale: factor on all three dimensions.
         colour: sRGB.
@@ -59,7 +59,7 @@ class SceneObject(_Described):
 
 
 class Lamp(_Described):
-    """A square area lamp: its place and the point it faces (scene frame, m), side (m), power (W)."""
+    """A square area lamp: its position and the point that it faces (scene frame, m), side (m), power (W)."""
 
     name: LampName
     position: Vector
@@ -69,10 +69,10 @@ class Lamp(_Described):
 
 
 class Backdrop(_Described):
-    """The light-grey ground behind everything: linear brightness level (1 - falloff |p - centre|^2).
+    """The light-grey background: linear brightness level (1 - falloff |p - centre|^2).
 
-    p is the place in the image in units of its side, x right and y down from the top left corner. As a
-    function of the pixel alone, the backdrop tells neither depth nor focal length.
+    p is the place in the image in units of its side, x right and y down from the top left corner. The backdrop
+    depends on the pixel alone and therefore reveals neither depth nor focal length.
     """
 
     level: Share
@@ -81,7 +81,7 @@ class Backdrop(_Described):
 
 
 class Pose(_Described):
-    """Where a camera stands, as the motion from the scene's frame to its own: p_camera = R p_scene + translation.
+    """Pose of a camera, the map from the scene's frame to the camera's: p_camera = R p_scene + translation.
 
     Attributes:
         rotation: unit quaternion (w, x, y, z) of R.
@@ -106,12 +106,12 @@ Objects = Annotated[tuple[SceneObject, ...], Field(min_length=1), AfterValidator
 
 
 class Scene(_Described):
-    """All that the renderer needs for one image.
+    """The renderer's input for one image.
 
     Attributes:
         f: focal length, px; the principal point is the middle of the image.
         S: side of the square image, px.
-        pose: of the camera.
+        pose: pose of the camera.
         objects: the cylinder first.
         noise_seed: seed of the path tracer.
     """
@@ -126,18 +126,18 @@ class Scene(_Described):
 
 
 class SampleRecord(_Described):
-    """One line of `metadata.jsonl`: the image's name, what a network is asked for, how the image came to be.
+    """One line of `metadata.jsonl`: the image's name, the network's targets, and the scene.
 
     Attributes:
-        file_name: the image, beside the line's own file (the name Hugging Face `imagefolder` asks for).
+        file_name: the image, in the folder of the line's file (the key of Hugging Face `imagefolder`).
         x, y, z: centre of the cylinder, camera frame, m.
         f, S: focal length and side of the image, px.
         scale: size factor of the cylinder.
-        visibility: visible pixels of the cylinder over those it would show alone; 0 if it would show none.
-        truncation: share of the cylinder's silhouette, alone, that lies outside the image.
-        index, split, seed: the three numbers from which everything else follows, given the specification.
-        scene, view: which scene of the split the image shows, and which of its views it is.
-        sha256: of the image file.
+        visibility: visible pixels of the cylinder over those visible without other objects; 0 if there are none.
+        truncation: share of the cylinder's silhouette, without other objects, that lies outside the image.
+        index, split, seed: determine everything else, given the specification.
+        scene, view: number of the scene in the split, and of the view of that scene.
+        sha256: checksum of the image file.
     """
 
     file_name: Annotated[str, Field(pattern=r"^[0-9]{6,12}\.(png|webp|jpg)$")]
@@ -163,13 +163,5 @@ class SampleRecord(_Described):
 
     @property
     def shown(self) -> Scene:
-        """What this image shows, as the renderer takes it."""
-        return Scene(
-            f=self.f,
-            S=self.S,
-            pose=self.pose,
-            objects=self.objects,
-            lamps=self.lamps,
-            backdrop=self.backdrop,
-            noise_seed=self.noise_seed,
-        )
+        """The scene of this image, the renderer's input."""
+        return Scene(**{key: getattr(self, key) for key in Scene.model_fields})

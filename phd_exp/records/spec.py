@@ -1,8 +1,10 @@
-"""What a data set is, said once: the few numbers from which every one of its samples follows."""
+"""The specification of a data set, from which each of its samples follows, and its shares (shards)."""
 
 import hashlib
 import json
-from typing import Annotated, Literal
+import re
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StrictBool
 
@@ -17,19 +19,20 @@ def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:
 
 Positive = Annotated[Number, Field(gt=0)]
 FocalLength = Annotated[Number, Field(ge=10, le=1e6)]
-# Half a metre keeps the camera outside the largest object (a cube of 0.2 m, scaled by 2, reaches 0.35 m).
+# half a metre keeps the camera outside the largest object: a cube of 0.2 m, scaled by 2, reaches 0.35 m
 Distance = Annotated[Number, Field(ge=0.5, le=100)]
 Factor = Annotated[Number, Field(ge=0.1, le=2)]
-# Beyond a right angle, half the cameras would look at the lamps.
+# beyond a right angle, half the cameras would face the lamps
 Angle = Annotated[Number, Field(ge=0, le=90)]
 Range = AfterValidator(_ascending)
 ImageFormat = Literal["png", "webp", "jpeg"]
+SHARD = "expected INDEX/COUNT with 0 <= INDEX < COUNT"
 
 
 class DatasetSpec(BaseModel):
-    """Everything a sample depends on, besides its split and index; the number of samples is no part of it.
+    """Everything that a sample depends on, except its split and index. It does not hold the number of samples.
 
-    A position is drawn as z ~ U(z_range) and x, y ~ (S z / f) xy_range U(-1/2, 1/2).
+    Positions have the distribution z ~ U(z_range) and x, y ~ (S z / f) xy_range U(-1/2, 1/2).
 
     Attributes:
         variant: name of the data set, and of its folder.
@@ -37,16 +40,16 @@ class DatasetSpec(BaseModel):
         sensor_size: S, side of the square image, px.
         f_range: bounds of the focal length, px.
         z_range: bounds of the depth of every object's centre, m.
-        xy_range: share of the image's width and height over which centres are spread: 1.0 is the paper's
-            text, 0.5 its authors' generator.
-        scale_range: bounds of each object's own size factor; (1, 1) leaves sizes known.
-        occluders: whether a cube and a sphere join the cylinder.
-        lamp_jitter: largest relative change of a lamp's place and strength.
+        xy_range: share of the image's width and height that centres span: 1.0 in the paper's text, 0.5 in its
+            authors' generator.
+        scale_range: bounds of each object's size factor; (1, 1) makes sizes known.
+        occluders: whether to add a cube and a sphere.
+        lamp_jitter: largest relative change of a lamp's place and power.
         samples_per_pixel: light paths traced per pixel, before denoising.
-        views: cameras that look at each scene; sample i is view i mod views of scene i div views.
-        view_angle_range: bounds of the angle between a further view's line of sight and the first's, degrees.
-        image_format: of the files; png keeps every pixel, webp and jpeg are small.
-        image_quality: of webp and jpeg, in per cent.
+        views: cameras per scene; sample i is view i mod views of scene i div views.
+        view_angle_range: bounds of the angle between the lines of sight of a further view and the first, degrees.
+        image_format: png keeps every pixel, webp and jpeg are small.
+        image_quality: of webp and jpeg, per cent.
 
     Raises:
         pydantic.ValidationError: a missing or unknown key, a wrong type, a value out of range.
@@ -73,10 +76,54 @@ class DatasetSpec(BaseModel):
 
     @property
     def z_over_f_range(self) -> tuple[float, float]:
-        """Smallest and largest z / f (m/px) that a sample can have; mu_z0 and D follow from them."""
+        """Smallest and largest possible z / f (m/px), which determine mu_z0 and D."""
         return self.z_range[0] / self.f_range[1], self.z_range[1] / self.f_range[0]
 
     def fingerprint(self) -> str:
-        """Sixteen hexadecimal digits that differ whenever any value differs, the same on every machine."""
+        """Sixteen hexadecimal digits that identify the values, the same on every machine."""
         canonical = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Shard:
+    """The samples of each split whose index is `index` modulo `count`: shares of equal cost.
+
+    Raises:
+        ValueError: index is not in [0, count).
+
+    Example:
+        >>> shard = Shard.parse("1/4")
+        >>> [index for index in range(10) if shard.holds(index)]
+        [1, 5, 9]
+    """
+
+    index: int
+    count: int
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.index < self.count:
+            examples = (
+                f"from 0/{self.count} to {self.count - 1}/{self.count}" if self.count else "such as 0/4"
+            )
+            raise ValueError(f"{SHARD}, {examples}")
+
+    @classmethod
+    def parse(cls, text: Any) -> "Shard":
+        """The shard that a user writes as `0/4`. Raises ValueError for anything else."""
+        match = re.fullmatch(r"(\d+)/(\d+)", text) if isinstance(text, str) else None
+        if match is None:
+            raise ValueError(f"{SHARD}, such as 0/4")
+        return cls(int(match[1]), int(match[2]))
+
+    def __str__(self) -> str:
+        return f"{self.index}/{self.count}"
+
+    @property
+    def slug(self) -> str:
+        """The shard as part of a file name."""
+        return f"{self.index}-of-{self.count}"
+
+    def holds(self, index: int) -> bool:
+        """Whether the shard contains the sample with this index."""
+        return index % self.count == self.index

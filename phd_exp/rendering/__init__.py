@@ -1,4 +1,4 @@
-"""A seed becomes a scene (`sampling`), a scene an image (`blender`), and images a folder (`render`).
+"""From a seed to a scene (`sampling`), to an image (`samples`), to a folder of images (`render`).
 
-Imports the records alone, and no torch; bpy is imported in `blender` alone, when the first image is rendered.
+This package imports `records` alone, and no torch; `blender` imports bpy when the first image is rendered.
 """

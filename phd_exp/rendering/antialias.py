@@ -1,12 +1,13 @@
-"""Smooth edges: what share of a pixel each surface takes, by geometry instead of by chance.
+"""Smooth edges: each surface's share of a pixel from geometry instead of random rays.
 
-The path tracer is asked for the light at the middle of every pixel, where one surface alone is seen. A pixel's value
-is the mean of that light over Blender's own pixel filter (Blackman-Harris, 1.5 px: three pixels from end to end).
-Along edges a tracer finds the shares of the surfaces by a few random rays a pixel, which makes three quarters of the
-error that is left after denoising; here they come from rays that carry no light and cost next to nothing.
+The path tracer computes the light at the middle of each pixel, which shows a single surface. A pixel's value is the
+mean of that light over Blender's own pixel filter (Blackman-Harris, 1.5 px: three pixels from end to end). Along
+edges, a tracer estimates the surfaces' shares from a few random rays per pixel, which causes three quarters of the
+error left after denoising. Here the shares come from rays that carry no light and cost almost nothing.
 """
 
 from functools import cache
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ GENERATOR = 5
 
 
 def smoothed(light: Light, surfaces: Labels, scene: Scene) -> Light:
-    """Light (S, S, 3) at the middles of pixels, that show `surfaces` (S, S), averaged over the filter along edges."""
+    """Light (S, S, 3), filtered along edges, from light at the middles of pixels, which show `surfaces` (S, S)."""
     rows, columns = np.nonzero(edges(surfaces, REACH))
     right, down = filter_points()
     x, y = columns[:, None] + 0.5 + right, rows[:, None] + 0.5 + down
@@ -43,7 +44,7 @@ def edges(surfaces: Labels, reach: int) -> Mask:
 
 @cache  # the same for every picture
 def filter_points() -> tuple[Light, Light]:
-    """Offsets to the right and down (POINTS,), px, as dense as the filter is high, for equal weights."""
+    """Offsets to the right and down (POINTS,), px, distributed as the filter, so that their weights are equal."""
     number = np.arange(POINTS) - POINTS // 2  # about the middle: the lattice is its own quarter turn
     places = np.linspace(0, 1, 4097)
     angle = 2 * np.pi * places
@@ -55,9 +56,9 @@ def filter_points() -> tuple[Light, Light]:
 
 
 def _donors(surfaces: Labels, seen: Labels, x: Light, y: Light) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """For each point the pixel whose light stands for it: its own, or the nearest one that shows the same surface.
+    """For each point, the pixel that provides its light: its own, or the nearest one that shows the same surface.
 
-    A surface that shows in the middle of no pixel around lends the point its own pixel's light.
+    If no pixel nearby shows that surface in its middle, the point's own pixel provides the light.
     """
     last = len(surfaces) - 1
     row, column = (np.floor(place).astype(np.intp).clip(0, last) for place in (y, x))
@@ -68,14 +69,13 @@ def _donors(surfaces: Labels, seen: Labels, x: Light, y: Light) -> tuple[NDArray
         near = (row[lost] + down).clip(0, last), (column[lost] + right).clip(0, last)
         found = surfaces[near] == seen[lost]
         hit = tuple(axis[found] for axis in lost)
-        # neighbours of a donor found are never looked at again: `lost` shrinks by it
         row[hit], column[hit] = near[0][found], near[1][found]
         lost = tuple(axis[~found] for axis in lost)
     return row, column
 
 
 def _extreme(ufunc: np.ufunc, values: Labels, reach: int, axis: int) -> Labels:
-    """The largest or smallest value within `reach` along one axis; beyond the border there is nothing."""
+    """The largest or smallest value within `reach` along one axis of the image."""
     result = values.copy()
     towards = np.moveaxis(result, axis, 0)
     source = np.moveaxis(values, axis, 0)
@@ -85,12 +85,7 @@ def _extreme(ufunc: np.ufunc, values: Labels, reach: int, axis: int) -> Labels:
     return result
 
 
-_NEIGHBOURS = sorted(
-    (
-        (down, right)
-        for down in range(-REACH, REACH + 1)
-        for right in range(-REACH, REACH + 1)
-        if down or right
-    ),
-    key=lambda step: step[0] ** 2 + step[1] ** 2,
-)
+_STEPS = range(-REACH, REACH + 1)
+_NEIGHBOURS = sorted(product(_STEPS, _STEPS), key=lambda step: step[0] ** 2 + step[1] ** 2)[
+    1:
+]  # without itself

@@ -1,4 +1,4 @@
-"""Scenes to pixels with Cycles: the one file that imports Blender."""
+"""From scenes to pixels with Cycles; the only file that imports Blender."""
 
 import importlib
 import importlib.metadata
@@ -22,11 +22,7 @@ X_LIBRARIES = "libx11-6 libxext6 libxfixes3 libxi6 libxrender1 libxkbcommon0 lib
 
 
 def require_bpy() -> None:
-    """Check, without loading it, that Blender's Python module is installed.
-
-    Raises:
-        RenderError: it is not.
-    """
+    """Raise RenderError unless Blender's Python module is installed; does not load it."""
     if importlib.util.find_spec("bpy") is None:
         raise RenderError(
             "rendering needs bpy, Blender as a Python module, which is not installed: "
@@ -44,10 +40,10 @@ def renderer_version() -> str:
 
 
 def load_bpy() -> Any:
-    """Blender's Python module, a second or so the first time.
+    """Blender's Python module, which takes about a second to load.
 
     Raises:
-        RenderError: it, or a library of the system that it needs, is not installed.
+        RenderError: the module, or a system library that it needs, is not installed.
     """
     require_bpy()
     try:
@@ -69,12 +65,12 @@ class Box(NamedTuple):
 
 @dataclass(frozen=True)
 class Settings:
-    """How the tracer finds light.
+    """Settings of the path tracer.
 
     Attributes:
-        samples: light paths a pixel.
-        denoised: by Open Image Denoise.
-        at_middles: the light at the middle of each pixel; else Blender's own mean over a pixel and its surroundings.
+        samples: light paths per pixel.
+        denoised: use Open Image Denoise.
+        at_middles: compute the light at the middle of each pixel, instead of Blender's filtered mean.
     """
 
     samples: int
@@ -83,16 +79,18 @@ class Settings:
 
 
 class Renderer:
-    """Renders scenes; builds Blender's scene once and then only moves what differs.
+    """Renders scenes; builds Blender's scene once and then changes only the differences.
 
-    Blender keeps its state per process, so a second renderer in the same process takes the scene over.
+    Blender has one state per process: a second renderer in the same process replaces the first one's scene.
 
     Raises:
         RenderError: bpy or a library it needs is missing.
     """
 
     def __init__(self, settings: Settings) -> None:
-        self._output = _fast_folder() / f"phd_exp-{uuid.uuid4().hex}.exr"
+        memory = Path("/dev/shm")  # a folder in memory, where the system has one
+        place = memory if os.access(memory, os.W_OK) else Path(tempfile.gettempdir())
+        self._output = place / f"phd_exp-{uuid.uuid4().hex}.exr"
         with silence():
             self._bpy = load_bpy()
             self._stage = build_stage(self._bpy)
@@ -101,29 +99,27 @@ class Renderer:
             _configure_tracer(self._scene.cycles, settings)
 
     def render(self, scene: Scene, box: Box | None = None) -> Light:
-        """Linear light of a box of pixels (height, width, 3), or of all (S, S, 3), rows from the top.
+        """Linear light of a box of pixels (height, width, 3), by default of all (S, S, 3); rows from the top.
 
-        1 is the brightest that a picture can show. A pure function of the scene, the box and the settings.
+        An image is white from 1 upwards. A pure function of the scene, the box and the settings.
         """
         box = box or Box(0, 0, scene.S, scene.S)
         self._frame(box, scene.S)
         self._stage.show(scene)
         self._scene.cycles.seed = scene.noise_seed
-        return read_light(self._shoot(), box.bottom - box.top, box.right - box.left)
-
-    def _shoot(self) -> bytes:
         self._scene.render.filepath = str(self._output)
         try:
             with silence():
                 self._bpy.ops.render.render(write_still=True)
-            return self._output.read_bytes()
+            content = self._output.read_bytes()
         finally:
             self._output.unlink(missing_ok=True)
+        return read_light(content, box.bottom - box.top, box.right - box.left)
 
     def _frame(self, box: Box, side: int) -> None:
-        """Blender wants shares of the image from the bottom left corner, and cuts them off to whole pixels.
+        """Set the box as fractions of the image from the bottom left corner, which Blender truncates to whole pixels.
 
-        Half a pixel more, and rounding cannot lose one.
+        The added half pixel ensures that rounding loses none.
         """
         render = self._scene.render
         render.resolution_x = render.resolution_y = side
@@ -133,7 +129,7 @@ class Renderer:
 
 
 def _configure_image(scene: Any) -> None:
-    """What differs from Blender's factory settings in the making of an image, with its reason."""
+    """Set the image options that differ from Blender's factory settings."""
     render = scene.render
     render.engine = "CYCLES"
     render.threads_mode = "FIXED"
@@ -142,24 +138,23 @@ def _configure_image(scene: Any) -> None:
     render.resolution_percentage = 100
     render.use_border = render.use_crop_to_border = True
     render.use_file_extension = False
-    image = render.image_settings  # light as it is, in a file that is read in a moment
+    image = render.image_settings  # linear light, in a temporary file
     image.file_format, image.color_mode, image.color_depth, image.exr_codec = "OPEN_EXR", "RGB", "16", "NONE"
 
 
 def _configure_tracer(cycles: Any, settings: Settings) -> None:
-    """The same for the path tracer."""
+    """Set the options of the path tracer that differ from Blender's factory settings."""
     cycles.device = "CPU"
     cycles.samples = settings.samples
-    cycles.use_adaptive_sampling = False  # would spend a variable number of samples; there are few anyway
-    cycles.sampling_pattern = (
-        "BLUE_NOISE"  # the denoiser takes the default one's noise for texture now and then
-    )
-    cycles.use_light_tree = True  # a fifth slower, and worth more than a fifth more samples
-    cycles.max_bounces = 2  # objects colour each other once; more changes nothing one can measure
+    cycles.use_adaptive_sampling = False  # would vary the number of samples, which is small anyway
+    # the denoiser sometimes takes the default pattern's noise for texture
+    cycles.sampling_pattern = "BLUE_NOISE"
+    cycles.use_light_tree = True  # a fifth slower, but better than a fifth more samples
+    cycles.max_bounces = 2  # objects colour each other once; more bounces change nothing measurable
     cycles.diffuse_bounces = cycles.glossy_bounces = 2
     cycles.transmission_bounces = cycles.volume_bounces = cycles.transparent_max_bounces = 0
     if settings.at_middles:
-        cycles.pixel_filter_type = "GAUSSIAN"  # the one whose width may be next to nothing
+        cycles.pixel_filter_type = "GAUSSIAN"  # the only filter whose width may be almost zero
         cycles.filter_width = 0.01
     cycles.use_denoising = settings.denoised
     cycles.denoiser = "OPENIMAGEDENOISE"
@@ -168,15 +163,9 @@ def _configure_tracer(cycles: Any, settings: Settings) -> None:
     cycles.denoising_prefilter = "NONE"
 
 
-def _fast_folder() -> Path:
-    """A folder in memory where the system has one."""
-    memory = Path("/dev/shm")
-    return memory if os.access(memory, os.W_OK) else Path(tempfile.gettempdir())
-
-
 @contextmanager
 def silence() -> Iterator[None]:
-    """Send nowhere what Blender's C code prints, past Python, to the standard output and error."""
+    """Discard what Blender's C code prints to the standard output and error."""
     sys.stdout.flush()
     sys.stderr.flush()
     kept = {stream: os.dup(stream) for stream in (1, 2)}

@@ -1,4 +1,4 @@
-"""The three shapes as meshes filling the cube [-1, 1]^3: plain lists, to be checked without Blender."""
+"""The three shapes as meshes that fill the cube [-1, 1]^3: plain lists, which tests check without Blender."""
 
 import math
 from dataclasses import dataclass
@@ -8,14 +8,14 @@ from phd_exp.records.scenes import Shape
 Point = tuple[float, float, float]
 Face = tuple[int, ...]
 
-# A polygon of n sides lies within r (1 - cos(pi / n)) of its circle: 0.01 px at the worst.
+# A polygon of n sides deviates from its circle by at most r (1 - cos(pi / n)): 0.01 px at the worst.
 SIDES = 192
 RINGS = 96
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """Vertices, faces (counter-clockwise from outside), and which faces are shaded as a curved surface."""
+    """Vertices, faces (counter-clockwise from outside), and whether each face is shaded as a curved surface."""
 
     vertices: list[Point]
     faces: list[Face]
@@ -23,12 +23,12 @@ class Mesh:
 
 
 def build_mesh(shape: Shape) -> Mesh:
-    """The mesh of a shape. No bevel: the same solid as `visibility` casts rays at."""
+    """The mesh of a shape without bevels, the same solid as in `rays`."""
     return {"cylinder": _cylinder, "cube": _cube, "sphere": _sphere}[shape]()
 
 
 def _cylinder() -> Mesh:
-    """Axis z; the caps have vertices of their own, so that shading does not bleed over the sharp rim."""
+    """Axis z; the caps have separate vertices, so that shading stops at the sharp rim."""
     rings = [_circle(z=-1.0), _circle(z=1.0)]
     vertices = [point for _ in range(2) for ring in rings for point in ring]
     sides = [(i, (i + 1) % SIDES, SIDES + (i + 1) % SIDES, SIDES + i) for i in range(SIDES)]

@@ -1,4 +1,4 @@
-"""Pixels: linear light, 8-bit sRGB (IEC 61966-2-1), and the files that hold either."""
+"""Pixels: linear light, 8-bit sRGB (IEC 61966-2-1), and the files of both."""
 
 import io
 from typing import Any
@@ -12,8 +12,8 @@ from phd_exp.records.spec import DatasetSpec, ImageFormat
 Light = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
 
-# Level 6 of zlib: level 9 saves 2 % of the bytes for twice the time. Colour at full resolution in a JPEG: a
-# silhouette is often a step in colour alone.
+# Level 9 of zlib saves 2 % of the bytes for twice the time. A JPEG has colour at full resolution, since a silhouette
+# is often a step in colour alone.
 OPTIONS: dict[ImageFormat, dict[str, Any]] = {
     "png": {"compress_level": 6},
     "webp": {"method": 4},
@@ -22,12 +22,12 @@ OPTIONS: dict[ImageFormat, dict[str, Any]] = {
 
 
 def linear(signal: float) -> float:
-    """The light that a signal of 0 to 1 stands for."""
+    """The linear light of an sRGB signal from 0 to 1."""
     return signal / 12.92 if signal <= 0.04045 else ((signal + 0.055) / 1.055) ** 2.4
 
 
 def encoded(light: Light) -> Pixels:
-    """Linear light to 8-bit sRGB, clipped where a picture can show no more."""
+    """Linear light to 8-bit sRGB, clipped to its range."""
     return np.searchsorted(_STEPS, light, side="right").astype(np.uint8)
 
 
@@ -37,10 +37,8 @@ _STEPS: Light = np.array([linear((value + 0.5) / 255) for value in range(255)])
 
 def encode(pixels: Pixels, spec: DatasetSpec) -> bytes:
     """Image (S, S, 3) as the bytes of a file of the specification's format and quality."""
-    options = OPTIONS[spec.image_format]
-    if spec.image_format != "png":
-        options = options | {"quality": spec.image_quality}
-    return file_of(Image.fromarray(pixels), spec.image_format, **options)
+    quality = {} if spec.image_format == "png" else {"quality": spec.image_quality}
+    return file_of(Image.fromarray(pixels), spec.image_format, **OPTIONS[spec.image_format], **quality)
 
 
 def file_of(image: Image.Image, image_format: ImageFormat, **options: Any) -> bytes:
@@ -51,16 +49,16 @@ def file_of(image: Image.Image, image_format: ImageFormat, **options: Any) -> by
 
 
 def read_light(content: bytes, height: int, width: int) -> NDArray[np.float64]:
-    """Linear light (height, width, 3), rows from the top, from an OpenEXR file as Blender is asked to write it here.
+    """Linear light (height, width, 3), rows from the top, from an OpenEXR file with the settings of `Renderer`.
 
-    Three channels of half floats, one block a row, not compressed. In background mode Blender returns pixels through
-    files only, and of those only OpenEXR keeps the light of an overexposed pixel.
+    The file has three channels of half floats in uncompressed blocks of one row. In background mode, Blender returns
+    pixels through files only, and only OpenEXR keeps the light of an overexposed pixel.
 
     Raises:
-        ValueError: the file is of another kind or size.
+        ValueError: the file has another format or size.
 
-    Source: "OpenEXR file layout" of the OpenEXR documentation: the rows are the end of the file, each its number and
-    its length (int32), then blue, green and red.
+    Source: "OpenEXR file layout" in the OpenEXR documentation. The rows are at the end of the file; each has its
+    number and length (int32), then blue, green and red.
     """
     row = np.dtype([("number", "<i4"), ("length", "<i4"), ("light", "<f2", (3, width))])
     begin = len(content) - height * row.itemsize

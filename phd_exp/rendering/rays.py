@@ -1,8 +1,8 @@
-"""Analytic ray casting: which surface a ray meets first, how far away, and how much of the cylinder shows.
+"""Analytic ray casting: the first surface that a ray hits, its depth, and the visible share of the cylinder.
 
-A pinhole ray is v = z (u, w, 1). In an object's own frame, stretched so that the object fills [-1, 1]^3, it
-is still a straight line with the same parameter z: every object is one of three unit solids, and its depth is
-where the line enters.
+A pinhole ray is v = z (u, w, 1). In an object's own frame, scaled so that the object fills [-1, 1]^3, the ray is
+still a straight line with the same parameter z. Every object is thus one of three unit solids, and its depth is the
+parameter at which the line enters.
 """
 
 import math
@@ -12,23 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phd_exp.records.scenes import Pose, Scene, SceneObject
-from phd_exp.rendering.rotations import rotation_matrix
 
 Image = NDArray[np.float64]
 Labels = NDArray[np.int8]
 Mask = NDArray[np.bool_]
 
 FACES = 8  # at most that many smooth faces on one object
-NOTHING = 0  # the label of a ray that meets no object
+NOTHING = 0  # the label of a ray that hits no object
 
 
 @dataclass(frozen=True)
 class Hits:
-    """What rays (...) meet, for each object were it alone.
+    """The hits of rays (...) on each object, as if it were alone.
 
     Attributes:
         depths: z (objects, ...), m; infinity where a ray misses the object.
-        surfaces: the number in the scene of the smooth face (objects, ...) that is met; NOTHING where missed.
+        surfaces: number in the scene of the smooth face (objects, ...) that is hit; NOTHING where missed.
     """
 
     depths: Image
@@ -36,15 +35,14 @@ class Hits:
 
     @property
     def first(self) -> Labels:
-        """The surface (...) that is met first: what a camera sees."""
+        """The surface (...) that is hit first, and which a camera therefore shows."""
         nearest = self.depths.argmin(axis=0)
         return np.take_along_axis(self.surfaces, nearest[None], axis=0)[0]
 
 
 def trace_pixels(scene: Scene) -> Hits:
-    """What the rays through the middles (c + 1/2, r + 1/2) of all pixels (column c, row r) meet: (S, S)."""
-    shape = (len(scene.objects), scene.S, scene.S)
-    hits = Hits(np.full(shape, np.inf), np.full(shape, NOTHING, np.int8))
+    """The hits (S, S) of the rays through the middles (c + 1/2, r + 1/2) of all pixels (column c, row r)."""
+    hits = _no_hits(scene, (scene.S, scene.S))
     for number, item in enumerate(scene.objects):
         rows, columns = (_clipped(span, scene.S) for span in window(scene, item))
         if rows and columns:
@@ -55,9 +53,8 @@ def trace_pixels(scene: Scene) -> Hits:
 
 
 def trace_points(scene: Scene, x: Image, y: Image) -> Hits:
-    """What the rays through some points (...) of the image meet: x to the right, y down, px."""
-    shape = (len(scene.objects), *x.shape)
-    hits = Hits(np.full(shape, np.inf), np.full(shape, NOTHING, np.int8))
+    """The hits (...) of the rays through points of the image: x to the right, y down, px."""
+    hits = _no_hits(scene, x.shape)
     for number, item in enumerate(scene.objects):
         rows, columns = window(scene, item)
         near = (x >= columns.start) & (x <= columns.stop) & (y >= rows.start) & (y <= rows.stop)
@@ -65,21 +62,26 @@ def trace_points(scene: Scene, x: Image, y: Image) -> Hits:
     return hits
 
 
+def _no_hits(scene: Scene, shape: tuple[int, ...]) -> Hits:
+    shape = (len(scene.objects), *shape)
+    return Hits(np.full(shape, np.inf), np.full(shape, NOTHING, np.int8))
+
+
 def cylinder_mask(hits: Hits) -> Mask:
-    """Pixels (S, S) that show the first object, the cylinder, rows from the top."""
+    """Pixels (S, S) that show the cylinder, the scene's first object; rows from the top."""
     return (hits.surfaces[0] != NOTHING) & (hits.depths[0] <= hits.depths.min(axis=0))
 
 
 def visibility(hits: Hits) -> float:
-    """Visible pixels of the cylinder over those it would show alone; 0 if it would show none."""
+    """Visible pixels of the cylinder over those visible without other objects; 0 if there are none."""
     alone = (hits.surfaces[0] != NOTHING).sum()
     return float(cylinder_mask(hits).sum() / alone) if alone else 0.0
 
 
 def truncation(scene: Scene, hits: Hits) -> float:
-    """Share of the pixels that the cylinder, alone, would take in an image without borders and that this one lacks.
+    """Share of the cylinder's pixels, in an image without borders or other objects, that lie outside this image.
 
-    1 if it would take none anywhere.
+    1 if the cylinder has no pixels at all.
     """
     cylinder = scene.model_copy(update={"objects": scene.objects[:1]})
     everywhere = trace_points(cylinder, *pixel_middles(*window(scene, scene.objects[0])))
@@ -93,19 +95,31 @@ def pixel_middles(rows: range, columns: range) -> tuple[Image, Image]:
     return x, y
 
 
+def rotation_matrix(quaternion: tuple[float, float, float, float]) -> Image:
+    """Matrix (3, 3) of a unit quaternion (w, x, y, z)."""
+    w, x, y, z = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
 def in_camera_frame(position: Image, pose: Pose) -> Image:
-    """A point (3,) of the scene's frame as the camera sees it, m."""
+    """A point (3,) of the scene's frame in the camera's frame, m."""
     return rotation_matrix(pose.rotation) @ position + np.array(pose.translation)
 
 
 def window(scene: Scene, item: SceneObject) -> tuple[range, range]:
-    """Rows and columns, not only of the image, that hold an object's silhouette: those of a ball around it.
+    """Rows and columns, possibly outside the image, that contain an object's silhouette: those of a ball around it.
 
-    The ball's shadow on an axis of the image reaches from tan(angle - width) to tan(angle + width).
+    The ball's projection on an axis of the image reaches from tan(angle - width) to tan(angle + width).
     """
     x, y, z = in_camera_frame(np.array(item.position), scene.pose)
     radius = 0.5 * item.scale * math.hypot(*item.dimensions)
-    if z <= radius:  # beside or around the camera: nothing is known but the image's own borders
+    if z <= radius:  # next to or around the camera: only the image's borders bound the silhouette
         return range(scene.S), range(scene.S)
     return _shadow(y, z, radius, scene), _shadow(x, z, radius, scene)
 
@@ -123,7 +137,7 @@ def _clipped(span: range, side: int) -> range:
 
 
 def _cast(scene: Scene, number: int, x: Image, y: Image) -> tuple[Image, Labels]:
-    """Depth (...) at which the rays through points (...) of the image enter one object, and through which surface."""
+    """Depth (...) at which the rays through points (...) of the image enter one object, and the surface."""
     item = scene.objects[number]
     rotation = rotation_matrix(scene.pose.rotation) @ rotation_matrix(item.rotation)
     to_unit = rotation.T / (0.5 * item.scale * np.array(item.dimensions))[:, None]
@@ -133,19 +147,19 @@ def _cast(scene: Scene, number: int, x: Image, y: Image) -> tuple[Image, Labels]
     meet = {"cylinder": _cylinder, "cube": _cube, "sphere": _sphere}[item.shape]
     with np.errstate(divide="ignore", invalid="ignore"):
         enter, leave, face = meet(origin, rays @ to_unit.T)
-        # An interval whose ends are NaN or reversed is empty; what lies behind the camera is not seen.
+        # an interval whose ends are NaN or reversed is empty; a camera shows nothing behind it
         hit = (enter <= leave) & (enter > 0)
     return np.where(hit, enter, np.inf), np.where(hit, 1 + FACES * number + face, NOTHING).astype(np.int8)
 
 
 def _slabs(origin: Image, rays: Image) -> tuple[Image, Image]:
-    """Intervals (..., axes) of the parameter within |coordinate| <= 1."""
+    """Intervals (..., axes) of the parameter in which |coordinate| <= 1."""
     one, two = (-1 - origin) / rays, (1 - origin) / rays
     return np.minimum(one, two), np.maximum(one, two)
 
 
 def _ball(origin: Image, rays: Image) -> tuple[Image, Image]:
-    """Interval of the parameter within the unit ball of the coordinates given; NaN where the line misses."""
+    """Interval of the parameter inside the unit ball of the given coordinates; NaN where the line misses."""
     a, b, c = (rays * rays).sum(axis=-1), rays @ origin, origin @ origin - 1
     root = np.sqrt(b * b - a * c)
     return (-b - root) / a, (-b + root) / a
@@ -157,7 +171,7 @@ def _sphere(origin: Image, rays: Image) -> tuple[Image, Image, Image]:
 
 
 def _cube(origin: Image, rays: Image) -> tuple[Image, Image, Image]:
-    """Two faces an axis: which one of them a ray enters by follows from its direction."""
+    """Each axis has two faces; the direction of a ray decides which one it enters."""
     enter, leave = _slabs(origin, rays)
     axis = enter.argmax(axis=-1)
     rising = np.take_along_axis(rays, axis[..., None], axis=-1)[..., 0] > 0
@@ -165,7 +179,7 @@ def _cube(origin: Image, rays: Image) -> tuple[Image, Image, Image]:
 
 
 def _cylinder(origin: Image, rays: Image) -> tuple[Image, Image, Image]:
-    """Where an infinite round column and the slab between the caps overlap: the side, and two caps."""
+    """The intersection of an infinite round column and the slab between the caps: the side, and two caps."""
     side_in, side_out = _ball(origin[:2], rays[..., :2])
     cap_in, cap_out = _slabs(origin[2], rays[..., 2])
     face = np.where(side_in >= cap_in, 0, 1 + (rays[..., 2] > 0))

@@ -1,8 +1,9 @@
-"""From (specification, split, index) to a scene: numpy alone, no state, no order."""
+"""From (specification, split, index) to a scene: a pure function, with numpy alone."""
 
 import colorsys
 import math
 from enum import IntEnum
+from typing import get_args
 
 import numpy as np
 
@@ -13,26 +14,27 @@ from phd_exp.records.scenes import (
     LampName,
     Material,
     Pose,
+    Quaternion,
     Scene,
     SceneObject,
     Shape,
     Split,
-)
+    Vector,
+)  # fmt: skip
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.rotations import about_axis, rotation_matrix, uniform_rotation
+from phd_exp.rendering.rays import rotation_matrix
 
-# Raised whenever the same specification starts to give other scenes or other pixels: folders made by
-# another generation are then refused instead of being continued with samples of another kind.
+# Increment it when the same specification starts to give other scenes or other pixels. Folders of another version are
+# refused, not continued with samples that do not match.
 GENERATOR_VERSION = 2
 
-SPLIT_NUMBER: dict[Split, int] = {"train": 0, "test": 1}
 SIZE = 0.2  # m: height and diameter of the cylinder, side of the cube, diameter of the sphere
-CLEARANCE = 0.5  # m from a further view's camera to every object: none is inside another's lens
+CLEARANCE = 0.5  # m: least depth of an object in a further view
 MOST_TRIES = 10_000
 
 
 class Purpose(IntEnum):
-    """One random stream for each purpose, so that variants are paired: what one adds shifts nothing else.
+    """One random stream per purpose, so that variants are paired: an addition to a variant changes nothing else.
 
     The numbers are part of every data set; append, never renumber.
     """
@@ -41,26 +43,15 @@ class Purpose(IntEnum):
     LAMPS = 1
     BACKDROP = 2
     NOISE = 3
-    CYLINDER_POSE = 10
-    CYLINDER_LOOK = 11
-    CYLINDER_SCALE = 12
-    CUBE_POSE = 20
-    CUBE_LOOK = 21
-    CUBE_SCALE = 22
-    SPHERE_POSE = 30
-    SPHERE_LOOK = 31
-    SPHERE_SCALE = 32
+    OBJECT = 10  # plus 10 per shape, in the order of SHAPES; then POSE, LOOK or SCALE
     VIEW = 40  # followed by the view's number
 
 
-STREAMS: dict[Shape, tuple[Purpose, Purpose, Purpose]] = {
-    "cylinder": (Purpose.CYLINDER_POSE, Purpose.CYLINDER_LOOK, Purpose.CYLINDER_SCALE),
-    "cube": (Purpose.CUBE_POSE, Purpose.CUBE_LOOK, Purpose.CUBE_SCALE),
-    "sphere": (Purpose.SPHERE_POSE, Purpose.SPHERE_LOOK, Purpose.SPHERE_SCALE),
-}
+SHAPES: tuple[Shape, ...] = get_args(Shape)
+POSE, LOOK, SCALE = range(3)
 
-# (name, direction from the middle of the scene, side in m, power in W). They stand far away: across two
-# metres of depth a lamp's light changes by less than its jitter, so that brightness does not give depth away.
+# (name, direction from the middle of the scene, side in m, power in W). The lamps are far away: across two metres of
+# depth a lamp's light changes by less than its jitter, so that brightness does not reveal depth.
 LAMP_DISTANCE = 20.0
 LAMPS: tuple[tuple[LampName, tuple[float, float, float], float, float], ...] = (
     ("key", (-0.62, -0.62, -0.48), 7.0, 4200.0),
@@ -70,25 +61,24 @@ LAMPS: tuple[tuple[LampName, tuple[float, float, float], float, float], ...] = (
 
 
 def scene_and_view(spec: DatasetSpec, index: int) -> tuple[int, int]:
-    """Which scene of its split a sample shows, and which view of it."""
+    """Number of the scene that a sample shows, within its split, and of the view."""
     return divmod(index, spec.views)
 
 
 def sample_scene(spec: DatasetSpec, split: Split, index: int) -> Scene:
-    """Draw what one sample shows: a pure function of the three arguments.
+    """Draw the scene of one sample, a pure function of the three arguments.
 
     Source: paper, section "Dataset"; lamps after CLEVR (key, fill and back area lamps with jitter).
     """
     number, view = scene_and_view(spec, index)
 
-    def stream(purpose: Purpose) -> np.random.Generator:
+    def stream(purpose: int) -> np.random.Generator:
         return _stream(spec, split, number, purpose)
 
     f = _uniform(stream(Purpose.CAMERA), spec.f_range)
-    shapes: tuple[Shape, ...] = ("cylinder", "cube", "sphere") if spec.occluders else ("cylinder",)
     objects = []
-    for shape in shapes:
-        pose, look, size = (stream(purpose) for purpose in STREAMS[shape])
+    for place, shape in enumerate(SHAPES if spec.occluders else SHAPES[:1]):
+        pose, look, size = (stream(Purpose.OBJECT + 10 * place + part) for part in (POSE, LOOK, SCALE))
         objects.append(_object(spec, shape, f, pose, look, size))
     scene = Scene(
         f=f,
@@ -102,30 +92,45 @@ def sample_scene(spec: DatasetSpec, split: Split, index: int) -> Scene:
     return _seen_again(scene, spec, _stream(spec, split, number, Purpose.VIEW, view)) if view else scene
 
 
+def about_axis(axis: Vector, angle: float) -> Quaternion:
+    """Unit quaternion of a right-handed turn by `angle` (radians) about a unit vector."""
+    x, y, z = (math.sin(angle / 2) * component for component in axis)
+    return math.cos(angle / 2), x, y, z
+
+
+def uniform_rotation(rng: np.random.Generator) -> Quaternion:
+    """Unit quaternion of a random rotation with the uniform distribution (the Haar measure of SO(3)).
+
+    Source: K. Shoemake, "Uniform random rotations", Graphics Gems III (1992).
+    """
+    u, first, second = rng.random(3).tolist()
+    a, b = math.sqrt(1 - u), math.sqrt(u)
+    return (
+        b * math.cos(math.tau * second),
+        a * math.sin(math.tau * first),
+        a * math.cos(math.tau * first),
+        b * math.sin(math.tau * second),
+    )
+
+
 def _stream(spec: DatasetSpec, split: Split, scene: int, *purpose: int) -> np.random.Generator:
-    key = (SPLIT_NUMBER[split], scene, *(int(part) for part in purpose))
+    key = (get_args(Split).index(split), scene, *map(int, purpose))
     return np.random.default_rng(np.random.SeedSequence(entropy=spec.seed, spawn_key=key))
 
 
 def _seen_again(scene: Scene, spec: DatasetSpec, rng: np.random.Generator) -> Scene:
-    """The same scene before another camera, turned about an axis across the first one's line of sight.
+    """The same scene in front of another camera, turned about an axis orthogonal to the first one's line of sight.
 
-    Its focal length and the cylinder's place before it follow the law of the first view, and as the cylinder's
-    rotation is uniform, it is so before every camera. The lamps stand where they stood.
+    The focal length and the cylinder's position in the camera frame have the distribution of the first view. The
+    cylinder's rotation is uniform in every camera frame, because it is so in one. The lamps do not move.
     """
     f = _uniform(rng, spec.f_range)
-    return scene.model_copy(
-        update={
-            "f": f,
-            "pose": _pose(scene.objects, spec, f, rng),
-            "backdrop": _backdrop(rng),
-            "noise_seed": _seed(rng),
-        }
-    )
+    changes = {"f": f, "pose": _pose(scene.objects, spec, f, rng), "backdrop": _backdrop(rng)}
+    return scene.model_copy(update=changes | {"noise_seed": _seed(rng)})
 
 
 def _pose(objects: tuple[SceneObject, ...], spec: DatasetSpec, f: float, rng: np.random.Generator) -> Pose:
-    """A camera with all objects in front of it."""
+    """The pose of a further camera that has all objects in front of it."""
     places = np.array([item.position for item in objects])
     for _ in range(MOST_TRIES):
         direction = _uniform(rng, (0.0, math.tau))
@@ -159,7 +164,7 @@ def _object(
 
 
 def _position(spec: DatasetSpec, f: float, rng: np.random.Generator) -> tuple[float, float, float]:
-    """A place before a camera; z first, since x and y are spread over the field of view at that depth."""
+    """A position in the camera frame; z is drawn first, because x and y span the field of view at that depth."""
     z = _uniform(rng, spec.z_range)
     half_width = 0.5 * spec.xy_range * spec.sensor_size * z / f
     x, y = (_uniform(rng, (-half_width, half_width)) for _ in range(2))
@@ -167,7 +172,7 @@ def _position(spec: DatasetSpec, f: float, rng: np.random.Generator) -> tuple[fl
 
 
 def _colour(rng: np.random.Generator) -> tuple[float, float, float]:
-    """sRGB of any hue, neither so grey as to merge with the backdrop nor so dark that shading is lost."""
+    """sRGB of any hue; not too grey, which would merge with the backdrop, and not too dark to show shading."""
     hue, saturation, value = rng.random(), _uniform(rng, (0.45, 0.95)), _uniform(rng, (0.45, 0.95))
     r, g, b = colorsys.hsv_to_rgb(hue, saturation, value)
     return r, g, b
@@ -178,7 +183,7 @@ def _material(rng: np.random.Generator) -> Material:
 
 
 def _lamps(spec: DatasetSpec, rng: np.random.Generator) -> tuple[Lamp, ...]:
-    """The three lamps about the middle of the scene, each moved and dimmed or brightened by the jitter."""
+    """The three lamps around the middle of the scene, with jitter in place and power."""
     middle = (0.0, 0.0, sum(spec.z_range) / 2)
     jitter = (-spec.lamp_jitter, spec.lamp_jitter)
     lamps = []
@@ -191,7 +196,7 @@ def _lamps(spec: DatasetSpec, rng: np.random.Generator) -> tuple[Lamp, ...]:
 
 
 def _backdrop(rng: np.random.Generator) -> Backdrop:
-    """Brightest about the upper middle of the image, as under a studio lamp."""
+    """Brightest near the upper middle of the image, as under a studio lamp."""
     centre = (_uniform(rng, (0.25, 0.75)), _uniform(rng, (0.0, 0.5)))
     return Backdrop(level=_uniform(rng, (0.52, 0.68)), falloff=_uniform(rng, (0.15, 0.45)), centre=centre)
 

@@ -1,7 +1,8 @@
-"""From images and journals to a finished folder: what is known of it, and the order in which it is sealed.
+"""From images and journals to a finished folder: the samples known so far, and the order in which it is sealed.
 
-Every writer has a journal of its own, an unsharded render the plain one; all of them count as finished work,
-whoever goes on. Only one who holds the folder alone seals it, so that no journal is removed under its writer.
+Each writer has its own journal; an unsharded render has the plain one. The samples of all journals count as
+finished, whoever resumes. A folder is sealed only under an exclusive lock, so that no journal is removed while
+another process writes it.
 """
 
 from contextlib import suppress
@@ -19,18 +20,16 @@ Known = dict[Split, dict[int, SampleRecord]]
 
 
 def begin(folder: DatasetFolder, spec: DatasetSpec) -> None:
-    """Write the folder's manifest if there is none: before the first image, it says of which data set it is.
+    """Write the manifest, which names the data set, before the first image, unless there is one.
 
     Raises:
-        DatasetError: the folder was made by another generator or another Blender: the rest would not match.
+        DatasetError: another generator or another Blender made the folder, whose samples would not match the rest.
     """
     for split in SPLITS:
         folder.split_folder(split).mkdir(exist_ok=True)
     if not folder.manifest_path.exists():
-        folder.write_manifest(
-            Manifest(generator=GENERATOR_VERSION, renderer=renderer_version(), spec=spec, splits={})
-        )
-        return
+        manifest = Manifest(generator=GENERATOR_VERSION, renderer=renderer_version(), spec=spec, splits={})
+        folder.write_manifest(manifest)
     for key, theirs, ours in other_make(folder.manifest):
         raise DatasetError(
             f"{folder.root}: begun with {key} {theirs}, this is {ours}, and the rest would not match; "
@@ -39,7 +38,7 @@ def begin(folder: DatasetFolder, spec: DatasetSpec) -> None:
 
 
 def other_make(manifest: Manifest) -> list[tuple[str, int | str, int | str]]:
-    """What differs between the programmes that made a data set and these: its name, theirs, ours."""
+    """Differences between the programs that made a data set and the present ones: key, their version, ours."""
     made = (
         ("generator", manifest.generator, GENERATOR_VERSION),
         ("renderer", manifest.renderer, renderer_version()),
@@ -53,10 +52,10 @@ def known_samples(folder: DatasetFolder) -> Known:
 
 
 def _known_of(folder: DatasetFolder, split: Split) -> dict[int, SampleRecord]:
-    # In the order in which sealing moves them: whoever reads while another process seals finds each record once.
-    journals = [path for path in folder.journals(split) if path != folder.journal_path(split)]
+    # in the order in which sealing moves records, so that none is missed while another process seals
+    plain = folder.journal_path(split)
     records: list[SampleRecord] = []
-    for path in (*journals, folder.journal_path(split), folder.metadata_path(split)):
+    for path in (*(set(folder.journals(split)) - {plain}), plain, folder.metadata_path(split)):
         try:
             with suppress(FileNotFoundError):
                 records += read_jsonl(path, SampleRecord.model_validate_json)
@@ -68,14 +67,14 @@ def _known_of(folder: DatasetFolder, split: Split) -> dict[int, SampleRecord]:
 
 
 def missing(known: Known, wanted: Wanted) -> int:
-    """How many of the samples asked for are not known."""
+    """Number of wanted samples that are not known."""
     return sum(index not in known[split] for split in SPLITS for index in range(wanted[split]))
 
 
 def seal(folder: DatasetFolder, known: Known) -> None:
-    """Write `metadata.jsonl`, remove the journals, and count the samples in the manifest: in this order.
+    """Write `metadata.jsonl`, remove the journals, and count the samples in the manifest, in this order.
 
-    The caller holds the folder alone.
+    The caller holds `render.lock` exclusively.
     """
     seals = {split: done for split in SPLITS if (done := _seal_split(folder, split, known[split])).n}
     remove_temporaries(folder.root)
@@ -83,16 +82,18 @@ def seal(folder: DatasetFolder, known: Known) -> None:
 
 
 def _seal_split(folder: DatasetFolder, split: Split, known: dict[int, SampleRecord]) -> Seal:
-    """Turn all samples without a gap into `metadata.jsonl`; what lies beyond a gap stays in the plain journal."""
+    """Turn the samples up to the first gap into `metadata.jsonl`; those beyond it stay in the plain journal."""
     n = next(index for index in range(len(known) + 1) if index not in known)
-    lines = "".join(known[index].model_dump_json() + "\n" for index in range(n))
-    if n:
-        write_atomic(folder.metadata_path(split), lines)
-    beyond = "".join(known[index].model_dump_json() + "\n" for index in sorted(known) if index > n)
-    if beyond:
-        write_atomic(folder.journal_path(split), beyond)
+    lines, beyond = (
+        "".join(known[index].model_dump_json() + "\n" for index in indices)
+        for indices in (range(n), sorted(index for index in known if index > n))
+    )
+    plain = folder.journal_path(split)
+    for path, text in ((folder.metadata_path(split), lines), (plain, beyond)):
+        if text:
+            write_atomic(path, text)
     for journal in folder.journals(split):
-        if not beyond or journal != folder.journal_path(split):
+        if not beyond or journal != plain:
             journal.unlink()
     remove_temporaries(folder.split_folder(split))
     return Seal(n=n, metadata_sha256=sha256(lines.encode()))

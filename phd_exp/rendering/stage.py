@@ -1,7 +1,7 @@
-"""Blender's scene as a stage: built once, then set for one scene after another.
+"""Blender's scene as a stage: built once, then arranged for one scene after another.
 
 Blender's camera looks along -z with y up, ours along z with y down: p_blender = diag(1, -1, -1) p. Functions receive
-Blender's module or its objects; nothing here imports it.
+Blender's module or its objects; this file does not import it.
 """
 
 from typing import Any, get_args
@@ -12,41 +12,25 @@ from numpy.typing import NDArray
 from phd_exp.records.scenes import Backdrop, Lamp, LampName, Material, Pose, Scene, SceneObject, Shape
 from phd_exp.rendering.meshes import build_mesh
 from phd_exp.rendering.pixels import linear
-from phd_exp.rendering.rotations import rotation_matrix
+from phd_exp.rendering.rays import rotation_matrix
 
 TO_BLENDER = np.diag([1.0, -1.0, -1.0])
-SENSOR_WIDTH = 36.0  # mm; any value does, the focal length is given in the same unit
+SENSOR_WIDTH = 36.0  # mm; arbitrary, because the focal length has the same unit
 SHAPES: tuple[Shape, ...] = get_args(Shape)
 MATERIALS: tuple[Material, ...] = get_args(Material)
 LAMP_NAMES: tuple[LampName, ...] = get_args(LampName)
-# Principled BSDF, by input. Rubber is matt with a faint sheen; metal is polished enough to mirror the lamps
-# as soft boxes and its neighbours as blurs.
+# Inputs of Principled BSDF. Rubber is matt with a faint sheen; metal reflects the lamps as soft boxes and its
+# neighbours as blurs.
 SURFACES: dict[Material, dict[str, float]] = {
     "rubber": {"Metallic": 0.0, "Roughness": 0.75, "Specular IOR Level": 0.25},
     "metal": {"Metallic": 1.0, "Roughness": 0.24},
 }
-# What objects, not the camera, see all around: dim below, brighter above, for metal to mirror.
+# Surroundings that metal reflects and the camera does not show: dim below, brighter above.
 SURROUNDINGS = (0.10, 0.75)
 
 
-class BackdropInputs:
-    """The three inputs of a painted world's nodes that change from sample to sample."""
-
-    def __init__(self, tree: Any) -> None:
-        nodes = tree.nodes
-        self._centre = nodes["offset"].inputs[1]
-        self._slope, self._level = nodes["line"].inputs[1], nodes["line"].inputs[2]
-
-    def show(self, backdrop: Backdrop) -> None:
-        """Let the camera see this backdrop."""
-        x, y = backdrop.centre
-        self._centre.default_value = (x, 1 - y, 0.0)  # Blender counts from the bottom
-        self._slope.default_value = -backdrop.level * backdrop.falloff
-        self._level.default_value = backdrop.level
-
-
 class Stage:
-    """What a scene moves, found by name in Blender's open file."""
+    """The parts of Blender's open file that change from scene to scene, found by name."""
 
     def __init__(self, bpy: Any) -> None:
         data = bpy.data
@@ -54,10 +38,10 @@ class Stage:
         self._objects = {shape: data.objects[shape] for shape in SHAPES}
         self._lamps = {name: data.objects[name] for name in LAMP_NAMES}
         self._materials = {name: data.materials[name] for name in MATERIALS}
-        self._backdrop = BackdropInputs(data.worlds["world"].node_tree)
+        self._backdrop = data.worlds["world"].node_tree.nodes
 
     def show(self, scene: Scene) -> None:
-        """Put everything where the scene says."""
+        """Arrange everything as in a scene."""
         self._camera.data.lens = scene.f * SENSOR_WIDTH / scene.S
         self._camera.matrix_world = _camera_matrix(scene.pose)
         shown = {item.shape: item for item in scene.objects}
@@ -67,7 +51,7 @@ class Stage:
                 self._place_object(handle, shown[shape])
         for lamp in scene.lamps:
             _place_lamp(self._lamps[lamp.name], lamp)
-        self._backdrop.show(scene.backdrop)
+        show_backdrop(self._backdrop, scene.backdrop)
 
     def _place_object(self, handle: Any, item: SceneObject) -> None:
         stretch = 0.5 * item.scale * np.array(item.dimensions)
@@ -78,17 +62,17 @@ class Stage:
 
 
 def build_stage(bpy: Any) -> Stage:
-    """Empty Blender's file and fill it with one of everything that a scene can hold."""
+    """Empty Blender's file and fill it with one of each thing that a scene can contain."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     for material in MATERIALS:
         paint_surface(bpy.data.materials.new(material).node_tree, material)
     for shape in SHAPES:
         _add(bpy, shape, _new_mesh(bpy, shape))
     for name in LAMP_NAMES:
-        _add(bpy, name, _new_lamp(bpy, name)).visible_camera = False  # a turned camera may look at one
+        _add(bpy, name, _new_lamp(bpy, name)).visible_camera = False  # a turned camera may face one
     bpy.context.scene.camera = _add(bpy, "camera", _new_camera(bpy))
     world = bpy.context.scene.world = bpy.data.worlds.new("world")
-    world.cycles.sampling_method = "NONE"  # too smooth for a map of its light to be worth it
+    world.cycles.sampling_method = "NONE"  # an importance map is not worth it for such smooth light
     paint_world(world.node_tree)
     return Stage(bpy)
 
@@ -123,7 +107,7 @@ def _new_camera(bpy: Any) -> Any:
 
 
 def _place_lamp(handle: Any, lamp: Lamp) -> None:
-    """An area lamp shines along its own -z."""
+    """An area lamp shines along its local -z."""
     position = np.array(lamp.position)
     forward = np.array(lamp.towards) - position
     handle.matrix_world = _matrix(TO_BLENDER @ _facing(TO_BLENDER @ forward), position)
@@ -132,13 +116,13 @@ def _place_lamp(handle: Any, lamp: Lamp) -> None:
 
 
 def _camera_matrix(pose: Pose) -> list[list[float]]:
-    """The camera's own axes are Blender's on both sides: p_scene = R^T (p_camera - translation)."""
+    """p_scene = R^T (p_camera - translation), with Blender's axes in both frames."""
     back = rotation_matrix(pose.rotation).T
     return _matrix(back @ TO_BLENDER, -back @ np.array(pose.translation))
 
 
 def _matrix(linear: NDArray[np.float64], place: NDArray[np.float64]) -> list[list[float]]:
-    """Blender's matrix, by columns, of p = linear local + place in our axes."""
+    """Blender's matrix, by columns, of the map p = linear local + place in our axes."""
     matrix = np.eye(4)
     matrix[:3, :3] = TO_BLENDER @ linear
     matrix[:3, 3] = TO_BLENDER @ place
@@ -155,7 +139,7 @@ def _facing(direction: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def paint_surface(tree: Any, material: Material) -> None:
-    """Make a new material's node tree a surface whose colour is that of the object it is on."""
+    """Make a new material's node tree a surface with the colour of its object."""
     shader = tree.nodes["Principled BSDF"]
     for key, value in SURFACES[material].items():
         shader.inputs[key].default_value = value
@@ -164,10 +148,10 @@ def paint_surface(tree: Any, material: Material) -> None:
 
 
 def paint_world(tree: Any) -> None:
-    """Make a new world's node tree two worlds in one: the camera sees the backdrop, all else the surroundings.
+    """Make a new world's node tree the backdrop for the camera, and the surroundings for all other rays.
 
-    A backdrop that is no surface takes no shadow and no light from the objects, so that nothing in it tells where
-    they are, and it costs no samples.
+    The backdrop is no surface: it receives no shadow and no light from the objects, which could reveal where they
+    are, and it costs no samples.
     """
     tree.nodes.clear()
     output = tree.nodes.new("ShaderNodeOutputWorld")
@@ -183,7 +167,7 @@ def paint_world(tree: Any) -> None:
 
 
 def _backdrop_nodes(tree: Any) -> Any:
-    """level + slope |window - centre|^2, with slope = -level falloff; named, for `BackdropInputs` to find."""
+    """level + slope |window - centre|^2, with slope = -level falloff; `show_backdrop` finds the nodes by name."""
     window = tree.nodes.new("ShaderNodeTexCoord")
     offset = tree.nodes.new("ShaderNodeVectorMath")
     square = tree.nodes.new("ShaderNodeVectorMath")
@@ -195,6 +179,14 @@ def _backdrop_nodes(tree: Any) -> Any:
     tree.links.new(offset.outputs["Vector"], square.inputs[1])
     tree.links.new(square.outputs["Value"], line.inputs[0])
     return line.outputs["Value"]
+
+
+def show_backdrop(nodes: Any, backdrop: Backdrop) -> None:
+    """Set the inputs of a painted world's nodes to a backdrop."""
+    x, y = backdrop.centre
+    nodes["offset"].inputs[1].default_value = (x, 1 - y, 0.0)  # Blender counts from the bottom
+    nodes["line"].inputs[1].default_value = -backdrop.level * backdrop.falloff
+    nodes["line"].inputs[2].default_value = backdrop.level
 
 
 def _surroundings_nodes(tree: Any) -> Any:

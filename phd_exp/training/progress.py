@@ -9,6 +9,7 @@ from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.utilities import rank_zero_only
 
+from phd_exp.records.processes import duration
 from phd_exp.training.recorder import epoch_metrics
 
 FIRST_LINE = 5.0  # s after the first batch
@@ -77,13 +78,6 @@ class Progress(Callback):
         """The time left at the mean speed so far, evaluations included."""
         since, before = self.first or (time.monotonic(), done)
         return f"about {duration((time.monotonic() - since) / max(done - before, 1) * (total - done))} left"
-
-
-def duration(seconds: float) -> str:
-    """Seconds in a readable unit."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 def _epoch(trainer: Trainer) -> str:

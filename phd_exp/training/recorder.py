@@ -61,12 +61,11 @@ class Recorder(Checkpoint):
         step = trainer.global_step - 1  # as Lightning counts
         self.record(trainer.current_epoch, epoch_metrics(trainer), step)
 
-    @rank_zero_only
     def record(self, epoch: int, metrics: Mapping[str, float], step: int) -> None:
         """Write the metrics of an epoch, with null for numbers that are not finite."""
         finite = {key: value if math.isfinite(value) else None for key, value in metrics.items()}
         self.rows[epoch] = {"epoch": epoch, "step": step} | finite
-        self.folder.write_metrics(self.rows[key] for key in sorted(self.rows))
+        rank_zero_only(self.folder.write_metrics)(self.rows[key] for key in sorted(self.rows))
 
     def forget_after(self, epoch: int) -> None:
         """Drop the epochs that a resumed run repeats."""

@@ -4,8 +4,8 @@ import os
 from pathlib import Path
 
 import pytest
-from filelock import FileLock
 
+from phd_exp.records.processes import held
 from tests.bad_input.place import Place, copied, make
 
 
@@ -14,7 +14,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Made by whichever test process comes first; nobody changes it."""
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "sound_place"
-    with FileLock(folder.with_suffix(".lock")):
+    with held(folder.with_suffix(".lock"), waiting="another process makes the sound place"):
         if not folder.exists():
             making = folder.with_suffix(".making")
             making.mkdir()

@@ -18,10 +18,10 @@ from PIL import Image
 
 from phd_exp.__main__ import main
 from phd_exp.cli.paths import conf_folder
-from phd_exp.records.dataset import SPLITS, DatasetFolder, Manifest, Seal, sha256
+from phd_exp.records.dataset import SPLITS, DatasetFolder, Seal, sha256
 from phd_exp.records.runs import RunFolder, find_runs
 from phd_exp.records.spec import DatasetSpec
-from tests.data.conftest import picture, record
+from tests.support.handmade import write_handmade
 
 TRAIN = (
     "preset=smoke", "logger=none", "data=folder", "data.batch_size=4", "data.image_size=32", "data.n_held_out=0",
@@ -121,21 +121,6 @@ def write_photos(folder: Path) -> None:
         (folder / split / "metadata.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
 
 
-def write_handmade(folder: DatasetFolder, spec: DatasetSpec) -> None:
-    """Noise as a rendered data set, sealed."""
-    seals = {}
-    for split in SPLITS:
-        folder.split_folder(split).mkdir(parents=True)
-        lines = ""
-        for index in range(2):
-            file = folder.image_path(split, index)
-            Image.fromarray(picture(index)).save(file)
-            lines += record(index, split, file.read_bytes()).model_dump_json() + "\n"
-        folder.metadata_path(split).write_text(lines)
-        seals[split] = Seal(n=2, metadata_sha256=sha256(lines.encode()))
-    folder.write_manifest(Manifest(generator=1, renderer="none", spec=spec, splits=seals))
-
-
 def handmade_spec() -> DatasetSpec:
     with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
         data = hydra.compose("config", list(HANDMADE)).data
@@ -145,7 +130,7 @@ def handmade_spec() -> DatasetSpec:
 def make(root: Path) -> None:
     """Everything sound; the run is trained for one epoch."""
     write_photos(root / "photos")
-    write_handmade(DatasetFolder(root / "renders/handmade"), handmade_spec())
+    write_handmade(DatasetFolder(root / "renders/handmade"), handmade_spec(), dict.fromkeys(SPLITS, 2))
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(root)
         patch.setattr("sys.argv", ["phd_exp"])

@@ -24,9 +24,9 @@ from phd_exp.records.scenes import Scene
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer, Settings, load_bpy, silence
 from phd_exp.rendering.pixels import encoded
+from phd_exp.rendering.samples import fast_settings, make_sample
 from phd_exp.rendering.sampling import sample_scene
 from phd_exp.rendering.stage import MATERIALS, SHAPES, Stage, build_stage
-from phd_exp.rendering.worker import fast_settings, make_sample
 
 Paint = Callable[[Scene, int, Path], None]
 

@@ -25,7 +25,6 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.pool import render_all
 from phd_exp.rendering.render import worker_count
 from phd_exp.rendering.sampling import GENERATOR_VERSION
-from phd_exp.rendering.worker import Task
 
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(7200)]
 
@@ -84,7 +83,7 @@ def our_images_a_second(spec: DatasetSpec, folder: DatasetFolder) -> float:
     n = BURST["ours"]
     for path in (folder.cache, folder.split_folder("test")):
         path.mkdir(parents=True, exist_ok=True)
-    tasks = [Task(split="test", index=index) for index in range(n)]
+    tasks = [("test", index) for index in range(n)]
     times = [time.perf_counter() for _ in render_all(folder, spec, tasks, worker_count(n))]
     return (n - 1) / (times[-1] - times[0])
 

@@ -13,7 +13,7 @@ from phd_exp.cli import sweep
 from phd_exp.cli.paths import conf_folder
 from phd_exp.cli.sweep import Combination, cores_a_job, plan
 from phd_exp.cli.train import run_name, standing
-from phd_exp.records.provenance import usable_cores
+from phd_exp.records.processes import usable_cores
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import check
 

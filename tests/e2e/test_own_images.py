@@ -19,13 +19,12 @@ from phd_exp.records.dataset import DatasetFolder, sha256
 from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.scenes import SampleRecord, Scene
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.compose import backdrop_light
 from phd_exp.rendering.pixels import encoded
-from phd_exp.rendering.rays import trace_pixels
+from phd_exp.rendering.rays import rotation_matrix, trace_pixels
 from phd_exp.rendering.render import ensure_rendered
-from phd_exp.rendering.rotations import rotation_matrix
+from phd_exp.rendering.samples import backdrop_light
 from tests.e2e.runs import only_run
-from tests.rendering.folders import silhouettes
+from tests.support.renders import silhouettes
 
 N = {"train": 14, "held_out": 0, "test": 2}
 SIDE = 96

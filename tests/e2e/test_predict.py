@@ -23,8 +23,8 @@ from phd_exp.geometry import VirtualCamera, intrinsics
 from phd_exp.inference import pictures
 from phd_exp.records.errors import DatasetError
 from phd_exp.records.runs import RunFolder
-from tests.disks import small_disk
 from tests.e2e.conftest import SIDE, trained
+from tests.support.disks import small_disk
 
 GUIDE = Path(__file__).parents[2] / "docs" / "guides" / "predict.md"
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from phd_exp.geometry.grid import middles
+from phd_exp.geometry.camera import middles
 from phd_exp.models.locating import localisation_loss
 
 

@@ -8,8 +8,8 @@ from hydra.utils import instantiate
 from torch.testing import assert_close
 
 from phd_exp.geometry import Camera, Cartesian, DepthScale, LogDepth, Projected
+from phd_exp.geometry.camera import middles
 from phd_exp.geometry.charts import projected
-from phd_exp.geometry.grid import middles
 from phd_exp.models.heads import ChartHead, DistributionHead, Head
 from phd_exp.models.locating import Locating
 from phd_exp.models.regressor import Regressor

@@ -11,6 +11,7 @@ from PIL import Image
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import CorruptFileError, DatasetError
 from phd_exp.records.spec import DatasetSpec
+from tests.support.handmade import picture
 
 MakeSpec = Callable[..., DatasetSpec]
 
@@ -93,7 +94,7 @@ def test_pandas_and_pillow_read_it_as_it_is(dataset: DatasetFolder) -> None:
     assert table.columns[0] == "file_name"
     assert table.z.tolist() == pytest.approx([record.z for record in dataset.records("train")], rel=1e-15)
     with Image.open(folder / table.file_name[4]) as image:
-        assert image.getpixel((0, 0)) == (4, 0, 0)
+        assert image.getpixel((0, 0)) == tuple(picture(4)[0, 0])
 
 
 def test_it_is_what_imagefolder_asks_for(dataset: DatasetFolder) -> None:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from phd_exp.records.shards import Shard
+from phd_exp.records.spec import Shard
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7])

@@ -1,4 +1,4 @@
-"""Specifications, and a few real images of each variant, rendered once."""
+"""Specifications, and a few rendered data sets."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,12 +6,15 @@ from typing import Any
 import pytest
 
 from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.scenes import Scene
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.render import ensure_rendered
+from phd_exp.rendering.sampling import sample_scene
+from tests.support.renders import N_TEST, N_TRAIN, VARIANTS
 
-VARIANTS = ("default", "occl", "scale", "occl_scale")
 # A quarter of the sensor and of the focal length: the same pictures, in a moment.
 SMALL: dict[str, Any] = {"sensor_size": 56, "f_range": (300.0, 500.0), "samples_per_pixel": 1}
+HALF: dict[str, Any] = {"sensor_size": 112, "f_range": (600.0, 1000.0)}
 
 
 @pytest.fixture(scope="session")
@@ -22,33 +25,49 @@ def specs(make_spec: Callable[..., DatasetSpec]) -> dict[str, DatasetSpec]:
 
 @pytest.fixture(scope="session")
 def small_spec(make_spec: Callable[..., DatasetSpec]) -> DatasetSpec:
-    """A data set whose images cost next to nothing."""
+    """A data set whose images are cheap."""
     return make_spec(**SMALL)
 
 
 @pytest.fixture(scope="session")
+def scenes(make_spec: Callable[..., DatasetSpec]) -> list[Scene]:
+    """Scenes of three objects in small images."""
+    spec = make_spec("occl_scale", sensor_size=40, f_range=(200.0, 300.0))
+    return [sample_scene(spec, "train", index) for index in range(12)]
+
+
+@pytest.fixture(scope="session")
 def rendered(
-    specs: dict[str, DatasetSpec], tmp_path_factory: pytest.TempPathFactory
+    make_spec: Callable[..., DatasetSpec], tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, DatasetFolder]:
-    """Five training images and one test image of each variant, by two processes."""
+    """Five training images and one test image of each variant."""
     root = tmp_path_factory.mktemp("renders")
-    folders = {variant: DatasetFolder(root / variant) for variant in specs}
+    folders = {variant: DatasetFolder(root / variant) for variant in VARIANTS}
     for variant, folder in folders.items():
-        ensure_rendered(folder, specs[variant], n_train=5, n_test=1, workers=2)
+        ensure_rendered(folder, make_spec(variant, **HALF), n_train=5, n_test=1, workers=1)
     return folders
 
 
 @pytest.fixture(scope="session")
 def small(small_spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory) -> DatasetFolder:
-    """Twelve training and four test images, rendered without interruption by one process."""
+    """Training and test images, rendered without interruption by one process."""
     folder = DatasetFolder(tmp_path_factory.mktemp("small") / "default")
-    ensure_rendered(folder, small_spec, n_train=12, n_test=4, workers=1)
+    assert ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=1)
     return folder
 
 
 @pytest.fixture(scope="session")
 def small_webp(small_spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory) -> DatasetFolder:
-    """The first samples of `small` as WebP files."""
+    """The first samples of `small` as WebP files, rendered in two steps, between which an image is lost."""
     folder = DatasetFolder(tmp_path_factory.mktemp("webp") / "default")
-    ensure_rendered(folder, small_spec.model_copy(update={"image_format": "webp"}), 5, 2, workers=1)
+    spec = small_spec.model_copy(update={"image_format": "webp"})
+    ensure_rendered(folder, spec, 3, 1, workers=1)
+    folder.image_path("train", 2, "webp").unlink()
+    ensure_rendered(folder, spec, 5, 2, workers=1)
     return folder
+
+
+@pytest.fixture
+def folder(tmp_path: Any) -> DatasetFolder:
+    """A data set that does not exist yet."""
+    return DatasetFolder(tmp_path / "default")

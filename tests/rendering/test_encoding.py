@@ -1,20 +1,17 @@
-"""What a format keeps of the pixels, and that a data set of any format is a data set."""
+"""Image formats: the pixels that they keep, and data sets in each of them; light from OpenEXR files."""
 
-import io
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.sources import RenderedSource
 from phd_exp.records.dataset import SPLITS, DatasetFolder
-from phd_exp.records.errors import DatasetError
 from phd_exp.records.spec import DatasetSpec, ImageFormat
-from phd_exp.rendering.pixels import encode
+from phd_exp.rendering.pixels import encode, read_light
 from phd_exp.rendering.render import ensure_rendered
+from tests.support.renders import decoded
 
 MakeSpec = Callable[..., DatasetSpec]
 LOSSY: tuple[ImageFormat, ...] = ("webp", "jpeg")
@@ -24,24 +21,13 @@ LOSSY: tuple[ImageFormat, ...] = ("webp", "jpeg")
 def pictures(make_spec: MakeSpec, tmp_path_factory: pytest.TempPathFactory) -> list[np.ndarray]:
     """Images (S, S, 3) of full size, as the path tracer leaves them."""
     folder = DatasetFolder(tmp_path_factory.mktemp("pictures") / "occl_scale")
-    ensure_rendered(folder, make_spec("occl_scale"), n_train=3, n_test=0, workers=1)
-    return [decoded(folder.image_path("train", index).read_bytes()) for index in range(3)]
-
-
-def decoded(content: bytes) -> np.ndarray:
-    with Image.open(io.BytesIO(content)) as image:
-        assert image.mode == "RGB"
-        return np.asarray(image)
+    ensure_rendered(folder, make_spec("occl_scale"), n_train=2, n_test=0, workers=1)
+    return [decoded(folder.image_path("train", index).read_bytes()) for index in range(2)]
 
 
 def psnr(one: np.ndarray, other: np.ndarray) -> float:
     """Peak signal over noise, dB."""
     return float(10 * np.log10(255**2 / ((one.astype(float) - other) ** 2).mean()))
-
-
-def files(folder: DatasetFolder) -> dict[str, bytes]:
-    found = (path for path in folder.root.rglob("*") if path.is_file() and folder.cache not in path.parents)
-    return {str(path.relative_to(folder.root)): path.read_bytes() for path in found}
 
 
 def test_png_keeps_every_pixel(pictures: list[np.ndarray], make_spec: MakeSpec) -> None:
@@ -84,9 +70,7 @@ def test_the_same_pixels_are_the_same_bytes(
     assert encode(pictures[0].copy(), spec) == encode(pictures[0], spec) != encode(pictures[1], spec)
 
 
-def test_webp_files_hold_the_pixels_of_the_png_files(
-    small: DatasetFolder, small_webp: DatasetFolder, small_spec: DatasetSpec
-) -> None:
+def test_webp_files_hold_the_pixels_of_the_png_files(small: DatasetFolder, small_webp: DatasetFolder) -> None:
     spec = small_webp.manifest.spec
     assert spec.image_format == "webp"
     for split, n in zip(SPLITS, (5, 2), strict=True):
@@ -111,23 +95,31 @@ def test_the_data_module_reads_webp(small_webp: DatasetFolder) -> None:
             assert (image == decoded((small_webp.split_folder(split) / record.file_name).read_bytes())).all()
 
 
-def test_a_webp_folder_is_resumed(small_webp: DatasetFolder, tmp_path: Path) -> None:
-    """Grown, and mended where an image has gone, it has the bytes of one rendered at once."""
-    spec, folder = small_webp.manifest.spec, DatasetFolder(tmp_path / "default")
-    ensure_rendered(folder, spec, 3, 1, workers=1)
-    first = folder.image_path("train", 0, "webp").stat().st_mtime_ns
-    folder.image_path("train", 2, "webp").unlink()
-    ensure_rendered(folder, spec, 5, 2, workers=1)
-    assert folder.image_path("train", 0, "webp").stat().st_mtime_ns == first
-    assert files(folder) == files(small_webp)
+@pytest.fixture
+def light() -> np.ndarray:
+    return np.random.default_rng(0).uniform(0, 50, (4, 5, 3)).astype("<f2").astype(float)
 
 
-@pytest.mark.parametrize(("key", "value"), [("image_format", "webp"), ("image_quality", 90)])
-def test_a_folder_keeps_its_format(small: DatasetFolder, key: str, value: object) -> None:
-    before, spec = files(small), small.manifest.spec
-    with pytest.raises(
-        DatasetError, match=f"{key}={getattr(spec, key)}, but {key}={value} is asked for; move"
-    ) as error:
-        ensure_rendered(small, spec.model_copy(update={key: value}), 20, 4)
-    assert "\n" not in str(error.value)
-    assert files(small) == before
+def written(light: np.ndarray) -> bytes:
+    """An OpenEXR file as Blender writes it, but for the header, which is not read."""
+    rows = b"".join(
+        np.array([number, 6 * light.shape[1]], "<i4").tobytes() + row.T[::-1].astype("<f2").tobytes()
+        for number, row in enumerate(light, start=7)
+    )
+    return b"\x76\x2f\x31\x01" + b"header and offsets" + rows
+
+
+def test_light_comes_back_from_a_file(light: np.ndarray) -> None:
+    assert (read_light(written(light), 4, 5) == light).all()
+
+
+@pytest.mark.parametrize(("height", "width"), [(4, 4), (5, 4), (2, 10), (400, 500)])
+def test_light_of_another_size_is_refused(light: np.ndarray, height: int, width: int) -> None:
+    with pytest.raises(ValueError, match=f"{height}|{width}"):
+        read_light(written(light), height, width)
+
+
+@pytest.mark.parametrize("content", [b"", b"BM nonsense", b"\x76\x2f\x31\x01" + bytes(500)])
+def test_a_file_of_another_kind_is_refused(content: bytes) -> None:
+    with pytest.raises(ValueError, match="OpenEXR"):
+        read_light(content, 4, 5)

@@ -19,7 +19,7 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.antialias import edges
 from phd_exp.rendering.rays import trace_pixels
 from phd_exp.rendering.sampling import sample_scene
-from tests.rendering.folders import silhouettes
+from tests.support.renders import silhouettes
 
 HOME = Path(__file__).parents[2]
 RIM = 3  # px around silhouettes, which bilinear interpolation blurs
@@ -30,7 +30,7 @@ import sys
 import numpy as np
 from phd_exp.records.scenes import Scene
 from phd_exp.rendering.blender import Renderer, Settings
-from phd_exp.rendering.compose import take_picture
+from phd_exp.rendering.samples import take_picture
 from phd_exp.rendering.rays import trace_pixels
 renderer = Renderer(Settings(samples=16, denoised=True, at_middles=True))
 scenes = [Scene.model_validate_json(line) for line in sys.stdin]

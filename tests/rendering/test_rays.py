@@ -1,26 +1,28 @@
-"""Ray casting against a search along every ray, and against what must be so."""
+"""Ray casting against a search along every ray, and counts of pixels; rotations against those of scipy."""
 
+import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from phd_exp.records.scenes import Scene, SceneObject
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.rays import NOTHING, cylinder_mask, trace_pixels, trace_points
-from phd_exp.rendering.rotations import rotation_matrix
-from phd_exp.rendering.sampling import sample_scene
-from tests.rendering.folders import silhouettes
+from phd_exp.rendering.rays import (
+    NOTHING,
+    cylinder_mask,
+    rotation_matrix,
+    trace_pixels,
+    trace_points,
+    truncation,
+    visibility,
+)  # fmt: skip
+from phd_exp.rendering.sampling import about_axis, sample_scene, uniform_rotation
+from tests.support.renders import placed, silhouettes, with_objects
 
 MakeSpec = Callable[..., DatasetSpec]
 STEP = 2e-3  # m
-
-
-@pytest.fixture(scope="module")
-def scenes(make_spec: MakeSpec) -> list[Scene]:
-    spec = make_spec("occl_scale", sensor_size=40, f_range=(200.0, 300.0))
-    return [sample_scene(spec, "train", index) for index in range(12)]
 
 
 def marched(scene: Scene) -> np.ndarray:
@@ -44,7 +46,7 @@ def first_inside(item: SceneObject, points: np.ndarray, depths: np.ndarray) -> n
 
 
 def test_rays_find_what_a_search_finds(scenes: list[Scene]) -> None:
-    for scene in scenes[:3]:
+    for scene in scenes[:2]:
         cast, walked = trace_pixels(scene).depths, marched(scene)
         # A ray that grazes a solid for less than a step is missed by the search.
         assert (np.isfinite(cast) & ~np.isfinite(walked)).sum() <= 3
@@ -75,13 +77,8 @@ def test_what_is_seen_is_the_nearest(scenes: list[Scene]) -> None:
         assert (depth_of_first[~nothing] == hits.depths.min(axis=0)[~nothing]).all()
 
 
-def placed(scene: Scene, **changes: Any) -> SceneObject:
-    straight = {"rotation": (1.0, 0.0, 0.0, 0.0), "scale": 1.0}
-    return scene.objects[0].model_copy(update=straight | changes)
-
-
 def test_what_lies_behind_the_camera_is_not_seen(scenes: list[Scene]) -> None:
-    scene = scenes[0].model_copy(update={"objects": (placed(scenes[0], position=(0.0, 0.0, -3.0)),)})
+    scene = with_objects(scenes[0], placed(scenes[0], position=(0.0, 0.0, -3.0)))
     assert not silhouettes(trace_pixels(scene)).any()
 
 
@@ -91,18 +88,18 @@ def test_axes_and_pixel_middles(scenes: list[Scene]) -> None:
     for direction, (row, column) in {(1, 0): (0, 10), (0, 1): (10, 0)}.items():
         centre = tuple(10 * 4.0 / f * axis for axis in direction)
         ball = placed(scenes[0], shape="sphere", position=(*centre, 4.0))
-        mask = cylinder_mask(trace_pixels(scenes[0].model_copy(update={"objects": (ball,)})))
+        mask = cylinder_mask(trace_pixels(with_objects(scenes[0], ball)))
         middle = np.argwhere(mask).mean(axis=0) + 0.5
         assert middle == pytest.approx([side / 2 + row, side / 2 + column], abs=0.2)
 
 
 def test_the_axis_of_a_cylinder_is_its_local_z(scenes: list[Scene]) -> None:
-    """BackboneOutput along its axis a cylinder is a disc, seen from the side a square."""
+    """The silhouette is a disc along the axis, and a square from the side."""
     area = (2 * 0.1 * scenes[0].f / 4.0) ** 2
     along = placed(scenes[0], position=(0.0, 0.0, 4.1))
     aside = placed(scenes[0], position=(0.0, 0.0, 4.1), rotation=(0.5**0.5, 0.5**0.5, 0.0, 0.0))
     for item, share in ((along, np.pi / 4), (aside, 1.0)):
-        pixels = silhouettes(trace_pixels(scenes[0].model_copy(update={"objects": (item,)}))).sum()
+        pixels = silhouettes(trace_pixels(with_objects(scenes[0], item))).sum()
         assert pixels == pytest.approx(area * share, rel=0.12)
 
 
@@ -114,3 +111,61 @@ def test_a_silhouette_lies_about_the_projected_position(make_spec: MakeSpec) -> 
         projection = np.array([y, x]) / z * scene.f + scene.S / 2
         middle = np.argwhere(silhouettes(trace_pixels(scene))).mean(axis=0) + 0.5
         assert np.abs(middle - projection).max() < 1.5
+
+
+def test_visibility_counts_pixels(scenes: list[Scene]) -> None:
+    for scene in scenes:
+        hits = trace_pixels(scene)
+        own, others = hits.depths[0], hits.depths[1:].min(axis=0)
+        assert visibility(hits) == pytest.approx((own < others).sum() / np.isfinite(own).sum())
+    assert min(visibility(trace_pixels(scene)) for scene in scenes) < 1, "some cylinder has to be occluded"
+
+
+@pytest.mark.parametrize(
+    ("position", "expected"),
+    [((0.0, 0.0, 3.0), 0.0), ((0.0, 0.0, 5.0), 1.0), ((0.6, 0.0, 3.0), 1.0)],
+    ids=["before", "behind", "beside"],
+)
+def test_a_large_occluder_hides_all_or_nothing(
+    scenes: list[Scene], position: tuple[float, float, float], expected: float
+) -> None:
+    cylinder = placed(scenes[0], position=(0.0, 0.0, 4.0))
+    cube = placed(scenes[0], shape="cube", position=position, scale=2.0)
+    assert visibility(trace_pixels(with_objects(scenes[0], cylinder, cube))) == expected
+
+
+@pytest.mark.parametrize(
+    ("x", "expected"), [(0.0, 0.0), (0.4, 0.5), (2.0, 1.0)], ids=["inside", "half outside", "outside"]
+)
+def test_truncation_is_the_share_beyond_the_border(scenes: list[Scene], x: float, expected: float) -> None:
+    """Half of a ball at the middle of the right border lies outside, apart from perspective."""
+    scene = scenes[0].model_copy(update={"f": 200.0})  # the border is at x = 0.1 z
+    ball = placed(scene, shape="sphere", position=(x, 0.0, 4.0))
+    alone = with_objects(scene, ball)
+    hits = trace_pixels(alone)
+    assert truncation(alone, hits) == pytest.approx(expected, abs=0.05)
+    assert visibility(hits) == (expected < 1)
+
+
+def test_an_occluder_truncates_nothing(scenes: list[Scene]) -> None:
+    for scene in scenes:
+        alone = with_objects(scene, scene.objects[0])
+        assert truncation(scene, trace_pixels(scene)) == truncation(alone, trace_pixels(alone))
+
+
+def test_a_matrix_is_that_of_its_quaternion() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        quaternion = uniform_rotation(rng)
+        w, x, y, z = quaternion
+        assert math.hypot(*quaternion) == pytest.approx(1, abs=1e-12)
+        expected = Rotation.from_quat([x, y, z, w]).as_matrix()
+        assert rotation_matrix(quaternion) == pytest.approx(expected, abs=1e-12)
+        assert rotation_matrix((-w, -x, -y, -z)) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("angle", [-3.0, 0.0, 0.3, math.pi / 2])
+def test_a_turn_about_an_axis_is_right_handed(angle: float) -> None:
+    for axis in ((1.0, 0.0, 0.0), (0.0, 0.6, -0.8)):
+        expected = Rotation.from_rotvec(angle * np.array(axis)).as_matrix()
+        assert rotation_matrix(about_axis(axis, angle)) == pytest.approx(expected, abs=1e-12)

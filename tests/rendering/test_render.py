@@ -1,6 +1,5 @@
 """A folder ends with the same bytes whatever the workers, the order, and the interruptions."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,10 +11,7 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering import blender
 from phd_exp.rendering.pool import render_all
 from phd_exp.rendering.render import ensure_rendered, worker_count
-from phd_exp.rendering.worker import Task
-from tests.rendering.folders import contents
-
-MakeSpec = Callable[..., DatasetSpec]
+from tests.support.renders import contents
 
 
 def test_the_manifest_and_the_records_fit_the_files(small: DatasetFolder, small_spec: DatasetSpec) -> None:
@@ -31,32 +27,20 @@ def test_the_manifest_and_the_records_fit_the_files(small: DatasetFolder, small_
     assert len({record.sha256 for split in counts for record in small.records(split)}) == 16
 
 
-def test_two_workers_give_the_same_bytes_as_one(
-    small: DatasetFolder, small_spec: DatasetSpec, tmp_path: Path
-) -> None:
-    folder = DatasetFolder(tmp_path / "again")
-    ensure_rendered(folder, small_spec, n_train=12, n_test=4, workers=2)
-    assert contents(folder) == contents(small)
-
-
 def test_a_sample_is_the_same_alone_and_in_another_order(
-    small: DatasetFolder, small_spec: DatasetSpec, tmp_path: Path
+    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec
 ) -> None:
-    folder = DatasetFolder(tmp_path)
+    folder.root.mkdir()
     for path in (folder.cache, folder.split_folder("train"), folder.split_folder("test")):
         path.mkdir()
     order: list[tuple[Split, int]] = [("train", 7), ("test", 2), ("train", 3), ("train", 0)]
-    tasks = [Task(split=split, index=index) for split, index in order]
-    for record in render_all(folder, small_spec, tasks, workers=1):
+    for record in render_all(folder, small_spec, order, workers=1):
         assert record == small.records(record.split)[record.index]
-    (alone,) = render_all(folder, small_spec, tasks[:1], workers=1)
-    assert alone == small.records("train")[7]
 
 
 def test_a_folder_grows_and_keeps_what_it_has(
-    small: DatasetFolder, small_spec: DatasetSpec, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    folder = DatasetFolder(tmp_path / "grown")
     ensure_rendered(folder, small_spec, n_train=3, n_test=1, workers=1)
     assert folder.manifest.splits["train"].n == 3
     first = folder.image_path("train", 0).stat().st_mtime_ns
@@ -64,21 +48,9 @@ def test_a_folder_grows_and_keeps_what_it_has(
     ensure_rendered(folder, small_spec, n_train=12, n_test=4, workers=1)
     assert "rendering the remaining 12 images" in capfd.readouterr().err
     assert folder.image_path("train", 0).stat().st_mtime_ns == first
-    assert contents(folder) == contents(small)
     ensure_rendered(folder, small_spec, n_train=2, n_test=1)
     assert contents(folder) == contents(small), "asking for less takes nothing away"
     assert capfd.readouterr() == ("", "")
-
-
-def test_a_deleted_image_is_rendered_again(
-    small: DatasetFolder, small_spec: DatasetSpec, tmp_path: Path
-) -> None:
-    folder = DatasetFolder(tmp_path / "default")
-    ensure_rendered(folder, small_spec, n_train=4, n_test=1, workers=1)
-    whole = contents(folder)
-    folder.image_path("train", 1).unlink()
-    ensure_rendered(folder, small_spec, n_train=4, n_test=1, workers=1)
-    assert contents(folder) == whole
 
 
 def test_nothing_is_loaded_when_nothing_is_missing(
@@ -90,13 +62,13 @@ def test_nothing_is_loaded_when_nothing_is_missing(
 
 
 def test_a_missing_bpy_is_one_line(
-    small_spec: DatasetSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: DatasetFolder, small_spec: DatasetSpec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(blender.importlib.util, "find_spec", lambda _: None)
     with pytest.raises(RenderError, match=r"bpy.* not installed: pip install 'phd_exp\[render\]'") as error:
-        ensure_rendered(DatasetFolder(tmp_path / "new"), small_spec, 1, 1)
+        ensure_rendered(folder, small_spec, 1, 1)
     assert "\n" not in str(error.value)
-    assert not (tmp_path / "new").exists()
+    assert not folder.root.exists()
 
 
 def test_a_missing_library_of_bpy_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,34 +81,36 @@ def test_a_missing_library_of_bpy_is_one_line(monkeypatch: pytest.MonkeyPatch) -
         blender.load_bpy()
 
 
-def test_another_specification_is_refused(small: DatasetFolder, make_spec: MakeSpec) -> None:
-    before = contents(small)
-    with pytest.raises(DatasetError, match="sensor_size=56, but sensor_size=224 is asked for"):
-        ensure_rendered(small, make_spec(), n_train=20, n_test=4)
+@pytest.mark.parametrize(
+    ("key", "value"), [("sensor_size", 224), ("image_format", "webp"), ("image_quality", 90)]
+)
+def test_another_specification_is_refused(small: DatasetFolder, key: str, value: object) -> None:
+    before, spec = contents(small), small.manifest.spec
+    said = f"{key}={getattr(spec, key)}, but {key}={value} is asked for; move"
+    with pytest.raises(DatasetError, match=said) as error:
+        ensure_rendered(small, spec.model_copy(update={key: value}), n_train=20, n_test=4)
+    assert "\n" not in str(error.value)
     assert contents(small) == before
 
 
 @pytest.mark.parametrize(("key", "value"), [("generator", 0), ("renderer", "bpy 4.2.0")])
 def test_a_folder_of_another_make_is_not_continued(
-    small: DatasetFolder, small_spec: DatasetSpec, tmp_path: Path, key: str, value: object
+    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec, key: str, value: object
 ) -> None:
-    folder = DatasetFolder(tmp_path / "default")
     folder.root.mkdir()
     folder.write_manifest(small.manifest.model_copy(update={key: value, "splits": {}}))
     with pytest.raises(DatasetError, match=f"begun with {key} {value}, this is .*; move the folder"):
         ensure_rendered(folder, small_spec, n_train=1, n_test=0)
 
 
-def test_a_folder_that_cannot_be_written_is_one_line(small_spec: DatasetSpec, tmp_path: Path) -> None:
-    """A path below a file: refused even to root."""
-    (tmp_path / "file").write_text("")
+def test_an_image_that_cannot_be_written_is_one_line(
+    folder: DatasetFolder, small_spec: DatasetSpec, tmp_path: Path
+) -> None:
+    """Nor a folder: a path below a file is refused even to root."""
+    (tmp_path / "file").touch()
     with pytest.raises(RenderError, match=r"cannot be written .* choose another data\.root") as error:
         ensure_rendered(DatasetFolder(tmp_path / "file" / "default"), small_spec, 1, 1)
     assert "\n" not in str(error.value)
-
-
-def test_an_image_that_cannot_be_written_is_one_line(small_spec: DatasetSpec, tmp_path: Path) -> None:
-    folder = DatasetFolder(tmp_path / "default")
     (folder.image_path("train", 1) / "in the way").mkdir(parents=True)
     with pytest.raises(RenderError, match=r"000001\.png.*: cannot be written") as error:
         ensure_rendered(folder, small_spec, n_train=2, n_test=0, workers=1)
@@ -148,10 +122,9 @@ def test_an_image_that_cannot_be_written_is_one_line(small_spec: DatasetSpec, tm
     ]
 
 
-@pytest.mark.parametrize("count", [0, -1])
-def test_no_workers_is_refused(small_spec: DatasetSpec, tmp_path: Path, count: int) -> None:
-    with pytest.raises(RenderError, match=f"workers={count}: expected"):
-        ensure_rendered(DatasetFolder(tmp_path / "new"), small_spec, 1, 1, workers=count)
+def test_no_workers_is_refused(folder: DatasetFolder, small_spec: DatasetSpec) -> None:
+    with pytest.raises(RenderError, match="workers=0: expected"):
+        ensure_rendered(folder, small_spec, 1, 1, workers=0)
 
 
 def test_few_samples_take_few_workers(monkeypatch: pytest.MonkeyPatch) -> None:

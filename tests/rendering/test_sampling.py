@@ -8,7 +8,7 @@ from scipy import stats
 
 from phd_exp.records.scenes import Scene
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.rotations import rotation_matrix
+from phd_exp.rendering.rays import rotation_matrix
 from phd_exp.rendering.sampling import sample_scene
 
 MakeSpec = Callable[..., DatasetSpec]

@@ -7,18 +7,17 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.scenes import SampleRecord
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.antialias import REACH, edges
 from phd_exp.rendering.blender import Box
-from phd_exp.rendering.compose import MARGIN, backdrop_light, box_around
 from phd_exp.rendering.pixels import encoded
 from phd_exp.rendering.rays import Mask, trace_pixels
 from phd_exp.rendering.render import ensure_rendered
-from tests.rendering.folders import silhouettes
+from phd_exp.rendering.samples import MARGIN, backdrop_light, box_around
+from tests.support.renders import pixels, silhouettes
 
 MakeSpec = Callable[..., DatasetSpec]
 FEW, MANY = 20, 1000
@@ -36,15 +35,13 @@ class Picture(NamedTuple):
 
 def pictures(folder: DatasetFolder, spec: DatasetSpec, count: int) -> list[Picture]:
     """Images at a quarter of the sensor that show any object."""
-    ensure_rendered(folder, spec, count, 0, workers=2)
+    ensure_rendered(folder, spec, count, 0, workers=1 if count == FEW else 2)
     found = []
     for record in folder.records("train", count):
         shown = silhouettes(trace_pixels(record.shown))
         if shown.any():
             free = ~shown & ~edges(shown.astype(np.int8), REACH)
-            with Image.open(folder.image_path("train", record.index)) as image:
-                pixels = np.asarray(image).astype(int)
-            found.append(Picture(pixels, free, box_around(shown, MARGIN), record))
+            found.append(Picture(pixels(folder, record), free, box_around(shown, MARGIN), record))
     assert len(found) > 0.9 * count
     return found
 
@@ -54,23 +51,15 @@ def spec(make_spec: MakeSpec) -> DatasetSpec:
     return make_spec("occl_scale", sensor_size=56, f_range=(300.0, 500.0))
 
 
-@pytest.fixture(scope="module")
-def few(spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory) -> list[Picture]:
-    return pictures(DatasetFolder(tmp_path_factory.mktemp("few") / "occl_scale"), spec, FEW)
-
-
 def steps(picture: Picture, box: Box) -> tuple[np.ndarray, np.ndarray]:
     """Largest difference over colours of free neighbours: those with a box's border between them, and all others."""
     inside = np.zeros_like(picture.free)
     inside[box.top : box.bottom, box.left : box.right] = True
     across, elsewhere = [], []
     for axis in (0, 1):
-        pixels, free, within = (np.moveaxis(map_, axis, 0) for map_ in (picture.pixels, picture.free, inside))
-        step, both, border = (
-            np.abs(np.diff(pixels, axis=0)).max(axis=-1),
-            free[1:] & free[:-1],
-            within[1:] != within[:-1],
-        )
+        image, free, within = (np.moveaxis(map_, axis, 0) for map_ in (picture.pixels, picture.free, inside))
+        step = np.abs(np.diff(image, axis=0)).max(axis=-1)
+        both, border = free[1:] & free[:-1], within[1:] != within[:-1]
         across.append(step[both & border])
         elsewhere.append(step[both & ~border])
     return np.concatenate(across), np.concatenate(elsewhere)
@@ -104,11 +93,9 @@ def check_borders(found: list[Picture]) -> None:
     assert np.concatenate(own).max() <= np.concatenate(rest).max()
 
 
-def test_the_backdrop_is_its_formula_in_a_few_images(few: list[Picture]) -> None:
+def test_a_few_images_have_no_seam(spec: DatasetSpec, tmp_path: Path) -> None:
+    few = pictures(DatasetFolder(tmp_path / "occl_scale"), spec, FEW)
     check_formula(few)
-
-
-def test_a_few_images_have_no_seam(few: list[Picture]) -> None:
     check_borders(few)
 
 

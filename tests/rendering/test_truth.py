@@ -6,12 +6,12 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from phd_exp.records.scenes import Scene, SceneObject, Shape
+from phd_exp.records.scenes import Scene, Shape
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer, Settings, load_bpy
 from phd_exp.rendering.rays import FACES, NOTHING, cylinder_mask, in_camera_frame, trace_pixels, visibility
-from phd_exp.rendering.rotations import uniform_rotation
-from phd_exp.rendering.sampling import sample_scene
+from phd_exp.rendering.sampling import sample_scene, uniform_rotation
+from tests.support.renders import with_objects
 
 MakeSpec = Callable[..., DatasetSpec]
 SHAPES = get_args(Shape)
@@ -59,14 +59,13 @@ def cast(scene: Scene) -> np.ndarray:
     return numbers[np.where(first == NOTHING, 0, (first - 1) // FACES + 1)]
 
 
-def alone(scene: Scene, item: SceneObject) -> Scene:
-    """The scene with one object; a `Scene` would insist on a cylinder."""
-    return scene.model_copy(update={"objects": (item,)})
-
-
 def check(scene: Scene, drawn: Callable[[Scene], np.ndarray]) -> None:
     """All that a record says of pixels, against Blender's."""
-    hits, seen, bare = trace_pixels(scene), drawn(scene) == 1, drawn(alone(scene, scene.objects[0])) == 1
+    hits, seen, bare = (
+        trace_pixels(scene),
+        drawn(scene) == 1,
+        drawn(with_objects(scene, scene.objects[0])) == 1,
+    )
     mask, whole = cylinder_mask(hits), hits.surfaces[0] != NOTHING
     assert abs(int(mask.sum()) - int(seen.sum())) <= FEW
     assert abs(int(whole.sum()) - int(bare.sum())) <= FEW
@@ -78,26 +77,15 @@ def check(scene: Scene, drawn: Callable[[Scene], np.ndarray]) -> None:
         assert np.abs(offset).max() <= 0.05
 
 
-def check_variant(spec: DatasetSpec, count: int, drawn: Callable[[Scene], np.ndarray]) -> None:
-    scenes = [sample_scene(spec, "train", EVERY * number) for number in range(count)]
+@pytest.mark.parametrize("count", [3, pytest.param(30, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_labels_are_those_of_blenders_pixels(
+    make_spec: MakeSpec, drawn: Callable[[Scene], np.ndarray], variant: str, count: int
+) -> None:
+    scenes = [sample_scene(make_spec(variant), "train", EVERY * number) for number in range(count)]
     assert any(cylinder_mask(trace_pixels(scene)).sum() >= 100 for scene in scenes)
     for scene in scenes:
         check(scene, drawn)
-
-
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_labels_are_those_of_blenders_pixels(
-    make_spec: MakeSpec, drawn: Callable[[Scene], np.ndarray], variant: str
-) -> None:
-    check_variant(make_spec(variant), 3, drawn)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_labels_are_those_of_blenders_pixels_in_many_samples(
-    make_spec: MakeSpec, drawn: Callable[[Scene], np.ndarray], variant: str
-) -> None:
-    check_variant(make_spec(variant), 30, drawn)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -114,7 +102,7 @@ def test_mesh_and_solid_are_one_shape(
                 "dimensions": (0.18, 0.23, 0.28),
             }
         )
-        near = alone(scene, item).model_copy(update={"f": 1500.0})
+        near = with_objects(scene, item).model_copy(update={"f": 1500.0})
         solid, mesh = cast(near), drawn(near)
         assert (solid > 0).sum() > 5_000
         assert (solid != mesh).sum() <= FEW
@@ -129,5 +117,5 @@ def test_another_view_is_drawn_from_where_its_pose_says(
         scene = sample_scene(spec, "train", index)
         x, y, z = in_camera_frame(np.array(scene.objects[0].position), scene.pose)
         tiny = scene.objects[0].model_copy(update={"scale": 0.1})
-        middle = np.argwhere(drawn(alone(scene, tiny)) == 1).mean(axis=0) + 0.5
+        middle = np.argwhere(drawn(with_objects(scene, tiny)) == 1).mean(axis=0) + 0.5
         assert middle == pytest.approx(scene.f * np.array([y, x]) / z + scene.S / 2, abs=0.5)

@@ -14,8 +14,8 @@ from phd_exp.records.scenes import SampleRecord, Scene, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.rays import trace_pixels
 from phd_exp.rendering.render import ensure_rendered
+from phd_exp.rendering.samples import describe
 from phd_exp.rendering.sampling import CLEARANCE, sample_scene, scene_and_view
-from phd_exp.rendering.worker import describe
 
 MakeSpec = Callable[..., DatasetSpec]
 SCENES, VIEWS = 400, 4

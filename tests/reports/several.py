@@ -10,7 +10,7 @@ from phd_exp.distributions import ProjectedHuber
 from phd_exp.evaluation.several_views import ROTATION, TRANSLATION
 from phd_exp.fusion import Pose
 from phd_exp.records import scenes
-from phd_exp.rendering.rotations import about_axis
+from phd_exp.rendering.sampling import about_axis
 from phd_exp.training.predictions import columns, write_parquet
 from tests.reports.site.synthetic import calibrated, truths
 

@@ -15,9 +15,8 @@ from pathlib import Path
 import pytest
 
 from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.processes import Child
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.pool import Worker
-from phd_exp.rendering.worker import Job, Task
 from tests.e2e.conftest import QUICK
 from tests.soak.soaker import memory
 
@@ -58,13 +57,15 @@ def test_a_render_worker_does_not_grow(tmp_path: Path, make_spec: Callable[..., 
     spec = make_spec("occl_scale", sensor_size=64, f_range=(343.0, 571.0))
     folder = DatasetFolder(tmp_path / "occl_scale")
     folder.split_folder("train").mkdir(parents=True)
-    with Worker(Job(root=folder.root, spec=spec), tmp_path / "render.log") as worker:
+    with Child("phd_exp.rendering.worker", log=tmp_path / "render.log") as worker:
+        worker.send((folder, spec))
         kilobytes, handles = [], []
         for index in range(IMAGES):
-            worker.render(Task(split="train", index=index))
+            worker.send(("train", index))
+            worker.receive()
             if index in (IMAGES // 10, IMAGES - 1):
-                kilobytes.append(memory(worker._process.pid))
-                handles.append(len(os.listdir(f"/proc/{worker._process.pid}/fd")))
+                kilobytes.append(memory(worker.process.pid))
+                handles.append(len(os.listdir(f"/proc/{worker.process.pid}/fd")))
     print(f"\n{IMAGES} images: {kilobytes} kB, {handles} handles")
     assert kilobytes[1] < MOST_GROWTH * kilobytes[0]
     assert handles[1] == handles[0]

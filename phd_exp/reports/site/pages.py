@@ -10,6 +10,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from phd_exp.evaluation.reference import Band
+from phd_exp.records.processes import duration
 from phd_exp.reports.fusion_table import fusion_table, headline
 from phd_exp.reports.paper import PUBLISHED
 from phd_exp.reports.quantities import SCORES, Quantity, quantity
@@ -41,7 +42,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters["moment"] = _moment
-    environment.filters["duration"] = _duration
+    environment.filters["duration"] = duration
     environment.globals["score"] = quantity
     environment.globals["headline"] = headline
     return environment
@@ -49,13 +50,6 @@ def _environment() -> Environment:
 
 def _moment(moment: datetime) -> str:
     return f"{moment.astimezone(UTC):%Y-%m-%d %H:%M} UTC"
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 120:
-        return f"{seconds:.0f} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
 
 
 _ENVIRONMENT = _environment()

@@ -12,7 +12,7 @@ from pydantic import BaseModel, BeforeValidator, Field, StrictBool, ValidationEr
 
 from phd_exp.records.choices import flatten, setting
 from phd_exp.records.errors import ConfigError, shown
-from phd_exp.records.shards import Shard
+from phd_exp.records.spec import Shard
 from phd_exp.training.config.sections import (
     CameraConfig,
     DataConfig,

@@ -1,0 +1,135 @@
+"""Work on a finished data set: verify it against its manifest and specification, and draw masks of its cylinders."""
+
+import random
+from collections.abc import Iterator
+from pathlib import Path
+
+from PIL import Image
+
+from phd_exp.records.dataset import SPLITS, DatasetFolder, Seal, checksum
+from phd_exp.records.errors import DatasetError, RenderError, UserError, writing
+from phd_exp.records.files import write_atomic
+from phd_exp.records.images import recorded_image
+from phd_exp.records.processes import announce
+from phd_exp.records.scenes import SampleRecord, Split
+from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.blender import Renderer, renderer_version, require_bpy
+from phd_exp.rendering.pixels import file_of
+from phd_exp.rendering.progress import shown_progress
+from phd_exp.rendering.rays import cylinder_mask, trace_pixels
+from phd_exp.rendering.samples import fast_settings, make_sample
+from phd_exp.rendering.sampling import GENERATOR_VERSION
+from phd_exp.rendering.sealing import other_make
+
+
+def verify(folder: DatasetFolder, spec: DatasetSpec, rerender: int, seed: int | None = None) -> int:
+    """Check a whole data set and render `rerender` of its samples again; returns the number of samples checked.
+
+    Each image is compared with its checksum and decoded, each line of metadata is compared with the manifest. The
+    samples to render again are drawn at random with `seed`; their images and records must come out identical.
+
+    Raises:
+        DatasetError: one line for each fault, with its remedy; or the folder holds no such data set.
+        RenderError: samples are to be rendered again, and bpy is missing.
+    """
+    manifest = folder.require(spec)
+    if rerender:
+        require_bpy()
+    if rerender and other_make(manifest):
+        raise DatasetError(
+            f"{folder.root}: made by generator {manifest.generator} with {manifest.renderer}, this is generator "
+            f"{GENERATOR_VERSION} with {renderer_version()}: its images cannot be compared; verify files alone by "
+            "rerender=0"
+        )
+    wrong: list[str] = []
+    sound: list[SampleRecord] = []
+    records: list[SampleRecord] = []
+    for split in SPLITS:
+        found, faults = _metadata(folder, split, manifest.splits.get(split))
+        records += found
+        wrong += [*faults, *_strangers(folder, split, found)]
+    with shown_progress(len(records), f"verifying {spec.variant}") as advance:
+        for record in records:
+            path = folder.split_folder(record.split) / record.file_name
+            try:
+                recorded_image(path, record)
+                sound.append(record)
+            except DatasetError as error:
+                first = "delete it, and " if path.exists() else ""
+                wrong.append(f"{error}; {first}`render` makes it again")
+            advance()
+    wrong += _rendered_again(folder, spec, random.Random(seed).sample(sound, min(rerender, len(sound))))
+    if wrong:
+        raise DatasetError("\n".join(wrong))
+    return len(sound)
+
+
+def _metadata(folder: DatasetFolder, split: Split, seal: Seal | None) -> tuple[list[SampleRecord], list[str]]:
+    """The records of a split, and the faults of their file."""
+    if seal is None or not seal.n:
+        return [], []
+    path, faults = folder.metadata_path(split), []
+    if path.exists() and checksum(path) != seal.metadata_sha256:
+        faults.append(
+            f"{path}: its checksum is not that of the manifest; restore it, or render the data set anew"
+        )
+    try:
+        return folder.records(split), faults
+    except UserError as error:
+        return [], [*faults, str(error)]
+
+
+def _strangers(folder: DatasetFolder, split: Split, records: list[SampleRecord]) -> Iterator[str]:
+    """Images without a line of metadata, which image loaders would take for samples."""
+    if not records or folder.journals(split):
+        return  # a render that is running or was interrupted has images that are not sealed yet
+    for name in sorted(folder.images(split) - {record.file_name for record in records}):
+        yield f"{folder.split_folder(split) / name}: no line of metadata.jsonl names it; delete it"
+
+
+def _rendered_again(folder: DatasetFolder, spec: DatasetSpec, records: list[SampleRecord]) -> Iterator[str]:
+    """The differences between samples that are rendered again and those on disk."""
+    if not records:
+        return
+    names = ", ".join(f"{record.split}/{record.file_name}" for record in records)
+    announce(f"rendering {len(records)} samples again: {names}")
+    renderer = Renderer(fast_settings(spec))
+    for record in records:
+        image, again = make_sample(renderer, spec, record.split, record.index)
+        path = folder.split_folder(record.split) / record.file_name
+        for (key, new), (_, old) in zip(again, record, strict=True):
+            if new != old and key != "sha256":
+                yield f"{path}: recorded {key}={old}, rendering it again gives {new}"
+        if image != path.read_bytes():
+            yield f"{path}: rendering it again gives another image; delete the data set, and `render` makes it again"
+
+
+def write_masks(folder: DatasetFolder, masks: Path) -> int:
+    """Write `<masks>/<split>/<index>.png`, white where the cylinder is visible, for all samples; returns how many.
+
+    The masks have one bit per pixel and follow from the records, without Blender.
+
+    Raises:
+        DatasetError: there is no data set, or a broken one.
+        RenderError: the masks cannot be written, or would lie among the images.
+    """
+    require_elsewhere(folder, masks)
+    records = [record for split in SPLITS for record in folder.records(split)]
+    with writing(masks, instead="masks=FOLDER"):
+        for split in SPLITS:
+            (masks / split).mkdir(parents=True, exist_ok=True)
+        with shown_progress(len(records), "drawing masks") as advance:
+            for record in records:
+                image = Image.fromarray(cylinder_mask(trace_pixels(record.shown)))
+                path = (masks / record.split / record.file_name).with_suffix(".png")
+                write_atomic(path, file_of(image, "png"))
+                advance()
+    return len(records)
+
+
+def require_elsewhere(folder: DatasetFolder, masks: Path) -> None:
+    """Raise RenderError if masks would lie inside the data set, where loaders would take them for samples."""
+    if masks.absolute().is_relative_to(folder.root):
+        raise RenderError(
+            f"masks={masks}: lies in the data set itself; expected a folder outside {folder.root}"
+        )

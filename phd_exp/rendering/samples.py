@@ -1,0 +1,102 @@
+"""One sample: its image and its record.
+
+An image takes its light from the path tracer, its smooth edges from geometry (`antialias`), and its backdrop from a
+formula. The tracer renders only the box around the objects, and of that only the pixels that show an object are
+used. The box therefore leaves no seam that could reveal where the objects are.
+"""
+
+import numpy as np
+
+from phd_exp.records.dataset import DatasetFolder, image_name, sha256
+from phd_exp.records.files import write_atomic
+from phd_exp.records.scenes import Backdrop, SampleRecord, Scene, Split
+from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.antialias import smoothed
+from phd_exp.rendering.blender import Box, Renderer, Settings
+from phd_exp.rendering.pixels import Light, Pixels, encode, encoded
+from phd_exp.rendering.rays import NOTHING, Hits, Mask, in_camera_frame, trace_pixels, truncation, visibility
+from phd_exp.rendering.sampling import sample_scene, scene_and_view
+
+MARGIN = 4  # px around the objects: the denoiser is less accurate along the border of its image
+
+
+def fast_settings(spec: DatasetSpec) -> Settings:
+    """Settings of the tracer for the images of a data set."""
+    return Settings(samples=spec.samples_per_pixel, denoised=True, at_middles=True)
+
+
+def render_sample(
+    renderer: Renderer, folder: DatasetFolder, spec: DatasetSpec, split: Split, index: int
+) -> SampleRecord:
+    """Render one sample, write its image, and return its record. Raises OSError if the image cannot be written."""
+    image, record = make_sample(renderer, spec, split, index)
+    write_atomic(folder.image_path(split, index, spec.image_format), image)
+    return record
+
+
+def make_sample(
+    renderer: Renderer, spec: DatasetSpec, split: Split, index: int
+) -> tuple[bytes, SampleRecord]:
+    """The image file and the record of one sample."""
+    scene = sample_scene(spec, split, index)
+    hits = trace_pixels(scene)
+    image = encode(take_picture(renderer, scene, hits), spec)
+    return image, describe(spec, split, index, scene, hits, sha256(image))
+
+
+def describe(
+    spec: DatasetSpec, split: Split, index: int, scene: Scene, hits: Hits, checksum: str
+) -> SampleRecord:
+    """The record of a sample, given the scene, what the rays of its pixels hit, and the image's checksum."""
+    number, view = scene_and_view(spec, index)
+    cylinder = scene.objects[0]
+    x, y, z = in_camera_frame(np.array(cylinder.position), scene.pose).tolist()
+    return SampleRecord(
+        **{key: getattr(scene, key) for key in Scene.model_fields},
+        file_name=image_name(index, spec.image_format),
+        x=x,
+        y=y,
+        z=z,
+        scale=cylinder.scale,
+        visibility=visibility(hits),
+        truncation=truncation(scene, hits),
+        index=index,
+        split=split,
+        seed=spec.seed,
+        scene=number,
+        view=view,
+        sha256=checksum,
+    )
+
+
+def take_picture(renderer: Renderer, scene: Scene, hits: Hits) -> Pixels:
+    """Image (S, S, 3) of a scene, given what the rays of its pixels hit; sRGB, rows from the top."""
+    light = backdrop_light(scene.backdrop, scene.S)
+    first = hits.first
+    shown = first != NOTHING
+    if not shown.any():
+        return encoded(light)
+    box = box_around(shown, MARGIN)
+    inside = (slice(box.top, box.bottom), slice(box.left, box.right))
+    light[inside] = np.where(shown[inside][..., None], renderer.render(scene, box), light[inside])
+    return encoded(smoothed(light, first, scene))
+
+
+def backdrop_light(backdrop: Backdrop, side: int) -> Light:
+    """The backdrop alone (S, S, 3), linear light."""
+    middles = (np.arange(side) + 0.5) / side
+    x, y = middles - backdrop.centre[0], middles - backdrop.centre[1]
+    light = backdrop.level * (1 - backdrop.falloff * (x[None, :] ** 2 + y[:, None] ** 2))
+    return np.repeat(light[..., None], 3, axis=-1)
+
+
+def box_around(mask: Mask, margin: int) -> Box:
+    """The smallest box around the true pixels of a mask (S, S) and a margin, clipped to the image."""
+    side = mask.shape[0]
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return Box(
+        left=max(int(columns[0]) - margin, 0),
+        top=max(int(rows[0]) - margin, 0),
+        right=min(int(columns[-1]) + 1 + margin, side),
+        bottom=min(int(rows[-1]) + 1 + margin, side),
+    )

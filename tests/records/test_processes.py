@@ -1,0 +1,56 @@
+"""Locks exclude other processes, and a child that dies is noticed."""
+
+from pathlib import Path
+
+import pytest
+
+from phd_exp.records.processes import Child, duration, held
+
+
+def test_shared_locks_are_compatible_and_exclude_an_exclusive_one(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    lock = tmp_path / "lock"
+    with held(lock, shared=True), held(lock, shared=True) as both, held(lock) as third:
+        assert [both, third] == [True, False]
+    with held(lock, waiting="nobody waits") as alone, held(lock, shared=True) as other:
+        assert [alone, other] == [True, False]
+    assert capfd.readouterr().err == ""
+
+
+def test_a_lock_that_is_a_link_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "lock").symlink_to(tmp_path / "diary")
+    with pytest.raises(OSError, match="symbolic links"), held(tmp_path / "lock"):
+        pass
+    assert not (tmp_path / "diary").exists()
+
+
+CHILD = """
+from phd_exp.records.processes import parent
+connection = parent()
+print("printed")
+while True:
+    connection.send(1 / connection.recv())
+"""
+
+
+def test_a_child_answers_until_it_dies_or_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "inverse.py").write_text(CHILD)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    log = tmp_path / "log"
+    with Child("inverse", log=log) as dying, Child("inverse", log=log) as closed:
+        for child in (dying, closed):
+            child.send(4)
+            assert child.receive() == 0.25
+        dying.send(0)
+        with pytest.raises(EOFError, match=f"process {dying.process.pid} ended with status 1"):
+            dying.receive()
+        dying.send(4)  # does nothing
+    assert closed.process.returncode is not None
+    assert "ZeroDivisionError" in log.read_text()
+    assert log.read_text().count("printed") == 2
+
+
+@pytest.mark.parametrize(("seconds", "words"), [(0, "0 s"), (90, "2 min"), (5399, "90 min"), (5400, "1.5 h")])
+def test_durations_are_readable(seconds: float, words: str) -> None:
+    assert duration(seconds) == words

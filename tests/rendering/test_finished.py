@@ -1,0 +1,170 @@
+"""`verify` finds each change of a data set, and masks are the pixels that the records count."""
+
+import io
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from phd_exp.records.dataset import DatasetFolder, Seal, sha256
+from phd_exp.records.errors import DatasetError, RenderError
+from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering import finished as module
+from phd_exp.rendering.finished import verify, write_masks
+from phd_exp.rendering.rays import cylinder_mask, trace_pixels
+from tests.support.renders import N_TEST, N_TRAIN
+
+
+@pytest.fixture
+def copy(small: DatasetFolder, tmp_path: Path) -> DatasetFolder:
+    return DatasetFolder(Path(shutil.copytree(small.root, tmp_path / "default")))
+
+
+def complaints(folder: DatasetFolder, spec: DatasetSpec, rerender: int = 0) -> list[str]:
+    with pytest.raises(DatasetError) as error:
+        verify(folder, spec, rerender, seed=0)
+    return str(error.value).splitlines()
+
+
+def change(folder: DatasetFolder, index: int, content: bytes | None = None, **changes: float) -> None:
+    """Change a record, and its image, and make the checksums fit, as an expert could."""
+    image = folder.image_path("train", index)
+    if content is not None:
+        image.write_bytes(content)
+    changed = {"sha256": sha256(image.read_bytes())} | changes
+    lines = [
+        record.model_copy(update=changed if record.index == index else {}).model_dump_json() + "\n"
+        for record in folder.records("train")
+    ]
+    folder.metadata_path("train").write_text("".join(lines))
+    seal = Seal(n=N_TRAIN, metadata_sha256=sha256("".join(lines).encode()))
+    manifest = folder.manifest
+    folder.write_manifest(manifest.model_copy(update={"splits": manifest.splits | {"train": seal}}))
+
+
+def png(side: int) -> bytes:
+    stream = io.BytesIO()
+    Image.new("RGB", (side, side), "red").save(stream, "png")
+    return stream.getvalue()
+
+
+def test_samples_rendered_again_are_drawn_at_random_and_the_same(
+    small: DatasetFolder, small_spec: DatasetSpec, capfd: pytest.CaptureFixture[str]
+) -> None:
+    said = set()
+    for seed in range(3):
+        assert verify(small, small_spec, rerender=2, seed=seed) == N_TRAIN + N_TEST
+        said.add(capfd.readouterr().err)
+    assert len(said) == 3
+
+
+def test_a_changed_image(copy: DatasetFolder, small_spec: DatasetSpec) -> None:
+    path = copy.image_path("train", 3)
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    (line,) = complaints(copy, small_spec)
+    assert line == f"{path}: its checksum is not the recorded one; delete it, and `render` makes it again"
+
+
+def test_every_missing_and_every_strange_image_is_named(copy: DatasetFolder, small_spec: DatasetSpec) -> None:
+    copy.image_path("train", 1).unlink()
+    copy.image_path("test", 2).unlink()
+    shutil.copy(copy.image_path("train", 0), copy.image_path("train", 99))
+    missing, stranger = [], []
+    for line in complaints(copy, small_spec):
+        (stranger if "names it" in line else missing).append(line)
+    assert ["000001.png" in missing[0], "000002.png" in missing[1], len(missing)] == [True, True, 2]
+    assert ["000099.png" in stranger[0], len(stranger)] == [True, 1]
+
+
+@pytest.mark.parametrize("change", ["cut", "shuffled", "gone", "value"])
+def test_changed_metadata(copy: DatasetFolder, small_spec: DatasetSpec, change: str) -> None:
+    path = copy.metadata_path("train")
+    text = path.read_text()
+    lines = text.splitlines(keepends=True)
+    if change == "gone":
+        path.unlink()
+    else:
+        new = {"cut": text[:-20], "shuffled": "".join(lines[::-1]), "value": text.replace("rubber", "metal")}
+        path.write_text(new[change])
+    assert str(path) in complaints(copy, small_spec)[0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [({"x": 0.5}, "recorded x=0.5"), ({"content": png(56)}, "rendering it again gives another image")],
+    ids=["label", "image"],
+)
+def test_a_change_with_fitting_checksums_shows_when_rendered_again(
+    copy: DatasetFolder, small_spec: DatasetSpec, changes: dict[str, Any], said: str
+) -> None:
+    change(copy, 5, **changes)
+    assert verify(copy, small_spec, rerender=0) == N_TRAIN + N_TEST
+    (line,) = complaints(copy, small_spec, rerender=N_TRAIN + N_TEST)
+    assert f"000005.png: {said}" in line
+
+
+@pytest.mark.parametrize(
+    ("content", "said"), [(b"GIF89a", "cannot be decoded"), (png(8), "8 x 8 pixels, 56 x 56 recorded")]
+)
+def test_an_image_of_another_kind_is_named(
+    copy: DatasetFolder, small_spec: DatasetSpec, content: bytes, said: str
+) -> None:
+    change(copy, 0, content)
+    (line,) = complaints(copy, small_spec)
+    assert said in line
+
+
+def test_another_data_set_and_none_are_refused(
+    small: DatasetFolder, make_spec: Callable[..., DatasetSpec], tmp_path: Path
+) -> None:
+    with pytest.raises(DatasetError, match="sensor_size=56, but sensor_size=224 is asked for"):
+        verify(small, make_spec(), rerender=0)
+    with pytest.raises(DatasetError, match="no data set here"):
+        verify(DatasetFolder(tmp_path), make_spec(), rerender=0)
+
+
+def test_images_of_another_make_cannot_be_compared(copy: DatasetFolder, small_spec: DatasetSpec) -> None:
+    copy.write_manifest(copy.manifest.model_copy(update={"generator": 1}))
+    with pytest.raises(DatasetError, match=r"made by generator 1 .*; verify files alone by rerender=0"):
+        verify(copy, small_spec, rerender=1)
+    assert verify(copy, small_spec, rerender=0) == N_TRAIN + N_TEST
+
+
+def test_without_blender_files_can_be_verified(
+    small: DatasetFolder, small_spec: DatasetSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing() -> None:
+        raise RenderError("no bpy")
+
+    monkeypatch.setattr(module, "require_bpy", missing)
+    assert verify(small, small_spec, rerender=0) == N_TRAIN + N_TEST
+    with pytest.raises(RenderError, match="no bpy"):
+        verify(small, small_spec, rerender=1)
+
+
+def test_a_mask_for_every_sample(rendered: dict[str, DatasetFolder], tmp_path: Path) -> None:
+    folder = rendered["occl"]
+    assert write_masks(folder, tmp_path / "masks") == 6
+    for record in folder.records("train"):
+        with Image.open(tmp_path / "masks" / "train" / record.file_name) as image:
+            assert image.mode == "1"
+            mask = np.asarray(image)
+        hits = trace_pixels(record.shown)
+        assert (mask == cylinder_mask(hits)).all()
+        alone = np.isfinite(hits.depths[0]).sum()
+        assert mask.sum() == pytest.approx(record.visibility * alone)
+    assert (tmp_path / "masks" / "test" / "000000.png").exists()
+
+
+def test_masks_that_cannot_be_written_are_one_line(small: DatasetFolder, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(RenderError, match=r"masks=.*: lies in the data set itself"):
+        write_masks(small, small.root / "train" / "masks")
+    with pytest.raises(RenderError, match=r"cannot be written .* choose another masks=FOLDER"):
+        write_masks(small, tmp_path / "file" / "masks")
+    with pytest.raises(DatasetError, match="no data set here"):
+        write_masks(DatasetFolder(tmp_path / "none"), tmp_path / "masks")

@@ -1,0 +1,116 @@
+"""Helpers of the tests that render: contents of a folder, waiting, and a render in a separate process."""
+
+import io
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from phd_exp.records.dataset import SPLITS, DatasetFolder
+from phd_exp.records.files import read_jsonl
+from phd_exp.records.scenes import SampleRecord, Scene, SceneObject
+from phd_exp.records.spec import DatasetSpec, Shard
+from phd_exp.rendering.rays import NOTHING, Hits, Mask
+
+HOME = Path(__file__).parents[2]
+PATIENCE = 60.0  # s
+N_TRAIN, N_TEST = 12, 4
+"""Samples of the fixture `small`."""
+VARIANTS = ("default", "occl", "scale", "occl_scale")
+
+
+def contents(folder: DatasetFolder) -> dict[str, bytes]:
+    """All files of a data set except its cache."""
+    files = (path for path in folder.root.rglob("*") if path.is_file() and folder.cache not in path.parents)
+    return {str(path.relative_to(folder.root)): path.read_bytes() for path in files}
+
+
+def journaled(folder: DatasetFolder) -> dict[Path, int]:
+    """The images with a line in a journal, each of which is whole, and when they were written, ns."""
+    names = [
+        folder.split_folder(split) / line["file_name"]
+        for split in SPLITS
+        for journal in folder.journals(split)
+        for line in read_jsonl(journal)
+    ]
+    for path in names:
+        decoded(path.read_bytes())
+    return {path: path.stat().st_mtime_ns for path in names}
+
+
+def unsealed(folder: DatasetFolder) -> None:
+    """As a kill just before the end leaves a folder: all images, and all lines in the journals."""
+    for split in SPLITS:
+        if folder.metadata_path(split).exists():
+            folder.metadata_path(split).rename(folder.journal_path(split))
+    folder.write_manifest(folder.manifest.model_copy(update={"splits": {}}))
+
+
+def decoded(content: bytes) -> np.ndarray:
+    """The pixels (height, width, 3) of an image file."""
+    with Image.open(io.BytesIO(content)) as image:
+        assert image.mode == "RGB"
+        return np.asarray(image)
+
+
+def pixels(folder: DatasetFolder, record: SampleRecord) -> np.ndarray:
+    """The pixels (S, S, 3) of a sample, as signed integers."""
+    array = decoded((folder.split_folder(record.split) / record.file_name).read_bytes())
+    assert array.shape == (record.S, record.S, 3)
+    return array.astype(int)
+
+
+def wait_until(condition: Callable[[], object]) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline, "waited too long"
+        time.sleep(0.005)
+
+
+@contextmanager
+def rendering_elsewhere(
+    folder: DatasetFolder,
+    spec: DatasetSpec,
+    workers: int = 1,
+    n: tuple[int, int] = (N_TRAIN, N_TEST),
+    shard: Shard | None = None,
+) -> Iterator[subprocess.Popen[str]]:
+    """`ensure_rendered` in a process, and a group of processes, of its own, which is killed at the end."""
+    script = (
+        # a shell makes background processes ignore interrupts, and this process would inherit that
+        "import signal\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from phd_exp.records.dataset import DatasetFolder\n"
+        "from phd_exp.records.spec import DatasetSpec, Shard\n"
+        "from phd_exp.rendering.render import ensure_rendered\n"
+        f"spec = DatasetSpec.model_validate_json({spec.model_dump_json()!r})\n"
+        f"ensure_rendered(DatasetFolder({str(folder.root)!r}), spec, *{n}, {workers}, shard={shard!r})\n"
+    )
+    options: dict[str, Any] = {"stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    with subprocess.Popen([sys.executable, "-c", script], cwd=HOME, **options) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def silhouettes(hits: Hits) -> Mask:
+    """Pixels (S, S) that show any object, rows from the top."""
+    return np.asarray((hits.surfaces != NOTHING).any(axis=0))
+
+
+def placed(scene: Scene, **changes: Any) -> SceneObject:
+    """A scene's cylinder, upright and of size one, with some changes."""
+    straight = {"rotation": (1.0, 0.0, 0.0, 0.0), "scale": 1.0}
+    return scene.objects[0].model_copy(update=straight | changes)
+
+
+def with_objects(scene: Scene, *objects: SceneObject) -> Scene:
+    """A scene with other objects, which need not include a cylinder."""
+    return scene.model_copy(update={"objects": objects})
