@@ -8,7 +8,8 @@ from types import FrameType
 from typing import Any
 
 import torch
-from lightning import Callback, LightningModule, Trainer
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins.io import CheckpointIO
 
 from phd_exp.records.files import write_atomic
@@ -40,11 +41,12 @@ class AtomicCheckpoints(CheckpointIO):
         Path(path).unlink(missing_ok=True)
 
 
-class StopBetweenBatches(Callback):
+class StopBetweenBatches(Checkpoint):
     """Delays a SIGINT or SIGTERM to the end of the batch, saves a checkpoint, and raises the signal again.
 
-    The handlers that were installed before the training receive it. During a validation the signal waits for the
-    checkpoint of the epoch. A second signal is raised at once.
+    The handlers that were installed before the training receive it. During the last batch and the validation the
+    signal waits for the checkpoint of the epoch: as a Checkpoint callback this one runs in the order of the Trainer's
+    list, and belongs after ModelCheckpoint. A second signal is raised at once.
     """
 
     def __init__(self, checkpoint: Path) -> None:
