@@ -12,8 +12,8 @@ from phd_exp.records.errors import ConfigError, complaint, nearest
 from phd_exp.records.files import remove_temporaries
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
-    from phd_exp.inference.predictor import Predictor
     from phd_exp.inference.answers import Sighting
+    from phd_exp.inference.predictor import Predictor
 
 Arguments_ = TypeVar("Arguments_", bound="Arguments")
 

@@ -18,7 +18,7 @@ from phd_exp.cli.arguments import (
     predicted,
     require_file,
 )
-from phd_exp.records.detections import Detection, Observed, detections_in, observed
+from phd_exp.records.detections import Observed, detections_in, observed
 from phd_exp.records.errors import ConfigError, listed
 from phd_exp.records.files import write_atomic
 

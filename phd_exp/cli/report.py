@@ -36,8 +36,8 @@ def main(words: list[str]) -> int:
 def _report(runs: Path, out: Path) -> None:
     # imports of seconds, which follow the check of the arguments
     from phd_exp.reports.files import all_tables, write_tables
-    from phd_exp.reports.terminal import print_report
     from phd_exp.reports.runs import read_report
+    from phd_exp.reports.terminal import print_report
 
     # on a terminal, one line names the run being measured
     line = "\r\x1b[Kmeasuring {}\r" if sys.stderr.isatty() else ""

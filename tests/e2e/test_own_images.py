@@ -21,7 +21,7 @@ from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.scenes import SampleRecord, Scene
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.pixels import encoded
-from phd_exp.rendering.rays import rotation_matrix, trace_pixels
+from phd_exp.rendering.rays import trace_pixels
 from phd_exp.rendering.render import ensure_rendered
 from phd_exp.rendering.samples import backdrop_light
 from tests.e2e.runs import only_run

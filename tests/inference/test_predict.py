@@ -18,7 +18,7 @@ from phd_exp.distributions import PointEstimate, ProjectedHuber
 from phd_exp.inference import pictures
 from phd_exp.records.errors import DatasetError, RunError
 from phd_exp.records.runs import RunFolder
-from tests.disks import small_disk
+from tests.support.disks import small_disk
 from tests.support.untrained import SMALL, read_lines, untrained, virtual_cameras, write_photos
 
 
