@@ -8,9 +8,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from shutil import which
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from hydra.core.plugins import Plugins
 from hydra.experimental.callback import Callback
 
 from phd_exp.cli.frame import run_verb
@@ -108,8 +110,32 @@ def test_failures_come_back_and_stop_no_other_job(
         assert [(tmp_path / f"{seed}.done").read_text() for seed in (0, 5)] == [str(cores)] * 2
 
 
-@pytest.mark.parametrize("launcher", ["joblib", pytest.param("submitit", marks=pytest.mark.slow)])
-def test_a_killed_job_is_named(sweep: Callable, launcher: str) -> None:
+def test_a_killed_job_is_named_and_others_keep_their_state(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["task"])
+    (tmp_path / "5.done").touch()
+
+    def launch(*arguments: Any, **named: Any) -> None:
+        Path("7.begun").touch()
+        raise RuntimeError("a worker died")  # as joblib and submitit do
+
+    launcher = SimpleNamespace(launch=launch)
+    monkeypatch.setattr(Plugins, "instantiate_launcher", lambda *arguments, **named: launcher)
+    assert main(["-m", "preset=smoke", "seed=5,7,0"]) == 1
+    out, err = capfd.readouterr()
+    assert "3 jobs: 1 finished already, 1 failed, 1 not started\n" in out
+    assert err.splitlines() == [
+        "error: 2 jobs failed",
+        "error: preset=smoke seed=7: killed; the same command resumes",
+        "error: preset=smoke seed=0: did not start; the same command resumes",
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", LAUNCHERS)
+def test_a_launcher_with_a_killed_process_names_its_job(sweep: Callable, launcher: str) -> None:
     status, _, errors = sweep(launcher, "4,0")
     assert status == 1
     assert "error: seed=4 preset=smoke: killed; the same command resumes" in errors
