@@ -100,12 +100,6 @@ def test_nothing_changes_without_a_motion(batch: Batch) -> None:
     assert torch.equal(still.xyz, batch.xyz)
 
 
-def test_the_same_seed_gives_the_same_batch(batch: Batch) -> None:
-    one, same, other = (augmented(batch, 1.3, seed) for seed in (1, 1, 2))
-    assert torch.equal(one.image, same.image)
-    assert not torch.equal(one.image, other.image)
-
-
 def test_colours_change_places_alone(batch: Batch) -> None:
     noise = torch.randint(0, 256, batch.image.shape, dtype=torch.uint8)
     batch = Batch(noise, batch.xyz, batch.f, batch.S, batch.row)
