@@ -1,17 +1,115 @@
-"""Geometric augmentation: the same scene through other cameras at the same place, with exact labels."""
+"""Augmentation: the same scenes through other cameras and in other light, with exact labels."""
 
+import io
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import ClassVar
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
+from numpy.typing import NDArray
+from PIL import Image, ImageFilter
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from phd_exp.data.batches import Batch
-from phd_exp.data.photometry import Photometry
 from phd_exp.geometry.camera import middles
 from phd_exp.geometry.motion import Motion, small_turns, symmetries
+
+FIELD = 512
+"""Side of the field of standard normal numbers from which the noise of each image is cut, pixels."""
+
+
+@dataclass(frozen=True)
+class Photometry:
+    """Random changes of light, colour and image quality, each up to a limit.
+
+    Half of the images change in brightness, contrast, gamma and white balance together, with factors log-uniform
+    between 1/limit and the limit. A quarter each is blurred, gets noise, or is compressed, uniformly up to the limit.
+
+    Args:
+        brightness: largest factor of all values; 1 for none.
+        contrast: largest factor of the distance from middle grey; 1 for none.
+        gamma: largest exponent of values between 0 and 1; 1 for none.
+        white_balance: largest factor of each colour channel; 1 for none.
+        blur: largest standard deviation of a Gaussian blur, pixels; 0 for none.
+        noise: largest standard deviation of white Gaussian noise, levels of 255; 0 for none.
+        jpeg: lowest JPEG quality; 100 for none.
+    """
+
+    n_numbers: ClassVar[int] = 12
+    brightness: float = 1.0
+    contrast: float = 1.0
+    gamma: float = 1.0
+    white_balance: float = 1.0
+    blur: float = 0.0
+    noise: float = 0.0
+    jpeg: int = 100
+
+    @property
+    def changes_anything(self) -> bool:
+        """Whether any change can be drawn."""
+        return self != Photometry()
+
+    def __call__(
+        self, image: UInt8[Tensor, "batch height width 3"], numbers: Float[Tensor, "batch 12"]
+    ) -> UInt8[Tensor, "batch height width 3"]:
+        """The images, changed by uniform numbers from -1 to 1."""
+        result = [self._changed(one, row) for one, row in zip(image.numpy(), numbers.tolist(), strict=True)]
+        return torch.from_numpy(np.stack(result))
+
+    def _changed(self, image: NDArray[np.uint8], numbers: list[float]) -> NDArray[np.uint8]:
+        picture = Image.fromarray(image)
+        if numbers[0] > 0:
+            picture = picture.point(self._tone(numbers[1:7]))
+        if self.blur and (blur := _strength(numbers[7])):
+            picture = picture.filter(ImageFilter.GaussianBlur(self.blur * blur))
+        if self.noise and (noise := _strength(numbers[8])):
+            picture = Image.fromarray(_noisy(np.asarray(picture), self.noise * noise, numbers[9:11]))
+        if self.jpeg < 100 and (loss := _strength(numbers[11])):
+            picture = _compressed(picture, round(100 - (100 - self.jpeg) * loss))
+        return np.asarray(picture)
+
+    def _tone(self, numbers: list[float]) -> list[int]:
+        """Table from the 256 levels of each of the three channels to their new levels."""
+        limits = (self.brightness, self.contrast, self.gamma)
+        brightness, contrast, gamma = (
+            limit**number for limit, number in zip(limits, numbers[:3], strict=True)
+        )
+        gain = brightness * self.white_balance ** np.array(numbers[3:])
+        value = (gain[:, None] * np.arange(256) / 255).clip(0, 1)
+        value = (0.5 + contrast * (value - 0.5)).clip(0, 1) ** gamma
+        table: list[int] = (255 * value).round().astype(int).ravel().tolist()
+        return table
+
+
+def _strength(number: float) -> float:
+    """Uniform numbers from -1 to 1 -> 0 for three quarters of them, else uniform from 0 to 1."""
+    return max(0.0, 4 * abs(number) - 3)
+
+
+def _noisy(image: NDArray[np.uint8], deviation: float, place: list[float]) -> NDArray[np.uint8]:
+    """The image with noise from a position (-1 to 1) of the field."""
+    height, width = image.shape[:2]
+    field = _field(max(FIELD, 2 * height, 2 * width))
+    top, left = (
+        int((len(field) - side) * (number + 1) / 2)
+        for side, number in zip((height, width), place, strict=True)
+    )
+    noise = field[top : top + height, left : left + width]
+    return (image + deviation * noise).round().clip(0, 255).astype(np.uint8)
+
+
+def _compressed(picture: Image.Image, quality: int) -> Image.Image:
+    stream = io.BytesIO()
+    picture.save(stream, format="jpeg", quality=quality)
+    return Image.open(stream)
+
+
+@cache
+def _field(side: int) -> NDArray[np.float32]:
+    return np.random.default_rng(0).standard_normal((side, side, 3), dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -70,8 +168,8 @@ def _rearranged(
     for one, new, (x, y, exchange), order in zip(
         image, result, (signs < 0).tolist(), colours.tolist(), strict=True
     ):
-        seen = one.transpose(0, 1) if exchange else one
-        mirrored = seen.flip([axis for axis, wanted in ((1, x), (0, y)) if wanted]) if x or y else seen
+        turned = one.transpose(0, 1) if exchange else one
+        mirrored = turned.flip([axis for axis, wanted in ((1, x), (0, y)) if wanted]) if x or y else turned
         for channel, old in enumerate(order):
             new[..., channel] = mirrored[..., old]
     return result

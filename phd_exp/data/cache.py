@@ -1,9 +1,8 @@
 """A cache of decoded images: a memory-mapped uint8 array next to the data set."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -11,10 +10,9 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from phd_exp.records.errors import DatasetError
 from phd_exp.records.files import read_plain, require_plain, write_atomic
 from phd_exp.records.parsing import parse_json
-from phd_exp.records.processes import held
+from phd_exp.records.processes import announce, held
 
 DECODERS = 4
 LARGEST_AT_ONCE = 1 << 26
@@ -23,10 +21,6 @@ LARGEST_AT_ONCE = 1 << 26
 Job = TypeVar("Job")
 Fill = Callable[[np.ndarray, Job], None]
 """Decodes one job into its own rows of the array."""
-
-
-class CacheError(DatasetError):
-    """The cache folder cannot be written."""
 
 
 def cached(
@@ -49,42 +43,38 @@ def cached(
         words: description of the progress bar.
         largest: pixels of the largest image; bounds the number of threads.
 
-    Raises CacheError if the folder cannot be written, and the errors of `fill`.
+    If the folder cannot be written, the images are decoded into memory, and a line says so.
     """
-    key_file = file.with_suffix(".json")
-    with _locked(file.parent):  # concurrent runs of a sweep decode once
-        if (kept := _kept(file, key_file, key, shape)) is not None:
-            return kept
-        unfinished = file.with_suffix(".unfinished")
-        unfinished.unlink(missing_ok=True)  # if it is a link, writing would overwrite its target
-        array = np.lib.format.open_memmap(unfinished, mode="w+", dtype=np.uint8, shape=shape)
-        fill_all(array, jobs, fill, words, largest)
-        array.flush()
-        unfinished.replace(file)
-        write_atomic(key_file, json.dumps(key) + "\n")
-        return _mapped(file)
+    key_file, unfinished = file.with_suffix(".json"), file.with_suffix(".unfinished")
+    waiting = f"{file.parent}: another process decodes images; waiting for it"
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with held(file.parent / "decoding.lock", waiting=waiting):  # concurrent runs of a sweep decode once
+            if (kept := _kept(file, key_file, key, shape)) is not None:
+                return kept
+            unfinished.unlink(missing_ok=True)  # if it is a link, writing would overwrite its target
+            mapped = np.lib.format.open_memmap(unfinished, mode="w+", dtype=np.uint8, shape=shape)
+            _fill_all(mapped, jobs, fill, words, largest)
+            mapped.flush()
+            unfinished.replace(file)
+            write_atomic(key_file, json.dumps(key) + "\n")
+            return _mapped(file)
+    except OSError as error:
+        why = f"{file.parent}: decoded images cannot be kept here ({error.strerror})"
+        announce(f"{why}; they are decoded into memory, each run anew")
+        array = np.empty(shape, dtype=np.uint8)
+        _fill_all(array, jobs, fill, words, largest)
+        return array
 
 
-def fill_all(array: np.ndarray, jobs: Sequence[Job], fill: Fill, words: str, largest: int = 1) -> None:
-    """Do all jobs in several threads, with a progress bar on a terminal; arguments as for `cached`."""
+def _fill_all(array: np.ndarray, jobs: Sequence[Job], fill: Fill, words: str, largest: int) -> None:
+    """Do all jobs in several threads, with a progress bar on a terminal."""
     with ThreadPoolExecutor(max(1, min(DECODERS, LARGEST_AT_ONCE // largest))) as pool:
         done = pool.map(lambda job: fill(array, job), jobs)
         console = Console(stderr=True)
         quiet = not console.is_terminal
         for _ in track(done, words, len(jobs), console=console, transient=True, disable=quiet):
             pass
-
-
-@contextmanager
-def _locked(cache: Path) -> Iterator[None]:
-    try:
-        cache.mkdir(parents=True, exist_ok=True)
-        with held(
-            cache / "decoding.lock", waiting=f"{cache}: another process decodes images; waiting for it"
-        ):
-            yield
-    except OSError as error:
-        raise CacheError(f"{cache}: decoded images cannot be kept here ({error.strerror})") from None
 
 
 def _kept(file: Path, key_file: Path, key: dict[str, Any], shape: tuple[int, ...]) -> np.ndarray | None:

@@ -55,9 +55,7 @@ def read_image(file: Path, content: bytes) -> Image.Image:
                 "turn them for good (`mogrify -auto-orient`), and let f, cx, cy and box refer to the result"
             )
         if getattr(image, "is_animated", False) and image.format not in ONE_PICTURE:
-            raise DatasetError(
-                f"{file}: holds several pictures; expected one, save that which is meant by itself"
-            )
+            raise DatasetError(f"{file}: holds several pictures; expected one, saved as a separate file")
         image.load()
         return _as_rgb(file, image)
 
@@ -78,9 +76,9 @@ def cut(image: Image.Image, camera: VirtualCamera) -> UInt8[np.ndarray, "S S 3"]
     across, down = -(-(right - left) // block), -(-(bottom - top) // block)
     finest = min(FINEST, 2 * max(across, down) / S)
     multiple = max(1, math.ceil(min(most / block, finest) - 1e-6))  # 2.0000000001 is two
-    seen = Image.new("RGB", (block * across, block * down), GREY)
-    seen.paste(image.crop((left, top, right, bottom)))
-    bands = [band.convert("F") for band in seen.reduce(block).split()]
+    visible = Image.new("RGB", (block * across, block * down), GREY)
+    visible.paste(image.crop((left, top, right, bottom)))
+    bands = [band.convert("F") for band in visible.reduce(block).split()]
     back = np.diag([1 / block, 1 / block, 1.0]) @ np.array([[1, 0, -left], [0, 1, -top], [0, 0, 1]])
     back = back @ np.linalg.inv(camera.homography) @ np.diag([1 / multiple, 1 / multiple, 1.0])
     view = np.empty((S, S, 3), dtype=np.uint8)

@@ -1,7 +1,6 @@
 """Samples from a folder of the user's own images, with one virtual camera per detection."""
 
 import math
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import torch
 from jaxtyping import Float
 
 from phd_exp.data.batches import Batch
-from phd_exp.data.cache import CacheError, cached, fill_all
+from phd_exp.data.cache import cached
 from phd_exp.data.crops import cut, image_size, read_image
 from phd_exp.data.sources import Known, Part, Source
 from phd_exp.geometry.charts import DepthScale
@@ -98,7 +97,7 @@ class FolderSource(Source):
 
     @pillow_warnings()
     def _images(self, crops: list[Crop], part: Part) -> np.ndarray:
-        """The crops, from the cache, or decoded into memory if the folder is read-only."""
+        """The crops, cached."""
         rows: dict[Path, list[int]] = {}  # a file may have many detections
         for row, crop in enumerate(crops):
             rows.setdefault(crop.detection.file, []).append(row)
@@ -120,13 +119,7 @@ class FolderSource(Source):
         kept = self.folder.cache / f"crops-{part}-{len(crops)}x{self.side}.npy"
         largest = max((math.prod(self.sizes[file]) for file in rows), default=1)
         shape, words = (len(crops), self.side, self.side, 3), f"decoding {part.replace('_', '-')} images once"
-        try:
-            return cached(kept, key, shape, list(rows), fill, words, largest)
-        except CacheError as error:
-            print(f"{error}; they are decoded into memory, each run anew", file=sys.stderr)
-            array = np.empty(shape, dtype=np.uint8)
-            fill_all(array, list(rows), fill, words, largest)
-            return array
+        return cached(kept, key, shape, list(rows), fill, words, largest)
 
 
 def _crop(detection: Detection, side: int, sizes: dict[Path, tuple[int, int]]) -> Crop:

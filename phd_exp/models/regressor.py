@@ -87,9 +87,9 @@ class Regressor(nn.Module):
     def forward(self, image: UInt8[Tensor, "batch height width 3"], camera: Camera) -> Prediction:
         return self.prediction(self.see(image), camera)
 
-    def prediction(self, seen: BackboneOutput, camera: Camera) -> Prediction:
+    def prediction(self, output: BackboneOutput, camera: Camera) -> Prediction:
         """The prediction, given the output of the backbone."""
-        return self.head(self.numbers(seen, camera.f), camera)
+        return self.head(self.numbers(output, camera.f), camera)
 
     def raw(
         self, image: UInt8[Tensor, "batch height width 3"], f: Float[Tensor, " batch"] | None = None
@@ -102,16 +102,16 @@ class Regressor(nn.Module):
         width = image.shape[2]
         # row by row: four times faster than three colours at a time, which do not fill vector units
         rows = image.flatten(2).to(self.mean.dtype).sub_(self.mean.repeat(width)).div_(self.std.repeat(width))
-        seen: BackboneOutput = self.backbone(rows.unflatten(2, (width, 3)).permute(0, 3, 1, 2))
-        return seen
+        output: BackboneOutput = self.backbone(rows.unflatten(2, (width, 3)).permute(0, 3, 1, 2))
+        return output
 
     def numbers(
-        self, seen: BackboneOutput, f: Float[Tensor, " batch"] | None
+        self, output: BackboneOutput, f: Float[Tensor, " batch"] | None
     ) -> Float[Tensor, "batch n_outputs"]:
         """The raw numbers for the head, given the output of the backbone, and f if it is an input."""
         dtype = self.last.weight.dtype
-        with torch.autocast(seen.features.device.type, enabled=False):
-            raw: Tensor = self.last(seen.features.to(dtype))
+        with torch.autocast(output.features.device.type, enabled=False):
+            raw: Tensor = self.last(output.features.to(dtype))
             if self.shown is not None:
                 raw = self.shown(raw, f)
-            return raw if seen.place is None else self.head.placed(raw, seen.place.to(dtype))
+            return raw if output.place is None else self.head.placed(raw, output.place.to(dtype))

@@ -9,10 +9,9 @@ from lightning import Trainer
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar, TQDMProgressBar
 
-from phd_exp.data.augmentation import Augmentation
+from phd_exp.data.augmentation import Augmentation, Photometry
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.folder import FolderSource
-from phd_exp.data.photometry import Photometry
 from phd_exp.data.sources import Part, RenderedSource, Source
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.detections import DetectionFolder

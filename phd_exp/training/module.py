@@ -72,13 +72,13 @@ class PositionModule(LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        seen = self.regressor.see(batch.image)
-        prediction = self.regressor.prediction(seen, self.camera(batch))
+        output = self.regressor.see(batch.image)
+        prediction = self.regressor.prediction(output, self.camera(batch))
         losses = self.loss(prediction, batch.xyz)
         total = losses.mean()
-        if self.localisation and seen.log_heat is not None:
+        if self.localisation and output.log_heat is not None:
             place = projected(batch.xyz, batch.camera)
-            total = total + self.localisation * localisation_loss(seen.log_heat, place)
+            total = total + self.localisation * localisation_loss(output.log_heat, place)
         self._require_finite(total, losses, batch, "train")
         with torch.no_grad():
             nll = losses if isinstance(self.loss, NegativeLogLikelihood) else None

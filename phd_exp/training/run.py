@@ -12,7 +12,7 @@ from lightning import Trainer, seed_everything
 
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.images import SHRINKING
-from phd_exp.data.sources import Part
+from phd_exp.data.sources import PARTS, Part
 from phd_exp.distributions.columns import Columns
 from phd_exp.records.choices import flatten, has_influence
 from phd_exp.records.dataset import DatasetFolder, checksum
@@ -212,9 +212,7 @@ def _circumstances(config: RunConfig, data: PositionData, trainer: Trainer) -> d
         "data": config.data.name,
         "model": config.model.name,
         "seed": config.seed,
-        "n_train": data.source.count("train"),
-        "n_held_out": data.source.count("held_out"),
-        "n_test": data.source.count("test"),
+        **{f"n_{part}": data.source.count(part) for part in PARTS},
         "epochs": trainer.current_epoch,
         "devices": trainer.world_size,
         "threads": torch.get_num_threads(),  # of each process

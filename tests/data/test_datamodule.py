@@ -22,8 +22,9 @@ def data(
     return module
 
 
-def test_batches_hold_what_the_records_say(folder: DatasetFolder, spec: DatasetSpec) -> None:
+def test_batches_are_those_of_the_records(folder: DatasetFolder, spec: DatasetSpec) -> None:
     module = data(folder, spec)
+    assert [len(batch) for batch in module.train_dataloader()] == [2, 2]
     (first, second) = list(module.val_dataloader())
     records = folder.records("test")
     assert [len(first), len(second)] == [2, 1]
@@ -31,12 +32,6 @@ def test_batches_hold_what_the_records_say(folder: DatasetFolder, spec: DatasetS
     assert torch.equal(torch.cat([first.xyz, second.xyz]), xyz)
     assert torch.cat([first.f, second.f]).tolist() == [record.f for record in records]
     assert first.S == 64.0
-
-
-def test_training_batches_are_full_and_shuffled(folder: DatasetFolder, spec: DatasetSpec) -> None:
-    loader = data(folder, spec).train_dataloader()
-    assert [len(batch) for batch in loader] == [2, 2]
-    assert loader.shuffle
 
 
 @pytest.mark.parametrize("image_size", [64, 32])
@@ -65,13 +60,10 @@ def test_depth_scale_comes_from_the_specification(folder: DatasetFolder, spec: D
     assert math.sqrt((5 / 400) / (3 / 600)) == pytest.approx(depth.D)
 
 
-def test_uses_the_first_samples(folder: DatasetFolder, spec: DatasetSpec) -> None:
-    assert len(data(folder, spec, n_train=2).samples["train"]) == 2
-
-
 def test_held_out_samples_follow_those_trained_on(folder: DatasetFolder, spec: DatasetSpec) -> None:
     module = data(folder, spec, n_train=3, n_held_out=2)
     whole = data(folder, spec)
+    assert "held_out" not in whole.samples
     assert [len(module.samples[part]) for part in ("train", "held_out", "test")] == [3, 2, 3]  # type: ignore[index]
     assert torch.equal(module.samples["train"].image, whole.samples["train"].image[:3])
     assert torch.equal(module.samples["held_out"].image, whole.samples["train"].image[3:])
@@ -79,10 +71,6 @@ def test_held_out_samples_follow_those_trained_on(folder: DatasetFolder, spec: D
     assert module.source.known("held_out")["file_name"] == whole.source.known("train")["file_name"][3:]
     (batch,) = module.in_order("held_out")
     assert batch.row.tolist() == [0, 1]
-
-
-def test_none_need_be_held_out(folder: DatasetFolder, spec: DatasetSpec) -> None:
-    assert "held_out" not in data(folder, spec).samples
 
 
 def test_too_few_samples_are_one_line(folder: DatasetFolder, spec: DatasetSpec) -> None:

@@ -168,21 +168,6 @@ def test_a_changed_image_of_the_same_name_and_time_is_never_served_from_the_cach
     assert (after[2, 24] == 9).sum() > (before[2, 24] == 9).sum()
 
 
-def test_a_folder_that_cannot_be_written_is_decoded_into_memory_and_said_so(
-    photos: DetectionFolder, capsys: pytest.CaptureFixture[str]
-) -> None:
-    expected = images(photos)
-    assert capsys.readouterr().err == ""
-    for file in photos.cache.iterdir():
-        file.unlink()
-    photos.cache.rmdir()
-    photos.cache.write_text("in the way of the folder")
-    np.testing.assert_array_equal(images(photos), expected)
-    (line,) = capsys.readouterr().err.splitlines()
-    assert ".cache: decoded images cannot be kept here" in line
-    assert "decoded into memory" in line
-
-
 def test_a_broken_image_leaves_no_cache(photos: DetectionFolder) -> None:
     file = photos.root / "train" / "wide.jpg"
     file.write_bytes(file.read_bytes()[:1000])

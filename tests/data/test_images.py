@@ -1,5 +1,7 @@
 """Images decoded once: exact, found again, and never taken for others."""
 
+import shutil
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -147,7 +149,14 @@ def test_two_processes_may_decode_at_once(folder: DatasetFolder) -> None:
         np.testing.assert_array_equal(array, arrays[0])
 
 
-def test_a_read_only_data_set_is_one_line(folder: DatasetFolder) -> None:
+def test_images_of_a_read_only_data_set_are_decoded_into_memory(
+    folder: DatasetFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    expected = cached_images(folder, "train", folder.records("train"), 32)
+    assert capsys.readouterr().err == ""
+    shutil.rmtree(folder.cache)
     folder.cache.write_text("in the way of the folder")
-    with pytest.raises(DatasetError, match=r"\.cache: decoded images cannot be kept here"):
-        cached_images(folder, "train", folder.records("train"), 32)
+    found = cached_images(folder, "train", folder.records("train"), 32)
+    np.testing.assert_array_equal(found, expected)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert ".cache: decoded images cannot be kept here (File exists); they are decoded into memory" in line

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from phd_exp.data.photometry import Photometry
+from phd_exp.data.augmentation import Photometry
 
 N, SIDE = 400, 32
 

@@ -52,7 +52,6 @@ def test_examples_run(capsys: pytest.CaptureFixture[str]) -> None:
     assert failed == [], capsys.readouterr().out
 
 
-@pytest.mark.xfail(strict=True, reason="not all of them have an example yet")
 def test_main_names_have_an_example() -> None:
     named = {example.name.rpartition(".")[2] for file in FILES for example in _examples(file)}
     assert sorted(MAIN - named) == []

@@ -41,11 +41,3 @@ def test_mae_is_zero_at_the_truth_and_a_distance_elsewhere(
     offset = torch.tensor([[3.0, 4.0, 0.0], [0.0, 0.0, 2.0], [0.0, 0.0, 0.0]])
     loss = MeanAbsoluteError()(PointEstimate(truth + offset, chart, camera), xyz)
     assert loss.tolist() == pytest.approx([5, 2, 0], rel=1e-6)
-
-
-@pytest.mark.parametrize("chart", CHARTS, ids=lambda chart: type(chart).__name__)
-def test_the_estimate_is_the_position_with_these_coordinates(
-    chart: Chart, camera: Camera, xyz: torch.Tensor
-) -> None:
-    estimate = PointEstimate(chart.coordinates(xyz, camera), chart, camera)
-    torch.testing.assert_close(estimate.mode, xyz)

@@ -1,4 +1,4 @@
-"""The whole network: what it starts from, what every output learns, what precision it keeps."""
+"""The network: its initial predictions, gradients and precision."""
 
 from collections.abc import Callable
 
@@ -43,14 +43,7 @@ def regressor(head: Head) -> Regressor:
     return Regressor(resnet(18), head)
 
 
-@pytest.mark.parametrize("name", HEADS)
-def test_starts_at_zero_whatever_the_image(name: str, image: torch.Tensor, camera: Camera) -> None:
-    raw = regressor(HEADS[name]).raw(image)
-    assert raw.shape == (4, HEADS[name].n_outputs)
-    assert not raw.any()
-
-
-def test_starts_in_the_middle_of_the_data_set(image: torch.Tensor, camera: Camera) -> None:
+def test_initial_predictions_are_the_centre_of_the_data_set(image: torch.Tensor, camera: Camera) -> None:
     for name, head in HEADS.items():
         mode = regressor(head)(image, camera).mode
         assert mode[:, :2].abs().max() < 1e-6, name
@@ -80,25 +73,21 @@ def test_channels_last_changes_no_number(image: torch.Tensor, camera: Camera) ->
     torch.testing.assert_close(network.raw(image.contiguous()), raw, rtol=1e-4, atol=1e-4)
 
 
-def test_the_images_that_are_seen_stay_what_they_were(image: torch.Tensor) -> None:
+def test_the_input_images_do_not_change(image: torch.Tensor) -> None:
     before = image.clone()
     regressor(HEADS["mae_vz"]).raw(image)
     assert torch.equal(image, before)
 
 
-@pytest.mark.parametrize("depth", [10, 18, 34, 50])
-def test_no_batch_norm_is_left(depth: int) -> None:
-    kinds = [type(module) for module in resnet(depth).modules()]
-    assert torch.nn.BatchNorm2d not in kinds
-    groups = {m.num_groups for m in resnet(depth).modules() if isinstance(m, torch.nn.GroupNorm)}
-    assert groups == {1}
-
-
 @pytest.mark.parametrize(("depth", "torchvisions"), [(18, resnet18), (34, resnet34), (50, resnet50)])
-def test_the_layers_are_torchvisions(depth: int, torchvisions: Callable[..., torch.nn.Module]) -> None:
+def test_resnets_are_torchvisions_with_group_norm(
+    depth: int, torchvisions: Callable[..., torch.nn.Module]
+) -> None:
+    network = resnet(depth).network
     theirs = {name: weight.shape for name, weight in torchvisions().named_parameters() if "fc" not in name}
-    ours = {name: weight.shape for name, weight in resnet(depth).network.named_parameters()}
-    assert ours == theirs
+    assert {name: weight.shape for name, weight in network.named_parameters()} == theirs
+    assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in network.modules())
+    assert {m.num_groups for m in network.modules() if isinstance(m, torch.nn.GroupNorm)} == {1}
 
 
 def test_under_autocast_the_last_layer_stays_in_float32(image: torch.Tensor, camera: Camera) -> None:
