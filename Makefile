@@ -1,4 +1,4 @@
-# The commands of the README. Each makes .venv and installs what it needs, once.
+# Every target creates .venv on first use.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
@@ -7,19 +7,19 @@ INSTALLED := $(VENV)/.installed
 .DEFAULT_GOAL := help
 .PHONY: help install demo tables test test-all lint bench docs notebooks clean
 
-help:  ## what there is to make
+help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
 
 $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || \
-	  { echo "make: Blender's bpy needs Python 3.11; found $$($(PYTHON) --version). Say which: make PYTHON=/path/to/python3.11" >&2; exit 2; }
+	  { echo "make: Blender's bpy needs Python 3.11; found $$($(PYTHON) --version). Name one: make PYTHON=/path/to/python3.11" >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
 	$(BIN)/pip install --quiet --editable '.[render,report,export,launchers,dev]' --constraint constraints.txt
-	$(BIN)/python -m phd_exp.fusion  # else the first call to fuse waits for it
+	$(BIN)/python -m phd_exp.fusion  # otherwise the first call of fuse compiles it
 	@touch $@
 
-install: $(INSTALLED)  ## .venv with everything in it
+install: $(INSTALLED)  ## create .venv with all extras
 
 demo: $(INSTALLED)  ## render, train the probabilistic model, draw its calibration, print its row of the table
 	$(BIN)/python -m phd_exp preset=demo recipe=strong
@@ -31,16 +31,16 @@ JOBS ?= 4
 MORE ?=
 TABLES := preset=$(PRESET) recipe=$(RECIPE) $(MORE)
 
-tables: $(INSTALLED)  ## both tables, JOBS runs at once; wants a GPU at PRESET=paper, and goes on where it was stopped
+tables: $(INSTALLED)  ## both tables, JOBS runs at once; PRESET=paper needs a GPU; resumes after an interruption
 	$(BIN)/python -m phd_exp -m render data=default,occl,scale,occl_scale $(TABLES)
 	$(BIN)/python -m phd_exp -m experiment=table1,table2 $(TABLES) hydra/launcher=joblib hydra.launcher.n_jobs=$(JOBS)
 	$(BIN)/python -m phd_exp report
 
-lint: $(INSTALLED)  ## ruff, mypy, the import floors, and no release that is known to be bad
+lint: $(INSTALLED)  ## ruff, mypy, import contracts, and a check for known bad releases
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/lint-imports --no-cache  # a cache survives a merge and then sees imports that are gone
+	$(BIN)/lint-imports --no-cache  # a cache from before a merge reports imports that no longer exist
 	$(BIN)/python .ci/audit.py
 
 test: lint  ## lint and the default tests (under 5 minutes on 2 cores)
@@ -49,14 +49,14 @@ test: lint  ## lint and the default tests (under 5 minutes on 2 cores)
 test-all: lint  ## the slow tests too
 	$(BIN)/python -m pytest -n 2 -m 'not bench'
 
-bench: $(INSTALLED)  ## quality and speed, each beside a named reference, in one run
+bench: $(INSTALLED)  ## quality and speed against named references
 	$(BIN)/python -m pytest tests/benchmarks -m bench
 
-docs: $(INSTALLED)  ## site/index.html: the ideas behind it, and the reference from docstrings
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict  # the variable keeps the theme from praising its successor
+docs: $(INSTALLED)  ## site/index.html: guides, ideas, and the reference from docstrings
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict  # the variable silences an advertisement of the theme
 
-notebooks: $(INSTALLED)  ## execute the notebooks, minutes; what runs and data sets are missing takes more
+notebooks: $(INSTALLED)  ## execute the notebooks: minutes, more if runs and data sets are missing
 	$(BIN)/python notebooks/execute.py
 
-clean:  ## forget .venv and caches; renders/ and runs/ stay
+clean:  ## remove .venv and caches; keep renders/ and runs/
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

@@ -1,4 +1,4 @@
-"""The sweeper of phd_exp, where Hydra looks for plugins; other programmes that use Hydra load this file too."""
+"""The sweeper of phd_exp, where Hydra finds plugins. Other programmes that use Hydra load this file too."""
 
 from collections.abc import Mapping
 from functools import partial
@@ -13,7 +13,7 @@ class EveryCombination(Sweeper):
     """Runs every combination of the values on the command line and in an experiment: `phd_exp.cli.sweep`."""
 
     def __init__(self, params: Mapping[str, Any] | None = None) -> None:
-        self.params = params  # of conf/experiment; `sweep` reads them for each experiment
+        self.params = params  # from conf/experiment; `sweep` reads them for each experiment
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         from phd_exp.cli.jobs import Job

@@ -1,4 +1,4 @@
-"""`python -m phd_exp [verb] [group=choice ...] [key=value ...]`; imports nothing heavy before the verb is known."""
+"""`python -m phd_exp [verb] [group=choice ...] [key=value ...]`; imports the verb only after reading its name."""
 
 import os
 import re
@@ -6,14 +6,14 @@ import sys
 from importlib import import_module
 
 from phd_exp import __version__
-from phd_exp.cli.help import OF_VERB, VERBS, show
+from phd_exp.cli.help import OF_VERB, VERBS, text_of
 
 HELP = {"-h", "--help", "help"}
 COMPLETION = {"-sc", "--shell-completion"}
 TYPED = "COMP_LINE"
-"""The line so far, where a shell asks how it may continue."""
+"""The variable with the line that a shell wants completed."""
 NOBODY_READS = 128 + 13
-"""The exit status that a shell gives to a programme ended by SIGPIPE."""
+"""The exit status that a shell reports for a programme ended by SIGPIPE."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -29,7 +29,7 @@ def main(arguments: list[str] | None = None) -> int:
         if not status:
             print(f"error: standard output: {error.strerror}", file=sys.stderr)
         status = 1
-    # Python flushes once more when it ends, and would complain
+    # otherwise Python prints an error when it flushes at exit
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return status
 
@@ -38,23 +38,21 @@ def _run(words: list[str]) -> int:
     verb = _take_verb(words)
     if COMPLETION & set(words):
         verb = _take_verb_from_line()
-        if verb and not OF_VERB[verb]:  # Hydra completes, and this verb takes none of its groups
+        if verb and verb not in OF_VERB:  # Hydra completes, and this verb has no groups
             return 0
-    if HELP & set(words):
-        return show(verb)
-    if "--version" in words:
-        print(f"phd_exp {__version__}")
-        return 0
     if verb is not None and verb not in VERBS:
         print(f"error: no verb {verb!r}; expected one of {', '.join(VERBS)}, or key=value", file=sys.stderr)
         return 2
+    if HELP & set(words) or "--version" in words:
+        print(text_of(verb) if HELP & set(words) else f"phd_exp {__version__}")
+        return 0
     from phd_exp.cli.frame import run_verb
 
     return run_verb(lambda rest: import_module(f"phd_exp.cli.{verb or 'train'}").main(rest), words)
 
 
 def _take_verb(words: list[str]) -> str | None:
-    """Remove the verb from the words and return it; it comes first, or right after -m."""
+    """Remove the verb from the words and return it. It is the first word, or follows -m."""
     place = 1 if words[:1] in (["-m"], ["--multirun"]) else 0
     word = words[place] if place < len(words) else ""
     if not word or word in HELP or "=" in word or word.startswith(("-", "~", "+")):
@@ -63,7 +61,7 @@ def _take_verb(words: list[str]) -> str | None:
 
 
 def _take_verb_from_line() -> str | None:
-    """Remove the verb from the line that a shell wants completed, since Hydra knows no verbs, and return it."""
+    """Remove the verb from the line to complete, because Hydra knows no verbs, and return it."""
     line = os.environ.get(TYPED, "")
     found = re.match(rf"(\S+(?: -m| --multirun)?) ({'|'.join(VERBS)})(?= )", line)
     if found is None:

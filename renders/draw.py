@@ -12,8 +12,8 @@ import hydra
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from phd_exp.cli import conf_folder
 from phd_exp.cli.jobs import plain
-from phd_exp.cli.paths import conf_folder
 from phd_exp.records.files import write_atomic
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec

@@ -13,15 +13,14 @@ import torch
 from jaxtyping import install_import_hook
 from omegaconf import OmegaConf
 
-from phd_exp.cli.paths import conf_folder
+from phd_exp.cli import conf_folder
 from phd_exp.records.spec import DatasetSpec
 
-# before anything is imported: every annotated function of these folders checks its shapes while tests run
-HOOKED = [
-    f"phd_exp.{folder}"
-    for folder in ("geometry", "distributions", "losses", "metrics", "fusion", "models", "data", "evaluation")
-]
-install_import_hook(HOOKED, "beartype.beartype")
+# before anything is imported: every annotated function of these modules checks its shapes while tests run; numba
+# compiles the other modules of fusion
+FUSION = ("fusion.fuse", "fusion.gaussian", "fusion.pose", "fusion.problems")
+HOOKED = ("geometry", "distributions", "losses", "metrics", "models", "data", "evaluation", *FUSION)
+install_import_hook([f"phd_exp.{name}" for name in HOOKED], "beartype.beartype")
 
 
 # two test processes on two cores; more threads would only wait for each other

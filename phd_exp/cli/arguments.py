@@ -1,88 +1,101 @@
-"""The arguments of verbs that are no Hydra programmes: key=value, held against a model of what there may be."""
+"""What the verbs without Hydra share: arguments `key=value`, places to write to, the predictions of a run."""
 
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
+from phd_exp.records.detections import Detection
 from phd_exp.records.errors import ConfigError, complaint, nearest
 from phd_exp.records.files import remove_temporaries
 
+if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
+    from phd_exp.inference.answers import Sighting
+    from phd_exp.inference.predictor import Predictor
+
 Arguments_ = TypeVar("Arguments_", bound="Arguments")
-Item = TypeVar("Item")
 
 
 class Arguments(BaseModel):
-    """Arguments of a verb; a key without a default must be given."""
+    """Arguments of a verb; a key without a default is required."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 def parsed(verb: str, model: type[Arguments_], words: Sequence[str]) -> Arguments_:
-    """The arguments of `key=value` words. Raises ConfigError, in one line, for the first that is none."""
+    """The arguments of `key=value` words. Raises ConfigError, in one line, for the first that is invalid."""
+    keys = ", ".join(f"{key}=" for key in model.model_fields)
+    takes = f"{verb} takes {keys} (see `python -m phd_exp {verb} --help`)"
     values: dict[str, str] = {}
     for word in words:
-        key, equals, value = word.partition("=")
-        if not equals or not value:
-            raise ConfigError(f"{word}: expected key=value; {_takes(verb, model)}")
+        key, _, value = word.partition("=")
+        if not value:
+            raise ConfigError(f"{word}: expected key=value; {takes}")
         if key in values:
             raise ConfigError(f"{key}: given twice")
         values[key] = value
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        raise ConfigError(_complaint(verb, model, error.errors(include_url=False)[0])) from None
+        problem = error.errors(include_url=False)[0]
+        key = ".".join(map(str, problem["loc"]))
+        ours = {
+            "extra_forbidden": f"{key}: unknown key{nearest(key, model.model_fields)}; {takes}",
+            "missing": f"{key}: missing; {takes}",
+        }
+        raise ConfigError(ours.get(problem["type"]) or complaint(key, problem)) from None
 
 
-def four_numbers(text: Any, expected: str) -> tuple[float, float, float, float]:
-    """The numbers of A,B,C,D, with brackets or without. Raises ValueError, saying what was expected."""
-    numbers = str(text).strip("[]()").split(",")
-    try:
-        a, b, c, d = map(float, numbers)
-    except ValueError:
-        raise ValueError(f"expected {expected}") from None
-    return a, b, c, d
+def four_numbers(expected: str) -> BeforeValidator:
+    """Reads A,B,C,D, with or without brackets, as four numbers; the error names what was expected."""
+
+    def read(text: Any) -> tuple[float, ...]:
+        try:
+            numbers = tuple(map(float, str(text).strip("[]()").split(",")))
+        except ValueError:
+            numbers = ()
+        if len(numbers) != 4:
+            raise ValueError(f"expected {expected}")
+        return numbers
+
+    return BeforeValidator(read)
 
 
-def output_folder(out: Path) -> Path:
-    """A folder to write into, made if missing. Raises ConfigError where that cannot be."""
+def output_folder(out: Path) -> None:
+    """Make a folder to write into. Raises ConfigError if that is impossible."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        remove_temporaries(out)  # of a process that was killed
+        remove_temporaries(out)  # of a killed process
     except OSError as error:
         raise ConfigError(f"{out}: cannot be written ({error.strerror}); choose another by out=") from None
-    return out
 
 
-def say_if_unfinished(run: Path, state: str) -> None:
-    """A note on stderr where a run is used that has not ended well."""
-    if state != "finished":
-        print(f"note: {run}: the run is {state}; its last checkpoint is used", file=sys.stderr)
+def require_file(out: Path, name: str) -> None:
+    """Raise ConfigError if an output file is a folder; the message suggests `name` inside it."""
+    if out.is_dir():
+        raise ConfigError(f"out={out}: is a folder; expected a file, such as {out / name}")
 
 
-def with_progress(items: Iterable[Item], n: int, words: str) -> Iterator[Item]:
-    """The items, with a bar where stderr is a terminal and there are several."""
-    if n == 1 or not sys.stderr.isatty():
-        yield from items
-        return
+def loaded(run: Path, device: str = "auto", recalibrate: bool = False) -> "Predictor":
+    """The predictor of a run, with a note on standard error if the run is not finished."""
+    from phd_exp.inference.predictor import load
+
+    predictor = load(run, device, recalibrate)
+    if predictor.state != "finished":
+        print(f"note: {run}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
+    return predictor
+
+
+def predicted(predictor: "Predictor", detections: Sequence[Detection]) -> Iterable["Sighting"]:
+    """The predictions, with a progress bar for several detections on a terminal."""
+    from phd_exp.inference.answers import sightings
+
+    seen = sightings(predictor, detections)
+    if len(detections) == 1 or not sys.stderr.isatty():
+        return seen
     from rich.console import Console
     from rich.progress import track
 
-    yield from track(items, words, n, console=Console(stderr=True), transient=True)
-
-
-def _complaint(verb: str, model: type[Arguments], problem: ErrorDetails) -> str:
-    key = ".".join(str(part) for part in problem["loc"])
-    if problem["type"] == "extra_forbidden":
-        return f"{key}: unknown key{nearest(key, model.model_fields)}; {_takes(verb, model)}"
-    if problem["type"] == "missing":
-        return f"{key}: missing; {_takes(verb, model)}"
-    return complaint(key, problem)
-
-
-def _takes(verb: str, model: type[Arguments]) -> str:
-    keys = ", ".join(f"{key}=" for key in model.model_fields)
-    return f"{verb} takes {keys} (see `python -m phd_exp {verb} --help`)"
+    return track(seen, "predicting", len(detections), console=Console(stderr=True), transient=True)

@@ -1,14 +1,29 @@
-"""The frame around every verb and every job: whatever ends one becomes lines for the user and an exit status."""
+"""The boundary around every verb and every job: any error or signal becomes lines for the user and an exit status."""
 
+import os
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from types import FrameType
 from typing import NamedTuple
 
-from phd_exp.cli.signals import Stopped, stopping_on_signals
 from phd_exp.records.errors import UNPRINTABLE, ConfigError, UserError, one_line
 
 RESUMES = "the same command resumes"
+
+
+class Stopped(SystemExit):
+    """The process received a signal. The exit status is 128 + the signal's number, as shells expect."""
+
+    def __init__(self, signum: int) -> None:
+        super().__init__(128 + signum)
+        self.signum = signum
+
+    def __str__(self) -> str:
+        return signal.Signals(self.signum).name
 
 
 class Ending(NamedTuple):
@@ -16,8 +31,8 @@ class Ending(NamedTuple):
 
     Attributes:
         state: one or two words.
-        lines: what is wrong, one thing a line.
-        exit_status: 0 if it ended well.
+        lines: the errors, one a line.
+        exit_status: 0 for success.
         value: the number that a sweeper minimizes.
     """
 
@@ -28,14 +43,16 @@ class Ending(NamedTuple):
 
 
 def failure(error: BaseException) -> Ending:
-    """The ending by an error. A fault of the programme also prints its traceback."""
+    """The ending that an error causes. An unexpected error also prints its traceback."""
     if isinstance(error, Stopped):
-        return Ending("interrupted", (f"stopped by {error}; {RESUMES}",), int(str(error.code)))
+        return Ending("interrupted", (f"stopped by {error}; {RESUMES}",), 128 + error.signum)
     if isinstance(error, UserError):
         return Ending("failed", tuple(str(error).splitlines()), 1)
+    # torch raises a RuntimeError on a CPU, and a class of the second name on a GPU
+    no_memory = type(error).__name__ in ("MemoryError", "OutOfMemoryError")
     if isinstance(error, OSError) and error.strerror:
         line = f"{error.filename or 'output'}: {error.strerror}; mend that, and {RESUMES}"
-    elif _is_out_of_memory(error):
+    elif no_memory or "can't allocate memory" in str(error):
         line = f"memory ran out; free some, and {RESUMES}, or lower data.batch_size, which makes a new run"
     else:
         traceback.print_exception(error)
@@ -43,12 +60,13 @@ def failure(error: BaseException) -> Ending:
     return Ending("failed", (one_line(line),), 1)
 
 
-def run_verb(main: Callable[[list[str]], int], words: Sequence[str]) -> int:
+def run_verb(main: Callable[[list[str]], int], words: list[str]) -> int:
     """Run a verb with the words of its command line; returns the exit status."""
     try:
-        _require_visible(words)
+        for word in filter(UNPRINTABLE.search, words):
+            raise ConfigError(f"{one_line(word)}: holds control characters; expected printable KEY=VALUE")
         with stopping_on_signals():
-            return main(list(words))
+            return main(words)
     except BrokenPipeError:
         raise
     except (Exception, Stopped) as error:
@@ -58,18 +76,46 @@ def run_verb(main: Callable[[list[str]], int], words: Sequence[str]) -> int:
 
 
 def print_errors(lines: Iterable[str]) -> None:
-    """Print what is wrong to standard error."""
+    """Print errors to standard error."""
     for line in lines:
         print(f"error: {line}", file=sys.stderr)
 
 
-def _is_out_of_memory(error: BaseException) -> bool:
-    # torch raises a RuntimeError on a CPU, and its own class on a GPU
-    name = type(error).__name__
-    return name in ("MemoryError", "OutOfMemoryError") or "can't allocate memory" in str(error)
+@contextmanager
+def stopping_on_signals() -> Iterator[None]:
+    """Make SIGINT and SIGTERM raise Stopped in the body.
+
+    Without this, Lightning ends with status 0 after a SIGTERM, and a sweep continues with its next job.
+    """
+
+    def stop(signum: int, frame: FrameType | None) -> None:
+        raise Stopped(signum)
+
+    before = {signum: signal.signal(signum, stop) for signum in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for signum, handler in before.items():
+            signal.signal(signum, handler)
 
 
-def _require_visible(words: Sequence[str]) -> None:
-    for word in words:
-        if UNPRINTABLE.search(word):
-            raise ConfigError(f"{one_line(word)}: holds control characters; expected printable KEY=VALUE")
+@contextmanager
+def ending_with(parent: int | None) -> Iterator[None]:
+    """Send SIGTERM to this process if its parent ends during the body; None disables this.
+
+    A killed launcher cannot stop its workers: those of joblib would run all jobs that they have been given.
+    """
+    over = threading.Event()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            if over.wait(1.0):
+                return
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    if parent is not None:
+        threading.Thread(target=watch, daemon=True).start()
+    try:
+        yield
+    finally:
+        over.set()

@@ -1,16 +1,16 @@
-"""What `--help` prints: read from the files under conf/, so that it cannot fall behind them."""
+"""What `--help` prints, read from the files under conf/."""
 
 from collections.abc import Iterable
 
-from phd_exp.cli.paths import conf_folder
+from phd_exp.cli import conf_folder
 
 VERBS = {
-    "train": "render what is missing, train, measure and record a run (the default)",
-    "render": "render a data set, or what is missing of it",
+    "train": "render missing data, train, measure and record a run (the default)",
+    "render": "render a data set, or its missing samples",
     "report": "the paper's tables, the dashboard and the figures of all recorded runs",
-    "predict": "where the object in an image is and how sure a run is of it: JSON lines, and pictures with out=",
+    "predict": "the object's position in an image and its uncertainty: JSON lines, and pictures with out=",
     "fuse": "one position from the predictions of several cameras, and/or on a ground plane: a JSON line a scene",
-    "export": "write a run's network as ONNX, checked against torch; decoding it needs NumPy and SciPy alone",
+    "export": "write a run's network as ONNX, compared with torch; it needs onnxruntime and NumPy alone",
 }
 OF_VERB = {
     "train": (
@@ -18,12 +18,8 @@ OF_VERB = {
         *("backbone", "camera", "loss", "optimizer", "trainer", "logger"),
     ),
     "render": ("data", "preset"),
-    "report": (),
-    "predict": (),
-    "fuse": (),
-    "export": (),
 }
-"""The groups whose choice a verb looks at."""
+"""The configuration groups that a verb uses; the other verbs use none."""
 COMPLETION = 'eval "$(phd-exp -sc install=bash)"'
 EXAMPLES = {
     "train": [
@@ -61,66 +57,50 @@ EXAMPLES = {
 }
 
 
-def show(verb: str | None) -> int:
-    """Print the help of one verb, or of the programme; returns the exit status."""
-    if verb is not None and verb not in VERBS:
-        print(f"no verb {verb!r}; there are {', '.join(VERBS)}")
-        return 2
-    print(_verb_help(verb) if verb else _programme_help())
-    return 0
+def text_of(verb: str | None) -> str:
+    """The help of one verb, or of the programme."""
+    if verb is None:
+        return _PROGRAMME.format(
+            verbs="\n".join(f"  {name:<8} {purpose}" for name, purpose in VERBS.items()),
+            groups=_choices(OF_VERB["train"]),
+            conf=conf_folder(),
+            examples="\n".join(f"  {lines[0]}" for lines in EXAMPLES.values()),
+            completion=COMPLETION,
+        )
+    words, groups = "[key=value ...]", ""
+    if verb in OF_VERB:
+        words, groups = f"[-m] [group=choice ...] {words}", f"\n\ngroups\n{_choices(OF_VERB[verb])}"
+    examples = "".join(f"\n  {line}" for line in EXAMPLES[verb])
+    return f"usage: python -m phd_exp {verb} {words}\n\n{VERBS[verb]}{groups}\n\nexamples{examples}"
 
 
-def _programme_help() -> str:
-    verbs = [f"  {name:<8} {purpose}" for name, purpose in VERBS.items()]
-    examples = [f"  {lines[0]}" for lines in EXAMPLES.values()]
-    return "\n".join(
-        [
-            "usage: python -m phd_exp [verb] [-m] [group=choice ...] [key=value ...]",
-            "",
-            "Probabilistic 3-D position estimation from a single camera, with uncertainty you can trust.",
-            "",
-            "verbs",
-            *verbs,
-            "",
-            "groups (the first choice of a run is named in conf/config.yaml)",
-            *_groups(OF_VERB["train"]),
-            "",
-            "-m runs every combination of values given with commas, or of an experiment; the same command again",
-            "skips what is finished and goes on with the rest. Every key is explained in the files of",
-            f"{conf_folder()}; `python -m phd_exp --cfg job` prints the whole configuration.",
-            "",
-            "cost: the default preset=paper renders 11,000 images and trains ResNet-50 for 50 epochs on 8000 of",
-            "them, which takes a GPU or many hours. preset=small takes ten minutes on two cores.",
-            "A run prints what it is going to do, and the time left once its first batches are timed.",
-            "",
-            "examples",
-            *examples,
-            "",
-            "python -m phd_exp <verb> --help tells more. An installed phd-exp is the same programme; the TAB key",
-            f"completes its words after {COMPLETION}.",
-        ]
-    )
+def _choices(groups: Iterable[str]) -> str:
+    """The choices of each group, a line a group."""
+    files = {group: sorted((conf_folder() / group).glob("*.yaml")) for group in groups}
+    return "\n".join(f"  {group:<10} {', '.join(file.stem for file in files[group])}" for group in files)
 
 
-def _verb_help(verb: str) -> str:
-    groups = ["", "groups", *_groups(OF_VERB[verb])] if OF_VERB[verb] else []
-    words = "[-m] [group=choice ...] [key=value ...]" if groups else "[key=value ...]"
-    return "\n".join(
-        [
-            f"usage: python -m phd_exp {verb} {words}",
-            "",
-            VERBS[verb],
-            *groups,
-            "",
-            "examples",
-            *(f"  {line}" for line in EXAMPLES[verb]),
-        ]
-    )
+_PROGRAMME = """\
+usage: python -m phd_exp [verb] [-m] [group=choice ...] [key=value ...]
 
+Probabilistic 3-D position estimation from a single camera, with uncertainty you can trust.
 
-def _groups(names: Iterable[str]) -> list[str]:
-    return [f"  {name:<10} {', '.join(_choices(name))}" for name in names]
+verbs
+{verbs}
 
+groups (conf/config.yaml names the default of each)
+{groups}
 
-def _choices(group: str) -> list[str]:
-    return sorted(file.stem for file in (conf_folder() / group).glob("*.yaml"))
+-m runs every combination of comma-separated values, or of an experiment. The same command again skips finished
+runs and resumes the others. The files of {conf} explain every key;
+`python -m phd_exp --cfg job` prints the whole configuration.
+
+cost: the default preset=paper renders 11,000 images and trains ResNet-50 on 8,000 of them for 50 epochs, which
+takes a GPU or many hours. preset=small takes ten minutes on two cores. A run first prints its work, and the time
+left after its first batches.
+
+examples
+{examples}
+
+`python -m phd_exp <verb> --help` explains a verb. An installed `phd-exp` is the same programme; after
+{completion} the TAB key completes its words."""

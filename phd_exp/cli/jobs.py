@@ -1,41 +1,51 @@
-"""A job: the task of a verb as Hydra, its launchers and its sweepers call it."""
+"""Hydra for the verbs `train` and `render`: a job, and its launch, once or with -m as a sweep."""
 
+import os
+import re
+import sys
 import uuid
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NoReturn
 
+import hydra
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from phd_exp.cli.frame import Ending, failure, print_errors
-from phd_exp.cli.signals import Stopped, ending_with, stopping_on_signals
-from phd_exp.records.errors import ConfigError, RunError
+from phd_exp.cli import conf_folder
+from phd_exp.cli.frame import Ending, Stopped, ending_with, failure, print_errors, stopping_on_signals
+from phd_exp.records.errors import ConfigError, RunError, nearest
 from phd_exp.records.processes import usable_cores
 
+LONGEST = 400
+"""Characters of Hydra's messages that are repeated."""
+REFUSED = (HydraException, OmegaConfBaseException, ValueError, ArithmeticError, RecursionError)
+"""The errors that a bad override raises; ValueError for a group set to null."""
 HOME = uuid.uuid4().hex
-"""This process: another one that imports this module has another."""
+"""Names this process: another process that imports this module has another value."""
 
 Task = Callable[[dict[str, Any], list[str], int], float | None]
-"""Takes the resolved configuration, its overrides and the number of cores it may use; returns its score, if any."""
+"""Takes the resolved configuration, its overrides and the number of cores to use; returns the score, if any."""
 Standing = Callable[[dict[str, Any], list[str]], str | None]
-"""How the job of a configuration, given its overrides, stands on disk: "finished", "running" in some process, what
-ended it otherwise, or None if nothing is recorded.
+"""The state on disk of the job with a configuration and overrides: "finished", "running" (in any process), the error
+that ended it, or None without a record.
 """
 
 
 @dataclass(frozen=True)
 class Job:
-    """A verb as Hydra and its launchers call it; a launcher may pickle it and run it on another machine.
+    """A task that Hydra calls. A launcher may pickle it and run it on another machine.
 
     Attributes:
-        task: what a job does.
-        standing: how a job stands on disk; None if the verb records nothing.
+        task: the work of a job.
+        standing: the state of a job on disk; None if the verb records nothing.
         endings: of all jobs, in the launcher's own process.
-        n_jobs: how many jobs the sweep has.
-        cores: how many each may use; None: all that its process may use.
+        n_jobs: the number of jobs of the sweep.
+        cores: the number of cores for each; None: all that its process may use.
         parent: the process with which a job ends; None: jobs outlive the launcher.
         home: the launcher's own process.
     """
@@ -49,7 +59,7 @@ class Job:
     home: str = HOME
 
     def __call__(self, config: DictConfig) -> float | None:
-        """Run the job; a single run keeps its ending, a sweeper of others gets the score or an error."""
+        """Run the job. A single run keeps its ending; other sweepers than ours get the score or an error."""
         ending = self.end(config)
         if HydraConfig.get().mode == RunMode.RUN:
             print_errors(ending.lines)
@@ -59,17 +69,17 @@ class Job:
         return ending.value
 
     def end(self, config: DictConfig) -> Ending:
-        """Run the job and say how it ended. A stop ends everything in the launcher's own process, else this job."""
+        """Run the job; returns how it ended. In the launcher's own process, a signal stops the whole sweep."""
         at_home = self.home == HOME
         try:
-            # launchers install signal handlers of their own, or none
+            # a launcher may have changed the signal handlers
             with stopping_on_signals(), ending_with(None if at_home else self.parent):
                 return Ending("finished", value=self._run(config))
         except Stopped as stop:
             if at_home:
                 raise
             return failure(stop)
-        except OmegaConfBaseException as error:  # an interpolation that leads nowhere
+        except OmegaConfBaseException as error:  # an interpolation of an unknown key
             return refusal(ConfigError(" ".join(str(error).split())))
         except ConfigError as error:
             return refusal(error)
@@ -78,7 +88,7 @@ class Job:
 
     def _run(self, config: DictConfig) -> float | None:
         composed = HydraConfig.get()
-        # as they read once interpolations are resolved: their values are part of the run's name
+        # with interpolations resolved: the values are part of the run's name
         overrides = list(composed.overrides.task)
         if composed.mode == RunMode.MULTIRUN:
             print(f"job {composed.job.num + 1}/{self.n_jobs}: {' '.join(overrides)}", flush=True)
@@ -89,12 +99,12 @@ class Job:
 
 
 def refusal(error: ConfigError) -> Ending:
-    """The ending of what a wrong configuration keeps from running."""
+    """The ending of a job whose configuration is wrong."""
     return failure(error)._replace(exit_status=2)
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
-    """The configuration as plain containers, interpolations resolved; missing values are left out for the check."""
+    """The configuration as plain containers with interpolations resolved and without missing values."""
     values = _without_missing(OmegaConf.to_container(config, resolve=True))
     return {str(key): value for key, value in values.items()}
 
@@ -103,3 +113,71 @@ def _without_missing(node: Any) -> Any:
     if not isinstance(node, dict):
         return node
     return {key: _without_missing(value) for key, value in node.items() if value != MISSING}
+
+
+def launch(
+    task: Task, words: list[str], config_name: str = "config", standing: Standing | None = None
+) -> int:
+    """Run a task through Hydra, once or (-m) for every combination; returns the exit status.
+
+    `words` follow the verb; they change the configuration in `conf/<config_name>.yaml`. `standing` finds the state of
+    a job on disk. Raises RunError if a launcher fails.
+    """
+    # Hydra would print errors over several lines, and exit
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    job = Job(task, standing)
+    try:
+        sys.argv = [sys.argv[0], *_options_last(words)]
+        hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=config_name)(job)()
+    except (*REFUSED, ConfigError) as error:
+        refused = error if isinstance(error, ConfigError) else ConfigError(explain(error, config_name))
+        job.endings.append(refusal(refused))
+        print_errors(job.endings[-1].lines)
+    return max((ending.exit_status for ending in job.endings), default=0)
+
+
+def _options_last(words: list[str]) -> list[str]:
+    """The words with Hydra's options after the overrides; its parser wants the overrides in one piece.
+
+    Raises ConfigError instead of the parser's usage message of several lines.
+    """
+
+    def refuse(message: str) -> NoReturn:
+        raise ConfigError(f"{message}; see `python -m phd_exp --help`")
+
+    parser = get_args_parser()
+    parser.error = refuse  # type: ignore[method-assign]
+    overrides = parser.parse_intermixed_args(words).overrides
+    return [*overrides, *(word for word in words if word not in overrides)]
+
+
+def explain(error: Exception, config_name: str) -> str:
+    """An error of Hydra as one line: the override, why it is invalid, and the nearest valid one."""
+    text = " ".join(str(error).split())
+    if unknown := re.search(r"Could not override '([^']+)'", text):
+        return _unknown_key(unknown[1].lstrip("+~"), config_name)
+    pattern = r"Could not find '([^']+)/([^']+)' Available options in '[^']+': (.*?) Config search path"
+    if choice := re.search(pattern, text):
+        group, name, options = choice[1], choice[2], choice[3].split()
+        return f"{group}={name}: no such choice{nearest(name, options)}; expected one of {', '.join(options)}"
+    text = re.sub(r" Set the environment variable.*| Config search path:.*", "", text)
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+
+
+def _unknown_key(key: str, config_name: str) -> str:
+    section, _, leaf = key.rpartition(".")
+    if section:
+        group, _, rest = key.partition(".")
+        files = sorted((conf_folder() / group).glob("*.yaml"))
+        # a list of keys, since `in` a DictConfig is false for ???
+        if owners := [f"{group}={file.stem}" for file in files if rest in list(OmegaConf.load(file))]:
+            return f"{key}: not a key of this choice, but of {' or '.join(owners)}; name that choice too"
+    with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
+        config = hydra.compose(config_name)
+    node = OmegaConf.select(config, section) if section else config
+    valid = [str(name) for name in node] if isinstance(node, DictConfig) else []
+    if section:
+        return f"{key}: unknown key{nearest(leaf, valid)}; expected one of {', '.join(valid)}"
+    valid += [path.name for path in conf_folder().iterdir() if path.is_dir()]
+    verb = "" if config_name == "config" else f" {config_name}"
+    return f"{key}: unknown key{nearest(leaf, valid)}; see `python -m phd_exp{verb} --cfg job`"

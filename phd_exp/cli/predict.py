@@ -2,31 +2,23 @@
 
 import json
 import sys
-from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import field_validator, model_validator
+from pydantic import model_validator
 
-from phd_exp.cli.arguments import (
-    Arguments,
-    four_numbers,
-    output_folder,
-    parsed,
-    say_if_unfinished,
-    with_progress,
-)
+from phd_exp.cli.arguments import Arguments, four_numbers, loaded, output_folder, parsed, predicted
 from phd_exp.records.detections import Detection, detection_of, detections_in
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import read_plain, write_atomic
 from phd_exp.records.parsing import parse_json
 from phd_exp.records.runs import RunFolder
 
-if TYPE_CHECKING:  # seconds of imports, which a mistake need not wait for
+if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
     from phd_exp.inference.predictor import Predictor
-    from phd_exp.inference.sightings import Sighting
 
+BOX = four_numbers("box=LEFT,TOP,RIGHT,BOTTOM in pixels")
 OF_A_CAMERA = ("f", "fx", "fy", "cx", "cy", "box")
 LONGEST_STEM = 50
 """Characters of an image's name in the name of its picture."""
@@ -43,16 +35,15 @@ class PredictArguments(Arguments):
     fy: float | None = None
     cx: float | None = None
     cy: float | None = None
-    box: tuple[float, float, float, float] | None = None
+    box: Annotated[tuple[float, float, float, float], BOX] | None = None
     out: Path | None = None
     recalibrate: bool = False
     calibration: bool = False
 
-    @field_validator("box", mode="before")
-    @classmethod
-    def box_of_four_numbers(cls, text: Any) -> Any:
-        """A box as it is written on a command line."""
-        return four_numbers(text, "box=LEFT,TOP,RIGHT,BOTTOM in pixels")
+    @property
+    def camera(self) -> dict[str, Any]:
+        """The keys of a camera that were given."""
+        return {key: getattr(self, key) for key in OF_A_CAMERA if getattr(self, key) is not None}
 
     @model_validator(mode="after")
     def one_source(self) -> "PredictArguments":
@@ -61,72 +52,65 @@ class PredictArguments(Arguments):
             raise ValueError(
                 "predict: expected either image=FILE with f=PIXELS, or folder=DIR with a metadata.jsonl in it"
             )
-        given = [key for key in OF_A_CAMERA if getattr(self, key) is not None]
-        if self.folder is not None and given:
+        if self.folder is not None and self.camera:
             raise ValueError(
-                f"{given[0]}: belongs to image=FILE; for a folder, write it into each line of metadata.jsonl"
+                f"{next(iter(self.camera))}: belongs to image=FILE; for a folder, write it into each line of "
+                "metadata.jsonl"
             )
         if self.calibration and self.out is None:
             raise ValueError("calibration: is drawn into the pictures; expected out=DIR too")
         return self
 
-    def detections(self) -> list[Detection]:
-        """The detections to predict. Raises DatasetError if they cannot be read."""
-        if self.folder is not None:
-            return detections_in(self.folder)
-        assert self.image is not None
-        camera = {key: getattr(self, key) for key in OF_A_CAMERA}
-        return [detection_of(self.image, {key: value for key, value in camera.items() if value is not None})]
-
 
 def main(words: list[str]) -> int:
-    """Predict as the words say; returns the exit status."""
+    """Predict each detection; returns the exit status."""
     arguments = parsed("predict", PredictArguments, words)
-    detections = arguments.detections()
-    if arguments.out is not None:
-        _require_drawing()
-        _require_no_image_lost(detections, arguments.out)
-        output_folder(arguments.out)
-    _predict(arguments, detections)
+    out = arguments.out
+    if arguments.folder is not None:
+        detections = detections_in(arguments.folder)
+    else:
+        assert arguments.image is not None  # checked by `one_source`
+        detections = [detection_of(arguments.image, arguments.camera)]
+    if out is not None:
+        _require_possible(detections, out)
+        output_folder(out)
+    predictor = loaded(arguments.run, recalibrate=arguments.recalibrate)
+    curve = _depth_curve(arguments.run, predictor) if arguments.calibration else None
+    if out is not None:
+        _write(predictor, detections, out, curve)
+        return 0
+    from phd_exp.inference.answers import answer
+
+    for sighting in predicted(predictor, detections):
+        print(json.dumps(answer(sighting, predictor.temperature), allow_nan=False), flush=True)
     return 0
 
 
-def _predict(arguments: PredictArguments, detections: list[Detection]) -> None:
-    from phd_exp.inference.predictor import load
-
-    predictor = load(arguments.run, recalibrate=arguments.recalibrate)
-    say_if_unfinished(arguments.run, predictor.state)
-    curve = _depth_curve(arguments.run, predictor) if arguments.calibration else None
-    from phd_exp.inference.answers import answer
-    from phd_exp.inference.sightings import sightings
-
-    seen = with_progress(sightings(predictor, detections), len(detections), "predicting")
-    answers = ((sighting, answer(sighting, predictor.temperature)) for sighting in seen)
-    if arguments.out is not None:
-        _write(answers, len(detections), arguments.out, predictor.temperature is not None, curve)
-        return
-    for _, said in answers:
-        print(json.dumps(said, allow_nan=False), flush=True)
+def _require_possible(detections: list[Detection], out: Path) -> None:
+    if find_spec("matplotlib") is None:
+        raise ConfigError(
+            "out: pictures need `pip install 'phd_exp[report]'`; without out= there is JSON alone"
+        )
+    if out.resolve() in {detection.file.resolve().parent for detection in detections}:
+        raise ConfigError(f"out={out}: holds the images themselves; choose another folder")
 
 
 def _write(
-    answers: Iterable[tuple["Sighting", dict[str, Any]]],
-    n: int,
-    out: Path,
-    recalibrated: bool,
-    curve: dict[str, Any] | None,
+    predictor: "Predictor", detections: list[Detection], out: Path, curve: dict[str, Any] | None
 ) -> None:
-    """Write each line of `predictions.jsonl` before its picture, which is named by the number of the line."""
+    """Write each line of `predictions.jsonl` before its picture, whose name begins with the line's number."""
+    from phd_exp.inference.answers import answer
     from phd_exp.inference.pictures import picture
 
-    file = out / "predictions.jsonl"
+    file, temperature = out / "predictions.jsonl", predictor.temperature
     file.unlink(missing_ok=True)
     with open(file, "x", buffering=1) as lines:
-        for number, (sighting, said) in enumerate(answers, start=1):
+        for number, sighting in enumerate(predicted(predictor, detections), start=1):
             stem = Path(sighting.detection.line.file_name).stem[:LONGEST_STEM]
-            name = f"{number:0{len(str(n))}}-{stem}.png"
-            lines.write(json.dumps(said | {"picture": name}, allow_nan=False) + "\n")
-            write_atomic(out / name, picture(sighting, recalibrated, curve))
+            name = f"{number:0{len(str(len(detections)))}}-{stem}.png"
+            line = answer(sighting, temperature) | {"picture": name}
+            lines.write(json.dumps(line, allow_nan=False) + "\n")
+            write_atomic(out / name, picture(sighting, temperature is not None, curve))
     print(f"{file}, and a picture for each line", file=sys.stderr)
 
 
@@ -150,15 +134,3 @@ def _depth_curve(run: Path, predictor: "Predictor") -> dict[str, Any]:
     raise RunError(
         f"{file}: no calibration curve of depth; expected a finished run of a model with a density"
     )
-
-
-def _require_no_image_lost(detections: list[Detection], out: Path) -> None:
-    if out.resolve() in {detection.file.resolve().parent for detection in detections}:
-        raise ConfigError(f"out={out}: holds the images themselves; choose another folder")
-
-
-def _require_drawing() -> None:
-    if find_spec("matplotlib") is None:
-        raise ConfigError(
-            "out: pictures need `pip install 'phd_exp[report]'`; without out= there is JSON alone"
-        )

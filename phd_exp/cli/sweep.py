@@ -1,6 +1,6 @@
-"""A sweep: every combination once, finished runs skipped, each outcome named at the end.
+"""A sweep: every combination once, finished runs skipped, each outcome printed at the end.
 
-Hydra calls it through its plugin `hydra_plugins/phd_exp_sweeper.py`; `hydra/sweeper=NAME` chooses another sweeper.
+Hydra calls it through its plugin `hydra_plugins/phd_exp_sweeper.py`; `hydra/sweeper=NAME` selects another sweeper.
 """
 
 import itertools
@@ -34,61 +34,47 @@ SECONDS_BETWEEN_LOOKS = 1.0
 
 @dataclass(frozen=True)
 class Combination:
-    """One job to be: the overrides that lead to it, and the whole configuration, not checked yet."""
+    """The overrides of one job and the whole configuration, not checked yet."""
 
     overrides: list[str]
     config: dict[str, Any]
 
-
-@dataclass(frozen=True)
-class Plan:
-    """All jobs of a sweep, no two of them the same, and the configuration that its launcher takes."""
-
-    config: DictConfig
-    jobs: list[Combination]
-
-    @property
-    def launcher(self) -> dict[str, Any]:
-        """The launcher's part of the configuration, as plain containers."""
-        return plain(self.config.hydra.launcher)
+    def standing(self, job: Job) -> str | None:
+        """The state of this job on disk."""
+        return job.standing(self.config, self.overrides) if job.standing else None
 
 
 def sweep(job: Job, config: DictConfig, context: HydraContext, arguments: list[str]) -> list[float | None]:
-    """Run every combination, with the launcher that `config` names; returns the scores.
+    """Run every combination with the launcher in `config`; returns the scores.
 
-    A failing job stops no other, whatever launcher runs the jobs and wherever. `job` keeps the endings.
+    A failed job does not stop the others, with any launcher. `job.endings` receives the endings.
     """
-    planned = plan([*config.hydra.overrides.hydra, *arguments], config.hydra.job.config_name)
-    finished = [_standing(job, combination) == "finished" for combination in planned.jobs]
+    master, jobs = plan([*config.hydra.overrides.hydra, *arguments], config.hydra.job.config_name)
+    finished = [combination.standing(job) == "finished" for combination in jobs]
     tail = f", {sum(finished)} of them finished already" if job.standing else ""
-    print(f"{_counted(len(finished))}{tail}", flush=True)
+    print(f"{_counted(len(jobs))}{tail}", flush=True)
     endings = [
         ending._replace(state="finished already") if before and ending.exit_status == 0 else ending
-        for before, ending in zip(finished, _run(job, planned, context), strict=True)
+        for before, ending in zip(finished, _run(job, master, jobs, context), strict=True)
     ]
-    _print_outcome(planned.jobs, endings)
+    _print_outcome(jobs, endings)
     job.endings.extend(endings)
     return [ending.value for ending in endings]
 
 
-def _standing(job: Job, combination: Combination) -> str | None:
-    return job.standing(combination.config, combination.overrides) if job.standing else None
-
-
-def _run(job: Job, planned: Plan, context: HydraContext) -> list[Ending]:
+def _run(job: Job, master: DictConfig, jobs: list[Combination], context: HydraContext) -> list[Ending]:
     """Let the launcher run the jobs; returns their endings in the order of the jobs."""
-    n, is_joblib = len(planned.jobs), planned.launcher["_target_"].endswith(".JoblibLauncher")
-    cores, parent = cores_a_job(planned.launcher, n), os.getpid() if is_joblib else None
+    launcher = plain(master.hydra.launcher)
+    parent = os.getpid() if launcher["_target_"].endswith(".JoblibLauncher") else None
+    shared = replace(job, n_jobs=len(jobs), cores=cores_a_job(launcher, len(jobs)), parent=parent)
     try:
-        launcher = Plugins.instance().instantiate_launcher(
-            context, replace(job, n_jobs=n, cores=cores, parent=parent).end, planned.config
-        )
-        returns = launcher.launch([combination.overrides for combination in planned.jobs], initial_job_idx=0)
+        runner = Plugins.instance().instantiate_launcher(context, shared.end, master)
+        returns = runner.launch([combination.overrides for combination in jobs], initial_job_idx=0)
         return [done.return_value for done in returns]
     except (HydraException, OmegaConfBaseException, OSError):
         raise
-    except Exception as error:  # how joblib, Ray and submitit say that a job has died
-        found = [_recorded(job, combination) for combination in planned.jobs]
+    except Exception as error:  # joblib, Ray and submitit raise when a job's process dies
+        found = [_recorded(job, combination) for combination in jobs]
         if any(ending and ending.exit_status for ending in found):
             missing = Ending("not started", (f"did not start; {RESUMES}",), 1)
             return [ending or missing for ending in found]
@@ -99,22 +85,22 @@ def _run(job: Job, planned: Plan, context: HydraContext) -> list[Ending]:
 
 
 def _recorded(job: Job, combination: Combination) -> Ending | None:
-    """How a job ended according to its record; waits for one that still runs. None if there is no record."""
-    while (standing := _standing(job, combination)) == "running":
+    """The ending of a job according to its record, once it no longer runs. None without a record."""
+    while (standing := combination.standing(job)) == "running":
         time.sleep(SECONDS_BETWEEN_LOOKS)
-    if standing is None:
-        return None
-    return Ending("finished") if standing == "finished" else Ending("failed", (f"{standing}; {RESUMES}",), 1)
+    if standing in (None, "finished"):
+        return Ending("finished") if standing else None
+    return Ending("failed", (f"{standing}; {RESUMES}",), 1)
 
 
-def plan(words: list[str], config_name: str) -> Plan:
-    """The jobs that the words of a command line stand for; Hydra has to be initialised.
+def plan(words: list[str], config_name: str) -> tuple[DictConfig, list[Combination]]:
+    """The configuration of the launcher and the jobs that a command line describes. Hydra must be initialised.
 
-    The command line overrides an experiment. Combinations with the same configuration, as those that two experiments
-    have in common, are one job.
+    The command line overrides an experiment. Combinations with equal configurations, which two experiments may share,
+    are one job.
 
-    Raises HydraException or OmegaConfBaseException where any combination cannot be composed, ConfigError where there
-    is none or there are too many.
+    Raises HydraException or OmegaConfBaseException if a combination cannot be composed, ConfigError if there are no
+    combinations or too many.
     """
     loader = GlobalHydra.instance().config_loader()
     jobs: dict[str, Combination] = {}
@@ -128,11 +114,11 @@ def plan(words: list[str], config_name: str) -> Plan:
             jobs.setdefault(json.dumps(config, sort_keys=True), Combination(overrides, config))
     if not jobs:
         raise ConfigError(f"{_given(words)}: not one combination; does a glob(...) match nothing?")
-    return Plan(master, list(jobs.values()))
+    return master, list(jobs.values())
 
 
 def _one_experiment_each(words: list[str], loader: ConfigLoader) -> Iterator[list[str]]:
-    """The words once for each experiment named, since each brings combinations of its own."""
+    """The words once for each experiment, because each experiment has its own combinations."""
     overrides = OverridesParser.create(loader).parse_overrides(words)
     several = [item for item in overrides if item.key_or_group == "experiment" and item.is_sweep_override()]
     if not several:
@@ -162,48 +148,36 @@ def _given(words: list[str]) -> str:
 
 
 def _values(item: Override) -> list[str]:
-    """The values of an override as text. Raises ConfigError for a range too long to be expanded."""
+    """The values of an override as text. Raises ConfigError for a range that is too long to expand."""
     if not item.is_sweep_override():
         return [item.get_value_element_as_str()]
     value = item.value()
-    # a comparison with NaN is false
-    if isinstance(value, RangeSweep) and not _span(value) <= MOST_JOBS * abs(value.step):
-        raise ConfigError(f"{item.input_line}: more than {MOST_JOBS} jobs; expected a shorter range")
+    if isinstance(value, RangeSweep):
+        span = abs((value.stop or 0) - (value.start or 0))
+        if not span <= MOST_JOBS * abs(value.step):  # also for NaN
+            raise ConfigError(f"{item.input_line}: more than {MOST_JOBS} jobs; expected a shorter range")
     return list(item.sweep_string_iterator())
 
 
-def _span(values: RangeSweep) -> float:
-    return abs((values.stop or 0) - (values.start or 0))
-
-
 def cores_a_job(launcher: Mapping[str, Any], jobs: int) -> int | None:
-    """The share of each job where a launcher runs several at once on this machine, at least one core.
+    """The number of cores of each of `jobs` jobs, at least 1, if `launcher` runs several at once on this machine.
 
-    None where a job has all cores that its process may use: with Hydra's basic launcher, in a queue.
-
-    Args:
-        launcher: its section of the configuration.
-        jobs: how many there are to run.
+    None if a job may use all cores of its process: with Hydra's basic launcher, or in a queue.
     """
     match str(launcher["_target_"]).rpartition(".")[2]:
         case "JoblibLauncher":
             n = launcher["n_jobs"]
-            return _share(
-                min(jobs, n if n > 0 else max(1, usable_cores() + 1 + n))
-            )  # -1 stands for all cores
+            at_once = n if n > 0 else max(1, usable_cores() + 1 + n)  # -1 stands for all cores
+            return max(1, usable_cores() // min(jobs, at_once))
         case "LocalLauncher":  # submitit without a queue starts all jobs at once
-            return _share(jobs)
-        case "RayLauncher":  # starts as many jobs as their cores allow, one each by default
+            return max(1, usable_cores() // jobs)
+        case "RayLauncher":  # starts as many jobs as their cores allow, one core each by default
             return int(launcher["ray"]["remote"].get("num_cpus") or 1)
     return None
 
 
-def _share(jobs_at_once: int) -> int:
-    return max(1, usable_cores() // jobs_at_once)
-
-
 def _print_outcome(jobs: list[Combination], endings: list[Ending]) -> None:
-    """Print the outcome of each job by the overrides that set it apart, then every error by all its overrides."""
+    """Print the outcome of each job with the overrides that distinguish it, then every error with all overrides."""
     shared = set.intersection(*(set(job.overrides) for job in jobs))
     for job, ending in zip(jobs, endings, strict=True):
         own = [override for override in job.overrides if override not in shared]

@@ -1,4 +1,4 @@
-"""`python -m phd_exp [train]`: render what is missing, train, measure and record a run."""
+"""`python -m phd_exp [train]`: render missing data, train, measure and record a run."""
 
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -7,17 +7,17 @@ from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from phd_exp.cli.app import launch
-from phd_exp.cli.render import ensure_dataset
-from phd_exp.cli.several_views import Several
+from phd_exp.cli.jobs import launch
 from phd_exp.records.choices import RunName, has_influence, setting
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder
+from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.render import ensure_rendered
 from phd_exp.training.config import RenderedConfig, RunConfig, check
 
 NAMED = ("preset", "recipe", "data", "data.name", "model", "seed", "experiment")
-"""Choices that have a place of their own in a run's name, and the one that does nothing but name several runs."""
+"""Choices with a place of their own in a run's name, and `experiment`, which only names several runs."""
 SHOWN = (
     "test/projected_error_mm",
     "test/depth_error_mm",
@@ -26,37 +26,37 @@ SHOWN = (
     "test/calibration/projected_ence",
     "test/calibration/miscalibration_area",
 )
-"""What is printed at the end of a run; results.json holds more."""
+"""The numbers that are printed at the end of a run; results.json holds more."""
 SCORES = ("test/nll", "test/depth_error_mm")
-"""The number that a sweeper takes: of a baseline, which has no likelihood, the depth error."""
+"""The number that a sweeper receives: the first that the run has. A baseline has no likelihood."""
 
 
 def main(words: list[str]) -> int:
-    """Train once or for every combination; returns the exit status."""
+    """Train once, or (-m) for every combination; returns the exit status."""
     return launch(task, words, standing=standing)
 
 
 def task(config: dict[str, Any], overrides: list[str], cores: int) -> float | None:
-    """Render what is missing, train and print the numbers of one run; returns the first of SCORES that it has."""
+    """Render missing data, train one run and print its numbers; returns the first of SCORES that it has."""
     checked = check(config)
-    # seconds of imports, which a refused configuration need not wait for
+    # imports of seconds, which follow the check of the configuration
     from phd_exp.training.run import require_possible, train
 
+    data = checked.data
     folder = RunFolder(run_name(checked, overrides).folder(checked.runs))
-    several = Several.of(checked)
-    skipped = folder.is_finished()
+    several, skipped = _several_views(checked), folder.is_finished()
     if not skipped:
         require_possible(checked, folder)
-        if several:
-            several.require_possible()
+        if several is not None:
+            several[0].missing(several[1], 0, 0)  # refuses another data set before hours of training
         announce(checked, folder, overrides)
-        if isinstance(checked.data, RenderedConfig):
-            ensure_dataset(checked.data, cores)
+        if isinstance(data, RenderedConfig):
+            place = DatasetFolder(data.folder)
+            ensure_rendered(place, data.spec, data.n_training_split, data.n_test, data.workers, cores)
     results = train(checked, folder, draw=_draw(), cores=cores)
-    if several:
-        several.record(folder, cores)
-    state = "finished already" if skipped else "finished"
-    print(f"{folder.path}: {state}")
+    if several is not None and isinstance(data, RenderedConfig):
+        _record_views(folder, *several, data.workers, cores)
+    print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
     for key in filter(results.__contains__, SHOWN):
         print(f"  {key} {_number(results[key])} (untrained {_number(results.get(f'untrained/{key}'))})")
     if (folder.calibration / "final.png").exists():
@@ -65,28 +65,47 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> float | No
 
 
 def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> None:
-    """Say what the run is going to do and, where that takes long, what would not."""
+    """Print the work of the run and, if it takes many hours, a shorter alternative."""
     from phd_exp.training.network import has_gpu
 
     data, epochs = checked.data, checked.trainer.max_epochs
+    n_missing = 0
+    if isinstance(data, RenderedConfig):
+        place = DatasetFolder(data.folder)
+        n_missing = sum(map(len, place.missing(data.spec, data.n_training_split, data.n_test).values()))
+    render = f"{n_missing} images to render, then " if n_missing else ""
     network = f"{checked.backbone['_target_'].rpartition('.')[2]}{checked.backbone.get('depth', '')}"
-    device = "a GPU" if has_gpu(checked.trainer) else "the CPU"
     images = "all" if data.n_train is None else data.n_train
-    print(f"{folder.path}: {_to_render(checked)}{epochs} epochs of {network} on {images} images of", end=" ")
-    print(f"{data.image_size} px, on {device}", flush=True)
-    if checked.preset == "paper" and not has_gpu(checked.trainer):
+    gpu = has_gpu(checked.trainer)
+    print(f"{folder.path}: {render}{epochs} epochs of {network} on {images} images of", end=" ")
+    print(f"{data.image_size} px, on {'a GPU' if gpu else 'the CPU'}", flush=True)
+    if checked.preset == "paper" and not gpu:
         words = " ".join([*(word for word in overrides if not word.startswith("preset=")), "preset=small"])
         print("  the authors' protocol takes many hours without a GPU: an estimate follows the first batches")
         print(f"  in about ten minutes: python -m phd_exp {words}", flush=True)
 
 
-def _to_render(checked: RunConfig) -> str:
-    data = checked.data
-    if not isinstance(data, RenderedConfig):
-        return ""
-    missing = DatasetFolder(data.folder).missing(data.spec, data.n_training_split, data.n_test)
-    n = sum(map(len, missing.values()))
-    return f"{n} images to render, then " if n else ""
+def _several_views(checked: RunConfig) -> tuple[DatasetFolder, DatasetSpec, int] | None:
+    """The scenes with several cameras that follow the training: their folder, specification and number."""
+    asked, data = checked.evaluation.multiview, checked.data
+    if asked is None or asked.scenes == 0 or not isinstance(data, RenderedConfig):
+        return None
+    spec = asked.spec_beside(data.spec)
+    return DatasetFolder(data.root / spec.variant), spec, asked.scenes
+
+
+def _record_views(
+    run: RunFolder, scenes: DatasetFolder, spec: DatasetSpec, n: int, workers: int | None, cores: int
+) -> None:
+    """Render the missing views of `n` scenes and record the run's predictions of them, once."""
+    from phd_exp.inference.several_views import is_recorded, record_views
+
+    if is_recorded(run, spec, n):
+        return
+    ensure_rendered(scenes, spec, 0, n * spec.views, workers, cores)
+    if record_views(run, scenes, spec, n):
+        count = "1 scene" if n == 1 else f"{n} scenes"
+        print(f"{run.views}: {count} seen by {spec.views} cameras each")
 
 
 def _number(value: Any) -> str:
@@ -94,11 +113,11 @@ def _number(value: Any) -> str:
 
 
 def standing(config: dict[str, Any], overrides: list[str]) -> str | None:
-    """How the run of a configuration stands; the configuration is not checked yet, since checking imports torch."""
+    """The state of a configuration's run. The configuration is not checked, because checking it imports torch."""
     try:
         data = config["data"].get("variant") or config["data"]["name"]
         preset = setting(config["preset"], config["recipe"]["name"])
-        name = RunName(preset, data, config["model"]["name"], config["seed"], _telling(overrides))
+        name = RunName(preset, data, config["model"]["name"], config["seed"], _hashed(overrides))
         folder = RunFolder(name.folder(Path(config["runs"])))
         status = folder.status()
         if status is None:
@@ -108,25 +127,23 @@ def standing(config: dict[str, Any], overrides: list[str]) -> str | None:
         several = config["evaluation"]["multiview"]["scenes"] > 0
         is_whole = status.state == "finished" and (folder.views.exists() or not several)
         return "finished" if is_whole else status.error or "interrupted"
-    except (KeyError, TypeError, AttributeError, OSError, RunError):  # the run itself will say what is wrong
+    except (KeyError, TypeError, AttributeError, OSError, RunError):  # the run itself will report it
         return None
 
 
 def run_name(config: RunConfig, overrides: list[str]) -> RunName:
-    """The choices that name a run; every other override that can change a number goes into its hash."""
-    return RunName(config.setting, config.data.name, config.model.name, config.seed, _telling(overrides))
+    """The name of a run; all other overrides that can change a number go into its hash."""
+    return RunName(config.setting, config.data.name, config.model.name, config.seed, _hashed(overrides))
 
 
-def _telling(overrides: list[str]) -> tuple[str, ...]:
+def _hashed(overrides: list[str]) -> tuple[str, ...]:
     parsed = OverridesParser.create().parse_overrides(overrides)
-    # 1e-3 and 0.001, true and True are one value: a sweep hands on the one where the user wrote the other
-    texts = [f"{item.key_or_group}={item.get_value_element_as_str()}" for item in parsed]
-    return tuple(text for text in texts if _is_telling(text))
-
-
-def _is_telling(override: str) -> bool:
-    key = override.split("=")[0]
-    return key not in NAMED and has_influence(key)
+    # parsed values, because a sweep rewrites them: 1e-3 and 0.001, true and True are one value
+    return tuple(
+        f"{item.key_or_group}={item.get_value_element_as_str()}"
+        for item in parsed
+        if item.key_or_group not in NAMED and has_influence(item.key_or_group)
+    )
 
 
 def _draw() -> Callable[[dict[str, Any], Path], None] | None:

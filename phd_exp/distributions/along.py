@@ -1,4 +1,4 @@
-"""The law of one coordinate of the position along any direction: depth as another camera sees it, for one.
+"""The law of the position's coordinate along any direction, such as the depth for another camera.
 
 For a vector c, c . v = (c . m) z + |g| q_1 in law, with m = (mu_x, mu_y, 1) and g = A_xy^(-1) (c_x, c_y): the depth z
 and q_1, any one coordinate of q, are independent.
@@ -15,9 +15,9 @@ from phd_exp.distributions.huber import RADIAL_NORMALISER, radial_icdf
 from phd_exp.distributions.projected_huber import ProjectedHuber
 
 FURTHEST = 45.0
-"""|q_1| beyond which there is no probability left in float64."""
-_TAILS = (1e-14, 1e-9, 1e-5, 1e-3, 0.02, 0.1, 0.3)  # between such quantiles the law of depth is smooth
-_BREAKS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, FURTHEST)
+"""The |q_1| beyond which no probability is left in float64."""
+_TAILS = (1e-14, 1e-9, 1e-5, 1e-3, 0.02, 0.1, 0.3)  # the law of depth is smooth between these quantiles
+_BREAKS = np.array([-FURTHEST, -16.0, -8.0, -4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0, 8.0, 16.0, FURTHEST])
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 
 
@@ -45,52 +45,42 @@ def quantiles_along(
 ) -> Float[np.ndarray, " quantiles"]:
     """The values s with P(direction . v <= s) = p, for p in (0, 1); metres for a unit vector.
 
-    P = E[P(z <= (s - |g| q_1) / kappa)] with kappa = direction . m > 0, an integral over the law of q_1, computed in
-    float64 to about 1e-8 between the places where either law is not smooth. Along (0, 0, 1) it is `depth_icdf`.
+    P = E[P(z <= (s - |g| q_1) / kappa)] with kappa = direction . m > 0, an integral over the law of q_1, computed
+    piecewise in float64 to about 1e-8. Along (0, 0, 1) it is `depth_icdf`.
 
     Raises ValueError for a batch of distributions, or a direction in which the mode does not lie (kappa <= 0).
     Source: own derivation (q and t are independent); checked against samples in tests/distributions/test_along.py.
     """
     if distribution.batch_shape != torch.Size([]):
         raise ValueError(f"quantiles are those of one distribution, not of {tuple(distribution.batch_shape)}")
-    mu_xy, mu_z, A = (
-        tensor.detach().cpu().double() for tensor in (distribution.mu_xy, distribution.mu_z, distribution.A)
-    )
-    depth = ProjectedHuber(mu_xy, mu_z, A, distribution.a.detach().cpu().double())
+    parameters = (distribution.mu_xy, distribution.mu_z, distribution.A, distribution.a)
+    mu_xy, mu_z, A, a = (tensor.detach().cpu().double() for tensor in parameters)
+    depth = ProjectedHuber(mu_xy, mu_z, A, a)
     kappa = float(direction[:2] @ mu_xy.numpy() + direction[2])
     if not kappa > 0:
         raise ValueError("the mode lies 90 degrees or more from this direction")
     reach = float(np.linalg.norm(np.linalg.solve(A.numpy(), direction[:2]))) * float(mu_z)
     if reach == 0:
         return kappa * depth.depth_icdf(torch.as_tensor(p)).numpy()
-    law = _Sum(depth, kappa, reach)
-    return np.array([law.quantile(float(value)) for value in p])
+    return np.array([_quantile(depth, kappa, reach, float(value)) for value in p])
 
 
-class _Sum:
-    """The law of kappa z + reach q_1."""
+def _quantile(depth: ProjectedHuber, kappa: float, reach: float, p: float) -> float:
+    """The s with P(kappa z + reach q_1 <= s) = p."""
+    quantiles = torch.tensor([*_TAILS, 0.5, *(1 - tail for tail in _TAILS)], dtype=torch.float64)
+    z_breaks = np.append(depth.depth_icdf(quantiles).numpy(), float(depth.mu_z))
 
-    def __init__(self, depth: ProjectedHuber, kappa: float, reach: float) -> None:
-        self.depth = depth
-        self.kappa = kappa
-        self.reach = reach
-        p = torch.tensor([*_TAILS, 0.5, *(1 - tail for tail in _TAILS)], dtype=torch.float64)
-        self.z_breaks = np.append(depth.depth_icdf(p).numpy(), float(depth.mu_z))
-
-    def quantile(self, p: float) -> float:
-        # of each part at half the risk: together they enclose the sum
-        far = torch.tensor([p / 2, 1 - (1 - p) / 2], dtype=torch.float64)
-        low, high = (self.kappa * self.depth.depth_icdf(far)).tolist()
-        below, above = (self.reach * radial_icdf(torch.maximum(far, 1 - far))).tolist()
-        root: float = optimize.brentq(lambda s: self.cdf(s) - p, low - below, high + above, rtol=1e-10)
-        return root
-
-    def cdf(self, s: float) -> float:
-        breaks = np.array([*_BREAKS, *(-value for value in _BREAKS)])
-        of_depth = np.clip((s - self.kappa * self.z_breaks) / self.reach, -FURTHEST, FURTHEST)
-        edges = np.unique(np.concatenate([breaks, of_depth]))
+    def cdf(s: float) -> float:
+        of_depth = np.clip((s - kappa * z_breaks) / reach, -FURTHEST, FURTHEST)
+        edges = np.unique(np.concatenate([_BREAKS, of_depth]))
         half = np.diff(edges)[:, None] / 2
         q = (edges[:-1, None] + half * (_NODES + 1)).ravel()
         weight = (half * _WEIGHTS).ravel() * whitened_marginal(np.abs(q))
-        z = torch.from_numpy((s - self.reach * q) / self.kappa)
-        return float(weight @ self.depth.depth_cdf(z).numpy())
+        return float(weight @ depth.depth_cdf(torch.from_numpy((s - reach * q) / kappa)).numpy())
+
+    # the quantiles of each part at half the probability enclose that of the sum
+    far = torch.tensor([p / 2, 1 - (1 - p) / 2], dtype=torch.float64)
+    low, high = (kappa * depth.depth_icdf(far)).tolist()
+    below, above = (reach * radial_icdf(torch.maximum(far, 1 - far))).tolist()
+    root: float = optimize.brentq(lambda s: cdf(s) - p, low - below, high + above, rtol=1e-10)
+    return root

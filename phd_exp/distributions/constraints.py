@@ -1,7 +1,7 @@
 """The paper's seven constraints on a predicted density, each as a measurement on a family of densities.
 
-A family turns inputs and a camera into densities. The inputs are the raw numbers of a head, or the images of a whole
-network. Each measurement returns by how much the worst case violates the constraint, and whether that counts.
+A family maps inputs and a camera to densities. The inputs are the raw numbers of a head, or the images of a whole
+network. Each measurement returns the largest violation, and whether it counts as one.
 tests/distributions/test_constraint_table.py compares the findings with theory.
 
 Source: paper, section "Desired constraints for estimated distribution".
@@ -9,6 +9,7 @@ Source: paper, section "Desired constraints for estimated distribution".
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -20,15 +21,15 @@ from phd_exp.distributions.projected_huber import ProjectedHuber
 from phd_exp.geometry import Camera, Cartesian, Chart, DepthScale, LogDepth, Projected
 
 F_RANGE, Z_RANGE, S = (1200.0, 2000.0), (3.0, 5.0), 224.0
+MIDDLE_F = (F_RANGE[0] * F_RANGE[1]) ** 0.5
 DEPTH = DepthScale.from_ranges(F_RANGE, Z_RANGE)
 SCALE = 0.1
-"""Of the baselines' residuals, in units of their charts."""
-_PAIRS = 20_000
+"""Scale of the baselines' residuals, in units of their charts."""
 
 
 @dataclass(frozen=True)
 class Decomposed:
-    """The density p(x/z, y/z) p(z)/z^2 of an independent ray and depth, each with the law that it has in `law`.
+    """The density p(x/z, y/z) p(z)/z^2 of an independent ray and depth, each distributed as in `law`.
 
     The paper's Proposition 1: no density that decomposes in this way satisfies all seven constraints.
     """
@@ -43,26 +44,40 @@ class Decomposed:
         return self.law.log_prob(xyz) + change + 2 * ratio.log()
 
     def rsample(self, shape: tuple[int, ...], generator: torch.Generator) -> Float[Tensor, "*shape 3"]:
-        """Exact samples: the offset from the centre is that of the law, times z/mu_z."""
+        """Exact samples: those of `law`, with the offset from the centre multiplied by z/mu_z."""
         xy, z = self.law.rsample(shape, generator).split((2, 1), dim=-1)
         centre = z * self.law.mu_xy
         return torch.cat([centre + (xy - centre) * z / self.law.mu_z[..., None], z], dim=-1)
 
 
-Density = ProjectedHuber | PointDensity | Decomposed
+@runtime_checkable
+class Density(Protocol):
+    """A density over positions (metres) with samples: `ProjectedHuber`, `PointDensity` or `Decomposed`."""
+
+    def log_prob(self, xyz: Tensor, /) -> Tensor:
+        """Log density of positions, nats per cubic metre."""
+        ...
+
+    def rsample(self, shape: tuple[int, ...], generator: torch.Generator, /) -> Tensor:
+        """Exact samples."""
+        ...
 
 
 @dataclass(frozen=True)
 class Family:
-    """The densities of a model: `predict` returns those of inputs and a camera, `inputs` returns inputs to try."""
+    """The densities of a model: `predict` maps inputs and a camera to densities, `inputs` returns inputs to try."""
 
     predict: Callable[[Tensor, Camera], Density]
     inputs: Callable[[int, torch.Generator], Tensor]
 
+    def members(self, n: int, generator: torch.Generator) -> Density:
+        """The densities of n inputs, for a camera in the middle of the data set's range of f."""
+        return self.predict(self.inputs(n, generator), _camera(n))
+
 
 @dataclass(frozen=True)
 class Finding:
-    """Whether a constraint holds, and the number that says so."""
+    """Whether a constraint holds, and the measured number."""
 
     holds: bool
     measured: float
@@ -71,12 +86,12 @@ class Finding:
 def families() -> dict[str, Family]:
     """The heads: the probabilistic one, a decomposed one, and the four baselines with constant scale in their charts.
 
-    A head does not contain the network in front of it. With camera=shown that network depends on f, so that the whole
-    model breaks constraint 2 though its head satisfies it: measure the whole model.
+    A head does not contain the network. With camera=shown the network depends on f, so that the whole model violates
+    constraint 2 although its head satisfies it; measure the whole model.
     """
 
     def constant(camera: Camera) -> Camera:
-        return Camera(torch.full_like(camera.f, _middle_f()), camera.S)
+        return Camera(torch.full_like(camera.f, MIDDLE_F), camera.S)
 
     return {
         "probabilistic": Family(_projected_huber, _seven_numbers),
@@ -93,7 +108,7 @@ def _projected_huber(raw: Tensor, camera: Camera) -> ProjectedHuber:
 
 
 def _seven_numbers(n: int, generator: torch.Generator) -> Tensor:
-    """B over four decades, nu_p inside the image, a over four decades, nu_z within the range of depths or so."""
+    """B over four decades, nu_p inside the image, a over four decades, nu_z about the range of depths."""
     uniform = torch.rand(n, 7, generator=generator, dtype=torch.float64)
     b, a = 10 ** (5 * uniform[:, 2] - 2), 10 ** (4 * uniform[:, 5] - 1)
     nu_p = b[:, None] * (2 * uniform[:, :2] - 1)
@@ -103,47 +118,39 @@ def _seven_numbers(n: int, generator: torch.Generator) -> Tensor:
 
 
 def _baseline(chart: Chart, used: Callable[[Camera], Camera] = lambda camera: camera) -> Family:
-    def predict(raw: Tensor, camera: Camera) -> PointDensity:
-        return PointDensity(PointEstimate(raw, chart, used(camera)), SCALE)
-
-    def inputs(n: int, generator: torch.Generator) -> Tensor:
-        camera = _camera(_middle_f(), n)
-        return chart.coordinates(_in_view(n, camera, generator), camera)
-
-    return Family(predict, inputs)
+    return Family(
+        lambda raw, camera: PointDensity(PointEstimate(raw, chart, used(camera)), SCALE),
+        lambda n, generator: chart.coordinates(_in_view(n, generator), _camera(n)),
+    )
 
 
-def _middle_f() -> float:
-    return (F_RANGE[0] * F_RANGE[1]) ** 0.5
-
-
-def _camera(f: float, n: int) -> Camera:
+def _camera(n: int, f: float = MIDDLE_F) -> Camera:
     return Camera(torch.full((n,), f, dtype=torch.float64), S)
 
 
-def _in_view(n: int, camera: Camera, generator: torch.Generator) -> Float[Tensor, "n 3"]:
-    """Positions all over the field of view, at depths of the data set."""
+def _in_view(n: int, generator: torch.Generator) -> Float[Tensor, "n 3"]:
+    """Positions throughout the field of view of a camera with the middle f, at depths of the data set."""
     u, v, z = torch.rand(3, n, generator=generator, dtype=torch.float64)
-    return camera.unproject(S * torch.stack([u, v], dim=-1), Z_RANGE[0] + (Z_RANGE[1] - Z_RANGE[0]) * z)
+    depth = Z_RANGE[0] + (Z_RANGE[1] - Z_RANGE[0]) * z
+    return _camera(n).unproject(S * torch.stack([u, v], dim=-1), depth)
 
 
 def variances_are_free(family: Family, generator: torch.Generator) -> Finding:
-    """1: any depth variance goes with any projected covariance.
+    """1: any depth variance is possible with any projected covariance.
 
     Measured: the factor by which the nearest of 2000 members misses spreads (between the quartiles) of 1 %, 10 % and
-    100 % in depth with 0.001, 0.01 and 0.1 in x/z; free means below 1.5, a step of the search.
+    100 % in depth with 0.001, 0.01 and 0.1 in x/z. Below 1.5, the resolution of the search, the constraint holds.
     """
-    n = 2000
-    density = family.predict(family.inputs(n, generator), _camera(_middle_f(), n))
-    samples = density.rsample((100,), generator)
-    z, ray = samples[..., 2], samples[..., 0] / samples[..., 2]
+    samples = family.members(2000, generator).rsample((100,), generator)
+    z = samples[..., 2]
     # by the quartiles: x/z has no variance where a density has mass on both sides of z = 0
-    spreads = [_interquartile(z) / z.median(0).values.abs(), _interquartile(ray)]
-    worst = 0.0
-    for depth in (0.01, 0.1, 1.0):
-        for projected in (0.001, 0.01, 0.1):
-            miss = torch.maximum((spreads[0] / depth).log().abs(), (spreads[1] / projected).log().abs())
-            worst = max(worst, float(miss.min().exp()))
+    relative, projected = _interquartile(z) / z.median(0).values.abs(), _interquartile(samples[..., 0] / z)
+    misses = [
+        torch.maximum((relative / depth).log().abs(), (projected / ray).log().abs()).min().exp()
+        for depth in (0.01, 0.1, 1.0)
+        for ray in (0.001, 0.01, 0.1)
+    ]
+    worst = float(torch.stack(misses).max())
     return Finding(worst < 1.5, worst)
 
 
@@ -159,23 +166,20 @@ def focal_length_enters_through_the_ray_and_z_over_f(family: Family, generator: 
     """
     n, chart = 500, Projected(DEPTH)
     inputs = family.inputs(n, generator)
-    middle = _camera(_middle_f(), n)
-    coordinates = chart.coordinates(_in_view(n, middle, generator), middle)
+    coordinates = chart.coordinates(_in_view(n, generator), _camera(n))
     values = []
     for f in F_RANGE:
-        camera = _camera(f, n)
+        camera = _camera(n, f)
         xyz = chart.position(coordinates, camera)
         values.append(family.predict(inputs, camera).log_prob(xyz) - chart.log_abs_det_jacobian(xyz, camera))
-    worst = _largest((values[0] - values[1]).abs() / values[0].abs().clamp_min(1))
+    change = (values[0] - values[1]).abs() / values[0].abs().clamp_min(1)
+    worst = float(change.nan_to_num(nan=torch.inf).max())
     return Finding(worst < 1e-6, worst)
 
 
 def nothing_is_behind(family: Family, generator: torch.Generator) -> Finding:
     """3: p = 0 for z < 0. Measured: the largest density behind the camera over that at the same place in front."""
-    n = 500
-    camera = _camera(_middle_f(), n)
-    raw, xyz = family.inputs(n, generator), _in_view(n, camera, generator)
-    density = family.predict(raw, camera)
+    density, xyz = family.members(500, generator), _in_view(500, generator)
     behind = density.log_prob(xyz * torch.tensor([1.0, 1.0, -1.0], dtype=xyz.dtype))
     worst = float((behind - density.log_prob(xyz)).exp().max())
     return Finding(worst == 0, worst)
@@ -183,22 +187,19 @@ def nothing_is_behind(family: Family, generator: torch.Generator) -> Finding:
 
 def everything_in_view_is_possible(family: Family, generator: torch.Generator) -> Finding:
     """4: p > 0 in the field of view. Measured: the share of its positions where -log p is infinite."""
-    n = 5000
-    camera = _camera(_middle_f(), n)
-    value = family.predict(family.inputs(n, generator), camera).log_prob(_in_view(n, camera, generator))
+    value = family.members(5000, generator).log_prob(_in_view(5000, generator))
     share = float((~value.isfinite()).double().mean())
     return Finding(share == 0, share)
 
 
 def minus_log_is_convex(family: Family, generator: torch.Generator) -> Finding:
     """5: -log p is convex in v. Measured: the largest excess over a chord between positions in view, nats."""
-    camera = _camera(_middle_f(), _PAIRS)
-    density = family.predict(family.inputs(_PAIRS, generator), camera)
-    one, other = _in_view(_PAIRS, camera, generator), _in_view(_PAIRS, camera, generator)
-    share = torch.rand(_PAIRS, 1, generator=generator, dtype=torch.float64)
+    n = 20_000
+    density = family.members(n, generator)
+    one, other = _in_view(n, generator), _in_view(n, generator)
+    share = torch.rand(n, 1, generator=generator, dtype=torch.float64)
     ends = density.log_prob(one), density.log_prob(other)
-    chord = torch.lerp(*ends, share.squeeze(-1))
-    excess = chord - density.log_prob(torch.lerp(one, other, share))
+    excess = torch.lerp(*ends, share.squeeze(-1)) - density.log_prob(torch.lerp(one, other, share))
     rounding = 1e-9 * torch.maximum(ends[0].abs(), ends[1].abs()).clamp_min(1)
     return Finding(bool((excess <= rounding).all()), float(excess.max().clamp_min(0)))
 
@@ -206,22 +207,14 @@ def minus_log_is_convex(family: Family, generator: torch.Generator) -> Finding:
 def it_vanishes_far_away_and_at_the_camera(family: Family, generator: torch.Generator) -> Finding:
     """6: p -> 0 at infinity and as z -> 0.
 
-    Measured: the least fall of log p, nats, on the last factor of 1000 of three ways from positions in view: along
-    the ray to 10^9 times as far, along it to the camera (10^(-12)), and straight to the plane z = 0.
+    Measured: the least fall of log p, nats, on the last factor of 1000 of three paths from positions in view: along
+    the ray to 10^9 times the distance, along it to the camera (10^(-12)), and straight to the plane z = 0.
     """
-    n = 500
-    camera = _camera(_middle_f(), n)
-    density = family.predict(family.inputs(n, generator), camera)
-    xyz = _in_view(n, camera, generator)
-    falls = []
-    for near, far in (
-        ((1e6, 1e6, 1e6), (1e9, 1e9, 1e9)),
-        ((1e-9, 1e-9, 1e-9), (1e-12, 1e-12, 1e-12)),
-        ((1.0, 1.0, 1e-9), (1.0, 1.0, 1e-12)),
-    ):
-        places = [xyz * torch.tensor(factors, dtype=xyz.dtype) for factors in (near, far)]
-        falls.append(density.log_prob(places[0]) - density.log_prob(places[1]))
-    least = float(torch.stack(falls).min())
+    density, xyz = family.members(500, generator), _in_view(500, generator)
+    before = torch.tensor([[1e6, 1e6, 1e6], [1e-9, 1e-9, 1e-9], [1.0, 1.0, 1e-9]], dtype=xyz.dtype)
+    last = torch.tensor([[1e9, 1e9, 1e9], [1e-12, 1e-12, 1e-12], [1.0, 1.0, 1e-12]], dtype=xyz.dtype)
+    near, far = (density.log_prob(xyz * factors[:, None]) for factors in (before, last))
+    least = float((near - far).min())
     return Finding(least > 1, least)
 
 
@@ -230,10 +223,8 @@ def it_is_continuous(family: Family, generator: torch.Generator) -> Finding:
 
     Measured: the largest jump of log p, nats, found by halving segments in view towards their largest change.
     """
-    n = 2000
-    camera = _camera(_middle_f(), n)
-    density = family.predict(family.inputs(n, generator), camera)
-    one, other = _in_view(n, camera, generator), _in_view(n, camera, generator)
+    density = family.members(2000, generator)
+    one, other = _in_view(2000, generator), _in_view(2000, generator)
     for _ in range(60):
         middle = (one + other) / 2
         values = [density.log_prob(place) for place in (one, middle, other)]
@@ -241,10 +232,6 @@ def it_is_continuous(family: Family, generator: torch.Generator) -> Finding:
         one, other = torch.where(first, one, middle), torch.where(first, middle, other)
     jump = (density.log_prob(one) - density.log_prob(other)).abs()
     return Finding(bool((jump < 1e-6).all()), float(jump.max()))
-
-
-def _largest(values: Tensor) -> float:
-    return float(values.nan_to_num(nan=torch.inf).max())
 
 
 CONSTRAINTS: dict[str, Callable[[Family, torch.Generator], Finding]] = {

@@ -1,18 +1,28 @@
 """The depth law of t = z / mu_z, with density exp(-a max(t, 1/t)) / N(a), as functions of log t and log a.
 
-Logarithms keep every quantity finite where a or t would underflow. Two facts carry the file. The excess energy
+Logarithms keep every quantity finite where a or t underflows. All formulas follow from two facts. The excess energy
 w = a (max(t, 1/t) - 1) has the density e^(-w) / (1 + g(a)) on the side t > 1, and (1 + w/a)^(-2) times that on the
 side t < 1. The moments are those of `tail_moment`, J_k(a) = int_0^inf s^k e^(-s) (1 + s/a)^(-k-2) ds.
+
+The continuous ranked probability score is int (F(u) - 1[u >= t])^2 du = E|T - t| - E|T - T'|/2. Both terms have
+closed forms in the exponential integrals. In units of 1/a, the width of the law, nothing cancels where a is large and
+nothing underflows where a is small.
 """
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from phd_exp.distributions.special import log_scaled_normaliser, scaled_expint, signed_log1p, tail_moment
+from phd_exp.distributions.special import (
+    log_scaled_normaliser,
+    scaled_expint,
+    signed_log1p,
+    tail_moment,
+    weighted_integral,
+)
 
 LARGEST_ENERGY = 700.0
-"""An excess energy beyond which e^(-w) is nothing beside 1, in any precision."""
+"""The excess energy above which 1 + e^(-w) rounds to 1 in any precision."""
 _NEWTON_STEPS = 6  # to rounding from any a and p; test_icdf_inverts_cdf covers both tails
 
 
@@ -37,7 +47,7 @@ def depth_cdf(log_t: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]) 
     P(z/mu_z <= t) = t^2 g(a/t) e^(-w) / (1 + g(a)) for t <= 1 and 1 - e^(-w) / (1 + g(a)) beyond, with the excess
     energy w of t.
 
-    Source: own derivation (the normaliser's integral with another border); checked in
+    Source: own derivation (the normaliser's integral with another limit); checked in
     tests/distributions/test_depth.py.
     """
     near = log_t <= 0
@@ -117,3 +127,56 @@ def depth_mean_energy(log_a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]
     """
     a = log_a.exp()
     return 2 * (1 + a) * scaled_expint(3, a) / (1 + tail_moment(0, a))
+
+
+def crps_beyond_distance(
+    log_t: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]
+) -> Float[Tensor, "*#batch"]:
+    """a (CRPS(t) - |t - 1|): the score minus the distance from the mode, in units of 1/a.
+
+    a (E|T - t| - |t - 1|) is (2 e^(-w) - 1 + J_1) / (1 + g) beyond the mode and
+    (1 - J_1 + 2 e^(-w) t^4 J_1(a + w)) / (1 + g) before it; a E|T - T'|/2 is `half_mean_difference`.
+
+    Source: own derivation (partial moments of the excess energy); checked against quadrature and samples in
+    tests/distributions/test_crps.py.
+    """
+    a = log_a.exp()
+    w = depth_energy(log_t, log_a).clamp_max(LARGEST_ENERGY)  # no mass lies beyond
+    j_0, j_1 = tail_moment(0, a), tail_moment(1, a)
+    decay = torch.exp(-w)
+    near = torch.exp(4 * log_t.clamp_max(0)) * tail_moment(1, a + w)
+    twice_beyond = torch.where(log_t > 0, 2 * decay - 1 + j_1, 1 - j_1 + 2 * decay * near)
+    return twice_beyond / (1 + j_0) - half_mean_difference(log_a)
+
+
+def half_mean_difference(log_a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """a E|T - T'|/2 = a int F (1 - F) dt = (1/2 + g + (1 + g) J_1 - Q) / (1 + g)^2 for independent depths T and T'.
+
+    Q(a) = int_0^inf e^(-2w) (1 + w/a)^(-6) g(a + w)^2 dw = a^3 e^(2a) int_1^inf v^(-4) E_2(a v)^2 dv.
+
+    Source: own derivation; checked against quadrature in tests/distributions/test_crps.py.
+    """
+    a = log_a.exp()
+    j_0, j_1 = tail_moment(0, a), tail_moment(1, a)
+    small = a <= 1
+    below, above = a.masked_fill(~small, 1), a.masked_fill(small, 1)
+    Q = torch.where(small, _squared_tail_by_parts(below), _squared_tail_by_rule(above))
+    return (0.5 + j_0 + (1 + j_0) * j_1 - Q) / (1 + j_0).square()
+
+
+def _squared_tail_by_rule(a: Tensor) -> Tensor:
+    """Q(a) for a >= 1, with s = 2 w by the Gauss rule for the weight e^(-s)."""
+    return weighted_integral(lambda s: (a / (a + s / 2)) ** 6 * tail_moment(0, a + s / 2) ** 2, a) / 2
+
+
+def _squared_tail_by_parts(a: Tensor) -> Tensor:
+    """Q(a) for a <= 1, by parts from (E_2)' = -E_1 and (E_1)' = -e^(-x)/x; all integrals are from 1 to infinity.
+
+    V = int v^(-2) e^(-a v) E_1 dv = e^(-a) E_1 - a E_1^2/2 - E_2(2a),  U = int v^(-2) E_1^2 dv = E_1^2 - 2 V,
+    R = int v^(-3) E_2 E_1 dv = (E_2 E_1 - a U - E_3(2a) + a V)/2,      Q = a^3 e^(2a) (E_2^2 - 2 a R)/3.
+    """
+    e_1, e_2 = scaled_expint(1, a), scaled_expint(2, a)  # each with its factor e^a, products with e^(2a)
+    V = e_1 - a * e_1.square() / 2 - scaled_expint(2, 2 * a)
+    U = e_1.square() - 2 * V
+    R = (e_2 * e_1 - a * U - scaled_expint(3, 2 * a) + a * V) / 2
+    return a**3 * (e_2.square() - 2 * a * R) / 3

@@ -26,18 +26,9 @@ def huber_energy(q: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
     """
     squared = q.square().sum(dim=-1)
     outer = squared > 1
-    # the root is taken of 1 where it is not wanted: its gradient at q = 0 would be 0/0
+    # the inner branch takes the root of 1, because its gradient at q = 0 is 0/0
     r = squared.masked_fill(~outer, 1).sqrt()
     return torch.where(outer, r - 0.5, squared / 2)
-
-
-def energy_survival(y: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """P(h(|q|) > y) for y >= 0: (e^(-1/2) + e^(-y))/Z up to y = 1/2, and (y + 3/2) e^(-y)/Z beyond.
-
-    Source: own derivation from the radial law; checked in tests/distributions/test_huber.py.
-    """
-    inner = math.exp(-0.5) + torch.exp(-y)
-    return torch.where(y <= 0.5, inner, (y + 1.5) * torch.exp(-y)) / RADIAL_NORMALISER
 
 
 def radial_cdf(r: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:

@@ -14,8 +14,9 @@ def credible_level(energy: Float[Tensor, "*#batch"], a: Float[Tensor, "*#batch"]
     """P(h(|q|) + a (max(t, 1/t) - 1) <= W) for an energy W >= 0 above the mode's, in [0, 1].
 
     The excess depth energy w has the density e^(-w) (1 + (1 + w/a)^(-2)) / (1 + g(a)), one term for each side of the
-    mode, and G(y) = P(h(|q|) > y) is elementary (`energy_survival`). Hence 1 - level = P(w > W) +
-    int_0^W e^(-w) (1 + (1 + w/a)^(-2)) G(W - w) dw / (1 + g(a)), which has a closed form: G changes its own at w = X.
+    mode. With Z = 1 + e^(-1/2), G(y) = P(h(|q|) > y) is (e^(-1/2) + e^(-y))/Z up to y = 1/2 and (y + 3/2) e^(-y)/Z
+    beyond. Hence 1 - level = P(w > W) + int_0^W e^(-w) (1 + (1 + w/a)^(-2)) G(W - w) dw / (1 + g(a)), which has a
+    closed form on each side of w = X, where G changes.
 
     Source: own derivation; checked against quadrature in tests/distributions/test_level.py.
     """

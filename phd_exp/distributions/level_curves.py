@@ -21,30 +21,29 @@ Points = Float[np.ndarray, "_ 2"]
 
 LEVELS = (0.5, 0.9, 0.99)
 _POINTS = 73  # of a curve, and of half an outline
-_STRATA = 500  # equally probable values that stand for a one-dimensional law
+_STRATA = 500  # equally probable values of t that represent its law
 
 
 @dataclass(frozen=True)
 class LevelCurves:
-    """Closed curves of one distribution, one for each level.
-
-    Attributes:
-        levels: the probability inside each curve.
-        projected: (x, y)/z along each curve, without unit.
-        birds_eye: (x, z) along each curve, metres.
-        mode: position of highest density, metres.
-    """
+    """Closed curves of one distribution: (x, y)/z and (x, z) (metres) along each, for the probability inside it."""
 
     levels: tuple[float, ...]
     projected: tuple[Points, ...]
     birds_eye: tuple[Points, ...]
     mode: Float[np.ndarray, " 3"]
+    """Position of highest density, metres."""
 
 
 def level_curves(distribution: ProjectedHuber, levels: tuple[float, ...] = LEVELS) -> LevelCurves:
     """The curves of a distribution with an empty batch shape, computed in float64.
 
     Raises ValueError for a batch of distributions, or a level outside (0, 1).
+
+    Example:
+        >>> p = ProjectedHuber(torch.zeros(2), torch.tensor(4.0), 100 * torch.eye(2), torch.tensor(20.0))
+        >>> [curve.shape for curve in level_curves(p, (0.5, 0.9)).projected]
+        [(73, 2), (73, 2)]
     """
     if distribution.batch_shape != torch.Size([]):
         raise ValueError(
@@ -52,7 +51,8 @@ def level_curves(distribution: ProjectedHuber, levels: tuple[float, ...] = LEVEL
         )
     if not all(0 < level < 1 for level in levels):
         raise ValueError(f"levels lie between 0 and 1, exclusive; these are {levels}")
-    t = _depth_strata(distribution)
+    middles = (torch.arange(_STRATA, dtype=torch.float64) + 0.5) / _STRATA  # of equally probable strata
+    t = _float64(distribution.depth_icdf(middles) / distribution.mu_z)
     return LevelCurves(
         levels=levels,
         projected=tuple(_ellipse(distribution, _radius(t, level)) for level in levels),
@@ -70,12 +70,6 @@ def _float64(values: torch.Tensor) -> np.ndarray:
     return values.detach().cpu().double().numpy()
 
 
-def _depth_strata(distribution: ProjectedHuber) -> Float[np.ndarray, " strata"]:
-    """Equally probable values of t = z / mu_z, the middles of strata."""
-    middles = (torch.arange(_STRATA, dtype=torch.float64) + 0.5) / _STRATA
-    return _float64(distribution.depth_icdf(middles) / distribution.mu_z)
-
-
 def _radius(t: Float[np.ndarray, " strata"], level: float) -> float:
     """The rho with P(|A (u - mu_xy)| <= rho) = level for u = (x, y)/z, where A (u - mu_xy) = q/t.
 
@@ -85,7 +79,7 @@ def _radius(t: Float[np.ndarray, " strata"], level: float) -> float:
     def excess(log_rho: float) -> float:
         return float(radial_cdf(torch.from_numpy(np.exp(log_rho) * t)).mean()) - level
 
-    # |q| lies in [1e-6, 60] at any level that is asked for
+    # |q| lies in [1e-6, 60] at any reasonable level
     return float(np.exp(optimize.brentq(excess, np.log(1e-6 / t.max()), np.log(60 / t.min()), xtol=1e-10)))
 
 
@@ -108,16 +102,12 @@ def _marginal() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _excess(distribution: ProjectedHuber, t: np.ndarray, level: float) -> float:
     """The c with P(a (max(t, 1/t) - 1) + e(q_1) <= c) = level."""
     _, energy, cumulative = _marginal()
-    of_depth = _depth_energy(distribution, t)
+    of_depth = float(distribution.a) * (np.maximum(t, 1 / t) - 1)
 
     def surplus(c: float) -> float:
         return float(np.interp(c - of_depth, energy, cumulative, left=0).mean()) - level
 
     return float(optimize.brentq(surplus, 0, of_depth.max() + energy[-1], xtol=1e-10))
-
-
-def _depth_energy(distribution: ProjectedHuber, t: np.ndarray) -> np.ndarray:
-    return float(distribution.a) * (np.maximum(t, 1 / t) - 1)
 
 
 def _outline(distribution: ProjectedHuber, excess: float) -> Points:
@@ -129,14 +119,15 @@ def _outline(distribution: ProjectedHuber, excess: float) -> Points:
     Source: own derivation; the law of (x, z) is constant along the curve, checked by quadrature.
     """
     s, energy, _ = _marginal()
-    furthest = 1 + excess / float(distribution.a)
+    a, mu_z = float(distribution.a), float(distribution.mu_z)
+    furthest = 1 + excess / a
     bend = np.linspace(0, np.pi / 2, (_POINTS + 1) // 2)
     above = 1 + (furthest - 1) * np.sin(bend)  # dense where the curve closes
     t = np.concatenate([1 / above[:0:-1], above])
-    half_width = np.interp(np.clip(excess - _depth_energy(distribution, t), 0, None), energy, s)
-    z = float(distribution.mu_z) * t
-    reach = float(distribution.mu_z) * np.linalg.norm(np.linalg.inv(_float64(distribution.A))[0])
+    of_depth = a * (np.maximum(t, 1 / t) - 1)
+    half_width = mu_z * np.linalg.norm(np.linalg.inv(_float64(distribution.A))[0])
+    half_width = half_width * np.interp(np.clip(excess - of_depth, 0, None), energy, s)
+    z = mu_z * t
     middle = z * float(distribution.mu_xy[0])
-    right = np.stack([middle + reach * half_width, z], axis=-1)
-    left = np.stack([middle - reach * half_width, z], axis=-1)
+    right, left = (np.stack([x, z], axis=-1) for x in (middle + half_width, middle - half_width))
     return np.concatenate([right, left[::-1], right[:1]])

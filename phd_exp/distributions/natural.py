@@ -1,15 +1,16 @@
-"""The parameters of the Projected Huber distribution in the form in which its density needs them, and the maps to it.
+"""The parameters of the Projected Huber distribution as its density uses them, the maps to them, and their checks.
 
-Products and logarithms are kept in place of mu_xy, mu_z, A and a, because these overflow or underflow for raw numbers
-of a network that are merely large; and no matrix is inverted and multiplied back on the way to the density.
+Products and logarithms replace mu_xy, mu_z, A and a, which overflow or underflow for large raw numbers of a network.
+The density needs no inverse of a matrix.
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.distributions.constraints import Constraint
 
 from phd_exp.distributions import spd
 from phd_exp.distributions.special import signed_log1p
@@ -55,11 +56,11 @@ class Natural:
     def from_raw(
         cls, raw: Float[Tensor, "*#batch 7"], f: Float[Tensor, "*#batch"], S: float, mu_z0: float
     ) -> "Natural":
-        """From seven raw numbers (n_1, n_2, b_1, b_2, b_3, w_1, w_2) of a network and the camera it was told.
+        """From seven raw numbers (n_1, n_2, b_1, b_2, b_3, w_1, w_2) of a network and its camera.
 
         In the frame of the network nu_p = (n_1, n_2), B = `spectral_map`(b_1, b_2, b_3), a = `positive`(w_1) and
         log nu_z = sign(w_2) log(1 + |w_2|/a). Then mu_z = nu_z mu_z0 f, A_xy = 2 B / (S mu_z0) and
-        nu_xy = nu_p / (mu_z0 f): in camera frame and network frame alike, nu_z leaves the projection alone.
+        nu_xy = nu_p / (mu_z0 f): in both frames, nu_z does not affect the projection.
 
         Source: paper, sections "Parameter remapping" and "Enforcing constraints on distribution parameters".
         """
@@ -88,21 +89,60 @@ class Natural:
     @property
     def batch_shape(self) -> torch.Size:
         """The common batch shape of the parameters."""
-        first, *others = (self._batch_shape_of(field.name) for field in fields(self))
+        first, *others = (_batch_shape(name, value) for name, value in vars(self).items())
         if all(shape == first for shape in others):  # broadcasting takes 50 us
             return first
         return torch.broadcast_shapes(first, *others)
 
     def expand(self, batch_shape: torch.Size) -> "Natural":
         """The same parameters with a larger batch shape; nothing is copied."""
-        expanded = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            expanded[field.name] = value.expand(
-                batch_shape + value.shape[len(self._batch_shape_of(field.name)) :]
-            )
-        return type(self)(**expanded)
+        return type(self)(
+            **{
+                name: value.expand(batch_shape + value.shape[len(_batch_shape(name, value)) :])
+                for name, value in vars(self).items()
+            }
+        )
 
-    def _batch_shape_of(self, name: str) -> torch.Size:
-        value = getattr(self, name)
-        return torch.Size(value.shape[: value.ndim - _EVENT_DIMS.get(name, 0)])
+
+def _batch_shape(name: str, value: Tensor) -> torch.Size:
+    return torch.Size(value.shape[: value.ndim - _EVENT_DIMS.get(name, 0)])
+
+
+def require(name: str, value: Tensor, constraint: Constraint) -> None:
+    """Raise a ValueError that names the parameter, its shape, its constraint and an invalid value."""
+    if value.numel() == 0:  # which torch's constraints cannot check
+        return
+    # a constraint on vectors or matrices gives one result for each of them
+    batch = value.shape[: value.ndim - constraint.event_dim]
+    invalid = ~(constraint.check(value) & value.isfinite().reshape((*batch, -1)).all(-1))
+    if bool(invalid.any()):
+        raise ValueError(
+            f"{name} of shape {tuple(value.shape)} must be finite and satisfy {constraint}, "
+            f"but {int(invalid.sum())} of {invalid.numel()} do not, the first of them {value[invalid][0].tolist()}"
+        )
+
+
+def require_representable(mode: Float[Tensor, "*batch 3"], *covariances: Tensor) -> None:
+    """Raise ValueError if a mode or covariance is not finite."""
+    parts = [mode, *(covariance.flatten(-2) for covariance in covariances)]
+    overflow = ~torch.cat(parts, dim=-1).isfinite().all(-1)
+    if bool(overflow.any()):
+        raise ValueError(
+            f"parameters: mode or covariance of {int(overflow.sum())} of {overflow.numel()} distributions "
+            f"overflow in {mode.dtype}; expected parameters nearer to 1"
+        )
+
+
+def require_positions(xyz: Tensor, batch_shape: torch.Size) -> None:
+    """Raise ValueError unless these are positions for a batch of this shape, without NaN."""
+    if xyz.ndim == 0 or xyz.shape[-1] != 3:
+        raise ValueError(f"positions: got shape {tuple(xyz.shape)}; expected 3 as the last dimension")
+    try:
+        torch.broadcast_shapes(xyz.shape[:-1], batch_shape)
+    except RuntimeError as error:
+        shapes = f"{tuple(xyz.shape[:-1])}; expected one that broadcasts with {tuple(batch_shape)}"
+        raise ValueError(f"positions: got batch shape {shapes}") from error
+    if bool(xyz.isnan().any()):
+        raise ValueError(
+            f"positions: got NaN in {int(xyz.isnan().any(dim=-1).sum())} of them; expected numbers"
+        )

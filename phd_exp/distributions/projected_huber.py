@@ -4,7 +4,7 @@ With q = A_xy (x, y) - nu_xy z and t = z / mu_z,
 
     -log p(v) = h(|q|) - log|A_xy| + log(2 pi (1 + e^(-1/2))) + a max(t, 1/t) + log(mu_z N(a))   for z > 0.
 
-q and t are independent, and v is linear in (q, t): every statistic below rests on that.
+q and t are independent, and v is linear in (q, t). Every statistic below follows from that.
 """
 
 from collections.abc import Sequence
@@ -17,22 +17,12 @@ from torch.distributions import Distribution, constraints
 from torch.distributions.constraints import Constraint
 
 from phd_exp.distributions import depth, huber, spd
-from phd_exp.distributions.crps import crps_beyond_distance
 from phd_exp.distributions.level import credible_level
-from phd_exp.distributions.natural import Natural
+from phd_exp.distributions.natural import Natural, require, require_positions, require_representable
 from phd_exp.distributions.special import log_scaled_normaliser
 
 LARGEST_RAW = 1e9
-"""Squares of larger raw numbers, and of what they are multiplied with, would overflow in float32."""
-
-
-class _InFrontOfCamera(Constraint):
-    """Positions with z > 0."""
-
-    event_dim = 1
-
-    def check(self, value: Tensor) -> Tensor:
-        return value[..., 2] > 0
+"""Squares of larger raw numbers, and their products, would overflow in float32."""
 
 
 class ProjectedHuber(Distribution):
@@ -43,11 +33,18 @@ class ProjectedHuber(Distribution):
         mu_z: centre of z, metres; the mode is mu_z (mu_xy, 1).
         A: precision of (x, y)/z, symmetric positive definite; (x, y)/z has covariance 3.0765 A^(-2).
         a: precision of z; Var[z] is about 2 mu_z^2/a^2 where a is large.
-        validate_args: check parameters here and positions later (default: True). Each check makes a GPU wait, and
-            `torch.func.vmap` cannot check: pass False there.
+        validate_args: check parameters here and positions later (default: True). A check synchronises with the GPU
+            and does not run under `torch.func.vmap`; pass False there.
 
     Raises:
         ValueError: a parameter violates its constraint, or mode or covariance overflow.
+
+    Example:
+        >>> p = ProjectedHuber(torch.zeros(2), torch.tensor(4.0), 100 * torch.eye(2), torch.tensor(20.0))
+        >>> p.mode
+        tensor([0., 0., 4.])
+        >>> p.log_prob(torch.tensor([0.1, 0.0, 4.2])) < p.log_prob(p.mode)  # nats per cubic metre
+        tensor(True)
 
     Source: paper, section "Projected Huber distribution".
     """
@@ -58,7 +55,9 @@ class ProjectedHuber(Distribution):
         "A": constraints.positive_definite,
         "a": constraints.positive,
     }
-    support = _InFrontOfCamera()
+    support = constraints.independent(
+        constraints.cat([constraints.real, constraints.positive], dim=-1, lengths=[2, 1]), 1
+    )
     has_rsample = True
 
     def __init__(
@@ -71,10 +70,9 @@ class ProjectedHuber(Distribution):
     ) -> None:
         if _wants_validation(validate_args):
             for name, value in (("mu_xy", mu_xy), ("mu_z", mu_z), ("A", A), ("a", a)):
-                _require(name, value, self.arg_constraints[name])
+                require(name, value, self.arg_constraints[name])
         self._adopt(Natural.from_camera_frame(mu_xy, mu_z, A, a), validate_args)
-        if self._validate_args:
-            self._require_representable()
+        self._require_representable()
 
     @classmethod
     def from_raw(
@@ -93,53 +91,49 @@ class ProjectedHuber(Distribution):
             f: focal length, pixels, for each element of the batch; of shape (*, 1) for several points per camera.
             S: side of the image, pixels.
             mu_z0: the data set's depth per focal length, metres per pixel.
-            validate_args: as for the constructor.
+            validate_args: as for the constructor; without validation `log_prob` and its gradient are finite for raw
+                numbers up to 1e9.
 
         Raises:
             ValueError: a raw number is beyond +-1e9; f, S or mu_z0 is not positive and finite; or mode or covariance
-                overflow. Without validation `log_prob` and its gradient are finite for raw numbers up to 1e9.
+                overflow.
 
         Source: paper, section "Enforcing constraints on distribution parameters"; formulas in `Natural.from_raw`.
         """
         f = torch.as_tensor(f, dtype=raw.dtype, device=raw.device)
         if _wants_validation(validate_args):
-            _require("raw", raw, constraints.independent(constraints.interval(-LARGEST_RAW, LARGEST_RAW), 1))
-            for name, value in (("f", f), ("S", torch.tensor(S)), ("mu_z0", torch.tensor(mu_z0))):
-                _require(name, value, constraints.positive)
+            require("raw", raw, constraints.independent(constraints.interval(-LARGEST_RAW, LARGEST_RAW), 1))
+            for name, value in (("f", f), ("S", S), ("mu_z0", mu_z0)):
+                require(name, torch.as_tensor(value), constraints.positive)
+        distribution = cls._of(Natural.from_raw(raw, f, S, mu_z0), validate_args)
+        distribution._require_representable()
+        return distribution
+
+    @classmethod
+    def _of(cls, natural: Natural, validate_args: bool | None) -> "ProjectedHuber":
         distribution = cls.__new__(cls)
-        distribution._adopt(Natural.from_raw(raw, f, S, mu_z0), validate_args)
-        if distribution._validate_args:
-            distribution._require_representable()
+        distribution._adopt(natural, validate_args)
         return distribution
 
     def _adopt(self, natural: Natural, validate_args: bool | None) -> None:
-        """Become the distribution of these parameters, which are not checked again."""
+        """Initialise from parameters that are valid."""
         batch_shape = natural.batch_shape
         self._natural = natural.expand(batch_shape)
         super().__init__(batch_shape, torch.Size([3]), validate_args=False)
         self._validate_args = _wants_validation(validate_args)
 
     def _require_representable(self) -> None:
-        """Raise a ValueError where mode or covariances are too large for the data type."""
-        parts = self.mode, self.covariance_matrix.flatten(-2), self.projected_covariance.flatten(-2)
-        overflow = ~torch.cat(parts, dim=-1).isfinite().all(-1)
-        if bool(overflow.any()):
-            raise ValueError(
-                f"parameters: mode or covariance of {int(overflow.sum())} of {overflow.numel()} distributions "
-                f"overflow in {self._natural.log_a.dtype}; expected parameters nearer to 1"
-            )
+        """Raise ValueError if mode or covariances overflow in the data type, unless validation is off."""
+        if self._validate_args:
+            require_representable(self.mode, self.covariance_matrix, self.projected_covariance)
 
     def expand(self, batch_shape: Sequence[int], _instance: Distribution | None = None) -> "ProjectedHuber":
         """The same distribution with a larger batch shape; nothing is copied."""
-        distribution = self._get_checked_instance(ProjectedHuber, _instance)
-        distribution._adopt(self._natural.expand(torch.Size(batch_shape)), self._validate_args)
-        return distribution
+        return self._of(self._natural.expand(torch.Size(batch_shape)), self._validate_args)
 
     def tempered(self, projected: float, depth: float) -> "ProjectedHuber":
         """The distribution with A / projected and a / depth in place of A and a, around the same mode."""
-        distribution = ProjectedHuber.__new__(ProjectedHuber)
-        distribution._adopt(self._natural.tempered(projected, depth), self._validate_args)
-        return distribution
+        return self._of(self._natural.tempered(projected, depth), self._validate_args)
 
     def __repr__(self) -> str:
         return f"ProjectedHuber(batch_shape={tuple(self.batch_shape)})"
@@ -165,11 +159,6 @@ class ProjectedHuber(Distribution):
         return self._natural.log_a.exp()
 
     @property
-    def depth_precision(self) -> Float[Tensor, "*batch"]:
-        """Precision of z, a."""
-        return self.a
-
-    @property
     def log_det_A(self) -> Float[Tensor, "*batch"]:
         """log|A|; half of it is the log of the typical precision of (x, y)/z."""
         return self._natural.log_det_A_xy + 2 * self._natural.log_mu_z
@@ -181,8 +170,7 @@ class ProjectedHuber(Distribution):
     @property
     def _direction(self) -> Tensor:
         """m = (mu_x, mu_y, 1), metres of position per metre of depth."""
-        mu_xy = self.mu_xy
-        return torch.cat([mu_xy, torch.ones_like(mu_xy[..., :1])], dim=-1)
+        return torch.nn.functional.pad(self.mu_xy, (0, 1), value=1)
 
     def whiten(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 2"]:
         """The projection of a position in units of its precision, q = A ((x, y)/z - mu_xy) z/mu_z."""
@@ -193,10 +181,10 @@ class ProjectedHuber(Distribution):
         return depth.depth_energy(z.log() - self._natural.log_mu_z, self._natural.log_a)
 
     def log_prob(self, value: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch"]:
-        """Log density of a position (metres), in nats per cubic metre; -inf, with a zero gradient, for z <= 0.
+        """Log density of a position (metres), nats per cubic metre; -inf, with zero gradient, for z <= 0.
 
-        It is -inf at infinity too. The transforms of `torch.func` work through it, with one exception: torch cannot
-        differentiate an autograd.Function in forward mode twice, so jacfwd of jacfwd is wrong; use hessian.
+        It is -inf at infinity too. The transforms of `torch.func` work, except for forward mode within forward mode:
+        jacfwd of jacfwd raises NotImplementedError; use hessian.
 
         Raises:
             ValueError: the shape does not fit the batch shape, or a coordinate is NaN (if arguments are validated).
@@ -204,36 +192,18 @@ class ProjectedHuber(Distribution):
         Source: paper, section "Projected Huber distribution"; the constants are kept.
         """
         energy, visible = self._excess_energy(value)
-        log_mode = (
-            self._natural.log_det_A_xy
-            - huber.HUBER_LOG_NORMALISER
-            - self._natural.log_mu_z
-            - log_scaled_normaliser(self._natural.log_a)
-        )
+        n = self._natural
+        log_mode = n.log_det_A_xy - huber.HUBER_LOG_NORMALISER - n.log_mu_z - log_scaled_normaliser(n.log_a)
         return (log_mode - energy).masked_fill(~visible, -torch.inf)
 
     def _excess_energy(self, xyz: Tensor) -> tuple[Tensor, Tensor]:
         """Log density at the mode minus log density at a position, and whether that is finite with z > 0."""
         if self._validate_args:
-            self._check_positions(xyz)
+            require_positions(xyz, self.batch_shape)
         visible = (xyz[..., 2] > 0) & (xyz.abs().amax(-1) != torch.inf)
-        # other positions are moved, so that no NaN is computed and then multiplied by a zero gradient
+        # other positions are replaced, so that no NaN is multiplied by a zero gradient
         xyz = xyz.masked_fill(~visible[..., None], 1)
-        log_t = xyz[..., 2].log() - self._natural.log_mu_z
-        return huber.huber_energy(self.whiten(xyz)) + depth.depth_energy(log_t, self._natural.log_a), visible
-
-    def _check_positions(self, xyz: Tensor) -> None:
-        if xyz.ndim == 0 or xyz.shape[-1] != 3:
-            raise ValueError(
-                f"a position has 3 coordinates in its last dimension, but the shape is {tuple(xyz.shape)}"
-            )
-        try:
-            torch.broadcast_shapes(xyz.shape[:-1], self.batch_shape)
-        except RuntimeError as error:
-            shapes = f"{tuple(xyz.shape[:-1])}, the distribution's is {tuple(self.batch_shape)}"
-            raise ValueError(f"batch shapes must broadcast, but that of the positions is {shapes}") from error
-        if bool(xyz.isnan().any()):
-            raise ValueError(f"positions must not be NaN, but {int(xyz.isnan().any(dim=-1).sum())} are")
+        return huber.huber_energy(self.whiten(xyz)) + self.depth_energy(xyz[..., 2]), visible
 
     def level(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch"]:
         """Credible level of a position: the probability of the smallest region of highest density that contains it.
@@ -275,10 +245,9 @@ class ProjectedHuber(Distribution):
     def projected_covariance(self) -> Float[Tensor, "*batch 2 2"]:
         """Covariance of (x, y)/z, c A^(-2).
 
-        Source: paper, section "Variance of projected coordinates", with the constant mended.
+        Source: paper, section "Variance of projected coordinates", with the constant corrected.
         """
-        inverse = spd.inverse(self.A, self.log_det_A)
-        return huber.HUBER_COVARIANCE * spd.square(inverse)
+        return huber.HUBER_COVARIANCE * spd.square(spd.inverse(self.A, self.log_det_A))
 
     @property
     def depth_mean(self) -> Float[Tensor, "*batch"]:
@@ -292,7 +261,7 @@ class ProjectedHuber(Distribution):
 
     @property
     def depth_median(self) -> Float[Tensor, "*batch"]:
-        """The depth with as much probability before as behind it, metres."""
+        """The median of z, metres."""
         return self.depth_icdf(0.5)
 
     def depth_cdf(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
@@ -302,13 +271,13 @@ class ProjectedHuber(Distribution):
         return depth.depth_cdf(log_t, self._natural.log_a).masked_fill(~visible, 0)
 
     def depth_crps(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
-        """Continuous ranked probability score of a depth, int (P(depth <= u) - 1[u >= z])^2 du, metres, as is z.
+        """Continuous ranked probability score of a depth z (metres), int (P(depth <= u) - 1[u >= z])^2 du, metres.
 
         Source: own derivation, see `crps_beyond_distance`.
         """
         log_t = z.clamp_min(torch.finfo(z.dtype).tiny).log() - self._natural.log_mu_z
         width = torch.exp(self._natural.log_mu_z - self._natural.log_a)
-        return (z - self.mu_z).abs() + width * crps_beyond_distance(log_t, self._natural.log_a)
+        return (z - self.mu_z).abs() + width * depth.crps_beyond_distance(log_t, self._natural.log_a)
 
     def depth_icdf(self, p: Float[Tensor, "*#batch"] | float) -> Float[Tensor, "*#batch"]:
         """The depth z, metres, with P(depth <= z) = p, for p in [0, 1]; 0 at p = 0, inf at p = 1."""
@@ -319,8 +288,6 @@ class ProjectedHuber(Distribution):
         self, sample_shape: torch.Size | Sequence[int] = (), generator: torch.Generator | None = None
     ) -> Float[Tensor, "*shape 3"]:
         """Exact samples, differentiable in the parameters: (x, y) = z mu_xy + A_xy^(-1) q.
-
-        Random numbers come from the generator, or from torch's global one.
 
         Source: own derivation (q and t are independent); gradients by the implicit function theorem.
         """
@@ -343,17 +310,3 @@ class ProjectedHuber(Distribution):
 
 def _wants_validation(validate_args: bool | None) -> bool:
     return Distribution._validate_args if validate_args is None else validate_args
-
-
-def _require(name: str, value: Tensor, constraint: Constraint) -> None:
-    """Raise a ValueError that names the parameter, its shape, its constraint and an offending value."""
-    # a constraint on vectors or matrices answers once for each of them
-    if value.numel() == 0:  # which torch's constraints cannot check
-        return
-    batch = value.shape[: value.ndim - constraint.event_dim]
-    invalid = ~(constraint.check(value) & value.isfinite().reshape((*batch, -1)).all(-1))
-    if bool(invalid.any()):
-        raise ValueError(
-            f"{name} of shape {tuple(value.shape)} must be finite and satisfy {constraint}, "
-            f"but {int(invalid.sum())} of {invalid.numel()} do not, the first of them {value[invalid][0].tolist()}"
-        )

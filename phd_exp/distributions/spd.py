@@ -32,7 +32,7 @@ def spectral_map(
     """B = phi(M), `positive` acting on the eigenvalues of M = [[b_1, b_2/sqrt 2], [b_2/sqrt 2, b_3]], and log|B|.
 
     With M's eigenvalues s = m +- r, B = (phi(s+) + phi(s-))/2 I + (phi(s+) - phi(s-))/(s+ - s-) (M - m I).
-    Value and derivative are true at equal eigenvalues and at s = 0, where a network with a zero last layer starts.
+    Value and derivative are exact at equal eigenvalues and at s = 0, where a network with a zero last layer starts.
     log|B| is finite for |b| up to 1e4, where B itself underflows.
 
     Source: paper, section "Enforcing constraints on distribution parameters"; closed form: own derivation, checked
@@ -64,7 +64,7 @@ def _divided_difference(upper: Tensor, lower: Tensor) -> Tensor:
 
 def matvec(M: Float[Tensor, "*#batch 2 2"], x: Float[Tensor, "*#batch 2"]) -> Float[Tensor, "*#batch 2"]:
     """The product M x."""
-    # written out: a sum over two elements takes longer than its terms
+    # written out, because a sum over two elements is slower
     return M[..., 0] * x[..., :1] + M[..., 1] * x[..., 1:]
 
 

@@ -1,6 +1,6 @@
 """The special functions of the depth law: exponential integrals, their tail moments and the log normaliser.
 
-Everything rests on two schemes that meet at a = 1 and lose no digits to cancellation, in any precision.
+All use two schemes that meet at a = 1. Neither loses digits to cancellation, in any precision.
 
 - a <= 1: the series e^a E_1(a) = sum_k (psi(k + 1) - log a) a^k / k!, then n E_(n+1)(a) = e^(-a) - a E_n(a) upwards.
 - a > 1: one Gauss rule sum_i w_i F(s_i) for int_0^inf e^(-s) F(s) ds with F(s) = s^k (1 + s/a)^(-n). All w_i are
@@ -11,6 +11,7 @@ Source: DLMF 6.6 and 8.19 for the series; the rule is an own derivation, see `GA
 
 import inspect
 import math
+import sys
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -47,21 +48,19 @@ _LARGEST_N = 5  # the highest order for which the Gauss rule was built
 
 
 def scaled_expint(n: int, a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """The scaled exponential integral e^a E_n(a) = int_0^inf e^(-a s) (1 + s)^(-n) ds, for a > 0 and integer n <= 5.
+    """The scaled exponential integral e^a E_n(a) = int_0^inf e^(-a s) (1 + s)^(-n) ds, for a > 0 and n = 1, ..., 5.
 
     Relative error below 1e-12 in float64 and 1e-6 in float32 for a in [1e-6, 1e6].
 
     Raises:
-        ValueError: n > 5.
+        ValueError: n is below 1 or above 5.
 
     Source: DLMF 8.19; checked against mpmath in tests/distributions/test_special.py.
     """
-    if n > _LARGEST_N:
-        raise ValueError(f"n must be at most {_LARGEST_N}, but is {n}")
-    if n <= 0:
-        return _elementary(-n, a)
+    if not 1 <= n <= _LARGEST_N:
+        raise ValueError(f"n: got {n}; expected 1 to {_LARGEST_N}")
     small = a <= 1
-    # each scheme sees only what it is for; a clamp would have no gradient at a = 1, where a network starts
+    # masked, because a clamp has no gradient at a = 1, where a network starts
     below, above = a.masked_fill(~small, 1), a.masked_fill(small, 1)
     return torch.where(small, _series(n, below)[-1], _by_rule(above, (0, n))[0] / above)
 
@@ -69,8 +68,8 @@ def scaled_expint(n: int, a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]
 def tail_moment(k: int, a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """The k-th moment of the lower tail of the depth law, J_k(a) = int_0^inf s^k e^(-s) (1 + s/a)^(-k-2) ds, k >= 0.
 
-    J_0 is the paper's g(a) = a e^a E_2(a), and J_k(inf) = k!. The family is closed under differentiation:
-    dJ_k/da = (k + 2) J_(k+1)(a) / a^2, so derivatives of every order follow. a may have underflowed to 0.
+    J_0 is the paper's g(a) = a e^a E_2(a), and J_k(inf) = k!. From dJ_k/da = (k + 2) J_(k+1)(a) / a^2 follow the
+    derivatives of every order. a may underflow to 0.
 
     Source: own derivation (differentiate under the integral); checked against mpmath in
     tests/distributions/test_special.py.
@@ -115,10 +114,10 @@ def weighted_integral(
 def signed_log1p(x: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
     """sign(x) log(1 + |x|/a), smooth at x = 0 with the derivative 1 / (a + |x|); finite where a underflows.
 
-    Where a + |x| is below the machine's epsilon the derivative in x is held at its inverse, so that it stays finite.
+    The derivative in x is bounded by the inverse of the machine epsilon.
 
-    Source: own derivation (log nu_z as a function of w_2, one formula for both branches of the paper's activation);
-    checked in tests/distributions/test_special.py.
+    Source: own derivation (log nu_z as a function of w_2, for both branches of the paper's activation); checked in
+    tests/distributions/test_special.py.
     """
     function = _SignedLog1p if torch.compiler.is_compiling() else _DualSignedLog1p
     value: Tensor = function.apply(*torch.broadcast_tensors(x, log_a))
@@ -156,6 +155,7 @@ class _DualSignedLog1p(_SignedLog1p):
 
     @staticmethod
     def jvp(ctx: Any, x_dot: Tensor, log_a_dot: Tensor) -> Tensor:
+        _refuse_nested_forward_mode()
         x, log_a = ctx.saved_tensors
         return (x_dot - x * log_a_dot) * _SignedLog1p.slope(x, log_a)
 
@@ -203,16 +203,22 @@ class _DualTailMoment(_TailMoment):
 
     @staticmethod
     def jvp(ctx: Any, a_dot: Tensor, _: None) -> tuple[Tensor, None]:
+        _refuse_nested_forward_mode()
         (a,) = ctx.saved_tensors
         return a_dot * _TailMoment.derivative(a, ctx.k), None
 
 
-def _keep_signature(forward: Any) -> None:
-    forward.__signature__ = inspect.signature(forward)  # torch asks for it in every call, which takes 15 us
+def _refuse_nested_forward_mode() -> None:
+    """Raise NotImplementedError where torch would return a derivative of zero instead of a second derivative."""
+    if getattr(sys.modules.get("torch._functorch.eager_transforms"), "JVP_NESTING", 1) > 1:
+        raise NotImplementedError(
+            "derivatives: got forward mode within forward mode, of which torch ignores one in an autograd.Function; "
+            "expected one of them at most; use torch.func.hessian"
+        )
 
 
-_keep_signature(_SignedLog1p.forward)
-_keep_signature(_TailMoment.forward)
+for _forward in (_SignedLog1p.forward, _TailMoment.forward):  # torch asks for signatures in every call: 15 us
+    vars(_forward)["__signature__"] = inspect.signature(_forward)
 
 
 def _tail_moment_and_derivative(k: int, a: Tensor) -> tuple[Tensor, Tensor]:
@@ -226,14 +232,6 @@ def _tail_moment_and_derivative(k: int, a: Tensor) -> tuple[Tensor, Tensor]:
     derivative_above = (k + 2) * next_above / above.square()
     value = torch.where(small, value_below, value_above)
     return value, torch.where(small, derivative_below, derivative_above)
-
-
-def _elementary(k: int, a: Tensor) -> Tensor:
-    """e^a E_(-k)(a) = k!/a^(k+1) sum_(j <= k) a^j/j! for k >= 0, by Horner's rule."""
-    value = torch.ones_like(a)
-    for j in range(1, k + 1):
-        value = 1 + value * j / a
-    return value / a
 
 
 def _series(n: int, a: Tensor) -> list[Tensor]:

@@ -1,4 +1,4 @@
-"""Recalibration: two temperatures that make every prediction more or less certain without moving it."""
+"""Recalibration: two temperatures that change the uncertainty of every prediction but not its mode."""
 
 import math
 from collections.abc import Callable
@@ -17,20 +17,27 @@ _WIDEST = 80.0  # of log(1/temperature); a fit beyond has no minimum
 
 @dataclass(frozen=True)
 class Temperature:
-    """A' = A / projected and a' = a / depth: above 1 the predictions were too certain, below 1 too cautious."""
+    """A' = A / projected and a' = a / depth: above 1 for overconfident predictions, below 1 for underconfident ones.
+
+    Example:
+        >>> p = ProjectedHuber(torch.zeros(2), torch.tensor(4.0), 100 * torch.eye(2), torch.tensor(20.0))
+        >>> wider = Temperature(projected=1.0, depth=2.0).apply(p)
+        >>> bool(wider.a == p.a / 2), torch.equal(wider.mode, p.mode)
+        (True, True)
+    """
 
     projected: float
     depth: float
 
     @classmethod
     def fit(cls, distribution: ProjectedHuber, xyz: Float[Tensor, "samples 3"]) -> "Temperature":
-        """The temperatures of least mean NLL over positions (metres) that belong to a batch of predictions.
+        """The temperatures that minimise the mean NLL of true positions (metres) under a batch of predictions.
 
         The mean NLL is a sum of one function of each temperature, convex in its reciprocal r:
         h(r |q|) - 2 log r and a r max(t, 1/t) + log N(a r). Each minimum is the one root of a derivative.
 
-        Raises ValueError without samples, with one that is not finite or not in front of the camera, and where all
-        lie at their modes, so that no temperature is low enough.
+        Raises ValueError if there are no samples, if one is not finite or not in front of the camera, or if all lie
+        at their modes, so that no temperature is low enough.
         Source: temperature scaling (Guo et al., 2017); convexity: h is convex and grows, and log N(a) is the log of
         an integral of exponentials of a. Checked in tests/distributions/test_temperature.py.
         """
@@ -44,25 +51,20 @@ class Temperature:
                     "temperatures are fitted to finite predictions and positions with z > 0, at least one, but "
                     f"{int((~values.isfinite()).sum())} of {values.numel()} numbers are not finite"
                 )
-        return cls(
-            projected=_temperature(lambda r: _projected_slope(radius, r)),
-            depth=_temperature(lambda r: _depth_slope(energy, log_a, r)),
-        )
+
+        def projected_slope(r: Tensor) -> Tensor:  # r d/dr of the mean of h(r |q|) - 2 log r
+            return torch.minimum(r * radius, (r * radius).square()).mean() - 2
+
+        def depth_slope(
+            r: Tensor,
+        ) -> Tensor:  # of r a max(t, 1/t) + log N(r a): actual minus predicted energies
+            return (r * energy - depth_mean_energy(log_a + r.log())).mean()
+
+        return cls(projected=_temperature(projected_slope), depth=_temperature(depth_slope))
 
     def apply(self, distribution: ProjectedHuber) -> ProjectedHuber:
         """The same predictions at these temperatures; mu_xy and mu_z stay."""
         return distribution.tempered(self.projected, self.depth)
-
-
-def _projected_slope(radius: Tensor, r: Tensor) -> Tensor:
-    """r d/dr of the mean of h(r |q|) - 2 log r."""
-    scaled = r * radius
-    return torch.minimum(scaled, scaled.square()).mean() - 2
-
-
-def _depth_slope(energy: Tensor, log_a: Tensor, r: Tensor) -> Tensor:
-    """r d/dr of the mean of r a max(t, 1/t) + log N(r a): energies as they are minus as they are predicted."""
-    return (r * energy - depth_mean_energy(log_a + r.log())).mean()
 
 
 def _temperature(slope: Callable[[Tensor], Tensor]) -> float:
@@ -76,6 +78,6 @@ def _temperature(slope: Callable[[Tensor], Tensor]) -> float:
         width *= 2
         if width > _WIDEST:
             raise ValueError(
-                "no temperature fits: the errors are zero, or out of all proportion to the predictions"
+                "no temperature fits: the errors are zero, or out of proportion to the predictions"
             )
     return math.exp(-brentq(at, -width, width, xtol=1e-12))

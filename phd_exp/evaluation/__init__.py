@@ -1,1 +1,1 @@
-"""Measures recorded predictions: scores, strata, temperatures, fusion. Knows no network."""
+"""Evaluates recorded predictions: scores, strata, temperatures, fusion. Imports no network."""

@@ -1,6 +1,6 @@
-"""Tables of predictions, which anyone may have written: columns of numbers, or one line that says why not."""
+"""Reads tables of predictions: columns of numbers, or a RunError of one line. The files are not trusted."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,42 +11,52 @@ from phd_exp.records.errors import RunError, gist
 from phd_exp.records.files import MB, require_plain
 
 Columns = Mapping[str, np.ndarray]
-"""Column name -> one value a sample: float64, or text for `TEXTS`."""
+"""Column name -> one value per sample: float64, or text for `TEXTS`."""
 
 LARGEST = 500 * MB
-"""Bytes of the file, and of the table that it claims to hold."""
+"""Bytes of the file, and of the table according to its metadata."""
 MOST_VALUES = 10**7
-"""Rows times columns. Predictions of 2,000 images have 80,000."""
+"""Rows times columns; predictions of 2,000 images have 80,000."""
 TEXTS = ("file_name",)
 
 
-def read_table(file: Path, names: Sequence[str] = ()) -> Columns:
-    """All columns of a table that has at least one row and these `names`.
+def read_table(file: Path) -> Columns:
+    """All columns of a table that has at least one row.
 
-    The size is bounded before any row is read: a file of 100 kB can unfold to gigabytes.
+    The size is checked before any row is read: a file of 100 kB can expand to gigabytes.
 
-    Raises RunError, one line, where the file is missing, cannot be read, is too large, lacks a column, or holds
-    something else than numbers.
+    Raises RunError, one line, if the file is missing, cannot be read, is too large, or contains other values than
+    numbers.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.NamedTemporaryFile(suffix=".parquet") as file:
+        ...     pq.write_table(pa.table({"z": [3.5, 4.5]}), file.name)
+        ...     read_table(Path(file.name))["z"].tolist()
+        [3.5, 4.5]
     """
     try:
         require_plain(file, LARGEST)
         with open(file, "rb") as stream:  # pyarrow opens no name that is not UTF-8
             metadata = pq.read_metadata(stream)
             _require_small(file, metadata)
-            # a text that repeats in every row is stored once
+            # a text that repeats in every row is kept once in memory
             texts = [name for name in TEXTS if name in metadata.schema.to_arrow_schema().names]
-            columns = arrays(pq.ParquetFile(stream, metadata=metadata, read_dictionary=texts).read())
+            return arrays(pq.ParquetFile(stream, metadata=metadata, read_dictionary=texts).read())
     except FileNotFoundError:
         raise RunError(f"{file.name}: missing, though the run has finished") from None
     except (pa.ArrowException, OSError, KeyError, TypeError, ValueError) as error:
         raise RunError(f"{file.name}: cannot be read ({gist(error)})") from None
-    if lacking := [name for name in names if name not in columns]:
-        raise RunError(f"{file.name}: has no column {', '.join(lacking)}")
-    return columns
+
+
+def require_columns(names: Iterable[str], table: Collection[str], what: str = "predictions") -> None:
+    """Raise RunError if a table lacks one of these columns."""
+    if lacking := [name for name in names if name not in table]:
+        raise RunError(f"{what}: no column {', '.join(lacking)}, as in older records; run the model again")
 
 
 def arrays(table: pa.Table | Columns) -> dict[str, np.ndarray]:
-    """The columns of a table as arrays. Raises ValueError or TypeError for a column that holds no numbers."""
+    """The columns of a table as arrays. Raises ValueError or TypeError for a column of other values than numbers."""
     if isinstance(table, pa.Table):
         table = {name: table[name].to_numpy() for name in table.column_names}
     return {name: column if name in TEXTS else _numbers(name, column) for name, column in table.items()}

@@ -1,15 +1,15 @@
 """Mean errors of a run's point estimates, from its table of predictions.
 
-The columns used, a row a test sample; positions are metres in the camera frame:
+Columns, one row per sample; positions are metres in the camera frame:
 
     x, y, z                  the truth
-    f, S                     focal length and side of the image, both in pixels of one image
+    f, S                     focal length and side of the image, both in pixels of the same image
     mode_x, mode_y, mode_z   the estimate of every model
-    mean_x, mean_y, mean_z   of a distribution: its mean
-    median_z, mu_x, mu_y     of a distribution: the median of depth, and the projected centre
+    mean_x, mean_y, mean_z   a distribution's mean
+    median_z, mu_x, mu_y     a distribution's median of depth, and its projected centre
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float64
 from scipy import stats
 from torch import Tensor
 
-from phd_exp.evaluation.parquet import Columns
+from phd_exp.evaluation.parquet import Columns, require_columns
 from phd_exp.metrics.bootstrap import means, resampled
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
 from phd_exp.records.errors import RunError
@@ -36,16 +36,16 @@ COLUMNS: Mapping[Estimate, tuple[str, str, str]] = {
     "median": ("mu_x", "mu_y", "median_z"),
 }
 CENTRAL = 0.5
-"""Largest |v_p| of either coordinate in the central half of the field of view."""
+"""Largest |v_p| of both coordinates in the central half of the field of view."""
 RESAMPLES = 200
 SEED = 0
-"""Of all bootstraps: runs that were tested on the same images are resampled alike, and can be compared in pairs."""
+"""Seed of all bootstraps: runs tested on the same images are resampled alike, so that differences are paired."""
 _ERRORS = {"projected": projected_error, "depth": depth_error}
 
 
 @dataclass(frozen=True)
 class ErrorKey:
-    """Which error: of which point estimate, over which test samples, along the true ray or across it."""
+    """An error: its point estimate, its test samples, and whether it is along the true ray or across it."""
 
     estimate: Estimate
     reading: Reading
@@ -58,7 +58,7 @@ class SampleMean:
 
     Attributes:
         standard_error: None for a single sample.
-        resampled: the mean over resampled test images; the same images for all runs with as many of them.
+        resampled: the mean over each bootstrap sample of test images; runs with equal n share these samples.
     """
 
     n: int
@@ -68,23 +68,35 @@ class SampleMean:
 
 
 MeanErrors = Mapping[ErrorKey, SampleMean]
-"""Millimetres; a reading without a test sample has no key."""
+"""Mean errors in millimetres; a reading without a test sample has no key."""
 
 
 def mean_errors(table: Columns, estimates: Sequence[Estimate]) -> MeanErrors:
     """The mean errors of these estimates, in both readings.
 
-    Raises RunError, one line, where the table lacks a column or a mean is not finite.
+    Raises RunError, one line, if the table lacks a column or a mean is not finite.
+
+    Example:
+        >>> row = {"x": 0, "y": 0, "z": 4, "f": 1500, "S": 224, "mode_x": 0.003, "mode_y": 0.004, "mode_z": 4.5}
+        >>> found = mean_errors({name: np.array([value], dtype=float) for name, value in row.items()}, ["mode"])
+        >>> found[ErrorKey("mode", "whole", "projected")].value, found[ErrorKey("mode", "whole", "depth")].value
+        (5.0, 500.0)
     """
     needed = ["x", "y", "z", "f", "S", *(name for estimate in estimates for name in COLUMNS[estimate])]
-    if lacking := [name for name in needed if name not in table]:
-        raise RunError(f"predictions: have no column {', '.join(lacking)}; run the model again")
+    require_columns(needed, table)
     for name in needed:
         if not (np.isfinite(table[name]).all() and (name not in ("z", "f", "S") or (table[name] > 0).all())):
             raise RunError(f"predictions: column {name} is not finite everywhere, or not positive")
     truth = _stacked(table, ("x", "y", "z"))
     central = in_central_half(truth, _stacked(table, ("f",)), _stacked(table, ("S",)))
-    found = dict(_means(truth, central, {name: _points(table, name) for name in estimates}))
+    found: dict[ErrorKey, SampleMean] = {}
+    for estimate in estimates:
+        points = _points(table, estimate)
+        for quantity in QUANTITIES:
+            values = MILLIMETRES * _ERRORS[quantity](truth, points)
+            found[ErrorKey(estimate, "whole", quantity)] = _mean(values)
+            if bool(central.any()):
+                found[ErrorKey(estimate, "central", quantity)] = _mean(values[central])
     if not all(np.isfinite(mean.value) for mean in found.values()):
         raise RunError("predictions: are so far off that a mean error is not finite")
     return found
@@ -95,29 +107,17 @@ def in_central_half(
 ) -> Bool[Tensor, " n"]:
     """Whether a position lies in the central half of the field of view, |v_p| <= 1/2 in both coordinates.
 
-    v_p = 2 f (x, y) / (S z). The authors' generator places its objects there.
+    v_p = 2 f (x, y) / (S z). The authors' generator places all objects there.
     """
     return ((2 * f * truth[:, :2] / (S * truth[:, 2:])).abs() <= CENTRAL).all(dim=-1)
 
 
-def _means(
-    truth: Tensor, central: Tensor, estimates: Mapping[Estimate, Tensor]
-) -> Iterator[tuple[ErrorKey, SampleMean]]:
-    for reading, chosen in (("whole", torch.ones_like(central)), ("central", central)):
-        if not bool(chosen.any()):
-            continue
-        columns = {
-            f"{estimate} {quantity}": MILLIMETRES * error(truth, points)[chosen]
-            for estimate, points in estimates.items()
-            for quantity, error in _ERRORS.items()
-        }
-        _, drawn = resampled(means, columns, RESAMPLES, SEED)
-        for name, values in columns.items():
-            estimate, quantity = name.split()
-            n = len(values)
-            error = float(values.std() / n**0.5) if n > 1 else None
-            mean = SampleMean(n, float(values.mean()), error, drawn[name].numpy())
-            yield ErrorKey(estimate, reading, quantity), mean  # type: ignore[arg-type]
+def _mean(values: Tensor) -> SampleMean:
+    n = len(values)
+    _, drawn = resampled(means, {"mean": values}, RESAMPLES, SEED)
+    return SampleMean(
+        n, float(values.mean()), float(values.std() / n**0.5) if n > 1 else None, drawn["mean"].numpy()
+    )
 
 
 def _stacked(table: Columns, names: Sequence[str]) -> Tensor:
@@ -133,11 +133,11 @@ def _points(table: Columns, estimate: Estimate) -> Tensor:
 
 
 def difference(one: Sequence[SampleMean], other: Sequence[SampleMean]) -> tuple[float, float]:
-    """Mean of `one` minus mean of `other`, each a mean a seed, and the half width of its 95 % interval.
+    """The mean over seeds of `one` minus that of `other`, and the half width of its 95 % interval.
 
-    The standard error is that of a bootstrap over seeds of each model and over the test images that they share;
-    deviations of seeds are scaled by sqrt(k / (k - 1)), since k seeds are few, and the interval uses Student's law
-    with the seeds' degrees of freedom. One seed says nothing of another training: the half width is then infinite.
+    A bootstrap over the seeds of each model and over the shared test images gives the standard error. Deviations of k
+    seeds are scaled by sqrt(k / (k - 1)), and the interval uses Student's law with the seeds' degrees of freedom.
+    With one seed the half width is infinite: nothing is known about other trainings.
 
     Source: Davison and Hinkley, "Bootstrap methods and their application" (1997), section 2.3 (small samples).
     """
@@ -151,7 +151,7 @@ def difference(one: Sequence[SampleMean], other: Sequence[SampleMean]) -> tuple[
 
 
 def _over_seeds(means: Sequence[SampleMean], random: np.random.Generator) -> np.ndarray:
-    """Resampled means: seeds and images are drawn anew each time."""
+    """Resampled means: both seeds and images are drawn anew."""
     values, k = np.stack([mean.resampled for mean in means]), len(means)
     weights = random.multinomial(k, [1 / k] * k, values.shape[1]).T / k
     return np.asarray((values * (1 / k + np.sqrt(k / (k - 1)) * (weights - 1 / k))).sum(0))

@@ -1,6 +1,6 @@
-"""Measures a table of predictions: scores, curves and strata with bootstrap intervals; recalibrates it."""
+"""Evaluates a table of predictions: scores, curves and strata with bootstrap intervals; recalibrates it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -12,13 +12,12 @@ from torch import Tensor
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import PARAMETERS, distribution_columns, draws, from_columns
 from phd_exp.distributions.temperature import Temperature
-from phd_exp.evaluation.parquet import Columns, arrays, read_table
+from phd_exp.evaluation.parquet import Columns, arrays, read_table, require_columns
 from phd_exp.evaluation.point_errors import SEED
 from phd_exp.evaluation.reference import Band, calibrated_reference
 from phd_exp.metrics.bootstrap import Interval, Statistic, bands, interval, resampled
 from phd_exp.metrics.calibration import CalibrationCurve, calibration_curve
-from phd_exp.metrics.calibration_scores import COLUMNS, calibration_scores, ordered
-from phd_exp.metrics.curves import abscissae, curves
+from phd_exp.metrics.calibration_scores import COLUMNS, abscissae, calibration_scores, curves, ordered
 from phd_exp.metrics.errors import MILLIMETRES
 from phd_exp.metrics.scores import DRAWS, energy_score
 from phd_exp.metrics.strata import strata
@@ -26,7 +25,7 @@ from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder
 
 ERRORS = ("projected_error_mm", "depth_error_mm")
-OF_A_DISTRIBUTION = (*COLUMNS, *ERRORS, "nll", "energy_score")
+OF_A_DISTRIBUTION = (*PARAMETERS, *COLUMNS, *ERRORS, "nll", "energy_score")
 XYZ = ("x", "y", "z")
 QUANTITIES: Mapping[str, tuple[str, str, tuple[float, ...] | int]] = {
     "visibility": ("visibility", "", (0.0, 0.25, 0.5, 0.75, 0.95, 1.0)),
@@ -36,7 +35,8 @@ QUANTITIES: Mapping[str, tuple[str, str, tuple[float, ...] | int]] = {
 }
 """Quantity of the strata -> its column, its unit, and edges or a number of equal parts.
 
-The true depth is what is predicted: even calibrated predictions are not calibrated among samples chosen by it.
+Predictions in strata of true depth are not calibrated even if all predictions are: true depth is the predicted
+quantity.
 """
 
 
@@ -62,15 +62,15 @@ class Stratum:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A table of predictions, measured; `left_out` further samples had a number that is not finite.
+    """The evaluation of n samples; `left_out` further samples had values that are not finite.
 
     Attributes:
-        scores: of a distribution `calibration_scores` and the means of `nll` (nats) and `energy_score_mm`; of a point
-            estimate too the means of `projected_error_mm` and `depth_error_mm`.
-        reference: of each score that is a distance from calibration, the median and the 95 % interval that calibrated
-            predictions with the same uncertainties have (`calibrated_reference`): such a distance is never zero.
-        curves: `metrics.curves.curves`; x is the predicted variance, credible level, PIT, or share of samples kept.
-        resampled: each score on the same resampled test images for every run that has as many of them.
+        scores: means of `projected_error_mm` and `depth_error_mm`; of a distribution also of `nll` (nats) and
+            `energy_score_mm`, and the `calibration_scores`.
+        reference: for each score that is a distance from calibration, the median and 95 % interval of calibrated
+            predictions with the same uncertainties (`calibrated_reference`): the distance is never zero.
+        curves: `metrics.calibration_scores.curves`; x is the predicted variance, credible level, PIT, or share kept.
+        resampled: each score on resampled test images, the same images for all runs with equal n.
     """
 
     n: int
@@ -83,46 +83,37 @@ class Evaluation:
 
 
 def evaluate(table: pa.Table | Columns, window: int = 200, resamples: int = 200) -> Evaluation:
-    """Measure predictions of a distribution.
+    """Evaluate predictions: of a distribution if the table has its parameters, else of points, which have no curves.
 
-    Raises RunError where a column is missing, or where no sample has all of them finite.
+    Raises RunError if a column is missing, or if no sample has finite values.
     """
-    columns, left_out = _finite(table, OF_A_DISTRIBUTION, PARAMETERS)
-    parameters = set(PARAMETERS) <= columns.keys()
-    x = abscissae(columns, window)
-    intervals = bands(partial(curves, window=window), columns, resamples, SEED)
-    scores, drawn = _scores(_distribution_scores, columns, resamples)
-    return Evaluation(
-        n=len(columns["nll"]),
-        scores=scores,
-        curves={name: _curve(x[name], interval) for name, interval in intervals.items()},
-        strata=_strata(_distribution_scores, columns, resamples),
-        left_out=left_out,
-        reference=calibrated_reference(_distribution(columns)) if parameters else {},
-        resampled=drawn,
-    )
-
-
-def evaluate_points(table: pa.Table | Columns, resamples: int = 200) -> Evaluation:
-    """Measure predictions of a point alone: its errors, no curves. Raises RunError as `evaluate` does."""
-    columns, left_out = _finite(table, ERRORS)
-    scores, drawn = _scores(_point_scores, columns, resamples)
+    recorded = arrays(table)
+    is_distribution = "a" in recorded
+    columns, left_out = _finite(recorded, OF_A_DISTRIBUTION if is_distribution else ERRORS)
+    statistic: Statistic = _distribution_scores if is_distribution else _point_scores
+    scores, drawn = _scores(statistic, columns, resamples)
+    found: dict[str, Curve] = {}
+    if is_distribution:
+        x = abscissae(columns, window)
+        intervals = bands(partial(curves, window=window), columns, resamples, SEED)
+        found = {name: _curve(x[name], interval) for name, interval in intervals.items()}
     return Evaluation(
         n=len(columns[ERRORS[0]]),
         scores=scores,
-        curves={},
-        strata=_strata(_point_scores, columns, resamples),
+        curves=found,
+        strata=_strata(statistic, columns, resamples),
         left_out=left_out,
+        reference=calibrated_reference(_distribution(columns)) if is_distribution else {},
         resampled=drawn,
     )
 
 
 def fit_temperature(held_out_table: pa.Table | Columns) -> Temperature:
-    """The temperatures that fit predictions of samples that were held out of training.
+    """The temperatures fitted on predictions of samples that were held out of training.
 
-    Raises RunError where a column is missing, or where none fits.
+    Raises RunError if a column is missing, or if no temperature fits.
     """
-    columns, _ = _finite(held_out_table, (*PARAMETERS, *XYZ))
+    columns, _ = _finite(arrays(held_out_table), (*PARAMETERS, *XYZ))
     try:
         return Temperature.fit(_distribution(columns), _positions(columns))
     except ValueError as error:
@@ -130,38 +121,43 @@ def fit_temperature(held_out_table: pa.Table | Columns) -> Temperature:
 
 
 def held_out_temperature(folder: RunFolder) -> Temperature:
-    """The temperatures that fit a run's recorded predictions of held-out samples.
-
-    Raises RunError where they cannot be read, and as `fit_temperature` does.
-    """
+    """`fit_temperature` of a run's recorded predictions of held-out samples. Raises RunError as it does."""
     return fit_temperature(read_table(folder.held_out))
 
 
 def recalibrated(table: pa.Table | Columns, temperature: Temperature) -> dict[str, np.ndarray]:
-    """The same columns for A / projected and a / depth: estimates of the mode stay, all that is uncertain changes.
+    """The same columns for A / projected and a / depth: modes are unchanged, all uncertainties and scores change.
 
-    Samples whose parameters are not finite are dropped. Raises RunError where a column is missing, or where no sample
-    has all of them finite.
+    Drops samples whose parameters are not finite. Raises RunError if a column is missing, or if no sample is left.
+
+    Example:
+        >>> from phd_exp.distributions import ProjectedHuber
+        >>> one = ProjectedHuber(torch.zeros(1, 2), torch.full((1,), 4.0), torch.eye(2)[None], torch.ones(1))
+        >>> table = {name: column.numpy() for name, column in distribution_columns(one, torch.ones(1, 3)).items()}
+        >>> xyz = {name: np.ones(1) for name in "xyz"}
+        >>> recalibrated(table | xyz, Temperature(projected=2.0, depth=4.0))["a"].tolist()
+        [0.25]
     """
-    arrays = _arrays(table, (*PARAMETERS, *XYZ))
-    columns = {name: _tensor(arrays[name]) for name in (*PARAMETERS, *XYZ)}
+    recorded = arrays(table)
+    require_columns((*PARAMETERS, *XYZ), recorded)
+    columns = _tensors(recorded, (*PARAMETERS, *XYZ))
     finite = _all_finite(columns, tuple(columns))
     columns = {name: column[finite] for name, column in columns.items()}
     distribution, xyz = temperature.apply(_distribution(columns)), _positions(columns)
     changed = distribution_columns(distribution, xyz)
     changed["energy_score"] = energy_score(draws(distribution, DRAWS, SEED), xyz)
-    kept = {name: array[finite.numpy()] for name, array in arrays.items()}
+    kept = {name: array[finite.numpy()] for name, array in recorded.items()}
     return kept | {name: column.numpy() for name, column in changed.items()}
 
 
 def recalibrated_depth_curve(folder: RunFolder, temperature: Temperature, window: int) -> CalibrationCurve:
-    """Of a run's test samples, predicted at these temperatures; square metres.
+    """The calibration curve of depth (m^2) of a run's test samples at these temperatures.
 
-    Raises RunError where they cannot be read.
+    Raises RunError if they cannot be read.
     """
     table = recalibrated(read_table(folder.predictions), temperature)
-    variance, squared_error = (_tensor(table[f"depth_{name}"]) for name in ("variance", "squared_error"))
-    return calibration_curve(variance, squared_error, window)
+    columns = _tensors(table, ("depth_variance", "depth_squared_error"))
+    return calibration_curve(columns["depth_variance"], columns["depth_squared_error"], window)
 
 
 def _distribution_scores(columns: Mapping[str, Tensor], weight: Tensor) -> dict[str, Tensor]:
@@ -187,7 +183,7 @@ def _scores(
 
 
 def band_of(found: Interval) -> Band:
-    """An interval of one number."""
+    """The interval of a scalar as plain numbers."""
     return Band(float(found.value), float(found.low), float(found.high))
 
 
@@ -198,29 +194,24 @@ def _curve(x: Tensor, interval: Interval) -> Curve:
 def _strata(statistic: Statistic, columns: Mapping[str, Tensor], resamples: int) -> list[Stratum]:
     found = []
     for quantity, (column, unit, edges) in QUANTITIES.items():
-        if column not in columns:
-            continue
-        for stratum in strata(quantity, columns[column], edges, unit):
+        for stratum in strata(quantity, columns[column], edges, unit) if column in columns else []:
             part = {name: values[stratum.mask] for name, values in columns.items()}
             scores, _ = _scores(statistic, part, resamples)
             found.append(Stratum(quantity, stratum.label, int(stratum.mask.sum()), scores))
     return found
 
 
-def _finite(
-    table: pa.Table | Columns, names: tuple[str, ...], welcome: tuple[str, ...] = ()
-) -> tuple[dict[str, Tensor], int]:
-    """These columns and the welcome ones, of samples where they are finite, with the strata; how many are not."""
-    columns = _arrays(table, names)
-    names += tuple(name for name in welcome if name in columns)
-    of_strata = [column for column, _, _ in QUANTITIES.values() if column in columns]
-    tensors = {name: _tensor(columns[name]) for name in dict.fromkeys((*names, *of_strata))}
-    finite = _all_finite(tensors, names)
-    return {name: column[finite] for name, column in tensors.items()}, int((~finite).sum())
+def _finite(table: Columns, names: tuple[str, ...]) -> tuple[dict[str, Tensor], int]:
+    """These columns and those of the strata, of samples whose `names` are finite; the number of other samples."""
+    require_columns(names, table)
+    of_strata = [column for column, _, _ in QUANTITIES.values() if column in table]
+    columns = _tensors(table, (*names, *of_strata))
+    finite = _all_finite(columns, names)
+    return {name: column[finite] for name, column in columns.items()}, int((~finite).sum())
 
 
 def _all_finite(columns: Mapping[str, Tensor], names: tuple[str, ...]) -> Tensor:
-    """Which samples have these numbers finite. Raises RunError where none has."""
+    """Whether each sample has finite values in these columns. Raises RunError if no sample has."""
     finite = torch.stack([columns[name] for name in names]).isfinite().all(dim=0)
     if not bool(finite.any()):
         raise RunError(
@@ -229,18 +220,8 @@ def _all_finite(columns: Mapping[str, Tensor], names: tuple[str, ...]) -> Tensor
     return finite
 
 
-def _arrays(table: pa.Table | Columns, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    columns = arrays(table)
-    if missing := [name for name in names if name not in columns]:
-        raise RunError(
-            f"predictions: column {', '.join(missing)} missing, which an older version may not have written; "
-            "run the model again"
-        )
-    return columns
-
-
-def _tensor(array: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.array(array, dtype=np.float64))
+def _tensors(table: Columns, names: Sequence[str]) -> dict[str, Tensor]:
+    return {name: torch.from_numpy(np.array(table[name], dtype=np.float64)) for name in names}
 
 
 def _distribution(columns: Mapping[str, Tensor]) -> ProjectedHuber:

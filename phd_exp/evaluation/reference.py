@@ -1,4 +1,4 @@
-"""Distances from calibration that a calibrated model has: they cannot be zero for finitely many samples."""
+"""The distances from calibration of a calibrated model: they are not zero for finitely many samples."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -8,14 +8,13 @@ from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import draws
-from phd_exp.metrics.calibration import ence_of, miscalibration_area_of, uniform_distance_of
+from phd_exp.metrics.calibration import ence_of, miscalibration_area, uniform_distance
 from phd_exp.metrics.calibration_scores import ence_bins
 from phd_exp.metrics.ordered import in_order_of
 
-SIMULATIONS = 200
 SEED = 1
 _AT_ONCE = 10**6
-"""Positions that are drawn at a time."""
+"""Positions drawn at a time."""
 DISTANCES = ("depth_ence", "projected_ence", "miscalibration_area", "depth_pit_area", "depth_pit_ks")
 
 
@@ -28,24 +27,23 @@ class Band:
     high: float
 
 
-def calibrated_reference(
-    distribution: ProjectedHuber, simulations: int = SIMULATIONS, seed: int = SEED
-) -> dict[str, Band]:
-    """Median and 95 % interval of the `DISTANCES` over truths drawn from a batch of predictions themselves.
+def calibrated_reference(distribution: ProjectedHuber, simulations: int = 200) -> dict[str, Band]:
+    """Median and 95 % interval of the `DISTANCES` if the truths were drawn from the predictions themselves.
 
     ENCE depends on the predicted densities, so positions are drawn from them. Credible levels and PITs of a
-    calibrated model are uniform whatever it predicts: their distances depend on the number of samples alone.
+    calibrated model are uniform for any prediction: their distances depend on the number of samples alone.
 
     Source: the simulated null distribution of a test statistic; coverage in tests/evaluation/test_reference.py.
     """
     (n,) = distribution.batch_shape
-    found = {name: list(values) for name, values in _uniform(n, simulations, seed).items()}
-    found |= {"depth_ence": [], "projected_ence": []}
+    areas, distances = _uniform(n, simulations)
+    found: dict[str, list[float]] = {"depth_ence": [], "projected_ence": []}
+    found |= {"miscalibration_area": areas, "depth_pit_area": areas, "depth_pit_ks": distances}
     each = max(1, _AT_ONCE // n)
     for start in range(0, simulations, each):
-        for name, values in _ence(distribution, min(each, simulations - start), seed + start).items():
+        for name, values in _ence(distribution, min(each, simulations - start), SEED + start).items():
             found[name] += values.tolist()
-    return {name: _band(torch.tensor(found[name])) for name in DISTANCES}
+    return {name: _band(found[name]) for name in DISTANCES}
 
 
 def _ence(distribution: ProjectedHuber, simulations: int, seed: int) -> dict[str, Tensor]:
@@ -67,22 +65,18 @@ def _ence(distribution: ProjectedHuber, simulations: int, seed: int) -> dict[str
 
 
 @cache
-def _uniform(n: int, simulations: int, seed: int) -> dict[str, tuple[float, ...]]:
-    generator = torch.Generator().manual_seed(seed)
+def _uniform(n: int, simulations: int) -> tuple[list[float], list[float]]:
+    """Miscalibration areas and Kolmogorov-Smirnov distances of n uniform levels."""
+    generator = torch.Generator().manual_seed(SEED)
     areas, distances = [], []
     for _ in range(simulations):
         order = in_order_of(torch.rand(n, generator=generator, dtype=torch.float64), {})
-        areas.append(float(miscalibration_area_of(order)))
-        distances.append(float(uniform_distance_of(order)))
-    return {
-        "miscalibration_area": tuple(areas),
-        "depth_pit_area": tuple(areas),
-        "depth_pit_ks": tuple(distances),
-    }
+        areas.append(float(miscalibration_area(order)))
+        distances.append(float(uniform_distance(order)))
+    return areas, distances
 
 
-def _band(values: Tensor) -> Band:
-    low, value, high = (
-        values.double().quantile(torch.tensor([0.025, 0.5, 0.975], dtype=torch.float64)).tolist()
-    )
+def _band(values: list[float]) -> Band:
+    shares = torch.tensor([0.025, 0.5, 0.975], dtype=torch.float64)
+    low, value, high = torch.tensor(values).double().quantile(shares).tolist()
     return Band(value, low, high)

@@ -8,9 +8,9 @@ A gradient and a symmetric matrix are one tuple (g_0, g_1, g_2, H_00, H_10, H_11
 registers. Arguments of compiled functions have no annotations: the types are those of the values. Division by zero
 gives infinity.
 """
+# mypy: no-check-untyped-defs, allow-untyped-defs
 
 import math
-from typing import no_type_check
 
 import numpy as np
 from numba import njit
@@ -21,7 +21,6 @@ ZERO = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @compiled
-@no_type_check
 def measured(slope, at_origin, u):
     """(q_x, q_y, t) of one camera at u."""
     x, y, t = change(slope, u)
@@ -29,7 +28,6 @@ def measured(slope, at_origin, u):
 
 
 @compiled
-@no_type_check
 def change(slope, du):
     """The change of (q_x, q_y, t) of one camera with a change of u."""
     return (
@@ -40,14 +38,12 @@ def change(slope, du):
 
 
 @compiled
-@no_type_check
 def huber(squared):
     """h(|q|) of |q|^2."""
     return math.sqrt(squared) - 0.5 if squared > 1 else squared / 2
 
 
 @compiled
-@no_type_check
 def huber_weight(q_x, q_y):
     """h'(|q|)/|q|, and q/|q| where h is linear, else 0."""
     weight = 1 / math.sqrt(max(q_x * q_x + q_y * q_y, 1.0))
@@ -57,7 +53,6 @@ def huber_weight(q_x, q_y):
 
 
 @compiled
-@no_type_check
 def add(sums, slope, by_x, by_y, by_t, xx, xy, yy, tt):
     """Gradient and Hessian plus those of one more camera, which are given with respect to (q_x, q_y, t)."""
     g_0, g_1, g_2, h_00, h_10, h_11, h_20, h_21, h_22 = sums
@@ -81,7 +76,6 @@ def add(sums, slope, by_x, by_y, by_t, xx, xy, yy, tt):
 
 
 @compiled
-@no_type_check
 def factor(sums):
     """(L_00, L_10, L_11, L_20, L_21, L_22) with L L^T = H; NaN where H is not positive definite."""
     _, _, _, h_00, h_10, h_11, h_20, h_21, h_22 = sums
@@ -95,7 +89,6 @@ def factor(sums):
 
 
 @compiled
-@no_type_check
 def forward(L, b):
     """The x with L x = b."""
     l_00, l_10, l_11, l_20, l_21, l_22 = L
@@ -105,7 +98,6 @@ def forward(L, b):
 
 
 @compiled
-@no_type_check
 def backward(L, b):
     """The x with L^T x = b."""
     l_00, l_10, l_11, l_20, l_21, l_22 = L
@@ -115,7 +107,6 @@ def backward(L, b):
 
 
 @compiled
-@no_type_check
 def newton_step(sums):
     """-H^(-1) g."""
     L = factor(sums)
@@ -123,7 +114,6 @@ def newton_step(sums):
 
 
 @compiled
-@no_type_check
 def squared_norm(x):
     """|x|^2."""
     return x[0] * x[0] + x[1] * x[1] + x[2] * x[2]

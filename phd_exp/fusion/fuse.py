@@ -15,20 +15,15 @@ from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.level import credible_level
 from phd_exp.fusion.pose import Plane, Pose
 from phd_exp.fusion.problems import Problems, Status
-from phd_exp.records.errors import UserError
 from phd_exp.threads import one_thread
 
 _NO_LEVELS = np.empty(0)
 # `kernels` and `moments` are imported in the functions that use them: importing numba takes a second
 
 
-class FusionError(UserError):
-    """Problems that have no fused position, with the reason for each."""
-
-
 @dataclass(frozen=True)
 class Fused:
-    """One position for each problem, and its uncertainty; NaN where a problem failed.
+    """One position for each problem and its uncertainty; NaN where a problem failed.
 
     Args:
         point: the most likely position, world, metres.
@@ -36,7 +31,7 @@ class Fused:
             flat for a bound.
         subgradient: norm of a subgradient of the summed -log p at `point`, nats per metre; 0 proves the optimum.
         status: `Status` of each problem.
-        problems: what was solved, `unknowns` its solution, and `excess` the energy of each view above its minimum:
+        problems: the problems, `unknowns` their solution, and `excess` the energy of each view above its minimum;
             surprise, mean and covariance are computed from them on demand.
     """
 
@@ -84,8 +79,8 @@ class Fused:
         """The probability of the ellipsoids of mean and covariance that have these probabilities under a Gaussian.
 
         The densities have heavier tails than a Gaussian: 0.878 of the positions lie in the 90 % ellipsoid of one
-        camera, 0.888 in that of four. This is the share of true positions to expect there if the predictions are
-        calibrated. From the quadrature of `moments`, accurate to 0.01 for one problem and to 0.001 on average.
+        camera, 0.888 in that of four. For calibrated predictions this is the expected share of true positions. The
+        quadrature of `moments` is accurate to 0.01 for one problem and to 0.001 on average.
         """
         radii = stats.chi2.ppf(np.array(levels), self.problems.dimensions)
         fused = self.status.cpu().flatten() == Status.FUSED
@@ -94,30 +89,22 @@ class Fused:
     def _quadrature(
         self, chosen: Bool[Tensor, " flat"], radii: Float[np.ndarray, " levels"] = _NO_LEVELS
     ) -> tuple[Float[Tensor, "flat 3"], Float[Tensor, "flat 3 3"], Float[Tensor, "flat levels"]]:
-        """What `moments` returns for the unknowns of the chosen problems, NaN for the others."""
+        """The results of `moments` for the chosen problems, NaN for the others."""
         from phd_exp.fusion.kernels import all_moments
         from phd_exp.fusion.moments import student_points
 
-        shapes = ((3,), (3, 3), radii.shape)
-        results = [np.full((len(chosen), *shape), np.nan) for shape in shapes]
+        mean, covariance, inside = (np.full((len(chosen), *s), np.nan) for s in ((3,), (3, 3), radii.shape))
         views = (*self.problems.views, self.unknowns.numpy(), *student_points(self.problems.dimensions))
-        all_moments(chosen.numpy(), *views, radii, *results)
-        mean, covariance, inside = map(torch.from_numpy, results)
-        return mean, covariance, inside
+        all_moments(chosen.numpy(), *views, radii, mean, covariance, inside)
+        return torch.from_numpy(mean), torch.from_numpy(covariance), torch.from_numpy(inside)
 
     def errors(self) -> list[str]:
         """One line for each problem that failed: its index and the reason."""
         failed = (self.status != Status.FUSED).nonzero().tolist()
-        reasons = [Status(code).reason for code in self.status[self.status != Status.FUSED].tolist()]
         return [
-            f"problem {', '.join(map(str, index)) or 0}: {reason}"
-            for index, reason in zip(failed, reasons, strict=True)
+            f"problem {', '.join(map(str, index)) or 0}: {Status(int(self.status[tuple(index)])).reason}"
+            for index in failed
         ]
-
-    def raise_if_failed(self) -> None:
-        """Raises FusionError with the `errors`, if there are any."""
-        if lines := self.errors():
-            raise FusionError("\n".join(lines))
 
 
 @torch.no_grad()
@@ -130,9 +117,9 @@ def fuse(
 ) -> Fused:
     """The position v of highest sum_i log p_i(R_i v + t_i), optionally among the points of a plane.
 
-    A convex problem, non-smooth where z = mu_z. It is solved on the CPU in float64, one problem per core at a time;
-    results are on the device of the predictions. A problem that fails gives the reason in `status` and does not
-    affect the others.
+    The problem is convex, and not smooth where z = mu_z. It is solved on the CPU in float64, one problem per core at
+    a time; results are on the device of the predictions. A problem that fails has its reason in `status` and does
+    not affect the others.
 
     Args:
         predictions: of batch shape (*problems, cameras).
@@ -144,6 +131,13 @@ def fuse(
 
     Raises:
         ValueError: shapes do not broadcast.
+
+    Example:
+        >>> A, a = 300 * torch.eye(2).expand(2, 2, 2), torch.full((2,), 10.0)
+        >>> predictions = ProjectedHuber(torch.zeros(2, 2), torch.tensor([4.0, 6.0]), A, a)
+        >>> ahead = Pose(torch.eye(3), torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]]))  # the second 2 m behind
+        >>> fuse(predictions, ahead).point
+        tensor([0., 0., 4.], dtype=torch.float64)
 
     Source: paper, section "Multi-view fusion and ground plane constraints".
     """

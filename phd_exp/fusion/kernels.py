@@ -1,8 +1,8 @@
 """The compiled loops over the problems of a batch, each problem on one core."""
+# mypy: no-check-untyped-defs, allow-untyped-defs
 
 import hashlib
 from pathlib import Path
-from typing import no_type_check
 
 import numpy as np
 from numba import njit, prange
@@ -10,8 +10,7 @@ from numba import njit, prange
 from phd_exp.fusion.arithmetic import compiled, huber, measured
 from phd_exp.fusion.certificate import certify
 from phd_exp.fusion.moments import moments
-from phd_exp.fusion.newton import optimum
-from phd_exp.fusion.polish import polish
+from phd_exp.fusion.newton import optimum, polish
 from phd_exp.fusion.problems import Status
 
 CONVERGED = 1e-6
@@ -21,7 +20,6 @@ _NO_COMMON_VIEW, _PLANE_BEHIND_CAMERA = int(Status.NO_COMMON_VIEW), int(Status.P
 
 
 @compiled
-@no_type_check
 def _solve(slope, at_origin, a, free_slope, u, certificate, excess):
     """Moves u to the optimum of one problem; returns its status."""
     lam = np.zeros(len(a))
@@ -36,12 +34,11 @@ def _solve(slope, at_origin, a, free_slope, u, certificate, excess):
     return _FUSED if certificate[1] <= CONVERGED else _NOT_CONVERGED
 
 
-@no_type_check
 def _loops(sources):
     """The two loops, compiled from these sources.
 
-    numba keeps what it compiles beside this file, and looks at this file alone to see whether it is up to date. It
-    also looks at the variables that a function closes over: hence the digest of all sources is one.
+    numba's cache depends on this file and on the variables that a function closes over. The digest of all sources is
+    therefore one of them.
     """
 
     @njit(cache=True, error_model="numpy", parallel=True)

@@ -4,10 +4,10 @@ A second derivative at the optimum misses the kinks of depth, which usually hold
 the Gaussian of second derivatives averaged over itself (`_averaged_precision`) only places the points at which the
 density is evaluated, and the moments follow from the values.
 """
+# mypy: no-check-untyped-defs, allow-untyped-defs
 
 import math
 from functools import cache
-from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -46,7 +46,6 @@ def student_points(k: int) -> tuple[Float[np.ndarray, "3 points"], Float[np.ndar
 
 
 @compiled
-@no_type_check
 def moments(views, u, points, log_density, radii, mean, covariance, inside):
     """Fills `mean` (metres) and `covariance` (square metres) of u with density exp(-energy), of which u is the mode.
 
@@ -76,7 +75,6 @@ def moments(views, u, points, log_density, radii, mean, covariance, inside):
 
 
 @compiled
-@no_type_check
 def _weighted(slope, at_origin, a, centre, root, points, log_density, value):
     """Mean and covariance of the points x, weighted by the density at centre + root x; fills `value` with weights.
 
@@ -105,7 +103,6 @@ def _weighted(slope, at_origin, a, centre, root, points, log_density, value):
 
 
 @njit(error_model="numpy", fastmath={"reassoc"})  # in any order: on all lanes of a vector unit
-@no_type_check
 def _sums(points, weight):
     """The sums over the points of weight times 1, x and x x^T."""
     total = m_0 = m_1 = m_2 = c_00 = c_10 = c_11 = c_20 = c_21 = c_22 = np.float32(0)
@@ -120,7 +117,6 @@ def _sums(points, weight):
 
 
 @compiled
-@no_type_check
 def _subtract_energy(x, y, t, columns, a, points, value):
     """Subtracts the energy of one camera at each point from its value; without a branch, for vector units."""
     (x_0, y_0, t_0), (x_1, y_1, t_1), (x_2, y_2, t_2) = columns
@@ -140,7 +136,6 @@ def _subtract_energy(x, y, t, columns, a, points, value):
 
 
 @compiled
-@no_type_check
 def _probabilities(points, weight, total, first, second, radii, inside):
     """The weighted share of the points in each ellipsoid."""
     inside[:] = 0.0
@@ -154,7 +149,6 @@ def _probabilities(points, weight, total, first, second, radii, inside):
 
 
 @compiled
-@no_type_check
 def _move(mean, root, covariance, first, second):
     """Moves the mean to that of the points, and root to a root of their covariance; fills in that covariance."""
     l_00, l_10, l_11, l_20, l_21, l_22 = factor(second)
@@ -168,7 +162,6 @@ def _move(mean, root, covariance, first, second):
 
 
 @compiled
-@no_type_check
 def _averaged_precision(slope, at_origin, a, u):
     """About the second derivative of the energy averaged over N(u, its inverse), a fixed point; 1/square metres.
 

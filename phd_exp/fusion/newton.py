@@ -1,22 +1,23 @@
-"""The smoothed problem by a primal-dual Newton method.
+"""The optimum of one problem: of the smoothed problem by a primal-dual Newton method, then of the exact problem.
 
 The energy of a camera is h(|q|) + a max(t, 1/t). With g = (t - 1/t)/2 the maximum is (t + 1/t)/2 + |g|, and |g| is
 smoothed to s = sqrt(g^2 + width^2). This is the w of the epigraph's barrier, (w - t)(w - 1/t) = width^2. It is convex
 in t, because its second derivative is (1 - g/s)/t^3 + width^2 g'^2/s^3, and at most `width` too large.
 
-Plain Newton steps see no curvature where h or max(t, 1/t) is linear and overshoot. So, as in total-variation
-denoising (Chan, Golub and Mulet, 1999), the directions of both are unknowns too:
+Plain Newton steps overshoot where h or max(t, 1/t) is linear, because their curvature is zero there. As in
+total-variation denoising (Chan, Golub and Mulet, 1999), the directions of both are therefore unknowns too:
 
     y max(1, |q|) = q,    lam s = g    with |y| <= 1, |lam| <= 1,
 
 each linearised together with the stationarity in u. From y = 0, lam = 0 the first steps are those of reweighted least
-squares, the last ones quadratic. The width falls to its floor meanwhile; a line search keeps every step a descent.
+squares, and the last ones converge quadratically, while the width falls to its floor. A line search ensures that the
+energy falls in every step. `polish` then replaces the kinks at which the optimum lies by equalities t = 1.
 
 Source: own derivation; optima checked against a conic solver in tests/fusion/test_conic.py.
 """
+# mypy: no-check-untyped-defs, allow-untyped-defs
 
 import math
-from typing import no_type_check
 
 import numpy as np
 
@@ -28,12 +29,17 @@ MOST_STEPS, MOST_HALVINGS = 80, 40
 SETTLED = 1e-9  # relative change of (q_x, q_y, t)
 RIDGE = 1e-9  # share of the curvature of least squares: a flat direction must not stop the rest
 ARMIJO = 1e-4
+KINK = 1e-6
+"""|t - 1| within which a kink may hold the optimum; the smoothed optimum is about 1e-9 from such a kink."""
+ROUNDS, PENALTY = 4, 1e7
+EXACT_RIDGE = 1e-12
+FARTHEST = 1e-4  # metres; a larger correction is rejected
+STILL = 1e-16  # metres
 LEAST_DEPTHS = (1e-2, 1e-4, 1e-6)
 """Shares of the predicted depth below which 1/t is continued, tried in turn until the optimum lies beyond."""
 
 
 @compiled
-@no_type_check
 def optimum(slope, at_origin, a, u, lam):
     """Moves u to the optimum and lam to its multipliers; returns whether one has t >= 1e-6 in every camera.
 
@@ -51,18 +57,17 @@ def optimum(slope, at_origin, a, u, lam):
 
 
 @compiled
-@no_type_check
 def minimise(slope, at_origin, a, u, lam, least):
     """Moves u to the minimum with 1/t continued below t = least, and lam to the multipliers of the kinks.
 
-    After 80 steps u is left where it is: the certificate judges it.
+    It stops after 80 steps at the latest; the certificate bounds the error.
     """
     cameras = len(a)
     at, moved = np.empty((cameras, 3)), np.empty((cameras, 3))
     y, terms = np.zeros((cameras, 2)), np.empty((cameras, 6))
     width = FIRST_WIDTH
     for _ in range(MOST_STEPS):
-        before, sums = _linearise(slope, at_origin, a, u, y, lam, width, least, at, terms)
+        before, sums = _linearise_smooth(slope, at_origin, a, u, y, lam, width, least, at, terms)
         du = newton_step(sums)
         for c in range(cameras):
             moved[c] = change(slope[c], du)
@@ -77,12 +82,11 @@ def minimise(slope, at_origin, a, u, lam, least):
 
 
 @compiled
-@no_type_check
 def extended_inverse(t, least):
     """1/t with its first two derivatives, continued below t = least > 0 by its second-order Taylor polynomial.
 
-    The continuation is convex and finite everywhere, so that a search may start behind a camera. A minimum of the
-    continued problem that has t >= least in every camera is the minimum of the problem itself, by convexity.
+    The continuation is convex and finite everywhere, so that a search may start behind a camera. By convexity a
+    minimum of the continued problem with t >= least in every camera is the minimum of the original problem.
     """
     inverse = 1 / max(t, least)
     short = min(t - least, 0.0) / least
@@ -90,7 +94,6 @@ def extended_inverse(t, least):
 
 
 @compiled
-@no_type_check
 def smooth_depth_energy(t, inverse, width):
     """(t + 1/t)/2 + s, which is max(t, 1/t) at width 0; and g and s."""
     g = (t - inverse) / 2
@@ -99,8 +102,7 @@ def smooth_depth_energy(t, inverse, width):
 
 
 @compiled
-@no_type_check
-def _linearise(slope, at_origin, a, u, y, lam, width, least, at, terms):
+def _linearise_smooth(slope, at_origin, a, u, y, lam, width, least, at, terms):
     """The smoothed energy, its gradient and Hessian; fills `at` with (q_x, q_y, t) and `terms` for `_step`."""
     value, sums = 0.0, ZERO
     for c in range(len(a)):
@@ -121,7 +123,6 @@ def _linearise(slope, at_origin, a, u, y, lam, width, least, at, terms):
 
 
 @compiled
-@no_type_check
 def _line_search(before, at, moved, a, descent, width, least):
     """The share of the step to take: halved until the energy falls by Armijo's rule."""
     enough = before + 1e-12 * abs(before)  # rounding may add this much where nothing is left to gain
@@ -140,7 +141,6 @@ def _line_search(before, at, moved, a, descent, width, least):
 
 
 @compiled
-@no_type_check
 def _step(at, terms, moved, y, lam, share):
     """Moves the duals; returns whether (q_x, q_y, t) hardly moved in any camera."""
     settled = True
@@ -156,3 +156,53 @@ def _step(at, terms, moved, y, lam, share):
         for m in range(3):
             settled &= abs(share * moved[c, m]) <= SETTLED * (1 + abs(at[c, m]))
     return settled
+
+
+@compiled
+def polish(slope, at_origin, a, u, lam):
+    """Moves u to the optimum, to rounding, and lam to the subgradients of max(t, 1/t) at kinks.
+
+    The method of multipliers: at a kink the energy is a (lam (t - 1) + penalty (t - 1)^2 / 2), and lam moves by the
+    penalty times the remaining t - 1. A kink whose lam leaves [-1, 1] does not hold the optimum: its camera goes to
+    that side. A result farther away than 0.1 mm is rejected: u and lam stay as they were.
+
+    Source: own derivation; checked against a conic solver in tests/fusion/test_conic.py.
+    """
+    cameras = len(a)
+    start, first = u.copy(), lam.copy()
+    kink = np.zeros(cameras, dtype=np.bool_)
+    for _ in range(ROUNDS):
+        du = newton_step(_linearise_exact(slope, at_origin, a, u, lam, kink))
+        for j in range(3):
+            u[j] += du[j]
+        for c in range(cameras):
+            if kink[c]:
+                lam[c] += PENALTY * (measured(slope[c], at_origin[c], u)[2] - 1)
+        if max(abs(du[0]), abs(du[1]), abs(du[2])) <= STILL:
+            break
+    if not np.all(np.abs(u - start) <= FARTHEST):  # NaN too
+        u[:] = start
+        lam[:] = first
+    for c in range(cameras):
+        lam[c] = min(max(lam[c], -1.0), 1.0)
+
+
+@compiled
+def _linearise_exact(slope, at_origin, a, u, lam, kink):
+    """Gradient and Hessian; fills `kink` with the cameras at one, and lam of the others with their side."""
+    sums = ZERO
+    for c in range(len(a)):
+        q_x, q_y, t = measured(slope[c], at_origin[c], u)
+        near = abs(t - 1) <= KINK
+        side = np.sign(lam[c] if near else t - 1)
+        kink[c] = near and abs(lam[c]) < 1
+        by_t, bend = (1.0, 0.0) if side > 0 else (-1 / (t * t), 2 / (t * t * t))
+        if kink[c]:
+            by_t, bend = lam[c] + PENALTY * (t - 1), PENALTY
+        else:
+            lam[c] = side
+        weight, unit_x, unit_y = huber_weight(q_x, q_y)
+        xx, xy = weight * (1 + EXACT_RIDGE - unit_x * unit_x), -weight * unit_x * unit_y
+        yy, tt = weight * (1 + EXACT_RIDGE - unit_y * unit_y), a[c] * (bend + EXACT_RIDGE)
+        sums = add(sums, slope[c], weight * q_x, weight * q_y, a[c] * by_t, xx, xy, yy, tt)
+    return sums

@@ -3,8 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from phd_exp.records import scenes
@@ -16,7 +18,7 @@ RIGID_WITHIN = 1e-6  # float32 keeps a rotation to 1e-7
 class Pose:
     """The motion from the world into the frame of each camera: v_camera = R v_world + t.
 
-    This is the convention of the `pose` in the metadata of a data set, where the world is the scene's own frame.
+    The `pose` in the metadata of a data set has this convention; its world is the frame of the scene.
 
     Args:
         R: rotations from the world's axes to the camera's.
@@ -28,28 +30,18 @@ class Pose:
 
     @classmethod
     def from_scene(cls, poses: Sequence[scenes.Pose]) -> "Pose":
-        """The poses of a data set's records, one camera each, in float64; the quaternion (w, x, y, z) becomes R.
-
-        Source: R = (w^2 - |u|^2) I + 2 u u^T + 2 w [u]_x for the unit quaternion (w, u).
-        """
-        quaternion = torch.tensor([pose.rotation for pose in poses], dtype=torch.float64).reshape(-1, 4)
-        # records keep unit length to 1e-6, and R is quadratic in the quaternion
-        quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
-        w, u = quaternion[:, :1, None], quaternion[:, 1:]
-        x, y, z = u.unbind(-1)
-        zero = torch.zeros_like(x)
-        cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
-        scale = w.square() - u.square().sum(-1)[:, None, None]
-        R = scale * torch.eye(3, dtype=torch.float64) + 2 * u[:, :, None] * u[:, None] + 2 * w * cross
-        return cls(R, torch.tensor([pose.translation for pose in poses], dtype=torch.float64).reshape(-1, 3))
+        """The poses of a data set's records, one camera each, in float64; the quaternion (w, x, y, z) becomes R."""
+        quaternion = np.reshape([pose.rotation for pose in poses], (-1, 4))
+        R = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()  # normalises the quaternion
+        t = torch.tensor([pose.translation for pose in poses], dtype=torch.float64).reshape(-1, 3)
+        return cls(torch.from_numpy(R), t)
 
     @property
     def is_rigid(self) -> Bool[Tensor, "*batch"]:
         """Whether R is a rotation, R R^T = I within 1e-6 and |R| > 0; false where R is not finite."""
         R = self.R.double()
         error = (R @ R.mT - torch.eye(3, dtype=R.dtype, device=R.device)).abs().amax((-2, -1))
-        handed = (R[..., 0, :] * torch.linalg.cross(R[..., 1, :], R[..., 2, :])).sum(-1) > 0
-        return (error <= RIGID_WITHIN) & handed
+        return (error <= RIGID_WITHIN) & (torch.linalg.det(R) > 0)
 
     def into_camera(self, v: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
         """World to camera frame, R v + t."""

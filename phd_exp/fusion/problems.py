@@ -15,56 +15,46 @@ from phd_exp.fusion.pose import Plane, Pose
 
 
 class Status(IntEnum):
-    """How a problem ended; all but FUSED are failures, with NaN in place of numbers."""
+    """How a problem ended, with the `reason` in one line; all but FUSED are failures, with NaN instead of numbers."""
 
-    FUSED = 0
-    NO_CAMERA = 1
-    NOT_FINITE = 2
-    NOT_A_ROTATION = 3
-    NOT_A_PLANE = 4
-    NO_COMMON_VIEW = 5
-    PLANE_BEHIND_CAMERA = 6
-    CONTRADICTION = 7
-    NOT_CONVERGED = 8
+    reason: str
 
-    @property
-    def reason(self) -> str:
-        """What is wrong, what was expected and how to fix it, in one line."""
-        return _REASONS[self]
-
-
-_REASONS = {
-    Status.FUSED: "fused",
-    Status.NO_CAMERA: "all cameras are masked out; expected at least one",
-    Status.NOT_FINITE: "a prediction, pose or plane is not finite; mask out that camera or correct its numbers",
-    Status.NOT_A_ROTATION: "the R of a pose is not a rotation to 1e-6; expected R R^T = I and |R| = 1",
-    Status.NOT_A_PLANE: "the normal of the plane is zero; expected a direction",
-    Status.NO_COMMON_VIEW: "no position is in front of every camera; check that poses map world to camera, R v + t",
-    Status.PLANE_BEHIND_CAMERA: "no point of the plane is in front of every camera; check its normal and offset",
-    Status.CONTRADICTION: (
+    FUSED = 0, "fused"
+    NO_CAMERA = 1, "all cameras are masked out; expected at least one"
+    NOT_FINITE = 2, "a prediction, pose or plane is not finite; mask out that camera or correct its numbers"
+    NOT_A_ROTATION = 3, "the R of a pose is not a rotation to 1e-6; expected R R^T = I and |R| = 1"
+    NOT_A_PLANE = 4, "the normal of the plane is zero; expected a direction"
+    NO_COMMON_VIEW = (
+        5,
+        "no position is in front of every camera; check that poses map world to camera, R v + t",
+    )
+    PLANE_BEHIND_CAMERA = 6, "no point of the plane is in front of every camera; check its normal and offset"
+    CONTRADICTION = (
+        7,
         "at least half of the views rule out every common position; check the poses, the plane, and that all "
-        "cameras see the same object"
-    ),
-    Status.NOT_CONVERGED: "the optimum was not found to machine precision; check whether the numbers are extreme",
-}
+        "cameras see the same object",
+    )
+    NOT_CONVERGED = 8, "the optimum was not found to machine precision; check whether the numbers are extreme"
+
+    def __new__(cls, code: int, reason: str = "") -> "Status":
+        status = int.__new__(cls, code)
+        status._value_, status.reason = code, reason
+        return status
 
 
 @dataclass(frozen=True)
 class Problems:
     """The (q_x, q_y, t) of every camera as an affine function of the unknowns u; in float64, on the CPU.
 
-    A camera that is masked out measures q = 0 and t = 1 of every position and has a = 0: it adds a constant.
+    A masked camera has q = 0 and t = 1 at every position, and a = 0: it adds a constant to the energy.
 
     Args:
-        predictions: as given to `fuse`.
-        pose: of the cameras.
-        mask: which cameras take part.
+        predictions, pose, mask: as given to `fuse`.
         origin: the world position of u = 0, where the search starts, metres: the average of the predicted positions,
-            or the point of the plane nearest to it.
+            or the nearest point of the plane.
         directions: the world position is origin + directions u; on a plane the third column is zero.
         dimensions: the number of unknowns, 3, or 2 on a plane.
-        slope: d(q_x, q_y, t)/du, 1/metres.
-        free_slope: the same with respect to the world position.
+        slope, free_slope: d(q_x, q_y, t)/du and the same with respect to the world position, 1/metres.
         at_origin: (q_x, q_y, t) at u = 0.
         a: precision of the depth.
         status: FUSED where the input is valid.
@@ -95,9 +85,7 @@ class Problems:
         if len(shape) == 0 or shape[-1] == 0:
             raise ValueError(f"predictions: got batch shape {tuple(shape)}; expected (*problems, cameras)")
         pose = Pose(_flat("pose.R", pose.R, shape, event=2), _flat("pose.t", pose.t, shape, event=1))
-        if mask is None:
-            mask = torch.ones(shape, dtype=torch.bool)
-        mask = _flat("mask", mask, shape) > 0
+        mask = _flat("mask", torch.ones(shape) if mask is None else mask, shape) > 0
         measure = _flat("predictions", _measure(predictions), shape, event=2)
         mode = _flat("predictions", predictions.mode, shape, event=1)
         a = _flat("predictions", predictions.a, shape)
@@ -149,12 +137,8 @@ class Problems:
         return alone, pose.into_world(mean), pose.R.mT @ covariance @ pose.R
 
 
-def _status(
-    mask: Bool[Tensor, "problems cameras"],
-    valid: Bool[Tensor, "problems cameras"],
-    rigid: Bool[Tensor, "problems cameras"],
-    plane: Plane | None,
-) -> Int[Tensor, " problems"]:
+def _status(mask: Tensor, valid: Tensor, rigid: Tensor, plane: Plane | None) -> Int[Tensor, " problems"]:
+    """The status of each problem, from three masks over its cameras."""
     status = torch.full(mask.shape[:1], int(Status.FUSED))
     status[(~rigid & mask).any(-1)] = Status.NOT_A_ROTATION
     status[(~valid & mask).any(-1)] = Status.NOT_FINITE

@@ -1,21 +1,93 @@
-"""A sighting as one JSON object, in the frame of the real camera."""
+"""Detections in image files, each predicted by a network, and the predictions as JSON objects."""
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
 
+from phd_exp.data.cache import LARGEST_AT_ONCE
+from phd_exp.data.crops import read_image
+from phd_exp.data.folder import content_of
 from phd_exp.distributions import ProjectedHuber, Temperature
 from phd_exp.distributions.along import quantiles_along
 from phd_exp.geometry.camera import Camera
-from phd_exp.inference.sightings import Sighting
-from phd_exp.inference.views import View
+from phd_exp.geometry.virtual import intrinsics
+from phd_exp.inference.predictor import BATCH, Predictor, View
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
+from phd_exp.models.heads import Prediction
+from phd_exp.records.detections import Detection
+from phd_exp.records.errors import DatasetError, RunError
+from phd_exp.records.images import pillow_warnings
 
 LEVELS = (50, 90, 99)
 """Per cent of the credible intervals of depth."""
 DIGITS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """A detection, its image, and its prediction in the frame of the view's virtual camera (float64).
+
+    `raw` holds the outputs of the network, from which `Predictor.predict` makes the prediction.
+    """
+
+    detection: Detection
+    image: Image.Image
+    view: View
+    raw: Float[Tensor, " n_outputs"]
+    prediction: Prediction
+
+
+def sightings(predictor: Predictor, detections: Sequence[Detection]) -> Iterator[Sighting]:
+    """The prediction for each detection, in their order.
+
+    Raises DatasetError, naming the file, for an invalid image, and RunError if a network output is not finite.
+    """
+    for batch in _batches(predictor, detections):
+        f = torch.tensor([view.camera.f for _, _, view in batch], dtype=torch.float64)
+        raw = predictor.raw(np.stack([view.image for _, _, view in batch]), f).double()
+        for row, (detection, image, view) in enumerate(batch):
+            if not bool(raw[row].isfinite().all()):
+                raise RunError(
+                    f"{detection.where}: the network returns numbers that are not finite; train the run again"
+                )
+            yield Sighting(detection, image, view, raw[row], predictor.predict(raw[row], f[row]))
+
+
+def _batches(
+    predictor: Predictor, detections: Sequence[Detection]
+) -> Iterator[list[tuple[Detection, Image.Image, View]]]:
+    """Detections with image and view; consecutive detections in one file share its image.
+
+    A batch ends at `BATCH` detections, or when its images exceed `LARGEST_AT_ONCE` pixels.
+    """
+    batch: list[tuple[Detection, Image.Image, View]] = []
+    pixels = 0
+    for detection in detections:
+        try:
+            if batch and batch[-1][0].file == detection.file:
+                image = batch[-1][1]
+            else:
+                with pillow_warnings():
+                    image = read_image(detection.file, content_of(detection.file))
+                pixels += image.width * image.height
+            K = intrinsics(*detection.focal_lengths_and_centre(*image.size))
+            view = View.of_box(image, K, detection.box(*image.size), predictor.side, detection.where)
+        except DatasetError:
+            if batch:
+                yield batch  # the predictions before the invalid image are not lost
+            raise
+        batch.append((detection, image, view))
+        if len(batch) == BATCH or pixels > LARGEST_AT_ONCE:
+            yield batch
+            batch, pixels = [], 0
+    if batch:
+        yield batch
 
 
 def answer(sighting: Sighting, temperature: Temperature | None) -> dict[str, Any]:
@@ -41,30 +113,27 @@ def answer(sighting: Sighting, temperature: Temperature | None) -> dict[str, Any
 
 def _distribution(distribution: ProjectedHuber, view: View) -> dict[str, Any]:
     R = view.camera.R
-    quantiles = _depth_quantiles(distribution, view)
+    median, *intervals = _depth_quantiles(distribution, R[:, 2])  # the axis of the real camera
     return {
         "mode": rounded(view.camera.to_real(_array(distribution.mode))),
         "mean": rounded(view.camera.to_real(_array(distribution.mean))),
         "covariance": rounded(R.T @ _array(distribution.covariance_matrix) @ R),
-        "median_depth": None if quantiles is None else rounded(quantiles[0]),
-        "depth_interval": {
-            str(level): None if quantiles is None else rounded(quantiles[[1 + place, -1 - place]])
-            for place, level in enumerate(LEVELS)
-        },
+        "median_depth": median,
+        "depth_interval": dict(zip(map(str, LEVELS), intervals, strict=True)),
     }
 
 
-def _depth_quantiles(distribution: ProjectedHuber, view: View) -> Float[np.ndarray, " quantiles"] | None:
-    """The median of depth, then the lower ends of the intervals and the upper ones, the last first.
+def _depth_quantiles(distribution: ProjectedHuber, axis: Float[np.ndarray, "3"]) -> list[Any]:
+    """The median of depth along an axis and the interval of each level, for JSON.
 
-    None where the mode lies 90 degrees or more from the axis of the real camera, far out of the field.
+    All are None if the mode lies 90 degrees or more from the axis, far out of the field.
     """
-    tails = [(1 - level / 100) / 2 for level in LEVELS]
-    p = np.array([0.5, *tails, *(1 - tail for tail in reversed(tails))])
-    axis = view.camera.R[:, 2]  # that of the real camera, in the frame of the virtual one
     if not axis @ _array(distribution.mode) > 0:
-        return None
-    return quantiles_along(distribution, axis, p)
+        return [None] * (1 + len(LEVELS))
+    tails = [(1 - level / 100) / 2 for level in LEVELS]
+    p = np.array([0.5, *tails, *(1 - tail for tail in tails)])
+    median, *ends = rounded(quantiles_along(distribution, axis, p))
+    return [median, *map(list, zip(ends[: len(LEVELS)], ends[len(LEVELS) :], strict=True))]
 
 
 def uncertainty(temperature: Temperature | None) -> str:
@@ -87,7 +156,7 @@ def _errors(sighting: Sighting) -> dict[str, Any]:
     return {name: rounded(value.numpy()) for name, value in errors.items()}
 
 
-def _array(tensor: torch.Tensor) -> Float[np.ndarray, "..."]:
+def _array(tensor: Tensor) -> Float[np.ndarray, "..."]:
     array: np.ndarray = tensor.detach().cpu().double().numpy()
     return array
 

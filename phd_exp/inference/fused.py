@@ -1,7 +1,6 @@
 """Scenes as JSON objects: one position from several cameras, or from one camera and a known plane."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -10,9 +9,8 @@ from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion import Fused, Plane, Pose, Status, fuse
-from phd_exp.inference.answers import rounded, uncertainty
+from phd_exp.inference.answers import Sighting, rounded, uncertainty
 from phd_exp.inference.predictor import Predictor
-from phd_exp.inference.sightings import Sighting
 from phd_exp.metrics.errors import MILLIMETRES, squared_mahalanobis
 from phd_exp.records.detections import Observed
 from phd_exp.records.errors import DatasetError
@@ -21,28 +19,19 @@ AGREE = 0.01
 """Largest distance between the true positions that lines of a scene give, relative to that from the camera."""
 
 
-@dataclass(frozen=True, eq=False)
-class Outputs:
-    """Network outputs for a sequence of views, and the poses of their virtual cameras in the world."""
+def outputs(
+    scenes: Sequence[Observed], sightings: Iterable[Sighting]
+) -> tuple[Float[Tensor, "views 7"], Float[Tensor, " views"], Pose]:
+    """Network outputs, focal lengths and the poses of the virtual cameras in the world, for each view of the scenes.
 
-    raw: Float[Tensor, "views 7"]
-    f: Float[Tensor, " views"]
-    pose: Pose
-
-    @classmethod
-    def of(cls, scenes: Sequence[Observed], sightings: Iterable[Sighting]) -> "Outputs":
-        """From the sightings of the scenes' detections, in their order; no image is kept.
-
-        A virtual camera is the real one turned: v_virtual = R_v v_camera, so that its pose is (R_v R, R_v t).
-        """
-        told = [(sighting.raw, sighting.view.camera) for sighting in sightings]
-        R = torch.stack([torch.from_numpy(camera.R) for _, camera in told])
-        real = Pose.from_scene([pose for scene in scenes for pose in scene.poses])
-        return cls(
-            torch.stack([raw for raw, _ in told]),
-            torch.tensor([camera.f for _, camera in told], dtype=torch.float64),
-            Pose(R @ real.R, (R @ real.t[..., None]).squeeze(-1)),
-        )
+    No image is kept. A virtual camera is the real one turned, v_virtual = R_v v_camera, so that its pose is
+    (R_v R, R_v t).
+    """
+    views = [(sighting.raw, sighting.view.camera) for sighting in sightings]
+    R = torch.stack([torch.from_numpy(camera.R) for _, camera in views])
+    real = Pose.from_scene([pose for scene in scenes for pose in scene.poses])
+    f = torch.tensor([camera.f for _, camera in views], dtype=torch.float64)
+    return torch.stack([raw for raw, _ in views]), f, Pose(R @ real.R, (R @ real.t[..., None]).squeeze(-1))
 
 
 def fused_answers(
@@ -60,17 +49,25 @@ def fused_answers(
 
     Raises DatasetError, before the first sighting is computed, if lines of a scene give different true positions.
     """
-    truth = true_positions(scenes)
-    seen = Outputs.of(scenes, sightings)
+    truth = torch.stack([_true_position(scene) for scene in scenes])
+    raw, f, pose = outputs(scenes, sightings)
     rows, mask = layout([len(scene.detections) for scene in scenes])
-    predictions = predictor.predict(seen.raw[rows], seen.f[rows])
+    predictions = predictor.predict(raw[rows], f[rows])
     assert isinstance(predictions, ProjectedHuber)
-    fused = fuse(predictions, Pose(seen.pose.R[rows], seen.pose.t[rows]), plane, mask)
-    errors = _errors(fused, truth, plane)
-    told = {"uncertainty": uncertainty(predictor.temperature)}
-    return [
-        _answer(scene, fused, place) | told | _errors_of(errors, place) for place, scene in enumerate(scenes)
-    ]
+    fused = fuse(predictions, Pose(pose.R[rows], pose.t[rows]), plane, mask)
+    errors = {
+        "error_mm": MILLIMETRES * (fused.point - truth).norm(dim=-1),
+        "squared_mahalanobis": squared_mahalanobis(
+            truth - fused.mean, fused.covariance, None if plane is None else plane.directions
+        ),
+    }
+    origin = {"uncertainty": uncertainty(predictor.temperature)}
+    answers = []
+    for place, scene in enumerate(scenes):
+        known = bool(truth[place].isfinite().all())
+        scores = {name: rounded(value[place].numpy()) for name, value in errors.items() if known}
+        answers.append(_answer(scene, fused, place) | origin | scores)
+    return answers
 
 
 def layout(
@@ -84,15 +81,11 @@ def layout(
     return torch.where(mask, first[:, None] + place, 0), mask
 
 
-def true_positions(scenes: Sequence[Observed]) -> Float[Tensor, "scenes 3"]:
-    """The true position of each scene's object in the world, metres; NaN where no line gives it.
+def _true_position(scene: Observed) -> Float[Tensor, "3"]:
+    """The true position of a scene's object in the world, metres; NaN if no line gives it.
 
     Raises DatasetError if two lines disagree by more than 1 % of its distance; poses or scenes are wrong then.
     """
-    return torch.stack([_true_position(scene) for scene in scenes])
-
-
-def _true_position(scene: Observed) -> Float[Tensor, "3"]:
     known = [(d, pose) for d, pose in zip(scene.detections, scene.poses, strict=True) if d.line.z is not None]
     if not known:
         return torch.full((3,), torch.nan, dtype=torch.float64)
@@ -127,19 +120,3 @@ def _answer(scene: Observed, fused: Fused, place: int) -> dict[str, Any]:
         "surprise": fused.surprise[place, :views],
     }
     return named | {name: rounded(value.numpy()) for name, value in numbers.items()}
-
-
-def _errors(fused: Fused, truth: Float[Tensor, "scenes 3"], plane: Plane | None) -> dict[str, Tensor]:
-    """Distance of the point from the truth, and of the mean in units of the covariance, within the plane if given."""
-    along = None if plane is None else plane.directions
-    distance = squared_mahalanobis(truth - fused.mean, fused.covariance, along)
-    point = MILLIMETRES * (fused.point - truth).norm(dim=-1)
-    known = truth.isfinite().all(-1)
-    return {"error_mm": point, "squared_mahalanobis": distance, "known": known}
-
-
-def _errors_of(errors: dict[str, Tensor], place: int) -> dict[str, Any]:
-    """The errors of one scene; empty if its true position is unknown."""
-    if not bool(errors["known"][place]):
-        return {}
-    return {name: rounded(errors[name][place].numpy()) for name in ("error_mm", "squared_mahalanobis")}

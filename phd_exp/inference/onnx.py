@@ -1,7 +1,7 @@
-"""A run as an ONNX file that answers by itself: uint8 images in, positions with their uncertainty out.
+"""A run as an ONNX file: uint8 images in, positions with their uncertainty out.
 
-The graph is traced from the classes that `predict` uses, so no formula has a second copy. The network computes in
-float32, all after it in float64; outputs are float32. `DESCRIPTIONS` says what inputs and outputs are.
+The graph is traced from the classes that `predict` uses. The network computes in float32 and everything after it in
+float64; outputs are float32. `DESCRIPTIONS` describes inputs and outputs.
 """
 
 import json
@@ -40,12 +40,10 @@ DESCRIPTIONS = {
 }
 OPSET = 18
 TOLERANCE = 1e-5
-SMALL = 0.01
-"""Size of an output of the network below which it is compared absolutely."""
+SMALL = 0.01  # size of an output of the network below which it is compared absolutely
 CHECKED = (1, 7, 56)
 """Batches of images on which the file is compared with torch."""
-FOCAL_LENGTHS = (5.0, 9.0)
-"""Range for the comparison, in sides of the image."""
+FOCAL_LENGTHS = (5.0, 9.0)  # range for the comparison, in sides of the image
 
 
 class ParityError(UserError):
@@ -67,7 +65,7 @@ class _Deployed(nn.Module):
 
 
 def outputs(prediction: Prediction) -> dict[str, Tensor]:
-    """What the graph returns for a batch of predictions, beside `raw`."""
+    """The outputs of the graph for a batch of predictions, after `raw`."""
     if not isinstance(prediction, ProjectedHuber):
         return {"position": prediction.mode}
     tails = torch.tensor([(1 - level / 100) / 2 for level in LEVELS], dtype=torch.float64)
@@ -126,25 +124,20 @@ def _exported(predictor: Predictor) -> Any:
 
 
 def _names(predictor: Predictor) -> list[str]:
-    """Of the outputs after `raw`."""
+    """The names of the outputs after `raw`."""
     head = predictor.regressor.head
     return list(outputs(predictor.predict(torch.zeros(1, head.n_outputs).double(), torch.ones(1).double())))
 
 
 def _metadata(predictor: Predictor) -> dict[str, Any]:
     config, temperature = predictor.config, predictor.temperature
-    known = ("image", "f", "raw", *_names(predictor))
+    run = {"preset": config.preset, "data": config.data.name, "model": config.model.name, "seed": config.seed}
     return {
         "version": phd_exp.__version__,
-        "run": {
-            "preset": config.preset,
-            "data": config.data.name,
-            "model": config.model.name,
-            "seed": config.seed,
-        },
+        "run": run,
         "side": predictor.side,
         "temperature": asdict(temperature) if temperature else None,
-        **{name: DESCRIPTIONS[name] for name in known},
+        **{name: DESCRIPTIONS[name] for name in ("image", "f", "raw", *_names(predictor))},
     }
 
 

@@ -12,26 +12,23 @@ from matplotlib.figure import Figure
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.level_curves import LevelCurves, level_curves
-from phd_exp.inference.sightings import Sighting
-from phd_exp.inference.views import View
+from phd_exp.inference.answers import Sighting
+from phd_exp.inference.predictor import View
 from phd_exp.records.errors import one_line
 from phd_exp.reports.figures import draw_birds_eye, draw_curve, encoded
 
-LARGEST = 1024
-"""Pixels along the longer side of the image in the picture."""
-LONGEST_NAME = 60
-"""Characters of a file name in the title."""
-MARGIN = 0.5
-"""Width of the margin around a box, in sizes of the box."""
+LARGEST = 1024  # pixels along the longer side of the image in the picture
+LONGEST_NAME = 60  # characters of a file name in the title
+MARGIN = 0.5  # width of the margin around a box, in sizes of the box
 _AMBER = "#ffb000"
 
 
 def picture(
     sighting: Sighting, recalibrated: bool = False, calibration: Mapping[str, Any] | None = None
 ) -> bytes:
-    """A PNG of the image and the bird's-eye view with level curves of 50, 90 and 99 %; of a baseline's point alone.
+    """A PNG of the image and the bird's-eye view with level curves of 50, 90 and 99 %, or of a baseline's point.
 
-    A third panel shows the calibration curve of depth, if given. The title holds the file name, the focal length and
+    A third panel has the calibration curve of depth, if given. The title has the file name, the focal length and
     whether the prediction is recalibrated.
     """
     curves = level_curves(sighting.prediction) if isinstance(sighting.prediction, ProjectedHuber) else None
@@ -79,16 +76,17 @@ def _draw_image(axes: Axes, sighting: Sighting, curves: LevelCurves | None) -> N
     axes.plot(*pixels(view, mode[:2] / mode[2]), "x", color=_AMBER, markersize=6)
     truth = _truth(sighting)
     if truth is not None:
-        on = pixels(view, truth[:2] / truth[2])
-        axes.plot(*on, "o", color="white", markeredgecolor="black", markersize=4)
+        axes.plot(
+            *pixels(view, truth[:2] / truth[2]), "o", color="white", markeredgecolor="black", markersize=4
+        )
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="column (px)", ylabel="row (px)")
 
 
 def pixels(view: View, xy_over_z: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*points 2"]:
     """Pixels of the real image at (x, y)/z of the virtual camera; NaN behind the real camera."""
     rays = np.concatenate([xy_over_z, np.ones_like(xy_over_z[..., :1])], axis=-1)
-    seen = view.camera.to_real(rays) @ view.camera.K.T
-    return np.where(seen[..., 2:] > 0, seen[..., :2] / seen[..., 2:], np.nan)
+    real = view.camera.to_real(rays) @ view.camera.K.T
+    return np.where(real[..., 2:] > 0, real[..., :2] / real[..., 2:], np.nan)
 
 
 def _truth(sighting: Sighting) -> Float[np.ndarray, "3"] | None:

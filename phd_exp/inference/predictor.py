@@ -12,12 +12,12 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
+from phd_exp.data.crops import cut
 from phd_exp.data.sources import RenderedSource
 from phd_exp.distributions import ProjectedHuber, Temperature
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import DepthScale
-from phd_exp.geometry.virtual import intrinsics
-from phd_exp.inference.views import View
+from phd_exp.geometry.virtual import Box, VirtualCamera, intrinsics
 from phd_exp.models.heads import Prediction
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.dataset import DatasetFolder
@@ -28,29 +28,55 @@ from phd_exp.training.network import build_regressor
 from phd_exp.training.stored import load_checkpoint, require_same_shrinking
 
 WEIGHTS = "regressor."
-"""What the names of the network's weights begin with in a checkpoint."""
+"""Prefix of the network's weights in a checkpoint."""
 BATCH = 64
 
 
-@dataclass(frozen=True)
-class Constants:
-    """What a network was told of its data set, in pixels of its own images (see `Source`)."""
+@dataclass(frozen=True, eq=False)
+class View:
+    """The input image of a network, prepared as in training, and its virtual camera, whose frame predictions have.
 
-    depth: DepthScale
-    constant_f: float
+    Example:
+        >>> photo, K = Image.new("RGB", (90, 60)), intrinsics(300.0, 300.0, 45.0, 30.0)
+        >>> View.of_box(photo, K, (50.0, 10.0, 80.0, 50.0), side=32, where="photo").image.shape
+        (32, 32, 3)
+    """
+
+    image: UInt8[np.ndarray, "S S 3"]
+    camera: VirtualCamera
+
+    @classmethod
+    def of_box(
+        cls, image: Image.Image, K: Float[np.ndarray, "3 3"], box: Box | None, side: int, where: str
+    ) -> "View":
+        """The view of a box in an RGB image (None: all of it), `side` pixels a side.
+
+        Raises DatasetError, naming `where`, if the box is too wide.
+        """
+        left, top, right, bottom = map(float, (0, 0, *image.size) if box is None else box)
+        try:
+            camera = VirtualCamera.of_box(K, (left, top, right, bottom), float(side))
+        except ValueError as error:
+            raise DatasetError(f"{where}: box={[left, top, right, bottom]}: {error}") from None
+        return cls(cut(image, camera), camera)
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether the frame of the virtual camera differs from that of the real camera."""
+        return not np.array_equal(self.camera.R, np.eye(3))
 
 
 @dataclass(frozen=True, eq=False)
 class Predictor:
-    """A trained network, in float32 whatever arithmetic it was trained in.
+    """A trained network, in float32 whatever the precision of its training.
 
     Args:
-        config: of the run.
-        side: of the network's image, pixels.
+        config: the configuration of the run.
+        side: side of the network's image, pixels.
         depth: the constants that normalise depth.
-        constant_f: the focal length that it is told for every image, px; None: the true one.
-        temperature: of recalibrated predictions; None: as trained.
-        state: how the run stands, "finished" for one that has ended well.
+        constant_f: the focal length that the network receives for every image, px; None: the true one.
+        temperature: temperatures of recalibrated predictions; None: as trained.
+        state: the state of the run, "finished" if it completed.
     """
 
     config: RunConfig
@@ -73,72 +99,59 @@ class Predictor:
         *,
         f: float | Sequence[float] | Float[np.ndarray | Tensor, " batch"],
     ) -> Prediction:
-        """What whole images show, in the frame of their camera: a batch of predictions, or one for one image.
+        """Predictions for whole images in the frame of their camera: a batch, or one without a batch for one image.
 
         Args:
             images: RGB of 8 bits, (n, height, width, 3) or (height, width, 3), of any size.
             f: focal length, pixels of these images; one for all or one each. The principal point is in the middle.
 
-        Returns a ProjectedHuber (metres); of a baseline a PointEstimate. For crops and other cameras see `view`.
-        Raises DatasetError where images or f are none.
+        Returns a ProjectedHuber (metres), or a PointEstimate for a baseline. For crops and other cameras see `view`.
+        Raises DatasetError if images or f are invalid.
         """
         array = _images(images)
         height, width = array.shape[1:3]
-        centre, box = (width / 2, height / 2), (0.0, 0.0, float(width), float(height))
+        cameras = [intrinsics(value, value, width / 2, height / 2) for value in _focal_lengths(f, len(array))]
         views = [
-            View.of_box(
-                Image.fromarray(image), intrinsics(value, value, *centre), box, self.side, f"image {row}"
-            )
-            for row, (image, value) in enumerate(zip(array, _focal_lengths(f, len(array)), strict=True))
+            View.of_box(Image.fromarray(image), K, None, self.side, f"image {row}")
+            for row, (image, K) in enumerate(zip(array, cameras, strict=True))
         ]
         return self.see(views if images.ndim == 4 else views[0])
 
     def view(
-        self,
-        image: UInt8[np.ndarray, "height width 3"],
-        K: Float[np.ndarray, "3 3"],
-        box: tuple[float, float, float, float] | None = None,
+        self, image: UInt8[np.ndarray, "height width 3"], K: Float[np.ndarray, "3 3"], box: Box | None = None
     ) -> View:
-        """What the network sees of a box (left, top, right, bottom, px; None: all) in an image of a camera K.
+        """The network's input for a box (left, top, right, bottom, px; None: all) in an image of a camera K.
 
-        Predictions of it are in the frame of `view.camera`, whose `to_real` is the way back.
-        Raises DatasetError where the image is none, or where no pinhole camera sees the box.
+        Predictions for it are in the frame of `view.camera`; `view.camera.to_real` maps them back.
+        Raises DatasetError if the image is invalid or the box is outside the field of every pinhole camera.
         """
         (array,) = _images(image[None])
-        height, width = array.shape[:2]
-        left, top, right, bottom = map(float, (0, 0, width, height) if box is None else box)
-        return View.of_box(Image.fromarray(array), K, (left, top, right, bottom), self.side, "image")
+        return View.of_box(Image.fromarray(array), K, box, self.side, "image")
 
     def see(self, views: View | Sequence[View]) -> Prediction:
         """Predictions for views, each in the frame of its own virtual camera; for one view, one without a batch."""
-        one = isinstance(views, View)
         sequence = [views] if isinstance(views, View) else views
         f = torch.tensor([view.camera.f for view in sequence], dtype=torch.float32)
-        parts = [
-            self.raw(
-                np.stack([view.image for view in sequence[start : start + BATCH]]), f[start : start + BATCH]
-            )
-            for start in range(0, len(sequence), BATCH)
-        ]
-        raw = torch.cat(parts)
-        return self.predict(raw[0], f[0]) if one else self.predict(raw, f)
+        raw = self.raw(np.stack([view.image for view in sequence]), f)
+        return self.predict(raw, f) if sequence is views else self.predict(raw[0], f[0])
 
     def raw(
         self, images: UInt8[np.ndarray, "batch S S 3"], f: Float[Tensor, " batch"]
     ) -> Float[Tensor, "batch n_outputs"]:
-        """The network's numbers before the head, on the CPU; f in pixels of its images."""
+        """The raw numbers of the network, on the CPU, computed in batches of 64; f in pixels of its images."""
         known = self.camera(f.float().to(self.device)).f
-        return self.regressor.raw(torch.from_numpy(images).to(self.device), known).cpu()
+        batches = zip(torch.from_numpy(images).split(BATCH), known.split(BATCH), strict=True)
+        return torch.cat([self.regressor.raw(image.to(self.device), f).cpu() for image, f in batches])
 
     def predict(self, raw: Float[Tensor, "*batch n_outputs"], f: Float[Tensor, "*batch"]) -> Prediction:
-        """From the network's numbers, and focal lengths in pixels of its images, to predictions."""
+        """Predictions from the raw numbers of the network and focal lengths in pixels of its images."""
         prediction = self.regressor.head(raw, self.camera(f))
         if self.temperature is not None and isinstance(prediction, ProjectedHuber):
             return self.temperature.apply(prediction)
         return prediction
 
     def camera(self, f: Float[Tensor, "*batch"]) -> Camera:
-        """The camera as the network knows it."""
+        """The camera as the network receives it."""
         return Camera(f, float(self.side)).with_constant_f(self.constant_f)
 
 
@@ -147,67 +160,67 @@ def load(run: Path, device: str = "auto", recalibrate: bool = False) -> Predicto
 
     Args:
         run: the run's folder.
-        device: "auto" takes a GPU if there is one.
-        recalibrate: at the temperatures that fit the run's predictions of held-out samples.
+        device: "auto" chooses a GPU if there is one.
+        recalibrate: apply the temperatures that fit the run's predictions of held-out samples.
 
-    Raises RunError where there is no usable run, ConfigError where its configuration is none, names code of others,
-    or cannot be recalibrated.
+    Raises:
+        RunError: the folder holds no usable run.
+        ConfigError: its configuration is invalid, names code outside the package, or cannot be recalibrated.
     """
     folder = RunFolder(Path(run))
     if not folder.config_file.exists():
         raise RunError(f"{folder.path}: no run; expected a folder with config.yaml and checkpoints/last.ckpt")
     config = check(folder.config(), "stored")
     require_same_shrinking(folder, config)
-    constants = _constants(folder, config)
+    depth, constant_f = _constants(folder, config)
     place = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)
-    regressor = build_regressor(config, constants.depth)
+    regressor = build_regressor(config, depth)
     _load_weights(regressor, folder.last_checkpoint)
     status = folder.status()
     return Predictor(
         config=config,
         regressor=regressor.requires_grad_(False).eval().to(place),
         side=config.data.image_size,
-        depth=constants.depth,
-        constant_f=constants.constant_f if config.camera.focal_length == "constant" else None,
+        depth=depth,
+        constant_f=constant_f if config.camera.focal_length == "constant" else None,
         device=place,
         temperature=_temperature(folder, regressor) if recalibrate else None,
         state="unknown" if status is None else status.state,
     )
 
 
-def _constants(folder: RunFolder, config: RunConfig) -> Constants:
-    """As recorded; those of a rendered data set follow from its specification too."""
+def _constants(folder: RunFolder, config: RunConfig) -> tuple[DepthScale, float]:
+    """Depth scale and constant f of the run's data: as recorded, or from the specification of a rendered data set."""
     if not isinstance(config.data, FolderConfig):
         data = config.data
         source = RenderedSource(DatasetFolder(data.folder), data.spec, {}, data.image_size)
-        return Constants(source.depth, source.constant_f)
-    if not folder.constants_file.exists():
+        return source.depth, source.constant_f
+    file = folder.constants_file
+    if not file.exists():
         raise RunError(
-            f"{folder.constants_file}: missing, so that the depth scale of its data is unknown; train the run again"
+            f"{file}: missing, so that the depth scale of its data is unknown; train the run again"
         )
     values = folder.constants()
     try:
-        depth = DepthScale(*(float(values[name]) for name in ("mu_z0", "D", "z_centre")))
         constant_f = float(values["constant_f"])
         if not 0 < constant_f < math.inf:
             raise ValueError(f"constant_f must be positive and finite, but is {constant_f}")
-        return Constants(depth, constant_f)
+        return DepthScale(*(float(values[name]) for name in ("mu_z0", "D", "z_centre"))), constant_f
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise RunError(f"{folder.constants_file}: not the constants of a run ({error})") from None
+        raise RunError(f"{file}: not the constants of a run ({error})") from None
 
 
 def _load_weights(regressor: Regressor, checkpoint: Path) -> None:
-    """Take the network's weights from a checkpoint, of which nothing but numbers is read."""
+    """Load the network's weights from a checkpoint; only tensors are read."""
     if not checkpoint.exists():
         raise RunError(f"{checkpoint}: missing; the run has not trained a whole epoch yet")
     content = load_checkpoint(checkpoint)
     try:
         state: dict[str, Any] = content["state_dict"]
-        weights = {
-            name.removeprefix(WEIGHTS): value for name, value in state.items() if name.startswith(WEIGHTS)
-        }
-        regressor.load_state_dict(weights)
-    except Exception as error:  # whatever torch stumbles over where these are other weights, or none
+        regressor.load_state_dict(
+            {name.removeprefix(WEIGHTS): value for name, value in state.items() if name.startswith(WEIGHTS)}
+        )
+    except Exception as error:  # torch raises many kinds for other weights, or none
         reason = " ".join(str(error).split())[:120]
         raise RunError(f"{checkpoint}: not a whole checkpoint of this network ({reason})") from None
 
@@ -219,9 +232,7 @@ def _temperature(folder: RunFolder, regressor: Regressor) -> Temperature:
         raise RunError(
             f"{folder.held_out}: missing; recalibration is fitted on held-out samples: train with data.n_held_out > 0"
         )
-    from phd_exp.evaluation.predictions import (
-        held_out_temperature,
-    )  # recalibration alone needs it, and pyarrow with it
+    from phd_exp.evaluation.predictions import held_out_temperature  # imports pyarrow
 
     return held_out_temperature(folder)
 

@@ -17,18 +17,13 @@ from phd_exp.training.predictions import columns, write_parquet
 def record_views(folder: RunFolder, data: DatasetFolder, spec: DatasetSpec, scenes: int) -> bool:
     """Predict every view of the first test scenes and record them. Returns False if they were recorded already.
 
-    The file holds a row a view, as `predictions.parquet` has them, with `scene`, `view` and the pose.
+    The file has a row for each view, with the columns of `predictions.parquet`, `scene`, `view` and the pose. The run
+    is finished; `spec` is that of its own data set, except for the number of views.
 
-    Args:
-        folder: of a finished run.
-        data: the folder of the data set.
-        spec: its specification, that of the run's own data set but for the number of views.
-        scenes: how many.
-
-    Raises RunError where another process works on the run or it has no checkpoint, DatasetError where the data set is
-    another one or lacks a sample.
+    Raises RunError if another process holds the run or it has no checkpoint, DatasetError if the data set is another
+    one or lacks a sample.
     """
-    said = _said(spec, scenes, folder)
+    origin = _origin(spec, scenes, folder)
     with folder.held():
         if is_recorded(folder, spec, scenes):
             return False
@@ -42,29 +37,24 @@ def record_views(folder: RunFolder, data: DatasetFolder, spec: DatasetSpec, scen
             part = samples.select(rows)
             table.update(columns(predictor.predict(predictor.raw(part.image.numpy(), part.f), part.f), part))
         poses = [(*record.pose.rotation, *record.pose.translation) for record in data.records("test", n)]
-        known = dict(source.known("test")) | dict(
-            zip((*ROTATION, *TRANSLATION), map(list, zip(*poses, strict=True)), strict=True)
-        )
-        write_parquet(folder.views, table.columns(), known, said)
+        pose_columns = zip((*ROTATION, *TRANSLATION), map(list, zip(*poses, strict=True)), strict=True)
+        known = dict(source.known("test")) | dict(pose_columns)
+        write_parquet(folder.views, table.columns(), known, origin)
     return True
 
 
 def is_recorded(folder: RunFolder, spec: DatasetSpec, scenes: int) -> bool:
-    """Whether the record of precisely these scenes is there, by this run and no other that was in its folder."""
+    """Whether the record exists, for exactly these scenes and this run."""
     try:
         found = pq.read_schema(folder.views).metadata or {}
     except (OSError, pa.ArrowException):
         return False
-    return all(
-        found.get(key.encode()) == value.encode() for key, value in _said(spec, scenes, folder).items()
-    )
+    wanted = _origin(spec, scenes, folder).items()
+    return all(found.get(key.encode()) == value.encode() for key, value in wanted)
 
 
-def _said(spec: DatasetSpec, scenes: int, folder: RunFolder) -> dict[str, str]:
-    """What a record was made of: another one is not it."""
+def _origin(spec: DatasetSpec, scenes: int, folder: RunFolder) -> dict[str, str]:
+    """The data, the number of scenes and the run of a record."""
     status = folder.status()
-    return {
-        "data": spec.fingerprint(),
-        "scenes": str(scenes),
-        "run": "" if status is None else str(status.started),
-    }
+    started = "" if status is None else str(status.started)
+    return {"data": spec.fingerprint(), "scenes": str(scenes), "run": started}

@@ -1,7 +1,7 @@
-"""How far a number would move with another test set: percentile bootstrap over samples.
+"""Percentile bootstrap over samples: how much a number would vary with another test set.
 
-A resample is a row of counts, how often each sample was drawn. A statistic that takes counts sorts its samples once
-and measures many resamples at a time.
+A resample is a row of counts: how often each sample was drawn. A statistic that takes counts sorts its samples once
+and evaluates many resamples at a time.
 """
 
 from collections.abc import Callable, Mapping
@@ -14,12 +14,12 @@ from torch import Tensor
 Statistic = Callable[[Mapping[str, Tensor], Tensor], Mapping[str, Tensor]]
 """Columns of shape (samples,) and counts (resamples, samples) -> name -> (resamples, *points)."""
 _AT_ONCE = 10**6
-"""Counts that are held in memory at a time."""
+"""Counts held in memory at a time."""
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A statistic of the samples, and between which bounds it lies in most resamples."""
+    """A statistic of the samples, and the bounds that contain it in most resamples."""
 
     value: Float[Tensor, "*points"]
     low: Float[Tensor, "*points"]
@@ -33,14 +33,18 @@ def bands(
     seed: int,
     confidence: float = 0.95,
 ) -> dict[str, Interval]:
-    """Percentile intervals of scalars, and of curves at each of their points; the same for the same seed.
+    """Percentile intervals of scalars, and of curves at each of their points; equal for equal seeds.
 
-    They say how far a number would move with another test set. They are no test of calibration: a distance from
-    calibration cannot be negative and drawing with replacement adds noise to it, so near perfect calibration all
-    resamples may lie above the value. The interval is then stretched to hold it.
+    They do not test calibration: a distance from calibration cannot be negative and resampling adds noise to it, so
+    close to perfect calibration all resamples may lie above the value. The interval is then extended to contain it.
 
-    Raises ValueError without samples, with fewer than one resample, or for a confidence outside (0, 1).
+    Raises ValueError for no samples, fewer than one resample, or a confidence outside (0, 1).
     Source: Efron and Tibshirani, "An introduction to the bootstrap" (1993), chapter 13.
+
+    Example:
+        >>> band = bands(means, {"x": torch.arange(100.0)}, resamples=200, seed=0)["x"]
+        >>> float(band.value), bool(band.low < band.value < band.high)
+        (49.5, True)
     """
     if not 0 < confidence < 1:
         raise ValueError(f"confidence: got {confidence}; expected a number between 0 and 1")
@@ -53,7 +57,7 @@ def resampled(
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """The statistic of the samples, and of each resample (along the first dimension).
 
-    Tables of equally many rows are resampled alike. Raises ValueError without samples or resamples.
+    Tables with equal numbers of rows are resampled alike. Raises ValueError for no samples or no resamples.
     """
     n = len(next(iter(columns.values()), ()))
     if n == 0 or resamples < 1:
@@ -70,14 +74,14 @@ def resampled(
 
 
 def _counts(n: int, resamples: int, generator: torch.Generator) -> Float[Tensor, "resamples n"]:
-    """How often each of n samples is drawn when n are drawn with replacement, once a row."""
+    """How often each of n samples is drawn when n are drawn with replacement: a row per resample."""
     drawn = torch.randint(n, (resamples, n), generator=generator)
     zeros = torch.zeros(resamples, n, dtype=torch.float64)
     return zeros.scatter_add_(1, drawn, torch.ones_like(zeros))
 
 
 def interval(value: Tensor, drawn: Tensor, confidence: float = 0.95) -> Interval:
-    """The percentile interval of resampled values, which holds the value itself."""
+    """The percentile interval of resampled values, extended to contain the value itself."""
     tails = torch.tensor([(1 - confidence) / 2, (1 + confidence) / 2], dtype=torch.float64)
     # a resample may lack every sample that a point needs
     low, high = torch.nanquantile(drawn, tails, dim=0)
@@ -85,5 +89,5 @@ def interval(value: Tensor, drawn: Tensor, confidence: float = 0.95) -> Interval
 
 
 def means(columns: Mapping[str, Tensor], counts: Tensor) -> dict[str, Tensor]:
-    """The statistic of which each number is the mean of a column."""
+    """The statistic "mean of each column"."""
     return {name: (counts @ column.double()) / counts.sum(-1) for name, column in columns.items()}

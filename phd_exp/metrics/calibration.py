@@ -1,7 +1,9 @@
-"""Calibration: are squared errors as large as predicted variances, and credible levels as frequent as they claim?
+"""Calibration: squared errors against predicted variances, and credible levels against the uniform law.
 
-Credible levels and probability integral transforms (PIT: the predicted probability of a smaller depth) are uniform on
-[0, 1] over the samples of a calibrated model, so both are held against the uniform law here.
+Credible levels and probability integral transforms (PIT: the predicted probability of a smaller depth) of a
+calibrated model are uniform on [0, 1]. The functions of levels take a tensor, or samples in the order of their
+levels; with an `Ordered` they return one number for each of its leading dimensions. All raise ValueError for no
+samples, or for samples that are not finite.
 """
 
 from dataclasses import asdict, dataclass
@@ -15,21 +17,23 @@ from torch import Tensor
 from phd_exp.metrics.ordered import Ordered, in_order_of, require_finite
 
 FEWEST_POINTS = 5
-"""Of a curve; a small test set narrows its window to draw at least this many independent ones."""
+"""Independent points of a curve; the window of a small test set is narrowed to give as many."""
 
 
 @dataclass(frozen=True)
 class CalibrationCurve:
-    """Predicted variance against mean squared error; a calibrated model lies on the identity."""
+    """Predicted variance against mean squared error; a calibrated model lies on the identity.
+
+    `left_out` counts samples whose variance or error is not finite, as an untrained network may predict.
+    """
 
     predicted: Float[Tensor, " points"]
     empirical: Float[Tensor, " points"]
     window: int
     left_out: int
-    """Samples whose variance or error was not finite, as an untrained network may predict."""
 
     def as_data(self) -> dict[str, Any]:
-        """For JSON and for drawing: lists of numbers."""
+        """The curve as lists of numbers, for JSON and for drawing."""
         return asdict(self) | {"predicted": self.predicted.tolist(), "empirical": self.empirical.tolist()}
 
 
@@ -38,11 +42,16 @@ def calibration_curve(
 ) -> CalibrationCurve:
     """Sort by predicted variance and average both over a sliding window of neighbours.
 
-    The window holds `window` samples, or a fifth of the samples where there are fewer than five windows of
-    them. A set of n samples gives n - window + 1 points, in the unit of the variance.
+    The window holds `window` samples, but at most a fifth of all samples. n samples give n - window + 1 points, in
+    the unit of the variance.
 
-    Raises ValueError for a window below 1, or where no sample has a finite variance and error.
+    Raises ValueError for a window below 1, or if no sample has a finite variance and error.
     Source: paper, section "Empirical error vs. estimated error" (window 200).
+
+    Example:
+        >>> curve = calibration_curve(torch.tensor([4.0, 1.0]), torch.tensor([5.0, 2.0]), window=200)
+        >>> curve.predicted.tolist(), curve.empirical.tolist(), curve.window
+        ([1.0, 4.0], [2.0, 5.0], 1)
     """
     both = torch.stack([predicted_variance, squared_error]).double()
     finite = both[:, both.isfinite().all(dim=0)]
@@ -60,12 +69,16 @@ def ence(
 ) -> Float[Tensor, ""]:
     """Expected normalised calibration error: the mean over bins of |RMV - RMSE| / RMV.
 
-    Bins hold about equally many samples, sorted by predicted variance; samples of equal variance stay together, and
-    bins count by their samples where they cannot be equal. Errors of n/bins samples scatter: a calibrated model is
-    at about 0.4 sqrt((k - 1) bins/n) with the kurtosis k of its errors, not at zero.
+    Bins hold about equally many samples, sorted by predicted variance. Samples of equal variance share a bin, and
+    each bin is weighted by its samples. A calibrated model has about 0.4 sqrt((k - 1) bins/n), k the kurtosis of its
+    errors, because errors of n/bins samples scatter.
 
-    Raises ValueError for bins below 1, no samples, or samples that are not finite.
+    Raises ValueError for bins below 1.
     Source: Levi et al., "Evaluating and calibrating uncertainty prediction in regression tasks" (2022).
+
+    Example:
+        >>> float(ence(torch.ones(4), torch.full((4,), 4.0), bins=2))  # deviations twice as large as predicted
+        1.0
     """
     if bins < 1:
         raise ValueError(f"bins must be at least 1, not {bins}")
@@ -81,51 +94,52 @@ def ence_of(ordered: Ordered, variance: str, squared_error: str, bins: int) -> F
     return (count * gap).sum(-1) / count.sum(-1)
 
 
-def coverage(levels: Float[Tensor, " samples"], at: Float[Tensor, " points"]) -> Float[Tensor, " points"]:
-    """The share of samples whose credible level is at most each of the levels asked for: their empirical CDF.
+Levels = Float[Tensor, " samples"] | Ordered
 
-    Raises ValueError without samples, or with one that is not finite.
+
+def _in_order(levels: Levels) -> Ordered:
+    return levels if isinstance(levels, Ordered) else in_order_of(levels, {})
+
+
+def coverage(levels: Levels, at: Float[Tensor, " points"]) -> Float[Tensor, "*batch points"]:
+    """The share of samples whose credible level is at most each value of `at`: their empirical CDF.
+
+    Example:
+        >>> coverage(torch.tensor([0.2, 0.4, 0.6, 0.8]), torch.tensor([0.5, 0.9])).tolist()
+        [0.5, 1.0]
     """
-    return coverage_of(in_order_of(levels, {}), at)
-
-
-def coverage_of(ordered: Ordered, at: Float[Tensor, " points"]) -> Float[Tensor, "*batch points"]:
-    """`coverage` of samples in the order of their levels."""
+    ordered = _in_order(levels)
     share = torch.nn.functional.pad(ordered.share_up_to(), (1, 0))
     return share[..., torch.searchsorted(ordered.points, at.double(), right=True)]
 
 
-def miscalibration_area(levels: Float[Tensor, " samples"]) -> Float[Tensor, ""]:
-    """int_0^1 |coverage(p) - p| dp, exactly: coverage is a step function. 0 is perfect, 1/2 the worst.
+def miscalibration_area(levels: Levels) -> Float[Tensor, "*batch"]:
+    """int_0^1 |coverage(p) - p| dp, exactly: coverage is a step function. 0 is the best value, 1/2 the worst.
 
-    Raises ValueError without samples, or with one that is not finite.
+    Example:
+        >>> float(miscalibration_area(torch.tensor([0.5])))
+        0.25
     """
-    return miscalibration_area_of(in_order_of(levels, {}))
-
-
-def miscalibration_area_of(ordered: Ordered) -> Float[Tensor, "*batch"]:
-    """`miscalibration_area` of samples in the order of their levels."""
+    ordered = _in_order(levels)
     share = torch.nn.functional.pad(ordered.share_up_to(), (1, 0))
     edges = torch.nn.functional.pad(torch.nn.functional.pad(ordered.points, (1, 0)), (0, 1), value=1.0)
     upper, lower = edges[1:] - share, edges[:-1] - share  # p - coverage at both ends of each step
     return (upper * upper.abs() - lower * lower.abs()).sum(-1) / 2
 
 
-def overconfidence(levels: Float[Tensor, " samples"]) -> Float[Tensor, ""]:
-    """int_0^1 (p - coverage(p)) dp, the mean level minus 1/2: above 0 too certain, below 0 too cautious.
+def overconfidence(levels: Levels) -> Float[Tensor, "*batch"]:
+    """int_0^1 (p - coverage(p)) dp, the mean level minus 1/2: positive if overconfident, negative if underconfident.
 
-    Of a PIT it is the bias: above 0 depths are predicted too small.
-    Raises ValueError without samples, or with one that is not finite.
+    Of a PIT it is the bias: positive if depths are predicted too small.
     """
-    require_finite(levels)
-    return levels.double().mean() - 0.5
+    ordered = _in_order(levels)
+    return (ordered.count * ordered.points).sum(-1) / ordered.count.sum(-1) - 0.5
 
 
 def pit_histogram(pit: Float[Tensor, " samples"], bins: int) -> Float[Tensor, " bins"]:
     """The share of samples in each of equal bins of [0, 1], times the number of bins: 1 where calibrated.
 
-    A U says too certain, a hump too cautious, a slope biased.
-    Raises ValueError without samples, or with one that is not finite.
+    A U shape means overconfident, a hump underconfident, a slope biased.
     """
     require_finite(pit)
     return torch.histc(pit.double(), bins, min=0, max=1) * bins / len(pit)
@@ -133,24 +147,21 @@ def pit_histogram(pit: Float[Tensor, " samples"], bins: int) -> Float[Tensor, " 
 
 @dataclass(frozen=True)
 class UniformityTest:
-    """Kolmogorov and Smirnov's distance from the uniform law, and how probable a larger one is under it."""
+    """The Kolmogorov-Smirnov distance from the uniform law, and the probability of a larger one under it."""
 
     statistic: float
     pvalue: float
 
 
 def uniformity_test(levels: Float[Tensor, " samples"]) -> UniformityTest:
-    """Are levels, or PITs, uniform on [0, 1]? The largest |coverage(p) - p|, with its exact two-sided p-value.
-
-    Raises ValueError without samples, or with one that is not finite.
-    """
-    distance = float(uniform_distance_of(in_order_of(levels, {})))
+    """Test levels, or PITs, for uniformity on [0, 1]: the exact two-sided Kolmogorov-Smirnov test."""
+    distance = float(uniform_distance(levels))
     return UniformityTest(distance, float(kstwo.sf(distance, len(levels))))
 
 
-def uniform_distance_of(ordered: Ordered) -> Float[Tensor, "*batch"]:
-    """max |coverage(p) - p| over p, of samples in the order of their levels."""
+def uniform_distance(levels: Levels) -> Float[Tensor, "*batch"]:
+    """max |coverage(p) - p| over p."""
+    ordered = _in_order(levels)
     after = ordered.share_up_to()
     before = after - ordered.count / ordered.total
-    gaps = torch.maximum(after - ordered.points, ordered.points - before)
-    return gaps.amax(-1)
+    return torch.maximum(after - ordered.points, ordered.points - before).amax(-1)

@@ -1,4 +1,4 @@
-"""The two columns of the paper's tables, error along the true viewing ray and across it; error against covariance."""
+"""The two errors of the paper's tables, along the true viewing ray and across it, and the Mahalanobis distance."""
 
 import torch
 from jaxtyping import Float
@@ -10,18 +10,20 @@ MILLIMETRES = 1000.0
 def along_true_ray(
     xyz: Float[Tensor, "*batch 3"], estimate: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 3"]:
-    """The true position moved along its own viewing ray to where the estimate projects onto that ray.
-
-    v_par = (v . v^ / |v|^2) v, in metres.
-    """
-    scale = (xyz * estimate).sum(-1, keepdim=True) / xyz.square().sum(-1, keepdim=True)
-    return scale * xyz
+    """v_par = (v . v^ / |v|^2) v: the projection of the estimate onto the true viewing ray, in metres."""
+    return (xyz * estimate).sum(-1, keepdim=True) / xyz.square().sum(-1, keepdim=True) * xyz
 
 
 def projected_error(
     xyz: Float[Tensor, "*batch 3"], estimate: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch"]:
-    """|v^ - v_par|: the distance of the estimate from the true viewing ray, in metres."""
+    """|v^ - v_par|: the distance of the estimate from the true viewing ray, in metres.
+
+    Example:
+        >>> xyz, estimate = torch.tensor([0.0, 0.0, 4.0]), torch.tensor([0.3, 0.4, 4.5])
+        >>> float(projected_error(xyz, estimate)), float(depth_error(xyz, estimate))
+        (0.5, 0.5)
+    """
     return (estimate - along_true_ray(xyz, estimate)).norm(dim=-1)
 
 
@@ -37,9 +39,9 @@ def squared_mahalanobis(
     covariance: Float[Tensor, "*batch n n"],
     along: Float[Tensor, "*#batch n k"] | None = None,
 ) -> Float[Tensor, "*batch"]:
-    """e^T C^(-1) e, of expectation n where C is the covariance of e; NaN where C is singular or not finite.
+    """e^T C^(-1) e, with expectation n if C is the covariance of e; NaN where C is singular or not finite.
 
-    Along k directions, the columns of a matrix, that of their components, of expectation k.
+    `along` restricts it to the components along k directions, the columns of a matrix; its expectation is then k.
     """
     if along is not None:
         error, covariance = (along.mT @ error[..., None]).squeeze(-1), along.mT @ covariance @ along

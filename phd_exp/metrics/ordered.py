@@ -1,8 +1,7 @@
-"""Samples in the order of a quantity: the one thing that every measure of calibration is computed from.
+"""Samples sorted by a quantity: every measure of calibration is computed from them.
 
-Samples that are equal in the quantity form a group and stay together, so no result depends on the order of rows; a
-histogram is a coarser grouping of the same kind. Counts may carry leading dimensions, one for each resample of a
-bootstrap.
+Samples with equal values form a group, so no result depends on the order of rows; a histogram is a coarser grouping.
+Counts may have leading dimensions, one entry for each resample of a bootstrap.
 """
 
 from collections.abc import Mapping
@@ -18,8 +17,8 @@ class Ordered:
     """Groups of samples in ascending order of a quantity.
 
     Args:
-        points: the quantity, one value a group.
-        count: how many samples a group has.
+        points: the quantity, one value per group.
+        count: number of samples in each group.
         sums: name of a column -> its sum over each group.
     """
 
@@ -46,11 +45,11 @@ class Ordered:
         return self.sums[name].sum(-1) / self.count.sum(-1)
 
     def pooled(self, name: str, bins: int) -> Float[Tensor, "*batch bins"]:
-        """The sum of a column over bins of about equally many samples; whole groups, each where its middle lies."""
+        """The sum of a column over bins of about equally many samples; the middle of a group decides its bin."""
         return _pooled(self.sums[name], self._bin(bins), bins)
 
     def pooled_count(self, bins: int) -> Float[Tensor, "*batch bins"]:
-        """How many samples each of those bins has."""
+        """The number of samples in each of these bins."""
         return _pooled(self.count, self._bin(bins), bins)
 
     def _bin(self, bins: int) -> Tensor:
@@ -63,35 +62,31 @@ def in_order_of(
     columns: Mapping[str, Float[Tensor, "... samples"]],
     weight: Float[Tensor, "*batch samples"] | None = None,
 ) -> Ordered:
-    """Samples by a quantity, each counted `weight` times (once if None), with the sums of columns.
+    """Sort samples by a quantity and sum columns over equal values, each sample counted `weight` times (default 1).
 
-    A column may have the leading dimensions of `weight`, as one that is simulated several times.
+    A column may have the leading dimensions of `weight`, for example if it is simulated several times.
 
-    Raises ValueError where there are no samples or a number is not finite.
+    Raises ValueError for no samples, or for samples that are not finite.
     """
     require_finite(quantity, *columns.values())
     quantity = quantity.double()
     if weight is None:
         weight = torch.ones_like(quantity)
     points, group = quantity.unique(return_inverse=True)
-
-    def added(values: Tensor) -> Tensor:
-        zeros = values.new_zeros((*values.shape[:-1], len(points)))
-        return zeros.scatter_add_(-1, group.expand_as(values), values)
-
-    sums = {name: added(weight * column.double()) for name, column in columns.items()}
-    return Ordered(points, added(weight), sums)
+    sums = {name: _pooled(weight * column.double(), group, len(points)) for name, column in columns.items()}
+    return Ordered(points, _pooled(weight, group, len(points)), sums)
 
 
 def require_finite(*columns: Float[Tensor, "... samples"]) -> None:
-    """Raise ValueError where there are no samples or a number is not finite."""
+    """Raise ValueError for no samples, or for samples that are not finite."""
     for column in columns:
-        finite = column.isfinite()
-        if len(column) == 0 or not bool(finite.all()):
+        bad = int((~column.isfinite()).sum())
+        if len(column) == 0 or bad:
             raise ValueError(
-                f"a measure needs samples, all of them finite; {int((~finite).sum())} of {len(column)} are not"
+                f"samples: got {len(column)}, {bad} of them not finite; expected at least one, all finite"
             )
 
 
 def _pooled(values: Tensor, bin: Tensor, bins: int) -> Tensor:
-    return values.new_zeros((*values.shape[:-1], bins)).scatter_add_(-1, bin, values)
+    """The sum of values over each bin."""
+    return values.new_zeros((*values.shape[:-1], bins)).scatter_add_(-1, bin.expand_as(values), values)

@@ -1,4 +1,4 @@
-"""The rows of an evaluation, kept whole: every score of a split is computed from one table."""
+"""The rows of an evaluation: every score of a split is computed from one table."""
 
 from collections.abc import Mapping
 
@@ -10,11 +10,11 @@ from torchmetrics.utilities import dim_zero_cat
 
 
 class Rows(Metric):
-    """Collects named columns, one row a sample, over batches and processes.
+    """Collects named columns, one row per sample, over batches and processes.
 
-    `columns` returns them in float64 on the CPU, sorted by the column `row` where there is one, so that the
-    result does not depend on how the samples were dealt out. A checkpoint in the middle of an epoch holds the rows so
-    far. Two thousand rows of thirty columns take 0.5 MB.
+    `columns` returns them in float64 on the CPU, sorted by the column `row` if there is one: the result does not
+    depend on how samples are distributed. A checkpoint in the middle of an epoch includes the rows so far. Two
+    thousand rows of thirty columns take 0.5 MB.
 
     Example:
         >>> rows = Rows()
@@ -32,7 +32,7 @@ class Rows(Metric):
         self.add_state("parts", [], dist_reduce_fx="cat", persistent=True)
 
     def update(self, columns: Mapping[str, Real[Tensor, " rows"]]) -> None:
-        """Add rows. Raises ValueError if the columns are not those of the rows before."""
+        """Add rows. Raises ValueError if the columns differ from those of earlier rows."""
         if self.names and self.names != tuple(columns):
             raise ValueError(f"expected columns {self.names}, got {tuple(columns)}")
         self.names = tuple(columns)
@@ -43,7 +43,7 @@ class Rows(Metric):
         return dim_zero_cat(self.parts).cpu()
 
     def columns(self) -> dict[str, Float[Tensor, " rows"]]:
-        """All rows of all processes, column by column; torchmetrics alone would make scalars of a single row."""
+        """All rows of all processes by column; `compute` alone would turn a single row into scalars."""
         table = self.compute().reshape(-1, len(self.names))
         columns = dict(zip(self.names, table.unbind(-1), strict=True))
         if "row" not in columns:

@@ -1,4 +1,4 @@
-"""Scores of predictions: how sharp, how good as a whole, and whether uncertainty finds the bad ones."""
+"""Scores of predictions: the energy score, and whether predicted uncertainty ranks the errors."""
 
 from dataclasses import dataclass
 
@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from phd_exp.metrics.ordered import Ordered, in_order_of, require_finite
+from phd_exp.metrics.ordered import Ordered
 
 DRAWS = 64
-"""Of a prediction, for its energy score."""
+"""Draws of a prediction for its energy score."""
 _CHUNK = 512
 """Rows whose pairs of draws are held in memory at once."""
 
@@ -17,11 +17,15 @@ _CHUNK = 512
 def energy_score(
     samples: Float[Tensor, "draws *batch 3"], truth: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch"]:
-    """E|X - v| - E|X - X'|/2 in the unit of positions, unbiased from independent draws; the CRPS of positions.
+    """E|X - v| - E|X - X'|/2 in the unit of positions: the CRPS of positions, unbiased for independent draws.
 
-    The second mean is over all pairs of different draws, n (n - 1) of them.
-    Raises ValueError for fewer than two draws.
+    The second mean is over all n (n - 1) pairs of different draws. Raises ValueError for fewer than two draws.
     Source: Gneiting and Raftery, "Strictly proper scoring rules, prediction, and estimation" (2007).
+
+    Example:
+        >>> draws = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, 5.0]])
+        >>> float(energy_score(draws, torch.tensor([0.0, 0.0, 4.0])))  # distance 1 from the truth, 2 from each other
+        0.0
     """
     n = len(samples)
     if n < 2:
@@ -37,21 +41,12 @@ def _pair_distances(samples: Float[Tensor, "rows draws 3"]) -> Float[Tensor, " r
     return torch.cdist(samples, samples, compute_mode="donot_use_mm_for_euclid_dist").sum((-2, -1))
 
 
-def sharpness(predicted_variance: Float[Tensor, " samples"]) -> Float[Tensor, ""]:
-    """The root mean square of the predicted standard deviation; says nothing of whether it is right.
-
-    Raises ValueError without samples, or with one that is not finite.
-    """
-    require_finite(predicted_variance)
-    return predicted_variance.double().mean().sqrt()
-
-
 @dataclass(frozen=True)
 class RiskCoverage:
-    """The mean error of the most certain samples, by the share of samples that they are.
+    """The mean error of the most certain samples (risk) against their share of all samples (coverage).
 
-    Areas are means of the risk over all coverages 1/n, 2/n, ..., 1: by predicted uncertainty, by the error itself
-    (an oracle; nothing is lower) and in random order.
+    Areas are means of the risk over the coverages 1/n, 2/n, ..., 1: sorted by predicted uncertainty, by the error
+    itself (an oracle, the lower bound), and in random order.
     """
 
     coverage: Float[Tensor, "*batch points"]
@@ -62,22 +57,16 @@ class RiskCoverage:
 
     @property
     def excess(self) -> Float[Tensor, "*batch"]:
-        """(area - oracle) / (random - oracle): 0 finds the bad samples perfectly, 1 not at all."""
+        """(area - oracle) / (random - oracle): 0 if uncertainty ranks the errors perfectly, 1 if at random."""
         return (self.area - self.oracle_area) / (self.random_area - self.oracle_area)
 
 
-def risk_coverage(uncertainty: Float[Tensor, " samples"], error: Float[Tensor, " samples"]) -> RiskCoverage:
-    """Keep the most certain samples: what is their mean error? Equally uncertain ones count as if in random order.
+def risk_coverage(by_uncertainty: Ordered, by_error: Ordered, error: str) -> RiskCoverage:
+    """The risk-coverage curve of samples ordered by their uncertainty and by their error, the column `error`.
 
-    Raises ValueError without samples, or with one that is not finite.
+    Samples of equal uncertainty count as if in random order.
     Source: Geifman and El-Yaniv, "Selective classification for deep neural networks" (2017).
     """
-    columns = {"error": error}
-    return risk_coverage_of(in_order_of(uncertainty, columns), in_order_of(error, columns), "error")
-
-
-def risk_coverage_of(by_uncertainty: Ordered, by_error: Ordered, error: str) -> RiskCoverage:
-    """`risk_coverage` of samples in the order of their uncertainty and of their error."""
     kept = by_uncertainty.up_to
     return RiskCoverage(
         coverage=kept / by_uncertainty.total,
@@ -91,7 +80,7 @@ def risk_coverage_of(by_uncertainty: Ordered, by_error: Ordered, error: str) -> 
 def risk_at(
     ordered: Ordered, error: str, coverage: Float[Tensor, " points"]
 ) -> Float[Tensor, "*batch points"]:
-    """The risk at given coverages in (0, 1], of samples in the order of their uncertainty."""
+    """The risk at given coverages in (0, 1], of samples ordered by their uncertainty."""
     kept = torch.nn.functional.pad(ordered.up_to, (1, 0))
     errors = torch.nn.functional.pad(ordered.sums[error].cumsum(-1), (1, 0))
     wanted = coverage.double() * ordered.total

@@ -1,4 +1,4 @@
-"""Samples by what makes them hard: named parts of a data set, each sample in exactly one."""
+"""Strata: named parts of a data set, each sample in exactly one."""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Stratum:
-    """A part of the samples, and what it is called."""
+    """A part of the samples and its label."""
 
     label: str
     mask: Bool[Tensor, " samples"]
@@ -21,12 +21,16 @@ class Stratum:
 def strata(
     name: str, values: Float[Tensor, " samples"], edges: Sequence[float] | int, unit: str = ""
 ) -> list[Stratum]:
-    """Split samples between edges, or into n parts of about equal size; empty parts are left out.
+    """Split samples at edges, or into n parts of about equal size; empty parts are left out.
 
-    A part holds its lower edge and not its upper one, except for the last, which holds both. What lies outside all
-    edges is `below` or `above`, and NaN is `unknown`. Labels read `depth 3.0-3.5 m`.
+    A part includes its lower edge; only the last includes its upper edge. Values outside all edges are `below` or
+    `above`, NaN is `unknown`. Labels read `depth 3.0-3.5 m`.
 
     Raises ValueError for edges that do not ascend, or for fewer than one part.
+
+    Example:
+        >>> [part.label for part in strata("depth", torch.tensor([3.0, 3.5, 4.0]), (3, 3.5, 4), "m")]
+        ['depth 3-3.5 m', 'depth 3.5-4 m']
     """
     values = values.double()
     known = values[~values.isnan()]
@@ -34,7 +38,7 @@ def strata(
     if not borders:
         return _named([(f"{name} unknown", values.isnan())])
     if any(high <= low for low, high in pairwise(borders)):
-        raise ValueError(f"the edges of {name} must ascend, but are {borders}")
+        raise ValueError(f"edges of {name}: got {borders}; expected them to ascend")
     rule = f".{_decimals(borders)}f" if isinstance(edges, int) else "g"
     words, suffix = [format(border, rule) for border in borders], f" {unit}" if unit else ""
     parts = [(f"{name} below {words[0]}{suffix}", values < borders[0])]
@@ -49,9 +53,9 @@ def strata(
 
 
 def _quantiles(known: Tensor, n: int) -> list[float]:
-    """n + 1 borders of parts of equal size; fewer where many values are equal."""
+    """n + 1 borders of parts of equal size; fewer if many values are equal."""
     if n < 1:
-        raise ValueError(f"samples split into at least 1 part, not {n}")
+        raise ValueError(f"edges: got {n} parts; expected at least 1 part")
     if len(known) == 0:
         return []
     shares = torch.linspace(0, 1, n + 1, dtype=torch.float64)
@@ -60,7 +64,7 @@ def _quantiles(known: Tensor, n: int) -> list[float]:
 
 
 def _decimals(borders: Sequence[float]) -> int:
-    """As few as let neighbouring borders read as different."""
+    """The fewest decimals with which neighbouring borders differ."""
     gaps = [high - low for low, high in pairwise(borders)]
     return max(0, -math.floor(math.log10(min(gaps)))) if gaps else 2
 

@@ -1,6 +1,4 @@
-"""Distances from calibration, each beside the value that a calibrated model of the same predictions has."""
-
-from collections.abc import Sequence
+"""Distances from calibration, each with the value of a calibrated model that predicts the same uncertainties."""
 
 from phd_exp.evaluation.predictions import Evaluation
 from phd_exp.evaluation.reference import DISTANCES
@@ -9,7 +7,6 @@ from phd_exp.reports.quantities import SCORES
 from phd_exp.reports.runs import Report, Run
 from phd_exp.reports.table import Table, TableCell, TableRow, file_stem
 
-RECALIBRATED = "recalibrated"
 OF_A_CELL = (
     "A cell: the distance of the run's predictions; below it the 95 % interval of calibrated predictions with the "
     "same uncertainties (truths simulated from them). Finitely many samples never give zero: a "
@@ -18,54 +15,48 @@ OF_A_CELL = (
 
 
 def calibration_tables(report: Report) -> list[Table]:
-    """A table for every preset that has a measured distribution."""
-    tables = []
-    for preset in report.presets:
-        runs = [run for run in report.runs if run.preset == preset and _evaluations(run)]
-        if runs:
-            tables.append(_table(preset, runs))
-    return tables
-
-
-def _table(preset: str, runs: Sequence[Run]) -> Table:
-    return Table(
-        stem=file_stem("calibration", preset),
-        kind="calibration",
-        title=f"Calibration, {in_words(preset)}: distances on the test samples",
-        stub=("run",),
-        columns=tuple(SCORES[name].label for name in DISTANCES),
-        groups=tuple(tuple(_rows(run)) for run in runs),
-        notes=(OF_A_CELL,),
-        below="calibrated",
-        preset=preset,
-        numbers=tuple(
-            {"preset": preset, "data": run.data, "model": run.model, "run": run.name, "predictions": kind}
-            | {"quantity": name, "value": measured.scores[name].value}
-            | dict(zip(("calibrated", "low", "high"), vars(measured.reference[name]).values(), strict=True))
-            for run in runs
-            for kind, measured in _evaluations(run)
-            for name in DISTANCES
-        ),
-    )
-
-
-def _evaluations(run: Run) -> list[tuple[str, Evaluation]]:
-    found = (("as trained", run.measured.before), (RECALIBRATED, run.measured.after))
-    return [(kind, measured) for kind, measured in found if measured and measured.reference]
-
-
-def _rows(run: Run) -> list[TableRow]:
+    """A table for every preset with an evaluated distribution."""
+    found = {
+        preset: [(run, kinds) for run in report.runs if run.preset == preset and (kinds := _evaluations(run))]
+        for preset in report.presets
+    }
     return [
-        TableRow(
-            (f"{run.title}, {run.name}{', recalibrated' if kind == RECALIBRATED else ''}",),
-            tuple(_cell(measured, name) for name in DISTANCES),
+        Table(
+            stem=file_stem("calibration", preset),
+            kind="calibration",
+            title=f"Calibration, {in_words(preset)}: distances on the test samples",
+            stub=("run",),
+            columns=tuple(SCORES[name].label for name in DISTANCES),
+            groups=tuple(tuple(_row(run, *kind) for kind in kinds.items()) for run, kinds in runs),
+            notes=(OF_A_CELL,),
+            below="calibrated",
+            preset=preset,
+            numbers=tuple(
+                {"preset": preset, "data": run.data, "model": run.model, "run": run.name, "predictions": kind}
+                | {"quantity": name, "value": evaluation.scores[name].value}
+                | dict(
+                    zip(("calibrated", "low", "high"), vars(evaluation.reference[name]).values(), strict=True)
+                )
+                for run, kinds in runs
+                for kind, evaluation in kinds.items()
+                for name in DISTANCES
+            ),
         )
-        for kind, measured in _evaluations(run)
+        for preset, runs in found.items()
+        if runs
     ]
 
 
-def _cell(measured: Evaluation, name: str) -> TableCell:
-    text, reference = SCORES[name].text, measured.reference[name]
-    return TableCell(
-        text(measured.scores[name].value), below=f"({text(reference.low)}–{text(reference.high)})"
-    )
+def _evaluations(run: Run) -> dict[str, Evaluation]:
+    found = {"as trained": run.measured.before, "recalibrated": run.measured.after}
+    return {kind: evaluation for kind, evaluation in found.items() if evaluation and evaluation.reference}
+
+
+def _row(run: Run, kind: str, evaluation: Evaluation) -> TableRow:
+    label = f"{run.title}, {run.name}{', recalibrated' if kind == 'recalibrated' else ''}"
+    cells = []
+    for name in DISTANCES:
+        text, reference = SCORES[name].text, evaluation.reference[name]
+        below = f"({text(reference.low)}–{text(reference.high)})"
+        cells.append(TableCell(text(evaluation.scores[name].value), below=below))
+    return TableRow((label,), tuple(cells))

@@ -18,7 +18,7 @@ COVERAGE = 0.95
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean and its 95 % interval, mean ± half_width; None where there is no interval."""
+    """A mean and its 95 % interval, mean ± half_width; None if there is no interval."""
 
     mean: float
     half_width: float | None
@@ -34,7 +34,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class Gap:
-    """A run that a table wants and lacks, with the reason."""
+    """A run that is missing in a table, with the reason."""
 
     data: str
     model: str
@@ -49,9 +49,9 @@ class Cell:
 
     Attributes:
         means: seed -> mean error, of the finished runs.
-        images: digests of the test images; one where all runs were tested on the same.
-        sees_f: whether the networks see the focal length.
-        gaps: the seeds that other cells of the table have, or that were begun, and this one lacks.
+        images: digests of the test images; a single one if all runs were tested on the same images.
+        sees_f: whether the focal length is an input of the networks.
+        gaps: seeds that are missing here and that other cells of the table have or that were started.
     """
 
     preset: str
@@ -65,17 +65,17 @@ class Cell:
 
     @property
     def interval(self) -> Interval | None:
-        """Of the mean over seeds; None where no run has finished."""
+        """The mean over seeds and its interval; None if no run has finished."""
         return interval(list(self.means.values())) if self.means else None
 
     @property
     def mean(self) -> float | None:
-        """Ours, mm; None where no run has finished."""
+        """Our mean, mm; None if no run has finished."""
         return self.interval.mean if self.interval else None
 
     @property
     def state(self) -> str:
-        """`finished`; why there is no number; or how many of the seeds there are."""
+        """`finished`, the reason for a missing number, or the number of finished seeds."""
         if not self.gaps:
             return "finished"
         if not self.means:
@@ -89,7 +89,7 @@ class Cell:
 
     @property
     def bound(self) -> float | None:
-        """The bound on its mean, mm, that applies to these runs."""
+        """The bound on the mean, mm, that applies to these runs."""
         return bound_mm(self.model, self.data, self.key.quantity, self.sees_f)
 
     @property
@@ -98,7 +98,7 @@ class Cell:
         return self.mean / self.published if self.mean is not None and self.published else None
 
     def beats(self, other: "Cell") -> bool:
-        """Whether a paired bootstrap over seeds and the shared test images separates this smaller mean."""
+        """Whether this mean is significantly smaller: a paired bootstrap over seeds and the shared test images."""
         if len(self.images | other.images) != 1:
             return False
         gap, half_width = difference(list(self.means.values()), list(other.means.values()))
@@ -113,7 +113,7 @@ class Cell:
             "quantity": f"{self.key.quantity}_error_mm", "n_seeds": len(self.means),
             "mean": self.mean, "low": low, "high": high, "interval": self.interval.kind if self.interval else "none",
             "published": self.published, "ratio": self.ratio, "bound": self.bound, "best": bold,
-            # of runs that were tested on different numbers of samples, the least
+            # the smallest, if runs were tested on different numbers of samples
             "n_test": min((mean.n for mean in self.means.values()), default=0), "state": self.state,
         }  # fmt: skip
 
@@ -121,9 +121,13 @@ class Cell:
 def make_cell(
     report: Report, preset: str, data: str, model: str, key: ErrorKey, seeds: Sequence[int]
 ) -> Cell:
-    """The cell of one preset, data set, model and error, which should have these seeds."""
+    """The cell of a preset, data set, model and error, for these seeds."""
     runs = report.at_defaults(preset, data, model)
-    gaps = [gap for seed in seeds if (gap := _gap(runs.get(seed), data, model, seed, key)) is not None]
+    gaps = [
+        _gap(runs.get(seed), data, model, seed)
+        for seed in seeds
+        if seed not in runs or key not in runs[seed].errors
+    ]
     measured = {seed: run for seed, run in sorted(runs.items()) if key in run.errors}
     return Cell(
         preset=preset,
@@ -140,9 +144,13 @@ def make_cell(
 def interval(means: Sequence[SampleMean]) -> Interval:
     """The mean over seeds with its 95 % interval.
 
-    Of k >= 2 seeds with means m_i and their standard deviation s: mean ± t s / sqrt(k), t the 97.5 % quantile of
-    Student's law with k - 1 degrees of freedom: how another training would scatter. Of one seed: mean ± 1.96
-    standard errors over its test samples, how another test set would scatter; of one sample: none.
+    k >= 2 seeds with standard deviation s: mean ± t s / sqrt(k), t the 97.5 % quantile of Student's law with k - 1
+    degrees of freedom, the scatter of trainings. One seed: mean ± 1.96 standard errors over its test samples, the
+    scatter of test sets. One sample: no interval.
+
+    Example:
+        >>> interval([SampleMean(100, 40.0, 1.0), SampleMean(100, 42.0, 1.0)]).mean
+        41.0
     """
     values = np.array([mean.value for mean in means])
     tail = (1 + COVERAGE) / 2
@@ -156,11 +164,10 @@ def interval(means: Sequence[SampleMean]) -> Interval:
     return Interval(means[0].value, float(stats.norm.ppf(tail)) * error, "normal_over_samples")
 
 
-def _gap(run: Run | None, data: str, model: str, seed: int, key: ErrorKey) -> Gap | None:
+def _gap(run: Run | None, data: str, model: str, seed: int) -> Gap:
+    """Why a run has no error."""
     if run is None:
         return Gap(data, model, seed, "missing")
     if run.state != "finished":
         return Gap(data, model, seed, run.state, run.detail)
-    if key not in run.errors:
-        return Gap(data, model, seed, "no sample", "none of its test samples lies in the central half")
-    return None
+    return Gap(data, model, seed, "no sample", "none of its test samples lies in the central half")

@@ -1,4 +1,4 @@
-"""Pictures drawn from records."""
+"""Figures of calibration curves and level curves, drawn with matplotlib."""
 
 import io
 import math
@@ -18,7 +18,7 @@ LABELS = {
     "projected": ("Projected position", "no unit"),
 }
 _CELL, _LEFT, _RIGHT, _BOTTOM, _TOP = 4.2, 0.8, 0.2, 0.6, 0.4
-"""Side of the square in which one curve is drawn, and its margins, inches."""
+"""Side of the square for one curve, and its margins, inches."""
 
 
 def draw_calibration(curves: Mapping[str, Mapping[str, Any]], file: Path) -> None:
@@ -26,26 +26,23 @@ def draw_calibration(curves: Mapping[str, Mapping[str, Any]], file: Path) -> Non
 
     Source: paper, Figure "correlation between predicted variance and empirical variance".
     """
-    figure = Figure(figsize=(_CELL * len(curves), _CELL))
-    _leave_margins(figure, len(curves))
-    for place, (name, curve) in enumerate(curves.items()):
-        draw_curve(figure.add_subplot(1, len(curves), place + 1), name, curve)
-    write_atomic(file, encoded(figure, "png", dpi=120))
-
-
-def _leave_margins(figure: Figure, columns: int) -> None:
-    """The same around every curve: to find what its labels need (`layout="constrained"`) is half of the drawing."""
+    n = len(curves)
+    figure = Figure(figsize=(_CELL * n, _CELL))
+    # fixed margins: `layout="constrained"`, which measures the labels, takes half of the drawing time
     figure.subplots_adjust(
-        left=_LEFT / (_CELL * columns),
-        right=1 - _RIGHT / (_CELL * columns),
+        left=_LEFT / (_CELL * n),
+        right=1 - _RIGHT / (_CELL * n),
         bottom=_BOTTOM / _CELL,
         top=1 - _TOP / _CELL,
         wspace=(_LEFT + _RIGHT) / (_CELL - _LEFT - _RIGHT),
     )
+    for place, (name, curve) in enumerate(curves.items()):
+        draw_curve(figure.add_subplot(1, n, place + 1), name, curve)
+    write_atomic(file, encoded(figure, "png", dpi=120))
 
 
 def encoded(figure: Figure, kind: str, dpi: int) -> bytes:
-    """A figure as the bytes of a `png` or `pdf` file, which hold no date."""
+    """A figure as the bytes of a `png` or `pdf` file without a date."""
     dateless = {"CreationDate": None} if kind == "pdf" else {}
     buffer = io.BytesIO()
     figure.savefig(buffer, format=kind, dpi=dpi, metadata=dateless)
@@ -53,28 +50,28 @@ def encoded(figure: Figure, kind: str, dpi: int) -> bytes:
 
 
 def draw_curve(axes: Axes, name: str, curve: Mapping[str, Any]) -> None:
-    """Draw one of them: of `depth` or of `projected`."""
-    title, unit = LABELS[name]
-    predicted, empirical = curve["predicted"], curve["empirical"]
-    bounds = decades((*predicted, *empirical)) or (0.1, 1.0)
-    axes.plot(bounds, bounds, "--", color="tab:red", linewidth=1, label="calibrated")
-    axes.plot(predicted, empirical, color="tab:blue", label=_words(curve))
-    axes.set(xscale="log", yscale="log", xlim=bounds, ylim=bounds, aspect="equal", title=title)
-    axes.set_xlabel(f"predicted variance ({unit})")
-    axes.set_ylabel(f"mean squared error ({unit})")
-    axes.grid(which="both", alpha=0.25)
-    axes.legend(frameon=False)  # where no curve is
-
-
-def _words(curve: Mapping[str, Any]) -> str:
+    """Draw one calibration curve, of `depth` or of `projected`."""
+    draw_identity(axes, name, (*curve["predicted"], *curve["empirical"]), label="calibrated")
     left_out = f", {curve['left_out']} samples left out" if curve["left_out"] else ""
-    return f"window of {curve['window']}{left_out}"
+    label = f"window of {curve['window']}{left_out}"
+    axes.plot(curve["predicted"], curve["empirical"], color="tab:blue", label=label)
+    axes.grid(which="both", alpha=0.25)
+    axes.legend(frameon=False)
+
+
+def draw_identity(axes: Axes, name: str, values: Iterable[float], label: str | None = None) -> None:
+    """Prepare logarithmic axes around the values of calibration curves, with the identity dashed."""
+    bounds = decades(values) or (0.1, 1.0)
+    title, unit = LABELS[name]
+    axes.plot(bounds, bounds, "--", color="tab:red", linewidth=1, label=label)
+    axes.set(xscale="log", yscale="log", xlim=bounds, ylim=bounds, aspect="equal", title=title)
+    axes.set(xlabel=f"predicted variance ({unit})", ylabel=f"mean squared error ({unit})")
 
 
 def draw_on_image(
     axes: Axes, curves: LevelCurves, image: np.ndarray | None, f: float, S: float, truth: np.ndarray | None
 ) -> None:
-    """The image with the curves of (x, y)/z, the mode as a cross and the projected truth as a dot."""
+    """Draw the image with the curves of (x, y)/z, the mode as a cross and the projected truth as a dot."""
     if image is not None:
         axes.imshow(image, extent=(0, S, S, 0))
     for width, points in zip((1.6, 1.1, 0.7), curves.projected, strict=False):
@@ -88,23 +85,28 @@ def draw_on_image(
 
 
 def draw_birds_eye(axes: Axes, curves: LevelCurves, truth: np.ndarray | None) -> None:
-    """The curves of (x, z), the mode as a cross and the truth as a dot; the axes have scales of their own."""
+    """Draw the curves of (x, z), the mode as a cross and the truth as a dot; the axes differ in scale."""
     for width, level, points in zip((1.6, 1.1, 0.7), curves.levels, curves.birds_eye, strict=False):
         axes.plot(*points.T, color="#0072b2", linewidth=width, label=f"{100 * level:g} %")
     axes.plot(curves.mode[0], curves.mode[2], "x", color="#0072b2", markersize=6, label="mode")
     if truth is not None:
         axes.plot(truth[0], truth[2], "o", color="black", markersize=4, label="truth")
     axes.set(xlabel="x (m)", ylabel="z (m)")
-    axes.locator_params(axis="x", nbins=5)  # more labels would run into each other
+    axes.locator_params(axis="x", nbins=5)  # more labels would overlap
     axes.grid(alpha=0.25)
     axes.legend(frameon=False, fontsize="small")
 
 
 def decades(values: Iterable[float]) -> tuple[float, float] | None:
-    """The powers of ten around the positive ones of some values; None where there is none."""
+    """The powers of ten around the positive finite values; None if there are none.
+
+    Example:
+        >>> decades([0.02, 3.0])
+        (0.01, 10.0)
+    """
     positive = [value for value in values if 0 < value < math.inf]
     if not positive:
         return None
-    # whole decades: the labels between them would run into each other
+    # whole decades: labels between them would overlap
     low, high = math.floor(math.log10(min(positive))), math.ceil(math.log10(max(positive)))
     return 10.0**low, 10.0 ** max(high, low + 1)

@@ -1,7 +1,6 @@
-"""Fusion of several cameras as a table: a column a number of cameras, a line a method."""
+"""Fusion of several cameras as a table: a column per number of cameras, a line per method."""
 
 import math
-from collections.abc import Iterator
 
 from phd_exp.evaluation.fusion import (
     CALIBRATION,
@@ -34,11 +33,11 @@ QUANTITIES = {
 }
 ON_GROUND = ", ground"
 STRONG = 0.5
-"""A correlation from which on the one is said to move with the other."""
+"""The smallest correlation that a note reports as a common cause."""
 OF_A_LINE = (
-    "Columns: how many cameras of each scene are fused, beginning with the first. Depth: the error along the first "
-    "camera's true viewing ray, as in the paper's tables; distance: in space; both means over scenes. In brackets: "
-    "95 % bootstrap intervals over scenes."
+    "Columns: number of cameras of each scene that are fused, starting with the first. Depth: the error along the "
+    "first camera's true viewing ray, as in the paper's tables; distance: in space; both means over scenes. In "
+    "brackets: 95 % bootstrap intervals over scenes."
 )
 OF_METHODS = (
     "Huber: the most likely position under the product of the views' Projected Huber densities, and the mean of that "
@@ -46,8 +45,8 @@ OF_METHODS = (
 )
 OF_THE_GROUND = (
     "Ground: every position is also known to lie on a plane through the true one with the normal (0, cos 30°, "
-    "sin 30°) in the first camera's frame, the ground before a camera that looks down by 30°; a level camera would "
-    "see its ground edge-on. The average is moved to the nearest point of the plane, the Gaussian conditioned on it."
+    "sin 30°) in the first camera's frame, the ground in front of a camera that looks down by 30°. The average is "
+    "moved to the nearest point of the plane, the Gaussian is conditioned on it."
 )
 
 
@@ -59,50 +58,43 @@ def fusion_tables(report: Report) -> list[Table]:
 def fusion_table(run: Run, scores: FusionScores) -> Table:
     """The table of a run's scores."""
     apart = "" if (run.data, run.model) == ("scale", "probabilistic") else f"{run.title}, "
+    places = (False, True)
+    groups = [_rows(scores, quantity, on_plane) for on_plane in places for quantity in ERRORS]
+    groups += [[row for name in CALIBRATION for row in _rows(scores, name, on_plane)] for on_plane in places]
     return Table(
         stem=file_stem("fusion", run.preset, run.data, run.model, run.name),
         kind="fusion",
         title=f"Fusion, {in_words(run.preset)}, {apart}{run.name}: {scores.n} scenes seen by {scores.views} cameras",
         stub=("quantity", "method"),
-        columns=tuple(f"{k} camera{'s' if k > 1 else ''}" for k in _cameras(scores)),
-        groups=tuple(_groups(scores)),
+        columns=tuple(f"{k} camera{'s' if k > 1 else ''}" for k in range(1, scores.views + 1)),
+        groups=tuple(map(tuple, groups)),
         below="exact densities",
-        notes=(OF_A_LINE, OF_METHODS, OF_THE_GROUND, *_measured(scores)),
+        notes=(OF_A_LINE, OF_METHODS, OF_THE_GROUND, *_notes(scores)),
         preset=run.preset,
         numbers=tuple(
             {"preset": run.preset, "data": run.data, "model": run.model, "run": run.name}
             | dict(zip(("quantity", "method", "cameras", "ground"), at.split("/"), strict=True))
-            | {
-                "mean": band.value,
-                "low": band.low,
-                "high": band.high,
-                "exact": scores.exact.get(at),
-                "n_scenes": scores.n,
-            }
+            | {"mean": band.value, "low": band.low, "high": band.high}
+            | {"exact": scores.exact.get(at), "n_scenes": scores.n}
             for at, band in scores.bands.items()
         ),
     )
 
 
-def _cameras(scores: FusionScores) -> range:
-    return range(1, scores.views + 1)
-
-
-def _groups(scores: FusionScores) -> Iterator[tuple[TableRow, ...]]:
-    for on_plane in (False, True):
-        for quantity in ERRORS:
-            yield tuple(_rows(scores, quantity, on_plane))
-    for on_plane in (False, True):
-        yield tuple(row for name in CALIBRATION for row in _rows(scores, name, on_plane))
-
-
-def _rows(scores: FusionScores, quantity: str, on_plane: bool) -> Iterator[TableRow]:
+def _rows(scores: FusionScores, quantity: str, on_plane: bool) -> list[TableRow]:
     label = QUANTITIES[quantity] + (ON_GROUND if on_plane else "")
+    rows = []
     for method in METHODS if quantity in ERRORS else PROBABILISTIC:
-        name = NAMES[method] if quantity in ERRORS else NAMES[method].removesuffix(", mean")
-        places = [place(quantity, method, k, on_plane) for k in _cameras(scores)]
-        cells = (_cell(quantity, scores.bands[at], scores.exact.get(at)) for at in places)
-        yield TableRow((label, name), tuple(cells))
+        name = NAMES[method] if quantity in ERRORS else alone(method)
+        places = [place(quantity, method, k, on_plane) for k in range(1, scores.views + 1)]
+        cells = tuple(_cell(quantity, scores.bands[at], scores.exact.get(at)) for at in places)
+        rows.append(TableRow((label, name), cells))
+    return rows
+
+
+def alone(method: Method) -> str:
+    """The name of a method in a chart or group with one line per density."""
+    return NAMES[method].removesuffix(", mean")
 
 
 def _cell(quantity: str, band: Band, exact: float | None) -> TableCell:
@@ -116,47 +108,43 @@ def _number(quantity: str, value: float) -> str:
     return f"{value:.2f}" if quantity == "normalised_squared_error" else f"{value:.0f}"
 
 
-def _measured(scores: FusionScores) -> list[str]:
+def _notes(scores: FusionScores) -> list[str]:
     levels = ", ".join(map(str, LEVELS))
-    said = [
-        f"Inside {levels} %: per cent of true positions in the ellipsoids of mean and covariance that hold so "
-        "much of a Gaussian; below it the share that exact densities have there, whose tails are longer. "
-        "Squared error: the squared Mahalanobis distance per dimension, 1 on average where calibrated, above 1 where "
-        "overconfident."
+    notes = [
+        f"Inside {levels} %: per cent of true positions in the ellipsoids of mean and covariance that contain as "
+        "much of a Gaussian; below it the share that exact densities have there, whose tails are longer. Squared "
+        "error: the squared Mahalanobis distance per dimension, 1 on average where calibrated, above 1 where "
+        "overconfident.",
+        _common_cause(scores),
     ]
-    said.append(_common_cause(scores))
     if scores.left_out:
-        said.append(
+        notes.append(
             f"{scores.left_out} further scenes are left out: a prediction was not finite, or no position is in front "
             "of every camera."
         )
-    return said
+    return notes
 
 
 def _common_cause(scores: FusionScores) -> str:
     views, size = scores.correlation, scores.with_size
-    said = (
-        f"Fusion takes the views' errors for independent. Those of log depth of two views of a scene have the "
+    text = (
+        f"Fusion assumes that the views' errors are independent. Those of log depth of two views of a scene have the "
         f"correlation {views.value:.2f} ({views.low:.2f}–{views.high:.2f})"
     )
     if math.isfinite(size.value):
-        said += f", and their average has {size.value:.2f} with log size"
+        text += f", and their average has {size.value:.2f} with log size"
         if abs(size.value) > STRONG:
-            said += ": the size of an object, common to its views, shifts all of them"
+            text += ": the size of an object, common to its views, shifts all of them"
     last = scores.band("normalised_squared_error", "mean", scores.views)
-    if last.low > 1:
-        said += f"; the fused squared error of {last.value:.2f} says that they are overconfident together"
-    elif last.high < 1:
-        said += f"; the fused squared error of {last.value:.2f} says that they are underconfident together"
-    else:
-        said += f"; the fused squared error of {last.value:.2f} does not differ from 1 by more than chance"
-    return said + "."
+    verdict = "does not differ from 1 by more than chance"
+    if last.low > 1 or last.high < 1:
+        verdict = f"means that together they are {'over' if last.low > 1 else 'under'}confident"
+    return f"{text}; the fused squared error of {last.value:.2f} {verdict}."
 
 
 def headline(scores: FusionScores) -> str:
-    """The depth error of one camera and of all, in words."""
-    one, all_ = (scores.band("depth_error_mm", "mode", k) for k in (1, scores.views))
-    return (
-        f"depth error {_number('depth_error_mm', one.value)} mm with one camera, "
-        f"{_number('depth_error_mm', all_.value)} mm with {scores.views}"
+    """The depth error with one camera and with all, in words."""
+    one, all_ = (
+        _number("depth_error_mm", scores.band("depth_error_mm", "mode", k).value) for k in (1, scores.views)
     )
+    return f"depth error {one} mm with one camera, {all_} mm with {scores.views}"

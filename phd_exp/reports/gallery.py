@@ -1,4 +1,4 @@
-"""The best and the worst test images of a run: the level curves on the image and from above, as SVG."""
+"""The best and the worst test images of a run, with level curves on the image and from above, as SVG."""
 
 import base64
 import io
@@ -13,8 +13,8 @@ from PIL import Image
 
 from phd_exp.distributions.columns import PARAMETERS, from_columns
 from phd_exp.distributions.level_curves import LEVELS, LevelCurves, level_curves, on_image
-from phd_exp.evaluation.parquet import Columns
-from phd_exp.records.errors import RunError, UserError
+from phd_exp.evaluation.parquet import Columns, require_columns
+from phd_exp.records.errors import UserError
 from phd_exp.records.files import require_plain
 from phd_exp.records.images import LARGEST_IMAGE, RENDERED, decoding, pillow_warnings
 from phd_exp.reports.quantities import SCORES
@@ -22,9 +22,9 @@ from phd_exp.reports.quantities import SCORES
 EACH = 6
 NEEDED = ("file_name", "f", "S", "x", "y", "z", "mode_x", "mode_y", "mode_z")
 LARGEST = 448  # pixels; larger test images are shrunk for the page
-_CLOSE = 0.25  # a share of the image below which curves deserve a close-up
-_SMALLEST = 0.1  # the same for the side of a close-up
-_PANEL, _LEFT, _BOTTOM, _EDGE = 200.0, 44.0, 30.0, 6.0  # of the bird's-eye view, in its own units
+_CLOSE = 0.25  # curves smaller than this share of the image have a close-up
+_SMALLEST = 0.1  # smallest side of a close-up, a share of the image
+_PANEL, _LEFT, _BOTTOM, _EDGE = 200.0, 44.0, 30.0, 6.0  # side and margins of the bird's-eye view, SVG units
 _FACTS = {
     "level": ("credible level of the truth", "", 2),
     "visibility": ("visibility", "", 2),
@@ -55,9 +55,9 @@ class Picture:
     """One test sample.
 
     Attributes:
-        image: as a `data:` address; None where the image is not at hand.
-        side: of the image, pixels, in which `paths`, `mode` and `truth` are given.
-        close_up: left, top and side of the part worth enlarging; None where the curves fill the image.
+        image: as a `data:` address; None if the image is not available.
+        side: of the image, in pixels, the unit of `paths`, `mode` and `truth`.
+        close_up: left, top and side of an enlarged part; None if the curves fill the image.
         facts: pairs of a name and a value.
     """
 
@@ -75,7 +75,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Gallery:
-    """The pictures of a run, the best first and the worst first; `ranked_by` names the measure of both."""
+    """The pictures of a run: best first, and worst first; `ranked_by` names the measure."""
 
     ranked_by: str
     best: list[Picture]
@@ -85,21 +85,20 @@ class Gallery:
 
 
 def images_folder(config: Mapping[str, str]) -> Path | None:
-    """Where the test images of a run on a rendered data set lie; None for other images. `config` has dotted keys."""
+    """The folder of the test images of a rendered data set; None for other images. `config` has dotted keys."""
     root, variant = config.get("data.root"), config.get("data.spec.variant")
     return Path(root) / variant / "test" if root and variant else None
 
 
 def make_gallery(table: Columns, config: Mapping[str, str]) -> Gallery:
-    """Choose and draw the pictures. Raises RunError where the table lacks a column."""
-    if missing := [name for name in NEEDED if name not in table]:
-        raise RunError(f"no gallery: predictions lack the column {', '.join(missing)}; run the model again")
+    """Choose and draw the pictures. Raises RunError if the table lacks a column."""
+    require_columns(NEEDED, table)
     if "nll" in table:
         key, ranked_by, error = "nll", "negative log density at the truth", table["nll"]
     else:
         key, ranked_by = "", "distance from the truth"
         error = np.linalg.norm([table[f"mode_{axis}"] - table[axis] for axis in "xyz"], axis=0)
-    order = np.argsort(error, kind="stable")  # NaN comes last: a prediction that is none is the worst
+    order = np.argsort(error, kind="stable")  # NaN comes last, as the worst
     each = min(EACH, len(order) // 2) or 1
     source = images_folder(config)
 
@@ -120,7 +119,7 @@ def _picture(row: Mapping[str, Any], key: str, source: Path | None) -> Picture:
     f, S = float(row["f"]), float(row["S"])
     curves = curves_of(row)
     outlines = [on_image(points, f, S) for points in curves.projected] if curves else []
-    with np.errstate(all="ignore"):  # whatever a record holds
+    with np.errstate(all="ignore"):  # a record may contain any number
         on = [on_image(at[:2] / at[2], f, S) for at in (truth, mode)]
     facts = _facts(row, key)
     image = load_image(source, str(row["file_name"])) if source else None
@@ -139,7 +138,7 @@ def _picture(row: Mapping[str, Any], key: str, source: Path | None) -> Picture:
 
 
 def curves_of(row: Mapping[str, Any]) -> LevelCurves | None:
-    """The level curves of a row; None for a baseline, and for numbers that are no distribution."""
+    """The level curves of a row; None for a baseline, or if the parameters are not of a distribution."""
     if any(name not in row for name in PARAMETERS):
         return None
     numbers = {name: torch.tensor(float(row[name]), dtype=torch.float64) for name in PARAMETERS}
@@ -157,7 +156,7 @@ def _facts(row: Mapping[str, Any], key: str) -> list[tuple[str, str]]:
 
 
 def load_image(source: Path, name: str) -> Image.Image | None:
-    """A test image, shrunk where it is large; None where it is not there, no image, or outside its folder."""
+    """A test image, reduced to `LARGEST`; None if it is missing, not an image, or outside its folder."""
     file = source / name
     try:
         if not file.resolve().is_relative_to(source.resolve()):
@@ -167,19 +166,19 @@ def load_image(source: Path, name: str) -> Image.Image | None:
             with Image.open(file, formats=RENDERED) as image:
                 image.thumbnail((LARGEST, LARGEST))
                 return image.convert("RGB")
-    except (UserError, OSError, ValueError, RuntimeError):  # also a NUL byte, a link that leads to itself
+    except (UserError, OSError, ValueError, RuntimeError):  # also a NUL byte, or a link to itself
         return None
 
 
 def _as_address(image: Image.Image) -> str:
-    """The image itself as an address, so that a page is one file."""
+    """The image as a `data:` address, so that a page is one file."""
     buffer = io.BytesIO()
     image.save(buffer, "WEBP", quality=90)
     return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 
 def close_up(points: np.ndarray, S: float) -> tuple[float, float, float] | None:
-    """Left, top and side of a square around points that lie close together in an image of S pixels; else None."""
+    """Left, top and side of a square around close points in an image of S pixels; None if they are not close."""
     low, high = points.min(axis=0), points.max(axis=0)
     extent = float((high - low).max())
     if not np.isfinite(extent) or extent > _CLOSE * S:
@@ -190,7 +189,7 @@ def close_up(points: np.ndarray, S: float) -> tuple[float, float, float] | None:
 
 
 def birds_eye_view(curves: LevelCurves, truth: np.ndarray) -> BirdsEye:
-    """The view from above: x to the right, z upwards, scaled so that the curves and the truth are visible."""
+    """The view from above: x to the right, z upwards, scaled to the curves and the truth."""
     seen = np.concatenate([*curves.birds_eye, curves.mode[None, ::2], truth[None, ::2]])
     low, high = seen.min(axis=0), seen.max(axis=0)
     margin = np.maximum(0.06 * (high - low), 1e-9)
@@ -211,7 +210,7 @@ def birds_eye_view(curves: LevelCurves, truth: np.ndarray) -> BirdsEye:
 
 
 def _ticks(low: float, high: float) -> list[tuple[float, str]]:
-    """Two to five round numbers between two, with as many digits as tell them apart."""
+    """Two to five round numbers in an interval, with as many digits as distinguish them."""
     power = 10.0 ** np.floor(np.log10(high - low))
     step = next(power * k for k in (0.2, 0.5, 1, 2, 5) if (high - low) / (power * k) <= 5)
     digits = max(0, int(np.ceil(-np.log10(step) - 1e-9)))
@@ -224,11 +223,11 @@ def _round(value: float) -> float:
 
 
 def _svg_path(points: np.ndarray) -> str:
-    """Points as an SVG path; what lies far outside a picture is brought nearer, or renderers would lose digits."""
+    """Points as an SVG path; distant points are clipped, because renderers would lose digits."""
     return "M" + " ".join(f"{x:.2f},{y:.2f}" for x, y in np.clip(points, -1e4, 1e4)) + "Z"
 
 
 def _point(xy: np.ndarray) -> tuple[float, float]:
-    """A place as SVG takes it; one that is no number lies far outside."""
+    """A point for SVG; NaN becomes a distant point."""
     x, y = np.clip(np.nan_to_num(xy, nan=-1e4), -1e4, 1e4)
     return _round(x), _round(y)

@@ -1,4 +1,4 @@
-"""What is measured of a run's predictions, inside one boundary, and kept on disk until the run changes."""
+"""Measures a run's predictions inside one boundary, and stores the result until the run changes."""
 
 import hashlib
 import json
@@ -14,14 +14,8 @@ from pydantic import TypeAdapter
 
 from phd_exp.distributions.temperature import Temperature
 from phd_exp.evaluation.fusion import FusionScores, fusion_scores
-from phd_exp.evaluation.parquet import Columns, read_table
-from phd_exp.evaluation.predictions import (
-    Evaluation,
-    evaluate,
-    evaluate_points,
-    fit_temperature,
-    recalibrated,
-)
+from phd_exp.evaluation.parquet import Columns
+from phd_exp.evaluation.predictions import Evaluation, evaluate, fit_temperature, recalibrated
 from phd_exp.evaluation.several_views import read_views
 from phd_exp.records.errors import UserError, one_line
 from phd_exp.records.files import write_atomic
@@ -33,10 +27,10 @@ Found = TypeVar("Found")
 
 
 class Notes(list[str]):
-    """What is wrong with a run, a line each. This is the boundary of a run: nothing it does ends the report."""
+    """The problems of a run, a line each. This is the boundary of a run: no error in it ends the report."""
 
     def attempt(self, read: Callable[[], Found]) -> Found | None:
-        """What `read` returns; None where it raises anything, which is then noted in one line."""
+        """The result of `read`; None if it raises any exception, which is noted in one line."""
         try:
             return read()
         except Exception as error:
@@ -49,12 +43,12 @@ class Notes(list[str]):
 
 @dataclass(frozen=True)
 class Measured:
-    """What is measured of a run: plain data, kept on disk until the run or this code changes.
+    """The measurements of a run: plain data, stored until the run or this code changes.
 
     Attributes:
-        before: of the predictions as recorded.
-        after: of the same predictions recalibrated; None where nothing was held out.
-        images: a digest of data set and true positions: runs with the same one were tested on the same images.
+        before: evaluation of the recorded predictions.
+        after: evaluation of the recalibrated predictions; None without held-out samples.
+        images: a digest of data set and true positions, equal for runs tested on the same images.
     """
 
     before: Evaluation | None = None
@@ -66,19 +60,18 @@ class Measured:
     notes: list[str] = field(default_factory=list)
 
 
-def measure(folder: RunFolder, config: Mapping[str, str]) -> Measured:
-    """Measure all predictions of a run; what cannot be measured is noted."""
+def measure(
+    folder: RunFolder, config: Mapping[str, str], predictions: Columns | None, held_out: Columns | None
+) -> Measured:
+    """Measure all predictions of a run, its test samples and held-out samples as read; problems are noted."""
     notes = Notes()
     found: dict[str, Any] = {}
-    if folder.predictions.exists() and (table := notes.attempt(lambda: read_table(folder.predictions))):
-        found["images"] = _images(folder, table)
-        if "a" in table:
-            found["before"] = notes.attempt(lambda: evaluate(table))
-        else:
-            found["before"] = notes.attempt(lambda: evaluate_points(table))
-        if "a" in table and folder.held_out.exists():
-            found |= notes.attempt(lambda: _recalibrated(folder, table)) or {}
-        found["gallery"] = notes.attempt(lambda: make_gallery(table, config))
+    if predictions:
+        found["images"] = _images(folder, predictions)
+        found["before"] = notes.attempt(lambda: evaluate(predictions))
+        if "a" in predictions and held_out:
+            found |= notes.attempt(lambda: _recalibrated(predictions, held_out)) or {}
+        found["gallery"] = notes.attempt(lambda: make_gallery(predictions, config))
         if found["before"] and (left_out := found["before"].left_out):
             notes.append(f"{left_out} test samples are left out: a prediction was not finite")
     if folder.views.exists():
@@ -86,13 +79,13 @@ def measure(folder: RunFolder, config: Mapping[str, str]) -> Measured:
     return Measured(**found, notes=notes)
 
 
-def _recalibrated(folder: RunFolder, table: Columns) -> dict[str, Any]:
-    temperature = fit_temperature(read_table(folder.held_out))
-    return {"temperature": temperature, "after": evaluate(recalibrated(table, temperature))}
+def _recalibrated(predictions: Columns, held_out: Columns) -> dict[str, Any]:
+    temperature = fit_temperature(held_out)
+    return {"temperature": temperature, "after": evaluate(recalibrated(predictions, temperature))}
 
 
 def _images(folder: RunFolder, table: Columns) -> str:
-    """Of the data set's name too: its variants show the same positions in other images."""
+    """A digest that includes the name of the data set: its variants have equal positions in other images."""
     name = os.fsencode(folder.path.parts[-3])
     positions = b"".join(table[axis].tobytes() for axis in "xyz" if axis in table)
     return hashlib.sha256(name + positions).hexdigest()[:16]
@@ -101,10 +94,16 @@ def _images(folder: RunFolder, table: Columns) -> str:
 _ADAPTER: TypeAdapter[Measured] = TypeAdapter(Measured)
 
 
-def kept_or_measured(folder: RunFolder, config: Mapping[str, str], kept: Path | None) -> Measured:
-    """What was measured before, if nothing has changed since; else measured now, and kept."""
+def kept_or_measured(
+    folder: RunFolder,
+    config: Mapping[str, str],
+    predictions: Columns | None,
+    held_out: Columns | None,
+    kept: Path | None,
+) -> Measured:
+    """The stored measurements if the run has not changed; else measures, and stores them in `kept` if given."""
     if kept is None:
-        return measure(folder, config)
+        return measure(folder, config, predictions, held_out)
     file = kept / f"{file_stem(*folder.path.parts[-4:])}.json"
     key = _key(folder, config)
     try:
@@ -112,15 +111,15 @@ def kept_or_measured(folder: RunFolder, config: Mapping[str, str], kept: Path | 
         if content["key"] == key:
             return _ADAPTER.validate_python(content["measured"])
     except (OSError, ValueError, LookupError, TypeError):
-        pass  # nothing is kept, or another version kept it
-    measured = measure(folder, config)
-    with suppress(OSError):  # without it the next report measures again
+        pass  # nothing is stored, or another version stored it
+    measured = measure(folder, config, predictions, held_out)
+    with suppress(OSError):  # then the next report measures again
         write_atomic(file, json.dumps({"key": key, "measured": asdict(measured)}))
     return measured
 
 
 def _key(folder: RunFolder, config: Mapping[str, str]) -> str:
-    """A digest that changes whenever a measurement would: the run's tables, its images, this code."""
+    """A digest of all inputs of a measurement: the run's tables, its images, this code."""
     files = [folder.predictions, folder.held_out, folder.views, folder.config_file, images_folder(config)]
     return hashlib.sha256(json.dumps([_code(), *map(_stamp, files)]).encode()).hexdigest()
 

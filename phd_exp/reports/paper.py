@@ -1,5 +1,6 @@
-"""The paper's figures and layout, and the bounds on depth error that are known."""
+"""The paper's figures and layout, and the known bounds on depth error."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -8,54 +9,44 @@ from phd_exp.evaluation.point_errors import Estimate, Quantity
 TableName = Literal["table1", "table2"]
 
 
-@dataclass(frozen=True)
-class Published:
-    """One cell of the paper's tables: mean errors over 2000 test samples, millimetres."""
-
-    projected_error_mm: float
-    depth_error_mm: float
-
-
-PUBLISHED = {
+PUBLISHED: Mapping[tuple[str, str], Mapping[Quantity, float]] = {
     # Table 1
-    ("mae_vz", "default"): Published(3.6, 69),
-    ("mae_vz", "occl"): Published(22.8, 218),
-    ("mae_vz", "scale"): Published(3.7, 359),
-    ("mae_vz", "occl_scale"): Published(37.2, 386),
-    ("mae_logz", "default"): Published(5.0, 36),
-    ("mae_logz", "occl"): Published(18.0, 178),
-    ("mae_logz", "scale"): Published(5.1, 355),
-    ("mae_logz", "occl_scale"): Published(27.6, 355),
-    ("probabilistic", "default"): Published(2.4, 48),
-    ("probabilistic", "occl"): Published(13.0, 168),
-    ("probabilistic", "scale"): Published(1.6, 347),
-    ("probabilistic", "occl_scale"): Published(17.0, 350),
-    # Table 2, where it is not Table 1's
-    ("mae_xyz", "default"): Published(13.0, 327),
-    ("mae_constf", "default"): Published(10.8, 325),
+    ("mae_vz", "default"): {"projected": 3.6, "depth": 69},
+    ("mae_vz", "occl"): {"projected": 22.8, "depth": 218},
+    ("mae_vz", "scale"): {"projected": 3.7, "depth": 359},
+    ("mae_vz", "occl_scale"): {"projected": 37.2, "depth": 386},
+    ("mae_logz", "default"): {"projected": 5.0, "depth": 36},
+    ("mae_logz", "occl"): {"projected": 18.0, "depth": 178},
+    ("mae_logz", "scale"): {"projected": 5.1, "depth": 355},
+    ("mae_logz", "occl_scale"): {"projected": 27.6, "depth": 355},
+    ("probabilistic", "default"): {"projected": 2.4, "depth": 48},
+    ("probabilistic", "occl"): {"projected": 13.0, "depth": 168},
+    ("probabilistic", "scale"): {"projected": 1.6, "depth": 347},
+    ("probabilistic", "occl_scale"): {"projected": 17.0, "depth": 350},
+    # Table 2, without the rows of Table 1
+    ("mae_xyz", "default"): {"projected": 13.0, "depth": 327},
+    ("mae_constf", "default"): {"projected": 10.8, "depth": 325},
 }
-"""(model, data set) -> published errors."""
+"""(model, data set) -> mean errors over 2000 test samples, mm."""
 
 
 def published_mm(model: str, data: str, estimate: Estimate, quantity: Quantity) -> float | None:
-    """The paper's figure; it has none of means and medians: its point estimate is the mode."""
-    cell = PUBLISHED.get((model, data))
-    if cell is None or estimate != "mode":
-        return None
-    return cell.projected_error_mm if quantity == "projected" else cell.depth_error_mm
+    """The paper's figure; None for means and medians, because its point estimate is the mode."""
+    return PUBLISHED.get((model, data), {}).get(quantity) if estimate == "mode" else None
 
 
 UNKNOWN_SIZE = 291.0
-"""Least mean depth error, mm, on `scale`: z ~ U(3, 5) m, size factor ~ U(0.8, 1.2), the image gives size / z alone.
+"""Lower bound on mean depth error, mm, on `scale`: z ~ U(3, 5) m, size factor ~ U(0.8, 1.2), the image gives size /
+z.
 
-Nearly exact: size and depth scale together; only the fixed lamps leak a little.
+Nearly exact: size and depth scale together, and only the fixed lamps give a little more information.
 """
 UNKNOWN_SIZE_AND_F = 336.0
-"""The same for a network that does not see f ~ U(1200, 2000) px, from apparent size alone."""
+"""The same for a network without the input f ~ U(1200, 2000) px, from apparent size alone."""
 UNKNOWN_F = 331.0
-"""Least mean depth error, mm, of known size and unknown f, from apparent size alone.
+"""Lower bound on mean depth error, mm, for known size and unknown f, from apparent size alone.
 
-Perspective tells f and z apart (Cramer-Rao at edges of 0.1 px: 0.07 m in z), so this binds no estimator that uses it.
+Perspective separates f and z (Cramer-Rao at edges of 0.1 px: 0.07 m in z): an estimator that uses it is not bound.
 """
 GUESS = 500.0
 """Mean depth error, mm, of the constant estimate 4 m."""
@@ -63,7 +54,7 @@ WITHOUT_F = ("mae_xyz", "mae_constf")
 
 
 def bound_mm(model: str, data: str, quantity: Quantity, sees_f: bool) -> float | None:
-    """The bound or reference that applies to a model's mean error; None where none is known (as on `occl_scale`)."""
+    """The bound or reference for a model's mean error; None if none is known, as on `occl_scale`."""
     if quantity == "projected":
         return None
     if data == "scale":
@@ -73,7 +64,7 @@ def bound_mm(model: str, data: str, quantity: Quantity, sees_f: bool) -> float |
 
 @dataclass(frozen=True)
 class Column:
-    """One column of a table: a data set, and an error unless each line has its own."""
+    """One column of a table: a data set, and an error unless the lines have theirs."""
 
     data: str
     quantity: Quantity | None = None
@@ -81,7 +72,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Line:
-    """One line of a table: a model's point estimate, and an error unless each column has its own."""
+    """One line of a table: a model's point estimate, and an error unless the columns have theirs."""
 
     model: str
     estimate: Estimate
@@ -90,7 +81,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Bound:
-    """A line of bounds on depth error: data set -> what stands there."""
+    """A line of bounds on depth error: data set -> text."""
 
     label: str
     depth: dict[str, str]
@@ -116,7 +107,7 @@ class Layout:
 
 
 def _groups(models: tuple[str, ...], quantities: tuple[Quantity | None, ...]) -> tuple[tuple[Line, ...], ...]:
-    """The paper's lines, and below them what it leaves out: mean and median of the density."""
+    """The paper's lines, and below them the density's mean and median, which the paper omits."""
     others: tuple[Estimate, ...] = ("mean", "median")
     return (
         tuple(Line(model, "mode", quantity) for model in models for quantity in quantities),
@@ -141,8 +132,8 @@ TABLE_1 = Layout(
     columns=tuple(Column(data) for data in _DATA),
     groups=_groups(("mae_vz", "mae_logz", "probabilistic"), ("projected", "depth")),
     bounds=(
-        Bound("bound, f seen", {"scale": f"{UNKNOWN_SIZE:.0f}"}),
-        Bound("apparent size, f not seen", {"scale": f"{UNKNOWN_SIZE_AND_F:.0f}"}),
+        Bound("bound, with f", {"scale": f"{UNKNOWN_SIZE:.0f}"}),
+        Bound("apparent size, without f", {"scale": f"{UNKNOWN_SIZE_AND_F:.0f}"}),
         Bound("guess without the image", dict.fromkeys(_DATA, f"{GUESS:.0f}")),
     ),
     note="On scale the size factor ~ U(0.8, 1.2) is unknown and the image gives size / z: 291 mm is nearly exact for "

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from phd_exp.evaluation.parquet import read_table
 from phd_exp.records.files import remove_temporaries, write_atomic
-from phd_exp.reports.figures import LABELS, decades, draw_birds_eye, draw_on_image, encoded
+from phd_exp.reports.figures import LABELS, decades, draw_birds_eye, draw_identity, draw_on_image, encoded
 from phd_exp.reports.gallery import curves_of, images_folder, load_image
 from phd_exp.reports.measured import Notes
 from phd_exp.reports.paper import PUBLISHED
@@ -22,9 +22,9 @@ LONGEST_NAME = 30
 
 
 def write_figures(report: Report, folder: Path) -> list[str]:
-    """The paper's figures for every preset and data set, as PDF and PNG; returns their names.
+    """Write the paper's figures for every preset and data set, as PDF and PNG; returns their names.
 
-    Of each preset and data set the finished probabilistic run without overrides that has the lowest seed is shown.
+    Each shows the finished probabilistic run without overrides that has the lowest seed.
     """
     folder.mkdir(parents=True, exist_ok=True)
     remove_temporaries(folder)
@@ -37,8 +37,7 @@ def write_figures(report: Report, folder: Path) -> list[str]:
         }
         plans |= {file_stem("level_curves", preset, run.data): partial(_level_curves, run) for run in runs}
         for name, draw in plans.items():
-            # what a hostile run makes of a figure is its own affair: the other figures are drawn
-            files = Notes().attempt(partial(_files, draw)) or {}
+            files = Notes().attempt(partial(_files, draw)) or {}  # an error affects this figure alone
             for kind, content in files.items():
                 write_atomic(folder / f"{name}.{kind}", content)
             names += [name] if files else []
@@ -46,18 +45,16 @@ def write_figures(report: Report, folder: Path) -> list[str]:
 
 
 def _files(draw: Callable[[], Figure | None]) -> dict[str, bytes]:
-    """A figure as the bytes of its files; none where there is nothing to draw."""
+    """The bytes of a figure by file type; empty if there is nothing to draw."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of letters that the font lacks, of numbers out of all proportion
+        warnings.simplefilter("ignore")  # missing letters of the font, extreme numbers
         figure = draw()
         return {kind: encoded(figure, kind, dpi=250) for kind in ("png", "pdf")} if figure else {}
 
 
 def _first_seeds(report: Report, preset: str) -> list[Run]:
-    order = list(dict.fromkeys(data for _, data in PUBLISHED))
-    data = sorted({run.data for run in report.runs}, key=lambda name: (name not in order, name))
-    data.sort(key=lambda name: order.index(name) if name in order else len(order))
-    found = [report.at_defaults(preset, name, PROBABILISTIC) for name in data]
+    order = dict.fromkeys([*(data for _, data in PUBLISHED), *sorted({run.data for run in report.runs})])
+    found = [report.at_defaults(preset, data, PROBABILISTIC) for data in order]
     measured = [[run for _, run in sorted(runs.items()) if run.measured.before] for runs in found]
     return [runs[0] for runs in measured if runs]
 
@@ -69,18 +66,13 @@ def _calibration(runs: Sequence[Run]) -> Figure | None:
     """
     figure = Figure(figsize=(7.2, 3.5), layout="constrained")
     for axes, name in zip(figure.subplots(1, 2), LABELS, strict=True):
-        curves = [
-            (run, run.measured.before.curves[f"{name}_calibration"]) for run in runs if run.measured.before
-        ]
-        bounds = decades([value for _, curve in curves for value in (*curve.x, *curve.y)])
-        if bounds is None:
+        curves = [before.curves[f"{name}_calibration"] for run in runs if (before := run.measured.before)]
+        values = [value for curve in curves for value in (*curve.x, *curve.y)]
+        if decades(values) is None:
             return None
-        axes.plot(bounds, bounds, "--", color="tab:red", linewidth=1)
-        for (run, curve), style in zip(curves, _styles(), strict=False):
+        draw_identity(axes, name, values)
+        for run, curve, style in zip(runs, curves, _styles(), strict=False):
             axes.plot(curve.x, curve.y, linewidth=1.3, label=_plain(run.data), **style)
-        title, unit = LABELS[name]
-        axes.set(xscale="log", yscale="log", xlim=bounds, ylim=bounds, aspect="equal", title=title)
-        axes.set(xlabel=f"predicted variance ({unit})", ylabel=f"mean squared error ({unit})")
     figure.axes[0].legend(frameon=False, fontsize="small")
     return figure
 
@@ -107,14 +99,14 @@ def _precision(runs: Sequence[Run]) -> Figure | None:
 
 
 def _level_curves(run: Run) -> Figure | None:
-    """Level curves on the test image whose negative log density is the median, and from above; None without images.
+    """Level curves on the test image with the median NLL, and from above; None without images.
 
     Source: paper, its first figure.
     """
     source = images_folder(run.config)
-    table = Notes().attempt(lambda: read_table(run.folder.predictions, ["nll", "file_name"]))
-    if source is None or table is None:
+    if source is None:
         return None
+    table = read_table(run.folder.predictions)
     place = int(np.argsort(table["nll"])[len(table["nll"]) // 2])
     row = {name: column[place] for name, column in table.items()}
     image, curves = load_image(source, str(row["file_name"])), curves_of(row)
@@ -129,7 +121,7 @@ def _level_curves(run: Run) -> Figure | None:
 
 
 def _styles() -> Iterator[dict[str, str]]:
-    """Colours that everybody can tell apart, and dashes."""
+    """Colours that colour-blind readers can distinguish, and dashes."""
     colours = ("#0072b2", "#c44e00", "#007d5a", "#a3487c", "#8a6200")
     return cycle(
         {"color": colour, "linestyle": dash}
@@ -138,6 +130,6 @@ def _styles() -> Iterator[dict[str, str]]:
 
 
 def _plain(name: str) -> str:
-    """A name as a legend holds it: matplotlib would read dollar signs as mathematics."""
+    """A name for a legend: shortened, and without dollar signs, which matplotlib reads as mathematics."""
     short = name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}…"
     return short.replace("$", r"\$")

@@ -1,7 +1,7 @@
-"""The paper's two tables, for every preset with a run of theirs, in both readings."""
+"""The paper's two tables in both readings, for every preset with any of their runs."""
 
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Set
 
 from phd_exp.evaluation.point_errors import READINGS, ErrorKey, Quantity, Reading
 from phd_exp.records.choices import PLAIN_RECIPE, in_words, preset_and_recipe
@@ -22,7 +22,7 @@ from phd_exp.reports.runs import PROBABILISTIC, Report
 from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem
 
 DIGITS: dict[Quantity, int] = {"projected": 1, "depth": 0}
-"""Decimals of a millimetre, the paper's."""
+"""Decimals of a millimetre, as in the paper."""
 MOST_DIGITS = 4
 ONE_SEED = "†"
 FEWER_SEEDS = "‡"
@@ -50,29 +50,34 @@ OF_AN_INTERVAL = {
     "another training would differ.",
     "none": "No ±: one seed, one test sample.",
 }
-OF_FEWER_SEEDS = f"{FEWER_SEEDS}: fewer seeds than other cells of this table have."
+OF_FEWER_SEEDS = f"{FEWER_SEEDS}: fewer seeds than other cells of this table."
 
 
 def paper_tables(report: Report) -> list[Table]:
     """Both tables in both readings, for every preset that has any of a table's runs."""
-    return [
-        _table(report, preset, layout, reading, seeds)
-        for preset in report.presets
-        for layout in LAYOUTS
-        if (seeds := _seeds(report, preset, layout))
-        for reading in READINGS
-    ]
+    tables = []
+    for preset in report.presets:
+        for layout in LAYOUTS:
+            begun = {choice: report.at_defaults(preset, *choice) for choice in layout.choices}
+            seeds = sorted({seed for runs in begun.values() for seed in runs})
+            choices = {choice for choice, runs in begun.items() if runs}
+            tables += [
+                _table(report, preset, layout, reading, choices, seeds) for reading in READINGS if seeds
+            ]
+    return tables
 
 
-def _seeds(report: Report, preset: str, layout: Layout) -> list[int]:
-    """Every seed with which any run of a table was begun."""
-    return sorted({seed for choice in layout.choices for seed in report.at_defaults(preset, *choice)})
-
-
-def _table(report: Report, preset: str, layout: Layout, reading: Reading, seeds: Sequence[int]) -> Table:
-    begun = {choice for choice in layout.choices if report.at_defaults(preset, *choice)}
-    columns = [column for column in layout.columns if column.data in {data for data, _ in begun}]
-    models = {model for _, model in begun}
+def _table(
+    report: Report,
+    preset: str,
+    layout: Layout,
+    reading: Reading,
+    choices: Set[tuple[str, str]],
+    seeds: Sequence[int],
+) -> Table:
+    """The table of these seeds, of the data sets and models that a (data set, model) of `choices` has."""
+    data, models = ({choice[place] for choice in choices} for place in (0, 1))
+    columns = [column for column in layout.columns if column.data in data]
     groups = [lines for group in layout.groups if (lines := [line for line in group if line.model in models])]
 
     def cell(line: Line, column: Column) -> Cell:
@@ -85,7 +90,7 @@ def _table(report: Report, preset: str, layout: Layout, reading: Reading, seeds:
     cells = [one for group in measured for line in group for one in line]
     best = {id(one) for one in _best([one for line in measured[0] for one in line])}
     gaps = dict.fromkeys(gap for one in cells for gap in one.gaps)
-    left_out = _left_out(layout, columns, models)
+    left_out = _left_out(layout, data, models)
     can_be_made = left_out or any(gap.state != "no sample" for gap in gaps)
     by_line = layout.columns[0].quantity is None
     bounds = [row for bound in layout.bounds if (row := _bound_row(bound, columns, by_line))]
@@ -110,18 +115,16 @@ def _table(report: Report, preset: str, layout: Layout, reading: Reading, seeds:
     )
 
 
-def _left_out(layout: Layout, columns: Sequence[Column], models: set[str]) -> list[str]:
-    """One line that names the rows and columns without a run."""
-    data = dict.fromkeys(column.data for column in layout.columns if column not in columns)
-    lacking = dict.fromkeys(
-        line.model for group in layout.groups for line in group if line.model not in models
-    )
-    names = ", ".join([*data, *lacking])
+def _left_out(layout: Layout, data: Set[str], models: Set[str]) -> list[str]:
+    """One line that names the columns and rows without a run."""
+    columns = [column.data for column in layout.columns if column.data not in data]
+    lines = [line.model for group in layout.groups for line in group if line.model not in models]
+    names = ", ".join(dict.fromkeys([*columns, *lines]))
     return [f"Left out of {layout.title}, without a run: {names}."] if names else []
 
 
 def _best(cells: Sequence[Cell]) -> list[Cell]:
-    """Of each data set and error, the cell that every rival is separated from, where there is one."""
+    """For each data set and error, the cell that is significantly better than every other, if there is one."""
     columns: dict[tuple[str, Quantity], list[Cell]] = {}
     for cell in cells:
         if cell.means:
@@ -159,7 +162,7 @@ def _spread(cell: Cell) -> str:
         marks = ONE_SEED + marks
     digits = DIGITS[cell.key.quantity]
     while digits < MOST_DIGITS and 0 < half_width < 0.5 * 10.0**-digits:
-        digits += 1  # a small interval is not an exact number
+        digits += 1  # a small interval must not print as zero
     return f"±{half_width:.{digits}f}{marks}"
 
 
@@ -172,14 +175,14 @@ def _number(value: float, quantity: Quantity) -> str:
 
 
 def _bound_row(bound: Bound, columns: Sequence[Column], by_line: bool) -> TableRow | None:
-    """None where no column has this bound."""
+    """The row of a bound; None if no column has it."""
     texts = [NOTHING if c.quantity == "projected" else bound.depth.get(c.data, NOTHING) for c in columns]
     stub = (bound.label, "depth") if by_line else (bound.label,)
     return TableRow(stub, tuple(map(TableCell, texts))) if set(texts) != {NOTHING} else None
 
 
 def _notes(layout: Layout, reading: Reading, cells: Sequence[Cell]) -> list[str]:
-    """How to read what a table holds."""
+    """The notes that explain the contents of a table."""
     kinds = {cell.interval.kind for cell in cells if cell.interval}
     notes = [OF_THE_READING[reading], OF_A_CELL]
     notes += [text for kind, text in OF_AN_INTERVAL.items() if kind in kinds]
@@ -191,15 +194,15 @@ def _notes(layout: Layout, reading: Reading, cells: Sequence[Cell]) -> list[str]
 
 
 def _samples(cells: Sequence[Cell]) -> str:
-    """How many test samples count; a range where runs were tested on different numbers of them."""
+    """The number of test samples; a range if runs were tested on different numbers of them."""
     counts = sorted({mean.n for cell in cells for mean in cell.means.values()})
     if not counts:
         return ""
-    return f", {counts[0]} to {counts[-1]} test samples" if len(counts) > 1 else f", {counts[0]} test samples"
+    return f", {' to '.join(map(str, dict.fromkeys([counts[0], counts[-1]])))} test samples"
 
 
 def gap_lines(gaps: Iterable[Gap]) -> list[str]:
-    """A line for each reason and model: which runs a table lacks."""
+    """The missing runs of a table: a line for each reason, model and set of seeds."""
     seeds: dict[tuple[str, str, str], list[int]] = {}
     for gap in gaps:
         reason = f"{gap.state}: {one_line(gap.detail)}" if gap.detail else gap.state
@@ -215,7 +218,7 @@ def gap_lines(gaps: Iterable[Gap]) -> list[str]:
 
 
 def making_command(report: Report, preset: str, name: TableName, seeds: Iterable[int] = (0,)) -> str:
-    """The command line that makes the runs that a table lacks."""
+    """The command line that makes the missing runs of a table."""
     preset, recipe = preset_and_recipe(preset)
     words = [f"experiment={name}", f"preset={preset}"]
     if recipe != PLAIN_RECIPE:

@@ -1,4 +1,4 @@
-"""What the numbers of a report are called, in which unit, with how many digits, and which way is better."""
+"""The numbers of a report: their names, units, digits, meanings and best values."""
 
 import math
 from dataclasses import dataclass
@@ -10,17 +10,15 @@ class Quantity:
 
     Attributes:
         label: its name in words.
-        unit: empty where it has none.
+        unit: empty if it has none.
         digits: after the decimal point.
-        means: one line for a reader who does not know it.
-        best: the value a better model comes closer to; None where smaller is better without bound.
+        means: its meaning, one line.
     """
 
     label: str
     unit: str
     digits: int
     means: str
-    best: float | None = 0.0
 
     @property
     def axis(self) -> str:
@@ -28,7 +26,12 @@ class Quantity:
         return f"{self.label} ({self.unit})" if self.unit else self.label
 
     def text(self, value: float | None) -> str:
-        """A value with its digits; a dash for one that is missing or not finite."""
+        """A value with its digits; a dash if it is missing or not finite.
+
+        Example:
+            >>> SCORES["depth_error_mm"].text(47.96)
+            '48.0'
+        """
         if value is None or not math.isfinite(value):
             return "–"
         return f"{value:.{self.digits}f}".replace("-", "−")
@@ -36,58 +39,52 @@ class Quantity:
 
 _RISK = "mean error of the predictions kept when the least certain are dropped first, averaged over the share kept"
 _EXCESS = "0 if predicted variance ranks the errors perfectly, 1 if no better than chance"
-
-SCORES = {
-    "projected_error_mm": Quantity(
-        "Projected error", "mm", 1, "distance of the estimate from the true viewing ray"
-    ),
-    "depth_error_mm": Quantity("Depth error", "mm", 1, "error along the true viewing ray"),
-    "nll": Quantity("NLL", "nats", 2, "mean negative log density at the truth, per cubic metre", None),
-    "depth_crps_mm": Quantity(
-        "CRPS of depth", "mm", 1, "continuous ranked probability score of the depth’s law"
-    ),
-    "energy_score_mm": Quantity("Energy score", "mm", 1, "the same of the position in space"),
-    "depth_ence": Quantity(
-        "Depth ENCE", "", 3, "expected normalised calibration error of the depth’s variance"
-    ),
-    "projected_ence": Quantity("Projected ENCE", "", 3, "the same of the variance of (x, y)/z"),
-    "miscalibration_area": Quantity(
-        "Miscalibration area", "", 3, "between the coverage of credible regions and the diagonal"
-    ),
-    "overconfidence": Quantity(
-        "Overconfidence",
+_OVERCONFIDENCE = "mean credible level of the truths minus 1/2; negative if underconfident"
+_ROWS: tuple[tuple[str, str, str, int, str], ...] = (
+    ("projected_error_mm", "Projected error", "mm", 1, "distance of the estimate from the true viewing ray"),
+    ("depth_error_mm", "Depth error", "mm", 1, "error along the true viewing ray"),
+    ("nll", "NLL", "nats", 2, "mean negative log density at the truth, per cubic metre"),
+    ("depth_crps_mm", "CRPS of depth", "mm", 1, "continuous ranked probability score of the depth’s law"),
+    ("energy_score_mm", "Energy score", "mm", 1, "the same of the position in space"),
+    ("depth_ence", "Depth ENCE", "", 3, "expected normalised calibration error of the depth’s variance"),
+    ("projected_ence", "Projected ENCE", "", 3, "the same of the variance of (x, y)/z"),
+    (
+        "miscalibration_area",
+        "Miscalibration area",
         "",
         3,
-        "mean credible level of the truths, less 1/2; negative where predictions are too cautious",
+        "between coverage of credible regions and diagonal",
     ),
-    "depth_pit_area": Quantity(
-        "Depth PIT area", "", 3, "between the distribution of the depth’s PIT and the diagonal"
+    ("overconfidence", "Overconfidence", "", 3, _OVERCONFIDENCE),
+    (
+        "depth_pit_area",
+        "Depth PIT area",
+        "",
+        3,
+        "between the distribution of the depth’s PIT and the diagonal",
     ),
-    "depth_pit_ks": Quantity(
-        "Depth PIT distance", "", 3, "the largest gap between those two (Kolmogorov–Smirnov)"
-    ),
-    "depth_sharpness_mm": Quantity(
-        "Depth sharpness", "mm", 1, "root mean square of the predicted standard deviation of z", None
-    ),
-    "projected_sharpness_mrad": Quantity("Projected sharpness", "mrad", 2, "the same of x/z and y/z", None),
-    "depth_risk_coverage_area": Quantity("Depth risk–coverage area", "mm", 1, _RISK),
-    "projected_risk_coverage_area": Quantity("Projected risk–coverage area", "mrad", 2, _RISK),
-    "depth_risk_coverage_excess": Quantity("Depth risk–coverage excess", "", 3, _EXCESS),
-    "projected_risk_coverage_excess": Quantity("Projected risk–coverage excess", "", 3, _EXCESS),
-}
-"""Keys of `Evaluation.scores`, in the order of a page."""
+    ("depth_pit_ks", "Depth PIT distance", "", 3, "the largest gap between those two (Kolmogorov–Smirnov)"),
+    ("depth_sharpness_mm", "Depth sharpness", "mm", 1, "root mean square of the predicted deviation of z"),
+    ("projected_sharpness_mrad", "Projected sharpness", "mrad", 2, "the same of x/z and y/z"),
+    ("depth_risk_coverage_area", "Depth risk–coverage area", "mm", 1, _RISK),
+    ("projected_risk_coverage_area", "Projected risk–coverage area", "mrad", 2, _RISK),
+    ("depth_risk_coverage_excess", "Depth risk–coverage excess", "", 3, _EXCESS),
+    ("projected_risk_coverage_excess", "Projected risk–coverage excess", "", 3, _EXCESS),
+)
+SCORES = {key: Quantity(label, unit, digits, means) for key, label, unit, digits, means in _ROWS}
+"""Key of `Evaluation.scores` -> quantity, in the order of a page."""
 
 METRICS = {
     "projected_error_mm": SCORES["projected_error_mm"],
     "depth_error_mm": SCORES["depth_error_mm"],
     "nll": SCORES["nll"],
-    "loss": Quantity("Loss", "", 3, "what training minimises", None),
-    "depth_precision": Quantity("Mean a", "", 1, "predicted precision of the depth", None),
-    "projected_precision": Quantity("Mean |A|", "", 0, "predicted precision of (x, y)/z", None),
+    "loss": Quantity("Loss", "", 3, "what training minimises"),
+    "depth_precision": Quantity("Mean a", "", 1, "predicted precision of the depth"),
+    "projected_precision": Quantity("Mean |A|", "", 0, "predicted precision of (x, y)/z"),
 }
-"""Keys of metrics.jsonl behind `train/` and `test/`, in the order of a page."""
+"""Key of metrics.jsonl, after `train/` or `test/` -> quantity, in the order of a page."""
 
 
 def quantity(key: str) -> Quantity:
-    """What is known of a score; a key that this page has not met is shown under its own name."""
-    return SCORES.get(key) or Quantity(key.replace("_", " "), "", 3, "", None)
+    """The quantity of a score; an unknown key is its own label."""
+    return SCORES.get(key) or Quantity(key.replace("_", " "), "", 3, "")

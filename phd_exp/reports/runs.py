@@ -1,4 +1,4 @@
-"""Reads and measures every recorded run, each inside one boundary: a broken record costs its own page a line."""
+"""Reads and measures every recorded run, each inside one boundary: a broken record only affects its own page."""
 
 import math
 import re
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from phd_exp.evaluation.parquet import read_table
+from phd_exp.evaluation.parquet import Columns, read_table
 from phd_exp.evaluation.point_errors import COLUMNS, Estimate, MeanErrors, mean_errors
 from phd_exp.records.choices import flatten, has_influence
 from phd_exp.records.errors import one_line
@@ -18,23 +18,24 @@ from phd_exp.reports.table import file_stem, printable
 
 RunState = Literal["finished", "running", "interrupted", "failed", "unreadable"]
 PROBABILISTIC = "probabilistic"
+ESTIMATES: tuple[Estimate, ...] = tuple(COLUMNS)
 LEAF = re.compile(r"seed(0|[1-9][0-9]{0,8})(-[0-9a-f]{8})?")
 
 
 @dataclass(frozen=True)
 class Run:
-    """One run. What could not be read is None or empty, and `notes` say why.
+    """One run. Parts that cannot be read are None or empty; `notes` give the reasons.
 
     Attributes:
-        preset, data, model, name: of its folder, printable.
-        seed: None where the folder's name is none that a run is given.
-        overrides: None of a run at its preset's values; else how it differs.
+        preset, data, model, name: names of its folders, printable.
+        seed: None if the name of the folder is not that of a run.
+        overrides: None for a run at its preset's values, else the differences.
         detail: one line on a state other than finished.
         errors, nll: of a finished run; NLL in nats, None for a model without a density.
         held_out_errors, held_out_nll: the same on its held-out samples.
         config: every value as text, by its dotted key.
         epochs: epochs trained before each row of `metrics`; 0 is the untrained network.
-        metrics: a series a key, None where a row lacks it.
+        metrics: a series per key, None in rows without it.
     """
 
     folder: RunFolder
@@ -64,29 +65,29 @@ class Run:
 
     @property
     def path(self) -> str:
-        """All its names."""
+        """Preset, data set, model and name."""
         return f"{self.preset}/{self.data}/{self.model}/{self.name}"
 
     @property
     def slug(self) -> str:
-        """Its name as a file name."""
+        """The path as a file name."""
         return file_stem(*self.folder.path.parts[-4:])
 
 
 @dataclass(frozen=True)
 class Report:
-    """All runs under a folder, by their paths: read once, and drawn from by the terminal, the files and the pages."""
+    """All runs under a folder, sorted by path: read once for the terminal, the files and the pages."""
 
     folder: Path
     runs: tuple[Run, ...]
 
     @property
     def presets(self) -> list[str]:
-        """All presets, with their recipes, in order."""
+        """All presets, with their recipes, sorted."""
         return sorted({run.preset for run in self.runs})
 
     def at_defaults(self, preset: str, data: str, model: str) -> dict[int, Run]:
-        """Seed -> run, of the runs that follow their preset in all that changes the law of their results."""
+        """Seed -> run, of the runs without overrides that change the law of their results."""
         choice = (preset, data, model)
         # of two runs of a seed the one without a hash, which sorts first, wins
         return {
@@ -99,15 +100,15 @@ class Report:
 def read_report(
     runs: Path, kept: Path | None = None, progress: Callable[[str], None] = lambda run: None
 ) -> Report:
-    """Read and measure every run; measurements are kept in a folder, if any, and reused until the run changes.
+    """Read and measure every run; the folder `kept`, if given, stores measurements until their run changes.
 
-    Raises OSError where that folder cannot be written.
+    Raises OSError if that folder cannot be written.
     """
     found = []
     folders = find_runs(runs)
     if folders and kept:
         kept.mkdir(parents=True, exist_ok=True)
-        remove_temporaries(kept)  # of a process that was killed
+        remove_temporaries(kept)  # of a killed process
     for folder in folders:
         progress("/".join(map(printable, folder.path.parts[-4:])))
         found.append(_read_run(folder, kept))
@@ -131,14 +132,22 @@ def _whole_run(folder: RunFolder, names: tuple[str, str, str, str], kept: Path |
         state, detail = "unreadable", f"{names[3]}: expected a folder named seed<k> or seed<k>-<hash>"
     config = notes.attempt(lambda: _config(folder)) or {}
     rows = notes.attempt(folder.metrics) or []
-    estimates: Sequence[Estimate] = tuple(COLUMNS) if names[2] == PROBABILISTIC else ("mode",)
-    tested = notes.attempt(lambda: _errors(folder.predictions, estimates)) if state == "finished" else None
-    if state == "finished" and tested is None:
-        state, detail = "unreadable", f"{notes[-1]}; delete the folder to run again"
-    held_out = (
-        notes.attempt(lambda: _errors(folder.held_out, ("mode",))) if folder.held_out.exists() else None
+    predictions = held_out = tested = tested_held_out = None
+    if state == "finished" or folder.predictions.exists():
+        predictions = notes.attempt(lambda: read_table(folder.predictions))
+    if state == "finished":
+        estimates = ESTIMATES if names[2] == PROBABILISTIC else ("mode",)
+        tested = notes.attempt(lambda: _errors(predictions, estimates)) if predictions else None
+        if tested is None:
+            state, detail = "unreadable", f"{notes[-1]}; delete the folder to run again"
+    if folder.held_out.exists():
+        held_out = notes.attempt(lambda: read_table(folder.held_out))
+        tested_held_out = notes.attempt(lambda: _errors(held_out, ("mode",))) if held_out else None
+    measured = (
+        notes.attempt(lambda: kept_or_measured(folder, config, predictions, held_out, kept)) or Measured()
     )
-    measured = notes.attempt(lambda: kept_or_measured(folder, config, kept)) or Measured()
+    errors, nll = tested or ({}, None)
+    held_out_errors, held_out_nll = tested_held_out or ({}, None)
     return Run(
         folder,
         *names,
@@ -147,10 +156,10 @@ def _whole_run(folder: RunFolder, names: tuple[str, str, str, str], kept: Path |
         overrides=_overrides(folder) if leaf and leaf[2] else None,
         detail=one_line(detail),
         status=status,
-        errors=tested[0] if tested else {},
-        nll=tested[1] if tested else None,
-        held_out_errors=held_out[0] if held_out else {},
-        held_out_nll=held_out[1] if held_out else None,
+        errors=errors,
+        nll=nll,
+        held_out_errors=held_out_errors,
+        held_out_nll=held_out_nll,
         config=config,
         epochs=[row["epoch"] + 1 for row in rows],
         metrics=_series(rows),
@@ -159,8 +168,7 @@ def _whole_run(folder: RunFolder, names: tuple[str, str, str, str], kept: Path |
     )
 
 
-def _errors(file: Path, estimates: Sequence[Estimate]) -> tuple[MeanErrors, float | None]:
-    table = read_table(file)
+def _errors(table: Columns, estimates: Sequence[Estimate]) -> tuple[MeanErrors, float | None]:
     return mean_errors(table, estimates), _number(float(table["nll"].mean())) if "nll" in table else None
 
 
@@ -171,7 +179,7 @@ def _state(folder: RunFolder, status: RunStatus | None) -> tuple[RunState, str]:
         return status.state, status.error or ""
     try:
         alive = folder.is_held()
-    except OSError as error:  # a lock cannot be tried in a folder that is read-only
+    except OSError as error:  # a read-only folder
         return "running", f"or interrupted: its lock cannot be tried ({error.strerror})"
     return ("running", "") if alive else ("interrupted", "the same command resumes it")
 
@@ -188,13 +196,13 @@ def _series(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[float | None]]:
 def _number(value: Any) -> float | None:
     try:
         number = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
-    except OverflowError:  # JSON knows whole numbers without end
+    except OverflowError:  # JSON has whole numbers of any size
         return None
     return number if math.isfinite(number) else None
 
 
 def _overrides(folder: RunFolder) -> str | None:
-    """How a run differs from one beside it at its preset's values; None where all that matters is equal."""
+    """The differences of a run from one of its siblings without overrides; None if they do not change results."""
     for path in sorted(folder.path.parent.glob("seed*")):
         if "-" not in path.name and (plain := Notes().attempt(RunFolder(path).config)) is not None:
             changes = _changes(plain, folder.config())
@@ -203,7 +211,7 @@ def _overrides(folder: RunFolder) -> str | None:
 
 
 def _changes(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
-    """By dotted keys. Of a part made by another class: its name, and what both classes take."""
+    """Changed values by dotted key. For a part of another class: its name, and the arguments of both classes."""
     old, new = flatten(before), flatten(now)
     changes: dict[str, Any] = {}
     for key in dict.fromkeys([*old, *new]):

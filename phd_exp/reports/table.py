@@ -1,4 +1,4 @@
-"""A table as data: what stands where, in words and figures, whatever format draws it."""
+"""A table as data, for the terminal, files and pages alike."""
 
 import hashlib
 import os
@@ -17,13 +17,13 @@ LONGEST_STEM = 120
 
 @dataclass(frozen=True)
 class TableCell:
-    """What stands in one place of a table.
+    """One cell of a table.
 
     Attributes:
-        ours: a number, or why there is none.
+        ours: a number, or the reason why it is missing.
         spread: its interval, with its marks.
         below: a second line, such as the paper's figure.
-        bold: whether `ours` is separated from all its rivals.
+        bold: whether `ours` is significantly the best.
     """
 
     ours: str
@@ -34,7 +34,7 @@ class TableCell:
 
 @dataclass(frozen=True)
 class TableRow:
-    """One line: what it is about, and a cell a column."""
+    """One line of a table: its labels, and a cell per column."""
 
     stub: tuple[str, ...]
     cells: tuple[TableCell, ...]
@@ -42,17 +42,17 @@ class TableRow:
 
 @dataclass(frozen=True)
 class Table:
-    """A table, its reading aids, and its numbers for CSV.
+    """A table with its notes, and its numbers for CSV.
 
     Attributes:
         stem: of its file names.
-        kind: of its CSV file, which holds the numbers of all tables of a kind.
-        stub: headings of the columns that say what a line is about; `columns` those of the cells.
+        kind: stem of the CSV file that collects the numbers of all tables of a kind.
+        stub, columns: headings of the labels, and of the cells.
         groups: lines, with a rule between groups.
-        below: what the second lines of cells are.
-        notes: how to read it, a sentence or two each.
-        gaps: which runs are missing, a line each; `command` makes them.
-        numbers: a mapping a number, at full precision.
+        below: the meaning of the cells' second lines.
+        notes: explanations, a sentence or two each.
+        gaps: missing runs, a line each; `command` makes them.
+        numbers: a mapping per number, at full precision.
     """
 
     stem: str
@@ -76,19 +76,19 @@ class Table:
 
 
 def printable(name: str) -> str:
-    """A name of a file as text that every terminal, file and page can hold."""
+    """The name of a file as text that every terminal, file and page can represent."""
     return one_line(os.fsencode(name).decode(errors="replace"))
 
 
 def file_stem(*names: str) -> str:
-    """A file name of at most `LONGEST_STEM` characters that differs wherever the names differ, whatever they hold."""
+    """A file name of at most `LONGEST_STEM` plain characters, different for different names."""
     plain = "-".join(re.sub(r"[^A-Za-z0-9_+-]+", "-", name) for name in names)
-    # a hyphen in any name but the last could be taken for one that joins them
+    # a hyphen in any name but the last could be mistaken for a joining one
     unmistakable = plain == "-".join(names) and not any("-" in name for name in names[:-1])
     digest = hashlib.sha256("/".join(names).encode(errors="surrogateescape")).hexdigest()[:8]
     return plain if unmistakable and len(plain) <= LONGEST_STEM else f"{plain[:100]}-{digest}"
 
 
 def write_text(file: Path, text: str) -> None:
-    """Write a file of the report, whole; a letter that no encoding knows becomes `?`. Raises OSError."""
+    """Write a file of the report atomically; a lone surrogate becomes `?`. Raises OSError."""
     write_atomic(file, text.encode(errors="replace"))

@@ -17,7 +17,7 @@ import yaml
 from PIL import Image
 
 from phd_exp.__main__ import main
-from phd_exp.cli.paths import conf_folder
+from phd_exp.cli import conf_folder
 from phd_exp.records.dataset import SPLITS, DatasetFolder, Seal, sha256
 from phd_exp.records.runs import RunFolder, find_runs
 from phd_exp.records.spec import DatasetSpec

@@ -341,7 +341,7 @@ FOLDERS = [
     reported("predictions: gone", lambda place: place.run.predictions.unlink(), r"unreadable: predictions\.parquet: missing, though the run has finished; .*"),
     reported("predictions: a pipe", lambda place: images.pipe(place.run.predictions), r"unreadable: predictions\.parquet: cannot be read \(a pipe or a device; .*\)"),
     reported("predictions: text", lambda place: place.put(place.run.predictions, "no parquet"), r"unreadable: predictions\.parquet: cannot be read \(.*\)"),
-    reported("predictions: a column less", lambda place: place.put_column("mode_x", None), r"unreadable: predictions: have no column mode_x; .*"),
+    reported("predictions: a column less", lambda place: place.put_column("mode_x", None), r"unreadable: predictions: no column mode_x, as in older records; .*"),
     reported("predictions: text for numbers", column("mode_x", lambda n: ["x"] * n), r"unreadable: predictions\.parquet: cannot be read \(column 'mode_x' holds str; expected numbers\); .*"),
     reported("predictions: lists for numbers", column("nll", lambda n: [[1.0]] * n), r"unreadable: predictions\.parquet: cannot be read \(column 'nll' holds ndarray; expected numbers\); .*"),
     reported("predictions: NaN", column("z", lambda n: [float("nan")] * n), r"unreadable: predictions: column z is not finite everywhere, or not positive; .*"),

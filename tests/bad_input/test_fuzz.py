@@ -12,8 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from phd_exp.cli import train
-from phd_exp.cli.app import launch
 from phd_exp.cli.frame import run_verb
+from phd_exp.cli.jobs import launch
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.detections import DetectionLine, detections_in
 from phd_exp.records.errors import UserError

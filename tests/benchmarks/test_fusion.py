@@ -12,9 +12,8 @@ import torch
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion import Pose, fuse
-from tests.fusion.conic import Program
-from tests.fusion.random_problems import columns_of, random_problems
-from tests.fusion.test_conic import cameras_of
+from tests.support.conic import Program, cameras_of
+from tests.support.random_problems import columns_of, random_problems
 
 pytestmark = pytest.mark.bench
 

@@ -1,4 +1,4 @@
-"""How near the whole programme comes to the arithmetic of its network; ratios within one process, medians of five."""
+"""The speed of the programme relative to the arithmetic of its network: ratios in one process, medians of five."""
 
 import itertools
 import json
@@ -31,7 +31,7 @@ def renders(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def measured(loop: str, folder: Path, *overrides: str) -> dict[str, list[float]]:
     """In a process without the checks of annotations that all tests have."""
     done = subprocess.run(
-        [sys.executable, str(HERE / "trainer.py"), loop, str(folder), str(EPOCHS), *overrides],
+        [sys.executable, str(HERE / "loops.py"), loop, str(folder), str(EPOCHS), *overrides],
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     rows = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
@@ -101,10 +101,18 @@ def test_evaluation_and_logging_are_a_twentieth_of_an_epoch(
 
 
 def test_all_samples_of_the_paper_take_two_gibibytes(tmp_path: Path, record: Callable) -> None:
-    """Beyond what the network and one batch take."""
+    """In addition to the memory of the network and one batch."""
 
     def peak(loop: str, *overrides: str) -> float:
-        command = [sys.executable, str(HERE / "memory.py"), loop, str(tmp_path), "preset=paper", *overrides]
+        command = [
+            sys.executable,
+            str(HERE / "loops.py"),
+            loop,
+            str(tmp_path),
+            "0",
+            "preset=paper",
+            *overrides,
+        ]
         return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout) / 2**30
 
     bare, programme = peak("bare", "data.n_train=64", "data.n_test=1"), peak("programme")

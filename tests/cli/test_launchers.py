@@ -1,4 +1,4 @@
-"""Whatever launcher runs the jobs of a sweep, wherever: all of them end, and every failure comes back."""
+"""With any launcher, in any process: every job of a sweep ends, and every failure comes back."""
 
 import os
 import signal
@@ -8,31 +8,24 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from shutil import which
+from typing import Any
 
 import pytest
+from hydra.experimental.callback import Callback
 
-HOME = Path(__file__).parents[2]
-TINY = (
-    "preset=smoke",
-    "data.sensor_size=64",
-    "data.f_range=[343,571]",
-    "data.n_train=9",
-    "data.n_test=3",
-    "data.batch_size=8",
-    "data.workers=1",
-)
+from phd_exp.cli.frame import run_verb
+from phd_exp.cli.jobs import launch
+from phd_exp.records.errors import UserError
+
 LAUNCHERS = {
     "joblib": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
     "submitit": ["hydra/launcher=submitit_local"],
 }
-TASK = """
-import os, signal, sys, time
-from pathlib import Path
-from phd_exp.cli.app import launch
-from phd_exp.cli.frame import run_verb
-from phd_exp.records.errors import UserError
+PROGRAMME = "import sys; from tests.cli.test_launchers import main; sys.exit(main(sys.argv[1:]))"
 
-def task(config, overrides, cores):
+
+def task(config: dict[str, Any], overrides: list[str], cores: int) -> float:
+    """A job that finishes, fails or dies, by its seed."""
     seed = config["seed"]
     Path(f"{seed}.begun").touch()
     if seed == 1:
@@ -50,140 +43,110 @@ def task(config, overrides, cores):
             time.sleep(60)
         finally:
             Path(f"{config['preset']}.awake").touch()
-    time.sleep(1)
+    time.sleep(0.3)
     Path(f"{seed}.done").write_text(str(cores))
-    return seed / 2
+    return float(seed / 2)
 
-def standing(config, overrides):
+
+def standing(config: dict[str, Any], overrides: list[str]) -> str | None:
     done, begun = (Path(f"{config['seed']}.{state}") for state in ("done", "begun"))
     return "finished" if done.exists() else "killed" if begun.exists() else None
 
-if __name__ == "__main__":
-    sys.exit(run_verb(lambda words: launch(task, words, standing=standing), sys.argv[1:]))
-"""
 
-SCORES = """
-from hydra.experimental.callback import Callback
+def main(words: list[str]) -> int:
+    return run_verb(lambda rest: launch(task, rest, standing=standing), words)
+
 
 class Scores(Callback):
-    def on_job_end(self, config, job_return, **rest):
+    """Prints what Hydra's own sweeper receives from each job."""
+
+    def on_job_end(self, config: Any, job_return: Any, **rest: Any) -> None:
         print("score", job_return.return_value)
-"""
-
-
-def call(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"PYTHONPATH": str(HOME)}
-    return subprocess.run(
-        [sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True, timeout=200
-    )
-
-
-def errors(done: subprocess.CompletedProcess[str]) -> list[str]:
-    return [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    files = (path for path in folder.rglob("*") if path.is_file() and ".cache" not in path.parts)
-    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
 @pytest.fixture
-def sweep(tmp_path: Path):  # type: ignore[no-untyped-def]
-    """A sweep of jobs that finish, fail and die, by their seed."""
-    (tmp_path / "task.py").write_text(TASK)
-    return lambda launcher, seeds: call(
-        tmp_path, "task.py", "-m", f"seed={seeds}", "preset=smoke", *LAUNCHERS[launcher]
-    )
+def begin(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
+    """A sweep in a process of its own."""
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    return lambda launcher, *words: subprocess.Popen(
+        [sys.executable, "-c", PROGRAMME, "-m", *words, *LAUNCHERS[launcher]],
+        cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def unsharded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    folder = tmp_path_factory.mktemp("unsharded")
-    assert call(folder, "-m", "phd_exp", "render", *TINY).returncode == 0
-    return contents(folder / "renders")
+@pytest.fixture
+def sweep(begin: Callable) -> Callable[..., tuple[int, list[str], list[str]]]:
+    """A whole sweep over seeds: its status, its lines and its errors."""
+
+    def run(launcher: str, seeds: str) -> tuple[int, list[str], list[str]]:
+        with begin(launcher, f"seed={seeds}", "preset=smoke") as process:
+            out, err = process.communicate(timeout=200)
+        errors = [line for line in err.splitlines() if line.startswith("error: ")]
+        return process.returncode, out.splitlines(), errors
+
+    return run
 
 
-@pytest.mark.parametrize("launcher", ["joblib", pytest.param("submitit", marks=pytest.mark.slow)])
-def test_shards_at_once_give_the_bytes_of_one_render(
-    tmp_path: Path, unsharded: dict[str, bytes], launcher: str
+@pytest.mark.parametrize(("launcher", "seeds"), [("joblib", (0, 1, 2, 3, 5)), ("submitit", (0, 1, 3))])
+def test_failures_come_back_and_stop_no_other_job(
+    sweep: Callable, tmp_path: Path, launcher: str, seeds: tuple[int, ...]
 ) -> None:
-    """A share that does not exist fails alone, and is named."""
-    words = ("-m", "phd_exp", "-m", "render", *TINY, "shard=0/2,2/2,1/2", *LAUNCHERS[launcher])
-    done = call(tmp_path, *words)
-    assert done.returncode == 2
-    (line,) = errors(done)
-    assert "shard=2/2: shard: got '2/2'; expected INDEX/COUNT" in line
-    assert contents(tmp_path / "renders") == unsharded
-
-
-@pytest.mark.parametrize("launcher", LAUNCHERS)
-def test_failures_come_back_and_stop_no_other_job(sweep, tmp_path: Path, launcher: str) -> None:  # type: ignore[no-untyped-def]
-    done = sweep(launcher, "0,1,2,3,5")
-    assert done.returncode == 143
-    heading, user, fault, stopped = errors(done)
-    assert heading == "error: 3 jobs failed"
-    assert user == "error: seed=1 preset=smoke: a mistake"
-    assert fault == "error: seed=2 preset=smoke: ValueError: a fault"
-    assert "seed=3" in stopped
-    assert "stopped by SIGTERM" in stopped
-    assert {path.name for path in tmp_path.glob("*.done")} == {"0.done", "5.done"}
+    status, lines, errors = sweep(launcher, ",".join(map(str, seeds)))
+    wrong = {1: "a mistake", 2: "ValueError: a fault", 3: "stopped by SIGTERM; the same command resumes"}
+    expected = [f"error: seed={seed} preset=smoke: {wrong[seed]}" for seed in seeds if seed in wrong]
+    assert (status, errors) == (143, [f"error: {len(expected)} jobs failed", *expected])
+    assert lines[0] == f"{len(seeds)} jobs, 0 of them finished already"
+    outcomes = {1: "failed", 2: "failed", 3: "interrupted"}
+    *_, total = lines
+    assert lines[-1 - len(seeds) : -1] == [f"seed={s}: {outcomes.get(s, 'finished')}" for s in seeds]
+    assert total.startswith(f"{len(seeds)} jobs: {len(seeds) - len(expected)} finished, ")
+    assert {path.name for path in tmp_path.glob("*.done")} == {f"{s}.done" for s in seeds if s not in wrong}
+    if launcher == "joblib":  # the output of submitit's jobs is in its logs
+        headers = [f"job {i}/5: seed={seed} preset=smoke" for i, seed in enumerate(seeds, 1)]
+        assert sorted(line for line in lines if line.startswith("job ")) == headers
+        cores = max(1, len(os.sched_getaffinity(0)) // 2)  # two jobs at once share them
+        assert [(tmp_path / f"{seed}.done").read_text() for seed in (0, 5)] == [str(cores)] * 2
 
 
 @pytest.mark.parametrize("launcher", ["joblib", pytest.param("submitit", marks=pytest.mark.slow)])
-def test_a_job_that_is_killed_is_named(sweep, tmp_path: Path, launcher: str) -> None:  # type: ignore[no-untyped-def]
-    done = sweep(launcher, "4,0")
-    assert done.returncode == 1
-    assert "error: seed=4 preset=smoke: killed; the same command resumes" in errors(done)
+def test_a_killed_job_is_named(sweep: Callable, launcher: str) -> None:
+    status, _, errors = sweep(launcher, "4,0")
+    assert status == 1
+    assert "error: seed=4 preset=smoke: killed; the same command resumes" in errors
     if launcher == "submitit":  # joblib ends all its processes when one of them dies
-        assert len(errors(done)) == 1
+        assert len(errors) == 1
 
 
-def test_jobs_at_once_share_the_cores_and_say_who_they_are(sweep, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    done = sweep("joblib", "0,5")
-    assert done.returncode == 0, done.stderr
-    first, *headers, zero, five, total = done.stdout.splitlines()
-    assert first == "2 jobs, 0 of them finished already"
-    assert sorted(headers) == ["job 1/2: seed=0 preset=smoke", "job 2/2: seed=5 preset=smoke"]
-    assert (zero, five, total) == ("seed=0: finished", "seed=5: finished", "2 jobs: 2 finished")
-    cores = max(1, len(os.sched_getaffinity(0)) // 2)
-    assert [(tmp_path / f"{seed}.done").read_text() for seed in (0, 5)] == [str(cores)] * 2
-    assert errors(done) == []
-
-
-def test_a_sweeper_of_others_gets_the_number_of_each_job_and_stops_at_an_error(tmp_path: Path) -> None:
-    """Hydra's own; a job returns what a sweeper minimizes."""
-    (tmp_path / "task.py").write_text(TASK)
-    (tmp_path / "scores.py").write_text(SCORES)
-    words = ("task.py", "-m", "preset=smoke", "hydra/sweeper=basic")
-    done = call(tmp_path, *words, "seed=5,0", "+hydra.callbacks.scores._target_=scores.Scores")
-    assert [line for line in done.stdout.splitlines() if "score" in line] == ["score 2.5", "score 0.0"]
-    failed = call(tmp_path, *words, "seed=1,0")
-    assert (failed.returncode, errors(failed)) == (1, ["error: a mistake"])
+def test_other_sweepers_receive_the_score_of_each_job_and_stop_at_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["task"])
+    words = ("-m", "preset=smoke", "hydra/sweeper=basic")
+    assert main([*words, "seed=5,0", f"+hydra.callbacks.scores._target_={__name__}.Scores"]) == 0
+    out = capfd.readouterr().out
+    assert [line for line in out.splitlines() if "score" in line] == ["score 2.5", "score 0.0"]
+    assert main([*words, "seed=1,0"]) == 1
+    assert capfd.readouterr().err.splitlines()[-1] == "error: a mistake"
 
 
 @pytest.mark.slow
-def test_jobs_of_a_queue_outlive_a_stopped_launcher(tmp_path: Path) -> None:
-    (tmp_path / "task.py").write_text(TASK)
-    words = [sys.executable, "task.py", "-m", "seed=0,5", "preset=smoke", *LAUNCHERS["submitit"]]
-    environment = os.environ | {"PYTHONPATH": str(HOME)}
-    launches = tmp_path / "runs" / ".sweep"
-    with subprocess.Popen(words, cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL) as launcher:
-        wait_for(lambda: len(list(launches.glob(".submitit/*/*_submitted.pkl"))) == 2)
+def test_queued_jobs_outlive_a_stopped_launcher(begin: Callable, tmp_path: Path) -> None:
+    with begin("submitit", "seed=0,5", "preset=smoke") as launcher:
+        submitted = tmp_path / "runs" / ".sweep"
+        wait_for(lambda: len(list(submitted.glob(".submitit/*/*_submitted.pkl"))) == 2)
         assert not list(tmp_path.glob("*.begun")), "no job has begun"
         launcher.send_signal(signal.SIGTERM)
         assert launcher.wait(60) == 143
     wait_for(lambda: {path.name for path in tmp_path.glob("*.done")} == {"0.done", "5.done"})
 
 
-def test_jobs_of_joblib_end_with_a_killed_launcher(tmp_path: Path) -> None:
-    """Those that have begun, and those that were handed out and have not."""
-    (tmp_path / "task.py").write_text(TASK)
-    words = [sys.executable, "task.py", "-m", "seed=6", "preset=smoke,small,paper,demo", *LAUNCHERS["joblib"]]
-    environment = os.environ | {"PYTHONPATH": str(HOME)}
-    with subprocess.Popen(words, cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL) as launcher:
+def test_jobs_of_joblib_end_with_a_killed_launcher(begin: Callable, tmp_path: Path) -> None:
+    """Running jobs end, and jobs that a worker has received but not begun."""
+    with begin("joblib", "seed=6", "preset=smoke,small,paper,demo") as launcher:
         wait_for(lambda: len(list(tmp_path.glob("*.asleep"))) == 2)
         launcher.kill()
-    wait_for(lambda: len(list(tmp_path.glob("*.awake"))) >= 2)
+        wait_for(lambda: len(list(tmp_path.glob("*.awake"))) >= 2)
     time.sleep(0.5)
     assert len(list(tmp_path.glob("*.awake"))) == len(list(tmp_path.glob("*.asleep")))
     assert not list(tmp_path.glob("*.done"))
@@ -197,8 +160,8 @@ def wait_for(condition: Callable[[], bool]) -> None:
 
 
 @pytest.mark.skipif(which("srun") is not None, reason="needs a machine without SLURM")
-def test_a_launcher_that_cannot_begin_is_one_line(phd_exp: Callable, tmp_path: Path) -> None:
-    outcome = phd_exp("-m", "render", *TINY, "shard=0/2,1/2", "hydra/launcher=submitit_slurm")
+def test_a_launcher_that_cannot_start_is_one_line(phd_exp: Callable) -> None:
+    outcome = phd_exp("-m", "render", "preset=smoke", "shard=0/2,1/2", "hydra/launcher=submitit_slurm")
     assert outcome.status == 1
     (line,) = outcome.err.splitlines()
     assert line.startswith("error: the launcher failed (RuntimeError: Could not detect")

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.reports.recorded import predicted, record
-from tests.reports.several import write_views
+from tests.support.recorded import predicted, record
+from tests.support.several import write_views
 
 
 @pytest.fixture

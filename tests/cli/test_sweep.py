@@ -9,8 +9,7 @@ from typing import Any
 import hydra
 import pytest
 
-from phd_exp.cli import sweep
-from phd_exp.cli.paths import conf_folder
+from phd_exp.cli import conf_folder, sweep
 from phd_exp.cli.sweep import Combination, cores_a_job, plan
 from phd_exp.cli.train import run_name, standing
 from phd_exp.records.processes import usable_cores
@@ -24,7 +23,7 @@ HYDRA = "hydra_plugins"
 def jobs() -> Iterator[Callable[..., list[Combination]]]:
     """The jobs that the words of a command line stand for."""
     with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
-        yield lambda *words: plan(list(words), "config").jobs
+        yield lambda *words: plan(list(words), "config")[1]
 
 
 def folder(job: Combination) -> Path:
@@ -61,7 +60,8 @@ def test_an_experiment_says_how_many_runs_it_has(jobs: Callable, experiment: str
 
 def test_jobs_in_a_queue_come_back() -> None:
     with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
-        launcher = plan(["hydra/launcher=slurm", "hydra.launcher.partition=gpu"], "config").launcher
+        master, _ = plan(["hydra/launcher=slurm", "hydra.launcher.partition=gpu"], "config")
+    launcher = master.hydra.launcher
     assert launcher["_target_"].endswith("SlurmLauncher")
     assert (launcher["timeout_min"], launcher["max_num_timeout"], launcher["partition"]) == (1440, 10, "gpu")
 
@@ -80,31 +80,6 @@ def test_what_the_user_says_counts(jobs: Callable) -> None:
         assert job.config["data"]["variant"] in ("scale", "occl")
         keys = [override.split("=")[0] for override in job.overrides]
         assert len(keys) == len(set(keys))
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (
-            ["experiment=table1"],
-            "experiment=table1: names several runs; write -m before it: -m experiment=table1",
-        ),
-        (["-m", "experiment=tabel1"], "experiment=tabel1: no such choice, did you mean 'table1'?"),
-        (["-m", "experiment=table1,tabel2"], "experiment=tabel2: no such choice, did you mean 'table2'?"),
-        (["-m", "experiment=glob(nothing*)"], "experiment=glob(nothing*): not one combination"),
-        (
-            ["-m", "experiment=null", "seed=0,1"],
-            "Config group override must be a string or a list. Got NoneType",
-        ),
-    ],
-)
-def test_mistakes_are_one_line(phd_exp: Callable, tmp_path: Path, words: list[str], said: str) -> None:
-    outcome = phd_exp(*words)
-    assert outcome.status == 2
-    (line,) = outcome.err.splitlines()
-    assert line.startswith("error: ")
-    assert said in line
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_how_a_run_stands_is_read_before_the_configuration_is_checked(

@@ -1,4 +1,4 @@
-"""A run's name: every override that can change a number is in it, and no other; what a run says before it begins."""
+"""A run's name contains every override that can change a number, and no other; a run first prints its work."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import RunConfig, check
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def config(composed) -> RunConfig:  # type: ignore[no-untyped-def]
     return check(composed("preset=smoke"))
 
@@ -26,38 +26,18 @@ def test_a_recipe_has_a_place_beside_the_preset(composed) -> None:  # type: igno
     assert run_name(check(composed("recipe=paper")), ["recipe=paper"]).preset == "paper"
 
 
-@pytest.mark.parametrize(
-    "override",
-    [
-        "runs=elsewhere",
-        "logger=none",
-        "logger.project=mine",
-        "data.name=mine",
-        "data.root=/data",
-        "data.workers=1",
-        "trainer.progress_bar=false",
-        "trainer.threads=1",
-    ],
-)
-def test_what_changes_no_number_is_left_out(config: RunConfig, override: str) -> None:
-    assert run_name(config, [override]).overrides == ()
-
-
-@pytest.mark.parametrize(
-    "override",
-    [
-        "data.n_train=8",
-        "data.folder=photos",
-        "backbone=resnet50",
-        "camera=constant",
-        "optimizer.lr=0.1",
-        "recipe.localisation=0",
-        "trainer.precision=float32",
-    ],
-)
-def test_everything_else_is_in_it(config: RunConfig, override: str) -> None:
-    assert run_name(config, [override]).overrides == (override,)
-    assert run_name(config, [f"+{override}"]).overrides == (override,)
+def test_the_name_contains_the_overrides_that_can_change_a_number(config: RunConfig) -> None:
+    for override in (
+        *("runs=elsewhere", "logger=none", "logger.project=mine", "data.name=mine", "data.root=/data"),
+        *("data.workers=1", "trainer.progress_bar=false", "trainer.threads=1"),
+    ):
+        assert run_name(config, [override]).overrides == ()
+    for override in (
+        *("data.n_train=8", "data.folder=photos", "backbone=resnet50", "camera=constant", "optimizer.lr=0.1"),
+        *("recipe.localisation=0", "trainer.precision=float32"),
+    ):
+        assert run_name(config, [override]).overrides == (override,)
+        assert run_name(config, [f"+{override}"]).overrides == (override,)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +50,7 @@ def test_everything_else_is_in_it(config: RunConfig, override: str) -> None:
     ],
 )
 def test_one_value_has_one_name(config: RunConfig, one: str, other: str) -> None:
-    """A sweep writes values anew before it hands them to its runs."""
+    """A sweep rewrites the values of its runs."""
     assert run_name(config, [one]) == run_name(config, [other])
 
 
@@ -82,7 +62,7 @@ def test_one_value_has_one_name(config: RunConfig, one: str, other: str) -> None
         (False, ["preset=small"], 1),
     ],
 )
-def test_what_a_run_costs_is_said_at_once(
+def test_a_run_first_prints_its_cost(
     composed, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path,
     gpu: bool, words: list[str], lines: int,
 ) -> None:  # type: ignore[no-untyped-def]  # fmt: skip

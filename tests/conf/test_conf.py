@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from phd_exp.cli.paths import conf_folder
+from phd_exp.cli import conf_folder
 from phd_exp.records.choices import flatten
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.training.build import build_augmentation

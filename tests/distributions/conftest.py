@@ -36,6 +36,6 @@ INSTANCES = {
 }
 
 
-@pytest.fixture(params=INSTANCES.values(), ids=INSTANCES.keys())
+@pytest.fixture(scope="session", params=INSTANCES.values(), ids=INSTANCES.keys())
 def distribution(request: pytest.FixtureRequest) -> ProjectedHuber:
     return request.param

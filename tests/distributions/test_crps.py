@@ -9,7 +9,7 @@ import torch
 from torch.autograd import gradcheck
 
 from phd_exp.distributions import ProjectedHuber, depth
-from phd_exp.distributions.crps import crps_beyond_distance, half_mean_difference
+from phd_exp.distributions.depth import crps_beyond_distance, half_mean_difference
 
 PRECISIONS = [1e-3, 1e-2, 0.3, 0.999, 1.0, 1.001, 3.0, 30.0, 1e3, 1e4, 1e6]
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(40)
@@ -50,11 +50,8 @@ def test_mean_difference_is_that_of_the_integral(log_a: torch.Tensor) -> None:
     """E CRPS(T) = E|T - T'|/2: the law scored by itself."""
     p = torch.from_numpy((NODES + 1) / 2)
     log_t = depth.depth_icdf(p, log_a)
-    own = (
-        (log_t.expm1().abs() * log_a.exp() + crps_beyond_distance(log_t, log_a))
-        @ torch.from_numpy(WEIGHTS)
-        / 2
-    )
+    score = log_t.expm1().abs() * log_a.exp() + crps_beyond_distance(log_t, log_a)
+    own = score @ torch.from_numpy(WEIGHTS) / 2
     assert half_mean_difference(log_a).item() == pytest.approx(own.item(), rel=0.002)
 
 

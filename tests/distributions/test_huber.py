@@ -53,25 +53,11 @@ def test_radial_cdf_is_the_integral(r: float) -> None:
     assert cdf.item() == pytest.approx(radial_integral(lambda _: 1.0, 0.0, r) / Z if r else 0.0, abs=1e-13)
 
 
-@pytest.mark.parametrize("r", [0.0, 0.3, 0.999, 1.0, 1.001, 2.5, 9.0])
-def test_energy_survival_is_that_of_the_radius(r: float) -> None:
-    survival = huber.energy_survival(torch.tensor(h(r), dtype=torch.float64))
-    assert survival.item() == pytest.approx(
-        1 - huber.radial_cdf(torch.tensor(r, dtype=torch.float64)).item(), abs=1e-13
-    )
-
-
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-14), (torch.float32, 5e-7)])
 def test_radial_icdf_inverts_radial_cdf(dtype: torch.dtype, tolerance: float) -> None:
     p = torch.cat([torch.linspace(0, 1, 1001, dtype=dtype)[:-1], 1 - torch.logspace(-6, -2, 30, dtype=dtype)])
     torch.testing.assert_close(huber.radial_cdf(huber.radial_icdf(p)), p, rtol=0, atol=tolerance)
-
-
-def test_radial_icdf_is_finite_up_to_the_last_number_below_one() -> None:
-    for dtype in (torch.float32, torch.float64):
-        assert (
-            huber.radial_icdf(torch.tensor([0.0, 1 - torch.finfo(dtype).eps], dtype=dtype)).isfinite().all()
-        )
+    assert huber.radial_icdf(torch.tensor([0.0, 1 - torch.finfo(dtype).eps], dtype=dtype)).isfinite().all()
 
 
 def test_samples_follow_the_law() -> None:

@@ -71,16 +71,6 @@ def test_the_law_of_the_birds_eye_view_is_constant_along_a_curve(distribution: P
         np.testing.assert_allclose(density, density[0], rtol=5e-3)
 
 
-def test_curves_are_nested_around_the_mode() -> None:
-    curves = level_curves(_distribution(20.0))
-    mode = curves.mode
-    for places, middle in ((curves.projected, mode[:2] / mode[2]), (curves.birds_eye, mode[::2])):
-        inner, between, outer = (Outline(points) for points in places)
-        assert inner.contains_point(middle)
-        assert between.contains_points(inner.vertices).all()
-        assert outer.contains_points(between.vertices).all()
-
-
 def test_pixels_are_the_cameras() -> None:
     camera = Camera(torch.tensor([1500.0], dtype=torch.float64), 224.0)
     xyz = torch.tensor([[0.11, -0.07, 3.7]], dtype=torch.float64)

@@ -66,22 +66,18 @@ def test_camera_frame_parameters_are_the_printed_ones() -> None:
         torch.testing.assert_close(distribution.a, a)
 
 
-def on_a_seam(**numbers: float) -> list[float]:
-    """The generic raw numbers with some replaced, by position."""
-    return [numbers.get(f"at_{i}", x) for i, x in enumerate(GENERIC)]
-
-
+n_1, n_2, b_1, b_2, b_3, w_1, w_2 = GENERIC
 SEAMS = {
     "generic": GENERIC,
     "zero": [0.0] * 7,
-    "equal eigenvalues": on_a_seam(at_2=1.3, at_3=0.0, at_4=1.3),
-    "equal negative eigenvalues": on_a_seam(at_2=-0.7, at_3=0.0, at_4=-0.7),
-    "an eigenvalue of zero": on_a_seam(at_2=1.0, at_3=math.sqrt(2), at_4=1.0),
-    "both eigenvalues zero": on_a_seam(at_2=0.0, at_3=0.0, at_4=0.0),
-    "w_1 = 0": on_a_seam(at_5=0.0),
-    "w_2 = 0": on_a_seam(at_6=0.0),
-    "w_1 = w_2 = 0": on_a_seam(at_5=0.0, at_6=0.0),
-    "w_2 = 0, a < 1": on_a_seam(at_5=-1.0, at_6=0.0),
+    "equal eigenvalues": [n_1, n_2, 1.3, 0.0, 1.3, w_1, w_2],
+    "equal negative eigenvalues": [n_1, n_2, -0.7, 0.0, -0.7, w_1, w_2],
+    "an eigenvalue of zero": [n_1, n_2, 1.0, math.sqrt(2), 1.0, w_1, w_2],
+    "both eigenvalues zero": [n_1, n_2, 0.0, 0.0, 0.0, w_1, w_2],
+    "w_1 = 0": [n_1, n_2, b_1, b_2, b_3, 0.0, w_2],
+    "w_2 = 0": [n_1, n_2, b_1, b_2, b_3, w_1, 0.0],
+    "w_1 = w_2 = 0": [n_1, n_2, b_1, b_2, b_3, 0.0, 0.0],
+    "w_2 = 0, a < 1": [n_1, n_2, b_1, b_2, b_3, -1.0, 0.0],
 }
 
 
@@ -174,7 +170,7 @@ def test_gradients_are_bounded(scale: float) -> None:
 
     The paper's proof leaves out log nu_z, whose slope at w_2 = 0 is 1/a.
     """
-    raw = torch.cat([raw_numbers(2000, scale, seed=3), EXTREMES.double() * scale / 1e4])
+    raw = torch.cat([raw_numbers(1000, scale, seed=3), EXTREMES.double() * scale / 1e4])
     slopes = gradients(raw)
     D, a = 5 / 3, torch.where(raw[:, 5] < 0, raw[:, 5].exp(), raw[:, 5] + 1)
     slope_of_log_nu_z = 1 / (a + raw[:, 6].abs()).clamp_min(torch.finfo(raw.dtype).eps)
@@ -206,20 +202,12 @@ def test_loss_without_log_nu_z_is_convex_in_the_outputs(scale: float) -> None:
         distribution = ProjectedHuber.from_raw(raw, f=F, S=S, mu_z0=MU_Z0)
         return -distribution.log_prob(xyz) - distribution.mu_z.log()
 
-    one, other = convex_points(2000, scale, seed=4), convex_points(2000, scale, seed=6)
+    one, other = convex_points(1000, scale, seed=4), convex_points(1000, scale, seed=6)
     for xyz in data_set_positions():
         for share in (0.5, 0.1):
             chord = (1 - share) * convex_part(one, xyz) + share * convex_part(other, xyz)
             value = convex_part((1 - share) * one + share * other, xyz)
             assert (value <= chord + 1e-9 * chord.abs().clamp_min(1)).all()
-
-
-def test_loss_is_convex_in_all_outputs_but_w_2() -> None:
-    one, other = convex_points(2000, 3.0, seed=8), convex_points(2000, 3.0, seed=10)
-    one[:, 6] = other[:, 6] = 0  # nu_z = 1
-    for xyz in data_set_positions():
-        chord = (loss(one, xyz) + loss(other, xyz)) / 2
-        assert (loss((one + other) / 2, xyz) <= chord + 1e-9 * chord.abs().clamp_min(1)).all()
 
 
 def test_curvature_that_the_loss_lacks_is_that_of_log_nu_z() -> None:

@@ -12,7 +12,7 @@ from phd_exp.distributions import special
 
 TOLERANCE = {torch.float64: 1e-12, torch.float32: 1e-6}
 GRID = np.unique(
-    np.concatenate([np.logspace(-6, 6, 145), 1 + np.linspace(-1e-3, 1e-3, 9), np.linspace(0.5, 4, 36)])
+    np.concatenate([np.logspace(-6, 6, 49), 1 + np.linspace(-1e-3, 1e-3, 5), np.linspace(0.5, 4, 15)])
 )
 
 
@@ -47,29 +47,23 @@ def a(request: pytest.FixtureRequest) -> torch.Tensor:
     return torch.tensor(GRID, dtype=request.param)
 
 
-@pytest.mark.parametrize("n", [-3, -2, -1, 0, 1, 2, 3, 4, 5])
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 5])
 def test_scaled_expint(n: int, a: torch.Tensor) -> None:
     truth = exact(lambda x: scaled_expint(n, x), a)
     assert relative_error(special.scaled_expint(n, a), truth) < TOLERANCE[a.dtype]
 
 
-@pytest.mark.parametrize("n", [6, 20])
+@pytest.mark.parametrize("n", [0, 6, 20])
 def test_scaled_expint_refuses_orders_the_rule_was_not_built_for(n: int) -> None:
-    with pytest.raises(ValueError, match=f"n must be at most 5, but is {n}"):
+    with pytest.raises(ValueError, match=f"n: got {n}; expected 1 to 5"):
         special.scaled_expint(n, torch.ones(1))
 
 
 @pytest.mark.parametrize("k", [0, 1, 2, 3])
 def test_tail_moment_to_the_precision_that_moments_need(k: int, a: torch.Tensor) -> None:
-    truth = exact(lambda x: tail_moment(k, x), a)
-    error = (special.tail_moment(k, a).double() - truth).abs().max()
-    assert error < TOLERANCE[a.dtype] * math.factorial(k)
-
-
-def test_g_is_a_small_number_to_full_relative_precision(a: torch.Tensor) -> None:
-    assert (
-        relative_error(special.tail_moment(0, a), exact(lambda x: tail_moment(0, x), a)) < TOLERANCE[a.dtype]
-    )
+    truth, value = exact(lambda x: tail_moment(k, x), a), special.tail_moment(k, a)
+    assert (value.double() - truth).abs().max() < TOLERANCE[a.dtype] * math.factorial(k)
+    assert k > 0 or relative_error(value, truth) < TOLERANCE[a.dtype]  # g, also where it is small
 
 
 def test_log_normaliser(a: torch.Tensor) -> None:
@@ -84,18 +78,6 @@ def test_log_normaliser_derivative(a: torch.Tensor) -> None:
     assert relative_error(derivative, exact(log_normaliser_derivative, a)) < TOLERANCE[a.dtype]
 
 
-@pytest.mark.parametrize(
-    ("value", "log_n", "derivative"),
-    [(0.3, 1.0779024, None), (1.0, -0.6609221, -1.8497079), (10.0, -11.6908288, -1.0932743)],
-)
-def test_log_normaliser_at_reference_values(value: float, log_n: float, derivative: float | None) -> None:
-    a = torch.tensor(value, dtype=torch.float64, requires_grad=True)
-    result = special.log_normaliser(a)
-    assert result.item() == pytest.approx(log_n, abs=5e-8)
-    if derivative is not None:
-        assert torch.autograd.grad(result, a)[0].item() == pytest.approx(derivative, abs=5e-8)
-
-
 @pytest.mark.parametrize("k", [0, 1])
 def test_tail_moment_differentiates_twice(k: int) -> None:
     a = torch.tensor([0.01, 0.4, 0.99, 1.0, 1.01, 3.0, 40.0], dtype=torch.float64, requires_grad=True)
@@ -103,7 +85,7 @@ def test_tail_moment_differentiates_twice(k: int) -> None:
     assert gradgradcheck(lambda a: special.tail_moment(k, a), a)
 
 
-@pytest.mark.parametrize("n", [-2, 0, 1, 2, 3, 5])
+@pytest.mark.parametrize("n", [1, 2, 3, 5])
 def test_scaled_expint_is_differentiable(n: int) -> None:
     a = torch.tensor([0.01, 0.4, 0.99, 1.0, 1.01, 3.0, 40.0], dtype=torch.float64, requires_grad=True)
     assert gradcheck(lambda a: special.scaled_expint(n, a), a)
@@ -136,18 +118,11 @@ def test_signed_log1p_stays_finite_where_a_underflows() -> None:
 
 
 def test_validation_before_training_leaves_no_inference_tensors_behind() -> None:
-    special._kept_constants.cache_clear()
-    a = torch.tensor([0.5, 2.0], requires_grad=True)
+    """In a data type that no other test uses, so that its constants are built here."""
+    a = torch.tensor([0.5, 2.0], dtype=torch.bfloat16, requires_grad=True)
     with torch.inference_mode():
         special.scaled_expint(2, a)
     special.scaled_expint(2, a).sum().backward()
-
-
-def test_autocast_changes_nothing() -> None:
-    a = torch.logspace(-2, 2, 20)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        values = special.log_normaliser(a)
-    torch.testing.assert_close(values, special.log_normaliser(a), rtol=0, atol=0)
 
 
 def test_gauss_rule_is_the_one_its_comment_describes() -> None:
@@ -158,12 +133,8 @@ def test_gauss_rule_is_the_one_its_comment_describes() -> None:
         nodes = [mp.exp(y - mp.exp(-y)) for y in grid]
         density = [s * (1 + mp.exp(-y)) * mp.exp(-s) / 24 for s, y in zip(nodes, grid, strict=True)]
         density = [w / mp.fprod(1 + s / p for p in poles) for s, w in zip(nodes, density, strict=True)]
-        jacobi, current, previous, last = (
-            mp.matrix(13),
-            [mp.mpf(1)] * len(nodes),
-            [mp.mpf(0)] * len(nodes),
-            None,
-        )
+        jacobi, last = mp.matrix(13), None
+        current, previous = [mp.mpf(1)] * len(nodes), [mp.mpf(0)] * len(nodes)
         for k in range(13):
             norm = mp.fsum(w * p * p for w, p in zip(density, current, strict=True))
             mean = mp.fsum(w * p * p * s for w, p, s in zip(density, current, nodes, strict=True)) / norm

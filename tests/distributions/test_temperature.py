@@ -45,28 +45,18 @@ def test_is_the_minimum_of_the_mean_nll(truth: ProjectedHuber, xyz: torch.Tensor
         return -float(predicted.tempered(projected, depth).log_prob(xyz).mean())
 
     least = nll(found.projected, found.depth)
-    for step in (1e-2, 1e-3):
-        assert nll(found.projected * (1 + step), found.depth) > least
-        assert nll(found.projected * (1 - step), found.depth) > least
-        assert nll(found.projected, found.depth * (1 + step)) > least
-        assert nll(found.projected, found.depth * (1 - step)) > least
+    for factor in (0.99, 0.999, 1.001, 1.01):
+        assert nll(found.projected * factor, found.depth) > least
+        assert nll(found.projected, found.depth * factor) > least
 
 
 def test_mean_nll_is_convex_in_both_reciprocals(truth: ProjectedHuber, xyz: torch.Tensor) -> None:
-    truth, xyz = (
-        from_columns({name: column[:2000] for name, column in parameter_columns(truth).items()}),
-        xyz[:2000],
-    )
+    few = {name: column[:2000] for name, column in parameter_columns(truth).items()}
+    truth, xyz = from_columns(few), xyz[:2000]
     r = torch.linspace(0.05, 6, 20).tolist()
     for line in (lambda r: (1 / r, 1.0), lambda r: (1.0, 1 / r), lambda r: (1 / r, 1 / r)):
         nll = torch.tensor([-float(truth.tempered(*line(at)).log_prob(xyz).mean()) for at in r]).double()
         assert (nll.diff().diff() > 0).all()
-
-
-def test_separates_into_two_problems(truth: ProjectedHuber, xyz: torch.Tensor) -> None:
-    once, other = (Temperature.fit(truth.tempered(projected, 0.5), xyz) for projected in (0.5, 4.0))
-    assert once.depth == pytest.approx(other.depth, rel=1e-9)
-    assert once.projected * 0.5 == pytest.approx(other.projected * 4.0, rel=1e-9)
 
 
 def test_leaves_mode_and_batch(distribution: ProjectedHuber) -> None:

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
-from phd_exp.cli.paths import PACKAGE
+from phd_exp.cli import PACKAGE
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"

@@ -1,7 +1,9 @@
 """The documentation as `make docs` builds it: without a warning, and read from the disk without a network."""
 
+import html
 import os
 import re
+import runpy
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,12 +13,14 @@ from typing import Any
 
 import pytest
 
-from tests.docs.pages import PAGES, ROOT
+from tests.docs.pages import DOCS, PAGES, ROOT
 
 pytestmark = pytest.mark.slow
 
+REFERENCE = runpy.run_path(str(DOCS / ".build" / "reference.py"))["pages"]()
+
 LOADED = {"script": "src", "img": "src", "iframe": "src", "source": "src", "link": "href"}
-"""Tags that make a browser fetch something, and the attribute that says what."""
+"""Tags that make a browser fetch something, and the attribute with its address."""
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +52,7 @@ class _Loaded(HTMLParser):
 
 def test_every_page_is_built_and_loads_nothing_from_elsewhere(site: Path) -> None:
     pages = list(site.rglob("*.html"))
-    assert len(pages) == len(PAGES) + 1  # and 404.html
+    assert len(pages) == len(PAGES) + len(REFERENCE) + 1  # and 404.html
     for page in pages:
         loaded = _Loaded()
         loaded.feed(page.read_text())
@@ -62,14 +66,16 @@ def test_styles_load_nothing_from_elsewhere(site: Path) -> None:
 
 
 def test_shapes_stand_in_the_reference(site: Path) -> None:
-    text = _text((site / "api" / "distributions.html").read_text())
-    assert 'mu_xy: Float[Tensor, "*batch 2"]' in text
-    text = _text((site / "api" / "metrics.html").read_text())
-    assert 'levels: Float[Tensor, "samples"]' in text
+    for package, shape in (
+        ("distributions", 'mu_xy: Float[Tensor, "*batch 2"]'),
+        ("metrics", 'levels: Float[Tensor, "samples"]'),
+    ):
+        texts = [page.read_text() for page in (site / "api" / package).glob("*.html")]
+        assert any(shape in html.unescape(re.sub(r"<[^>]+>", "", text)) for text in texts)
 
 
-def _text(html: str) -> str:
-    return re.sub(r"<[^>]+>", "", html).replace("&#39;", "'").replace("&quot;", '"')
+def test_formulas_are_drawn_by_the_browser(site: Path) -> None:
+    assert (site / "ideas" / "charts.html").read_text().count("<math") > 10
 
 
 @pytest.fixture
@@ -79,7 +85,7 @@ def faults() -> list[str]:
 
 @pytest.fixture
 def page(chromium: Any, faults: list[str]) -> Iterator[Any]:
-    """A page of a real browser without a network; whatever goes wrong on it is a fault."""
+    """A page of a real browser without a network; errors and failed requests are collected in `faults`."""
     opened = chromium.new_context(offline=True).new_page()
     opened.on("pageerror", lambda error: faults.append(str(error)))
     opened.on("requestfailed", lambda request: faults.append(request.url))
@@ -99,5 +105,15 @@ def test_the_search_finds_a_name_from_the_file_system(site: Path, page: Any, fau
     page.keyboard.type("quantiles_along")
     page.wait_for_selector(".md-search-result__item")
     page.click(".md-search-result__item a")
-    page.wait_for_url("**/api/distributions.html*")
+    page.wait_for_url("**/api/distributions/*.html*")
     assert faults == []
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize(
+    "address", ["index", "ideas/density", "guides/tables", "api/index", "api/fusion/fuse"]
+)
+def test_no_page_is_wider_than_the_window(site: Path, page: Any, address: str, width: int) -> None:
+    page.set_viewport_size({"width": width, "height": 900})
+    page.goto((site / f"{address}.html").as_uri())
+    assert page.evaluate("document.documentElement.scrollWidth") <= width

@@ -1,22 +1,28 @@
-"""What the pages show is run: Python blocks in order, page by page; commands as far as their configuration.
+"""The snippets of the pages run: Python blocks in order, page by page; commands up to their checked configuration.
 
 A YAML block is the file that its first line names.
 """
 
+import itertools
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import hydra
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from phd_exp.cli.help import OF_VERB, VERBS
-from phd_exp.cli.paths import conf_folder
-from phd_exp.cli.sweep import plan
+from phd_exp.cli import conf_folder
+from phd_exp.cli.help import EXAMPLES, OF_VERB, VERBS
+from phd_exp.cli.jobs import plain
 from phd_exp.training.config import check, check_render
 from tests.docs.pages import PAGES, ROOT, blocks, commands, name
 
-README = ROOT / "README.md"
+README, HELP = ROOT / "README.md", ROOT / "phd_exp" / "cli" / "help.py"
 COMMANDS = {tuple(words): page for page in (*PAGES, README) for words in commands(page)}
+COMMANDS |= {
+    tuple(line.partition(" >")[0].split()[3:]): HELP for lines in EXAMPLES.values() for line in lines
+}
 CHECKS = {"train": ("config", check), "render": ("render", check_render)}
 
 
@@ -27,37 +33,47 @@ def test_python_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.Monke
     for block in blocks(page):
         assert block.language in ("python", "sh", "yaml"), f"{name(page)}:{block.line}: not run by anything"
         if block.language == "python":
-            # lines of their own, so that a traceback shows those of the page
+            # the line numbers of a traceback are those of the page
             exec(compile("\n" * (block.line - 1) + block.text, str(page), "exec"), scope)
 
 
-@pytest.mark.parametrize(
-    ("words", "page"),
-    [
-        pytest.param(words, page, id=" ".join(words), marks=pytest.mark.slow if page == README else ())
-        for words, page in COMMANDS.items()
-    ],
-)
-def test_commands_are_those_of_this_programme(
-    words: tuple[str, ...], page: Path, phd_exp: Callable, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_commands_are_valid(words: tuple[str, ...], phd_exp: Callable, tmp_path: Path) -> None:
     verb = next((word for word in words[:2] if word in VERBS), "train")
     if any(word.startswith("--") for word in words):
-        _write_files(page, tmp_path)
+        _write_files(COMMANDS[words], tmp_path)
         assert phd_exp(*words).status == 0
-    elif OF_VERB[verb]:
-        config_name, checked = CHECKS[verb]
-        overrides = [word for word in words if word not in (verb, "-m")]
-        with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
-            jobs = plan(overrides, config_name).jobs
-        assert jobs
-        for job in jobs:
-            checked(job.config)
+    elif verb in OF_VERB:
+        for single in _single_runs([word for word in words if word not in (verb, "-m")]):
+            _check(verb, single)
     else:
         assert all("=" in word for word in words[1:])
 
 
-def test_there_are_snippets_on_every_page_of_an_idea() -> None:
+def _single_runs(words: list[str]) -> list[tuple[str, ...]]:
+    """As few combinations of the values as contain each value; `tests/cli/test_sweep.py` expands experiments."""
+    choices: list[list[str]] = []
+    for word, item in zip(words, OverridesParser.create().parse_overrides(words), strict=True):
+        several = list(item.sweep_string_iterator()) if item.is_sweep_override() else []
+        if item.key_or_group == "experiment":
+            for choice in several or [item.value()]:
+                assert (conf_folder() / "experiment" / f"{choice}.yaml").is_file()
+        else:
+            choices.append([f"{item.get_key_element()}={value}" for value in several] or [word])
+    n = max(map(len, choices), default=1)
+    return list(zip(*(itertools.islice(itertools.cycle(values), n) for values in choices), strict=True)) or [
+        ()
+    ]
+
+
+@cache  # many pages repeat a command
+def _check(verb: str, overrides: tuple[str, ...]) -> None:
+    config_name, checked = CHECKS[verb]
+    with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
+        checked(plain(hydra.compose(config_name, list(overrides))))
+
+
+def test_every_idea_has_snippets() -> None:
     for page in PAGES:
         if page.parent.name == "ideas":
             assert len([block for block in blocks(page) if block.language == "python"]) >= 2, name(page)

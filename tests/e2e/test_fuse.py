@@ -1,4 +1,4 @@
-"""Scenes of several cameras become one position each; what cannot be fused, and what a user gets wrong."""
+"""Scenes of several cameras become one position each; scenes that cannot be fused, and mistakes of a user."""
 
 import json
 from collections.abc import Callable
@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 import phd_exp as package
 from phd_exp.__main__ import main
 from phd_exp.geometry import intrinsics
-from phd_exp.records.runs import RunFolder, find_runs
-from tests.e2e.conftest import QUICK, QUICKER
+from phd_exp.records.runs import RunFolder
+from tests.e2e.conftest import QUICK
+from tests.support.untrained import SMALL, read_lines, untrained
 
 VIEWS, SCENES = 3, 4
 
@@ -32,12 +33,8 @@ def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root / "multiview" / "test"
 
 
-def answers(out: str) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in out.splitlines()]
-
-
 def metadata(folder: Path) -> list[dict[str, Any]]:
-    return answers((folder / "metadata.jsonl").read_text())
+    return read_lines((folder / "metadata.jsonl").read_text())
 
 
 def matrix(line: dict[str, Any]) -> np.ndarray:
@@ -48,7 +45,7 @@ def matrix(line: dict[str, Any]) -> np.ndarray:
 def require_most_likely(
     run: RunFolder, folder: Path, views: list[dict[str, Any]], point: list[float]
 ) -> None:
-    """All positions around are less likely, by the densities of the views, each of them asked for by itself."""
+    """All positions nearby are less likely, by the densities of the views, each predicted alone."""
     predictor = package.load(run.path)
     around = 0.02 * np.random.default_rng(0).standard_normal((1000, 3))
     tried = np.concatenate([np.zeros((1, 3)), around]) + point
@@ -69,7 +66,7 @@ def test_the_test_split_of_a_rendered_set_is_fused_as_it_is(
 ) -> None:
     outcome = phd_exp("fuse", f"run={run.path}", f"folder={several}")
     assert (outcome.status, outcome.err) == (0, "")
-    rows, lines = answers(outcome.out), metadata(several)
+    rows, lines = read_lines(outcome.out), metadata(several)
     assert [row["scene"] for row in rows] == list(range(SCENES))
     for row in rows:
         views = [line for line in lines if line["scene"] == row["scene"]]
@@ -93,7 +90,7 @@ def test_on_a_plane_positions_and_their_uncertainty_lie_in_it(
     outcome = phd_exp("fuse", f"run={run.path}", f"folder={several}", "plane=[0,0.6,0.8,3.2]")
     assert (outcome.status, outcome.err) == (0, "")
     normal = np.array([0, 0.6, 0.8])
-    for row in answers(outcome.out):
+    for row in read_lines(outcome.out):
         assert normal @ row["point"] == pytest.approx(3.2)
         assert normal @ row["mean"] == pytest.approx(3.2)
         values, directions = np.linalg.eigh(row["covariance"])
@@ -128,20 +125,20 @@ def test_crops_of_any_cameras_are_fused_in_the_world_of_their_poses(
 ) -> None:
     outcome = phd_exp("fuse", f"run={run.path}", f"folder={photos}", "out=there/fused.jsonl")
     assert (outcome.status, outcome.out) == (0, ""), outcome.err
-    rows, lines = answers((tmp_path / "there" / "fused.jsonl").read_text()), metadata(photos)
+    rows, lines = read_lines((tmp_path / "there" / "fused.jsonl").read_text()), metadata(photos)
     assert [(row["scene"], len(row["surprise"])) for row in rows] == [("two", 2), ("three", 3), ("one", 1)]
     assert all("error_mm" not in row for row in rows)
     for row in rows:
         views = [line for line in lines if line["scene"] == row["scene"]]
         require_most_likely(run, photos, views, row["point"])
     # alone, a view's most likely position is its mode
-    alone = answers(phd_exp("predict", f"run={run.path}", f"folder={photos}").out)[2]
+    alone = read_lines(phd_exp("predict", f"run={run.path}", f"folder={photos}").out)[2]
     pose = lines[2]["pose"]
     world = matrix(lines[2]).T @ (np.array(alone["mode"]) - pose["translation"])
     np.testing.assert_allclose(rows[2]["point"], world, rtol=1e-5, atol=1e-5)
     # a scene does not depend on what else is in the file
     write(photos, [line for line in lines if line["scene"] == "three"])
-    (three,) = answers(phd_exp("fuse", f"run={run.path}", f"folder={photos}").out)
+    (three,) = read_lines(phd_exp("fuse", f"run={run.path}", f"folder={photos}").out)
     np.testing.assert_allclose(three["point"], rows[1]["point"], rtol=1e-5)
     np.testing.assert_allclose(three["covariance"], rows[1]["covariance"], rtol=1e-4)
 
@@ -149,7 +146,7 @@ def test_crops_of_any_cameras_are_fused_in_the_world_of_their_poses(
 def test_a_scene_that_fails_says_why_and_harms_no_other(
     phd_exp: Callable, run: RunFolder, photos: Path
 ) -> None:
-    before = answers(phd_exp("fuse", f"run={run.path}", f"folder={photos}").out)
+    before = read_lines(phd_exp("fuse", f"run={run.path}", f"folder={photos}").out)
     lines = metadata(photos)
     back_to_back = {"rotation": [0.0, 0.0, 1.0, 0.0], "translation": [0.0, 0.0, 0.0]}
     lines[4]["pose"] = back_to_back
@@ -160,7 +157,7 @@ def test_a_scene_that_fails_says_why_and_harms_no_other(
     assert outcome.err.splitlines() == [
         "error: 1 of 3 scenes have no fused position: two; the line of each says why"
     ]
-    failed, *others = answers(outcome.out)
+    failed, *others = read_lines(outcome.out)
     assert (failed["status"], failed["point"]) == ("contradiction", [None] * 3)
     assert failed["reason"].startswith("at least half of the views rule out")
     for row, same in zip(others, before[1:], strict=True):
@@ -169,17 +166,13 @@ def test_a_scene_that_fails_says_why_and_harms_no_other(
 
 def test_recalibration_reaches_the_fused_covariance(phd_exp: Callable, run: RunFolder, several: Path) -> None:
     words = ("fuse", f"run={run.path}", f"folder={several}")
-    before, after = answers(phd_exp(*words).out), answers(phd_exp(*words, "recalibrate=true").out)
+    before, after = read_lines(phd_exp(*words).out), read_lines(phd_exp(*words, "recalibrate=true").out)
     assert after[0]["uncertainty"].startswith("recalibrated: A / ")
     assert after[0]["covariance"] != before[0]["covariance"]
 
 
-def test_a_baseline_is_refused(phd_exp: Callable, run: RunFolder, several: Path, tmp_path: Path) -> None:
-    outcome = phd_exp(
-        *QUICK, *QUICKER, "model=mae_vz", f"data.root={run.config()['data']['root']}", "runs=points"
-    )
-    assert outcome.status == 0, outcome.err
-    (points,) = find_runs(tmp_path / "points")
+def test_a_baseline_is_refused(phd_exp: Callable, several: Path, composed: Callable, tmp_path: Path) -> None:
+    points = untrained(tmp_path / "points", composed(*SMALL, "model=mae_vz"))
     refused = phd_exp("fuse", f"run={points.path}", f"folder={several}")
     assert (refused.status, refused.out) == (1, "")
     (line,) = refused.err.splitlines()
@@ -200,18 +193,6 @@ LINES = [
 ]
 
 
-@pytest.mark.parametrize(("line", "said"), LINES, ids=[said for _, said in LINES])
-def test_a_mistake_in_a_line_is_one_line(
-    phd_exp: Callable, tmp_path: Path, line: dict[str, Any], said: str
-) -> None:
-    write(tmp_path, [{"file_name": "a.png", "f": 400} | line])
-    outcome = phd_exp("fuse", "run=nowhere", "folder=.")
-    assert (outcome.status, outcome.out) == (1, "")
-    (complaint,) = outcome.err.splitlines()
-    assert complaint.startswith("error: ")
-    assert said in complaint
-
-
 ARGUMENTS = [
     (("run=nowhere",), "folder: missing; fuse takes run=, folder=, plane=, out=, recalibrate="),
     (("run=nowhere", "folder=."), "nowhere: no run; expected a folder with config.yaml"),
@@ -222,16 +203,20 @@ ARGUMENTS = [
     (("run=nowhere", "folder=.", "out=metadata.jsonl"), "is one of the files that are read"),
     (("run=nowhere", "folder=.", "out=a.png"), "is one of the files that are read"),
 ]
+MISTAKES = [(("run=nowhere", "folder=."), line, said) for line, said in LINES]
+MISTAKES += [(words, {"scene": 1, "pose": POSE}, said) for words, said in ARGUMENTS]
 
 
-@pytest.mark.parametrize(("words", "said"), ARGUMENTS, ids=[" ".join(words) for words, _ in ARGUMENTS])
-def test_a_mistake_in_the_arguments_is_one_line(
-    phd_exp: Callable, tmp_path: Path, words: tuple[str, ...], said: str
+@pytest.mark.parametrize(("words", "line", "said"), MISTAKES, ids=[said for _, _, said in MISTAKES])
+def test_a_mistake_is_one_line(
+    phd_exp: Callable, tmp_path: Path, words: tuple[str, ...], line: dict[str, Any], said: str
 ) -> None:
-    write(tmp_path, [{"file_name": "a.png", "f": 400, "scene": 1, "pose": POSE}])
+    """In the line of a view, or in the arguments."""
+    write(tmp_path, [{"file_name": "a.png", "f": 400} | line])
     outcome = phd_exp("fuse", *words)
     assert (outcome.status, outcome.out) == (1, "")
     (complaint,) = outcome.err.splitlines()
+    assert complaint.startswith("error: ")
     assert said in complaint
 
 

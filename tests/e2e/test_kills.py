@@ -14,7 +14,7 @@ from PIL import Image
 
 from phd_exp.__main__ import main
 from phd_exp.records.runs import RunFolder
-from tests.reports.site.conftest import write_runs
+from tests.support.site_runs import write_runs
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 

@@ -1,4 +1,4 @@
-"""Distances from calibration lie where calibrated predictions have them, as often as the reference interval says."""
+"""The reference interval contains the distances of calibrated predictions as often as it claims."""
 
 import numpy as np
 import pytest
@@ -7,15 +7,15 @@ import torch
 from phd_exp.distributions.columns import distribution_columns, draws
 from phd_exp.evaluation.reference import DISTANCES, calibrated_reference
 from phd_exp.metrics.calibration_scores import exact_scores
-from tests.reports.site.synthetic import calibrated, truths
+from tests.support.synthetic import calibrated, truths
 
-TIMES = 150
+TIMES = 100
 
 
 @pytest.mark.parametrize("n", [60, pytest.param(250, marks=pytest.mark.slow)])
 def test_calibrated_models_lie_in_the_interval_95_times_of_100(n: int) -> None:
     prediction = calibrated(truths(n, seed=1)[0], a=20.0, A=600.0, overconfidence=1.0, seed=3)
-    reference = calibrated_reference(prediction, simulations=400)
+    reference = calibrated_reference(prediction, simulations=200)
     inside, below = dict.fromkeys(DISTANCES, 0), dict.fromkeys(DISTANCES, 0)
     for truth in draws(prediction, TIMES, seed=5):
         scores = exact_scores(distribution_columns(prediction, truth))

@@ -7,7 +7,7 @@ from torch import Tensor
 from phd_exp.fusion import fuse
 from phd_exp.fusion.certificate import certify
 from phd_exp.fusion.problems import Problems
-from tests.fusion.random_problems import random_problems
+from tests.support.random_problems import random_problems
 
 
 def certified(problems: Problems, v: Tensor, lam: Tensor) -> Tensor:

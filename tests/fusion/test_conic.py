@@ -4,19 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from phd_exp.distributions import ProjectedHuber
-from phd_exp.fusion import Plane, Pose, Status, fuse
-from tests.fusion.conic import Camera, Program
-from tests.fusion.random_problems import columns_of, random_problems
+from phd_exp.fusion import Plane, Status, fuse
+from tests.support.conic import Camera, Program, cameras_of
+from tests.support.random_problems import random_problems
 
 AGREE = 1e-6  # metres
-
-
-def cameras_of(predictions: ProjectedHuber, pose: Pose) -> list[list[Camera]]:
-    columns = (*columns_of(predictions), pose.R, pose.t)
-    arrays = [column.numpy() for column in columns]
-    problems, cameras = predictions.batch_shape
-    return [[Camera(*(array[i, j] for array in arrays)) for j in range(cameras)] for i in range(problems)]
 
 
 def energy(cameras: list[Camera], v: np.ndarray) -> np.longdouble:
@@ -51,7 +43,7 @@ def conic_optimum(
 
 
 def compare(n: int, cameras: int, seed: int, on_plane: bool) -> tuple[np.ndarray, int, int]:
-    """Distances between the optima (metres), how many kinks hold ours, and how often Clarabel's energy is lower."""
+    """Distances between the optima (metres), the kinks at ours, and how often Clarabel's energy is lower."""
     predictions, pose, truth = random_problems(n, cameras, seed)
     generator = torch.Generator().manual_seed(seed)
     normal = torch.randn(n, 3, generator=generator, dtype=torch.float64)

@@ -2,16 +2,15 @@
 
 import pytest
 import torch
+from scipy import stats
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion import Fused, Plane, Pose, fuse
-from tests.fusion.random_problems import columns_of, random_problems
+from tests.support.random_problems import columns_of, random_problems
 
 LEVELS = (0.5, 0.9, 0.99)
-RADII = torch.tensor(
-    [2.365974, 6.251389, 11.344867], dtype=torch.float64
-)  # quantiles of chi-square, 3 degrees
+RADII = torch.from_numpy(stats.chi2.ppf(LEVELS, 3))
 
 
 def log_density(predictions: ProjectedHuber, pose: Pose, v: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """The smooth stand-in for max(t, 1/t), and the compiled code that is kept on disk."""
 
-import importlib.util
+import importlib
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +21,7 @@ def stand_in(t: np.ndarray, width: float, least: float = LEAST) -> np.ndarray:
 def test_the_stand_in_is_convex_also_across_zero(width: float) -> None:
     """Along random chords."""
     random = np.random.default_rng(0)
-    one, other, share = (
-        random.uniform(-0.5, 2.5, 2000),
-        random.uniform(-0.5, 2.5, 2000),
-        random.uniform(size=2000),
-    )
+    (one, other), share = random.uniform(-0.5, 2.5, (2, 2000)), random.uniform(size=2000)
     chord = (1 - share) * stand_in(one, width) + share * stand_in(other, width)
     assert (stand_in((1 - share) * one + share * other, width) <= chord * (1 + 1e-12)).all()
 
@@ -65,14 +61,13 @@ def function(sources):
 """
 
 
-def test_numba_compiles_anew_what_closes_over_another_text(tmp_path: Path) -> None:
+def test_numba_compiles_anew_what_closes_over_another_text(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """On this rests that no change of the sources leaves old compiled code in use."""
-    (tmp_path / "module.py").write_text(MODULE)
-    spec = importlib.util.spec_from_file_location("module", tmp_path / "module.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    (tmp_path / "module_of_numba.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    module = importlib.import_module("module_of_numba")
     for sources, hits in (("one", 0), ("one", 1), ("other", 0), ("other", 1)):
         following = module.function(sources)
         assert following(1) == 2

@@ -1,25 +1,33 @@
 """Poses and planes."""
 
+import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 from phd_exp.fusion import Plane, Pose
 from phd_exp.records import scenes
-from tests.fusion.random_problems import rotations
+from tests.support.random_problems import rotations
 
 
 def test_a_scene_record_becomes_the_motion_it_describes() -> None:
-    """Against scipy's rotations."""
-    quaternions = Rotation.random(10, random_state=0).as_quat(scalar_first=True)
-    records = [
-        scenes.Pose(rotation=tuple(quaternion), translation=(1.0, -2.0, i))
-        for i, quaternion in enumerate(quaternions.tolist())
+    """v -> q v q* + t with the product of quaternions; records need not keep unit length."""
+
+    def product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+        return np.array(
+            [p[0] * q[0] - p[1:] @ q[1:], *(p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:]))]
+        )
+
+    draw = np.random.default_rng(0)
+    quaternions = draw.standard_normal((10, 4))
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    t, v = draw.standard_normal((2, 10, 3))
+    pairs = zip((quaternions * (1 + 1e-7)).tolist(), t.tolist(), strict=True)
+    pose = Pose.from_scene([scenes.Pose(rotation=tuple(q), translation=tuple(t)) for q, t in pairs])
+    turned = [
+        product(product(q, np.array([0, *x])), q * [1, -1, -1, -1])[1:]
+        for q, x in zip(quaternions, v, strict=True)
     ]
-    pose = Pose.from_scene(records)
-    expected = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
-    torch.testing.assert_close(pose.R, torch.from_numpy(expected))
-    assert pose.t[3].tolist() == [1, -2, 3]
+    np.testing.assert_allclose(pose.into_camera(torch.from_numpy(v)), turned + t, rtol=1e-12, atol=1e-12)
     assert bool(pose.is_rigid.all())
 
 

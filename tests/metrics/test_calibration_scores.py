@@ -1,6 +1,6 @@
-"""Every score on predictions of known calibration: perfect, twice too certain or too cautious, off by a deviation.
+"""Every score on predictions of known calibration: perfect, off by a factor of 2, biased by a deviation.
 
-Where the depth law is Laplace's with the scale b, theory gives the values.
+The expected values are those of a Laplace law of depth with the scale b.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""One table from batches and processes, whatever their sizes and order."""
+"""One table from batches and processes of any size and order."""
 
 from collections.abc import Sequence
 

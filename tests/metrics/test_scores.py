@@ -1,15 +1,20 @@
-"""Scores against plain loops and where theory gives them."""
+"""Scores against plain loops and theory."""
 
 import numpy as np
 import pytest
 import torch
 
 from phd_exp.metrics.ordered import in_order_of
-from phd_exp.metrics.scores import energy_score, risk_at, risk_coverage
+from phd_exp.metrics.scores import RiskCoverage, energy_score, risk_at, risk_coverage
 
 
 def numbers(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def curve_of(uncertainty: torch.Tensor, error: torch.Tensor) -> RiskCoverage:
+    columns = {"error": error}
+    return risk_coverage(in_order_of(uncertainty, columns), in_order_of(error, columns), "error")
 
 
 def test_energy_score_equals_a_loop_over_pairs() -> None:
@@ -43,7 +48,7 @@ def test_energy_score_needs_two_draws() -> None:
 
 def test_risk_coverage_equals_a_loop() -> None:
     uncertainty, error = numbers(200).exp(), numbers(200, seed=1).square()
-    curve = risk_coverage(uncertainty, error)
+    curve = curve_of(uncertainty, error)
     ordered = error.numpy()[np.argsort(uncertainty.numpy())]
     risk = [ordered[: k + 1].mean() for k in range(200)]
     best = np.sort(error.numpy())
@@ -56,7 +61,7 @@ def test_risk_coverage_equals_a_loop() -> None:
 
 def test_risk_at_a_coverage_is_on_the_curve() -> None:
     uncertainty, error = numbers(200).exp(), numbers(200, seed=1).square()
-    curve = risk_coverage(uncertainty, error)
+    curve = curve_of(uncertainty, error)
     ordered = in_order_of(uncertainty, {"error": error})
     torch.testing.assert_close(risk_at(ordered, "error", curve.coverage), curve.risk)
     first = curve.risk[0].item()  # less than one sample is that sample
@@ -72,15 +77,13 @@ def test_ties_count_as_if_in_random_order() -> None:
         order = shuffled[np.argsort(uncertainty.numpy()[shuffled], kind="stable")]
         areas.append(np.mean(np.cumsum(error.numpy()[order]) / np.arange(1, 61)))
     standard_error = np.std(areas) / 4000**0.5
-    assert risk_coverage(uncertainty, error).area.item() == pytest.approx(
-        np.mean(areas), abs=4 * standard_error
-    )
+    assert curve_of(uncertainty, error).area.item() == pytest.approx(np.mean(areas), abs=4 * standard_error)
 
 
-def test_excess_is_zero_for_an_oracle_and_one_for_what_knows_nothing() -> None:
+def test_excess_is_zero_for_an_oracle_and_one_for_a_random_order() -> None:
     error = numbers(4000).square()
-    assert risk_coverage(3 * error + 1, error).excess.item() == pytest.approx(0)
-    assert risk_coverage(torch.ones(4000), error).excess.item() == pytest.approx(1)
-    assert risk_coverage(numbers(4000, seed=5), error).excess.item() == pytest.approx(1, abs=0.05)
-    assert risk_coverage(-error, error).excess.item() > 1.5
-    assert risk_coverage(error + numbers(4000, seed=6).abs(), error).excess.item() < 0.5
+    assert curve_of(3 * error + 1, error).excess.item() == pytest.approx(0)
+    assert curve_of(torch.ones(4000), error).excess.item() == pytest.approx(1)
+    assert curve_of(numbers(4000, seed=5), error).excess.item() == pytest.approx(1, abs=0.05)
+    assert curve_of(-error, error).excess.item() > 1.5
+    assert curve_of(error + numbers(4000, seed=6).abs(), error).excess.item() < 0.5

@@ -1,4 +1,4 @@
-"""The notebooks are what they say they are, prose and calls with their outputs, and they run."""
+"""The notebooks contain prose, calls and their outputs, and they run."""
 
 import ast
 import json
@@ -38,15 +38,11 @@ def test_they_are_numbered() -> None:
     assert [name[:3] for name in NAMES] == [f"{place:02d}_" for place in range(1, len(NAMES) + 1)] != []
 
 
-@pytest.mark.parametrize(
-    "source", ["def f(): pass", "class A: pass", "f = lambda: 1", "if 1:\n  def f(): pass"]
-)
-def test_a_definition_is_seen(source: str) -> None:
-    assert defines(source)
-
-
-def test_a_call_is_no_definition() -> None:
+def test_definitions_and_absolute_paths_are_recognised() -> None:
+    assert all(map(defines, ("def f(): pass", "class A: pass", "f = lambda: 1", "if 1:\n  def f(): pass")))
     assert not defines("figure = draw(sorted([1], key=lambda x: -x))")
+    assert all(ABSOLUTE.search(text) for text in ("'/home/me/runs'", "at /tmp/x.png", "C:\\\\runs"))
+    assert not ABSOLUTE.search("runs/small, m/px and </td>")
 
 
 @pytest.mark.parametrize("file", FILES, ids=NAMES)
@@ -71,7 +67,7 @@ def test_it_was_executed_from_top_to_bottom_without_an_error(file: Path) -> None
 
 
 @pytest.mark.parametrize("file", FILES, ids=NAMES)
-def test_it_says_nothing_of_when_and_where(file: Path) -> None:
+def test_it_records_neither_time_nor_place(file: Path) -> None:
     notebook = read(file)
     assert set(notebook.metadata) == {"kernelspec", "language_info"}
     assert notebook.metadata.kernelspec.name == "python3"
@@ -80,11 +76,6 @@ def test_it_says_nothing_of_when_and_where(file: Path) -> None:
         for output in cell.get("outputs", []):
             output.get("data", {}).pop("image/png", None)
     assert not ABSOLUTE.search(json.dumps(notebook))
-
-
-def test_an_absolute_path_is_seen() -> None:
-    assert all(ABSOLUTE.search(text) for text in ("'/home/me/runs'", "at /tmp/x.png", "C:\\\\runs"))
-    assert not ABSOLUTE.search("runs/small, m/px and </td>")
 
 
 def test_all_together_are_light() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from phd_exp.cli.paths import conf_folder
+from phd_exp.cli import conf_folder
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,7 @@ from scipy import stats
 from phd_exp.evaluation.point_errors import ErrorKey, SampleMean, difference
 from phd_exp.reports.cells import Cell, interval, make_cell
 from phd_exp.reports.runs import read_report
-from tests.reports.recorded import by_hand, predicted, record
+from tests.support.recorded import by_hand, predicted, record
 
 KEY = ErrorKey("median", "central", "depth")
 
@@ -42,14 +42,11 @@ def test_one_seed_against_a_hand_computation(tmp_path: Path) -> None:
     assert cell.interval.kind == "normal_over_samples"
     assert cell.interval.half_width == pytest.approx(1.959963984540054 * stats.sem(values), rel=1e-9)
     assert cell.means[0].n == len(values)
+    single = interval([SampleMean(1, 12.0, None)])
+    assert (single.mean, *single.ends, single.kind) == (12.0, None, None, "none")
 
 
-def test_one_sample_of_one_seed_has_no_interval() -> None:
-    found = interval([SampleMean(1, 12.0, None)])
-    assert (found.mean, *found.ends, found.kind) == (12.0, None, None, "none")
-
-
-def test_the_interval_covers_as_often_as_it_says() -> None:
+def test_the_interval_covers_as_often_as_it_claims() -> None:
     """Three seeds a time, 4000 times, from a known law: 95 % of the intervals hold its mean."""
     random = np.random.default_rng(0)
     held = 0
@@ -69,7 +66,7 @@ def test_gaps_are_named_and_the_rest_is_averaged(tmp_path: Path) -> None:
     assert cell.interval is not None
 
 
-def test_a_cell_without_a_number_says_why(tmp_path: Path) -> None:
+def test_a_cell_without_a_number_has_a_reason(tmp_path: Path) -> None:
     assert made(tmp_path, (0,)).state == "missing"
     drawn = predicted(0)
     record(tmp_path, "occl", "probabilistic", 0, drawn.frame[(np.abs(drawn.v_p) > 0.5).any(axis=1)])
@@ -78,7 +75,7 @@ def test_a_cell_without_a_number_says_why(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seeds", [2, 3, 5])
-def test_models_of_one_law_are_rarely_told_apart_and_others_are(seeds: int) -> None:
+def test_equal_models_are_rarely_separated_and_different_ones_often(seeds: int) -> None:
     """Means of two models on shared images, 300 times: errors of images are shared, those of trainings are not."""
     random = np.random.default_rng(seeds)
     counts = random.multinomial(80, [1 / 80] * 80, 200) / 80

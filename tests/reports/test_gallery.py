@@ -1,4 +1,4 @@
-"""Which pictures a gallery shows, where things lie in them, and what it never opens."""
+"""The choice of pictures, the positions in them, and the files that are never opened."""
 
 from pathlib import Path
 
@@ -12,14 +12,13 @@ from phd_exp.records.errors import RunError
 from phd_exp.reports.gallery import (
     EACH,
     LARGEST,
-    _ticks,
     birds_eye_view,
     close_up,
     curves_of,
     load_image,
     make_gallery,
 )
-from tests.reports.site.synthetic import write_run
+from tests.support.synthetic import write_run
 
 
 @pytest.fixture(scope="module")
@@ -56,29 +55,22 @@ def test_marks_lie_where_the_camera_sees_them(table: Columns) -> None:
         np.testing.assert_allclose(mark, on_image(u, float(table["f"][place]), 224.0), atol=0.01)
 
 
-@pytest.mark.parametrize(
-    ("low", "high"), [(0, 1), (-0.3, 0.31), (2.9, 17.3), (1e-4, 1.3e-4), (-900, 40), (3, 3.5)]
-)
-def test_ticks_are_few_and_round(low: float, high: float) -> None:
-    places, texts = zip(*_ticks(low, high), strict=True)
-    assert 2 <= len(places) <= 6
-    assert all(low <= place <= high for place in places)
-    assert [float(text.replace("−", "-")) for text in texts] == pytest.approx(places)
-    assert len(set(texts)) == len(texts)
-
-
-def test_the_birds_eye_view_places_ticks_and_marks_on_one_scale(row: dict) -> None:
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 7.0, 300.0])
+def test_the_birds_eye_view_has_few_round_ticks_on_the_scale_of_its_marks(row: dict, scale: float) -> None:
     curves = curves_of(row)
     assert curves is not None
-    view = birds_eye_view(curves, np.array([row["x"], row["y"], row["z"]]))
-    for place, ticks, value in ((0, view.x_ticks, row["x"]), (1, view.z_ticks, row["z"])):
-        at, text = zip(*ticks, strict=True)
-        values = [float(label.replace("−", "-")) for label in text]
+    truth = curves.mode + scale * np.array([0.3, 0.0, -0.7])
+    view = birds_eye_view(curves, truth)
+    for place, ticks, value in ((0, view.x_ticks, truth[0]), (1, view.z_ticks, truth[2])):
+        at, texts = zip(*ticks, strict=True)
+        assert 2 <= len(set(texts)) == len(texts) <= 6
+        values = [float(text.replace("−", "-")) for text in texts]
         slope, offset = np.polyfit(values, at, 1)
+        np.testing.assert_allclose(slope * np.array(values) + offset, at, atol=0.02)
         assert view.truth[place] == pytest.approx(slope * value + offset, abs=0.05)
 
 
-def test_only_what_lies_close_together_is_enlarged() -> None:
+def test_only_close_points_have_a_close_up() -> None:
     near = np.array([[100.0, 50.0], [110.0, 52.0]])
     left, top, side = close_up(near, 224.0) or (0, 0, 0)
     assert (near >= (left, top)).all()
@@ -87,7 +79,7 @@ def test_only_what_lies_close_together_is_enlarged() -> None:
     assert close_up(np.array([[np.nan, 0.0], [1.0, 1.0]]), 224.0) is None
 
 
-def test_images_are_read_from_their_folder_alone(tmp_path: Path) -> None:
+def test_only_images_of_their_folder_are_read(tmp_path: Path) -> None:
     folder = tmp_path / "test"
     folder.mkdir()
     Image.new("RGB", (1000, 500)).save(folder / "large.png")
@@ -100,10 +92,10 @@ def test_images_are_read_from_their_folder_alone(tmp_path: Path) -> None:
 
 
 def test_a_table_without_its_columns_is_one_line(table: Columns) -> None:
-    with pytest.raises(RunError, match="lack the column file_name, f; run the model again"):
+    with pytest.raises(RunError, match="no column file_name, f, as in older records; run the model again"):
         make_gallery({name: table[name] for name in table if name not in ("file_name", "f")}, {})
 
 
-def test_numbers_that_are_no_distribution_have_no_curves(row: dict) -> None:
+def test_parameters_of_no_distribution_have_no_curves(row: dict) -> None:
     assert curves_of(row | {"a": -1.0}) is None
     assert curves_of(row | {"A_xx": float("nan")}) is None

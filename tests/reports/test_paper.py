@@ -1,6 +1,7 @@
 """What the paper prints, and the bounds recomputed."""
 
 import math
+from itertools import product
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from phd_exp.reports.paper import LAYOUTS, PUBLISHED, bound_mm, published_mm
 
 
 def bound_of_a_ratio(low: float, high: float) -> float:
-    """Least expected |z - z^|, mm, for z ~ U(3, 5) of which r = s / z alone is seen, s ~ U(low, high).
+    """Least expected |z - z^|, mm, for z ~ U(3, 5) if r = s / z alone is observed, s ~ U(low, high).
 
     Given r, z has a density proportional to z between max(3, low / r) and min(5, high / r): its median is the root
     mean square of these bounds. The joint density of (z, r) is z / (2 (high - low)).
@@ -27,17 +28,12 @@ def bound_of_a_ratio(low: float, high: float) -> float:
     return 1000 * value
 
 
-def test_the_bound_where_size_is_unknown() -> None:
+def test_bounds_equal_an_integral() -> None:
     assert pytest.approx(bound_of_a_ratio(0.8, 1.2), abs=0.5) == paper.UNKNOWN_SIZE
-
-
-def test_the_bound_where_focal_length_is_unknown() -> None:
     assert pytest.approx(bound_of_a_ratio(1200, 2000), abs=0.5) == paper.UNKNOWN_F
-
-
-def test_the_bound_of_knowing_nothing() -> None:
-    # z ~ U(3, 5): the mean distance to its median 4 is a quarter of its range
-    assert paper.GUESS == 1000 * (5 - 3) / 4
+    assert (
+        paper.GUESS == 1000 * (5 - 3) / 4
+    )  # the mean distance of U(3, 5) from its median is a quarter of its range
 
 
 def test_the_bound_where_size_and_focal_length_are_unknown() -> None:
@@ -58,20 +54,12 @@ def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
     return float(values[order][np.searchsorted(total, total[-1] / 2)])
 
 
-def test_bounds_bind_those_alone_that_know_no_more() -> None:
+def test_bounds_apply_only_to_models_with_as_little_information() -> None:
     models, sets = ("mae_vz", "probabilistic", "mae_xyz"), ("default", "occl", "scale", "occl_scale")
-    bound = {
-        (model, data, sees_f): value
-        for model in models
-        for data in sets
-        for sees_f in (False, True)
-        if (value := bound_mm(model, data, "depth", sees_f))
-    }
-    on_scale = {
-        (model, "scale", sees_f): 291 if sees_f else 336 for model in models for sees_f in (False, True)
-    }
-    assert bound == on_scale | {("mae_xyz", "default", sees_f): 331 for sees_f in (False, True)}
-    assert bound_mm("probabilistic", "scale", "projected", True) is None
+    for model, data, sees_f in product(models, sets, (False, True)):
+        expected = {"scale": 291 if sees_f else 336, "default": 331 if model == "mae_xyz" else None}.get(data)
+        assert bound_mm(model, data, "depth", sees_f) == expected
+        assert bound_mm(model, data, "projected", sees_f) is None
 
 
 def test_every_published_figure_has_its_place() -> None:

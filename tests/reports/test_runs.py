@@ -1,8 +1,9 @@
-"""Runs and how they stand, from records alone."""
+"""Runs and their states, from records alone."""
 
 import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -13,8 +14,8 @@ from phd_exp.records.runs import RunFolder
 from phd_exp.reports import measured as measured_module
 from phd_exp.reports.measured import Measured
 from phd_exp.reports.runs import Run, read_report
-from tests.reports.recorded import predicted, record
-from tests.reports.site.synthetic import write_run
+from tests.support.recorded import predicted, record
+from tests.support.synthetic import write_run
 
 DEPTH = ErrorKey("mode", "whole", "depth")
 
@@ -34,29 +35,29 @@ def unfinished(runs: Path, error: BaseException) -> RunFolder:
 
 def test_a_finished_run_has_its_errors(tmp_path: Path) -> None:
     record(tmp_path, "occl", "probabilistic", 3, predicted(0).frame)
-    run = only(tmp_path)
+    record(tmp_path, "scale", "mae_vz", 0, predicted(0, probabilistic=False).frame)
+    run, baseline = read_report(tmp_path).runs
     assert (run.preset, run.data, run.model, run.seed) == ("small", "occl", "probabilistic", 3)
-    assert (run.state, run.overrides, run.detail) == ("finished", None, "")
-    assert len(run.errors) == 12
+    assert (run.state, run.overrides, run.detail, len(run.errors)) == ("finished", None, "", 12)
     assert run.nll is not None
+    assert {key.estimate for key in baseline.errors} == {"mode"}
+    assert baseline.nll is None
 
 
-def test_a_baseline_has_one_estimate_and_no_nll(tmp_path: Path) -> None:
-    record(tmp_path, "occl", "mae_vz", 0, predicted(0, probabilistic=False).frame)
+@pytest.mark.parametrize(
+    ("error", "state", "detail"),
+    [
+        (ValueError("odd\nnumber"), "failed", "ValueError: odd number"),
+        (KeyboardInterrupt(), "interrupted", None),
+    ],
+)
+def test_an_unfinished_run_has_its_reason_on_one_line(
+    tmp_path: Path, error: BaseException, state: str, detail: str | None
+) -> None:
+    unfinished(tmp_path, error)
     run = only(tmp_path)
-    assert {key.estimate for key in run.errors} == {"mode"}
-    assert run.nll is None
-
-
-def test_a_failed_run_says_why_on_one_line(tmp_path: Path) -> None:
-    unfinished(tmp_path, ValueError("odd\nnumber"))
-    run = only(tmp_path)
-    assert (run.state, run.detail, run.errors) == ("failed", "ValueError: odd number", {})
-
-
-def test_a_stopped_run_is_interrupted(tmp_path: Path) -> None:
-    unfinished(tmp_path, KeyboardInterrupt())
-    assert only(tmp_path).state == "interrupted"
+    assert (run.state, run.errors) == (state, {})
+    assert detail in (None, run.detail)
 
 
 def test_a_killed_run_does_not_look_alive(tmp_path: Path) -> None:
@@ -70,7 +71,7 @@ def test_a_killed_run_does_not_look_alive(tmp_path: Path) -> None:
     assert only(tmp_path).state == "interrupted"
 
 
-def test_a_lock_that_cannot_be_tried_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lock_that_cannot_be_tried_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = unfinished(tmp_path, ValueError())
     status = folder.status()
     assert status is not None
@@ -99,50 +100,38 @@ def test_runs_with_other_overrides_are_apart_and_say_which(tmp_path: Path) -> No
     assert chosen[0].folder.path == plain.path
 
 
-def test_how_a_run_was_computed_sets_it_apart_from_none(tmp_path: Path) -> None:
-    """A run with other threads, workers, logger or progress bar stands in its table."""
-    shared = {
-        "optimizer": {"lr": 0.1},
-        "trainer": {"threads": None, "progress_bar": True},
-        "logger": {"kind": "wandb"},
-    }
-    other = {
-        "optimizer": {"lr": 0.1},
-        "trainer": {"threads": 1, "progress_bar": False},
-        "logger": {"kind": "none"},
-    }
-    record(tmp_path, "occl", "mae_vz", 0, predicted(0).frame).write_config(shared)
-    record(tmp_path, "occl", "mae_vz", 1, predicted(1).frame, overrides=("trainer.threads=1",)).write_config(
-        other
-    )
+def test_settings_of_the_computation_are_not_overrides(tmp_path: Path) -> None:
+    """A run with other threads, logger or progress bar enters the tables."""
+    computed = ((None, True, "wandb"), (1, False, "none"))
+    for seed, (threads, bar, logger) in enumerate(computed):
+        overrides = ("trainer.threads=1",) if threads else ()
+        folder = record(tmp_path, "occl", "mae_vz", seed, predicted(seed).frame, overrides=overrides)
+        trainer = {"threads": threads, "progress_bar": bar}
+        folder.write_config({"optimizer": {"lr": 0.1}, "trainer": trainer, "logger": {"kind": logger}})
     assert list(read_report(tmp_path).at_defaults("small", "occl", "mae_vz")) == [1, 0]
 
 
-def test_of_another_class_the_name_is_told_and_what_both_take(tmp_path: Path) -> None:
+def test_another_class_is_named_with_the_arguments_of_both(tmp_path: Path) -> None:
     plain = {"_target_": "here.Muon", "lr": 0.1, "momentum": 0.9}
     other = {"_target_": "torch.optim.Adam", "lr": 0.2, "fused": True}
     for overrides, optimizer, often in (((), plain, 1), (("optimizer=adam",), other, 2)):
         run = record(tmp_path, "occl", "mae_vz", 0, predicted(0).frame, overrides=overrides)
-        # how often is measured changes no number
+        # the frequency of evaluation changes no number
         run.write_config({"optimizer": optimizer, "evaluation": {"every_n_epochs": often}})
     assert [run.overrides for run in read_report(tmp_path).runs] == [None, "optimizer=Adam, optimizer.lr=0.2"]
 
 
-def test_overrides_without_a_run_to_compare_with_are_not_guessed(tmp_path: Path) -> None:
+def test_overrides_are_unknown_without_a_run_to_compare_with(tmp_path: Path) -> None:
     record(tmp_path, "occl", "mae_vz", 0, predicted(1).frame, overrides=("optimizer.lr=0.5",))
     assert only(tmp_path).overrides == "unknown: there is no run without overrides to compare with"
 
 
 @pytest.mark.parametrize("leaf", ["seed", "seedx", "seed00", "seed1-xyz", "seed-1"])
-def test_a_folder_that_no_run_is_given_stays_out_of_the_tables(tmp_path: Path, leaf: str) -> None:
+def test_a_folder_with_another_name_enters_no_table(tmp_path: Path, leaf: str) -> None:
     folder = record(tmp_path, "occl", "mae_vz", 0, predicted(0).frame)
     folder.path.rename(folder.path.with_name(leaf))
     assert only(tmp_path).state == "unreadable"
     assert read_report(tmp_path).at_defaults("small", "occl", "mae_vz") == {}
-
-
-def test_no_runs_are_no_error(tmp_path: Path) -> None:
-    assert read_report(tmp_path).runs == ()
 
 
 def test_a_run_is_measured_again_where_it_has_changed(
@@ -150,13 +139,13 @@ def test_a_run_is_measured_again_where_it_has_changed(
 ) -> None:
     runs, kept = tmp_path / "runs", tmp_path / "kept"
     for data in ("default", "occl"):
-        write_run(runs, data, n=40, epochs=2)
+        write_run(runs, data, "mae_vz", n=40, epochs=2)
     measured: list[str] = []
     real = measured_module.measure
 
-    def counted(folder: RunFolder, config: dict[str, str]) -> Measured:
+    def counted(folder: RunFolder, *rest: Any) -> Measured:
         measured.append(folder.path.parent.parent.name)
-        return real(folder, config)
+        return real(folder, *rest)
 
     monkeypatch.setattr(measured_module, "measure", counted)
     first = read_report(runs, kept)
@@ -166,6 +155,6 @@ def test_a_run_is_measured_again_where_it_has_changed(
     texts = [[json.dumps(asdict(run.measured)) for run in report.runs] for report in (first, again)]
     assert texts[0] == texts[1]
     pd.read_parquet(predictions).iloc[1:].to_parquet(predictions)
-    (kept / "small-default-probabilistic-seed0.json").write_text("{")
+    (kept / "small-default-mae_vz-seed0.json").write_text("{")
     assert [run.measured.before.n for run in read_report(runs, kept).runs if run.measured.before] == [40, 39]
     assert measured == ["default", "occl"] * 2

@@ -1,8 +1,9 @@
-"""The paper's tables: every number against a hand computation, what is best, what is missing."""
+"""The paper's tables: every number against a hand computation, bold cells, missing runs."""
 
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
 
@@ -11,7 +12,7 @@ from phd_exp.reports.cells import make_cell
 from phd_exp.reports.paper_tables import paper_tables
 from phd_exp.reports.runs import Report, read_report
 from phd_exp.reports.table import Table, TableCell
-from tests.reports.recorded import DATA, ODD_PRESET, Predicted, both_tables, by_hand, fail, predicted, record
+from tests.support.recorded import DATA, ODD_PRESET, Predicted, both_tables, by_hand, fail, predicted, record
 
 PAPER = {
     ("mae_vz", "occl", "projected"): 22.8,
@@ -20,7 +21,7 @@ PAPER = {
     ("mae_xyz", "default", "projected"): 13.0,
     ("mae_constf", "default", "depth"): 325,
 }
-"""Some of the paper's figures, typed once more."""
+"""Some of the paper's figures, copied independently."""
 
 
 def one(found: list[Table], name: str, reading: str = "whole", preset: str = "small") -> Table:
@@ -102,10 +103,9 @@ def test_the_layout_is_the_papers(found: list[Table]) -> None:
     assert first.columns == DATA
     assert second.columns == ("projected error (mm)", "depth error (mm)")
     models, others, bounds = first.groups
+    labels = ("mae_vz", "mae_logz", "probabilistic (mode)")
     assert [row.stub for row in models] == [
-        (model, quantity)
-        for model in ("mae_vz", "mae_logz", "probabilistic (mode)")
-        for quantity in ("projected", "depth")
+        (name, error) for name in labels for error in ("projected", "depth")
     ]
     assert [row.stub[0] for row in others[::2]] == ["probabilistic (mean)", "probabilistic (median)"]
     assert [[cell.ours for cell in row.cells] for row in bounds] == [
@@ -113,20 +113,16 @@ def test_the_layout_is_the_papers(found: list[Table]) -> None:
         ["–", "–", "336", "–"],
         ["500"] * 4,
     ]
-    assert [row.stub for row in second.groups[0]] == [
-        ("mae_xyz",),
-        ("mae_constf",),
-        ("probabilistic (mode)",),
-    ]
+    assert [row.stub[0] for row in second.groups[0]] == ["mae_xyz", "mae_constf", "probabilistic (mode)"]
     assert [cell.ours for cell in second.groups[2][0].cells] == ["–", "331"]
     for table in found:
         assert all(len(row.cells) == len(table.columns) for row in table.rows)
         assert all(len(row.stub) == len(table.stub) for row in table.rows)
 
 
-def test_presets_have_tables_of_their_own(found: list[Table]) -> None:
+def test_each_preset_has_its_own_tables(found: list[Table]) -> None:
     assert [(table.preset, table.numbers[0]["table"], table.reading) for table in found] == [
-        (ODD_PRESET, "table2", "whole"),  # of Table 1 it has nothing
+        (ODD_PRESET, "table2", "whole"),  # it has no run of Table 1
         (ODD_PRESET, "table2", "central"),
         ("small", "table1", "whole"),
         ("small", "table1", "central"),
@@ -135,37 +131,43 @@ def test_presets_have_tables_of_their_own(found: list[Table]) -> None:
     ]
 
 
-def test_bold_is_what_a_paired_test_separates_from_every_other_model(tmp_path: Path) -> None:
+MODELS = ("mae_vz", "mae_logz", "probabilistic")
+EXTRA = dict.fromkeys(("mean_x", "mean_y", "mean_z", "mu_x", "mu_y", "median_z"), 4.0)
+
+
+def read(runs: Path, name: str = "table1", reading: str = "whole", preset: str = "small") -> Table:
+    return one(paper_tables(read_report(runs)), name, reading, preset)
+
+
+def peripheral(drawn: Predicted) -> pd.DataFrame:
+    """The samples outside the central half."""
+    return drawn.frame[(np.abs(drawn.v_p) > 0.5).any(axis=1)]
+
+
+def test_bold_cells_are_separated_from_every_other_model_by_a_paired_test(tmp_path: Path) -> None:
     """Three seeds a model on the same images; the third model is worse by far, the first two are alike."""
     drawn = [predicted(0, noise=noise, probabilistic=False) for noise in (0.02, 0.02, 0.2)]
-    for model, table in zip(("mae_vz", "mae_logz", "probabilistic"), drawn, strict=True):
+    for model, table in zip(MODELS, drawn, strict=True):
         for seed in range(3):
             scatter = np.random.default_rng([seed, len(model)]).normal(1, 1e-3, len(table.frame))
             columns = {name: table.frame[name] * scatter for name in ("mode_x", "mode_y", "mode_z")}
-            record(tmp_path, "occl", model, seed, table.frame.assign(**columns, **EXTRA))
-            if model != "mae_logz":
-                record(tmp_path, "scale", model, seed, table.frame.assign(**columns, **EXTRA))
-    table = one(paper_tables(read_report(tmp_path)), "table1")
+            for data in ("occl",) if model == "mae_logz" else ("occl", "scale"):
+                record(tmp_path, data, model, seed, table.frame.assign(**columns, **EXTRA))
+    found = read(tmp_path)
     for quantity in ("projected", "depth"):
-        assert place(table, "mae_vz", "scale", quantity).bold
-        assert not any(cell.bold for cell in (place(table, model, "occl", quantity) for model in MODELS))
-
-
-MODELS = ("mae_vz", "mae_logz", "probabilistic")
-EXTRA = dict.fromkeys(("mean_x", "mean_y", "mean_z", "mu_x", "mu_y", "median_z"), 4.0)
+        assert place(found, "mae_vz", "scale", quantity).bold
+        assert not any(place(found, model, "occl", quantity).bold for model in MODELS)
 
 
 def test_one_seed_is_never_bold(tmp_path: Path) -> None:
     for model, noise in (("mae_vz", 0.001), ("mae_logz", 0.5)):
         record(tmp_path, "occl", model, 0, predicted(0, noise=noise, probabilistic=False).frame)
-    assert not any(
-        cell.bold for row in one(paper_tables(read_report(tmp_path)), "table1").rows for cell in row.cells
-    )
+    assert not any(cell.bold for row in read(tmp_path).rows for cell in row.cells)
 
 
-def test_what_has_no_run_is_left_out_and_named(tmp_path: Path) -> None:
+def test_rows_and_columns_without_a_run_are_left_out_and_named(tmp_path: Path) -> None:
     record(tmp_path, "occl", "probabilistic", 0, predicted(0).frame)
-    table = one(paper_tables(read_report(tmp_path)), "table1")
+    table = read(tmp_path)
     assert table.columns == ("occl",)
     assert {row.stub[0].split()[0] for group in table.groups[:2] for row in group} == {"probabilistic"}
     assert "Left out of Table 1, without a run: default, scale, occl_scale, mae_vz, mae_logz." in table.notes
@@ -174,19 +176,17 @@ def test_what_has_no_run_is_left_out_and_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("focal_length", "bound"), [("known", 336), ("shown", 291)])
-def test_what_lies_below_its_bound_is_marked(tmp_path: Path, focal_length: str, bound: int) -> None:
-    drawn = predicted(0, noise=0.001)
-    run = record(tmp_path, "scale", "probabilistic", 0, drawn.frame)
+def test_means_below_their_bound_are_marked(tmp_path: Path, focal_length: str, bound: int) -> None:
+    run = record(tmp_path, "scale", "probabilistic", 0, predicted(0, noise=0.001).frame)
     run.write_config({"camera": {"focal_length": focal_length}})
-    report = read_report(tmp_path)
-    cell = make_cell(report, "small", "scale", "probabilistic", ErrorKey("mode", "whole", "depth"), [0])
-    assert cell.bound == bound
-    table = one(paper_tables(report), "table1")
+    key = ErrorKey("mode", "whole", "depth")
+    assert make_cell(read_report(tmp_path), "small", "scale", "probabilistic", key, [0]).bound == bound
+    table = read(tmp_path)
     assert place(table, "probabilistic", "scale", "depth").spread.endswith("†§")
     assert any(note.startswith("§") for note in table.notes)
 
 
-def test_what_is_missing_is_named_with_the_command_that_makes_it(found: list[Table]) -> None:
+def test_missing_runs_are_named_with_the_command_that_makes_them(found: list[Table]) -> None:
     table = one(found, "table1")
     assert [line.split(":")[0] for line in table.gaps] == [
         "mae_vz on scale (seed 1)",
@@ -195,8 +195,7 @@ def test_what_is_missing_is_named_with_the_command_that_makes_it(found: list[Tab
     assert place(table, "mae_logz", "occl", "depth").ours == "missing"
     assert place(table, "mae_vz", "scale", "depth").spread.endswith("†§‡")
     assert table.command.startswith("python -m phd_exp -m experiment=table1 preset=small seed=0,1 runs=")
-    assert one(found, "table2").gaps == ()
-    assert one(found, "table2").command == ""
+    assert (one(found, "table2").gaps, one(found, "table2").command) == ((), "")
 
 
 def test_every_state_is_named_in_its_cell(tmp_path: Path) -> None:
@@ -206,22 +205,19 @@ def test_every_state_is_named_in_its_cell(tmp_path: Path) -> None:
     status = running.status()
     assert status is not None
     running.write_status(status.model_copy(update={"state": "running"}))
-    drawn = predicted(0)
-    record(tmp_path, "scale", "mae_logz", 0, drawn.frame[(np.abs(drawn.v_p) > 0.5).any(axis=1)])
+    record(tmp_path, "scale", "mae_logz", 0, peripheral(predicted(0)))
     with running.held():
         found = paper_tables(read_report(tmp_path))
     row = one(found, "table1").rows[0]
     assert [cell.ours for cell in row.cells] == ["unreadable", "failed", "running"]
-    assert one(paper_tables(read_report(tmp_path)), "table1").rows[0].cells[2].ours == "interrupted"
+    assert read(tmp_path).rows[0].cells[2].ours == "interrupted"
     assert place(one(found, "table1", "central"), "mae_logz", "scale", "depth").ours == "no sample"
 
 
-def test_no_run_helps_where_no_sample_is_central(tmp_path: Path) -> None:
-    drawn = predicted(0)
-    frame = drawn.frame[(np.abs(drawn.v_p) > 0.5).any(axis=1)]
+def test_no_command_makes_central_samples(tmp_path: Path) -> None:
     for model in ("mae_xyz", "mae_constf", "probabilistic"):
-        record(tmp_path, "default", model, 0, frame)
-    table = one(paper_tables(read_report(tmp_path)), "table2", "central")
+        record(tmp_path, "default", model, 0, peripheral(predicted(0)))
+    table = read(tmp_path, "table2", "central")
     assert all("none of its test samples lies in the central half" in line for line in table.gaps)
     assert table.command == ""
 
@@ -230,53 +226,44 @@ def test_overrides_never_enter(tmp_path: Path) -> None:
     record(tmp_path, "occl", "mae_vz", 0, predicted(0).frame, overrides=("optimizer.lr=0.5",))
     assert paper_tables(read_report(tmp_path)) == []
     record(tmp_path, "occl", "mae_vz", 1, predicted(1).frame)
-    table = one(paper_tables(read_report(tmp_path)), "table1")
-    assert [line["n_seeds"] for line in table.numbers if line["model"] == "mae_vz"] == [1, 1]
+    assert [line["n_seeds"] for line in read(tmp_path).numbers if line["model"] == "mae_vz"] == [1, 1]
 
 
-def test_a_small_interval_does_not_print_as_nothing(tmp_path: Path) -> None:
+def test_a_small_interval_does_not_print_as_zero(tmp_path: Path) -> None:
     frame = predicted(0, probabilistic=False).frame
-    record(tmp_path, "occl", "mae_vz", 0, frame)
-    record(tmp_path, "occl", "mae_vz", 1, frame.assign(mode_z=frame["mode_z"] * (1 + 1e-6)))
-    record(tmp_path, "occl", "mae_logz", 0, frame)
-    record(tmp_path, "occl", "mae_logz", 1, frame)
-    table = one(paper_tables(read_report(tmp_path)), "table1")
-    spread = place(table, "mae_vz", "occl", "depth").spread
-    assert float(spread.removeprefix("±")) > 0
-    assert place(table, "mae_logz", "occl", "depth").spread == "±0"  # two seeds that are equal
+    for seed, factor in enumerate((1.0, 1 + 1e-6)):
+        record(tmp_path, "occl", "mae_vz", seed, frame.assign(mode_z=frame["mode_z"] * factor))
+        record(tmp_path, "occl", "mae_logz", seed, frame)
+    table = read(tmp_path)
+    assert float(place(table, "mae_vz", "occl", "depth").spread.removeprefix("±")) > 0
+    assert place(table, "mae_logz", "occl", "depth").spread == "±0"  # equal seeds
 
 
-def test_a_recipe_has_tables_of_its_own_and_a_command_that_makes_what_they_lack(tmp_path: Path) -> None:
-    record(tmp_path, "occl", "mae_vz", 0, predicted(0, n=30).frame, preset="small+strong")
+def test_a_recipe_has_its_own_tables_and_command(tmp_path: Path) -> None:
+    title = "The paper's Table 1, preset small"
+    for preset, titled, command in (
+        ("small+strong", f"{title}, recipe strong: ", " experiment=table1 preset=small recipe=strong runs="),
+        ("small", f"{title}: ", " experiment=table1 preset=small runs="),
+    ):
+        record(tmp_path, "occl", "mae_vz", 0, predicted(0, n=30).frame, preset=preset)
+        table = read(tmp_path, preset=preset)
+        assert table.title.startswith(f"{titled}the whole field of view")
+        assert command in table.command
+
+
+def test_the_title_has_the_number_of_test_samples(tmp_path: Path) -> None:
     record(tmp_path, "occl", "mae_vz", 0, predicted(0, n=30).frame)
-    found = paper_tables(read_report(tmp_path))
-    strong = one(found, "table1", preset="small+strong")
-    assert strong.title.startswith(
-        "The paper's Table 1, preset small, recipe strong: the whole field of view"
-    )
-    assert " experiment=table1 preset=small recipe=strong runs=" in strong.command
-    plain = one(found, "table1")
-    assert plain.title.startswith("The paper's Table 1, preset small: ")
-    assert " recipe=" not in plain.command
-
-
-def test_the_number_of_test_samples_is_said(tmp_path: Path) -> None:
-    record(tmp_path, "occl", "mae_vz", 0, predicted(0, n=30).frame)
-    (whole, *_) = paper_tables(read_report(tmp_path))
-    assert whole.title == "The paper's Table 1, preset small: the whole field of view, 30 test samples"
+    title = "The paper's Table 1, preset small: the whole field of view"
+    assert read(tmp_path).title == f"{title}, 30 test samples"
     record(tmp_path, "occl", "mae_logz", 0, predicted(0, n=50).frame)
-    (whole, *_) = paper_tables(read_report(tmp_path))
-    assert whole.title.endswith(", 30 to 50 test samples")
+    assert read(tmp_path).title == f"{title}, 30 to 50 test samples"
 
 
-def test_only_the_kinds_of_interval_that_occur_are_explained(tmp_path: Path) -> None:
-    record(tmp_path, "occl", "mae_vz", 0, predicted(0).frame)
-    (table, *_) = paper_tables(read_report(tmp_path))
-    said = " ".join(table.notes)
-    assert "standard errors" in said
-    assert "Student" not in said
-    record(tmp_path, "occl", "mae_vz", 1, predicted(1).frame)
-    (table, *_) = paper_tables(read_report(tmp_path))
-    said = " ".join(table.notes)
-    assert "standard errors" not in said
-    assert "Student" in said
+def test_only_the_intervals_that_occur_are_explained(tmp_path: Path) -> None:
+    for seed, (explained, other) in enumerate(
+        [("standard errors", "Student"), ("Student", "standard errors")]
+    ):
+        record(tmp_path, "occl", "mae_vz", seed, predicted(seed).frame)
+        notes = " ".join(read(tmp_path).notes)
+        assert explained in notes
+        assert other not in notes

@@ -1,14 +1,14 @@
-"""What single choices contribute: every number by hand, and what enters no table of it."""
+"""The contribution of single choices: every number by hand, and the runs that enter no table."""
 
 from pathlib import Path
 
 import pytest
 
-from phd_exp.reports.formats.files import write_tables
+from phd_exp.reports.files import write_tables
 from phd_exp.reports.runs import read_report
 from phd_exp.reports.table import Table
 from phd_exp.reports.variations import variation_tables
-from tests.reports.recorded import Predicted, by_hand, predicted, record
+from tests.support.recorded import Predicted, by_hand, predicted, record
 
 PLAIN = {"optimizer": {"lr": 0.1}, "recipe": {"localisation": 1}}
 VARIED = {"optimizer": {"lr": 0.5}, "recipe": {"localisation": 1}}
@@ -18,7 +18,7 @@ SEEDS = (0, 1)
 def held_out(
     runs: Path, config: dict, seed: int, number: int, noise: float, model: str = "probabilistic"
 ) -> Predicted:
-    """A finished run with these predictions of its held-out images; those of its test images are others."""
+    """A finished run with these predictions of its held-out images, and others of its test images."""
     overrides = () if config == PLAIN else ("optimizer.lr=0.5",)
     probabilistic = model == "probabilistic"
     tested = predicted(1000 + number, noise=1, probabilistic=probabilistic).frame
@@ -53,24 +53,18 @@ def test_numbers_are_of_the_held_out_images(drawn: dict, tmp_path: Path) -> None
             assert cell.spread == f"({min(values):.{digits}f} to {max(values):.{digits}f})"
 
 
-def test_a_difference_is_between_runs_of_one_seed(drawn: dict, tmp_path: Path) -> None:
+def test_a_difference_is_between_runs_of_the_same_seed(drawn: dict, tmp_path: Path) -> None:
+    held_out(tmp_path, VARIED, 2, 12, noise=0.3)  # a seed without a counterpart
     (plain,), (varied,) = only(tmp_path).groups
     nll = {key: table.frame["nll"].mean() for key, table in drawn.items()}
     differences = [nll[0.5, seed] - nll[0.1, seed] for seed in SEEDS]
+    assert varied.stub[1] == "0, 1, 2"
     assert varied.cells[3].ours == f"{sum(differences) / 2:+.2f}"
     assert varied.cells[3].spread == f"({min(differences):+.2f} to {max(differences):+.2f})"
     assert plain.cells[3].ours == ""
 
 
-def test_a_seed_that_has_no_counterpart_enters_no_difference(drawn: dict, tmp_path: Path) -> None:
-    held_out(tmp_path, VARIED, 2, 12, noise=0.3)
-    (_,), (varied,) = only(tmp_path).groups
-    assert varied.stub[1] == "0, 1, 2"
-    nll = {key: table.frame["nll"].mean() for key, table in drawn.items()}
-    assert varied.cells[3].ours == f"{sum(nll[0.5, seed] - nll[0.1, seed] for seed in SEEDS) / 2:+.2f}"
-
-
-def test_of_points_the_depth_error_is_compared(tmp_path: Path) -> None:
+def test_baselines_are_compared_by_depth_error(tmp_path: Path) -> None:
     plain, varied = (
         held_out(tmp_path, config, 0, number, noise, model="mae_vz")
         for number, (config, noise) in enumerate([(PLAIN, 0.02), (VARIED, 0.04)])
@@ -93,7 +87,7 @@ def test_the_best_comes_first(drawn: dict, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("broken", ["held_out", "state"])
-def test_what_is_not_finished_or_cannot_be_read_is_left_out(drawn: dict, tmp_path: Path, broken: str) -> None:
+def test_unfinished_and_unreadable_runs_are_left_out(drawn: dict, tmp_path: Path, broken: str) -> None:
     for run in read_report(tmp_path).runs:
         if run.overrides:
             file = run.folder.held_out if broken == "held_out" else run.folder.status_file
@@ -101,7 +95,7 @@ def test_what_is_not_finished_or_cannot_be_read_is_left_out(drawn: dict, tmp_pat
     assert variation_tables(read_report(tmp_path)) == []
 
 
-def test_files_are_named_by_what_they_are_about(drawn: dict, tmp_path: Path) -> None:
+def test_files_are_named_by_preset_data_and_model(drawn: dict, tmp_path: Path) -> None:
     folder = write_tables([only(tmp_path)], tmp_path / "report")
     assert {file.name for file in folder.iterdir()} == {
         "variations-small-occl-probabilistic.md",

@@ -1,4 +1,4 @@
-"""The site of all runs: written file by file, each whole, so that a report that is killed leaves pages that open."""
+"""Writes the site of all runs, each file atomically: an interrupted report leaves pages that open."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -18,19 +18,19 @@ _ASSETS = Path(__file__).parent / "assets"
 
 
 def write_site(report: Report, tables: Sequence[Table], figures: Sequence[str], site: Path) -> Path:
-    """Write the pages; returns `index.html`. Raises OSError where the folder cannot be written.
+    """Write the pages; returns `index.html`. Raises OSError if the folder cannot be written.
 
         site/
             index.html  compare.html
-            runs/<slug>.html           a page a run, with its pictures
-            data/<slug>.js             what its charts show; data/overview.js those of the overview
-            assets/                    scripts and style, shared by all pages
+            runs/<slug>.html           a page per run, with its pictures
+            data/<slug>.js             the data of its charts; data/overview.js those of the overview
+            assets/                    scripts and style of all pages
 
-    Pages name each other by relative paths, so that the folder can be moved.
+    Links are relative, so that the folder can be moved.
     """
     for folder in (site / "runs", site / "data", site / "assets"):
         folder.mkdir(parents=True, exist_ok=True)
-        remove_temporaries(folder)  # of a process that was killed
+        remove_temporaries(folder)  # of a killed process
     for asset in sorted(_ASSETS.iterdir()):
         write_atomic(site / "assets" / asset.name, asset.read_bytes())
     write_atomic(site / "assets" / "plotly.min.js", get_plotlyjs())
@@ -41,12 +41,15 @@ def write_site(report: Report, tables: Sequence[Table], figures: Sequence[str], 
     write_text(site / "data" / "overview.js", as_script("overview", {"charts": charts}))
     write_text(site / "compare.html", comparison_page(report.runs))
     write_text(site / "index.html", overview_page([one.run for one in drawn], tables, groups, figures))
-    _forget(site, {"overview", *(run.slug for run in report.runs)})
+    kept = {"overview", *(run.slug for run in report.runs)}
+    for file in [*(site / "runs").glob("*.html"), *(site / "data").glob("*.js")]:
+        if file.stem not in kept:
+            file.unlink()
     return site / "index.html"
 
 
 def _write_run(site: Path, place: int, run: Run, several: bool) -> Drawn:
-    """Inside the boundary of the run: where something of it cannot be drawn, its page says so without it."""
+    """Write the files of a run inside its boundary: its page reports what cannot be drawn."""
     notes = Notes(run.notes)
     drawn = Drawn.at(place, run, notes.attempt(lambda: run_charts(run)) or {})
     texts = notes.attempt(lambda: (run_page(drawn, several), run_script(drawn)))
@@ -57,10 +60,3 @@ def _write_run(site: Path, place: int, run: Run, several: bool) -> Drawn:
     write_text(site / "runs" / f"{run.slug}.html", texts[0])
     write_text(site / "data" / f"{run.slug}.js", texts[1])
     return drawn
-
-
-def _forget(site: Path, kept: set[str]) -> None:
-    """Remove what belongs to runs that are no longer there."""
-    for file in [*(site / "runs").glob("*.html"), *(site / "data").glob("*.js")]:
-        if file.stem not in kept:
-            file.unlink()

@@ -1,7 +1,7 @@
 """Charts as plain plotly figures: data and layout, in JSON.
 
-Colours are the style sheet's (`var(--series-1)`), so that a page can change them with its theme. A trace's `meta`
-says what the script needs to know: its `role`, and `low` and `high` of an interval, drawn as a band or as bars.
+Colours are those of the style sheet (`var(--series-1)`): they change with the theme of a page. The `meta` of a trace
+is for the script: its `role`, and `low` and `high` of an interval, drawn as a band or as bars.
 """
 
 import math
@@ -16,17 +16,12 @@ Numbers = Sequence[float | None]
 
 DASHES = ("solid", "dash", "dot", "dashdot")
 POINTS = 120
-"""Of a curve; more would only make pages heavy."""
+"""Most points of a curve; more would only make pages larger."""
 
 
 @dataclass(frozen=True)
 class Chart:
-    """One chart.
-
-    Attributes:
-        title: what it shows.
-        label: the same for those who do not see it, with the main numbers.
-    """
+    """One chart; `label` describes it to a screen reader, with the main numbers."""
 
     title: str
     label: str
@@ -35,7 +30,7 @@ class Chart:
 
 
 def axis(title: str, log: bool = False, **more: Any) -> dict[str, Any]:
-    """An axis of a layout: its title, linear or logarithmic, and whatever else plotly knows of one."""
+    """An axis of a layout, linear or logarithmic; `more` are further properties in plotly."""
     return {"title": {"text": title}, "type": "log" if log else "linear", **more}
 
 
@@ -44,18 +39,19 @@ def line(name: str, x: Numbers, y: Numbers, colour: int, *, dash: str = "solid",
     points = sum(value is not None for value in y)
     return {
         "type": "scatter",
-        "mode": "lines" if points > 1 else "markers",  # one point makes no line
+        "mode": "lines" if points > 1 else "markers",
         "connectgaps": True,  # not every epoch is evaluated
         "name": name,
         "x": _rounded(x),
         "y": _rounded(y),
         "line": {"color": f"var(--series-{colour})", "dash": dash, "width": 2},
-        "meta": {"role": "line"} | {key: _compact(value) for key, value in meta.items()},
+        "meta": {"role": "line"}
+        | {key: value if isinstance(value, str) else _rounded(value) for key, value in meta.items()},
     }
 
 
 def bars(name: str, x: Numbers, y: Sequence[str], colour: int, low: Numbers, high: Numbers) -> Trace:
-    """Points with intervals, one a category of the vertical axis."""
+    """Points with intervals, one per category of the vertical axis."""
     return {
         "type": "scatter",
         "mode": "markers",
@@ -68,25 +64,21 @@ def bars(name: str, x: Numbers, y: Sequence[str], colour: int, low: Numbers, hig
 
 
 def identity(low: float, high: float, name: str) -> Trace:
-    """The diagonal on which something calibrated lies."""
+    """The diagonal, on which calibrated values lie."""
     trace = line(name, (low, high), (low, high), 0, dash="dash", role="identity")
     trace["line"]["width"] = 1.5
     return trace
 
 
 def square(layout: dict[str, Any], low: float, high: float) -> dict[str, Any]:
-    """A layout whose axes both reach from low to high."""
+    """The layout with both axes from low to high."""
     log = layout["xaxis"]["type"] == "log"
     ends = [math.log10(low), math.log10(high)] if log else [low, high]
     return {name: given | {"range": ends} for name, given in layout.items()}
 
 
-def _compact(value: Any) -> Any:
-    return _rounded(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
-
-
 def _rounded(values: Numbers) -> list[float | None]:
-    """Five digits are more than any screen shows; JSON knows neither NaN nor infinity."""
+    """Rounded to five digits, with None for NaN and infinity, which JSON does not have."""
     return [None if v is None or not math.isfinite(v) else float(f"{v:.5g}") for v in values]
 
 
@@ -98,7 +90,12 @@ def curve_line(name: str, curve: Curve, colour: int, dash: str, role: str) -> Tr
 
 
 def thinned(n: int, points: int = POINTS) -> list[int]:
-    """Indices of at most `points` of n values, the first and the last among them."""
+    """Indices of at most `points` of n values, including the first and the last.
+
+    Example:
+        >>> thinned(9, points=3)
+        [0, 4, 8]
+    """
     if n <= points:
         return list(range(n))
     return [round(i * (n - 1) / (points - 1)) for i in range(points)]

@@ -1,4 +1,4 @@
-"""Charts of all runs together, from the charts of each: one colour and dash a run, named in the legend."""
+"""Charts of all runs together, from the charts of each: one colour and dash per run, named in the legend."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -23,20 +23,20 @@ class Drawn:
 
     @classmethod
     def at(cls, place: int, run: Run, charts: dict[str, dict[str, Chart]]) -> "Drawn":
-        """The run at a place among all: colours first, then dashes."""
+        """The run at a place among all runs; colours change first, then dashes."""
         return cls(run, charts, place % COLOURS + 1, DASHES[place // COLOURS % len(DASHES)])
 
 
 @dataclass(frozen=True)
 class Group:
-    """Charts that share a legend: the runs that they show."""
+    """Charts that share a legend of these runs."""
 
     charts: dict[str, Chart]
     runs: list[Drawn]
 
 
 def overview_groups(runs: Sequence[Drawn]) -> dict[str, Group]:
-    """Calibration and learning curves, a line a run; a group that would be empty is left out."""
+    """Calibration and learning curves with a line per run, without empty groups."""
     groups = {
         "calibration": ("calibration", "before", CALIBRATION),
         "learning": ("learning", "test", tuple(f"learning_{key}" for key in LEARNING)),
@@ -68,7 +68,7 @@ def _overlaid(runs: Sequence[Drawn], section: str, key: str, role: str) -> Chart
 
 
 def _in_words(traces: Iterable[Trace], key: str) -> str:
-    """Where the line of each run ends."""
+    """The last value of each run."""
     metric = METRICS.get(key.removeprefix("learning_"))
     ends = {
         trace["text"]: known[-1]
@@ -84,7 +84,7 @@ def _with_role(chart: Chart, role: str) -> list[Trace]:
 
 
 def _of_run(trace: Trace, one: Drawn) -> Trace:
-    """A run's line among those of others, without its band."""
+    """The line of a run in a chart of all runs, without its band."""
     return {
         **trace,
         "name": one.run.path,

@@ -1,6 +1,7 @@
-"""HTML of the pages; whatever comes from files is escaped."""
+"""HTML of the pages; all text from files is escaped."""
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -18,8 +19,6 @@ from phd_exp.reports.runs import Run
 from phd_exp.reports.site.overview import Drawn, Group
 from phd_exp.reports.table import Table
 
-_HERE = Path(__file__).parent
-
 
 @dataclass(frozen=True)
 class ScoreRow:
@@ -33,26 +32,19 @@ class ScoreRow:
     paper: float | None
 
 
-def _environment() -> Environment:
-    environment = Environment(
-        loader=FileSystemLoader(_HERE / "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["moment"] = _moment
-    environment.filters["duration"] = duration
-    environment.globals["score"] = quantity
-    environment.globals["headline"] = headline
-    return environment
-
-
 def _moment(moment: datetime) -> str:
     return f"{moment.astimezone(UTC):%Y-%m-%d %H:%M} UTC"
 
 
-_ENVIRONMENT = _environment()
+_ENVIRONMENT = Environment(
+    loader=FileSystemLoader(Path(__file__).parent / "templates"),
+    autoescape=True,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+_ENVIRONMENT.filters |= {"moment": _moment, "duration": duration}
+_ENVIRONMENT.globals |= {"score": quantity, "headline": headline}
 
 
 def overview_page(
@@ -63,7 +55,8 @@ def overview_page(
     for table in tables:
         kinds.setdefault(table.kind, []).append(table)
     paper = kinds.get("tables", [])
-    presets = sorted({table.preset for table in paper}, key=lambda name: -_runs_of(runs, name))
+    finished = Counter(run.preset for run in runs if run.state == "finished")
+    presets = sorted({table.preset for table in paper}, key=lambda name: -finished[name])
     return _ENVIRONMENT.get_template("overview.html").render(
         root="",
         several=len(runs) > 1,
@@ -73,13 +66,9 @@ def overview_page(
         groups=groups,
         figures=figures,
         overrides=any(run.overrides for run in runs),
-        finished=sum(run.state == "finished" for run in runs),
+        finished=finished.total(),
         choices={"preset": sorted({run.preset for run in runs}), "data": sorted({run.data for run in runs})},
     )
-
-
-def _runs_of(runs: Sequence[Run], preset: str) -> int:
-    return sum(run.preset == preset and run.state == "finished" for run in runs)
 
 
 def run_page(drawn: Drawn, several: bool) -> str:
@@ -91,16 +80,15 @@ def run_page(drawn: Drawn, several: bool) -> str:
         run=run,
         measured=run.measured,
         scores=_score_rows(run),
-        environment=_ran_on(run),
+        environment=_environment(run),
         charts=drawn.charts,
         fusion=fusion_table(run, run.measured.fusion) if run.measured.fusion else None,
     )
 
 
-def _ran_on(run: Run) -> dict[str, str]:
+def _environment(run: Run) -> dict[str, str]:
     """Machine, commit, data set and versions."""
-    status = run.status
-    if status is None:
+    if (status := run.status) is None:
         return {}
     known = {"machine": status.machine, "git commit": status.git_commit, "data set": status.data_manifest}
     return {name: value or "unknown" for name, value in known.items()} | status.versions
@@ -118,42 +106,47 @@ def _score_rows(run: Run) -> list[ScoreRow]:
     before, after = run.measured.before, run.measured.after
     if before is None:
         return []
-    published = PUBLISHED.get((run.model, run.data))
-    names = [name for name in SCORES if name in before.scores]
+    published = PUBLISHED.get((run.model, run.data), {})
+    paper = {f"{name}_error_mm": value for name, value in published.items()}
+    recalibrated = after.scores if after else {}
     return [
         ScoreRow(
             name,
-            SCORES[name],
+            score,
             before.scores[name],
-            after.scores.get(name) if after else None,
+            recalibrated.get(name),
             before.reference.get(name),
-            getattr(published, name, None),
+            paper.get(name),
         )
-        for name in names
+        for name, score in SCORES.items()
+        if name in before.scores
     ]
 
 
 def run_script(drawn: Drawn) -> str:
-    """What the charts of a run and the comparison show."""
+    """The data of a run's charts and of the comparison."""
     run, before = drawn.run, drawn.run.measured.before
     content = {
         "preset": run.preset, "data": run.data, "model": run.model, "run": run.name, "title": run.title,
         "images": run.measured.images, "config": dict(run.config),
         "scores": {row.key: asdict(row.before) for row in _score_rows(run)},
-        "resampled": _short(before.resampled) if before else {},
+        "resampled": {
+            name: [float(f"{value:.6g}") for value in values]
+            for name, values in (before.resampled if before else {}).items()
+        },
         "charts": {key: asdict(chart) for charts in drawn.charts.values() for key, chart in charts.items()},
     }  # fmt: skip
     return as_script(run.slug, content)
 
 
-def _short(resampled: Mapping[str, Sequence[float]]) -> dict[str, list[float]]:
-    return {name: [float(f"{value:.6g}") for value in values] for name, values in resampled.items()}
-
-
 def as_script(name: str, content: Any) -> str:
     """`phdExp.receive("<name>", {...});`, a script because pages opened as files may not fetch.
 
-    Safe in HTML and JavaScript: without <, >, & and line separators. NaN and infinity become null.
+    Safe in HTML and JavaScript: <, >, & and line separators are escaped; NaN and infinity become null.
+
+    Example:
+        >>> as_script("a", {"x": [1.5, float("nan")]})
+        'phdExp.receive("a", {"x":[1.5,null]});\\n'
     """
     finite = json.loads(json.dumps(content), parse_constant=lambda _: None)
     text = f"phdExp.receive({json.dumps(name)}, {json.dumps(finite, separators=(',', ':'))});\n"

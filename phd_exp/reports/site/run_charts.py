@@ -1,10 +1,10 @@
-"""The charts of one run: its calibration, its training, and where its errors are."""
+"""The charts of one run: calibration, training, and errors by stratum."""
 
 import re
-from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from phd_exp.evaluation.predictions import Curve, Evaluation
+from phd_exp.evaluation.predictions import Curve, Evaluation, Stratum
 from phd_exp.reports.figures import decades
 from phd_exp.reports.quantities import METRICS, Quantity, quantity
 from phd_exp.reports.runs import Run
@@ -23,7 +23,7 @@ from phd_exp.reports.site.fusion_charts import fusion_charts
 
 
 def run_charts(run: Run) -> dict[str, dict[str, Chart]]:
-    """The charts of a run by the section of its page; a section that would be empty is left out."""
+    """The charts of a run by the section of its page, without empty sections."""
     before, after, fusion = run.measured.before, run.measured.after, run.measured.fusion
     sections = {
         "calibration": calibration_charts(before, after) if before else {},
@@ -34,15 +34,13 @@ def run_charts(run: Run) -> dict[str, dict[str, Chart]]:
     return {name: charts for name, charts in sections.items() if charts}
 
 
-def calibration_charts(evaluation: Evaluation, after: Evaluation | None) -> dict[str, Chart]:
-    """The six charts of a distribution, of the predictions as they are and after recalibration."""
+def calibration_charts(before: Evaluation, after: Evaluation | None) -> dict[str, Chart]:
+    """The six charts of a distribution, of the predictions as recorded and after recalibration."""
     recalibrated = after.curves if after else {}
     return {
-        key: _calibration_chart(
-            kind, evaluation.curves[key], recalibrated.get(key) if kind.diagonal else None
-        )
+        key: _calibration_chart(kind, before.curves[key], recalibrated.get(key) if kind.diagonal else None)
         for key, kind in _KINDS.items()
-        if key in evaluation.curves
+        if key in before.curves
     }
 
 
@@ -51,80 +49,68 @@ class _Kind:
     title: str
     x: str
     y: str
-    diagonal: str = ""
+    diagonal: bool = True
     log: bool = False
 
 
+_KEPT = "share of predictions kept, surest first"
 _KINDS = {
     "depth_calibration": _Kind(
-        "Calibration of depth", "predicted variance (m²)", "mean squared error (m²)", "calibrated", log=True
+        "Calibration of depth", "predicted variance (m²)", "mean squared error (m²)", log=True
     ),
     "projected_calibration": _Kind(
         "Calibration of the projected position",
         "predicted variance of (x, y)/z",
         "mean squared error of (x, y)/z",
-        "calibrated",
         log=True,
     ),
-    "coverage": _Kind(
-        "Coverage of credible regions", "credible level", "share of truths inside", "calibrated"
-    ),
-    "depth_pit": _Kind("Depth PIT", "PIT of the true depth", "share of samples below", "calibrated"),
+    "coverage": _Kind("Coverage of credible regions", "credible level", "share of truths inside"),
+    "depth_pit": _Kind("Depth PIT", "PIT of the true depth", "share of samples below"),
     "depth_risk_coverage": _Kind(
-        "Depth: risk and coverage", "share of predictions kept, surest first", "mean error of depth (mm)"
+        "Depth: risk and coverage", _KEPT, "mean error of depth (mm)", diagonal=False
     ),
     "projected_risk_coverage": _Kind(
-        "Projection: risk and coverage",
-        "share of predictions kept, surest first",
-        "mean error of (x, y)/z (mrad)",
+        "Projection: risk and coverage", _KEPT, "mean error of (x, y)/z (mrad)", diagonal=False
     ),
 }
 
 
 def _calibration_chart(kind: _Kind, before: Curve, after: Curve | None) -> Chart:
-    traces = []
-    if kind.diagonal:
-        ends = (decades([*before.x, *before.y]) or (0.1, 1.0)) if kind.log else (0.0, 1.0)
-        traces.append(identity(*ends, kind.diagonal))
-    traces.append(curve_line("as predicted" if after else "predictions", before, 1, "solid", "before"))
+    traces = [curve_line("as predicted" if after else "predictions", before, 1, "solid", "before")]
+    label = f"{kind.title}: {kind.y} against {kind.x}. {_in_words(kind, before)}"
     if after:
         traces.append(curve_line("recalibrated", after, 2, "dash", "after"))
-    said = f"{kind.title}: {kind.y} against {kind.x}. {_in_words(kind, before)}"
-    if after:
-        said += f" Recalibrated: {_in_words(kind, after)}"
+        label += f" Recalibrated: {_in_words(kind, after)}"
     layout = {"xaxis": axis(kind.x, kind.log), "yaxis": axis(kind.y, kind.log)}
     if kind.diagonal:
+        ends = (decades([*before.x, *before.y]) or (0.1, 1.0)) if kind.log else (0.0, 1.0)
+        traces.insert(0, identity(*ends, "calibrated"))
         layout = square(layout, *ends)
     else:
         layout["yaxis"] |= {"rangemode": "tozero"}
-    return Chart(kind.title, said, traces, layout)
+    return Chart(kind.title, label, traces, layout)
 
 
 def _in_words(kind: _Kind, curve: Curve) -> str:
+    points = list(zip(curve.x, curve.y, strict=True))
     if kind.log:
-        ratios = sorted(y / x for x, y in zip(curve.x, curve.y, strict=True) if x > 0 and y > 0)
+        ratios = sorted(y / x for x, y in points if x > 0 and y > 0)
         middle = f"{ratios[len(ratios) // 2]:.2g}" if ratios else "unknown"
         return f"The squared error is {middle} times the predicted variance in the median; 1 is calibrated."
-    if kind.diagonal:
-        furthest = max(
-            zip(curve.x, curve.y, strict=True), key=lambda pair: abs(pair[1] - pair[0]), default=(0, 0)
-        )
-        return f"Furthest from the diagonal at {furthest[0]:.2f}, where the share is {furthest[1]:.2f}."
-    if not curve.y:
+    if not points:
         return "No points."
-    half = min(range(len(curve.x)), key=lambda i: abs(curve.x[i] - 0.5))
-    return f"The surer half has {curve.y[half]:.3g}, all predictions have {curve.y[-1]:.3g}."
+    if kind.diagonal:
+        x, y = max(points, key=lambda point: abs(point[1] - point[0]))
+        return f"Furthest from the diagonal at {x:.2f}, where the share is {y:.2f}."
+    _, half = min(points, key=lambda point: abs(point[0] - 0.5))
+    return f"The surer half has {half:.3g}, all predictions have {curve.y[-1]:.3g}."
 
 
 def learning_charts(run: Run) -> dict[str, Chart]:
-    """A chart a metric, training and test split over the epochs."""
-    charts = {
-        f"learning_{key}": chart
-        for key, metric in METRICS.items()
-        if (chart := _learning_chart(run, key, metric)) is not None
-    }
-    calibration = _calibration_over_epochs(run)
-    return charts | ({"learning_calibration": calibration} if calibration else {})
+    """A chart per metric: training and test split over the epochs."""
+    charts = {f"learning_{key}": _learning_chart(run, key, metric) for key, metric in METRICS.items()}
+    charts["learning_calibration"] = _calibration_over_epochs(run)
+    return {key: chart for key, chart in charts.items() if chart}
 
 
 def _learning_chart(run: Run, key: str, metric: Quantity) -> Chart | None:
@@ -138,8 +124,10 @@ def _learning_chart(run: Run, key: str, metric: Quantity) -> Chart | None:
         return None
     log = key not in ("nll", "loss")
     layout = {"xaxis": axis("epochs of training"), "yaxis": axis(metric.axis, log)}
-    said = "; ".join(_course(trace, metric) for trace in traces)
-    return Chart(f"{metric.label} over training", f"{metric.axis} over the epochs: {said}.", traces, layout)
+    courses = "; ".join(_course(trace, metric) for trace in traces)
+    return Chart(
+        f"{metric.label} over training", f"{metric.axis} over the epochs: {courses}.", traces, layout
+    )
 
 
 def _course(trace: Trace, metric: Quantity) -> str:
@@ -155,51 +143,45 @@ _OVER_EPOCHS = ("depth_ence", "projected_ence", "miscalibration_area", "depth_pi
 
 def _calibration_over_epochs(run: Run) -> Chart | None:
     known = [key for key in _OVER_EPOCHS if f"test/calibration/{key}" in run.metrics]
+    if not known:
+        return None
     traces = [
-        line(
-            quantity(key).label,
-            run.epochs,
-            run.metrics[f"test/calibration/{key}"],
-            i + 1,
-            dash=DASHES[i],
-        )
+        line(quantity(key).label, run.epochs, run.metrics[f"test/calibration/{key}"], i + 1, dash=DASHES[i])
         for i, key in enumerate(known)
     ]
-    if not traces:
-        return None
-    said = "; ".join(_course(trace, quantity(key)) for trace, key in zip(traces, known, strict=True))
+    courses = "; ".join(_course(trace, quantity(key)) for trace, key in zip(traces, known, strict=True))
     layout = {"xaxis": axis("epochs of training"), "yaxis": axis("calibration error", rangemode="tozero")}
-    return Chart("Calibration over training", f"Calibration errors over the epochs: {said}.", traces, layout)
+    return Chart(
+        "Calibration over training", f"Calibration errors over the epochs: {courses}.", traces, layout
+    )
 
 
 def strata_charts(evaluation: Evaluation) -> dict[str, Chart]:
-    """Both errors of the tables by visibility, truncation, depth and focal length, where samples differ in them."""
+    """Both errors of the tables by each quantity with more than one stratum."""
     charts = {}
-    parts = Counter(stratum.quantity for stratum in evaluation.strata)
-    for name in [name for name, count in parts.items() if count > 1]:
-        for key, colour in (("projected_error_mm", 1), ("depth_error_mm", 2)):
-            charts[f"strata_{name}_{key}".replace(" ", "_")] = _strata_chart(evaluation, name, key, colour)
+    for name in dict.fromkeys(stratum.quantity for stratum in evaluation.strata):
+        strata = [stratum for stratum in evaluation.strata if stratum.quantity == name]
+        if len(strata) > 1:
+            for key, colour in (("projected_error_mm", 1), ("depth_error_mm", 2)):
+                charts[f"strata_{name}_{key}".replace(" ", "_")] = _strata_chart(strata, name, key, colour)
     return charts
 
 
-def _strata_chart(evaluation: Evaluation, name: str, key: str, colour: int) -> Chart:
+def _strata_chart(strata: Sequence[Stratum], name: str, key: str, colour: int) -> Chart:
     score = quantity(key)
-    strata = [stratum for stratum in evaluation.strata if stratum.quantity == name and key in stratum.scores]
     bands = [stratum.scores[key] for stratum in strata]
-    labels = [_range(stratum.label.removeprefix(f"{name} ")) for stratum in strata]
+    # an en dash between two numbers
+    labels = [re.sub(r"(?<=\d)-(?=\d)", "–", stratum.label.removeprefix(f"{name} ")) for stratum in strata]
     lows, highs = [band.low for band in bands], [band.high for band in bands]
     trace = bars(score.label, [band.value for band in bands], labels, colour, lows, highs)
     trace["meta"]["n"] = [stratum.n for stratum in strata]
-    said = "; ".join(
-        f"{label}: {score.text(b.value)} {score.unit}" for label, b in zip(labels, bands, strict=True)
+    values = (
+        f"{text}: {score.text(band.value)} {score.unit}" for text, band in zip(labels, bands, strict=True)
     )
     layout = {
         "xaxis": axis(score.axis, rangemode="tozero", nticks=4),
         "yaxis": axis(name) | {"type": "category", "autorange": "reversed"},
     }
-    return Chart(f"{score.label} by {name}", f"{score.label} by {name}: {said}.", [trace], layout)
-
-
-def _range(label: str) -> str:
-    """With an en dash between two numbers."""
-    return re.sub(r"(?<=\d)-(?=\d)", "–", label)
+    return Chart(
+        f"{score.label} by {name}", f"{score.label} by {name}: {'; '.join(values)}.", [trace], layout
+    )

@@ -1,59 +1,14 @@
-"""One site for all tests, from one run of each kind: good, bad and hostile."""
+"""One site for all tests, and a browser page that records every fault."""
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pytest
-from PIL import Image
 
-from phd_exp.records.choices import RunName
-from phd_exp.records.runs import RunFolder
-from tests.reports.recorded import once, reported
-from tests.reports.several import write_views
-from tests.reports.site.synthetic import write_run
-
-HOSTILE = "<img src=x onerror=window.owned=1>"
-
-
-def write_runs(folder: Path) -> Path:
-    """A calibrated run, a recalibrated and an unusual one; a baseline; failed, broken off, unreadable ones."""
-    runs, images = folder / "runs", folder / "renders" / "default" / "test"
-    images.mkdir(parents=True)
-    random = np.random.default_rng(0)
-    for index in range(100):
-        Image.fromarray(random.integers(0, 255, (56, 56, 3), dtype=np.uint8)).save(
-            images / f"{index:06d}.png"
-        )
-    write_run(runs, "default", n=100, root=folder / "renders")
-    certain = write_run(runs, "occl", n=100, overconfidence=2.0)
-    held_out = write_run(folder / "elsewhere", "occl", seed=1, n=100, overconfidence=2.0)
-    held_out.predictions.rename(certain.path / "held_out.parquet")
-    write_views(certain.views, 50)
-    write_run(runs, "default", "mae_logz", n=100, root=folder / "renders")
-    write_run(runs, "default", "mae_vz", preset="demo", overrides=("optimizer.lr=0.1",), n=100)
-    _fail(_folder(runs, "occl", "mae_vz"))
-    broken_off = _folder(runs, "scale", "probabilistic")
-    with broken_off.recording(data_manifest=None):
-        status = broken_off.status()
-    assert status is not None
-    broken_off.write_status(status.model_copy(update={"state": "running"}))
-    _folder(runs, "scale", "mae_vz").status_file.write_text("{")
-    odd = write_run(runs, HOSTILE, n=100)
-    odd.predictions.write_bytes(b"no parquet")
-    return runs
-
-
-def _fail(folder: RunFolder) -> None:
-    folder.write_config({"model": {"name": HOSTILE}})
-    folder.write_metrics([{"epoch": -1, "test/nll": 3.0, HOSTILE: 1.0}, {"epoch": 0, "test/nll": "NaN"}])
-    with pytest.raises(ValueError, match="script"), folder.recording(data_manifest=None):
-        raise ValueError(f"</script><script>window.owned=1</script>{HOSTILE}")
-
-
-def _folder(runs: Path, data: str, model: str) -> RunFolder:
-    folder = RunFolder(RunName("small", data, model, 0).folder(runs))
-    folder.path.mkdir(parents=True)
-    return folder
+from tests.support.browser import Visit
+from tests.support.recorded import once, reported
+from tests.support.site_runs import write_runs
 
 
 @pytest.fixture(scope="session")
@@ -65,3 +20,12 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def site(shared: Path) -> Path:
     return shared / "out" / "site"
+
+
+@pytest.fixture
+def visit(chromium: Any, site: Path, request: pytest.FixtureRequest) -> Iterator[Visit]:
+    options = getattr(request, "param", {"viewport": {"width": 1280, "height": 800}})
+    visited = Visit(chromium, site, **options)
+    yield visited
+    visited.context.close()
+    assert visited.faults == []

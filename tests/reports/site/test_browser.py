@@ -1,81 +1,25 @@
-"""The site as people meet it: in a real browser, from the file system, without a network."""
+"""The site in a real browser, from the file system, without a network."""
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 import pytest
 
+from tests.support.browser import Visit
+
 RUN = "runs/small-default-probabilistic-seed0.html"
 OTHER = "small-occl-probabilistic-seed0"
+FAILED = "runs/small-occl-mae_vz-seed0.html"
 COMPARISON = f"compare.html#a=small-default-probabilistic-seed0&b={OTHER}"
-
-
-class Visit:
-    """One page, and everything that went wrong on it."""
-
-    def __init__(self, browser: Any, site: Path, **options: Any) -> None:
-        self.site = site
-        self.context = browser.new_context(offline=True, **options)
-        self.page = self.context.new_page()
-        self.faults: list[str] = []
-        self.page.on("console", lambda message: self._heard(message))
-        self.page.on("pageerror", lambda error: self.faults.append(str(error)))
-        self.page.on("requestfailed", lambda request: self._missed(request))
-        self.page.on("request", lambda request: self._asked(request.url))
-
-    def _heard(self, message: Any) -> None:
-        if message.type in ("error", "warning"):
-            self.faults.append(message.text)
-
-    def _asked(self, url: str) -> None:
-        if not url.startswith(("file:", "data:", "blob:")):
-            self.faults.append(f"asked the network for {url}")
-
-    def _missed(self, request: Any) -> None:
-        if request.failure != "net::ERR_ABORTED":  # a page that is left while it loads
-            self.faults.append(f"{request.failure}: {request.url}")
-
-    def open(self, address: str) -> None:
-        path, _, fragment = address.partition("#")
-        self.page.goto(f"{(self.site / path).as_uri()}{'#' + fragment if fragment else ''}")
-        self.page.wait_for_load_state("load")
-
-    def draw(self) -> int:
-        """Draw every chart, also those out of sight; how many there are."""
-        figures = self.page.locator("figure.chart")
-        self.page.evaluate("phdExp.drawAll()")
-        self.page.wait_for_function(
-            "document.querySelectorAll('figure.chart').length === document.querySelectorAll('figure.drawn').length"
-        )
-        return figures.count()
-
-    def width_beyond(self) -> int:
-        return self.page.evaluate("document.documentElement.scrollWidth - window.innerWidth")
-
-
-@pytest.fixture
-def visit(chromium: Any, site: Path, request: pytest.FixtureRequest) -> Iterator[Visit]:
-    options = getattr(request, "param", {"viewport": {"width": 1280, "height": 800}})
-    visited = Visit(chromium, site, **options)
-    yield visited
-    visited.context.close()
-    assert visited.faults == []
-
-
 PHONE_DARK = {"viewport": {"width": 360, "height": 740}, "color_scheme": "dark", "has_touch": True}
 LAPTOP = {"viewport": {"width": 1280, "height": 800}, "color_scheme": "light"}
 SEVERAL = 5
 """Charts of several cameras."""
-FAILED = "runs/small-occl-mae_vz-seed0.html"
-
-
 LONGEST_LINES = """plots => plots.map(plot => Math.max(
     ...[...plot.querySelectorAll('.scatterlayer path')].map(path => path.getTotalLength())
 ))"""
-"""Of the lines, bands or points of each chart: more than its empty frame."""
+"""The longest line, band or point of each chart: zero for an empty frame."""
 
 
 def _opens_and_draws(visit: Visit, page: str) -> int:
@@ -90,8 +34,8 @@ def _opens_and_draws(visit: Visit, page: str) -> int:
 
 
 @pytest.mark.slow
-def test_charts_out_of_sight_draw_themselves(visit: Visit) -> None:
-    """Whoever takes a picture of the whole page sees them too."""
+def test_charts_outside_the_view_draw_themselves(visit: Visit) -> None:
+    """A screenshot of the whole page has all charts."""
     visit.open("index.html")
     visit.page.wait_for_function(
         "[...document.querySelectorAll('figure.chart')].every(it => !it.clientWidth || it.matches('.drawn'))"
@@ -105,7 +49,7 @@ def test_pages_of_each_kind_open_and_draw_their_charts(visit: Visit) -> None:
     charts = [_opens_and_draws(visit, page) for page in ("index.html", RUN, COMPARISON, FAILED)]
     assert charts[0] == 9
     assert charts[1] > 15
-    assert charts[2] == charts[1] + SEVERAL  # which the other run has
+    assert charts[2] == charts[1] + SEVERAL  # of the other run
     assert charts[3] == 1
 
 
@@ -116,35 +60,29 @@ def test_every_page_opens_and_draws_its_charts(visit: Visit, site: Path) -> None
         _opens_and_draws(visit, f"runs/{quote(file.name)}")
 
 
-def test_links_lead_somewhere(visit: Visit) -> None:
+def test_links_and_the_comparison_keep_their_runs(visit: Visit) -> None:
     visit.open("index.html")
     visit.page.get_by_role("link", name="probabilistic on default").first.click()
     visit.page.wait_for_url(f"**/{RUN}")
     visit.page.get_by_role("link", name="Compare with another run").click()
     visit.page.wait_for_url("**/compare.html**")
     assert visit.page.locator("#run-a").input_value() == "small-default-probabilistic-seed0"
-    visit.page.get_by_role("link", name="Overview").click()
-    visit.page.wait_for_url("**/index.html")
-
-
-def test_the_comparison_is_in_its_address(visit: Visit) -> None:
-    visit.open(COMPARISON)
+    visit.page.locator("#run-b").select_option(OTHER)
+    visit.page.wait_for_function(f"location.hash.endsWith('{OTHER}')")
     scores = visit.page.locator("#scores table")
-    scores.wait_for()
-    assert visit.page.locator("#run-b").input_value() == OTHER
     before = scores.locator("tbody tr").first.inner_text().split("\t")
     assert before[0] == "Projected error (mm)"
     visit.page.get_by_role("button", name="Swap").click()
     visit.page.wait_for_function("location.hash.startsWith('#a=small-occl')")
     after = scores.locator("tbody tr").first.inner_text().split("\t")
     assert [after[1], after[2]] == [before[2], before[1]]
-    visit.page.locator("#run-b").select_option("small-default-mae_logz-seed0")
-    visit.page.wait_for_function("location.hash.endsWith('mae_logz-seed0')")
     assert "data.spec.variant" in visit.page.locator("#config").inner_text()
+    visit.page.get_by_role("link", name="Overview").click()
+    visit.page.wait_for_url("**/index.html")
 
 
 def test_the_paired_difference_has_its_interval(visit: Visit) -> None:
-    """Runs on the same test images are compared image by image; others are not."""
+    """Only runs on the same test images are compared image by image."""
     visit.open("compare.html#a=small-default-probabilistic-seed0&b=small-default-mae_logz-seed0")
     row = visit.page.locator("#scores tbody tr").first
     row.wait_for()
@@ -159,12 +97,9 @@ def test_overlays_name_their_runs(visit: Visit) -> None:
     texts = legend.all_inner_texts()
     assert [text[:2] for text in texts if text[1] == ":"] == ["A:", "B:"]
     assert "probabilistic on default seed0" in texts[1]
-    visit.open("index.html")
-    names = visit.page.locator("#learning .legend.runs li").all_inner_texts()
-    assert "small/default/probabilistic/seed0" in [name.strip() for name in names]
 
 
-def test_runs_are_sorted_by_any_column(visit: Visit) -> None:
+def test_the_overview_sorts_runs_and_filters_lines(visit: Visit) -> None:
     visit.open("index.html")
     assert visit.page.locator("main section").first.get_attribute("id") == "runs"
     column = (
@@ -177,9 +112,19 @@ def test_runs_are_sorted_by_any_column(visit: Visit) -> None:
         assert len(values) > 2
         assert values == sorted(values, key=lambda value: sign * value)
     assert button.locator("..").get_attribute("aria-sort") == "descending"
+    names = visit.page.locator("#learning .legend.runs li").all_inner_texts()
+    assert "small/default/probabilistic/seed0" in [name.strip() for name in names]
+    visit.draw()
+    lines = visit.page.locator("[data-chart=calibration_coverage] .scatterlayer .trace")
+    every = lines.count()
+    visit.page.locator("[data-filter=data]").select_option("occl")
+    visit.page.wait_for_function(
+        f"document.querySelectorAll('[data-chart=calibration_coverage] .scatterlayer .trace').length < {every}"
+    )
+    assert lines.count() == 2  # the diagonal and one run
 
 
-def test_charts_can_be_read_as_numbers(visit: Visit) -> None:
+def test_a_chart_has_its_numbers_as_a_table_and_as_csv(visit: Visit) -> None:
     visit.open(RUN)
     figure = visit.page.locator("figure[data-chart=coverage]")
     figure.locator("summary").click()
@@ -193,34 +138,20 @@ def test_charts_can_be_read_as_numbers(visit: Visit) -> None:
     assert len(Path(download.value.path()).read_text().splitlines()) == rows.count() + 1
 
 
-def test_the_theme_stays_as_chosen_and_reaches_the_charts(visit: Visit) -> None:
+def test_the_theme_is_kept_and_applied_to_charts(visit: Visit) -> None:
     visit.open(RUN)
     visit.draw()
     stroke = "getComputedStyle(document.querySelector('[data-chart=coverage] .xtick text')).fill"
-    light, paper = (
-        visit.page.evaluate(stroke),
-        visit.page.evaluate("getComputedStyle(document.body).backgroundColor"),
-    )
+    paper = "getComputedStyle(document.body).backgroundColor"
+    light = [visit.page.evaluate(colour) for colour in (stroke, paper)]
     button = visit.page.get_by_role("button", name="Dark theme")
     assert button.get_attribute("aria-pressed") == "false"
     button.click()
     assert button.get_attribute("aria-pressed") == "true"
-    visit.page.wait_for_function(f"{stroke} !== '{light}'")
-    assert visit.page.evaluate("getComputedStyle(document.body).backgroundColor") != paper
+    visit.page.wait_for_function(f"{stroke} !== '{light[0]}'")
+    assert visit.page.evaluate(paper) != light[1]
     visit.open("index.html")
     assert visit.page.locator("html").get_attribute("data-theme") == "dark"
-
-
-def test_filters_choose_lines(visit: Visit) -> None:
-    visit.open("index.html")
-    visit.draw()
-    lines = visit.page.locator("[data-chart=calibration_coverage] .scatterlayer .trace")
-    every = lines.count()
-    visit.page.locator("[data-filter=data]").select_option("occl")
-    visit.page.wait_for_function(
-        f"document.querySelectorAll('[data-chart=calibration_coverage] .scatterlayer .trace').length < {every}"
-    )
-    assert lines.count() == 2  # the diagonal and one run
 
 
 def test_several_cameras_have_their_charts_and_table(visit: Visit) -> None:
@@ -230,19 +161,10 @@ def test_several_cameras_have_their_charts_and_table(visit: Visit) -> None:
     visit.draw()
     section = visit.page.locator("section[aria-labelledby=fusion-title]")
     assert section.locator("figure.drawn").count() == SEVERAL
-    names = section.locator(
-        "[data-chart=fusion_depth_error_mm] .legend text, [data-chart=fusion_depth_error_mm] .legend li"
-    )
+    names = section.locator("[data-chart=fusion_depth_error_mm] .legend li")
     assert "Huber, mean, ground" in names.all_inner_texts()
-    assert section.locator("table thead th").all_inner_texts() == [
-        "quantity",
-        "method",
-        "1 camera",
-        "2 cameras",
-        "3 cameras",
-        "4 cameras",
-    ]
-    assert visit.width_beyond() <= 0
+    headings = ["quantity", "method", "1 camera", "2 cameras", "3 cameras", "4 cameras"]
+    assert section.locator("table thead th").all_inner_texts() == headings
 
 
 def test_the_keyboard_reaches_the_content_first(visit: Visit) -> None:
@@ -253,10 +175,9 @@ def test_the_keyboard_reaches_the_content_first(visit: Visit) -> None:
     assert visit.page.evaluate("document.activeElement.id") == "main"
 
 
-def test_pictures_are_there(visit: Visit) -> None:
+def test_pictures_are_loaded_and_labelled(visit: Visit) -> None:
     visit.open(RUN)
-    images = visit.page.locator("svg.panel image")
-    assert images.count() >= 12
+    assert visit.page.locator("svg.panel image").count() >= 12
     loaded = visit.page.evaluate(
         """() => Promise.all([...document.querySelectorAll('svg.panel image')].map(image => {
             const copy = new Image(); copy.src = new URL(image.getAttribute('href'), location.href);
@@ -265,5 +186,4 @@ def test_pictures_are_there(visit: Visit) -> None:
     )
     assert set(loaded) == {56}
     assert visit.page.locator("svg.birds-eye").count() == 12
-    for panel in visit.page.locator("svg.panel").all():
-        assert panel.get_attribute("aria-label")
+    assert visit.page.locator("svg.panel:not([aria-label])").count() == 0

@@ -1,10 +1,9 @@
-"""Files of a site: whole, small, escaped, linked."""
+"""Files of a site: complete, small, escaped, linked."""
 
 import json
 import re
 import shutil
 from html.parser import HTMLParser
-from itertools import combinations
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
@@ -12,15 +11,15 @@ import pytest
 
 from phd_exp.reports.runs import Run, read_report
 from phd_exp.reports.site import build
-from tests.reports.recorded import reported
-from tests.reports.site.conftest import HOSTILE
-from tests.reports.site.synthetic import write_run
+from tests.support.recorded import reported
+from tests.support.site_runs import HOSTILE
+from tests.support.synthetic import write_run
 
 MEGABYTE = 1_000_000
 
 
 class Page(HTMLParser):
-    """What a page links to, and its outline."""
+    """The links and tags of a page."""
 
     def __init__(self, file: Path) -> None:
         super().__init__()
@@ -41,22 +40,22 @@ def _pages(site: Path) -> list[Path]:
     return sorted(site.rglob("*.html"))
 
 
-def test_links_point_to_files_that_are_there(site: Path) -> None:
+@pytest.fixture(scope="module")
+def runs(shared: Path) -> tuple[Run, ...]:
+    return read_report(shared / "runs", shared / "out" / "measured").runs
+
+
+def test_links_point_to_files_and_pages_load_little(site: Path) -> None:
     for file in _pages(site):
-        for link in Page(file).links:
+        total = file.stat().st_size
+        for link in set(Page(file).links):
             parts = urlsplit(link)
-            assert parts.scheme in ("", "data"), f"{file}: {link} wants a network"
+            assert parts.scheme in ("", "data"), f"{file}: {link} needs a network"
             if parts.path and not parts.scheme:
-                assert (file.parent / unquote(parts.path)).exists(), f"{file}: {link}"
-
-
-def test_pages_are_small_with_all_that_they_load(site: Path) -> None:
-    for file in _pages(site):
-        loaded = [link for link in Page(file).links if link.endswith((".js", ".css", ".webp"))]
-        total = file.stat().st_size + sum(
-            (file.parent / unquote(link)).stat().st_size for link in set(loaded)
-        )
-        assert total < 6 * MEGABYTE
+                target = file.parent / unquote(parts.path)
+                assert target.exists(), f"{file}: {link}"
+                total += target.stat().st_size if target.suffix in (".js", ".css", ".webp") else 0
+        assert total < 6 * MEGABYTE, file
 
 
 def test_every_page_has_an_outline(site: Path) -> None:
@@ -64,8 +63,7 @@ def test_every_page_has_an_outline(site: Path) -> None:
         page = Page(file)
         assert [page.count(tag) for tag in ("h1", "main", "header", "footer", "title")] == [1] * 5
         assert ("html", {"lang": "en"}) in page.tags
-        labelled = [named for tag, named in page.tags if named.get("role") == "img"]
-        assert all(named.get("aria-label") for named in labelled)
+        assert all(named.get("aria-label") for _, named in page.tags if named.get("role") == "img")
         ids = [named["id"] for _, named in page.tags if "id" in named]
         assert len(ids) == len(set(ids))
 
@@ -78,7 +76,7 @@ def _luminance(colour: str) -> float:
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
-def test_colours_stand_out_from_the_page(site: Path, theme: str) -> None:
+def test_colours_contrast_with_the_page(site: Path, theme: str) -> None:
     style = (site / "assets" / "report.css").read_text()
     (block,) = re.findall(rf':root\[data-theme="{theme}"\] {{(.*?)}}', style, re.DOTALL)
     colours = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6});", block))
@@ -90,7 +88,7 @@ def test_colours_stand_out_from_the_page(site: Path, theme: str) -> None:
             assert (high + 0.05) / (low + 0.05) >= least, f"{name} on {ground}"
 
 
-def test_what_runs_say_is_text(site: Path) -> None:
+def test_text_of_runs_is_escaped(site: Path) -> None:
     pages = {file.name: file.read_text() for file in _pages(site)}
     assert any("&lt;img src=x" in text for text in pages.values())
     for text in [*pages.values(), *(file.read_text() for file in (site / "data").iterdir())]:
@@ -98,93 +96,71 @@ def test_what_runs_say_is_text(site: Path) -> None:
         assert "<script>window" not in text
 
 
-def test_a_page_for_every_run_whatever_its_state(shared: Path, site: Path) -> None:
-    runs = read_report(shared / "runs").runs
+def test_every_run_has_a_page_in_any_state(runs: tuple[Run, ...], site: Path) -> None:
     assert {run.state for run in runs} == {"finished", "failed", "interrupted", "unreadable"}
-    for run in runs:
-        page = (site / "runs" / f"{run.slug}.html").read_text()
-        assert f">{run.state}</span>" in page
-    failed = (site / "runs" / "small-occl-mae_vz-seed0.html").read_text()
-    assert "Traceback (most recent call last)" in failed
-    assert (
-        "the same command resumes it" in (site / "runs" / "small-scale-probabilistic-seed0.html").read_text()
-    )
+    pages = {run.slug: (site / "runs" / f"{run.slug}.html").read_text() for run in runs}
+    assert all(f">{run.state}</span>" in pages[run.slug] for run in runs)
+    assert "Traceback (most recent call last)" in pages["small-occl-mae_vz-seed0"]
+    assert "the same command resumes it" in pages["small-scale-probabilistic-seed0"]
 
 
 def script(site: Path, slug: str) -> dict:
-    """What the charts of a page show."""
+    """The data of a page's charts."""
     text = (site / "data" / f"{slug}.js").read_text()
     return json.loads(text[text.index(", ") + 2 : -3])
 
 
-def test_the_numbers_are_those_of_the_records(shared: Path, site: Path) -> None:
-    (run,) = (
-        run for run in read_report(shared / "runs").runs if run.slug == "small-default-probabilistic-seed0"
-    )
+def test_a_run_page_shows_its_numbers_and_pictures(runs: tuple[Run, ...], site: Path) -> None:
+    (run,) = (run for run in runs if run.slug == "small-default-probabilistic-seed0")
     assert run.nll is not None
     assert script(site, run.slug)["scores"]["nll"]["value"] == pytest.approx(run.nll)
     page = (site / "runs" / f"{run.slug}.html").read_text()
     assert f"{run.nll:.2f}".replace("-", "−") in page
+    sections = ("gallery", "calibration", "learning", "strata", "numbers")
+    places = [page.index(f'id="{name}"') for name in sections]
+    assert places == sorted(places)
 
 
-def test_recalibration_is_shown_where_samples_were_held_out(site: Path) -> None:
-    certain = script(site, "small-occl-probabilistic-seed0")
-    names = [trace["name"] for trace in certain["charts"]["depth_calibration"]["data"]]
-    assert names == ["calibrated", "as predicted", "recalibrated"]
+def test_recalibration_is_shown_with_held_out_samples(site: Path) -> None:
+    chart = script(site, "small-occl-probabilistic-seed0")["charts"]["depth_calibration"]
+    assert [trace["name"] for trace in chart["data"]] == ["calibrated", "as predicted", "recalibrated"]
     page = (site / "runs" / "small-occl-probabilistic-seed0.html").read_text()
     assert "Recalibrated</th>" in page
     assert "Calibrated</th>" in page
 
 
-def test_a_run_page_shows_pictures_and_plots_before_the_table(site: Path) -> None:
-    page = (site / "runs" / "small-default-probabilistic-seed0.html").read_text()
-    places = [
-        page.index(f'id="{name}"') for name in ("gallery", "calibration", "learning", "strata", "numbers")
-    ]
-    assert places == sorted(places)
-
-
-def test_slugs_differ_wherever_runs_do(tmp_path: Path) -> None:
-    for names in (
-        ("a", "b-c", "d"),
-        ("a-b", "c", "d"),
-        ("a", "b c", "d"),
-        ("a", "b?c", "d"),
-        ("a", "b", "c-d"),
-    ):
-        folder = tmp_path.joinpath(*names, "seed0")
+def test_different_runs_have_different_slugs(tmp_path: Path) -> None:
+    folders = ("a/b-c/d", "a-b/c/d", "a/b c/d", "a/b?c/d", "a/b/c-d")
+    for names in folders:
+        folder = tmp_path / names / "seed0"
         folder.mkdir(parents=True)
         (folder / "status.json").write_text("{")
     slugs = [run.slug for run in read_report(tmp_path).runs]
-    assert len(slugs) == 5
-    assert all(a.lower() != b.lower() for a, b in combinations(slugs, 2))
+    assert len({slug.lower() for slug in slugs}) == len(folders)
     assert all(re.fullmatch(r"[A-Za-z0-9_-]+", slug) for slug in slugs)
 
 
 @pytest.fixture
 def own(tmp_path: Path) -> Path:
-    """Two runs and their site, to be changed."""
+    """Two runs and their site, which a test may change."""
     write_run(tmp_path / "runs", "default", "mae_vz", n=40, epochs=2)
     write_run(tmp_path / "runs", "occl", "mae_vz", n=40, epochs=2)
     reported(tmp_path / "runs", tmp_path / "out")
     return tmp_path
 
 
-def test_runs_that_are_gone_leave_nothing_and_one_alone_is_not_compared(own: Path) -> None:
+def test_removed_runs_leave_no_page_and_a_single_run_is_not_compared(own: Path) -> None:
     site = own / "out" / "site"
     assert "compare.html" in (site / "index.html").read_text()
     shutil.rmtree(own / "runs" / "small" / "occl")
     reported(own / "runs", own / "out")
     assert not list(site.rglob("*occl*"))
     assert "occl-mae_vz" not in (site / "index.html").read_text()
-    assert not [
-        page
-        for page in site.rglob("*.html")
-        if page.name != "compare.html" and "compare.html" in page.read_text()
-    ]
+    others = [page for page in site.rglob("*.html") if page.name != "compare.html"]
+    assert not [page for page in others if "compare.html" in page.read_text()]
 
 
-def test_a_report_that_is_killed_leaves_the_old_pages(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_report_leaves_the_old_pages(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     site = own / "out" / "site"
     before = {file: file.read_bytes() for file in _pages(site)}
 
@@ -200,7 +176,7 @@ def test_a_report_that_is_killed_leaves_the_old_pages(own: Path, monkeypatch: py
     assert {file: file.read_bytes() for file in _pages(site)} == before
 
 
-def test_a_run_that_cannot_be_drawn_says_so_alone(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_of_drawing_affects_one_page(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = build.run_charts
 
     def faulty(run: Run) -> dict:

@@ -1,4 +1,4 @@
-"""What charts show: safe to put into a page, and no more than a screen holds."""
+"""Chart data is safe in a page and has a limited size."""
 
 import json
 
@@ -21,7 +21,7 @@ def test_a_script_holds_any_text(text: str) -> None:
     assert (name, content) == (text, {text: [text]})
 
 
-def test_what_json_does_not_know_is_null() -> None:
+def test_numbers_that_json_lacks_are_null() -> None:
     script = as_script("a", {"x": [float("nan"), float("inf"), -float("inf"), 1.5]})
     assert script == 'phdExp.receive("a", {"x":[null,null,null,1.5]});\n'
 
@@ -35,7 +35,7 @@ def test_a_thinned_curve_keeps_its_ends(n: int) -> None:
     assert kept[-1:] == list(range(n))[-1:]
 
 
-def test_decades_hold_all_that_is_positive() -> None:
+def test_decades_contain_all_positive_values() -> None:
     for values in ([3e-4, 0.2], [1.0], [0.1, 0.1], [0.0, -1.0, float("nan"), 2.0]):
         low, high = decades(values) or (0, 0)
         assert np.log10(high / low) >= 1 - 1e-9

@@ -1,7 +1,7 @@
 // Any two runs: their data files are loaded when chosen, and their charts drawn over each other.
 (() => {
   const NAMES = ["a", "b"];
-  const ROLES = ["before", "test", "points", "line"];  // one line a run: the tests', before recalibration
+  const ROLES = ["before", "test", "points", "line"];  // one line per run: on the test split, before recalibration
   const select = (name) => document.getElementById(`run-${name}`);
   const loading = new Map();
 
@@ -20,7 +20,7 @@
 
   const label = (run) => [run.preset, run.data, run.model, run.run].join(" / ");
 
-  /** Values as run pages print them. */
+  /** Values in the format of the run pages. */
   const fixed = (value, digits) => (value === null ? "–" : value.toFixed(digits).replace("-", "−"));
   const band = (score, digits) => (score ? `${fixed(score.value, digits)} [${fixed(score.low, digits)}, ${fixed(score.high, digits)}]` : "–");
 
@@ -55,7 +55,7 @@
 
   const main = (chart) => chart.data.filter((trace) => ROLES.includes(trace.meta.role));
 
-  /** Both runs' axes and diagonal, as far as either reaches. */
+  /** Axes and diagonal that cover both runs. */
   function frame(known) {
     const layout = structuredClone(known[0].layout);
     const diagonals = known.flatMap((chart) => chart.data.filter((trace) => trace.meta.role === "identity"));
@@ -69,7 +69,7 @@
     return { layout, data: [{ ...diagonals[0], x: reach, y: reach }] };
   }
 
-  /** One chart of both runs; the second's lines are dashed, so that colour is not all that tells them apart. */
+  /** One chart of both runs; the lines of the second are dashed, to differ without colour too. */
   function overlaid(key, runs) {
     const charts = runs.map((run) => run.charts[key]);
     const known = charts.filter(Boolean);
@@ -88,8 +88,8 @@
         });
       }
     });
-    const said = charts.map((chart, place) => `${NAMES[place].toUpperCase()}: ${chart ? chart.label : "not recorded"}`).join(" ");
-    return { title: known[0].title, label: said, data, layout };
+    const words = charts.map((chart, place) => `${NAMES[place].toUpperCase()}: ${chart ? chart.label : "not recorded"}`).join(" ");
+    return { title: known[0].title, label: words, data, layout };
   }
 
   function figure(key, chart) {
@@ -118,7 +118,7 @@
     const status = document.getElementById("status");
     try {
       const runs = await Promise.all(slugs.map(load));
-      if (slugs.some((slug, place) => slug !== select(NAMES[place]).value)) return;  // chosen anew meanwhile
+      if (slugs.some((slug, place) => slug !== select(NAMES[place]).value)) return;  // the choice has changed meanwhile
       status.hidden = true;
       fill("scores", scores(...runs));
       fill("config", configuration(...runs));
@@ -131,7 +131,7 @@
     }
   }
 
-  /** The runs named in the address; the first two where it names none. */
+  /** Select the runs of the address, or the first two. */
   function fromAddress() {
     const asked = new URLSearchParams(location.hash.slice(1));
     NAMES.forEach((name, place) => {

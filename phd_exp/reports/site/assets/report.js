@@ -4,7 +4,7 @@ const phdExp = (() => {
   const drawn = new Set();
   const LOG = "log";
 
-  /** Called by every data file. */
+  /** Every data file calls it. */
   function receive(name, content) {
     runs.set(name, content);
     document.dispatchEvent(new CustomEvent("received", { detail: name }));
@@ -13,7 +13,7 @@ const phdExp = (() => {
   const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const escaped = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
 
-  /** A copy in which colours named by the style sheet are those of the present theme. */
+  /** A copy with the colours of the current theme. */
   function themed(value) {
     if (typeof value === "string") {
       const name = /^var\((--[\w-]+)\)$/.exec(value);
@@ -32,7 +32,7 @@ const phdExp = (() => {
     return chosen;
   }
 
-  /** Lines without filtered fields, such as the diagonal, always stay. */
+  /** Lines without the filtered fields, such as the diagonal, are always visible. */
   function visible(trace, chosen) {
     return Object.entries(chosen).every(([key, value]) => !(key in trace.meta) || trace.meta[key] === value);
   }
@@ -50,7 +50,7 @@ const phdExp = (() => {
     });
   }
 
-  /** Categories on the vertical axis, the first on top: their names may be long. */
+  /** Points with error bars, one per category of the vertical axis. */
   function withBars(line, { low, high }) {
     const x = line.x;
     line.y = line.y.map(escaped);
@@ -98,7 +98,7 @@ const phdExp = (() => {
     };
   }
 
-  /** Ticks at powers of ten, with others between them where there are few; numbers in full where they are short. */
+  /** Ticks at powers of ten, with more between them for short axes. */
   function logTicks(chart, name) {
     const values = chart.data.flatMap((trace) => [...trace[name], ...(trace.meta.low ?? [])]).filter((value) => value > 0);
     if (!values.length) return {};
@@ -113,7 +113,7 @@ const phdExp = (() => {
 
   const DASHES = { solid: "none", dash: "7 4", dot: "2 3", dashdot: "7 3 2 3" };
 
-  /** What each line means, below the caption; not where a whole group of charts shares one legend. */
+  /** The legend of a chart, unless its group shares one. */
   function legend(figure, chart) {
     const named = new Map(shownOf(chart).map((trace) => [trace.name, trace]));
     figure.querySelector(".legend")?.remove();
@@ -147,7 +147,7 @@ const phdExp = (() => {
     }).then(() => figure.classList.add("drawn"));
   }
 
-  /** Numbers of the shown lines, as a table and as a file, made when asked for. */
+  /** The numbers of the visible lines as a table and a file, made on demand. */
   function tabulate(figure) {
     const chart = chartOf(figure);
     const shown = shownOf(chart).filter((trace) => trace.meta.role !== "identity");
@@ -202,7 +202,7 @@ const phdExp = (() => {
 
   const idle = () => new Promise((resolve) => (window.requestIdleCallback ?? setTimeout)(resolve));
 
-  /** Draw the charts below an element: those in view at once, the others when nothing else is to be done. */
+  /** Draw the charts of an element: those in view at once, the others when the browser is idle. */
   async function watch(parent = document) {
     const figures = parent.querySelectorAll("figure.chart");
     for (const figure of figures) {
@@ -211,7 +211,7 @@ const phdExp = (() => {
     }
     for (const figure of figures) {
       await idle();
-      if (figure.clientWidth && !drawn.has(figure)) await draw(figure);  // in what is folded it would have no width
+      if (figure.clientWidth && !drawn.has(figure)) await draw(figure);  // inside closed details it has no width
     }
   }
 
@@ -219,7 +219,7 @@ const phdExp = (() => {
   const drawAll = () => Promise.all(all().map(draw));
   const redraw = () => Promise.all(all().filter((figure) => drawn.has(figure)).map(draw));
 
-  /** Sort the lines of a table by the column of a heading, numbers as numbers; again the other way round. */
+  /** Sort a table by the column of a heading, numbers numerically; a second click reverses the order. */
   function sortBy(heading) {
     const table = heading.closest("table");
     const down = heading.getAttribute("aria-sort") === "ascending";
@@ -235,7 +235,7 @@ const phdExp = (() => {
     heading.setAttribute("aria-sort", down ? "descending" : "ascending");
   }
 
-  /** The legend of all runs names those that the charts show. */
+  /** Show only the filtered runs in the shared legend. */
   function filterLegends() {
     const chosen = filters();
     for (const item of document.querySelectorAll(".legend.runs li")) {

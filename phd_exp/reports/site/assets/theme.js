@@ -1,4 +1,4 @@
-// Runs before the page is painted: the theme chosen last, or that of the system.
+// Runs before the page is painted: applies the last chosen theme, or that of the system.
 (() => {
   const root = document.documentElement;
   const system = window.matchMedia("(prefers-color-scheme: dark)");
@@ -7,7 +7,7 @@
     try { return localStorage.getItem("phd_exp.theme"); } catch { return null; }  // storage may be forbidden
   };
   const remember = (theme) => {
-    try { localStorage.setItem("phd_exp.theme", theme); } catch { /* then it lasts for this page */ }
+    try { localStorage.setItem("phd_exp.theme", theme); } catch { /* then the choice lasts for this page */ }
   };
 
   const apply = (theme) => {

@@ -20,7 +20,7 @@ def rotations(n: int, generator: torch.Generator) -> Tensor:
 def random_problems(
     n: int, cameras: int, seed: int = 0, outliers: float = 0.1
 ) -> tuple[ProjectedHuber, Pose, Tensor]:
-    """Predictions, poses and true positions; a share of the predictions is off by far more than it says."""
+    """Predictions, poses and true positions; a share of the predictions has errors far beyond its uncertainty."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int, low: float, high: float) -> Tensor:
@@ -51,5 +51,5 @@ def random_problems(
 
 
 def columns_of(predictions: ProjectedHuber) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """What the constructor takes."""
+    """The arguments of the constructor."""
     return predictions.mu_xy, predictions.mu_z, predictions.A, predictions.a

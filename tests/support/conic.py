@@ -6,6 +6,10 @@ import clarabel
 import numpy as np
 from scipy import sparse
 
+from phd_exp.distributions import ProjectedHuber
+from phd_exp.fusion import Pose
+from tests.support.random_problems import columns_of
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -17,6 +21,13 @@ class Camera:
     a: float
     R: np.ndarray
     t: np.ndarray
+
+
+def cameras_of(predictions: ProjectedHuber, pose: Pose) -> list[list[Camera]]:
+    columns = (*columns_of(predictions), pose.R, pose.t)
+    arrays = [column.numpy() for column in columns]
+    problems, cameras = predictions.batch_shape
+    return [[Camera(*(array[i, j] for array in arrays)) for j in range(cameras)] for i in range(problems)]
 
 
 class Program:
@@ -43,12 +54,12 @@ class Program:
         m, n, w = np.eye(self.n)[first : first + 3]
         self.P[first, first] = 1
         self.c[first + 1], self.c[first + 2] = 1, camera.a
-        seen = np.zeros((3, self.n))
-        seen[:, :3] = camera.R * self.unit
+        xyz = np.zeros((3, self.n))
+        xyz[:, :3] = camera.R * self.unit
         at_origin = camera.R @ self.origin + camera.t
-        q = camera.A @ (seen[:2] - np.outer(camera.mu_xy, seen[2])) / camera.mu_z
+        q = camera.A @ (xyz[:2] - np.outer(camera.mu_xy, xyz[2])) / camera.mu_z
         q_0 = camera.A @ (at_origin[:2] - camera.mu_xy * at_origin[2]) / camera.mu_z
-        t, t_0 = seen[2] / camera.mu_z, at_origin[2] / camera.mu_z
+        t, t_0 = xyz[2] / camera.mu_z, at_origin[2] / camera.mu_z
         self.require(clarabel.NonnegativeConeT(2), np.stack([n, w - t]), np.array([0, -t_0]))
         self.require(clarabel.SecondOrderConeT(3), np.vstack([m + n, q]), np.array([0, *q_0]))
         self.require(
@@ -56,14 +67,14 @@ class Program:
         )
 
     def on_plane(self, normal: np.ndarray, offset: float) -> "Program":
-        """With normal . v = offset besides."""
+        """With the constraint normal . v = offset."""
         row = np.zeros((1, self.n))
         row[0, :3] = normal * self.unit
         self.require(clarabel.ZeroConeT(1), row, np.array([normal @ self.origin - offset]))
         return self
 
     def solver(self, tolerance: float = 1e-14) -> clarabel.DefaultSolver:
-        """Ready to solve."""
+        """The solver of this programme."""
         settings = clarabel.DefaultSettings()
         settings.verbose = False
         settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
@@ -77,6 +88,6 @@ class Program:
         )
 
     def solve(self, tolerance: float = 1e-14) -> tuple[np.ndarray, str]:
-        """The position v, and how the solver says it ended."""
+        """The position v, and the status of the solver."""
         solution = self.solver(tolerance).solve()
         return self.origin + self.unit * np.array(solution.x[:3]), str(solution.status)

@@ -12,7 +12,7 @@ from phd_exp.fusion import Pose
 from phd_exp.records import scenes
 from phd_exp.rendering.sampling import about_axis
 from phd_exp.training.predictions import columns, write_parquet
-from tests.reports.site.synthetic import calibrated, truths
+from tests.support.synthetic import calibrated, truths
 
 ANGLES = (0.0, 0.5, -0.6, 0.7)
 """By which further cameras are turned against the first, each about an axis of its own."""

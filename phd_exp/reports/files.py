@@ -1,0 +1,208 @@
+"""Tables as files: GitHub's Markdown, LaTeX that needs the package booktabs alone, and CSV."""
+
+import csv
+import io
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from phd_exp.distributions.constraints import SCALE, Finding
+from phd_exp.records.files import remove_temporaries
+from phd_exp.reports.calibration_table import calibration_tables
+from phd_exp.reports.fusion_table import fusion_tables
+from phd_exp.reports.paper_tables import paper_tables
+from phd_exp.reports.runs import Report
+from phd_exp.reports.table import Table, TableCell, TableRow, write_text
+from phd_exp.reports.variations import variation_tables
+
+SPECIAL = re.compile(r"([\\`*_\[\]<>#|~&@$])")
+"""Characters that GitHub may read as markup, a mention, an issue or mathematics."""
+SYMBOLS = {
+    "\\": r"\textbackslash{}",
+    "~": r"$\sim$",
+    "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    '"': r"\symbol{34}",
+    "`": r"\textasciigrave{}",
+    "-": r"-{}",  # LaTeX joins two to a dash
+    **{letter: f"\\{letter}" for letter in "&%$#_{}"},
+    "±": r"$\pm$",
+    "°": r"$^\circ$",
+    "×": r"$\times$",
+    "≥": r"$\geq$",
+    "≤": r"$\leq$",
+    "–": "--",
+    "†": r"\textsuperscript{\dag}",
+    "‡": r"\textsuperscript{\ddag}",
+}
+OF_CONSTRAINTS = f"""\
+- A baseline is the density exp(-|residual|/{SCALE:g}) in its own coordinates: minimising the mean norm of
+  residuals is maximum likelihood under it. The decomposed density is p(x/z, y/z) p(z)/z^2.
+- Columns are heads. A network with camera=shown breaks 2, whatever its head.
+- In brackets: 1 the factor by which wanted spreads are missed; 2 the relative change of log p with f;
+  3 the density behind the camera over that in front; 4 the share of positions ruled out; 5 nats above a
+  chord; 6 the least fall of log p over a factor of 1000 towards a limit, nats; 7 its largest jump, nats.
+"""
+
+
+def all_tables(report: Report) -> list[Table]:
+    """The paper's tables, and the tables of calibration, variations and fusion of the runs that have them."""
+    makers = (paper_tables, calibration_tables, variation_tables, fusion_tables)
+    return [table for make in makers for table in make(report)]
+
+
+def write_tables(tables: Sequence[Table], out: Path) -> Path:
+    """Write `<out>/tables/<stem>.{md,tex}` of each table and `<kind>.csv` of each kind; returns that folder."""
+    folder = out / "tables"
+    folder.mkdir(parents=True, exist_ok=True)
+    remove_temporaries(folder)  # of a killed process
+    for table in tables:
+        write_text(folder / f"{table.stem}.md", markdown(table))
+        write_text(folder / f"{table.stem}.tex", latex(table))
+    for kind, alike in groupby(tables, key=lambda table: table.kind):
+        write_text(folder / f"{kind}.csv", tidy([line for table in alike for line in table.numbers]))
+    return folder
+
+
+def tidy(numbers: Sequence[Mapping[str, Any]]) -> str:
+    """CSV with a line per number, at full precision; missing values are empty."""
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, list(numbers[0]) if numbers else [], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(numbers)
+    return stream.getvalue()
+
+
+def markdown(table: Table) -> str:
+    """The table as Markdown: heading, cells, missing runs with the command that makes them, notes.
+
+    Example:
+        >>> from phd_exp.reports.table import Table, TableCell, TableRow
+        >>> row = TableRow(("mae_vz",), (TableCell("48", "±3", bold=True),))
+        >>> print(markdown(Table("t", "tables", "Depth", ("model",), ("mm",), ((row,),), notes=("95 %",))))
+        ## Depth
+        <BLANKLINE>
+        | model | mm |
+        | --- | ---: |
+        | mae\\_vz | **48** ±3 |
+        <BLANKLINE>
+        - 95 %
+        <BLANKLINE>
+    """
+    headings = [*table.stub, *table.columns]
+    aligned = ["---"] * len(table.stub) + ["---:"] * len(table.columns)
+    blank = "|" + " |" * len(headings)
+    body = f"\n{blank}\n".join("\n".join(map(_markdown_line, group)) for group in table.groups)
+    parts = [f"## {_plain(table.title)}", "\n".join([_joined(map(_plain, headings)), _joined(aligned), body])]
+    if table.gaps:
+        parts.append("\n".join(["Missing:", "", *(f"- {_plain(line)}" for line in table.gaps)]))
+    if table.command:
+        # a fence of more backticks than the command has in a row
+        fence = "`" * (1 + max((len(run) for run in re.findall("`+", table.command)), default=0))
+        space = "" if fence == "`" else " "
+        parts.append(f"Made by {fence}{space}{table.command}{space}{fence}")
+    parts.append("\n".join(f"- {_plain(note)}" for note in table.notes))
+    return "\n\n".join(parts) + "\n"
+
+
+def _plain(text: str) -> str:
+    """Text without a meaning in Markdown."""
+    return SPECIAL.sub(r"\\\1", text)
+
+
+def _markdown_line(row: TableRow) -> str:
+    return _joined([*map(_plain, row.stub), *map(_markdown_cell, row.cells)])
+
+
+def _markdown_cell(cell: TableCell) -> str:
+    ours = f"**{_plain(cell.ours)}**" if cell.bold else _plain(cell.ours)
+    first = f"{ours} {_plain(cell.spread)}".rstrip()
+    return f"{first}<br>{_plain(cell.below)}" if cell.below else first
+
+
+def _joined(texts: Iterable[str]) -> str:
+    return f"| {' | '.join(texts)} |"
+
+
+def constraints_table(measured: Mapping[str, Mapping[str, Finding]]) -> str:
+    """Which of the paper's seven constraints each density satisfies, as Markdown; a dash if not measured.
+
+    `constraints_table(findings())` with `phd_exp.distributions.constraints.findings` is the table of the heads.
+    """
+    models = list(dict.fromkeys(model for row in measured.values() for model in row))
+    lines = [_joined(["constraint", *map(_plain, models)]), _joined(["---"] * (1 + len(models)))]
+    for constraint, row in measured.items():
+        lines.append(_joined([_plain(constraint), *(_finding(row.get(model)) for model in models)]))
+    return "\n".join(["## The seven constraints", "", *lines, "", OF_CONSTRAINTS])
+
+
+def _finding(finding: Finding | None) -> str:
+    if finding is None:
+        return "-"
+    return f"{'holds' if finding.holds else '**breaks**'} ({finding.measured:.2g})"
+
+
+def latex(table: Table) -> str:
+    """The table as an environment for \\input: caption, tabular, missing runs with their command, notes."""
+    headings = " & ".join(map(_escaped, (*table.stub, *table.columns)))
+    label = re.sub(r"[^A-Za-z0-9-]", "-", table.stem)
+    notes = [_escaped(note) for note in table.notes]
+    if table.gaps:
+        notes += ["Missing:", *map(_escaped, table.gaps)]
+    if table.command:
+        # straight quotes, so that the command can be copied to a shell
+        command = _escaped(table.command).replace("'", r"\textquotesingle{}")
+        notes.append(f"Made by \\texttt{{{command}}}")
+    return "\n".join(
+        [
+            f"% {_escaped(table.title)}; needs \\usepackage{{booktabs}}",
+            r"\begin{table}",
+            r"\centering",
+            f"\\caption{{{_escaped(table.title)}}}",
+            f"\\label{{tab:{label}}}",
+            r"\footnotesize\setlength{\tabcolsep}{2.5pt}",
+            f"\\begin{{tabular}}{{@{{}}{'l' * len(table.stub)}{'r' * len(table.columns)}@{{}}}}",
+            r"\toprule",
+            f"{headings} \\\\",
+            r"\midrule",
+            "\n\\midrule\n".join(_latex_group(group, table.below) for group in table.groups),
+            r"\bottomrule",
+            r"\end{tabular}",
+            r"\par\medskip",
+            r"\begin{minipage}{\linewidth}\footnotesize\raggedright",
+            "\\par\n".join(notes),
+            r"\end{minipage}",
+            r"\end{table}",
+            "",
+        ]
+    )
+
+
+def _escaped(text: str) -> str:
+    """Text without a meaning in LaTeX; letters beyond ASCII, which a font may lack, by their numbers."""
+    return "".join(
+        SYMBOLS.get(letter) or (letter if letter.isascii() else f"U+{ord(letter):04X}") for letter in text
+    )
+
+
+def _latex_group(rows: Sequence[TableRow], below: str) -> str:
+    """Two lines for a row whose cells have a second line; a label that repeats is printed once."""
+    lines = []
+    above = ""
+    for row in rows:
+        label, *rest = row.stub
+        lines.append([*map(_escaped, ["" if label == above else label, *rest]), *map(_latex_cell, row.cells)])
+        if any(cell.below for cell in row.cells):
+            second = [_escaped(cell.below) for cell in row.cells]
+            lines.append([*[""] * len(rest), f"\\quad {_escaped(below)}", *second])
+        above = label
+    return "\n".join(f"{' & '.join(line)} \\\\" for line in lines)
+
+
+def _latex_cell(cell: TableCell) -> str:
+    ours = f"\\textbf{{{_escaped(cell.ours)}}}" if cell.bold else _escaped(cell.ours)
+    return f"{ours} {_escaped(cell.spread)}".rstrip()

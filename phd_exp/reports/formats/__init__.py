@@ -1,1 +1,0 @@
-"""The same tables for a terminal, Markdown, LaTeX and CSV."""

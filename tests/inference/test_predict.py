@@ -1,0 +1,301 @@
+"""`predict` and `load` with a network of random weights: what they read, what they write, and mistakes."""
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import phd_exp as package
+from phd_exp.distributions import PointEstimate, ProjectedHuber
+from phd_exp.inference import pictures
+from phd_exp.records.errors import DatasetError, RunError
+from phd_exp.records.runs import RunFolder
+from tests.support.disks import small_disk
+from tests.support.untrained import SMALL, read_lines, untrained, virtual_cameras, write_photos
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("photos") / "test"
+    write_photos(folder, 4)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def make(composed: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> Callable[..., RunFolder]:
+    """An untrained run of some overrides."""
+    return lambda *words: untrained(tmp_path_factory.mktemp("runs") / "run", composed(*SMALL, *words))
+
+
+@pytest.fixture(scope="module")
+def run(make: Callable[..., RunFolder]) -> RunFolder:
+    return make("data=folder", "data.folder=nowhere")
+
+
+@pytest.fixture(scope="module")
+def baseline(make: Callable[..., RunFolder]) -> RunFolder:
+    return make("data=folder", "data.folder=nowhere", "model=mae_constf")
+
+
+@pytest.fixture
+def spoiled(run: RunFolder, tmp_path: Path) -> RunFolder:
+    """A copy of the run, to be changed."""
+    return RunFolder(shutil.copytree(run.path, tmp_path / "spoiled"))
+
+
+def stacked(rows: list[dict[str, Any]], key: str) -> np.ndarray:
+    return np.array([row[key] for row in rows])
+
+
+def test_answers_are_in_the_frame_of_the_real_camera(phd_exp: Callable, run: RunFolder, photos: Path) -> None:
+    """Against samples of the prediction for a crop, turned back."""
+    outcome = phd_exp("predict", f"run={run.path}", f"folder={photos}")
+    assert (outcome.status, outcome.err) == (0, "")
+    predictor, n = package.load(run.path), 100_000
+    for row, camera in zip(read_lines(outcome.out)[:2], virtual_cameras(photos), strict=False):
+        view = predictor.view(np.asarray(Image.open(photos / row["file_name"])), camera.K, row["box"])
+        prediction = predictor.see(view)
+        assert isinstance(prediction, ProjectedHuber)
+        real = camera.to_real(prediction.rsample((n,), torch.Generator().manual_seed(0)).double().numpy())
+        for level, (low, high) in row["depth_interval"].items():
+            share = int(level) / 100
+            inside = ((low < real[:, 2]) & (real[:, 2] < high)).mean()
+            assert abs(inside - share) < 4 * np.sqrt(share * (1 - share) / n)
+        assert abs((real[:, 2] < row["median_depth"]).mean() - 0.5) < 4 * np.sqrt(0.25 / n)
+        scale = np.sqrt(np.diag(row["covariance"]))
+        assert np.abs(np.cov(real.T) - row["covariance"]).max() < 0.1 * scale.max() ** 2
+        assert np.abs((real.mean(axis=0) - row["mean"]) / scale).max() < 0.02
+
+
+def test_a_baseline_has_positions_without_uncertainty(
+    phd_exp: Callable, baseline: RunFolder, photos: Path, tmp_path: Path
+) -> None:
+    outcome = phd_exp("predict", f"run={baseline.path}", f"folder={photos}", "out=drawn")
+    assert outcome.status == 0, outcome.err
+    rows = read_lines((tmp_path / "drawn" / "predictions.jsonl").read_text())
+    errors = {"projected_error_mm", "depth_error_mm"}
+    assert rows[0].keys() == errors | {
+        "file_name",
+        "box",
+        "position",
+        "uncertainty",
+        "out_of_field",
+        "picture",
+    }
+    assert rows[0]["uncertainty"].startswith("none")
+    predictor = package.load(baseline.path)
+    for row, camera in zip(rows, virtual_cameras(photos), strict=True):
+        image = np.asarray(Image.open(photos / row["file_name"]))
+        prediction = predictor.see(predictor.view(image, camera.K, row["box"]))
+        assert isinstance(prediction, PointEstimate)
+        np.testing.assert_allclose(
+            row["position"], camera.to_real(prediction.mode.numpy()), rtol=1e-5, atol=1e-5
+        )
+    for word, said in (
+        ("recalibrate", "nothing to recalibrate"),
+        ("calibration", "no calibration curve of depth"),
+    ):
+        refused = phd_exp("predict", f"run={baseline.path}", f"folder={photos}", f"{word}=true", "out=more")
+        assert refused.status == 1
+        assert said in refused.err
+
+
+def test_one_image_is_the_line_of_a_folder_and_is_drawn(
+    phd_exp: Callable, run: RunFolder, photos: Path, tmp_path: Path
+) -> None:
+    camera = ("fx=300", "fy=310", "cx=50", "cy=40", "box=5,10,60,70")
+    image = f"image={photos / '0.png'}"
+    outcome = phd_exp("predict", f"run={run.path}", image, *camera, "out=drawn")
+    assert (outcome.status, outcome.out) == (0, "")
+    (row,) = read_lines((tmp_path / "drawn" / "predictions.jsonl").read_text())
+    there = read_lines(phd_exp("predict", f"run={run.path}", f"folder={photos}").out)[0]
+    assert row.keys() - {"picture"} <= there.keys()
+    for key in ("mode", "covariance", "median_depth"):
+        np.testing.assert_allclose(row[key], there[key], rtol=1e-5, atol=1e-6)
+    with Image.open(tmp_path / "drawn" / row["picture"]) as picture:
+        assert picture.format == "PNG"
+        assert picture.width > 2 * picture.height * 0.9
+    before = (photos / "0.png").read_bytes()
+    lost = phd_exp("predict", f"run={run.path}", image, *camera, f"out={photos}")
+    assert lost.status == 1
+    assert "holds the images themselves" in lost.err
+    assert (photos / "0.png").read_bytes() == before
+
+
+def test_every_line_has_its_own_picture(
+    phd_exp: Callable, run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the images are called; where one cannot be drawn, the lines before it are whole."""
+    titles: list[str] = []
+    suptitle = pictures.Figure.suptitle
+
+    def kept(self: pictures.Figure, text: str, **how: Any) -> Any:
+        titles.append(text)
+        return suptitle(self, text, **how)
+
+    monkeypatch.setattr(pictures.Figure, "suptitle", kept)
+    names = ["a.png", "a.jpg", "a.png", f"$x_${'l' * 240}.png", "\u4e2d.png"]
+    (tmp_path / "in").mkdir()
+    for name in names:
+        Image.new("RGB", (64, 64)).save(tmp_path / "in" / name)
+    text = "".join(json.dumps({"file_name": name, "f": 400.5}) + "\n" for name in names)
+    (tmp_path / "in" / "metadata.jsonl").write_text(text)
+    outcome = phd_exp("predict", f"run={run.path}", "folder=in", "out=drawn")
+    assert outcome.status == 0, outcome.err
+    rows = read_lines((tmp_path / "drawn" / "predictions.jsonl").read_text())
+    assert [row["file_name"] for row in rows] == names
+    files = {row["picture"] for row in rows}
+    assert len(files) == len(names)
+    assert {file.name for file in (tmp_path / "drawn").iterdir()} == files | {"predictions.jsonl"}
+    assert titles[0] == "a.png, f = 400.5 px"
+    (tmp_path / "in" / names[1]).write_bytes(b"no image")
+    assert phd_exp("predict", f"run={run.path}", "folder=in", "out=broken").status == 1
+    assert len(read_lines((tmp_path / "broken" / "predictions.jsonl").read_text())) == 1
+
+
+def test_a_full_disk_is_one_line_and_the_predictions_before_are_whole(
+    phd_exp: Callable, run: RunFolder, photos: Path, tmp_path: Path
+) -> None:
+    with small_disk(tmp_path / "disk", 200) as disk:
+        outcome = phd_exp("predict", f"run={run.path}", f"folder={photos}", f"out={disk}/drawn")
+        assert outcome.status == 1
+        (line,) = outcome.err.splitlines()
+        assert "No space left on device" in line
+        rows = read_lines((disk / "drawn" / "predictions.jsonl").read_text())
+        assert 1 < len(rows) <= 4
+        assert all((disk / "drawn" / row["picture"]).exists() for row in rows[:-1])
+
+
+def test_from_python_arrays_of_any_size(run: RunFolder) -> None:
+    predictor = package.load(run.path)
+    images = np.random.default_rng(0).integers(0, 256, (3, 64, 64, 3), dtype=np.uint8)
+    f = np.array([380.0, 400.0, 420.0])
+    prediction = predictor(images, f=f)
+    one = predictor(torch.from_numpy(images[2]), f=420.0)
+    assert one.mode.shape == (3,)
+    torch.testing.assert_close(one.mode, prediction.mode[2], rtol=1e-5, atol=1e-5)
+    for same in (f.tolist(), torch.tensor(f, requires_grad=True), [torch.tensor(value) for value in f]):
+        torch.testing.assert_close(predictor(images, f=same).mode, prediction.mode)
+    for same in ([420.0], torch.tensor(420.0), torch.tensor([420.0]), np.float32(420.0)):
+        torch.testing.assert_close(predictor(images[2], f=same).mode, one.mode)
+    assert predictor(np.zeros((65, 9, 16, 3), dtype=np.uint8), f=40.0).mode.shape == (65, 3)
+    for wrong in (images[0, :, :, 0], images.astype(np.float32), images[:, :, :, :2]):
+        with pytest.raises(DatasetError, match=r"^images: got .* expected uint8 of shape"):
+            predictor(wrong, f=400.0)
+    for bad in (0.0, -1.0, float("nan"), [1.0, 2.0], "wide", None, [[1.0], 2.0]):
+        with pytest.raises(DatasetError, match=r"^f: got"):
+            predictor(images, f=bad)
+
+
+MISTAKES = [
+    (("image=good.png", "f=400", "folder=."), "predict: expected either image=FILE"),
+    (("folder=.", "f=400"), "f: belongs to image=FILE"),
+    (("folder=.",), "metadata.jsonl, line 2: expected either f, or fx and fy"),
+    (("folder=dot",), "dot: cannot be read (Is a directory)"),
+    (("folder=nowhere",), "nowhere/metadata.jsonl: cannot be read"),
+    (("image=good.png", "f=400", "run=nowhere"), "run: given twice"),
+    (("imag=good.png",), "imag: unknown key, did you mean 'image'?"),
+    (("good.png",), "good.png: expected key=value"),
+    (("image=good.png", "f=400", "out=good.png/x"), "good.png/x: cannot be written"),
+    (
+        ("image=good.png", "f=400", "calibration=true"),
+        "calibration: is drawn into the pictures; expected out=",
+    ),
+]
+"""Of this verb alone; tests/bad_input has those of images, cameras and folders."""
+
+
+@pytest.mark.parametrize(("words", "said"), MISTAKES, ids=[" ".join(words) for words, _ in MISTAKES])
+def test_a_mistake_is_one_line(
+    phd_exp: Callable, run: RunFolder, tmp_path: Path, words: tuple[str, ...], said: str
+) -> None:
+    Image.new("RGB", (64, 64)).save(tmp_path / "good.png")
+    (tmp_path / "dot").mkdir()
+    (tmp_path / "dot" / "metadata.jsonl").write_text('{"file_name": ".", "f": 400}')
+    good = json.dumps({"file_name": "good.png", "f": 400})
+    (tmp_path / "metadata.jsonl").write_text(f"{good}\n{json.dumps({'file_name': 'good.png'})}\n")
+    outcome = phd_exp("predict", f"run={run.path}", *words)
+    assert (outcome.status, outcome.out) == (1, "")
+    (line,) = outcome.err.splitlines()
+    assert line.startswith("error: ")
+    assert said in line
+
+
+def diverge(folder: RunFolder) -> None:
+    checkpoint = torch.load(folder.last_checkpoint, weights_only=True)
+    checkpoint["state_dict"]["regressor.last.bias"][0] = torch.nan
+    torch.save(checkpoint, folder.last_checkpoint)
+
+
+SPOILED: list[tuple[Callable[[RunFolder], Any], str]] = [
+    (lambda it: it.last_checkpoint.unlink(), "last.ckpt: missing; the run has not trained a whole epoch yet"),
+    (lambda it: it.constants_file.unlink(), "constants.json: missing, so that the depth scale of its data"),
+    (lambda it: it.write_constants({"mu_z0": 0.01}), "constants.json: not the constants of a run ('constant_f')"),
+    (diverge, "0.png: the network returns numbers that are not finite; train the run again"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("spoil", "said"), SPOILED, ids=[said for _, said in SPOILED])
+def test_a_folder_that_holds_no_usable_run_is_one_line(
+    phd_exp: Callable, spoiled: RunFolder, photos: Path, spoil: Callable, said: str
+) -> None:
+    spoil(spoiled)
+    outcome = phd_exp("predict", f"run={spoiled.path}", f"image={photos / '0.png'}", "f=400")
+    assert outcome.status == 1
+    (line,) = outcome.err.splitlines()
+    assert said in line
+
+
+def test_a_run_on_images_that_an_earlier_version_shrunk_is_refused(make: Callable[..., RunFolder]) -> None:
+    rendered = make("data.sensor_size=64")
+    assert package.load(rendered.path).side == 48
+    rendered.constants_file.unlink()
+    with pytest.raises(
+        RunError, match="trained with images shrunk from 64 to 48 pixels by an earlier version"
+    ):
+        package.load(rendered.path)
+
+
+def test_an_unfinished_run_is_used_with_a_notice(phd_exp: Callable, spoiled: RunFolder, photos: Path) -> None:
+    status = spoiled.status()
+    assert status is not None
+    spoiled.write_status(status.model_copy(update={"state": "interrupted"}))
+    outcome = phd_exp("predict", f"run={spoiled.path}", f"image={photos / '0.png'}", "f=400")
+    assert outcome.status == 0
+    assert "the run is interrupted; its last checkpoint is used" in outcome.err
+    assert len(read_lines(outcome.out)) == 1
+
+
+def test_the_import_does_not_wait_for_torch_nor_a_prediction_for_lightning(run: RunFolder) -> None:
+    code = (
+        "import sys, phd_exp\n"
+        "assert 'torch' not in sys.modules\n"
+        "phd_exp.load(sys.argv[1])\n"
+        "assert not {'lightning', 'matplotlib', 'pyarrow', 'bpy'} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(run.path)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+EXPORT_MISTAKES = [
+    ((), "run: missing; export takes run=, out=, recalibrate="),
+    (("run=nowhere",), "nowhere: no run; expected a folder with config.yaml"),
+    (("run=.", "out=."), "out=.: is a folder"),
+]
+
+
+@pytest.mark.parametrize(("words", "said"), EXPORT_MISTAKES)
+def test_a_mistake_in_exporting_is_one_line(phd_exp: Callable, words: tuple[str, ...], said: str) -> None:
+    pytest.importorskip("onnxruntime", reason="export needs `pip install 'phd_exp[export]'`")
+    outcome = phd_exp("export", *words)
+    assert outcome.status == 1
+    (line,) = outcome.err.splitlines()
+    assert line.startswith(f"error: {said}")
