@@ -24,9 +24,9 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> None:
         n = verify(folder, data.spec, checked.rerender)
         print(f"{folder.root}: all {n} samples are as they were rendered")
         return
-    counts = data.n_training_split, data.n_test
-    if not ensure_rendered(folder, data.spec, *counts, data.workers, cores, checked.shard):
+    n_train, n_test = data.n_training_split, data.n_test
+    if not ensure_rendered(folder, data.spec, n_train, n_test, data.workers, cores, checked.shard):
         return  # other shards are missing
-    print(f"{folder.root}: {data.n_training_split} training and {data.n_test} test samples are there")
+    print(f"{folder.root}: {n_train} training and {n_test} test samples are there")
     if checked.masks is not None:
         print(f"{checked.masks}: {write_masks(folder, checked.masks)} masks")

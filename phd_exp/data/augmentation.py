@@ -1,4 +1,4 @@
-"""Batches seen by other cameras at the same place: more to learn from, and every label exact."""
+"""Geometric augmentation: the same scene through other cameras at the same place, with exact labels."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -16,12 +16,12 @@ from phd_exp.geometry.motion import Motion, small_turns, symmetries
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Which changes of a sample are drawn at random.
+    """Random changes of the samples of a batch.
 
     Args:
-        symmetries: one of the eight turns and mirrors that map pixels to pixels.
-        largest_zoom: a small turn and zoom of the camera, up to this factor; 1 for none.
-        colours: the three colour channels in any order, which tells nothing of where things are.
+        symmetries: apply one of the eight rotations and reflections that map pixels to pixels.
+        largest_zoom: largest factor of a small rotation and zoom of the camera; 1 for none.
+        colours: permute the three colour channels.
         photometry: changes of light and image quality.
     """
 
@@ -37,9 +37,9 @@ class Augmentation:
         return self.symmetries or self.largest_zoom > 1 or self.colours or self.photometry.changes_anything
 
     def __call__(self, batch: Batch, numbers: Float[Tensor, "batch 22"]) -> Batch:
-        """The samples, changed given uniform numbers from -1 to 1.
+        """The samples, changed by uniform numbers from -1 to 1.
 
-        One whose object would leave the image by a turn or zoom keeps its symmetry alone.
+        A rotation and zoom that would move the object out of the image is skipped; the symmetry is kept.
         """
         if self.photometry.changes_anything:
             batch = replace(batch, image=self.photometry(batch.image, numbers[:, 10:]))
@@ -62,9 +62,9 @@ def _rearranged(
     signs: Float[Tensor, "batch 3"],
     colours: Int[Tensor, "batch 3"],
 ) -> UInt8[Tensor, "batch side side 3"]:
-    """As `warped` by `symmetries` of these signs, without looking between pixels; with the channels in that order.
+    """The images `warped` by `symmetries` of these signs, without interpolation; with the channels in that order.
 
-    Image by image: to take a whole batch for every mirror is ten times slower.
+    One image at a time: indexing the batch once per reflection is ten times slower.
     """
     result = torch.empty_like(image)
     for one, new, (x, y, exchange), order in zip(
@@ -78,14 +78,14 @@ def _rearranged(
 
 
 def moved(batch: Batch, motion: Motion) -> Batch:
-    """The samples as the cameras see them after a motion."""
+    """The samples after a motion of the cameras."""
     return Batch(
         warped(batch, motion), motion.position(batch.xyz), motion.camera(batch.camera).f, batch.S, batch.row
     )
 
 
 def warped(batch: Batch, motion: Motion) -> UInt8[Tensor, "batch height width 3"]:
-    """The images after a motion, between pixels bilinearly; beyond its border an image goes on as its border is."""
+    """The images after a motion, interpolated bilinearly; pixels beyond the border repeat it."""
     side = batch.image.shape[1]
     origin = motion.origin(middles(side, side).to(batch.f), batch.camera)
     images = batch.image.permute(0, 3, 1, 2).to(origin.dtype)

@@ -1,7 +1,7 @@
-"""Batches of a resident data set, in an order that depends on (seed, epoch) alone."""
+"""Batches of a data set in memory, in an order that depends on (seed, epoch) alone."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -18,17 +18,17 @@ OCTANTS = 8
 
 @dataclass(frozen=True)
 class Batch:
-    """Samples, one a row: what a network sees, what it is told, and the truth."""
+    """Samples, one per row: the inputs of a network and the truth."""
 
     image: UInt8[Tensor, "batch height width 3"]
     xyz: Float[Tensor, "batch 3"]
     """True position in the camera frame, metres."""
     f: Float[Tensor, " batch"]
-    """Focal length in pixels of `image`, not of the sensor it was rendered on."""
+    """Focal length in pixels of `image`, which may have been shrunk."""
     S: float
     """Side of `image` in pixels."""
     row: Int[Tensor, " batch"]
-    """Place of each sample in its split."""
+    """Index of each sample in its split."""
 
     @property
     def camera(self) -> Camera:
@@ -44,70 +44,66 @@ class Batch:
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> "Batch":
         """The same samples on a device."""
-
-        def moved(tensor: Tensor) -> Tensor:
-            return tensor.to(device, non_blocking=non_blocking)
-
-        return Batch(moved(self.image), moved(self.xyz), moved(self.f), self.S, moved(self.row))
+        moved = {
+            name: getattr(self, name).to(device, non_blocking=non_blocking)
+            for name in ("image", "xyz", "f", "row")
+        }
+        return replace(self, **moved)
 
 
 @runtime_checkable
 class Augment(Protocol):
-    """A random change of samples, of which the labels stay exact."""
+    """A random change of samples that keeps their labels exact."""
 
     n_numbers: ClassVar[int]
-    """How many random numbers decide over one sample."""
+    """Number of random numbers per sample."""
 
     def __call__(self, batch: Batch, numbers: Float[Tensor, "batch n_numbers"]) -> Batch:
-        """The samples, changed as uniform numbers from -1 to 1 say."""
+        """The samples, changed by uniform numbers from -1 to 1."""
         ...
 
 
+@dataclass(eq=False)
 class BatchLoader:
     """Iterates over the batches of one epoch; each iteration is the next epoch.
 
-    The order is a function of (seed, epoch), never of what ran before, and the state holds both the epoch and how far
-    it has come: a resumed epoch goes on with the batches that were left, where a DataLoader would replay its first
-    ones.
+    `shuffle` is for training: a random order, without the last batch if it is not full. The order is a function of
+    (seed, epoch). The state holds the epoch and the next batch, so a resumed epoch continues with its remaining
+    batches; a DataLoader would repeat its first ones.
 
-    Of several processes that train together each takes its share of every batch: rank r the rows r, r + world, ...
-    No row is seen twice, and a last batch that has no row for a rank does not exist for it.
+    With several processes, rank r takes the rows r, r + world, ... of every batch. No row is repeated; a rank skips a
+    last batch without a row for it.
 
-    `augment` changes a batch given random numbers, `n_numbers` a row. They are a function of (seed, epoch, batch) for
-    the whole batch, of which each process takes its share, so they depend neither on what ran before nor on `world`.
-    The signs of a row's first three numbers are stratified: within eight epochs each row gets all eight combinations.
+    `augment` changes a batch given `n_numbers` random numbers per row. They are a function of (seed, epoch, batch)
+    for the whole batch, so they do not depend on `world`. The signs of the first three numbers of a row are
+    stratified: within eight epochs each row gets all eight combinations.
+
+    Example:
+        >>> n = 4
+        >>> samples = Batch(torch.zeros(n, 8, 8, 3, dtype=torch.uint8), torch.ones(n, 3), torch.ones(n), 8.0,
+        ...                 torch.arange(n))
+        >>> loader = BatchLoader(samples, 3, shuffle=True, seed=0)
+        >>> [batch.row.tolist() for batch in loader]
+        [[1, 0, 3]]
     """
 
-    def __init__(
-        self,
-        samples: Batch,
-        batch_size: int,
-        *,
-        shuffle: bool,
-        drop_last: bool,
-        seed: int,
-        rank: int = 0,
-        world: int = 1,
-        augment: Augment | None = None,
-    ) -> None:
-        self.samples = samples
-        self.batch_size = batch_size
-        self.shuffle = shuffle
-        self.drop_last = drop_last
-        self.seed = seed
-        self.rank = rank
-        self.world = world
-        self.augment = augment
-        self.epoch = -1
-        self.next_batch = 0
+    samples: Batch
+    batch_size: int
+    shuffle: bool
+    seed: int
+    rank: int = 0
+    world: int = 1
+    augment: Augment | None = None
+    epoch: int = field(default=-1, init=False)
+    next_batch: int = field(default=0, init=False)
 
     def __len__(self) -> int:
         whole, rest = divmod(len(self.samples), self.batch_size)
-        return whole + (rest > self.rank and not self.drop_last)
+        return whole + (rest > self.rank and not self.shuffle)
 
     def __iter__(self) -> Iterator[Batch]:
         if self.next_batch in (0, len(self)):  # else: resumed in the middle of an epoch
-            self.epoch += 1  # at the start, since an iterator is not always exhausted
+            self.epoch += 1  # at the start, since an iterator may not be exhausted
             self.next_batch = 0
         order = self.order(self.epoch)
         signs = self.signs(self.epoch) if self.augment else np.empty(0)
@@ -119,20 +115,20 @@ class BatchLoader:
             yield self.augment(batch, self._numbers(signs[rows], number)) if self.augment else batch
 
     def order(self, epoch: int) -> Int[Tensor, " samples"]:
-        """The rows in the order in which that epoch visits them."""
+        """The rows in the order of an epoch."""
         if not self.shuffle:
             return torch.arange(len(self.samples))
         return torch.from_numpy(self._random(epoch).permutation(len(self.samples)))
 
     def _numbers(self, signs: NDArray[np.int64], number: int) -> Float[Tensor, "share n_numbers"]:
-        """This process's share of a batch's random numbers, uniform from -1 to 1, given the signs of the first."""
+        """This process's share of the random numbers of a batch, given the signs of the first three of each row."""
         assert self.augment is not None
         numbers = self._random(self.epoch, number).uniform(-1, 1, (len(signs), self.augment.n_numbers))
         numbers[:, :3] = signs * np.abs(numbers[:, :3])
         return torch.from_numpy(numbers[self.rank :: self.world])
 
     def signs(self, epoch: int) -> NDArray[np.int64]:
-        """The signs (samples, 3) of an epoch: a random order of all eight for each sample in every eight epochs."""
+        """The signs (samples, 3) of an epoch: every eight epochs, each sample gets all eight in random order."""
         block, place = divmod(epoch, OCTANTS)
         orders = np.tile(np.arange(OCTANTS), (len(self.samples), 1))
         octant = self._random(block, 0, 0).permuted(orders, axis=1)[:, place]
@@ -142,9 +138,9 @@ class BatchLoader:
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=place))
 
     def state_dict(self) -> dict[str, int]:
-        """Where the iteration stands, for a checkpoint."""
+        """The position of the iteration, for a checkpoint."""
         return {"epoch": self.epoch, "next_batch": self.next_batch}
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
-        """Let the next iteration go on from there."""
+        """Continue the next iteration at this position."""
         self.epoch, self.next_batch = state_dict["epoch"], state_dict["next_batch"]

@@ -1,4 +1,4 @@
-"""Images decoded once: a memory-mapped uint8 array beside the data set, so that no epoch decodes a file again."""
+"""A cache of decoded images: a memory-mapped uint8 array next to the data set."""
 
 import json
 from collections.abc import Callable, Iterator, Sequence
@@ -18,15 +18,15 @@ from phd_exp.records.processes import held
 
 DECODERS = 4
 LARGEST_AT_ONCE = 1 << 26
-"""Pixels of the images that are decoded at the same time."""
+"""Pixels decoded at the same time."""
 
 Job = TypeVar("Job")
 Fill = Callable[[np.ndarray, Job], None]
-"""Decodes what one job asks for into rows of the array that no other job writes."""
+"""Decodes one job into its own rows of the array."""
 
 
 class CacheError(DatasetError):
-    """There is no place for decoded images."""
+    """The cache folder cannot be written."""
 
 
 def cached(
@@ -38,30 +38,35 @@ def cached(
     words: str,
     largest: int = 1,
 ) -> np.ndarray:
-    """The array of this key, memory-mapped from the file; filled first unless the file holds precisely that.
+    """The array of a key, memory-mapped from a file; filled first unless the file already holds it.
 
-    `largest` is the number of pixels of the largest image, which bounds how many are decoded at the same time.
+    Args:
+        file: the array; the key is stored next to it.
+        key: everything that the pixels depend on.
+        shape: of the array.
+        jobs: arguments of the calls to `fill`, which run in several threads.
+        fill: decodes one job into the array.
+        words: description of the progress bar.
+        largest: pixels of the largest image; bounds the number of threads.
 
-    Raises CacheError where the file's folder cannot be written, and whatever `fill` raises.
+    Raises CacheError if the folder cannot be written, and the errors of `fill`.
     """
     key_file = file.with_suffix(".json")
-    with _alone_in(file.parent):  # the runs of a parallel sweep all come here first
-        if (kept := _kept(file, key_file, key, shape)) is None:
-            unfinished = file.with_suffix(".unfinished")
-            unfinished.unlink(
-                missing_ok=True
-            )  # a link there, of somebody else, would have its target written
-            array = np.lib.format.open_memmap(unfinished, mode="w+", dtype=np.uint8, shape=shape)
-            fill_all(array, jobs, fill, words, largest)
-            array.flush()
-            unfinished.replace(file)
-            write_atomic(key_file, json.dumps(key) + "\n")
-            kept = _mapped(file)
-    return kept
+    with _locked(file.parent):  # concurrent runs of a sweep decode once
+        if (kept := _kept(file, key_file, key, shape)) is not None:
+            return kept
+        unfinished = file.with_suffix(".unfinished")
+        unfinished.unlink(missing_ok=True)  # if it is a link, writing would overwrite its target
+        array = np.lib.format.open_memmap(unfinished, mode="w+", dtype=np.uint8, shape=shape)
+        fill_all(array, jobs, fill, words, largest)
+        array.flush()
+        unfinished.replace(file)
+        write_atomic(key_file, json.dumps(key) + "\n")
+        return _mapped(file)
 
 
 def fill_all(array: np.ndarray, jobs: Sequence[Job], fill: Fill, words: str, largest: int = 1) -> None:
-    """Do all jobs in several threads, with a progress bar on a terminal; the larger the images, the fewer threads."""
+    """Do all jobs in several threads, with a progress bar on a terminal; arguments as for `cached`."""
     with ThreadPoolExecutor(max(1, min(DECODERS, LARGEST_AT_ONCE // largest))) as pool:
         done = pool.map(lambda job: fill(array, job), jobs)
         console = Console(stderr=True)
@@ -71,8 +76,7 @@ def fill_all(array: np.ndarray, jobs: Sequence[Job], fill: Fill, words: str, lar
 
 
 @contextmanager
-def _alone_in(cache: Path) -> Iterator[None]:
-    """One process at a time decodes; the others wait and find the work done."""
+def _locked(cache: Path) -> Iterator[None]:
     try:
         cache.mkdir(parents=True, exist_ok=True)
         with held(
@@ -84,7 +88,7 @@ def _alone_in(cache: Path) -> Iterator[None]:
 
 
 def _kept(file: Path, key_file: Path, key: dict[str, Any], shape: tuple[int, ...]) -> np.ndarray | None:
-    """The array that is there; None where it is none of this key and shape, so that it is made again."""
+    """The stored array; None if it is missing, broken, or of another key or shape."""
     try:
         if parse_json(read_plain(key_file).decode()) != key:
             return None
@@ -96,6 +100,6 @@ def _kept(file: Path, key_file: Path, key: dict[str, Any], shape: tuple[int, ...
 
 
 def _mapped(file: Path) -> np.ndarray:
-    # copy-on-write: torch wants a writable array, and nothing may write into this file
+    # copy-on-write: torch requires a writable array, but the file must not change
     array: np.ndarray = np.load(file, mmap_mode="c", allow_pickle=False)
     return array

@@ -1,4 +1,4 @@
-"""The user's own images: read, and seen by virtual cameras."""
+"""Reading the user's own images, and resampling them to the views of virtual cameras."""
 
 import io
 import math
@@ -16,24 +16,24 @@ from phd_exp.records.files import require_plain
 from phd_exp.records.images import FORMATS, LARGEST_IMAGE, decoding, pillow_warnings
 
 GREY = (128, 128, 128)
-"""The colour beyond the edges of an image and where it is transparent."""
+"""The colour of transparent pixels and of those beyond the edges of an image."""
 PLAIN = ("1", "L", "RGB", "YCbCr", "CMYK")
-WITH_ALPHA = ("P", "PA", "LA", "La", "RGBA", "RGBa")  # a palette may hold a transparent colour
+WITH_ALPHA = ("P", "PA", "LA", "La", "RGBA", "RGBa")  # a palette may contain a transparent colour
 SIXTEEN_BITS = ("I;16", "I;16L", "I;16B", "I;16N")
 ONE_PICTURE = ("JPEG", "MPO")
-"""Formats whose further frames are previews and depth maps of the first."""
+"""Formats whose further frames are previews and depth maps."""
 MARGIN = 2
-"""Pixels around a position that bicubic interpolation reads."""
+"""Pixels around a position read by bicubic interpolation."""
 FINE = 4
-"""Samples along a pixel of the view where the image is sparsest."""
+"""Samples along a pixel of the view at the lowest density."""
 FINEST = 16
-"""Samples along a pixel of the view, at most; near 90 degrees from the axis of its camera an image has no end."""
+"""Largest number of samples along a pixel of the view; near 90 degrees from the optical axis it has no bound."""
 LARGEST_STRIPE = 1 << 22
-"""Samples that are in memory at once."""
+"""Samples in memory at once."""
 
 
 def image_size(file: Path) -> tuple[int, int]:
-    """Width and height, from the header of the file. Raises DatasetError if it is not an image."""
+    """Width and height from the header of the file. Raises DatasetError if it is not an image."""
     with decoding(file), pillow_warnings():
         require_plain(file, LARGEST_IMAGE)
         with Image.open(file, formats=FORMATS) as image:
@@ -41,31 +41,33 @@ def image_size(file: Path) -> tuple[int, int]:
 
 
 def read_image(file: Path, content: bytes) -> Image.Image:
-    """The image as RGB: grey, palette and 16 bits (the upper 8 of them) converted, transparency laid over grey.
+    """The image as RGB: grey, palette and 16 bits (its upper 8) converted, transparency composed over grey.
 
     Raises DatasetError, naming the file, if it is not one whole image, exceeds Pillow's limit of pixels, has an EXIF
     orientation (the pixels of the intrinsics are then ambiguous), or its colours cannot be converted to RGB.
     """
     with decoding(file), Image.open(io.BytesIO(content), formats=FORMATS) as image:
-        orientation = image.getexif().get(
-            ExifTags.Base.Orientation, 1
-        )  # first: Pillow turns a TIFF as it loads
+        # before loading, during which Pillow rotates a TIFF
+        orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
         if orientation != 1:
             raise DatasetError(
                 f"{file}: has the EXIF orientation {orientation}, so that its stored pixels are turned; "
                 "turn them for good (`mogrify -auto-orient`), and let f, cx, cy and box refer to the result"
             )
-        _require_one_picture(file, image)
+        if getattr(image, "is_animated", False) and image.format not in ONE_PICTURE:
+            raise DatasetError(
+                f"{file}: holds several pictures; expected one, save that which is meant by itself"
+            )
         image.load()
         return _as_rgb(file, image)
 
 
 def cut(image: Image.Image, camera: VirtualCamera) -> UInt8[np.ndarray, "S S 3"]:
-    """The virtual camera's view of an RGB image of its real camera; grey beyond the edges of that image.
+    """The virtual camera's view of an RGB image of its real camera; grey beyond the edges of the image.
 
-    A square image seen as a whole is `shrunk`. Any other view averages bicubic samples over the area of each pixel.
-    Where an image has many pixels for each pixel of the view, blocks of them are averaged first. Memory does not grow
-    with the density of the samples.
+    A square image viewed as a whole is `shrunk`. Any other view averages bicubic samples over the area of each pixel.
+    If an image has many pixels per pixel of the view, blocks of them are averaged first. The memory does not depend
+    on the density of the samples.
     """
     S = int(camera.S)
     if _is_whole(image, camera) and image.width >= S:
@@ -93,14 +95,14 @@ def cut(image: Image.Image, camera: VirtualCamera) -> UInt8[np.ndarray, "S S 3"]
 
 
 def _is_whole(image: Image.Image, camera: VirtualCamera) -> bool:
-    """Whether the view is all of a square image, on fewer or more pixels."""
+    """Whether the view is a whole square image, on fewer or more pixels."""
     zoom = camera.S / image.width
     whole = image.width == image.height and np.array_equal(camera.R, np.eye(3))
     return whole and np.allclose(camera.homography, np.diag([zoom, zoom, 1]), rtol=0, atol=1e-9)
 
 
 def _reach(image: Image.Image, camera: VirtualCamera) -> tuple[int, int, int, int]:
-    """Left, top, right and bottom of the part of the image that the view needs; never empty."""
+    """Left, top, right and bottom of the part of the image that the view reads; never empty."""
     S = camera.S
     corners = np.linalg.inv(camera.homography) @ np.array([[0, S, 0, S], [0, 0, S, S], [1, 1, 1, 1]])
     size = np.array(image.size)
@@ -114,27 +116,12 @@ def _sampled(
     bands: Sequence[Image.Image], back: Float[np.ndarray, "3 3"], width: int, height: int
 ) -> Float[np.ndarray, "height width 3"]:
     """Bicubic samples at the pixels to which `back` maps those of a `width` x `height` image."""
-    # Pillow maps the middle of an output pixel, (column + 1/2, row + 1/2), to input pixels counted in the same way
+    # in Pillow's coordinates, too, the centre of a pixel is (column + 1/2, row + 1/2)
     coefficients = (back / back[2, 2]).flatten()[:8].tolist()
-    # band by band in floating point: of whole bytes Pillow would cut off the fraction
-    levels = [
-        band.transform(
-            (width, height),
-            Image.Transform.PERSPECTIVE,
-            coefficients,
-            Image.Resampling.BICUBIC,
-            fillcolor=grey,
-        )
-        for band, grey in zip(bands, GREY, strict=True)
-    ]
-    return np.stack([np.asarray(band) for band in levels], axis=-1)
-
-
-def _require_one_picture(file: Path, image: Image.Image) -> None:
-    if getattr(image, "is_animated", False) and image.format not in ONE_PICTURE:
-        raise DatasetError(
-            f"{file}: holds several pictures; expected one, save that which is meant by itself"
-        )
+    how = ((width, height), Image.Transform.PERSPECTIVE, coefficients, Image.Resampling.BICUBIC)
+    # band by band in floating point: Pillow truncates the samples of bytes
+    samples = [band.transform(*how, fillcolor=grey) for band, grey in zip(bands, GREY, strict=True)]
+    return np.stack([np.asarray(band) for band in samples], axis=-1)
 
 
 def _as_rgb(file: Path, image: Image.Image) -> Image.Image:

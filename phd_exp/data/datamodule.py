@@ -1,4 +1,6 @@
-"""A data set as Lightning takes it."""
+"""A data set as a LightningDataModule."""
+
+from functools import partial
 
 from lightning import LightningDataModule
 
@@ -8,12 +10,12 @@ from phd_exp.records.errors import ConfigError
 
 
 class PositionData(LightningDataModule):
-    """The samples of a source in batches; of several processes that train together (`world`), those of one (`rank`).
+    """The samples of a source in batches, or the share of one of several processes (`rank` of `world`).
 
-    `augment` changes the batches that are trained on, and no others.
+    `augment` changes training batches only.
 
-    Raises ConfigError where there are too few samples for one batch, or where processes could not share them; on
-    `setup`, DatasetError where the source lacks samples or an image is damaged.
+    Raises ConfigError if there are too few samples for one batch, or if the processes cannot share them; on `setup`,
+    DatasetError if the source lacks samples or an image is damaged.
     """
 
     def __init__(
@@ -34,50 +36,32 @@ class PositionData(LightningDataModule):
             )
         _require_shares(source, batch_size, world)
         self.source = source
-        self.batch_size = batch_size
-        self.seed = seed
-        self.rank = rank
-        self.world = world
         self.augment = augment
+        self.batches = partial(BatchLoader, batch_size=batch_size, seed=seed, rank=rank, world=world)
         self.samples: dict[Part, Batch] = {}
         self.train_batches: BatchLoader | None = None
 
     def setup(self, stage: str | None = None) -> None:
-        """Open every part that has samples; decodes their images the first time."""
+        """Open every part that has samples. Decodes their images on first use."""
         for part in PARTS:
             if part not in self.samples and self.source.count(part):
                 self.samples[part] = self.source.samples(part)
         if self.train_batches is None:
-            self.train_batches = self._batches("train", shuffle=True, drop_last=True)
+            self.train_batches = self.batches(self.samples["train"], shuffle=True, augment=self.augment)
 
     def train_dataloader(self) -> BatchLoader:
         assert self.train_batches is not None, "setup comes first"
         return self.train_batches
 
     def val_dataloader(self) -> BatchLoader:
-        # the paper reports the test split after every epoch; nothing is selected by it
-        return self.test_dataloader()
-
-    def test_dataloader(self) -> BatchLoader:
+        # the paper reports the test split after every epoch; it selects nothing
         return self.in_order("test")
 
     def in_order(self, part: Part) -> BatchLoader:
-        """Every sample of a part once, as they come."""
-        return self._batches(part, shuffle=False, drop_last=False)
+        """Every sample of a part once, in the order of the data set."""
+        return self.batches(self.samples[part], shuffle=False)
 
-    def _batches(self, part: Part, *, shuffle: bool, drop_last: bool) -> BatchLoader:
-        return BatchLoader(
-            self.samples[part],
-            self.batch_size,
-            shuffle=shuffle,
-            drop_last=drop_last,
-            seed=self.seed,
-            rank=self.rank,
-            world=self.world,
-            augment=self.augment if shuffle else None,
-        )
-
-    # Lightning restores the state of a loader in the middle of an epoch alone, that of a datamodule always
+    # Lightning restores the state of a datamodule always, that of a loader in the middle of an epoch only
     def state_dict(self) -> dict[str, int]:
         return self.train_dataloader().state_dict()
 

@@ -1,9 +1,7 @@
-"""Samples from a folder of the user's own images, one virtual camera for each detection."""
+"""Samples from a folder of the user's own images, with one virtual camera per detection."""
 
-import hashlib
 import math
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,7 +40,7 @@ class FolderSource(Source):
     """The first n detections (None: all) of each split of a folder.
 
     Held-out detections follow the training detections; if `n_train` is None, they are the last of the training split.
-    The constants are computed from the training detections. Everything but the images is checked here.
+    The constants are computed from the training detections. The constructor checks everything but the images.
 
     Raises DatasetError, naming file and line, for an invalid sample; ConfigError if no training sample is left.
     """
@@ -76,10 +74,8 @@ class FolderSource(Source):
 
     def samples(self, part: Part) -> Batch:
         crops = self.crops[part]
-        with pillow_warnings():
-            images = self._images(part)
         return Batch(
-            image=torch.from_numpy(images),
+            image=torch.from_numpy(self._images(crops, part)),
             xyz=torch.from_numpy(np.stack([crop.xyz for crop in crops]).astype(np.float32)),
             f=torch.tensor([crop.camera.f for crop in crops], dtype=torch.float32),
             S=float(self.side),
@@ -100,15 +96,14 @@ class FolderSource(Source):
     def count(self, part: Part) -> int:
         return len(self.crops[part])
 
-    def _images(self, part: Part) -> np.ndarray:
+    @pillow_warnings()
+    def _images(self, crops: list[Crop], part: Part) -> np.ndarray:
         """The crops, from the cache, or decoded into memory if the folder is read-only."""
-        crops = self.crops[part]
-        rows: dict[Path, list[int]] = {}
+        rows: dict[Path, list[int]] = {}  # a file may have many detections
         for row, crop in enumerate(crops):
             rows.setdefault(crop.detection.file, []).append(row)
         checksums = {file: sha256(content_of(file)) for file in rows}
 
-        # a whole file at a time, since it may hold many detections
         def fill(array: np.ndarray, file: Path) -> None:
             content = content_of(file)
             if sha256(content) != checksums[file]:
@@ -117,24 +112,21 @@ class FolderSource(Source):
             for row in rows[file]:
                 array[row] = cut(image, crops[row].camera)
 
+        # the pixels depend on the files, and on camera, box and side, which determine the homography
+        content = [
+            checksums[crop.detection.file].encode() + crop.camera.homography.tobytes() for crop in crops
+        ]
+        key = {"layout": CROP_LAYOUT, "crops": sha256(b"".join(content))}
         kept = self.folder.cache / f"crops-{part}-{len(crops)}x{self.side}.npy"
         largest = max((math.prod(self.sizes[file]) for file in rows), default=1)
         shape, words = (len(crops), self.side, self.side, 3), f"decoding {part.replace('_', '-')} images once"
         try:
-            return cached(kept, _key(crops, checksums), shape, list(rows), fill, words, largest)
+            return cached(kept, key, shape, list(rows), fill, words, largest)
         except CacheError as error:
             print(f"{error}; they are decoded into memory, each run anew", file=sys.stderr)
             array = np.empty(shape, dtype=np.uint8)
             fill_all(array, list(rows), fill, words, largest)
             return array
-
-
-def _key(crops: list[Crop], checksums: Mapping[Path, str]) -> dict[str, Any]:
-    """What the pixels of crops depend on: the files, and camera, box and side, which are all in the homography."""
-    digest = hashlib.sha256()
-    for crop in crops:
-        digest.update(checksums[crop.detection.file].encode() + crop.camera.homography.tobytes())
-    return {"layout": CROP_LAYOUT, "crops": digest.hexdigest()}
 
 
 def _crop(detection: Detection, side: int, sizes: dict[Path, tuple[int, int]]) -> Crop:

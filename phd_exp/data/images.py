@@ -1,4 +1,4 @@
-"""The images of a rendered data set, checked, and their exact shrinking."""
+"""The images of a rendered data set, checked and shrunk."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -15,9 +15,9 @@ from phd_exp.records.images import recorded_image
 from phd_exp.records.scenes import SampleRecord, Split
 
 SHRINKING = 2
-"""Version of `shrunk`, recorded with each run and each cache. Version 1 was exact for integer factors only."""
+"""Version of `shrunk`, recorded with each run and cache. Version 1 was exact for integer factors only."""
 _LARGEST_STRIPE = 1 << 22
-"""Values that `shrunk` converts to float64 at once."""
+"""Values converted to float64 at once."""
 
 
 def cached_images(
@@ -25,10 +25,10 @@ def cached_images(
 ) -> np.ndarray:
     """The images of the records as a memory-mapped array (n, image_size, image_size, 3), uint8.
 
-    Decodes them if no array of precisely these images is there yet. Down-sampling averages areas, so that f and
-    S scale by the same factor as the image's side.
+    Decodes them unless the cache holds exactly these images. Shrinking averages areas, so f and S scale by the same
+    factor as the side of the image.
 
-    Raises DatasetError for an image that is missing, is damaged, or cannot be decoded.
+    Raises DatasetError for an image that is missing, damaged, or cannot be decoded.
     """
 
     def fill(array: np.ndarray, row: int) -> None:
@@ -46,7 +46,7 @@ def cached_images(
 
 
 def decode(file: Path, record: SampleRecord, image_size: int) -> np.ndarray:
-    """One image as (image_size, image_size, 3), uint8. Raises DatasetError where the file is not as recorded."""
+    """One image as (image_size, image_size, 3), uint8. Raises DatasetError if the file is not as recorded."""
     try:
         image = recorded_image(file, record)
     except DatasetError as error:
@@ -57,17 +57,22 @@ def decode(file: Path, record: SampleRecord, image_size: int) -> np.ndarray:
 
 
 def shrunk(pixels: UInt8[np.ndarray, "height width 3"], side: int) -> UInt8[np.ndarray, "side side 3"]:
-    """The image with `side` x `side` pixels, each the mean of the area that it covers, rounded.
+    """The image with `side` x `side` pixels, each the rounded mean of the area that it covers.
 
         out[i, j] = sum_(y, x) H[i, y] W[j, x] pixels[y, x] / (height width)
 
     H and W are the overlaps of `_overlaps`. The sums are exact integers, so mirrored images give mirrored results.
+
+    Example:
+        >>> pixels = np.arange(16, dtype=np.uint8).reshape(4, 4, 1).repeat(3, axis=2)
+        >>> shrunk(pixels, 2)[..., 0].tolist()
+        [[2, 4], [10, 12]]
     """
     height, width, _ = pixels.shape
     if (height, width) == (side, side):
         return pixels
     H, W = _overlaps(height, side), _overlaps(width, side)
-    step = max(1, side * _LARGEST_STRIPE // pixels.size)  # rows of the result at once: bounds the memory
+    step = max(1, side * _LARGEST_STRIPE // pixels.size)  # rows at once: bounds the memory
     out = np.empty((side, side, 3), dtype=np.uint8)
     for first in range(0, side, step):
         last = min(first + step, side)
@@ -81,7 +86,7 @@ def shrunk(pixels: UInt8[np.ndarray, "height width 3"], side: int) -> UInt8[np.n
 
 @lru_cache(maxsize=16)
 def _overlaps(n: int, side: int) -> csr_array:
-    """Overlap of pixel i of `side` with pixel x of n, in units of 1/side of a pixel x; each row sums to n."""
+    """Overlap of output pixel i with input pixel x, in units of 1/side input pixels; each row sums to n."""
     first = np.arange(side) * n // side
     x = first[:, None] + np.arange(n // side + 2)
     i = np.arange(side)[:, None]

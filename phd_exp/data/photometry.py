@@ -1,4 +1,4 @@
-"""Photometric augmentation: the same scene in other light, through another camera. Labels do not change."""
+"""Photometric augmentation: changes of light and image quality that keep the labels."""
 
 import io
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ from PIL import Image, ImageFilter
 from torch import Tensor
 
 FIELD = 512
-"""Side of the field of standard normal numbers from which every image's noise is cut, pixels."""
+"""Side of the field of standard normal numbers from which the noise of each image is cut, pixels."""
 
 
 @dataclass(frozen=True)
 class Photometry:
     """Random changes of light, colour and image quality, each up to a limit.
 
-    Half of the images change in tone: brightness, contrast, gamma and white balance together, each factor log-uniform
+    Half of the images change in brightness, contrast, gamma and white balance together, with factors log-uniform
     between 1/limit and the limit. A quarter each is blurred, gets noise, or is compressed, uniformly up to the limit.
 
     Args:
@@ -50,7 +50,7 @@ class Photometry:
     def __call__(
         self, image: UInt8[Tensor, "batch height width 3"], numbers: Float[Tensor, "batch 12"]
     ) -> UInt8[Tensor, "batch height width 3"]:
-        """The images, changed given uniform numbers from -1 to 1."""
+        """The images, changed by uniform numbers from -1 to 1."""
         result = [self._changed(one, row) for one, row in zip(image.numpy(), numbers.tolist(), strict=True)]
         return torch.from_numpy(np.stack(result))
 
@@ -67,7 +67,7 @@ class Photometry:
         return np.asarray(picture)
 
     def _tone(self, numbers: list[float]) -> list[int]:
-        """What each of the 256 levels of the three channels becomes."""
+        """Table from the 256 levels of each of the three channels to their new levels."""
         limits = (self.brightness, self.contrast, self.gamma)
         brightness, contrast, gamma = (
             limit**number for limit, number in zip(limits, numbers[:3], strict=True)
@@ -80,12 +80,12 @@ class Photometry:
 
 
 def _strength(number: float) -> float:
-    """0 for three quarters of uniform numbers from -1 to 1, else uniform from 0 to 1."""
+    """Uniform numbers from -1 to 1 -> 0 for three quarters of them, else uniform from 0 to 1."""
     return max(0.0, 4 * abs(number) - 3)
 
 
 def _noisy(image: NDArray[np.uint8], deviation: float, place: list[float]) -> NDArray[np.uint8]:
-    """The image with noise from a place of the field; places are numbers from -1 to 1."""
+    """The image with noise from a position (-1 to 1) of the field."""
     height, width = image.shape[:2]
     field = _field(max(FIELD, 2 * height, 2 * width))
     top, left = (

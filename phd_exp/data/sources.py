@@ -1,4 +1,4 @@
-"""Where samples come from, and one such source: a rendered data set."""
+"""The interface of a source of samples, and rendered data sets as sources."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -15,20 +15,20 @@ from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
 
 Part = Literal["train", "held_out", "test"]
-"""What a run uses samples for; both of the first come out of the training split."""
+"""A part of the samples of a run; the first two are taken from the training split."""
 PARTS: tuple[Part, ...] = ("train", "held_out", "test")
 
 Known = Mapping[str, Sequence[Any]]
-"""What is known of samples besides their positions: name -> a value a sample."""
+"""Columns of metadata: name -> one value per sample."""
 
 
 class Source(ABC):
-    """Samples to train on, to recalibrate on and to test on, all of one image size.
+    """Abstract base class: samples for training, recalibration and testing, all of one image size.
 
-    What is held out is never trained on, nor looked at before the training has ended; there may be none of it.
+    Held-out samples are never used for training; there may be none.
 
     `depth` holds the constants that normalise depth, in the pixels of the samples' images; `constant_f` is the focal
-    length of models that know none, the geometric mean of the extremes.
+    length of models that do not know it, the geometric mean of the extremes.
     """
 
     depth: DepthScale
@@ -36,24 +36,24 @@ class Source(ABC):
 
     @abstractmethod
     def samples(self, part: Part) -> Batch:
-        """All samples of a part; decodes their images the first time. Raises DatasetError."""
+        """All samples of a part. Decodes their images on first use. Raises DatasetError."""
 
     @abstractmethod
     def known(self, part: Part) -> Known:
-        """The columns that the record of predictions repeats, in the order of the samples."""
+        """The columns to record with the predictions, in the order of the samples."""
 
     @abstractmethod
     def count(self, part: Part) -> int:
-        """How many samples a part has."""
+        """The number of samples of a part."""
 
 
 class RenderedSource(Source):
-    """The first samples of each split of a rendered data set, shrunk to image_size pixels a side.
+    """The first samples of each split of a rendered data set, shrunk to `side` x `side` pixels.
 
-    Of the training split, those held out follow those trained on.
+    Held-out samples follow the training samples in the training split.
 
-    The constants follow from the specification, so that nothing need be rendered yet. Where an image shrinks, f and S
-    shrink with it and mu_z0 grows.
+    The constants follow from the specification, before anything is rendered. When an image shrinks, f and S shrink
+    with it and mu_z0 grows.
     """
 
     def __init__(self, folder: DatasetFolder, spec: DatasetSpec, n: Mapping[Part, int], side: int) -> None:
@@ -66,8 +66,8 @@ class RenderedSource(Source):
 
     def samples(self, part: Part) -> Batch:
         split, rows = self._place(part)
-        images = cached_images(self.folder, split, self._records(split), self.side)
-        records = self._records(split)[rows]
+        of_split = self._records(split)
+        images, records = cached_images(self.folder, split, of_split, self.side), of_split[rows]
         return Batch(
             image=torch.from_numpy(images[rows]),
             xyz=torch.tensor([(record.x, record.y, record.z) for record in records], dtype=torch.float32),
@@ -86,13 +86,13 @@ class RenderedSource(Source):
         return self.n[part]
 
     def _place(self, part: Part) -> tuple[Split, slice]:
-        """The split that holds a part, and which of its samples they are."""
+        """The split of a part, and its samples there."""
         if part == "test":
             return "test", slice(0, self.n["test"])
         start = self.n["train"] if part == "held_out" else 0
         return "train", slice(start, start + self.n[part])
 
     def _records(self, split: Split) -> list[SampleRecord]:
-        """Everything that a run uses of a split."""
+        """All records of a split that the run uses."""
         n = self.n["test"] if split == "test" else self.n["train"] + self.n["held_out"]
         return self.folder.records(split, n)

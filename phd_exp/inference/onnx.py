@@ -85,7 +85,7 @@ def export(predictor: Predictor, file: Path) -> float:
 
     Raises ParityError, and writes no file, if that exceeds 1e-5.
     """
-    model = _exported(predictor)
+    model = graph(predictor)
     model.metadata_props.add(key=METADATA, value=json.dumps(_metadata(predictor)))
     content = model.SerializeToString()
     deviation = largest_deviation(predictor, content)
@@ -98,8 +98,8 @@ def export(predictor: Predictor, file: Path) -> float:
     return deviation
 
 
-def _exported(predictor: Predictor) -> Any:
-    """The graph, for batches of any size."""
+def graph(predictor: Predictor) -> Any:
+    """The network and its answers as a graph, for batches of any size."""
     side = predictor.side
     examples = torch.zeros(2, side, side, 3, dtype=torch.uint8), torch.tensor(FOCAL_LENGTHS) * side
     batch = torch.export.Dim("batch", min=1)

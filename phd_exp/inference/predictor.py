@@ -24,8 +24,7 @@ from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, DatasetError, RunError, shown
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import FolderConfig, RunConfig, check
-from phd_exp.training.network import build_regressor
-from phd_exp.training.stored import load_checkpoint, require_same_shrinking
+from phd_exp.training.network import build_regressor, load_checkpoint, require_same_shrinking
 
 WEIGHTS = "regressor."
 """Prefix of the network's weights in a checkpoint."""

@@ -1,4 +1,4 @@
-"""Losses: a prediction and the true positions -> one number a sample, of which training minimises the mean."""
+"""Losses: a prediction and the true positions -> one number per sample; training minimises the mean."""
 
 from phd_exp.losses.mae import MeanAbsoluteError
 from phd_exp.losses.nll import NegativeLogLikelihood

@@ -7,7 +7,15 @@ from phd_exp.distributions import PointEstimate
 
 
 class MeanAbsoluteError(nn.Module):
-    """The Euclidean norm of each residual, in the coordinates in which the network regresses (no unit).
+    """The Euclidean norm of each residual, in the coordinates that the network regresses (no unit).
+
+    Example:
+        >>> import torch
+        >>> from phd_exp.geometry import Camera, Cartesian, DepthScale
+        >>> chart = Cartesian(DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0)))
+        >>> estimate = PointEstimate(torch.zeros(1, 3), chart, Camera(torch.tensor([1500.0]), 224.0))
+        >>> MeanAbsoluteError()(estimate, torch.tensor([[0.0, 0.0, 4.0]]))
+        tensor([0.])
 
     Source: what the paper's tables call MAE.
     """

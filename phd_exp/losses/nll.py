@@ -9,8 +9,15 @@ from phd_exp.distributions import ProjectedHuber
 class NegativeLogLikelihood(nn.Module):
     """-log p(v) of each sample, in nats, of the full density in the camera frame.
 
-    Source: paper, eq. "loss after basis change"; the constants it drops are kept here, so that models and
-    data sets compare. They do not move gradients.
+    Example:
+        >>> import torch
+        >>> A = 20 * torch.eye(2).expand(1, 2, 2)
+        >>> prediction = ProjectedHuber(torch.zeros(1, 2), torch.tensor([4.0]), A, torch.tensor([20.0]))
+        >>> NegativeLogLikelihood()(prediction, torch.tensor([[0.1, 0.0, 4.1]]))
+        tensor([-1.2429])
+
+    Source: paper, eq. "loss after basis change", with the constants that it drops: they do not change gradients, and
+    make models and data sets comparable.
     """
 
     prediction = ProjectedHuber

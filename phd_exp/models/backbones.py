@@ -1,4 +1,4 @@
-"""The networks that turn an image into features: torchvision's ResNets, trained from scratch."""
+"""Networks from image to features: torchvision's ResNets, trained from scratch."""
 
 from functools import partial
 from typing import Literal, NamedTuple
@@ -13,16 +13,16 @@ BLOCKS: dict[int, tuple[type[BasicBlock | Bottleneck], list[int]]] = {
     34: (BasicBlock, [3, 4, 6, 3]),
     50: (Bottleneck, [3, 4, 6, 3]),
 }
-"""Depth -> kind of block, and how many of them at each of the four resolutions."""
+"""Depth -> type of block, and the number of blocks at each of the four resolutions."""
 
 Depth = Literal[10, 18, 34, 50]
 
 
 class BackboneOutput(NamedTuple):
-    """What a backbone makes of images.
+    """The output of a backbone.
 
-    A backbone that keeps where things are also says where the object is: `place`, its projected position v_p, and
-    `log_heat`, log probabilities of the cells of a grid over the image.
+    A backbone that locates the object also returns `place`, its projected position v_p, and `log_heat`, the log
+    probabilities of the cells of a grid over the image.
     """
 
     features: Float[Tensor, "batch n_features"]
@@ -31,11 +31,11 @@ class BackboneOutput(NamedTuple):
 
 
 class Backbone(nn.Module):
-    """An image (batch, 3, height, width) -> what is seen in it.
+    """Abstract base class: images -> features.
 
     Attributes:
-        n_features: of each image.
-        locates: whether it says where the object is.
+        n_features: number of features of an image.
+        locates: whether the output has a place.
     """
 
     n_features: int
@@ -46,7 +46,7 @@ class Backbone(nn.Module):
 
 
 class PooledFeatures(Backbone):
-    """The features of a network that averages them over the image, as ResNets do."""
+    """A network that averages its features over the image, as ResNets do."""
 
     locates = False
 
@@ -61,6 +61,10 @@ class PooledFeatures(Backbone):
 
 def resnet(depth: Depth) -> PooledFeatures:
     """A ResNet of torchvision without its last layer, every BatchNorm replaced by GroupNorm(1, C).
+
+    Example:
+        >>> resnet(18).n_features
+        512
 
     Source: the authors' training protocol.
     """

@@ -1,8 +1,7 @@
-"""Heads: from the raw numbers of a network and the camera it is told to a prediction.
+"""Heads: from the raw numbers of a network and its camera to a prediction.
 
-A head says how many raw numbers it wants and what kind of prediction it makes. The loss, the metrics and the
-figures see the prediction alone. Where a backbone says in which place it sees the object, the raw numbers are made
-relative to that: `placed` gives those of the same prediction moved there.
+A head declares its number of raw numbers and its type of prediction. Loss, metrics and figures use the prediction
+alone. With a backbone that locates the object, the raw numbers are relative to its place: `placed` moves them there.
 """
 
 from collections.abc import Callable
@@ -22,7 +21,7 @@ Prediction = ProjectedHuber | PointEstimate
 
 @runtime_checkable
 class Head(Protocol):
-    """What a regressor asks of a head."""
+    """The interface of a head."""
 
     n_outputs: int
     prediction: type[Prediction]
@@ -32,12 +31,21 @@ class Head(Protocol):
     def placed(
         self, raw: Float[Tensor, "*batch n_outputs"], place: Float[Tensor, "*batch 2"]
     ) -> Float[Tensor, "*batch n_outputs"]:
-        """The raw numbers of the same prediction, moved by `place`, a projected position v_p."""
+        """Raw numbers of the prediction moved by `place`, a projected position v_p."""
         ...
 
 
 class DistributionHead:
-    """Seven raw numbers -> the Projected Huber distribution."""
+    """Seven raw numbers -> the Projected Huber distribution.
+
+    Example:
+        >>> import torch
+        >>> from phd_exp.geometry import Camera, DepthScale
+        >>> depth = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
+        >>> head = DistributionHead(depth)
+        >>> head(torch.zeros(7), Camera(torch.tensor(1500.0), 224.0)).mode
+        tensor([0.0000, 0.0000, 3.7500])
+    """
 
     n_outputs = 7
     prediction = ProjectedHuber
@@ -46,19 +54,27 @@ class DistributionHead:
         self.mu_z0 = depth.mu_z0
 
     def __call__(self, raw: Float[Tensor, "*batch 7"], camera: Camera) -> ProjectedHuber:
-        # the loss calls this for every batch; a NaN is caught once, by the training step
+        # not validated for speed: the training step refuses a loss that is not finite
         return ProjectedHuber.from_raw(raw, f=camera.f, S=camera.S, mu_z0=self.mu_z0, validate_args=False)
 
     def placed(
         self, raw: Float[Tensor, "*batch 7"], place: Float[Tensor, "*batch 2"]
     ) -> Float[Tensor, "*batch 7"]:
-        """Those of the density whose middle nu_p = B v_p lies B `place` further: as far at any precision."""
+        """Raw numbers with the centre nu_p = B v_p shifted by B `place`: the same shift of v_p for every B."""
         B, _ = spectral_map(raw[..., 2:5])
         return torch.cat([raw[..., :2] + (B @ place[..., None]).squeeze(-1), raw[..., 2:]], dim=-1)
 
 
 class ChartHead:
-    """Three raw numbers -> the position with these coordinates in a chart."""
+    """Three raw numbers -> the position with these coordinates in a chart.
+
+    Example:
+        >>> import torch
+        >>> from phd_exp.geometry import Camera, DepthScale, LogDepth
+        >>> head = ChartHead(DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0)), LogDepth)
+        >>> head(torch.zeros(3), Camera(torch.tensor(1500.0), 224.0)).mode
+        tensor([0.0000, 0.0000, 3.7500])
+    """
 
     n_outputs = 3
     prediction = PointEstimate
@@ -72,7 +88,7 @@ class ChartHead:
     def placed(
         self, raw: Float[Tensor, "*batch 3"], place: Float[Tensor, "*batch 2"]
     ) -> Float[Tensor, "*batch 3"]:
-        """Further by `place` where the chart's first coordinates are v_p; elsewhere the features must tell."""
+        """Raw numbers shifted by `place` if the chart's first coordinates are v_p, else unchanged."""
         if not self.chart.has_projection:
             return raw
         return torch.cat([raw[..., :2] + place, raw[..., 2:]], dim=-1)

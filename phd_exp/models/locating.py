@@ -1,4 +1,4 @@
-"""A backbone that keeps where things are: a narrow ResNet, a pyramid, and a map of where the object is."""
+"""A backbone that locates the object: a narrow ResNet, a feature pyramid, and a heat map."""
 
 from functools import partial
 from typing import Annotated, Literal
@@ -17,17 +17,17 @@ _norm = partial(nn.GroupNorm, 1)
 
 
 class Locating(Backbone):
-    """A ResNet, its stages brought together at the second one's resolution, and read where the object is.
+    """A ResNet whose stages are combined at the resolution of the second one, with features read at the object.
 
-    The ResNet has `width` channels where torchvision's have 64, and no max-pooling: with half the channels on four
-    times the pixels it costs the same and sees twice as sharply. Large images with a `stride` of 4 cost little more
-    than images of half the size with one of 2, and show more of where an edge is.
+    The ResNet has `width` channels instead of torchvision's 64, and no max-pooling: half the channels on four times
+    the pixels cost the same and double the resolution. Large images with stride 4 cost little more than images of
+    half the size with stride 2, and have sharper edges.
 
-    A map over the finest level of the pyramid says with what probability the object's middle lies in a cell, and how
-    far from the cell's own middle; `place` is the mean of that. The features are the level's, averaged with the same
-    weights, and the last stage's mean.
+    A map over the finest level of the pyramid holds for each cell the probability that it contains the object's
+    centre, and the offset of the centre from that of the cell; `place` is the mean position. The features are those
+    of the level, averaged with the same probabilities, and the mean of the last stage.
 
-    What is read from the pyramid is computed in float32: in bfloat16 places would be rounded to a tenth of a pixel.
+    The map and its means are computed in float32: bfloat16 would round places to a tenth of a pixel.
 
     Args:
         depth: of the ResNet.
@@ -64,7 +64,7 @@ class Locating(Backbone):
         self.lateral = nn.ModuleList(nn.Conv2d(n, channels, 1) for n in outputs[1:])
         self.smooth = nn.Conv2d(channels, channels, 3, padding=1)
         self.map = nn.Conv2d(channels, 3, 1)
-        # every cell as likely as another: the object is in the middle, as for a network whose last layer is zero
+        # a uniform map: the place is the centre of the image, as for a network whose last layer is zero
         nn.init.zeros_(self.map.weight)
         nn.init.zeros_(self.map.bias)  # type: ignore[arg-type]  # it has one
         self.n_features = channels + outputs[-1]
@@ -79,7 +79,7 @@ class Locating(Backbone):
             return self._read(finest.float(), stages[-1].float())
 
     def _finest(self, stages: list[Tensor]) -> Float[Tensor, "batch channels rows columns"]:
-        """The finest level of the pyramid: what is seen there, with what coarser stages say of it."""
+        """The finest level of the pyramid, with the upsampled coarser stages added."""
         levels = [lateral(stage) for lateral, stage in zip(self.lateral, stages, strict=True)]
         finest = levels[-1]
         for finer in reversed(levels[:-1]):
@@ -106,10 +106,37 @@ def _stem(width: int, stride: int) -> nn.Sequential:
 def _stage(
     block: type[BasicBlock | Bottleneck], count: int, n_in: int, width: int, stride: int
 ) -> nn.Sequential:
-    """So many blocks, the first of which changes resolution and channels."""
+    """`count` blocks, the first of which changes resolution and channels."""
     n_out = width * block.expansion
     shortcut = None
     if stride > 1 or n_in != n_out:
         shortcut = nn.Sequential(nn.Conv2d(n_in, n_out, 1, stride, bias=False), _norm(n_out))
     first = block(n_in, width, stride, shortcut, norm_layer=_norm)
     return nn.Sequential(first, *(block(n_out, width, norm_layer=_norm) for _ in range(count - 1)))
+
+
+def localisation_loss(
+    log_heat: Float[Tensor, "batch rows columns"], v_p: Float[Tensor, "batch 2"]
+) -> Float[Tensor, ""]:
+    """The mean cross entropy between a map and the cells around the true place, in nats.
+
+    The truth is distributed over the four nearest cells with bilinear weights, so that the mean of their centres is
+    the place; a place beyond the outermost centres belongs to these. The gradient of the map's mean alone takes
+    thousands of steps to find an object that differs from others by its shape only, as in `occl`.
+
+    Args:
+        log_heat: log probabilities of the cells of a grid over the image, which reaches from -1 to 1.
+        v_p: projected positions (x, y).
+
+    Source: own design.
+    """
+    rows, columns = log_heat.shape[1:]
+    y, x = _shares(v_p[:, 1], rows), _shares(v_p[:, 0], columns)
+    # no einsum, which autocast would round to bfloat16
+    return -(log_heat * y[:, :, None] * x[:, None, :]).sum((1, 2)).mean()
+
+
+def _shares(place: Float[Tensor, " batch"], n: int) -> Float[Tensor, "batch n"]:
+    """Linear weights of a place for n cells between -1 and 1; they sum to 1."""
+    cell = ((place + 1) * n / 2 - 0.5).clamp(0, n - 1)
+    return (1 - (cell[:, None] - torch.arange(n).to(cell)).abs()).clamp(min=0)

@@ -1,24 +1,73 @@
-"""The whole network: image and camera in, prediction out."""
+"""The network: image and camera in, prediction out."""
+
+import math
 
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from phd_exp.geometry.camera import Camera
+from phd_exp.geometry.charts import DepthScale
 from phd_exp.models.backbones import Backbone, BackboneOutput
-from phd_exp.models.focal_length import FocalLengthInput
 from phd_exp.models.heads import Head, Prediction
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
+WIDTH = 64
+"""Of the hidden layers that take the focal length."""
+
+
+class FocalLengthInput(nn.Module):
+    """Corrects a head's raw numbers given the focal length; the identity at the start of training.
+
+    An image determines v_p and z/f only. If the sizes of objects vary, it determines z/f up to a factor, and the
+    range of depths excludes part of that factor: if all objects are between 3 and 5 m, one that appears to be at 6 m
+    is a large one. A network can learn this only if f is an input. It then relies on the range of depths of its
+    training data; for other ranges train with camera=known.
+
+    Two hidden layers take the raw numbers and log f, clamped to the range of the data set to avoid extrapolation.
+
+    Args:
+        n_outputs: raw numbers of the head.
+        depth: constants of the data set.
+    """
+
+    def __init__(self, n_outputs: int, depth: DepthScale) -> None:
+        super().__init__()
+        self.middle = math.log(depth.z_centre / depth.mu_z0)
+        self.half_range = max(math.log(depth.D), 1e-3)
+        self.layers = nn.Sequential(
+            nn.Linear(n_outputs + 1, WIDTH), nn.GELU(), nn.Linear(WIDTH, WIDTH), nn.GELU()
+        )
+        self.last = nn.Linear(WIDTH, n_outputs)
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)
+
+    def forward(
+        self, raw: Float[Tensor, "batch n_outputs"], f: Float[Tensor, " batch"]
+    ) -> Float[Tensor, "batch n_outputs"]:
+        log_f = ((f.log() - self.middle) / self.half_range).clamp(-1, 1)
+        shown: Tensor = self.last(self.layers(torch.cat([raw, log_f.to(raw)[:, None]], dim=-1)))
+        return raw + shown
 
 
 class Regressor(nn.Module):
-    """backbone -> one linear layer, zero at the start -> what the focal length adds, if it is shown -> head.
+    """backbone -> linear layer, zero at the start -> correction by the focal length, if it is an input -> head.
 
-    The backbone runs in whatever precision is switched on around it; the linear layer and everything after it
-    in float32, since nu_p = B v_p rounded to bf16 would be wrong by up to 0.2 pixels at the border of the image.
-    Images lie in memory as they come, channels last: on CPUs and GPUs convolutions are as fast that way, or faster.
+    The backbone runs in the precision of the enclosing autocast; the linear layer and everything after it run in
+    float32, since nu_p = B v_p rounded to bfloat16 has errors up to 0.2 pixels at the border of the image.
+    Images keep their memory format, channels last, which is at least as fast on CPUs and GPUs.
+
+    Example:
+        >>> import torch
+        >>> from phd_exp.geometry import Camera, DepthScale
+        >>> from phd_exp.models.backbones import resnet
+        >>> from phd_exp.models.heads import DistributionHead
+        >>> depth = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
+        >>> regressor = Regressor(resnet(10), DistributionHead(depth))
+        >>> image = torch.zeros(2, 64, 64, 3, dtype=torch.uint8)
+        >>> regressor(image, Camera(torch.tensor([1200.0, 2000.0]), 224.0))
+        ProjectedHuber(batch_shape=(2,))
     """
 
     mean: Tensor
@@ -39,19 +88,19 @@ class Regressor(nn.Module):
         return self.prediction(self.see(image), camera)
 
     def prediction(self, seen: BackboneOutput, camera: Camera) -> Prediction:
-        """What follows from what was seen."""
+        """The prediction, given the output of the backbone."""
         return self.head(self.numbers(seen, camera.f), camera)
 
     def raw(
         self, image: UInt8[Tensor, "batch height width 3"], f: Float[Tensor, " batch"] | None = None
     ) -> Float[Tensor, "batch n_outputs"]:
-        """The numbers before the head, in the precision of the last layer; f (px) is wanted where it is shown."""
+        """The raw numbers for the head, in the precision of the last layer; f (px) is needed if it is an input."""
         return self.numbers(self.see(image), f)
 
     def see(self, image: UInt8[Tensor, "batch height width 3"]) -> BackboneOutput:
-        """What the backbone makes of the images."""
+        """The output of the backbone."""
         width = image.shape[2]
-        # by whole rows, which fill vector units where the three colours of a pixel do not: four times faster
+        # row by row: four times faster than three colours at a time, which do not fill vector units
         rows = image.flatten(2).to(self.mean.dtype).sub_(self.mean.repeat(width)).div_(self.std.repeat(width))
         seen: BackboneOutput = self.backbone(rows.unflatten(2, (width, 3)).permute(0, 3, 1, 2))
         return seen
@@ -59,7 +108,7 @@ class Regressor(nn.Module):
     def numbers(
         self, seen: BackboneOutput, f: Float[Tensor, " batch"] | None
     ) -> Float[Tensor, "batch n_outputs"]:
-        """The numbers before the head, of what was seen, and of f where it is shown."""
+        """The raw numbers for the head, given the output of the backbone, and f if it is an input."""
         dtype = self.last.weight.dtype
         with torch.autocast(seen.features.device.type, enabled=False):
             raw: Tensor = self.last(seen.features.to(dtype))

@@ -1,4 +1,4 @@
-"""How a network's numbers step, given their gradients."""
+"""Optimizers beyond those of torch."""
 
 from phd_exp.optimizers.muon import Muon
 

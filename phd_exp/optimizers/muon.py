@@ -1,4 +1,4 @@
-"""Muon: every layer steps with its momentum made orthogonal, so that no direction of its output is left behind."""
+"""Muon: each layer steps along its orthogonalised momentum, equally far in all directions of its output."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -18,19 +18,26 @@ _FEWEST_CHANNELS = 4
 
 
 class Muon(Optimizer):
-    """Orthogonal steps for convolutions from features to features, Adam's for all else.
+    """Orthogonal steps for convolutions between features, Adam for all other parameters.
 
-    A convolution is the matrix (channels out, channels in x kernel). Its step is the Nesterov momentum with all
-    singular values brought close to 1, scaled to the root mean square that Adam's steps have. What reads the pixels
-    or writes a handful of numbers is left to Adam, as are scales and offsets.
+    A convolution is the matrix (channels out, channels in x kernel). Its step is the Nesterov momentum with singular
+    values close to 1, scaled to the root mean square of Adam's steps. Adam updates convolutions that read pixels or
+    have few outputs, and all vectors.
 
-    `torch.optim.Muon` takes matrices alone, and iterates on them in bfloat16, which a CPU without units for it does
-    slowly; here the iteration is on their Gram matrices, in float32, for a third of the arithmetic.
+    `torch.optim.Muon` takes matrices only and iterates on them in bfloat16, which is slow on most CPUs. Here the
+    iteration is on their Gram matrices in float32, with a third of the arithmetic.
 
     Args:
-        lr: of Adam's steps.
-        orthogonal_lr: of the orthogonal ones.
-        momentum: share of the running mean of gradients that a step keeps.
+        params: parameters of the network.
+        lr: learning rate of Adam.
+        orthogonal_lr: learning rate of the orthogonal steps.
+        momentum: weight of the previous mean of gradients.
+
+    Example:
+        >>> network = nn.Sequential(nn.Conv2d(3, 8, 3), nn.Conv2d(8, 8, 3))
+        >>> optimizer = Muon(network.parameters(), lr=0.002, orthogonal_lr=0.005)
+        >>> network(torch.ones(1, 3, 8, 8)).sum().backward()
+        >>> optimizer.step()
 
     Source: Jordan et al., "Muon: an optimizer for hidden layers in neural networks" (2024); the scale is that of
     Liu et al., "Muon is scalable for LLM training" (2025); the iteration on Gram matrices is an own derivation.
@@ -94,8 +101,8 @@ class Muon(Optimizer):
 def orthogonal(matrix: Float[Tensor, "rows columns"]) -> Float[Tensor, "rows columns"]:
     """Nearly U V^T of a matrix U S V^T: singular values from 0.6 to 1.3, of all above a 500th of the matrix's norm.
 
-    The Newton-Schulz iteration X <- (a + b X X^T + c (X X^T)^2) X multiplies X by polynomials of G = X X^T alone:
-    they are gathered as one matrix of G's size, which X is multiplied by at the end.
+    The Newton-Schulz iteration X <- (a + b X X^T + c (X X^T)^2) X multiplies X by polynomials of G = X X^T only.
+    Their product is accumulated in one matrix of the size of G and multiplied by X at the end.
     """
     tall = matrix.shape[0] > matrix.shape[1]
     wide = matrix.T if tall else matrix

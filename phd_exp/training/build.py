@@ -1,4 +1,4 @@
-"""The one place, with `network.py`, that turns a checked configuration into objects."""
+"""Builds the objects of a checked configuration; `network.py` builds the network."""
 
 import sys
 from dataclasses import fields
@@ -17,19 +17,17 @@ from phd_exp.data.sources import Part, RenderedSource, Source
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError
-from phd_exp.training.checkpoints import AtomicCheckpoints
+from phd_exp.training.checkpoints import AtomicCheckpoints, StopBetweenBatches
 from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig
 from phd_exp.training.config.sections import RecipeConfig
-from phd_exp.training.module import PositionModule
+from phd_exp.training.module import PositionModule, factor
 from phd_exp.training.network import build_regressor, naming, precision
 from phd_exp.training.progress import Progress
 from phd_exp.training.recorder import Recorder
-from phd_exp.training.schedule import factor
-from phd_exp.training.stopping import StopBetweenBatches
 
 
 def build_data(config: RunConfig, rank: int = 0) -> PositionData:
-    """The data set of a run, or of one of its processes. Its images are opened by `setup`, not here."""
+    """The data set of a run, or of one of its processes. `setup` opens the images."""
     return PositionData(
         _source(config.data),
         batch_size=config.data.batch_size,
@@ -59,12 +57,12 @@ def _source(data: RenderedConfig | FolderConfig) -> Source:
 def build_module(config: RunConfig, data: PositionData) -> PositionModule:
     """The network, its loss and its optimizer, initialised from torch's current random state.
 
-    Raises ConfigError, naming the key, where a part refuses its values.
+    Raises ConfigError, naming the key, for values that a part refuses.
     """
     regressor = build_regressor(config, data.source.depth)
     with naming("optimizer"):
         optimizer = instantiate(config.optimizer, _partial_=True)
-        optimizer(regressor.parameters())  # refuses bad values now rather than after hours of rendering
+        optimizer(regressor.parameters())  # refuses bad values before hours of rendering
     constant_f = data.source.constant_f if config.camera.focal_length == "constant" else None
     recipe = config.recipe
     if recipe.localisation and not regressor.backbone.locates:
@@ -83,23 +81,23 @@ def build_module(config: RunConfig, data: PositionData) -> PositionModule:
 
 
 def build_trainer(config: RunConfig, recorder: Recorder) -> Trainer:
-    """Lightning's Trainer with what a run records."""
+    """Lightning's Trainer with the callbacks of a run."""
     folder = recorder.folder
     callbacks: list[Callback] = [
         recorder,
-        # after the whole epoch: a checkpoint taken after its validation would leave the epoch half-counted
+        # at the end of the epoch: a checkpoint taken after the validation leaves the epoch half-counted
         ModelCheckpoint(
             folder.checkpoints, filename="last", enable_version_counter=False, save_on_train_epoch_end=True
         ),
     ]
-    if config.trainer.devices == 1:  # of several, each would stop at a batch of its own
+    if config.trainer.devices == 1:  # several processes would stop at different batches
         callbacks.append(StopBetweenBatches(folder.last_checkpoint))
     callbacks += _progress(config)
     return Trainer(
         accelerator=config.trainer.accelerator,
         devices=config.trainer.devices,
         strategy="ddp" if config.trainer.devices > 1 else "auto",
-        # not a queue's environment: ours are the processes, and a queue's job is no process of a run
+        # not the environment of a cluster, whose tasks are not the processes of a run
         plugins=[LightningEnvironment(), AtomicCheckpoints()],
         precision=precision(config.trainer),
         max_epochs=config.trainer.max_epochs,
@@ -107,7 +105,7 @@ def build_trainer(config: RunConfig, recorder: Recorder) -> Trainer:
         callbacks=callbacks,
         enable_progress_bar=any(isinstance(callback, ProgressBar) for callback in callbacks),
         check_val_every_n_epoch=config.evaluation.every_n_epochs,
-        log_every_n_steps=1,  # metrics are logged once an epoch; this only keeps Lightning from remarking on it
+        log_every_n_steps=1,  # avoids a warning; metrics are logged once an epoch
         enable_model_summary=False,
         num_sanity_val_steps=0,
         use_distributed_sampler=False,
@@ -116,7 +114,7 @@ def build_trainer(config: RunConfig, recorder: Recorder) -> Trainer:
 
 
 def _progress(config: RunConfig) -> list[Callback]:
-    """A bar on a terminal, lines elsewhere, nothing with trainer.progress_bar=false."""
+    """A progress bar on a terminal, lines elsewhere, nothing with trainer.progress_bar=false."""
     if not config.trainer.progress_bar:
         return []
     bar = TQDMProgressBar() if on_a_terminal() else None

@@ -1,5 +1,6 @@
-"""The one LightningModule: every model of the tables trains through it."""
+"""The LightningModule with which all models are trained."""
 
+import math
 from collections.abc import Callable, Iterable
 
 import torch
@@ -13,27 +14,27 @@ from phd_exp.distributions.columns import Columns
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import projected
 from phd_exp.losses import NegativeLogLikelihood
-from phd_exp.losses.localisation import localisation_loss
 from phd_exp.metrics.rows import Rows
 from phd_exp.models.heads import Prediction
+from phd_exp.models.locating import localisation_loss
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.errors import RunError, listed
 from phd_exp.training.predictions import columns, summary, training_columns
 
 
 class PositionModule(LightningModule):
-    """Image and camera -> prediction -> loss; metrics of both splits, logged once an epoch.
+    """Image and camera -> prediction -> loss, with the metrics of both splits logged once per epoch.
 
-    Training runs in the Trainer's precision. Evaluation always runs in float32, so that logged metrics, recorded
+    Training runs in the precision of the Trainer. Evaluation always runs in float32, so that logged metrics, recorded
     predictions, `predict` and an exported network agree.
 
     Args:
         regressor: image and camera -> prediction.
-        loss: prediction and true positions -> one number a sample, or their mean.
+        loss: prediction and true positions -> one number per sample, or their mean.
         optimizer: parameters -> optimizer.
         constant_f: focal length in pixels that the model uses for every sample; None: the true one.
-        localisation: weight of the localisation loss; above 0 only with a backbone that locates.
-        schedule: number of steps -> factor of the learning rate at each; see `schedule.factor`.
+        localisation: weight of the localisation loss; 0 for a backbone that does not locate the object.
+        schedule: number of steps -> factor of the learning rate at each; see `factor`.
 
     Attributes:
         table: the rows of the last evaluation, see `training.predictions.columns`.
@@ -62,7 +63,7 @@ class PositionModule(LightningModule):
         return self.regressor(batch.image, self.camera(batch))
 
     def camera(self, batch: Batch) -> Camera:
-        """The cameras that the model uses for a batch."""
+        """The cameras of a batch as the model knows them."""
         return batch.camera.with_constant_f(self.constant_f)
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
@@ -96,7 +97,7 @@ class PositionModule(LightningModule):
         self._require_finite(losses.mean(), losses, batch, "test")
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        return self._evaluate(batch)  # Lightning warns of a step without a result
+        return self._evaluate(batch)  # Lightning warns about None
 
     def on_validation_epoch_end(self) -> None:
         self._finish_evaluation()
@@ -106,7 +107,7 @@ class PositionModule(LightningModule):
         self._finish_evaluation()
 
     def _evaluate(self, batch: Batch) -> Tensor:
-        """Predict a batch in float32 and keep its rows; returns the losses."""
+        """Predict a batch in float32 and record its rows; returns the losses."""
         with torch.autocast(self.device.type, enabled=False):
             prediction = self(batch)
             losses = self.loss(prediction, batch.xyz)
@@ -118,7 +119,7 @@ class PositionModule(LightningModule):
         self.evaluation_rows.reset()
 
     def _require_finite(self, total: Tensor, losses: Tensor, batch: Batch, split: str) -> None:
-        """Raise RunError that names the samples whose loss is not finite; all of them if only the total is not."""
+        """Raise RunError naming the samples whose loss is not finite, or all if only the total is not."""
         if total.isfinite():
             return
         is_bad = ~losses.detach().expand(len(batch)).isfinite()
@@ -129,3 +130,22 @@ class PositionModule(LightningModule):
             f"{listed([files[row] for row in rows])}; the last checkpoint is whole: lower optimizer.lr, or look at "
             "these images"
         )
+
+
+def factor(schedule: str, warmup_steps: int, steps: int) -> Callable[[int], float]:
+    """Step -> factor of the optimizer's learning rate, in a run of `steps` steps.
+
+    It rises linearly over the first `warmup_steps`. Then "constant" stays; "cosine" falls to zero as half a wave.
+
+    Example:
+        >>> at = factor("cosine", warmup_steps=1, steps=100)
+        >>> [round(at(step), 3) for step in (0, 50, 100)]
+        [0.5, 0.5, 0.0]
+    """
+
+    def at(step: int) -> float:
+        rise = min(1.0, (step + 1) / (warmup_steps + 1))
+        fall = (1 + math.cos(math.pi * min(step / steps, 1.0))) / 2 if schedule == "cosine" else 1.0
+        return rise * fall
+
+    return at

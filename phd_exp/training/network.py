@@ -1,28 +1,34 @@
-"""A checked configuration -> the network alone, without Lightning: what training and prediction share."""
+"""The network of a configuration and the weights of a checkpoint, without Lightning: shared with prediction."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
+from zipfile import ZIP_STORED, ZipFile
 
 import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 
+from phd_exp.data.images import SHRINKING
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.models.backbones import Backbone
-from phd_exp.models.focal_length import FocalLengthInput
-from phd_exp.models.regressor import Regressor
-from phd_exp.records.errors import ConfigError
-from phd_exp.training.config import RunConfig, TrainerConfig
+from phd_exp.models.regressor import FocalLengthInput, Regressor
+from phd_exp.records.errors import ConfigError, RunError
+from phd_exp.records.files import require_plain
+from phd_exp.records.runs import RunFolder
+from phd_exp.training.config import RenderedConfig, RunConfig, TrainerConfig
+
+ADVICE = "delete it to begin the run again"
 
 
 def build_regressor(config: RunConfig, depth: DepthScale) -> Regressor:
     """The network, initialised from torch's current random state.
 
-    Raises ConfigError, naming the key, where a part refuses its values.
+    Raises ConfigError, naming the key, for values that a part refuses.
     """
-    # partial, then called: an object among instantiate's own arguments would be turned into a configuration
+    # partial, then called: `instantiate` would convert an object among its arguments to a configuration
     with naming("model.head"):
         head = instantiate(config.model.head, _partial_=True)(depth=depth)
     with naming("backbone"):
@@ -31,13 +37,13 @@ def build_regressor(config: RunConfig, depth: DepthScale) -> Regressor:
             raise ValueError(
                 f"_target_: {config.backbone['_target_']!r} makes no Backbone; see conf/backbone"
             )
-        shown = FocalLengthInput(head.n_outputs, depth) if config.camera.focal_length == "shown" else None
-        return Regressor(backbone, head, shown)
+        is_input = config.camera.focal_length == "shown"
+        return Regressor(backbone, head, FocalLengthInput(head.n_outputs, depth) if is_input else None)
 
 
 @contextmanager
 def naming(key: str) -> Iterator[None]:
-    """Let what a part says of its values name the part of the configuration that they stand in."""
+    """Convert the errors of a part to a ConfigError that names its section of the configuration."""
     try:
         yield
     except (ValueError, TypeError, InstantiationException) as error:
@@ -46,24 +52,62 @@ def naming(key: str) -> Iterator[None]:
 
 
 def has_gpu(config: TrainerConfig) -> bool:
-    """Whether a run is trained on a GPU."""
+    """Whether a run trains on a GPU."""
     return config.accelerator != "cpu" and torch.cuda.is_available()
 
 
 def precision(config: TrainerConfig) -> Any:
-    """Lightning's name of the arithmetic: bfloat16 autocast where the hardware has units for it.
+    """Lightning's name of the arithmetic: bfloat16 autocast on hardware with bfloat16 units.
 
     Without such units bfloat16 is three times slower than float32 on a CPU (resnet18, 112 px).
     """
-    if config.precision != "auto":
-        return {"float32": "32-true", "bfloat16": "bf16-mixed"}[config.precision]
+    fast = cpu_has_bfloat16()
     if has_gpu(config):
-        return "bf16-mixed" if torch.cuda.is_bf16_supported(including_emulation=False) else "32-true"
-    return "bf16-mixed" if cpu_has_bfloat16() else "32-true"
+        fast = torch.cuda.is_bf16_supported(including_emulation=False)
+    return (
+        "bf16-mixed" if config.precision == "bfloat16" or (config.precision == "auto" and fast) else "32-true"
+    )
 
 
 def cpu_has_bfloat16() -> bool:
-    """Whether this CPU has units for bfloat16; false where it cannot be told."""
+    """Whether this CPU has bfloat16 units; False if the system does not list them."""
     flags = Path("/proc/cpuinfo")
     words = flags.read_text().split() if flags.exists() else []
     return "amx_bf16" in words or "avx512_bf16" in words
+
+
+def require_same_shrinking(folder: RunFolder, config: RunConfig) -> None:
+    """Raise RunError for a run trained with another version of `shrunk`, whose images differ."""
+    data = config.data
+    if not isinstance(data, RenderedConfig) or not folder.last_checkpoint.exists():
+        return
+    constants = folder.constants() if folder.constants_file.exists() else {}
+    before, after = data.spec.sensor_size, data.image_size
+    if before % after and constants.get("shrinking") != SHRINKING:
+        raise RunError(
+            f"{folder.path}: trained with images shrunk from {before} to {after} pixels by an earlier version, which "
+            "shifted them; move the folder away and train again"
+        )
+
+
+def load_checkpoint(file: Path, map_location: Any = None) -> dict[str, Any]:
+    """The content of a checkpoint: tensors and plain containers. No code in the file is executed.
+
+    Raises RunError, one line, for any other file.
+    """
+    try:
+        require_plain(file)
+        with ZipFile(file) as archive:  # a compressed file may unpack to any size
+            if any(entry.compress_type != ZIP_STORED for entry in archive.infolist()):
+                raise ValueError("its content is compressed, which torch never does")
+        content = torch.load(file, map_location or "cpu", weights_only=True)
+    except UnpicklingError:
+        raise RunError(
+            f"{file}: holds more than tensors and plain values, which is not read; {ADVICE}"
+        ) from None
+    except Exception as error:  # torch raises any error on other bytes
+        reason = " ".join((getattr(error, "strerror", None) or str(error).split("\n")[0]).split())[:120]
+        raise RunError(f"{file}: not a whole checkpoint ({reason}); {ADVICE}") from None
+    if not isinstance(content, dict):
+        raise RunError(f"{file}: not a checkpoint of a run; {ADVICE}")
+    return content

@@ -1,4 +1,4 @@
-"""A prediction as columns, one row a sample: the same for logged metrics, calibration curves and the record."""
+"""Predictions as columns, one row per sample, for logged metrics, calibration curves and the record."""
 
 import io
 from collections.abc import Mapping
@@ -36,8 +36,8 @@ UNRECORDED = ("row", "loss")
 def training_columns(
     prediction: Prediction, xyz: Float[Tensor, "batch 3"], nll: Float[Tensor, " batch"] | None
 ) -> Columns:
-    """The metrics of a training batch, a number a sample: errors in millimetres; of a distribution also its NLL
-    (nats; computed unless given) and the precisions a and |A|.
+    """The metrics of a training batch: errors in millimetres; of a distribution also its NLL (nats; computed unless
+    given) and the precisions a and |A|.
     """
     table = _errors(prediction, xyz)
     if isinstance(prediction, ProjectedHuber):
@@ -57,7 +57,7 @@ def _errors(prediction: Prediction, xyz: Tensor) -> Columns:
 
 @torch.no_grad()
 def columns(prediction: Prediction, batch: Batch) -> Columns:
-    """A batch as a table: truth, estimate and its errors; of a distribution parameters, moments and scores too.
+    """A batch as a table: truth, estimate and errors; of a distribution also parameters, moments and scores.
 
     Positions, `depth_crps` and `energy_score` are in metres, in the camera frame; see `distribution_columns`.
     """
@@ -65,14 +65,14 @@ def columns(prediction: Prediction, batch: Batch) -> Columns:
     table |= _errors(prediction, batch.xyz)
     if isinstance(prediction, ProjectedHuber):
         table |= distribution_columns(prediction, batch.xyz)
-        # seeded by the sample: the score depends neither on the epoch nor on what ran before
+        # seeded by the sample, so that the score does not depend on the epoch
         drawn = draws(prediction, DRAWS, seed=int(batch.row[0]))
         table["energy_score"] = energy_score(drawn, batch.xyz)
     return {name: column.double() for name, column in table.items()}
 
 
 def calibration_curves(table: Columns, window: int) -> dict[str, CalibrationCurve]:
-    """The paper's two curves, of depth and of the projected position; none for a point estimate."""
+    """The paper's two curves, for depth and projected position; a point estimate has none."""
     return {
         name: calibration_curve(table[f"{name}_variance"], table[f"{name}_squared_error"], window)
         for name in ("depth", "projected")
@@ -81,7 +81,7 @@ def calibration_curves(table: Columns, window: int) -> dict[str, CalibrationCurv
 
 
 def summary(table: Columns) -> dict[str, float]:
-    """The numbers of an evaluation, by their metric keys: means over the rows, and scores of calibration."""
+    """Metrics of an evaluation: means over the rows, and calibration scores."""
     means = {metric: float(table[column].mean()) for column, metric in MEANS.items() if column in table}
     scores = exact_scores(table) if "a" in table else {}
     return {f"test/{name}": value for name, value in means.items()} | {
@@ -90,7 +90,7 @@ def summary(table: Columns) -> dict[str, float]:
 
 
 def write_parquet(file: Path, table: Columns, known: Known, said: Mapping[str, str] | None = None) -> None:
-    """Write the columns and what the source knows of each sample, in the order of the data set.
+    """Write the columns and the metadata of the samples, in the order of the data set.
 
     `said` goes into the metadata of the schema.
     """

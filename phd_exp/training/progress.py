@@ -1,4 +1,4 @@
-"""What a training prints: how long it will take, and lines where a progress bar cannot be drawn."""
+"""Lines that a training prints: the time left, and progress without a progress bar."""
 
 import math
 import time
@@ -18,10 +18,10 @@ SHOWN = ("test/loss", "test/projected_error_mm", "test/depth_error_mm")
 
 
 class Progress(Callback):
-    """Prints the time left once the first batches are timed; without a bar also every half minute and every epoch.
+    """Prints the time left after the first batches; without a progress bar also every half minute and every epoch.
 
     Args:
-        bar: the progress bar of the same training, above which lines are printed.
+        bar: the progress bar of the training; lines are printed above it.
     """
 
     def __init__(self, bar: ProgressBar | None = None) -> None:
@@ -29,10 +29,10 @@ class Progress(Callback):
         self.say = bar.print if bar else partial(print, flush=True)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._begin()
+        self.first: tuple[float, int] | None = None
+        self.due = math.inf
 
-    def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._begin()
+    on_predict_start = on_train_start
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -65,21 +65,17 @@ class Progress(Callback):
         self.say(f"{_epoch(trainer)}: {', '.join([*words, left])}")
         self.due = time.monotonic() + BETWEEN_LINES
 
-    def _begin(self) -> None:
-        self.first: tuple[float, int] | None = None
-        self.due = math.inf
-
     @rank_zero_only
     def _count(self, done: int, total: int, place: str) -> None:
         now = time.monotonic()
-        if self.first is None:  # the first batch also pays for what is allocated and compiled
+        if self.first is None:  # the first batch includes allocation and compilation
             self.first, self.due = (now, done), now + FIRST_LINE
         elif now >= self.due:
             self.due = math.inf if self.has_bar else now + BETWEEN_LINES
             self.say(f"{place}: {self._left(done, total)}")
 
     def _left(self, done: int, total: int) -> str:
-        """The time that the remaining batches take at the mean speed so far, evaluations included."""
+        """The time left at the mean speed so far, evaluations included."""
         since, before = self.first or (time.monotonic(), done)
         return f"about {duration((time.monotonic() - since) / max(done - before, 1) * (total - done))} left"
 

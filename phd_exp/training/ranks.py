@@ -1,142 +1,104 @@
-"""Processes that train one run together: started with one plain run each, watched, and ended together.
+"""Training one run with several processes, which end together.
 
-Lightning would start the command of this process again, which in a sweep is the whole sweep. Each process here is
-`python -m phd_exp.training.rank`, whatever launcher runs the job, and hears of its run through a socket; that socket
-ends with this process, however it dies, and then so does the other.
+Lightning would start the command of this process again, which in a sweep is the whole sweep. Here each process is a
+`Child`, whatever launcher runs the job. It exits when its connection closes, and so when this process dies.
 """
 
 import os
-import signal
 import socket
-import subprocess
-import sys
-from collections.abc import Mapping
-from contextlib import ExitStack
-from dataclasses import dataclass
-from multiprocessing import Pipe
+import threading
+import traceback
+from contextlib import ExitStack, suppress
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
+import torch.distributed as dist
+
 from phd_exp.records.errors import RunError, UserError
+from phd_exp.records.processes import Child, parent
+from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import RunConfig
 from phd_exp.training.recorder import Draw
 
-
-@dataclass(frozen=True)
-class Share:
-    """What one process is told: the run, and which of how many it is."""
-
-    config: RunConfig
-    folder: Path
-    draw: Draw | None
-    threads: int
-    rank: int
-
-
-@dataclass(frozen=True)
-class Report:
-    """What a process says at its end: the results of the run, or what went wrong.
-
-    Attributes:
-        error: something that the user can mend.
-        fault: the traceback of anything else.
-    """
-
-    results: dict[str, Any] | None = None
-    error: UserError | None = None
-    fault: str | None = None
-
-
-class Rank:
-    """One process; used as a context, it is gone at the end."""
-
-    def __init__(self, share: Share, environment: Mapping[str, str]) -> None:
-        self.name = f"process {share.rank} of {share.config.trainer.devices}"
-        self.connection, theirs = Pipe()
-        with theirs:
-            self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "phd_exp.training.rank", str(theirs.fileno())],
-                stdin=subprocess.DEVNULL,
-                pass_fds=[theirs.fileno()],
-                env={**os.environ, **environment},
-            )
-        self.connection.send(share)
-
-    def __enter__(self) -> "Rank":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is not None:
-            self._process.kill()
-        self.connection.close()
-        self._process.wait()
-
-    def report(self) -> Report:
-        """What it says. Raises the error or the fault of which it tells; RunError where it died without a word."""
-        try:
-            report: Report = self.connection.recv()
-        except (EOFError, ConnectionResetError):
-            raise RunError(self._obituary()) from None
-        if report.error is not None:
-            raise report.error
-        if report.fault is not None:
-            fault = RuntimeError(f"{self.name} failed with {report.fault.splitlines()[-1]}")
-            fault.add_note(report.fault)
-            raise fault
-        return report
-
-    def _obituary(self) -> str:
-        code = self._process.wait()
-        how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
-        return (
-            f"{self.name} {how}; the others were ended, and the same command goes on from the last checkpoint"
-        )
+Share = tuple[RunConfig, Path, Draw | None, int, int]
+"""The task of one process: the run, its folder, how curves are drawn, the number of threads, and the rank."""
 
 
 def train_together(config: RunConfig, folder: Path, draw: Draw | None, threads: int) -> dict[str, Any]:
-    """Run one run with `trainer.devices` processes, each with its share of the threads; returns its results.
+    """Train one run with `trainer.devices` processes, which share the threads; returns its results.
 
-    Raises what the first process to fail says; the others are ended.
+    Raises the error of the first process to fail; the others are ended.
     """
     world = config.trainer.devices
-    threads = max(1, threads // world)
-    shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(_free_port()), "WORLD_SIZE": str(world)}
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    environment = {
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": str(port),
+        "WORLD_SIZE": str(world),
+        "NODE_RANK": "0",
+    }
+    results: dict[int, dict[str, Any]] = {}
     with ExitStack() as stack:
-        ranks = []
-        for number in range(world):
-            own = {"RANK": str(number), "LOCAL_RANK": str(number), "NODE_RANK": "0", "PYTHONPATH": _path()}
-            share = Share(config, folder, draw, threads, number)
-            ranks.append(stack.enter_context(Rank(share, shared | own)))
-        reports = _all_reports(ranks)
-    results = reports[0].results
-    assert results is not None
+        ranks: dict[Any, tuple[int, Child]] = {}
+        for rank in range(world):
+            of_rank = environment | {"RANK": str(rank), "LOCAL_RANK": str(rank)}
+            child = stack.enter_context(Child("phd_exp.training.ranks", of_rank))
+            child.send((config, folder, draw, max(1, threads // world), rank))
+            ranks[child.connection] = (rank, child)
+        while ranks:
+            for connection in wait(list(ranks)):
+                rank, child = ranks.pop(connection)
+                results[rank] = _received(child, f"rank {rank} of {world}")
+    return results[0]
+
+
+def _received(child: Child, name: str) -> dict[str, Any]:
+    try:
+        outcome = child.receive()
+    except EOFError as death:
+        raise RunError(
+            f"{name}: {death}; the others were ended, and the same command goes on from the last checkpoint"
+        ) from None
+    if isinstance(outcome, Exception):
+        raise outcome
+    results: dict[str, Any] = outcome
     return results
 
 
-def _all_reports(ranks: list[Rank]) -> list[Report]:
-    """What the processes say, in their order. Raises what the first to fail says."""
-    silent = {rank.connection: number for number, rank in enumerate(ranks)}
-    reports: dict[int, Report] = {}
-    while silent:
-        for connection in wait(list(silent)):
-            assert isinstance(connection, Connection)
-            number = silent.pop(connection)
-            reports[number] = ranks[number].report()
-    return [reports[number] for number in range(len(ranks))]
+def main() -> None:
+    """In a child: train, and send back the results or the error."""
+    connection = parent()
+    share: Share = connection.recv()
+    threading.Thread(target=_exit_with_parent, args=(connection,), daemon=True).start()
+    connection.send(_outcome(share))
+    if dist.is_initialized():
+        dist.destroy_process_group()
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+def _outcome(share: Share) -> dict[str, Any] | Exception:
+    from phd_exp.training.run import run  # it imports this module
+
+    config, folder, draw, threads, rank = share
+    try:
+        return run(config, RunFolder(folder), draw, threads, rank)
+    except UserError as error:
+        return error
+    except Exception as error:  # it may not pickle, its traceback does
+        last = traceback.format_exception_only(error)[-1].strip()
+        fault = RuntimeError(f"rank {rank} of {config.trainer.devices} failed with {last}")
+        fault.add_note(traceback.format_exc())
+        return fault
 
 
-def _path() -> str:
-    """PYTHONPATH with this package's home, which need not be installed."""
-    home = str(Path(__file__).resolve().parents[2])
-    return os.pathsep.join(filter(None, [home, os.environ.get("PYTHONPATH")]))
+def _exit_with_parent(connection: Connection) -> None:
+    """Exit at once when the connection closes; nothing else arrives through it."""
+    with suppress(EOFError, OSError):
+        connection.recv()
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,4 +1,4 @@
-"""What a run writes while it trains: one line of metrics an epoch, and calibration curves every few epochs."""
+"""The record of a run during training: one line of metrics per epoch, and calibration curves."""
 
 import json
 import math
@@ -19,24 +19,24 @@ from phd_exp.training.predictions import calibration_curves
 
 CalibrationData = dict[str, dict[str, Any]]
 Draw = Callable[[CalibrationData, Path], None]
-"""Draws calibration curves into a picture file."""
+"""Draws calibration curves to an image file."""
 
 
 class Recorder(Checkpoint):
-    """Keeps the run record up to date, and sends loggers what Lightning does not.
+    """Keeps the run record up to date, and sends pictures and earlier epochs to the loggers.
 
-    `metrics.jsonl` is written whole after every epoch: a resumed run replaces the epochs it repeats, and no reader
-    sees half a line. A Checkpoint callback runs after the module's own hooks, and this one before Lightning's
-    ModelCheckpoint, so an epoch is recorded before its checkpoint exists.
+    `metrics.jsonl` is rewritten after every epoch, since a resumed run replaces the epochs it repeats. Lightning
+    calls Checkpoint callbacks after the module's hooks, and this one before ModelCheckpoint, so an epoch is recorded
+    before its checkpoint exists.
 
     Args:
-        folder: the run's record.
-        evaluation: how often calibration curves are kept, and their window.
-        draw: draws the curves; None records them as data alone.
+        folder: the record of the run.
+        evaluation: interval and window of the calibration curves.
+        draw: draws the curves; None records their data alone.
         loggers: Lightning's loggers; those with `log_image` receive the pictures.
 
     Attributes:
-        begun: whether this process has begun to train; an error before that lies in the checkpoint.
+        begun: whether training has begun in this process; an earlier error comes from the checkpoint.
     """
 
     def __init__(
@@ -61,20 +61,19 @@ class Recorder(Checkpoint):
         step = trainer.global_step - 1  # as Lightning counts
         self.record(trainer.current_epoch, epoch_metrics(trainer), step)
 
-    @rank_zero_only
     def record(self, epoch: int, metrics: Mapping[str, float], step: int) -> None:
-        """Write the metrics of an epoch; null stands for a number that is not finite."""
+        """Write the metrics of an epoch, with null for numbers that are not finite."""
         finite = {key: value if math.isfinite(value) else None for key, value in metrics.items()}
         self.rows[epoch] = {"epoch": epoch, "step": step} | finite
-        self.folder.write_metrics(self.rows[key] for key in sorted(self.rows))
+        rank_zero_only(self.folder.write_metrics)(self.rows[key] for key in sorted(self.rows))
 
     def forget_after(self, epoch: int) -> None:
-        """Drop the epochs that a resumed run trains again."""
+        """Drop the epochs that a resumed run repeats."""
         self.rows = {key: row for key, row in self.rows.items() if key <= epoch}
 
     @rank_zero_only
     def record_curves(self, name: str, table: Columns, step: int) -> None:
-        """Write the calibration curves of a table of predictions, draw them and send them; none of a baseline."""
+        """Write, draw and send the calibration curves of a table; a point estimate has none."""
         curves = calibration_curves(table, self.evaluation.calibration_window)
         if not curves:
             return
@@ -87,7 +86,7 @@ class Recorder(Checkpoint):
         self._send_picture(name, step)
 
     def send_recorded(self) -> None:
-        """Send the loggers the epochs of the record that were trained before this process began."""
+        """Send the recorded epochs, which an earlier process trained, to the loggers."""
         for epoch, row in self.rows.items():
             metrics = {key: value for key, value in row.items() if key != "step" and value is not None}
             for logger in self.loggers:
@@ -102,10 +101,10 @@ class Recorder(Checkpoint):
 
 
 def epoch_metrics(trainer: Trainer) -> dict[str, float]:
-    """The metrics of the current epoch; without those of the test split in an epoch that is not evaluated."""
+    """The metrics of the current epoch, without the test split if it was not evaluated."""
     evaluated = (trainer.current_epoch + 1) % (trainer.check_val_every_n_epoch or 1) == 0
     return {
         key: float(value)
         for key, value in trainer.callback_metrics.items()
-        if evaluated or not key.startswith("test/")  # Lightning keeps the metrics of earlier epochs
+        if evaluated or not key.startswith("test/")  # else of an earlier epoch
     }

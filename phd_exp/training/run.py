@@ -2,7 +2,6 @@
 
 import logging
 import warnings
-from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
@@ -22,38 +21,38 @@ from phd_exp.records.errors import ConfigError, RunError, shown
 from phd_exp.records.files import remove_temporaries
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import build_data, build_module, build_trainer
-from phd_exp.training.config import FolderConfig, RunConfig, TrainerConfig
+from phd_exp.training.config import FolderConfig, RunConfig
 from phd_exp.training.module import PositionModule
+from phd_exp.training.network import ADVICE, load_checkpoint, require_same_shrinking
 from phd_exp.training.predictions import summary, write_parquet
 from phd_exp.training.ranks import train_together
 from phd_exp.training.recorder import Draw, Recorder
-from phd_exp.training.stored import ADVICE, load_checkpoint, require_same_shrinking
 from phd_exp.training.tracking import require_key, tracked
 
 UNTRAINED = -1
-"""The epoch before the first: what the untrained network gives."""
+"""The number of the epoch before the first, whose metrics are those of the untrained network."""
 
 
 def train(config: RunConfig, folder: RunFolder, draw: Draw | None, cores: int) -> dict[str, Any]:
-    """Train, measure and record one run; returns its results. A finished run is not run again.
+    """Train, evaluate and record one run; returns its results. A finished run is not run again.
 
-    A run that was stopped goes on with its next batch, one that was killed after its last whole epoch.
+    An interrupted run resumes with its next batch, a killed one after its last whole epoch.
 
     Args:
-        config: what to run.
-        folder: where its record goes.
-        draw: draws calibration curves; None records them alone.
-        cores: how many threads it has, unless trainer.threads says otherwise.
+        config: the run.
+        folder: the folder of its record.
+        draw: draws calibration curves; None records their data alone.
+        cores: number of threads, unless trainer.threads is set.
 
-    Raises RunError where the folder holds a run of another configuration or another process works on it, DatasetError
-    where the data set is incomplete.
+    Raises RunError if the folder holds a run of another configuration or another process uses it, DatasetError if the
+    data set is incomplete.
     """
     with folder.held():
         require_same_config(folder, config)
         if folder.is_finished():
             return folder.results()
         for place in (folder.path, folder.checkpoints, folder.calibration):
-            remove_temporaries(place)  # of a process that was killed
+            remove_temporaries(place)  # of a killed process
         folder.write_config(config.model_dump(mode="json"))
         threads = config.trainer.threads or cores
         with folder.recording(data_manifest=_manifest_hash(config)):
@@ -66,30 +65,26 @@ def train(config: RunConfig, folder: RunFolder, draw: Draw | None, cores: int) -
 
 
 def require_possible(config: RunConfig, folder: RunFolder) -> None:
-    """Raise, before anything is rendered or written, what would stop the run later.
+    """Raise the errors that would stop the run later, before anything is rendered or written.
 
-    RunError: the folder holds a run of another configuration, or cannot be written. ConfigError: there is no GPU, no
-    key of wandb, or a part of the model refuses its values.
+    RunError: the folder holds a run of another configuration, or cannot be written. ConfigError: no GPU, no key of
+    wandb, or values that a part of the model refuses.
     """
     require_same_config(folder, config)
     folder.require_writable()
     require_key(config.logger)
-    if config.trainer.accelerator == "gpu" and not torch.cuda.is_available():
+    trainer, found = config.trainer, torch.cuda.device_count()
+    if trainer.accelerator == "gpu" and not torch.cuda.is_available():
         raise ConfigError(
             "trainer.accelerator: got 'gpu', but torch sees none here; expected 'cpu' or 'auto'"
         )
-    _require_devices(config.trainer)
+    if trainer.accelerator != "cpu" and 0 < found < trainer.devices:
+        raise ConfigError(f"trainer.devices: got {trainer.devices}, but torch sees {found} GPUs here")
     build_module(config, build_data(config))
 
 
-def _require_devices(trainer: TrainerConfig) -> None:
-    found = torch.cuda.device_count()
-    if trainer.accelerator != "cpu" and 0 < found < trainer.devices:
-        raise ConfigError(f"trainer.devices: got {trainer.devices}, but torch sees {found} GPUs here")
-
-
 def require_same_config(folder: RunFolder, config: RunConfig) -> None:
-    """Raise RunError where the folder holds a run that computes something else, naming the first key."""
+    """Raise RunError if the folder holds a run with other results, naming the first key that differs."""
     if not folder.config_file.exists():
         return
     require_same_shrinking(folder, config)
@@ -101,27 +96,21 @@ def require_same_config(folder: RunFolder, config: RunConfig) -> None:
                 f"{folder.path}: holds a run with {key}={before}, but {key}={now} is asked for; "
                 "move that folder away, or choose another place by runs=DIR"
             )
-    _require_same_data(folder, config)
-
-
-def _require_same_data(folder: RunFolder, config: RunConfig) -> None:
-    """The user's own data may be another under the same name; a rendered set that differs is no more than longer."""
-    status = folder.status()
-    if isinstance(config.data, FolderConfig) and status is not None:
-        recorded, now = status.data_manifest, _manifest_hash(config)
-        if now is not None and recorded != now:
-            raise RunError(
-                f"{folder.path}: holds a run on {config.data.folder} as it was before its metadata.jsonl changed; "
-                "move that run's folder away, or choose another place by runs=DIR"
-            )
+    # the user's own data may change under the same name; a rendered set only grows
+    status, manifest = folder.status(), _manifest_hash(config)
+    if isinstance(config.data, FolderConfig) and status and manifest not in (None, status.data_manifest):
+        raise RunError(
+            f"{folder.path}: holds a run on {config.data.folder} as it was before its metadata.jsonl changed; "
+            "move that run's folder away, or choose another place by runs=DIR"
+        )
 
 
 def run(
     config: RunConfig, folder: RunFolder, draw: Draw | None, threads: int, rank: int = 0
 ) -> dict[str, Any]:
-    """What one process does of a run: all of it, or its share where several train together (`ranks.py`).
+    """Run in this process: the whole run, or one rank of several that train together (`ranks.py`).
 
-    Returns the results. Of several processes, all compute them and the first (`rank` 0) alone writes the record.
+    Every rank computes and returns the results; rank 0 alone writes the record.
     """
     _quiet_lightning()
     torch.set_num_threads(threads)
@@ -135,48 +124,39 @@ def run(
     with tracked(config, folder) if rank == 0 else nullcontext() as logger:
         recorder = Recorder(folder, config.evaluation, draw, [logger] if logger else [])
         trainer = build_trainer(config, recorder)
-        checkpoint = _take_up(trainer, module, data, recorder)
+        checkpoint = _last_checkpoint(trainer, module, data, recorder)
         recorder.send_recorded()
         _fit(trainer, module, data, checkpoint, recorder)
-        tables: dict[Part, Columns] = {
-            part: _evaluate(trainer, module, data, part) for part in data.samples if part != "train"
-        }
-        results = summary(tables["test"]) | _untrained(recorder) | _circumstances(config, data, trainer)
-        if trainer.is_global_zero:
+        tables = {part: _evaluate(trainer, module, data, part) for part in data.samples if part != "train"}
+        untrained = recorder.rows[UNTRAINED].items()
+        results = summary(tables["test"])
+        results |= {f"untrained/{key}": value for key, value in untrained if "test/" in key}
+        results |= _circumstances(config, data, trainer)
+        if rank == 0:
             recorder.record_curves("final", tables["test"], trainer.global_step)
-            _write_tables(folder, tables, data)
+            for part, table in tables.items():
+                file = folder.held_out if part == "held_out" else folder.predictions
+                write_parquet(file, table, data.source.known(part))
         if logger:
             logger.experiment.summary.update(results)
     return results
 
 
-def _write_tables(folder: RunFolder, tables: Mapping[Part, Columns], data: PositionData) -> None:
-    for part, table in tables.items():
-        file = folder.held_out if part == "held_out" else folder.predictions
-        write_parquet(file, table, data.source.known(part))
+def _last_checkpoint(
+    trainer: Trainer, module: PositionModule, data: PositionData, recorder: Recorder
+) -> Path | None:
+    """The checkpoint to resume from, with the record cut to its epochs.
 
-
-def _take_up(trainer: Trainer, module: PositionModule, data: PositionData, recorder: Recorder) -> Path | None:
-    """Leave in the record what was done before: the epochs up to the last checkpoint, which is returned.
-
-    A new run has none; what its untrained network gives is recorded.
+    A new run has none; the metrics of its untrained network are recorded.
     """
     checkpoint = recorder.folder.last_checkpoint
-    if checkpoint.exists():
-        epochs = trainer.max_epochs or 0
-        last = _last_whole_epoch(checkpoint, epochs, len(data.train_dataloader()))
-        recorder.forget_after(last)
-        _require_recorded(recorder, checkpoint)
-        if trainer.is_global_zero and last + 1 < epochs:
-            print(f"{recorder.folder.path}: resuming at epoch {last + 2} of {epochs}", flush=True)
-        return checkpoint
-    recorder.forget_after(UNTRAINED)
-    recorder.record(UNTRAINED, summary(_evaluate(trainer, module, data, "test")), step=0)
-    return None
-
-
-def _require_recorded(recorder: Recorder, checkpoint: Path) -> None:
-    """Raise RunError unless the epochs before a checkpoint are recorded with their numbers."""
+    if not checkpoint.exists():
+        recorder.forget_after(UNTRAINED)
+        recorder.record(UNTRAINED, summary(_evaluate(trainer, module, data, "test")), step=0)
+        return None
+    epochs = trainer.max_epochs or 0
+    last = _last_whole_epoch(checkpoint, epochs, len(data.train_dataloader()))
+    recorder.forget_after(last)
     untrained = recorder.rows.get(UNTRAINED, {})
     numbers = [value for row in recorder.rows.values() for value in row.values()]
     if not any(key.startswith("test/") for key in untrained) or not all(map(_is_number, numbers)):
@@ -184,35 +164,17 @@ def _require_recorded(recorder: Recorder, checkpoint: Path) -> None:
             f"{recorder.folder.metrics_file}: not the record of the epochs before {checkpoint.name}; "
             "delete both to begin the run again"
         )
+    if trainer.is_global_zero and last + 1 < epochs:
+        print(f"{recorder.folder.path}: resuming at epoch {last + 2} of {epochs}", flush=True)
+    return checkpoint
 
 
 def _is_number(value: Any) -> bool:
     return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
 
 
-def _fit(
-    trainer: Trainer, module: PositionModule, data: PositionData, checkpoint: Path | None, recorder: Recorder
-) -> None:
-    """Train to the last epoch, from the checkpoint if there is one.
-
-    Raises RunError if the checkpoint is one of another run.
-    """
-    try:
-        trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
-    except (KeyError, ValueError, TypeError, AttributeError, RuntimeError, IndexError) as error:
-        if checkpoint is None or recorder.begun:
-            raise
-        reason = " ".join(str(error).split())[:120]
-        raise RunError(f"{checkpoint}: not a checkpoint of this run ({reason}); {ADVICE}") from None
-
-
-def _untrained(recorder: Recorder) -> dict[str, Any]:
-    """The numbers of the untrained network, for comparison."""
-    return {f"untrained/{key}": value for key, value in recorder.rows[UNTRAINED].items() if "test/" in key}
-
-
 def _last_whole_epoch(checkpoint: Path, epochs: int, batches: int) -> int:
-    """The last epoch that a checkpoint has seen whole. Raises RunError where it is none of a run so long."""
+    """The last complete epoch of a checkpoint. Raises RunError if it is not from a run of so many epochs."""
     content = load_checkpoint(checkpoint)
     epoch = content.get("epoch")
     if type(epoch) is not int or not 0 <= epoch < epochs:
@@ -224,8 +186,21 @@ def _last_whole_epoch(checkpoint: Path, epochs: int, batches: int) -> int:
     return epoch if is_whole else epoch - 1
 
 
+def _fit(
+    trainer: Trainer, module: PositionModule, data: PositionData, checkpoint: Path | None, recorder: Recorder
+) -> None:
+    """Train to the last epoch. Raises RunError if the checkpoint does not belong to this run."""
+    try:
+        trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+    except (KeyError, ValueError, TypeError, AttributeError, RuntimeError, IndexError) as error:
+        if checkpoint is None or recorder.begun:
+            raise
+        reason = " ".join(str(error).split())[:120]
+        raise RunError(f"{checkpoint}: not a checkpoint of this run ({reason}); {ADVICE}") from None
+
+
 def _evaluate(trainer: Trainer, module: PositionModule, data: PositionData, part: Part) -> Columns:
-    """Predictions of the present weights, a row a sample, from all processes."""
+    """Predictions of the current weights for all samples of a part, gathered from all processes."""
     trainer.predict(module, dataloaders=data.in_order(part), return_predictions=False)
     return module.table
 
@@ -252,19 +227,19 @@ def _manifest_hash(config: RunConfig) -> str | None:
     if isinstance(config.data, FolderConfig):
         try:
             return DetectionFolder(config.data.folder).fingerprint()
-        except OSError:  # the data of a finished run may have gone
+        except OSError:  # the data of a finished run may be gone
             return None
     manifest = DatasetFolder(config.data.folder).manifest_path
     return checksum(manifest) if manifest.is_file() else None
 
 
 def _quiet_lightning() -> None:
-    """Leave the terminal to this programme's own lines, and say nothing of what is meant."""
+    """Silence Lightning's remarks and the warnings about intended behaviour."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
-    # Lightning calls an old name of torch
+    # Lightning calls a deprecated name of torch
     warnings.filterwarnings("ignore", ".*LeafSpec.*is deprecated", FutureWarning)
-    # a run that was broken off goes on in its own folder
+    # an interrupted run resumes in the same folder
     warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
-    # what is logged are sums over all processes already
+    # the logged values are already sums over all processes
     warnings.filterwarnings("ignore", "It is recommended to use .*sync_dist=True")

@@ -1,4 +1,4 @@
-"""Weights & Biases: one run there for each run here, with the same outcome."""
+"""Weights & Biases: one wandb run per run, with the same outcome."""
 
 import os
 import shutil
@@ -16,7 +16,7 @@ from phd_exp.training.config.sections import LoggerConfig
 
 
 def require_key(logger: LoggerConfig) -> None:
-    """Raise ConfigError where wandb has no key to send a run with; on a terminal it asks for one."""
+    """Raise ConfigError if an online run has no API key; on a terminal wandb asks for one."""
     if logger.kind == "none" or logger.offline:
         return
     try:
@@ -29,15 +29,15 @@ def require_key(logger: LoggerConfig) -> None:
 
 @contextmanager
 def tracked(config: RunConfig, folder: RunFolder) -> Iterator[WandbLogger | None]:
-    """The logger of a run, finished or failed at the end as the run did; None without one.
+    """The logger of a run, or None. On exit its wandb run is finished, as failed after an exception.
 
-    An unfinished wandb run would receive whatever the next run of a sweep logs.
+    An unfinished wandb run would receive the metrics of the next run of a sweep.
     """
     if config.logger.kind == "none":
         yield None
         return
     with _everything_in(folder.wandb):
-        run = _begin(config, folder)
+        run = _begin(config, folder)  # as a context it would print a traceback
         try:
             yield WandbLogger(experiment=run)
         except BaseException:
@@ -48,9 +48,9 @@ def tracked(config: RunConfig, folder: RunFolder) -> Iterator[WandbLogger | None
 
 @contextmanager
 def _everything_in(place: Path) -> Iterator[None]:
-    """Have wandb write the logs of its service to `place` instead of the home folder.
+    """Make wandb write its logs and caches to `place` instead of the home folder.
 
-    The service reads these variables when it starts, so each run starts and ends its own.
+    The wandb service reads these variables when it starts, so each run starts and stops one.
     """
     set_here = [name for name in ("WANDB_DATA_DIR", "WANDB_CACHE_DIR") if name not in os.environ]
     os.environ.update(dict.fromkeys(set_here, str(place.absolute())))
@@ -64,14 +64,14 @@ def _everything_in(place: Path) -> Iterator[None]:
 
 def _begin(config: RunConfig, folder: RunFolder) -> wandb.Run:
     if config.logger.offline:
-        os.environ["WANDB_ERROR_REPORTING"] = "false"  # its only look-up of a host
-        # an interrupted run left half a run; its epochs are in the record and are sent again
+        os.environ["WANDB_ERROR_REPORTING"] = "false"  # it uses the network
+        # of an interrupted run, whose recorded epochs are sent again
         shutil.rmtree(folder.wandb, ignore_errors=True)
     return wandb.init(
         project=config.logger.project,
         name="/".join(folder.path.parts[-4:]),
-        dir=folder.path.absolute(),  # the service that writes there may have been started elsewhere
+        dir=folder.path.absolute(),  # the service may have another working folder
         mode="offline" if config.logger.offline else "online",
         config=config.model_dump(mode="json"),
-        settings=wandb.Settings(silent=True, console="off"),  # the terminal and its end are handled here
+        settings=wandb.Settings(silent=True, console="off"),
     )

@@ -1,6 +1,7 @@
 """The order of batches: a function of (seed, epoch), resumable at any batch."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -21,8 +22,8 @@ def samples() -> Batch:
     )
 
 
-def loader(samples: Batch, seed: int = 0, drop_last: bool = False, shuffle: bool = True) -> BatchLoader:
-    return BatchLoader(samples, 3, shuffle=shuffle, drop_last=drop_last, seed=seed)
+def loader(samples: Batch, shuffle: bool = True, size: int = 3, **others: Any) -> BatchLoader:
+    return BatchLoader(samples, size, shuffle, **{"seed": 0} | others)
 
 
 def rows(batches: list[Batch]) -> list[int]:
@@ -30,16 +31,16 @@ def rows(batches: list[Batch]) -> list[int]:
 
 
 def test_every_sample_once_an_epoch_and_in_another_order_the_next(samples: Batch) -> None:
-    batches = loader(samples)
+    batches = loader(samples, size=5)
     first, second = rows(list(batches)), rows(list(batches))
     assert sorted(first) == sorted(second) == list(range(N))
     assert first != second
+    assert rows(list(loader(samples, shuffle=False))) == list(range(N)), "the order of the data set"
 
 
 def test_order_depends_on_seed_and_epoch_alone(samples: Batch) -> None:
-    one, other = loader(samples), loader(samples)
-    next(iter(one))  # an epoch broken off
-    list(one.samples.row)
+    one, other = loader(samples, size=5), loader(samples, size=5)
+    next(iter(one))  # an interrupted epoch
     other.epoch = 0
     assert rows(list(other)) == one.order(1).tolist()
     assert loader(samples, seed=1).order(0).tolist() != one.order(0).tolist()
@@ -53,32 +54,27 @@ def test_rows_stay_together(samples: Batch) -> None:
         assert batch.S == 4.0
 
 
-@pytest.mark.parametrize(("drop_last", "sizes"), [(False, [3, 3, 3, 1]), (True, [3, 3, 3])])
-def test_length(samples: Batch, drop_last: bool, sizes: list[int]) -> None:
-    batches = loader(samples, drop_last=drop_last)
+@pytest.mark.parametrize(("shuffle", "sizes"), [(False, [3, 3, 3, 1]), (True, [3, 3, 3])])
+def test_length(samples: Batch, shuffle: bool, sizes: list[int]) -> None:
+    batches = loader(samples, shuffle)
     assert [len(batch) for batch in batches] == sizes
     assert len(batches) == len(sizes)
 
 
-def test_without_shuffling_the_order_is_the_data_sets(samples: Batch) -> None:
-    assert rows(list(loader(samples, shuffle=False))) == list(range(N))
-
-
-@pytest.mark.parametrize("done", [0, 1, 2, 4])
-def test_resumes_with_the_batches_that_were_left(samples: Batch, done: int) -> None:
+@pytest.mark.parametrize("done", [0, 1, 2, 3])
+def test_resumes_with_the_remaining_batches(samples: Batch, done: int) -> None:
     whole = loader(samples)
     expected = [rows([batch]) for _ in range(3) for batch in whole]
 
     broken = loader(samples)
-    seen = []
     list(broken)  # epoch 0
     epoch = iter(broken)
-    seen = [rows([next(epoch)]) for _ in range(done)]
+    found = [rows([next(epoch)]) for _ in range(done)]
     resumed = loader(samples)
     resumed.load_state_dict(broken.state_dict())
-    seen += [rows([batch]) for batch in resumed] if done < 4 else []
-    seen += [rows([batch]) for batch in resumed]
-    assert seen == expected[4:]
+    found += [rows([batch]) for batch in resumed] if done < 3 else []
+    found += [rows([batch]) for batch in resumed]
+    assert found == expected[3:]
 
 
 def test_moves_to_a_device_whole(samples: Batch) -> None:
@@ -88,13 +84,10 @@ def test_moves_to_a_device_whole(samples: Batch) -> None:
 
 
 @pytest.mark.parametrize("world", [1, 2, 3])
-@pytest.mark.parametrize("drop_last", [False, True])
-def test_shares_are_each_batch_without_gaps_and_repeats(samples: Batch, world: int, drop_last: bool) -> None:
-    whole = BatchLoader(samples, 3, shuffle=True, drop_last=drop_last, seed=5)
-    shares = [
-        BatchLoader(samples, 3, shuffle=True, drop_last=drop_last, seed=5, rank=rank, world=world)
-        for rank in range(world)
-    ]
+@pytest.mark.parametrize("shuffle", [False, True])
+def test_shares_are_each_batch_without_gaps_and_repeats(samples: Batch, world: int, shuffle: bool) -> None:
+    whole = loader(samples, shuffle, seed=5)
+    shares = [loader(samples, shuffle, seed=5, rank=rank, world=world) for rank in range(world)]
     for _ in range(2):  # epochs
         batches, of_ranks = list(whole), [list(share) for share in shares]
         assert [len(parts) for parts in of_ranks] == [len(share) for share in shares]
@@ -102,11 +95,11 @@ def test_shares_are_each_batch_without_gaps_and_repeats(samples: Batch, world: i
             parts = [rows([share[place]]) for share in of_ranks if place < len(share)]
             assert sorted(row for part in parts for row in part) == sorted(rows([batch]))
             assert parts[0] == rows([batch])[::world]
-    assert len({tuple(share.state_dict().items()) for share in shares if drop_last}) <= 1
+    assert len({tuple(share.state_dict().items()) for share in shares if shuffle}) <= 1
 
 
 class Shift:
-    """Adds one of the numbers to the positions, so that they can be seen."""
+    """Adds one of the numbers to the positions."""
 
     n_numbers = 3
 
@@ -116,7 +109,7 @@ class Shift:
 
 def test_random_changes_depend_on_seed_epoch_and_batch_alone(samples: Batch) -> None:
     def changing(seed: int = 0, **share: int) -> BatchLoader:
-        return BatchLoader(samples, 4, shuffle=True, drop_last=True, seed=seed, augment=Shift(), **share)
+        return loader(samples, size=4, seed=seed, augment=Shift(), **share)
 
     first, again = list(changing()), list(changing())
     assert all(torch.equal(one.xyz, other.xyz) for one, other in zip(first, again, strict=True))
@@ -148,11 +141,11 @@ def test_every_row_gets_all_eight_signs_in_eight_epochs(samples: Batch) -> None:
             assert numbers.abs().max() <= 1
             return replace(batch, xyz=numbers.sign())
 
-    batches = BatchLoader(samples, 5, shuffle=True, drop_last=True, seed=0, augment=Signs())
+    batches = loader(samples, size=5, augment=Signs())
     for _ in range(2):
-        seen: dict[int, list[tuple[float, ...]]] = {row: [] for row in range(N)}
+        found: dict[int, list[tuple[float, ...]]] = {row: [] for row in range(N)}
         for batch in (batch for _ in range(8) for batch in batches):
             for row, signs in zip(batch.row.tolist(), batch.xyz.tolist(), strict=True):
-                seen[row].append(tuple(signs))
-        assert all(len(set(signs)) == 8 for signs in seen.values())
-    assert len({tuple(signs) for signs in seen.values()}) > N // 2  # the order differs between images
+                found[row].append(tuple(signs))
+        assert all(len(set(signs)) == 8 for signs in found.values())
+    assert len({tuple(signs) for signs in found.values()}) > N // 2  # the order differs between images

@@ -24,7 +24,7 @@ def data(
 
 def test_batches_hold_what_the_records_say(folder: DatasetFolder, spec: DatasetSpec) -> None:
     module = data(folder, spec)
-    (first, second) = list(module.test_dataloader())
+    (first, second) = list(module.val_dataloader())
     records = folder.records("test")
     assert [len(first), len(second)] == [2, 1]
     xyz = torch.tensor([(record.x, record.y, record.z) for record in records])

@@ -18,9 +18,8 @@ from phd_exp.distributions.constraints import (
 from phd_exp.distributions.point_estimate import PointDensity
 from phd_exp.geometry import Camera, Cartesian, LogDepth, Projected
 from phd_exp.models.backbones import resnet
-from phd_exp.models.focal_length import FocalLengthInput
 from phd_exp.models.heads import DistributionHead
-from phd_exp.models.regressor import Regressor
+from phd_exp.models.regressor import FocalLengthInput, Regressor
 
 KEPT = {
     # every one of them, by construction

@@ -9,9 +9,6 @@ from typing import Any
 import pytest
 import torch
 
-from phd_exp.data.batches import Batch
-from phd_exp.models.backbones import BackboneOutput
-from phd_exp.models.regressor import Regressor
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.module import PositionModule
 from tests.e2e.runs import only_run, weights
@@ -131,32 +128,6 @@ def test_memory_that_runs_out_is_one_line(
     status = only_run(runs).status()
     assert status is not None
     assert status.state == "failed"
-    ends_as_unhindered(runs)
-
-
-def test_an_image_on_which_the_network_fails_is_named_and_the_run_goes_on_from_the_epoch_before(
-    train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends_as_unhindered: Callable
-) -> None:
-    training_step, see = PositionModule.training_step, Regressor.see
-
-    def blind_to_one(self: PositionModule, batch: Batch, batch_idx: int) -> torch.Tensor:
-        lost = (batch.row == 3) & (self.current_epoch == 1)
-
-        def seen(regressor: Regressor, image: torch.Tensor) -> BackboneOutput:
-            whole = see(regressor, image)
-            return whole._replace(features=whole.features.masked_fill(lost[:, None], torch.nan))
-
-        with monkeypatch.context() as patch:
-            patch.setattr(Regressor, "see", seen)
-            return training_step(self, batch, batch_idx)
-
-    runs = tmp_path / "runs"
-    with monkeypatch.context() as patch:
-        patch.setattr(PositionModule, "training_step", blind_to_one)
-        line = refused(train(*QUIET, f"runs={runs}"))
-    assert "loss is nan in epoch 2/3, at train samples 000003.png; the last checkpoint is whole" in line
-    assert torch.load(only_run(runs).last_checkpoint, weights_only=True)["epoch"] == 0
-    assert all(weight.isfinite().all() for weight in weights(only_run(runs)).values())
     ends_as_unhindered(runs)
 
 

@@ -27,7 +27,7 @@ TOGETHER = ("trainer=ddp", "trainer.accelerator=cpu")
 
 
 def descendants(process: int) -> list[int]:
-    """The processes that a process started and that run phd_exp.training.rank, in the order of their ranks."""
+    """The processes that a process started and that run phd_exp.training.ranks, in the order of their ranks."""
     found = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -35,7 +35,7 @@ def descendants(process: int) -> list[int]:
             words = (stat.parent / "cmdline").read_text().split("\0")
         except (OSError, IndexError):
             continue
-        if parent == process and "phd_exp.training.rank" in words:
+        if parent == process and "phd_exp.training.ranks" in words:
             found.append(int(stat.parent.name))
     return sorted(found)
 
@@ -113,8 +113,7 @@ def test_one_killed_ends_all_and_the_same_command_goes_on(
     assert len(ranks) == 2
     assert not any(alive(rank) for rank in ranks)
     (line,) = outcome.err.splitlines()
-    killed = f"process {place} of 2 was killed by SIGKILL"
-    assert f"{killed}; the others were ended, and the same command goes on" in line
+    assert f"rank {place} of 2: process {ranks[place]} was killed by SIGKILL; the others were ended" in line
     run = only_run(tmp_path / "runs")
     status = run.status()
     assert status is not None

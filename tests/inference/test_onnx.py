@@ -52,7 +52,7 @@ def worst(made: Predictor, images: np.ndarray, f: np.ndarray) -> dict[str, np.nd
         patch.setattr(
             "jaxtyping.config.jaxtyping_disable", True
         )  # a shape that is checked is a fixed one in a graph
-        content = onnx._exported(made).SerializeToString()
+        content = onnx.graph(made).SerializeToString()
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     assert [given.name for given in session.get_inputs()] == ["image", "f"]
     raw, *here = session.run(None, {"image": images, "f": f})

@@ -1,4 +1,4 @@
-"""Predictions whose calibration is known: what is drawn from them, and what is then claimed instead of them."""
+"""Predictions whose calibration is known, and positions drawn from them."""
 
 from collections.abc import Callable, Mapping
 from functools import cache

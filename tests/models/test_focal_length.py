@@ -5,9 +5,8 @@ import torch
 
 from phd_exp.geometry import Camera, DepthScale, LogDepth
 from phd_exp.models.backbones import resnet
-from phd_exp.models.focal_length import FocalLengthInput
 from phd_exp.models.heads import ChartHead, DistributionHead
-from phd_exp.models.regressor import Regressor
+from phd_exp.models.regressor import FocalLengthInput, Regressor
 
 F_RANGE, Z_RANGE = (1200.0, 2000.0), (3.0, 5.0)
 DEPTH = DepthScale.from_ranges(F_RANGE, Z_RANGE)

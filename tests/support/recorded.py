@@ -1,8 +1,10 @@
-"""Run folders as a training would leave them, with predictions that a test has drawn itself."""
+"""Run folders in the format of a training, with predictions drawn by a test."""
 
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +23,7 @@ ODD_PRESET = "a_b & [red]|c| `$1` %"
 
 @dataclass(frozen=True)
 class Predicted:
-    """The table of a run, and what stands behind it."""
+    """The table of a run, and the positions behind it."""
 
     frame: pd.DataFrame
     truth: np.ndarray
@@ -70,7 +72,7 @@ def record(
     preset: str = "small",
     overrides: tuple[str, ...] = (),
 ) -> RunFolder:
-    """A finished run with these predictions; without any, with a file of none."""
+    """A finished run with these predictions, or without the file."""
     folder = RunFolder(RunName(preset, data, model, seed, overrides).folder(runs))
     folder.path.mkdir(parents=True)
     with folder.recording(data_manifest=None):
@@ -80,33 +82,25 @@ def record(
 
 
 HOSTILE = "\\end{table} $x_1$ & 5 % #1 ^~ {a} |b| `c` **d** <script> [red]e[/red] \x1b[31m 中 ' \" --"
-"""What an error's message may hold: markup of every format, and an order to the terminal."""
+"""An error's message with markup of every format, and a control sequence of the terminal."""
 
 
-def fail(
-    runs: Path, data: str, model: str, seed: int = 0, preset: str = "small", message: str = HOSTILE
-) -> None:
+def fail(runs: Path, data: str, model: str, seed: int = 0) -> None:
     """A run that failed."""
-    folder = RunFolder(RunName(preset, data, model, seed).folder(runs))
+    folder = RunFolder(RunName("small", data, model, seed).folder(runs))
     folder.path.mkdir(parents=True)
-    try:
-        with folder.recording(data_manifest=None):
-            raise ValueError(message)
-    except ValueError:
-        return
+    with suppress(ValueError), folder.recording(data_manifest=None):
+        raise ValueError(HOSTILE)
 
 
 def both_tables(runs: Path) -> dict[tuple[str, str, int], Predicted]:
-    """Two seeds of every run of both tables, but one that failed and one that is missing, and another preset."""
-    drawn = {}
-    choices = [(model, data) for model in ("mae_vz", "mae_logz", "probabilistic") for data in DATA]
+    """Two seeds of every run of both tables except one failed and two missing runs, and another preset."""
+    absent = (("mae_vz", "scale", 1), ("mae_logz", "occl", 0), ("mae_logz", "occl", 1))
+    choices = list(product(("mae_vz", "mae_logz", "probabilistic"), DATA))
+    drawn: dict[tuple[str, str, int], Predicted] = {}
     for model, data in [*choices, ("mae_xyz", "default"), ("mae_constf", "default")]:
         for seed in (0, 1):
-            if (model, data, seed) not in (
-                ("mae_vz", "scale", 1),
-                ("mae_logz", "occl", 0),
-                ("mae_logz", "occl", 1),
-            ):
+            if (model, data, seed) not in absent:
                 number = len(drawn)
                 point = predicted(number, noise=0.01 + 0.001 * number, probabilistic=model == "probabilistic")
                 drawn[model, data, seed] = point
@@ -117,12 +111,12 @@ def both_tables(runs: Path) -> dict[tuple[str, str, int], Predicted]:
 
 
 def reported(runs: Path, out: Path) -> None:
-    """The report of these runs, as the command makes it."""
+    """Run the command `report` on these runs."""
     assert report.main([f"runs={runs}", f"out={out}"]) == 0
 
 
 def once(factory: pytest.TempPathFactory, name: str, build: Callable[[Path], None]) -> Path:
-    """A folder that the first of all test processes builds for the others."""
+    """A folder built by the first test process for all others."""
     base = factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
     with FileLock(folder.with_suffix(".lock")):

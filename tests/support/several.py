@@ -1,4 +1,4 @@
-"""Records of several views whose calibration is known: what calibrated cameras would say."""
+"""Records of several views whose calibration is known."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from phd_exp.training.predictions import columns, write_parquet
 from tests.support.synthetic import calibrated, truths
 
 ANGLES = (0.0, 0.5, -0.6, 0.7)
-"""By which further cameras are turned against the first, each about an axis of its own."""
+"""Rotations of the cameras relative to the first, each about another axis."""
 
 
 def write_views(

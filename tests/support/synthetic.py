@@ -1,4 +1,4 @@
-"""Run records as a training leaves them, with predictions drawn so that their calibration is known."""
+"""Complete run records, with predictions drawn so that their calibration is known."""
 
 from pathlib import Path
 

@@ -1,42 +1,78 @@
-"""Precision follows the hardware unless it is named."""
+"""The parts that a configuration names: precision, learning rate, and values that are refused."""
+
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
+from phd_exp.data.images import SHRINKING
+from phd_exp.records.errors import ConfigError, RunError
+from phd_exp.records.runs import RunFolder
 from phd_exp.training import network
-from phd_exp.training.config import TrainerConfig
+from phd_exp.training.build import build_data, build_module
+from phd_exp.training.config import RunConfig, check
+from phd_exp.training.module import factor
 
 
-def config(precision: str, accelerator: str = "cpu") -> TrainerConfig:
-    return TrainerConfig.model_validate(
-        {
-            "max_epochs": 1,
-            "devices": 1,
-            "accelerator": accelerator,
-            "precision": precision,
-            "threads": None,
-            "progress_bar": False,
-        }
-    )
+@pytest.fixture
+def checked(composed: Callable[..., dict[str, Any]]) -> Callable[..., RunConfig]:
+    return lambda *overrides: check(composed("preset=smoke", *overrides))
 
 
-@pytest.mark.parametrize(("named", "lightning"), [("float32", "32-true"), ("bfloat16", "bf16-mixed")])
-def test_a_named_precision_is_taken(named: str, lightning: str) -> None:
-    assert network.precision(config(named)) == lightning
+@pytest.mark.parametrize(("named", "expected"), [("float32", "32-true"), ("bfloat16", "bf16-mixed")])
+def test_a_named_precision_is_used(checked: Callable, named: str, expected: str) -> None:
+    assert network.precision(checked("trainer=cpu", f"trainer.precision={named}").trainer) == expected
 
 
-@pytest.mark.parametrize(("has_units", "lightning"), [(True, "bf16-mixed"), (False, "32-true")])
-def test_bfloat16_only_where_the_cpu_has_units_for_it(
-    monkeypatch: pytest.MonkeyPatch, has_units: bool, lightning: str
+@pytest.mark.parametrize(("has_units", "expected"), [(True, "bf16-mixed"), (False, "32-true")])
+def test_bfloat16_only_on_hardware_with_units_for_it(
+    checked: Callable, monkeypatch: pytest.MonkeyPatch, has_units: bool, expected: str
 ) -> None:
     monkeypatch.setattr(network, "cpu_has_bfloat16", lambda: has_units)
-    assert network.precision(config("auto")) == lightning
-
-
-@pytest.mark.parametrize(("has_units", "lightning"), [(True, "bf16-mixed"), (False, "32-true")])
-def test_bfloat16_only_where_the_gpu_has_units_for_it(
-    monkeypatch: pytest.MonkeyPatch, has_units: bool, lightning: str
-) -> None:
+    assert network.precision(checked("trainer=cpu").trainer) == expected
+    monkeypatch.setattr(network, "cpu_has_bfloat16", lambda: not has_units)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: has_units)
-    assert network.precision(config("auto", "auto")) == lightning
+    assert network.precision(checked("trainer=auto").trainer) == expected
+
+
+def test_the_localisation_loss_requires_a_backbone_with_a_map(checked: Callable) -> None:
+    config = checked("recipe.localisation=1")
+    with pytest.raises(
+        ConfigError, match=r"^recipe\.localisation: got 1\.0, but this backbone does not say where"
+    ):
+        build_module(config, build_data(config))
+
+
+def test_a_constant_learning_rate_has_the_factor_one() -> None:
+    assert {factor("constant", 0, 100)(step) for step in range(100)} == {1.0}
+
+
+def test_the_learning_rate_rises_linearly_and_falls_as_half_a_wave() -> None:
+    at = factor("cosine", 9, 1000)
+    found = [at(step) for step in (0, 4, 9, 500, 1000)]
+    assert found == pytest.approx([0.1, 0.5, 1, 0.5, 0], rel=1e-3, abs=1e-12)
+    assert at(1001) == at(1000)  # Lightning asks for a step after the last
+    falling = [at(step) for step in range(10, 1000)]
+    assert falling == sorted(falling, reverse=True)
+
+
+@pytest.mark.parametrize("side", [64, 112])
+@pytest.mark.parametrize("version", [None, SHRINKING - 1, SHRINKING])
+@pytest.mark.parametrize("begun", [True, False])
+def test_images_shrunk_by_another_version_are_refused_where_they_differ(
+    checked: Callable, tmp_path: Path, side: int, version: int | None, begun: bool
+) -> None:
+    folder = RunFolder(tmp_path)
+    folder.checkpoints.mkdir()
+    if begun:
+        folder.last_checkpoint.touch()
+    if version is not None:
+        folder.write_constants({"shrinking": version})
+    config = checked("data.sensor_size=224", f"data.image_size={side}")
+    refused = begun and side == 64 and version != SHRINKING
+    with pytest.raises(RunError, match="shrunk from 224 to 64 pixels") if refused else nullcontext():
+        network.require_same_shrinking(folder, config)

@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
+from phd_exp.records.processes import duration
 from phd_exp.training import progress
-from phd_exp.training.progress import BETWEEN_LINES, FIRST_LINE, Progress, duration
+from phd_exp.training.progress import BETWEEN_LINES, FIRST_LINE, Progress
 
 BATCHES, EPOCHS = 100, 10
 
@@ -63,10 +64,3 @@ def test_with_a_bar_the_estimate_is_printed_once(trained: Callable) -> None:
     ((time, line),) = trained(36.0, bar=True)
     assert time == pytest.approx(72)
     assert line == "epoch 1/10, batch 2/100: about 10.0 h left"
-
-
-@pytest.mark.parametrize(
-    ("seconds", "words"), [(0, "0 s"), (89, "89 s"), (600, "10 min"), (111_600, "31.0 h")]
-)
-def test_durations_are_read_at_a_glance(seconds: float, words: str) -> None:
-    assert duration(seconds) == words

@@ -1,14 +1,36 @@
-"""What a configuration must look like: checked as a whole before anything is built.
+"""A configuration, checked as a whole before anything is built.
 
-The YAML files under conf/ hold the values, these their types and ranges; neither repeats the other. A group whose
-choices are closed (data, trainer, ...) is a model here. A group that is open to new classes (backbone, head, loss,
-optimizer) names a `_target_`, and its keys are held against that target's own signature (`targets.py`).
+The YAML files under conf/ hold the values, this package their types and ranges. A group with a closed set of choices
+(data, trainer, ...) is a model in `sections.py`. A group that is open to new classes (backbone, head, loss,
+optimizer) names a `_target_`; its keys are checked against the signature of that target (`targets.py`).
 """
 
-from phd_exp.training.config.check import check, check_render
-from phd_exp.training.config.data import FolderConfig, RenderedConfig
-from phd_exp.training.config.run import RenderConfig, RunConfig
-from phd_exp.training.config.sections import TrainerConfig
+import math
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, Field, StrictBool, ValidationError, model_validator
+
+from phd_exp.records.choices import flatten, setting
+from phd_exp.records.errors import ConfigError, shown
+from phd_exp.records.spec import Shard
+from phd_exp.training.config.sections import (
+    CameraConfig,
+    DataConfig,
+    EvaluationConfig,
+    Folder,
+    FolderConfig,
+    LoggerConfig,
+    ModelConfig,
+    Name,
+    Natural,
+    RecipeConfig,
+    RenderedConfig,
+    Section,
+    TrainerConfig,
+    Whole,
+    is_folder,
+)
+from phd_exp.training.config.targets import Origin, Target, describe, locate
 
 __all__ = [
     "FolderConfig",
@@ -19,3 +41,137 @@ __all__ = [
     "check",
     "check_render",
 ]
+
+SINGLE_VIEW = "scale"
+"""The data set whose runs can be evaluated on several views."""
+
+Checked = TypeVar("Checked", bound=BaseModel)
+
+
+class RenderConfig(Section):
+    """The configuration of `render`: the data, and the keys of conf/render.yaml."""
+
+    data: RenderedConfig
+    shard: Annotated[Shard, BeforeValidator(Shard.parse)] | None
+    verify: StrictBool
+    rerender: Natural
+    masks: Folder | None
+
+
+class RunConfig(Section):
+    """The configuration of one run."""
+
+    seed: Annotated[Whole, Field(ge=0, lt=2**32)]
+    runs: Folder
+    preset: Name
+    data: DataConfig
+    model: ModelConfig
+    camera: CameraConfig
+    recipe: RecipeConfig
+    backbone: Target
+    loss: Target
+    optimizer: Target
+    trainer: TrainerConfig
+    logger: LoggerConfig
+    evaluation: EvaluationConfig
+
+    @property
+    def setting(self) -> str:
+        """Preset and recipe in one word, the first level of the run's folder."""
+        return setting(self.preset, self.recipe.name)
+
+    @property
+    def prediction(self) -> type[Any]:
+        """The type of the model's predictions."""
+        return _prediction("model.head", self.model.head)
+
+    @model_validator(mode="after")
+    def parts_fit(self) -> "RunConfig":
+        """Refuse a loss of another type of prediction."""
+        made, taken = self.prediction, _prediction("loss", self.loss)
+        if not issubclass(made, taken):
+            raise ValueError(
+                f"loss: takes a {taken.__name__}, but model={self.model.name} predicts a {made.__name__}; "
+                "leave out loss=..., and the model picks its own"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def sizes_fit(self) -> "RunConfig":
+        """Refuse a batch larger than the training set, and images larger than rendered."""
+        data = self.data
+        if data.n_train is not None and data.batch_size > data.n_train:
+            raise ValueError(
+                f"data: batch_size={data.batch_size} is larger than n_train={data.n_train}: not one batch is full"
+            )
+        if isinstance(data, RenderedConfig) and data.image_size > data.spec.sensor_size:
+            raise ValueError(
+                f"data: image_size={data.image_size} is larger than sensor_size={data.spec.sensor_size}: "
+                "images are only ever shrunk"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def several_views_fit(self) -> "RunConfig":
+        """Refuse several views for a point estimate, and for a data set without them."""
+        multiview = self.evaluation.multiview
+        if multiview is None or multiview.scenes == 0:
+            return self
+        from phd_exp.distributions import ProjectedHuber  # imports torch, which takes seconds
+
+        expected = "or evaluation.multiview.scenes=0"
+        if not issubclass(self.prediction, ProjectedHuber):
+            raise ValueError(
+                f"evaluation.multiview.scenes: model={self.model.name} predicts points, which cannot be fused by "
+                f"their uncertainty; expected model=probabilistic, {expected}"
+            )
+        if not isinstance(self.data, RenderedConfig) or self.data.name != SINGLE_VIEW:
+            raise ValueError(
+                f"evaluation.multiview.scenes: several cameras see the scenes of data={SINGLE_VIEW}, not of "
+                f"data={self.data.name}; expected data={SINGLE_VIEW}, {expected}"
+            )
+        return self
+
+
+def _prediction(key: str, node: dict[str, Any]) -> type:
+    """The type of prediction that a head makes or a loss takes."""
+    kind = getattr(locate(node["_target_"], "typed"), "prediction", None)
+    if not isinstance(kind, type) or node.get("_partial_"):
+        name = key.rpartition(".")[2]
+        raise ValueError(f"{key}._target_: {node['_target_']!r} is no {name}; expected one as in conf/model")
+    return kind
+
+
+def check(config: dict[str, Any], origin: Origin = "typed") -> RunConfig:
+    """The configuration with its types. Raises ConfigError with one line for each error.
+
+    `origin` decides which classes it may name, see `targets.ALLOWED`.
+    """
+    return _validated(RunConfig, config, origin)
+
+
+def check_render(config: dict[str, Any]) -> RenderConfig:
+    """The configuration of `render`, given that of a run; other keys of a run are not checked."""
+    if is_folder(config.get("data")):
+        raise ConfigError(
+            "data=folder: there is nothing to render, these are your own images; leave out `render` to train on them"
+        )
+    others = RunConfig.model_fields.keys() - RenderConfig.model_fields.keys()
+    kept = {key: value for key, value in config.items() if key not in others}
+    return _validated(RenderConfig, kept, "typed")
+
+
+def _validated(model: type[Checked], config: dict[str, Any], origin: Origin) -> Checked:
+    for key, value in flatten(config).items():
+        # Hydra would evaluate it on `instantiate`, and put values of this machine into a stranger's configuration
+        if "${" in str(value):
+            raise ConfigError(
+                f"{key}: got {shown(value)}; expected a value, since no interpolation is evaluated here"
+            )
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigError(f"{key}: got {value}; expected to be a finite number")
+    try:
+        return model.model_validate(config, context={"origin": origin})
+    except ValidationError as error:
+        lines = [describe(problem, model) for problem in error.errors(include_url=False)]
+        raise ConfigError("\n".join(dict.fromkeys(lines))) from None

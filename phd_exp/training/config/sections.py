@@ -1,53 +1,144 @@
-"""The sections of a run's configuration, but for `data`."""
+"""The sections of a configuration: their keys, types and ranges."""
 
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    StrictBool,
+    Tag,
+    model_validator,
+)
 
 from phd_exp.records.spec import Angle, DatasetSpec, Range
-from phd_exp.training.config.section import Name, Section, Whole
 from phd_exp.training.config.targets import Target
-from phd_exp.training.schedule import Schedule
 
 MULTIVIEW = "multiview"
-"""The data set that shows its scenes to several cameras."""
+"""The data set whose scenes are rendered from several cameras."""
+
+Whole = Annotated[int, Field(strict=True)]
+Natural = Annotated[Whole, Field(ge=0)]
+Count = Annotated[Whole, Field(ge=1)]
+Name = Annotated[str, Field(strict=True, pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
+Factor = Annotated[float, Field(ge=1, le=10)]
+
+
+def _named(folder: Any) -> Any:
+    """Refuse the empty string, which pathlib takes for the current folder, and values of other types."""
+    if not folder or not isinstance(folder, (str, Path)):
+        raise ValueError("expected the name of a folder")
+    return folder
+
+
+Folder = Annotated[Path, Field(strict=False), BeforeValidator(_named)]
+
+
+class Section(BaseModel):
+    """Base class of all sections: immutable, without unknown keys."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class SizesConfig(Section):
+    """How much of a data set a run uses; None: all samples."""
+
+    n_train: Count | None
+    n_held_out: Natural
+    n_test: Count | None
+    image_size: Annotated[Whole, Field(ge=32, le=4096)]  # a ResNet halves the side five times
+    batch_size: Count
+
+
+class RenderedConfig(SizesConfig):
+    """A rendered data set: the keys of `DatasetSpec`, and how much of it a run uses."""
+
+    root: Folder
+    n_train: Count
+    n_test: Count
+    workers: Count | None
+    spec: DatasetSpec
+
+    @model_validator(mode="before")
+    @classmethod
+    def gather_spec(cls, values: Any) -> Any:
+        """Move the keys of the specification, which the user writes next to the others, into `spec`."""
+        if not isinstance(values, dict) or "spec" in values:
+            return values
+        spec = {key: value for key, value in values.items() if key in DatasetSpec.model_fields}
+        return {key: value for key, value in values.items() if key not in spec} | {"spec": spec}
+
+    @property
+    def n_training_split(self) -> int:
+        """Samples to render of the training split."""
+        return self.n_train + self.n_held_out
+
+    @property
+    def name(self) -> str:
+        """The variant, which names the data set and its runs."""
+        return self.spec.variant
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the data set."""
+        return self.root / self.spec.variant
+
+
+class FolderConfig(SizesConfig):
+    """A folder of the user's own images; `name` names its runs."""
+
+    name: Name
+    folder: Folder
+
+
+def is_folder(values: Any) -> bool:
+    """Whether a `data` section describes the user's own images: it has at most one key of `DatasetSpec`."""
+    if not isinstance(values, dict):
+        return isinstance(values, FolderConfig)
+    return "spec" not in values and len(DatasetSpec.model_fields.keys() & values.keys()) <= 1
+
+
+DataConfig = Annotated[
+    Annotated[RenderedConfig, Tag("<rendered>")] | Annotated[FolderConfig, Tag("<folder>")],
+    Discriminator(lambda values: "<folder>" if is_folder(values) else "<rendered>"),
+]
 
 
 class ModelConfig(Section):
-    """The head, which decides what is predicted, and the model's name in a run's folder."""
+    """The head, which decides what the model predicts, and the model's name in the run's folder."""
 
     name: Name
     head: Target
 
 
 class CameraConfig(Section):
-    """What the model knows of each camera's focal length: how to compute with it; besides, what it says of depth; or
-    one constant for all.
+    """How the model uses the focal length. known: geometry only; shown: also an input of the network; constant: one
+    value for all cameras.
     """
 
     focal_length: Literal["known", "shown", "constant"]
 
 
 class TrainerConfig(Section):
-    """How long is trained, on what, and in which arithmetic; None: as many threads as there are cores."""
+    """Length, hardware and arithmetic of the training; threads=None: one per core."""
 
-    max_epochs: Annotated[Whole, Field(ge=1)]
+    max_epochs: Count
     accelerator: Literal["auto", "cpu", "gpu"]
     precision: Literal["auto", "float32", "bfloat16"]
-    threads: Annotated[Whole, Field(ge=1)] | None
-    devices: Annotated[Whole, Field(ge=1)]
-    progress_bar: Annotated[bool, Field(strict=True)]
-
-
-Factor = Annotated[float, Field(ge=1, le=10)]
+    threads: Count | None
+    devices: Count
+    progress_bar: StrictBool
 
 
 class AugmentationConfig(Section):
     """The arguments of `Augmentation` and of its `Photometry`."""
 
-    symmetries: Annotated[bool, Field(strict=True)]
+    symmetries: StrictBool
     largest_zoom: Annotated[float, Field(ge=1, le=2)]
-    colours: Annotated[bool, Field(strict=True)]
+    colours: StrictBool
     brightness: Factor
     contrast: Factor
     gamma: Factor
@@ -61,44 +152,44 @@ class RecipeConfig(Section):
     """How a network is trained, whatever it predicts."""
 
     name: Name
-    schedule: Schedule
-    warmup_steps: Annotated[Whole, Field(ge=0)]
+    schedule: Literal["constant", "cosine"]
+    warmup_steps: Natural
     localisation: Annotated[float, Field(ge=0, le=1000)]
     augmentation: AugmentationConfig
 
 
 class LoggerConfig(Section):
-    """Where the run is logged besides its own record."""
+    """The logger that receives the metrics in addition to the run record."""
 
     kind: Literal["none", "wandb"]
     project: Name
-    offline: Annotated[bool, Field(strict=True)]
+    offline: StrictBool
 
 
 class MultiviewConfig(Section):
-    """What several cameras are to see after the training: nothing, or so many scenes of the variant `multiview`."""
+    """Evaluation on several views after the training: the number of scenes of the variant `multiview`, 0 for none."""
 
-    scenes: Annotated[Whole, Field(ge=0)]
+    scenes: Natural
     views: Annotated[Whole, Field(ge=2, le=64)]
     angle_range: Annotated[tuple[Angle, Angle], Range]
 
     def spec_beside(self, spec: DatasetSpec) -> DatasetSpec:
-        """The data set of several views that is otherwise the one of this specification."""
+        """The data set of several views that otherwise equals `spec`."""
         changes = {"variant": MULTIVIEW, "views": self.views, "view_angle_range": self.angle_range}
         return DatasetSpec(**(spec.model_dump() | changes))
 
 
 class EvaluationConfig(Section):
-    """What is measured besides the metrics of every epoch."""
+    """What is evaluated, and in which epochs."""
 
-    calibration_window: Annotated[Whole, Field(ge=1)]
-    calibration_every_n_epochs: Annotated[Whole, Field(ge=1)]
-    every_n_epochs: Annotated[Whole, Field(ge=1)] = 1  # so in records from before there was this
-    multiview: MultiviewConfig | None = None  # and this
+    calibration_window: Count
+    calibration_every_n_epochs: Count
+    every_n_epochs: Count = 1  # default for older run records
+    multiview: MultiviewConfig | None = None  # default for older run records
 
     @model_validator(mode="after")
     def calibration_is_evaluated(self) -> "EvaluationConfig":
-        """Refuse calibration curves in epochs that are not evaluated."""
+        """Refuse calibration curves in epochs without an evaluation."""
         if self.calibration_every_n_epochs % self.every_n_epochs:
             raise ValueError(
                 f"calibration_every_n_epochs={self.calibration_every_n_epochs} is no multiple of "

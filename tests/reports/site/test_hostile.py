@@ -5,8 +5,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
+import pandas as pd
 import pytest
 from PIL import Image
 
@@ -28,22 +27,12 @@ def rewrite(folder: RunFolder) -> None:
     """Put it wherever a run record holds a text."""
     folder.config_file.write_text(json.dumps(folder.config() | {EVIL: {EVIL: EVIL}, "model": {"name": EVIL}}))
     status = json.loads(folder.status_file.read_text())
-    evil = {
-        "versions": {EVIL: EVIL},
-        "machine": EVIL,
-        "git_commit": EVIL,
-        "data_manifest": EVIL,
-        "traceback": EVIL,
-    }
-    folder.status_file.write_text(json.dumps(status | evil | {"error": EVIL}))
+    texts = dict.fromkeys(("machine", "git_commit", "data_manifest", "traceback", "error"), EVIL)
+    folder.status_file.write_text(json.dumps(status | texts | {"versions": {EVIL: EVIL}}))
     rows = [row | {EVIL: 1.0, f"test/{EVIL}": float(row["epoch"])} for row in folder.metrics()]
     folder.write_metrics(rows)
     if folder.predictions.exists():
-        table = pq.read_table(folder.predictions)
-        names = pa.array([NAME + ".png"] * len(table))
-        pq.write_table(
-            table.set_column(table.column_names.index("file_name"), "file_name", names), folder.predictions
-        )
+        pd.read_parquet(folder.predictions).assign(file_name=f"{NAME}.png").to_parquet(folder.predictions)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,233 @@
+"""One run: its record, and the same numbers whatever interrupts it."""
+
+import math
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+import torch
+
+from phd_exp.records.errors import RunError
+from phd_exp.records.runs import RunFolder
+from phd_exp.training.checkpoints import AtomicCheckpoints
+from phd_exp.training.module import PositionModule
+from tests.e2e.runs import weights
+
+MODELS = ("probabilistic", "mae_vz", "mae_logz", "mae_xyz", "mae_constf")
+ERRORS = {"loss", "projected_error_mm", "depth_error_mm"}
+OF_A_DISTRIBUTION = {"nll", "depth_precision", "projected_precision"}
+CALIBRATION = {"depth_ence", "projected_ence", "miscalibration_area", "depth_crps_mm", "left_out"}
+LONG = ("trainer.max_epochs=2", "data.batch_size=4", "recipe.warmup_steps=2")
+
+
+def power_cut(*arguments: Any) -> None:
+    raise RuntimeError("power cut")
+
+
+def require_same(one: RunFolder, other: RunFolder) -> None:
+    assert one.metrics() == other.metrics()
+    assert one.results_file.read_bytes() == other.results_file.read_bytes()
+    assert all(torch.equal(weight, weights(other)[name]) for name, weight in weights(one).items())
+
+
+@pytest.fixture(scope="module")
+def whole(run_in: Callable, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A run that nothing interrupts."""
+    run: RunFolder = run_in(tmp_path_factory.mktemp("whole"), *LONG)
+    return run
+
+
+@pytest.fixture(params=MODELS, scope="module")
+def model(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture(scope="module")
+def run(model: str, run_in: Callable, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    found: RunFolder = run_in(tmp_path_factory.mktemp(model), f"model={model}", "trainer.max_epochs=2")
+    return found
+
+
+def test_every_model_leaves_a_whole_record(run: RunFolder, model: str) -> None:
+    assert run.is_finished()
+    assert (run.results()["model"], run.results()["recipe"]) == (model, "strong")
+    assert "regressor.backbone.map.weight" in weights(run)
+    assert [row["epoch"] for row in run.metrics()] == [-1, 0, 1]
+    quantities = ERRORS | (OF_A_DISTRIBUTION if model == "probabilistic" else set())
+    for row in run.metrics()[1:]:
+        assert {f"{split}/{name}" for split in ("train", "test") for name in quantities} <= row.keys()
+        assert all(math.isfinite(value) for value in row.values())
+    scores = {f"test/calibration/{name}" for name in CALIBRATION}
+    assert scores & row.keys() == (scores if model == "probabilistic" else set())
+
+
+def test_results_are_those_of_the_last_epoch_and_of_the_predictions(run: RunFolder, model: str) -> None:
+    results, table = run.results(), pd.read_parquet(run.predictions)
+    untrained, *_, last = run.metrics()
+    of_test = {key: value for key, value in last.items() if key.startswith("test/")}
+    assert of_test == pytest.approx({key: results[key] for key in of_test}, rel=1e-6)  # logged in float32
+    for name in ("projected_error_mm", "depth_error_mm"):
+        assert results[f"test/{name}"] == pytest.approx(table[name].mean())
+        assert results[f"untrained/test/{name}"] == untrained[f"test/{name}"]
+    scored = {"depth_pit", "depth_crps", "energy_score"}
+    assert scored & set(table.columns) == (scored if model == "probabilistic" else set())
+    held_out = pd.read_parquet(run.held_out)
+    assert list(held_out.columns) == list(table.columns)
+    assert held_out["file_name"].tolist() == [f"{index:06d}.png" for index in range(16, 20)]
+    assert (results["n_train"], results["n_held_out"], results["n_test"], len(table)) == (16, 4, 6, 6)
+
+
+def test_the_untrained_network_predicts_the_centre_of_the_data_set(run: RunFolder, model: str) -> None:
+    table = pd.read_parquet(run.predictions)
+    xyz = torch.tensor(table[["x", "y", "z"]].to_numpy())
+    mu_z0 = math.sqrt((3 / 600) * (5 / 400))
+    z = {"mae_xyz": 4.0, "mae_constf": mu_z0 * math.sqrt(400 * 600)}.get(model, mu_z0 * table["f"].to_numpy())
+    error = (torch.as_tensor(z) * xyz[:, 2] / xyz.norm(dim=1) - xyz.norm(dim=1)).abs()
+    expected = pytest.approx(1000 * error.mean().item(), rel=1e-4)
+    assert run.results()["untrained/test/depth_error_mm"] == expected
+
+
+def test_the_schedule_makes_one_step_per_batch(whole: RunFolder) -> None:
+    content = torch.load(whole.last_checkpoint, weights_only=True)
+    assert content["lr_schedulers"][0]["last_epoch"] == content["global_step"] == 8
+
+
+def test_a_failed_run_resumes_at_its_last_epoch(
+    run_in: Callable, whole: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    validation_step = PositionModule.validation_step
+
+    def fail(self: PositionModule, *arguments: Any) -> Any:
+        return power_cut() if self.current_epoch == 1 else validation_step(self, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PositionModule, "validation_step", fail)
+        with pytest.raises(RuntimeError, match="power cut"):
+            run_in(tmp_path, *LONG)
+    status = RunFolder(tmp_path).status()
+    assert status is not None
+    assert (status.state, status.error) == ("failed", "RuntimeError: power cut")
+    require_same(run_in(tmp_path, *LONG), whole)
+    assert "resuming at epoch 2 of 2" in capsys.readouterr().out
+
+
+def test_an_epoch_is_recorded_before_its_checkpoint(
+    run_in: Callable, whole: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_checkpoint = AtomicCheckpoints.save_checkpoint
+
+    def fail(self: AtomicCheckpoints, *arguments: Any, **options: Any) -> None:
+        save_checkpoint(self, *arguments, **options)
+        power_cut()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(AtomicCheckpoints, "save_checkpoint", fail)
+        with pytest.raises(RuntimeError, match="power cut"):
+            run_in(tmp_path, *LONG)
+    assert [row["epoch"] for row in RunFolder(tmp_path).metrics()] == [-1, 0]
+    require_same(run_in(tmp_path, *LONG), whole)
+
+
+@pytest.mark.parametrize(("name", "batch"), [("SIGTERM", 1), ("SIGINT", 0), ("SIGTERM", 3)])
+def test_a_signal_stops_after_the_batch_and_the_run_resumes_with_the_next(
+    run_in: Callable, whole: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, batch: int
+) -> None:
+    training_step, steps = PositionModule.training_step, []
+    signum = signal.Signals[name]
+
+    def signalled(self: PositionModule, data: Any, batch_idx: int) -> Any:
+        steps.append((self.current_epoch, batch_idx))
+        if steps[-1] == (1, batch) and steps.count((1, batch)) == 1:
+            os.kill(os.getpid(), signum)
+        return training_step(self, data, batch_idx)
+
+    monkeypatch.setattr(PositionModule, "training_step", signalled)
+    before = signal.signal(signum, power_cut)
+    try:
+        with pytest.raises(RuntimeError, match="power cut"):
+            run_in(tmp_path, *LONG)
+        assert signal.getsignal(signum) is power_cut
+    finally:
+        signal.signal(signum, before)
+    require_same(run_in(tmp_path, *LONG), whole)
+    assert steps == [(epoch, step) for epoch in range(2) for step in range(4)], "each once"
+
+
+def test_evaluating_less_often_changes_no_number(run_in: Callable, whole: RunFolder, tmp_path: Path) -> None:
+    other = run_in(tmp_path, *LONG, "evaluation.every_n_epochs=2", "evaluation.calibration_every_n_epochs=2")
+    assert all(torch.equal(weight, weights(whole)[name]) for name, weight in weights(other).items())
+    tested = [any(key.startswith("test/") for key in row) for row in other.metrics()]
+    assert tested == [True, False, True]
+    for row, same in zip(whole.metrics(), other.metrics(), strict=True):
+        assert same.items() <= row.items()
+    assert other.results() == whole.results()
+
+
+def test_curves_are_recorded_and_drawn(run_in: Callable, tmp_path: Path) -> None:
+    drawn: dict[str, Any] = {}
+    words = ("trainer.max_epochs=2", "evaluation.calibration_every_n_epochs=1")
+    run_in(tmp_path, *words, draw=lambda curves, file: drawn.update({file.name: curves}))
+    assert drawn.keys() == {"epoch-0000.png", "epoch-0001.png", "final.png"}
+    for curves in drawn.values():
+        assert curves.keys() == {"depth", "projected"}
+        for curve in curves.values():
+            assert len(curve["predicted"]) == len(curve["empirical"]) == 6 - curve["window"] + 1
+
+
+def test_a_finished_run_is_not_run_again_and_never_taken_for_another(
+    run_in: Callable, whole: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("phd_exp.training.run.run", lambda *_: pytest.fail("run again"))
+    run_in(whole.path, *LONG)
+    with pytest.raises(RunError, match=r"holds a run with optimizer.lr=0.002, but optimizer.lr=0.5 is asked"):
+        run_in(whole.path, *LONG, "optimizer.lr=0.5")
+
+
+def test_a_broken_checkpoint_is_one_line(run_in: Callable, tmp_path: Path) -> None:
+    words = ("trainer.max_epochs=1", "model=mae_vz")
+    run = run_in(tmp_path, *words)
+    run.status_file.write_text(run.status_file.read_text().replace("finished", "running"))
+    content = run.last_checkpoint.read_bytes()
+    for broken in (content[: len(content) // 2], b"", b"no checkpoint"):
+        run.last_checkpoint.write_bytes(broken)
+        with pytest.raises(RunError, match=r"last\.ckpt: not a whole checkpoint .*; delete it") as caught:
+            run_in(tmp_path, *words)
+        assert "\n" not in str(caught.value)
+    run.last_checkpoint.unlink()
+    assert run_in(tmp_path, *words).is_finished()
+
+
+def test_a_loss_that_is_not_finite_names_its_samples(
+    run_in: Callable, whole: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    training_step = PositionModule.training_step
+
+    def blind_to_one(self: PositionModule, batch: Any, batch_idx: int) -> Any:
+        if self.current_epoch == 1:
+            batch.xyz[batch.row == 3] = torch.nan  # a copy of the data set's
+        return training_step(self, batch, batch_idx)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PositionModule, "training_step", blind_to_one)
+        with pytest.raises(
+            RunError, match=r"loss is nan in epoch 2/2, at train samples 000003\.png; the last"
+        ) as caught:
+            run_in(tmp_path, *LONG)
+    assert "lower optimizer.lr" in str(caught.value)
+    assert all(weight.isfinite().all() for weight in weights(RunFolder(tmp_path)).values())
+    require_same(run_in(tmp_path, *LONG), whole)
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_progress_is_a_bar_on_a_terminal_and_lines_elsewhere(
+    run_in: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any, terminal: bool
+) -> None:
+    monkeypatch.setattr("phd_exp.training.build.on_a_terminal", lambda: terminal)
+    run_in(tmp_path, "model=mae_vz", "trainer.progress_bar=true", "trainer.max_epochs=1")
+    out, err = capfd.readouterr()
+    assert ("epoch 1/1: test/loss" in out) is not terminal
+    assert ("Epoch 0: 100%" in out + err) is terminal
