@@ -29,7 +29,7 @@ def strata(
     Raises ValueError for edges that do not ascend, or for fewer than one part.
 
     Example:
-        >>> [part.label for part in strata("depth", torch.tensor([3.0, 3.5, 4.0]), (3, 3.5, 4), "m")]
+        >>> [part.label for part in strata("depth", torch.tensor([3.0, 3.5, 4.0]), (3.0, 3.5, 4.0), "m")]
         ['depth 3-3.5 m', 'depth 3.5-4 m']
     """
     values = values.double()
