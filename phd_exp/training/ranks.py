@@ -48,10 +48,15 @@ def train_together(config: RunConfig, folder: Path, draw: Draw | None, threads: 
             child = stack.enter_context(Child("phd_exp.training.ranks", of_rank))
             child.send((config, folder, draw, max(1, threads // world), rank))
             ranks[child.connection] = (rank, child)
-        while ranks:
-            for connection in wait(list(ranks)):
-                rank, child = ranks.pop(connection)
-                results[rank] = _received(child, f"rank {rank} of {world}")
+        try:
+            while ranks:
+                for connection in wait(list(ranks)):
+                    rank, child = ranks.pop(connection)
+                    results[rank] = _received(child, f"rank {rank} of {world}")
+        except BaseException:
+            for _, child in ranks.values():
+                child.process.kill()  # at once: Gloo would print that it lost a peer
+            raise
     return results[0]
 
 
