@@ -60,9 +60,7 @@ def make_spec(composed: Callable[..., dict[str, Any]]) -> Callable[..., DatasetS
         data = composed(f"data={variant if known else 'default'}")["data"]
         return {key: value for key, value in data.items() if key in DatasetSpec.model_fields}
 
-    return lambda variant="default", **changes: DatasetSpec(
-        **(values(variant) | {"variant": variant} | changes)
-    )
+    return lambda variant="default", **changes: DatasetSpec(**(values(variant) | {"variant": variant} | changes))
 
 
 @pytest.fixture

@@ -14,9 +14,7 @@ class _Formula(InlineProcessor):
 
     def handleMatch(self, m: re.Match[str], data: str) -> tuple[Any, int, int]:  # type: ignore[override]
         display = "block" if m[1] == "$$" else "inline"
-        mathml = convert(m[2].strip(), display=display).replace(
-            'xmlns="http://www.w3.org/1998/Math/MathML" ', ""
-        )
+        mathml = convert(m[2].strip(), display=display).replace('xmlns="http://www.w3.org/1998/Math/MathML" ', "")
         return fromstring(mathml), m.start(), m.end()
 
 

@@ -115,9 +115,7 @@ def _without_missing(node: Any) -> Any:
     return {key: _without_missing(value) for key, value in node.items() if value != MISSING}
 
 
-def launch(
-    task: Task, words: list[str], config_name: str = "config", standing: Standing | None = None
-) -> int:
+def launch(task: Task, words: list[str], config_name: str = "config", standing: Standing | None = None) -> int:
     """Run a task through Hydra, once or (-m) for every combination; returns the exit status.
 
     `words` follow the verb; they change the configuration in `conf/<config_name>.yaml`. `standing` finds the state of

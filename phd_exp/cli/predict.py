@@ -88,16 +88,12 @@ def main(words: list[str]) -> int:
 
 def _require_possible(detections: list[Detection], out: Path) -> None:
     if find_spec("matplotlib") is None:
-        raise ConfigError(
-            "out: pictures need `pip install 'phd_exp[report]'`; without out= there is JSON alone"
-        )
+        raise ConfigError("out: pictures need `pip install 'phd_exp[report]'`; without out= there is JSON alone")
     if out.resolve() in {detection.file.resolve().parent for detection in detections}:
         raise ConfigError(f"out={out}: holds the images themselves; choose another folder")
 
 
-def _write(
-    predictor: "Predictor", detections: list[Detection], out: Path, curve: dict[str, Any] | None
-) -> None:
+def _write(predictor: "Predictor", detections: list[Detection], out: Path, curve: dict[str, Any] | None) -> None:
     """Write each line of `predictions.jsonl` before its picture, whose name begins with the line's number."""
     from phd_exp.inference.answers import answer
     from phd_exp.inference.pictures import picture
@@ -131,6 +127,4 @@ def _depth_curve(run: Path, predictor: "Predictor") -> dict[str, Any]:
             return dict(curve)
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         pass
-    raise RunError(
-        f"{file}: no calibration curve of depth; expected a finished run of a model with a density"
-    )
+    raise RunError(f"{file}: no calibration curve of depth; expected a finished run of a model with a density")

@@ -27,9 +27,7 @@ def main(words: list[str]) -> int:
             _report(folders.runs, folders.out)
     except OSError as error:
         place = error.filename or folders.out
-        raise UserError(
-            f"{place}: cannot be written ({error.strerror}); choose another folder by out=DIR"
-        ) from None
+        raise UserError(f"{place}: cannot be written ({error.strerror}); choose another folder by out=DIR") from None
     return 0
 
 

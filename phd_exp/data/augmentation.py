@@ -74,9 +74,7 @@ class Photometry:
     def _tone(self, numbers: list[float]) -> list[int]:
         """Table from the 256 levels of each of the three channels to their new levels."""
         limits = (self.brightness, self.contrast, self.gamma)
-        brightness, contrast, gamma = (
-            limit**number for limit, number in zip(limits, numbers[:3], strict=True)
-        )
+        brightness, contrast, gamma = (limit**number for limit, number in zip(limits, numbers[:3], strict=True))
         gain = brightness * self.white_balance ** np.array(numbers[3:])
         value = (gain[:, None] * np.arange(256) / 255).clip(0, 1)
         value = (0.5 + contrast * (value - 0.5)).clip(0, 1) ** gamma
@@ -94,8 +92,7 @@ def _noisy(image: NDArray[np.uint8], deviation: float, place: list[float]) -> ND
     height, width = image.shape[:2]
     field = _field(max(FIELD, 2 * height, 2 * width))
     top, left = (
-        int((len(field) - side) * (number + 1) / 2)
-        for side, number in zip((height, width), place, strict=True)
+        int((len(field) - side) * (number + 1) / 2) for side, number in zip((height, width), place, strict=True)
     )
     noise = field[top : top + height, left : left + width]
     return (image + deviation * noise).round().clip(0, 255).astype(np.uint8)
@@ -165,9 +162,7 @@ def _rearranged(
     One image at a time: indexing the batch once per reflection is ten times slower.
     """
     result = torch.empty_like(image)
-    for one, new, (x, y, exchange), order in zip(
-        image, result, (signs < 0).tolist(), colours.tolist(), strict=True
-    ):
+    for one, new, (x, y, exchange), order in zip(image, result, (signs < 0).tolist(), colours.tolist(), strict=True):
         turned = one.transpose(0, 1) if exchange else one
         mirrored = turned.flip([axis for axis, wanted in ((1, x), (0, y)) if wanted]) if x or y else turned
         for channel, old in enumerate(order):
@@ -177,9 +172,7 @@ def _rearranged(
 
 def moved(batch: Batch, motion: Motion) -> Batch:
     """The samples after a motion of the cameras."""
-    return Batch(
-        warped(batch, motion), motion.position(batch.xyz), motion.camera(batch.camera).f, batch.S, batch.row
-    )
+    return Batch(warped(batch, motion), motion.position(batch.xyz), motion.camera(batch.camera).f, batch.S, batch.row)
 
 
 def warped(batch: Batch, motion: Motion) -> UInt8[Tensor, "batch height width 3"]:

@@ -77,6 +77,4 @@ def _require_shares(source: Source, batch_size: int, world: int) -> None:
         )
     for part in PARTS:
         if 0 < (n := source.count(part)) < world:
-            raise ConfigError(
-                f"trainer.devices: got {world}, more than the {n} samples of {part} that there are"
-            )
+            raise ConfigError(f"trainer.devices: got {world}, more than the {n} samples of {part} that there are")

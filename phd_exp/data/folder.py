@@ -112,9 +112,7 @@ class FolderSource(Source):
                 array[row] = cut(image, crops[row].camera)
 
         # the pixels depend on the files, and on camera, box and side, which determine the homography
-        content = [
-            checksums[crop.detection.file].encode() + crop.camera.homography.tobytes() for crop in crops
-        ]
+        content = [checksums[crop.detection.file].encode() + crop.camera.homography.tobytes() for crop in crops]
         key = {"layout": CROP_LAYOUT, "crops": sha256(b"".join(content))}
         kept = self.folder.cache / f"crops-{part}-{len(crops)}x{self.side}.npy"
         largest = max((math.prod(self.sizes[file]) for file in rows), default=1)
@@ -132,9 +130,7 @@ def _crop(detection: Detection, side: int, sizes: dict[Path, tuple[int, int]]) -
     size = sizes[detection.file]
     box = detection.box(*size)
     try:
-        camera = VirtualCamera.of_box(
-            intrinsics(*detection.focal_lengths_and_centre(*size)), box, float(side)
-        )
+        camera = VirtualCamera.of_box(intrinsics(*detection.focal_lengths_and_centre(*size)), box, float(side))
     except ValueError as error:
         raise DatasetError(f"{detection.where}: box={list(box)}: {error}") from None
     detection.require_in_sight(*size)

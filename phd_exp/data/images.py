@@ -50,9 +50,7 @@ def decode(file: Path, record: SampleRecord, image_size: int) -> np.ndarray:
     try:
         image = recorded_image(file, record)
     except DatasetError as error:
-        raise DatasetError(
-            f"{error}; delete the file and run `python -m phd_exp render` to make it again"
-        ) from None
+        raise DatasetError(f"{error}; delete the file and run `python -m phd_exp render` to make it again") from None
     return shrunk(np.asarray(image), image_size)
 
 

@@ -26,9 +26,7 @@ LARGEST_ENERGY = 700.0
 _NEWTON_STEPS = 6  # to rounding from any a and p; test_icdf_inverts_cdf covers both tails
 
 
-def depth_energy(
-    log_t: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]
-) -> Float[Tensor, "*#batch"]:
+def depth_energy(log_t: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
     """The excess energy a (max(t, 1/t) - 1) >= 0, zero at the mode t = 1.
 
     Source: paper, section "Projected Huber distribution".

@@ -46,9 +46,7 @@ def level_curves(distribution: ProjectedHuber, levels: tuple[float, ...] = LEVEL
         [(73, 2), (73, 2)]
     """
     if distribution.batch_shape != torch.Size([]):
-        raise ValueError(
-            f"level curves are those of one distribution, not of {tuple(distribution.batch_shape)}"
-        )
+        raise ValueError(f"level curves are those of one distribution, not of {tuple(distribution.batch_shape)}")
     if not all(0 < level < 1 for level in levels):
         raise ValueError(f"levels lie between 0 and 1, exclusive; these are {levels}")
     middles = (torch.arange(_STRATA, dtype=torch.float64) + 0.5) / _STRATA  # of equally probable strata

@@ -143,6 +143,4 @@ def require_positions(xyz: Tensor, batch_shape: torch.Size) -> None:
         shapes = f"{tuple(xyz.shape[:-1])}; expected one that broadcasts with {tuple(batch_shape)}"
         raise ValueError(f"positions: got batch shape {shapes}") from error
     if bool(xyz.isnan().any()):
-        raise ValueError(
-            f"positions: got NaN in {int(xyz.isnan().any(dim=-1).sum())} of them; expected numbers"
-        )
+        raise ValueError(f"positions: got NaN in {int(xyz.isnan().any(dim=-1).sum())} of them; expected numbers")

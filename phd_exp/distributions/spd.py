@@ -74,9 +74,7 @@ def log_det(M: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch"]:
     return torch.log(pivot) + torch.log(M[..., 1, 1] - M[..., 0, 1] * M[..., 1, 0] / pivot)
 
 
-def inverse(
-    M: Float[Tensor, "*batch 2 2"], log_det_M: Float[Tensor, "*batch"]
-) -> Float[Tensor, "*batch 2 2"]:
+def inverse(M: Float[Tensor, "*batch 2 2"], log_det_M: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2 2"]:
     """The inverse of a symmetric positive definite matrix whose log determinant is known: adj(M) / |M|."""
     adjugate = torch.stack([M[..., 1, 1], -M[..., 0, 1], -M[..., 1, 0], M[..., 0, 0]], dim=-1)
     root = torch.exp(-log_det_M / 2)[..., None, None]  # of 1/|M|, which may itself overflow

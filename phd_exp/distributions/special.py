@@ -100,9 +100,7 @@ def log_normaliser(a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     return log_scaled_normaliser(a.log()) - a
 
 
-def weighted_integral(
-    F: Callable[[Tensor], Tensor], like: Float[Tensor, "*batch"]
-) -> Float[Tensor, "*batch"]:
+def weighted_integral(F: Callable[[Tensor], Tensor], like: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """int_0^inf e^(-s) F(s) ds by the Gauss rule, where F has its singularities at s <= -1; for the batch of `like`.
 
     F takes nodes s of shape `(nodes, 1, ..., 1)` and returns `(nodes, *batch)`.
@@ -187,9 +185,7 @@ class _TailMoment(torch.autograd.Function):
         return grad * derivative, None
 
     @staticmethod
-    def vmap(
-        _: Any, in_dims: tuple[int, None], a: Tensor, k: int
-    ) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
+    def vmap(_: Any, in_dims: tuple[int, None], a: Tensor, k: int) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
         value, derivative = _DualTailMoment.apply(a, k)
         return (value, derivative), (in_dims[0], in_dims[0])
 

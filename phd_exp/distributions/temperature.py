@@ -77,7 +77,5 @@ def _temperature(slope: Callable[[Tensor], Tensor]) -> float:
     while not at(-width) < 0 < at(width):
         width *= 2
         if width > _WIDEST:
-            raise ValueError(
-                "no temperature fits: the errors are zero, or out of proportion to the predictions"
-            )
+            raise ValueError("no temperature fits: the errors are zero, or out of proportion to the predictions")
     return math.exp(-brentq(at, -width, width, xtol=1e-12))

@@ -115,9 +115,7 @@ def in_central_half(
 def _mean(values: Tensor) -> SampleMean:
     n = len(values)
     _, drawn = resampled(means, {"mean": values}, RESAMPLES, SEED)
-    return SampleMean(
-        n, float(values.mean()), float(values.std() / n**0.5) if n > 1 else None, drawn["mean"].numpy()
-    )
+    return SampleMean(n, float(values.mean()), float(values.std() / n**0.5) if n > 1 else None, drawn["mean"].numpy())
 
 
 def _stacked(table: Columns, names: Sequence[str]) -> Tensor:

@@ -66,9 +66,7 @@ def moments(views, u, points, log_density, radii, mean, covariance, inside):
         root[:, j] = backward(L, root[:, j])
     mean[:] = u
     for points_used in (PILOT, PILOT, len(value)):
-        first, second, total = _weighted(
-            slope, at_origin, a, mean, root, points, log_density, value[:points_used]
-        )
+        first, second, total = _weighted(slope, at_origin, a, mean, root, points, log_density, value[:points_used])
         if points_used == len(value):
             _probabilities(points, value, total, first, second, radii, inside)
         _move(mean, root, covariance, first, second)

@@ -32,9 +32,7 @@ class Camera:
     def __post_init__(self) -> None:
         """Check f and S."""
         if not (math.isfinite(self.S) and self.S > 0):
-            raise ValueError(
-                f"S, the side of the image in pixels, must be positive and finite, but is {self.S}"
-            )
+            raise ValueError(f"S, the side of the image in pixels, must be positive and finite, but is {self.S}")
         if torch.compiler.is_compiling():  # a graph cannot refuse values
             return
         valid = (self.f > 0) & self.f.isfinite()
@@ -51,9 +49,7 @@ class Camera:
         """
         return self.f[..., None] * xyz[..., :2] / xyz[..., 2:] + self.S / 2
 
-    def unproject(
-        self, pixel: Float[Tensor, "*#batch 2"], z: Float[Tensor, "*#batch"]
-    ) -> Float[Tensor, "*#batch 3"]:
+    def unproject(self, pixel: Float[Tensor, "*#batch 2"], z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch 3"]:
         """Position at depth z (metres) that projects to a pixel: ((u, v) - S/2) z/f, z."""
         return at_depth((pixel - self.S / 2) / self.f[..., None], z)
 
@@ -80,9 +76,7 @@ class Camera:
         return self if constant_f is None else Camera(torch.full_like(self.f, constant_f), self.S)
 
 
-def at_depth(
-    xy_over_z: Float[Tensor, "*#batch 2"], z: Float[Tensor, "*#batch"]
-) -> Float[Tensor, "*#batch 3"]:
+def at_depth(xy_over_z: Float[Tensor, "*#batch 2"], z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch 3"]:
     """Position (x, y, z) at depth z (metres), given (x, y)/z."""
     return torch.cat([xy_over_z, torch.ones_like(xy_over_z[..., :1])], dim=-1) * z[..., None]
 

@@ -54,9 +54,7 @@ class DepthScale:
         """
         for name, (low, high) in (("f_range", f_range), ("z_range", z_range)):
             if not 0 < low <= high < math.inf:
-                raise ValueError(
-                    f"{name} must be (low, high) with 0 < low <= high < inf, but is {(low, high)}"
-                )
+                raise ValueError(f"{name} must be (low, high) with 0 < low <= high < inf, but is {(low, high)}")
         return cls._from_extremes(z_range[0] / f_range[1], z_range[1] / f_range[0], *z_range)
 
     @classmethod
@@ -91,9 +89,7 @@ def projected(xyz: Float[Tensor, "*#batch 3"], camera: Camera) -> Float[Tensor, 
     return 2 * camera.f[..., None] * xyz[..., :2] / (camera.S * xyz[..., 2:])
 
 
-def compensated_depth(
-    xyz: Float[Tensor, "*#batch 3"], camera: Camera, mu_z0: float
-) -> Float[Tensor, "*#batch"]:
+def compensated_depth(xyz: Float[Tensor, "*#batch 3"], camera: Camera, mu_z0: float) -> Float[Tensor, "*#batch"]:
     """Depth compensated for the focal length, z_p = z / (mu_z0 f), in [1/D, D] over the data set.
 
     Source: paper, section "Parameter remapping".
@@ -131,9 +127,7 @@ class Chart(ABC):
         """The position (metres) with these coordinates; the inverse of `coordinates`."""
 
     @abstractmethod
-    def log_abs_det_jacobian(
-        self, xyz: Float[Tensor, "*#batch 3"], camera: Camera
-    ) -> Float[Tensor, "*#batch"]:
+    def log_abs_det_jacobian(self, xyz: Float[Tensor, "*#batch 3"], camera: Camera) -> Float[Tensor, "*#batch"]:
         """log|det d coordinates / d xyz| at a position, the difference of log densities in the two frames."""
 
 
@@ -151,13 +145,9 @@ class Projected(Chart):
         return torch.cat([projected(xyz, camera), z_p[..., None] - 1], dim=-1)
 
     def position(self, coordinates: Float[Tensor, "*#batch 3"], camera: Camera) -> Float[Tensor, "*#batch 3"]:
-        return _position(
-            coordinates[..., :2], (coordinates[..., 2] + 1) * self.depth.mu_z0 * camera.f, camera
-        )
+        return _position(coordinates[..., :2], (coordinates[..., 2] + 1) * self.depth.mu_z0 * camera.f, camera)
 
-    def log_abs_det_jacobian(
-        self, xyz: Float[Tensor, "*#batch 3"], camera: Camera
-    ) -> Float[Tensor, "*#batch"]:
+    def log_abs_det_jacobian(self, xyz: Float[Tensor, "*#batch 3"], camera: Camera) -> Float[Tensor, "*#batch"]:
         return _log_abs_det_projected(xyz, camera) - torch.log(self.depth.mu_z0 * camera.f)
 
 
@@ -178,9 +168,7 @@ class LogDepth(Chart):
         z = torch.exp(self.depth.D * coordinates[..., 2]) * self.depth.mu_z0 * camera.f
         return _position(coordinates[..., :2], z, camera)
 
-    def log_abs_det_jacobian(
-        self, xyz: Float[Tensor, "*#batch 3"], camera: Camera
-    ) -> Float[Tensor, "*#batch"]:
+    def log_abs_det_jacobian(self, xyz: Float[Tensor, "*#batch 3"], camera: Camera) -> Float[Tensor, "*#batch"]:
         return _log_abs_det_projected(xyz, camera) - torch.log(self.depth.D * xyz[..., 2])
 
 
@@ -203,11 +191,7 @@ class Cartesian(Chart):
         return torch.cat([xyz[..., :2] / self.xy_unit, xyz[..., 2:] - self.depth.z_centre], dim=-1)
 
     def position(self, coordinates: Float[Tensor, "*#batch 3"], camera: Camera) -> Float[Tensor, "*#batch 3"]:
-        return torch.cat(
-            [coordinates[..., :2] * self.xy_unit, coordinates[..., 2:] + self.depth.z_centre], dim=-1
-        )
+        return torch.cat([coordinates[..., :2] * self.xy_unit, coordinates[..., 2:] + self.depth.z_centre], dim=-1)
 
-    def log_abs_det_jacobian(
-        self, xyz: Float[Tensor, "*#batch 3"], camera: Camera
-    ) -> Float[Tensor, "*#batch"]:
+    def log_abs_det_jacobian(self, xyz: Float[Tensor, "*#batch 3"], camera: Camera) -> Float[Tensor, "*#batch"]:
         return torch.full_like(xyz[..., 2], -2 * math.log(self.xy_unit))

@@ -53,9 +53,7 @@ class VirtualCamera:
         R = smallest_rotation(middle / np.linalg.norm(middle))
         corners = rays(K, np.array([[left, top], [right, top], [left, bottom], [right, bottom]])) @ R.T
         if not (corners[:, 2] > 0).all():
-            raise ValueError(
-                "its corners are 90 degrees or more from its middle; no pinhole image shows that"
-            )
+            raise ValueError("its corners are 90 degrees or more from its middle; no pinhole image shows that")
         half_width = np.abs(corners[:, :2] / corners[:, 2:]).max()
         seen = np.array([[x, y, 1.0] for x in (-half_width, half_width) for y in (-half_width, half_width)])
         if not (seen @ R[:, 2] > 0).all():  # z in the frame of the real camera, from R^T

@@ -23,9 +23,7 @@ MARGIN = 0.5  # width of the margin around a box, in sizes of the box
 _AMBER = "#ffb000"
 
 
-def picture(
-    sighting: Sighting, recalibrated: bool = False, calibration: Mapping[str, Any] | None = None
-) -> bytes:
+def picture(sighting: Sighting, recalibrated: bool = False, calibration: Mapping[str, Any] | None = None) -> bytes:
     """A PNG of the image and the bird's-eye view with level curves of 50, 90 and 99 %, or of a baseline's point.
 
     A third panel has the calibration curve of depth, if given. The title has the file name, the focal length and
@@ -76,9 +74,7 @@ def _draw_image(axes: Axes, sighting: Sighting, curves: LevelCurves | None) -> N
     axes.plot(*pixels(view, mode[:2] / mode[2]), "x", color=_AMBER, markersize=6)
     truth = _truth(sighting)
     if truth is not None:
-        axes.plot(
-            *pixels(view, truth[:2] / truth[2]), "o", color="white", markeredgecolor="black", markersize=4
-        )
+        axes.plot(*pixels(view, truth[:2] / truth[2]), "o", color="white", markeredgecolor="black", markersize=4)
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="column (px)", ylabel="row (px)")
 
 

@@ -196,9 +196,7 @@ def _constants(folder: RunFolder, config: RunConfig) -> tuple[DepthScale, float]
         return source.depth, source.constant_f
     file = folder.constants_file
     if not file.exists():
-        raise RunError(
-            f"{file}: missing, so that the depth scale of its data is unknown; train the run again"
-        )
+        raise RunError(f"{file}: missing, so that the depth scale of its data is unknown; train the run again")
     values = folder.constants()
     try:
         constant_f = float(values["constant_f"])

@@ -167,9 +167,7 @@ def _window_means(columns: Mapping[str, Tensor], name: str, weight: Tensor, wind
     counts = weight[:, order]
     errors = counts * columns[f"{name}_squared_error"].double()[order]
     stride = _stride(len(curve.predicted))
-    pooled_errors, pooled_counts = torch.nn.functional.avg_pool1d(
-        torch.stack([errors, counts]), curve.window, stride
-    )
+    pooled_errors, pooled_counts = torch.nn.functional.avg_pool1d(torch.stack([errors, counts]), curve.window, stride)
     return pooled_errors / pooled_counts
 
 

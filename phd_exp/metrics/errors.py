@@ -7,16 +7,12 @@ from torch import Tensor
 MILLIMETRES = 1000.0
 
 
-def along_true_ray(
-    xyz: Float[Tensor, "*batch 3"], estimate: Float[Tensor, "*batch 3"]
-) -> Float[Tensor, "*batch 3"]:
+def along_true_ray(xyz: Float[Tensor, "*batch 3"], estimate: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     """v_par = (v . v^ / |v|^2) v: the projection of the estimate onto the true viewing ray, in metres."""
     return (xyz * estimate).sum(-1, keepdim=True) / xyz.square().sum(-1, keepdim=True) * xyz
 
 
-def projected_error(
-    xyz: Float[Tensor, "*batch 3"], estimate: Float[Tensor, "*batch 3"]
-) -> Float[Tensor, "*batch"]:
+def projected_error(xyz: Float[Tensor, "*batch 3"], estimate: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
     """|v^ - v_par|: the distance of the estimate from the true viewing ray, in metres.
 
     Example:
@@ -27,9 +23,7 @@ def projected_error(
     return (estimate - along_true_ray(xyz, estimate)).norm(dim=-1)
 
 
-def depth_error(
-    xyz: Float[Tensor, "*batch 3"], estimate: Float[Tensor, "*batch 3"]
-) -> Float[Tensor, "*batch"]:
+def depth_error(xyz: Float[Tensor, "*batch 3"], estimate: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
     """| |v_par| - |v| |: the error along the true viewing ray, in metres."""
     return (along_true_ray(xyz, estimate).norm(dim=-1) - xyz.norm(dim=-1)).abs()
 

@@ -77,16 +77,12 @@ def risk_coverage(by_uncertainty: Ordered, by_error: Ordered, error: str) -> Ris
     )
 
 
-def risk_at(
-    ordered: Ordered, error: str, coverage: Float[Tensor, " points"]
-) -> Float[Tensor, "*batch points"]:
+def risk_at(ordered: Ordered, error: str, coverage: Float[Tensor, " points"]) -> Float[Tensor, "*batch points"]:
     """The risk at given coverages in (0, 1], of samples ordered by their uncertainty."""
     kept = torch.nn.functional.pad(ordered.up_to, (1, 0))
     errors = torch.nn.functional.pad(ordered.sums[error].cumsum(-1), (1, 0))
     wanted = coverage.double() * ordered.total
-    after = (
-        torch.searchsorted(kept[..., 1:].contiguous(), wanted.contiguous()).clamp_max(kept.shape[-1] - 2) + 1
-    )
+    after = torch.searchsorted(kept[..., 1:].contiguous(), wanted.contiguous()).clamp_max(kept.shape[-1] - 2) + 1
     at = [values.gather(-1, place) for values in (kept, errors) for place in (after - 1, after)]
     share = ((wanted - at[0]) / (at[1] - at[0]).clamp_min(1)).clamp(0, 1)
     return torch.lerp(at[2], at[3], share) / wanted

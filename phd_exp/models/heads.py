@@ -57,9 +57,7 @@ class DistributionHead:
         # not validated for speed: the training step refuses a loss that is not finite
         return ProjectedHuber.from_raw(raw, f=camera.f, S=camera.S, mu_z0=self.mu_z0, validate_args=False)
 
-    def placed(
-        self, raw: Float[Tensor, "*batch 7"], place: Float[Tensor, "*batch 2"]
-    ) -> Float[Tensor, "*batch 7"]:
+    def placed(self, raw: Float[Tensor, "*batch 7"], place: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 7"]:
         """Raw numbers with the centre nu_p = B v_p shifted by B `place`: the same shift of v_p for every B."""
         B, _ = spectral_map(raw[..., 2:5])
         return torch.cat([raw[..., :2] + (B @ place[..., None]).squeeze(-1), raw[..., 2:]], dim=-1)
@@ -85,9 +83,7 @@ class ChartHead:
     def __call__(self, raw: Float[Tensor, "*batch 3"], camera: Camera) -> PointEstimate:
         return PointEstimate(raw, self.chart, camera)
 
-    def placed(
-        self, raw: Float[Tensor, "*batch 3"], place: Float[Tensor, "*batch 2"]
-    ) -> Float[Tensor, "*batch 3"]:
+    def placed(self, raw: Float[Tensor, "*batch 3"], place: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
         """Raw numbers shifted by `place` if the chart's first coordinates are v_p, else unchanged."""
         if not self.chart.has_projection:
             return raw

@@ -103,9 +103,7 @@ def _stem(width: int, stride: int) -> nn.Sequential:
     return nn.Sequential(convolution, _norm(width), nn.ReLU(inplace=True))
 
 
-def _stage(
-    block: type[BasicBlock | Bottleneck], count: int, n_in: int, width: int, stride: int
-) -> nn.Sequential:
+def _stage(block: type[BasicBlock | Bottleneck], count: int, n_in: int, width: int, stride: int) -> nn.Sequential:
     """`count` blocks, the first of which changes resolution and channels."""
     n_out = width * block.expansion
     shortcut = None

@@ -36,9 +36,7 @@ class FocalLengthInput(nn.Module):
         super().__init__()
         self.middle = math.log(depth.z_centre / depth.mu_z0)
         self.half_range = max(math.log(depth.D), 1e-3)
-        self.layers = nn.Sequential(
-            nn.Linear(n_outputs + 1, WIDTH), nn.GELU(), nn.Linear(WIDTH, WIDTH), nn.GELU()
-        )
+        self.layers = nn.Sequential(nn.Linear(n_outputs + 1, WIDTH), nn.GELU(), nn.Linear(WIDTH, WIDTH), nn.GELU())
         self.last = nn.Linear(WIDTH, n_outputs)
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)
@@ -105,9 +103,7 @@ class Regressor(nn.Module):
         output: BackboneOutput = self.backbone(rows.unflatten(2, (width, 3)).permute(0, 3, 1, 2))
         return output
 
-    def numbers(
-        self, output: BackboneOutput, f: Float[Tensor, " batch"] | None
-    ) -> Float[Tensor, "batch n_outputs"]:
+    def numbers(self, output: BackboneOutput, f: Float[Tensor, " batch"] | None) -> Float[Tensor, "batch n_outputs"]:
         """The raw numbers for the head, given the output of the backbone, and f if it is an input."""
         dtype = self.last.weight.dtype
         with torch.autocast(output.features.device.type, enabled=False):

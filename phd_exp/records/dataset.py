@@ -96,9 +96,7 @@ class DatasetFolder:
         try:
             return Manifest.model_validate_json(read_plain(self.manifest_path))
         except FileNotFoundError:
-            raise DatasetError(
-                f"{self.root}: no data set here (manifest.json is missing); render it first"
-            ) from None
+            raise DatasetError(f"{self.root}: no data set here (manifest.json is missing); render it first") from None
         except (OSError, ValidationError) as error:
             raise DatasetError(
                 f"{self.manifest_path}: not a readable manifest ({gist(error)}); restore it, or move the folder "
@@ -128,9 +126,7 @@ class DatasetFolder:
             raise DatasetError(f"{path}: missing though the manifest counts {finished} samples; render again")
         records = read_jsonl(path, SampleRecord.model_validate_json, limit=wanted, sealed=True)
         if [record.index for record in records] != list(range(wanted)):
-            raise DatasetError(
-                f"{path}: expected samples 0 to {wanted - 1} in order; restore it, or move the folder"
-            )
+            raise DatasetError(f"{path}: expected samples 0 to {wanted - 1} in order; restore it, or move the folder")
         return records
 
     def missing(self, spec: DatasetSpec, n_train: int, n_test: int) -> dict[Split, list[int]]:
@@ -144,9 +140,7 @@ class DatasetFolder:
         for split, n in wanted.items():
             there = self.images(split) if self.metadata_path(split).exists() else set()
             finished = manifest.count(split) if manifest else 0
-            missing[split] = [
-                i for i in range(n) if i >= finished or image_name(i, spec.image_format) not in there
-            ]
+            missing[split] = [i for i in range(n) if i >= finished or image_name(i, spec.image_format) not in there]
         return missing
 
     def require(self, spec: DatasetSpec) -> Manifest:

@@ -124,9 +124,7 @@ class Detection:
         """True position in the frame of the real camera, m. Raises DatasetError if the line has none."""
         x, y, z = self.line.x, self.line.y, self.line.z
         if x is None or y is None or z is None:
-            raise DatasetError(
-                f"{self.where}: x, y, z are missing; training and testing need the true position"
-            )
+            raise DatasetError(f"{self.where}: x, y, z are missing; training and testing need the true position")
         return x, y, z
 
     def focal_lengths_and_centre(self, width: int, height: int) -> tuple[float, float, float, float]:
@@ -286,9 +284,7 @@ def _complaint(problem: ErrorDetails) -> str:
     """The fault of a line: the key, the value, and what was expected."""
     key = ".".join(str(part) for part in problem["loc"])
     if problem["type"] == "extra_forbidden" and DISTORTION.fullmatch(key):
-        return (
-            f"{key}: a distorted image is no pinhole image; undistort the images first, then leave out {key}"
-        )
+        return f"{key}: a distorted image is no pinhole image; undistort the images first, then leave out {key}"
     if problem["type"] == "extra_forbidden":
         known = (Pose if key.startswith("pose.") else DetectionLine).model_fields
         return f"{key}: unknown key{nearest(key, known)}; expected one of {', '.join(known)}"

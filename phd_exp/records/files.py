@@ -136,7 +136,5 @@ def read_jsonl(
             try:
                 records.append(parse(line.removesuffix(b"\n").decode()))
             except ValueError as error:  # also UnicodeDecodeError and pydantic's ValidationError
-                raise CorruptFileError(
-                    f"{path}, line {number}: not a valid record ({gist(error)})"
-                ) from error
+                raise CorruptFileError(f"{path}, line {number}: not a valid record ({gist(error)})") from error
     return records

@@ -68,9 +68,7 @@ class Child:
             process.
     """
 
-    def __init__(
-        self, module: str, environment: Mapping[str, str] | None = None, log: Path | None = None
-    ) -> None:
+    def __init__(self, module: str, environment: Mapping[str, str] | None = None, log: Path | None = None) -> None:
         self.connection, theirs = Pipe()
         importable = os.pathsep.join(filter(None, [str(HOME), os.environ.get("PYTHONPATH")]))
         with theirs, nullcontext() if log is None else open(log, "ab") as stream:

@@ -163,9 +163,7 @@ class RunFolder:
         """Raise RunError if the folder could not be made, before hours of computation."""
         nearest = next(path for path in (self.path, *self.path.absolute().parents) if path.exists())
         if not (nearest.is_dir() and os.access(nearest, os.W_OK)):
-            raise RunError(
-                f"{self.path}: cannot be written ({nearest} is in the way or read-only); choose runs=DIR"
-            )
+            raise RunError(f"{self.path}: cannot be written ({nearest} is in the way or read-only); choose runs=DIR")
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -174,9 +172,7 @@ class RunFolder:
             self.path.mkdir(parents=True, exist_ok=True)
             for place in (self.checkpoints, self.calibration, self.wandb):
                 if place.is_symlink():  # in a stranger's run, it would redirect what is written
-                    raise RunError(
-                        f"{place}: leads out of the run's folder; put the folder itself in its place"
-                    )
+                    raise RunError(f"{place}: leads out of the run's folder; put the folder itself in its place")
             lock = ExitStack()
             free = lock.enter_context(held(self.path / ".lock"))
         except OSError as error:
@@ -201,9 +197,7 @@ class RunFolder:
         )
 
         def ended(state: State, **details: str) -> None:
-            self.write_status(
-                status.model_copy(update={"state": state, "ended": datetime.now(UTC), **details})
-            )
+            self.write_status(status.model_copy(update={"state": state, "ended": datetime.now(UTC), **details}))
 
         self.write_status(status)
         try:

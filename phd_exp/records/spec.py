@@ -97,9 +97,7 @@ class Shard:
 
     def __post_init__(self) -> None:
         if not 0 <= self.index < self.count:
-            examples = (
-                f"from 0/{self.count} to {self.count - 1}/{self.count}" if self.count else "such as 0/4"
-            )
+            examples = f"from 0/{self.count} to {self.count - 1}/{self.count}" if self.count else "such as 0/4"
             raise ValueError(f"{SHARD}, {examples}")
 
     @classmethod

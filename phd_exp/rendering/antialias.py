@@ -86,6 +86,4 @@ def _extreme(ufunc: np.ufunc, values: Labels, reach: int, axis: int) -> Labels:
 
 
 _STEPS = range(-REACH, REACH + 1)
-_NEIGHBOURS = sorted(product(_STEPS, _STEPS), key=lambda step: step[0] ** 2 + step[1] ** 2)[
-    1:
-]  # without itself
+_NEIGHBOURS = sorted(product(_STEPS, _STEPS), key=lambda step: step[0] ** 2 + step[1] ** 2)[1:]  # without itself

@@ -70,9 +70,7 @@ def _metadata(folder: DatasetFolder, split: Split, seal: Seal | None) -> tuple[l
         return [], []
     path, faults = folder.metadata_path(split), []
     if path.exists() and checksum(path) != seal.metadata_sha256:
-        faults.append(
-            f"{path}: its checksum is not that of the manifest; restore it, or render the data set anew"
-        )
+        faults.append(f"{path}: its checksum is not that of the manifest; restore it, or render the data set anew")
     try:
         return folder.records(split), faults
     except UserError as error:
@@ -130,6 +128,4 @@ def write_masks(folder: DatasetFolder, masks: Path) -> int:
 def require_elsewhere(folder: DatasetFolder, masks: Path) -> None:
     """Raise RenderError if masks would lie inside the data set, where loaders would take them for samples."""
     if masks.absolute().is_relative_to(folder.root):
-        raise RenderError(
-            f"masks={masks}: lies in the data set itself; expected a folder outside {folder.root}"
-        )
+        raise RenderError(f"masks={masks}: lies in the data set itself; expected a folder outside {folder.root}")

@@ -126,9 +126,7 @@ def window(scene: Scene, item: SceneObject) -> tuple[range, range]:
 
 def _shadow(off_axis: float, z: float, radius: float, scene: Scene) -> range:
     angle, width = math.atan2(off_axis, z), math.asin(radius / math.hypot(off_axis, z))
-    first, last = (
-        scene.f * math.tan(min(max(angle + side, -1.5), 1.5)) + scene.S / 2 for side in (-width, width)
-    )
+    first, last = (scene.f * math.tan(min(max(angle + side, -1.5), 1.5)) + scene.S / 2 for side in (-width, width))
     return range(math.floor(first), math.ceil(last))
 
 

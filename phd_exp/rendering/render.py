@@ -144,9 +144,7 @@ def render_missing(
     begun = time.monotonic()
     title = spec.variant if shard is None else f"{spec.variant} {shard}"
     with ExitStack() as stack:
-        journals = {
-            split: stack.enter_context(open_journal(folder.journal_path(split, shard))) for split in SPLITS
-        }
+        journals = {split: stack.enter_context(open_journal(folder.journal_path(split, shard))) for split in SPLITS}
         advance = stack.enter_context(shown_progress(len(samples), f"rendering {title}"))
         for record in stack.enter_context(closing(render_all(folder, spec, samples, workers))):
             journals[record.split].write(record.model_dump_json() + "\n")

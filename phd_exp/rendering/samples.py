@@ -24,9 +24,7 @@ def fast_settings(spec: DatasetSpec) -> Settings:
     return Settings(samples=spec.samples_per_pixel, denoised=True, at_middles=True)
 
 
-def make_sample(
-    renderer: Renderer, spec: DatasetSpec, split: Split, index: int
-) -> tuple[bytes, SampleRecord]:
+def make_sample(renderer: Renderer, spec: DatasetSpec, split: Split, index: int) -> tuple[bytes, SampleRecord]:
     """The image file and the record of one sample."""
     scene = sample_scene(spec, split, index)
     hits = trace_pixels(scene)
@@ -34,9 +32,7 @@ def make_sample(
     return image, describe(spec, split, index, scene, hits, sha256(image))
 
 
-def describe(
-    spec: DatasetSpec, split: Split, index: int, scene: Scene, hits: Hits, checksum: str
-) -> SampleRecord:
+def describe(spec: DatasetSpec, split: Split, index: int, scene: Scene, hits: Hits, checksum: str) -> SampleRecord:
     """The record of a sample, given the scene, what the rays of its pixels hit, and the image's checksum."""
     number, view = scene_and_view(spec, index)
     cylinder = scene.objects[0]

@@ -144,9 +144,7 @@ def _pose(objects: tuple[SceneObject, ...], spec: DatasetSpec, f: float, rng: St
     raise ValueError(f"no camera sees all {len(objects)} objects: lower view_angle_range")
 
 
-def _object(
-    spec: DatasetSpec, shape: Shape, f: float, pose: Stream, look: Stream, size: Stream
-) -> SceneObject:
+def _object(spec: DatasetSpec, shape: Shape, f: float, pose: Stream, look: Stream, size: Stream) -> SceneObject:
     return SceneObject(
         shape=shape,
         position=_position(spec, f, pose),

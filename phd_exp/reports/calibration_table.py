@@ -34,9 +34,7 @@ def calibration_tables(report: Report) -> list[Table]:
             numbers=tuple(
                 {"preset": preset, "data": run.data, "model": run.model, "run": run.name, "predictions": kind}
                 | {"quantity": name, "value": evaluation.scores[name].value}
-                | dict(
-                    zip(("calibrated", "low", "high"), vars(evaluation.reference[name]).values(), strict=True)
-                )
+                | dict(zip(("calibrated", "low", "high"), vars(evaluation.reference[name]).values(), strict=True))
                 for run, kinds in runs
                 for kind, evaluation in kinds.items()
                 for name in DISTANCES

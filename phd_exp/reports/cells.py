@@ -118,15 +118,11 @@ class Cell:
         }  # fmt: skip
 
 
-def make_cell(
-    report: Report, preset: str, data: str, model: str, key: ErrorKey, seeds: Sequence[int]
-) -> Cell:
+def make_cell(report: Report, preset: str, data: str, model: str, key: ErrorKey, seeds: Sequence[int]) -> Cell:
     """The cell of a preset, data set, model and error, for these seeds."""
     runs = report.at_defaults(preset, data, model)
     gaps = [
-        _gap(runs.get(seed), data, model, seed)
-        for seed in seeds
-        if seed not in runs or key not in runs[seed].errors
+        _gap(runs.get(seed), data, model, seed) for seed in seeds if seed not in runs or key not in runs[seed].errors
     ]
     measured = {seed: run for seed, run in sorted(runs.items()) if key in run.errors}
     return Cell(

@@ -78,9 +78,7 @@ def draw_on_image(
         axes.plot(*on_image(points, f, S).T, color="#ffb000", linewidth=width)
     axes.plot(*on_image(curves.mode[:2] / curves.mode[2], f, S), "x", color="#ffb000", markersize=6)
     if truth is not None:
-        axes.plot(
-            *on_image(truth[:2] / truth[2], f, S), "o", color="white", markeredgecolor="black", markersize=4
-        )
+        axes.plot(*on_image(truth[:2] / truth[2], f, S), "o", color="white", markeredgecolor="black", markersize=4)
     axes.set(xlim=(0, S), ylim=(S, 0), aspect="equal", xlabel="column (px)", ylabel="row (px)")
 
 

@@ -184,9 +184,7 @@ def latex(table: Table) -> str:
 
 def _escaped(text: str) -> str:
     """Text without a meaning in LaTeX; letters beyond ASCII, which a font may lack, by their numbers."""
-    return "".join(
-        SYMBOLS.get(letter) or (letter if letter.isascii() else f"U+{ord(letter):04X}") for letter in text
-    )
+    return "".join(SYMBOLS.get(letter) or (letter if letter.isascii() else f"U+{ord(letter):04X}") for letter in text)
 
 
 def _latex_group(rows: Sequence[TableRow], below: str) -> str:

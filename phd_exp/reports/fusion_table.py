@@ -144,7 +144,5 @@ def _common_cause(scores: FusionScores) -> str:
 
 def headline(scores: FusionScores) -> str:
     """The depth error with one camera and with all, in words."""
-    one, all_ = (
-        _number("depth_error_mm", scores.band("depth_error_mm", "mode", k).value) for k in (1, scores.views)
-    )
+    one, all_ = (_number("depth_error_mm", scores.band("depth_error_mm", "mode", k).value) for k in (1, scores.views))
     return f"depth error {one} mm with one camera, {all_} mm with {scores.views}"

@@ -101,9 +101,7 @@ class Layout:
     @property
     def choices(self) -> set[tuple[str, str]]:
         """Every (data set, model) of the table."""
-        return {
-            (column.data, line.model) for group in self.groups for line in group for column in self.columns
-        }
+        return {(column.data, line.model) for group in self.groups for line in group for column in self.columns}
 
 
 def _groups(models: tuple[str, ...], quantities: tuple[Quantity | None, ...]) -> tuple[tuple[Line, ...], ...]:

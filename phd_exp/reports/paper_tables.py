@@ -41,9 +41,7 @@ OF_A_CELL = (
     "A cell: our mean error in mm; below it the paper's figure and (× ours / paper). Bold: smaller than every other "
     "model of its column by a 95 % paired test, a bootstrap over seeds and the shared test images; never one seed."
 )
-OF_THE_SPLITS = (
-    "Held-out training samples chose the recipe and fitted the temperatures. Test samples chose nothing."
-)
+OF_THE_SPLITS = "Held-out training samples chose the recipe and fitted the temperatures. Test samples chose nothing."
 OF_AN_INTERVAL = {
     "student_t_over_seeds": "±: 95 % interval of the mean over seeds, Student's t.",
     "normal_over_samples": f"±{ONE_SEED}: one seed; 1.96 standard errors over its test samples. It does not say how "
@@ -61,9 +59,7 @@ def paper_tables(report: Report) -> list[Table]:
             begun = {choice: report.at_defaults(preset, *choice) for choice in layout.choices}
             seeds = sorted({seed for runs in begun.values() for seed in runs})
             choices = {choice for choice, runs in begun.items() if runs}
-            tables += [
-                _table(report, preset, layout, reading, choices, seeds) for reading in READINGS if seeds
-            ]
+            tables += [_table(report, preset, layout, reading, choices, seeds) for reading in READINGS if seeds]
     return tables
 
 
@@ -212,8 +208,7 @@ def gap_lines(gaps: Iterable[Gap]) -> list[str]:
         numbers = f"seed{'s' if len(found) > 1 else ''} {', '.join(map(str, found))}"
         lacking.setdefault((reason, model, numbers), []).append(data)
     return [
-        f"{model} on {', '.join(data)} ({numbers}): {reason}"
-        for (reason, model, numbers), data in lacking.items()
+        f"{model} on {', '.join(data)} ({numbers}): {reason}" for (reason, model, numbers), data in lacking.items()
     ]
 
 

@@ -97,9 +97,7 @@ class Report:
         }
 
 
-def read_report(
-    runs: Path, kept: Path | None = None, progress: Callable[[str], None] = lambda run: None
-) -> Report:
+def read_report(runs: Path, kept: Path | None = None, progress: Callable[[str], None] = lambda run: None) -> Report:
     """Read and measure every run; the folder `kept`, if given, stores measurements until their run changes.
 
     Raises OSError if that folder cannot be written.
@@ -143,9 +141,7 @@ def _whole_run(folder: RunFolder, names: tuple[str, str, str, str], kept: Path |
     if folder.held_out.exists():
         held_out = notes.attempt(lambda: read_table(folder.held_out))
         tested_held_out = notes.attempt(lambda: _errors(held_out, ("mode",))) if held_out else None
-    measured = (
-        notes.attempt(lambda: kept_or_measured(folder, config, predictions, held_out, kept)) or Measured()
-    )
+    measured = notes.attempt(lambda: kept_or_measured(folder, config, predictions, held_out, kept)) or Measured()
     errors, nll = tested or ({}, None)
     held_out_errors, held_out_nll = tested_held_out or ({}, None)
     return Run(

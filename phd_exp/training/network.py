@@ -34,9 +34,7 @@ def build_regressor(config: RunConfig, depth: DepthScale) -> Regressor:
     with naming("backbone"):
         backbone = instantiate(config.backbone)
         if not isinstance(backbone, Backbone):
-            raise ValueError(
-                f"_target_: {config.backbone['_target_']!r} makes no Backbone; see conf/backbone"
-            )
+            raise ValueError(f"_target_: {config.backbone['_target_']!r} makes no Backbone; see conf/backbone")
         is_input = config.camera.focal_length == "shown"
         return Regressor(backbone, head, FocalLengthInput(head.n_outputs, depth) if is_input else None)
 
@@ -64,9 +62,7 @@ def precision(config: TrainerConfig) -> Any:
     fast = cpu_has_bfloat16()
     if has_gpu(config):
         fast = torch.cuda.is_bf16_supported(including_emulation=False)
-    return (
-        "bf16-mixed" if config.precision == "bfloat16" or (config.precision == "auto" and fast) else "32-true"
-    )
+    return "bf16-mixed" if config.precision == "bfloat16" or (config.precision == "auto" and fast) else "32-true"
 
 
 def cpu_has_bfloat16() -> bool:
@@ -102,9 +98,7 @@ def load_checkpoint(file: Path, map_location: Any = None) -> dict[str, Any]:
                 raise ValueError("its content is compressed, which torch never does")
         content = torch.load(file, map_location or "cpu", weights_only=True)
     except UnpicklingError:
-        raise RunError(
-            f"{file}: holds more than tensors and plain values, which is not read; {ADVICE}"
-        ) from None
+        raise RunError(f"{file}: holds more than tensors and plain values, which is not read; {ADVICE}") from None
     except Exception as error:  # torch raises any error on other bytes
         reason = " ".join((getattr(error, "strerror", None) or str(error).split("\n")[0]).split())[:120]
         raise RunError(f"{file}: not a whole checkpoint ({reason}); {ADVICE}") from None

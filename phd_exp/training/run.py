@@ -75,9 +75,7 @@ def require_possible(config: RunConfig, folder: RunFolder) -> None:
     require_key(config.logger)
     trainer, found = config.trainer, torch.cuda.device_count()
     if trainer.accelerator == "gpu" and not torch.cuda.is_available():
-        raise ConfigError(
-            "trainer.accelerator: got 'gpu', but torch sees none here; expected 'cpu' or 'auto'"
-        )
+        raise ConfigError("trainer.accelerator: got 'gpu', but torch sees none here; expected 'cpu' or 'auto'")
     if trainer.accelerator != "cpu" and 0 < found < trainer.devices:
         raise ConfigError(f"trainer.devices: got {trainer.devices}, but torch sees {found} GPUs here")
     build_module(config, build_data(config))
@@ -105,9 +103,7 @@ def require_same_config(folder: RunFolder, config: RunConfig) -> None:
         )
 
 
-def run(
-    config: RunConfig, folder: RunFolder, draw: Draw | None, threads: int, rank: int = 0
-) -> dict[str, Any]:
+def run(config: RunConfig, folder: RunFolder, draw: Draw | None, threads: int, rank: int = 0) -> dict[str, Any]:
     """Run in this process: the whole run, or one rank of several that train together (`ranks.py`).
 
     Every rank computes and returns the results; rank 0 alone writes the record.
@@ -142,9 +138,7 @@ def run(
     return results
 
 
-def _last_checkpoint(
-    trainer: Trainer, module: PositionModule, data: PositionData, recorder: Recorder
-) -> Path | None:
+def _last_checkpoint(trainer: Trainer, module: PositionModule, data: PositionData, recorder: Recorder) -> Path | None:
     """The checkpoint to resume from, with the record cut to its epochs.
 
     A new run has none; the metrics of its untrained network are recorded.
@@ -178,9 +172,7 @@ def _last_whole_epoch(checkpoint: Path, epochs: int, batches: int) -> int:
     content = load_checkpoint(checkpoint)
     epoch = content.get("epoch")
     if type(epoch) is not int or not 0 <= epoch < epochs:
-        raise RunError(
-            f"{checkpoint}: not a checkpoint of this run (epoch {shown(epoch)} of {epochs}); {ADVICE}"
-        )
+        raise RunError(f"{checkpoint}: not a checkpoint of this run (epoch {shown(epoch)} of {epochs}); {ADVICE}")
     place = content.get(PositionData.__qualname__)
     is_whole = not isinstance(place, dict) or place.get("next_batch") == batches
     return epoch if is_whole else epoch - 1

@@ -113,9 +113,7 @@ def stored(name: str, said: str, **changes: Any) -> list[Bad]:
     ]
 
 
-def record(
-    name: str, said: str, image: bytes | Callable[[], bytes] | None = None, **changes: Any
-) -> list[Bad]:
+def record(name: str, said: str, image: bytes | Callable[[], bytes] | None = None, **changes: Any) -> list[Bad]:
     """The same rendered data set, verified and trained on."""
 
     def spoil(place: Place) -> None:
@@ -143,8 +141,7 @@ def column(name: str, values: Callable[[int], Any]) -> Callable[[Place], None]:
 GOOD = '"file_name": "0.png", "f": 300'
 DEEP = "[" * 100_000
 BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
-    f"{name}: &{name} [{','.join([f'*{before}'] * 9)}]\n"
-    for before, name in zip("abcdefgh", "bcdefghi", strict=True)
+    f"{name}: &{name} [{','.join([f'*{before}'] * 9)}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
 )
 
 CONFIGURATIONS = [

@@ -116,8 +116,6 @@ def test_no_variable_of_the_environment_is_read(
     assert outcome.status == 1
     assert "sesame-7391" not in outcome.err
     command(*REPORT)
-    pages = [
-        page.read_text() for page in place.root.glob("report/site/**/*.*") if page.suffix in (".html", ".js")
-    ]
+    pages = [page.read_text() for page in place.root.glob("report/site/**/*.*") if page.suffix in (".html", ".js")]
     assert pages
     assert not any("sesame-7391" in page for page in pages)

@@ -76,9 +76,7 @@ BYTES = st.binary(max_size=200) | TEXTS.map(str.encode) | TEXTS.flatmap(
 )  # fmt: skip
 
 
-STATUS = RunStatus(
-    state="finished", started=1.0, versions={}, git_commit=None, data_manifest=None, machine="x"
-)
+STATUS = RunStatus(state="finished", started=1.0, versions={}, git_commit=None, data_manifest=None, machine="x")
 RECORDS = st.fixed_dictionaries(
     {
         "status.json": (spoiled(STATUS.model_dump(mode="json")) | VALUES).map(dumped).map(str.encode) | BYTES,

@@ -76,9 +76,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
 def _machine() -> str:
     words = Path("/proc/cpuinfo")
     lines = words.read_text().splitlines() if words.exists() else []
-    name = next(
-        (line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine()
-    )
+    name = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine())
     units = "with" if cpu_has_bfloat16() else "without"
     gpu = f", {torch.cuda.get_device_name()}" if torch.cuda.is_available() else ""
     return f"{os.cpu_count()} cores of {name} {units} bfloat16 units{gpu}, torch {torch.__version__}"

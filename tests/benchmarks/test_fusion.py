@@ -55,9 +55,7 @@ def one_by_one() -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
-def test_a_batch_is_far_faster_than_one_by_one(
-    device: str, unchecked: None, record: Callable[..., None]
-) -> None:
+def test_a_batch_is_far_faster_than_one_by_one(device: str, unchecked: None, record: Callable[..., None]) -> None:
     if device == "cuda" and not torch.cuda.is_available():
         pytest.skip("no CUDA device")
     n = BATCH[device]

@@ -47,9 +47,7 @@ def measured(loop: str, folder: Path, *overrides: str) -> dict[str, list[float]]
     ],
     ids=["resnet18", "resnet50"],
 )  # fmt: skip
-def test_nothing_but_arithmetic(
-    tmp_path: Path, record: Callable, name: str, overrides: tuple[str, ...]
-) -> None:
+def test_nothing_but_arithmetic(tmp_path: Path, record: Callable, name: str, overrides: tuple[str, ...]) -> None:
     found = measured("bare", tmp_path, "preset=small", "data.n_test=16", *overrides)
     ratio = compared(found, "bare", f"programme, {name}", "0.97", record)
     assert ratio >= 0.97
@@ -77,9 +75,7 @@ def test_faster_than_the_conventional_loop(
     assert ratio >= least
 
 
-def compared(
-    found: dict[str, list[float]], loop: str, what: str, goal: str, record: Callable[..., None]
-) -> float:
+def compared(found: dict[str, list[float]], loop: str, what: str, goal: str, record: Callable[..., None]) -> float:
     """The median of the programme's speed over the loop's."""
     ratio = statistics.median(mine / its for mine, its in zip(found["programme"], found[loop], strict=True))
     ours, theirs = (f"{statistics.median(found[key]):.1f} images/s" for key in ("programme", loop))
@@ -88,9 +84,7 @@ def compared(
 
 
 @pytest.mark.parametrize("recipe", ["paper", "strong"])
-def test_evaluation_and_logging_are_a_twentieth_of_an_epoch(
-    tmp_path: Path, record: Callable, recipe: str
-) -> None:
+def test_evaluation_and_logging_are_a_twentieth_of_an_epoch(tmp_path: Path, record: Callable, recipe: str) -> None:
     """Of preset=small, whose training and test samples are as many to one another as here."""
     words = ("preset=small", f"recipe={recipe}", "data.n_train=1600", "data.n_test=250")
     of_epochs = measured("bare", tmp_path, *words)["evaluation"]

@@ -118,9 +118,7 @@ def test_an_unwritable_folder_of_a_sweep(phd_exp: Callable, tmp_path: Path) -> N
     (tmp_path / "file").write_text("in the way")
     outcome = phd_exp("-m", "preset=smoke", "seed=0,1", "runs=file/runs")
     assert outcome.status == 1
-    assert (
-        outcome.err == "error: file/runs/.sweep: Not a directory; mend that, and the same command resumes\n"
-    )
+    assert outcome.err == "error: file/runs/.sweep: Not a directory; mend that, and the same command resumes\n"
 
 
 def test_wandb_without_a_key_is_refused_before_anything_is_rendered(

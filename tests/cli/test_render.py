@@ -32,9 +32,7 @@ def test_render_prints_its_cost_and_verify_accepts_the_result(render: Callable) 
     assert "all 6 samples are as they were rendered" in verified.out
 
 
-def test_verify_names_every_fault_and_render_repairs_it(
-    render: Callable, phd_exp: Callable, tmp_path: Path
-) -> None:
+def test_verify_names_every_fault_and_render_repairs_it(render: Callable, phd_exp: Callable, tmp_path: Path) -> None:
     """The data set is rendered in shards; a shard that does not exist fails alone, and is named."""
     outcome = phd_exp("-m", "render", *TINY, "data=default", "shard=0/2,2/2,1/2")
     assert outcome.status == 2

@@ -99,10 +99,7 @@ def test_how_a_run_stands_is_read_before_the_configuration_is_checked(
     status = runs[1].status()
     assert status is not None
     runs[1].write_status(status.model_copy(update={"state": "running"}))
-    assert (
-        standing(planned[1].config, planned[1].overrides)
-        == "exited without a result (killed or out of memory)"
-    )
+    assert standing(planned[1].config, planned[1].overrides) == "exited without a result (killed or out of memory)"
 
 
 @pytest.mark.parametrize("change", [{"data": 3}, {"model": {}}, {"runs": None}, {"seed": [1]}])

@@ -71,8 +71,7 @@ def test_a_run_first_prints_its_cost(
     first, *rest = capsys.readouterr().out.splitlines()
     if "preset=small" in words:
         assert (
-            first
-            == "runs/x: 4200 images to render, then 30 epochs of resnet10 on 3200 images of 64 px, on the CPU"
+            first == "runs/x: 4200 images to render, then 30 epochs of resnet10 on 3200 images of 64 px, on the CPU"
         )
     else:
         assert "runs/x: 11000 images to render, then 50 epochs of resnet50 on 8000 images of 224 px" in first

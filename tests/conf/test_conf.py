@@ -125,9 +125,7 @@ def test_without_removes_one_part_of_the_strong_recipe(composed: Callable, part:
 
 
 def test_the_command_line_overrides_all_files(checked: Callable) -> None:
-    config = checked(
-        "preset=smoke", "backbone=resnet50", "model=mae_vz", "camera=constant", "data.n_train=48"
-    )
+    config = checked("preset=smoke", "backbone=resnet50", "model=mae_vz", "camera=constant", "data.n_train=48")
     assert config.backbone["depth"] == 50
     assert config.camera.focal_length == "constant"
     assert config.data.n_train == 48

@@ -18,9 +18,9 @@ def spots(camera: Camera, xyz: torch.Tensor) -> torch.Tensor:
     """Images that show a soft white spot where a position is seen."""
     pixel = camera.project(xyz)
     middles = torch.arange(SIDE) + 0.5
-    distance = (middles[None, :] - pixel[:, :1]).square()[:, None] + (
-        middles[None, :] - pixel[:, 1:]
-    ).square()[:, :, None]
+    distance = (middles[None, :] - pixel[:, :1]).square()[:, None] + (middles[None, :] - pixel[:, 1:]).square()[
+        :, :, None
+    ]
     return (255 * (-distance / 18).exp()).round().to(torch.uint8)[..., None].repeat(1, 1, 1, 3)
 
 
@@ -29,9 +29,7 @@ def spot_of(image: torch.Tensor) -> torch.Tensor:
     weight = image[..., 0].double()
     middles = torch.arange(SIDE) + 0.5
     total = weight.sum((1, 2))
-    return (
-        torch.stack([(weight * middles).sum((1, 2)), (weight.mT * middles).sum((1, 2))], -1) / total[:, None]
-    )
+    return torch.stack([(weight * middles).sum((1, 2)), (weight.mT * middles).sum((1, 2))], -1) / total[:, None]
 
 
 def augmented(batch: Batch, largest_zoom: float, seed: int) -> Batch:

@@ -51,9 +51,7 @@ def centroid(picture: np.ndarray, about: np.ndarray, reach: float) -> np.ndarray
     ],
     ids=["whole", "off centre", "enlarged", "shrunk", "whole, shrunk"],
 )
-def test_what_lies_at_a_place_is_seen_where_the_virtual_camera_projects_it(
-    zoom: int, box: Box, S: float
-) -> None:
+def test_what_lies_at_a_place_is_seen_where_the_virtual_camera_projects_it(zoom: int, box: Box, S: float) -> None:
     camera_K = np.diag([zoom, zoom, 1.0]) @ K
     left, top, right, bottom = box
     pixels = np.array([left, top]) + PLACES * [right - left, bottom - top]
@@ -214,9 +212,7 @@ def test_no_image_is_one_line_at_first_sight(tmp_path: Path, content: bytes) -> 
 
 
 @pytest.mark.parametrize("limit", [1000, 200], ids=["over the limit", "twice over the limit"])
-def test_a_decompression_bomb_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: int
-) -> None:
+def test_a_decompression_bomb_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: int) -> None:
     file = tmp_path / "a.png"
     file.write_bytes(saved(NOISE))
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", limit)
@@ -234,7 +230,5 @@ def test_an_orientation_is_neither_applied_nor_ignored(kind: str, orientation: i
     if orientation == 1:
         assert read_image(Path("a"), content).size == (40, 40)
         return
-    with pytest.raises(
-        DatasetError, match=rf"^a: has the EXIF orientation {orientation}.*mogrify -auto-orient"
-    ):
+    with pytest.raises(DatasetError, match=rf"^a: has the EXIF orientation {orientation}.*mogrify -auto-orient"):
         read_image(Path("a"), content)

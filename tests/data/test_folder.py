@@ -105,9 +105,7 @@ def test_what_is_known_is_what_the_lines_say(photos: DetectionFolder) -> None:
     assert (own.count("train"), own.count("held_out"), own.count("test")) == (3, 0, 1)
 
 
-@pytest.mark.parametrize(
-    ("n_train", "n_held_out", "counts"), [(None, 1, (2, 1)), (1, 1, (1, 1)), (1, 2, (1, 2))]
-)
+@pytest.mark.parametrize(("n_train", "n_held_out", "counts"), [(None, 1, (2, 1)), (1, 1, (1, 1)), (1, 2, (1, 2))])
 def test_what_is_held_out_follows_what_is_trained_on(
     photos: DetectionFolder, n_train: int | None, n_held_out: int, counts: tuple[int, int]
 ) -> None:

@@ -122,9 +122,7 @@ def test_writing_into_the_array_leaves_the_file_alone(folder: DatasetFolder) -> 
     ],
     ids=["missing", "empty", "cut off"],
 )
-def test_a_damaged_image_is_one_line_and_leaves_no_cache(
-    folder: DatasetFolder, damage: object, said: str
-) -> None:
+def test_a_damaged_image_is_one_line_and_leaves_no_cache(folder: DatasetFolder, damage: object, said: str) -> None:
     damage(folder.image_path("train", 3))  # type: ignore[operator]
     with pytest.raises(DatasetError, match=rf"train/000003\.png: .*{said}.*render"):
         cached_images(folder, "train", folder.records("train"), 32)

@@ -61,9 +61,7 @@ def test_a_point_read_as_a_density_has_the_mass_of_its_samples(
 
     # one Gauss rule in each of the eight corners around the estimate, where the density has its kink
     nodes, weights = (torch.from_numpy(part) for part in leggauss(24))
-    places = [
-        torch.cat([-(1 - nodes) / 2, (1 + nodes) / 2]) * h + c for h, c in zip(half, centre, strict=True)
-    ]
+    places = [torch.cat([-(1 - nodes) / 2, (1 + nodes) / 2]) * h + c for h, c in zip(half, centre, strict=True)]
     weight = torch.cat([weights, weights]) / 2
     grid = torch.stack(torch.meshgrid(*places, indexing="ij"), dim=-1)
     volume = torch.einsum("i,j,k->ijk", weight, weight, weight) * half.prod()

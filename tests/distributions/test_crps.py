@@ -58,9 +58,7 @@ def test_mean_difference_is_that_of_the_integral(log_a: torch.Tensor) -> None:
 def test_large_precisions_are_laplace_and_small_ones_exponential() -> None:
     """Half the mean difference of Laplace's law is 3/4 of its scale, of the exponential law 1/2."""
     ends = torch.tensor([1e-8, 1e8], dtype=torch.float64).log()
-    torch.testing.assert_close(
-        half_mean_difference(ends), torch.tensor([0.5, 0.75]).double(), rtol=1e-6, atol=0
-    )
+    torch.testing.assert_close(half_mean_difference(ends), torch.tensor([0.5, 0.75]).double(), rtol=1e-6, atol=0)
 
 
 def test_derivatives_in_both_arguments(log_a: torch.Tensor) -> None:

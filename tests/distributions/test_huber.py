@@ -20,8 +20,7 @@ def radial_integral(function, low: float = 0.0, high: float = 60.0) -> float:
     borders = sorted({low, high, *(x for x in (1.0, 10.0) if low < x < high)})
     pieces = itertools.pairwise(borders)
     return sum(
-        integrate.quad(lambda r: function(r) * r * math.exp(-h(r)), *piece, epsabs=1e-14)[0]
-        for piece in pieces
+        integrate.quad(lambda r: function(r) * r * math.exp(-h(r)), *piece, epsabs=1e-14)[0] for piece in pieces
     )
 
 
@@ -38,9 +37,7 @@ def test_constants_are_the_integrals() -> None:
 def test_energy_is_hubers_function_of_the_norm() -> None:
     r = torch.tensor([0.0, 1e-9, 0.5, 1.0, 1.0 + 1e-9, 3.0, 1e5], dtype=torch.float64)
     q = r[:, None] * torch.tensor([0.6, -0.8], dtype=torch.float64)
-    torch.testing.assert_close(
-        huber.huber_energy(q), torch.tensor([h(x) for x in r.tolist()], dtype=torch.float64)
-    )
+    torch.testing.assert_close(huber.huber_energy(q), torch.tensor([h(x) for x in r.tolist()], dtype=torch.float64))
     q = q[:-1].requires_grad_()
     assert gradcheck(huber.huber_energy, q)
     (gradient,) = torch.autograd.grad(huber.huber_energy(q).sum(), q)
@@ -66,6 +63,4 @@ def test_samples_follow_the_law() -> None:
     assert stats.kstest(huber.radial_cdf(q.norm(dim=-1)), "uniform").pvalue > 1e-3
     angle = torch.atan2(q[:, 1], q[:, 0]) / (2 * math.pi) + 0.5
     assert stats.kstest(angle, "uniform").pvalue > 1e-3
-    torch.testing.assert_close(
-        torch.cov(q.T), huber.HUBER_COVARIANCE * torch.eye(2).double(), rtol=0.02, atol=0.05
-    )
+    torch.testing.assert_close(torch.cov(q.T), huber.HUBER_COVARIANCE * torch.eye(2).double(), rtol=0.02, atol=0.05)

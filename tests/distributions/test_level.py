@@ -32,8 +32,7 @@ def level_by_quadrature(W: float, a: float) -> float:
 
     borders = [0.0, math.log1p(max(W - 0.5, 0) / a), math.log1p(W / a)]
     return sum(
-        integrate.quad(integrand, low, high, epsabs=1e-12, limit=200)[0]
-        for low, high in itertools.pairwise(borders)
+        integrate.quad(integrand, low, high, epsabs=1e-12, limit=200)[0] for low, high in itertools.pairwise(borders)
     )
 
 

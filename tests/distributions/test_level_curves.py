@@ -19,9 +19,7 @@ SAMPLES = 100_000
 def _distribution(a: float, precision: float = 200.0) -> ProjectedHuber:
     A = precision * torch.tensor([[1.5, 0.6], [0.6, 0.9]], dtype=torch.float64)
     mu_xy = torch.tensor([0.05, -0.03], dtype=torch.float64)
-    return ProjectedHuber(
-        mu_xy, torch.tensor(4.0, dtype=torch.float64), A, torch.tensor(a, dtype=torch.float64)
-    )
+    return ProjectedHuber(mu_xy, torch.tensor(4.0, dtype=torch.float64), A, torch.tensor(a, dtype=torch.float64))
 
 
 CASES = [

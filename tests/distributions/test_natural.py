@@ -19,9 +19,7 @@ GENERIC = [0.4, -0.8, 1.3, 0.7, 2.1, 3.0, -0.9]
 
 def loss(raw: torch.Tensor, xyz: torch.Tensor, f: float = F) -> torch.Tensor:
     """-log p without its constants, so that it is the paper's L: of order one for an untrained network."""
-    constants = (
-        math.log(2 * math.pi * (1 + math.exp(-0.5))) + 2 * math.log(S * MU_Z0 / 2) + math.log(MU_Z0 * f)
-    )
+    constants = math.log(2 * math.pi * (1 + math.exp(-0.5))) + 2 * math.log(S * MU_Z0 / 2) + math.log(MU_Z0 * f)
     distribution = ProjectedHuber.from_raw(raw, f=f, S=S, mu_z0=MU_Z0, validate_args=False)  # as in training
     return -distribution.log_prob(xyz) - constants
 
@@ -151,9 +149,7 @@ def test_bfloat16_autocast_rounds_nothing_of_the_loss_and_its_gradient(raw: torc
 
 def data_set_positions() -> torch.Tensor:
     """Positions with |v_p| <= 1 in each coordinate and z_p in [1/D, D] for D = 5/3, all of them at their extremes."""
-    corners = torch.tensor(
-        list(itertools.product((-1.0, 1.0), (-1.0, 1.0), (0.6, 1.0, 5 / 3))), dtype=torch.float64
-    )
+    corners = torch.tensor(list(itertools.product((-1.0, 1.0), (-1.0, 1.0), (0.6, 1.0, 5 / 3))), dtype=torch.float64)
     z = corners[:, 2:] * MU_Z0 * F
     return torch.cat([corners[:, :2] * S * z / (2 * F), z], dim=-1)
 

@@ -64,9 +64,7 @@ def test_log_prob_is_the_papers_density(distribution: ProjectedHuber, samples: t
     torch.testing.assert_close(distribution.log_prob(xyz), expected, rtol=1e-8, atol=1e-8)
 
 
-def test_mean_and_covariance_are_those_of_samples(
-    distribution: ProjectedHuber, samples: torch.Tensor
-) -> None:
+def test_mean_and_covariance_are_those_of_samples(distribution: ProjectedHuber, samples: torch.Tensor) -> None:
     scale = distribution.stddev
     assert ((samples.mean(0) - distribution.mean) / scale).abs().max() < 0.01
     difference = torch.cov(samples.T) - distribution.covariance_matrix
@@ -98,9 +96,7 @@ def test_levels_of_samples_are_uniform(distribution: ProjectedHuber, samples: to
     assert stats.kstest(level, "uniform").pvalue > 1e-3
 
 
-def test_level_orders_positions_as_the_density_does(
-    distribution: ProjectedHuber, samples: torch.Tensor
-) -> None:
+def test_level_orders_positions_as_the_density_does(distribution: ProjectedHuber, samples: torch.Tensor) -> None:
     xyz = samples[:1000]
     level, order = distribution.level(xyz), distribution.log_prob(xyz).argsort(descending=True)
     assert (level[order].diff() >= -1e-9).all()
@@ -298,9 +294,7 @@ def test_refuses_bad_parameters(name: str, value: torch.Tensor, message: str) ->
 )
 def test_refuses_bad_raw_numbers_and_cameras(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        ProjectedHuber.from_raw(
-            **{"raw": torch.zeros(2, 7), "f": 1500.0, "S": 224.0, "mu_z0": 2.5e-3, **arguments}
-        )
+        ProjectedHuber.from_raw(**{"raw": torch.zeros(2, 7), "f": 1500.0, "S": 224.0, "mu_z0": 2.5e-3, **arguments})
 
 
 def test_refuses_positions_of_a_wrong_shape_or_kind() -> None:

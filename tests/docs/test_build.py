@@ -110,9 +110,7 @@ def test_the_search_finds_a_name_from_the_file_system(site: Path, page: Any, fau
 
 
 @pytest.mark.parametrize("width", [1280, 390])
-@pytest.mark.parametrize(
-    "address", ["index", "ideas/density", "guides/tables", "api/index", "api/fusion/fuse"]
-)
+@pytest.mark.parametrize("address", ["index", "ideas/density", "guides/tables", "api/index", "api/fusion/fuse"])
 def test_no_page_is_wider_than_the_window(site: Path, page: Any, address: str, width: int) -> None:
     page.set_viewport_size({"width": width, "height": 900})
     page.goto((site / f"{address}.html").as_uri())

@@ -20,9 +20,7 @@ from tests.docs.pages import PAGES, ROOT, blocks, commands, name
 
 README, HELP = ROOT / "README.md", ROOT / "phd_exp" / "cli" / "help.py"
 COMMANDS = {tuple(words): page for page in (*PAGES, README) for words in commands(page)}
-COMMANDS |= {
-    tuple(line.partition(" >")[0].split()[3:]): HELP for lines in EXAMPLES.values() for line in lines
-}
+COMMANDS |= {tuple(line.partition(" >")[0].split()[3:]): HELP for lines in EXAMPLES.values() for line in lines}
 CHECKS = {"train": ("config", check), "render": ("render", check_render)}
 
 
@@ -61,9 +59,7 @@ def _single_runs(words: list[str]) -> list[tuple[str, ...]]:
         else:
             choices.append([f"{item.get_key_element()}={value}" for value in several] or [word])
     n = max(map(len, choices), default=1)
-    return list(zip(*(itertools.islice(itertools.cycle(values), n) for values in choices), strict=True)) or [
-        ()
-    ]
+    return list(zip(*(itertools.islice(itertools.cycle(values), n) for values in choices), strict=True)) or [()]
 
 
 @cache  # many pages repeat a command

@@ -42,9 +42,7 @@ def matrix(line: dict[str, Any]) -> np.ndarray:
     return Rotation.from_quat([x, y, z, w]).as_matrix()
 
 
-def require_most_likely(
-    run: RunFolder, folder: Path, views: list[dict[str, Any]], point: list[float]
-) -> None:
+def require_most_likely(run: RunFolder, folder: Path, views: list[dict[str, Any]], point: list[float]) -> None:
     """All positions nearby are less likely, by the densities of the views, each predicted alone."""
     predictor = package.load(run.path)
     around = 0.02 * np.random.default_rng(0).standard_normal((1000, 3))
@@ -61,9 +59,7 @@ def require_most_likely(
     assert bool((energy[0] < energy[1:]).all())
 
 
-def test_the_test_split_of_a_rendered_set_is_fused_as_it_is(
-    phd_exp: Callable, run: RunFolder, several: Path
-) -> None:
+def test_the_test_split_of_a_rendered_set_is_fused_as_it_is(phd_exp: Callable, run: RunFolder, several: Path) -> None:
     outcome = phd_exp("fuse", f"run={run.path}", f"folder={several}")
     assert (outcome.status, outcome.err) == (0, "")
     rows, lines = read_lines(outcome.out), metadata(several)
@@ -143,9 +139,7 @@ def test_crops_of_any_cameras_are_fused_in_the_world_of_their_poses(
     np.testing.assert_allclose(three["covariance"], rows[1]["covariance"], rtol=1e-4)
 
 
-def test_a_scene_that_fails_says_why_and_harms_no_other(
-    phd_exp: Callable, run: RunFolder, photos: Path
-) -> None:
+def test_a_scene_that_fails_says_why_and_harms_no_other(phd_exp: Callable, run: RunFolder, photos: Path) -> None:
     before = read_lines(phd_exp("fuse", f"run={run.path}", f"folder={photos}").out)
     lines = metadata(photos)
     back_to_back = {"rotation": [0.0, 0.0, 1.0, 0.0], "translation": [0.0, 0.0, 0.0]}
@@ -154,9 +148,7 @@ def test_a_scene_that_fails_says_why_and_harms_no_other(
     write(photos, lines)
     outcome = phd_exp("fuse", f"run={run.path}", f"folder={photos}")
     assert outcome.status == 1
-    assert outcome.err.splitlines() == [
-        "error: 1 of 3 scenes have no fused position: two; the line of each says why"
-    ]
+    assert outcome.err.splitlines() == ["error: 1 of 3 scenes have no fused position: two; the line of each says why"]
     failed, *others = read_lines(outcome.out)
     assert (failed["status"], failed["point"]) == ("contradiction", [None] * 3)
     assert failed["reason"].startswith("at least half of the views rule out")

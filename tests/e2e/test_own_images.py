@@ -68,9 +68,7 @@ def photos(rendered: DatasetFolder) -> Path:
 
 
 @pytest.mark.parametrize("side", [224, 112])
-def test_a_rendered_image_seen_as_a_whole_is_itself(
-    rendered: DatasetFolder, spec: DatasetSpec, side: int
-) -> None:
+def test_a_rendered_image_seen_as_a_whole_is_itself(rendered: DatasetFolder, spec: DatasetSpec, side: int) -> None:
     there = RenderedSource(rendered, spec, N, side).samples("train")  # type: ignore[arg-type]
     own = FolderSource(DetectionFolder(rendered.root), None, 0, None, side)
     here = own.samples("train")
@@ -130,9 +128,7 @@ def test_a_rendered_image_seen_in_a_box_shows_the_object_where_the_virtual_camer
 def train(phd_exp: Callable, photos: Path, monkeypatch: pytest.MonkeyPatch) -> Callable:
     """A run on the photographs, on a machine without Blender."""
     real = importlib.util.find_spec
-    monkeypatch.setattr(
-        "importlib.util.find_spec", lambda name, *more: None if name == "bpy" else real(name, *more)
-    )
+    monkeypatch.setattr("importlib.util.find_spec", lambda name, *more: None if name == "bpy" else real(name, *more))
     quick = ("preset=smoke", "data=folder", "data.batch_size=4", "trainer.progress_bar=false")
     quick += ("trainer.threads=1", "logger=none", "data.name=mycams")
     return lambda *arguments: phd_exp(*quick, f"data.folder={photos}", *arguments)
@@ -189,9 +185,7 @@ def test_a_run_on_other_data_is_never_reused(train: Callable, photos: Path, tmp_
     assert f"data.folder=elsewhere, but data.folder={photos} is asked for" in outcome.err
 
 
-def test_too_few_images_for_a_batch_is_one_line_and_nothing_is_written(
-    train: Callable, tmp_path: Path
-) -> None:
+def test_too_few_images_for_a_batch_is_one_line_and_nothing_is_written(train: Callable, tmp_path: Path) -> None:
     outcome = train("data.batch_size=16")
     assert outcome.status == 2
     assert outcome.err == (

@@ -101,9 +101,7 @@ def exported(run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_lines_of_the_guide_deploy_it_without_torch(
     phd_exp: Callable, exported: Path, run: RunFolder, tmp_path: Path
 ) -> None:
-    (indented,) = re.findall(
-        r"\n\n((?:    .*\n|\n)*    import onnxruntime\n(?:    .*\n|\n)*)", GUIDE.read_text()
-    )
+    (indented,) = re.findall(r"\n\n((?:    .*\n|\n)*    import onnxruntime\n(?:    .*\n|\n)*)", GUIDE.read_text())
     shutil.copy(exported, tmp_path / "network.onnx")
     draw = np.random.default_rng(1)
     coarse = Image.fromarray(draw.integers(0, 256, (6, 6, 3), dtype=np.uint8))

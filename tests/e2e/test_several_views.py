@@ -76,9 +76,7 @@ def test_views_are_recorded_once_and_the_run_stays_as_it_was(phd_exp: Callable, 
     assert run.views.read_bytes() == before
 
 
-def test_another_data_set_in_its_place_is_found_before_the_training(
-    phd_exp: Callable, tmp_path: Path
-) -> None:
+def test_another_data_set_in_its_place_is_found_before_the_training(phd_exp: Callable, tmp_path: Path) -> None:
     sizes = ("data.n_train=2", "data.n_held_out=0", "data.n_test=2", "data.batch_size=2", "data.workers=1")
     assert phd_exp("render", *QUICK, *sizes, "data=multiview", "data.views=3").status == 0
     outcome = phd_exp(*asked(2))

@@ -27,9 +27,7 @@ FOUR = ("-m", "experiment=table2", "model=mae_xyz,mae_constf", "seed=0,1", "logg
 def seen(run: RunFolder) -> dict[str, tuple[int, bytes]]:
     """Every file of a run: when it was written, and what it holds."""
     files = [file for file in run.path.rglob("*") if file.is_file() and file.name != ".lock"]
-    return {
-        file.relative_to(run.path).as_posix(): (file.stat().st_mtime_ns, file.read_bytes()) for file in files
-    }
+    return {file.relative_to(run.path).as_posix(): (file.stat().st_mtime_ns, file.read_bytes()) for file in files}
 
 
 def finished(runs: Path) -> dict[Path, dict[str, tuple[int, bytes]]]:
@@ -94,9 +92,7 @@ def test_killed_at_any_moment_the_same_command_goes_on(
 
 
 @pytest.mark.slow
-def test_a_preempted_job_comes_back_and_takes_up_its_run(
-    train: Callable, begun: Callable, tmp_path: Path
-) -> None:
+def test_a_preempted_job_comes_back_and_takes_up_its_run(train: Callable, begun: Callable, tmp_path: Path) -> None:
     """As SLURM does it: the queue tells the job by SIGUSR2, submitit puts it back, and it goes on where it was."""
     words = ("-m", "model=mae_vz", "seed=0", "logger=none", "trainer.max_epochs=12")
     assert train(*words, f"runs={tmp_path / 'whole'}").status == 0
@@ -176,31 +172,23 @@ def test_a_changed_configuration_never_reuses_a_run(train: Callable, tmp_path: P
     assert finished(tmp_path / "runs") == before
 
 
-WITHOUT_RAY = pytest.mark.skipif(
-    find_spec("ray") is None, reason="needs the extra `ray`, in a venv of its own"
-)
+WITHOUT_RAY = pytest.mark.skipif(find_spec("ray") is None, reason="needs the extra `ray`, in a venv of its own")
 
 
 @pytest.mark.parametrize(
     "words",
     [
         ["seed=1,0"],
-        pytest.param(
-            ["seed=1,0", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"], marks=pytest.mark.slow
-        ),
+        pytest.param(["seed=1,0", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"], marks=pytest.mark.slow),
         pytest.param(["seed=0,1", "hydra/launcher=submitit_local"], marks=pytest.mark.slow),
         pytest.param(["seed=0,1", "hydra/launcher=ray"], marks=[pytest.mark.slow, WITHOUT_RAY]),
     ],
     ids=["order", "joblib", "submitit", "ray"],
 )
-def test_neither_order_nor_launcher_changes_a_number(
-    train: Callable, tmp_path: Path, words: list[str]
-) -> None:
+def test_neither_order_nor_launcher_changes_a_number(train: Callable, tmp_path: Path, words: list[str]) -> None:
     """At one number of threads, which the shared words set."""
     assert train(*TWO, "runs=here").status == 0
-    outcome = train(
-        "-m", "model=mae_vz", "recipe=strong", "data.image_size=64", "logger=none", *words, "runs=there"
-    )
+    outcome = train("-m", "model=mae_vz", "recipe=strong", "data.image_size=64", "logger=none", *words, "runs=there")
     assert outcome.status == 0, outcome.err
     assert numbers(tmp_path / "here") == numbers(tmp_path / "there")
     assert len(find_runs(tmp_path / "here")) == 2

@@ -71,9 +71,7 @@ def test_the_numbers_are_those_of_one_process(train: Callable, tmp_path: Path) -
         one, other = pd.read_parquet(alone.path / name), pd.read_parquet(together.path / name)
         assert list(other["file_name"]) == list(one["file_name"])
         drawn = ["energy_score"]  # from random numbers that depend on who shares a batch
-        pd.testing.assert_frame_equal(
-            one.drop(columns=drawn), other.drop(columns=drawn), rtol=1e-3, atol=1e-5
-        )
+        pd.testing.assert_frame_equal(one.drop(columns=drawn), other.drop(columns=drawn), rtol=1e-3, atol=1e-5)
     for curve in ("epoch-0000", "final"):
         curves = [json.loads(run.curves(curve).read_text()) for run in (alone, together)]
         assert curves[1]["depth"]["predicted"] == pytest.approx(curves[0]["depth"]["predicted"], rel=1e-3)
@@ -184,9 +182,7 @@ def test_runs_of_a_sweep_under_any_launcher(train: Callable, tmp_path: Path, lau
         ("trainer.devices=0", "trainer.devices: got 0"),
     ],
 )
-def test_processes_that_cannot_share_are_refused(
-    train: Callable, tmp_path: Path, word: str, said: str
-) -> None:
+def test_processes_that_cannot_share_are_refused(train: Callable, tmp_path: Path, word: str, said: str) -> None:
     outcome = train("logger=none", *TOGETHER, word)
     assert outcome.status == 2
     (line,) = outcome.err.splitlines()

@@ -69,9 +69,7 @@ def in_wandb_viewer(run: RunFolder, *words: str) -> str:
 
 
 @pytest.mark.slow
-def test_wandb_ends_as_the_run_ended(
-    train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_wandb_ends_as_the_run_ended(train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One wandb run: failed if the run failed; complete, from the first epoch on, if the run was resumed."""
 
     def power_cut_in_epoch_1(self: Any) -> None:
@@ -102,9 +100,7 @@ def test_wandb_ends_as_the_run_ended(
 def test_a_signal_ends_the_command_with_its_status(
     train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        PositionModule, "on_train_batch_start", lambda *_: signal.raise_signal(signal.SIGTERM)
-    )
+    monkeypatch.setattr(PositionModule, "on_train_batch_start", lambda *_: signal.raise_signal(signal.SIGTERM))
     outcome = train("logger=none", "recipe=strong", "data.image_size=64", "backbone.width=8")
     assert outcome.status == 143
     assert "stopped by SIGTERM" in outcome.err
@@ -124,9 +120,7 @@ def test_the_strong_recipe_is_exported(train: Callable, phd_exp: Callable, tmp_p
     assert (tmp_path / "network.onnx").exists()
 
 
-def test_an_unwritable_runs_folder_is_reported_before_anything_is_done(
-    train: Callable, tmp_path: Path
-) -> None:
+def test_an_unwritable_runs_folder_is_reported_before_anything_is_done(train: Callable, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     outcome = train("logger=none", "runs=file/runs")
     assert outcome.status == 1
@@ -164,15 +158,11 @@ def test_the_report_computes_what_training_recorded(run: RunFolder, phd_exp: Cal
     assert "finished" in line
 
 
-def test_a_missing_bpy_is_one_line(
-    phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_bpy_is_one_line(phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import importlib.util
 
     real = importlib.util.find_spec
-    monkeypatch.setattr(
-        "importlib.util.find_spec", lambda name, *more: None if name == "bpy" else real(name, *more)
-    )
+    monkeypatch.setattr("importlib.util.find_spec", lambda name, *more: None if name == "bpy" else real(name, *more))
     outcome = phd_exp("preset=smoke", "logger=none")
     assert outcome.status == 1
     (line,) = [line for line in outcome.err.splitlines() if line.startswith("error: ")]

@@ -88,9 +88,7 @@ def test_every_further_camera_helps_and_weights_help_more_than_an_average(scores
             assert value(scores, quantity, "mode", k) < 0.6 * value(scores, quantity, "average", k)
 
 
-def test_with_one_camera_every_method_returns_its_own_estimate(
-    calibrated: Path, scores: FusionScores
-) -> None:
+def test_with_one_camera_every_method_returns_its_own_estimate(calibrated: Path, scores: FusionScores) -> None:
     views = read_views(calibrated)
     table = pd.read_parquet(calibrated)
     first = table[table["view"] == 0]
@@ -136,9 +134,7 @@ def test_conditioning_is_the_limit_of_a_narrow_observation() -> None:
     narrow = 1e-9
     precision = torch.linalg.inv(covariance) + normal[:, :, None] * normal[:, None] / narrow
     expected = torch.linalg.inv(precision)
-    shift = (
-        torch.linalg.inv(covariance) @ mean[..., None] + (normal * plane.offset[:, None])[..., None] / narrow
-    )
+    shift = torch.linalg.inv(covariance) @ mean[..., None] + (normal * plane.offset[:, None])[..., None] / narrow
     torch.testing.assert_close(left, expected, atol=1e-6, rtol=0)
     torch.testing.assert_close(point, (expected @ shift).squeeze(-1), atol=1e-5, rtol=0)
     torch.testing.assert_close(plane.nearest(point), point)

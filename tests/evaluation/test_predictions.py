@@ -127,9 +127,7 @@ def test_temperatures_mend_what_is_overconfident(table: Callable, perfect: Evalu
     after = evaluate(mended, resamples=20)
     assert after.scores["nll"].value == pytest.approx(perfect.scores["nll"].value, abs=0.02)
     assert after.scores["miscalibration_area"].value < 0.03
-    assert after.scores["energy_score_mm"].value == pytest.approx(
-        perfect.scores["energy_score_mm"].value, rel=0.02
-    )
+    assert after.scores["energy_score_mm"].value == pytest.approx(perfect.scores["energy_score_mm"].value, rel=0.02)
     for name in ("projected_error_mm", "mode_z", "file_name", "f"):
         np.testing.assert_array_equal(mended[name], over[name])
 

@@ -153,9 +153,7 @@ def failing(kind: Status) -> tuple[ProjectedHuber, Pose, Plane, Tensor]:
     return predictions, Pose(R, pose.t), Plane(normal, torch.zeros(3, dtype=torch.float64)), mask
 
 
-@pytest.mark.parametrize(
-    "kind", [kind for kind in Status if kind not in (Status.FUSED, Status.NOT_CONVERGED)]
-)
+@pytest.mark.parametrize("kind", [kind for kind in Status if kind not in (Status.FUSED, Status.NOT_CONVERGED)])
 def test_a_failure_is_named_and_leaves_its_neighbours_alone(kind: Status) -> None:
     predictions, pose, plane, mask = failing(kind)
     fused = fuse(predictions, pose, plane, mask)
@@ -177,9 +175,7 @@ def test_a_common_view_is_found_where_there_is_one() -> None:
     )
     eye = torch.eye(2, dtype=torch.float64).expand(n, cameras, 2, 2)
     ahead = torch.full((n, cameras), 4.0, dtype=torch.float64)
-    fused = fuse(
-        ProjectedHuber(torch.zeros_like(eye[..., 0]), ahead, 30 * eye, ahead), pose, contradiction=0.0
-    )
+    fused = fuse(ProjectedHuber(torch.zeros_like(eye[..., 0]), ahead, 30 * eye, ahead), pose, contradiction=0.0)
     reached = []
     for R, t in zip(pose.R.numpy(), pose.t.numpy(), strict=True):
         rows = np.concatenate([-R[:, 2], np.ones((cameras, 1))], axis=1)
@@ -304,6 +300,4 @@ def test_a_gpu_finds_the_same() -> None:
     on_gpu = fuse(ProjectedHuber(*(column.cuda() for column in columns)), Pose(pose.R.cuda(), pose.t.cuda()))
     fused = fuse(predictions, pose)
     torch.testing.assert_close(on_gpu.point.cpu(), fused.point, rtol=0, atol=1e-6, equal_nan=True)
-    torch.testing.assert_close(
-        on_gpu.covariance.cpu(), fused.covariance, rtol=1e-6, atol=1e-9, equal_nan=True
-    )
+    torch.testing.assert_close(on_gpu.covariance.cpu(), fused.covariance, rtol=1e-6, atol=1e-9, equal_nan=True)

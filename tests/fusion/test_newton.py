@@ -61,9 +61,7 @@ def function(sources):
 """
 
 
-def test_numba_compiles_anew_what_closes_over_another_text(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_numba_compiles_anew_what_closes_over_another_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On this rests that no change of the sources leaves old compiled code in use."""
     (tmp_path / "module_of_numba.py").write_text(MODULE)
     monkeypatch.syspath_prepend(tmp_path)

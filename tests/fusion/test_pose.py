@@ -13,9 +13,7 @@ def test_a_scene_record_becomes_the_motion_it_describes() -> None:
     """v -> q v q* + t with the product of quaternions; records need not keep unit length."""
 
     def product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-        return np.array(
-            [p[0] * q[0] - p[1:] @ q[1:], *(p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:]))]
-        )
+        return np.array([p[0] * q[0] - p[1:] @ q[1:], *(p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:]))])
 
     draw = np.random.default_rng(0)
     quaternions = draw.standard_normal((10, 4))
@@ -24,8 +22,7 @@ def test_a_scene_record_becomes_the_motion_it_describes() -> None:
     pairs = zip((quaternions * (1 + 1e-7)).tolist(), t.tolist(), strict=True)
     pose = Pose.from_scene([scenes.Pose(rotation=tuple(q), translation=tuple(t)) for q, t in pairs])
     turned = [
-        product(product(q, np.array([0, *x])), q * [1, -1, -1, -1])[1:]
-        for q, x in zip(quaternions, v, strict=True)
+        product(product(q, np.array([0, *x])), q * [1, -1, -1, -1])[1:] for q, x in zip(quaternions, v, strict=True)
     ]
     np.testing.assert_allclose(pose.into_camera(torch.from_numpy(v)), turned + t, rtol=1e-12, atol=1e-12)
     assert bool(pose.is_rigid.all())

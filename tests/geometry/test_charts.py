@@ -18,9 +18,7 @@ from phd_exp.geometry import (
 
 DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
 CAMERA = Camera(torch.tensor([1200.0, 1500.0, 1500.0, 2000.0], dtype=torch.float64), 224.0)
-XYZ = torch.tensor(
-    [[0.1, -0.2, 3.0], [-0.3, 0.25, 4.0], [0.0, 0.0, 3.75], [0.2, 0.1, 5.0]], dtype=torch.float64
-)
+XYZ = torch.tensor([[0.1, -0.2, 3.0], [-0.3, 0.25, 4.0], [0.0, 0.0, 3.75], [0.2, 0.1, 5.0]], dtype=torch.float64)
 CHARTS = [Projected(DEPTH), LogDepth(DEPTH), Cartesian(DEPTH), Cartesian(DEPTH, xy_unit=0.5)]
 
 
@@ -66,9 +64,7 @@ def test_definitions_of_the_baselines() -> None:
         Cartesian: [-0.3 / 0.25, 0.25 / 0.25, 0.0],
     }
     for make, coordinates in expected.items():
-        torch.testing.assert_close(
-            make(DEPTH).coordinates(xyz, one), torch.tensor(coordinates, dtype=torch.float64)
-        )
+        torch.testing.assert_close(make(DEPTH).coordinates(xyz, one), torch.tensor(coordinates, dtype=torch.float64))
 
 
 def test_projected_agrees_with_the_camera() -> None:

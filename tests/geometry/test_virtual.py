@@ -118,9 +118,7 @@ def test_densities_enclose_those_of_finite_differences_in_the_middle(case: tuple
 
 @pytest.mark.parametrize("direction", [(0, 0, 1), (0.6, 0, 0.8), (0, -0.6, 0.8), (0.48, 0.64, 0.6)])
 def test_smallest_rotation_takes_the_direction_to_the_axis(direction: tuple[float, ...]) -> None:
-    np.testing.assert_allclose(
-        smallest_rotation(np.array(direction, dtype=float)) @ direction, [0, 0, 1], atol=1e-15
-    )
+    np.testing.assert_allclose(smallest_rotation(np.array(direction, dtype=float)) @ direction, [0, 0, 1], atol=1e-15)
 
 
 def test_refuses_what_no_pinhole_image_shows() -> None:

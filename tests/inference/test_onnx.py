@@ -49,9 +49,7 @@ def worst(made: Predictor, images: np.ndarray, f: np.ndarray) -> dict[str, np.nd
     from phd_exp.inference import onnx
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "jaxtyping.config.jaxtyping_disable", True
-        )  # a shape that is checked is a fixed one in a graph
+        patch.setattr("jaxtyping.config.jaxtyping_disable", True)  # a shape that is checked is a fixed one in a graph
         content = onnx.graph(made).SerializeToString()
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     assert [given.name for given in session.get_inputs()] == ["image", "f"]

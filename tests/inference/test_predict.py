@@ -96,9 +96,7 @@ def test_a_baseline_has_positions_without_uncertainty(
         image = np.asarray(Image.open(photos / row["file_name"]))
         prediction = predictor.see(predictor.view(image, camera.K, row["box"]))
         assert isinstance(prediction, PointEstimate)
-        np.testing.assert_allclose(
-            row["position"], camera.to_real(prediction.mode.numpy()), rtol=1e-5, atol=1e-5
-        )
+        np.testing.assert_allclose(row["position"], camera.to_real(prediction.mode.numpy()), rtol=1e-5, atol=1e-5)
     for word, said in (
         ("recalibrate", "nothing to recalibrate"),
         ("calibration", "no calibration curve of depth"),
@@ -258,9 +256,7 @@ def test_a_run_on_images_that_an_earlier_version_shrunk_is_refused(make: Callabl
     rendered = make("data.sensor_size=64")
     assert package.load(rendered.path).side == 48
     rendered.constants_file.unlink()
-    with pytest.raises(
-        RunError, match="trained with images shrunk from 64 to 48 pixels by an earlier version"
-    ):
+    with pytest.raises(RunError, match="trained with images shrunk from 64 to 48 pixels by an earlier version"):
         package.load(rendered.path)
 
 

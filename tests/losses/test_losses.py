@@ -33,9 +33,7 @@ def test_nll_is_one_number_a_sample(camera: Camera, xyz: torch.Tensor) -> None:
 
 
 @pytest.mark.parametrize("chart", CHARTS, ids=lambda chart: type(chart).__name__)
-def test_mae_is_zero_at_the_truth_and_a_distance_elsewhere(
-    chart: Chart, camera: Camera, xyz: torch.Tensor
-) -> None:
+def test_mae_is_zero_at_the_truth_and_a_distance_elsewhere(chart: Chart, camera: Camera, xyz: torch.Tensor) -> None:
     truth = chart.coordinates(xyz, camera)
     assert MeanAbsoluteError()(PointEstimate(truth, chart, camera), xyz).tolist() == [0, 0, 0]
     offset = torch.tensor([[3.0, 4.0, 0.0], [0.0, 0.0, 2.0], [0.0, 0.0, 0.0]])

@@ -45,9 +45,7 @@ def test_intervals_contain_the_truth_as_often_as_they_claim() -> None:
 
 def test_curves_have_an_interval_at_each_point() -> None:
     found = bands(means, {"x": numbers(100, seed=1)}, resamples=50, seed=0)
-    torch.testing.assert_close(
-        found["curve"].high, found["mean"].high * torch.tensor([1.0, 2.0, 3.0]).double()
-    )
+    torch.testing.assert_close(found["curve"].high, found["mean"].high * torch.tensor([1.0, 2.0, 3.0]).double())
 
 
 def test_resamples_in_parts_continue_one_stream() -> None:

@@ -126,9 +126,7 @@ def test_overconfidence_has_a_sign(power: float) -> None:
     levels = uniform(100_000, power)
     assert overconfidence(levels).item() == pytest.approx(1 / (1 + power) - 0.5, abs=3e-3)
     if power != 1:
-        assert abs(overconfidence(levels).item()) == pytest.approx(
-            miscalibration_area(levels).item(), abs=1e-4
-        )
+        assert abs(overconfidence(levels).item()) == pytest.approx(miscalibration_area(levels).item(), abs=1e-4)
 
 
 @pytest.mark.parametrize(("extreme", "area"), [([0.0], 0.5), ([1.0], 0.5), ([0.5], 0.25), ([0.0, 1.0], 0.25)])

@@ -49,12 +49,8 @@ def test_deviations_off_by_a_factor(claimed: Callable, factor: float) -> None:
     assert scores["depth_crps_mm"] > 1.02 * perfect["depth_crps_mm"]
     for name in ("depth_sharpness_mm", "projected_sharpness_mrad"):
         assert scores[name] == pytest.approx(perfect[name] / factor, rel=5e-3)  # Laplace but for 1/a
-    assert scores["projected_risk_coverage_excess"] == pytest.approx(
-        perfect["projected_risk_coverage_excess"]
-    )
-    assert scores["depth_risk_coverage_excess"] == pytest.approx(
-        perfect["depth_risk_coverage_excess"], abs=1e-3
-    )
+    assert scores["projected_risk_coverage_excess"] == pytest.approx(perfect["projected_risk_coverage_excess"])
+    assert scores["depth_risk_coverage_excess"] == pytest.approx(perfect["depth_risk_coverage_excess"], abs=1e-3)
 
 
 def test_depth_predicted_one_deviation_too_small(claimed: Callable) -> None:

@@ -69,9 +69,7 @@ def depth_errors(head: ChartHead, shown: FocalLengthInput, n: int, seed: int) ->
 def test_of_the_whole_network_the_numbers_depend_on_f_where_it_is_shown() -> None:
     torch.manual_seed(0)
     image = torch.randint(0, 256, (2, 64, 64, 3), dtype=torch.uint8)
-    networks = [
-        Regressor(resnet(10), DistributionHead(DEPTH), shown) for shown in (None, FocalLengthInput(7, DEPTH))
-    ]
+    networks = [Regressor(resnet(10), DistributionHead(DEPTH), shown) for shown in (None, FocalLengthInput(7, DEPTH))]
     for network, depends in zip(networks, (False, True), strict=True):
         if network.shown is not None:
             torch.nn.init.normal_(network.shown.last.weight)

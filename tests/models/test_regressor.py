@@ -80,9 +80,7 @@ def test_the_input_images_do_not_change(image: torch.Tensor) -> None:
 
 
 @pytest.mark.parametrize(("depth", "torchvisions"), [(18, resnet18), (34, resnet34), (50, resnet50)])
-def test_resnets_are_torchvisions_with_group_norm(
-    depth: int, torchvisions: Callable[..., torch.nn.Module]
-) -> None:
+def test_resnets_are_torchvisions_with_group_norm(depth: int, torchvisions: Callable[..., torch.nn.Module]) -> None:
     network = resnet(depth).network
     theirs = {name: weight.shape for name, weight in torchvisions().named_parameters() if "fc" not in name}
     assert {name: weight.shape for name, weight in network.named_parameters()} == theirs
@@ -104,9 +102,7 @@ def test_normalises_as_torchvision_does(image: torch.Tensor) -> None:
     seen = []
     network.backbone.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
     network.raw(image)
-    expected = normalize(
-        image.permute(0, 3, 1, 2) / 255, mean=[0.485, 0.456, 0.406], std=[0.229, 0.224, 0.225]
-    )
+    expected = normalize(image.permute(0, 3, 1, 2) / 255, mean=[0.485, 0.456, 0.406], std=[0.229, 0.224, 0.225])
     torch.testing.assert_close(seen[0], expected)
 
 

@@ -94,6 +94,4 @@ def test_channels_last_makes_the_same_step() -> None:
         descend(model, Muon(model.parameters(), lr=0.01, orthogonal_lr=0.01), steps=2)
         return model[1].weight.detach()
 
-    torch.testing.assert_close(
-        stepped(torch.channels_last), stepped(torch.contiguous_format), rtol=1e-4, atol=1e-5
-    )
+    torch.testing.assert_close(stepped(torch.channels_last), stepped(torch.contiguous_format), rtol=1e-4, atol=1e-5)

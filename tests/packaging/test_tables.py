@@ -32,16 +32,12 @@ def test_it_asks_for_the_authors_protocol_on_a_gpu_unless_told_otherwise(tmp_pat
 
 @pytest.mark.slow
 def test_both_tables_are_made_and_made_only_once(tmp_path: Path) -> None:
-    pytest.importorskip(
-        "hydra_plugins.hydra_joblib_launcher", reason="needs `pip install 'phd_exp[launchers]'`"
-    )
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs `pip install 'phd_exp[launchers]'`")
     render, train, report = commands(tmp_path, "PRESET=smoke", "RECIPE=strong", "JOBS=2", "MORE=logger=none")
 
     def said(command: list[str]) -> str:
         environment = os.environ | {"PYTHONPATH": str(ROOT)}
-        done = subprocess.run(
-            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-        )
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
         return done.stdout
 

@@ -17,9 +17,7 @@ def test_records_come_in_order(dataset: DatasetFolder) -> None:
     assert dataset.records("test", 0) == []
 
 
-@pytest.mark.parametrize(
-    ("wanted", "train", "test"), [((5, 2), [], []), ((3, 0), [], []), ((7, 3), [5, 6], [2])]
-)
+@pytest.mark.parametrize(("wanted", "train", "test"), [((5, 2), [], []), ((3, 0), [], []), ((7, 3), [5, 6], [2])])
 def test_samples_beyond_the_finished_ones_are_missing(
     dataset: DatasetFolder, make_spec: MakeSpec, wanted: tuple[int, int], train: list[int], test: list[int]
 ) -> None:
@@ -36,9 +34,7 @@ def test_what_is_deleted_is_missing(dataset: DatasetFolder, make_spec: MakeSpec)
 
 
 def test_another_specification_is_refused(dataset: DatasetFolder, make_spec: MakeSpec) -> None:
-    with pytest.raises(
-        DatasetError, match=r"default: holds .* seed=0, but seed=1 is asked for; move .* or choose"
-    ):
+    with pytest.raises(DatasetError, match=r"default: holds .* seed=0, but seed=1 is asked for; move .* or choose"):
         dataset.missing(make_spec(seed=1, xy_range=0.5), 5, 2)
 
 

@@ -115,9 +115,7 @@ BAD: list[tuple[Any, str]] = [
 
 
 @pytest.mark.parametrize(("line", "said"), BAD, ids=[str(said)[:40] for _, said in BAD])
-def test_a_bad_line_is_one_line_that_names_it(
-    read: Callable, folder: DetectionFolder, line: Any, said: str
-) -> None:
+def test_a_bad_line_is_one_line_that_names_it(read: Callable, folder: DetectionFolder, line: Any, said: str) -> None:
     with pytest.raises(UserError) as caught:
         read(GOOD, "", line)
     assert str(caught.value).startswith(f"{folder.metadata_path('train')}, line 3: ")
@@ -126,9 +124,7 @@ def test_a_bad_line_is_one_line_that_names_it(
 
 
 @pytest.mark.parametrize("absolute", [True, False])
-def test_no_link_leaves_the_folder(
-    read: Callable, folder: DetectionFolder, tmp_path: Path, absolute: bool
-) -> None:
+def test_no_link_leaves_the_folder(read: Callable, folder: DetectionFolder, tmp_path: Path, absolute: bool) -> None:
     (tmp_path / "secret.png").touch()
     (folder.root / "train" / "inside.png").touch()
     target = tmp_path / "secret.png" if absolute else Path("../../secret.png")

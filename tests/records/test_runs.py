@@ -24,9 +24,7 @@ def test_a_run_is_named_by_its_choices(tmp_path: Path) -> None:
     plain = RunName("paper", "scale", "mae_logz", 3).folder(tmp_path)
     assert plain.relative_to(tmp_path).as_posix() == "paper/scale/mae_logz/seed3"
     overrides = (("n=256", "lr=0.1"), ("lr=0.1", "n=256"), ("lr=0.2", "n=256"))
-    one, same, other = (
-        RunName("paper", "scale", "mae_logz", 3, words).folder(tmp_path) for words in overrides
-    )
+    one, same, other = (RunName("paper", "scale", "mae_logz", 3, words).folder(tmp_path) for words in overrides)
     assert one == same != other
     assert one.name.startswith("seed3-")
 
@@ -79,10 +77,7 @@ def test_an_unwritable_run_folder_is_one_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("read", "content", "said"),
     [
-        *(
-            ("status", content, r"status\.json: not a run status .*delete the folder")
-            for content in NO_STATUS
-        ),
+        *(("status", content, r"status\.json: not a run status .*delete the folder") for content in NO_STATUS),
         ("results", "{", "results.json: cannot be read"),
         ("results", "[1]", "results.json: expected a mapping, found list"),
         ("results", None, r"results\.json: missing"),

@@ -50,13 +50,9 @@ def test_lossy_formats_are_small_and_near(
 
 
 @pytest.mark.parametrize("image_format", LOSSY)
-def test_quality_is_paid_in_bytes(
-    pictures: list[np.ndarray], make_spec: MakeSpec, image_format: ImageFormat
-) -> None:
+def test_quality_is_paid_in_bytes(pictures: list[np.ndarray], make_spec: MakeSpec, image_format: ImageFormat) -> None:
     for pixels in pictures:
-        contents = [
-            encode(pixels, make_spec(image_format=image_format, image_quality=q)) for q in (30, 60, 90, 100)
-        ]
+        contents = [encode(pixels, make_spec(image_format=image_format, image_quality=q)) for q in (30, 60, 90, 100)]
         sizes, errors = [len(content) for content in contents], [psnr(decoded(c), pixels) for c in contents]
         assert sizes == sorted(set(sizes))
         assert errors == sorted(set(errors))

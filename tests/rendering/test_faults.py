@@ -86,9 +86,7 @@ def test_a_killed_worker_is_one_line_and_its_work_is_kept(
 
     killer = threading.Thread(target=kill_one)
     killer.start()
-    with pytest.raises(
-        RenderError, match=r"a render worker.* was killed by SIGKILL; finished images are kept"
-    ):
+    with pytest.raises(RenderError, match=r"a render worker.* was killed by SIGKILL; finished images are kept"):
         ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=2)
     killer.join()
     assert not render_workers(os.getpid())

@@ -14,9 +14,7 @@ DRAW = runpy.run_path(str(Path(__file__).parents[2] / "renders" / "draw.py"))
 GAP, MARK, ZOOM = DRAW["GAP"], DRAW["MARK"], DRAW["ZOOM"]
 
 
-def test_samples_stand_in_rows_and_columns(
-    small: DatasetFolder, small_spec: DatasetSpec, tmp_path: Path
-) -> None:
+def test_samples_stand_in_rows_and_columns(small: DatasetFolder, small_spec: DatasetSpec, tmp_path: Path) -> None:
     DRAW["draw_gallery"](tmp_path / "gallery.jpg", [small_spec, small_spec], [4, 2, 0])
     with Image.open(tmp_path / "gallery.jpg") as picture:
         sheet = np.asarray(picture).astype(int)

@@ -80,9 +80,7 @@ def test_a_missing_library_of_bpy_is_one_line(monkeypatch: pytest.MonkeyPatch) -
         blender.load_bpy()
 
 
-@pytest.mark.parametrize(
-    ("key", "value"), [("sensor_size", 224), ("image_format", "webp"), ("image_quality", 90)]
-)
+@pytest.mark.parametrize(("key", "value"), [("sensor_size", 224), ("image_format", "webp"), ("image_quality", 90)])
 def test_another_specification_is_refused(small: DatasetFolder, key: str, value: object) -> None:
     before, spec = contents(small), small.manifest.spec
     said = f"{key}={getattr(spec, key)}, but {key}={value} is asked for; move"

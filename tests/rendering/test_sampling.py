@@ -111,9 +111,7 @@ def test_a_scene_is_the_same_for_ever(make_spec: MakeSpec) -> None:
     """Numbers of generator version 1: if they change, so must GENERATOR_VERSION."""
     scene = sample_scene(make_spec("occl_scale"), "test", 7)
     assert scene.f == pytest.approx(1327.6351861766607, rel=1e-14)
-    assert scene.objects[0].position == pytest.approx(
-        (0.26127093599, -0.0568530401749, 3.8616721129), rel=1e-9
-    )
+    assert scene.objects[0].position == pytest.approx((0.26127093599, -0.0568530401749, 3.8616721129), rel=1e-9)
     assert scene.objects[2].scale == pytest.approx(1.178370938, rel=1e-9)
     assert scene.noise_seed == 2146766929
 

@@ -44,9 +44,7 @@ def shine_with_number(tree: object) -> None:
     """Make a material's surface a light as strong as the pass index of the object it is on."""
     nodes, links = tree.nodes, tree.links  # type: ignore[attr-defined]
     nodes.clear()
-    info, light, output = (
-        nodes.new(f"ShaderNode{kind}") for kind in ("ObjectInfo", "Emission", "OutputMaterial")
-    )
+    info, light, output = (nodes.new(f"ShaderNode{kind}") for kind in ("ObjectInfo", "Emission", "OutputMaterial"))
     light.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
     links.new(info.outputs["Object Index"], light.inputs["Strength"])
     links.new(light.outputs["Emission"], output.inputs["Surface"])

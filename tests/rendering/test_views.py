@@ -27,10 +27,7 @@ def spec(make_spec: MakeSpec) -> DatasetSpec:
 @pytest.fixture(scope="module")
 def seen(spec: DatasetSpec) -> list[list[Scene]]:
     """The views of each scene."""
-    return [
-        [sample_scene(spec, "train", VIEWS * scene + view) for view in range(VIEWS)]
-        for scene in range(SCENES)
-    ]
+    return [[sample_scene(spec, "train", VIEWS * scene + view) for view in range(VIEWS)] for scene in range(SCENES)]
 
 
 def motion(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -83,9 +80,7 @@ def test_every_view_has_the_cylinder_in_its_field(spec: DatasetSpec, seen: list[
         assert max(abs(x), abs(y)) <= scene.S * z / scene.f / 2 * (1 + 1e-9)
 
 
-def test_lines_of_sight_are_turned_by_an_angle_of_the_range(
-    spec: DatasetSpec, seen: list[list[Scene]]
-) -> None:
+def test_lines_of_sight_are_turned_by_an_angle_of_the_range(spec: DatasetSpec, seen: list[list[Scene]]) -> None:
     """Uniformly within it, and towards all sides."""
     matrices = np.array([motion(scene)[0] for views in seen for scene in views[1:]])
     ahead = matrices[:, 2]  # a further camera's line of sight in the frame of the first
@@ -98,9 +93,7 @@ def test_lines_of_sight_are_turned_by_an_angle_of_the_range(
 
 
 @pytest.mark.parametrize("view", range(VIEWS))
-def test_each_view_alone_follows_the_law_of_the_first(
-    spec: DatasetSpec, seen: list[list[Scene]], view: int
-) -> None:
+def test_each_view_alone_follows_the_law_of_the_first(spec: DatasetSpec, seen: list[list[Scene]], view: int) -> None:
     """Focal length, depth, projected position and, before its camera, the cylinder's rotation."""
     scenes = [views[view] for views in seen]
     x, y, z = np.array([places(scene)[0] for scene in scenes]).T

@@ -29,9 +29,7 @@ def test_a_calibration_picture_has_ink(tmp_path: Path) -> None:
 
 def test_the_figure_shows_curves_mode_and_truth() -> None:
     one = torch.tensor(1.0, dtype=torch.float64)
-    curves = level_curves(
-        ProjectedHuber(torch.zeros(2).double(), 4 * one, 200 * torch.eye(2).double(), 20 * one)
-    )
+    curves = level_curves(ProjectedHuber(torch.zeros(2).double(), 4 * one, 200 * torch.eye(2).double(), 20 * one))
     truth = np.array([0.25, -0.1, 4.2])
     left, right = Figure().subplots(1, 2)
     draw_on_image(left, curves, np.zeros((224, 224, 3), dtype=np.uint8), 1500.0, 224.0, truth)

@@ -31,8 +31,7 @@ def records(tmp_path_factory: pytest.TempPathFactory) -> Report:
     runs = tmp_path_factory.mktemp("runs")
     both_tables(runs)
     folders = [
-        record(runs, "scale", "probabilistic", seed, predicted(seed).frame, preset="several")
-        for seed in (0, 1)
+        record(runs, "scale", "probabilistic", seed, predicted(seed).frame, preset="several") for seed in (0, 1)
     ]
     write_views(folders[0].views, 60, a=30.0, common=0.1)
     folders[1].views.write_bytes(b"torn")
@@ -82,9 +81,7 @@ def test_markdown_parses_to_the_same_cells(found: list[Table]) -> None:
     for table in found:
         tokens = rendered(table)
         cells = [
-            "".join(
-                " " if child.type == "html_inline" else child.content for child in tokens[place + 1].children
-            )
+            "".join(" " if child.type == "html_inline" else child.content for child in tokens[place + 1].children)
             for place, token in enumerate(tokens)
             if token.type == "td_open"
         ]
@@ -185,9 +182,7 @@ def test_the_terminal_prints_whole_cells_and_plain_text(
         assert all(f"{cell.ours} {cell.spread}" in line for cell in row.cells)
 
 
-def test_bold_is_bold_on_a_terminal(
-    records: Report, found: list[Table], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bold_is_bold_on_a_terminal(records: Report, found: list[Table], monkeypatch: pytest.MonkeyPatch) -> None:
     stream = io.StringIO()
     real = Console
 
@@ -216,9 +211,7 @@ def test_runs_with_overrides_are_listed_apart(tmp_path: Path, capsys: pytest.Cap
 def test_without_runs_the_command_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     print_report(read_report(tmp_path), [])
     (line,) = capsys.readouterr().out.strip().splitlines()
-    assert line.startswith(
-        "no runs recorded yet; begin by: python -m phd_exp -m experiment=table1 preset=paper"
-    )
+    assert line.startswith("no runs recorded yet; begin by: python -m phd_exp -m experiment=table1 preset=paper")
 
 
 # files, and the table of several views

@@ -78,9 +78,7 @@ LONG: dict[str, Spoil] = {
     "one variance of zero": rows(
         lambda frame: frame.assign(depth_variance=frame["depth_variance"].where(frame.index > 0, 0.0))
     ),
-    "a config with a lone surrogate": files(
-        config='a: "\\ud800"\ndata: {root: "\\ud800", spec: {variant: x}}\n'
-    ),
+    "a config with a lone surrogate": files(config='a: "\\ud800"\ndata: {root: "\\ud800", spec: {variant: x}}\n'),
     "long texts": column(file_name="x" * 100_000),
     **{name: renamed(name) for name in RENAMED if name not in HARMLESS},
 }

@@ -31,9 +31,7 @@ def bound_of_a_ratio(low: float, high: float) -> float:
 def test_bounds_equal_an_integral() -> None:
     assert pytest.approx(bound_of_a_ratio(0.8, 1.2), abs=0.5) == paper.UNKNOWN_SIZE
     assert pytest.approx(bound_of_a_ratio(1200, 2000), abs=0.5) == paper.UNKNOWN_F
-    assert (
-        paper.GUESS == 1000 * (5 - 3) / 4
-    )  # the mean distance of U(3, 5) from its median is a quarter of its range
+    assert paper.GUESS == 1000 * (5 - 3) / 4  # the mean distance of U(3, 5) from its median is a quarter of its range
 
 
 def test_the_bound_where_size_and_focal_length_are_unknown() -> None:
@@ -41,9 +39,7 @@ def test_the_bound_where_size_and_focal_length_are_unknown() -> None:
     random = np.random.default_rng(0)
     z, s, f = (random.uniform(low, high, 1_000_000) for low, high in ((3, 5), (0.8, 1.2), (1200, 2000)))
     parts = np.array_split(np.argsort(s * f / z), 300)  # in each the network sees one size
-    absolute = [
-        f[part] * np.abs(z[part] / f[part] - _weighted_median(z[part] / f[part], f[part])) for part in parts
-    ]
+    absolute = [f[part] * np.abs(z[part] / f[part] - _weighted_median(z[part] / f[part], f[part])) for part in parts]
     errors = np.concatenate(absolute)
     assert 1000 * errors.mean() == pytest.approx(paper.UNKNOWN_SIZE_AND_F, abs=2)
 

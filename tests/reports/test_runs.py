@@ -134,9 +134,7 @@ def test_a_folder_with_another_name_enters_no_table(tmp_path: Path, leaf: str) -
     assert read_report(tmp_path).at_defaults("small", "occl", "mae_vz") == {}
 
 
-def test_a_run_is_measured_again_where_it_has_changed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_is_measured_again_where_it_has_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     runs, kept = tmp_path / "runs", tmp_path / "kept"
     for data in ("default", "occl"):
         write_run(runs, data, "mae_vz", n=40, epochs=2)

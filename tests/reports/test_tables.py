@@ -93,9 +93,7 @@ def test_the_papers_figures_stand_below(
     line = {"model": model, "data": data, "reading": "whole", "quantity": quantity, "estimate": "mode"}
     table = one(found, "table2" if model in ("mae_xyz", "mae_constf") else "table1")
     digits = 1 if quantity == "projected" else 0
-    assert (
-        place(table, *choice).below == f"{figure:.{digits}f} (×{np.mean(expected(drawn, line)) / figure:.2f})"
-    )
+    assert place(table, *choice).below == f"{figure:.{digits}f} (×{np.mean(expected(drawn, line)) / figure:.2f})"
 
 
 def test_the_layout_is_the_papers(found: list[Table]) -> None:
@@ -104,9 +102,7 @@ def test_the_layout_is_the_papers(found: list[Table]) -> None:
     assert second.columns == ("projected error (mm)", "depth error (mm)")
     models, others, bounds = first.groups
     labels = ("mae_vz", "mae_logz", "probabilistic (mode)")
-    assert [row.stub for row in models] == [
-        (name, error) for name in labels for error in ("projected", "depth")
-    ]
+    assert [row.stub for row in models] == [(name, error) for name in labels for error in ("projected", "depth")]
     assert [row.stub[0] for row in others[::2]] == ["probabilistic (mean)", "probabilistic (median)"]
     assert [[cell.ours for cell in row.cells] for row in bounds] == [
         ["–", "–", "291", "–"],  # no bound is known on occl_scale
@@ -260,9 +256,7 @@ def test_the_title_has_the_number_of_test_samples(tmp_path: Path) -> None:
 
 
 def test_only_the_intervals_that_occur_are_explained(tmp_path: Path) -> None:
-    for seed, (explained, other) in enumerate(
-        [("standard errors", "Student"), ("Student", "standard errors")]
-    ):
+    for seed, (explained, other) in enumerate([("standard errors", "Student"), ("Student", "standard errors")]):
         record(tmp_path, "occl", "mae_vz", seed, predicted(seed).frame)
         notes = " ".join(read(tmp_path).notes)
         assert explained in notes

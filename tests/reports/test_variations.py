@@ -76,9 +76,7 @@ def test_baselines_are_compared_by_depth_error(tmp_path: Path) -> None:
 
 def test_the_best_comes_first(drawn: dict, tmp_path: Path) -> None:
     better = {"optimizer": {"lr": 0.1}, "recipe": {"localisation": 2}}
-    folder = record(
-        tmp_path, "occl", "probabilistic", 0, predicted(5).frame, overrides=("recipe.localisation=2",)
-    )
+    folder = record(tmp_path, "occl", "probabilistic", 0, predicted(5).frame, overrides=("recipe.localisation=2",))
     folder.write_config(better)
     frame = predicted(20).frame
     frame["nll"] = -9.0

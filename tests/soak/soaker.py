@@ -36,8 +36,7 @@ def held() -> dict[str, int]:
     gc.collect()
     folders = [Path.cwd(), *(Path(os.environ[name]) for name in ("HOME", "TMPDIR"))]
     files = [
-        [file for file in folder.rglob("*") if file.relative_to(folder).parts[0] not in OWN]
-        for folder in folders
+        [file for file in folder.rglob("*") if file.relative_to(folder).parts[0] not in OWN] for folder in folders
     ]
     return {
         "memory": memory(os.getpid()),
@@ -54,9 +53,7 @@ def held() -> dict[str, int]:
 def marked() -> list[int]:
     """This process and those that it started, whoever is their parent now: they have its environment."""
     mark = f"SOAK={os.environ['SOAK']}".encode()
-    return [
-        int(entry.parent.name) for entry in Path("/proc").glob("[0-9]*/environ") if mark in content(entry)
-    ]
+    return [int(entry.parent.name) for entry in Path("/proc").glob("[0-9]*/environ") if mark in content(entry)]
 
 
 def memory(process: int) -> int:

@@ -37,15 +37,11 @@ def test_a_process_that_trains_and_renders_for_long_neither_grows_nor_leaves_any
     folders = {name: tmp_path / name.lower() for name in ("WORK", "HOME", "TMPDIR")}
     for folder in folders.values():
         folder.mkdir()
-    environment = {
-        name: value for name, value in os.environ.items() if not name.startswith(("WANDB_", "XDG_"))
-    }
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("WANDB_", "XDG_"))}
     environment |= {name: str(folder) for name, folder in folders.items() if name != "WORK"}
     environment |= {"SOAK": uuid.uuid4().hex, "PYTHONPATH": str(Path(__file__).parents[2])}
     command = [sys.executable, str(SOAKER), str(ROUNDS), *QUICK]
-    done = subprocess.run(
-        command, capture_output=True, text=True, cwd=folders["WORK"], env=environment, check=False
-    )
+    done = subprocess.run(command, capture_output=True, text=True, cwd=folders["WORK"], env=environment, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     before, after = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
     print(f"\n{ROUNDS} rounds\nbefore {before}\nafter  {after}")

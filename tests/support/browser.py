@@ -47,6 +47,4 @@ class Visit:
         return self.page.evaluate("document.documentElement.scrollWidth - window.innerWidth")
 
     def open_details(self) -> None:
-        self.page.evaluate(
-            "document.querySelectorAll('details').forEach(details => { details.open = true; })"
-        )
+        self.page.evaluate("document.querySelectorAll('details').forEach(details => { details.open = true; })")

@@ -43,9 +43,7 @@ def random_problems(
     error = ProjectedHuber(*centre, A, a).rsample((), generator)  # (A^(-1) q, t)
     mu_xy, mu_z = xy_over_z - error[..., :2] / error[..., 2:], z / error[..., 2]
     wild = (uniform(n, cameras, low=0, high=1) < outliers).double()
-    mu_xy = mu_xy + 0.1 * wild[..., None] * torch.randn(
-        n, cameras, 2, generator=generator, dtype=torch.float64
-    )
+    mu_xy = mu_xy + 0.1 * wild[..., None] * torch.randn(n, cameras, 2, generator=generator, dtype=torch.float64)
     mu_z = mu_z * torch.exp(0.5 * wild * torch.randn(n, cameras, generator=generator, dtype=torch.float64))
     return ProjectedHuber(mu_xy, mu_z, A, a), pose, truth.squeeze(1)
 

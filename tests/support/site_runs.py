@@ -20,9 +20,7 @@ def write_runs(folder: Path) -> Path:
     images.mkdir(parents=True)
     random = np.random.default_rng(0)
     for index in range(100):
-        Image.fromarray(random.integers(0, 255, (56, 56, 3), dtype=np.uint8)).save(
-            images / f"{index:06d}.png"
-        )
+        Image.fromarray(random.integers(0, 255, (56, 56, 3), dtype=np.uint8)).save(images / f"{index:06d}.png")
     write_run(runs, "default", n=100, root=folder / "renders")
     certain = write_run(runs, "occl", n=100, overconfidence=2.0)
     held_out = write_run(folder / "elsewhere", "occl", seed=1, n=100, overconfidence=2.0)

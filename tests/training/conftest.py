@@ -22,9 +22,7 @@ TINY = (
 
 
 @pytest.fixture(scope="session")
-def handmade(
-    make_spec: Callable[..., DatasetSpec], tmp_path_factory: pytest.TempPathFactory
-) -> DatasetFolder:
+def handmade(make_spec: Callable[..., DatasetSpec], tmp_path_factory: pytest.TempPathFactory) -> DatasetFolder:
     spec = make_spec("handmade", sensor_size=64, f_range=(400.0, 600.0))
     folder = DatasetFolder(tmp_path_factory.mktemp("renders") / "handmade")
     return write_handmade(folder, spec, {"train": 20, "test": 6})

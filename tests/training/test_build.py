@@ -41,9 +41,7 @@ def test_bfloat16_only_on_hardware_with_units_for_it(
 
 def test_the_localisation_loss_requires_a_backbone_with_a_map(checked: Callable) -> None:
     config = checked("recipe.localisation=1")
-    with pytest.raises(
-        ConfigError, match=r"^recipe\.localisation: got 1\.0, but this backbone does not say where"
-    ):
+    with pytest.raises(ConfigError, match=r"^recipe\.localisation: got 1\.0, but this backbone does not say where"):
         build_module(config, build_data(config))
 
 

@@ -45,9 +45,7 @@ def overview_groups(runs: Sequence[Drawn]) -> dict[str, Group]:
     for name, (section, role, keys) in groups.items():
         charts = {f"{name}_{key}": chart for key in keys if (chart := _overlaid(runs, section, key, role))}
         if charts:
-            found[name] = Group(
-                charts, [one for one in runs if set(keys) & one.charts.get(section, {}).keys()]
-            )
+            found[name] = Group(charts, [one for one in runs if set(keys) & one.charts.get(section, {}).keys()])
     return found
 
 

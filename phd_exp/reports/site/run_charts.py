@@ -66,9 +66,7 @@ _KINDS = {
     ),
     "coverage": _Kind("Coverage of credible regions", "credible level", "share of truths inside"),
     "depth_pit": _Kind("Depth PIT", "PIT of the true depth", "share of samples below"),
-    "depth_risk_coverage": _Kind(
-        "Depth: risk and coverage", _KEPT, "mean error of depth (mm)", diagonal=False
-    ),
+    "depth_risk_coverage": _Kind("Depth: risk and coverage", _KEPT, "mean error of depth (mm)", diagonal=False),
     "projected_risk_coverage": _Kind(
         "Projection: risk and coverage", _KEPT, "mean error of (x, y)/z (mrad)", diagonal=False
     ),
@@ -125,9 +123,7 @@ def _learning_chart(run: Run, key: str, metric: Quantity) -> Chart | None:
     log = key not in ("nll", "loss")
     layout = {"xaxis": axis("epochs of training"), "yaxis": axis(metric.axis, log)}
     courses = "; ".join(_course(trace, metric) for trace in traces)
-    return Chart(
-        f"{metric.label} over training", f"{metric.axis} over the epochs: {courses}.", traces, layout
-    )
+    return Chart(f"{metric.label} over training", f"{metric.axis} over the epochs: {courses}.", traces, layout)
 
 
 def _course(trace: Trace, metric: Quantity) -> str:
@@ -151,9 +147,7 @@ def _calibration_over_epochs(run: Run) -> Chart | None:
     ]
     courses = "; ".join(_course(trace, quantity(key)) for trace, key in zip(traces, known, strict=True))
     layout = {"xaxis": axis("epochs of training"), "yaxis": axis("calibration error", rangemode="tozero")}
-    return Chart(
-        "Calibration over training", f"Calibration errors over the epochs: {courses}.", traces, layout
-    )
+    return Chart("Calibration over training", f"Calibration errors over the epochs: {courses}.", traces, layout)
 
 
 def strata_charts(evaluation: Evaluation) -> dict[str, Chart]:
@@ -175,13 +169,9 @@ def _strata_chart(strata: Sequence[Stratum], name: str, key: str, colour: int) -
     lows, highs = [band.low for band in bands], [band.high for band in bands]
     trace = bars(score.label, [band.value for band in bands], labels, colour, lows, highs)
     trace["meta"]["n"] = [stratum.n for stratum in strata]
-    values = (
-        f"{text}: {score.text(band.value)} {score.unit}" for text, band in zip(labels, bands, strict=True)
-    )
+    values = (f"{text}: {score.text(band.value)} {score.unit}" for text, band in zip(labels, bands, strict=True))
     layout = {
         "xaxis": axis(score.axis, rangemode="tozero", nticks=4),
         "yaxis": axis(name) | {"type": "category", "autorange": "reversed"},
     }
-    return Chart(
-        f"{score.label} by {name}", f"{score.label} by {name}: {'; '.join(values)}.", [trace], layout
-    )
+    return Chart(f"{score.label} by {name}", f"{score.label} by {name}: {'; '.join(values)}.", [trace], layout)

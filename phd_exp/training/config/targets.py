@@ -61,9 +61,7 @@ def _check_nodes(path: str, value: Any, origin: Origin) -> None:
     if _is_node(value):
         check_target(value, origin, path)
         return
-    children = (
-        value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    )
+    children = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, child in children:
         _check_nodes(f"{path}.{key}", child, origin)
 
@@ -134,9 +132,7 @@ def _valid_keys(model: Any, location: list[str]) -> list[str]:
             model = next(get_args(member)[0] for member in get_args(model) if Tag(name) in get_args(member))
         else:
             model = model.model_fields[name].annotation
-    model = next(
-        (member for member in get_args(model) if inspect.isclass(member)), model
-    )  # of Section | None
+    model = next((member for member in get_args(model) if inspect.isclass(member)), model)  # of Section | None
     fields = dict(model.model_fields)
     inlined = fields.pop("spec", None)
     return [*fields, *(inlined.annotation.model_fields if inlined else ())]

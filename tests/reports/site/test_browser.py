@@ -102,9 +102,7 @@ def test_overlays_name_their_runs(visit: Visit) -> None:
 def test_the_overview_sorts_runs_and_filters_lines(visit: Visit) -> None:
     visit.open("index.html")
     assert visit.page.locator("main section").first.get_attribute("id") == "runs"
-    column = (
-        "[...document.querySelectorAll('table.runs tbody tr')].map(row => Number(row.cells[3].dataset.value))"
-    )
+    column = "[...document.querySelectorAll('table.runs tbody tr')].map(row => Number(row.cells[3].dataset.value))"
     button = visit.page.locator("table.runs thead button").nth(3)
     for sign in (1, -1):
         button.click()

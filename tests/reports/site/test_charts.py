@@ -10,9 +10,7 @@ from phd_exp.reports.site.charts import POINTS, thinned
 from phd_exp.reports.site.pages import as_script
 
 
-@pytest.mark.parametrize(
-    "text", ["</script><script>", "<!--", "a & b", "line\u2028separator\u2029", '"quote\\', "é"]
-)
+@pytest.mark.parametrize("text", ["</script><script>", "<!--", "a & b", "line\u2028separator\u2029", '"quote\\', "é"])
 def test_a_script_holds_any_text(text: str) -> None:
     script = as_script(text, {text: [text]})
     assert not set("<>&\u2028\u2029") & set(script)
