@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import torch
 from PIL import Image
 
@@ -34,8 +33,8 @@ class Bad:
         name: what is wrong.
         spoil: makes it so.
         words: of the command line.
-        said: the whole line after `error: `, or, of a report, a part of what it prints, as a regular expression.
-        status: the exit status; 0 of a report, which names a bad run and goes on.
+        said: the whole line after `error: `, as a regular expression.
+        status: the exit status.
         again: another verb meets the same input, through the same reader, in the default tests already.
     """
 
@@ -126,16 +125,8 @@ def record(name: str, said: str, image: bytes | Callable[[], bytes] | None = Non
     ]
 
 
-def reported(name: str, spoil: Callable[[Place], Any], said: str) -> Bad:
-    return Bad(f"run folder: {name}", spoil, REPORT, said, 0)
-
-
 def status(**changes: Any) -> Callable[[Place], None]:
     return lambda place: place.put_json(place.run.status_file, **changes)
-
-
-def column(name: str, values: Callable[[int], Any]) -> Callable[[Place], None]:
-    return lambda place: place.put_column(name, pa.array(values(3)))
 
 
 GOOD = '"file_name": "0.png", "f": 300'
@@ -328,21 +319,6 @@ RECORDS = [
 ]  # fmt: skip
 
 FOLDERS = [
-    reported("status: a pipe", lambda place: images.pipe(place.run.status_file), r"unreadable: .*status\.json: not a run status \(a pipe or a device; expected a plain file\)"),
-    reported("status: a folder", lambda place: (place.run.status_file.unlink(), place.run.status_file.mkdir()), r"unreadable: .*status\.json: not a run status \(Is a directory\)"),
-    reported("status: nesting without end", lambda place: place.put(place.run.status_file, DEEP), r"unreadable: .*status\.json: not a run status"),
-    reported("status: a date beyond all", status(started=1e300), r"unreadable: .*status\.json: not a run status .*started"),
-    reported("status: an unknown state", status(state="done"), r"unreadable: .*status\.json: not a run status .*state"),
-    reported("status: an unknown key", status(__class__="os.system"), r"unreadable: .*status\.json: not a run status .*__class__"),
-    reported("status: 20 MB", lambda place: place.put(place.run.status_file, " " * 20_000_000), r"unreadable: .*status\.json: not a run status \(20 MB; expected at most 16 MB\)"),
-    reported("predictions: gone", lambda place: place.run.predictions.unlink(), r"unreadable: predictions\.parquet: missing, though the run has finished; .*"),
-    reported("predictions: a pipe", lambda place: images.pipe(place.run.predictions), r"unreadable: predictions\.parquet: cannot be read \(a pipe or a device; .*\)"),
-    reported("predictions: text", lambda place: place.put(place.run.predictions, "no parquet"), r"unreadable: predictions\.parquet: cannot be read \(.*\)"),
-    reported("predictions: a column less", lambda place: place.put_column("mode_x", None), r"unreadable: predictions: no column mode_x, as in older records; .*"),
-    reported("predictions: text for numbers", column("mode_x", lambda n: ["x"] * n), r"unreadable: predictions\.parquet: cannot be read \(column 'mode_x' holds str; expected numbers\); .*"),
-    reported("predictions: lists for numbers", column("nll", lambda n: [[1.0]] * n), r"unreadable: predictions\.parquet: cannot be read \(column 'nll' holds ndarray; expected numbers\); .*"),
-    reported("predictions: NaN", column("z", lambda n: [float("nan")] * n), r"unreadable: predictions: column z is not finite everywhere, or not positive; .*"),
-    reported("predictions: two million rows", lambda place: place.run.predictions.write_bytes(many_rows()), r"unreadable: predictions\.parquet: has 2000000 rows of .* columns; expected at most .*"),
     Bad("run folder: no numbers before the checkpoint", lambda place: (place.run.metrics_file.unlink(), status(state="interrupted")(place)), LEARN, r"runs/.*metrics\.jsonl: not the record of the epochs before last\.ckpt; .*"),
     Bad("run folder: an epoch of text", lambda place: (place.put(place.run.metrics_file, '{"epoch": "x"}\n'), status(state="interrupted")(place)), LEARN, r"runs/.*metrics\.jsonl, line 1: not a valid record \(epoch: expected a whole number .*\)"),
     Bad("run folder: numbers of text", lambda place: (place.put(place.run.metrics_file, '{"epoch": -1, "test/nll": "<b>"}\n'), status(state="interrupted")(place)), LEARN, r"runs/.*metrics\.jsonl: not the record of .*"),
@@ -352,33 +328,6 @@ FOLDERS = [
     Bad("run folder: checkpoints that lead elsewhere", lambda place: (place.run.checkpoints.rename(place.root / "elsewhere"), place.run.checkpoints.symlink_to(place.root / "elsewhere"), status(state="interrupted")(place)), LEARN, r"runs/.*/checkpoints: leads out of the run's folder; .*"),
     Bad("run folder: a lock that leads elsewhere", lambda place: (place.put("diary", "dear"), images.link(place.run.path / ".lock", place.root / "diary"), status(state="interrupted")(place)), LEARN, r"runs/.*: cannot be written \(.*\); .*"),
 ]  # fmt: skip
-
-
-def many_rows() -> bytes:
-    import io
-
-    import pyarrow.parquet as pq
-
-    zeros = pa.array(np.zeros(2_000_000))
-    names = [
-        "x",
-        "y",
-        "z",
-        "f",
-        "S",
-        "mode_x",
-        "mode_y",
-        "mode_z",
-        "mean_x",
-        "mean_y",
-        "mean_z",
-        "median_z",
-        "mu_x",
-        "mu_y",
-    ]
-    buffer = io.BytesIO()
-    pq.write_table(pa.table(dict.fromkeys(names, zeros)), buffer)
-    return buffer.getvalue()
 
 
 TABLE = [
