@@ -41,10 +41,7 @@ def test_a_resumed_checkpoint_removes_nothing(
     place.put("diary", "dear")
     go_on(place, composed)
     content = torch.load(place.run.last_checkpoint, weights_only=True)
-    state = {
-        "dirpath": str(place.run.checkpoints),
-        "best_model_path": f"{place.run.checkpoints}/{'../' * 6}diary",
-    }
+    state = {"dirpath": str(place.run.checkpoints), "best_model_path": f"{place.run.checkpoints}/{'../' * 6}diary"}
     assert Path(state["best_model_path"]).exists()
     names = [name for name in content["callbacks"] if "ModelCheckpoint" in name]
     place.put_checkpoint(callbacks={name: content["callbacks"][name] | state for name in names})

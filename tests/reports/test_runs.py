@@ -46,10 +46,7 @@ def test_a_finished_run_has_its_errors(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("error", "state", "detail"),
-    [
-        (ValueError("odd\nnumber"), "failed", "ValueError: odd number"),
-        (KeyboardInterrupt(), "interrupted", None),
-    ],
+    [(ValueError("odd\nnumber"), "failed", "ValueError: odd number"), (KeyboardInterrupt(), "interrupted", None)],
 )
 def test_an_unfinished_run_has_its_reason_on_one_line(
     tmp_path: Path, error: BaseException, state: str, detail: str | None
