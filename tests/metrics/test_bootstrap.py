@@ -45,15 +45,12 @@ def test_intervals_contain_the_truth_as_often_as_they_claim() -> None:
     assert sum(held) / 300 == pytest.approx(0.95, abs=0.035)
 
 
-def test_resamples_in_parts_continue_one_stream() -> None:
+def test_resamples_continue_one_stream_of_their_seed() -> None:
     """300,000 samples do not fit into one part with 5 resamples; the first resamples do not depend on later ones."""
     columns = {"x": numbers(300_000, seed=1)}
     few, more = (resampled(means, columns, n, seed=0)[1]["mean"] for n in (2, 5))
     torch.testing.assert_close(more[:2], few)
     assert len(set(more.tolist())) == 5
-
-
-def test_the_same_seed_gives_the_same_interval() -> None:
     one, same, other = (bands(means, {"x": numbers(100, seed=1)}, 50, seed)["mean"] for seed in (0, 0, 1))
     assert (one.low, one.high) == (same.low, same.high)
     assert one.low != other.low
