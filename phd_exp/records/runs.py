@@ -38,8 +38,7 @@ from phd_exp.records.parsing import parse_json, parse_yaml
 from phd_exp.records.processes import held
 
 LAST_EPOCH = 10**9
-LARGEST = MB
-"""Bytes of a configuration or of a run's numbers."""
+LARGEST = MB  # bytes of a configuration or of a run's numbers
 PACKAGES = ("phd_exp", "torch", "torchvision", "lightning", "hydra-core", "numpy")
 """Packages on which numbers depend, whose versions are recorded."""
 

@@ -28,8 +28,7 @@ from phd_exp.training.ranks import train_together
 from phd_exp.training.recorder import Draw, Recorder
 from phd_exp.training.tracking import require_key, tracked
 
-UNTRAINED = -1
-"""The number of the epoch before the first, whose metrics are those of the untrained network."""
+UNTRAINED = -1  # the number of the epoch before the first, whose metrics are those of the untrained network
 
 
 def train(config: RunConfig, folder: RunFolder, draw: Draw | None, cores: int) -> dict[str, Any]:
