@@ -300,7 +300,8 @@ RECORDS = [
 
 FOLDERS = [
     Bad("run folder: no numbers before the checkpoint", lambda place: (place.run.metrics_file.unlink(), status(state="interrupted")(place)), LEARN, r"runs/.*metrics\.jsonl: not the record of the epochs before last\.ckpt; .*"),
-    Bad("run folder: an epoch of text", lambda place: (place.put(place.run.metrics_file, '{"epoch": "x"}\n'), status(state="interrupted")(place)), LEARN, r"runs/.*metrics\.jsonl, line 1: not a valid record \(epoch: expected a whole number .*\)"),
+    Bad("run folder: an epoch of text", lambda place: (place.put(place.run.metrics_file, '{"epoch": "x"}\n'), status(state="interrupted")(place)), LEARN, r"runs/.*metrics\.jsonl, line 1: not a valid record \(epoch.*\)"),
+    Bad("run folder: numbers of text", lambda place: (place.put(place.run.metrics_file, '{"epoch": -1, "test/nll": "<b>"}\n'), status(state="interrupted")(place)), LEARN, r"runs/.*metrics\.jsonl, line 1: not a valid record \(test/nll.*"),
     Bad("run folder: a result of 400 digits", lambda place: place.put(place.run.results_file, f'{{"test/nll": {"9" * 400}}}'), LEARN, r"runs/.*results\.json: cannot be read \(a whole number of 400 digits\); .*"),
     Bad("run folder: checkpoints that lead elsewhere", lambda place: (place.run.checkpoints.rename(place.root / "elsewhere"), place.run.checkpoints.symlink_to(place.root / "elsewhere"), status(state="interrupted")(place)), LEARN, r"runs/.*/checkpoints: leads out of the run's folder; .*"),
     Bad("run folder: a lock that leads elsewhere", lambda place: (place.put("diary", "dear"), images.link(place.run.path / ".lock", place.root / "diary"), status(state="interrupted")(place)), LEARN, r"runs/.*: cannot be written \(.*\); .*"),

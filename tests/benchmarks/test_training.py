@@ -98,24 +98,12 @@ def test_all_samples_of_the_paper_take_two_gibibytes(tmp_path: Path, record: Cal
     """In addition to the memory of the network and one batch."""
 
     def peak(loop: str, *overrides: str) -> float:
-        command = [
-            sys.executable,
-            str(HERE / "loops.py"),
-            loop,
-            str(tmp_path),
-            "0",
-            "preset=paper",
-            *overrides,
-        ]
+        command = [sys.executable, str(HERE / "loops.py"), loop, str(tmp_path), "0", "preset=paper", *overrides]
         return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout) / 2**30
 
     bare, programme = peak("bare", "data.n_train=64", "data.n_test=1"), peak("programme")
     more = programme - bare
     record(
-        "peak memory, preset=paper",
-        f"{programme:.1f} GiB",
-        f"{bare:.1f} GiB, bare loop",
-        f"+{more:.2f} GiB",
-        "2 GiB",
+        "peak memory, preset=paper", f"{programme:.1f} GiB", f"{bare:.1f} GiB, bare loop", f"+{more:.2f} GiB", "2 GiB"
     )
     assert more <= 2

@@ -56,10 +56,7 @@ def test_masks_are_written_to_the_given_folder(render: Callable, tmp_path: Path)
     outcome = render("data=scale", "masks=masks", "data.image_format=webp")
     assert outcome.status == 0, outcome.err
     assert "masks: 6 masks" in outcome.out
-    assert sorted(path.name for path in (tmp_path / "masks" / "test").iterdir()) == [
-        "000000.png",
-        "000001.png",
-    ]
+    assert sorted(path.name for path in (tmp_path / "masks" / "test").iterdir()) == ["000000.png", "000001.png"]
     refused = render("data=default", "masks=renders/default/masks")
     assert refused.status == 1
     assert refused.err.startswith("error: masks=renders/default/masks: lies in the data set itself")

@@ -116,11 +116,7 @@ def test_a_configuration_that_makes_no_sense_has_no_run(jobs: Callable, change: 
         ({"_target_": f"{HYDRA}.hydra_submitit_launcher.submitit_launcher.LocalLauncher"}, 3, 4),
         ({"_target_": f"{HYDRA}.hydra_submitit_launcher.submitit_launcher.LocalLauncher"}, 30, 1),
         *(
-            (
-                {"_target_": f"{HYDRA}.hydra_joblib_launcher.joblib_launcher.JoblibLauncher", "n_jobs": n},
-                8,
-                each,
-            )
+            ({"_target_": f"{HYDRA}.hydra_joblib_launcher.joblib_launcher.JoblibLauncher", "n_jobs": n}, 8, each)
             for n, each in ((1, 12), (2, 6), (5, 2), (20, 1), (-1, 1), (-5, 1), (-11, 6), (-50, 12))
         ),
     ],

@@ -54,12 +54,7 @@ def test_defaults_are_the_authors_protocol(checked: Callable) -> None:
 
 def test_the_authors_recipe_changes_neither_images_nor_learning_rate(checked: Callable) -> None:
     recipe = checked().recipe
-    assert (recipe.name, recipe.schedule, recipe.warmup_steps, recipe.localisation) == (
-        "paper",
-        "constant",
-        0,
-        0,
-    )
+    assert (recipe.name, recipe.schedule, recipe.warmup_steps, recipe.localisation) == ("paper", "constant", 0, 0)
     assert build_augmentation(recipe) is None
 
 
@@ -164,9 +159,7 @@ def test_several_views_use_the_data_set_multiview(checked: Callable) -> None:
     assert beside == checked("data=multiview", "data.sensor_size=256", "data.seed=3").data.spec
 
 
-def test_older_records_without_several_views_are_valid(
-    composed: Callable[..., dict[str, Any]],
-) -> None:
+def test_older_records_without_several_views_are_valid(composed: Callable[..., dict[str, Any]]) -> None:
     config = composed("data=scale")
     del config["evaluation"]["multiview"]
     assert check(config).evaluation.multiview is None

@@ -43,15 +43,7 @@ def test_rendered_images_are_shrunk(folder: DatasetFolder) -> None:
         np.testing.assert_array_equal(array[0], shrunk(picture(folder, 0), side))
 
 
-SIZES = [
-    (224, 224, 64),
-    (224, 224, 112),
-    (301, 220, 64),
-    (100, 37, 33),
-    (97, 97, 96),
-    (40, 30, 64),
-    (1, 5000, 7),
-]
+SIZES = [(224, 224, 64), (224, 224, 112), (301, 220, 64), (100, 37, 33), (97, 97, 96), (40, 30, 64), (1, 5000, 7)]
 
 
 @pytest.mark.parametrize(("height", "width", "side"), SIZES)

@@ -7,14 +7,7 @@ import torch
 from numpy.polynomial.legendre import leggauss
 
 from phd_exp.distributions import PointEstimate, ProjectedHuber
-from phd_exp.distributions.constraints import (
-    CONSTRAINTS,
-    DEPTH,
-    Decomposed,
-    Family,
-    families,
-    minus_log_is_convex,
-)
+from phd_exp.distributions.constraints import CONSTRAINTS, DEPTH, Decomposed, Family, families, minus_log_is_convex
 from phd_exp.distributions.point_estimate import PointDensity
 from phd_exp.geometry import Camera, Cartesian, LogDepth, Projected
 from phd_exp.models.backbones import resnet
@@ -48,9 +41,7 @@ def test_a_model_keeps_the_constraints_that_theory_says_it_keeps(name: str, cons
 @pytest.mark.parametrize(
     "chart", [Projected(DEPTH), LogDepth(DEPTH), Cartesian(DEPTH)], ids=lambda c: type(c).__name__
 )
-def test_a_point_read_as_a_density_has_the_mass_of_its_samples(
-    chart: Projected | LogDepth | Cartesian,
-) -> None:
+def test_a_point_read_as_a_density_has_the_mass_of_its_samples(chart: Projected | LogDepth | Cartesian) -> None:
     """Quadrature of the density over a box around the estimate, against the share of samples in it."""
     camera = Camera(torch.tensor(1500.0, dtype=torch.float64), 224.0)
     centre = torch.tensor([0.05, -0.03, 4.0], dtype=torch.float64)

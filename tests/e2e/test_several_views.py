@@ -15,13 +15,7 @@ from phd_exp.records import scenes
 from phd_exp.records.runs import RunFolder, find_runs
 from tests.e2e.conftest import QUICK
 
-QUICKER = (
-    "data=scale",
-    "trainer.max_epochs=1",
-    "logger=none",
-    "data.workers=1",
-    "trainer.precision=bfloat16",
-)
+QUICKER = ("data=scale", "trainer.max_epochs=1", "logger=none", "data.workers=1", "trainer.precision=bfloat16")
 VIEWS = "evaluation.multiview.views=2"
 
 

@@ -37,11 +37,7 @@ def finished(runs: Path) -> dict[Path, dict[str, tuple[int, bytes]]]:
 def numbers(runs: Path) -> dict[str, Any]:
     """What the runs of a folder came to, to the bit."""
     return {
-        run.path.relative_to(runs).as_posix(): (
-            run.results_file.read_bytes(),
-            run.metrics(),
-            weight_bytes(run),
-        )
+        run.path.relative_to(runs).as_posix(): (run.results_file.read_bytes(), run.metrics(), weight_bytes(run))
         for run in find_runs(runs)
     }
 

@@ -138,14 +138,7 @@ def test_a_loss_that_is_not_finite_is_one_line(train: Callable) -> None:
 def test_none_outlives_the_process_that_started_them(renders: Path, tmp_path: Path) -> None:
     from phd_exp.__main__ import main
 
-    words = [
-        *QUICK,
-        f"data.root={renders}",
-        f"runs={tmp_path}",
-        "logger=none",
-        "trainer.max_epochs=50",
-        *TOGETHER,
-    ]
+    words = [*QUICK, f"data.root={renders}", f"runs={tmp_path}", "logger=none", "trainer.max_epochs=50", *TOGETHER]
     process = multiprocessing.get_context("spawn").Process(target=main, args=(words,))
     process.start()
     wait_for(lambda: list(tmp_path.rglob("last.ckpt")))

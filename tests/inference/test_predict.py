@@ -82,14 +82,7 @@ def test_a_baseline_has_positions_without_uncertainty(
     assert outcome.status == 0, outcome.err
     rows = read_lines((tmp_path / "drawn" / "predictions.jsonl").read_text())
     errors = {"projected_error_mm", "depth_error_mm"}
-    assert rows[0].keys() == errors | {
-        "file_name",
-        "box",
-        "position",
-        "uncertainty",
-        "out_of_field",
-        "picture",
-    }
+    assert rows[0].keys() == errors | {"file_name", "box", "position", "uncertainty", "out_of_field", "picture"}
     assert rows[0]["uncertainty"].startswith("none")
     predictor = package.load(baseline.path)
     for row, camera in zip(rows, virtual_cameras(photos), strict=True):
@@ -97,10 +90,7 @@ def test_a_baseline_has_positions_without_uncertainty(
         prediction = predictor.see(predictor.view(image, camera.K, row["box"]))
         assert isinstance(prediction, PointEstimate)
         np.testing.assert_allclose(row["position"], camera.to_real(prediction.mode.numpy()), rtol=1e-5, atol=1e-5)
-    for word, said in (
-        ("recalibrate", "nothing to recalibrate"),
-        ("calibration", "no calibration curve of depth"),
-    ):
+    for word, said in (("recalibrate", "nothing to recalibrate"), ("calibration", "no calibration curve of depth")):
         refused = phd_exp("predict", f"run={baseline.path}", f"folder={photos}", f"{word}=true", "out=more")
         assert refused.status == 1
         assert said in refused.err
@@ -203,10 +193,7 @@ MISTAKES = [
     (("imag=good.png",), "imag: unknown key, did you mean 'image'?"),
     (("good.png",), "good.png: expected key=value"),
     (("image=good.png", "f=400", "out=good.png/x"), "good.png/x: cannot be written"),
-    (
-        ("image=good.png", "f=400", "calibration=true"),
-        "calibration: is drawn into the pictures; expected out=",
-    ),
+    (("image=good.png", "f=400", "calibration=true"), "calibration: is drawn into the pictures; expected out="),
 ]
 """Of this verb alone; tests/bad_input has those of images, cameras and folders."""
 

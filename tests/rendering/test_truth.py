@@ -59,11 +59,7 @@ def cast(scene: Scene) -> np.ndarray:
 
 def check(scene: Scene, drawn: Callable[[Scene], np.ndarray]) -> None:
     """All that a record says of pixels, against Blender's."""
-    hits, seen, bare = (
-        trace_pixels(scene),
-        drawn(scene) == 1,
-        drawn(with_objects(scene, scene.objects[0])) == 1,
-    )
+    hits, seen, bare = (trace_pixels(scene), drawn(scene) == 1, drawn(with_objects(scene, scene.objects[0])) == 1)
     mask, whole = cylinder_mask(hits), hits.surfaces[0] != NOTHING
     assert abs(int(mask.sum()) - int(seen.sum())) <= FEW
     assert abs(int(whole.sum()) - int(bare.sum())) <= FEW
