@@ -140,7 +140,9 @@ BAD_COMMANDS = [
 ]
 
 
-@pytest.mark.parametrize(("arguments", "status", "parts"), BAD_COMMANDS, ids=[" ".join(words) for words, *_ in BAD_COMMANDS])
+@pytest.mark.parametrize(
+    ("arguments", "status", "parts"), BAD_COMMANDS, ids=[" ".join(words) for words, *_ in BAD_COMMANDS]
+)
 def test_a_wrong_command_is_one_line_and_nothing_is_written(
     phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     arguments: list[str], status: int, parts: list[str],
