@@ -106,15 +106,19 @@ def with_values(arguments: list[str]) -> tuple[str, DictConfig]:
     return verb, config
 
 
+def require_sound(verb: str, config: DictConfig, runs: Path) -> None:
+    """What a verb checks before it does anything."""
+    if verb == "render":
+        check_render(plain(config))
+    else:
+        require_possible(check(plain(config)), RunFolder(runs / "run"))
+
+
 @pytest.mark.parametrize(("arguments", "parts"), WRONG_VALUES, ids=lambda value: " ".join(value)[:40])
 def test_a_wrong_value_is_one_line(tmp_path: Path, arguments: list[str], parts: list[str]) -> None:
     verb, config = with_values(arguments)
     with pytest.raises(ConfigError) as refused:
-        if verb == "render":
-            check_render(plain(config))
-        else:
-            checked = check(plain(config))
-            require_possible(checked, RunFolder(tmp_path / "run"))
+        require_sound(verb, config, tmp_path)
     (line,) = str(refused.value).splitlines()
     assert all(part in line for part in parts), line
     assert list(tmp_path.iterdir()) == []

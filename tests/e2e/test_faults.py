@@ -109,7 +109,8 @@ def test_results_without_room_are_written_by_the_next_command(
     ends_as_unhindered(runs)
 
 
-def test_memory_that_runs_out_is_one_line(
+@pytest.mark.slow
+def test_memory_that_runs_out_is_one_line_and_nothing_is_lost(
     train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends_as_unhindered: Callable
 ) -> None:
     training_step = PositionModule.training_step

@@ -120,15 +120,6 @@ def test_the_strong_recipe_is_exported(train: Callable, phd_exp: Callable, tmp_p
     assert (tmp_path / "network.onnx").exists()
 
 
-def test_an_unwritable_runs_folder_is_reported_before_anything_is_done(train: Callable, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    outcome = train("logger=none", "runs=file/runs")
-    assert outcome.status == 1
-    (line,) = outcome.err.splitlines()
-    assert "file" in line
-    assert "runs=DIR" in line
-
-
 def test_a_sweep_survives_its_failures(train: Callable, tmp_path: Path) -> None:
     words = ("model=probabilistic,mae_vz", "seed=0,1", "loss=mae", "logger=none", "trainer.max_epochs=1")
     outcome = train("-m", *words)
