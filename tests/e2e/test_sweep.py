@@ -64,7 +64,8 @@ def begun(tmp_path: Path, renders: Path) -> Callable[..., BaseProcess]:
     return begin
 
 
-@pytest.mark.parametrize(("kills", "words"), [(1, TWO), pytest.param(20, FOUR, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("kills", "words"), [(1, TWO), (20, FOUR)])
 def test_killed_at_any_moment_the_same_command_goes_on(
     train: Callable, begun: Callable, tmp_path: Path, kills: int, words: tuple[str, ...]
 ) -> None:
@@ -156,13 +157,20 @@ def test_a_failing_run_among_others(train: Callable, tmp_path: Path, monkeypatch
     assert all([row["epoch"] for row in run.metrics()] == [-1, 0, 1] for run in find_runs(tmp_path / "runs"))
 
 
-def test_a_changed_configuration_never_reuses_a_run(train: Callable, tmp_path: Path) -> None:
+def test_runs_of_a_sweep_are_those_of_single_commands_and_never_reused_for_a_changed_configuration(
+    train: Callable, tmp_path: Path
+) -> None:
     assert train(*TWO).status == 0
-    changed = next(run for run in find_runs(tmp_path / "runs") if "seed1" in run.path.name)
-    config = changed.config()
+    (one, two) = sorted(find_runs(tmp_path / "runs"), key=lambda run: run.path.name)
+    assert train(*TWO[1:-2], "seed=1", "logger=none", "runs=alone").status == 0
+    ((place, alone),) = numbers(tmp_path / "alone").items()
+    assert numbers(tmp_path / "runs") == numbers(tmp_path / "runs") | {place: alone}
+
+    config = two.config()
     config["optimizer"]["lr"] = 0.5  # as if the file under conf/ had changed since
-    changed.write_config(config)
+    two.write_config(config)
     before = finished(tmp_path / "runs")
+    assert before.keys() == {one.path, two.path}
     outcome = train(*TWO)
     assert outcome.status == 1
     (line,) = [line for line in outcome.err.splitlines() if line.startswith("error: ")]
@@ -175,20 +183,21 @@ def test_a_changed_configuration_never_reuses_a_run(train: Callable, tmp_path: P
 WITHOUT_RAY = pytest.mark.skipif(find_spec("ray") is None, reason="needs the extra `ray`, in a venv of its own")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [
         ["seed=1,0"],
-        pytest.param(["seed=1,0", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"], marks=pytest.mark.slow),
-        pytest.param(["seed=0,1", "hydra/launcher=submitit_local"], marks=pytest.mark.slow),
-        pytest.param(["seed=0,1", "hydra/launcher=ray"], marks=[pytest.mark.slow, WITHOUT_RAY]),
+        ["seed=1,0", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
+        ["seed=0,1", "hydra/launcher=submitit_local"],
+        pytest.param(["seed=0,1", "hydra/launcher=ray"], marks=WITHOUT_RAY),
     ],
     ids=["order", "joblib", "submitit", "ray"],
 )
 def test_neither_order_nor_launcher_changes_a_number(train: Callable, tmp_path: Path, words: list[str]) -> None:
     """At one number of threads, which the shared words set."""
     assert train(*TWO, "runs=here").status == 0
-    outcome = train("-m", "model=mae_vz", "recipe=strong", "data.image_size=64", "logger=none", *words, "runs=there")
+    outcome = train(*TWO[:-2], "logger=none", *words, "runs=there")
     assert outcome.status == 0, outcome.err
     assert numbers(tmp_path / "here") == numbers(tmp_path / "there")
     assert len(find_runs(tmp_path / "here")) == 2
