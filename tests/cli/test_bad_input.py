@@ -20,24 +20,22 @@ from phd_exp.training.run import require_possible
 
 NOTHING_TO_RENDER = "data=folder: there is nothing to render, these are your own images"
 FOLDER = ["data=folder", "data.folder=photos"]
+TOGETHER = ["trainer=ddp", "trainer.accelerator=cpu"]
 MULTIVIEW = "evaluation.multiview.scenes"
 WRONG_VALUES = [
     # (arguments, parts of the line): found once Hydra has composed the configuration
     (["+model.typo=1"], ["model.typo", "unknown key", "expected one of name, head"]),
     (["+data.n_trian=1"], ["data.n_trian", "did you mean 'n_train'"]),
     (["+typo=1"], ["typo", "unknown key"]),
-    (["+optimizer.lrr=1"], ["optimizer.lrr", "did you mean 'lr'", "torch.optim.Adam"]),
     (["+model.head.depht=1"], ["model.head.depht", "unknown key"]),
     (["data.n_train=abc"], ["data.n_train", "'abc'", "integer"]),
     (["data.n_train=2.5"], ["data.n_train", "2.5", "integer"]),
     (["data.n_train=true"], ["data.n_train", "True", "integer"]),
-    (["optimizer.lr=fast"], ["optimizer.lr", "'fast'", "number"]),
     (["backbone.depth=19"], ["backbone.depth", "19", "18, 34 or 50"]),
     (["trainer.precision=half"], ["trainer.precision", "'half'", "'bfloat16'"]),
     (["data.n_train=0"], ["data.n_train", "got 0", "greater than or equal to 1"]),
     (["data.n_test=-1"], ["data.n_test", "got -1"]),
     (["data.f_range=[0,2000]"], ["data.f_range", "got 0", "greater than or equal to 10"]),
-    (["data.f_range=[-1200,2000]"], ["data.f_range", "got -1200"]),
     (["data.f_range=[2000,1200]"], ["data.f_range", "lower bound"]),
     (["data.z_range=[0,5]"], ["data.z_range"]),
     (["data.image_size=7"], ["data.image_size", "got 7", "greater than or equal to 32"]),
@@ -58,21 +56,21 @@ WRONG_VALUES = [
     (["loss=mae"], ["loss", "PointEstimate", "model=probabilistic", "ProjectedHuber"]),
     (["model=mae_vz", "loss=nll"], ["loss", "ProjectedHuber", "model=mae_vz"]),
     (["loss._target_=os.system"], ["loss._target_", "os.system", "phd_exp."]),
-    (["loss._target_=phd_exp.losses.nll.Nothing"], ["loss._target_", "does not exist"]),
     (["optimizer._target_=torch.optim.Nadam"], ["optimizer._target_", "does not exist"]),
     (["optimizer.lr=-1"], ["optimizer: ", "learning rate", "-1"]),
     (["+optimizer.betas=[0.9,1.5]"], ["optimizer: ", "beta", "1.5"]),
     (["optimizer._target_=torch.optim.SGD", "+optimizer.momentum=-1"], ["optimizer: ", "momentum"]),
+    ([*TOGETHER, "trainer.devices=3"], ["trainer.devices: got 3, which does not divide batch_size=16"]),
+    ([*TOGETHER, "trainer.devices=0"], ["trainer.devices: got 0"]),
+    (
+        [*TOGETHER, "trainer.devices=8", "data.n_held_out=4"],
+        ["trainer.devices: got 8, more than the 4 samples of held_out that there are"],
+    ),
     (["data=folder"], ["data.folder: missing", "data.folder=VALUE"]),
     (["+data.folder=photos"], ["data.folder: unknown key", "expected one of", "sensor_size"]),
-    ([*FOLDER, "+data.variant=x"], ["data.variant: unknown key", "name, folder"]),
-    ([*FOLDER, "data.n_train=3"], ["data", "batch_size=16", "n_train=3"]),
     ([*FOLDER, "data.name=../x"], ["data.name", "'../x'"]),
     (["render", "data=folder"], [NOTHING_TO_RENDER]),
     (["render", "shard=4/4"], ["shard: got '4/4'; expected INDEX/COUNT with 0 <= INDEX < COUNT, from 0/4 to 3/4"]),
-    (["render", "shard=-1/2"], ["shard: got '-1/2'; expected INDEX/COUNT"]),
-    (["render", "shard=1/0"], ["shard: got '1/0'; expected INDEX/COUNT"]),
-    (["render", "shard=a"], ["shard: got 'a'; expected INDEX/COUNT"]),
     (["render", "shard=2"], ["shard: got 2; expected INDEX/COUNT"]),
     (["render", "+shards=0/2"], ["shards: unknown key"]),
     (["render", "data.workers=0"], ["data.workers: got 0"]),

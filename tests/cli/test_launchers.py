@@ -90,8 +90,7 @@ def sweep(begin: Callable) -> Callable[..., tuple[int, list[str], list[str]]]:
 
 
 @pytest.mark.parametrize(
-    ("launcher", "seeds"),
-    [("joblib", (0, 1, 2, 3, 5)), pytest.param("submitit", (0, 1, 3), marks=pytest.mark.slow)],
+    ("launcher", "seeds"), [("joblib", (0, 1, 2, 3, 5)), pytest.param("submitit", (0, 1, 3), marks=pytest.mark.slow)]
 )
 def test_failures_come_back_and_stop_no_other_job(
     sweep: Callable, tmp_path: Path, launcher: str, seeds: tuple[int, ...]

@@ -112,12 +112,7 @@ def test_colours_change_places_alone(batch: Batch) -> None:
 
 @pytest.mark.parametrize(
     "part",
-    [
-        {"symmetries": True},
-        {"largest_zoom": 1.2},
-        {"colours": True},
-        {"photometry": Photometry(brightness=2.0)},
-    ],
+    [{"symmetries": True}, {"largest_zoom": 1.2}, {"colours": True}, {"photometry": Photometry(brightness=2.0)}],
 )
 def test_each_part_is_there_by_itself(batch: Batch, part: dict) -> None:
     nothing = {"symmetries": False, "largest_zoom": 1.0, "colours": False, "photometry": PLAIN}

@@ -152,9 +152,7 @@ def test_a_changed_line_is_never_served_the_old_crop(photos: DetectionFolder, ke
     np.testing.assert_array_equal(after[2], before[2])
 
 
-def test_a_changed_image_of_the_same_name_and_time_is_never_served_from_the_cache(
-    photos: DetectionFolder,
-) -> None:
+def test_a_changed_image_of_the_same_name_and_time_is_never_served_from_the_cache(photos: DetectionFolder) -> None:
     import os
 
     before, file = images(photos), photos.root / "train" / "deep" / "tall.png"

@@ -110,29 +110,6 @@ def test_results_without_room_are_written_by_the_next_command(
 
 
 @pytest.mark.slow
-def test_memory_that_runs_out_is_one_line_and_nothing_is_lost(
-    train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends_as_unhindered: Callable
-) -> None:
-    training_step = PositionModule.training_step
-
-    def greedy(self: PositionModule, *arguments: Any) -> torch.Tensor:
-        if self.current_epoch == 1:
-            torch.empty(1 << 50)
-        return training_step(self, *arguments)
-
-    runs = tmp_path / "runs"
-    with monkeypatch.context() as patch:
-        patch.setattr(PositionModule, "training_step", greedy)
-        line = refused(train(*QUIET, f"runs={runs}"))
-    assert "memory ran out" in line
-    assert "data.batch_size" in line
-    status = only_run(runs).status()
-    assert status is not None
-    assert status.state == "failed"
-    ends_as_unhindered(runs)
-
-
-@pytest.mark.slow
 def test_a_clock_that_jumps_changes_nothing(
     train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends_as_unhindered: Callable
 ) -> None:

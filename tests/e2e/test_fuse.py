@@ -176,10 +176,7 @@ LINES = [
     ({}, "line 1: scene is missing"),
     ({"scene": 1}, "line 1: pose is missing; expected the rotation [w, x, y, z]"),
     ({"scene": True, "pose": POSE}, "line 1: scene: got True; expected a whole number or a name"),
-    (
-        {"scene": 1, "pose": POSE | {"rotation": [1, 1, 0, 0]}},
-        "pose.rotation: got [1, 1, 0, 0]; a rotation is",
-    ),
+    ({"scene": 1, "pose": POSE | {"rotation": [1, 1, 0, 0]}}, "pose.rotation: got [1, 1, 0, 0]; a rotation is"),
     ({"scene": 1, "pose": {"rotation": [1, 0, 0, 0]}}, "line 1: pose.translation: missing"),
     ({"scene": 1, "pose": POSE | {"R": 1}}, "pose.R: unknown key; expected one of rotation, translation"),
 ]

@@ -16,7 +16,6 @@ import pytest
 
 from phd_exp.__main__ import main
 from phd_exp.records.runs import RunFolder, find_runs
-from phd_exp.training.module import PositionModule
 from tests.e2e.conftest import QUICK
 from tests.e2e.runs import weights
 
@@ -37,11 +36,7 @@ def finished(runs: Path) -> dict[Path, dict[str, tuple[int, bytes]]]:
 def numbers(runs: Path) -> dict[str, Any]:
     """What the runs of a folder came to, to the bit."""
     return {
-        run.path.relative_to(runs).as_posix(): (
-            run.results_file.read_bytes(),
-            run.metrics(),
-            weight_bytes(run),
-        )
+        run.path.relative_to(runs).as_posix(): (run.results_file.read_bytes(), run.metrics(), weight_bytes(run))
         for run in find_runs(runs)
     }
 
@@ -120,41 +115,6 @@ def jobs_of_submitit(runs: Path) -> list[int]:
             if "submitit.core._submit" in command and any(word.startswith(str(runs)) for word in command):
                 found.append(int(entry.name))
     return found
-
-
-@pytest.mark.slow
-def test_a_failing_run_among_others(train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is named with its error and stops no other; the same command takes it up where it failed, and no other."""
-    words = ("-m", "model=mae_vz", "seed=0,1,2", "logger=none")
-    training_step = PositionModule.training_step
-
-    def faulty(self: PositionModule, *arguments: Any) -> Any:
-        if self.current_epoch == 1 and self.trainer.default_root_dir.split("/")[-1].startswith("seed1"):
-            raise RuntimeError("planted")
-        return training_step(self, *arguments)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(PositionModule, "training_step", faulty)
-        outcome = train(*words)
-    assert outcome.status == 1
-    (error,) = [line for line in outcome.err.splitlines() if line.startswith("error: ")]
-    assert error.endswith("RuntimeError: planted")
-    assert "model=mae_vz seed=1" in error
-    *_, zero, one, two, total = outcome.out.splitlines()
-    assert zero == "seed=0: finished"
-    assert one == "seed=1: failed"
-    assert two == "seed=2: finished"
-    assert total == "3 jobs: 2 finished, 1 failed"
-    before = finished(tmp_path / "runs")
-    assert len(before) == 2
-
-    again = train(*words)
-    assert again.status == 0, again.err
-    assert "3 jobs, 2 of them finished already" in again.out
-    assert again.out.splitlines()[-1] == "3 jobs: 2 finished already, 1 finished"
-    now = finished(tmp_path / "runs")
-    assert {path: now[path] for path in before} == before
-    assert all([row["epoch"] for row in run.metrics()] == [-1, 0, 1] for run in find_runs(tmp_path / "runs"))
 
 
 def test_runs_of_a_sweep_are_those_of_single_commands_and_never_reused_for_a_changed_configuration(

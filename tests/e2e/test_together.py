@@ -138,14 +138,7 @@ def test_a_loss_that_is_not_finite_is_one_line(train: Callable) -> None:
 def test_none_outlives_the_process_that_started_them(renders: Path, tmp_path: Path) -> None:
     from phd_exp.__main__ import main
 
-    words = [
-        *QUICK,
-        f"data.root={renders}",
-        f"runs={tmp_path}",
-        "logger=none",
-        "trainer.max_epochs=50",
-        *TOGETHER,
-    ]
+    words = [*QUICK, f"data.root={renders}", f"runs={tmp_path}", "logger=none", "trainer.max_epochs=50", *TOGETHER]
     process = multiprocessing.get_context("spawn").Process(target=main, args=(words,))
     process.start()
     wait_for(lambda: list(tmp_path.rglob("last.ckpt")))
@@ -172,19 +165,3 @@ def test_runs_of_a_sweep_under_any_launcher(train: Callable, tmp_path: Path, lau
     assert [run.results()["seed"] for run in runs] == [0, 1]
     assert train("seed=1", *words, "runs=alone").status == 0
     assert only_run(tmp_path / "alone").metrics() == runs[1].metrics()
-
-
-@pytest.mark.parametrize(
-    ("word", "said"),
-    [
-        ("trainer.devices=3", "trainer.devices: got 3, which does not divide batch_size=8"),
-        ("trainer.devices=8", "trainer.devices: got 8, more than the 4 samples of held_out that there are"),
-        ("trainer.devices=0", "trainer.devices: got 0"),
-    ],
-)
-def test_processes_that_cannot_share_are_refused(train: Callable, tmp_path: Path, word: str, said: str) -> None:
-    outcome = train("logger=none", *TOGETHER, word)
-    assert outcome.status == 2
-    (line,) = outcome.err.splitlines()
-    assert said in line
-    assert list(tmp_path.iterdir()) == []

@@ -18,7 +18,6 @@ from phd_exp.distributions import PointEstimate, ProjectedHuber
 from phd_exp.inference import pictures
 from phd_exp.records.errors import DatasetError, RunError
 from phd_exp.records.runs import RunFolder
-from tests.support.disks import small_disk
 from tests.support.untrained import SMALL, read_lines, untrained, virtual_cameras, write_photos
 
 
@@ -147,20 +146,6 @@ def test_every_line_has_its_own_picture(
     (tmp_path / "in" / names[1]).write_bytes(b"no image")
     assert phd_exp("predict", f"run={run.path}", "folder=in", "out=broken").status == 1
     assert len(read_lines((tmp_path / "broken" / "predictions.jsonl").read_text())) == 1
-
-
-@pytest.mark.slow
-def test_a_full_disk_is_one_line_and_the_predictions_before_are_whole(
-    phd_exp: Callable, run: RunFolder, photos: Path, tmp_path: Path
-) -> None:
-    with small_disk(tmp_path / "disk", 200) as disk:
-        outcome = phd_exp("predict", f"run={run.path}", f"folder={photos}", f"out={disk}/drawn")
-        assert outcome.status == 1
-        (line,) = outcome.err.splitlines()
-        assert "No space left on device" in line
-        rows = read_lines((disk / "drawn" / "predictions.jsonl").read_text())
-        assert 1 < len(rows) <= 4
-        assert all((disk / "drawn" / row["picture"]).exists() for row in rows[:-1])
 
 
 def test_from_python_arrays_of_any_size(run: RunFolder) -> None:

@@ -40,11 +40,7 @@ def distribution(batch: Batch) -> ProjectedHuber:
 def test_columns_rebuild_the_distribution(batch: Batch, distribution: ProjectedHuber) -> None:
     table = columns(distribution, batch)
     A = torch.stack(
-        [
-            torch.stack([table["A_xx"], table["A_xy"]], -1),
-            torch.stack([table["A_xy"], table["A_yy"]], -1),
-        ],
-        -2,
+        [torch.stack([table["A_xx"], table["A_xy"]], -1), torch.stack([table["A_xy"], table["A_yy"]], -1)], -2
     )
     mu_xy = torch.stack([table["mu_x"], table["mu_y"]], -1)
     rebuilt = ProjectedHuber(mu_xy, table["mu_z"], A, table["a"])
@@ -108,10 +104,7 @@ def test_curves_of_samples_of_the_distribution_itself_are_calibrated() -> None:
 def test_the_record_is_in_the_order_of_the_data_set(
     batch: Batch, distribution: ProjectedHuber, tmp_path: Path
 ) -> None:
-    known = {
-        "file_name": [f"{i:06d}.png" for i in range(len(batch))],
-        "f": [1500.0 + i for i in range(len(batch))],
-    }
+    known = {"file_name": [f"{i:06d}.png" for i in range(len(batch))], "f": [1500.0 + i for i in range(len(batch))]}
     rows = Rows()
     rows.update(columns(distribution, batch))
     write_parquet(tmp_path / "predictions.parquet", rows.columns(), known)
