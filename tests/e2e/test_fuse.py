@@ -180,8 +180,6 @@ LINES = [
     ({"scene": 1, "pose": {"rotation": [1, 0, 0, 0]}}, "line 1: pose.translation: missing"),
     ({"scene": 1, "pose": POSE | {"R": 1}}, "pose.R: unknown key; expected one of rotation, translation"),
 ]
-
-
 ARGUMENTS = [
     (("run=nowhere",), "folder: missing; fuse takes run=, folder=, plane=, out=, recalibrate="),
     (("run=nowhere", "folder=."), "nowhere: no run; expected a folder with config.yaml"),

@@ -91,10 +91,3 @@ def test_a_run_on_other_data_is_never_reused(train: Callable, photos: Path, runs
     outcome = train()
     assert outcome.status == 1
     assert f"data.folder=elsewhere, but data.folder={photos} is asked for" in outcome.err
-
-
-def test_too_few_images_for_a_batch_is_one_line_and_nothing_is_written(train: Callable, tmp_path: Path) -> None:
-    outcome = train("data.batch_size=9")
-    assert (outcome.status, list(tmp_path.iterdir())) == (2, [])
-    said = f"batch_size=9 is larger than the {N_TRAIN} training samples there are: not one batch is full"
-    assert outcome.err == f"error: data: {said}; choose a smaller data.batch_size\n"

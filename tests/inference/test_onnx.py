@@ -85,18 +85,7 @@ def test_the_distribution_is_that_of_torch(composed: Callable[..., Any]) -> None
         assert deviation[rows].max() < 1e-5, name
 
 
-OTHER_CASES = [(Projected, 777.0), (LogDepth, None), (Cartesian, 777.0)]
-
-
-@pytest.mark.parametrize(
-    ("chart", "constant_f"),
-    [
-        (Projected, None),
-        (LogDepth, 777.0),
-        (Cartesian, None),
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in OTHER_CASES),
-    ],
-)
+@pytest.mark.parametrize(("chart", "constant_f"), [(Projected, None), (LogDepth, 777.0), (Cartesian, None)])
 def test_baselines_are_points(
     composed: Callable[..., Any], chart: Callable[[DepthScale], Chart], constant_f: float | None
 ) -> None:

@@ -50,10 +50,6 @@ def spoiled(run: RunFolder, tmp_path: Path) -> RunFolder:
     return RunFolder(shutil.copytree(run.path, tmp_path / "spoiled"))
 
 
-def stacked(rows: list[dict[str, Any]], key: str) -> np.ndarray:
-    return np.array([row[key] for row in rows])
-
-
 def test_answers_are_in_the_frame_of_the_real_camera(phd_exp: Callable, run: RunFolder, photos: Path) -> None:
     """Against samples of the prediction for a crop, turned back."""
     outcome = phd_exp("predict", f"run={run.path}", f"folder={photos}")
@@ -254,14 +250,14 @@ def test_the_import_does_not_wait_for_torch_nor_a_prediction_for_lightning(run: 
     assert done.returncode == 0, done.stderr
 
 
-EXPORT_MISTAKES = [
-    ((), "run: missing; export takes run=, out=, recalibrate="),
-    (("run=nowhere",), "nowhere: no run; expected a folder with config.yaml"),
-    (("run=.", "out=."), "out=.: is a folder"),
-]
-
-
-@pytest.mark.parametrize(("words", "said"), EXPORT_MISTAKES)
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), "run: missing; export takes run=, out=, recalibrate="),
+        (("run=nowhere",), "nowhere: no run; expected a folder with config.yaml"),
+        (("run=.", "out=."), "out=.: is a folder"),
+    ],
+)
 def test_a_mistake_in_exporting_is_one_line(phd_exp: Callable, words: tuple[str, ...], said: str) -> None:
     pytest.importorskip("onnxruntime", reason="export needs `pip install 'phd_exp[export]'`")
     outcome = phd_exp("export", *words)
