@@ -7,14 +7,7 @@ import torch
 from numpy.polynomial.legendre import leggauss
 
 from phd_exp.distributions import PointEstimate, ProjectedHuber
-from phd_exp.distributions.constraints import (
-    CONSTRAINTS,
-    DEPTH,
-    Decomposed,
-    Family,
-    families,
-    minus_log_is_convex,
-)
+from phd_exp.distributions.constraints import CONSTRAINTS, DEPTH, Decomposed, Family, families, minus_log_is_convex
 from phd_exp.distributions.point_estimate import PointDensity
 from phd_exp.geometry import Camera, Cartesian, LogDepth, Projected
 from phd_exp.models.backbones import resnet

@@ -9,15 +9,7 @@ from PIL import Image
 from phd_exp.distributions.level_curves import on_image
 from phd_exp.evaluation.parquet import Columns, read_table
 from phd_exp.records.errors import RunError
-from phd_exp.reports.gallery import (
-    EACH,
-    LARGEST,
-    birds_eye_view,
-    close_up,
-    curves_of,
-    load_image,
-    make_gallery,
-)
+from phd_exp.reports.gallery import EACH, LARGEST, birds_eye_view, close_up, curves_of, load_image, make_gallery
 from tests.support.synthetic import write_run
 
 
