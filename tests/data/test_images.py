@@ -64,20 +64,6 @@ def test_stripes_change_nothing(monkeypatch: pytest.MonkeyPatch, stripe: int) ->
     np.testing.assert_array_equal(shrunk(noise, 64), whole)
 
 
-@pytest.mark.parametrize(("n", "side"), [(224, 64), (224, 100), (223, 64), (640, 96)])
-def test_shrinking_moves_nothing(n: int, side: int) -> None:
-    """The centroid of a wide blob at any place, in pixels of the small image."""
-    u, v = np.meshgrid(np.arange(n) + 0.5, np.arange(n) + 0.5)
-    for x, y in n * np.array([[0.4, 0.5], [0.613, 0.42], [0.5, 0.5]]):
-        blob = np.round(250 * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * (n / 14) ** 2)))
-        small = shrunk(np.stack([blob.astype(np.uint8)] * 3, axis=-1), side)[..., 0].astype(float)
-        here, there = (
-            np.array([light.sum(0), light.sum(1)]) @ np.arange(0.5, len(light)) / light.sum()
-            for light in (small, blob)
-        )
-        assert np.abs(here - there * side / n).max() < 0.005
-
-
 def test_decodes_once(folder: DatasetFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     first = cached_images(folder, "train", folder.records("train"), 32)
     monkeypatch.setattr(images, "decode", lambda *_: pytest.fail("decoded again"))

@@ -5,7 +5,7 @@ from typing import Any, get_args
 import pytest
 from pydantic_core import PydanticCustomError
 
-from phd_exp.training.config.targets import Origin, check_target, locate
+from phd_exp.training.config.targets import Origin, check_target
 
 ADAM = "torch.optim.Adam"
 CHART = {"_target_": "phd_exp.geometry.charts.Cartesian", "_partial_": True}
@@ -57,9 +57,3 @@ def test_what_is_stored_builds_our_own_parts_alone(network: str) -> None:
         assert check_target(inner, "typed") == inner  # type: ignore[arg-type]
         with pytest.raises(PydanticCustomError, match="may not be built from a stored configuration"):
             check_target(inner, "stored")  # type: ignore[arg-type]
-
-
-def test_locates_classes() -> None:
-    from torch.optim import Adam
-
-    assert locate(ADAM, "stored") is Adam
