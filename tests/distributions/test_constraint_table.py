@@ -17,7 +17,7 @@ from phd_exp.distributions.constraints import (
 )
 from phd_exp.distributions.point_estimate import PointDensity
 from phd_exp.geometry import Camera, Cartesian, LogDepth, Projected
-from phd_exp.models.backbones import resnet
+from phd_exp.models.backbones import PooledFeatures
 from phd_exp.models.heads import DistributionHead
 from phd_exp.models.regressor import FocalLengthInput, Regressor
 
@@ -104,7 +104,9 @@ def test_a_decomposed_density_is_convex_only_where_depth_is_as_certain_as_the_ra
 def test_a_whole_network_to_which_f_is_shown_breaks_the_second_constraint(shown: bool) -> None:
     """Of random weights, last layers included; the head is the same."""
     torch.manual_seed(0)
-    network = Regressor(resnet(10), DistributionHead(DEPTH), FocalLengthInput(7, DEPTH) if shown else None)
+    layers = torch.nn.Conv2d(3, 8, 3), torch.nn.ReLU(), torch.nn.AdaptiveAvgPool2d(1), torch.nn.Flatten()
+    backbone = PooledFeatures(torch.nn.Sequential(*layers), 8)
+    network = Regressor(backbone, DistributionHead(DEPTH), FocalLengthInput(7, DEPTH) if shown else None)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.1)
     network = network.double().eval()

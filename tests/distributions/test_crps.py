@@ -11,7 +11,7 @@ from torch.autograd import gradcheck
 from phd_exp.distributions import ProjectedHuber, depth
 from phd_exp.distributions.depth import crps_beyond_distance, half_mean_difference
 
-PRECISIONS = [1e-3, 1e-2, 0.3, 0.999, 1.0, 1.001, 3.0, 30.0, 1e3, 1e4, 1e6]
+PRECISIONS = [1e-3, 0.3, 0.999, 1.0, 1.001, 30.0, 1e4, 1e6]
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(40)
 
 
@@ -37,7 +37,7 @@ def by_quadrature(log_t: float, log_a: torch.Tensor) -> float:
 
 
 def test_is_the_integral_of_the_definition(log_a: torch.Tensor) -> None:
-    p = torch.tensor([1e-9, 1e-3, 0.1, 0.3, 0.5, 0.8, 0.99, 1 - 1e-6], dtype=torch.float64)
+    p = torch.tensor([1e-9, 0.1, 0.3, 0.8, 1 - 1e-6], dtype=torch.float64)
     for log_t in [*depth.depth_icdf(p, log_a).tolist(), 0.0]:
         x = torch.tensor(log_t, dtype=torch.float64)
         score = abs(math.expm1(log_t)) + (crps_beyond_distance(x, log_a) / log_a.exp()).item()

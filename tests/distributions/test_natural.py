@@ -198,7 +198,7 @@ def test_loss_without_log_nu_z_is_convex_in_the_outputs(scale: float) -> None:
         distribution = ProjectedHuber.from_raw(raw, f=F, S=S, mu_z0=MU_Z0)
         return -distribution.log_prob(xyz) - distribution.mu_z.log()
 
-    one, other = convex_points(1000, scale, seed=4), convex_points(1000, scale, seed=6)
+    one, other = convex_points(200, scale, seed=4), convex_points(200, scale, seed=6)
     for xyz in data_set_positions():
         for share in (0.5, 0.1):
             chord = (1 - share) * convex_part(one, xyz) + share * convex_part(other, xyz)

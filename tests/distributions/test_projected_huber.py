@@ -18,7 +18,7 @@ from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.huber import HUBER_COVARIANCE, huber_energy
 from phd_exp.distributions.special import log_normaliser
 
-N_SAMPLES = 200_000
+N_SAMPLES = 100_000
 
 
 @pytest.fixture(scope="session")

@@ -38,13 +38,17 @@ def test_a_sample_is_the_same_alone_and_in_another_order(
 
 
 def test_a_folder_grows_and_keeps_what_it_has(
-    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec, capfd: pytest.CaptureFixture[str]
+    folder: DatasetFolder,
+    small: DatasetFolder,
+    small_spec: DatasetSpec,
+    copied: None,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
-    ensure_rendered(folder, small_spec, n_train=3, n_test=1, workers=1)
+    ensure_rendered(folder, small_spec, n_train=3, n_test=1)
     assert folder.manifest.splits["train"].n == 3
     first = folder.image_path("train", 0).stat().st_mtime_ns
     assert "rendering 4 images" in capfd.readouterr().err
-    ensure_rendered(folder, small_spec, n_train=12, n_test=4, workers=1)
+    ensure_rendered(folder, small_spec, n_train=12, n_test=4)
     assert "rendering the remaining 12 images" in capfd.readouterr().err
     assert folder.image_path("train", 0).stat().st_mtime_ns == first
     ensure_rendered(folder, small_spec, n_train=2, n_test=1)

@@ -12,7 +12,7 @@ from phd_exp.rendering.rays import rotation_matrix
 from phd_exp.rendering.sampling import sample_scene
 
 MakeSpec = Callable[..., DatasetSpec]
-MANY = 2000
+MANY = 1000
 UNLIKELY = 1e-3  # the seeds are fixed: a law either holds at this level for ever or never
 
 
