@@ -3,7 +3,6 @@
 import mpmath as mp
 import pytest
 import torch
-from numpy.polynomial.legendre import leggauss
 from torch.autograd import gradcheck
 
 from phd_exp.distributions import depth
@@ -50,16 +49,6 @@ def a(request: pytest.FixtureRequest) -> float:
     return request.param
 
 
-def test_density_integrates_to_one(a: float) -> None:
-    log_t = depth.depth_icdf(torch.tensor([1e-14, 1 - 1e-14], dtype=torch.float64), log(a))
-    nodes, weights = (torch.from_numpy(part) for part in leggauss(100))
-    mass = 0.0
-    for end in log_t:  # from the mode outwards, in six steps
-        x = end / 6 * (torch.arange(6)[:, None] + (1 + nodes) / 2)
-        mass += float((end.abs() / 12 * weights * (log_density(x, log(a)) + x).exp()).sum())
-    assert mass == pytest.approx(1, abs=1e-9)
-
-
 def test_cdf(a: float) -> None:
     spread = 1 / (1 + a)
     for t in (1 - 0.9 * spread, 1 - 0.1 * spread, 1.0, 1 + 0.1 * spread, 1 + 3 * spread, 1 + 20 * spread):
@@ -69,11 +58,8 @@ def test_cdf(a: float) -> None:
 def test_mean_and_variance(a: float) -> None:
     mean, variance = depth.depth_mean_and_variance(log(a))
     assert (mean.item(), variance.item()) == pytest.approx(exact_moments(a), rel=1e-12)
-
-
-def test_variance_in_float32_does_not_cancel(a: float) -> None:
-    variance = depth.depth_mean_and_variance(log(a).float())[1]
-    assert variance.item() == pytest.approx(exact_moments(a)[1], rel=1e-5)
+    in_float32 = depth.depth_mean_and_variance(log(a).float())[1]
+    assert in_float32.item() == pytest.approx(variance.item(), rel=1e-5), "without cancellation"
 
 
 def test_normaliser_and_mean_keep_their_bounds(a: float) -> None:

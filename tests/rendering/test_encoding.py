@@ -55,14 +55,6 @@ def test_quality_is_paid_in_bytes(pictures: list[np.ndarray], make_spec: MakeSpe
         assert errors == sorted(set(errors))
 
 
-@pytest.mark.parametrize("image_format", ["png", *LOSSY])
-def test_the_same_pixels_are_the_same_bytes(
-    pictures: list[np.ndarray], make_spec: MakeSpec, image_format: ImageFormat
-) -> None:
-    spec = make_spec(image_format=image_format)
-    assert encode(pictures[0].copy(), spec) == encode(pictures[0], spec) != encode(pictures[1], spec)
-
-
 def test_webp_files_hold_the_pixels_of_the_png_files(small: DatasetFolder, small_webp: DatasetFolder) -> None:
     spec = small_webp.manifest.spec
     assert spec.image_format == "webp"

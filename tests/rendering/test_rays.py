@@ -18,7 +18,7 @@ from phd_exp.rendering.rays import (
     truncation,
     visibility,
 )  # fmt: skip
-from phd_exp.rendering.sampling import about_axis, sample_scene, uniform_rotation
+from phd_exp.rendering.sampling import about_axis, uniform_rotation
 from tests.support.renders import placed, silhouettes, with_objects
 
 MakeSpec = Callable[..., DatasetSpec]
@@ -101,16 +101,6 @@ def test_the_axis_of_a_cylinder_is_its_local_z(scenes: list[Scene]) -> None:
     for item, share in ((along, np.pi / 4), (aside, 1.0)):
         pixels = silhouettes(trace_pixels(with_objects(scenes[0], item))).sum()
         assert pixels == pytest.approx(area * share, rel=0.12)
-
-
-def test_a_silhouette_lies_about_the_projected_position(make_spec: MakeSpec) -> None:
-    """Nearly: the near half of a solid looks larger than the far one, by (size / depth)^2 of its own extent."""
-    for index in range(10):
-        scene = sample_scene(make_spec(xy_range=0.2), "train", index)
-        x, y, z = scene.objects[0].position
-        projection = np.array([y, x]) / z * scene.f + scene.S / 2
-        middle = np.argwhere(silhouettes(trace_pixels(scene))).mean(axis=0) + 0.5
-        assert np.abs(middle - projection).max() < 1.5
 
 
 def test_visibility_counts_pixels(scenes: list[Scene]) -> None:

@@ -56,24 +56,6 @@ def test_four_at_once_in_an_empty_folder(
     assert sum(text.count(" images of ") for text in said) == 2, "each shard is rendered once"
 
 
-@pytest.mark.slow
-def test_a_killed_shard_loses_only_samples_in_progress(
-    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec, render_shard: Render
-) -> None:
-    with rendering_elsewhere(folder, small_spec, shard=FIRST) as process:
-        wait_until(lambda: len(journaled(folder)) >= 2)
-        process.kill()
-        process.communicate()
-    done = journaled(folder)
-    assert len(done) < N_TRAIN // 2
-    with held(folder.render_lock) as free:
-        assert free, "the system releases the locks of the dead"
-    assert not render_shard(SECOND)
-    render_shard()
-    assert contents(folder) == contents(small)
-    assert all(path.stat().st_mtime_ns == then for path, then in done.items())
-
-
 @pytest.mark.parametrize("shard", [None, FIRST])
 def test_an_unsharded_render_waits_for_others_and_repeats_nothing(
     folder: DatasetFolder,
