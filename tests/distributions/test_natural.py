@@ -96,17 +96,6 @@ def test_every_output_of_an_untrained_network_learns() -> None:
 EXTREMES = torch.tensor(list(itertools.product((-1e4, 0.0, 1e4), repeat=7)))
 
 
-@pytest.mark.parametrize("scale", [1.0, 1e5])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_extremes_are_finite_with_finite_gradients(dtype: torch.dtype, scale: float) -> None:
-    raw = (scale * EXTREMES).to(dtype).requires_grad_()
-    for xyz in XYZ.to(dtype):
-        value = loss(raw, xyz)
-        (gradient,) = torch.autograd.grad(value.sum(), raw)
-        assert value.isfinite().all()
-        assert gradient.isfinite().all()
-
-
 @pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
 def test_float32_is_near_float64(scale: float) -> None:
     raw = raw_numbers(300, scale, seed=2).requires_grad_()
@@ -131,8 +120,8 @@ def of_any_size(n: int, equal_eigenvalues: bool) -> torch.Tensor:
 
 @pytest.mark.parametrize(
     "raw",
-    [EXTREMES, of_any_size(2000, equal_eigenvalues=False), of_any_size(2000, equal_eigenvalues=True)],
-    ids=["extremes", "any size", "equal eigenvalues"],
+    [EXTREMES, 1e5 * EXTREMES, of_any_size(2000, equal_eigenvalues=False), of_any_size(2000, equal_eigenvalues=True)],
+    ids=["extremes", "further extremes", "any size", "equal eigenvalues"],
 )
 def test_bfloat16_autocast_rounds_nothing_of_the_loss_and_its_gradient(raw: torch.Tensor) -> None:
     """At positions on the edge of the field; as in training, where the backbone alone may be rounded."""

@@ -58,15 +58,6 @@ def test_the_lines_of_a_rendered_data_set_are_detections(dataset: DatasetFolder)
     assert [detection.line.scale for detection in detections] == [record.scale for record in records]
 
 
-def test_blank_lines_count_and_say_nothing(read: Callable) -> None:
-    detections = read(GOOD, "", "  ", GOOD)
-    assert [detection.where[-6:] for detection in detections] == ["line 1", "line 4"]
-
-
-def test_a_number_takes_the_first(read: Callable) -> None:
-    assert len(read(GOOD, GOOD, "not read at all", n=2)) == 2
-
-
 def test_a_position_is_asked_for_where_it_is_needed(read: Callable) -> None:
     (detection,) = read({"file_name": "a.png", "f": 900})
     with pytest.raises(DatasetError, match=r"metadata\.jsonl, line 1: x, y, z are missing"):
@@ -149,6 +140,11 @@ def test_a_box_may_reach_beyond_the_image_but_not_without_end(read: Callable) ->
     assert inside.box(640, 480) == (-600, -100, 1200, 500)
     with pytest.raises(DatasetError, match=r"line 2: box=.* more than 3 times as large"):
         huge.box(640, 480)
+
+
+def test_blank_lines_count_and_a_number_takes_the_first(read: Callable) -> None:
+    detections = read(GOOD, "", "  ", GOOD, "not read at all", n=2)
+    assert [detection.where[-6:] for detection in detections] == ["line 1", "line 4"]
 
 
 def test_too_few_none_and_no_file_at_all(read: Callable, folder: DetectionFolder) -> None:

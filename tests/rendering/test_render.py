@@ -84,16 +84,6 @@ def test_a_missing_library_of_bpy_is_one_line(monkeypatch: pytest.MonkeyPatch) -
         blender.load_bpy()
 
 
-@pytest.mark.parametrize(("key", "value"), [("sensor_size", 224), ("image_format", "webp"), ("image_quality", 90)])
-def test_another_specification_is_refused(small: DatasetFolder, key: str, value: object) -> None:
-    before, spec = contents(small), small.manifest.spec
-    said = f"{key}={getattr(spec, key)}, but {key}={value} is asked for; move"
-    with pytest.raises(DatasetError, match=said) as error:
-        ensure_rendered(small, spec.model_copy(update={key: value}), n_train=20, n_test=4)
-    assert "\n" not in str(error.value)
-    assert contents(small) == before
-
-
 @pytest.mark.parametrize(("key", "value"), [("generator", 0), ("renderer", "bpy 4.2.0")])
 def test_a_folder_of_another_make_is_not_continued(
     folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec, key: str, value: object

@@ -10,7 +10,7 @@ from phd_exp.records.scenes import Scene, Shape
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer, Settings, load_bpy
 from phd_exp.rendering.rays import FACES, NOTHING, cylinder_mask, in_camera_frame, trace_pixels, visibility
-from phd_exp.rendering.sampling import sample_scene, uniform_rotation
+from phd_exp.rendering.sampling import sample_scene
 from tests.support.renders import VARIANTS, with_objects
 
 MakeSpec = Callable[..., DatasetSpec]
@@ -86,26 +86,6 @@ def test_labels_are_those_of_blenders_pixels(
     assert any(cylinder_mask(trace_pixels(scene)).sum() >= 100 for scene in scenes)
     for scene in scenes:
         check(scene, drawn)
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_mesh_and_solid_are_one_shape(
-    make_spec: MakeSpec, drawn: Callable[[Scene], np.ndarray], shape: Shape
-) -> None:
-    """Close up, turned, and stretched by another factor along each axis: silhouettes of 10,000 pixels and more."""
-    scene, rng = sample_scene(make_spec("occl"), "train", 0), np.random.default_rng(0)
-    for _ in range(2):
-        item = scene.objects[SHAPES.index(shape)].model_copy(
-            update={
-                "position": (0.02, -0.03, 3.0),
-                "rotation": uniform_rotation(rng),
-                "dimensions": (0.18, 0.23, 0.28),
-            }
-        )
-        near = with_objects(scene, item).model_copy(update={"f": 1500.0})
-        solid, mesh = cast(near), drawn(near)
-        assert (solid > 0).sum() > 5_000
-        assert (solid != mesh).sum() <= FEW
 
 
 def test_another_view_is_drawn_from_where_its_pose_says(
