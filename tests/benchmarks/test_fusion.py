@@ -23,18 +23,16 @@ LEAST_RATIO = 100
 """Times faster than the conic solver, its problems' set-up included."""
 
 
-def seconds(task: Callable[[], object], device: str) -> tuple[float, float]:
-    """On the clock, until a GPU is idle again; and of processor time."""
-    begin, start = time.perf_counter(), time.process_time()
-    task()
-    if device == "cuda":
-        torch.cuda.synchronize()
-    return time.perf_counter() - begin, time.process_time() - start
-
-
-def medians(task: Callable[[], object], device: str, n: int) -> tuple[float, float]:
-    """Microseconds a problem, on the clock and of processor time."""
-    clock, processor = zip(*(seconds(task, device) for _ in range(ROUNDS)), strict=True)
+def microseconds(task: Callable[[], object], device: str, n: int) -> tuple[float, float]:
+    """Medians a problem, on the clock, until a GPU is idle again, and of processor time."""
+    took = []
+    for _ in range(ROUNDS):
+        begin, start = time.perf_counter(), time.process_time()
+        task()
+        if device == "cuda":
+            torch.cuda.synchronize()
+        took.append((time.perf_counter() - begin, time.process_time() - start))
+    clock, processor = zip(*took, strict=True)
     return 1e6 * median(clock) / n, 1e6 * median(processor) / n
 
 
@@ -67,8 +65,8 @@ def test_a_batch_is_far_faster_than_one_by_one(device: str, unchecked: None, rec
         return fuse(predictions, pose)
 
     solve()  # the first call loads what it needs
-    point, processor = medians(solve, device, n)
-    moments, _ = medians(lambda: fuse(predictions, pose).covariance, device, n)
+    point, processor = microseconds(solve, device, n)
+    moments, _ = microseconds(lambda: fuse(predictions, pose).covariance, device, n)
     whole, solving = one_by_one()
     record(
         f"fuse with certificate, {n} problems of {CAMERAS} cameras, {device}",

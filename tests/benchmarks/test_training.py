@@ -28,13 +28,16 @@ def renders(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+def printed(loop: str, folder: Path, epochs: int, *overrides: str) -> str:
+    """By a process without the checks of annotations that all tests have."""
+    command = [sys.executable, str(HERE / "loops.py"), loop, str(folder), str(epochs), *overrides]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
 def measured(loop: str, folder: Path, *overrides: str) -> dict[str, list[float]]:
-    """In a process without the checks of annotations that all tests have."""
-    done = subprocess.run(
-        [sys.executable, str(HERE / "loops.py"), loop, str(folder), str(EPOCHS), *overrides],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    rows = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    """The figures of each epoch but the first."""
+    lines = printed(loop, folder, EPOCHS, *overrides).splitlines()
+    rows = [json.loads(line) for line in lines if line.startswith("{")]
     assert len(rows) == EPOCHS - 1
     return {key: [row[key] for row in rows] for key in rows[0]}
 
@@ -98,12 +101,10 @@ def test_all_samples_of_the_paper_take_two_gibibytes(tmp_path: Path, record: Cal
     """In addition to the memory of the network and one batch."""
 
     def peak(loop: str, *overrides: str) -> float:
-        command = [sys.executable, str(HERE / "loops.py"), loop, str(tmp_path), "0", "preset=paper", *overrides]
-        return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout) / 2**30
+        return int(printed(loop, tmp_path, 0, "preset=paper", *overrides)) / 2**30
 
     bare, programme = peak("bare", "data.n_train=64", "data.n_test=1"), peak("programme")
     more = programme - bare
-    record(
-        "peak memory, preset=paper", f"{programme:.1f} GiB", f"{bare:.1f} GiB, bare loop", f"+{more:.2f} GiB", "2 GiB"
-    )
+    beside = f"{bare:.1f} GiB, bare loop"
+    record("peak memory, preset=paper", f"{programme:.1f} GiB", beside, f"+{more:.2f} GiB", "2 GiB")
     assert more <= 2

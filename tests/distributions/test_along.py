@@ -12,7 +12,7 @@ from phd_exp.distributions.along import quantiles_along, whitened_marginal
 
 P = np.array([0.005, 0.05, 0.25, 0.5, 0.75, 0.95, 0.995])
 SIDEWAYS = np.array([0.3, -0.4, math.sqrt(0.75)])
-PRECISIONS = [(0.05, 3.0), (1.0, 0.5), (3.0, 10.0), (30.0, 40.0), (300.0, 5.0), (5.0, 1e4)]
+PRECISIONS = [(0.05, 3.0), (3.0, 10.0), (300.0, 5.0), (5.0, 1e4)]
 
 
 def distribution(a: float, A: float) -> ProjectedHuber:
@@ -23,7 +23,7 @@ def distribution(a: float, A: float) -> ProjectedHuber:
 @pytest.mark.parametrize(("a", "A"), PRECISIONS)
 def test_quantiles_are_those_of_samples(a: float, A: float) -> None:
     p = distribution(a, A)
-    n = 200_000
+    n = 50_000
     samples = p.rsample((n,), torch.Generator().manual_seed(0)).numpy() @ SIDEWAYS
     below = (samples[:, None] <= quantiles_along(p, SIDEWAYS, P)).mean(axis=0)
     assert (np.abs(below - P) < 4 * np.sqrt(P * (1 - P) / n)).all()

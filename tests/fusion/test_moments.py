@@ -19,8 +19,8 @@ def log_density(predictions: ProjectedHuber, pose: Pose, v: Tensor) -> Tensor:
 
 
 def grid_moments(predictions: ProjectedHuber, pose: Pose, fused: Fused) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean, covariance and coverage by the midpoint rule on 60^3 points, denser near the optimum."""
-    s = torch.linspace(-3.5, 3.5, 61, dtype=torch.float64)
+    """Mean, covariance and coverage by the midpoint rule on 40^3 points, denser near the optimum."""
+    s = torch.linspace(-3.5, 3.5, 41, dtype=torch.float64)
     s = (s[1:] + s[:-1]) / 2
     axis = torch.sinh(s)  # up to 16 standard deviations
     x = torch.cartesian_prod(axis, axis, axis)[:, None]
@@ -80,7 +80,7 @@ def test_one_camera_has_exactly_the_moments_of_its_prediction() -> None:
 
 @pytest.mark.parametrize("cameras", [2, 4])
 def test_several_cameras_have_the_moments_of_a_dense_grid(cameras: int) -> None:
-    predictions, pose, _ = random_problems(8, cameras, seed=21, outliers=0.0)
+    predictions, pose, _ = random_problems(4, cameras, seed=21, outliers=0.0)
     fused = fuse(predictions, pose, contradiction=0.0)
     mean, covariance, coverage = grid_moments(predictions, pose, fused)
     error = (ratios(fused.covariance, covariance) - 1).abs()
@@ -97,7 +97,7 @@ def test_coverage_is_the_share_of_samples_in_the_ellipsoids() -> None:
     a = torch.tensor([[0.3], [1.0], [4.0], [20.0], [1000.0]], dtype=torch.float64)
     predictions = ProjectedHuber(*(column.expand(5, *column.shape[1:]) for column in columns[:3]), a)
     fused = fuse(predictions, Pose(torch.eye(3), torch.zeros(3)))
-    samples = predictions.rsample((100_000,), torch.Generator().manual_seed(0)).squeeze(2) - fused.mean
+    samples = predictions.rsample((50_000,), torch.Generator().manual_seed(0)).squeeze(2) - fused.mean
     distance = (samples * torch.linalg.solve(fused.covariance, samples.unsqueeze(-1)).squeeze(-1)).sum(-1)
     share = (distance[..., None] <= RADII).double().mean(0)
     torch.testing.assert_close(fused.coverage(LEVELS), share, rtol=0, atol=0.008)

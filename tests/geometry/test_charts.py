@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from phd_exp.geometry import Camera, Cartesian, Chart, DepthScale, LogDepth, Projected, compensated_depth, projected
+from phd_exp.geometry import Camera, Cartesian, Chart, DepthScale, LogDepth, Projected, projected
 
 DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
 CAMERA = Camera(torch.tensor([1200.0, 1500.0, 1500.0, 2000.0], dtype=torch.float64), 224.0)
@@ -62,24 +62,12 @@ def test_projected_agrees_with_the_camera() -> None:
     torch.testing.assert_close(projected(XYZ, CAMERA), CAMERA.project(XYZ) / (CAMERA.S / 2) - 1)
 
 
-def test_depth_scale_of_the_papers_ranges() -> None:
-    assert pytest.approx(2.5e-3) == DEPTH.mu_z0
-    assert pytest.approx(5 / 3) == DEPTH.D
-    assert DEPTH.z_centre == 4.0
-
-
-def test_depth_scale_from_samples_is_that_of_their_range() -> None:
+def test_depth_scale_is_that_of_the_papers_ranges_or_of_samples() -> None:
+    assert (DEPTH.mu_z0, DEPTH.D, DEPTH.z_centre) == pytest.approx((2.5e-3, 5 / 3, 4.0))
     z = torch.tensor([3.0, 5.0, 4.0], dtype=torch.float64)
     f = torch.tensor([2000.0, 1200.0, 1500.0], dtype=torch.float64)
     scale = DepthScale.from_samples(z, f)
     assert (scale.mu_z0, scale.D, scale.z_centre) == pytest.approx((DEPTH.mu_z0, DEPTH.D, DEPTH.z_centre))
-
-
-def test_compensated_depth_spans_one_over_D_to_D() -> None:
-    z, f = torch.tensor([3.0, 5.0], dtype=torch.float64), torch.tensor([2000.0, 1200.0], dtype=torch.float64)
-    xyz = torch.stack([torch.zeros_like(z), torch.zeros_like(z), z], dim=-1)
-    z_p = compensated_depth(xyz, Camera(f, 224.0), DEPTH.mu_z0)
-    torch.testing.assert_close(z_p, torch.tensor([1 / DEPTH.D, DEPTH.D], dtype=torch.float64))
 
 
 @pytest.mark.parametrize(

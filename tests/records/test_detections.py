@@ -58,15 +58,6 @@ def test_the_lines_of_a_rendered_data_set_are_detections(dataset: DatasetFolder)
     assert [detection.line.scale for detection in detections] == [record.scale for record in records]
 
 
-def test_blank_lines_count_and_say_nothing(read: Callable) -> None:
-    detections = read(GOOD, "", "  ", GOOD)
-    assert [detection.where[-6:] for detection in detections] == ["line 1", "line 4"]
-
-
-def test_a_number_takes_the_first(read: Callable) -> None:
-    assert len(read(GOOD, GOOD, "not read at all", n=2)) == 2
-
-
 def test_a_position_is_asked_for_where_it_is_needed(read: Callable) -> None:
     (detection,) = read({"file_name": "a.png", "f": 900})
     with pytest.raises(DatasetError, match=r"metadata\.jsonl, line 1: x, y, z are missing"):
@@ -81,21 +72,16 @@ BAD: list[tuple[Any, str]] = [
     (GOOD | {"cx": 10}, "cx is given alone; expected all of cx, cy"),
     ({"file_name": "a.png", "f": 900, "x": 1, "z": 3}, "x, z is given alone; expected all of x, y, z"),
     (GOOD | {"z": 0}, "z: got 0; expected to be greater than or equal to 0.000001"),
-    (GOOD | {"z": 1e-300}, "z: got 1e-300; expected to be greater than"),
-    (GOOD | {"z": -3.5}, "z: got -3.5; expected to be greater than"),
     (GOOD | {"f": 0}, "f: got 0; expected to be greater than 0"),
-    (GOOD | {"f": -900}, "f: got -900"),
     (GOOD | {"f": "900"}, "f: got '900'; expected a valid number"),
     (GOOD | {"f": True}, "f: got True; expected a valid number"),
     ('{"file_name": "a.png", "f": 900, "x": NaN, "y": 0, "z": 3}', "x: got nan; expected to be a finite"),
     ('{"file_name": "a.png", "f": Infinity, "x": 0, "y": 0, "z": 3}', "f: got inf; expected to be a finite"),
     (GOOD | {"box": [3, 0, 3, 5]}, "expected [left, top, right, bottom] of positive size"),
-    (GOOD | {"box": [0, 9, 3, 5]}, "expected [left, top, right, bottom] of positive size"),
     (GOOD | {"box": [0, 9, 3]}, "box.3: missing"),
     (GOOD | {"bx": [0, 0, 3, 5]}, "bx: unknown key, did you mean 'box'?"),
     (GOOD | {"filename": "a.png"}, "filename: unknown key, did you mean 'file_name'?"),
     (GOOD | {"k1": 0.1}, "k1: a distorted image is no pinhole image; undistort the images first"),
-    (GOOD | {"distortion": [0.1]}, "undistort the images first"),
     (GOOD | {"dist_coeffs": []}, "undistort the images first"),
     ('{"file_name": "a.png", "f": 900', "not JSON"),
     ("[1, 2]", "expected"),
@@ -106,7 +92,6 @@ BAD: list[tuple[Any, str]] = [
     (GOOD | {"file_name": "a\0.png"}, "is no file name"),
     (GOOD | {"cx": 1e300, "cy": 0}, "cx: got 1e+300"),
     (GOOD | {"z": 1e300}, "z: got 1e+300"),
-    (GOOD | {"z": "far"}, "z: got 'far'; expected a valid number"),
     (GOOD | {"f": 1e300}, "f: got 1e+300; expected to be less"),
     (GOOD | {"f": 1e-300}, "f: got 1e-300; expected a focal length in pixels, at least 0.01"),
     (GOOD | {"box": "all"}, "box: got 'all'; expected a valid tuple"),
@@ -155,6 +140,11 @@ def test_a_box_may_reach_beyond_the_image_but_not_without_end(read: Callable) ->
     assert inside.box(640, 480) == (-600, -100, 1200, 500)
     with pytest.raises(DatasetError, match=r"line 2: box=.* more than 3 times as large"):
         huge.box(640, 480)
+
+
+def test_blank_lines_count_and_a_number_takes_the_first(read: Callable) -> None:
+    detections = read(GOOD, "", "  ", GOOD, "not read at all", n=2)
+    assert [detection.where[-6:] for detection in detections] == ["line 1", "line 4"]
 
 
 def test_too_few_none_and_no_file_at_all(read: Callable, folder: DetectionFolder) -> None:

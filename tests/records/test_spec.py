@@ -44,10 +44,6 @@ def test_every_value_has_to_be_given(make_spec: MakeSpec) -> None:
             DatasetSpec(**{name: value for name, value in make_spec() if name != key})
 
 
-def test_what_configuration_files_hold_is_taken(make_spec: MakeSpec) -> None:
-    assert make_spec(f_range=[1200, 2000], z_range=[3, 5], xy_range=1, scale_range=[1, 1]) == make_spec()
-
-
 def test_a_fingerprint_depends_on_every_value_and_on_nothing_else(make_spec: MakeSpec) -> None:
     changes = {
         "variant": "other",

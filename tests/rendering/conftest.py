@@ -1,6 +1,7 @@
 """Specifications, and a few rendered data sets."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -8,9 +9,10 @@ import pytest
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.scenes import Scene
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering import render
 from phd_exp.rendering.render import ensure_rendered
 from phd_exp.rendering.sampling import sample_scene
-from tests.support.renders import N_TEST, N_TRAIN, VARIANTS
+from tests.support.renders import N_TEST, N_TRAIN, VARIANTS, contents, copying, written
 
 # A quarter of the sensor and of the focal length: the same pictures, in a moment.
 SMALL: dict[str, Any] = {"sensor_size": 56, "f_range": (300.0, 500.0), "samples_per_pixel": 1}
@@ -40,12 +42,20 @@ def scenes(make_spec: Callable[..., DatasetSpec]) -> list[Scene]:
 def rendered(
     make_spec: Callable[..., DatasetSpec], tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, DatasetFolder]:
-    """Five training images and one test image of each variant."""
+    """Four training images and one test image of two paired variants, which hold all that the four ever show."""
     root = tmp_path_factory.mktemp("renders")
-    folders = {variant: DatasetFolder(root / variant) for variant in VARIANTS}
+    folders = {variant: DatasetFolder(root / variant) for variant in ("scale", "occl_scale")}
     for variant, folder in folders.items():
-        ensure_rendered(folder, make_spec(variant, **HALF), n_train=5, n_test=1, workers=1)
+        ensure_rendered(folder, make_spec(variant, **HALF), n_train=4, n_test=1, workers=1)
     return folders
+
+
+@pytest.fixture(scope="session")
+def centred(make_spec: Callable[..., DatasetSpec], tmp_path_factory: pytest.TempPathFactory) -> DatasetFolder:
+    """Images of full size, with cylinders whose whole silhouette is inside."""
+    folder = DatasetFolder(tmp_path_factory.mktemp("centred") / "default")
+    ensure_rendered(folder, make_spec(xy_range=0.2), n_train=8, n_test=0, workers=1)
+    return folder
 
 
 @pytest.fixture(scope="session")
@@ -68,6 +78,26 @@ def small_webp(small_spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory
 
 
 @pytest.fixture
-def folder(tmp_path: Any) -> DatasetFolder:
+def folder(tmp_path: Path) -> DatasetFolder:
     """A data set that does not exist yet."""
     return DatasetFolder(tmp_path / "default")
+
+
+@pytest.fixture
+def copied(small: DatasetFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Images come from `small`, not from workers."""
+    monkeypatch.setattr(render, "render_all", copying(small))
+
+
+@pytest.fixture
+def complete(small: DatasetFolder, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """The same call completes a folder, here by copies, to the bytes of `small`, and touches no finished image."""
+
+    def complete(folder: DatasetFolder, kept: dict[Path, int]) -> None:
+        with monkeypatch.context() as patched:
+            patched.setattr(render, "render_all", copying(small))
+            ensure_rendered(folder, small.manifest.spec, N_TRAIN, N_TEST)
+        assert contents(folder) == contents(small)
+        assert kept.items() <= written(folder).items()
+
+    return complete

@@ -2,7 +2,7 @@
 
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -29,15 +29,8 @@ def refused(folder: DatasetFolder, spec: DatasetSpec, reason: str) -> dict[Path,
     return journaled(folder)
 
 
-def resumed(folder: DatasetFolder, small: DatasetFolder, kept: dict[Path, int]) -> None:
-    """The same call completes the folder and does not render finished images again."""
-    ensure_rendered(folder, small.manifest.spec, N_TRAIN, N_TEST, workers=1)
-    assert contents(folder) == contents(small)
-    assert all(path.stat().st_mtime_ns == moment for path, moment in kept.items())
-
-
 def test_a_full_disk_is_one_line_and_nothing_is_lost(
-    disk: Path, small: DatasetFolder, small_spec: DatasetSpec
+    disk: Path, small_spec: DatasetSpec, complete: Callable[..., None]
 ) -> None:
     """Full before the first byte, among the images, and when the journals become `metadata.jsonl`."""
     folder = DatasetFolder(disk / "default")
@@ -47,14 +40,14 @@ def test_a_full_disk_is_one_line_and_nothing_is_lost(
     some = refused(folder, small_spec, "No space left on device")
     assert 0 < len(some) < N_TRAIN + N_TEST
     make_room(disk)
-    resumed(folder, small, some)
+    complete(folder, some)
 
     unsealed(folder)
     leave_room(disk, 8 * KIB)
     every = refused(folder, small_spec, "No space left on device")
     assert len(every) == N_TRAIN + N_TEST
     make_room(disk)
-    resumed(folder, small, every)
+    complete(folder, every)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="the system has no file that is always full")
@@ -70,10 +63,10 @@ def test_a_journal_without_room_is_one_line(
 
 
 def test_a_disk_that_turns_read_only_serves_its_images(
-    disk: Path, small: DatasetFolder, small_spec: DatasetSpec
+    disk: Path, small: DatasetFolder, small_spec: DatasetSpec, copied: None
 ) -> None:
     folder = DatasetFolder(disk / "default")
-    ensure_rendered(folder, small_spec, 3, 1, workers=1)
+    ensure_rendered(folder, small_spec, 3, 1)
     before = contents(folder)
     remount(disk, "ro")
     refused(folder, small_spec, "Read-only file system")
@@ -83,7 +76,7 @@ def test_a_disk_that_turns_read_only_serves_its_images(
 
 
 def test_a_folder_that_disappears_amid_a_render_is_one_line(
-    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec, tmp_path: Path
+    folder: DatasetFolder, small_spec: DatasetSpec, complete: Callable[..., None], tmp_path: Path
 ) -> None:
     """A file in its place is refused even to root, who may write wherever there is a folder."""
     train, away = folder.split_folder("train"), tmp_path / "away"
@@ -101,4 +94,4 @@ def test_a_folder_that_disappears_amid_a_render_is_one_line(
     away.rename(train)
     safe = journaled(folder)
     assert len(safe) >= 2
-    resumed(folder, small, safe)
+    complete(folder, safe)

@@ -1,13 +1,11 @@
-"""A rendered folder is read by other programmes as it is: Hugging Face `datasets`, and plain pandas."""
+"""A rendered folder is read by other programmes as it is: Hugging Face `datasets`."""
 
 import importlib
 import json
-import math
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
-import pandas
 import pytest
 
 from phd_exp.records.dataset import SPLITS, DatasetFolder
@@ -50,16 +48,3 @@ def test_hugging_face_reads_it(folder: DatasetFolder, datasets: ModuleType, tmp_
             image = row.pop("image")
             assert (np.asarray(image) == pixels(folder, record)).all()
             assert row == as_read(record)
-
-
-def test_pandas_reads_it(folder: DatasetFolder) -> None:
-    for split in SPLITS:
-        records = folder.records(split)
-        # without precise_float the last bit of a number may differ
-        table = pandas.read_json(folder.metadata_path(split), lines=True, precise_float=True)
-        assert list(table.columns) == list(SampleRecord.model_fields)
-        for row, record in zip(table.to_dict("records"), records, strict=True):
-            for key in ("file_name", "index", "split", "scene", "view", "sha256"):
-                assert row[key] == getattr(record, key)
-            for key in ("x", "y", "z", "f", "S", "scale", "visibility", "truncation"):
-                assert math.isclose(row[key], getattr(record, key), rel_tol=1e-15)

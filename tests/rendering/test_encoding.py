@@ -10,7 +10,6 @@ from phd_exp.data.sources import RenderedSource
 from phd_exp.records.dataset import SPLITS, DatasetFolder
 from phd_exp.records.spec import DatasetSpec, ImageFormat
 from phd_exp.rendering.pixels import encode, read_light
-from phd_exp.rendering.render import ensure_rendered
 from tests.support.renders import decoded
 
 MakeSpec = Callable[..., DatasetSpec]
@@ -18,11 +17,9 @@ LOSSY: tuple[ImageFormat, ...] = ("webp", "jpeg")
 
 
 @pytest.fixture(scope="module")
-def pictures(make_spec: MakeSpec, tmp_path_factory: pytest.TempPathFactory) -> list[np.ndarray]:
+def pictures(centred: DatasetFolder) -> list[np.ndarray]:
     """Images (S, S, 3) of full size, as the path tracer leaves them."""
-    folder = DatasetFolder(tmp_path_factory.mktemp("pictures") / "occl_scale")
-    ensure_rendered(folder, make_spec("occl_scale"), n_train=2, n_test=0, workers=1)
-    return [decoded(folder.image_path("train", index).read_bytes()) for index in range(2)]
+    return [decoded(centred.image_path("train", index).read_bytes()) for index in range(2)]
 
 
 def psnr(one: np.ndarray, other: np.ndarray) -> float:
@@ -56,14 +53,6 @@ def test_quality_is_paid_in_bytes(pictures: list[np.ndarray], make_spec: MakeSpe
         sizes, errors = [len(content) for content in contents], [psnr(decoded(c), pixels) for c in contents]
         assert sizes == sorted(set(sizes))
         assert errors == sorted(set(errors))
-
-
-@pytest.mark.parametrize("image_format", ["png", *LOSSY])
-def test_the_same_pixels_are_the_same_bytes(
-    pictures: list[np.ndarray], make_spec: MakeSpec, image_format: ImageFormat
-) -> None:
-    spec = make_spec(image_format=image_format)
-    assert encode(pictures[0].copy(), spec) == encode(pictures[0], spec) != encode(pictures[1], spec)
 
 
 def test_webp_files_hold_the_pixels_of_the_png_files(small: DatasetFolder, small_webp: DatasetFolder) -> None:

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -23,14 +24,10 @@ from tests.support.renders import (
     rendering_elsewhere,
     unsealed,
     wait_until,
+    written,
 )
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self").exists(), reason="finds processes through /proc")
-
-
-def written(folder: DatasetFolder) -> dict[Path, int]:
-    """When each image on disk was written, ns."""
-    return {path: path.stat().st_mtime_ns for path in folder.root.rglob("*.png")}
 
 
 def render_workers(parent: int) -> list[int]:
@@ -57,10 +54,10 @@ def alive(process: int) -> bool:
 
 @pytest.mark.parametrize("stop", [signal.SIGKILL, signal.SIGINT], ids=["kill", "interrupt"])
 def test_a_stopped_parent_leaves_no_workers_and_its_images_are_kept(
-    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec, stop: signal.Signals
+    folder: DatasetFolder, small_spec: DatasetSpec, complete: Callable[..., None], stop: signal.Signals
 ) -> None:
-    with rendering_elsewhere(folder, small_spec, workers=2) as process:
-        wait_until(lambda: len(render_workers(process.pid)) == 2)
+    with rendering_elsewhere(folder, small_spec) as process:
+        wait_until(lambda: render_workers(process.pid))
         # before there are images, because this search takes as long as rendering some of them
         workers = render_workers(process.pid)
         wait_until(lambda: len(journaled(folder)) >= 2)
@@ -71,14 +68,12 @@ def test_a_stopped_parent_leaves_no_workers_and_its_images_are_kept(
             assert not any(alive(worker) for worker in workers)
         wait_until(lambda: not any(alive(worker) for worker in workers))
     assert 2 <= len(done) < N_TRAIN + N_TEST
-    assert len(written(folder)) <= len(done) + 2
-    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=1)
-    assert contents(folder) == contents(small)
-    assert done.items() <= written(folder).items(), "finished images are not rendered again"
+    assert len(written(folder)) <= len(done) + 1
+    complete(folder, done)
 
 
 def test_a_killed_worker_is_one_line_and_its_work_is_kept(
-    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec
+    folder: DatasetFolder, small_spec: DatasetSpec, complete: Callable[..., None]
 ) -> None:
     def kill_one() -> None:
         wait_until(lambda: journaled(folder))
@@ -92,29 +87,13 @@ def test_a_killed_worker_is_one_line_and_its_work_is_kept(
     assert not render_workers(os.getpid())
     done = journaled(folder)
     assert done
-    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=1)
-    assert contents(folder) == contents(small)
-    assert done.items() <= written(folder).items()
-
-
-def test_two_at_once_share_the_work(
-    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec, capfd: pytest.CaptureFixture[str]
-) -> None:
-    with rendering_elsewhere(folder, small_spec) as process:
-        wait_until(lambda: journaled(folder))
-        ensure_rendered(folder, small_spec, N_TRAIN, N_TEST)
-        process.communicate()
-        assert process.returncode == 0
-    assert contents(folder) == contents(small)
-    said = capfd.readouterr().err
-    assert "another process is rendering here; waiting" in said
-    assert "rendering the remaining" not in said
+    complete(folder, done)
 
 
 def test_a_torn_last_line_is_rendered_again_and_a_torn_line_elsewhere_is_named(
-    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec
+    folder: DatasetFolder, small_spec: DatasetSpec, copied: None, complete: Callable[..., None]
 ) -> None:
-    ensure_rendered(folder, small_spec, 3, 0, workers=1)
+    ensure_rendered(folder, small_spec, 3, 0)
     unsealed(folder)
     journal = folder.journal_path("train")
     first, second, third = journal.read_text().splitlines(keepends=True)
@@ -125,8 +104,7 @@ def test_a_torn_last_line_is_rendered_again_and_a_torn_line_elsewhere_is_named(
     assert journal.read_text() == broken
 
     journal.write_text(first + second + third[:100])
-    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST, workers=1)
-    assert contents(folder) == contents(small)
+    complete(folder, {})
 
 
 def kill_amid_work(process: subprocess.Popen[str], folder: DatasetFolder, moments: random.Random) -> None:

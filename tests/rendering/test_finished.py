@@ -147,8 +147,8 @@ def test_without_blender_files_can_be_verified(
 
 
 def test_a_mask_for_every_sample(rendered: dict[str, DatasetFolder], tmp_path: Path) -> None:
-    folder = rendered["occl"]
-    assert write_masks(folder, tmp_path / "masks") == 6
+    folder = rendered["occl_scale"]
+    assert write_masks(folder, tmp_path / "masks") == 5
     for record in folder.records("train"):
         with Image.open(tmp_path / "masks" / "train" / record.file_name) as image:
             assert image.mode == "1"

@@ -70,13 +70,7 @@ def motions(camera: Camera) -> dict[str, Motion]:
         return symmetries(torch.tensor([values], dtype=torch.float64))
 
     turn = small_turns(torch.tensor([[1.0, 0.7, 0.9, -0.9]], dtype=torch.float64), 1.3, camera)
-    return {
-        "mirror": signs(-1, 1, 1),
-        "half turn": signs(-1, -1, 1),
-        "quarter turn": signs(-1, 1, -1),
-        "zoom, roll and tilt": turn,
-        "all": turn.after(signs(1, -1, -1)),
-    }
+    return {"mirror": signs(-1, 1, 1), "quarter turn, zoom, roll and tilt": turn.after(signs(1, -1, -1))}
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +102,7 @@ def difference(picture: np.ndarray, warp: np.ndarray, scene: Scene) -> float:
     return float(np.abs(picture.astype(float) - warp)[within].mean())
 
 
-@pytest.mark.parametrize("name", ["mirror", "half turn", "quarter turn", "zoom, roll and tilt", "all"])
+@pytest.mark.parametrize("name", ["mirror", "quarter turn, zoom, roll and tilt"])
 def test_a_moved_camera_sees_the_warped_picture(
     scene: Scene, camera: Camera, pictures: dict[str, np.ndarray], name: str
 ) -> None:

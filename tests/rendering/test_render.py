@@ -38,13 +38,17 @@ def test_a_sample_is_the_same_alone_and_in_another_order(
 
 
 def test_a_folder_grows_and_keeps_what_it_has(
-    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec, capfd: pytest.CaptureFixture[str]
+    folder: DatasetFolder,
+    small: DatasetFolder,
+    small_spec: DatasetSpec,
+    copied: None,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
-    ensure_rendered(folder, small_spec, n_train=3, n_test=1, workers=1)
+    ensure_rendered(folder, small_spec, n_train=3, n_test=1)
     assert folder.manifest.splits["train"].n == 3
     first = folder.image_path("train", 0).stat().st_mtime_ns
     assert "rendering 4 images" in capfd.readouterr().err
-    ensure_rendered(folder, small_spec, n_train=12, n_test=4, workers=1)
+    ensure_rendered(folder, small_spec, n_train=12, n_test=4)
     assert "rendering the remaining 12 images" in capfd.readouterr().err
     assert folder.image_path("train", 0).stat().st_mtime_ns == first
     ensure_rendered(folder, small_spec, n_train=2, n_test=1)
@@ -78,16 +82,6 @@ def test_a_missing_library_of_bpy_is_one_line(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(blender.importlib, "import_module", broken)
     with pytest.raises(RenderError, match=r"libXi\.so\.6.*apt-get install .*libxi6"):
         blender.load_bpy()
-
-
-@pytest.mark.parametrize(("key", "value"), [("sensor_size", 224), ("image_format", "webp"), ("image_quality", 90)])
-def test_another_specification_is_refused(small: DatasetFolder, key: str, value: object) -> None:
-    before, spec = contents(small), small.manifest.spec
-    said = f"{key}={getattr(spec, key)}, but {key}={value} is asked for; move"
-    with pytest.raises(DatasetError, match=said) as error:
-        ensure_rendered(small, spec.model_copy(update={key: value}), n_train=20, n_test=4)
-    assert "\n" not in str(error.value)
-    assert contents(small) == before
 
 
 @pytest.mark.parametrize(("key", "value"), [("generator", 0), ("renderer", "bpy 4.2.0")])

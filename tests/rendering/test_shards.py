@@ -19,10 +19,10 @@ Render = Callable[..., bool]
 
 
 @pytest.fixture
-def render_shard(folder: DatasetFolder, small_spec: DatasetSpec) -> Render:
-    """Render a shard, or everything, by one worker."""
+def render_shard(folder: DatasetFolder, small_spec: DatasetSpec, copied: None) -> Render:
+    """Render a shard, or everything; the images are copies."""
     return lambda shard=None, n_train=N_TRAIN, n_test=N_TEST: ensure_rendered(
-        folder, small_spec, n_train, n_test, workers=1, shard=shard
+        folder, small_spec, n_train, n_test, shard=shard
     )
 
 
@@ -47,7 +47,7 @@ def test_four_at_once_in_an_empty_folder(
 ) -> None:
     with ExitStack() as stack:
         racing = [
-            stack.enter_context(rendering_elsewhere(folder, small_spec, shard=shard))
+            stack.enter_context(rendering_elsewhere(folder, small_spec, shard=shard, source=small))
             for shard in (FIRST, SECOND, FIRST, SECOND)
         ]
         said = [process.communicate()[1] for process in racing]
@@ -56,32 +56,16 @@ def test_four_at_once_in_an_empty_folder(
     assert sum(text.count(" images of ") for text in said) == 2, "each shard is rendered once"
 
 
-@pytest.mark.slow
-def test_a_killed_shard_loses_only_samples_in_progress(
-    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec, render_shard: Render
-) -> None:
-    with rendering_elsewhere(folder, small_spec, shard=FIRST) as process:
-        wait_until(lambda: len(journaled(folder)) >= 2)
-        process.kill()
-        process.communicate()
-    done = journaled(folder)
-    assert len(done) < N_TRAIN // 2
-    with held(folder.render_lock) as free:
-        assert free, "the system releases the locks of the dead"
-    assert not render_shard(SECOND)
-    render_shard()
-    assert contents(folder) == contents(small)
-    assert all(path.stat().st_mtime_ns == then for path, then in done.items())
-
-
-def test_an_unsharded_render_waits_for_shards_and_repeats_nothing(
+@pytest.mark.parametrize("shard", [None, FIRST])
+def test_an_unsharded_render_waits_for_others_and_repeats_nothing(
     folder: DatasetFolder,
     small: DatasetFolder,
     small_spec: DatasetSpec,
     render_shard: Render,
+    shard: Shard | None,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    with rendering_elsewhere(folder, small_spec, shard=FIRST) as process:
+    with rendering_elsewhere(folder, small_spec, shard=shard, source=small) as process:
         wait_until(lambda: journaled(folder))
         render_shard()
         process.communicate()
@@ -89,10 +73,9 @@ def test_an_unsharded_render_waits_for_shards_and_repeats_nothing(
     assert contents(folder) == contents(small)
     said = capfd.readouterr().err
     assert "another process is rendering here; waiting" in said
-    assert "rendering the remaining 8 images" in said
+    assert ("rendering the remaining 8 images" in said) is (shard is not None)
 
 
-@pytest.mark.slow
 def test_a_shard_of_more_samples_than_the_others_seals_no_gap(
     folder: DatasetFolder, small: DatasetFolder, render_shard: Render
 ) -> None:

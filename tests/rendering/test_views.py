@@ -15,7 +15,7 @@ from phd_exp.rendering.samples import describe
 from phd_exp.rendering.sampling import CLEARANCE, sample_scene, scene_and_view
 
 MakeSpec = Callable[..., DatasetSpec]
-SCENES, VIEWS = 400, 4
+SCENES, VIEWS = 200, 4
 UNLIKELY = 1e-3  # the seeds are fixed: a law either holds at this level for ever or never
 
 

@@ -4,7 +4,7 @@ import io
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,8 @@ import numpy as np
 from PIL import Image
 
 from phd_exp.records.dataset import SPLITS, DatasetFolder
-from phd_exp.records.files import read_jsonl
-from phd_exp.records.scenes import SampleRecord, Scene, SceneObject
+from phd_exp.records.files import read_jsonl, write_atomic
+from phd_exp.records.scenes import SampleRecord, Scene, SceneObject, Split
 from phd_exp.records.spec import DatasetSpec, Shard
 from phd_exp.rendering.rays import NOTHING, Hits, Mask
 
@@ -29,6 +29,11 @@ def contents(folder: DatasetFolder) -> dict[str, bytes]:
     """All files of a data set except its cache."""
     files = (path for path in folder.root.rglob("*") if path.is_file() and folder.cache not in path.parents)
     return {str(path.relative_to(folder.root)): path.read_bytes() for path in files}
+
+
+def written(folder: DatasetFolder) -> dict[Path, int]:
+    """When each image on disk was written, ns."""
+    return {path: path.stat().st_mtime_ns for path in folder.root.rglob("*.png")}
 
 
 def journaled(folder: DatasetFolder) -> dict[Path, int]:
@@ -73,6 +78,21 @@ def wait_until(condition: Callable[[], object]) -> None:
         time.sleep(0.005)
 
 
+def copying(source: DatasetFolder, seconds: float = 0.0) -> Callable[..., Iterator[SampleRecord]]:
+    """`render_all` whose images are copies, each after a pause: for laws of what is rendered when."""
+    records = {split: source.records(split) for split in SPLITS}
+
+    def render_all(
+        folder: DatasetFolder, spec: DatasetSpec, samples: Sequence[tuple[Split, int]], workers: int
+    ) -> Iterator[SampleRecord]:
+        for split, index in samples:
+            time.sleep(seconds)
+            write_atomic(folder.image_path(split, index), source.image_path(split, index).read_bytes())
+            yield records[split][index]
+
+    return render_all
+
+
 @contextmanager
 def rendering_elsewhere(
     folder: DatasetFolder,
@@ -80,17 +100,24 @@ def rendering_elsewhere(
     workers: int = 1,
     n: tuple[int, int] = (N_TRAIN, N_TEST),
     shard: Shard | None = None,
+    source: DatasetFolder | None = None,
 ) -> Iterator[subprocess.Popen[str]]:
-    """`ensure_rendered` in a process, and a group of processes, of its own, which is killed at the end."""
+    """`ensure_rendered` in a process, and a group of processes, of its own, which is killed at the end.
+
+    With a `source`, its images are copied, slowly.
+    """
+    stand_in = f"render.render_all = copying(DatasetFolder({str(source.root)!r}), 0.03)" if source else ""
     script = (
         # a shell makes background processes ignore interrupts, and this process would inherit that
         "import signal\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from phd_exp.records.dataset import DatasetFolder\n"
         "from phd_exp.records.spec import DatasetSpec, Shard\n"
-        "from phd_exp.rendering.render import ensure_rendered\n"
+        "from phd_exp.rendering import render\n"
+        "from tests.support.renders import copying\n"
+        f"{stand_in}\n"
         f"spec = DatasetSpec.model_validate_json({spec.model_dump_json()!r})\n"
-        f"ensure_rendered(DatasetFolder({str(folder.root)!r}), spec, *{n}, {workers}, shard={shard!r})\n"
+        f"render.ensure_rendered(DatasetFolder({str(folder.root)!r}), spec, *{n}, {workers}, shard={shard!r})\n"
     )
     options: dict[str, Any] = {"stderr": subprocess.PIPE, "text": True, "start_new_session": True}
     with subprocess.Popen([sys.executable, "-c", script], cwd=HOME, **options) as process:
