@@ -67,7 +67,7 @@ def _rewrite(folder: RunFolder) -> None:
 
 def _fail(folder: RunFolder) -> None:
     folder.write_config({"model": {"name": HOSTILE}})
-    folder.write_metrics([{"epoch": -1, "test/nll": 3.0, HOSTILE: 1.0}, {"epoch": 0, "test/nll": "NaN"}])
+    folder.write_metrics([{"epoch": -1, "test/nll": 3.0, HOSTILE: 1.0}, {"epoch": 0, "test/nll": None}])
     with pytest.raises(ValueError, match="script"), folder.recording(data_manifest=None):
         raise ValueError(f"</script><script>window.owned=1</script>{HOSTILE}")
 
