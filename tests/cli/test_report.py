@@ -70,18 +70,12 @@ def test_nothing_is_written_where_nothing_is_recorded(phd_exp: Callable, tmp_pat
         ("out=", "out=: expected key=value; report takes runs=, out= (see "),
         ("runs", "runs: expected key=value; report takes runs=, out= (see "),
         ("runs=x", "x: no such folder; train first, or name another by runs=DIR"),
+        ("out=file", "file/measured: cannot be written ("),
     ],
 )
 def test_a_mistake_is_one_line(phd_exp: Callable, runs: Path, argument: str, said: str) -> None:
+    Path("file").write_text("in the way")
     outcome = phd_exp("report", argument)
     assert (outcome.status, outcome.out) == (1, "")
     (line,) = outcome.err.splitlines()
     assert line.startswith(f"error: {said}")
-
-
-def test_a_folder_in_the_way_is_one_line(phd_exp: Callable, runs: Path, tmp_path: Path) -> None:
-    (tmp_path / "report").write_text("in the way")
-    outcome = phd_exp("report")
-    assert outcome.status == 1
-    (line,) = outcome.err.splitlines()
-    assert line.startswith("error: report/measured: cannot be written (")

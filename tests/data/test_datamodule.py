@@ -54,12 +54,6 @@ def test_normalised_truth_does_not_depend_on_image_size(
     assert module.source.constant_f == pytest.approx(math.sqrt(400 * 600) * image_size / 64)
 
 
-def test_depth_scale_comes_from_the_specification(folder: DatasetFolder, spec: DatasetSpec) -> None:
-    depth = data(folder, spec).source.depth
-    assert depth.mu_z0 == pytest.approx(math.sqrt((5 / 400) * (3 / 600)))
-    assert math.sqrt((5 / 400) / (3 / 600)) == pytest.approx(depth.D)
-
-
 def test_held_out_samples_follow_those_trained_on(folder: DatasetFolder, spec: DatasetSpec) -> None:
     module = data(folder, spec, n_train=3, n_held_out=2)
     whole = data(folder, spec)
