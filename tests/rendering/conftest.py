@@ -12,17 +12,11 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering import render
 from phd_exp.rendering.render import ensure_rendered
 from phd_exp.rendering.sampling import sample_scene
-from tests.support.renders import N_TEST, N_TRAIN, VARIANTS, contents, copying, written
+from tests.support.renders import N_TEST, N_TRAIN, contents, copying, written
 
 # A quarter of the sensor and of the focal length: the same pictures, in a moment.
 SMALL: dict[str, Any] = {"sensor_size": 56, "f_range": (300.0, 500.0), "samples_per_pixel": 1}
 HALF: dict[str, Any] = {"sensor_size": 112, "f_range": (600.0, 1000.0)}
-
-
-@pytest.fixture(scope="session")
-def specs(make_spec: Callable[..., DatasetSpec]) -> dict[str, DatasetSpec]:
-    """The four variants."""
-    return {variant: make_spec(variant) for variant in VARIANTS}
 
 
 @pytest.fixture(scope="session")

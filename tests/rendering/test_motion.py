@@ -18,9 +18,8 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.antialias import edges
 from phd_exp.rendering.rays import trace_pixels
 from phd_exp.rendering.sampling import sample_scene
-from tests.support.renders import silhouettes
+from tests.support.renders import HOME, silhouettes
 
-HOME = Path(__file__).parents[2]
 RIM = 3  # px around silhouettes, which bilinear interpolation blurs
 NOISE = 1.0  # grey values: of the tracer, whose random numbers differ, and of interpolation
 
