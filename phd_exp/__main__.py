@@ -10,10 +10,8 @@ from phd_exp.cli.help import OF_VERB, VERBS, text_of
 
 HELP = {"-h", "--help", "help"}
 COMPLETION = {"-sc", "--shell-completion"}
-TYPED = "COMP_LINE"
-"""The variable with the line that a shell wants completed."""
-NOBODY_READS = 128 + 13
-"""The exit status that a shell reports for a programme ended by SIGPIPE."""
+TYPED = "COMP_LINE"  # the variable with the line that a shell wants completed
+NOBODY_READS = 128 + 13  # the exit status that a shell reports for a programme ended by SIGPIPE
 
 
 def main(arguments: list[str] | None = None) -> int:

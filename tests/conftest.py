@@ -1,6 +1,7 @@
 """What all tests share: shapes checked at run time, the command line called in this process."""
 
 from collections.abc import Callable, Iterator
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -38,8 +39,9 @@ class Outcome:
 
 @pytest.fixture(scope="session")
 def composed() -> Callable[..., dict[str, Any]]:
-    """The configuration that Hydra composes from overrides, as plain containers."""
+    """The configuration that Hydra composes from overrides, as plain containers; each composed once."""
 
+    @cache
     def compose(*overrides: str) -> dict[str, Any]:
         with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
             config = hydra.compose("config", list(overrides))
@@ -47,7 +49,7 @@ def composed() -> Callable[..., dict[str, Any]]:
         assert isinstance(plain, dict)
         return {str(key): value for key, value in plain.items()}
 
-    return compose
+    return lambda *overrides: deepcopy(compose(*overrides))
 
 
 @pytest.fixture(scope="session")
@@ -92,8 +94,7 @@ def chromium() -> Iterator[Any]:
     sync_api = pytest.importorskip("playwright.sync_api")
     with sync_api.sync_playwright() as driver:
         browser = driver.chromium.launch(
-            executable_path=executable,
-            args=["--no-sandbox", "--disable-gpu", "--disable-background-networking"],
+            executable_path=executable, args=["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
         )
         yield browser
         browser.close()

@@ -9,15 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import field_validator
 
-from phd_exp.cli.arguments import (
-    Arguments,
-    four_numbers,
-    loaded,
-    output_folder,
-    parsed,
-    predicted,
-    require_file,
-)
+from phd_exp.cli.arguments import Arguments, four_numbers, loaded, output_folder, parsed, predicted, require_file
 from phd_exp.records.detections import Observed, detections_in, observed
 from phd_exp.records.errors import ConfigError, listed
 from phd_exp.records.files import write_atomic

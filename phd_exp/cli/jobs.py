@@ -21,12 +21,10 @@ from phd_exp.cli.frame import Ending, Stopped, ending_with, failure, print_error
 from phd_exp.records.errors import ConfigError, RunError, nearest
 from phd_exp.records.processes import usable_cores
 
-LONGEST = 400
-"""Characters of Hydra's messages that are repeated."""
+LONGEST = 400  # characters of Hydra's messages that are repeated
 REFUSED = (HydraException, OmegaConfBaseException, ValueError, ArithmeticError, RecursionError)
 """The errors that a bad override raises; ValueError for a group set to null."""
-HOME = uuid.uuid4().hex
-"""Names this process: another process that imports this module has another value."""
+HOME = uuid.uuid4().hex  # names this process: another process that imports this module has another value
 
 Task = Callable[[dict[str, Any], list[str], int], float | None]
 """Takes the resolved configuration, its overrides and the number of cores to use; returns the score, if any."""

@@ -20,8 +20,7 @@ if TYPE_CHECKING:  # imports of seconds, which follow the checks of the argument
 
 BOX = four_numbers("box=LEFT,TOP,RIGHT,BOTTOM in pixels")
 OF_A_CAMERA = ("f", "fx", "fy", "cx", "cy", "box")
-LONGEST_STEM = 50
-"""Characters of an image's name in the name of its picture."""
+LONGEST_STEM = 50  # characters of an image's name in the name of its picture
 
 
 class PredictArguments(Arguments):

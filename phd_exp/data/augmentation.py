@@ -17,8 +17,7 @@ from phd_exp.data.batches import Batch
 from phd_exp.geometry.camera import middles
 from phd_exp.geometry.motion import Motion, small_turns, symmetries
 
-FIELD = 512
-"""Side of the field of standard normal numbers from which the noise of each image is cut, pixels."""
+FIELD = 512  # side of the field of standard normal numbers from which the noise of each image is cut, pixels
 
 
 @dataclass(frozen=True)
@@ -153,9 +152,7 @@ class Augmentation:
 
 
 def _rearranged(
-    image: UInt8[Tensor, "batch side side 3"],
-    signs: Float[Tensor, "batch 3"],
-    colours: Int[Tensor, "batch 3"],
+    image: UInt8[Tensor, "batch side side 3"], signs: Float[Tensor, "batch 3"], colours: Int[Tensor, "batch 3"]
 ) -> UInt8[Tensor, "batch side side 3"]:
     """The images `warped` by `symmetries` of these signs, without interpolation; with the channels in that order.
 

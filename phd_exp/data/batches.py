@@ -12,8 +12,7 @@ from torch import Tensor
 
 from phd_exp.geometry.camera import Camera
 
-OCTANTS = 8
-"""Combinations of three signs."""
+OCTANTS = 8  # combinations of three signs
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from phd_exp.records.parsing import parse_json
 from phd_exp.records.processes import announce, held
 
 DECODERS = 4
-LARGEST_AT_ONCE = 1 << 26
-"""Pixels decoded at the same time."""
+LARGEST_AT_ONCE = 1 << 26  # pixels decoded at the same time
 
 Job = TypeVar("Job")
 Fill = Callable[[np.ndarray, Job], None]

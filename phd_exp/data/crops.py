@@ -15,21 +15,16 @@ from phd_exp.records.errors import DatasetError
 from phd_exp.records.files import require_plain
 from phd_exp.records.images import FORMATS, LARGEST_IMAGE, decoding, pillow_warnings
 
-GREY = (128, 128, 128)
-"""The colour of transparent pixels and of those beyond the edges of an image."""
+GREY = (128, 128, 128)  # the colour of transparent pixels and of those beyond the edges of an image
 PLAIN = ("1", "L", "RGB", "YCbCr", "CMYK")
 WITH_ALPHA = ("P", "PA", "LA", "La", "RGBA", "RGBa")  # a palette may contain a transparent colour
 SIXTEEN_BITS = ("I;16", "I;16L", "I;16B", "I;16N")
-ONE_PICTURE = ("JPEG", "MPO")
-"""Formats whose further frames are previews and depth maps."""
-MARGIN = 2
-"""Pixels around a position read by bicubic interpolation."""
-FINE = 4
-"""Samples along a pixel of the view at the lowest density."""
+ONE_PICTURE = ("JPEG", "MPO")  # formats whose further frames are previews and depth maps
+MARGIN = 2  # pixels around a position read by bicubic interpolation
+FINE = 4  # samples along a pixel of the view at the lowest density
 FINEST = 16
 """Largest number of samples along a pixel of the view; near 90 degrees from the optical axis it has no bound."""
-LARGEST_STRIPE = 1 << 22
-"""Samples in memory at once."""
+LARGEST_STRIPE = 1 << 22  # samples in memory at once
 
 
 def image_size(file: Path) -> tuple[int, int]:

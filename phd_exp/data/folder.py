@@ -22,8 +22,7 @@ from phd_exp.records.files import read_plain
 from phd_exp.records.images import LARGEST_IMAGE, pillow_warnings
 from phd_exp.records.scenes import Split
 
-CROP_LAYOUT = 2
-"""Version of `cut`, recorded with each cache."""
+CROP_LAYOUT = 2  # version of `cut`, recorded with each cache
 
 
 @dataclass(frozen=True)

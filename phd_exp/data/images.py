@@ -14,10 +14,8 @@ from phd_exp.records.errors import DatasetError
 from phd_exp.records.images import recorded_image
 from phd_exp.records.scenes import SampleRecord, Split
 
-SHRINKING = 2
-"""Version of `shrunk`, recorded with each run and cache. Version 1 was exact for integer factors only."""
-_LARGEST_STRIPE = 1 << 22
-"""Values converted to float64 at once."""
+SHRINKING = 2  # version of `shrunk`, recorded with each run and cache. Version 1 was exact for integer factors only.
+_LARGEST_STRIPE = 1 << 22  # values converted to float64 at once
 
 
 def cached_images(

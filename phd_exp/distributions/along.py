@@ -14,8 +14,7 @@ from scipy import optimize, special
 from phd_exp.distributions.huber import RADIAL_NORMALISER, radial_icdf
 from phd_exp.distributions.projected_huber import ProjectedHuber
 
-FURTHEST = 45.0
-"""The |q_1| beyond which no probability is left in float64."""
+FURTHEST = 45.0  # the |q_1| beyond which no probability is left in float64
 _TAILS = (1e-14, 1e-9, 1e-5, 1e-3, 0.02, 0.1, 0.3)  # the law of depth is smooth between these quantiles
 _BREAKS = np.array([-FURTHEST, -16.0, -8.0, -4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0, 8.0, 16.0, FURTHEST])
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)

@@ -21,8 +21,7 @@ from phd_exp.distributions.special import (
     weighted_integral,
 )
 
-LARGEST_ENERGY = 700.0
-"""The excess energy above which 1 + e^(-w) rounds to 1 in any precision."""
+LARGEST_ENERGY = 700.0  # the excess energy above which 1 + e^(-w) rounds to 1 in any precision
 _NEWTON_STEPS = 6  # to rounding from any a and p; test_icdf_inverts_cdf covers both tails
 
 

@@ -21,8 +21,7 @@ from phd_exp.distributions.level import credible_level
 from phd_exp.distributions.natural import Natural, require, require_positions, require_representable
 from phd_exp.distributions.special import log_scaled_normaliser
 
-LARGEST_RAW = 1e9
-"""Squares of larger raw numbers, and their products, would overflow in float32."""
+LARGEST_RAW = 1e9  # squares of larger raw numbers, and their products, would overflow in float32
 
 
 class ProjectedHuber(Distribution):

@@ -26,9 +26,7 @@ def log_positive(s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     return torch.log1p(s - low) + low
 
 
-def spectral_map(
-    b: Float[Tensor, "*batch 3"],
-) -> tuple[Float[Tensor, "*batch 2 2"], Float[Tensor, "*batch"]]:
+def spectral_map(b: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 2 2"], Float[Tensor, "*batch"]]:
     """B = phi(M), `positive` acting on the eigenvalues of M = [[b_1, b_2/sqrt 2], [b_2/sqrt 2, b_3]], and log|B|.
 
     With M's eigenvalues s = m +- r, B = (phi(s+) + phi(s-))/2 I + (phi(s+) - phi(s-))/(s+ - s-) (M - m I).

@@ -55,9 +55,7 @@ class Temperature:
         def projected_slope(r: Tensor) -> Tensor:  # r d/dr of the mean of h(r |q|) - 2 log r
             return torch.minimum(r * radius, (r * radius).square()).mean() - 2
 
-        def depth_slope(
-            r: Tensor,
-        ) -> Tensor:  # of r a max(t, 1/t) + log N(r a): actual minus predicted energies
+        def depth_slope(r: Tensor) -> Tensor:  # of r a max(t, 1/t) + log N(r a): actual minus predicted energies
             return (r * energy - depth_mean_energy(log_a + r.log())).mean()
 
         return cls(projected=_temperature(projected_slope), depth=_temperature(depth_slope))

@@ -22,10 +22,8 @@ from phd_exp.records.errors import RunError
 Method = Literal["mode", "mean", "average", "gaussian"]
 """Projected Huber fusion, its mode and its mean; the average of the modes; inverse-covariance fusion."""
 METHODS: tuple[Method, ...] = ("mode", "mean", "average", "gaussian")
-PROBABILISTIC: tuple[Method, ...] = ("mean", "gaussian")
-"""The methods with a covariance."""
-LEVELS = (50, 90, 99)
-"""Per cent of the ellipsoids whose coverage is counted."""
+PROBABILISTIC: tuple[Method, ...] = ("mean", "gaussian")  # the methods with a covariance
+LEVELS = (50, 90, 99)  # per cent of the ellipsoids whose coverage is counted
 ERRORS = ("depth_error_mm", "distance_mm")
 CALIBRATION = (*(f"coverage_{level}" for level in LEVELS), "normalised_squared_error")
 BINS = 20
@@ -88,10 +86,7 @@ def fusion_scores(views: SeveralViews, resamples: int = 200) -> FusionScores:
     exact: dict[str, float] = {}
     for (k, on_plane), found in fused.items():
         estimates = _baselines(kept.cameras(k), kept.ground if on_plane else None)
-        estimates |= {
-            "mode": (found.point[sound], None),
-            "mean": (found.mean[sound], found.covariance[sound]),
-        }
+        estimates |= {"mode": (found.point[sound], None), "mean": (found.mean[sound], found.covariance[sound])}
         for method in METHODS:
             for quantity, column in _columns(kept, *estimates[method], on_plane).items():
                 columns[place(quantity, method, k, on_plane)] = column

@@ -13,10 +13,8 @@ from phd_exp.records.files import MB, require_plain
 Columns = Mapping[str, np.ndarray]
 """Column name -> one value per sample: float64, or text for `TEXTS`."""
 
-LARGEST = 500 * MB
-"""Bytes of the file, and of the table according to its metadata."""
-MOST_VALUES = 10**7
-"""Rows times columns; predictions of 2,000 images have 80,000."""
+LARGEST = 500 * MB  # bytes of the file, and of the table according to its metadata
+MOST_VALUES = 10**7  # rows times columns; predictions of 2,000 images have 80,000
 TEXTS = ("file_name",)
 
 

@@ -35,11 +35,9 @@ COLUMNS: Mapping[Estimate, tuple[str, str, str]] = {
     "mean": ("mean_x", "mean_y", "mean_z"),
     "median": ("mu_x", "mu_y", "median_z"),
 }
-CENTRAL = 0.5
-"""Largest |v_p| of both coordinates in the central half of the field of view."""
+CENTRAL = 0.5  # largest |v_p| of both coordinates in the central half of the field of view
 RESAMPLES = 200
-SEED = 0
-"""Seed of all bootstraps: runs tested on the same images are resampled alike, so that differences are paired."""
+SEED = 0  # seed of all bootstraps: runs tested on the same images are resampled alike, so that differences are paired
 _ERRORS = {"projected": projected_error, "depth": depth_error}
 
 

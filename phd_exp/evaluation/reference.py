@@ -13,8 +13,7 @@ from phd_exp.metrics.calibration_scores import ence_bins
 from phd_exp.metrics.ordered import in_order_of
 
 SEED = 1
-_AT_ONCE = 10**6
-"""Positions drawn at a time."""
+_AT_ONCE = 10**6  # positions drawn at a time
 DISTANCES = ("depth_ence", "projected_ence", "miscalibration_area", "depth_pit_area", "depth_pit_ks")
 
 

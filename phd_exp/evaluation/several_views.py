@@ -22,8 +22,7 @@ ROTATION = ("pose_w", "pose_x", "pose_y", "pose_z")
 TRANSLATION = ("pose_t_x", "pose_t_y", "pose_t_z")
 """Columns of a camera's pose: the unit quaternion of R, and t (m), of v_camera = R v_scene + t."""
 NEEDED = ("scene", "view", "scale", *XYZ, *ROTATION, *TRANSLATION, *PARAMETERS)
-TILT = math.radians(30)
-"""Angle by which the first camera looks down at the ground; see `SeveralViews.ground`."""
+TILT = math.radians(30)  # angle by which the first camera looks down at the ground; see `SeveralViews.ground`
 AGAIN = "delete it and repeat the command that made it"
 
 

@@ -16,24 +16,16 @@ def average(
 
 
 def gaussian_fusion(
-    means: Float[Tensor, "*batch cameras 3"],
-    covariances: Float[Tensor, "*batch cameras 3 3"],
-    mask: Bool[Tensor, "*batch cameras"] | None = None,
+    means: Float[Tensor, "*batch cameras 3"], covariances: Float[Tensor, "*batch cameras 3 3"]
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3 3"]]:
     """Position and covariance of a product of Gaussians in the world: precisions add, means weighted by them.
 
     C = (sum C_i^(-1))^(-1) and v = C sum C_i^(-1) v_i, in the units of the means. Raises torch.linalg.LinAlgError
-    where a covariance is singular or all cameras are masked out.
+    if a covariance is singular.
 
     Source: inverse-covariance weighting; checked in tests/fusion/test_gaussian.py.
     """
-    if mask is not None:
-        means = torch.where(mask[..., None], means, 0)
-        identity = torch.eye(3, dtype=covariances.dtype, device=covariances.device)
-        covariances = torch.where(mask[..., None, None], covariances, identity)
     precisions = torch.linalg.inv(covariances)
-    if mask is not None:
-        precisions = torch.where(mask[..., None, None], precisions, 0)
     covariance = torch.linalg.inv(precisions.sum(-3))
     weighted = (precisions @ means[..., None]).sum(-3)
     return (covariance @ weighted).squeeze(-1), covariance

@@ -13,8 +13,7 @@ from phd_exp.fusion.moments import moments
 from phd_exp.fusion.newton import optimum, polish
 from phd_exp.fusion.problems import Status
 
-CONVERGED = 1e-6
-"""The largest relative subgradient at which a problem counts as solved."""
+CONVERGED = 1e-6  # the largest relative subgradient at which a problem counts as solved
 _FUSED, _NOT_CONVERGED = int(Status.FUSED), int(Status.NOT_CONVERGED)
 _NO_COMMON_VIEW, _PLANE_BEHIND_CAMERA = int(Status.NO_COMMON_VIEW), int(Status.PLANE_BEHIND_CAMERA)
 

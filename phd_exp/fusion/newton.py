@@ -29,8 +29,7 @@ MOST_STEPS, MOST_HALVINGS = 80, 40
 SETTLED = 1e-9  # relative change of (q_x, q_y, t)
 RIDGE = 1e-9  # share of the curvature of least squares: a flat direction must not stop the rest
 ARMIJO = 1e-4
-KINK = 1e-6
-"""|t - 1| within which a kink may hold the optimum; the smoothed optimum is about 1e-9 from such a kink."""
+KINK = 1e-6  # |t - 1| within which a kink may hold the optimum; the smoothed optimum is about 1e-9 from such a kink
 ROUNDS, PENALTY = 4, 1e7
 EXACT_RIDGE = 1e-12
 FARTHEST = 1e-4  # metres; a larger correction is rejected

@@ -24,10 +24,7 @@ class Status(IntEnum):
     NOT_FINITE = 2, "a prediction, pose or plane is not finite; mask out that camera or correct its numbers"
     NOT_A_ROTATION = 3, "the R of a pose is not a rotation to 1e-6; expected R R^T = I and |R| = 1"
     NOT_A_PLANE = 4, "the normal of the plane is zero; expected a direction"
-    NO_COMMON_VIEW = (
-        5,
-        "no position is in front of every camera; check that poses map world to camera, R v + t",
-    )
+    NO_COMMON_VIEW = (5, "no position is in front of every camera; check that poses map world to camera, R v + t")
     PLANE_BEHIND_CAMERA = 6, "no point of the plane is in front of every camera; check its normal and offset"
     CONTRADICTION = (
         7,

@@ -33,15 +33,7 @@ from the top left corner of the image; the centre of the pixel in column c and r
 """
 
 from phd_exp.geometry.camera import Camera
-from phd_exp.geometry.charts import (
-    Cartesian,
-    Chart,
-    DepthScale,
-    LogDepth,
-    Projected,
-    compensated_depth,
-    projected,
-)
+from phd_exp.geometry.charts import Cartesian, Chart, DepthScale, LogDepth, Projected, compensated_depth, projected
 from phd_exp.geometry.virtual import VirtualCamera, intrinsics
 
 __all__ = [

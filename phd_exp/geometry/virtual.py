@@ -109,10 +109,5 @@ def smallest_rotation(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3
     Source: Rodrigues' formula for the axis (b, -a, 0).
     """
     a, b, c = direction
-    return np.array(
-        [
-            [1 - a * a / (1 + c), -a * b / (1 + c), -a],
-            [-a * b / (1 + c), 1 - b * b / (1 + c), -b],
-            [a, b, c],
-        ]
-    )
+    first, second = [1 - a * a / (1 + c), -a * b / (1 + c), -a], [-a * b / (1 + c), 1 - b * b / (1 + c), -b]
+    return np.array([first, second, [a, b, c]])

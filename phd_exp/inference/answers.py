@@ -24,8 +24,7 @@ from phd_exp.records.detections import Detection
 from phd_exp.records.errors import DatasetError, RunError
 from phd_exp.records.images import pillow_warnings
 
-LEVELS = (50, 90, 99)
-"""Per cent of the credible intervals of depth."""
+LEVELS = (50, 90, 99)  # per cent of the credible intervals of depth
 DIGITS = 8
 
 

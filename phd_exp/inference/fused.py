@@ -70,9 +70,7 @@ def fused_answers(
     return answers
 
 
-def layout(
-    counts: Sequence[int],
-) -> tuple[Int[Tensor, "scenes cameras"], Bool[Tensor, "scenes cameras"]]:
+def layout(counts: Sequence[int]) -> tuple[Int[Tensor, "scenes cameras"], Bool[Tensor, "scenes cameras"]]:
     """The index of each scene's cameras in a sequence of views, padded, and the mask of cameras that exist."""
     n = torch.tensor(counts)
     place = torch.arange(int(n.max()))

@@ -25,8 +25,7 @@ from phd_exp.models.heads import Prediction
 from phd_exp.records.errors import UserError
 from phd_exp.records.files import write_atomic
 
-METADATA = "phd_exp"
-"""The key of the file's metadata: JSON with the run, the image size and `DESCRIPTIONS`."""
+METADATA = "phd_exp"  # the key of the file's metadata: JSON with the run, the image size and `DESCRIPTIONS`
 DESCRIPTIONS = {
     "image": "(batch, side, side, 3) uint8: RGB images of side x side pixels, principal point in the middle",
     "f": "(batch,) float32: focal length, pixels of these images",
@@ -41,8 +40,7 @@ DESCRIPTIONS = {
 OPSET = 18
 TOLERANCE = 1e-5
 SMALL = 0.01  # size of an output of the network below which it is compared absolutely
-CHECKED = (1, 7, 56)
-"""Batches of images on which the file is compared with torch."""
+CHECKED = (1, 7, 56)  # batches of images on which the file is compared with torch
 FOCAL_LENGTHS = (5.0, 9.0)  # range for the comparison, in sides of the image
 
 

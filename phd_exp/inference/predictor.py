@@ -26,8 +26,7 @@ from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import FolderConfig, RunConfig, check
 from phd_exp.training.network import build_regressor, load_checkpoint, require_same_shrinking
 
-WEIGHTS = "regressor."
-"""Prefix of the network's weights in a checkpoint."""
+WEIGHTS = "regressor."  # prefix of the network's weights in a checkpoint
 BATCH = 64
 
 

@@ -13,8 +13,7 @@ from torch import Tensor
 
 Statistic = Callable[[Mapping[str, Tensor], Tensor], Mapping[str, Tensor]]
 """Columns of shape (samples,) and counts (resamples, samples) -> name -> (resamples, *points)."""
-_AT_ONCE = 10**6
-"""Counts held in memory at a time."""
+_AT_ONCE = 10**6  # counts held in memory at a time
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from phd_exp.metrics.ordered import Ordered, in_order_of, require_finite
 
-FEWEST_POINTS = 5
-"""Independent points of a curve; the window of a small test set is narrowed to give as many."""
+FEWEST_POINTS = 5  # independent points of a curve; the window of a small test set is narrowed to give as many
 
 
 @dataclass(frozen=True)

@@ -30,12 +30,10 @@ COLUMNS = (
 )
 """One number per sample: variances and squared errors (m^2; no unit), level, PIT and CRPS (m) of depth."""
 
-MILLIRADIANS = 1000.0
-"""Unit of x/z and y/z, which are angles where they are small."""
+MILLIRADIANS = 1000.0  # unit of x/z and y/z, which are angles where they are small
 MOST_BINS = 10
 FEWEST_IN_A_BIN = 100
-STEPS = 100
-"""Points of coverage, PIT and risk; a calibration curve has from as many to twice as many."""
+STEPS = 100  # points of coverage, PIT and risk; a calibration curve has from as many to twice as many
 UNITS = {"depth": MILLIMETRES, "projected": MILLIRADIANS}
 
 
@@ -132,9 +130,7 @@ def abscissae(columns: Mapping[str, Float[Tensor, " samples"]], window: int) -> 
 
 
 def curves(
-    columns: Mapping[str, Float[Tensor, " samples"]],
-    weight: Float[Tensor, "resamples samples"],
-    window: int,
+    columns: Mapping[str, Float[Tensor, " samples"]], weight: Float[Tensor, "resamples samples"], window: int
 ) -> dict[str, Tensor]:
     """The y of each curve, each sample counted `weight` times: name -> (resamples, points).
 

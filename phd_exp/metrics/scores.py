@@ -8,10 +8,8 @@ from torch import Tensor
 
 from phd_exp.metrics.ordered import Ordered
 
-DRAWS = 64
-"""Draws of a prediction for its energy score."""
-_CHUNK = 512
-"""Rows whose pairs of draws are held in memory at once."""
+DRAWS = 64  # draws of a prediction for its energy score
+_CHUNK = 512  # rows whose pairs of draws are held in memory at once
 
 
 def energy_score(

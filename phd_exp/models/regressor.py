@@ -13,8 +13,7 @@ from phd_exp.models.heads import Head, Prediction
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-WIDTH = 64
-"""Of the hidden layers that take the focal length."""
+WIDTH = 64  # of the hidden layers that take the focal length
 
 
 class FocalLengthInput(nn.Module):

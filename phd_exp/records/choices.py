@@ -5,8 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-PLAIN_RECIPE = "paper"
-"""The recipe that a run's folder does not name."""
+PLAIN_RECIPE = "paper"  # the recipe that a run's folder does not name
 
 
 def setting(preset: str, recipe: str) -> str:

@@ -14,15 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    PlainValidator,
-    ValidationError,
-    model_validator,
-)
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidator, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
 from phd_exp.records.dataset import SPLITS, checksum, sha256
@@ -33,8 +25,7 @@ from phd_exp.records.scenes import Pose, SampleRecord, Split
 from phd_exp.records.spec import Number, Positive
 
 DISTORTION = re.compile(r"[kp][1-8]|.*distort.*|dist(_?coeff.*)?|.*fisheye.*", re.IGNORECASE)
-SHORTEST = 0.01
-"""Focal length, px; a shorter one is probably in metres."""
+SHORTEST = 0.01  # focal length, px; a shorter one is probably in metres
 LARGEST_BOX = 3
 """Sides of a box over the longer side of its image; the part outside the image is grey and holds no information."""
 

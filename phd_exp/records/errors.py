@@ -9,14 +9,11 @@ from pathlib import Path
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-LONGEST_GIST = 200
-"""Characters of an error that a message repeats."""
-LONGEST_VALUE = 120
-"""Characters of a value that a message repeats."""
+LONGEST_GIST = 200  # characters of an error that a message repeats
+LONGEST_VALUE = 120  # characters of a value that a message repeats
 UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 """Characters that would end the line of a message, or control the terminal."""
-NAMED = 5
-"""Names that a message lists."""
+NAMED = 5  # names that a message lists
 
 
 class UserError(Exception):

@@ -17,13 +17,10 @@ from phd_exp.records.parsing import parse_json
 
 Parsed = TypeVar("Parsed")
 
-_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{32}\.tmp", re.DOTALL)
-"""Names of the temporary files of `write_atomic`."""
+_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{32}\.tmp", re.DOTALL)  # names of the temporary files of `write_atomic`
 MB = 10**6
-LARGEST_RECORD = 16 * MB
-"""Bytes of a file that is read as a whole; the project's own files have a few thousand."""
-LONGEST_LINE = MB
-"""Bytes of a line of a journal; the line of a sample has about two thousand."""
+LARGEST_RECORD = 16 * MB  # bytes of a file that is read as a whole; the project's own files have a few thousand
+LONGEST_LINE = MB  # bytes of a line of a journal; the line of a sample has about two thousand
 
 
 def require_plain(path: Path, largest: int | None = None) -> None:
@@ -109,11 +106,7 @@ def open_journal(path: Path) -> TextIO:
 
 
 def read_jsonl(
-    path: Path,
-    parse: Callable[[str], Parsed] = parse_json,
-    *,
-    limit: int | None = None,
-    sealed: bool = False,
+    path: Path, parse: Callable[[str], Parsed] = parse_json, *, limit: int | None = None, sealed: bool = False
 ) -> list[Parsed]:
     """Parse the first `limit` lines of a file of JSON lines, all by default.
 

@@ -20,8 +20,7 @@ _LATER = (TiffImagePlugin, WebPImagePlugin, Jpeg2KImagePlugin)
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "JPEG2000")
 """Formats that are tried on a file, whatever its name. Pillow has more, such as EPS, whose code Ghostscript runs."""
 RENDERED = ("PNG", "WEBP", "JPEG")
-LARGEST_IMAGE = 256 * MB
-"""Bytes of an image file."""
+LARGEST_IMAGE = 256 * MB  # bytes of an image file
 BROKEN = (
     OSError, SyntaxError, ValueError, LookupError, EOFError, OverflowError, MemoryError, struct.error, zlib.error,
 )  # fmt: skip

@@ -5,8 +5,7 @@ from typing import Any
 
 import yaml
 
-MOST_DIGITS = 300
-"""Digits of an integer; a float holds 308."""
+MOST_DIGITS = 300  # digits of an integer; a float holds 308
 
 
 def parse_json(text: str) -> Any:

@@ -14,8 +14,7 @@ from types import TracebackType
 from typing import Any
 
 HOME = Path(__file__).resolve().parents[2]
-PATIENCE = 10.0
-"""Seconds that a child gets to finish its work before it is killed."""
+PATIENCE = 10.0  # seconds that a child gets to finish its work before it is killed
 
 
 @contextmanager

@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import AwareDatetime, BaseModel, ConfigDict, ValidationError
+from pydantic import AwareDatetime, BaseModel, ConfigDict, FiniteFloat, TypeAdapter, ValidationError
 
 from phd_exp.records.errors import RunError, gist
 from phd_exp.records.files import MB, read_jsonl, read_plain, write_atomic
@@ -38,10 +38,11 @@ from phd_exp.records.parsing import parse_json, parse_yaml
 from phd_exp.records.processes import held
 
 LAST_EPOCH = 10**9
-LARGEST = MB
-"""Bytes of a configuration or of a run's numbers."""
+LARGEST = MB  # bytes of a configuration or of a run's numbers
 PACKAGES = ("phd_exp", "torch", "torchvision", "lightning", "hydra-core", "numpy")
 """Packages on which numbers depend, whose versions are recorded."""
+
+_NUMBERS: TypeAdapter[dict[str, int | float | None]] = TypeAdapter(dict[str, int | FiniteFloat | None])
 
 State = Literal["running", "finished", "failed", "interrupted"]
 
@@ -224,11 +225,9 @@ def find_runs(runs: Path) -> list[RunFolder]:
 
 
 def _metrics_row(text: str) -> dict[str, Any]:
-    row = parse_json(text)
-    if not isinstance(row, dict):
-        raise ValueError(f"expected a mapping, found {type(row).__name__}")
+    row = _NUMBERS.validate_python(parse_json(text), strict=True)
     epoch = row.get("epoch")
-    if type(epoch) is not int or not -1 <= epoch <= LAST_EPOCH:
+    if not isinstance(epoch, int) or not -1 <= epoch <= LAST_EPOCH:
         raise ValueError(f"epoch: expected a whole number from -1 to {LAST_EPOCH}")
     return row
 

@@ -39,10 +39,7 @@ def begin(folder: DatasetFolder, spec: DatasetSpec) -> None:
 
 def other_make(manifest: Manifest) -> list[tuple[str, int | str, int | str]]:
     """Differences between the programs that made a data set and the present ones: key, their version, ours."""
-    made = (
-        ("generator", manifest.generator, GENERATOR_VERSION),
-        ("renderer", manifest.renderer, renderer_version()),
-    )
+    made = (("generator", manifest.generator, GENERATOR_VERSION), ("renderer", manifest.renderer, renderer_version()))
     return [(key, theirs, ours) for key, theirs, ours in made if theirs != ours]
 
 

@@ -13,10 +13,7 @@ from matplotlib.figure import Figure  # not pyplot: no global state, no window, 
 from phd_exp.distributions.level_curves import LevelCurves, on_image
 from phd_exp.records.files import write_atomic
 
-LABELS = {
-    "depth": ("Depth", "m²"),
-    "projected": ("Projected position", "no unit"),
-}
+LABELS = {"depth": ("Depth", "m²"), "projected": ("Projected position", "no unit")}
 _CELL, _LEFT, _RIGHT, _BOTTOM, _TOP = 4.2, 0.8, 0.2, 0.6, 0.4
 """Side of the square for one curve, and its margins, inches."""
 

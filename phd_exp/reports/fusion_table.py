@@ -2,16 +2,7 @@
 
 import math
 
-from phd_exp.evaluation.fusion import (
-    CALIBRATION,
-    ERRORS,
-    LEVELS,
-    METHODS,
-    PROBABILISTIC,
-    FusionScores,
-    Method,
-    place,
-)
+from phd_exp.evaluation.fusion import CALIBRATION, ERRORS, LEVELS, METHODS, PROBABILISTIC, FusionScores, Method, place
 from phd_exp.evaluation.reference import Band
 from phd_exp.records.choices import in_words
 from phd_exp.reports.runs import Report, Run
@@ -32,8 +23,7 @@ QUANTITIES = {
     "normalised_squared_error": "squared error",
 }
 ON_GROUND = ", ground"
-STRONG = 0.5
-"""The smallest correlation that a note reports as a common cause."""
+STRONG = 0.5  # the smallest correlation that a note reports as a common cause
 OF_A_LINE = (
     "Columns: number of cameras of each scene that are fused, starting with the first. Depth: the error along the "
     "first camera's true viewing ray, as in the paper's tables; distance: in space; both means over scenes. In "

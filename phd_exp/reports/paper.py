@@ -41,15 +41,13 @@ z.
 
 Nearly exact: size and depth scale together, and only the fixed lamps give a little more information.
 """
-UNKNOWN_SIZE_AND_F = 336.0
-"""The same for a network without the input f ~ U(1200, 2000) px, from apparent size alone."""
+UNKNOWN_SIZE_AND_F = 336.0  # the same for a network without the input f ~ U(1200, 2000) px, from apparent size alone
 UNKNOWN_F = 331.0
 """Lower bound on mean depth error, mm, for known size and unknown f, from apparent size alone.
 
 Perspective separates f and z (Cramer-Rao at edges of 0.1 px: 0.07 m in z): an estimator that uses it is not bound.
 """
-GUESS = 500.0
-"""Mean depth error, mm, of the constant estimate 4 m."""
+GUESS = 500.0  # mean depth error, mm, of the constant estimate 4 m
 WITHOUT_F = ("mae_xyz", "mae_constf")
 
 

@@ -7,22 +7,11 @@ from phd_exp.evaluation.point_errors import READINGS, ErrorKey, Quantity, Readin
 from phd_exp.records.choices import PLAIN_RECIPE, in_words, preset_and_recipe
 from phd_exp.records.errors import one_line
 from phd_exp.reports.cells import Cell, Gap, make_cell
-from phd_exp.reports.paper import (
-    ASSUMED,
-    BELOW_BOUND,
-    LAYOUTS,
-    OF_A_BOUND,
-    Bound,
-    Column,
-    Layout,
-    Line,
-    TableName,
-)
+from phd_exp.reports.paper import ASSUMED, BELOW_BOUND, LAYOUTS, OF_A_BOUND, Bound, Column, Layout, Line, TableName
 from phd_exp.reports.runs import PROBABILISTIC, Report
 from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem
 
-DIGITS: dict[Quantity, int] = {"projected": 1, "depth": 0}
-"""Decimals of a millimetre, as in the paper."""
+DIGITS: dict[Quantity, int] = {"projected": 1, "depth": 0}  # decimals of a millimetre, as in the paper
 MOST_DIGITS = 4
 ONE_SEED = "†"
 FEWER_SEEDS = "‡"
@@ -64,12 +53,7 @@ def paper_tables(report: Report) -> list[Table]:
 
 
 def _table(
-    report: Report,
-    preset: str,
-    layout: Layout,
-    reading: Reading,
-    choices: Set[tuple[str, str]],
-    seeds: Sequence[int],
+    report: Report, preset: str, layout: Layout, reading: Reading, choices: Set[tuple[str, str]], seeds: Sequence[int]
 ) -> Table:
     """The table of these seeds, of the data sets and models that a (data set, model) of `choices` has."""
     data, models = ({choice[place] for choice in choices} for place in (0, 1))

@@ -165,7 +165,8 @@ def _whole_run(folder: RunFolder, names: tuple[str, str, str, str], kept: Path |
 
 
 def _errors(table: Columns, estimates: Sequence[Estimate]) -> tuple[MeanErrors, float | None]:
-    return mean_errors(table, estimates), _number(float(table["nll"].mean())) if "nll" in table else None
+    nll = float(table["nll"].mean()) if "nll" in table else math.nan
+    return mean_errors(table, estimates), nll if math.isfinite(nll) else None
 
 
 def _state(folder: RunFolder, status: RunStatus | None) -> tuple[RunState, str]:
@@ -186,15 +187,7 @@ def _config(folder: RunFolder) -> dict[str, str]:
 
 def _series(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[float | None]]:
     keys = sorted({key for row in rows for key in row} - {"epoch", "step"})
-    return {key: [_number(row.get(key)) for row in rows] for key in keys}
-
-
-def _number(value: Any) -> float | None:
-    try:
-        number = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
-    except OverflowError:  # JSON has whole numbers of any size
-        return None
-    return number if math.isfinite(number) else None
+    return {key: [None if row.get(key) is None else float(row[key]) for row in rows] for key in keys}
 
 
 def _overrides(folder: RunFolder) -> str | None:

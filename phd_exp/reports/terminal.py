@@ -14,8 +14,7 @@ from phd_exp.reports.paper_tables import DIGITS, making_command
 from phd_exp.reports.runs import Report, Run
 from phd_exp.reports.table import NOTHING, Table, TableCell
 
-WIDTH = 118
-"""Columns, also if the output is not a terminal and rich would fall back to 80."""
+WIDTH = 118  # columns, also if the output is not a terminal and rich would fall back to 80
 OF_A_STAR = "* marks numbers that a terminal prints in bold."
 
 

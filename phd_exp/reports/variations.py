@@ -13,8 +13,7 @@ from phd_exp.records.errors import one_line
 from phd_exp.reports.runs import Report, Run
 from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem
 
-QUANTITIES: Mapping[str, int] = {"nll": 2, "projected": 1, "depth": 0}
-"""Columns and their decimals."""
+QUANTITIES: Mapping[str, int] = {"nll": 2, "projected": 1, "depth": 0}  # columns and their decimals
 OF_A_LINE = (
     "Held-out images: of the training split, never trained on, over the whole field of view. A number is the mean "
     "over seeds, in brackets the smallest and the largest. Errors: of the mode. Difference: of the NLL, or of a "

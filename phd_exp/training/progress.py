@@ -42,13 +42,7 @@ class Progress(Callback):
         self._count(done, (trainer.max_epochs or 1) * n, f"{_epoch(trainer)}, batch {batch_idx + 1}/{n}")
 
     def on_predict_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        *rest: Any,
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *rest: Any
     ) -> None:
         if not self.has_bar:
             n = int(trainer.num_predict_batches[0])

@@ -34,12 +34,7 @@ def train_together(config: RunConfig, folder: Path, draw: Draw | None, threads: 
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    environment = {
-        "MASTER_ADDR": "127.0.0.1",
-        "MASTER_PORT": str(port),
-        "WORLD_SIZE": str(world),
-        "NODE_RANK": "0",
-    }
+    environment = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": str(world), "NODE_RANK": "0"}
     results: dict[int, dict[str, Any]] = {}
     with ExitStack() as stack:
         ranks: dict[Any, tuple[int, Child]] = {}

@@ -4,7 +4,6 @@ import logging
 import warnings
 from contextlib import nullcontext
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -29,8 +28,7 @@ from phd_exp.training.ranks import train_together
 from phd_exp.training.recorder import Draw, Recorder
 from phd_exp.training.tracking import require_key, tracked
 
-UNTRAINED = -1
-"""The number of the epoch before the first, whose metrics are those of the untrained network."""
+UNTRAINED = -1  # the number of the epoch before the first, whose metrics are those of the untrained network
 
 
 def train(config: RunConfig, folder: RunFolder, draw: Draw | None, cores: int) -> dict[str, Any]:
@@ -120,9 +118,7 @@ def run(config: RunConfig, folder: RunFolder, draw: Draw | None, threads: int, r
     with tracked(config, folder) if rank == 0 else nullcontext() as logger:
         recorder = Recorder(folder, config.evaluation, draw, [logger] if logger else [])
         trainer = build_trainer(config, recorder)
-        checkpoint = _last_checkpoint(trainer, module, data, recorder)
-        recorder.send_recorded()
-        _fit(trainer, module, data, checkpoint, recorder)
+        _fit(trainer, module, data, recorder)
         tables = {part: _evaluate(trainer, module, data, part) for part in data.samples if part != "train"}
         untrained = recorder.rows[UNTRAINED].items()
         results = summary(tables["test"])
@@ -138,54 +134,38 @@ def run(config: RunConfig, folder: RunFolder, draw: Draw | None, threads: int, r
     return results
 
 
-def _last_checkpoint(trainer: Trainer, module: PositionModule, data: PositionData, recorder: Recorder) -> Path | None:
-    """The checkpoint to resume from, with the record cut to its epochs.
+def _fit(trainer: Trainer, module: PositionModule, data: PositionData, recorder: Recorder) -> None:
+    """Train to the last epoch, from the last checkpoint if there is one.
 
-    A new run has none; the metrics of its untrained network are recorded.
+    A new run has none; the metrics of its untrained network are recorded first.
+
+    Raises RunError if the checkpoint, or the record of the epochs before it, does not belong to this run.
     """
     checkpoint = recorder.folder.last_checkpoint
     if not checkpoint.exists():
         recorder.forget_after(UNTRAINED)
         recorder.record(UNTRAINED, summary(_evaluate(trainer, module, data, "test")), step=0)
-        return None
-    epochs = trainer.max_epochs or 0
-    last = _last_whole_epoch(checkpoint, epochs, len(data.train_dataloader()))
-    recorder.forget_after(last)
-    untrained = recorder.rows.get(UNTRAINED, {})
-    numbers = [value for row in recorder.rows.values() for value in row.values()]
-    if not any(key.startswith("test/") for key in untrained) or not all(map(_is_number, numbers)):
+        recorder.send_recorded()
+        trainer.fit(module, datamodule=data)
+        return
+    content, epochs = load_checkpoint(checkpoint), trainer.max_epochs or 0
+    epoch, place = content.get("epoch"), content.get(PositionData.__qualname__)
+    if type(epoch) is not int or not 0 <= epoch < epochs:
+        raise RunError(f"{checkpoint}: not a checkpoint of this run (epoch {shown(epoch)} of {epochs}); {ADVICE}")
+    is_whole = not isinstance(place, dict) or place.get("next_batch") == len(data.train_dataloader())
+    recorder.forget_after(epoch if is_whole else epoch - 1)
+    if not any(key.startswith("test/") for key in recorder.rows.get(UNTRAINED, {})):
         raise RunError(
             f"{recorder.folder.metrics_file}: not the record of the epochs before {checkpoint.name}; "
             "delete both to begin the run again"
         )
-    if trainer.is_global_zero and last + 1 < epochs:
-        print(f"{recorder.folder.path}: resuming at epoch {last + 2} of {epochs}", flush=True)
-    return checkpoint
-
-
-def _is_number(value: Any) -> bool:
-    return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
-
-
-def _last_whole_epoch(checkpoint: Path, epochs: int, batches: int) -> int:
-    """The last complete epoch of a checkpoint. Raises RunError if it is not from a run of so many epochs."""
-    content = load_checkpoint(checkpoint)
-    epoch = content.get("epoch")
-    if type(epoch) is not int or not 0 <= epoch < epochs:
-        raise RunError(f"{checkpoint}: not a checkpoint of this run (epoch {shown(epoch)} of {epochs}); {ADVICE}")
-    place = content.get(PositionData.__qualname__)
-    is_whole = not isinstance(place, dict) or place.get("next_batch") == batches
-    return epoch if is_whole else epoch - 1
-
-
-def _fit(
-    trainer: Trainer, module: PositionModule, data: PositionData, checkpoint: Path | None, recorder: Recorder
-) -> None:
-    """Train to the last epoch. Raises RunError if the checkpoint does not belong to this run."""
+    if trainer.is_global_zero and epoch + is_whole < epochs:
+        print(f"{recorder.folder.path}: resuming at epoch {epoch + is_whole + 1} of {epochs}", flush=True)
+    recorder.send_recorded()
     try:
         trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     except (KeyError, ValueError, TypeError, AttributeError, RuntimeError, IndexError) as error:
-        if checkpoint is None or recorder.begun:
+        if recorder.begun:
             raise
         reason = " ".join(str(error).split())[:120]
         raise RunError(f"{checkpoint}: not a checkpoint of this run ({reason}); {ADVICE}") from None

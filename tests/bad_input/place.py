@@ -9,8 +9,6 @@ from typing import Any
 
 import hydra
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 import torch
 import yaml
@@ -96,15 +94,6 @@ class Place:
         content = torch.load(self.run.last_checkpoint, weights_only=True) | changes
         self.run.last_checkpoint.unlink()
         torch.save(content, self.run.last_checkpoint)
-
-    def put_column(self, name: str, values: pa.Array | None) -> None:
-        """Replace a column of the predictions, or take it away."""
-        table = pq.read_table(self.run.predictions)
-        table = table.drop_columns([name])
-        if values is not None:
-            table = table.append_column(name, values)
-        self.run.predictions.unlink()
-        pq.write_table(table, self.run.predictions)
 
 
 def write_photos(folder: Path) -> None:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import torch
 from PIL import Image
 
@@ -34,9 +33,9 @@ class Bad:
         name: what is wrong.
         spoil: makes it so.
         words: of the command line.
-        said: the whole line after `error: `, or, of a report, a part of what it prints, as a regular expression.
-        status: the exit status; 0 of a report, which names a bad run and goes on.
-        again: another verb meets the same input, through the same reader, in the default tests already.
+        said: the whole line after `error: `, as a regular expression.
+        status: the exit status.
+        again: another verb or input is refused by the same check in the default tests already.
     """
 
     name: str
@@ -87,12 +86,9 @@ def checkpoint(name: str, spoil: Callable[[Place], Any], said: str) -> list[Bad]
     """The same checkpoint in each of the verbs that read it."""
     said = rf"runs/.*/last\.ckpt: {said}"
 
-    def broken_off(place: Place) -> None:
+    def resumed(place: Place) -> None:
         spoil(place)
         place.put_json(place.run.status_file, state="interrupted")
-
-    def resumed(place: Place) -> None:
-        broken_off(place)
 
     return [
         Bad(f"checkpoint: {name}, predicted with", spoil, ONE, said),
@@ -126,16 +122,8 @@ def record(name: str, said: str, image: bytes | Callable[[], bytes] | None = Non
     ]
 
 
-def reported(name: str, spoil: Callable[[Place], Any], said: str) -> Bad:
-    return Bad(f"run folder: {name}", spoil, REPORT, said, 0)
-
-
 def status(**changes: Any) -> Callable[[Place], None]:
     return lambda place: place.put_json(place.run.status_file, **changes)
-
-
-def column(name: str, values: Callable[[int], Any]) -> Callable[[Place], None]:
-    return lambda place: place.put_column(name, pa.array(values(3)))
 
 
 GOOD = '"file_name": "0.png", "f": 300'
@@ -151,29 +139,19 @@ CONFIGURATIONS = [
     configured("a group set to null", "model=null", r"Config group override must be a string or a list\..*"),
     configured("a part set to null", "model.head=null", r"model\.head: got None; expected a valid dictionary"),
     configured("a layer as a head", "model.head._target_=torch.nn.Linear", r"model\.head\._target_: 'torch\.nn\.Linear' is no head; .*"),
-    configured("a loss of others", "loss._target_=torch.nn.L1Loss", r"loss\._target_: 'torch\.nn\.L1Loss' is no loss; .*"),
-    configured("a tool of torch", "loss._target_=torch.nn.utils.clip_grad_norm_", r"loss\._target_: .* is no part of a network; .*"),
     configured("a private name", "optimizer._target_=torch.optim._adamw.x", r"optimizer\._target_: .* may not be built .*"),
     configured("arguments by place", "+backbone._args_=[1]", r"backbone\._args_: unknown key; .* takes depth"),
-    configured("half a loss", "+loss._partial_=true", r"loss\._target_: .* is no loss; .*"),
     configured("a partial that is no bool", "+loss._partial_=3", r"loss\._partial_: got 3; expected a bool"),
     configured("an interpolation kept as text", r"model.name='a\${b}'", r"model\.name: got 'a\$\{b\}'; expected a value, since no interpolation .*"),
     configured("an interpolation to nowhere", "seed=${nope}", r"Interpolation key 'nope' not found.*"),
-    configured("an interpolation of itself", "seed=${seed}", r"Recursive interpolation detected.*"),
-    configured("a variable that is not set", "seed=${oc.env:NO_SUCH}", r".*Environment variable 'NO_SUCH' not found.*"),
     configured("an infinite learning rate", "optimizer.lr=inf", r"optimizer\.lr: got inf; expected to be a finite number"),
-    configured("a learning rate that is no number", "optimizer.lr=nan", r"optimizer\.lr: got nan; expected to be a finite number"),
     configured("an image too large", "data.image_size=100000", r"data\.image_size: got 100000; expected to be less than or equal to 4096"),
-    configured("a focal length of nearly nothing", "data.f_range=[1e-300,2000]", r"data\.f_range\.0: got 1e-300; .* equal to 10"),
-    configured("a focal length without end", "data.f_range=[1200,1e300]", r"data\.f_range\.1: got 1e\+300; .*"),
     configured("a range that is one number", "data.f_range=5", r"data\.f_range: got 5; expected a valid tuple"),
-    configured("a seed beyond all", "seed=99999999999999999999", r"seed: got 99999999999999999999; expected to be less than .*"),
     configured("a folder without a name", "runs=''", r"runs: got ''; expected the name of a folder"),
     configured("brackets without end", "+a=" + "[" * 2000, r"[^\n]{1,420}"),
-    configured("no key at all", "=5", r"Config group override .*"),
     configured("an empty word", "", r".*mismatched input.*"),
     Bad("configuration: a zero byte", nothing, ("preset=smoke", "runs=a\0b"), r"runs=a\?b: holds control characters; .*"),
-    *(Bad(f"configuration: {word}", nothing, ("-m", "preset=smoke", word), r"seed=range\(0,.*\): more than 10000 jobs; .*", 2) for word in ("seed=range(0,1e9)", "seed=range(0,nan)", "seed=range(0,inf)")),
+    *(Bad(f"configuration: {word}", nothing, ("-m", "preset=smoke", word), r"seed=range\(0,.*\): more than 10000 jobs; .*", 2, again="1e9" not in word) for word in ("seed=range(0,1e9)", "seed=range(0,nan)", "seed=range(0,inf)")),
     Bad("configuration: two long ranges", nothing, ("-m", "preset=smoke", "seed=range(0,9999)", "data.seed=range(0,9999)"), r"preset=smoke seed=.*: more than 10000 jobs; .*", 2),
     Bad("configuration: a folder with a long name", nothing, ("preset=smoke", "logger=none", f"runs={'a' * 300}"), r"a{300}.*: File name too long; .*"),
     Bad("configuration: a folder that cannot be made", nothing, ("preset=smoke", "hydra.run.dir=/proc/nope"), r"/proc/nope: No such file or directory; .*"),
@@ -311,74 +289,23 @@ STORED = [
 
 RECORDS = [
     *record("a name that leads up", r"metadata\.jsonl, line 1: not a valid record \(.*file_name.*\)", file_name="../../../secret.png"),
-    *record("an absolute name", r"metadata\.jsonl, line 1: not a valid record \(.*file_name.*\)", file_name="/etc/passwd"),
-    *record("NaN", r"metadata\.jsonl, line 1: not a valid record \(.*\)", x=float("nan")),
     *record("behind the camera", r"metadata\.jsonl, line 1: not a valid record \(z: got -1\.0; expected .*greater than 0\)", z=-1.0),
     *record("an image too small", r"000000\.png: 32 x 32 pixels, 64 x 64 recorded; .*", lambda: images.saved(images.noise(32, 32, 3))),
-    *record("an image too large", r"000000\.png: 65535 x 65535 pixels.*|.*000000\.png: cannot be decoded \(.*\); .*", images.declared_png(65535, 65535)),
-    *record("grey", r"000000\.png: its pixels are of the kind 'L'; expected RGB of 8 bits; .*", lambda: images.saved(images.noise(64, 64))),
     *record("transparent", r"000000\.png: its pixels are of the kind 'RGBA'; .*", lambda: images.saved(images.noise(64, 64, 4))),
-    *record("16 bits", r"000000\.png: its pixels are of the kind 'I;16'; .*", lambda: images.saved(Image.fromarray(np.zeros((64, 64), dtype=np.uint16)))),
     *record("PostScript", r"000000\.png: cannot be decoded \(.*\); .*", images.POSTSCRIPT),
     Bad("rendered: a pipe", lambda place: images.pipe(place.handmade.image_path("test", 0)), VERIFY, r".*000000\.png: cannot be read \(a pipe or a device; .*"),
     Bad("rendered: a manifest of nesting without end", lambda place: place.put("renders/handmade/manifest.json", DEEP), VERIFY, r".*manifest\.json: not a readable manifest \(.*\); .*"),
-    Bad("rendered: a manifest that is a pipe", lambda place: images.pipe(place.handmade.manifest_path), VERIFY, r".*manifest\.json: not a readable manifest \(.*a pipe or a device.*\); .*"),
-    Bad("rendered: a manifest of another place", lambda place: place.put("renders/handmade/manifest.json", place.handmade.manifest_path.read_text().replace('"handmade"', '"../../photos"')), VERIFY, r".*manifest\.json: not a readable manifest \(.*variant.*\); .*"),
     Bad("rendered: a manifest of 20 MB", lambda place: place.put("renders/handmade/manifest.json", " " * 20_000_000), VERIFY, r".*manifest\.json: not a readable manifest \(.*20 MB; expected at most 16 MB.*\); .*"),
 ]  # fmt: skip
 
 FOLDERS = [
-    reported("status: a pipe", lambda place: images.pipe(place.run.status_file), r"unreadable: .*status\.json: not a run status \(a pipe or a device; expected a plain file\)"),
-    reported("status: a folder", lambda place: (place.run.status_file.unlink(), place.run.status_file.mkdir()), r"unreadable: .*status\.json: not a run status \(Is a directory\)"),
-    reported("status: nesting without end", lambda place: place.put(place.run.status_file, DEEP), r"unreadable: .*status\.json: not a run status"),
-    reported("status: a date beyond all", status(started=1e300), r"unreadable: .*status\.json: not a run status .*started"),
-    reported("status: an unknown state", status(state="done"), r"unreadable: .*status\.json: not a run status .*state"),
-    reported("status: an unknown key", status(__class__="os.system"), r"unreadable: .*status\.json: not a run status .*__class__"),
-    reported("status: 20 MB", lambda place: place.put(place.run.status_file, " " * 20_000_000), r"unreadable: .*status\.json: not a run status \(20 MB; expected at most 16 MB\)"),
-    reported("predictions: gone", lambda place: place.run.predictions.unlink(), r"unreadable: predictions\.parquet: missing, though the run has finished; .*"),
-    reported("predictions: a pipe", lambda place: images.pipe(place.run.predictions), r"unreadable: predictions\.parquet: cannot be read \(a pipe or a device; .*\)"),
-    reported("predictions: text", lambda place: place.put(place.run.predictions, "no parquet"), r"unreadable: predictions\.parquet: cannot be read \(.*\)"),
-    reported("predictions: a column less", lambda place: place.put_column("mode_x", None), r"unreadable: predictions: no column mode_x, as in older records; .*"),
-    reported("predictions: text for numbers", column("mode_x", lambda n: ["x"] * n), r"unreadable: predictions\.parquet: cannot be read \(column 'mode_x' holds str; expected numbers\); .*"),
-    reported("predictions: lists for numbers", column("nll", lambda n: [[1.0]] * n), r"unreadable: predictions\.parquet: cannot be read \(column 'nll' holds ndarray; expected numbers\); .*"),
-    reported("predictions: NaN", column("z", lambda n: [float("nan")] * n), r"unreadable: predictions: column z is not finite everywhere, or not positive; .*"),
-    reported("predictions: two million rows", lambda place: place.run.predictions.write_bytes(many_rows()), r"unreadable: predictions\.parquet: has 2000000 rows of .* columns; expected at most .*"),
     Bad("run folder: no numbers before the checkpoint", lambda place: (place.run.metrics_file.unlink(), status(state="interrupted")(place)), LEARN, r"runs/.*metrics\.jsonl: not the record of the epochs before last\.ckpt; .*"),
-    Bad("run folder: an epoch of text", lambda place: (place.put(place.run.metrics_file, '{"epoch": "x"}\n'), status(state="interrupted")(place)), LEARN, r"runs/.*metrics\.jsonl, line 1: not a valid record \(epoch: expected a whole number .*\)"),
-    Bad("run folder: numbers of text", lambda place: (place.put(place.run.metrics_file, '{"epoch": -1, "test/nll": "<b>"}\n'), status(state="interrupted")(place)), LEARN, r"runs/.*metrics\.jsonl: not the record of .*"),
-    Bad("run folder: nesting without end in metrics", lambda place: (place.put(place.run.metrics_file, DEEP + "\n"), status(state="interrupted")(place)), LEARN, r"runs/.*metrics\.jsonl, line 1: not a valid record \(nested too deeply\)"),
+    Bad("run folder: an epoch of text", lambda place: (place.put(place.run.metrics_file, '{"epoch": "x"}\n'), status(state="interrupted")(place)), LEARN, r"runs/.*metrics\.jsonl, line 1: not a valid record \(epoch.*\)"),
+    Bad("run folder: numbers of text", lambda place: (place.put(place.run.metrics_file, '{"epoch": -1, "test/nll": "<b>"}\n'), status(state="interrupted")(place)), LEARN, r"runs/.*metrics\.jsonl, line 1: not a valid record \(test/nll.*"),
     Bad("run folder: a result of 400 digits", lambda place: place.put(place.run.results_file, f'{{"test/nll": {"9" * 400}}}'), LEARN, r"runs/.*results\.json: cannot be read \(a whole number of 400 digits\); .*"),
-    Bad("run folder: results that are none", lambda place: place.put(place.run.results_file, "[1]"), LEARN, r"runs/.*results\.json: expected a mapping, found list"),
     Bad("run folder: checkpoints that lead elsewhere", lambda place: (place.run.checkpoints.rename(place.root / "elsewhere"), place.run.checkpoints.symlink_to(place.root / "elsewhere"), status(state="interrupted")(place)), LEARN, r"runs/.*/checkpoints: leads out of the run's folder; .*"),
     Bad("run folder: a lock that leads elsewhere", lambda place: (place.put("diary", "dear"), images.link(place.run.path / ".lock", place.root / "diary"), status(state="interrupted")(place)), LEARN, r"runs/.*: cannot be written \(.*\); .*"),
 ]  # fmt: skip
-
-
-def many_rows() -> bytes:
-    import io
-
-    import pyarrow.parquet as pq
-
-    zeros = pa.array(np.zeros(2_000_000))
-    names = [
-        "x",
-        "y",
-        "z",
-        "f",
-        "S",
-        "mode_x",
-        "mode_y",
-        "mode_z",
-        "mean_x",
-        "mean_y",
-        "mean_z",
-        "median_z",
-        "mu_x",
-        "mu_y",
-    ]
-    buffer = io.BytesIO()
-    pq.write_table(pa.table(dict.fromkeys(names, zeros)), buffer)
-    return buffer.getvalue()
 
 
 TABLE = [

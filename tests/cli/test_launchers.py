@@ -89,7 +89,9 @@ def sweep(begin: Callable) -> Callable[..., tuple[int, list[str], list[str]]]:
     return run
 
 
-@pytest.mark.parametrize(("launcher", "seeds"), [("joblib", (0, 1, 2, 3, 5)), ("submitit", (0, 1, 3))])
+@pytest.mark.parametrize(
+    ("launcher", "seeds"), [("joblib", (0, 1, 2, 3, 5)), pytest.param("submitit", (0, 1, 3), marks=pytest.mark.slow)]
+)
 def test_failures_come_back_and_stop_no_other_job(
     sweep: Callable, tmp_path: Path, launcher: str, seeds: tuple[int, ...]
 ) -> None:
@@ -167,6 +169,7 @@ def test_queued_jobs_outlive_a_stopped_launcher(begin: Callable, tmp_path: Path)
     wait_for(lambda: {path.name for path in tmp_path.glob("*.done")} == {"0.done", "5.done"})
 
 
+@pytest.mark.slow
 def test_jobs_of_joblib_end_with_a_killed_launcher(begin: Callable, tmp_path: Path) -> None:
     """Running jobs end, and jobs that a worker has received but not begun."""
     with begin("joblib", "seed=6", "preset=smoke,small,paper,demo") as launcher:

@@ -22,6 +22,7 @@ def test_tables_are_printed_and_written(phd_exp: Callable, runs: Path, tmp_path:
     assert "Table 1, preset small: the central half of the field of view" in outcome.out
     assert "Made by: python -m phd_exp -m experiment=table1 preset=small\n" in outcome.out
     assert "tables: report/tables\n" in outcome.out
+    assert "Fusion" not in outcome.out
     assert {path.name for path in (tmp_path / "report" / "tables").iterdir()} == {
         "table1-small-whole.md",
         "table1-small-whole.tex",
@@ -32,32 +33,26 @@ def test_tables_are_printed_and_written(phd_exp: Callable, runs: Path, tmp_path:
     assert not list((tmp_path / "report" / "site" / "runs").glob("*.tmp"))
 
 
-def test_several_views_are_printed_and_written_where_they_are_recorded(
+def test_several_views_are_printed_and_written_where_they_are_recorded_and_both_folders_can_be_named(
     phd_exp: Callable, runs: Path, tmp_path: Path
 ) -> None:
-    before = phd_exp("report")
-    assert "Fusion" not in before.out
-    write_views(runs / "small" / "occl" / "probabilistic" / "seed0" / "views.parquet", 20)
-    outcome = phd_exp("report")
+    runs = runs.rename(tmp_path / "elsewhere")
+    out = tmp_path / "for the paper"
+    views = runs / "small" / "occl" / "probabilistic" / "seed0" / "views.parquet"
+    write_views(views, 20)
+    outcome = phd_exp("report", "out=for the paper", "runs=elsewhere")
     assert (outcome.status, outcome.err) == (0, "")
     assert "Fusion, preset small, probabilistic on occl, seed0: 20 scenes seen by 4 cameras" in outcome.out
-    assert (tmp_path / "report" / "tables" / "fusion-small-occl-probabilistic-seed0.tex").exists()
-    assert 'id="of-fusion"' in (tmp_path / "report" / "site" / "index.html").read_text()
-    (runs / "small" / "occl" / "probabilistic" / "seed0" / "views.parquet").write_bytes(b"torn")
-    torn = phd_exp("report")
-    assert torn.status == 0
-    page = tmp_path / "report" / "site" / "runs" / "small-occl-probabilistic-seed0.html"
-    assert "views.parquet: cannot be read" in page.read_text()
-    assert "tables: report/tables\n" in torn.out
-
-
-def test_both_folders_can_be_named(phd_exp: Callable, runs: Path, tmp_path: Path) -> None:
-    runs.rename(tmp_path / "elsewhere")
-    outcome = phd_exp("report", "out=for the paper", "runs=elsewhere")
-    assert outcome.status == 0
-    assert (tmp_path / "for the paper" / "tables" / "tables.csv").exists()
+    assert (out / "tables" / "fusion-small-occl-probabilistic-seed0.tex").exists()
+    assert 'id="of-fusion"' in (out / "site" / "index.html").read_text()
     assert not (tmp_path / "report").exists()
     assert "runs=elsewhere\n" in outcome.out
+    views.write_bytes(b"torn")
+    torn = phd_exp("report", "out=for the paper", "runs=elsewhere")
+    assert torn.status == 0
+    page = out / "site" / "runs" / "small-occl-probabilistic-seed0.html"
+    assert "views.parquet: cannot be read" in page.read_text()
+    assert "tables: for the paper/tables\n" in torn.out
 
 
 def test_nothing_is_written_where_nothing_is_recorded(phd_exp: Callable, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Every file under conf/ composes into a configuration that passes the check."""
 
 from collections.abc import Callable
+from itertools import zip_longest
 from typing import Any
 
 import pytest
@@ -11,16 +12,17 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.training.build import build_augmentation
 from phd_exp.training.config import RunConfig, check
 
-CHOICES = sorted(
-    f"{file.parent.name}={file.stem}" for file in conf_folder().glob("*/*.yaml") if file.parent.name != "loss"
-)
-
-NEEDS = {"data=folder": ("data.folder=photos",)} | {
-    choice: ("recipe=strong", "preset=small")
-    for choice in CHOICES
-    if choice.startswith(("recipe_at_preset=", "without="))
+CHOICES = {
+    group.name: [f"{group.name}={file.stem}" for file in sorted(group.glob("*.yaml"))]
+    for group in sorted(path for path in conf_folder().iterdir() if path.is_dir() and path.name != "loss")
 }
-"""Overrides that a choice requires."""
+STRONG = ("recipe=strong", "preset=small")
+OF_STRONG = ("recipe_at_preset", "without")
+"""The groups that require a strong recipe, one choice at a time; choices of all other groups go with each other."""
+TOGETHER = [
+    tuple(word for word in words if word)
+    for words in zip_longest(*(words for group, words in CHOICES.items() if group not in OF_STRONG))
+] + [(*STRONG, word) for group in OF_STRONG for word in CHOICES[group]]
 
 
 @pytest.fixture
@@ -28,17 +30,16 @@ def checked(composed: Callable[..., dict[str, Any]]) -> Callable[..., RunConfig]
     return lambda *overrides: check(composed(*overrides))
 
 
-@pytest.mark.parametrize("choice", CHOICES)
-def test_every_choice_of_every_group_is_a_valid_configuration(checked: Callable, choice: str) -> None:
-    checked(choice, *NEEDS.get(choice, ()))
+@pytest.mark.parametrize("words", TOGETHER, ids=" ".join)
+def test_every_choice_of_every_group_is_a_valid_configuration(checked: Callable, words: tuple[str, ...]) -> None:
+    """The first of all groups, the second of all, and so on."""
+    checked(*words, *(["data.folder=photos"] if "data=folder" in words else []))
 
 
-@pytest.mark.parametrize(
-    "file", sorted(conf_folder().rglob("*.yaml")), ids=lambda file: f"{file.parent.name}/{file.stem}"
-)
-def test_every_file_begins_with_a_comment(file: Any) -> None:
-    lines = [line for line in file.read_text().splitlines() if line != "# @package _global_"]
-    assert lines[0].startswith("# ")
+def test_every_file_begins_with_a_comment() -> None:
+    for file in conf_folder().rglob("*.yaml"):
+        lines = [line for line in file.read_text().splitlines() if line != "# @package _global_"]
+        assert lines[0].startswith("# "), file
 
 
 def test_defaults_are_the_authors_protocol(checked: Callable) -> None:
@@ -50,16 +51,8 @@ def test_defaults_are_the_authors_protocol(checked: Callable) -> None:
     assert config.optimizer["_target_"] == "torch.optim.Adam"
     assert config.optimizer["lr"] == 1e-3
     assert config.camera.focal_length == "known"
-
-
-def test_the_authors_recipe_changes_neither_images_nor_learning_rate(checked: Callable) -> None:
-    recipe = checked().recipe
-    assert (recipe.name, recipe.schedule, recipe.warmup_steps, recipe.localisation) == (
-        "paper",
-        "constant",
-        0,
-        0,
-    )
+    recipe = config.recipe
+    assert (recipe.name, recipe.schedule, recipe.warmup_steps, recipe.localisation) == ("paper", "constant", 0, 0)
     assert build_augmentation(recipe) is None
 
 
@@ -78,31 +71,23 @@ def test_the_strong_recipe_keeps_the_depth_and_length_of_its_preset(
 
 
 @pytest.mark.parametrize(
-    ("model", "loss", "camera"),
+    ("model", "loss", "camera", "strong_camera"),
     [
-        ("probabilistic", "NegativeLogLikelihood", "known"),
-        ("mae_vz", "MeanAbsoluteError", "known"),
-        ("mae_logz", "MeanAbsoluteError", "known"),
-        ("mae_xyz", "MeanAbsoluteError", "known"),
-        ("mae_constf", "MeanAbsoluteError", "constant"),
+        ("probabilistic", "NegativeLogLikelihood", "known", "shown"),
+        ("mae_vz", "MeanAbsoluteError", "known", "shown"),
+        ("mae_logz", "MeanAbsoluteError", "known", "shown"),
+        ("mae_xyz", "MeanAbsoluteError", "known", "known"),
+        ("mae_constf", "MeanAbsoluteError", "constant", "constant"),
     ],
 )
-def test_a_model_picks_its_loss_and_camera(checked: Callable, model: str, loss: str, camera: str) -> None:
+def test_a_model_picks_its_loss_and_camera_and_whether_the_strong_recipe_shows_the_focal_length(
+    checked: Callable, model: str, loss: str, camera: str, strong_camera: str
+) -> None:
     config = checked(f"model={model}")
     assert config.model.name == model
     assert config.loss["_target_"].endswith(loss)
     assert config.camera.focal_length == camera
-
-
-@pytest.mark.parametrize(
-    ("model", "camera"),
-    [("probabilistic", "shown"), ("mae_logz", "shown"), ("mae_xyz", "known"), ("mae_constf", "constant")],
-)
-def test_the_strong_recipe_makes_the_focal_length_an_input_unless_the_model_forbids_it(
-    checked: Callable, model: str, camera: str
-) -> None:
-    assert checked("recipe=strong", f"model={model}").camera.focal_length == camera
-    assert checked("recipe=strong", f"model={model}", "camera=known").camera.focal_length == "known"
+    assert checked("recipe=strong", f"model={model}").camera.focal_length == strong_camera
 
 
 @pytest.mark.parametrize(
@@ -118,8 +103,7 @@ def test_the_strong_recipe_makes_the_focal_length_an_input_unless_the_model_forb
     ],
 )
 def test_without_removes_one_part_of_the_strong_recipe(composed: Callable, part: str, keys: set) -> None:
-    strong = ("recipe=strong", "preset=small")
-    whole, without = flatten(composed(*strong)), flatten(composed(*strong, f"without={part}"))
+    whole, without = flatten(composed(*STRONG)), flatten(composed(*STRONG, f"without={part}"))
     changed = {key for key in whole | without if whole.get(key, "none") != without.get(key, "none")}
     assert changed == keys
 
@@ -130,15 +114,14 @@ def test_the_command_line_overrides_all_files(checked: Callable) -> None:
     assert config.camera.focal_length == "constant"
     assert config.data.n_train == 48
     assert config.preset == "smoke"
-    assert checked("recipe=strong", "preset=small", "data.image_size=48").data.image_size == 48
+    strong = checked(*STRONG, "data.image_size=48", "model=mae_logz", "camera=known")
+    assert (strong.data.image_size, strong.camera.focal_length) == (48, "known")
 
 
 @pytest.mark.parametrize("preset", sorted(file.stem for file in (conf_folder() / "preset").glob("*.yaml")))
 def test_a_folder_is_used_whole_with_every_preset(checked: Callable, preset: str) -> None:
-    own, rendered = (
-        checked(f"preset={preset}", "data=folder", "data.folder=photos").data,
-        checked(f"preset={preset}").data,
-    )
+    own = checked(f"preset={preset}", "data=folder", "data.folder=photos").data
+    rendered = checked(f"preset={preset}").data
     assert (own.n_train, own.n_held_out, own.n_test) == (None, 0, None)
     assert (own.image_size, own.batch_size) == (rendered.image_size, rendered.batch_size)
 
@@ -164,9 +147,7 @@ def test_several_views_use_the_data_set_multiview(checked: Callable) -> None:
     assert beside == checked("data=multiview", "data.sensor_size=256", "data.seed=3").data.spec
 
 
-def test_older_records_without_several_views_are_valid(
-    composed: Callable[..., dict[str, Any]],
-) -> None:
-    config = composed("data=scale")
+def test_older_records_without_several_views_are_valid(composed: Callable[..., dict[str, Any]]) -> None:
+    config = composed()
     del config["evaluation"]["multiview"]
     assert check(config).evaluation.multiview is None

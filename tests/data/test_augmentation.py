@@ -1,5 +1,7 @@
 """Augmented batches: pixels and labels belong together."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch.testing import assert_close
@@ -51,6 +53,11 @@ def batch() -> Batch:
     return Batch(spots(camera, xyz), xyz, f, float(SIDE), torch.arange(N))
 
 
+@pytest.fixture
+def noise(batch: Batch) -> Batch:
+    return replace(batch, image=torch.randint(0, 256, batch.image.shape, dtype=torch.uint8))
+
+
 @pytest.mark.parametrize("largest_zoom", [1.0, 1.3])
 def test_the_object_is_where_its_label_says(batch: Batch, largest_zoom: float) -> None:
     new = augmented(batch, largest_zoom, seed=1)
@@ -59,26 +66,23 @@ def test_the_object_is_where_its_label_says(batch: Batch, largest_zoom: float) -
     assert ((new.f > batch.f).any()) == (largest_zoom > 1)
 
 
-def test_symmetries_move_pixels_as_they_are(batch: Batch) -> None:
-    noise = torch.randint(0, 256, batch.image.shape, dtype=torch.uint8)
-    batch = Batch(noise, batch.xyz, batch.f, batch.S, batch.row)
+def test_symmetries_move_pixels_as_they_are(noise: Batch) -> None:
+    there = noise.image
     expected = {
-        (1, 1, 1): noise,
-        (-1, 1, 1): noise.flip(2),
-        (1, -1, 1): noise.flip(1),
-        (1, 1, -1): noise.transpose(1, 2),
-        (-1, -1, -1): noise.transpose(1, 2).flip(1, 2),
+        (1, 1, 1): there,
+        (-1, 1, 1): there.flip(2),
+        (1, -1, 1): there.flip(1),
+        (1, 1, -1): there.transpose(1, 2),
+        (-1, -1, -1): there.transpose(1, 2).flip(1, 2),
     }
     for signs, image in expected.items():
-        new = moved(batch, symmetries(torch.tensor([signs], dtype=torch.float32).expand(N, 3)))
+        new = moved(noise, symmetries(torch.tensor([signs], dtype=torch.float32).expand(N, 3)))
         assert torch.equal(new.image, image), signs
 
 
-def test_symmetries_alone_are_those_of_the_camera(batch: Batch) -> None:
+def test_symmetries_alone_are_those_of_the_camera(noise: Batch) -> None:
     """Pixels are moved without a warp then; the two ways agree to the bit."""
-    noise = torch.randint(0, 256, batch.image.shape, dtype=torch.uint8)
-    batch = Batch(noise, batch.xyz, batch.f, batch.S, batch.row)
-    new, expected = augmented(batch, 1.0, seed=1), moved(batch, symmetries(numbers(1)[:, :3]))
+    new, expected = augmented(noise, 1.0, seed=1), moved(noise, symmetries(numbers(1)[:, :3]))
     assert torch.equal(new.image, expected.image)
     assert_close(new.xyz, expected.xyz)
     assert len((numbers(1)[:, :3] < 0).unique(dim=0)) == 8
@@ -86,8 +90,7 @@ def test_symmetries_alone_are_those_of_the_camera(batch: Batch) -> None:
 
 def test_objects_stay_in_view(batch: Batch) -> None:
     border = batch.camera.unproject(torch.full((N, 2), SIDE - 0.5), torch.full((N,), 4.0))
-    batch = Batch(batch.image, border, batch.f, batch.S, batch.row)
-    new = augmented(batch, 1.4, seed=1)
+    new = augmented(replace(batch, xyz=border), 1.4, seed=1)
     assert new.camera.contains(new.xyz).all()
 
 
@@ -97,35 +100,27 @@ def test_nothing_changes_without_a_motion(batch: Batch) -> None:
     assert torch.equal(still.xyz, batch.xyz)
 
 
-def test_colours_change_places_alone(batch: Batch) -> None:
-    noise = torch.randint(0, 256, batch.image.shape, dtype=torch.uint8)
-    batch = Batch(noise, batch.xyz, batch.f, batch.S, batch.row)
-    new = Augmentation(symmetries=False, largest_zoom=1.0, colours=True, photometry=PLAIN)(batch, numbers(1))
-    assert torch.equal(new.xyz, batch.xyz)
-    assert torch.equal(new.image.sort(-1).values, noise.sort(-1).values)
-    orders = {tuple(new.image[row, 0, 0].tolist()) == tuple(noise[row, 0, 0].tolist()) for row in range(N)}
+def test_colours_change_places_alone(noise: Batch) -> None:
+    new = Augmentation(symmetries=False, largest_zoom=1.0, colours=True, photometry=PLAIN)(noise, numbers(1))
+    assert torch.equal(new.xyz, noise.xyz)
+    assert torch.equal(new.image.sort(-1).values, noise.image.sort(-1).values)
+    orders = {tuple(new.image[row, 0, 0].tolist()) == tuple(noise.image[row, 0, 0].tolist()) for row in range(N)}
     assert orders == {True, False}
     # one order for all pixels of an image
-    first = [noise[0, ..., channel] for channel in range(3)]
+    first = [noise.image[0, ..., channel] for channel in range(3)]
     assert all(any(torch.equal(new.image[0, ..., channel], one) for one in first) for channel in range(3))
 
 
 @pytest.mark.parametrize(
     "part",
-    [
-        {"symmetries": True},
-        {"largest_zoom": 1.2},
-        {"colours": True},
-        {"photometry": Photometry(brightness=2.0)},
-    ],
+    [{"symmetries": True}, {"largest_zoom": 1.2}, {"colours": True}, {"photometry": Photometry(brightness=2.0)}],
 )
-def test_each_part_is_there_by_itself(batch: Batch, part: dict) -> None:
+def test_each_part_is_there_by_itself(noise: Batch, part: dict) -> None:
     nothing = {"symmetries": False, "largest_zoom": 1.0, "colours": False, "photometry": PLAIN}
     assert not Augmentation(**nothing).changes_anything
     augment = Augmentation(**(nothing | part))
     assert augment.changes_anything
-    noise = torch.randint(0, 256, batch.image.shape, dtype=torch.uint8)
-    new = augment(Batch(noise, batch.xyz, batch.f, batch.S, batch.row), numbers(1))
-    assert not torch.equal(new.image, noise)
-    assert torch.equal(new.f, batch.f) == ("largest_zoom" not in part)
-    assert torch.equal(new.xyz, batch.xyz) == (part.keys() <= {"colours", "photometry"})
+    new = augment(noise, numbers(1))
+    assert not torch.equal(new.image, noise.image)
+    assert torch.equal(new.f, noise.f) == ("largest_zoom" not in part)
+    assert torch.equal(new.xyz, noise.xyz) == (part.keys() <= {"colours", "photometry"})

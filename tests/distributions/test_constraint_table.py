@@ -6,14 +6,7 @@ import pytest
 import torch
 
 from phd_exp.distributions import PointEstimate, ProjectedHuber
-from phd_exp.distributions.constraints import (
-    CONSTRAINTS,
-    DEPTH,
-    Decomposed,
-    Density,
-    Family,
-    families,
-)
+from phd_exp.distributions.constraints import CONSTRAINTS, DEPTH, Decomposed, Density, Family, families
 from phd_exp.distributions.point_estimate import PointDensity
 from phd_exp.geometry import Camera, Cartesian, Chart, LogDepth, Projected
 from phd_exp.models.backbones import PooledFeatures

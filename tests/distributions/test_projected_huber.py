@@ -155,9 +155,7 @@ VALUES = {
 
 
 @pytest.mark.parametrize("value", VALUES.values(), ids=VALUES.keys())
-def test_an_empty_batch_gives_empty_values(
-    value: Callable[[ProjectedHuber, torch.Tensor], torch.Tensor],
-) -> None:
+def test_an_empty_batch_gives_empty_values(value: Callable[[ProjectedHuber, torch.Tensor], torch.Tensor]) -> None:
     empty = ProjectedHuber.from_raw(torch.zeros(0, 7), f=1500.0, S=224.0, mu_z0=2.5e-3)
     one = ProjectedHuber.from_raw(torch.zeros(1, 7), f=1500.0, S=224.0, mu_z0=2.5e-3)
     shape = value(one, torch.ones(1, 3)).shape

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from tests.docs.pages import DOCS, PAGES, ROOT
+from tests.support.browser import Visit
 
 pytestmark = pytest.mark.slow
 
@@ -79,39 +80,25 @@ def test_formulas_are_drawn_by_the_browser(site: Path) -> None:
 
 
 @pytest.fixture
-def faults() -> list[str]:
-    return []
+def visit(chromium: Any, site: Path) -> Iterator[Visit]:
+    visited = Visit(chromium, site)
+    yield visited
+    visited.context.close()
+    assert visited.faults == []
 
 
-@pytest.fixture
-def page(chromium: Any, faults: list[str]) -> Iterator[Any]:
-    """A page of a real browser without a network; errors and failed requests are collected in `faults`."""
-    opened = chromium.new_context(offline=True).new_page()
-    opened.on("pageerror", lambda error: faults.append(str(error)))
-    opened.on("requestfailed", lambda request: faults.append(request.url))
-    opened.on("request", lambda request: _note_if_foreign(request.url, faults))
-    yield opened
-    opened.context.close()
-
-
-def _note_if_foreign(url: str, faults: list[str]) -> None:
-    if not url.startswith(("file:", "data:", "blob:")):
-        faults.append(url)
-
-
-def test_the_search_finds_a_name_from_the_file_system(site: Path, page: Any, faults: list[str]) -> None:
-    page.goto((site / "index.html").as_uri())
-    page.click("input.md-search__input")
-    page.keyboard.type("quantiles_along")
-    page.wait_for_selector(".md-search-result__item")
-    page.click(".md-search-result__item a")
-    page.wait_for_url("**/api/distributions/*.html*")
-    assert faults == []
+def test_the_search_finds_a_name_from_the_file_system(visit: Visit) -> None:
+    visit.open("index.html")
+    visit.page.click("input.md-search__input")
+    visit.page.keyboard.type("quantiles_along")
+    visit.page.wait_for_selector(".md-search-result__item")
+    visit.page.click(".md-search-result__item a")
+    visit.page.wait_for_url("**/api/distributions/*.html*")
 
 
 @pytest.mark.parametrize("width", [1280, 390])
 @pytest.mark.parametrize("address", ["index", "ideas/density", "guides/tables", "api/index", "api/fusion/fuse"])
-def test_no_page_is_wider_than_the_window(site: Path, page: Any, address: str, width: int) -> None:
-    page.set_viewport_size({"width": width, "height": 900})
-    page.goto((site / f"{address}.html").as_uri())
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
+def test_no_page_is_wider_than_the_window(visit: Visit, address: str, width: int) -> None:
+    visit.page.set_viewport_size({"width": width, "height": 900})
+    visit.open(f"{address}.html")
+    assert visit.width_beyond() <= 0

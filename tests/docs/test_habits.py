@@ -49,12 +49,9 @@ def test_examples_are_short() -> None:
         assert f"tests/extending/{file.name}" in CONTRIBUTING
 
 
-def test_the_changelog_has_the_version() -> None:
+def test_changelog_and_citation_have_the_version() -> None:
     headings = re.findall(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert any(heading.startswith(f"{PROJECT['project']['version']} ") for heading in headings)
-
-
-def test_who_cites_the_package_cites_its_version() -> None:
     assert f"version = {{{PROJECT['project']['version']}}}" in (ROOT / "README.md").read_text()
 
 

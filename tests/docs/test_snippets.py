@@ -53,6 +53,8 @@ def _single_runs(words: list[str]) -> list[tuple[str, ...]]:
     choices: list[list[str]] = []
     for word, item in zip(words, OverridesParser.create().parse_overrides(words), strict=True):
         several = list(item.sweep_string_iterator()) if item.is_sweep_override() else []
+        if item.key_or_group in ("seed", "shard"):
+            several = several[-1:]  # numbers that differ in nothing else
         if item.key_or_group == "experiment":
             for choice in several or [item.value()]:
                 assert (conf_folder() / "experiment" / f"{choice}.yaml").is_file()

@@ -8,6 +8,7 @@ import pytest
 
 from phd_exp.__main__ import main
 from phd_exp.records.runs import RunFolder, find_runs
+from tests.support.recorded import once
 
 QUICK = (
     "preset=smoke",
@@ -17,6 +18,7 @@ QUICK = (
     "data.n_held_out=4",
     "data.n_test=6",
     "data.batch_size=8",
+    "data.workers=1",  # a start of Blender costs more than the images
     "trainer.progress_bar=false",
     "trainer.threads=1",  # of the two cores, pytest-xdist keeps the other busy
 )
@@ -27,19 +29,19 @@ QUICKER = ("trainer.max_epochs=1", "logger=none", "trainer.precision=bfloat16", 
 """Trained in bfloat16 on any CPU: what is recorded and predicted is float32 all the same."""
 
 
-def trained(runs: Path, *arguments: str) -> RunFolder:
-    """The one run that a command leaves in a folder of its own."""
+def trained(runs: Path, *arguments: str) -> None:
+    """Train one run into a folder of its own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", ["phd_exp"])
         assert main([*arguments, *QUICKER, f"runs={runs}"]) == 0
-    (run,) = find_runs(runs)
-    return run
 
 
 @pytest.fixture(scope="session")
 def run(renders: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """On a rendered data set, whose images shrink by no whole number; nobody changes it."""
-    return trained(tmp_path_factory.mktemp("rendered"), *QUICK, f"data.root={renders}")
+    words = (*QUICK, f"data.root={renders}")
+    (found,) = find_runs(once(tmp_path_factory, "rendered run", lambda runs: trained(runs, *words)))
+    return found
 
 
 @pytest.fixture(scope="session")

@@ -53,34 +53,29 @@ def refused(outcome: Any) -> str:
 
 
 @pytest.mark.slow
-def test_a_full_disk_is_one_line_and_nothing_is_lost(
-    train: Callable, disk: Path, ends_as_unhindered: Callable
+def test_a_disk_that_fails_at_any_moment_is_one_line_and_nothing_is_lost(
+    train: Callable, disk: Path, monkeypatch: pytest.MonkeyPatch, ends_as_unhindered: Callable
 ) -> None:
-    """Full before the first byte, and when the first checkpoint is written."""
-    runs = disk / "runs"
+    """Full before the first byte, at the first and second checkpoint and the results; read-only in between."""
+    runs, epoch_ends, write_results = disk / "runs", PositionModule.on_train_epoch_end, RunFolder.write_results
+
+    def fill_after_an_epoch(self: PositionModule) -> None:
+        epoch_ends(self)
+        if self.current_epoch == 1:
+            leave_room(disk, 0)
+
+    def fill_before_the_results(self: RunFolder, results: Any) -> None:
+        leave_room(disk, 0)
+        write_results(self, results)
+
     for room in (0, 200 * KIB):
         leave_room(disk, room)
         assert "No space left on device" in refused(train(*QUIET, f"runs={runs}"))
     assert not list(runs.rglob("*.tmp"))
     assert not list(runs.rglob("last.ckpt"))
     make_room(disk)
-    ends_as_unhindered(runs)
-
-
-@pytest.mark.slow
-def test_a_disk_that_fails_after_an_epoch_is_one_line_and_nothing_is_lost(
-    train: Callable, disk: Path, monkeypatch: pytest.MonkeyPatch, ends_as_unhindered: Callable
-) -> None:
-    """Full when the second checkpoint is written, and read-only when the run is to go on."""
-    runs, epoch_ends = disk / "runs", PositionModule.on_train_epoch_end
-
-    def fill(self: PositionModule) -> None:
-        epoch_ends(self)
-        if self.current_epoch == 1:
-            leave_room(disk, 0)
-
     with monkeypatch.context() as patch:
-        patch.setattr(PositionModule, "on_train_epoch_end", fill)
+        patch.setattr(PositionModule, "on_train_epoch_end", fill_after_an_epoch)
         line = refused(train(*QUIET, f"runs={runs}"))
     assert "No space left on device; mend that, and the same command resumes" in line
     assert torch.load(only_run(runs).last_checkpoint, weights_only=True)["epoch"] == 0
@@ -88,46 +83,11 @@ def test_a_disk_that_fails_after_an_epoch_is_one_line_and_nothing_is_lost(
     remount(disk, "ro")
     assert "is in the way or read-only" in refused(train(*QUIET, f"runs={runs}"))
     remount(disk, "rw")
-    ends_as_unhindered(runs)
-
-
-@pytest.mark.slow
-def test_results_without_room_are_written_by_the_next_command(
-    train: Callable, disk: Path, monkeypatch: pytest.MonkeyPatch, ends_as_unhindered: Callable
-) -> None:
-    runs, write_results = disk / "runs", RunFolder.write_results
-
-    def fail(self: RunFolder, results: Any) -> None:
-        leave_room(disk, 0)
-        write_results(self, results)
-
     with monkeypatch.context() as patch:
-        patch.setattr(RunFolder, "write_results", fail)
+        patch.setattr(RunFolder, "write_results", fill_before_the_results)
         assert "results.json: No space left on device" in refused(train(*QUIET, f"runs={runs}"))
     make_room(disk)
     assert not only_run(runs).is_finished()
-    ends_as_unhindered(runs)
-
-
-def test_memory_that_runs_out_is_one_line(
-    train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends_as_unhindered: Callable
-) -> None:
-    training_step = PositionModule.training_step
-
-    def greedy(self: PositionModule, *arguments: Any) -> torch.Tensor:
-        if self.current_epoch == 1:
-            torch.empty(1 << 50)
-        return training_step(self, *arguments)
-
-    runs = tmp_path / "runs"
-    with monkeypatch.context() as patch:
-        patch.setattr(PositionModule, "training_step", greedy)
-        line = refused(train(*QUIET, f"runs={runs}"))
-    assert "memory ran out" in line
-    assert "data.batch_size" in line
-    status = only_run(runs).status()
-    assert status is not None
-    assert status.state == "failed"
     ends_as_unhindered(runs)
 
 

@@ -18,7 +18,7 @@ from phd_exp.records.runs import RunFolder
 from tests.e2e.conftest import QUICK
 from tests.support.untrained import SMALL, read_lines, untrained
 
-VIEWS, SCENES = 3, 4
+VIEWS, SCENES = 3, 2
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The test split of a rendered data set of several views."""
     root = tmp_path_factory.mktemp("several")
     sizes = ("data.n_train=2", "data.n_held_out=0", f"data.n_test={VIEWS * SCENES}", "data.batch_size=2")
-    views = ("data=multiview", f"data.views={VIEWS}", "data.workers=1")
+    views = ("data=multiview", f"data.views={VIEWS}")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", ["phd_exp"])
         assert main(["render", *QUICK, *sizes, *views, f"data.root={root}"]) == 0
@@ -176,15 +176,10 @@ LINES = [
     ({}, "line 1: scene is missing"),
     ({"scene": 1}, "line 1: pose is missing; expected the rotation [w, x, y, z]"),
     ({"scene": True, "pose": POSE}, "line 1: scene: got True; expected a whole number or a name"),
-    (
-        {"scene": 1, "pose": POSE | {"rotation": [1, 1, 0, 0]}},
-        "pose.rotation: got [1, 1, 0, 0]; a rotation is",
-    ),
+    ({"scene": 1, "pose": POSE | {"rotation": [1, 1, 0, 0]}}, "pose.rotation: got [1, 1, 0, 0]; a rotation is"),
     ({"scene": 1, "pose": {"rotation": [1, 0, 0, 0]}}, "line 1: pose.translation: missing"),
     ({"scene": 1, "pose": POSE | {"R": 1}}, "pose.R: unknown key; expected one of rotation, translation"),
 ]
-
-
 ARGUMENTS = [
     (("run=nowhere",), "folder: missing; fuse takes run=, folder=, plane=, out=, recalibrate="),
     (("run=nowhere", "folder=."), "nowhere: no run; expected a folder with config.yaml"),

@@ -1,127 +1,29 @@
-"""Own images from files to a run record; rendered images replace photographs, because their truth is known."""
+"""Own images from files to a run record, and back by `predict`."""
 
 import importlib.util
-import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from PIL import Image
-from scipy import ndimage
-from scipy.spatial.transform import Rotation
 
-from phd_exp.data.crops import cut
 from phd_exp.data.folder import FolderSource
-from phd_exp.data.sources import RenderedSource
-from phd_exp.geometry.virtual import Box, VirtualCamera, intrinsics
-from phd_exp.records.dataset import DatasetFolder, sha256
 from phd_exp.records.detections import DetectionFolder
-from phd_exp.records.scenes import SampleRecord, Scene
-from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.pixels import encoded
-from phd_exp.rendering.rays import trace_pixels
-from phd_exp.rendering.render import ensure_rendered
-from phd_exp.rendering.samples import backdrop_light
 from tests.e2e.runs import only_run
-from tests.support.renders import silhouettes
-from tests.support.untrained import read_lines, virtual_cameras
+from tests.support.untrained import read_lines, virtual_cameras, write_photos
 
-N = {"train": 14, "held_out": 0, "test": 2}
-SIDE = 96
+N_TRAIN, N_TEST = 8, 2
 
 
 @pytest.fixture(scope="module")
-def spec(make_spec: Callable[..., DatasetSpec]) -> DatasetSpec:
-    """Cylinders that lie within the image as a whole."""
-    return make_spec("default", xy_range=0.5)
-
-
-@pytest.fixture(scope="module")
-def rendered(spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory) -> DatasetFolder:
-    folder = DatasetFolder(tmp_path_factory.mktemp("own") / "default")
-    ensure_rendered(folder, spec, N["train"], N["test"], workers=1)
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("own") / "photos"
+    folder.mkdir()
+    write_photos(folder / "train", N_TRAIN)
+    write_photos(folder / "test", N_TEST)
     return folder
-
-
-def box_about(scene: Scene) -> Box:
-    """A box with the object anywhere but in its middle."""
-    rows, columns = np.nonzero(silhouettes(trace_pixels(scene)))
-    return columns.min() - 12.0, rows.min() - 20.0, columns.max() + 25.0, rows.max() + 9.0
-
-
-@pytest.fixture(scope="module")
-def photos(rendered: DatasetFolder) -> Path:
-    """The same images as somebody else would hand them over: nothing but camera, box and position."""
-    folder = rendered.root.parent / "photos"
-    for split in ("train", "test"):
-        (folder / split).mkdir(parents=True)
-        lines = []
-        for record in rendered.records(split):  # type: ignore[arg-type]
-            image = rendered.image_path(split, record.index)  # type: ignore[arg-type]
-            (folder / split / image.name).write_bytes(image.read_bytes())
-            line = {"file_name": image.name, "f": record.f, "box": box_about(record.shown)}
-            lines.append(json.dumps(line | {"x": record.x, "y": record.y, "z": record.z}) + "\n")
-        (folder / split / "metadata.jsonl").write_text("".join(lines))
-    return folder
-
-
-@pytest.mark.parametrize("side", [224, 112])
-def test_a_rendered_image_seen_as_a_whole_is_itself(rendered: DatasetFolder, spec: DatasetSpec, side: int) -> None:
-    there = RenderedSource(rendered, spec, N, side).samples("train")  # type: ignore[arg-type]
-    own = FolderSource(DetectionFolder(rendered.root), None, 0, None, side)
-    here = own.samples("train")
-    assert all(np.array_equal(crop.camera.R, np.eye(3)) for crop in own.crops["train"])
-    np.testing.assert_array_equal(here.image.numpy(), there.image.numpy())
-    np.testing.assert_array_equal(here.xyz.numpy(), there.xyz.numpy())
-    np.testing.assert_allclose(here.f.numpy(), there.f.numpy(), rtol=1e-7)
-
-
-def seen_by(camera: VirtualCamera, scene: Scene, finer: int) -> Scene:
-    """The scene in the frame of a virtual camera, on `finer` times as many pixels."""
-    objects = []
-    for item in scene.objects:
-        rotation = Rotation.from_matrix(camera.R) * Rotation.from_quat(item.rotation, scalar_first=True)
-        turned = tuple(rotation.as_quat(scalar_first=True).tolist())
-        position = tuple(camera.to_virtual(np.array(item.position)))
-        objects.append(item.model_copy(update={"position": position, "rotation": turned}))
-    update = {"f": finer * camera.f, "S": finer * int(camera.S), "objects": tuple(objects)}
-    return scene.model_copy(update=update)
-
-
-def centroid(mask: np.ndarray) -> np.ndarray:
-    rows, columns = np.nonzero(mask)
-    return np.array([(columns + 0.5).mean(), (rows + 0.5).mean()])
-
-
-def shown(folder: DatasetFolder, record: SampleRecord, camera: VirtualCamera) -> np.ndarray:
-    """Pixels of the virtual image that show the object: those that differ from the backdrop, seen the same way.
-
-    An edge lies where the difference is half of the largest within three pixels.
-    """
-    with Image.open(folder.image_path("train", record.index)) as image:
-        seen = cut(image.convert("RGB"), camera).astype(float)
-    backdrop = cut(Image.fromarray(encoded(backdrop_light(record.backdrop, record.S))), camera)
-    difference = np.abs(seen - backdrop).max(axis=-1)
-    contrast = ndimage.maximum_filter(difference, 7)
-    return ndimage.binary_fill_holes((difference > 0.5 * contrast) & (contrast > 16))
-
-
-def test_a_rendered_image_seen_in_a_box_shows_the_object_where_the_virtual_camera_sees_it(
-    rendered: DatasetFolder,
-) -> None:
-    # the rim of a metal object may be of the backdrop's own colour
-    records = [record for record in rendered.records("train") if record.objects[0].material == "rubber"]
-    off = []
-    for record in records:
-        K = intrinsics(record.f, record.f, record.S / 2, record.S / 2)
-        camera = VirtualCamera.of_box(K, box_about(record.shown), float(SIDE))
-        expected = centroid(silhouettes(trace_pixels(seen_by(camera, record.shown, finer=4)))) / 4
-        assert np.abs(expected - SIDE / 2).max() > 2  # the object is not in the middle
-        off.append(centroid(shown(rendered, record, camera)) - expected)
-    assert len(off) >= 4
-    assert np.abs(off).max() < 0.1
 
 
 @pytest.fixture
@@ -134,16 +36,21 @@ def train(phd_exp: Callable, photos: Path, monkeypatch: pytest.MonkeyPatch) -> C
     return lambda *arguments: phd_exp(*quick, f"data.folder={photos}", *arguments)
 
 
-@pytest.mark.parametrize("model", ["probabilistic", "mae_constf"])
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("runs")
+
+
+@pytest.mark.parametrize("model", ["probabilistic", pytest.param("mae_constf", marks=pytest.mark.slow)])
 def test_a_run_on_own_images_leaves_a_whole_record_and_predicts_the_same(
-    train: Callable, phd_exp: Callable, photos: Path, tmp_path: Path, model: str
+    train: Callable, phd_exp: Callable, photos: Path, runs: Path, model: str
 ) -> None:
-    outcome = train(f"model={model}")
+    outcome = train(f"model={model}", f"runs={runs / model}")
     assert outcome.status == 0, outcome.err
-    run = only_run(tmp_path / "runs")
-    assert run.path.relative_to(tmp_path).as_posix().startswith(f"runs/smoke/mycams/{model}/seed0-")
+    run = only_run(runs / model)
+    assert run.path.relative_to(runs / model).as_posix().startswith(f"smoke/mycams/{model}/seed0-")
     results = run.results()
-    assert (results["data"], results["n_train"], results["n_test"]) == ("mycams", 14, 2)
+    assert (results["data"], results["n_train"], results["n_test"]) == ("mycams", N_TRAIN, N_TEST)
     assert np.isfinite(results["test/depth_error_mm"])
     status = run.status()
     assert status is not None
@@ -163,14 +70,15 @@ def test_a_run_on_own_images_leaves_a_whole_record_and_predicts_the_same(
         np.testing.assert_allclose([row[key] for row in rows], table[key], rtol=1e-3, atol=1e-2)
 
 
-def test_a_run_on_other_data_is_never_reused(train: Callable, photos: Path, tmp_path: Path) -> None:
+def test_a_run_on_other_data_is_never_reused(train: Callable, photos: Path, runs: Path, tmp_path: Path) -> None:
     """Neither with other metadata of the same name, nor from another folder."""
-    assert train("model=mae_vz").status == 0
-    assert "finished already" in train("model=mae_vz").out
+    assert train(f"runs={runs / 'probabilistic'}").status == 0
+    shutil.copytree(runs / "probabilistic", tmp_path / "runs")
+    assert "finished already" in train().out
     metadata = photos / "train" / "metadata.jsonl"
     before = metadata.read_text()
     metadata.write_text(before + "\n")
-    outcome = train("model=mae_vz")
+    outcome = train()
     metadata.write_text(before)
     assert outcome.status == 1
     (line,) = outcome.err.splitlines()
@@ -180,21 +88,6 @@ def test_a_run_on_other_data_is_never_reused(train: Callable, photos: Path, tmp_
     assert config["data"]["folder"] == str(photos)
     config["data"]["folder"] = "elsewhere"
     run.write_config(config)
-    outcome = train("model=mae_vz")
+    outcome = train()
     assert outcome.status == 1
     assert f"data.folder=elsewhere, but data.folder={photos} is asked for" in outcome.err
-
-
-def test_too_few_images_for_a_batch_is_one_line_and_nothing_is_written(train: Callable, tmp_path: Path) -> None:
-    outcome = train("data.batch_size=16")
-    assert outcome.status == 2
-    assert outcome.err == (
-        "error: data: batch_size=16 is larger than the 14 training samples there are: not one batch is full; "
-        "choose a smaller data.batch_size\n"
-    )
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_the_fingerprint_is_of_what_the_files_say(photos: Path) -> None:
-    digests = [sha256((photos / split / "metadata.jsonl").read_bytes()) for split in ("train", "test")]
-    assert DetectionFolder(photos).fingerprint() == sha256("".join(digests).encode())

@@ -59,23 +59,17 @@ def test_the_test_images_of_a_rendered_set_are_predicted_as_recorded(
     np.testing.assert_allclose(prediction.mode.numpy(), recorded["mode"], rtol=1e-5, atol=1e-5)
 
 
-def test_recalibration_changes_the_uncertainty_alone(
-    phd_exp: Callable, run: RunFolder, image: tuple[str, str]
-) -> None:
-    words = ("predict", f"run={run.path}", *image)
-    (before,), (after,) = (read_lines(phd_exp(*words, *more).out) for more in ((), ("recalibrate=true",)))
-    assert after["mode"] == before["mode"]
-    assert after["covariance"] != before["covariance"]
-    assert after["uncertainty"].startswith("recalibrated: A / ")
-
-
-def test_a_recalibrated_picture_has_the_recalibrated_curve(
-    phd_exp: Callable, run: RunFolder, image: tuple[str, str], monkeypatch: pytest.MonkeyPatch
+def test_recalibration_changes_the_uncertainty_alone_and_the_curve_in_the_picture(
+    phd_exp: Callable, run: RunFolder, image: tuple[str, str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     drawn: list[dict] = []
     monkeypatch.setattr(pictures, "draw_curve", lambda axes, name, curve: drawn.append(curve))
     for words in (("out=trained",), ("out=fitted", "recalibrate=true")):
         assert phd_exp("predict", f"run={run.path}", *image, "calibration=true", *words).status == 0
+    before, after = (json.loads((tmp_path / out / "predictions.jsonl").read_text()) for out in ("trained", "fitted"))
+    assert after["mode"] == before["mode"]
+    assert after["covariance"] != before["covariance"]
+    assert after["uncertainty"].startswith("recalibrated: A / ")
     trained, fitted = drawn
     temperature = package.load(run.path, recalibrate=True).temperature
     assert temperature is not None

@@ -16,7 +16,6 @@ import pytest
 
 from phd_exp.__main__ import main
 from phd_exp.records.runs import RunFolder, find_runs
-from phd_exp.training.module import PositionModule
 from tests.e2e.conftest import QUICK
 from tests.e2e.runs import weights
 
@@ -37,11 +36,7 @@ def finished(runs: Path) -> dict[Path, dict[str, tuple[int, bytes]]]:
 def numbers(runs: Path) -> dict[str, Any]:
     """What the runs of a folder came to, to the bit."""
     return {
-        run.path.relative_to(runs).as_posix(): (
-            run.results_file.read_bytes(),
-            run.metrics(),
-            weight_bytes(run),
-        )
+        run.path.relative_to(runs).as_posix(): (run.results_file.read_bytes(), run.metrics(), weight_bytes(run))
         for run in find_runs(runs)
     }
 
@@ -64,7 +59,8 @@ def begun(tmp_path: Path, renders: Path) -> Callable[..., BaseProcess]:
     return begin
 
 
-@pytest.mark.parametrize(("kills", "words"), [(1, TWO), pytest.param(20, FOUR, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("kills", "words"), [(1, TWO), (20, FOUR)])
 def test_killed_at_any_moment_the_same_command_goes_on(
     train: Callable, begun: Callable, tmp_path: Path, kills: int, words: tuple[str, ...]
 ) -> None:
@@ -121,48 +117,20 @@ def jobs_of_submitit(runs: Path) -> list[int]:
     return found
 
 
-@pytest.mark.slow
-def test_a_failing_run_among_others(train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is named with its error and stops no other; the same command takes it up where it failed, and no other."""
-    words = ("-m", "model=mae_vz", "seed=0,1,2", "logger=none")
-    training_step = PositionModule.training_step
-
-    def faulty(self: PositionModule, *arguments: Any) -> Any:
-        if self.current_epoch == 1 and self.trainer.default_root_dir.split("/")[-1].startswith("seed1"):
-            raise RuntimeError("planted")
-        return training_step(self, *arguments)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(PositionModule, "training_step", faulty)
-        outcome = train(*words)
-    assert outcome.status == 1
-    (error,) = [line for line in outcome.err.splitlines() if line.startswith("error: ")]
-    assert error.endswith("RuntimeError: planted")
-    assert "model=mae_vz seed=1" in error
-    *_, zero, one, two, total = outcome.out.splitlines()
-    assert zero == "seed=0: finished"
-    assert one == "seed=1: failed"
-    assert two == "seed=2: finished"
-    assert total == "3 jobs: 2 finished, 1 failed"
-    before = finished(tmp_path / "runs")
-    assert len(before) == 2
-
-    again = train(*words)
-    assert again.status == 0, again.err
-    assert "3 jobs, 2 of them finished already" in again.out
-    assert again.out.splitlines()[-1] == "3 jobs: 2 finished already, 1 finished"
-    now = finished(tmp_path / "runs")
-    assert {path: now[path] for path in before} == before
-    assert all([row["epoch"] for row in run.metrics()] == [-1, 0, 1] for run in find_runs(tmp_path / "runs"))
-
-
-def test_a_changed_configuration_never_reuses_a_run(train: Callable, tmp_path: Path) -> None:
+def test_runs_of_a_sweep_are_those_of_single_commands_and_never_reused_for_a_changed_configuration(
+    train: Callable, tmp_path: Path
+) -> None:
     assert train(*TWO).status == 0
-    changed = next(run for run in find_runs(tmp_path / "runs") if "seed1" in run.path.name)
-    config = changed.config()
+    (one, two) = sorted(find_runs(tmp_path / "runs"), key=lambda run: run.path.name)
+    assert train(*TWO[1:-2], "seed=1", "logger=none", "runs=alone").status == 0
+    ((place, alone),) = numbers(tmp_path / "alone").items()
+    assert numbers(tmp_path / "runs") == numbers(tmp_path / "runs") | {place: alone}
+
+    config = two.config()
     config["optimizer"]["lr"] = 0.5  # as if the file under conf/ had changed since
-    changed.write_config(config)
+    two.write_config(config)
     before = finished(tmp_path / "runs")
+    assert before.keys() == {one.path, two.path}
     outcome = train(*TWO)
     assert outcome.status == 1
     (line,) = [line for line in outcome.err.splitlines() if line.startswith("error: ")]
@@ -175,20 +143,21 @@ def test_a_changed_configuration_never_reuses_a_run(train: Callable, tmp_path: P
 WITHOUT_RAY = pytest.mark.skipif(find_spec("ray") is None, reason="needs the extra `ray`, in a venv of its own")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [
         ["seed=1,0"],
-        pytest.param(["seed=1,0", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"], marks=pytest.mark.slow),
-        pytest.param(["seed=0,1", "hydra/launcher=submitit_local"], marks=pytest.mark.slow),
-        pytest.param(["seed=0,1", "hydra/launcher=ray"], marks=[pytest.mark.slow, WITHOUT_RAY]),
+        ["seed=1,0", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
+        ["seed=0,1", "hydra/launcher=submitit_local"],
+        pytest.param(["seed=0,1", "hydra/launcher=ray"], marks=WITHOUT_RAY),
     ],
     ids=["order", "joblib", "submitit", "ray"],
 )
 def test_neither_order_nor_launcher_changes_a_number(train: Callable, tmp_path: Path, words: list[str]) -> None:
     """At one number of threads, which the shared words set."""
     assert train(*TWO, "runs=here").status == 0
-    outcome = train("-m", "model=mae_vz", "recipe=strong", "data.image_size=64", "logger=none", *words, "runs=there")
+    outcome = train(*TWO[:-2], "logger=none", *words, "runs=there")
     assert outcome.status == 0, outcome.err
     assert numbers(tmp_path / "here") == numbers(tmp_path / "there")
     assert len(find_runs(tmp_path / "here")) == 2

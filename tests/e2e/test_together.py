@@ -5,10 +5,8 @@ import multiprocessing
 import os
 import signal
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 import pytest
@@ -16,6 +14,7 @@ import pytest
 from phd_exp.records.runs import find_runs
 from tests.e2e.conftest import QUICK
 from tests.e2e.runs import only_run
+from tests.support.renders import wait_until
 
 THREE_EPOCHS = (
     "logger=none",
@@ -46,13 +45,6 @@ def alive(process: int) -> bool:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
-
-
-def wait_for(condition: Callable[[], Any], seconds: float = 120) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "waited too long"
-        time.sleep(0.02)
 
 
 @pytest.mark.slow
@@ -87,7 +79,7 @@ def killing_a_rank() -> Iterator[Callable[[Path, int], list[int]]]:
         found: list[int] = []
 
         def kill() -> None:
-            wait_for(lambda: len(list(runs.rglob("last.ckpt"))) == 1)
+            wait_until(lambda: len(list(runs.rglob("last.ckpt"))) == 1)
             found.extend(descendants(os.getpid()))
             os.kill(found[place], signal.SIGKILL)
 
@@ -126,35 +118,19 @@ def test_one_killed_ends_all_and_the_same_command_goes_on(
 
 
 @pytest.mark.slow
-def test_a_loss_that_is_not_finite_is_one_line(train: Callable) -> None:
-    outcome = train("logger=none", "optimizer.lr=1e30", *TOGETHER)
-    assert outcome.status == 1
-    (line,) = [line for line in outcome.err.splitlines() if line.startswith("error: ")]
-    assert "loss is " in line
-    assert "lower optimizer.lr" in line
-
-
-@pytest.mark.slow
 def test_none_outlives_the_process_that_started_them(renders: Path, tmp_path: Path) -> None:
     from phd_exp.__main__ import main
 
-    words = [
-        *QUICK,
-        f"data.root={renders}",
-        f"runs={tmp_path}",
-        "logger=none",
-        "trainer.max_epochs=50",
-        *TOGETHER,
-    ]
+    words = [*QUICK, f"data.root={renders}", f"runs={tmp_path}", "logger=none", "trainer.max_epochs=50", *TOGETHER]
     process = multiprocessing.get_context("spawn").Process(target=main, args=(words,))
     process.start()
-    wait_for(lambda: list(tmp_path.rglob("last.ckpt")))
+    wait_until(lambda: list(tmp_path.rglob("last.ckpt")))
     assert process.pid is not None
     ranks = descendants(process.pid)
     assert len(ranks) == 2
     process.kill()
     process.join()
-    wait_for(lambda: not any(alive(rank) for rank in ranks), seconds=10)
+    wait_until(lambda: not any(alive(rank) for rank in ranks))
     assert not only_run(tmp_path).is_held()
 
 
@@ -172,19 +148,3 @@ def test_runs_of_a_sweep_under_any_launcher(train: Callable, tmp_path: Path, lau
     assert [run.results()["seed"] for run in runs] == [0, 1]
     assert train("seed=1", *words, "runs=alone").status == 0
     assert only_run(tmp_path / "alone").metrics() == runs[1].metrics()
-
-
-@pytest.mark.parametrize(
-    ("word", "said"),
-    [
-        ("trainer.devices=3", "trainer.devices: got 3, which does not divide batch_size=8"),
-        ("trainer.devices=8", "trainer.devices: got 8, more than the 4 samples of held_out that there are"),
-        ("trainer.devices=0", "trainer.devices: got 0"),
-    ],
-)
-def test_processes_that_cannot_share_are_refused(train: Callable, tmp_path: Path, word: str, said: str) -> None:
-    outcome = train("logger=none", *TOGETHER, word)
-    assert outcome.status == 2
-    (line,) = outcome.err.splitlines()
-    assert said in line
-    assert list(tmp_path.iterdir()) == []

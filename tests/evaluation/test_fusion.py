@@ -62,9 +62,10 @@ def test_fused_calibrated_views_are_calibrated(
         assert low - slack < value(scores, f"coverage_{level}", method, cameras, on_plane) < high + slack
 
 
-def test_exact_densities_have_shorter_ellipsoids_than_a_gaussian(scores: FusionScores) -> None:
+def test_exact_densities_have_shorter_ellipsoids_and_every_view_counts_once(scores: FusionScores) -> None:
     assert scores.exact["coverage_90/mean/1/free"] == pytest.approx(87.8, abs=0.7)
     assert scores.exact["coverage_90/mean/4/free"] == pytest.approx(88.8, abs=0.7)
+    assert (len(scores.surprise), sum(scores.surprise)) == (BINS, N * 4)
 
 
 def test_overconfident_views_are_detected(overconfident: FusionScores) -> None:
@@ -158,11 +159,6 @@ def test_errors_that_views_share_are_detected(folder: Path, scores: FusionScores
     assert np.isnan(scores.with_size.value)
     # correlated views gain less from averaging
     assert value(found, "depth_error_mm", "average", 4) > 1.5 * value(scores, "depth_error_mm", "average", 4)
-
-
-def test_every_view_counts_once_in_the_histogram(scores: FusionScores) -> None:
-    assert len(scores.surprise) == BINS
-    assert sum(scores.surprise) == N * 4
 
 
 def changed(file: Path, to: Path, change: "object") -> Path:

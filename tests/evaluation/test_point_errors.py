@@ -46,9 +46,7 @@ def test_a_smaller_copy_of_an_image_has_the_same_central_half(drawn: Predicted) 
     for scale in (1.0, 0.5):
         found = in_central_half(truth, scale * f, torch.full_like(f, scale * 224))
         assert found.numpy().tolist() == expected.tolist()
-
-
-def test_the_central_half_includes_its_edge() -> None:
+    # the edge is inside
     truth = torch.tensor([[0.5, -0.5, 4.0], [0.5000001, 0.0, 4.0], [0.0, -0.5000001, 4.0]], dtype=torch.float64)
     f, S = torch.full((3, 1), 8.0).double(), torch.full((3, 1), 4.0).double()  # v_p = x, exactly
     assert in_central_half(truth, f, S).tolist() == [True, False, False]

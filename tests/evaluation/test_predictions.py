@@ -96,16 +96,6 @@ def test_risk_falls_with_the_share_kept(perfect: Evaluation, table: Callable) ->
     assert curve.y[20] < 0.8 * curve.y[-1]
 
 
-def test_overconfident_predictions_cover_less(table: Callable, perfect: Evaluation) -> None:
-    over = evaluate(table(2.0), resamples=20)
-    assert np.all(np.array(over.curves["coverage"].y[1:-1]) < perfect.curves["coverage"].y[1:-1])
-    worse = ("nll", "depth_crps_mm", "energy_score_mm", "depth_ence", "projected_ence", "miscalibration_area")
-    for name in worse:
-        assert over.scores[name].value > perfect.scores[name].value, name
-    for name in ("projected_error_mm", "depth_error_mm"):
-        assert over.scores[name].value == pytest.approx(perfect.scores[name].value)
-
-
 def test_every_sample_is_in_one_stratum_of_each_quantity(perfect: Evaluation) -> None:
     assert {part.quantity for part in perfect.strata} == {"visibility", "depth", "focal length"}
     for quantity in ("visibility", "depth", "focal length"):

@@ -29,14 +29,7 @@ def test_equal_covariances_give_the_average() -> None:
     torch.testing.assert_close(covariance, COVARIANCES[:1, 0].expand(5, 3, 3) / 4)
 
 
-def test_a_masked_camera_counts_nothing_whatever_it_holds() -> None:
-    means, covariances = MEANS.clone(), COVARIANCES.clone()
-    means[:, 2], covariances[:, 2] = torch.nan, torch.nan
-    kept = MASK[0]
-    torch.testing.assert_close(average(means, MASK), average(MEANS[:, kept]))
-    for ours, theirs in zip(
-        gaussian_fusion(means, covariances, MASK),
-        gaussian_fusion(MEANS[:, kept], COVARIANCES[:, kept]),
-        strict=True,
-    ):
-        torch.testing.assert_close(ours, theirs)
+def test_the_average_leaves_out_a_masked_camera_whatever_it_holds() -> None:
+    means = MEANS.clone()
+    means[:, 2] = torch.nan
+    torch.testing.assert_close(average(means, MASK), average(MEANS[:, MASK[0]]))

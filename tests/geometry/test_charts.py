@@ -5,14 +5,7 @@ import math
 import pytest
 import torch
 
-from phd_exp.geometry import (
-    Camera,
-    Cartesian,
-    Chart,
-    DepthScale,
-    LogDepth,
-    Projected,
-)
+from phd_exp.geometry import Camera, Cartesian, Chart, DepthScale, LogDepth, Projected
 
 DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
 CAMERA = Camera(torch.tensor([1200.0, 1500.0, 1500.0, 2000.0], dtype=torch.float64), 224.0)

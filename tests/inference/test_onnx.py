@@ -85,8 +85,7 @@ def test_the_distribution_is_that_of_torch(composed: Callable[..., Any]) -> None
         assert deviation[rows].max() < 1e-5, name
 
 
-@pytest.mark.parametrize("chart", [Projected, LogDepth, Cartesian])
-@pytest.mark.parametrize("constant_f", [None, 777.0])
+@pytest.mark.parametrize(("chart", "constant_f"), [(Projected, None), (LogDepth, 777.0), (Cartesian, None)])
 def test_baselines_are_points(
     composed: Callable[..., Any], chart: Callable[[DepthScale], Chart], constant_f: float | None
 ) -> None:

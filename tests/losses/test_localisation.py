@@ -45,18 +45,6 @@ def test_beyond_the_image_the_border_is_the_place() -> None:
     assert torch.equal(localisation_loss(scores, torch.tensor([[7.0, 1e6]])), corner)
 
 
-def test_descending_finds_the_place() -> None:
-    scores = torch.zeros(1, 40, requires_grad=True)
-    place = torch.tensor([[0.33, -0.21]])
-    optimizer = torch.optim.Adam([scores], lr=0.1)
-    for _ in range(300):
-        optimizer.zero_grad()
-        localisation_loss(scores.log_softmax(-1).view(1, 5, 8), place).backward()
-        optimizer.step()
-    heat = scores.detach().softmax(-1).view(1, 5, 8)
-    assert_close(torch.einsum("bij,cij->bc", heat, cells(5, 8)), place, atol=0.01, rtol=0)
-
-
 @pytest.mark.parametrize("scale", [1.0, 1e4])
 def test_bfloat16_autocast_rounds_nothing(scale: float) -> None:
     random = torch.Generator().manual_seed(0)

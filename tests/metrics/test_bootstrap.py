@@ -30,6 +30,8 @@ def test_interval_of_a_mean_has_the_width_of_theory() -> None:
     band = bands(means, {"x": x}, resamples=2000, seed=0)["mean"]
     assert band.value.item() == pytest.approx(x.mean().item())
     assert (band.high - band.low).item() == pytest.approx(2 * 1.96 * x.std().item() / 2000**0.5, rel=0.06)
+    curve = bands(means, {"x": x}, resamples=2000, seed=0)["curve"]
+    torch.testing.assert_close(curve.high, band.high * torch.tensor([1.0, 2.0, 3.0]).double())
     half = bands(means, {"x": x}, resamples=2000, seed=0, confidence=0.5)["mean"]
     assert (half.high - half.low).item() == pytest.approx(2 * 0.6745 * x.std().item() / 2000**0.5, rel=0.08)
 
@@ -43,20 +45,12 @@ def test_intervals_contain_the_truth_as_often_as_they_claim() -> None:
     assert sum(held) / 300 == pytest.approx(0.95, abs=0.035)
 
 
-def test_curves_have_an_interval_at_each_point() -> None:
-    found = bands(means, {"x": numbers(100, seed=1)}, resamples=50, seed=0)
-    torch.testing.assert_close(found["curve"].high, found["mean"].high * torch.tensor([1.0, 2.0, 3.0]).double())
-
-
-def test_resamples_in_parts_continue_one_stream() -> None:
+def test_resamples_continue_one_stream_of_their_seed() -> None:
     """300,000 samples do not fit into one part with 5 resamples; the first resamples do not depend on later ones."""
     columns = {"x": numbers(300_000, seed=1)}
     few, more = (resampled(means, columns, n, seed=0)[1]["mean"] for n in (2, 5))
     torch.testing.assert_close(more[:2], few)
     assert len(set(more.tolist())) == 5
-
-
-def test_the_same_seed_gives_the_same_interval() -> None:
     one, same, other = (bands(means, {"x": numbers(100, seed=1)}, 50, seed)["mean"] for seed in (0, 0, 1))
     assert (one.low, one.high) == (same.low, same.high)
     assert one.low != other.low

@@ -15,13 +15,6 @@ def pairs() -> tuple[torch.Tensor, torch.Tensor]:
     return xyz, xyz + 0.1 * torch.randn(64, 3, generator=generator, dtype=torch.float64)
 
 
-def test_by_hand() -> None:
-    xyz = torch.tensor([[0.0, 0.0, 4.0]], dtype=torch.float64)
-    estimate = torch.tensor([[0.3, 0.4, 4.2]], dtype=torch.float64)
-    assert projected_error(xyz, estimate).item() == pytest.approx(0.5)
-    assert depth_error(xyz, estimate).item() == pytest.approx(0.2)
-
-
 def test_the_two_errors_are_the_legs_of_a_right_triangle(pairs: tuple[torch.Tensor, torch.Tensor]) -> None:
     xyz, estimate = pairs
     hypotenuse = (estimate - xyz).square().sum(-1)

@@ -28,11 +28,8 @@ def test_batches_do_not_matter(sizes: list[int]) -> None:
     assert found["row"].tolist() == list(range(N))
     torch.testing.assert_close(found["error"], torch.arange(N).float().double() / 7, rtol=1e-6, atol=0)
     assert {column.dtype for column in found.values()} == {torch.float64}
-
-
-def test_one_row_is_a_table_too() -> None:
-    found = collected([torch.tensor([0])]).columns()
-    assert {name: column.shape for name, column in found.items()} == {"row": (1,), "error": (1,)}
+    one = collected([torch.tensor([0])]).columns()
+    assert {name: column.shape for name, column in one.items()} == {"row": (1,), "error": (1,)}
 
 
 def test_processes_do_not_matter() -> None:

@@ -39,9 +39,6 @@ def test_energy_score_keeps_the_digits_of_near_draws() -> None:
     truth = torch.full((5, 3), 4.0, dtype=torch.float64)
     expected = 1e-7 * energy_score((samples - 4) * 1e7, torch.zeros(5, 3).double())
     torch.testing.assert_close(energy_score(samples, truth), expected, rtol=1e-6, atol=0)
-
-
-def test_energy_score_needs_two_draws() -> None:
     with pytest.raises(ValueError, match="at least 2 draws"):
         energy_score(torch.zeros(1, 4, 3), torch.zeros(4, 3))
 

@@ -46,18 +46,14 @@ def test_definitions_and_absolute_paths_are_recognised() -> None:
 
 
 @pytest.mark.parametrize("file", FILES, ids=NAMES)
-def test_a_notebook_is_valid_short_and_defines_nothing(file: Path) -> None:
+def test_a_notebook_is_valid_short_executed_and_defines_nothing(file: Path) -> None:
     notebook = read(file)
     nbformat.validate(notebook)
     assert 10 <= len(notebook.cells) <= 25
     assert notebook.cells[0].cell_type == "markdown"
     assert "At the end one will have understood" in notebook.cells[0].source
-    assert not [cell.source for cell in code_of(file) if defines(cell.source)]
-
-
-@pytest.mark.parametrize("file", FILES, ids=NAMES)
-def test_it_was_executed_from_top_to_bottom_without_an_error(file: Path) -> None:
     cells = code_of(file)
+    assert not [cell.source for cell in cells if defines(cell.source)]
     assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
     outputs = [output for cell in cells for output in cell.outputs]
     assert sum("image/png" in output.get("data", {}) for output in outputs) >= 3

@@ -1,7 +1,5 @@
 """The orthogonal step, held against an SVD, against torch's own of matrices, and Adam's against torch's."""
 
-import copy
-
 import pytest
 import torch
 from torch import Tensor, nn
@@ -74,18 +72,6 @@ def test_only_what_mixes_features_steps_orthogonally() -> None:
 def test_a_network_without_either_kind_has_one_group() -> None:
     assert len(Muon([nn.Parameter(torch.zeros(3))], lr=0.1, orthogonal_lr=0.1).param_groups) == 1
     assert len(Muon([nn.Parameter(torch.zeros(4, 4, 1, 1))], lr=0.1, orthogonal_lr=0.1).param_groups) == 1
-
-
-def test_its_state_goes_on_where_it_was() -> None:
-    whole = network()
-    descend(whole, Muon(whole.parameters(), lr=0.01, orthogonal_lr=0.01), steps=4)
-    parts = network()
-    first = Muon(parts.parameters(), lr=0.01, orthogonal_lr=0.01)
-    descend(parts, first, steps=2)
-    second = Muon(parts.parameters(), lr=0.01, orthogonal_lr=0.01)
-    second.load_state_dict(copy.deepcopy(first.state_dict()))
-    descend(parts, second, steps=2)
-    assert all(map(torch.equal, whole.parameters(), parts.parameters()))
 
 
 def test_channels_last_makes_the_same_step() -> None:

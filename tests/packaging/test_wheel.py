@@ -57,15 +57,12 @@ def test_what_runs_is_the_wheel(run: Callable[..., str], installed: Path) -> Non
         assert str(installed / "phd_exp" / "conf") in run(*words, "--help")
 
 
-def test_the_configuration_is_in_it(run: Callable[..., str], installed: Path) -> None:
+def test_configuration_types_and_assets_are_in_it(run: Callable[..., str], installed: Path) -> None:
     assert "max_epochs: 50" in run("phd-exp", "--cfg", "job")
     assert "occluders: true" in run("phd-exp", "render", "data=occl", "--cfg", "job")
     files = {file.relative_to(conf_folder()) for file in conf_folder().rglob("*.yaml")}
     there = installed / "phd_exp" / "conf"
     assert {file.relative_to(there) for file in there.rglob("*.yaml")} == files
-
-
-def test_its_types_are_declared_and_its_pages_have_their_assets(installed: Path) -> None:
     assert (installed / "phd_exp" / "py.typed").is_file()
     assert list((installed / "phd_exp" / "reports" / "site" / "templates").glob("*.html"))
     assert not (installed / "tests").exists()

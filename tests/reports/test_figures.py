@@ -14,12 +14,7 @@ from phd_exp.reports.figures import draw_birds_eye, draw_calibration, draw_on_im
 
 def test_a_calibration_picture_has_ink(tmp_path: Path) -> None:
     predicted = np.geomspace(1e-4, 1e-1, 50)
-    curve = {
-        "predicted": predicted.tolist(),
-        "empirical": (2 * predicted).tolist(),
-        "window": 200,
-        "left_out": 0,
-    }
+    curve = {"predicted": predicted.tolist(), "empirical": (2 * predicted).tolist(), "window": 200, "left_out": 0}
     draw_calibration({"depth": curve, "projected": curve}, tmp_path / "curve.png")
     with Image.open(tmp_path / "curve.png") as picture:
         pixels = np.asarray(picture.convert("RGB")).astype(int)

@@ -208,12 +208,6 @@ def test_runs_with_overrides_are_listed_apart(tmp_path: Path, capsys: pytest.Cap
     assert "overrides: optimizer.lr=0.5" in after
 
 
-def test_without_runs_the_command_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    print_report(read_report(tmp_path), [])
-    (line,) = capsys.readouterr().out.strip().splitlines()
-    assert line.startswith("no runs recorded yet; begin by: python -m phd_exp -m experiment=table1 preset=paper")
-
-
 # files, and the table of several views
 
 

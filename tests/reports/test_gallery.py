@@ -9,15 +9,7 @@ from PIL import Image
 from phd_exp.distributions.level_curves import on_image
 from phd_exp.evaluation.parquet import Columns, read_table
 from phd_exp.records.errors import RunError
-from phd_exp.reports.gallery import (
-    EACH,
-    LARGEST,
-    birds_eye_view,
-    close_up,
-    curves_of,
-    load_image,
-    make_gallery,
-)
+from phd_exp.reports.gallery import EACH, LARGEST, birds_eye_view, close_up, curves_of, load_image, make_gallery
 from tests.support.synthetic import write_run
 
 
@@ -91,11 +83,8 @@ def test_only_images_of_their_folder_are_read(tmp_path: Path) -> None:
         assert load_image(folder, name) is None, name
 
 
-def test_a_table_without_its_columns_is_one_line(table: Columns) -> None:
+def test_what_cannot_be_drawn_is_said_or_left_out(table: Columns, row: dict) -> None:
     with pytest.raises(RunError, match="no column file_name, f, as in older records; run the model again"):
         make_gallery({name: table[name] for name in table if name not in ("file_name", "f")}, {})
-
-
-def test_parameters_of_no_distribution_have_no_curves(row: dict) -> None:
     assert curves_of(row | {"a": -1.0}) is None
     assert curves_of(row | {"A_xx": float("nan")}) is None

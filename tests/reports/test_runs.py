@@ -46,10 +46,7 @@ def test_a_finished_run_has_its_errors(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("error", "state", "detail"),
-    [
-        (ValueError("odd\nnumber"), "failed", "ValueError: odd number"),
-        (KeyboardInterrupt(), "interrupted", None),
-    ],
+    [(ValueError("odd\nnumber"), "failed", "ValueError: odd number"), (KeyboardInterrupt(), "interrupted", None)],
 )
 def test_an_unfinished_run_has_its_reason_on_one_line(
     tmp_path: Path, error: BaseException, state: str, detail: str | None
@@ -88,8 +85,9 @@ def test_a_lock_that_cannot_be_tried_is_reported(tmp_path: Path, monkeypatch: py
 
 
 def test_runs_with_other_overrides_are_apart_and_say_which(tmp_path: Path) -> None:
-    plain = record(tmp_path, "occl", "mae_vz", 0, predicted(0).frame)
     other = record(tmp_path, "occl", "mae_vz", 0, predicted(1).frame, overrides=("optimizer.lr=0.5",))
+    assert only(tmp_path).overrides == "unknown: there is no run without overrides to compare with"
+    plain = record(tmp_path, "occl", "mae_vz", 0, predicted(0).frame)
     config = {"seed": 0, "runs": "runs", "optimizer": {"lr": 0.001, "eps": 1}, "backbone": {"depth": 50}}
     plain.write_config(config)
     other.write_config({**config, "runs": "elsewhere", "optimizer": {"lr": 0.5, "eps": 1, "foreach": True}})
@@ -119,11 +117,6 @@ def test_another_class_is_named_with_the_arguments_of_both(tmp_path: Path) -> No
         # the frequency of evaluation changes no number
         run.write_config({"optimizer": optimizer, "evaluation": {"every_n_epochs": often}})
     assert [run.overrides for run in read_report(tmp_path).runs] == [None, "optimizer=Adam, optimizer.lr=0.2"]
-
-
-def test_overrides_are_unknown_without_a_run_to_compare_with(tmp_path: Path) -> None:
-    record(tmp_path, "occl", "mae_vz", 0, predicted(1).frame, overrides=("optimizer.lr=0.5",))
-    assert only(tmp_path).overrides == "unknown: there is no run without overrides to compare with"
 
 
 @pytest.mark.parametrize("leaf", ["seed", "seedx", "seed00", "seed1-xyz", "seed-1"])

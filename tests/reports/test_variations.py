@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from phd_exp.reports.files import write_tables
 from phd_exp.reports.runs import read_report
 from phd_exp.reports.table import Table
 from phd_exp.reports.variations import variation_tables
@@ -42,6 +41,7 @@ def only(runs: Path) -> Table:
 
 def test_numbers_are_of_the_held_out_images(drawn: dict, tmp_path: Path) -> None:
     (plain,), (varied,) = only(tmp_path).groups
+    assert only(tmp_path).stem == "variations-small-occl-probabilistic"
     assert plain.stub == ("none", "0, 1")
     assert varied.stub == ("optimizer.lr=0.5", "0, 1")
     for row, lr in ((plain, 0.1), (varied, 0.5)):
@@ -91,14 +91,3 @@ def test_unfinished_and_unreadable_runs_are_left_out(drawn: dict, tmp_path: Path
             file = run.folder.held_out if broken == "held_out" else run.folder.status_file
             file.write_bytes(b"torn")
     assert variation_tables(read_report(tmp_path)) == []
-
-
-def test_files_are_named_by_preset_data_and_model(drawn: dict, tmp_path: Path) -> None:
-    folder = write_tables([only(tmp_path)], tmp_path / "report")
-    assert {file.name for file in folder.iterdir()} == {
-        "variations-small-occl-probabilistic.md",
-        "variations-small-occl-probabilistic.tex",
-        "variations.csv",
-    }
-    text = (folder / "variations-small-occl-probabilistic.md").read_text()
-    assert "| optimizer.lr=0.5 | 0, 1 |" in text

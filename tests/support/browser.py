@@ -31,7 +31,8 @@ class Visit:
 
     def open(self, address: str) -> None:
         path, _, fragment = address.partition("#")
-        self.page.goto(f"{(self.site / path).as_uri()}{'#' + fragment if fragment else ''}")
+        target = (self.site / path).as_uri() if path != "about:blank" else path
+        self.page.goto(f"{target}{'#' + fragment if fragment else ''}")
         self.page.wait_for_load_state("load")
 
     def draw(self) -> int:

@@ -15,6 +15,9 @@ from filelock import FileLock
 from phd_exp.cli import report
 from phd_exp.records.choices import RunName
 from phd_exp.records.runs import RunFolder
+from phd_exp.reports.files import all_tables
+from phd_exp.reports.runs import read_report
+from phd_exp.reports.site import build
 
 COORDINATES = ("x", "y", "z")
 DATA = ("default", "occl", "scale", "occl_scale")
@@ -113,6 +116,12 @@ def both_tables(runs: Path) -> dict[tuple[str, str, int], Predicted]:
 def reported(runs: Path, out: Path) -> None:
     """Run the command `report` on these runs."""
     assert report.main([f"runs={runs}", f"out={out}"]) == 0
+
+
+def sited(runs: Path, out: Path) -> Path:
+    """The pages of these runs, without the figures and tables of a paper."""
+    found = read_report(runs, out / "measured")
+    return build.write_site(found, all_tables(found), [], out / "site").parent
 
 
 def once(factory: pytest.TempPathFactory, name: str, build: Callable[[Path], None]) -> Path:

@@ -19,13 +19,7 @@ ANGLES = (0.0, 0.5, -0.6, 0.7)
 
 
 def write_views(
-    file: Path,
-    n: int = 400,
-    *,
-    a: float = 60.0,
-    A: float = 600.0,
-    overconfidence: float = 1.0,
-    common: float = 0.0,
+    file: Path, n: int = 400, *, a: float = 60.0, A: float = 600.0, overconfidence: float = 1.0, common: float = 0.0
 ) -> None:
     """`n` scenes seen by four cameras that predict each on its own; `common` is the log scale all depths share."""
     xyz, f = truths(4 * n, seed=5)

@@ -1,8 +1,11 @@
 """Records of runs of each kind for a report: good, bad and hostile."""
 
+import json
+import shutil
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from PIL import Image
 
@@ -11,7 +14,14 @@ from phd_exp.records.runs import RunFolder
 from tests.support.several import write_views
 from tests.support.synthetic import write_run
 
-HOSTILE = "<img src=x onerror=window.owned=1>"
+OWNED = "window.owned=1"
+HOSTILE = (
+    f"'\"><img src=x onerror={OWNED}><svg onload={OWNED}></script><script>{OWNED}</script>"
+    f'<a href="javascript:{OWNED}">x</a>{{{{7*7}}}}\u2028&lt;b&gt;%3Cb%3E'
+)
+"""A text that tries to execute code in the reader's browser."""
+NAME = HOSTILE.replace("/", "")[:120]
+"""The same as a name of a folder or a file."""
 
 
 def write_runs(folder: Path) -> Path:
@@ -26,6 +36,7 @@ def write_runs(folder: Path) -> Path:
     held_out = write_run(folder / "elsewhere", "occl", seed=1, n=100, overconfidence=2.0)
     held_out.predictions.rename(certain.path / "held_out.parquet")
     write_views(certain.views, 50)
+    _rewrite(certain)
     write_run(runs, "default", "mae_logz", n=100, root=folder / "renders")
     write_run(runs, "default", "mae_vz", preset="demo", overrides=("optimizer.lr=0.1",), n=100)
     _fail(_folder(runs, "occl", "mae_vz"))
@@ -35,9 +46,23 @@ def write_runs(folder: Path) -> Path:
     assert status is not None
     broken_off.write_status(status.model_copy(update={"state": "running"}))
     _folder(runs, "scale", "mae_vz").status_file.write_text("{")
-    odd = write_run(runs, HOSTILE, n=100)
-    odd.predictions.write_bytes(b"no parquet")
+    _rewrite(write_run(runs, NAME, "mae_vz", preset="a<b>'\"&", n=40, epochs=2, root=folder / "renders"))
+    hostile = folder / "renders" / NAME / "test"
+    hostile.mkdir(parents=True)
+    shutil.copy(images / "000000.png", hostile / f"{NAME}.png")
     return runs
+
+
+def _rewrite(folder: RunFolder) -> None:
+    """Put the hostile text wherever a run record holds a text."""
+    folder.config_file.write_text(
+        json.dumps(folder.config() | {HOSTILE: {HOSTILE: HOSTILE}, "model": {"name": HOSTILE}})
+    )
+    status = json.loads(folder.status_file.read_text())
+    texts = dict.fromkeys(("machine", "git_commit", "data_manifest", "traceback", "error"), HOSTILE)
+    folder.status_file.write_text(json.dumps(status | texts | {"versions": {HOSTILE: HOSTILE}}))
+    folder.write_metrics([row | {HOSTILE: 1.0, f"test/{HOSTILE}": float(row["epoch"])} for row in folder.metrics()])
+    pd.read_parquet(folder.predictions).assign(file_name=f"{NAME}.png").to_parquet(folder.predictions)
 
 
 def _fail(folder: RunFolder) -> None:

@@ -14,12 +14,7 @@ from phd_exp.records.choices import RunName
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.predictions import columns, summary, write_parquet
 
-PRECISION = {
-    "default": (30.0, 900.0),
-    "occl": (12.0, 250.0),
-    "scale": (9.0, 900.0),
-    "occl_scale": (7.0, 200.0),
-}
+PRECISION = {"default": (30.0, 900.0), "occl": (12.0, 250.0), "scale": (9.0, 900.0), "occl_scale": (7.0, 200.0)}
 
 
 def _spread(shape: tuple[int, ...], factor: float, random: torch.Generator) -> Tensor:

@@ -12,6 +12,7 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.training.config import check
 from phd_exp.training.run import train
 from tests.support.handmade import write_handmade
+from tests.support.recorded import once
 
 TINY = (
     "preset=smoke", "recipe=strong", "backbone.width=8", "backbone.channels=4", "data.variant=handmade",
@@ -24,8 +25,12 @@ TINY = (
 @pytest.fixture(scope="session")
 def handmade(make_spec: Callable[..., DatasetSpec], tmp_path_factory: pytest.TempPathFactory) -> DatasetFolder:
     spec = make_spec("handmade", sensor_size=64, f_range=(400.0, 600.0))
-    folder = DatasetFolder(tmp_path_factory.mktemp("renders") / "handmade")
-    return write_handmade(folder, spec, {"train": 20, "test": 6})
+    place = once(
+        tmp_path_factory,
+        "handmade renders",
+        lambda root: write_handmade(DatasetFolder(root / "handmade"), spec, {"train": 20, "test": 6}),
+    )
+    return DatasetFolder(place / "handmade")
 
 
 @pytest.fixture(scope="session")

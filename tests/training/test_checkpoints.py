@@ -44,3 +44,14 @@ def test_code_in_a_checkpoint_is_not_run(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="holds more than tensors and plain values"):
         AtomicCheckpoints().load_checkpoint(str(tmp_path / "last.ckpt"), weights_only=False)
     assert not (tmp_path / "sprung").exists()
+
+
+def test_a_broken_checkpoint_is_one_line(tmp_path: Path) -> None:
+    file = tmp_path / "last.ckpt"
+    AtomicCheckpoints().save_checkpoint({"epoch": 3}, str(file))
+    content = file.read_bytes()
+    for broken in (content[: len(content) // 2], b"", b"no checkpoint"):
+        file.write_bytes(broken)
+        with pytest.raises(RunError, match=r"last\.ckpt: not a whole checkpoint .*; delete it") as caught:
+            AtomicCheckpoints().load_checkpoint(str(file))
+        assert "\n" not in str(caught.value)

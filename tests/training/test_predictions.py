@@ -40,11 +40,7 @@ def distribution(batch: Batch) -> ProjectedHuber:
 def test_columns_rebuild_the_distribution(batch: Batch, distribution: ProjectedHuber) -> None:
     table = columns(distribution, batch)
     A = torch.stack(
-        [
-            torch.stack([table["A_xx"], table["A_xy"]], -1),
-            torch.stack([table["A_xy"], table["A_yy"]], -1),
-        ],
-        -2,
+        [torch.stack([table["A_xx"], table["A_xy"]], -1), torch.stack([table["A_xy"], table["A_yy"]], -1)], -2
     )
     mu_xy = torch.stack([table["mu_x"], table["mu_y"]], -1)
     rebuilt = ProjectedHuber(mu_xy, table["mu_z"], A, table["a"])
@@ -60,10 +56,6 @@ def test_summary_is_the_mean_of_the_columns(batch: Batch, distribution: Projecte
     assert means["test/depth_precision"] == pytest.approx(distribution.a.mean().item(), rel=1e-5)
     determinant = distribution.log_det_A.exp().mean().item()
     assert means["test/projected_precision"] == pytest.approx(determinant, rel=1e-4)
-
-
-def test_summary_scores_calibration(batch: Batch, distribution: ProjectedHuber) -> None:
-    means = summary(columns(distribution, batch))
     scale = 1000 * distribution.depth_crps(batch.xyz[:, 2]).mean().item()
     assert means["test/calibration/depth_crps_mm"] == pytest.approx(scale, rel=1e-5)
     assert means["test/calibration/left_out"] == 0
@@ -108,10 +100,7 @@ def test_curves_of_samples_of_the_distribution_itself_are_calibrated() -> None:
 def test_the_record_is_in_the_order_of_the_data_set(
     batch: Batch, distribution: ProjectedHuber, tmp_path: Path
 ) -> None:
-    known = {
-        "file_name": [f"{i:06d}.png" for i in range(len(batch))],
-        "f": [1500.0 + i for i in range(len(batch))],
-    }
+    known = {"file_name": [f"{i:06d}.png" for i in range(len(batch))], "f": [1500.0 + i for i in range(len(batch))]}
     rows = Rows()
     rows.update(columns(distribution, batch))
     write_parquet(tmp_path / "predictions.parquet", rows.columns(), known)

@@ -15,8 +15,7 @@ Trace = dict[str, Any]
 Numbers = Sequence[float | None]
 
 DASHES = ("solid", "dash", "dot", "dashdot")
-POINTS = 120
-"""Most points of a curve; more would only make pages larger."""
+POINTS = 120  # most points of a curve; more would only make pages larger
 
 
 @dataclass(frozen=True)

@@ -44,10 +44,7 @@ def _squared_error(scores: FusionScores) -> Chart:
     ]
     label = f"Squared error of the fused position over its prediction, 1 where calibrated: {_courses(traces)}."
     traces.insert(0, line("calibrated", (1.0, scores.views), (1.0, 1.0), 0, dash="dash", role=ASIDE))
-    layout = {
-        "xaxis": axis("cameras", dtick=1),
-        "yaxis": axis("squared error / predicted", rangemode="tozero"),
-    }
+    layout = {"xaxis": axis("cameras", dtick=1), "yaxis": axis("squared error / predicted", rangemode="tozero")}
     return Chart("Fused: squared error over predicted", label, traces, layout)
 
 

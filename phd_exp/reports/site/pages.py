@@ -111,12 +111,7 @@ def _score_rows(run: Run) -> list[ScoreRow]:
     recalibrated = after.scores if after else {}
     return [
         ScoreRow(
-            name,
-            score,
-            before.scores[name],
-            recalibrated.get(name),
-            before.reference.get(name),
-            paper.get(name),
+            name, score, before.scores[name], recalibrated.get(name), before.reference.get(name), paper.get(name)
         )
         for name, score in SCORES.items()
         if name in before.scores

@@ -8,17 +8,7 @@ from phd_exp.evaluation.predictions import Curve, Evaluation, Stratum
 from phd_exp.reports.figures import decades
 from phd_exp.reports.quantities import METRICS, Quantity, quantity
 from phd_exp.reports.runs import Run
-from phd_exp.reports.site.charts import (
-    DASHES,
-    Chart,
-    Trace,
-    axis,
-    bars,
-    curve_line,
-    identity,
-    line,
-    square,
-)
+from phd_exp.reports.site.charts import DASHES, Chart, Trace, axis, bars, curve_line, identity, line, square
 from phd_exp.reports.site.fusion_charts import fusion_charts
 
 

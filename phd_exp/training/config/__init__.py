@@ -32,18 +32,9 @@ from phd_exp.training.config.sections import (
 )
 from phd_exp.training.config.targets import Origin, Target, describe, locate
 
-__all__ = [
-    "FolderConfig",
-    "RenderConfig",
-    "RenderedConfig",
-    "RunConfig",
-    "TrainerConfig",
-    "check",
-    "check_render",
-]
+__all__ = ["FolderConfig", "RenderConfig", "RenderedConfig", "RunConfig", "TrainerConfig", "check", "check_render"]
 
-SINGLE_VIEW = "scale"
-"""The data set whose runs can be evaluated on several views."""
+SINGLE_VIEW = "scale"  # the data set whose runs can be evaluated on several views
 
 Checked = TypeVar("Checked", bound=BaseModel)
 

@@ -3,22 +3,12 @@
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Discriminator,
-    Field,
-    StrictBool,
-    Tag,
-    model_validator,
-)
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, StrictBool, Tag, model_validator
 
 from phd_exp.records.spec import Angle, DatasetSpec, Range
 from phd_exp.training.config.targets import Target
 
-MULTIVIEW = "multiview"
-"""The data set whose scenes are rendered from several cameras."""
+MULTIVIEW = "multiview"  # the data set whose scenes are rendered from several cameras
 
 Whole = Annotated[int, Field(strict=True)]
 Natural = Annotated[Whole, Field(ge=0)]

@@ -1,4 +1,7 @@
-"""The site in a real browser, from the file system, without a network."""
+"""The site in a real browser, from the file system, without a network.
+
+By default one walk on a phone and one on a desktop; all other pages and interactions are slow.
+"""
 
 import re
 from pathlib import Path
@@ -7,6 +10,7 @@ from urllib.parse import quote
 import pytest
 
 from tests.support.browser import Visit
+from tests.support.site_runs import OWNED
 
 RUN = "runs/small-default-probabilistic-seed0.html"
 OTHER = "small-occl-probabilistic-seed0"
@@ -22,6 +26,10 @@ LONGEST_LINES = """plots => plots.map(plot => Math.max(
 """The longest line, band or point of each chart: zero for an empty frame."""
 
 
+BAD = "main img[src=x], main svg[onload], a[href^='javascript']"
+"""What a text of a run must not become."""
+
+
 def _opens_and_draws(visit: Visit, page: str) -> int:
     visit.open(page)
     charts = visit.draw()
@@ -29,6 +37,8 @@ def _opens_and_draws(visit: Visit, page: str) -> int:
     assert len(drawn) == charts
     assert min(drawn, default=1) > 0, page
     assert visit.width_beyond() <= 0, f"{page} is wider than the screen"
+    visit.open_details()
+    assert visit.page.locator(BAD).count() == 0, page
     assert visit.page.evaluate("window.owned === undefined"), page
     return charts
 
@@ -56,8 +66,17 @@ def test_pages_of_each_kind_open_and_draw_their_charts(visit: Visit) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("visit", [LAPTOP, PHONE_DARK], ids=["laptop, light", "phone, dark"], indirect=True)
 def test_every_page_opens_and_draws_its_charts(visit: Visit, site: Path) -> None:
-    for file in sorted((site / "runs").iterdir()):
-        _opens_and_draws(visit, f"runs/{quote(file.name)}")
+    """The labels under the mouse are texts of the run too."""
+    slugs = sorted(file.stem for file in (site / "runs").iterdir())
+    for page in (f"compare.html#a={slugs[0]}&b={slugs[1]}", *(f"runs/{quote(slug)}.html" for slug in slugs)):
+        _opens_and_draws(visit, page)
+        for axes in visit.page.locator(".plot .nsewdrag").all()[:3]:
+            axes.hover(force=True, timeout=2000)
+        assert visit.page.evaluate("window.owned === undefined"), page
+    visit.open(f"runs/{OTHER}.html")  # the text reads as it was written
+    text = visit.page.locator("main").text_content() or ""
+    assert text.count(f"'\"><img src=x onerror={OWNED}>") > 5
+    assert "{{7*7}}" in text
 
 
 def test_links_and_the_comparison_keep_their_runs(visit: Visit) -> None:
@@ -81,16 +100,15 @@ def test_links_and_the_comparison_keep_their_runs(visit: Visit) -> None:
     visit.page.wait_for_url("**/index.html")
 
 
-def test_the_paired_difference_has_its_interval(visit: Visit) -> None:
+@pytest.mark.slow
+def test_a_comparison_has_paired_differences_and_names_its_runs(visit: Visit) -> None:
     """Only runs on the same test images are compared image by image."""
     visit.open("compare.html#a=small-default-probabilistic-seed0&b=small-default-mae_logz-seed0")
     row = visit.page.locator("#scores tbody tr").first
     row.wait_for()
     assert re.fullmatch(r"−?\d+\.\d \[−?\d+\.\d, −?\d+\.\d\]", row.inner_text().split("\t")[3])
     assert "tested on the same images" in visit.page.locator("#paired").inner_text()
-
-
-def test_overlays_name_their_runs(visit: Visit) -> None:
+    visit.open("about:blank")
     visit.open(COMPARISON)
     legend = visit.page.locator("#curves figure[data-chart=coverage] .legend li")
     legend.first.wait_for()
@@ -99,6 +117,7 @@ def test_overlays_name_their_runs(visit: Visit) -> None:
     assert "probabilistic on default seed0" in texts[1]
 
 
+@pytest.mark.slow
 def test_the_overview_sorts_runs_and_filters_lines(visit: Visit) -> None:
     visit.open("index.html")
     assert visit.page.locator("main section").first.get_attribute("id") == "runs"
@@ -122,6 +141,7 @@ def test_the_overview_sorts_runs_and_filters_lines(visit: Visit) -> None:
     assert lines.count() == 2  # the diagonal and one run
 
 
+@pytest.mark.slow
 def test_a_chart_has_its_numbers_as_a_table_and_as_csv(visit: Visit) -> None:
     visit.open(RUN)
     figure = visit.page.locator("figure[data-chart=coverage]")
@@ -136,6 +156,7 @@ def test_a_chart_has_its_numbers_as_a_table_and_as_csv(visit: Visit) -> None:
     assert len(Path(download.value.path()).read_text().splitlines()) == rows.count() + 1
 
 
+@pytest.mark.slow
 def test_the_theme_is_kept_and_applied_to_charts(visit: Visit) -> None:
     visit.open(RUN)
     visit.draw()
@@ -152,6 +173,7 @@ def test_the_theme_is_kept_and_applied_to_charts(visit: Visit) -> None:
     assert visit.page.locator("html").get_attribute("data-theme") == "dark"
 
 
+@pytest.mark.slow
 def test_several_cameras_have_their_charts_and_table(visit: Visit) -> None:
     visit.open("index.html")
     visit.page.locator("#of-fusion a").click()
@@ -165,16 +187,13 @@ def test_several_cameras_have_their_charts_and_table(visit: Visit) -> None:
     assert section.locator("table thead th").all_inner_texts() == headings
 
 
-def test_the_keyboard_reaches_the_content_first(visit: Visit) -> None:
-    visit.open("index.html")
+@pytest.mark.slow
+def test_the_keyboard_reaches_the_content_first_and_pictures_are_loaded(visit: Visit) -> None:
+    visit.open(RUN)
     visit.page.keyboard.press("Tab")
     assert visit.page.evaluate("document.activeElement.textContent") == "Skip to the content"
     visit.page.keyboard.press("Enter")
     assert visit.page.evaluate("document.activeElement.id") == "main"
-
-
-def test_pictures_are_loaded_and_labelled(visit: Visit) -> None:
-    visit.open(RUN)
     assert visit.page.locator("svg.panel image").count() >= 12
     loaded = visit.page.evaluate(
         """() => Promise.all([...document.querySelectorAll('svg.panel image')].map(image => {

@@ -11,8 +11,8 @@ import pytest
 
 from phd_exp.reports.runs import Run, read_report
 from phd_exp.reports.site import build
-from tests.support.recorded import reported
-from tests.support.site_runs import HOSTILE
+from tests.support.recorded import sited
+from tests.support.site_runs import HOSTILE, OWNED
 from tests.support.synthetic import write_run
 
 MEGABYTE = 1_000_000
@@ -88,12 +88,17 @@ def test_colours_contrast_with_the_page(site: Path, theme: str) -> None:
             assert (high + 0.05) / (low + 0.05) >= least, f"{name} on {ground}"
 
 
-def test_text_of_runs_is_escaped(site: Path) -> None:
-    pages = {file.name: file.read_text() for file in _pages(site)}
-    assert any("&lt;img src=x" in text for text in pages.values())
-    for text in [*pages.values(), *(file.read_text() for file in (site / "data").iterdir())]:
-        assert HOSTILE not in text
-        assert "<script>window" not in text
+def test_text_of_runs_is_escaped_and_files_have_plain_names(site: Path) -> None:
+    for file in _pages(site):
+        for tag, named in Page(file).tags:
+            assert not [name for name in named if name.startswith("on")], f"{file}: {tag}"
+            assert not [link for link in named.values() if link == "x" or str(link).startswith("javascript")], file
+    texts = [file.read_text() for folder in ("runs", "data") for file in (site / folder).iterdir()]
+    assert sum("&lt;img src=x" in text or "\\u003cimg src=x" in text for text in texts) > 4
+    assert not [text for text in texts if HOSTILE in text or f"<script>{OWNED}" in text]
+    for file in site.rglob("*"):
+        assert file.name.isascii()
+        assert not set(file.name) & set("<>\"'&;\\ "), file
 
 
 def test_every_run_has_a_page_in_any_state(runs: tuple[Run, ...], site: Path) -> None:
@@ -145,7 +150,7 @@ def own(tmp_path: Path) -> Path:
     """Two runs and their site, which a test may change."""
     write_run(tmp_path / "runs", "default", "mae_vz", n=40, epochs=2)
     write_run(tmp_path / "runs", "occl", "mae_vz", n=40, epochs=2)
-    reported(tmp_path / "runs", tmp_path / "out")
+    sited(tmp_path / "runs", tmp_path / "out")
     return tmp_path
 
 
@@ -153,7 +158,7 @@ def test_removed_runs_leave_no_page_and_a_single_run_is_not_compared(own: Path) 
     site = own / "out" / "site"
     assert "compare.html" in (site / "index.html").read_text()
     shutil.rmtree(own / "runs" / "small" / "occl")
-    reported(own / "runs", own / "out")
+    sited(own / "runs", own / "out")
     assert not list(site.rglob("*occl*"))
     assert "occl-mae_vz" not in (site / "index.html").read_text()
     others = [page for page in site.rglob("*.html") if page.name != "compare.html"]
@@ -169,10 +174,10 @@ def test_an_interrupted_report_leaves_the_old_pages(own: Path, monkeypatch: pyte
 
     monkeypatch.setattr(build, "run_page", killed)
     with pytest.raises(KeyboardInterrupt):
-        reported(own / "runs", own / "out")
+        sited(own / "runs", own / "out")
     assert {file: file.read_bytes() for file in _pages(site)} == before
     monkeypatch.undo()
-    reported(own / "runs", own / "out")
+    sited(own / "runs", own / "out")
     assert {file: file.read_bytes() for file in _pages(site)} == before
 
 
@@ -185,7 +190,7 @@ def test_an_error_of_drawing_affects_one_page(own: Path, monkeypatch: pytest.Mon
         return real(run)
 
     monkeypatch.setattr(build, "run_charts", faulty)
-    reported(own / "runs", own / "out")
+    sited(own / "runs", own / "out")
     pages = own / "out" / "site" / "runs"
     assert "ZeroDivisionError: of nothing" in (pages / "small-occl-mae_vz-seed0.html").read_text()
     assert "Learning curves" in (pages / "small-default-mae_vz-seed0.html").read_text()

@@ -1,0 +1,26 @@
+"""How errors and the end of a parent end a job; no job runs here."""
+
+import os
+import time
+
+import pytest
+import torch
+
+from phd_exp.cli.frame import Stopped, ending_with, failure, stopping_on_signals
+
+
+def test_a_job_ends_with_the_process_that_started_it() -> None:
+    with pytest.raises(Stopped, match="SIGTERM"), stopping_on_signals(), ending_with(parent=-1):  # no parent of ours
+        time.sleep(60)
+    with stopping_on_signals(), ending_with(os.getppid()):
+        time.sleep(0.1)
+
+
+def test_memory_that_runs_out_is_one_line() -> None:
+    with pytest.raises(RuntimeError) as caught:
+        torch.empty(1 << 50)
+    for error in (caught.value, MemoryError(), torch.OutOfMemoryError()):
+        ending = failure(error)
+        assert (ending.state, ending.exit_status) == ("failed", 1)
+        (line,) = ending.lines
+        assert line.startswith("memory ran out; free some, and the same command resumes, or lower data.batch_size")
