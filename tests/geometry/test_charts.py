@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from phd_exp.geometry import Camera, Cartesian, Chart, DepthScale, LogDepth, Projected, projected
+from phd_exp.geometry import Camera, Cartesian, Chart, DepthScale, LogDepth, Projected
 
 DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
 CAMERA = Camera(torch.tensor([1200.0, 1500.0, 1500.0, 2000.0], dtype=torch.float64), 224.0)
@@ -56,10 +56,6 @@ def test_definitions_of_the_baselines() -> None:
     }
     for make, coordinates in expected.items():
         torch.testing.assert_close(make(DEPTH).coordinates(xyz, one), torch.tensor(coordinates, dtype=torch.float64))
-
-
-def test_projected_agrees_with_the_camera() -> None:
-    torch.testing.assert_close(projected(XYZ, CAMERA), CAMERA.project(XYZ) / (CAMERA.S / 2) - 1)
 
 
 def test_depth_scale_is_that_of_the_papers_ranges_or_of_samples() -> None:

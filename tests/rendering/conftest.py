@@ -12,17 +12,11 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering import render
 from phd_exp.rendering.render import ensure_rendered
 from phd_exp.rendering.sampling import sample_scene
-from tests.support.renders import N_TEST, N_TRAIN, VARIANTS, contents, copying, written
+from tests.support.renders import N_TEST, N_TRAIN, contents, copying, written
 
 # A quarter of the sensor and of the focal length: the same pictures, in a moment.
 SMALL: dict[str, Any] = {"sensor_size": 56, "f_range": (300.0, 500.0), "samples_per_pixel": 1}
 HALF: dict[str, Any] = {"sensor_size": 112, "f_range": (600.0, 1000.0)}
-
-
-@pytest.fixture(scope="session")
-def specs(make_spec: Callable[..., DatasetSpec]) -> dict[str, DatasetSpec]:
-    """The four variants."""
-    return {variant: make_spec(variant) for variant in VARIANTS}
 
 
 @pytest.fixture(scope="session")
@@ -39,15 +33,11 @@ def scenes(make_spec: Callable[..., DatasetSpec]) -> list[Scene]:
 
 
 @pytest.fixture(scope="session")
-def rendered(
-    make_spec: Callable[..., DatasetSpec], tmp_path_factory: pytest.TempPathFactory
-) -> dict[str, DatasetFolder]:
-    """Four training images and one test image of two paired variants, which hold all that the four ever show."""
-    root = tmp_path_factory.mktemp("renders")
-    folders = {variant: DatasetFolder(root / variant) for variant in ("scale", "occl_scale")}
-    for variant, folder in folders.items():
-        ensure_rendered(folder, make_spec(variant, **HALF), n_train=4, n_test=1, workers=1)
-    return folders
+def rendered(make_spec: Callable[..., DatasetSpec], tmp_path_factory: pytest.TempPathFactory) -> DatasetFolder:
+    """Training images and a test image with all that the variants show."""
+    folder = DatasetFolder(tmp_path_factory.mktemp("renders") / "occl_scale")
+    ensure_rendered(folder, make_spec("occl_scale", **HALF), n_train=6, n_test=1, workers=1)
+    return folder
 
 
 @pytest.fixture(scope="session")

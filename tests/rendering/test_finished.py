@@ -146,10 +146,9 @@ def test_without_blender_files_can_be_verified(
         verify(small, small_spec, rerender=1)
 
 
-def test_a_mask_for_every_sample(rendered: dict[str, DatasetFolder], tmp_path: Path) -> None:
-    folder = rendered["occl_scale"]
-    assert write_masks(folder, tmp_path / "masks") == 5
-    for record in folder.records("train"):
+def test_a_mask_for_every_sample(rendered: DatasetFolder, tmp_path: Path) -> None:
+    assert write_masks(rendered, tmp_path / "masks") == 7
+    for record in rendered.records("train"):
         with Image.open(tmp_path / "masks" / "train" / record.file_name) as image:
             assert image.mode == "1"
             mask = np.asarray(image)

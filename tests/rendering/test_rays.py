@@ -112,19 +112,6 @@ def test_visibility_counts_pixels(scenes: list[Scene]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("position", "expected"),
-    [((0.0, 0.0, 3.0), 0.0), ((0.0, 0.0, 5.0), 1.0), ((0.6, 0.0, 3.0), 1.0)],
-    ids=["before", "behind", "beside"],
-)
-def test_a_large_occluder_hides_all_or_nothing(
-    scenes: list[Scene], position: tuple[float, float, float], expected: float
-) -> None:
-    cylinder = placed(scenes[0], position=(0.0, 0.0, 4.0))
-    cube = placed(scenes[0], shape="cube", position=position, scale=2.0)
-    assert visibility(trace_pixels(with_objects(scenes[0], cylinder, cube))) == expected
-
-
-@pytest.mark.parametrize(
     ("x", "expected"), [(0.0, 0.0), (0.4, 0.5), (2.0, 1.0)], ids=["inside", "half outside", "outside"]
 )
 def test_truncation_is_the_share_beyond_the_border(scenes: list[Scene], x: float, expected: float) -> None:

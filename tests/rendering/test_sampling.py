@@ -10,6 +10,7 @@ from phd_exp.records.scenes import Scene
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.rays import rotation_matrix
 from phd_exp.rendering.sampling import sample_scene
+from tests.support.renders import VARIANTS
 
 MakeSpec = Callable[..., DatasetSpec]
 MANY = 1000
@@ -17,8 +18,8 @@ UNLIKELY = 1e-3  # the seeds are fixed: a law either holds at this level for eve
 
 
 @pytest.fixture(scope="module")
-def scenes(specs: dict[str, DatasetSpec]) -> list[Scene]:
-    return [sample_scene(specs["occl_scale"], "train", index) for index in range(MANY)]
+def scenes(make_spec: MakeSpec) -> list[Scene]:
+    return [sample_scene(make_spec("occl_scale"), "train", index) for index in range(MANY)]
 
 
 def assert_uniform(values: list[float], low: float, high: float) -> None:
@@ -76,10 +77,10 @@ def test_what_the_paper_fixes_is_fixed(scenes: list[Scene]) -> None:
         assert scene.S == 224
 
 
-def test_variants_are_paired(specs: dict[str, DatasetSpec]) -> None:
+def test_variants_are_paired(make_spec: MakeSpec) -> None:
     """Occluders are added and scales changed; nothing else differs, occluders included."""
     for index in range(50):
-        default, occl, scale, both = (sample_scene(spec, "train", index) for spec in specs.values())
+        default, occl, scale, both = (sample_scene(make_spec(variant), "train", index) for variant in VARIANTS)
         assert occl.model_copy(update={"objects": occl.objects[:1]}) == default
         assert unscaled(scale) == default
         assert unscaled(both) == occl
@@ -125,9 +126,9 @@ def test_lamps_stand_still_without_jitter(make_spec: MakeSpec) -> None:
     assert moved[0] != moved[1]
 
 
-def test_light_tells_depth_less_than_its_jitter_hides(specs: dict[str, DatasetSpec]) -> None:
+def test_light_tells_depth_less_than_its_jitter_hides(make_spec: MakeSpec) -> None:
     """Irradiance of the key lamp over the range of depths, against its spread over samples."""
-    keys = [sample_scene(specs["default"], "train", index).lamps[0] for index in range(200)]
+    keys = [sample_scene(make_spec(), "train", index).lamps[0] for index in range(200)]
 
     def light(depth: float) -> np.ndarray:
         return np.array([key.power / np.sum((np.array(key.position) - (0, 0, depth)) ** 2) for key in keys])

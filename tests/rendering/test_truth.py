@@ -71,14 +71,10 @@ def check(scene: Scene, drawn: Callable[[Scene], np.ndarray]) -> None:
         assert np.abs(offset).max() <= 0.05
 
 
-@pytest.mark.parametrize(
-    ("variant", "count"),
-    [
-        ("occl_scale", 3),
-        ("multiview", 3),
-        *(pytest.param(v, 30, marks=pytest.mark.slow) for v in (*VARIANTS, "multiview")),
-    ],
-)
+MANY = [pytest.param(variant, 30, marks=pytest.mark.slow) for variant in (*VARIANTS, "multiview")]
+
+
+@pytest.mark.parametrize(("variant", "count"), [("occl_scale", 3), ("multiview", 3), *MANY])
 def test_labels_are_those_of_blenders_pixels(
     make_spec: MakeSpec, drawn: Callable[[Scene], np.ndarray], variant: str, count: int
 ) -> None:

@@ -73,21 +73,12 @@ class Program:
         self.require(clarabel.ZeroConeT(1), row, np.array([normal @ self.origin - offset]))
         return self
 
-    def solver(self, tolerance: float = 1e-14) -> clarabel.DefaultSolver:
-        """The solver of this programme."""
+    def solve(self, tolerance: float = 1e-14) -> tuple[np.ndarray, str]:
+        """The position v, and the status of the solver."""
         settings = clarabel.DefaultSettings()
         settings.verbose = False
         settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
-        return clarabel.DefaultSolver(
-            sparse.csc_matrix(self.P),
-            self.c,
-            sparse.csc_matrix(np.vstack(self.rows)),
-            np.concatenate(self.constants),
-            self.cones,
-            settings,
-        )
-
-    def solve(self, tolerance: float = 1e-14) -> tuple[np.ndarray, str]:
-        """The position v, and the status of the solver."""
-        solution = self.solver(tolerance).solve()
+        P, rows = sparse.csc_matrix(self.P), sparse.csc_matrix(np.vstack(self.rows))
+        constants = np.concatenate(self.constants)
+        solution = clarabel.DefaultSolver(P, self.c, rows, constants, self.cones, settings).solve()
         return self.origin + self.unit * np.array(solution.x[:3]), str(solution.status)
