@@ -76,7 +76,7 @@ class BatchLoader:
     for the whole batch, so they do not depend on `world`. The signs of the first three numbers of a row are
     stratified: within eight epochs each row gets all eight combinations.
 
-    Example:
+    Examples:
         >>> n = 4
         >>> samples = Batch(torch.zeros(n, 8, 8, 3, dtype=torch.uint8), torch.ones(n, 3), torch.ones(n), 8.0,
         ...                 torch.arange(n))

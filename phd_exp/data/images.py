@@ -59,7 +59,7 @@ def shrunk(pixels: UInt8[np.ndarray, "height width 3"], side: int) -> UInt8[np.n
 
     H and W are the overlaps of `_overlaps`. The sums are exact integers, so mirrored images give mirrored results.
 
-    Example:
+    Examples:
         >>> pixels = np.arange(16, dtype=np.uint8).reshape(4, 4, 1).repeat(3, axis=2)
         >>> shrunk(pixels, 2)[..., 0].tolist()
         [[2, 4], [10, 12]]

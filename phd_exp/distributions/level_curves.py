@@ -40,7 +40,7 @@ def level_curves(distribution: ProjectedHuber, levels: tuple[float, ...] = LEVEL
 
     Raises ValueError for a batch of distributions, or a level outside (0, 1).
 
-    Example:
+    Examples:
         >>> p = ProjectedHuber(torch.zeros(2), torch.tensor(4.0), 100 * torch.eye(2), torch.tensor(20.0))
         >>> [curve.shape for curve in level_curves(p, (0.5, 0.9)).projected]
         [(73, 2), (73, 2)]

@@ -38,7 +38,7 @@ class ProjectedHuber(Distribution):
     Raises:
         ValueError: a parameter violates its constraint, or mode or covariance overflow.
 
-    Example:
+    Examples:
         >>> p = ProjectedHuber(torch.zeros(2), torch.tensor(4.0), 100 * torch.eye(2), torch.tensor(20.0))
         >>> p.mode
         tensor([0., 0., 4.])

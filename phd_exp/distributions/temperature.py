@@ -19,7 +19,7 @@ _WIDEST = 80.0  # of log(1/temperature); a fit beyond has no minimum
 class Temperature:
     """A' = A / projected and a' = a / depth: above 1 for overconfident predictions, below 1 for underconfident ones.
 
-    Example:
+    Examples:
         >>> p = ProjectedHuber(torch.zeros(2), torch.tensor(4.0), 100 * torch.eye(2), torch.tensor(20.0))
         >>> wider = Temperature(projected=1.0, depth=2.0).apply(p)
         >>> bool(wider.a == p.a / 2), torch.equal(wider.mode, p.mode)

@@ -26,7 +26,7 @@ def read_table(file: Path) -> Columns:
     Raises RunError, one line, if the file is missing, cannot be read, is too large, or contains other values than
     numbers.
 
-    Example:
+    Examples:
         >>> import tempfile
         >>> with tempfile.NamedTemporaryFile(suffix=".parquet") as file:
         ...     pq.write_table(pa.table({"z": [3.5, 4.5]}), file.name)

@@ -74,7 +74,7 @@ def mean_errors(table: Columns, estimates: Sequence[Estimate]) -> MeanErrors:
 
     Raises RunError, one line, if the table lacks a column or a mean is not finite.
 
-    Example:
+    Examples:
         >>> row = {"x": 0, "y": 0, "z": 4, "f": 1500, "S": 224, "mode_x": 0.003, "mode_y": 0.004, "mode_z": 4.5}
         >>> found = mean_errors({name: np.array([value], dtype=float) for name, value in row.items()}, ["mode"])
         >>> found[ErrorKey("mode", "whole", "projected")].value, found[ErrorKey("mode", "whole", "depth")].value

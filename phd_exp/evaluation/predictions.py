@@ -130,7 +130,7 @@ def recalibrated(table: pa.Table | Columns, temperature: Temperature) -> dict[st
 
     Drops samples whose parameters are not finite. Raises RunError if a column is missing, or if no sample is left.
 
-    Example:
+    Examples:
         >>> from phd_exp.distributions import ProjectedHuber
         >>> one = ProjectedHuber(torch.zeros(1, 2), torch.full((1,), 4.0), torch.eye(2)[None], torch.ones(1))
         >>> table = {name: column.numpy() for name, column in distribution_columns(one, torch.ones(1, 3)).items()}

@@ -132,7 +132,7 @@ def fuse(
     Raises:
         ValueError: shapes do not broadcast.
 
-    Example:
+    Examples:
         >>> A, a = 300 * torch.eye(2).expand(2, 2, 2), torch.full((2,), 10.0)
         >>> predictions = ProjectedHuber(torch.zeros(2, 2), torch.tensor([4.0, 6.0]), A, a)
         >>> ahead = Pose(torch.eye(3), torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]]))  # the second 2 m behind

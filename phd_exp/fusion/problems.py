@@ -46,12 +46,15 @@ class Problems:
     A masked camera has q = 0 and t = 1 at every position, and a = 0: it adds a constant to the energy.
 
     Args:
-        predictions, pose, mask: as given to `fuse`.
+        predictions: as given to `fuse`.
+        pose: as given to `fuse`.
+        mask: as given to `fuse`.
         origin: the world position of u = 0, where the search starts, metres: the average of the predicted positions,
             or the nearest point of the plane.
         directions: the world position is origin + directions u; on a plane the third column is zero.
         dimensions: the number of unknowns, 3, or 2 on a plane.
-        slope, free_slope: d(q_x, q_y, t)/du and the same with respect to the world position, 1/metres.
+        slope: d(q_x, q_y, t)/du, 1/metres.
+        free_slope: the same with respect to the world position.
         at_origin: (q_x, q_y, t) at u = 0.
         a: precision of the depth.
         status: FUSED where the input is valid.

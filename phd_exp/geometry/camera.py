@@ -21,7 +21,7 @@ class Camera:
 
     Raises ValueError if f or S is not positive or not finite.
 
-    Example:
+    Examples:
         >>> Camera(torch.tensor(1500.0), S=224.0).project(torch.tensor([0.28, 0.0, 4.0]))
         tensor([217., 112.])
     """

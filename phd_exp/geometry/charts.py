@@ -28,7 +28,7 @@ class DepthScale:
 
     Source: paper, section "Parameter remapping".
 
-    Example:
+    Examples:
         >>> DepthScale.from_ranges(f_range=(1000.0, 2000.0), z_range=(2.0, 4.0))
         DepthScale(mu_z0=0.002, D=2.0, z_centre=3.0)
     """

@@ -25,7 +25,7 @@ class VirtualCamera:
 
     Source: own derivation; both cameras are pinholes with one centre.
 
-    Example:
+    Examples:
         >>> K = intrinsics(900.0, 900.0, 320.0, 240.0)
         >>> camera = VirtualCamera.of_box(K, (270.0, 190.0, 370.0, 290.0), S=200.0)
         >>> camera.f, camera.to_virtual(np.array([0.0, 0.0, 4.0]))

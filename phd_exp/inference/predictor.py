@@ -34,7 +34,7 @@ BATCH = 64
 class View:
     """The input image of a network, prepared as in training, and its virtual camera, whose frame predictions have.
 
-    Example:
+    Examples:
         >>> photo, K = Image.new("RGB", (90, 60)), intrinsics(300.0, 300.0, 45.0, 30.0)
         >>> View.of_box(photo, K, (50.0, 10.0, 80.0, 50.0), side=32, where="photo").image.shape
         (32, 32, 3)

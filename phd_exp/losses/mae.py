@@ -9,7 +9,7 @@ from phd_exp.distributions import PointEstimate
 class MeanAbsoluteError(nn.Module):
     """The Euclidean norm of each residual, in the coordinates that the network regresses (no unit).
 
-    Example:
+    Examples:
         >>> import torch
         >>> from phd_exp.geometry import Camera, Cartesian, DepthScale
         >>> chart = Cartesian(DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0)))

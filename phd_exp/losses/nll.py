@@ -9,7 +9,7 @@ from phd_exp.distributions import ProjectedHuber
 class NegativeLogLikelihood(nn.Module):
     """-log p(v) of each sample, in nats, of the full density in the camera frame.
 
-    Example:
+    Examples:
         >>> import torch
         >>> A = 20 * torch.eye(2).expand(1, 2, 2)
         >>> prediction = ProjectedHuber(torch.zeros(1, 2), torch.tensor([4.0]), A, torch.tensor([20.0]))

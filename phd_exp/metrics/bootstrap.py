@@ -40,7 +40,7 @@ def bands(
     Raises ValueError for no samples, fewer than one resample, or a confidence outside (0, 1).
     Source: Efron and Tibshirani, "An introduction to the bootstrap" (1993), chapter 13.
 
-    Example:
+    Examples:
         >>> band = bands(means, {"x": torch.arange(100.0)}, resamples=200, seed=0)["x"]
         >>> float(band.value), bool(band.low < band.value < band.high)
         (49.5, True)

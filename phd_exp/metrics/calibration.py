@@ -47,7 +47,7 @@ def calibration_curve(
     Raises ValueError for a window below 1, or if no sample has a finite variance and error.
     Source: paper, section "Empirical error vs. estimated error" (window 200).
 
-    Example:
+    Examples:
         >>> curve = calibration_curve(torch.tensor([4.0, 1.0]), torch.tensor([5.0, 2.0]), window=200)
         >>> curve.predicted.tolist(), curve.empirical.tolist(), curve.window
         ([1.0, 4.0], [2.0, 5.0], 1)
@@ -75,7 +75,7 @@ def ence(
     Raises ValueError for bins below 1.
     Source: Levi et al., "Evaluating and calibrating uncertainty prediction in regression tasks" (2022).
 
-    Example:
+    Examples:
         >>> float(ence(torch.ones(4), torch.full((4,), 4.0), bins=2))  # deviations twice as large as predicted
         1.0
     """
@@ -103,7 +103,7 @@ def _in_order(levels: Levels) -> Ordered:
 def coverage(levels: Levels, at: Float[Tensor, " points"]) -> Float[Tensor, "*batch points"]:
     """The share of samples whose credible level is at most each value of `at`: their empirical CDF.
 
-    Example:
+    Examples:
         >>> coverage(torch.tensor([0.2, 0.4, 0.6, 0.8]), torch.tensor([0.5, 0.9])).tolist()
         [0.5, 1.0]
     """
@@ -115,7 +115,7 @@ def coverage(levels: Levels, at: Float[Tensor, " points"]) -> Float[Tensor, "*ba
 def miscalibration_area(levels: Levels) -> Float[Tensor, "*batch"]:
     """int_0^1 |coverage(p) - p| dp, exactly: coverage is a step function. 0 is the best value, 1/2 the worst.
 
-    Example:
+    Examples:
         >>> float(miscalibration_area(torch.tensor([0.5])))
         0.25
     """

@@ -15,7 +15,7 @@ def along_true_ray(xyz: Float[Tensor, "*batch 3"], estimate: Float[Tensor, "*bat
 def projected_error(xyz: Float[Tensor, "*batch 3"], estimate: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
     """|v^ - v_par|: the distance of the estimate from the true viewing ray, in metres.
 
-    Example:
+    Examples:
         >>> xyz, estimate = torch.tensor([0.0, 0.0, 4.0]), torch.tensor([0.3, 0.4, 4.5])
         >>> float(projected_error(xyz, estimate)), float(depth_error(xyz, estimate))
         (0.5, 0.5)

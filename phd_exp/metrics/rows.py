@@ -16,7 +16,7 @@ class Rows(Metric):
     depend on how samples are distributed. A checkpoint in the middle of an epoch includes the rows so far. Two
     thousand rows of thirty columns take 0.5 MB.
 
-    Example:
+    Examples:
         >>> rows = Rows()
         >>> rows.update({"row": torch.tensor([1, 0]), "error": torch.tensor([0.5, 0.25])})
         >>> rows.columns()["error"].tolist()

@@ -20,7 +20,7 @@ def energy_score(
     The second mean is over all n (n - 1) pairs of different draws. Raises ValueError for fewer than two draws.
     Source: Gneiting and Raftery, "Strictly proper scoring rules, prediction, and estimation" (2007).
 
-    Example:
+    Examples:
         >>> draws = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, 5.0]])
         >>> float(energy_score(draws, torch.tensor([0.0, 0.0, 4.0])))  # distance 1 from the truth, 2 from each other
         0.0

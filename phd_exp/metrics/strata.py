@@ -28,7 +28,7 @@ def strata(
 
     Raises ValueError for edges that do not ascend, or for fewer than one part.
 
-    Example:
+    Examples:
         >>> [part.label for part in strata("depth", torch.tensor([3.0, 3.5, 4.0]), (3.0, 3.5, 4.0), "m")]
         ['depth 3-3.5 m', 'depth 3.5-4 m']
     """

@@ -62,7 +62,7 @@ class PooledFeatures(Backbone):
 def resnet(depth: Depth) -> PooledFeatures:
     """A ResNet of torchvision without its last layer, every BatchNorm replaced by GroupNorm(1, C).
 
-    Example:
+    Examples:
         >>> resnet(18).n_features
         512
 

@@ -38,7 +38,7 @@ class Head(Protocol):
 class DistributionHead:
     """Seven raw numbers -> the Projected Huber distribution.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from phd_exp.geometry import Camera, DepthScale
         >>> depth = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
@@ -66,7 +66,7 @@ class DistributionHead:
 class ChartHead:
     """Three raw numbers -> the position with these coordinates in a chart.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from phd_exp.geometry import Camera, DepthScale, LogDepth
         >>> head = ChartHead(DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0)), LogDepth)

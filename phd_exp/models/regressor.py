@@ -55,7 +55,7 @@ class Regressor(nn.Module):
     float32, since nu_p = B v_p rounded to bfloat16 has errors up to 0.2 pixels at the border of the image.
     Images keep their memory format, channels last, which is at least as fast on CPUs and GPUs.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from phd_exp.geometry import Camera, DepthScale
         >>> from phd_exp.models.backbones import resnet

@@ -33,7 +33,7 @@ class Muon(Optimizer):
         orthogonal_lr: learning rate of the orthogonal steps.
         momentum: weight of the previous mean of gradients.
 
-    Example:
+    Examples:
         >>> network = nn.Sequential(nn.Conv2d(3, 8, 3), nn.Conv2d(8, 8, 3))
         >>> optimizer = Muon(network.parameters(), lr=0.002, orthogonal_lr=0.005)
         >>> network(torch.ones(1, 3, 8, 8)).sum().backward()

@@ -44,7 +44,7 @@ WITHOUT_INFLUENCE = (
 class RunName:
     """The choices that name a run and its folder; `preset` is a `setting`, which may include the recipe.
 
-    Example:
+    Examples:
         >>> RunName("paper", "scale", "mae_logz", seed=3).folder(Path("runs")).as_posix()
         'runs/paper/scale/mae_logz/seed3'
     """

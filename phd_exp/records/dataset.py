@@ -53,7 +53,7 @@ class Manifest(BaseModel):
 class DatasetFolder:
     """One data set on disk; `root` is its folder, `renders/<variant>`.
 
-    Example:
+    Examples:
         >>> folder = DatasetFolder(Path("/data/renders/scale"))
         >>> folder.image_path("train", 7).relative_to(folder.root).as_posix()
         'train/000007.png'

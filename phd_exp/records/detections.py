@@ -212,7 +212,7 @@ def detection_of(file: Path, values: Mapping[str, Any]) -> Detection:
 
     Raises DatasetError if the values are not a detection.
 
-    Example:
+    Examples:
         >>> detection_of(Path("photo.jpg"), {"f": 900.0}).focal_lengths_and_centre(640, 480)
         (900.0, 900.0, 320.0, 240.0)
     """

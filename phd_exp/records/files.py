@@ -53,7 +53,7 @@ def write_atomic(path: Path | str, data: bytes | str) -> None:
 
     Raises OSError if the folder is missing or unwritable, or the disk is full; `path` is then unchanged.
 
-    Example:
+    Examples:
         >>> from tempfile import TemporaryDirectory
         >>> with TemporaryDirectory() as folder:
         ...     write_atomic(Path(folder, "notes"), "whole or absent")

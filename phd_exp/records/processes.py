@@ -29,7 +29,7 @@ def held(path: Path, *, shared: bool = False, waiting: str | None = None) -> Ite
     Raises:
         OSError: the file cannot be opened for writing, or is a link, whose target may belong to someone else.
 
-    Example:
+    Examples:
         >>> from tempfile import TemporaryDirectory
         >>> with TemporaryDirectory() as folder, held(Path(folder, "lock")) as first:
         ...     with held(Path(folder, "lock")) as second:
@@ -131,7 +131,7 @@ def announce(message: str) -> None:
 def duration(seconds: float) -> str:
     """Seconds in a readable unit.
 
-    Example:
+    Examples:
         >>> duration(89), duration(600), duration(111_600)
         ('89 s', '10 min', '31.0 h')
     """

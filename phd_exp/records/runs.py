@@ -66,7 +66,7 @@ class RunStatus(BaseModel):
 class RunFolder:
     """One run's folder: typed access to its files, each written to a temporary name and renamed into place.
 
-    Example:
+    Examples:
         >>> from tempfile import TemporaryDirectory
         >>> with TemporaryDirectory() as place:
         ...     run = RunFolder(Path(place))

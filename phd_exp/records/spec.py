@@ -86,7 +86,7 @@ class Shard:
 
     Raises ValueError if index is not in [0, count).
 
-    Example:
+    Examples:
         >>> shard = Shard.parse("1/4")
         >>> [index for index in range(10) if shard.holds(index)]
         [1, 5, 9]

@@ -144,7 +144,7 @@ def interval(means: Sequence[SampleMean]) -> Interval:
     degrees of freedom, the scatter of trainings. One seed: mean ± 1.96 standard errors over its test samples, the
     scatter of test sets. One sample: no interval.
 
-    Example:
+    Examples:
         >>> interval([SampleMean(100, 40.0, 1.0), SampleMean(100, 42.0, 1.0)]).mean
         41.0
     """

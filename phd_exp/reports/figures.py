@@ -95,7 +95,7 @@ def draw_birds_eye(axes: Axes, curves: LevelCurves, truth: np.ndarray | None) ->
 def decades(values: Iterable[float]) -> tuple[float, float] | None:
     """The powers of ten around the positive finite values; None if there are none.
 
-    Example:
+    Examples:
         >>> decades([0.02, 3.0])
         (0.01, 10.0)
     """

@@ -80,7 +80,7 @@ def tidy(numbers: Sequence[Mapping[str, Any]]) -> str:
 def markdown(table: Table) -> str:
     """The table as Markdown: heading, cells, missing runs with the command that makes them, notes.
 
-    Example:
+    Examples:
         >>> from phd_exp.reports.table import Table, TableCell, TableRow
         >>> row = TableRow(("mae_vz",), (TableCell("48", "±3", bold=True),))
         >>> print(markdown(Table("t", "tables", "Depth", ("model",), ("mm",), ((row,),), notes=("95 %",))))

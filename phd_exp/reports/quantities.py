@@ -28,7 +28,7 @@ class Quantity:
     def text(self, value: float | None) -> str:
         """A value with its digits; a dash if it is missing or not finite.
 
-        Example:
+        Examples:
             >>> SCORES["depth_error_mm"].text(47.96)
             '48.0'
         """

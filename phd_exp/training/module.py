@@ -137,7 +137,7 @@ def factor(schedule: str, warmup_steps: int, steps: int) -> Callable[[int], floa
 
     It rises linearly over the first `warmup_steps`. Then "constant" stays; "cosine" falls to zero as half a wave.
 
-    Example:
+    Examples:
         >>> at = factor("cosine", warmup_steps=1, steps=100)
         >>> [round(at(step), 3) for step in (0, 50, 100)]
         [0.5, 0.5, 0.0]

@@ -91,7 +91,7 @@ def curve_line(name: str, curve: Curve, colour: int, dash: str, role: str) -> Tr
 def thinned(n: int, points: int = POINTS) -> list[int]:
     """Indices of at most `points` of n values, including the first and the last.
 
-    Example:
+    Examples:
         >>> thinned(9, points=3)
         [0, 4, 8]
     """

@@ -139,7 +139,7 @@ def as_script(name: str, content: Any) -> str:
 
     Safe in HTML and JavaScript: <, >, & and line separators are escaped; NaN and infinity become null.
 
-    Example:
+    Examples:
         >>> as_script("a", {"x": [1.5, float("nan")]})
         'phdExp.receive("a", {"x":[1.5,null]});\\n'
     """
