@@ -93,6 +93,8 @@ def test_links_and_the_comparison_keep_their_runs(visit: Visit) -> None:
     assert before[0] == "Projected error (mm)"
     visit.page.get_by_role("button", name="Swap").click()
     visit.page.wait_for_function("location.hash.startsWith('#a=small-occl')")
+    scores.locator("tbody tr").first.get_by_text(before[2]).first.wait_for()
+    visit.page.wait_for_timeout(200)  # the table is drawn after the address changes
     after = scores.locator("tbody tr").first.inner_text().split("\t")
     assert [after[1], after[2]] == [before[2], before[1]]
     assert "data.spec.variant" in visit.page.locator("#config").inner_text()
