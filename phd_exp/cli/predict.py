@@ -115,10 +115,15 @@ def _depth_curve(run: Path, predictor: "Predictor") -> dict[str, Any]:
     Raises RunError if there is none, as for a baseline.
     """
     if predictor.temperature is not None:
-        from phd_exp.evaluation.predictions import recalibrated_depth_curve
+        import torch
 
-        window = predictor.config.evaluation.calibration_window
-        return recalibrated_depth_curve(RunFolder(run), predictor.temperature, window).as_data()
+        from phd_exp.evaluation.parquet import read_table
+        from phd_exp.evaluation.predictions import recalibrated
+        from phd_exp.metrics.calibration import calibration_curve
+
+        table = recalibrated(read_table(RunFolder(run).predictions), predictor.temperature)
+        variance, error = (torch.from_numpy(table[f"depth_{name}"]) for name in ("variance", "squared_error"))
+        return calibration_curve(variance, error, predictor.config.evaluation.calibration_window).as_data()
     file = RunFolder(run).curves("final")
     try:
         curve = parse_json(read_plain(file).decode())["depth"]

@@ -12,17 +12,15 @@ from torch import Tensor
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import PARAMETERS, distribution_columns, draws, from_columns
 from phd_exp.distributions.temperature import Temperature
-from phd_exp.evaluation.parquet import Columns, arrays, read_table, require_columns
+from phd_exp.evaluation.parquet import Columns, arrays, require_columns
 from phd_exp.evaluation.point_errors import SEED
 from phd_exp.evaluation.reference import Band, calibrated_reference
 from phd_exp.metrics.bootstrap import Interval, Statistic, bands, interval, resampled
-from phd_exp.metrics.calibration import CalibrationCurve, calibration_curve
 from phd_exp.metrics.calibration_scores import COLUMNS, abscissae, calibration_scores, curves, ordered
 from phd_exp.metrics.errors import MILLIMETRES
 from phd_exp.metrics.scores import DRAWS, energy_score
 from phd_exp.metrics.strata import strata
 from phd_exp.records.errors import RunError
-from phd_exp.records.runs import RunFolder
 
 ERRORS = ("projected_error_mm", "depth_error_mm")
 OF_A_DISTRIBUTION = (*PARAMETERS, *COLUMNS, *ERRORS, "nll", "energy_score")
@@ -120,11 +118,6 @@ def fit_temperature(held_out_table: pa.Table | Columns) -> Temperature:
         raise RunError(f"predictions: no temperature fits them ({error})") from None
 
 
-def held_out_temperature(folder: RunFolder) -> Temperature:
-    """`fit_temperature` of a run's recorded predictions of held-out samples. Raises RunError as it does."""
-    return fit_temperature(read_table(folder.held_out))
-
-
 def recalibrated(table: pa.Table | Columns, temperature: Temperature) -> dict[str, np.ndarray]:
     """The same columns for A / projected and a / depth: modes are unchanged, all uncertainties and scores change.
 
@@ -148,16 +141,6 @@ def recalibrated(table: pa.Table | Columns, temperature: Temperature) -> dict[st
     changed["energy_score"] = energy_score(draws(distribution, DRAWS, SEED), xyz)
     kept = {name: array[finite.numpy()] for name, array in recorded.items()}
     return kept | {name: column.numpy() for name, column in changed.items()}
-
-
-def recalibrated_depth_curve(folder: RunFolder, temperature: Temperature, window: int) -> CalibrationCurve:
-    """The calibration curve of depth (m^2) of a run's test samples at these temperatures.
-
-    Raises RunError if they cannot be read.
-    """
-    table = recalibrated(read_table(folder.predictions), temperature)
-    columns = _tensors(table, ("depth_variance", "depth_squared_error"))
-    return calibration_curve(columns["depth_variance"], columns["depth_squared_error"], window)
 
 
 def _distribution_scores(columns: Mapping[str, Tensor], weight: Tensor) -> dict[str, Tensor]:

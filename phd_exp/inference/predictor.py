@@ -228,9 +228,10 @@ def _temperature(folder: RunFolder, regressor: Regressor) -> Temperature:
         raise RunError(
             f"{folder.held_out}: missing; recalibration is fitted on held-out samples: train with data.n_held_out > 0"
         )
-    from phd_exp.evaluation.predictions import held_out_temperature  # imports pyarrow
+    from phd_exp.evaluation.parquet import read_table  # imports pyarrow
+    from phd_exp.evaluation.predictions import fit_temperature
 
-    return held_out_temperature(folder)
+    return fit_temperature(read_table(folder.held_out))
 
 
 def _images(images: Any) -> UInt8[np.ndarray, "batch height width 3"]:

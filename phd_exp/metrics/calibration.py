@@ -11,10 +11,9 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from scipy.stats import kstwo
 from torch import Tensor
 
-from phd_exp.metrics.ordered import Ordered, in_order_of, require_finite
+from phd_exp.metrics.ordered import Ordered, in_order_of
 
 FEWEST_POINTS = 5  # independent points of a curve; the window of a small test set is narrowed to give as many
 
@@ -135,31 +134,8 @@ def overconfidence(levels: Levels) -> Float[Tensor, "*batch"]:
     return (ordered.count * ordered.points).sum(-1) / ordered.count.sum(-1) - 0.5
 
 
-def pit_histogram(pit: Float[Tensor, " samples"], bins: int) -> Float[Tensor, " bins"]:
-    """The share of samples in each of equal bins of [0, 1], times the number of bins: 1 where calibrated.
-
-    A U shape means overconfident, a hump underconfident, a slope biased.
-    """
-    require_finite(pit)
-    return torch.histc(pit.double(), bins, min=0, max=1) * bins / len(pit)
-
-
-@dataclass(frozen=True)
-class UniformityTest:
-    """The Kolmogorov-Smirnov distance from the uniform law, and the probability of a larger one under it."""
-
-    statistic: float
-    pvalue: float
-
-
-def uniformity_test(levels: Float[Tensor, " samples"]) -> UniformityTest:
-    """Test levels, or PITs, for uniformity on [0, 1]: the exact two-sided Kolmogorov-Smirnov test."""
-    distance = float(uniform_distance(levels))
-    return UniformityTest(distance, float(kstwo.sf(distance, len(levels))))
-
-
 def uniform_distance(levels: Levels) -> Float[Tensor, "*batch"]:
-    """max |coverage(p) - p| over p."""
+    """max |coverage(p) - p| over p: the statistic of the Kolmogorov-Smirnov test, as of `scipy.stats.kstest`."""
     ordered = _in_order(levels)
     after = ordered.share_up_to()
     before = after - ordered.count / ordered.total

@@ -21,12 +21,10 @@ class Stratum:
 def strata(
     name: str, values: Float[Tensor, " samples"], edges: Sequence[float] | int, unit: str = ""
 ) -> list[Stratum]:
-    """Split samples at edges, or into n parts of about equal size; empty parts are left out.
+    """Split samples at ascending edges, or into n >= 1 parts of about equal size; empty parts are left out.
 
     A part includes its lower edge; only the last includes its upper edge. Values outside all edges are `below` or
     `above`, NaN is `unknown`. Labels read `depth 3.0-3.5 m`.
-
-    Raises ValueError for edges that do not ascend, or for fewer than one part.
 
     Examples:
         >>> [part.label for part in strata("depth", torch.tensor([3.0, 3.5, 4.0]), (3.0, 3.5, 4.0), "m")]
@@ -37,8 +35,6 @@ def strata(
     borders = _quantiles(known, edges) if isinstance(edges, int) else [float(edge) for edge in edges]
     if not borders:
         return _named([(f"{name} unknown", values.isnan())])
-    if any(high <= low for low, high in pairwise(borders)):
-        raise ValueError(f"edges of {name}: got {borders}; expected them to ascend")
     rule = f".{_decimals(borders)}f" if isinstance(edges, int) else "g"
     words, suffix = [format(border, rule) for border in borders], f" {unit}" if unit else ""
     parts = [(f"{name} below {words[0]}{suffix}", values < borders[0])]
@@ -54,8 +50,6 @@ def strata(
 
 def _quantiles(known: Tensor, n: int) -> list[float]:
     """n + 1 borders of parts of equal size; fewer if many values are equal."""
-    if n < 1:
-        raise ValueError(f"edges: got {n} parts; expected at least 1 part")
     if len(known) == 0:
         return []
     shares = torch.linspace(0, 1, n + 1, dtype=torch.float64)

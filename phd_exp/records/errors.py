@@ -40,21 +40,19 @@ class CorruptFileError(UserError):
     """A line of a file cannot be read."""
 
 
-def unwritable(error: OSError, folder: Path, instead: str = "data.root") -> RenderError:
-    """The RenderError of a read-only folder or a full disk; `instead` is the key by which to choose another one."""
-    return RenderError(
-        f"{error.filename or folder}: cannot be written ({error.strerror or error}); make room, allow writing, "
-        f"or choose another {instead}"
-    )
-
-
 @contextmanager
 def writing(folder: Path, instead: str = "data.root") -> Iterator[None]:
-    """Raise `unwritable` for an OSError in the body."""
+    """Convert an OSError in the body, a read-only folder or a full disk, to a RenderError.
+
+    `instead` is the key by which to choose another folder.
+    """
     try:
         yield
     except OSError as error:
-        raise unwritable(error, folder, instead) from error
+        raise RenderError(
+            f"{error.filename or folder}: cannot be written ({error.strerror or error}); make room, allow writing, "
+            f"or choose another {instead}"
+        ) from error
 
 
 def listed(names: Sequence[str]) -> str:

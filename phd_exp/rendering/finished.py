@@ -107,11 +107,8 @@ def write_masks(folder: DatasetFolder, masks: Path) -> int:
 
     The masks have one bit per pixel and follow from the records, without Blender.
 
-    Raises:
-        DatasetError: there is no data set, or a broken one.
-        RenderError: the masks cannot be written, or would lie among the images.
+    Raises DatasetError if there is no data set, or a broken one, RenderError if the masks cannot be written.
     """
-    require_elsewhere(folder, masks)
     records = [record for split in SPLITS for record in folder.records(split)]
     with writing(masks, instead="masks=FOLDER"):
         for split in SPLITS:

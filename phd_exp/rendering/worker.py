@@ -4,7 +4,7 @@ import traceback
 from contextlib import suppress
 from multiprocessing.connection import Connection
 
-from phd_exp.records.errors import RenderError, UserError, unwritable
+from phd_exp.records.errors import RenderError, UserError, writing
 from phd_exp.records.files import write_atomic
 from phd_exp.records.processes import parent
 from phd_exp.records.scenes import SampleRecord
@@ -23,13 +23,12 @@ def serve(connection: Connection) -> None:
         split, index = connection.recv()
         answer: SampleRecord | UserError
         try:
-            renderer = renderer or Renderer(fast_settings(spec))
-            image, answer = make_sample(renderer, spec, split, index)
-            write_atomic(folder.image_path(split, index, spec.image_format), image)
+            with writing(folder.root):
+                renderer = renderer or Renderer(fast_settings(spec))
+                image, answer = make_sample(renderer, spec, split, index)
+                write_atomic(folder.image_path(split, index, spec.image_format), image)
         except UserError as error:
             answer = error
-        except OSError as error:
-            answer = unwritable(error, folder.root)
         except Exception as error:
             traceback.print_exc()
             answer = RenderError(f"sample {index} of {split}: {type(error).__name__}: {error}")

@@ -2,6 +2,7 @@
 
 import base64
 import io
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from phd_exp.distributions.columns import PARAMETERS, from_columns
@@ -185,7 +187,7 @@ def close_up(points: np.ndarray, S: float) -> tuple[float, float, float] | None:
         return None
     side = max(1.6 * extent, _SMALLEST * S)
     left, top = (low + high) / 2 - side / 2
-    return _round(left), _round(top), _round(side)
+    return round(float(left), 2), round(float(top), 2), round(side, 2)
 
 
 def birds_eye_view(curves: LevelCurves, truth: np.ndarray) -> BirdsEye:
@@ -204,22 +206,17 @@ def birds_eye_view(curves: LevelCurves, truth: np.ndarray) -> BirdsEye:
         paths=[_svg_path(place(points)) for points in curves.birds_eye],
         mode=_point(place(curves.mode[::2])),
         truth=_point(place(truth[::2])),
-        x_ticks=[(_round(place(np.array([x, low[1]]))[0]), text) for x, text in _ticks(low[0], high[0])],
-        z_ticks=[(_round(place(np.array([low[0], z]))[1]), text) for z, text in _ticks(low[1], high[1])],
+        x_ticks=[(_point(place(np.array([x, low[1]])))[0], text) for x, text in _ticks(low[0], high[0])],
+        z_ticks=[(_point(place(np.array([low[0], z])))[1], text) for z, text in _ticks(low[1], high[1])],
     )
 
 
 def _ticks(low: float, high: float) -> list[tuple[float, str]]:
     """Two to five round numbers in an interval, with as many digits as distinguish them."""
-    power = 10.0 ** np.floor(np.log10(high - low))
-    step = next(power * k for k in (0.2, 0.5, 1, 2, 5) if (high - low) / (power * k) <= 5)
-    digits = max(0, int(np.ceil(-np.log10(step) - 1e-9)))
-    values = step * np.arange(np.ceil(low / step), np.floor(high / step) + 1)
-    return [(float(v), f"{v:.{digits}f}".replace("-", "−")) for v in values]
-
-
-def _round(value: float) -> float:
-    return round(float(value), 2)
+    found = MaxNLocator(5, steps=[1, 2, 5, 10], min_n_ticks=2).tick_values(low, high)
+    values = [float(value) for value in found if low <= value <= high]
+    digits = max(0, -math.floor(math.log10(values[1] - values[0]) + 1e-9))
+    return [(value, f"{value:.{digits}f}".replace("-", "−")) for value in values]
 
 
 def _svg_path(points: np.ndarray) -> str:
@@ -230,4 +227,4 @@ def _svg_path(points: np.ndarray) -> str:
 def _point(xy: np.ndarray) -> tuple[float, float]:
     """A point for SVG; NaN becomes a distant point."""
     x, y = np.clip(np.nan_to_num(xy, nan=-1e4), -1e4, 1e4)
-    return _round(x), _round(y)
+    return round(float(x), 2), round(float(y), 2)

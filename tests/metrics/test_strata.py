@@ -51,11 +51,3 @@ def test_parts_are_of_equal_size_and_include_their_lower_edge() -> None:
     assert [int(part.mask.sum()) for part in strata("x", VALUES["spread"], 4)] == [125, 125, 125, 125]
     masks = [part.mask.int().tolist() for part in strata("x", VALUES["on the edges"], (0.0, 0.25, 0.5, 1.0))]
     assert masks == [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1]]
-
-
-@pytest.mark.parametrize(
-    ("edges", "message"), [(0, "at least 1 part"), ((1.0, 1.0), "ascend"), ((2.0, 1.0), "ascend")]
-)
-def test_refuses_impossible_edges(edges: int | tuple[float, ...], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        strata("x", VALUES["spread"], edges)

@@ -14,7 +14,7 @@ from phd_exp.records.dataset import DatasetFolder, Seal, sha256
 from phd_exp.records.errors import DatasetError, RenderError
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering import finished as module
-from phd_exp.rendering.finished import verify, write_masks
+from phd_exp.rendering.finished import require_elsewhere, verify, write_masks
 from phd_exp.rendering.rays import cylinder_mask, trace_pixels
 from tests.support.renders import N_TEST, N_TRAIN
 
@@ -162,7 +162,7 @@ def test_a_mask_for_every_sample(rendered: DatasetFolder, tmp_path: Path) -> Non
 def test_masks_that_cannot_be_written_are_one_line(small: DatasetFolder, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(RenderError, match=r"masks=.*: lies in the data set itself"):
-        write_masks(small, small.root / "train" / "masks")
+        require_elsewhere(small, small.root / "train" / "masks")
     with pytest.raises(RenderError, match=r"cannot be written .* choose another masks=FOLDER"):
         write_masks(small, tmp_path / "file" / "masks")
     with pytest.raises(DatasetError, match="no data set here"):
