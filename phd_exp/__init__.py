@@ -11,8 +11,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 
-def load(run: str | Path, device: str = "auto", recalibrate: bool = False) -> Predictor:
+def load(run: str | Path, device: str = "auto", recalibrate: bool = False, trust: tuple[str, ...] = ()) -> Predictor:
     """A trained run as a callable from images to predictions; see `phd_exp.inference.predictor.load`."""
     from phd_exp.inference import predictor  # torch, which importing phd_exp does without
 
-    return predictor.load(Path(run), device, recalibrate)
+    return predictor.load(Path(run), device, recalibrate, trust)

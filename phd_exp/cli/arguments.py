@@ -78,13 +78,22 @@ def require_file(out: Path, name: str) -> None:
         raise ConfigError(f"out={out}: is a folder; expected a file, such as {out / name}")
 
 
-def loaded(run: Path, device: str = "auto", recalibrate: bool = False) -> "Predictor":
+class RunArguments(Arguments):
+    """The run whose network a verb uses."""
+
+    run: Path
+    recalibrate: bool = False
+    trust: str | None = None
+
+
+def loaded(arguments: RunArguments, device: str = "auto") -> "Predictor":
     """The predictor of a run, with a note on standard error if the run is not finished."""
     from phd_exp.inference.predictor import load
 
-    predictor = load(run, device, recalibrate)
+    trust = tuple((arguments.trust or "").split(",")) if arguments.trust else ()
+    predictor = load(arguments.run, device, arguments.recalibrate, trust)
     if predictor.state != "finished":
-        print(f"note: {run}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
+        print(f"note: {arguments.run}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
     return predictor
 
 

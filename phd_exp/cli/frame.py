@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NamedTuple
 
-from phd_exp.records.errors import UNPRINTABLE, ConfigError, UserError, one_line
+from phd_exp.records.errors import UNPRINTABLE, ConfigError, UserError, in_user_code, one_line
 
 RESUMES = "the same command resumes"
 
@@ -49,6 +49,8 @@ def failure(error: BaseException) -> Ending:
     if isinstance(error, UserError):
         return Ending("failed", tuple(str(error).splitlines()), 1)
     # torch raises a RuntimeError on a CPU, and a class of the second name on a GPU
+    if place := in_user_code(error):
+        return Ending("failed", (f"{place}; mend it, and {RESUMES}",), 1)
     no_memory = type(error).__name__ in ("MemoryError", "OutOfMemoryError")
     if isinstance(error, OSError) and error.strerror:
         line = f"{error.filename or 'output'}: {error.strerror}; mend that, and {RESUMES}"

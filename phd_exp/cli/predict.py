@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import model_validator
 
-from phd_exp.cli.arguments import Arguments, four_numbers, loaded, output_folder, parsed, predicted
+from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_folder, parsed, predicted
 from phd_exp.records.detections import Detection, detection_of, detections_in
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import read_plain, write_atomic
@@ -23,10 +23,9 @@ OF_A_CAMERA = ("f", "fx", "fy", "cx", "cy", "box")
 LONGEST_STEM = 50  # characters of an image's name in the name of its picture
 
 
-class PredictArguments(Arguments):
+class PredictArguments(RunArguments):
     """The run, the images and their cameras; lengths in pixels of the image file."""
 
-    run: Path
     image: Path | None = None
     folder: Path | None = None
     f: float | None = None
@@ -36,7 +35,6 @@ class PredictArguments(Arguments):
     cy: float | None = None
     box: Annotated[tuple[float, float, float, float], BOX] | None = None
     out: Path | None = None
-    recalibrate: bool = False
     calibration: bool = False
 
     @property
@@ -73,7 +71,7 @@ def main(words: list[str]) -> int:
     if out is not None:
         _require_possible(detections, out)
         output_folder(out)
-    predictor = loaded(arguments.run, recalibrate=arguments.recalibrate)
+    predictor = loaded(arguments)
     curve = _depth_curve(arguments.run, predictor) if arguments.calibration else None
     if out is not None:
         _write(predictor, detections, out, curve)

@@ -1,12 +1,14 @@
 """The sections of a configuration: their keys, types and ranges."""
 
+import inspect
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, StrictBool, Tag, model_validator
 
+from phd_exp.records.errors import nearest
 from phd_exp.records.spec import Angle, DatasetSpec, Range
-from phd_exp.training.config.targets import Target
+from phd_exp.training.config.targets import Target, TrainingTarget
 
 MULTIVIEW = "multiview"  # the data set whose scenes are rendered from several cameras
 
@@ -84,16 +86,33 @@ class FolderConfig(SizesConfig):
     folder: Folder
 
 
-def is_folder(values: Any) -> bool:
-    """Whether a `data` section describes the user's own images: it has at most one key of `DatasetSpec`."""
+class SourceConfig(SizesConfig):
+    """The user's own `data.sources.Source`, built with `n`, the number of samples of each part, and `side`."""
+
+    name: Name
+    n_train: Count
+    n_test: Count
+    source: TrainingTarget
+
+
+def kind_of_data(values: Any) -> str:
+    """The kind of a `data` section: it names a source, or a folder of images, or it is a rendered data set.
+
+    With a folder it has at most one key of `DatasetSpec`.
+    """
     if not isinstance(values, dict):
-        return isinstance(values, FolderConfig)
-    return "spec" not in values and len(DatasetSpec.model_fields.keys() & values.keys()) <= 1
+        return {"SourceConfig": "<source>", "FolderConfig": "<folder>"}.get(type(values).__name__, "<rendered>")
+    if "source" in values:
+        return "<source>"
+    is_folder = "spec" not in values and len(DatasetSpec.model_fields.keys() & values.keys()) <= 1
+    return "<folder>" if is_folder else "<rendered>"
 
 
 DataConfig = Annotated[
-    Annotated[RenderedConfig, Tag("<rendered>")] | Annotated[FolderConfig, Tag("<folder>")],
-    Discriminator(lambda values: "<folder>" if is_folder(values) else "<rendered>"),
+    Annotated[RenderedConfig, Tag("<rendered>")]
+    | Annotated[FolderConfig, Tag("<folder>")]
+    | Annotated[SourceConfig, Tag("<source>")],
+    Discriminator(kind_of_data),
 ]
 
 
@@ -112,8 +131,33 @@ class CameraConfig(Section):
     focal_length: Literal["known", "shown", "constant"]
 
 
+OWNED = {
+    "callbacks": "they are a group: callbacks=NAME, or +callbacks.NAME._target_=CLASS",
+    "logger": "it is a group: logger=NAME",
+    "check_val_every_n_epoch": "set evaluation.every_n_epochs",
+    "val_check_interval": "the record has one row an epoch; set evaluation.every_n_epochs",
+    "enable_progress_bar": "set trainer.progress_bar",
+    "default_root_dir": "set runs",
+    "enable_checkpointing": "runs resume from their checkpoint; set callbacks for further ones",
+    "limit_predict_batches": "the record has all test samples; set data.n_test",
+    "num_sanity_val_steps": "the untrained network is always evaluated",
+    "use_distributed_sampler": "the batches are already divided among the processes",
+    "reload_dataloaders_every_n_epochs": "the data stays in memory",
+    "strategy": "set trainer.devices",
+    "num_nodes": "all processes of a run are on one machine",
+    "plugins": "they start the processes and write the checkpoints",
+    "barebones": "it would switch the run record off",
+}
+"""Arguments of Lightning's Trainer that the run record depends on, and what to do instead."""
+
+
 class TrainerConfig(Section):
-    """Length, hardware and arithmetic of the training; threads=None: one per core."""
+    """Length, hardware and arithmetic of the training; threads=None: one per core.
+
+    Further keys are arguments of Lightning's Trainer.
+    """
+
+    model_config = ConfigDict(extra="allow", frozen=True)
 
     max_epochs: Count
     accelerator: Literal["auto", "cpu", "gpu"]
@@ -121,6 +165,22 @@ class TrainerConfig(Section):
     threads: Count | None
     devices: Count
     progress_bar: StrictBool
+
+    @model_validator(mode="after")
+    def known_to_lightning(self) -> "TrainerConfig":
+        """Refuse keys that Lightning's Trainer does not take, or that the run record owns."""
+        if not self.model_extra:
+            return self
+        from lightning import Trainer  # of seconds
+
+        known = inspect.signature(Trainer).parameters.keys() - OWNED.keys()
+        for key in self.model_extra:
+            if key in OWNED:
+                raise ValueError(f"{key}: belongs to the run record: {OWNED[key]}")
+            if key not in known:
+                ours = sorted(known | TrainerConfig.model_fields.keys())
+                raise ValueError(f"{key}: unknown key{nearest(key, ours)}; expected one of {', '.join(ours)}")
+        return self
 
 
 class AugmentationConfig(Section):
@@ -148,14 +208,6 @@ class RecipeConfig(Section):
     augmentation: AugmentationConfig
 
 
-class LoggerConfig(Section):
-    """The logger that receives the metrics in addition to the run record."""
-
-    kind: Literal["none", "wandb"]
-    project: Name
-    offline: StrictBool
-
-
 class MultiviewConfig(Section):
     """Evaluation on several views after the training: the number of scenes of the variant `multiview`, 0 for none."""
 
@@ -175,6 +227,7 @@ class EvaluationConfig(Section):
     calibration_window: Count
     calibration_every_n_epochs: Count
     every_n_epochs: Count = 1  # default for older run records
+    held_out: StrictBool = False  # whether the held-out samples are evaluated too, for callbacks that monitor them
     multiview: MultiviewConfig | None = None  # default for older run records
 
     @model_validator(mode="after")
