@@ -57,7 +57,8 @@ def failure(error: BaseException) -> Ending:
     elif no_memory or "can't allocate memory" in str(error):
         line = f"memory ran out; free some, and {RESUMES}, or lower data.batch_size, which makes a new run"
     else:
-        traceback.print_exception(error)
+        if type(error).__name__ != "MisconfigurationException":  # Lightning's, of arguments that do not fit
+            traceback.print_exception(error)
         line = f"{type(error).__name__}: {error}"
     return Ending("failed", (one_line(line),), 1)
 

@@ -3,18 +3,22 @@
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from phd_exp.cli.jobs import launch
+from phd_exp.cli.jobs import composed, launch
 from phd_exp.records.choices import RunName, has_influence, setting
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import RunError
+from phd_exp.records.processes import usable_cores
 from phd_exp.records.runs import RunFolder
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.render import ensure_rendered
 from phd_exp.training.config import RenderedConfig, RunConfig, check
+
+if TYPE_CHECKING:
+    from phd_exp.inference.trained import TrainedRun
 
 NAMED = ("preset", "recipe", "data", "data.name", "model", "seed", "experiment")
 """Choices with a place of their own in a run's name, and `experiment`, which only names several runs."""
@@ -62,6 +66,15 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> float | No
     if (folder.calibration / "final.png").exists():
         print(f"  calibration curves: {folder.calibration / 'final.png'}")
     return next((results[key] for key in SCORES if results.get(key) is not None), None)
+
+
+def trained(overrides: list[str], config_dir: str | Path | None) -> "TrainedRun":
+    """Train one run from Python; see `phd_exp.train`."""
+    from phd_exp.inference.trained import TrainedRun
+
+    config = composed(overrides, config_dir)
+    task(config, overrides, usable_cores())
+    return TrainedRun(run_name(check(config), overrides).folder(Path(config["runs"])))
 
 
 def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> None:
