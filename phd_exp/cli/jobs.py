@@ -23,8 +23,8 @@ from phd_exp.records.errors import ConfigError, RunError, nearest
 from phd_exp.records.processes import usable_cores
 
 LONGEST = 400  # characters of Hydra's messages that are repeated
-REFUSED = (HydraException, OmegaConfBaseException, ValueError, ArithmeticError, RecursionError)
-"""The errors that a bad override raises; ValueError for a group set to null."""
+REFUSED = (HydraException, OmegaConfBaseException, ValueError, TypeError, ArithmeticError, RecursionError)
+"""The errors that a bad override raises; ValueError for a group set to null, TypeError for one set to numbers."""
 HOME = uuid.uuid4().hex  # names this process: another process that imports this module has another value
 
 Task = Callable[[dict[str, Any], list[str], int], float | None]

@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from phd_exp.evaluation.point_errors import QUANTITIES, ErrorKey
+from phd_exp.records.processes import HOME
 from phd_exp.records.runs import RunFolder
 from phd_exp.reports.runs import read_report
 from phd_exp.training.module import PositionModule
@@ -103,11 +104,12 @@ def test_a_signal_ends_the_command_with_its_status(
 
 
 @pytest.mark.slow
-def test_the_strong_recipe_is_exported(train: Callable, phd_exp: Callable, tmp_path: Path) -> None:
+def test_the_strong_recipe_is_exported(train: Callable, tmp_path: Path) -> None:
+    """In a process without checked shapes, whose comparisons would fix the size of a batch."""
     pytest.importorskip("onnxruntime", reason="export needs `pip install 'phd_exp[export]'`")
     assert train("recipe=strong", "data.image_size=64", "logger=none", "trainer.max_epochs=1").status == 0
-    outcome = phd_exp("export", f"run={only_run(tmp_path / 'runs').path}", "out=network.onnx")
-    assert outcome.status == 0, outcome.err
+    command = ["phd_exp", "export", f"run={only_run(tmp_path / 'runs').path}", "out=network.onnx"]
+    subprocess.run([sys.executable, "-m", *command], env={**os.environ, "PYTHONPATH": str(HOME)}, check=True)
     assert (tmp_path / "network.onnx").exists()
 
 
