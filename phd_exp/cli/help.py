@@ -10,6 +10,7 @@ VERBS = {
     "report": "the paper's tables, the dashboard and the figures of all recorded runs",
     "predict": "the object's position in an image and its uncertainty: JSON lines, and pictures with out=",
     "fuse": "one position from the predictions of several cameras, and/or on a ground plane: a JSON line a scene",
+    "search": "search for good values of keys with Optuna, judged on held-out samples",
     "export": "write a run's network as ONNX, compared with torch; it needs onnxruntime and NumPy alone",
 }
 OF_VERB = {
@@ -49,6 +50,10 @@ EXAMPLES = {
     "fuse": [
         "python -m phd_exp fuse run=runs/small/scale/probabilistic/seed0 folder=renders/multiview/test",
         "python -m phd_exp fuse run=DIR folder=photos/test plane=0,1,0,1.5 recalibrate=true out=fused.jsonl",
+    ],
+    "search": [
+        "python -m phd_exp search space.yaml trials=40",
+        "python -m phd_exp search space.yaml trials=40 preset=small data=occl",
     ],
     "export": [
         "python -m phd_exp export run=runs/small/default/probabilistic/seed0",

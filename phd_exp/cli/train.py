@@ -1,6 +1,6 @@
 """`python -m phd_exp [train]`: render missing data, train, measure and record a run."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,8 @@ from phd_exp.rendering.render import ensure_rendered
 from phd_exp.training.config import RenderedConfig, RunConfig, check
 
 if TYPE_CHECKING:
+    from lightning import Callback
+
     from phd_exp.inference.trained import TrainedRun
 
 NAMED = ("preset", "recipe", "data", "data.name", "model", "seed", "experiment")
@@ -40,8 +42,13 @@ def main(words: list[str]) -> int:
     return launch(task, words, standing=standing)
 
 
-def task(config: dict[str, Any], overrides: list[str], cores: int) -> float | None:
-    """Render missing data, train one run and print its numbers; returns the first of SCORES that it has."""
+def task(
+    config: dict[str, Any], overrides: list[str], cores: int, callbacks: "Sequence[Callback]" = ()
+) -> float | None:
+    """Render missing data, train one run and print its numbers; returns the first of SCORES that it has.
+
+    `callbacks` are Lightning's, in addition to those of the configuration.
+    """
     checked = check(config)
     # imports of seconds, which follow the check of the configuration
     from phd_exp.training.run import require_possible, train
@@ -57,7 +64,7 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> float | No
         if isinstance(data, RenderedConfig):
             place = DatasetFolder(data.folder)
             ensure_rendered(place, data.spec, data.n_training_split, data.n_test, data.workers, cores)
-    results = train(checked, folder, draw=_draw(), cores=cores)
+    results = train(checked, folder, draw=_draw(), cores=cores, callbacks=callbacks)
     if several is not None and isinstance(data, RenderedConfig):
         _record_views(folder, *several, data.workers, cores)
     print(f"{folder.path}: {'finished already' if skipped else 'finished'}")

@@ -156,7 +156,7 @@ TrainingTargets = Annotated[dict[str, Any], AfterValidator(_each_checked_if_type
 def describe(problem: ErrorDetails, model: type[BaseModel]) -> str:
     """One line for one error of pydantic: the key, the value, what was expected, the nearest valid key."""
     place = [str(part) for part in problem["loc"]]
-    location = [part for part in place if part not in ("spec", "<rendered>", "<folder>")]
+    location = [part for part in place if part not in ("spec", "<rendered>", "<folder>", "<source>")]
     key, context = ".".join(location), problem.get("ctx", {})
     if problem["type"] == "target":
         return f"{key}.{context['path']}: {context['reason']}"
