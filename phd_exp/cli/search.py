@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from warnings import catch_warnings
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, RangeSweep
@@ -83,19 +84,18 @@ def distributions(space: Mapping[str, str]) -> dict[str, Any]:
     for key, text in space.items():
         try:
             override = OverridesParser.create().parse_override(f"{key}={text}")
-            value = override.value()
+            value: Any = override.value()
             if isinstance(value, ChoiceSweep):
                 found[key] = CategoricalDistribution(list(override.sweep_string_iterator()))
-                continue
-            if isinstance(value, IntervalSweep):
-                low, high, more = value.start, value.end, {"log": "log" in value.tags}
+            elif isinstance(value, IntervalSweep):
+                is_whole = isinstance(value.start, int) and isinstance(value.end, int)
+                kind = IntDistribution if is_whole else FloatDistribution
+                found[key] = kind(value.start, value.end, log="log" in value.tags)
             elif isinstance(value, RangeSweep):
                 places = [int(place) for place in override.sweep_string_iterator()]
-                low, high, more = places[0], places[-1], {"step": value.step}
+                found[key] = IntDistribution(places[0], places[-1], step=int(value.step))
             else:
                 raise ValueError("expected choice(...), range(...) or interval(...)")
-            whole = isinstance(low, int) and isinstance(high, int)
-            found[key] = IntDistribution(low, high, **more) if whole else FloatDistribution(low, high, **more)
         except (HydraException, ValueError, TypeError, IndexError) as error:
             raise ConfigError(f"space.{key}: got {text!r}; {gist(error)}") from None
     return found
@@ -172,8 +172,9 @@ class _Search:
         from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 
         try:
-            importances = get_param_importances(self.study, evaluator=PedAnovaImportanceEvaluator())
-        except (ValueError, RuntimeError):  # too few trials, or all alike
+            with catch_warnings(action="ignore"):  # of too few trials
+                importances = get_param_importances(self.study, evaluator=PedAnovaImportanceEvaluator())
+        except (ValueError, RuntimeError):  # no finished trial, or all alike
             importances = {}
         states: dict[str, TrialState] = {"COMPLETE": "finished", "PRUNED": "pruned", "FAIL": "failed"}
         trials = [

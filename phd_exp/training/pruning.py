@@ -1,4 +1,4 @@
-"""The part of a search that runs inside a training: it reports held-out scores, and stops a trial without prospects."""
+"""The part of a search that runs inside a training: it reports held-out scores and stops trials without prospects."""
 
 from pathlib import Path
 from typing import Any
