@@ -88,9 +88,9 @@ def distributions(space: Mapping[str, str]) -> dict[str, Any]:
             if isinstance(value, ChoiceSweep):
                 found[key] = CategoricalDistribution(list(override.sweep_string_iterator()))
             elif isinstance(value, IntervalSweep):
-                is_whole = isinstance(value.start, int) and isinstance(value.end, int)
-                kind = IntDistribution if is_whole else FloatDistribution
-                found[key] = kind(value.start, value.end, log="log" in value.tags)
+                ends: Any = (value.start, value.end)
+                kind = IntDistribution if all(isinstance(end, int) for end in ends) else FloatDistribution
+                found[key] = kind(*ends, log="log" in value.tags)
             elif isinstance(value, RangeSweep):
                 places = [int(place) for place in override.sweep_string_iterator()]
                 found[key] = IntDistribution(places[0], places[-1], step=int(value.step))

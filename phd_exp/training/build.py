@@ -4,7 +4,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import fields
 from functools import partial
-from inspect import isclass
+from inspect import isclass, signature
 from typing import Any
 
 import torch
@@ -21,7 +21,7 @@ from phd_exp.data.sources import Part, RenderedSource, Source
 from phd_exp.geometry.camera import Camera
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.detections import DetectionFolder
-from phd_exp.records.errors import ConfigError
+from phd_exp.records.errors import ConfigError, nearest
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.checkpoints import AtomicCheckpoints, StopBetweenBatches
 from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig, SourceConfig
@@ -31,6 +31,25 @@ from phd_exp.training.module import PositionModule, factor
 from phd_exp.training.network import build_regressor, naming, precision
 from phd_exp.training.progress import Progress
 from phd_exp.training.recorder import Recorder
+
+OWNED = {
+    "callbacks": "set callbacks=NAME, or +callbacks.NAME._target_=CLASS",
+    "logger": "set logger=NAME, or +logger.NAME._target_=CLASS",
+    "check_val_every_n_epoch": "set evaluation.every_n_epochs",
+    "val_check_interval": "set evaluation.every_n_epochs, since the record has one row an epoch",
+    "enable_progress_bar": "set trainer.progress_bar",
+    "default_root_dir": "set runs",
+    "enable_checkpointing": "set callbacks for further checkpoints; runs resume from their own",
+    "limit_predict_batches": "set data.n_test, since the record has all test samples",
+    "num_sanity_val_steps": "leave it out: the untrained network is always evaluated",
+    "use_distributed_sampler": "leave it out: batches are divided among the processes already",
+    "reload_dataloaders_every_n_epochs": "leave it out: the data stays in memory",
+    "strategy": "set trainer.devices",
+    "num_nodes": "set trainer.devices, since all processes are on one machine",
+    "plugins": "leave it out: they start the processes and write the checkpoints",
+    "barebones": "leave it out: it would switch the run record off",
+}
+"""Arguments of Lightning's Trainer that the run record depends on, and what to do instead."""
 
 
 def build_data(config: RunConfig, rank: int = 0) -> PositionData:
@@ -150,7 +169,22 @@ def build_trainer(config: RunConfig, recorder: Recorder, callbacks: Sequence[Cal
         "default_root_dir": folder.path,
     }
     with naming("trainer", {}):
-        return Trainer(**arguments | (config.trainer.model_extra or {}))
+        return Trainer(**arguments | trainer_arguments(config))
+
+
+def trainer_arguments(config: RunConfig) -> dict[str, Any]:
+    """The arguments of Lightning's Trainer that are no keys of ours.
+
+    Raises ConfigError for one that it does not take, or that the run record depends on.
+    """
+    given, ours = config.trainer.model_extra or {}, type(config.trainer).model_fields
+    known = [*ours, *(key for key in signature(Trainer).parameters if key not in OWNED and key not in ours)]
+    for key in given:
+        if key in OWNED:
+            raise ConfigError(f"trainer.{key}: the run record depends on it; instead {OWNED[key]}")
+        if key not in known:
+            raise ConfigError(f"trainer.{key}: unknown key{nearest(key, known)}; expected one of {', '.join(known)}")
+    return given
 
 
 def build_callbacks(config: RunConfig, folder: RunFolder) -> list[Callback]:

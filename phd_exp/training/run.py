@@ -19,7 +19,7 @@ from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError, RunError, shown
 from phd_exp.records.files import remove_temporaries
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.build import build_callbacks, build_data, build_module, build_trainer
+from phd_exp.training.build import build_callbacks, build_data, build_module, build_trainer, trainer_arguments
 from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig
 from phd_exp.training.config.targets import custom_parts
 from phd_exp.training.module import PositionModule
@@ -74,6 +74,7 @@ def require_possible(config: RunConfig, folder: RunFolder) -> None:
     """
     require_same_config(folder, config)
     folder.require_writable()
+    trainer_arguments(config)
     require_possible_loggers(config.logger)
     build_callbacks(config, folder)
     trainer, found = config.trainer, torch.cuda.device_count()

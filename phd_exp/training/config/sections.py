@@ -1,12 +1,10 @@
 """The sections of a configuration: their keys, types and ranges."""
 
-import inspect
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, StrictBool, Tag, model_validator
 
-from phd_exp.records.errors import nearest
 from phd_exp.records.spec import Angle, DatasetSpec, Range
 from phd_exp.training.config.targets import Target, TrainingTarget
 
@@ -131,30 +129,10 @@ class CameraConfig(Section):
     focal_length: Literal["known", "shown", "constant"]
 
 
-OWNED = {
-    "callbacks": "they are a group: callbacks=NAME, or +callbacks.NAME._target_=CLASS",
-    "logger": "it is a group: logger=NAME",
-    "check_val_every_n_epoch": "set evaluation.every_n_epochs",
-    "val_check_interval": "the record has one row an epoch; set evaluation.every_n_epochs",
-    "enable_progress_bar": "set trainer.progress_bar",
-    "default_root_dir": "set runs",
-    "enable_checkpointing": "runs resume from their checkpoint; set callbacks for further ones",
-    "limit_predict_batches": "the record has all test samples; set data.n_test",
-    "num_sanity_val_steps": "the untrained network is always evaluated",
-    "use_distributed_sampler": "the batches are already divided among the processes",
-    "reload_dataloaders_every_n_epochs": "the data stays in memory",
-    "strategy": "set trainer.devices",
-    "num_nodes": "all processes of a run are on one machine",
-    "plugins": "they start the processes and write the checkpoints",
-    "barebones": "it would switch the run record off",
-}
-"""Arguments of Lightning's Trainer that the run record depends on, and what to do instead."""
-
-
 class TrainerConfig(Section):
     """Length, hardware and arithmetic of the training; threads=None: one per core.
 
-    Further keys are arguments of Lightning's Trainer.
+    Further keys are arguments of Lightning's Trainer; `build.trainer_arguments` checks them.
     """
 
     model_config = ConfigDict(extra="allow", frozen=True)
@@ -165,22 +143,6 @@ class TrainerConfig(Section):
     threads: Count | None
     devices: Count
     progress_bar: StrictBool
-
-    @model_validator(mode="after")
-    def known_to_lightning(self) -> "TrainerConfig":
-        """Refuse keys that Lightning's Trainer does not take, or that the run record owns."""
-        if not self.model_extra:
-            return self
-        from lightning import Trainer  # of seconds
-
-        known = inspect.signature(Trainer).parameters.keys() - OWNED.keys()
-        for key in self.model_extra:
-            if key in OWNED:
-                raise ValueError(f"{key}: belongs to the run record: {OWNED[key]}")
-            if key not in known:
-                ours = sorted(known | TrainerConfig.model_fields.keys())
-                raise ValueError(f"{key}: unknown key{nearest(key, ours)}; expected one of {', '.join(ours)}")
-        return self
 
 
 class AugmentationConfig(Section):
