@@ -89,7 +89,7 @@ def distributions(space: Mapping[str, str]) -> dict[str, Any]:
                 found[key] = CategoricalDistribution(list(override.sweep_string_iterator()))
             elif isinstance(value, IntervalSweep):
                 ends: Any = (value.start, value.end)
-                kind = IntDistribution if all(isinstance(end, int) for end in ends) else FloatDistribution
+                kind: Any = IntDistribution if all(isinstance(end, int) for end in ends) else FloatDistribution
                 found[key] = kind(*ends, log="log" in value.tags)
             elif isinstance(value, RangeSweep):
                 places = [int(place) for place in override.sweep_string_iterator()]

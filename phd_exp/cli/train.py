@@ -18,8 +18,6 @@ from phd_exp.rendering.render import ensure_rendered
 from phd_exp.training.config import RenderedConfig, RunConfig, check
 
 if TYPE_CHECKING:
-    from lightning import Callback
-
     from phd_exp.inference.trained import TrainedRun
 
 NAMED = ("preset", "recipe", "data", "data.name", "model", "seed", "experiment")
@@ -42,9 +40,7 @@ def main(words: list[str]) -> int:
     return launch(task, words, standing=standing)
 
 
-def task(
-    config: dict[str, Any], overrides: list[str], cores: int, callbacks: "Sequence[Callback]" = ()
-) -> float | None:
+def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Sequence[Any] = ()) -> float | None:
     """Render missing data, train one run and print its numbers; returns the first of SCORES that it has.
 
     `callbacks` are Lightning's, in addition to those of the configuration.
