@@ -10,8 +10,9 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, FiniteFloat, ValidationError
 
-from phd_exp.records.errors import RunError, gist
+from phd_exp.records.errors import gist
 from phd_exp.records.files import read_plain, write_atomic
+from phd_exp.records.processes import announce
 
 TrialState = Literal["finished", "pruned", "failed", "running"]
 
@@ -61,11 +62,11 @@ def write_search(folder: Path, search: Search) -> None:
 
 
 def read_searches(runs: Path) -> list[Search]:
-    """All searches below a folder of runs that can be read."""
+    """All searches below a folder of runs; a line on standard error names a record that cannot be read."""
     found = []
     for file in sorted(search_folder(runs, "").glob("*/search.json")):
         try:
             found.append(Search.model_validate_json(read_plain(file)))
         except (OSError, ValidationError) as error:
-            raise RunError(f"{file}: not the record of a search ({gist(error)})") from None
+            announce(f"note: {file}: not the record of a search ({gist(error)})")
     return found
