@@ -19,9 +19,9 @@ Arguments_ = TypeVar("Arguments_", bound="Arguments")
 
 
 class Arguments(BaseModel):
-    """Arguments of a verb; a key without a default is required."""
+    """Arguments of a verb; a key without a default is required. Each has a description, for --help."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 def parsed(verb: str, model: type[Arguments_], words: Sequence[str]) -> Arguments_:
@@ -82,8 +82,11 @@ class RunArguments(Arguments):
     """The run whose network a verb uses."""
 
     run: Path
+    """the folder of a run"""
     recalibrate: bool = False
+    """apply the temperatures that fit the run's held-out samples"""
     trust: str | None = None
+    """packages of the user's own parts that the run names, separated by commas; their code is executed"""
 
 
 def loaded(arguments: RunArguments, device: str = "auto") -> "Predictor":

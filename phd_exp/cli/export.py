@@ -11,6 +11,7 @@ class ExportArguments(RunArguments):
     """The run and the file; recalibrate=true applies the temperatures fitted on the run's held-out samples."""
 
     out: Path | None = None
+    """the file; by default network.onnx in the run's folder"""
 
 
 def main(words: list[str]) -> int:

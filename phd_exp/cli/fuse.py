@@ -21,8 +21,11 @@ class FuseArguments(RunArguments):
     """The run and the scenes; the plane holds the v with (nx, ny, nz) . v = offset, world frame, metres."""
 
     folder: Path
+    """images with a metadata.jsonl whose lines have a scene and a pose"""
     plane: Annotated[tuple[float, float, float, float], PLANE] | None = None
+    """NX,NY,NZ,OFFSET: the object lies on this plane, metres"""
     out: Path | None = None
+    """a file for the lines; by default they are printed"""
 
     @field_validator("plane")
     @classmethod

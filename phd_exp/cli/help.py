@@ -16,7 +16,7 @@ VERBS = {
 OF_VERB = {
     "train": (
         *("model", "data", "preset", "recipe", "without", "experiment"),
-        *("backbone", "camera", "loss", "optimizer", "trainer", "logger"),
+        *("backbone", "camera", "loss", "optimizer", "trainer", "logger", "callbacks"),
     ),
     "render": ("data", "preset"),
 }
@@ -72,11 +72,15 @@ def text_of(verb: str | None) -> str:
             examples="\n".join(f"  {lines[0]}" for lines in EXAMPLES.values()),
             completion=COMPLETION,
         )
-    words, groups = "[key=value ...]", ""
+    words, groups = "SPACE.yaml [key=value ...]" if verb == "search" else "[key=value ...]", ""
     if verb in OF_VERB:
         words, groups = f"[-m] [group=choice ...] {words}", f"\n\ngroups\n{_choices(OF_VERB[verb])}"
+    from phd_exp.cli.keys import keys_of  # pydantic, which the help of the programme does without
+
+    keys = "".join(f"\n  {name}  {kind}, {default}\n      {text}" for name, kind, default, text in keys_of(verb))
     examples = "".join(f"\n  {line}" for line in EXAMPLES[verb])
-    return f"usage: python -m phd_exp {verb} {words}\n\n{VERBS[verb]}{groups}\n\nexamples{examples}"
+    usage = f"usage: python -m phd_exp {verb} {words}\n\n{VERBS[verb]}"
+    return f"{usage}{groups}\n\nkeys: type, default{keys}\n\nexamples{examples}"
 
 
 def _choices(groups: Iterable[str]) -> str:

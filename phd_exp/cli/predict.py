@@ -27,15 +27,25 @@ class PredictArguments(RunArguments):
     """The run, the images and their cameras; lengths in pixels of the image file."""
 
     image: Path | None = None
+    """one image, with its camera as f= or fx= and fy="""
     folder: Path | None = None
+    """images with a metadata.jsonl, instead of image="""
     f: float | None = None
+    """focal length, px"""
     fx: float | None = None
+    """horizontal focal length, px"""
     fy: float | None = None
+    """vertical focal length, px"""
     cx: float | None = None
+    """column of the principal point, px; by default the middle"""
     cy: float | None = None
+    """row of the principal point, px; by default the middle"""
     box: Annotated[tuple[float, float, float, float], BOX] | None = None
+    """LEFT,TOP,RIGHT,BOTTOM of the object, px; by default the whole image"""
     out: Path | None = None
+    """a folder for predictions.jsonl and a picture for each line; by default lines are printed"""
     calibration: bool = False
+    """draw the run's calibration curve of depth into the pictures"""
 
     @property
     def camera(self) -> dict[str, Any]:

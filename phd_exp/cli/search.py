@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 from warnings import catch_warnings
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -12,6 +12,7 @@ from hydra.errors import HydraException
 from hydra.utils import instantiate
 from pydantic import BaseModel, ConfigDict, Field
 
+from phd_exp.cli.arguments import Arguments, parsed
 from phd_exp.cli.frame import print_errors
 from phd_exp.cli.jobs import composed
 from phd_exp.cli.train import run_name, task
@@ -24,6 +25,13 @@ from phd_exp.training.config import check
 
 if TYPE_CHECKING:  # optional
     import optuna
+
+
+class SearchArguments(Arguments):
+    """The keys of a search; all others are overrides of its runs."""
+
+    trials: Annotated[int, Field(ge=1, le=100_000)] = 20
+    """the number of trials, including those of an earlier command"""
 
 
 class Space(BaseModel):
@@ -65,10 +73,9 @@ def _arguments(words: list[str]) -> tuple[Path, int, list[str]]:
     """The file, the number of trials, and overrides of all runs."""
     if not words or "=" in words[0]:
         raise ConfigError("search: expected SPACE.yaml first; see `python -m phd_exp search --help`")
-    trials = next((word.partition("=")[2] for word in words if word.startswith("trials=")), "20")
-    if not trials.isdigit() or not 1 <= int(trials) <= 100_000:
-        raise ConfigError(f"trials: got {trials!r}; expected a number from 1 to 100000")
-    return Path(words[0]), int(trials), [word for word in words[1:] if not word.startswith("trials=")]
+    ours = [word for word in words[1:] if word.startswith("trials=")]
+    trials = parsed("search", SearchArguments, ours).trials
+    return Path(words[0]), trials, [word for word in words[1:] if word not in ours]
 
 
 def distributions(space: Mapping[str, str]) -> dict[str, Any]:

@@ -8,8 +8,8 @@ from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem
 
 MOST = 10  # trials of a table
 OF_A_SEARCH = (
-    "Searches minimise a score on held-out samples, which are never trained on. In the CSV file, the value of a pruned "
-    "trial is that of its last epoch. Test samples choose nothing."
+    "Searches minimise a score on held-out samples, which are never trained on; test samples choose nothing. In the "
+    "CSV file, the value of a pruned trial is that of its last epoch."
 )
 
 
