@@ -195,7 +195,7 @@ class RunFolder:
             yield
 
     @contextmanager
-    def recording(self, data_manifest: str | None, custom: Mapping[str, str]) -> Iterator[None]:
+    def recording(self, data_manifest: str | None, custom: Mapping[str, str] | None = None) -> Iterator[None]:
         """Record how the enclosed work ends: finished, failed with its traceback, or interrupted."""
         status = RunStatus(
             state="running",
@@ -203,7 +203,7 @@ class RunFolder:
             versions=versions(),
             git_commit=git_commit(),
             data_manifest=data_manifest,
-            custom=dict(custom),
+            custom=dict(custom or {}),
             machine=f"{platform.machine()}, {os.cpu_count()} cores",
         )
 

@@ -81,19 +81,18 @@ def tidy(numbers: Sequence[Mapping[str, Any]]) -> str:
 def markdown(table: Table) -> str:
     """The table as Markdown: heading, cells, missing runs with the command that makes them, notes.
 
-        Examples:
-            >>> from phd_exp.reports.searches import search_tables
-    from phd_exp.reports.table import Table, TableCell, TableRow
-            >>> row = TableRow(("mae_vz",), (TableCell("48", "±3", bold=True),))
-            >>> print(markdown(Table("t", "tables", "Depth", ("model",), ("mm",), ((row,),), notes=("95 %",))))
-            ## Depth
-            <BLANKLINE>
-            | model | mm |
-            | --- | ---: |
-            | mae\\_vz | **48** ±3 |
-            <BLANKLINE>
-            - 95 %
-            <BLANKLINE>
+    Examples:
+        >>> from phd_exp.reports.table import Table, TableCell, TableRow
+        >>> row = TableRow(("mae_vz",), (TableCell("48", "±3", bold=True),))
+        >>> print(markdown(Table("t", "tables", "Depth", ("model",), ("mm",), ((row,),), notes=("95 %",))))
+        ## Depth
+        <BLANKLINE>
+        | model | mm |
+        | --- | ---: |
+        | mae\\_vz | **48** ±3 |
+        <BLANKLINE>
+        - 95 %
+        <BLANKLINE>
     """
     headings = [*table.stub, *table.columns]
     aligned = ["---"] * len(table.stub) + ["---:"] * len(table.columns)
