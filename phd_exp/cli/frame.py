@@ -49,13 +49,13 @@ def failure(error: BaseException) -> Ending:
     if isinstance(error, UserError):
         return Ending("failed", tuple(str(error).splitlines()), 1)
     # torch raises a RuntimeError on a CPU, and a class of the second name on a GPU
-    if place := in_user_code(error):
-        return Ending("failed", (f"{place}; mend it, and {RESUMES}",), 1)
     no_memory = type(error).__name__ in ("MemoryError", "OutOfMemoryError")
     if isinstance(error, OSError) and error.strerror:
         line = f"{error.filename or 'output'}: {error.strerror}; mend that, and {RESUMES}"
     elif no_memory or "can't allocate memory" in str(error):
         line = f"memory ran out; free some, and {RESUMES}, or lower data.batch_size, which makes a new run"
+    elif place := in_user_code(error):
+        line = f"{place}; mend it, and {RESUMES}"
     else:
         if type(error).__name__ != "MisconfigurationException":  # Lightning's, of arguments that do not fit
             traceback.print_exception(error)

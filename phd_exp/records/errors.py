@@ -15,7 +15,8 @@ LONGEST_GIST = 200  # characters of an error that a message repeats
 LONGEST_VALUE = 120  # characters of a value that a message repeats
 UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 """Characters that would end the line of a message, or control the terminal."""
-_LIBRARIES = (str(Path(__file__).parents[1]), sysconfig.get_path("stdlib"), "<")
+_PACKAGE = Path(__file__).parents[1]
+_LIBRARIES = (str(_PACKAGE), str(_PACKAGE.parent / "hydra_plugins"), sysconfig.get_path("stdlib"), "<")
 """Beginnings of the file names of this package, the standard library, and code without a file."""
 NAMED = 5  # names that a message lists
 

@@ -182,7 +182,7 @@ class RunFolder:
             self.path.mkdir(parents=True, exist_ok=True)
             for place in self.path.iterdir():
                 if place.is_symlink():  # in a stranger's run, it would redirect what is written
-                    raise RunError(f"{place}: leads out of the run's folder; put the folder itself in its place")
+                    raise RunError(f"{place}: is a link; put the file or folder itself in its place")
             lock = ExitStack()
             free = lock.enter_context(held(self.path / ".lock"))
         except OSError as error:

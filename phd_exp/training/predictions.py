@@ -80,7 +80,7 @@ def calibration_curves(table: Columns, window: int) -> dict[str, CalibrationCurv
     }
 
 
-def summary(table: Columns, part: str) -> dict[str, float]:
+def summary(table: Columns, part: str = "test") -> dict[str, float]:
     """Metrics of the evaluation of a part of the samples: means over the rows, and calibration scores."""
     means = {metric: float(table[column].mean()) for column, metric in MEANS.items() if column in table}
     scores = exact_scores(table) if "a" in table else {}

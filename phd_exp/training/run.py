@@ -136,7 +136,7 @@ def run(
             module.load_state_dict(load_checkpoint(best)["state_dict"])
         tables = {part: _evaluate(trainer, module, data, part) for part in data.samples if part != "train"}
         untrained = recorder.rows[UNTRAINED].items()
-        results = summary(tables["test"], "test")
+        results = summary(tables["test"])
         results |= {f"untrained/{key}": value for key, value in untrained if "test/" in key}
         results |= _circumstances(config, data, trainer)
         if rank == 0:
@@ -158,7 +158,7 @@ def _fit(trainer: Trainer, module: PositionModule, data: PositionData, recorder:
     checkpoint = recorder.folder.last_checkpoint
     if not checkpoint.exists():
         recorder.forget_after(UNTRAINED)
-        recorder.record(UNTRAINED, summary(_evaluate(trainer, module, data, "test"), "test"), step=0)
+        recorder.record(UNTRAINED, summary(_evaluate(trainer, module, data, "test")), step=0)
         recorder.send_recorded()
         trainer.fit(module, datamodule=data)
         return
@@ -234,6 +234,7 @@ def _quiet_lightning() -> None:
     logging.getLogger("lightning.pytorch.profilers").setLevel(logging.INFO)
     # Lightning calls a deprecated name of torch
     warnings.filterwarnings("ignore", ".*LeafSpec.*is deprecated", FutureWarning)
+    warnings.filterwarnings("ignore", "Precision .* is not supported by the model summary")
     # an interrupted run resumes in the same folder
     warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
     # the logged values are already sums over all processes

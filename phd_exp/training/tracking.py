@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.utils import instantiate
-from lightning.pytorch.loggers import Logger
+from lightning.pytorch.loggers import Logger, WandbLogger
 
 from phd_exp.records.choices import flatten
 from phd_exp.records.errors import ConfigError
@@ -78,7 +78,6 @@ def _wandb(name: str, node: dict[str, Any], config: RunConfig, folder: RunFolder
     An unfinished one would receive the metrics of the next run of a sweep.
     """
     import wandb
-    from lightning.pytorch.loggers import WandbLogger
 
     arguments = {key: value for key, value in node.items() if key not in ("_target_", "offline")}
     with _everything_in(folder.path / name):
@@ -119,7 +118,7 @@ def _everything_in(place: Path) -> Iterator[None]:
 
 
 def send_results(loggers: Sequence[Logger], results: Mapping[str, Any]) -> None:
-    """Send the final numbers to the loggers that have a summary, as wandb does."""
+    """Put the final numbers into the summary of wandb; the other loggers have none."""
     for logger in loggers:
-        if summary := getattr(getattr(logger, "experiment", None), "summary", None):
-            summary.update(results)
+        if isinstance(logger, WandbLogger):
+            logger.experiment.summary.update(results)

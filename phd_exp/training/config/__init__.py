@@ -164,7 +164,7 @@ def check_render(config: dict[str, Any]) -> RenderConfig:
     """The configuration of `render`, given that of a run; other keys of a run are not checked."""
     if kind_of_data(config.get("data")) != "<rendered>":
         raise ConfigError(
-            "data: there is nothing to render, these are your own images; leave out `render` to train on them"
+            "data=folder: there is nothing to render, these are your own images; leave out `render` to train on them"
         )
     others = RunConfig.model_fields.keys() - RenderConfig.model_fields.keys()
     kept = {key: value for key, value in config.items() if key not in others}

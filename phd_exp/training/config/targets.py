@@ -92,7 +92,7 @@ def custom_parts(config: Any) -> dict[str, str]:
         found = {name: file for value in config.values() for name, file in custom_parts(value).items()}
         name = config.get("_target_")
         if name and not _is_below(name, KNOWN):
-            found[name] = str(inspect.getsourcefile(inspect.unwrap(locate(name, None))))
+            found[name] = str(getattr(inspect.getmodule(locate(name, None)), "__file__", "built in"))
         return found
     if isinstance(config, list):
         return {name: file for value in config for name, file in custom_parts(value).items()}
@@ -110,7 +110,8 @@ def locate(name: Any, trust: Trust, where: str = "") -> Any:
         raise _error(path, f"got {shown(name)}; expected MODULE.NAME of a class or function")
     if trust is not None and not _is_below(name, allowed := (*OURS, *trust)):
         package = name.partition(".")[0]
-        raise _error(path, f"{shown(name)} may be a stranger's code; if you trust this run, add trust={package}")
+        advice = "" if package == "phd_exp" else f"; if you trust this run, add trust={package}"
+        raise _error(path, f"{shown(name)} is not built from a stored configuration{advice}")
     module, _, attribute = name.rpartition(".")
     try:
         target = getattr(import_module(module), attribute)
