@@ -32,6 +32,8 @@ class SearchArguments(Arguments):
 
     trials: Annotated[int, Field(ge=1, le=100_000)] = 20
     """the number of trials, including those of an earlier command"""
+    config_dir: Path | None = None
+    """a folder with further choices, like --config-dir of train"""
 
 
 class Space(BaseModel):
@@ -47,17 +49,21 @@ class Space(BaseModel):
 
 def main(words: list[str]) -> int:
     """Search; returns the exit status. The same command resumes an interrupted search."""
-    file, trials, overrides = _arguments(words)
+    if not words or "=" in words[0]:
+        raise ConfigError("search: expected SPACE.yaml first; see `python -m phd_exp search --help`")
     if find_spec("optuna") is None:
         raise ConfigError("search needs Optuna: `pip install 'phd_exp[search]'`")
+    file, ours = (
+        Path(words[0]),
+        [word for word in words[1:] if word.partition("=")[0] in SearchArguments.model_fields],
+    )
+    arguments = parsed("search", SearchArguments, ours)
     try:
         space = Space.model_validate(parse_yaml(read_plain(file).decode()))
     except (OSError, ValueError) as error:
-        raise ConfigError(
-            f"{file}: {gist(error)}; expected a file with `space`, as in docs/guides/search.md"
-        ) from None
-    fixed = [*space.overrides, *overrides, "evaluation.held_out=true"]
-    config = check(composed(fixed))
+        raise ConfigError(f"{file}: {gist(error)}; expected `space`, as in docs/guides/search.md") from None
+    fixed = [*space.overrides, *(word for word in words[1:] if word not in ours), "evaluation.held_out=true"]
+    config = check(composed(fixed, arguments.config_dir))
     if config.data.n_held_out == 0:
         raise ConfigError("data.n_held_out: got 0; a search is judged by held-out samples, expected at least 1")
     folder = search_folder(config.runs, file.stem)
@@ -65,23 +71,14 @@ def main(words: list[str]) -> int:
     with held(folder / ".lock") as free:
         if not free:
             raise RunError(f"{folder}: another process works on this search; wait for it or stop it")
-        _Search(file.stem, space, fixed, folder).run(trials)
+        _Search(file.stem, space, fixed, arguments.config_dir, folder).run(arguments.trials)
     return 0
-
-
-def _arguments(words: list[str]) -> tuple[Path, int, list[str]]:
-    """The file, the number of trials, and overrides of all runs."""
-    if not words or "=" in words[0]:
-        raise ConfigError("search: expected SPACE.yaml first; see `python -m phd_exp search --help`")
-    ours = [word for word in words[1:] if word.startswith("trials=")]
-    trials = parsed("search", SearchArguments, ours).trials
-    return Path(words[0]), trials, [word for word in words[1:] if word not in ours]
 
 
 def distributions(space: Mapping[str, str]) -> dict[str, Any]:
     """Optuna's distributions of values in Hydra's grammar of sweeps: choice(...), range(...), interval(...).
 
-    An interval is of whole numbers if both ends are; `tag(log, interval(...))` searches its logarithm.
+    `int(interval(...))` is of whole numbers; `tag(log, interval(...))` searches the logarithm.
 
     Raises ConfigError for anything else.
     """
@@ -111,11 +108,11 @@ def distributions(space: Mapping[str, str]) -> dict[str, Any]:
 class _Search:
     """A study of Optuna whose trials are runs."""
 
-    def __init__(self, name: str, space: Space, fixed: list[str], folder: Path) -> None:
+    def __init__(self, name: str, space: Space, fixed: list[str], config_dir: Path | None, folder: Path) -> None:
         import optuna
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        self.name, self.fixed, self.folder = name, fixed, folder
+        self.name, self.fixed, self.config_dir, self.folder = name, fixed, config_dir, folder
         self.space = distributions(space.space)
         self.study = optuna.create_study(
             storage=f"sqlite:///{folder.absolute() / 'study.db'}",
@@ -155,7 +152,7 @@ class _Search:
         own = [f"{key}={value}" for key, value in trial.params.items()]
         overrides = [*self.fixed, *own]
         print(f"trial {trial.number + 1}/{trials}: {' '.join(own)}", flush=True)
-        config = composed(overrides)
+        config = composed(overrides, self.config_dir)
         checked = check(config)
         run = run_name(checked, overrides).folder(checked.runs)
         trial.set_user_attr("run", str(run))
