@@ -53,10 +53,8 @@ def main(words: list[str]) -> int:
         raise ConfigError("search: expected SPACE.yaml first; see `python -m phd_exp search --help`")
     if find_spec("optuna") is None:
         raise ConfigError("search needs Optuna: `pip install 'phd_exp[search]'`")
-    file, ours = (
-        Path(words[0]),
-        [word for word in words[1:] if word.partition("=")[0] in SearchArguments.model_fields],
-    )
+    file, keys = Path(words[0]), SearchArguments.model_fields
+    ours = [word for word in words[1:] if word.partition("=")[0] in keys]
     arguments = parsed("search", SearchArguments, ours)
     try:
         space = Space.model_validate(parse_yaml(read_plain(file).decode()))
