@@ -2,17 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from phd_exp.inference.predictor import Predictor
+    from phd_exp.inference.trained import TrainedRun
 
 __version__ = "0.1.0"
 
+# Each function imports what it needs: importing phd_exp alone takes no torch.
 
-def load(run: str | Path, device: str = "auto", recalibrate: bool = False) -> Predictor:
+
+def train(overrides: Sequence[str] = (), config_dir: str | Path | None = None) -> TrainedRun:
+    """Train a run as `python -m phd_exp` does with these overrides, or find it finished.
+
+    Args:
+        overrides: such as `["model=mae_logz", "data=scale", "preset=small"]`.
+        config_dir: a folder with further choices, like --config-dir.
+
+    Raises UserError, or an error of a custom part.
+    """
+    from phd_exp.cli.train import trained
+
+    return trained(list(overrides), config_dir)
+
+
+def load(run: str | Path, device: str = "auto", recalibrate: bool = False, trust: tuple[str, ...] = ()) -> Predictor:
     """A trained run as a callable from images to predictions; see `phd_exp.inference.predictor.load`."""
-    from phd_exp.inference import predictor  # torch, which importing phd_exp does without
+    from phd_exp.inference import predictor
 
-    return predictor.load(Path(run), device, recalibrate)
+    return predictor.load(Path(run), device, recalibrate, trust)
+
+
+def runs(folder: str | Path = "runs") -> Any:
+    """All runs under a folder as a table; see `phd_exp.inference.trained.runs_table`."""
+    from phd_exp.inference.trained import runs_table
+
+    return runs_table(Path(folder))

@@ -46,6 +46,7 @@ def _run(words: list[str]) -> int:
         return 0
     from phd_exp.cli.frame import run_verb
 
+    sys.path.append(os.getcwd())  # of the user's own parts, as for `python -m`
     return run_verb(lambda rest: import_module(f"phd_exp.cli.{verb or 'train'}").main(rest), words)
 
 

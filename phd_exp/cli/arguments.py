@@ -19,9 +19,9 @@ Arguments_ = TypeVar("Arguments_", bound="Arguments")
 
 
 class Arguments(BaseModel):
-    """Arguments of a verb; a key without a default is required."""
+    """Arguments of a verb; a key without a default is required. Each has a description, for --help."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 def parsed(verb: str, model: type[Arguments_], words: Sequence[str]) -> Arguments_:
@@ -78,13 +78,25 @@ def require_file(out: Path, name: str) -> None:
         raise ConfigError(f"out={out}: is a folder; expected a file, such as {out / name}")
 
 
-def loaded(run: Path, device: str = "auto", recalibrate: bool = False) -> "Predictor":
+class RunArguments(Arguments):
+    """The run whose network a verb uses."""
+
+    run: Path
+    """the folder of a run"""
+    recalibrate: bool = False
+    """apply the temperatures that fit the run's held-out samples"""
+    trust: str | None = None
+    """packages of the user's own parts that the run names, separated by commas; their code is executed"""
+
+
+def loaded(arguments: RunArguments, device: str = "auto") -> "Predictor":
     """The predictor of a run, with a note on standard error if the run is not finished."""
     from phd_exp.inference.predictor import load
 
-    predictor = load(run, device, recalibrate)
+    trust = tuple((arguments.trust or "").split(",")) if arguments.trust else ()
+    predictor = load(arguments.run, device, arguments.recalibrate, trust)
     if predictor.state != "finished":
-        print(f"note: {run}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
+        print(f"note: {arguments.run}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
     return predictor
 
 

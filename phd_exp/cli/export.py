@@ -3,16 +3,15 @@
 from importlib.util import find_spec
 from pathlib import Path
 
-from phd_exp.cli.arguments import Arguments, loaded, output_folder, parsed, require_file
+from phd_exp.cli.arguments import RunArguments, loaded, output_folder, parsed, require_file
 from phd_exp.records.errors import ConfigError
 
 
-class ExportArguments(Arguments):
+class ExportArguments(RunArguments):
     """The run and the file; recalibrate=true applies the temperatures fitted on the run's held-out samples."""
 
-    run: Path
     out: Path | None = None
-    recalibrate: bool = False
+    """the file; by default network.onnx in the run's folder"""
 
 
 def main(words: list[str]) -> int:
@@ -22,7 +21,7 @@ def main(words: list[str]) -> int:
     if missing := [name for name in ("onnx", "onnxscript", "onnxruntime") if find_spec(name) is None]:
         raise ConfigError(f"export needs {', '.join(missing)}: `pip install 'phd_exp[export]'`")
     require_file(file, "network.onnx")
-    predictor = loaded(arguments.run, "cpu", arguments.recalibrate)
+    predictor = loaded(arguments, "cpu")
     output_folder(file.parent)
     from phd_exp.inference.onnx import CHECKED, TOLERANCE, export
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NamedTuple
 
-from phd_exp.records.errors import UNPRINTABLE, ConfigError, UserError, one_line
+from phd_exp.records.errors import UNPRINTABLE, ConfigError, UserError, in_user_code, one_line
 
 RESUMES = "the same command resumes"
 
@@ -54,8 +54,11 @@ def failure(error: BaseException) -> Ending:
         line = f"{error.filename or 'output'}: {error.strerror}; mend that, and {RESUMES}"
     elif no_memory or "can't allocate memory" in str(error):
         line = f"memory ran out; free some, and {RESUMES}, or lower data.batch_size, which makes a new run"
+    elif place := in_user_code(error):
+        line = f"{place}; mend it, and {RESUMES}"
     else:
-        traceback.print_exception(error)
+        if type(error).__name__ != "MisconfigurationException":  # Lightning's, of arguments that do not fit
+            traceback.print_exception(error)
         line = f"{type(error).__name__}: {error}"
     return Ending("failed", (one_line(line),), 1)
 

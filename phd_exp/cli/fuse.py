@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import field_validator
 
-from phd_exp.cli.arguments import Arguments, four_numbers, loaded, output_folder, parsed, predicted, require_file
+from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_folder, parsed, predicted, require_file
 from phd_exp.records.detections import Observed, detections_in, observed
 from phd_exp.records.errors import ConfigError, listed
 from phd_exp.records.files import write_atomic
@@ -17,14 +17,15 @@ from phd_exp.records.files import write_atomic
 PLANE = four_numbers("plane=NX,NY,NZ,OFFSET: the points v with normal . v = offset, metres")
 
 
-class FuseArguments(Arguments):
+class FuseArguments(RunArguments):
     """The run and the scenes; the plane holds the v with (nx, ny, nz) . v = offset, world frame, metres."""
 
-    run: Path
     folder: Path
+    """images with a metadata.jsonl whose lines have a scene and a pose"""
     plane: Annotated[tuple[float, float, float, float], PLANE] | None = None
+    """NX,NY,NZ,OFFSET: the object lies on this plane, metres"""
     out: Path | None = None
-    recalibrate: bool = False
+    """a file for the lines; by default they are printed"""
 
     @field_validator("plane")
     @classmethod
@@ -68,7 +69,7 @@ def _answers(arguments: FuseArguments, scenes: Sequence[Observed]) -> list[dict[
     from phd_exp.fusion import Plane
     from phd_exp.inference.fused import fused_answers
 
-    predictor = loaded(arguments.run, recalibrate=arguments.recalibrate)
+    predictor = loaded(arguments)
     if not predictor.is_probabilistic:
         raise ConfigError(
             f"{arguments.run}: predicts positions without uncertainty, so they cannot be weighted; "

@@ -10,12 +10,13 @@ VERBS = {
     "report": "the paper's tables, the dashboard and the figures of all recorded runs",
     "predict": "the object's position in an image and its uncertainty: JSON lines, and pictures with out=",
     "fuse": "one position from the predictions of several cameras, and/or on a ground plane: a JSON line a scene",
+    "search": "search for good values of keys with Optuna, judged on held-out samples",
     "export": "write a run's network as ONNX, compared with torch; it needs onnxruntime and NumPy alone",
 }
 OF_VERB = {
     "train": (
         *("model", "data", "preset", "recipe", "without", "experiment"),
-        *("backbone", "camera", "loss", "optimizer", "trainer", "logger"),
+        *("backbone", "camera", "loss", "optimizer", "trainer", "logger", "callbacks"),
     ),
     "render": ("data", "preset"),
 }
@@ -50,6 +51,10 @@ EXAMPLES = {
         "python -m phd_exp fuse run=runs/small/scale/probabilistic/seed0 folder=renders/multiview/test",
         "python -m phd_exp fuse run=DIR folder=photos/test plane=0,1,0,1.5 recalibrate=true out=fused.jsonl",
     ],
+    "search": [
+        "python -m phd_exp search space.yaml trials=40",
+        "python -m phd_exp search space.yaml trials=40 preset=small data=occl",
+    ],
     "export": [
         "python -m phd_exp export run=runs/small/default/probabilistic/seed0",
         "python -m phd_exp export run=DIR out=network.onnx",
@@ -67,11 +72,15 @@ def text_of(verb: str | None) -> str:
             examples="\n".join(f"  {lines[0]}" for lines in EXAMPLES.values()),
             completion=COMPLETION,
         )
-    words, groups = "[key=value ...]", ""
+    words, groups = "SPACE.yaml [key=value ...]" if verb == "search" else "[key=value ...]", ""
     if verb in OF_VERB:
         words, groups = f"[-m] [group=choice ...] {words}", f"\n\ngroups\n{_choices(OF_VERB[verb])}"
+    from phd_exp.cli.keys import keys_of  # pydantic, which the help of the programme does without
+
+    keys = "".join(f"\n  {name}  {kind}, {default}\n      {text}" for name, kind, default, text in keys_of(verb))
     examples = "".join(f"\n  {line}" for line in EXAMPLES[verb])
-    return f"usage: python -m phd_exp {verb} {words}\n\n{VERBS[verb]}{groups}\n\nexamples{examples}"
+    usage = f"usage: python -m phd_exp {verb} {words}\n\n{VERBS[verb]}"
+    return f"{usage}{groups}\n\nkeys: type, default{keys}\n\nexamples{examples}"
 
 
 def _choices(groups: Iterable[str]) -> str:

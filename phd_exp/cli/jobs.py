@@ -6,6 +6,7 @@ import sys
 import uuid
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
@@ -130,6 +131,18 @@ def launch(task: Task, words: list[str], config_name: str = "config", standing: 
         job.endings.append(refusal(refused))
         print_errors(job.endings[-1].lines)
     return max((ending.exit_status for ending in job.endings), default=0)
+
+
+def composed(
+    overrides: list[str], config_dir: str | Path | None = None, config_name: str = "config"
+) -> dict[str, Any]:
+    """The configuration of one run, without Hydra's command line. Raises ConfigError for a bad override."""
+    search = [f"hydra.searchpath=[file://{Path(config_dir).absolute()}]"] if config_dir else []
+    try:
+        with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
+            return plain(hydra.compose("config", [*overrides, *search]))
+    except REFUSED as error:
+        raise ConfigError(explain(error, "config")) from None
 
 
 def _options_last(words: list[str]) -> list[str]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import model_validator
 
-from phd_exp.cli.arguments import Arguments, four_numbers, loaded, output_folder, parsed, predicted
+from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_folder, parsed, predicted
 from phd_exp.records.detections import Detection, detection_of, detections_in
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import read_plain, write_atomic
@@ -23,21 +23,29 @@ OF_A_CAMERA = ("f", "fx", "fy", "cx", "cy", "box")
 LONGEST_STEM = 50  # characters of an image's name in the name of its picture
 
 
-class PredictArguments(Arguments):
+class PredictArguments(RunArguments):
     """The run, the images and their cameras; lengths in pixels of the image file."""
 
-    run: Path
     image: Path | None = None
+    """one image, with its camera as f= or fx= and fy="""
     folder: Path | None = None
+    """images with a metadata.jsonl, instead of image="""
     f: float | None = None
+    """focal length, px"""
     fx: float | None = None
+    """horizontal focal length, px"""
     fy: float | None = None
+    """vertical focal length, px"""
     cx: float | None = None
+    """column of the principal point, px; by default the middle"""
     cy: float | None = None
+    """row of the principal point, px; by default the middle"""
     box: Annotated[tuple[float, float, float, float], BOX] | None = None
+    """LEFT,TOP,RIGHT,BOTTOM of the object, px; by default the whole image"""
     out: Path | None = None
-    recalibrate: bool = False
+    """a folder for predictions.jsonl and a picture for each line; by default lines are printed"""
     calibration: bool = False
+    """draw the run's calibration curve of depth into the pictures"""
 
     @property
     def camera(self) -> dict[str, Any]:
@@ -73,7 +81,7 @@ def main(words: list[str]) -> int:
     if out is not None:
         _require_possible(detections, out)
         output_folder(out)
-    predictor = loaded(arguments.run, recalibrate=arguments.recalibrate)
+    predictor = loaded(arguments)
     curve = _depth_curve(arguments.run, predictor) if arguments.calibration else None
     if out is not None:
         _write(predictor, detections, out, curve)

@@ -12,7 +12,9 @@ class ReportArguments(Arguments):
     """The folder of the runs and the folder of the report."""
 
     runs: Path = Path("runs")
+    """the folder of the runs"""
     out: Path = Path("report")
+    """the folder to write to"""
 
 
 def main(words: list[str]) -> int:

@@ -1,20 +1,24 @@
 """`python -m phd_exp [train]`: render missing data, train, measure and record a run."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from phd_exp.cli.jobs import launch
+from phd_exp.cli.jobs import composed, launch
 from phd_exp.records.choices import RunName, has_influence, setting
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import RunError
+from phd_exp.records.processes import usable_cores
 from phd_exp.records.runs import RunFolder
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.render import ensure_rendered
 from phd_exp.training.config import RenderedConfig, RunConfig, check
+
+if TYPE_CHECKING:
+    from phd_exp.inference.trained import TrainedRun
 
 NAMED = ("preset", "recipe", "data", "data.name", "model", "seed", "experiment")
 """Choices with a place of their own in a run's name, and `experiment`, which only names several runs."""
@@ -36,8 +40,11 @@ def main(words: list[str]) -> int:
     return launch(task, words, standing=standing)
 
 
-def task(config: dict[str, Any], overrides: list[str], cores: int) -> float | None:
-    """Render missing data, train one run and print its numbers; returns the first of SCORES that it has."""
+def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Sequence[Any] = ()) -> float | None:
+    """Render missing data, train one run and print its numbers; returns the first of SCORES that it has.
+
+    `callbacks` are Lightning's, in addition to those of the configuration.
+    """
     checked = check(config)
     # imports of seconds, which follow the check of the configuration
     from phd_exp.training.run import require_possible, train
@@ -53,7 +60,7 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> float | No
         if isinstance(data, RenderedConfig):
             place = DatasetFolder(data.folder)
             ensure_rendered(place, data.spec, data.n_training_split, data.n_test, data.workers, cores)
-    results = train(checked, folder, draw=_draw(), cores=cores)
+    results = train(checked, folder, draw=_draw(), cores=cores, callbacks=callbacks)
     if several is not None and isinstance(data, RenderedConfig):
         _record_views(folder, *several, data.workers, cores)
     print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
@@ -62,6 +69,15 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> float | No
     if (folder.calibration / "final.png").exists():
         print(f"  calibration curves: {folder.calibration / 'final.png'}")
     return next((results[key] for key in SCORES if results.get(key) is not None), None)
+
+
+def trained(overrides: list[str], config_dir: str | Path | None) -> "TrainedRun":
+    """Train one run from Python; see `phd_exp.train`."""
+    from phd_exp.inference.trained import TrainedRun
+
+    config = composed(overrides, config_dir)
+    task(config, overrides, usable_cores())
+    return TrainedRun(run_name(check(config), overrides).folder(Path(config["runs"])))
 
 
 def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> None:

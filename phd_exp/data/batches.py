@@ -94,15 +94,17 @@ class BatchLoader:
     augment: Augment | None = None
     epoch: int = field(default=-1, init=False)
     next_batch: int = field(default=0, init=False)
+    resumes: bool = field(default=False, init=False)
 
     def __len__(self) -> int:
         whole, rest = divmod(len(self.samples), self.batch_size)
         return whole + (rest > self.rank and not self.shuffle)
 
     def __iter__(self) -> Iterator[Batch]:
-        if self.next_batch in (0, len(self)):  # else: resumed in the middle of an epoch
+        if not self.resumes:
             self.epoch += 1  # at the start, since an iterator may not be exhausted
             self.next_batch = 0
+        self.resumes = False
         order = self.order(self.epoch)
         signs = self.signs(self.epoch) if self.augment else np.empty(0)
         while self.next_batch < len(self):
@@ -142,3 +144,4 @@ class BatchLoader:
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
         """Continue the next iteration at this position."""
         self.epoch, self.next_batch = state_dict["epoch"], state_dict["next_batch"]
+        self.resumes = 0 < self.next_batch < len(self)

@@ -12,7 +12,8 @@ from phd_exp.records.errors import ConfigError
 class PositionData(LightningDataModule):
     """The samples of a source in batches, or the share of one of several processes (`rank` of `world`).
 
-    `augment` changes training batches only.
+    `augment` changes training batches only. The validation evaluates the test samples, which choose nothing, and with
+    `held_out` also the held-out samples.
 
     Raises ConfigError if there are too few samples for one batch, or if the processes cannot share them; on `setup`,
     DatasetError if the source lacks samples or an image is damaged.
@@ -22,11 +23,12 @@ class PositionData(LightningDataModule):
         self,
         source: Source,
         *,
-        batch_size: int,
-        seed: int,
+        batch_size: int = 32,
+        seed: int = 0,
         rank: int = 0,
         world: int = 1,
         augment: Augment | None = None,
+        held_out: bool = False,
     ) -> None:
         super().__init__()
         if batch_size > source.count("train"):
@@ -37,6 +39,7 @@ class PositionData(LightningDataModule):
         _require_shares(source, batch_size, world)
         self.source = source
         self.augment = augment
+        self.validated: tuple[Part, ...] = ("test", "held_out") if held_out else ("test",)
         self.batches = partial(BatchLoader, batch_size=batch_size, seed=seed, rank=rank, world=world)
         self.samples: dict[Part, Batch] = {}
         self.train_batches: BatchLoader | None = None
@@ -53,9 +56,13 @@ class PositionData(LightningDataModule):
         assert self.train_batches is not None, "setup comes first"
         return self.train_batches
 
-    def val_dataloader(self) -> BatchLoader:
-        # the paper reports the test split after every epoch; it selects nothing
+    def val_dataloader(self) -> list[BatchLoader]:
+        return [self.in_order(part) for part in self.validated]
+
+    def test_dataloader(self) -> BatchLoader:
         return self.in_order("test")
+
+    predict_dataloader = test_dataloader
 
     def in_order(self, part: Part) -> BatchLoader:
         """Every sample of a part once, in the order of the data set."""

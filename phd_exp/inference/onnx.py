@@ -17,13 +17,13 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-import phd_exp
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.inference.answers import LEVELS
 from phd_exp.inference.predictor import Predictor
 from phd_exp.models.heads import Prediction
 from phd_exp.records.errors import UserError
 from phd_exp.records.files import write_atomic
+from phd_exp.records.runs import versions
 
 METADATA = "phd_exp"  # the key of the file's metadata: JSON with the run, the image size and `DESCRIPTIONS`
 DESCRIPTIONS = {
@@ -131,7 +131,7 @@ def _metadata(predictor: Predictor) -> dict[str, Any]:
     config, temperature = predictor.config, predictor.temperature
     run = {"preset": config.preset, "data": config.data.name, "model": config.model.name, "seed": config.seed}
     return {
-        "version": phd_exp.__version__,
+        "version": versions().get("phd_exp", "unknown"),
         "run": run,
         "side": predictor.side,
         "temperature": asdict(temperature) if temperature else None,

@@ -23,7 +23,8 @@ from phd_exp.models.regressor import Regressor
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, DatasetError, RunError, shown
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.config import FolderConfig, RunConfig, check
+from phd_exp.training.config import RenderedConfig, RunConfig, check
+from phd_exp.training.config.targets import Trust
 from phd_exp.training.network import build_regressor, load_checkpoint, require_same_shrinking
 
 WEIGHTS = "regressor."  # prefix of the network's weights in a checkpoint
@@ -153,27 +154,28 @@ class Predictor:
         return Camera(f, float(self.side)).with_constant_f(self.constant_f)
 
 
-def load(run: Path, device: str = "auto", recalibrate: bool = False) -> Predictor:
-    """The network of a run's last checkpoint.
+def load(run: Path, device: str = "auto", recalibrate: bool = False, trust: Trust = ()) -> Predictor:
+    """The network of a run's best checkpoint, or its last.
 
     Args:
         run: the run's folder.
         device: "auto" chooses a GPU if there is one.
         recalibrate: apply the temperatures that fit the run's predictions of held-out samples.
+        trust: packages other than phd_exp whose classes the run may build; None: any.
 
     Raises:
         RunError: the folder holds no usable run.
-        ConfigError: its configuration is invalid, names code outside the package, or cannot be recalibrated.
+        ConfigError: its configuration is invalid, names code that is not trusted, or cannot be recalibrated.
     """
     folder = RunFolder(Path(run))
     if not folder.config_file.exists():
         raise RunError(f"{folder.path}: no run; expected a folder with config.yaml and checkpoints/last.ckpt")
-    config = check(folder.config(), "stored")
+    config = check(folder.config(), trust)
     require_same_shrinking(folder, config)
     depth, constant_f = _constants(folder, config)
     place = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)
-    regressor = build_regressor(config, depth)
-    _load_weights(regressor, folder.last_checkpoint)
+    regressor = build_regressor(config, depth, is_new=False)
+    _load_weights(regressor, folder.best_checkpoint)
     status = folder.status()
     return Predictor(
         config=config,
@@ -189,7 +191,7 @@ def load(run: Path, device: str = "auto", recalibrate: bool = False) -> Predicto
 
 def _constants(folder: RunFolder, config: RunConfig) -> tuple[DepthScale, float]:
     """Depth scale and constant f of the run's data: as recorded, or from the specification of a rendered data set."""
-    if not isinstance(config.data, FolderConfig):
+    if isinstance(config.data, RenderedConfig):
         data = config.data
         source = RenderedSource(DatasetFolder(data.folder), data.spec, {}, data.image_size)
         return source.depth, source.constant_f

@@ -28,7 +28,7 @@ def record_views(folder: RunFolder, data: DatasetFolder, spec: DatasetSpec, scen
         if is_recorded(folder, spec, scenes):
             return False
         data.require(spec)
-        predictor = load(folder.path)
+        predictor = load(folder.path, trust=None)  # the user has just trained it
         n = scenes * spec.views
         source = RenderedSource(data, spec, {"train": 0, "held_out": 0, "test": n}, predictor.side)
         samples = source.samples("test")

@@ -1,8 +1,9 @@
-"""Networks from image to features: torchvision's ResNets, trained from scratch."""
+"""Networks from image to features: torchvision's ResNets, trained from scratch, and any other network."""
 
 from functools import partial
 from typing import Literal, NamedTuple
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torchvision.models.resnet import BasicBlock, Bottleneck, ResNet
@@ -46,7 +47,7 @@ class Backbone(nn.Module):
 
 
 class PooledFeatures(Backbone):
-    """A network that averages its features over the image, as ResNets do."""
+    """A network from images to feature vectors, or to feature maps, which are averaged over the image."""
 
     locates = False
 
@@ -56,7 +57,40 @@ class PooledFeatures(Backbone):
         self.n_features = n_features
 
     def forward(self, pixels: Float[Tensor, "batch 3 height width"]) -> BackboneOutput:
-        return BackboneOutput(self.network(pixels))
+        features = self.network(pixels)
+        return BackboneOutput(features.mean((2, 3)) if features.ndim == 4 else features)
+
+
+def pooled(network: nn.Module, side: int = 224, pretrained: str | None = None) -> PooledFeatures:
+    """Any network as a backbone: a black image shows the number of its features.
+
+    Args:
+        network: images (batch, 3, side, side), normalised as for ImageNet -> features (batch, n_features), or feature
+            maps (batch, n_features, rows, columns).
+        side: side of the images, pixels.
+        pretrained: file with the network's weights, as a state dict; None keeps those it has.
+
+    Raises ValueError for any other output.
+
+    Examples:
+        >>> pooled(nn.Conv2d(3, 8, 3), side=32).n_features
+        8
+    """
+    if pretrained is not None:
+        state = torch.load(pretrained, "cpu", weights_only=True)
+        network.load_state_dict(state.get("state_dict", state))
+    network.eval()
+    with torch.no_grad():
+        features = network(torch.zeros(2, 3, side, side))
+    network.train()
+    if not isinstance(features, Tensor) or features.ndim not in (2, 4) or len(features) != 2:
+        given = tuple(features.shape) if isinstance(features, Tensor) else type(features).__name__
+        raise ValueError(
+            f"returned {given} for 2 images of {side} px; expected (2, n) or feature maps (2, n, rows, columns)"
+        )
+    if not features.isfinite().all():
+        raise ValueError("returned features that are not finite for a black image")
+    return PooledFeatures(network, features.shape[1])
 
 
 def resnet(depth: Depth) -> PooledFeatures:

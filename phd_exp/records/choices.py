@@ -31,10 +31,12 @@ WITHOUT_INFLUENCE = (
     "data.root",
     "data.workers",
     "trainer.accelerator",
+    "trainer.profiler",
     "trainer.progress_bar",
     "trainer.threads",
     "evaluation.calibration_every_n_epochs",
     "evaluation.every_n_epochs",
+    "evaluation.held_out",
     "evaluation.multiview",
 )
 """Keys or sections that define how a run is computed, recorded and measured, but not its results' distribution."""

@@ -2,6 +2,8 @@
 
 import difflib
 import re
+import sysconfig
+import traceback
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +15,9 @@ LONGEST_GIST = 200  # characters of an error that a message repeats
 LONGEST_VALUE = 120  # characters of a value that a message repeats
 UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 """Characters that would end the line of a message, or control the terminal."""
+_PACKAGE = Path(__file__).parents[1]
+_LIBRARIES = (str(_PACKAGE), str(_PACKAGE.parent / "hydra_plugins"), sysconfig.get_path("stdlib"), "<")
+"""Beginnings of the file names of this package, the standard library, and code without a file."""
 NAMED = 5  # names that a message lists
 
 
@@ -82,7 +87,7 @@ def complaint(key: str, problem: ErrorDetails) -> str:
     return ": ".join(filter(None, [key, given + in_our_words(problem["msg"])]))
 
 
-def gist(error: Exception) -> str:
+def gist(error: BaseException) -> str:
     """The reason of an error on one line: the first complaint of a validation, or the reason of a system call."""
     if isinstance(error, ValidationError):
         problem = error.errors(include_url=False)[0]
@@ -90,6 +95,23 @@ def gist(error: Exception) -> str:
     else:
         text = str(getattr(error, "strerror", None) or error)
     return " ".join(text.split())[:LONGEST_GIST]
+
+
+def in_user_code(error: BaseException) -> str | None:
+    """The error and its place, on one line, if it was raised below code that belongs to no library; else None.
+
+    That is the user's own class or function; its last frame is the place.
+    """
+    place = None
+    for frame in traceback.extract_tb(error.__traceback__):
+        if not frame.filename.startswith(_LIBRARIES) and "site-packages" not in frame.filename:
+            place = f"{frame.filename}, line {frame.lineno}"
+    if isinstance(error, SyntaxError) and error.filename:
+        place = f"{error.filename}, line {error.lineno}"
+    if place is None:
+        return in_user_code(error.__cause__) if error.__cause__ else None
+    reason = error.msg if isinstance(error, SyntaxError) else str(error)
+    return one_line(f"{type(error).__name__}: {reason} ({place})")
 
 
 def one_line(text: str) -> str:

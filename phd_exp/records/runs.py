@@ -10,8 +10,8 @@
         held_out.parquet     the same for held-out training samples, for recalibration
         views.parquet        the same for scenes with several cameras, and their poses, if asked for
         calibration/         the calibration curves, as data (JSON) and as pictures (PNG)
-        checkpoints/         last.ckpt
-        wandb/               the same for wandb, ready for `wandb sync`
+        checkpoints/         last.ckpt; best.ckpt with callbacks=best_checkpoint
+        wandb/               the same for wandb, ready for `wandb sync`; likewise for other loggers
 
 The name of a run encodes its choices, never a date: the same command resumes the run or finds it finished.
 """
@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import AwareDatetime, BaseModel, ConfigDict, FiniteFloat, TypeAdapter, ValidationError
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
 
 from phd_exp.records.errors import RunError, gist
 from phd_exp.records.files import MB, read_jsonl, read_plain, write_atomic
@@ -48,7 +48,10 @@ State = Literal["running", "finished", "failed", "interrupted"]
 
 
 class RunStatus(BaseModel):
-    """State of a run, and the software and machine it ran on; times in UTC."""
+    """State of a run, and the software and machine it ran on; times in UTC.
+
+    `custom` are the user's own classes and functions, with the files that define them.
+    """
 
     model_config = ConfigDict(extra="forbid")
 
@@ -60,6 +63,7 @@ class RunStatus(BaseModel):
     versions: dict[str, str]
     git_commit: str | None
     data_manifest: str | None
+    custom: dict[str, str] = Field(default_factory=dict)
     machine: str
 
 
@@ -79,7 +83,6 @@ class RunFolder:
         self.path = path
         self.checkpoints = path / "checkpoints"
         self.calibration = path / "calibration"
-        self.wandb = path / "wandb"
         self.predictions = path / "predictions.parquet"
         self.held_out = path / "held_out.parquet"
         self.views = path / "views.parquet"
@@ -97,6 +100,12 @@ class RunFolder:
     def last_checkpoint(self) -> Path:
         """The checkpoint from which a run resumes."""
         return self.checkpoints / "last.ckpt"
+
+    @property
+    def best_checkpoint(self) -> Path:
+        """The checkpoint that is evaluated and predicts: of callbacks=best_checkpoint, otherwise the last."""
+        best = self.checkpoints / "best.ckpt"
+        return best if best.exists() else self.last_checkpoint
 
     def status(self) -> RunStatus | None:
         """The recorded status, or None. Raises RunError if it cannot be read."""
@@ -171,9 +180,9 @@ class RunFolder:
         """Hold the folder exclusively. Raises RunError if another process holds it, or it cannot be written."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            for place in (self.checkpoints, self.calibration, self.wandb):
+            for place in self.path.iterdir():
                 if place.is_symlink():  # in a stranger's run, it would redirect what is written
-                    raise RunError(f"{place}: leads out of the run's folder; put the folder itself in its place")
+                    raise RunError(f"{place}: is a link; put the file or folder itself in its place")
             lock = ExitStack()
             free = lock.enter_context(held(self.path / ".lock"))
         except OSError as error:
@@ -186,7 +195,7 @@ class RunFolder:
             yield
 
     @contextmanager
-    def recording(self, data_manifest: str | None) -> Iterator[None]:
+    def recording(self, data_manifest: str | None, custom: Mapping[str, str] | None = None) -> Iterator[None]:
         """Record how the enclosed work ends: finished, failed with its traceback, or interrupted."""
         status = RunStatus(
             state="running",
@@ -194,6 +203,7 @@ class RunFolder:
             versions=versions(),
             git_commit=git_commit(),
             data_manifest=data_manifest,
+            custom=dict(custom or {}),
             machine=f"{platform.machine()}, {os.cpu_count()} cores",
         )
 

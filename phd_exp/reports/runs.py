@@ -13,6 +13,7 @@ from phd_exp.records.choices import flatten, has_influence
 from phd_exp.records.errors import one_line
 from phd_exp.records.files import remove_temporaries
 from phd_exp.records.runs import RunFolder, RunStatus, find_runs
+from phd_exp.records.searches import Search, read_searches
 from phd_exp.reports.measured import Measured, Notes, kept_or_measured
 from phd_exp.reports.table import file_stem, printable
 
@@ -76,10 +77,11 @@ class Run:
 
 @dataclass(frozen=True)
 class Report:
-    """All runs under a folder, sorted by path: read once for the terminal, the files and the pages."""
+    """All runs and searches under a folder, sorted: read once for the terminal, the files and the pages."""
 
     folder: Path
     runs: tuple[Run, ...]
+    searches: tuple[Search, ...] = ()
 
     @property
     def presets(self) -> list[str]:
@@ -110,7 +112,7 @@ def read_report(runs: Path, kept: Path | None = None, progress: Callable[[str], 
     for folder in folders:
         progress("/".join(map(printable, folder.path.parts[-4:])))
         found.append(_read_run(folder, kept))
-    return Report(runs, tuple(found))
+    return Report(runs, tuple(found), tuple(read_searches(runs)))
 
 
 def _read_run(folder: RunFolder, kept: Path | None) -> Run:

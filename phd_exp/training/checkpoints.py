@@ -34,8 +34,10 @@ class AtomicCheckpoints(CheckpointIO):
     def load_checkpoint(
         self, path: Any, map_location: Any = None, weights_only: bool | None = True
     ) -> dict[str, Any]:
-        # no callback needs its state, and Lightning's ModelCheckpoint would delete the file it calls the best
-        return load_checkpoint(Path(path), map_location) | {"callbacks": {}}
+        content = load_checkpoint(Path(path), map_location)
+        # the ModelCheckpoint of the run, which monitors nothing, would delete the file it calls the best
+        states = {key: state for key, state in content.get("callbacks", {}).items() if "'monitor': None" not in key}
+        return content | {"callbacks": states}
 
     def remove_checkpoint(self, path: Any) -> None:
         Path(path).unlink(missing_ok=True)

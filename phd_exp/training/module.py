@@ -7,13 +7,15 @@ import torch
 from lightning import LightningModule
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
+from torch.nn.utils import clip_grad_norm_, clip_grad_value_
 from torch.optim.lr_scheduler import LambdaLR
 
 from phd_exp.data.batches import Batch
+from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import Columns
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import projected
-from phd_exp.losses import NegativeLogLikelihood
+from phd_exp.losses import MeanAbsoluteError, NegativeLogLikelihood
 from phd_exp.metrics.rows import Rows
 from phd_exp.models.heads import Prediction
 from phd_exp.models.locating import localisation_loss
@@ -30,7 +32,8 @@ class PositionModule(LightningModule):
 
     Args:
         regressor: image and camera -> prediction.
-        loss: prediction and true positions -> one number per sample, or their mean.
+        loss: prediction and true positions -> one number per sample, or their mean; None: negative log likelihood for
+            a density, mean absolute error for a point estimate.
         optimizer: parameters -> optimizer.
         constant_f: focal length in pixels that the model uses for every sample; None: the true one.
         localisation: weight of the localisation loss; 0 for a backbone that does not locate the object.
@@ -43,20 +46,21 @@ class PositionModule(LightningModule):
     def __init__(
         self,
         regressor: Regressor,
-        loss: Callable[[Prediction, Tensor], Tensor],
-        optimizer: Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer],
-        constant_f: float | None,
-        localisation: float,
-        schedule: Callable[[int], Callable[[int], float]],
+        loss: Callable[[Prediction, Tensor], Tensor] | None = None,
+        optimizer: Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer] = torch.optim.Adam,
+        constant_f: float | None = None,
+        localisation: float = 0.0,
+        schedule: Callable[[int], Callable[[int], float]] = lambda steps: lambda step: 1.0,
     ) -> None:
         super().__init__()
         self.regressor = regressor
-        self.loss = loss
+        is_density = issubclass(regressor.head.prediction, ProjectedHuber)
+        self.loss = loss or (NegativeLogLikelihood() if is_density else MeanAbsoluteError())
         self.make_optimizer = optimizer
         self.constant_f = constant_f
         self.localisation = localisation
         self.schedule = schedule
-        self.training_rows, self.evaluation_rows = Rows(), Rows()
+        self.training_rows, self.evaluation_rows, self.held_out_rows = Rows(), Rows(), Rows()
         self.table: Columns = {}
 
     def forward(self, batch: Batch) -> Prediction:
@@ -70,6 +74,17 @@ class PositionModule(LightningModule):
         optimizer = self.make_optimizer(self.regressor.parameters())
         scheduler = LambdaLR(optimizer, self.schedule(int(self.trainer.estimated_stepping_batches)))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def configure_gradient_clipping(
+        self,
+        optimizer: torch.optim.Optimizer,
+        gradient_clip_val: float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        # not Lightning's, which refuses fused optimizers for the sake of a scaler that bfloat16 does not need
+        if gradient_clip_val:
+            clip = clip_grad_value_ if gradient_clip_algorithm == "value" else clip_grad_norm_
+            clip(self.parameters(), gradient_clip_val)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         output = self.regressor.see(batch.image)
@@ -92,31 +107,39 @@ class PositionModule(LightningModule):
         self.training_rows.reset()
         self.log_dict({f"train/{name}": column.mean().float() for name, column in table.items()})
 
-    def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        losses = self._evaluate(batch)
-        self._require_finite(losses.mean(), losses, batch, "test")
+    def validation_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
+        part, rows = (("test", self.evaluation_rows), ("held_out", self.held_out_rows))[dataloader_idx]
+        _, losses = self._predict(batch, rows)
+        self._require_finite(losses.mean(), losses, batch, part)
 
-    def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        return self._evaluate(batch)  # Lightning warns about None
+    def test_step(self, batch: Batch, batch_idx: int) -> None:
+        self._predict(batch, self.evaluation_rows)
+
+    def predict_step(self, batch: Batch, batch_idx: int) -> Prediction:
+        return self._predict(batch, self.evaluation_rows)[0]
 
     def on_validation_epoch_end(self) -> None:
-        self._finish_evaluation()
-        self.log_dict({name: torch.tensor(value) for name, value in summary(self.table).items()})
+        for part, rows in (("held_out", self.held_out_rows), ("test", self.evaluation_rows)):
+            if rows.update_called:
+                self._finish_evaluation(rows)
+                self.log_dict({name: torch.tensor(value) for name, value in summary(self.table, part).items()})
+
+    on_test_epoch_end = on_validation_epoch_end
 
     def on_predict_epoch_end(self) -> None:
-        self._finish_evaluation()
+        self._finish_evaluation(self.evaluation_rows)
 
-    def _evaluate(self, batch: Batch) -> Tensor:
-        """Predict a batch in float32 and record its rows; returns the losses."""
+    def _predict(self, batch: Batch, rows: Rows) -> tuple[Prediction, Tensor]:
+        """Predict a batch in float32 and record its rows; returns the predictions and their losses."""
         with torch.autocast(self.device.type, enabled=False):
             prediction = self(batch)
             losses = self.loss(prediction, batch.xyz)
-        self.evaluation_rows.update(columns(prediction, batch) | {"loss": losses.expand(len(batch))})
-        return losses
+        rows.update(columns(prediction, batch) | {"loss": losses.expand(len(batch))})
+        return prediction, losses
 
-    def _finish_evaluation(self) -> None:
-        self.table = self.evaluation_rows.columns()
-        self.evaluation_rows.reset()
+    def _finish_evaluation(self, rows: Rows) -> None:
+        self.table = rows.columns()
+        rows.reset()
 
     def _require_finite(self, total: Tensor, losses: Tensor, batch: Batch, split: str) -> None:
         """Raise RunError naming the samples whose loss is not finite, or all if only the total is not."""
@@ -124,11 +147,12 @@ class PositionModule(LightningModule):
             return
         is_bad = ~losses.detach().expand(len(batch)).isfinite()
         rows = batch.row[is_bad if is_bad.any() else slice(None)].tolist()
-        files = self.trainer.datamodule.source.known(split)["file_name"]  # type: ignore[attr-defined]
+        data = getattr(self.trainer, "datamodule", None)
+        names = data.source.known(split).get("file_name") if data else None
         raise RunError(
             f"loss is {total.item()} in epoch {self.current_epoch + 1}/{self.trainer.max_epochs}, at {split} samples "
-            f"{listed([files[row] for row in rows])}; the last checkpoint is whole: lower optimizer.lr, or look at "
-            "these images"
+            f"{listed([names[row] if names else str(row) for row in rows])}; the last checkpoint is whole: lower "
+            "optimizer.lr, or look at these images"
         )
 
 

@@ -8,44 +8,62 @@ from typing import Any
 from zipfile import ZIP_STORED, ZipFile
 
 import torch
-from hydra.errors import InstantiationException
+from hydra.errors import HydraException
 from hydra.utils import instantiate
+from torch import nn
 
 from phd_exp.data.images import SHRINKING
 from phd_exp.geometry.charts import DepthScale
-from phd_exp.models.backbones import Backbone
+from phd_exp.models.backbones import Backbone, pooled
 from phd_exp.models.regressor import FocalLengthInput, Regressor
-from phd_exp.records.errors import ConfigError, RunError
+from phd_exp.records.errors import ConfigError, RunError, gist, in_user_code
 from phd_exp.records.files import require_plain
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import RenderedConfig, RunConfig, TrainerConfig
+from phd_exp.training.config.targets import custom_parts
 
 ADVICE = "delete it to begin the run again"
 
 
-def build_regressor(config: RunConfig, depth: DepthScale) -> Regressor:
-    """The network, initialised from torch's current random state.
+def build_regressor(config: RunConfig, depth: DepthScale, is_new: bool = True) -> Regressor:
+    """The network, initialised from torch's current random state; unless it is new, no pretrained weights are read.
 
     Raises ConfigError, naming the key, for values that a part refuses.
     """
     # partial, then called: `instantiate` would convert an object among its arguments to a configuration
-    with naming("model.head"):
+    with naming("model.head", config.model.head):
         head = instantiate(config.model.head, _partial_=True)(depth=depth)
-    with naming("backbone"):
-        backbone = instantiate(config.backbone)
+    node = config.backbone if is_new else _without_weights(config.backbone)
+    with naming("backbone", node):
+        backbone = instantiate(node)
+        if isinstance(backbone, nn.Module) and not isinstance(backbone, Backbone):
+            backbone = pooled(backbone, config.data.image_size)
         if not isinstance(backbone, Backbone):
-            raise ValueError(f"_target_: {config.backbone['_target_']!r} makes no Backbone; see conf/backbone")
+            raise ValueError(f"{node['_target_']} makes a {type(backbone).__name__}; expected a torch.nn.Module")
         is_input = config.camera.focal_length == "shown"
         return Regressor(backbone, head, FocalLengthInput(head.n_outputs, depth) if is_input else None)
 
 
+def _without_weights(node: Any) -> Any:
+    """A node without the arguments by which networks read or download weights: those of the checkpoint follow."""
+    if isinstance(node, list):
+        return [_without_weights(value) for value in node]
+    if not isinstance(node, dict):
+        return node
+    return {key: _without_weights(value) for key, value in node.items() if key not in ("pretrained", "weights")}
+
+
 @contextmanager
-def naming(key: str) -> Iterator[None]:
-    """Convert the errors of a part to a ConfigError that names its section of the configuration."""
+def naming(key: str, node: dict[str, Any]) -> Iterator[None]:
+    """Convert the errors of a part to a ConfigError that names its section of the configuration and its file."""
     try:
         yield
-    except (ValueError, TypeError, InstantiationException) as error:
-        reason = " ".join(str(error.__cause__ or error).split())
+    except Exception as error:
+        place = in_user_code(error)
+        if place is None and not isinstance(error, ValueError | TypeError | OSError | RuntimeError | HydraException):
+            raise
+        files = ", ".join(dict.fromkeys(custom_parts(node).values()))
+        reason = place or gist(error.__cause__ or error) + (f" ({files})" if files else "")
         raise ConfigError(f"{key}: {reason}") from None
 
 

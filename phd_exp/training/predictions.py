@@ -80,21 +80,22 @@ def calibration_curves(table: Columns, window: int) -> dict[str, CalibrationCurv
     }
 
 
-def summary(table: Columns) -> dict[str, float]:
-    """Metrics of an evaluation: means over the rows, and calibration scores."""
+def summary(table: Columns, part: str = "test") -> dict[str, float]:
+    """Metrics of the evaluation of a part of the samples: means over the rows, and calibration scores."""
     means = {metric: float(table[column].mean()) for column, metric in MEANS.items() if column in table}
     scores = exact_scores(table) if "a" in table else {}
-    return {f"test/{name}": value for name, value in means.items()} | {
-        f"test/calibration/{name}": score for name, score in scores.items()
+    return {f"{part}/{name}": value for name, value in means.items()} | {
+        f"{part}/calibration/{name}": score for name, score in scores.items()
     }
 
 
 def write_parquet(file: Path, table: Columns, known: Known, said: Mapping[str, str] | None = None) -> None:
-    """Write the columns and the metadata of the samples, in the order of the data set.
+    """Write the columns and the metadata of their samples, in the order of the data set.
 
     `said` goes into the metadata of the schema.
     """
-    arrays = {name: pa.array(values) for name, values in known.items()}
+    rows = table["row"].long().tolist()
+    arrays = {name: pa.array([values[row] for row in rows]) for name, values in known.items()}
     arrays |= {name: pa.array(column.numpy()) for name, column in table.items() if name not in UNRECORDED}
     buffer = io.BytesIO()
     pq.write_table(pa.table(arrays, metadata=dict(said or {})), buffer)

@@ -6,6 +6,7 @@ Lightning would start the command of this process again, which in a sweep is the
 
 import os
 import socket
+import sys
 import threading
 import traceback
 from contextlib import ExitStack, suppress
@@ -71,6 +72,7 @@ def _received(child: Child, name: str) -> dict[str, Any]:
 def main() -> None:
     """In a child: train, and send back the results or the error."""
     connection = parent()
+    sys.path.append(os.getcwd())  # of the user's own parts
     share: Share = connection.recv()
     threading.Thread(target=_exit_with_parent, args=(connection,), daemon=True).start()
     connection.send(_outcome(share))

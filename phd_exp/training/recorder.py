@@ -101,10 +101,10 @@ class Recorder(Checkpoint):
 
 
 def epoch_metrics(trainer: Trainer) -> dict[str, float]:
-    """The metrics of the current epoch, without the test split if it was not evaluated."""
+    """The metrics of the current epoch; those of training alone if nothing else was evaluated."""
     evaluated = (trainer.current_epoch + 1) % (trainer.check_val_every_n_epoch or 1) == 0
     return {
         key: float(value)
         for key, value in trainer.callback_metrics.items()
-        if evaluated or not key.startswith("test/")  # else of an earlier epoch
+        if evaluated or not key.startswith(("test/", "held_out/"))  # else of an earlier epoch
     }

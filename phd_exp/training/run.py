@@ -2,12 +2,12 @@
 
 import logging
 import warnings
-from contextlib import nullcontext
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
 import torch
-from lightning import Trainer, seed_everything
+from lightning import Callback, Trainer, seed_everything
 
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.images import SHRINKING
@@ -19,19 +19,22 @@ from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError, RunError, shown
 from phd_exp.records.files import remove_temporaries
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.build import build_data, build_module, build_trainer
-from phd_exp.training.config import FolderConfig, RunConfig
+from phd_exp.training.build import build_callbacks, build_data, build_module, build_trainer, trainer_arguments
+from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig
+from phd_exp.training.config.targets import custom_parts
 from phd_exp.training.module import PositionModule
 from phd_exp.training.network import ADVICE, load_checkpoint, require_same_shrinking
 from phd_exp.training.predictions import summary, write_parquet
 from phd_exp.training.ranks import train_together
 from phd_exp.training.recorder import Draw, Recorder
-from phd_exp.training.tracking import require_key, tracked
+from phd_exp.training.tracking import require_possible_loggers, send_results, tracked
 
 UNTRAINED = -1  # the number of the epoch before the first, whose metrics are those of the untrained network
 
 
-def train(config: RunConfig, folder: RunFolder, draw: Draw | None, cores: int) -> dict[str, Any]:
+def train(
+    config: RunConfig, folder: RunFolder, draw: Draw | None, cores: int, callbacks: Sequence[Callback] = ()
+) -> dict[str, Any]:
     """Train, evaluate and record one run; returns its results. A finished run is not run again.
 
     An interrupted run resumes with its next batch, a killed one after its last whole epoch.
@@ -41,6 +44,7 @@ def train(config: RunConfig, folder: RunFolder, draw: Draw | None, cores: int) -
         folder: the folder of its record.
         draw: draws calibration curves; None records their data alone.
         cores: number of threads, unless trainer.threads is set.
+        callbacks: of Lightning, further ones than the configuration's; with trainer.devices=1 only.
 
     Raises RunError if the folder holds a run of another configuration or another process uses it, DatasetError if the
     data set is incomplete.
@@ -53,11 +57,11 @@ def train(config: RunConfig, folder: RunFolder, draw: Draw | None, cores: int) -
             remove_temporaries(place)  # of a killed process
         folder.write_config(config.model_dump(mode="json"))
         threads = config.trainer.threads or cores
-        with folder.recording(data_manifest=_manifest_hash(config)):
+        with folder.recording(_manifest_hash(config), custom_parts(config.model_dump(mode="json"))):
             if config.trainer.devices > 1:
                 results = train_together(config, folder.path, draw, threads)
             else:
-                results = run(config, folder, draw, threads)
+                results = run(config, folder, draw, threads, callbacks=callbacks)
             folder.write_results(results)
     return folder.results()
 
@@ -70,7 +74,9 @@ def require_possible(config: RunConfig, folder: RunFolder) -> None:
     """
     require_same_config(folder, config)
     folder.require_writable()
-    require_key(config.logger)
+    trainer_arguments(config)
+    require_possible_loggers(config.logger)
+    build_callbacks(config, folder)
     trainer, found = config.trainer, torch.cuda.device_count()
     if trainer.accelerator == "gpu" and not torch.cuda.is_available():
         raise ConfigError("trainer.accelerator: got 'gpu', but torch sees none here; expected 'cpu' or 'auto'")
@@ -101,7 +107,14 @@ def require_same_config(folder: RunFolder, config: RunConfig) -> None:
         )
 
 
-def run(config: RunConfig, folder: RunFolder, draw: Draw | None, threads: int, rank: int = 0) -> dict[str, Any]:
+def run(
+    config: RunConfig,
+    folder: RunFolder,
+    draw: Draw | None,
+    threads: int,
+    rank: int = 0,
+    callbacks: Sequence[Callback] = (),
+) -> dict[str, Any]:
     """Run in this process: the whole run, or one rank of several that train together (`ranks.py`).
 
     Every rank computes and returns the results; rank 0 alone writes the record.
@@ -115,10 +128,12 @@ def run(config: RunConfig, folder: RunFolder, draw: Draw | None, threads: int, r
         constants = asdict(data.source.depth) | {"constant_f": data.source.constant_f}
         folder.write_constants(constants | {"shrinking": SHRINKING})
     module = build_module(config, data)
-    with tracked(config, folder) if rank == 0 else nullcontext() as logger:
-        recorder = Recorder(folder, config.evaluation, draw, [logger] if logger else [])
-        trainer = build_trainer(config, recorder)
+    with tracked(config, folder, rank) as loggers:
+        recorder = Recorder(folder, config.evaluation, draw, loggers)
+        trainer = build_trainer(config, recorder, callbacks)
         _fit(trainer, module, data, recorder)
+        if (best := folder.best_checkpoint) != folder.last_checkpoint:
+            module.load_state_dict(load_checkpoint(best)["state_dict"])
         tables = {part: _evaluate(trainer, module, data, part) for part in data.samples if part != "train"}
         untrained = recorder.rows[UNTRAINED].items()
         results = summary(tables["test"])
@@ -129,8 +144,7 @@ def run(config: RunConfig, folder: RunFolder, draw: Draw | None, threads: int, r
             for part, table in tables.items():
                 file = folder.held_out if part == "held_out" else folder.predictions
                 write_parquet(file, table, data.source.known(part))
-        if logger:
-            logger.experiment.summary.update(results)
+        send_results(loggers, results)
     return results
 
 
@@ -149,10 +163,10 @@ def _fit(trainer: Trainer, module: PositionModule, data: PositionData, recorder:
         trainer.fit(module, datamodule=data)
         return
     content, epochs = load_checkpoint(checkpoint), trainer.max_epochs or 0
-    epoch, place = content.get("epoch"), content.get(PositionData.__qualname__)
+    epoch = content.get("epoch")
     if type(epoch) is not int or not 0 <= epoch < epochs:
         raise RunError(f"{checkpoint}: not a checkpoint of this run (epoch {shown(epoch)} of {epochs}); {ADVICE}")
-    is_whole = not isinstance(place, dict) or place.get("next_batch") == len(data.train_dataloader())
+    is_whole = _ends_an_epoch(content)
     recorder.forget_after(epoch if is_whole else epoch - 1)
     if not any(key.startswith("test/") for key in recorder.rows.get(UNTRAINED, {})):
         raise RunError(
@@ -169,6 +183,14 @@ def _fit(trainer: Trainer, module: PositionModule, data: PositionData, recorder:
             raise
         reason = " ".join(str(error).split())[:120]
         raise RunError(f"{checkpoint}: not a checkpoint of this run ({reason}); {ADVICE}") from None
+
+
+def _ends_an_epoch(checkpoint: Mapping[str, Any]) -> bool:
+    """Whether a checkpoint was taken after the last batch of an epoch, as Lightning records it."""
+    try:
+        return bool(checkpoint["loops"]["fit_loop"]["epoch_loop.batch_progress"]["is_last_batch"])
+    except (KeyError, TypeError):
+        return True
 
 
 def _evaluate(trainer: Trainer, module: PositionModule, data: PositionData, part: Part) -> Columns:
@@ -199,16 +221,20 @@ def _manifest_hash(config: RunConfig) -> str | None:
             return DetectionFolder(config.data.folder).fingerprint()
         except OSError:  # the data of a finished run may be gone
             return None
+    if not isinstance(config.data, RenderedConfig):
+        return None
     manifest = DatasetFolder(config.data.folder).manifest_path
     return checksum(manifest) if manifest.is_file() else None
 
 
 def _quiet_lightning() -> None:
-    """Silence Lightning's remarks and the warnings about intended behaviour."""
+    """Silence Lightning's remarks, except a profiler's, and the warnings about intended behaviour."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
+    logging.getLogger("lightning.pytorch.profilers").setLevel(logging.INFO)
     # Lightning calls a deprecated name of torch
     warnings.filterwarnings("ignore", ".*LeafSpec.*is deprecated", FutureWarning)
+    warnings.filterwarnings("ignore", "Precision .* is not supported by the model summary")
     # an interrupted run resumes in the same folder
     warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
     # the logged values are already sums over all processes

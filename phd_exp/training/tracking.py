@@ -1,43 +1,96 @@
-"""Weights & Biases: one wandb run per run, with the same outcome."""
+"""Lightning's loggers, fed from the run record. Each writes to a folder of its name below the run."""
 
+import inspect
 import os
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
-import wandb
-from lightning.pytorch.loggers import WandbLogger
+from hydra.utils import instantiate
+from lightning.pytorch.loggers import Logger, WandbLogger
 
+from phd_exp.records.choices import flatten
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import RunConfig
-from phd_exp.training.config.sections import LoggerConfig
+from phd_exp.training.config.targets import locate
+from phd_exp.training.network import naming
+
+WANDB = "lightning.pytorch.loggers.WandbLogger"
 
 
-def require_key(logger: LoggerConfig) -> None:
-    """Raise ConfigError if an online run has no API key; on a terminal wandb asks for one."""
-    if logger.kind == "none" or logger.offline:
-        return
-    try:
-        wandb.login()
-    except wandb.errors.UsageError:
-        raise ConfigError(
-            "logger.offline: got false, but wandb has no API key; run `wandb login`, or keep logger.offline=true"
-        ) from None
+def require_possible_loggers(loggers: Mapping[str, Any]) -> None:
+    """Raise ConfigError if a logger cannot be imported, or wandb has no key; on a terminal wandb asks for one."""
+    for name, node in loggers.items():
+        if node["_target_"] != WANDB:
+            with naming(f"logger.{name}", node):
+                instantiate(node, _partial_=True)
+        elif not node.get("offline"):
+            import wandb
+
+            try:
+                wandb.login()
+            except wandb.errors.UsageError:
+                raise ConfigError(
+                    f"logger.{name}.offline: got false, but wandb has no API key; run `wandb login`, or keep it true"
+                ) from None
 
 
 @contextmanager
-def tracked(config: RunConfig, folder: RunFolder) -> Iterator[WandbLogger | None]:
-    """The logger of a run, or None. On exit its wandb run is finished, as failed after an exception.
+def tracked(config: RunConfig, folder: RunFolder, rank: int) -> Iterator[list[Logger]]:
+    """The loggers of a run, in the process of rank 0 alone.
 
-    An unfinished wandb run would receive the metrics of the next run of a sweep.
+    What an interrupted run has sent to their folders is removed: the record sends it again.
     """
-    if config.logger.kind == "none":
-        yield None
-        return
-    with _everything_in(folder.wandb):
-        run = _begin(config, folder)  # as a context it would print a traceback
+    with ExitStack() as stack:
+        loggers = []
+        for name, node in config.logger.items() if rank == 0 else ():
+            shutil.rmtree(folder.path / name, ignore_errors=True)
+            begin = _wandb if node["_target_"] == WANDB else _logger
+            loggers.append(stack.enter_context(begin(name, node, config, folder)))
+        yield loggers
+
+
+@contextmanager
+def _logger(name: str, node: dict[str, Any], config: RunConfig, folder: RunFolder) -> Iterator[Logger]:
+    os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")  # files need no database, and outlive MLflow
+    with naming(f"logger.{name}", node):
+        takes_folder = "save_dir" in inspect.signature(locate(node["_target_"], None)).parameters
+        place = {"save_dir": str(folder.path.absolute() / name)} if takes_folder else {}
+        logger = instantiate(place | node)
+        if not isinstance(logger, Logger):
+            raise ValueError(f"makes a {type(logger).__name__}; expected a Logger of Lightning")
+        logger.log_hyperparams(flatten(config.model_dump(mode="json")))
+    try:
+        yield logger
+    except BaseException:
+        logger.finalize("failed")
+        raise
+    logger.finalize("success")
+
+
+@contextmanager
+def _wandb(name: str, node: dict[str, Any], config: RunConfig, folder: RunFolder) -> Iterator[Logger]:
+    """A run of wandb that is finished on exit, as failed after an exception.
+
+    An unfinished one would receive the metrics of the next run of a sweep.
+    """
+    import wandb
+
+    arguments = {key: value for key, value in node.items() if key not in ("_target_", "offline")}
+    with _everything_in(folder.path / name):
+        if node.get("offline"):
+            os.environ["WANDB_ERROR_REPORTING"] = "false"  # it uses the network
+        run = wandb.init(  # as a context it would print a traceback
+            name="/".join(folder.path.parts[-4:]),
+            dir=folder.path.absolute(),  # the service may have another working folder
+            mode="offline" if node.get("offline") else "online",
+            config=config.model_dump(mode="json"),
+            settings=wandb.Settings(silent=True, console="off"),
+            **arguments,
+        )
         try:
             yield WandbLogger(experiment=run)
         except BaseException:
@@ -52,6 +105,8 @@ def _everything_in(place: Path) -> Iterator[None]:
 
     The wandb service reads these variables when it starts, so each run starts and stops one.
     """
+    import wandb
+
     set_here = [name for name in ("WANDB_DATA_DIR", "WANDB_CACHE_DIR") if name not in os.environ]
     os.environ.update(dict.fromkeys(set_here, str(place.absolute())))
     try:
@@ -62,16 +117,8 @@ def _everything_in(place: Path) -> Iterator[None]:
             del os.environ[name]
 
 
-def _begin(config: RunConfig, folder: RunFolder) -> wandb.Run:
-    if config.logger.offline:
-        os.environ["WANDB_ERROR_REPORTING"] = "false"  # it uses the network
-        # of an interrupted run, whose recorded epochs are sent again
-        shutil.rmtree(folder.wandb, ignore_errors=True)
-    return wandb.init(
-        project=config.logger.project,
-        name="/".join(folder.path.parts[-4:]),
-        dir=folder.path.absolute(),  # the service may have another working folder
-        mode="offline" if config.logger.offline else "online",
-        config=config.model_dump(mode="json"),
-        settings=wandb.Settings(silent=True, console="off"),
-    )
+def send_results(loggers: Sequence[Logger], results: Mapping[str, Any]) -> None:
+    """Put the final numbers into the summary of wandb; the other loggers have none."""
+    for logger in loggers:
+        if isinstance(logger, WandbLogger):
+            logger.experiment.summary.update(results)

@@ -33,7 +33,7 @@ def checked(composed: Callable[..., dict[str, Any]]) -> Callable[..., RunConfig]
 @pytest.mark.parametrize("words", TOGETHER, ids=" ".join)
 def test_every_choice_of_every_group_is_a_valid_configuration(checked: Callable, words: tuple[str, ...]) -> None:
     """The first of all groups, the second of all, and so on."""
-    checked(*words, *(["data.folder=photos"] if "data=folder" in words else []))
+    checked(*words, *(["data.folder=photos", "data.n_held_out=1"] if "data=folder" in words else []))
 
 
 def test_every_file_begins_with_a_comment() -> None:

@@ -25,7 +25,7 @@ def data(
 def test_batches_are_those_of_the_records(folder: DatasetFolder, spec: DatasetSpec) -> None:
     module = data(folder, spec)
     assert [len(batch) for batch in module.train_dataloader()] == [2, 2]
-    (first, second) = list(module.val_dataloader())
+    (first, second) = list(module.test_dataloader())
     records = folder.records("test")
     assert [len(first), len(second)] == [2, 1]
     xyz = torch.tensor([(record.x, record.y, record.z) for record in records])

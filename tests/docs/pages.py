@@ -1,6 +1,7 @@
 """The pages of the documentation, taken apart."""
 
 import re
+import shlex
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,6 +21,12 @@ class Block(NamedTuple):
     text: str
     line: int
 
+    @property
+    def file(self) -> str | None:
+        """The file that the block is, if its first line names one."""
+        found = re.match(r"# ([\w/]+\.(?:py|yaml))\b", self.text)
+        return found[1] if found else None
+
 
 def blocks(page: Path) -> list[Block]:
     """The fenced blocks of a page, in order."""
@@ -32,11 +39,11 @@ def commands(page: Path) -> list[list[str]]:
     fenced = [block.text for block in blocks(page) if block.language == "sh"]
     indented = _INDENTED.findall(_BLOCK.sub("", page.read_text()))
     lines = [
-        line.partition(" #")[0].split()
+        line.partition(" #")[0].strip()
         for text in (*fenced, *indented)
         for line in text.replace("\\\n", " ").splitlines()
     ]
-    return [line[3:] for line in lines if line[:3] == ["python", "-m", "phd_exp"]]
+    return [shlex.split(line)[3:] for line in lines if line.split()[:3] == ["python", "-m", "phd_exp"]]
 
 
 def module(file: Path) -> str:

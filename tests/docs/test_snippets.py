@@ -1,6 +1,6 @@
 """The snippets of the pages run: Python blocks in order, page by page; commands up to their checked configuration.
 
-A YAML block is the file that its first line names.
+A block whose first line names a file is that file.
 """
 
 import itertools
@@ -26,26 +26,28 @@ CHECKS = {"train": ("config", check), "render": ("render", check_render)}
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)], ids=name)
 def test_python_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+    _write_files(page, tmp_path, monkeypatch)
     scope: dict[str, object] = {}
     for block in blocks(page):
         assert block.language in ("python", "sh", "yaml"), f"{name(page)}:{block.line}: not run by anything"
-        if block.language == "python":
+        if block.language == "python" and block.file is None:
             # the line numbers of a traceback are those of the page
             exec(compile("\n" * (block.line - 1) + block.text, str(page), "exec"), scope)
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
-def test_commands_are_valid(words: tuple[str, ...], phd_exp: Callable, tmp_path: Path) -> None:
+def test_commands_are_valid(
+    words: tuple[str, ...], phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     verb = next((word for word in words[:2] if word in VERBS), "train")
+    _write_files(COMMANDS[words], tmp_path, monkeypatch)
     if any(word.startswith("--") for word in words):
-        _write_files(COMMANDS[words], tmp_path)
-        assert phd_exp(*words).status == 0
+        assert phd_exp(*words, *([] if "--cfg" in words else ["--cfg", "job"])).status == 0
     elif verb in OF_VERB:
         for single in _single_runs([word for word in words if word not in (verb, "-m")]):
             _check(verb, single)
     else:
-        assert all("=" in word for word in words[1:])
+        assert all("=" in word or word.endswith(".yaml") for word in words[1:])
 
 
 def _single_runs(words: list[str]) -> list[tuple[str, ...]]:
@@ -78,9 +80,11 @@ def test_every_idea_has_snippets() -> None:
             assert commands(page), name(page)
 
 
-def _write_files(page: Path, folder: Path) -> None:
-    for block in blocks(page):
-        if block.language == "yaml":
-            file = folder / block.text.splitlines()[0].removeprefix("# ")
-            file.parent.mkdir(parents=True)
-            file.write_text(block.text)
+def _write_files(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write the files that a page shows, and go there."""
+    monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend(folder)
+    for block in blocks(page) if page.suffix == ".md" else ():
+        if block.file is not None:
+            (folder / block.file).parent.mkdir(parents=True, exist_ok=True)
+            (folder / block.file).write_text(block.text)

@@ -55,7 +55,7 @@ def test_a_run_with_pictures_and_wandb_which_repeating_the_command_finds(
 
 def in_wandb_viewer(run: RunFolder, *words: str) -> str:
     """Output of wandb's own viewer for the only offline run."""
-    (offline,) = run.wandb.glob("offline-run-*")
+    (offline,) = (run.path / "wandb").glob("offline-run-*")
     command = [sys.executable, "-m", "wandb", "leet", "inspect", "--json", *words, str(offline)]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 

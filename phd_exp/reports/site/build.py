@@ -36,7 +36,7 @@ def write_site(report: Report, tables: Sequence[Table], figures: Sequence[str], 
     write_atomic(site / "assets" / "plotly.min.js", get_plotlyjs())
     several = len(report.runs) > 1
     drawn = [_write_run(site, place, run, several) for place, run in enumerate(report.runs)]
-    groups = overview_groups(drawn)
+    groups = overview_groups(drawn, report.searches)
     charts = {key: asdict(chart) for group in groups.values() for key, chart in group.charts.items()}
     write_text(site / "data" / "overview.js", as_script("overview", {"charts": charts}))
     write_text(site / "compare.html", comparison_page(report.runs))

@@ -3,8 +3,10 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from phd_exp.records.searches import Search
 from phd_exp.reports.quantities import METRICS
 from phd_exp.reports.runs import Run
+from phd_exp.reports.searches import search_charts
 from phd_exp.reports.site.charts import DASHES, Chart, Trace, identity, square
 
 COLOURS = 7
@@ -35,8 +37,8 @@ class Group:
     runs: list[Drawn]
 
 
-def overview_groups(runs: Sequence[Drawn]) -> dict[str, Group]:
-    """Calibration and learning curves with a line per run, without empty groups."""
+def overview_groups(runs: Sequence[Drawn], searches: Sequence[Search] = ()) -> dict[str, Group]:
+    """Calibration and learning curves with a line per run, and the charts of searches, without empty groups."""
     groups = {
         "calibration": ("calibration", "before", CALIBRATION),
         "learning": ("learning", "test", tuple(f"learning_{key}" for key in LEARNING)),
@@ -46,6 +48,8 @@ def overview_groups(runs: Sequence[Drawn]) -> dict[str, Group]:
         charts = {f"{name}_{key}": chart for key in keys if (chart := _overlaid(runs, section, key, role))}
         if charts:
             found[name] = Group(charts, [one for one in runs if set(keys) & one.charts.get(section, {}).keys()])
+    if charts := {key: chart for search in searches for key, chart in search_charts(search).items()}:
+        found["search"] = Group(charts, [])
     return found
 
 

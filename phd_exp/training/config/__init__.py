@@ -2,13 +2,13 @@
 
 The YAML files under conf/ hold the values, this package their types and ranges. A group with a closed set of choices
 (data, trainer, ...) is a model in `sections.py`. A group that is open to new classes (backbone, head, loss,
-optimizer) names a `_target_`; its keys are checked against the signature of that target (`targets.py`).
+optimizer, callbacks, logger) names a `_target_`; its keys are checked against that target's signature (`targets.py`).
 """
 
 import math
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, Field, StrictBool, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, StrictBool, ValidationError, ValidationInfo, model_validator
 
 from phd_exp.records.choices import flatten, setting
 from phd_exp.records.errors import ConfigError, shown
@@ -19,20 +19,29 @@ from phd_exp.training.config.sections import (
     EvaluationConfig,
     Folder,
     FolderConfig,
-    LoggerConfig,
     ModelConfig,
     Name,
     Natural,
     RecipeConfig,
     RenderedConfig,
     Section,
+    SourceConfig,
     TrainerConfig,
     Whole,
-    is_folder,
+    kind_of_data,
 )
-from phd_exp.training.config.targets import Origin, Target, describe, locate
+from phd_exp.training.config.targets import Target, TrainingTarget, TrainingTargets, Trust, describe, is_typed, locate
 
-__all__ = ["FolderConfig", "RenderConfig", "RenderedConfig", "RunConfig", "TrainerConfig", "check", "check_render"]
+__all__ = [
+    "FolderConfig",
+    "RenderConfig",
+    "RenderedConfig",
+    "RunConfig",
+    "SourceConfig",
+    "TrainerConfig",
+    "check",
+    "check_render",
+]
 
 SINGLE_VIEW = "scale"  # the data set whose runs can be evaluated on several views
 
@@ -60,10 +69,11 @@ class RunConfig(Section):
     camera: CameraConfig
     recipe: RecipeConfig
     backbone: Target
-    loss: Target
-    optimizer: Target
+    loss: TrainingTarget
+    optimizer: TrainingTarget
     trainer: TrainerConfig
-    logger: LoggerConfig
+    logger: TrainingTargets
+    callbacks: TrainingTargets = Field(default_factory=dict)
     evaluation: EvaluationConfig
 
     @property
@@ -71,20 +81,32 @@ class RunConfig(Section):
         """Preset and recipe in one word, the first level of the run's folder."""
         return setting(self.preset, self.recipe.name)
 
-    @property
-    def prediction(self) -> type[Any]:
-        """The type of the model's predictions."""
-        return _prediction("model.head", self.model.head)
-
     @model_validator(mode="after")
-    def parts_fit(self) -> "RunConfig":
-        """Refuse a loss of another type of prediction."""
-        made, taken = self.prediction, _prediction("loss", self.loss)
-        if not issubclass(made, taken):
+    def parts_fit(self, info: ValidationInfo) -> "RunConfig":
+        """Refuse what is no head, and a loss of another type of prediction; a loss without a type fits all."""
+        if not is_typed(info):
+            return self
+        made, taken = (_prediction(node) for node in (self.model.head, self.loss))
+        if made is None:
+            raise ValueError(f"model.head._target_: {self.model.head['_target_']!r} is no head; see conf/model")
+        if taken is not None and not issubclass(made, taken):
             raise ValueError(
                 f"loss: takes a {taken.__name__}, but model={self.model.name} predicts a {made.__name__}; "
                 "leave out loss=..., and the model picks its own"
             )
+        return self
+
+    @model_validator(mode="after")
+    def monitors_fit(self) -> "RunConfig":
+        """Refuse a callback that monitors the test samples, or held-out samples without an evaluation."""
+        is_held_out = self.evaluation.held_out and self.data.n_held_out > 0
+        for name, node in self.callbacks.items():
+            monitor = str(node.get("monitor"))
+            if monitor.startswith("test/") or (monitor.startswith("held_out/") and not is_held_out):
+                raise ValueError(
+                    f"callbacks.{name}.monitor: got {monitor}; test samples choose nothing: expected held_out/..., "
+                    "with evaluation.held_out=true and data.n_held_out > 0"
+                )
         return self
 
     @model_validator(mode="after")
@@ -111,7 +133,7 @@ class RunConfig(Section):
         from phd_exp.distributions import ProjectedHuber  # imports torch, which takes seconds
 
         expected = "or evaluation.multiview.scenes=0"
-        if not issubclass(self.prediction, ProjectedHuber):
+        if not issubclass(_prediction(self.model.head) or object, ProjectedHuber):
             raise ValueError(
                 f"evaluation.multiview.scenes: model={self.model.name} predicts points, which cannot be fused by "
                 f"their uncertainty; expected model=probabilistic, {expected}"
@@ -124,35 +146,32 @@ class RunConfig(Section):
         return self
 
 
-def _prediction(key: str, node: dict[str, Any]) -> type:
-    """The type of prediction that a head makes or a loss takes."""
-    kind = getattr(locate(node["_target_"], "typed"), "prediction", None)
-    if not isinstance(kind, type) or node.get("_partial_"):
-        name = key.rpartition(".")[2]
-        raise ValueError(f"{key}._target_: {node['_target_']!r} is no {name}; expected one as in conf/model")
-    return kind
+def _prediction(node: dict[str, Any]) -> type | None:
+    """The type of prediction that a head makes or a loss takes; None if it declares none."""
+    kind = getattr(locate(node["_target_"], None), "prediction", None)
+    return kind if isinstance(kind, type) and not node.get("_partial_") else None
 
 
-def check(config: dict[str, Any], origin: Origin = "typed") -> RunConfig:
+def check(config: dict[str, Any], trust: Trust = None) -> RunConfig:
     """The configuration with its types. Raises ConfigError with one line for each error.
 
-    `origin` decides which classes it may name, see `targets.ALLOWED`.
+    `trust` decides which classes it may name, see `targets.Trust`.
     """
-    return _validated(RunConfig, config, origin)
+    return _validated(RunConfig, config, trust)
 
 
 def check_render(config: dict[str, Any]) -> RenderConfig:
     """The configuration of `render`, given that of a run; other keys of a run are not checked."""
-    if is_folder(config.get("data")):
+    if kind_of_data(config.get("data")) != "<rendered>":
         raise ConfigError(
             "data=folder: there is nothing to render, these are your own images; leave out `render` to train on them"
         )
     others = RunConfig.model_fields.keys() - RenderConfig.model_fields.keys()
     kept = {key: value for key, value in config.items() if key not in others}
-    return _validated(RenderConfig, kept, "typed")
+    return _validated(RenderConfig, kept, None)
 
 
-def _validated(model: type[Checked], config: dict[str, Any], origin: Origin) -> Checked:
+def _validated(model: type[Checked], config: dict[str, Any], trust: Trust) -> Checked:
     for key, value in flatten(config).items():
         # Hydra would evaluate it on `instantiate`, and put values of this machine into a stranger's configuration
         if "${" in str(value):
@@ -162,7 +181,7 @@ def _validated(model: type[Checked], config: dict[str, Any], origin: Origin) -> 
         if isinstance(value, float) and not math.isfinite(value):
             raise ConfigError(f"{key}: got {value}; expected to be a finite number")
     try:
-        return model.model_validate(config, context={"origin": origin})
+        return model.model_validate(config, context={"trust": trust})
     except ValidationError as error:
         lines = [describe(problem, model) for problem in error.errors(include_url=False)]
         raise ConfigError("\n".join(dict.fromkeys(lines))) from None

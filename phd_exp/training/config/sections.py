@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, StrictBool, Tag, model_validator
 
 from phd_exp.records.spec import Angle, DatasetSpec, Range
-from phd_exp.training.config.targets import Target
+from phd_exp.training.config.targets import Target, TrainingTarget
 
 MULTIVIEW = "multiview"  # the data set whose scenes are rendered from several cameras
 
@@ -84,16 +84,33 @@ class FolderConfig(SizesConfig):
     folder: Folder
 
 
-def is_folder(values: Any) -> bool:
-    """Whether a `data` section describes the user's own images: it has at most one key of `DatasetSpec`."""
+class SourceConfig(SizesConfig):
+    """The user's own `data.sources.Source`, built with `n`, the number of samples of each part, and `side`."""
+
+    name: Name
+    n_train: Count
+    n_test: Count
+    source: TrainingTarget
+
+
+def kind_of_data(values: Any) -> str:
+    """The kind of a `data` section: it names a source, or a folder of images, or it is a rendered data set.
+
+    With a folder it has at most one key of `DatasetSpec`.
+    """
     if not isinstance(values, dict):
-        return isinstance(values, FolderConfig)
-    return "spec" not in values and len(DatasetSpec.model_fields.keys() & values.keys()) <= 1
+        return {"SourceConfig": "<source>", "FolderConfig": "<folder>"}.get(type(values).__name__, "<rendered>")
+    if "source" in values:
+        return "<source>"
+    is_folder = "spec" not in values and len(DatasetSpec.model_fields.keys() & values.keys()) <= 1
+    return "<folder>" if is_folder else "<rendered>"
 
 
 DataConfig = Annotated[
-    Annotated[RenderedConfig, Tag("<rendered>")] | Annotated[FolderConfig, Tag("<folder>")],
-    Discriminator(lambda values: "<folder>" if is_folder(values) else "<rendered>"),
+    Annotated[RenderedConfig, Tag("<rendered>")]
+    | Annotated[FolderConfig, Tag("<folder>")]
+    | Annotated[SourceConfig, Tag("<source>")],
+    Discriminator(kind_of_data),
 ]
 
 
@@ -113,7 +130,12 @@ class CameraConfig(Section):
 
 
 class TrainerConfig(Section):
-    """Length, hardware and arithmetic of the training; threads=None: one per core."""
+    """Length, hardware and arithmetic of the training; threads=None: one per core.
+
+    Further keys are arguments of Lightning's Trainer; `build.trainer_arguments` checks them.
+    """
+
+    model_config = ConfigDict(extra="allow", frozen=True)
 
     max_epochs: Count
     accelerator: Literal["auto", "cpu", "gpu"]
@@ -148,14 +170,6 @@ class RecipeConfig(Section):
     augmentation: AugmentationConfig
 
 
-class LoggerConfig(Section):
-    """The logger that receives the metrics in addition to the run record."""
-
-    kind: Literal["none", "wandb"]
-    project: Name
-    offline: StrictBool
-
-
 class MultiviewConfig(Section):
     """Evaluation on several views after the training: the number of scenes of the variant `multiview`, 0 for none."""
 
@@ -175,6 +189,7 @@ class EvaluationConfig(Section):
     calibration_window: Count
     calibration_every_n_epochs: Count
     every_n_epochs: Count = 1  # default for older run records
+    held_out: StrictBool = False  # whether the held-out samples are evaluated too, for callbacks that monitor them
     multiview: MultiviewConfig | None = None  # default for older run records
 
     @model_validator(mode="after")

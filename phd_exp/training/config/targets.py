@@ -1,8 +1,9 @@
-"""Config nodes that name a class by `_target_`: the allowed names, and the keys that the class takes."""
+"""Config nodes that name a class or function by `_target_`: who may name which, and the keys that it takes."""
 
 import inspect
+from collections.abc import Mapping
 from importlib import import_module
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, get_args
 
 from pydantic import (
     AfterValidator,
@@ -16,22 +17,17 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from phd_exp.records.errors import complaint, in_our_words, nearest, shown
+from phd_exp.records.errors import complaint, in_our_words, in_user_code, nearest, shown
 
-OURS = ("phd_exp.models.", "phd_exp.losses.", "phd_exp.optimizers.", "phd_exp.geometry.")
-Origin = Literal["typed", "stored"]
-"""Where a configuration comes from: the user's command line and files, or a run folder."""
-ALLOWED: dict[Origin, tuple[str, ...]] = {
-    "typed": (*OURS, "torch.optim.", "torch.nn.", "torchvision.models."),
-    "stored": (*OURS, "torch.optim."),
-}
-"""Allowed prefixes of a `_target_`. The object must also be defined there, not only imported.
-
-A stored configuration cannot build anything that downloads, as torchvision's models download their weights.
+OURS = ("phd_exp.models", "phd_exp.losses", "phd_exp.optimizers", "phd_exp.geometry")
+KNOWN = (*OURS, "torch.optim", "lightning")
+Trust = tuple[str, ...] | None
+"""None: the user typed the configuration, which may name anything importable. Otherwise it is read from a run folder,
+and may name the parts in `OURS` and those in these packages.
 """
 
 
-def check_target(node: dict[str, Any], origin: Origin, where: str = "") -> dict[str, Any]:
+def check_target(node: dict[str, Any], trust: Trust, where: str = "") -> dict[str, Any]:
     """Check a node, and all nodes in it, against the signatures of what they name; returns the node.
 
     Parameters without a default may be missing: the program passes them (the network's parameters to an optimizer,
@@ -39,80 +35,129 @@ def check_target(node: dict[str, Any], origin: Origin, where: str = "") -> dict[
 
     Raises PydanticCustomError naming the key, the value, and what was expected.
     """
-    target, prefix = locate(node.get("_target_"), origin, where), f"{where}." if where else ""
+    target, prefix = locate(node.get("_target_"), trust, where), f"{where}." if where else ""
     if not isinstance(node.get("_partial_", False), bool):
         raise _error(f"{prefix}_partial_", f"got {shown(node['_partial_'])}; expected a bool")
-    parameters = inspect.signature(target).parameters
+    parameters = _parameters(target)
     for key, value in node.items():
         if key in ("_target_", "_partial_"):
             continue
         path = f"{prefix}{key}"
+        _check_nodes(path, value, trust)
+        if parameters is None or (key not in parameters and _VARIABLE in _kinds(parameters)):
+            continue
         if key not in parameters:
             taken = f"{node['_target_']} takes {', '.join(parameters)}"
             raise _error(path, f"unknown key{nearest(key, parameters)}; {taken}")
-        _check_nodes(path, value, origin)
-        if not _is_node(value):
+        if not is_node(value):
             _check_value(path, value, parameters[key].annotation)
     return node
 
 
-def _check_nodes(path: str, value: Any, origin: Origin) -> None:
+_VARIABLE = inspect.Parameter.VAR_KEYWORD
+
+
+def _parameters(target: Any) -> Mapping[str, inspect.Parameter] | None:
+    """The parameters of a class or function; None if it has no signature, as some built-in ones."""
+    try:
+        return inspect.signature(target).parameters
+    except ValueError:
+        return None
+
+
+def _kinds(parameters: Mapping[str, inspect.Parameter]) -> set[Any]:
+    return {parameter.kind for parameter in parameters.values()}
+
+
+def _check_nodes(path: str, value: Any, trust: Trust) -> None:
     """Check a node, or the nodes inside lists and mappings, which Hydra would build as well."""
-    if _is_node(value):
-        check_target(value, origin, path)
+    if is_node(value):
+        check_target(value, trust, path)
         return
     children = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, child in children:
-        _check_nodes(f"{path}.{key}", child, origin)
+        _check_nodes(f"{path}.{key}", child, trust)
 
 
-def _is_node(value: Any) -> bool:
+def is_node(value: Any) -> bool:
+    """Whether a value of a configuration names a class or function."""
     return isinstance(value, dict) and "_target_" in value
 
 
-def locate(name: Any, origin: Origin, where: str = "") -> Any:
-    """The object that a `_target_` names. Raises PydanticCustomError if it is not allowed or does not exist."""
-    path, allowed = f"{where}._target_".lstrip("."), ALLOWED[origin]
-    if not isinstance(name, str) or not name.startswith(allowed) or "._" in name:
-        expected = f"expected a name under {', '.join(allowed)}"
-        raise _error(path, f"{shown(name)} may not be built from a {origin} configuration; {expected}")
+def custom_parts(config: Any) -> dict[str, str]:
+    """The classes and functions that a checked configuration names outside this project and the libraries it is made
+    of, with the files that define them.
+    """
+    if isinstance(config, dict):
+        found = {name: file for value in config.values() for name, file in custom_parts(value).items()}
+        name = config.get("_target_")
+        if name and not _is_below(name, KNOWN):
+            found[name] = str(getattr(inspect.getmodule(locate(name, None)), "__file__", "built in"))
+        return found
+    if isinstance(config, list):
+        return {name: file for value in config for name, file in custom_parts(value).items()}
+    return {}
+
+
+def _is_below(name: str, packages: tuple[str, ...]) -> bool:
+    return any(f"{name}.".startswith(f"{package}.") for package in packages)
+
+
+def locate(name: Any, trust: Trust, where: str = "") -> Any:
+    """The object that a `_target_` names. Raises PydanticCustomError if it is not allowed or cannot be imported."""
+    path = f"{where}._target_".lstrip(".")
+    if not isinstance(name, str) or "." not in name:
+        raise _error(path, f"got {shown(name)}; expected MODULE.NAME of a class or function")
+    if trust is not None and not _is_below(name, allowed := (*OURS, *trust)):
+        package = name.partition(".")[0]
+        advice = "" if package == "phd_exp" else f"; if you trust this run, add trust={package}"
+        raise _error(path, f"{shown(name)} is not built from a stored configuration{advice}")
     module, _, attribute = name.rpartition(".")
     try:
         target = getattr(import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise _error(path, f"{name!r} does not exist ({error})") from None
-    defined = getattr(target, "__module__", None)
-    if not (callable(target) and isinstance(defined, str) and f"{defined}.".startswith(allowed)):
-        raise _error(path, f"{name!r} is no class or function of its own; expected one defined there")
-    if not _makes_a_part(target, name):
-        raise _error(path, f"{name!r} is no part of a network; expected a module, a model or an optimizer")
+    except Exception as error:  # a module of the user may raise any
+        raise _error(path, f"{name!r} cannot be imported ({in_user_code(error) or error})") from None
+    if not callable(target):
+        raise _error(path, f"{name!r} is a {type(target).__name__}; expected a class or function")
+    # an imported name is somebody else's code
+    if trust is not None and not _is_below(str(getattr(target, "__module__", None)), allowed):
+        raise _error(path, f"{name!r} is only imported there; expected a class or function that is defined there")
     return target
 
 
-def _makes_a_part(target: Any, name: str) -> bool:
-    """Whether a call only constructs an object; the functions of a library may do anything."""
-    if name.startswith(OURS):
-        return True
-    from torch import nn, optim  # slow to import; `import_module` has done it already
-
-    if inspect.isclass(target):
-        return issubclass(target, (nn.Module, optim.Optimizer))
-    from torchvision.models import list_models
-
-    return target.__name__ in list_models()
-
-
 def _checked(node: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
-    return check_target(node, info.context["origin"] if info.context else "stored")
+    return check_target(node, info.context["trust"] if info.context else ())
+
+
+def is_typed(info: ValidationInfo) -> bool:
+    """Whether the user typed the configuration that is being checked."""
+    return info.context is not None and info.context["trust"] is None
+
+
+def _checked_if_typed(node: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+    return check_target(node, None) if is_typed(info) else node
+
+
+def _each_checked_if_typed(nodes: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+    for name, node in nodes.items() if is_typed(info) else ():
+        if not is_node(node):
+            raise _error(name, f"got {shown(node)}; expected a node with a _target_")
+        check_target(node, None, name)
+    return nodes
 
 
 Target = Annotated[dict[str, Any], AfterValidator(_checked)]
+"""A node that names a class or function."""
+TrainingTarget = Annotated[dict[str, Any], AfterValidator(_checked_if_typed)]
+"""The same for a part that only training builds: in a stored configuration it may name anything."""
+TrainingTargets = Annotated[dict[str, Any], AfterValidator(_each_checked_if_typed)]
+"""Any number of such nodes, each with a name."""
 
 
 def describe(problem: ErrorDetails, model: type[BaseModel]) -> str:
     """One line for one error of pydantic: the key, the value, what was expected, the nearest valid key."""
     place = [str(part) for part in problem["loc"]]
-    location = [part for part in place if part not in ("spec", "<rendered>", "<folder>")]
+    location = [part for part in place if part not in ("spec", "<rendered>", "<folder>", "<source>")]
     key, context = ".".join(location), problem.get("ctx", {})
     if problem["type"] == "target":
         return f"{key}.{context['path']}: {context['reason']}"

@@ -1,0 +1,195 @@
+"""`python -m phd_exp search SPACE.yaml`: Optuna over resumable runs, judged by their held-out samples."""
+
+from collections.abc import Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+from warnings import catch_warnings
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, RangeSweep
+from hydra.errors import HydraException
+from hydra.utils import instantiate
+from pydantic import BaseModel, ConfigDict, Field
+
+from phd_exp.cli.arguments import Arguments, parsed
+from phd_exp.cli.frame import print_errors
+from phd_exp.cli.jobs import composed
+from phd_exp.cli.train import run_name, task
+from phd_exp.records.errors import ConfigError, RunError, UserError, gist
+from phd_exp.records.files import read_plain
+from phd_exp.records.parsing import parse_yaml
+from phd_exp.records.processes import held, usable_cores
+from phd_exp.records.searches import Search, Trial, TrialState, search_folder, write_search
+from phd_exp.training.config import check
+
+if TYPE_CHECKING:  # optional
+    import optuna
+
+
+class SearchArguments(Arguments):
+    """The keys of a search; all others are overrides of its runs."""
+
+    trials: Annotated[int, Field(ge=1, le=100_000)] = 20
+    """the number of trials, including those of an earlier command"""
+    config_dir: Path | None = None
+    """a folder with further choices, like --config-dir of train"""
+
+
+class Space(BaseModel):
+    """The file of a search: overrides of all its runs, the values to try, and parts of Optuna."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    space: dict[str, str]
+    overrides: list[str] = Field(default_factory=list)
+    sampler: dict[str, Any] = {"_target_": "optuna.samplers.TPESampler", "seed": 0}
+    pruner: dict[str, Any] = {"_target_": "optuna.pruners.MedianPruner"}
+
+
+def main(words: list[str]) -> int:
+    """Search; returns the exit status. The same command resumes an interrupted search."""
+    if not words or "=" in words[0]:
+        raise ConfigError("search: expected SPACE.yaml first; see `python -m phd_exp search --help`")
+    if find_spec("optuna") is None:
+        raise ConfigError("search needs Optuna: `pip install 'phd_exp[search]'`")
+    file, keys = Path(words[0]), SearchArguments.model_fields
+    ours = [word for word in words[1:] if word.partition("=")[0] in keys]
+    arguments = parsed("search", SearchArguments, ours)
+    try:
+        space = Space.model_validate(parse_yaml(read_plain(file).decode()))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{file}: {gist(error)}; expected `space`, as in docs/guides/search.md") from None
+    fixed = [*space.overrides, *(word for word in words[1:] if word not in ours), "evaluation.held_out=true"]
+    config = check(composed(fixed, arguments.config_dir))
+    if config.data.n_held_out == 0:
+        raise ConfigError("data.n_held_out: got 0; a search is judged by held-out samples, expected at least 1")
+    folder = search_folder(config.runs, file.stem)
+    folder.mkdir(parents=True, exist_ok=True)
+    with held(folder / ".lock") as free:
+        if not free:
+            raise RunError(f"{folder}: another process works on this search; wait for it or stop it")
+        _Search(file.stem, space, fixed, arguments.config_dir, folder).run(arguments.trials)
+    return 0
+
+
+def distributions(space: Mapping[str, str]) -> dict[str, Any]:
+    """Optuna's distributions of values in Hydra's grammar of sweeps: choice(...), range(...), interval(...).
+
+    `int(interval(...))` is of whole numbers; `tag(log, interval(...))` searches the logarithm.
+
+    Raises ConfigError for anything else.
+    """
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+
+    found: dict[str, Any] = {}
+    for key, text in space.items():
+        try:
+            override = OverridesParser.create().parse_override(f"{key}={text}")
+            value: Any = override.value()
+            if isinstance(value, ChoiceSweep):
+                found[key] = CategoricalDistribution(list(override.sweep_string_iterator()))
+            elif isinstance(value, IntervalSweep):
+                ends: Any = (value.start, value.end)
+                kind: Any = IntDistribution if all(isinstance(end, int) for end in ends) else FloatDistribution
+                found[key] = kind(*ends, log="log" in value.tags)
+            elif isinstance(value, RangeSweep):
+                places = [int(place) for place in override.sweep_string_iterator()]
+                found[key] = IntDistribution(places[0], places[-1], step=int(value.step))
+            else:
+                raise ValueError("expected choice(...), range(...) or interval(...)")
+        except (HydraException, ValueError, TypeError, IndexError) as error:
+            raise ConfigError(f"space.{key}: got {text!r}; {gist(error)}") from None
+    return found
+
+
+class _Search:
+    """A study of Optuna whose trials are runs."""
+
+    def __init__(self, name: str, space: Space, fixed: list[str], config_dir: Path | None, folder: Path) -> None:
+        import optuna
+
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        self.name, self.fixed, self.config_dir, self.folder = name, fixed, config_dir, folder
+        self.space = distributions(space.space)
+        self.study = optuna.create_study(
+            storage=f"sqlite:///{folder.absolute() / 'study.db'}",
+            study_name=name,
+            sampler=instantiate(space.sampler),
+            pruner=instantiate(space.pruner),
+            load_if_exists=True,
+        )
+        asked = {"space": space.space, "overrides": fixed}
+        if self.study.user_attrs.get("asked", asked) != asked:
+            raise RunError(
+                f"{folder}: holds a search of {self.study.user_attrs['asked']}; rename the file, or that folder"
+            )
+        self.study.set_user_attr("asked", asked)
+
+    def run(self, trials: int) -> None:
+        """Run trials until there are as many; those that were interrupted are resumed first."""
+        import optuna
+
+        running = self.study.get_trials(deepcopy=False, states=[optuna.trial.TrialState.RUNNING])
+        begun = [optuna.trial.Trial(self.study, trial._trial_id) for trial in running]
+        while begun or len(self.study.trials) < trials:
+            trial = begun.pop() if begun else self.study.ask(self.space)
+            self._run_trial(trial, trials)
+            self._write()
+        best = self._write().best
+        if best is None:
+            raise RunError(f"{self.folder}: no trial has finished; each line above says why")
+        words = " ".join(f"{key}={value}" for key, value in best.overrides.items())
+        print(f"{self.folder}: best of {len(self.study.trials)} trials: {words}: {best.value:.4g}, {best.run}")
+
+    def _run_trial(self, trial: "optuna.Trial", trials: int) -> None:
+        import optuna
+
+        from phd_exp.training.pruning import Pruned, Pruning, held_out_score
+
+        own = [f"{key}={value}" for key, value in trial.params.items()]
+        overrides = [*self.fixed, *own]
+        print(f"trial {trial.number + 1}/{trials}: {' '.join(own)}", flush=True)
+        config = composed(overrides, self.config_dir)
+        checked = check(config)
+        run = run_name(checked, overrides).folder(checked.runs)
+        trial.set_user_attr("run", str(run))
+        try:
+            task(config, overrides, usable_cores(), callbacks=[Pruning(trial)])
+            objective, value = held_out_score(run)
+            self.study.set_user_attr("objective", objective)
+            self.study.tell(trial, value)
+        except Pruned as pruned:
+            print(f"{run}: {pruned}", flush=True)
+            self.study.tell(trial, state=optuna.trial.TrialState.PRUNED)
+        except ConfigError:
+            self.study.tell(trial, state=optuna.trial.TrialState.FAIL)
+            raise
+        except UserError as error:
+            print_errors(str(error).splitlines())
+            self.study.tell(trial, state=optuna.trial.TrialState.FAIL)
+
+    def _write(self) -> Search:
+        """Write the record of the search."""
+        from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
+
+        try:
+            with catch_warnings(action="ignore"):  # of too few trials
+                importances = get_param_importances(self.study, evaluator=PedAnovaImportanceEvaluator())
+        except (ValueError, RuntimeError):  # no finished trial, or all alike
+            importances = {}
+        states: dict[str, TrialState] = {"COMPLETE": "finished", "PRUNED": "pruned", "FAIL": "failed"}
+        trials = [
+            Trial(
+                number=trial.number,
+                state=states.get(trial.state.name, "running"),
+                overrides={key: str(value) for key, value in trial.params.items()},
+                run=trial.user_attrs.get("run", ""),
+                value=trial.value,
+            )
+            for trial in self.study.trials
+        ]
+        objective = self.study.user_attrs.get("objective", "held_out/nll")
+        search = Search(name=self.name, objective=objective, trials=trials, importances=importances)
+        write_search(self.folder, search)
+        return search

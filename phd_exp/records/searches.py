@@ -1,0 +1,72 @@
+"""The record of a search: every trial with its values, readable without Optuna.
+
+runs/.search/<name>/
+    study.db       Optuna's study, from which the search resumes
+    search.json    its trials and the importance of each key, rewritten after every trial
+"""
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, FiniteFloat, ValidationError
+
+from phd_exp.records.errors import gist
+from phd_exp.records.files import read_plain, write_atomic
+from phd_exp.records.processes import announce
+
+TrialState = Literal["finished", "pruned", "failed", "running"]
+
+
+class Trial(BaseModel):
+    """One trial: its overrides, the folder of its run, and the held-out score; of a pruned one, the last score."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    number: int
+    state: TrialState
+    overrides: dict[str, str]
+    run: str
+    value: FiniteFloat | None = None
+
+
+class Search(BaseModel):
+    """All trials of a search.
+
+    Attributes:
+        objective: the metric that is minimised.
+        importances: share of each key in the variance of the objective, as Optuna estimates it.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str
+    objective: str
+    trials: list[Trial]
+    importances: dict[str, FiniteFloat]
+
+    @property
+    def best(self) -> Trial | None:
+        """The finished trial with the smallest value."""
+        finished = [trial for trial in self.trials if trial.state == "finished" and trial.value is not None]
+        return min(finished, key=lambda trial: trial.value or 0.0, default=None)
+
+
+def search_folder(runs: Path, name: str) -> Path:
+    """The folder of a search."""
+    return runs / ".search" / name
+
+
+def write_search(folder: Path, search: Search) -> None:
+    """Write the record. Raises OSError."""
+    write_atomic(folder / "search.json", search.model_dump_json(indent=2) + "\n")
+
+
+def read_searches(runs: Path) -> list[Search]:
+    """All searches below a folder of runs; a line on standard error names a record that cannot be read."""
+    found = []
+    for file in sorted(search_folder(runs, "").glob("*/search.json")):
+        try:
+            found.append(Search.model_validate_json(read_plain(file)))
+        except (OSError, ValidationError) as error:
+            announce(f"note: {file}: not the record of a search ({gist(error)})")
+    return found

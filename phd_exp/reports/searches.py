@@ -1,0 +1,83 @@
+"""Searches: a table of the best trials of each, the history of its trials, and the importance of its keys."""
+
+from phd_exp.records.errors import one_line
+from phd_exp.records.searches import Search, Trial
+from phd_exp.reports.runs import Report
+from phd_exp.reports.site.charts import Chart, axis, bars, line
+from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem, printable
+
+MOST = 10  # trials of a table
+OF_A_SEARCH = (
+    "Searches minimise a score on held-out samples, which are never trained on; test samples choose nothing. In the "
+    "CSV file, the value of a pruned trial is that of its last epoch."
+)
+
+
+def search_tables(report: Report) -> list[Table]:
+    """The best trials of every search."""
+    return [_table(search) for search in report.searches]
+
+
+def _table(search: Search) -> Table:
+    finished = [trial for trial in search.trials if trial.state == "finished"]
+    best = sorted(finished, key=lambda trial: trial.value or 0.0)[:MOST]
+    counts = ", ".join(
+        f"{n} {state}"
+        for state in ("finished", "pruned", "failed", "running")
+        if (n := sum(trial.state == state for trial in search.trials))
+    )
+    return Table(
+        stem=file_stem("search", search.name),
+        kind="searches",
+        title=one_line(f"Search {search.name}: {counts}"),
+        stub=("trial", "overrides"),
+        columns=(search.objective,),
+        groups=(tuple(_row(trial) for trial in best),),
+        notes=(OF_A_SEARCH,),
+        numbers=tuple(
+            {"search": search.name, "trial": trial.number + 1, "state": trial.state, "value": trial.value}
+            | {"overrides": " ".join(_words(trial)), "run": printable(trial.run)}
+            for trial in search.trials
+        ),
+    )
+
+
+def _row(trial: Trial) -> TableRow:
+    value = NOTHING if trial.value is None else f"{trial.value:.4g}"
+    return TableRow((str(trial.number + 1), one_line(" ".join(_words(trial)))), (TableCell(value),))
+
+
+def _words(trial: Trial) -> list[str]:
+    """The overrides of a trial, with numbers short enough to read."""
+    return [f"{key}={_short(value)}" for key, value in trial.overrides.items()]
+
+
+def _short(text: str) -> str:
+    try:
+        return f"{float(text):.4g}"
+    except ValueError:
+        return text
+
+
+def search_charts(search: Search) -> dict[str, Chart]:
+    """The values of all trials with the best so far, and the importances of the keys."""
+    trials = [trial for trial in search.trials if trial.state == "finished" and trial.value is not None]
+    numbers, values = [trial.number + 1 for trial in trials], [trial.value or 0.0 for trial in trials]
+    if not trials:
+        return {}
+    so_far = [min(values[: place + 1]) for place in range(len(values))]
+    points = line("finished trials", numbers, values, 1) | {"mode": "markers"}
+    label = f"{search.objective} of {len(trials)} finished trials; the best is {min(values):.4g}."
+    layout = {"xaxis": axis("trial"), "yaxis": axis(search.objective)}
+    history = Chart(f"{search.name}: history", label, [points, line("best so far", numbers, so_far, 2)], layout)
+    charts = {f"history_{search.name}": history}
+    if ranked := sorted(search.importances.items(), key=lambda item: -item[1]):
+        keys, shares = zip(*ranked, strict=True)
+        label = ", ".join(f"{key} {share:.0%}" for key, share in ranked)
+        layout = {
+            "xaxis": axis("share of the variance of the score", rangemode="tozero"),
+            "yaxis": axis("") | {"type": "category", "autorange": "reversed"},
+        }
+        trace = bars("importance", shares, keys, 1, shares, shares)
+        charts[f"importance_{search.name}"] = Chart(f"{search.name}: importance of keys", label, [trace], layout)
+    return charts

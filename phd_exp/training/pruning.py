@@ -1,0 +1,39 @@
+"""The part of a search that runs inside a training: it reports held-out scores and stops trials without prospects."""
+
+from pathlib import Path
+from typing import Any
+
+from lightning import Callback, LightningModule, Trainer
+
+from phd_exp.evaluation.parquet import read_table
+from phd_exp.records.runs import RunFolder
+
+SCORES = ("nll", "depth_error_mm")
+"""What a search minimises on the held-out samples: the first that the model has. A baseline has no likelihood."""
+
+
+class Pruned(SystemExit):
+    """The trial was stopped by the search; its run is interrupted, and can be resumed."""
+
+
+class Pruning(Callback):
+    """Reports the held-out score of every evaluated epoch to a trial of Optuna, and stops it if that says so."""
+
+    def __init__(self, trial: Any) -> None:
+        self.trial = trial
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        metrics, epoch = trainer.callback_metrics, trainer.current_epoch
+        score = next(float(metrics[key]) for key in map("held_out/{}".format, SCORES) if key in metrics)
+        self.trial.report(score, epoch)
+        if self.trial.should_prune():
+            raise Pruned(
+                f"pruned after epoch {epoch + 1} of {trainer.max_epochs} with a held-out score of {score:.4g}"
+            )
+
+
+def held_out_score(run: Path) -> tuple[str, float]:
+    """The metric that a search minimises and its value for a finished run. Raises RunError."""
+    table = read_table(RunFolder(run).held_out)
+    name = next(name for name in SCORES if name in table)
+    return f"held_out/{name}", float(table[name].mean())

@@ -1,0 +1,250 @@
+"""The user's own parts from the command line and from Python; what is stored is built only on request."""
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+import yaml
+from PIL import Image
+
+import phd_exp as package
+from phd_exp.evaluation.parquet import read_table
+from phd_exp.records.errors import ConfigError
+from phd_exp.records.runs import RunFolder
+from tests.support.own_parts import QUICK, write_own_parts
+
+RUNS = Path("runs/smoke/squares")
+
+
+@pytest.fixture
+def own(phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable:
+    """A run of a second in a folder with own parts."""
+    write_own_parts(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    return lambda *words: phd_exp(*QUICK, *words)
+
+
+def run_of(runs: Path) -> RunFolder:
+    (path,) = runs.glob("*/seed*")
+    return RunFolder(path)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        [],
+        ["loss=l1"],
+        ["model=own"],
+        ["backbone._target_=torchvision.models.mobilenet_v3_small"],
+        ["backbone=pooled"],
+        ["camera=shown", "optimizer._target_=torch.optim.RMSprop", "~optimizer.fused"],
+        ["camera=constant", "model=mae_vz"],
+    ],
+    ids=" ".join,
+)
+def test_own_parts_train_and_are_recorded(own: Callable, words: list[str]) -> None:
+    outcome = own(*words)
+    assert outcome.status == 0, outcome.err
+    run = run_of(RUNS)
+    status = run.status()
+    assert status is not None
+    assert status.state == "finished"
+    assert Path(status.custom["myparts.Squares"]).name == "myparts.py"
+    assert len(read_table(run.predictions)["z"]) == 16
+
+
+def test_pretrained_weights_are_loaded_once(own: Callable, tmp_path: Path) -> None:
+    weights = {"layer.weight": torch.full((8, 3, 3, 3), 0.5), "layer.bias": torch.zeros(8)}
+    torch.save(weights, tmp_path / "weights.pth")
+    assert own("backbone=pooled", "+backbone.pretrained=weights.pth", "optimizer.lr=1e-12").status == 0
+    (tmp_path / "weights.pth").unlink()  # of the checkpoint from here on
+    predictor = package.load(run_of(RUNS).path, trust=("mynet",))
+    layer = dict(predictor.regressor.named_parameters())["backbone.network.layer.weight"]
+    torch.testing.assert_close(layer, torch.full_like(layer, 0.5), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["backbone._target_=mynet.Raises"], "backbone: KeyError: 'boom' ("),
+        (["backbone._target_=mynet.Scalar"], "backbone: returned () for 2 images of 32 px; expected (2, n)"),
+        (["backbone._target_=mynet.NaN"], "backbone: returned features that are not finite for a black image ("),
+        (["backbone._target_=mynet.NoModule"], "backbone: mynet.NoModule makes a NoModule; expected a"),
+        (["backbone._target_=mynet.Nothing"], "'mynet.Nothing' cannot be imported (module 'mynet'"),
+        (["backbone._target_=broken.X"], "cannot be imported (ModuleNotFoundError: No module named 'nothing_here' ("),
+        (["backbone._target_=nowhere.X"], "'nowhere.X' cannot be imported (No module named 'nowhere')"),
+        (["+backbone.depth=3"], "backbone.depth: unknown key, did you mean 'width'?; mynet.Mine takes width"),
+        (["+backbone.width=wide"], "backbone.width: got 'wide'; expected a valid integer"),
+        (["loss._target_=myloss.wrong_shape"], "loss: returned (2, 3) for 2 images; expected (2,) or () ("),
+        (["model.head._target_=mynet.Mine"], "model.head._target_: 'mynet.Mine' is no head; see conf/model"),
+        (["data.source._target_=mynet.NoModule"], "data.source: "),
+        (["+callbacks.mine._target_=mynet.Mine"], "callbacks.mine: makes a Mine; expected a lightning.Callback ("),
+        (["+callbacks.mine=3"], "callbacks.mine: got 3; expected a node with a _target_"),
+        (["+logger.mine._target_=mynet.Mine"], "logger.mine: makes a Mine; expected a Logger of Lightning ("),
+        (["callbacks=early_stopping", "callbacks.early_stopping.monitor=test/loss"], "test samples choose nothing"),
+        (["callbacks=early_stopping", "data.n_held_out=0"], "data.n_held_out > 0"),
+        (["callbacks=lr_monitor"], "Cannot use `LearningRateMonitor` callback with `Trainer` that has no logger"),
+        (["+trainer.callbacks=[]"], "trainer.callbacks: the run record depends on it; instead set callbacks=NAME"),
+        (["+trainer.gradient_clip=1"], "trainer.gradient_clip: unknown key, did you mean 'gradient_clip_val'?"),
+    ],
+    ids=str,
+)
+def test_bad_parts_are_one_line(own: Callable, words: list[str], message: str) -> None:
+    outcome = own(*words)
+    assert outcome.status != 0
+    (line,) = outcome.err.splitlines()
+    assert message in line
+    place = {"mynet": "mynet.py", "myloss": "myloss.py", "broken": "broken.py"}
+    if message.endswith("("):
+        assert any(file in line for file in place.values())
+
+
+def test_an_error_in_the_middle_is_recorded_and_the_run_resumes(own: Callable) -> None:
+    words = ("+callbacks.mine._target_=myparts.Raising", "trainer.max_epochs=3")
+    outcome = own(*words)
+    assert outcome.status == 1
+    (line,) = outcome.err.splitlines()
+    assert "ZeroDivisionError: my callback (" in line
+    assert "myparts.py, line" in line
+    run = run_of(RUNS)
+    status = run.status()
+    assert status is not None
+    assert (status.state, status.error) == ("failed", "ZeroDivisionError: my callback")
+    assert run.last_checkpoint.exists()
+    del import_module("myparts").Raising.on_train_epoch_end  # mended
+    outcome = own(*words)
+    assert outcome.status == 0, outcome.err
+    assert "resuming at epoch 2 of 3" in outcome.out
+
+
+def test_a_stored_run_builds_foreign_parts_only_on_request(own: Callable, phd_exp: Callable, tmp_path: Path) -> None:
+    assert own().status == 0
+    run = run_of(RUNS)
+    words = ("predict", f"run={run.path}", "image=x.png", "f=60")
+    Image.new("RGB", (32, 32)).save(tmp_path / "x.png")
+    refused = phd_exp(*words)
+    assert refused.status == 1
+    assert (
+        "'mynet.Mine' is not built from a stored configuration; if you trust this run, add trust=mynet" in refused.err
+    )
+    trusted = phd_exp(*words, "trust=mynet")
+    assert trusted.status == 0, trusted.err
+    assert "mode" in json.loads(trusted.out)
+
+
+@pytest.mark.parametrize("key", ["backbone", "loss", "optimizer", "callbacks", "logger"])
+def test_a_strangers_configuration_executes_nothing(run: RunFolder, tmp_path: Path, key: str) -> None:
+    """`run` has the project's own parts; what only training builds is not looked at."""
+    stolen = RunFolder(tmp_path / "stolen")
+    shutil.copytree(run.path, stolen.path)
+    config = yaml.safe_load(stolen.config_file.read_text())
+    evil = {"_target_": "os.mkdir", "path": str(tmp_path / "executed")}
+    config[key] = {"evil": evil} if key in ("callbacks", "logger") else evil
+    stolen.config_file.write_text(yaml.safe_dump(config))
+    if key == "backbone":
+        with pytest.raises(ConfigError, match="is not built from a stored configuration"):
+            package.load(stolen.path)
+    else:
+        package.load(stolen.path)
+    assert not (tmp_path / "executed").exists()
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        "gradient_clip_val=0.1",
+        "limit_train_batches=1",
+        "limit_val_batches=1",
+        "accumulate_grad_batches=2",
+        "fast_dev_run=true",
+        "profiler=simple",
+        "max_steps=3",
+        "overfit_batches=1",
+        "detect_anomaly=true",
+        "enable_model_summary=true",
+    ],
+)
+def test_arguments_of_lightnings_trainer(own: Callable, word: str) -> None:
+    outcome = own(f"+trainer.{word}")
+    assert outcome.status == 0, outcome.err
+    run = run_of(RUNS)
+    assert run.config()["trainer"][word.partition("=")[0]] == yaml.safe_load(word.partition("=")[2])
+    assert run.path.name.startswith("seed0-")
+
+
+def test_a_limited_epoch_is_a_whole_one(own: Callable) -> None:
+    """Each epoch has its own order of the batches, however many of them are used."""
+    words = ("+trainer.limit_train_batches=1", "trainer.max_epochs=4", "model=mae_vz")
+    assert own(*words).status == 0
+    whole = run_of(RUNS).metrics()
+    assert own(*words[:1], "trainer.max_epochs=2", words[2], "runs=resumed", "seed=0").status == 0
+    assert [row["epoch"] for row in whole] == [-1, 0, 1, 2, 3]
+    assert run_of(Path("resumed/smoke/squares")).metrics() == whole[:3]
+
+
+def test_callbacks_choose_by_held_out_samples(own: Callable) -> None:
+    words = ("callbacks=[early_stopping,best_checkpoint]", "callbacks.early_stopping.patience=1")
+    assert own(*words, "trainer.max_epochs=40", "optimizer.lr=0.1").status == 0
+    run = run_of(RUNS)
+    losses = [row["held_out/loss"] for row in run.metrics() if "held_out/loss" in row]
+    assert len(losses) < 40
+    assert losses[-1] >= min(losses)
+    assert run.best_checkpoint.name == "best.ckpt"
+    table = read_table(run.held_out)
+    assert table["nll"].mean() == pytest.approx(min(losses), rel=1e-5)
+
+
+def test_a_run_without_its_best_checkpoint_uses_the_last(own: Callable) -> None:
+    assert own("callbacks=ema", "+trainer.gradient_clip_val=1").status == 0
+    run = run_of(RUNS)
+    assert run.best_checkpoint == run.last_checkpoint
+    source = import_module("myparts").Squares({"test": 16}, 32).samples("test")
+    found = package.load(run.path, trust=("mynet",))(source.image.numpy(), f=source.f)
+    np.testing.assert_allclose(found.mode[:, 2], read_table(run.predictions)["mode_z"], rtol=1e-5)
+
+
+def test_every_logger_receives_the_record(own: Callable, tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard", reason="needs `pip install 'phd_exp[loggers]'`")
+    pytest.importorskip("mlflow", reason="needs `pip install 'phd_exp[loggers]'`")
+    words = ("logger=[csv,wandb,tensorboard,mlflow]", "+logger.own._target_=myparts.Keeping")
+    outcome = own(*words)
+    assert outcome.status == 0, outcome.err
+    run = run_of(RUNS)
+    epochs = [row["test/nll"] for row in run.metrics()]
+    kept = [row["test/nll"] for _, row in import_module("myparts").Keeping.rows if "test/nll" in row]
+    np.testing.assert_allclose(kept, epochs, rtol=1e-6)
+    logged = pd.read_csv(run.path / "csv" / "metrics.csv")["test/nll"].dropna()
+    np.testing.assert_allclose(logged, epochs, rtol=1e-5)
+    (file,) = run.path.glob("mlflow/*/*/metrics/test/nll")
+    np.testing.assert_allclose([float(line.split()[1]) for line in file.read_text().splitlines()], epochs, rtol=1e-5)
+    assert list(run.path.glob("wandb/offline-run-*/run-*.wandb"))
+    assert list(run.path.glob("tensorboard/events*"))
+    assert not (tmp_path / "mlruns").exists()
+
+
+def test_training_from_python(own: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = [word for word in QUICK if not word.startswith("--")]
+    run = package.train(words, config_dir="my_conf")
+    assert run.results["test/nll"] == pytest.approx(run.predictions["nll"].mean(), rel=1e-6)
+    mode = run.predictor()(np.zeros((2, 32, 32, 3), np.uint8), f=64.0).mode
+    assert mode.shape == (2, 3)
+    assert package.train(words, config_dir="my_conf") == run
+    assert own().out.startswith(f"{run.path}: finished already"), "the command line finds it too"
+    table = package.runs()
+    assert table[["data", "model", "state"]].values.tolist() == [["squares", "probabilistic", "finished"]]
+    assert table["test/nll"][0] == run.results["test/nll"]
+
+
+def test_only_what_is_chosen_is_imported() -> None:
+    names = ("wandb", "mlflow", "tensorboard", "optuna", "timm")
+    code = f"import sys, phd_exp.training.run; print([name for name in {names} if name in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
