@@ -1,6 +1,6 @@
 """The record of a search: every trial with its values, readable without Optuna.
 
-runs/.search/<name>/
+runs/.search/NAME/
     study.db       Optuna's study, from which the search resumes
     search.json    its trials and the importance of each key, rewritten after every trial
 """
