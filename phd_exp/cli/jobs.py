@@ -185,8 +185,9 @@ def _unknown_key(key: str, config_name: str) -> str:
         config = hydra.compose(config_name)
     node = OmegaConf.select(config, section) if section else config
     valid = [str(name) for name in node] if isinstance(node, DictConfig) else []
-    if section:
-        return f"{key}: unknown key{nearest(leaf, valid)}; expected one of {', '.join(valid)}"
-    valid += [path.name for path in conf_folder().iterdir() if path.is_dir()]
-    verb = "" if config_name == "config" else f" {config_name}"
-    return f"{key}: unknown key{nearest(leaf, valid)}; see `python -m phd_exp{verb} --cfg job`"
+    if not section:
+        groups = [path.name for path in conf_folder().iterdir() if path.is_dir()]
+        if key in groups:
+            return f"{key}: a group; expected {key}=CHOICE, or {key}.KEY=VALUE"
+        valid = sorted({*valid, *groups})
+    return f"{key}: unknown key{nearest(leaf, valid)}; expected one of {', '.join(valid)}"
