@@ -46,7 +46,8 @@ def _run(words: list[str]) -> int:
         return 0
     from phd_exp.cli.frame import run_verb
 
-    sys.path.append(os.getcwd())  # of the user's own parts, as for `python -m`
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # for the user's own parts, as with `python -m`
     return run_verb(lambda rest: import_module(f"phd_exp.cli.{verb or 'train'}").main(rest), words)
 
 

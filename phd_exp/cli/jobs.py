@@ -19,6 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from phd_exp.cli import conf_folder
 from phd_exp.cli.frame import Ending, Stopped, ending_with, failure, print_errors, stopping_on_signals
+from phd_exp.cli.help import OF_VERB
 from phd_exp.records.errors import ConfigError, RunError, nearest
 from phd_exp.records.processes import usable_cores
 
@@ -185,8 +186,9 @@ def _unknown_key(key: str, config_name: str) -> str:
         config = hydra.compose(config_name)
     node = OmegaConf.select(config, section) if section else config
     valid = [str(name) for name in node] if isinstance(node, DictConfig) else []
-    if section:
-        return f"{key}: unknown key{nearest(leaf, valid)}; expected one of {', '.join(valid)}"
-    valid += [path.name for path in conf_folder().iterdir() if path.is_dir()]
-    verb = "" if config_name == "config" else f" {config_name}"
-    return f"{key}: unknown key{nearest(leaf, valid)}; see `python -m phd_exp{verb} --cfg job`"
+    if not section:
+        groups = OF_VERB["render" if config_name == "render" else "train"]
+        if key in groups:
+            return f"{key}: a group; expected {key}=CHOICE, or {key}.KEY=VALUE"
+        valid = sorted({*valid, *groups})
+    return f"{key}: unknown key{nearest(leaf, valid)}; expected one of {', '.join(valid)}"

@@ -1,8 +1,8 @@
 """The record of a search: every trial with its values, readable without Optuna.
 
-    runs/.search/NAME/
-        study.db       Optuna's study, from which the search resumes
-        search.json    its trials and the importance of each key, rewritten after every trial
+runs/.search/NAME/
+    study.db       Optuna's study, from which the search resumes
+    search.json    its trials and the importance of each key, rewritten after every trial
 """
 
 from pathlib import Path

@@ -19,7 +19,7 @@ from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError, RunError, shown
 from phd_exp.records.files import remove_temporaries
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.build import build_callbacks, build_data, build_module, build_trainer, trainer_arguments
+from phd_exp.training.build import build_data, build_module
 from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig
 from phd_exp.training.config.targets import custom_parts
 from phd_exp.training.module import PositionModule
@@ -28,6 +28,7 @@ from phd_exp.training.predictions import summary, write_parquet
 from phd_exp.training.ranks import train_together
 from phd_exp.training.recorder import Draw, Recorder
 from phd_exp.training.tracking import require_possible_loggers, send_results, tracked
+from phd_exp.training.trainer import build_callbacks, build_trainer, trainer_arguments
 
 UNTRAINED = -1  # the number of the epoch before the first, whose metrics are those of the untrained network
 

@@ -34,11 +34,12 @@ from phd_exp.metrics.errors import depth_error, projected_error
 from phd_exp.models.regressor import IMAGENET_MEAN, IMAGENET_STD
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.build import build_data, build_module, build_trainer
+from phd_exp.training.build import build_data, build_module
 from phd_exp.training.config import RunConfig, check
 from phd_exp.training.module import PositionModule
 from phd_exp.training.network import precision
 from phd_exp.training.recorder import Recorder
+from phd_exp.training.trainer import build_trainer
 
 WORKERS = 2
 

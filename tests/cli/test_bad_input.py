@@ -128,7 +128,7 @@ BAD_COMMANDS = [
     (["data.n_train=["], 2, ["viable"]),
     (["loss=mae"], 2, ["loss", "PointEstimate", "model=probabilistic", "ProjectedHuber"]),
     (["data.folder=photos"], 2, ["data.folder", "not a key of this choice", "data=folder"]),
-    (["render", "shrad=0/2"], 2, ["shrad: unknown key, did you mean 'shard'?", "phd_exp render --cfg job`"]),
+    (["render", "shrad=0/2"], 2, ["shrad: unknown key, did you mean 'shard'?", "expected one of backbone,"]),
     (["experiment=table1"], 2, ["experiment=table1: names several runs; write -m before it: -m experiment=table1"]),
     (["-m", "experiment=fusion,tabel2"], 2, ["experiment=tabel2: no such choice, did you mean 'table2'?"]),
     (["-m", "experiment=glob(nothing*)"], 2, ["experiment=glob(nothing*)", "not one combination"]),

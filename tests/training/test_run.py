@@ -15,7 +15,7 @@ from lightning.pytorch.callbacks import ProgressBar, TQDMProgressBar
 
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder
-from phd_exp.training import build
+from phd_exp.training import trainer as build
 from phd_exp.training.checkpoints import AtomicCheckpoints
 from phd_exp.training.config import check
 from phd_exp.training.module import PositionModule

@@ -132,7 +132,7 @@ class CameraConfig(Section):
 class TrainerConfig(Section):
     """Length, hardware and arithmetic of the training; threads=None: one per core.
 
-    Further keys are arguments of Lightning's Trainer; `build.trainer_arguments` checks them.
+    Further keys are arguments of Lightning's Trainer; `training/trainer.py` checks them.
     """
 
     model_config = ConfigDict(extra="allow", frozen=True)
