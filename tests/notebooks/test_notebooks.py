@@ -51,7 +51,7 @@ def test_a_notebook_is_valid_short_executed_and_defines_nothing(file: Path) -> N
     nbformat.validate(notebook)
     assert 10 <= len(notebook.cells) <= 25
     assert notebook.cells[0].cell_type == "markdown"
-    assert "At the end one will have understood" in notebook.cells[0].source
+    assert "This notebook shows" in notebook.cells[0].source
     cells = code_of(file)
     assert not [cell.source for cell in cells if defines(cell.source)]
     assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
