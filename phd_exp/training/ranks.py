@@ -1,24 +1,17 @@
 """Training one run with several processes, which end together.
 
 Lightning would start the command of this process again, which in a sweep is the whole sweep. Here each process is a
-`Child`, whatever launcher runs the job. It exits when its connection closes, and so when this process dies.
+`Child` that runs `rank.py`, whatever launcher runs the job.
 """
 
-import os
 import socket
-import sys
-import threading
-import traceback
-from contextlib import ExitStack, suppress
-from multiprocessing.connection import Connection, wait
+from contextlib import ExitStack
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
-import torch.distributed as dist
-
-from phd_exp.records.errors import RunError, UserError
-from phd_exp.records.processes import Child, parent
-from phd_exp.records.runs import RunFolder
+from phd_exp.records.errors import RunError
+from phd_exp.records.processes import Child
 from phd_exp.training.config import RunConfig
 from phd_exp.training.recorder import Draw
 
@@ -41,7 +34,7 @@ def train_together(config: RunConfig, folder: Path, draw: Draw | None, threads: 
         ranks: dict[Any, tuple[int, Child]] = {}
         for rank in range(world):
             of_rank = environment | {"RANK": str(rank), "LOCAL_RANK": str(rank)}
-            child = stack.enter_context(Child("phd_exp.training.ranks", of_rank))
+            child = stack.enter_context(Child("phd_exp.training.rank", of_rank))
             child.send((config, folder, draw, max(1, threads // world), rank))
             ranks[child.connection] = (rank, child)
         try:
@@ -67,40 +60,3 @@ def _received(child: Child, name: str) -> dict[str, Any]:
         raise outcome
     results: dict[str, Any] = outcome
     return results
-
-
-def main() -> None:
-    """In a child: train, and send back the results or the error."""
-    connection = parent()
-    sys.path.append(os.getcwd())  # of the user's own parts
-    share: Share = connection.recv()
-    threading.Thread(target=_exit_with_parent, args=(connection,), daemon=True).start()
-    connection.send(_outcome(share))
-    if dist.is_initialized():
-        dist.destroy_process_group()
-
-
-def _outcome(share: Share) -> dict[str, Any] | Exception:
-    from phd_exp.training.run import run  # it imports this module
-
-    config, folder, draw, threads, rank = share
-    try:
-        return run(config, RunFolder(folder), draw, threads, rank)
-    except UserError as error:
-        return error
-    except Exception as error:  # it may not pickle, its traceback does
-        last = traceback.format_exception_only(error)[-1].strip()
-        fault = RuntimeError(f"rank {rank} of {config.trainer.devices} failed with {last}")
-        fault.add_note(traceback.format_exc())
-        return fault
-
-
-def _exit_with_parent(connection: Connection) -> None:
-    """Exit at once when the connection closes; nothing else arrives through it."""
-    with suppress(EOFError, OSError):
-        connection.recv()
-    os._exit(1)
-
-
-if __name__ == "__main__":
-    main()
