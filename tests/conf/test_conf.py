@@ -14,7 +14,8 @@ from phd_exp.training.config import RunConfig, check
 
 CHOICES = {
     group.name: [f"{group.name}={file.stem}" for file in sorted(group.glob("*.yaml"))]
-    for group in sorted(path for path in conf_folder().iterdir() if path.is_dir() and path.name != "loss")
+    for group in sorted(path for path in conf_folder().iterdir() if path.is_dir())
+    if group.name not in ("loss", "recipe_at_backbone", "locating_at_preset")  # chosen by other groups
 }
 STRONG = ("recipe=strong", "preset=small")
 OF_STRONG = ("recipe_at_preset", "without")
@@ -23,6 +24,7 @@ TOGETHER = [
     tuple(word for word in words if word)
     for words in zip_longest(*(words for group, words in CHOICES.items() if group not in OF_STRONG))
 ] + [(*STRONG, word) for group in OF_STRONG for word in CHOICES[group]]
+TOGETHER += [("recipe=strong", *words) for words in zip(CHOICES["preset"], CHOICES["backbone"], strict=True)]
 
 
 @pytest.fixture

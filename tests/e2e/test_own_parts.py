@@ -21,7 +21,7 @@ from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import RunFolder
 from tests.support.own_parts import QUICK, write_own_parts
 
-RUNS = Path("runs/smoke/squares")
+RUNS = Path("runs")
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def own(phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> C
 
 
 def run_of(runs: Path) -> RunFolder:
-    (path,) = runs.glob("*/seed*")
+    (path,) = runs.glob("*/*/*/seed*")
     return RunFolder(path)
 
 
@@ -47,6 +47,7 @@ def run_of(runs: Path) -> RunFolder:
         ["backbone=pooled"],
         ["camera=shown", "optimizer._target_=torch.optim.RMSprop", "~optimizer.fused"],
         ["camera=constant", "model=mae_vz"],
+        ["recipe=strong", "optimizer=adam"],
     ],
     ids=" ".join,
 )
@@ -57,7 +58,7 @@ def test_own_parts_train_and_are_recorded(own: Callable, words: list[str]) -> No
     status = run.status()
     assert status is not None
     assert status.state == "finished"
-    assert Path(status.custom["myparts.Squares"]).name == "myparts.py"
+    assert Path(status.custom["ownparts.Squares"]).name == "ownparts.py"
     assert len(read_table(run.predictions)["z"]) == 16
 
 
@@ -66,7 +67,7 @@ def test_pretrained_weights_are_loaded_once(own: Callable, tmp_path: Path) -> No
     torch.save(weights, tmp_path / "weights.pth")
     assert own("backbone=pooled", "+backbone.pretrained=weights.pth", "optimizer.lr=1e-12").status == 0
     (tmp_path / "weights.pth").unlink()  # of the checkpoint from here on
-    predictor = package.load(run_of(RUNS).path, trust=("mynet",))
+    predictor = package.load(run_of(RUNS).path, trust=("ownnet",))
     layer = dict(predictor.regressor.named_parameters())["backbone.network.layer.weight"]
     torch.testing.assert_close(layer, torch.full_like(layer, 0.5), rtol=0, atol=1e-6)
 
@@ -74,21 +75,21 @@ def test_pretrained_weights_are_loaded_once(own: Callable, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["backbone._target_=mynet.Raises"], "backbone: KeyError: 'boom' ("),
-        (["backbone._target_=mynet.Scalar"], "backbone: returned () for 2 images of 32 px; expected (2, n)"),
-        (["backbone._target_=mynet.NaN"], "backbone: returned features that are not finite for a black image ("),
-        (["backbone._target_=mynet.NoModule"], "backbone: mynet.NoModule makes a NoModule; expected a"),
-        (["backbone._target_=mynet.Nothing"], "'mynet.Nothing' cannot be imported (module 'mynet'"),
+        (["backbone._target_=ownnet.Raises"], "backbone: KeyError: 'boom' ("),
+        (["backbone._target_=ownnet.Scalar"], "backbone: returned () for 2 images of 32 px; expected (2, n)"),
+        (["backbone._target_=ownnet.NaN"], "backbone: returned features that are not finite for a black image ("),
+        (["backbone._target_=ownnet.NoModule"], "backbone: ownnet.NoModule makes a NoModule; expected a"),
+        (["backbone._target_=ownnet.Nothing"], "'ownnet.Nothing' cannot be imported (module 'ownnet'"),
         (["backbone._target_=broken.X"], "cannot be imported (ModuleNotFoundError: No module named 'nothing_here' ("),
         (["backbone._target_=nowhere.X"], "'nowhere.X' cannot be imported (No module named 'nowhere')"),
-        (["+backbone.depth=3"], "backbone.depth: unknown key, did you mean 'width'?; mynet.Mine takes width"),
+        (["+backbone.depth=3"], "backbone.depth: unknown key, did you mean 'width'?; ownnet.Mine takes width"),
         (["+backbone.width=wide"], "backbone.width: got 'wide'; expected a valid integer"),
-        (["loss._target_=myloss.wrong_shape"], "loss: returned (2, 3) for 2 images; expected (2,) or () ("),
-        (["model.head._target_=mynet.Mine"], "model.head._target_: 'mynet.Mine' is no head; see conf/model"),
-        (["data.source._target_=mynet.NoModule"], "data.source: "),
-        (["+callbacks.mine._target_=mynet.Mine"], "callbacks.mine: makes a Mine; expected a lightning.Callback ("),
+        (["loss._target_=ownloss.wrong_shape"], "loss: returned (2, 3) for 2 images; expected (2,) or () ("),
+        (["model.head._target_=ownnet.Mine"], "model.head._target_: 'ownnet.Mine' is no head; see conf/model"),
+        (["data.source._target_=ownnet.NoModule"], "data.source: "),
+        (["+callbacks.mine._target_=ownnet.Mine"], "callbacks.mine: makes a Mine; expected a lightning.Callback ("),
         (["+callbacks.mine=3"], "callbacks.mine: got 3; expected a node with a _target_"),
-        (["+logger.mine._target_=mynet.Mine"], "logger.mine: makes a Mine; expected a Logger of Lightning ("),
+        (["+logger.mine._target_=ownnet.Mine"], "logger.mine: makes a Mine; expected a Logger of Lightning ("),
         (["callbacks=early_stopping", "callbacks.early_stopping.monitor=test/loss"], "test samples choose nothing"),
         (["callbacks=early_stopping", "data.n_held_out=0"], "data.n_held_out > 0"),
         (["callbacks=lr_monitor"], "Cannot use `LearningRateMonitor` callback with `Trainer` that has no logger"),
@@ -102,24 +103,24 @@ def test_bad_parts_are_one_line(own: Callable, words: list[str], message: str) -
     assert outcome.status != 0
     (line,) = outcome.err.splitlines()
     assert message in line
-    place = {"mynet": "mynet.py", "myloss": "myloss.py", "broken": "broken.py"}
+    place = {"ownnet": "ownnet.py", "ownloss": "ownloss.py", "broken": "broken.py"}
     if message.endswith("("):
         assert any(file in line for file in place.values())
 
 
 def test_an_error_in_the_middle_is_recorded_and_the_run_resumes(own: Callable) -> None:
-    words = ("+callbacks.mine._target_=myparts.Raising", "trainer.max_epochs=3")
+    words = ("+callbacks.mine._target_=ownparts.Raising", "trainer.max_epochs=3")
     outcome = own(*words)
     assert outcome.status == 1
     (line,) = outcome.err.splitlines()
     assert "ZeroDivisionError: my callback (" in line
-    assert "myparts.py, line" in line
+    assert "ownparts.py, line" in line
     run = run_of(RUNS)
     status = run.status()
     assert status is not None
     assert (status.state, status.error) == ("failed", "ZeroDivisionError: my callback")
     assert run.last_checkpoint.exists()
-    del import_module("myparts").Raising.on_train_epoch_end  # mended
+    del import_module("ownparts").Raising.on_train_epoch_end  # mended
     outcome = own(*words)
     assert outcome.status == 0, outcome.err
     assert "resuming at epoch 2 of 3" in outcome.out
@@ -133,9 +134,10 @@ def test_a_stored_run_builds_foreign_parts_only_on_request(own: Callable, phd_ex
     refused = phd_exp(*words)
     assert refused.status == 1
     assert (
-        "'mynet.Mine' is not built from a stored configuration; if you trust this run, add trust=mynet" in refused.err
+        "'ownnet.Mine' is not built from a stored configuration; if you trust this run, add trust=ownnet"
+        in refused.err
     )
-    trusted = phd_exp(*words, "trust=mynet")
+    trusted = phd_exp(*words, "trust=ownnet")
     assert trusted.status == 0, trusted.err
     assert "mode" in json.loads(trusted.out)
 
@@ -187,7 +189,7 @@ def test_a_limited_epoch_is_a_whole_one(own: Callable) -> None:
     whole = run_of(RUNS).metrics()
     assert own(*words[:1], "trainer.max_epochs=2", words[2], "runs=resumed", "seed=0").status == 0
     assert [row["epoch"] for row in whole] == [-1, 0, 1, 2, 3]
-    assert run_of(Path("resumed/smoke/squares")).metrics() == whole[:3]
+    assert run_of(Path("resumed")).metrics() == whole[:3]
 
 
 def test_callbacks_choose_by_held_out_samples(own: Callable) -> None:
@@ -206,20 +208,20 @@ def test_a_run_without_its_best_checkpoint_uses_the_last(own: Callable) -> None:
     assert own("callbacks=ema", "+trainer.gradient_clip_val=1").status == 0
     run = run_of(RUNS)
     assert run.best_checkpoint == run.last_checkpoint
-    source = import_module("myparts").Squares({"test": 16}, 32).samples("test")
-    found = package.load(run.path, trust=("mynet",))(source.image.numpy(), f=source.f)
+    source = import_module("ownparts").Squares({"test": 16}, 32).samples("test")
+    found = package.load(run.path, trust=("ownnet",))(source.image.numpy(), f=source.f)
     np.testing.assert_allclose(found.mode[:, 2], read_table(run.predictions)["mode_z"], rtol=1e-5)
 
 
 def test_every_logger_receives_the_record(own: Callable, tmp_path: Path) -> None:
     pytest.importorskip("tensorboard", reason="needs `pip install 'phd_exp[loggers]'`")
     pytest.importorskip("mlflow", reason="needs `pip install 'phd_exp[loggers]'`")
-    words = ("logger=[csv,wandb,tensorboard,mlflow]", "+logger.own._target_=myparts.Keeping")
+    words = ("logger=[csv,wandb,tensorboard,mlflow]", "+logger.own._target_=ownparts.Keeping")
     outcome = own(*words)
     assert outcome.status == 0, outcome.err
     run = run_of(RUNS)
     epochs = [row["test/nll"] for row in run.metrics()]
-    kept = [row["test/nll"] for _, row in import_module("myparts").Keeping.rows if "test/nll" in row]
+    kept = [row["test/nll"] for _, row in import_module("ownparts").Keeping.rows if "test/nll" in row]
     np.testing.assert_allclose(kept, epochs, rtol=1e-6)
     logged = pd.read_csv(run.path / "csv" / "metrics.csv")["test/nll"].dropna()
     np.testing.assert_allclose(logged, epochs, rtol=1e-5)

@@ -28,7 +28,7 @@ sampler: {_target_: optuna.samplers.RandomSampler, seed: 1}
 @pytest.fixture
 def search(phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable:
     write_own_parts(tmp_path)
-    (tmp_path / "my_conf/backbone/mine.yaml").write_text("_target_: mynet.Mine\nwidth: 8\n")
+    (tmp_path / "my_conf/backbone/mine.yaml").write_text("_target_: ownnet.Mine\nwidth: 8\n")
     (tmp_path / "space.yaml").write_text(SPACE)
     monkeypatch.syspath_prepend(tmp_path)
     return lambda *words: phd_exp("search", *WORDS, *words)
@@ -74,7 +74,7 @@ def test_the_best_trial_is_the_best_on_held_out_samples(search: Callable, phd_ex
 
 
 def test_an_interrupted_trial_is_resumed(search: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
-    from myparts import Squares  # type: ignore[import-not-found]
+    from ownparts import Squares  # type: ignore[import-not-found]
 
     from phd_exp.training.pruning import Pruning
 

@@ -89,16 +89,16 @@ class Squares(Source):
         return self.n[part]
 """
 FILES = {
-    "mynet.py": NET,
-    "myloss.py": LOSS,
-    "myparts.py": OTHERS,
+    "ownnet.py": NET,
+    "ownloss.py": LOSS,
+    "ownparts.py": OTHERS,
     "broken.py": "import nothing_here\n",
-    "my_conf/backbone/mine.yaml": "_target_: mynet.Mine\n",
-    "my_conf/backbone/pooled.yaml": "_target_: phd_exp.models.backbones.pooled\nnetwork: {_target_: mynet.Mine}\n"
+    "my_conf/backbone/mine.yaml": "_target_: ownnet.Mine\n",
+    "my_conf/backbone/pooled.yaml": "_target_: phd_exp.models.backbones.pooled\nnetwork: {_target_: ownnet.Mine}\n"
     "side: ${data.image_size}\n",
-    "my_conf/loss/l1.yaml": "_target_: myloss.l1\nweight: 2.0\n",
-    "my_conf/model/own.yaml": "defaults: [/loss@_global_.loss: nll]\nname: own\nhead: {_target_: myparts.Head}\n",
-    "my_conf/data/squares.yaml": "name: squares\nsource: {_target_: myparts.Squares}\nn_train: 32\nn_held_out: 8\n"
+    "my_conf/loss/l1.yaml": "_target_: ownloss.l1\nweight: 2.0\n",
+    "my_conf/model/own.yaml": "defaults: [/loss@_global_.loss: nll]\nname: own\nhead: {_target_: ownparts.Head}\n",
+    "my_conf/data/squares.yaml": "name: squares\nsource: {_target_: ownparts.Squares}\nn_train: 32\nn_held_out: 8\n"
     "n_test: 16\nimage_size: 32\nbatch_size: 16\n",
 }
 QUICK = (
