@@ -115,10 +115,13 @@ class _Search:
         self.study = optuna.create_study(
             storage=f"sqlite:///{folder.absolute() / 'study.db'}",
             study_name=name,
-            sampler=instantiate(space.sampler),
             pruner=instantiate(space.pruner),
             load_if_exists=True,
         )
+        sampler = dict(space.sampler)
+        if "seed" in sampler:  # a resumed search would draw the values of its first trials again
+            sampler["seed"] += len(self.study.trials)
+        self.study.sampler = instantiate(sampler)
         asked = {"space": space.space, "overrides": fixed}
         if self.study.user_attrs.get("asked", asked) != asked:
             raise RunError(

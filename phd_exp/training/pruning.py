@@ -2,6 +2,7 @@
 
 from pathlib import Path
 from typing import Any
+from warnings import catch_warnings
 
 from lightning import Callback, LightningModule, Trainer
 
@@ -25,7 +26,8 @@ class Pruning(Callback):
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         metrics, epoch = trainer.callback_metrics, trainer.current_epoch
         score = next(float(metrics[key]) for key in map("held_out/{}".format, SCORES) if key in metrics)
-        self.trial.report(score, epoch)
+        with catch_warnings(action="ignore"):  # of epochs that a resumed trial reports again
+            self.trial.report(score, epoch)
         if self.trial.should_prune():
             raise Pruned(
                 f"pruned after epoch {epoch + 1} of {trainer.max_epochs} with a held-out score of {score:.4g}"

@@ -66,6 +66,8 @@ def test_the_best_trial_is_the_best_on_held_out_samples(search: Callable, phd_ex
     more = search("trials=4")
     assert more.out.count("trial ") == 1
     assert "trial 4/4" in more.out
+    (longer,) = read_searches(Path("runs"))
+    assert len({trial.overrides["optimizer.lr"] for trial in longer.trials}) == 4, "no value is drawn again"
     assert phd_exp("report").status == 0
     page = Path("report/site/index.html").read_text()
     assert "Search space: 4 finished" in page
