@@ -149,7 +149,7 @@ def test_a_strangers_configuration_executes_nothing(run: RunFolder, tmp_path: Pa
     shutil.copytree(run.path, stolen.path)
     config = yaml.safe_load(stolen.config_file.read_text())
     evil = {"_target_": "os.mkdir", "path": str(tmp_path / "executed")}
-    config[key] = {"evil": evil} if key in ("callbacks", "logger") else evil
+    config[key] = {"evil": evil, "odd": 3} if key in ("callbacks", "logger") else evil
     stolen.config_file.write_text(yaml.safe_dump(config))
     if key == "backbone":
         with pytest.raises(ConfigError, match="is not built from a stored configuration"):

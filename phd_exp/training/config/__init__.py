@@ -97,10 +97,10 @@ class RunConfig(Section):
         return self
 
     @model_validator(mode="after")
-    def monitors_fit(self) -> "RunConfig":
+    def monitors_fit(self, info: ValidationInfo) -> "RunConfig":
         """Refuse a callback that monitors the test samples, or held-out samples without an evaluation."""
         is_held_out = self.evaluation.held_out and self.data.n_held_out > 0
-        for name, node in self.callbacks.items():
+        for name, node in self.callbacks.items() if is_typed(info) else ():
             monitor = str(node.get("monitor"))
             if monitor.startswith("test/") or (monitor.startswith("held_out/") and not is_held_out):
                 raise ValueError(
