@@ -93,7 +93,7 @@ def loaded(arguments: RunArguments, device: str = "auto") -> "Predictor":
     """The predictor of a run, with a note on standard error if the run is not finished."""
     from phd_exp.inference.predictor import load
 
-    trust = tuple((arguments.trust or "").split(",")) if arguments.trust else ()
+    trust = tuple(arguments.trust.split(",")) if arguments.trust else ()
     predictor = load(arguments.run, device, arguments.recalibrate, trust)
     if predictor.state != "finished":
         print(f"note: {arguments.run}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)

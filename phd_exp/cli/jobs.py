@@ -134,9 +134,7 @@ def launch(task: Task, words: list[str], config_name: str = "config", standing: 
     return max((ending.exit_status for ending in job.endings), default=0)
 
 
-def composed(
-    overrides: list[str], config_dir: str | Path | None = None, config_name: str = "config"
-) -> dict[str, Any]:
+def composed(overrides: list[str], config_dir: str | Path | None = None) -> dict[str, Any]:
     """The configuration of one run, without Hydra's command line. Raises ConfigError for a bad override."""
     search = [f"hydra.searchpath=[file://{Path(config_dir).absolute()}]"] if config_dir else []
     try:

@@ -45,10 +45,14 @@ class Search(BaseModel):
     importances: dict[str, FiniteFloat]
 
     @property
+    def finished(self) -> list[tuple[float, Trial]]:
+        """The values of the finished trials, and these trials, in the order of their numbers."""
+        return [(one.value, one) for one in self.trials if one.state == "finished" and one.value is not None]
+
+    @property
     def best(self) -> Trial | None:
         """The finished trial with the smallest value."""
-        finished = [trial for trial in self.trials if trial.state == "finished" and trial.value is not None]
-        return min(finished, key=lambda trial: trial.value or 0.0, default=None)
+        return min(self.finished, key=lambda found: found[0], default=(0.0, None))[1]
 
 
 def search_folder(runs: Path, name: str) -> Path:

@@ -4,7 +4,7 @@ from phd_exp.records.errors import one_line
 from phd_exp.records.searches import Search, Trial
 from phd_exp.reports.runs import Report
 from phd_exp.reports.site.charts import Chart, axis, bars, line
-from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem, printable
+from phd_exp.reports.table import Table, TableCell, TableRow, file_stem, printable
 
 MOST = 10  # trials of a table
 OF_A_SEARCH = (
@@ -19,8 +19,7 @@ def search_tables(report: Report) -> list[Table]:
 
 
 def _table(search: Search) -> Table:
-    finished = [trial for trial in search.trials if trial.state == "finished"]
-    best = sorted(finished, key=lambda trial: trial.value or 0.0)[:MOST]
+    best = sorted(search.finished, key=lambda found: found[0])[:MOST]
     counts = ", ".join(
         f"{n} {state}"
         for state in ("finished", "pruned", "failed", "running")
@@ -32,7 +31,7 @@ def _table(search: Search) -> Table:
         title=one_line(f"Search {search.name}: {counts}"),
         stub=("trial", "overrides"),
         columns=(search.objective,),
-        groups=(tuple(_row(trial) for trial in best),),
+        groups=(tuple(_row(value, trial) for value, trial in best),),
         notes=(OF_A_SEARCH,),
         numbers=tuple(
             {"search": search.name, "trial": trial.number + 1, "state": trial.state, "value": trial.value}
@@ -42,9 +41,8 @@ def _table(search: Search) -> Table:
     )
 
 
-def _row(trial: Trial) -> TableRow:
-    value = NOTHING if trial.value is None else f"{trial.value:.4g}"
-    return TableRow((str(trial.number + 1), one_line(" ".join(_words(trial)))), (TableCell(value),))
+def _row(value: float, trial: Trial) -> TableRow:
+    return TableRow((str(trial.number + 1), one_line(" ".join(_words(trial)))), (TableCell(f"{value:.4g}"),))
 
 
 def _words(trial: Trial) -> list[str]:
@@ -61,13 +59,13 @@ def _short(text: str) -> str:
 
 def search_charts(search: Search) -> dict[str, Chart]:
     """The values of all trials with the best so far, and the importances of the keys."""
-    trials = [trial for trial in search.trials if trial.state == "finished" and trial.value is not None]
-    numbers, values = [trial.number + 1 for trial in trials], [trial.value or 0.0 for trial in trials]
-    if not trials:
+    if not search.finished:
         return {}
+    values = [value for value, _ in search.finished]
+    numbers = [trial.number + 1 for _, trial in search.finished]
     so_far = [min(values[: place + 1]) for place in range(len(values))]
     points = line("finished trials", numbers, values, 1) | {"mode": "markers"}
-    label = f"{search.objective} of {len(trials)} finished trials; the best is {min(values):.4g}."
+    label = f"{search.objective} of {len(values)} finished trials; the best is {min(values):.4g}."
     layout = {"xaxis": axis("trial"), "yaxis": axis(search.objective)}
     history = Chart(f"{search.name}: history", label, [points, line("best so far", numbers, so_far, 2)], layout)
     charts = {f"history_{search.name}": history}

@@ -30,7 +30,7 @@ QUICKER = ("trainer.max_epochs=1", "logger=none", "trainer.precision=bfloat16", 
 
 
 def trained(runs: Path, *arguments: str) -> None:
-    """Train one run into a folder of its own."""
+    """Train one run into its own folder."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", ["phd_exp"])
         assert main([*arguments, *QUICKER, f"runs={runs}"]) == 0

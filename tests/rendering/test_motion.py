@@ -44,7 +44,7 @@ def seen_after(scene: Scene, motion: Motion) -> Scene:
 
 
 def pictures(folder: Path, *scenes: Scene) -> np.ndarray:
-    """By Blender in a process of its own."""
+    """By Blender in its own process."""
     lines = "".join(f"{scene.model_dump_json()}\n" for scene in scenes)
     command = [sys.executable, "-c", RENDER, str(folder / "pictures.npy")]
     subprocess.run(command, input=lines, text=True, cwd=HOME, check=True)

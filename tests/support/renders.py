@@ -102,7 +102,7 @@ def rendering_elsewhere(
     shard: Shard | None = None,
     source: DatasetFolder | None = None,
 ) -> Iterator[subprocess.Popen[str]]:
-    """`ensure_rendered` in a process, and a group of processes, of its own, which is killed at the end.
+    """`ensure_rendered` in its own process group, which is killed at the end.
 
     With a `source`, its images are copied, slowly.
     """
