@@ -80,7 +80,9 @@ def build_module(config: RunConfig, data: PositionData) -> PositionModule:
             "expected 0, or a backbone that does, as in conf/recipe/strong.yaml"
         )
     schedule = partial(factor, recipe.schedule, recipe.warmup_steps)
-    module = PositionModule(regressor, loss, optimizer, constant_f, recipe.localisation, schedule)
+    module = PositionModule(
+        regressor, loss, optimizer, constant_f, recipe.localisation, schedule, config.camera.f_error
+    )
     if custom_parts({"head": config.model.head, "backbone": config.backbone, "loss": config.loss}):
         _try_out(module, config, data.source)
     return module

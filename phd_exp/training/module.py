@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 import torch
 from lightning import LightningModule
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_, clip_grad_value_
 from torch.optim.lr_scheduler import LambdaLR
@@ -23,6 +24,8 @@ from phd_exp.models.regressor import Regressor
 from phd_exp.records.errors import RunError, listed
 from phd_exp.training.predictions import columns, summary, training_columns
 
+GOLDEN = (math.sqrt(5) - 1) / 2
+
 
 class PositionModule(LightningModule):
     """Image and camera -> prediction -> loss, with the metrics of both splits logged once per epoch.
@@ -36,6 +39,7 @@ class PositionModule(LightningModule):
             a density, mean absolute error for a point estimate.
         optimizer: parameters -> optimizer.
         constant_f: focal length in pixels that the model uses for every sample; None: the true one.
+        f_error: largest relative error of the focal lengths that the model uses.
         localisation: weight of the localisation loss; 0 for a backbone that does not locate the object.
         schedule: number of steps -> factor of the learning rate at each; see `factor`.
 
@@ -51,6 +55,7 @@ class PositionModule(LightningModule):
         constant_f: float | None = None,
         localisation: float = 0.0,
         schedule: Callable[[int], Callable[[int], float]] = lambda steps: lambda step: 1.0,
+        f_error: float = 0.0,
     ) -> None:
         super().__init__()
         self.regressor = regressor
@@ -60,6 +65,7 @@ class PositionModule(LightningModule):
         self.constant_f = constant_f
         self.localisation = localisation
         self.schedule = schedule
+        self.f_error = f_error
         self.training_rows, self.evaluation_rows, self.held_out_rows = Rows(), Rows(), Rows()
         self.table: Columns = {}
 
@@ -68,7 +74,11 @@ class PositionModule(LightningModule):
 
     def camera(self, batch: Batch) -> Camera:
         """The cameras of a batch as the model knows them."""
-        return batch.camera.with_constant_f(self.constant_f)
+        camera = batch.camera.with_constant_f(self.constant_f)
+        if not self.f_error:
+            return camera
+        share = relative_error(batch.row, self.current_epoch if self.training else 0)
+        return Camera(camera.f * (1 + self.f_error * share), camera.S)
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         optimizer = self.make_optimizer(self.regressor.parameters())
@@ -154,6 +164,18 @@ class PositionModule(LightningModule):
             f"{listed([names[row] if names else str(row) for row in rows])}; the last checkpoint is whole: lower "
             "optimizer.lr, or look at these images"
         )
+
+
+def relative_error(row: Int[Tensor, " batch"], epoch: int) -> Float[Tensor, " batch"]:
+    """A number from -1 to 1 for each sample and epoch, evenly spread over samples and over epochs.
+
+    It depends on (row, epoch) alone, so a resumed or distributed run trains on the same numbers.
+
+    Source: multiples of irrational numbers modulo 1 are evenly distributed (Weyl); checked in
+    tests/training/test_f_error.py.
+    """
+    place = row.double() * GOLDEN + epoch * math.sqrt(2)
+    return (2 * place.frac() - 1).float()
 
 
 def factor(schedule: str, warmup_steps: int, steps: int) -> Callable[[int], float]:

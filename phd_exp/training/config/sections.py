@@ -123,10 +123,20 @@ class ModelConfig(Section):
 
 class CameraConfig(Section):
     """How the model uses the focal length. known: geometry only; shown: also an input of the network; constant: one
-    value for all cameras.
+    value for all cameras. Focal lengths are known within the factors 1 - f_error and 1 + f_error.
     """
 
     focal_length: Literal["known", "shown", "constant"]
+    f_error: Annotated[float, Field(ge=0, le=0.5)] = 0.0  # default for older run records
+
+    @model_validator(mode="after")
+    def error_is_of_a_known_f(self) -> "CameraConfig":
+        """Refuse an error of focal lengths that the model does not use."""
+        if self.f_error and self.focal_length == "constant":
+            raise ValueError(
+                f"f_error: got {self.f_error}; camera=constant uses no focal length; expected 0, or camera=known"
+            )
+        return self
 
 
 class TrainerConfig(Section):
