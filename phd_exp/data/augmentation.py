@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 from numpy.typing import NDArray
-from PIL import Image, ImageFilter
+from PIL import Image, ImageDraw, ImageFilter
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
@@ -28,6 +28,7 @@ class Photometry:
     between 1/limit and the limit. A quarter each is blurred, gets noise, or is compressed, uniformly up to the limit.
 
     Args:
+        occluders: share of the images in which a polygon of one colour hides a part.
         brightness: largest factor of all values; 1 for none.
         contrast: largest factor of the distance from middle grey; 1 for none.
         gamma: largest exponent of values between 0 and 1; 1 for none.
@@ -37,7 +38,8 @@ class Photometry:
         jpeg: lowest JPEG quality; 100 for none.
     """
 
-    n_numbers: ClassVar[int] = 12
+    n_numbers: ClassVar[int] = 14
+    occluders: float = 0.0
     brightness: float = 1.0
     contrast: float = 1.0
     gamma: float = 1.0
@@ -52,7 +54,7 @@ class Photometry:
         return self != Photometry()
 
     def __call__(
-        self, image: UInt8[Tensor, "batch height width 3"], numbers: Float[Tensor, "batch 12"]
+        self, image: UInt8[Tensor, "batch height width 3"], numbers: Float[Tensor, "batch 14"]
     ) -> UInt8[Tensor, "batch height width 3"]:
         """The images, changed by uniform numbers from -1 to 1."""
         result = [self._changed(one, row) for one, row in zip(image.numpy(), numbers.tolist(), strict=True)]
@@ -60,6 +62,8 @@ class Photometry:
 
     def _changed(self, image: NDArray[np.uint8], numbers: list[float]) -> NDArray[np.uint8]:
         picture = Image.fromarray(image)
+        if numbers[12] < 2 * self.occluders - 1:
+            _hide_a_part(picture, seed=int(2**32 * (numbers[13] + 1)))
         if numbers[0] > 0:
             picture = picture.point(self._tone(numbers[1:7]))
         if self.blur and (blur := _strength(numbers[7])):
@@ -84,6 +88,15 @@ class Photometry:
 def _strength(number: float) -> float:
     """Uniform numbers from -1 to 1 -> 0 for three quarters of them, else uniform from 0 to 1."""
     return max(0.0, 4 * abs(number) - 3)
+
+
+def _hide_a_part(picture: Image.Image, seed: int) -> None:
+    """Draw a convex polygon of one colour anywhere in the picture, 16 to 50 % of its width across."""
+    draw = np.random.default_rng(seed)
+    centre, radius = draw.uniform(0, 1, 2) * picture.size, draw.uniform(0.08, 0.25) * picture.width
+    angle = np.sort(draw.uniform(0, 2 * np.pi, draw.integers(3, 9)))
+    corners = centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    ImageDraw.Draw(picture).polygon(corners.ravel().tolist(), fill=tuple(draw.integers(0, 256, 3).tolist()))
 
 
 def _noisy(image: NDArray[np.uint8], deviation: float, place: list[float]) -> NDArray[np.uint8]:
@@ -130,7 +143,7 @@ class Augmentation:
         """Whether any change can be drawn."""
         return self.symmetries or self.largest_zoom > 1 or self.colours or self.photometry.changes_anything
 
-    def __call__(self, batch: Batch, numbers: Float[Tensor, "batch 22"]) -> Batch:
+    def __call__(self, batch: Batch, numbers: Float[Tensor, "batch 24"]) -> Batch:
         """The samples, changed by uniform numbers from -1 to 1.
 
         A rotation and zoom that would move the object out of the image is skipped; the symmetry is kept.

@@ -28,6 +28,7 @@ def images(n: int = N) -> torch.Tensor:
     [
         ({"brightness": 2.0}, 1 / 2), ({"contrast": 2.0}, 1 / 2), ({"gamma": 2.0}, 1 / 2),
         ({"white_balance": 1.5}, 1 / 2), ({"blur": 3.0}, 1 / 4), ({"noise": 20.0}, 1 / 4), ({"jpeg": 20}, 1 / 4),
+        ({"occluders": 0.3}, 0.3),
     ],
     ids=lambda value: "" if isinstance(value, float) else next(iter(value)),
 )  # fmt: skip
@@ -74,3 +75,18 @@ def test_blur_noise_and_compression() -> None:
     assert abs(noisy.mean()) * 255 < 1
     lossy = [value(Photometry(jpeg=20)(edge, drawn(strength, 11))) - value(edge) for strength in (0.8, 1.0)]
     assert 0 < lossy[0].std() < lossy[1].std() < 0.2
+
+
+def test_an_occluder_hides_a_convex_part_by_one_colour_and_the_original_stays() -> None:
+    before = images()
+    after = Photometry(occluders=1.0)(before, numbers())
+    assert torch.equal(before, images())
+    for image, original in zip(after, before, strict=True):
+        hidden = image.ne(original).any(-1)
+        if hidden.sum() < 40:
+            continue  # a sliver
+        rows, columns = hidden.nonzero().T
+        assert max(int(rows.max() - rows.min()), int(columns.max() - columns.min())) <= SIDE / 2
+        assert len(image[hidden].unique(dim=0)) == 1
+        middle = rows.double().mean().round().int(), columns.double().mean().round().int()
+        assert hidden[middle]  # the centroid of a convex shape lies inside
