@@ -100,7 +100,7 @@ def test_a_model_picks_its_loss_and_camera_and_whether_the_strong_recipe_shows_t
         ("localisation", {"recipe.localisation"}),
         ("symmetries", {"recipe.augmentation.symmetries"}),
         ("colours", {"recipe.augmentation.colours"}),
-        ("standardisation", {"recipe.standardise"}),
+        ("exposure", {"recipe.exposure"}),
         ("focal_length", {"camera.focal_length"}),
         ("fine_images", {"data.image_size", "backbone.width", "backbone.stride", "backbone.channels"}),
     ],

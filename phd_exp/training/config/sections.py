@@ -178,7 +178,7 @@ class RecipeConfig(Section):
     schedule: Literal["constant", "cosine"]
     warmup_steps: Natural
     localisation: Annotated[float, Field(ge=0, le=1000)]
-    standardise: StrictBool = False  # default for older run records
+    exposure: StrictBool = False  # default for older run records
     augmentation: AugmentationConfig
 
 
