@@ -16,12 +16,13 @@ from phd_exp.records.runs import RunFolder
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.render import ensure_rendered
 from phd_exp.training.config import RenderedConfig, RunConfig, check
+from phd_exp.training.config.sections import DataConfig
 
 if TYPE_CHECKING:
     from phd_exp.inference.trained import TrainedRun
 
-NAMED = ("preset", "recipe", "data", "data.name", "model", "seed", "experiment")
-"""Choices with a place of their own in a run's name, and `experiment`, which only names several runs."""
+NAMED = ("preset", "recipe", "data", "data.name", "model", "seed", "experiment", "shift")
+"""Choices with a place of their own in a run's name, and groups that change no weight."""
 SHOWN = (
     "test/projected_error_mm",
     "test/depth_error_mm",
@@ -56,6 +57,8 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
         require_possible(checked, folder)
         if several is not None:
             several[0].missing(several[1], 0, 0)  # refuses another data set before hours of training
+        for name in checked.evaluation.shifts:
+            _missing(checked.data_of(name), 0)  # likewise
         announce(checked, folder, overrides)
         if isinstance(data, RenderedConfig):
             place = DatasetFolder(data.folder)
@@ -63,6 +66,7 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
     results = train(checked, folder, draw=_draw(), cores=cores, callbacks=callbacks)
     if several is not None and isinstance(data, RenderedConfig):
         _record_views(folder, *several, data.workers, cores)
+    _record_shifts(folder, checked, cores)
     print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
     for key in filter(results.__contains__, SHOWN):
         print(f"  {key} {_number(results[key])} (untrained {_number(results.get(f'untrained/{key}'))})")
@@ -85,10 +89,7 @@ def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> Non
     from phd_exp.training.network import has_gpu
 
     data, epochs = checked.data, checked.trainer.max_epochs
-    n_missing = 0
-    if isinstance(data, RenderedConfig):
-        place = DatasetFolder(data.folder)
-        n_missing = sum(map(len, place.missing(data.spec, data.n_training_split, data.n_test).values()))
+    n_missing = _missing(data)
     render = f"{n_missing} images to render, then " if n_missing else ""
     network = f"{checked.backbone['_target_'].rpartition('.')[2]}{checked.backbone.get('depth', '')}"
     images = "all" if data.n_train is None else data.n_train
@@ -99,6 +100,14 @@ def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> Non
         words = " ".join([*(word for word in overrides if not word.startswith("preset=")), "preset=small"])
         print("  the authors' protocol takes many hours without a GPU: an estimate follows the first batches")
         print(f"  in about ten minutes: python -m phd_exp {words}", flush=True)
+
+
+def _missing(data: DataConfig, n_training_split: int | None = None) -> int:
+    """The number of samples to render. Raises DatasetError if another data set is in their folder."""
+    if not isinstance(data, RenderedConfig):
+        return 0
+    n = data.n_training_split if n_training_split is None else n_training_split
+    return sum(map(len, DatasetFolder(data.folder).missing(data.spec, n, data.n_test).values()))
 
 
 def _several_views(checked: RunConfig) -> tuple[DatasetFolder, DatasetSpec, int] | None:
@@ -124,6 +133,20 @@ def _record_views(
         print(f"{run.views}: {count} seen by {spec.views} cameras each")
 
 
+def _record_shifts(run: RunFolder, checked: RunConfig, cores: int) -> None:
+    """Render the missing samples of each shift and record the run's predictions of them, once."""
+    from phd_exp.inference.shifts import is_recorded, record_shift
+
+    for name in checked.evaluation.shifts:
+        if is_recorded(run, checked, name):
+            continue
+        data = checked.data_of(name)
+        if isinstance(data, RenderedConfig):
+            ensure_rendered(DatasetFolder(data.folder), data.spec, 0, data.n_test, data.workers, cores)
+        record_shift(run, checked, name)
+        print(f"{run.shift(name)}: recorded", flush=True)
+
+
 def _number(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, int | float) else "not finite"
 
@@ -140,8 +163,9 @@ def standing(config: dict[str, Any], overrides: list[str]) -> str | None:
             return None
         if status.state == "running":
             return "running" if folder.is_held() else "exited without a result (killed or out of memory)"
-        several = config["evaluation"]["multiview"]["scenes"] > 0
-        is_whole = status.state == "finished" and (folder.views.exists() or not several)
+        files = [folder.views] if config["evaluation"]["multiview"]["scenes"] > 0 else []
+        files += map(folder.shift, config["evaluation"]["shifts"])
+        is_whole = status.state == "finished" and all(file.exists() for file in files)
         return "finished" if is_whole else status.error or "interrupted"
     except (KeyError, TypeError, AttributeError, OSError, RunError):  # the run itself will report it
         return None

@@ -58,6 +58,12 @@ class Photometry:
         result = [self._changed(one, row) for one, row in zip(image.numpy(), numbers.tolist(), strict=True)]
         return torch.from_numpy(np.stack(result))
 
+    def fixed(self, image: UInt8[Tensor, "batch height width 3"]) -> UInt8[Tensor, "batch height width 3"]:
+        """The images, each changed exactly up to every limit; only noise is drawn. Here, limits may be below 1."""
+        numbers = torch.ones(len(image), self.n_numbers)
+        numbers[:, 9:11] = 2 * torch.rand(len(image), 2, generator=torch.Generator().manual_seed(0)) - 1
+        return self(image, numbers)
+
     def _changed(self, image: NDArray[np.uint8], numbers: list[float]) -> NDArray[np.uint8]:
         picture = Image.fromarray(image)
         if numbers[0] > 0:

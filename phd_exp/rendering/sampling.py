@@ -12,6 +12,7 @@ from phd_exp.records.scenes import (
     Backdrop,
     Lamp,
     LampName,
+    Material,
     Pose,
     Quaternion,
     Scene,
@@ -30,6 +31,8 @@ GENERATOR_VERSION = 2
 SIZE = 0.2  # m: height and diameter of the cylinder, side of the cube, diameter of the sphere
 CLEARANCE = 0.5  # m: least depth of an object in a further view
 MOST_TRIES = 10_000
+PANEL = (0.2, 0.4, 0.02)  # m
+PANEL_DEPTHS = (0.6, 0.8)  # bounds of a panel's depth over the cylinder's
 Stream = np.random.Generator
 
 
@@ -45,6 +48,7 @@ class Purpose(IntEnum):
     NOISE = 3
     OBJECT = 10  # plus 10 per shape, in the order of SHAPES; then POSE, LOOK or SCALE
     VIEW = 40  # followed by the view's number
+    PANEL = 50
 
 
 SHAPES: tuple[Shape, ...] = get_args(Shape)
@@ -80,6 +84,9 @@ def sample_scene(spec: DatasetSpec, split: Split, index: int) -> Scene:
     for place, shape in enumerate(SHAPES if spec.occluders else SHAPES[:1]):
         pose, look, size = (stream(Purpose.OBJECT + 10 * place + part) for part in (POSE, LOOK, SCALE))
         objects.append(_object(spec, shape, f, pose, look, size))
+    if spec.half_hidden:
+        objects = [item for item in objects if item.shape != "cube"]
+        objects.append(_panel(spec, objects[0].position, stream(Purpose.PANEL)))
     scene = Scene(
         f=f,
         S=spec.sensor_size,
@@ -151,8 +158,27 @@ def _object(spec: DatasetSpec, shape: Shape, f: float, pose: Stream, look: Strea
         rotation=uniform_rotation(pose),
         dimensions=(SIZE, SIZE, SIZE),
         scale=_uniform(size, spec.scale_range),
-        colour=_colour(look),
-        material="metal" if look.random() < 0.5 else "rubber",
+        colour=_colour(spec, look),
+        material=_material(look),
+    )
+
+
+def _panel(spec: DatasetSpec, hidden: Vector, rng: Stream) -> SceneObject:
+    """A thin panel parallel to the image, with an edge through the line of sight to the centre of the hidden object.
+
+    The silhouette of an object that is symmetric about its centre is symmetric too, up to perspective. Any line
+    through its middle halves it.
+    """
+    angle, depth = _uniform(rng, (0.0, math.tau)), _uniform(rng, PANEL_DEPTHS)
+    x, y, z = (depth * coordinate for coordinate in hidden)
+    return SceneObject(
+        shape="cube",
+        position=(x + 0.5 * PANEL[0] * math.cos(angle), y + 0.5 * PANEL[0] * math.sin(angle), z),
+        rotation=about_axis((0.0, 0.0, 1.0), angle),
+        dimensions=PANEL,
+        scale=1.0,
+        colour=_colour(spec, rng),
+        material=_material(rng),
     )
 
 
@@ -164,11 +190,15 @@ def _position(spec: DatasetSpec, f: float, rng: Stream) -> tuple[float, float, f
     return x, y, z
 
 
-def _colour(rng: Stream) -> tuple[float, float, float]:
-    """sRGB of any hue; not too grey, which would merge with the backdrop, and not too dark to show shading."""
-    hue, saturation, value = rng.random(), _uniform(rng, (0.45, 0.95)), _uniform(rng, (0.45, 0.95))
+def _colour(spec: DatasetSpec, rng: Stream) -> tuple[float, float, float]:
+    """sRGB of any hue, not too dark to show shading; by default not too grey, which would merge with the backdrop."""
+    hue, saturation, value = rng.random(), _uniform(rng, spec.saturation_range), _uniform(rng, (0.45, 0.95))
     r, g, b = colorsys.hsv_to_rgb(hue, saturation, value)
     return r, g, b
+
+
+def _material(rng: Stream) -> Material:
+    return "metal" if rng.random() < 0.5 else "rubber"
 
 
 def _lamps(spec: DatasetSpec, rng: Stream) -> tuple[Lamp, ...]:
