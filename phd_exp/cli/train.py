@@ -136,6 +136,7 @@ def _record_views(
 def _record_shifts(run: RunFolder, checked: RunConfig, cores: int) -> None:
     """Render the missing samples of each shift and record the run's predictions of them, once."""
     from phd_exp.inference.shifts import is_recorded, record_shift
+    from phd_exp.training.build import build_source
 
     for name in checked.evaluation.shifts:
         if is_recorded(run, checked, name):
@@ -143,7 +144,7 @@ def _record_shifts(run: RunFolder, checked: RunConfig, cores: int) -> None:
         data = checked.data_of(name)
         if isinstance(data, RenderedConfig):
             ensure_rendered(DatasetFolder(data.folder), data.spec, 0, data.n_test, data.workers, cores)
-        record_shift(run, checked, name)
+        record_shift(run, checked, name, build_source(data))
         print(f"{run.shift(name)}: recorded", flush=True)
 
 

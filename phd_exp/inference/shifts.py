@@ -3,26 +3,25 @@
 import torch
 
 from phd_exp.data.augmentation import Photometry
+from phd_exp.data.sources import Source
 from phd_exp.inference.predictor import load
 from phd_exp.inference.tables import is_table_of, origin_of, predicted
 from phd_exp.records.choices import flatten
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.build import build_source
 from phd_exp.training.config import RenderedConfig, RunConfig
 from phd_exp.training.predictions import write_parquet
 
 
-def record_shift(folder: RunFolder, config: RunConfig, name: str) -> None:
+def record_shift(folder: RunFolder, config: RunConfig, name: str, source: Source) -> None:
     """Predict the samples of a shift and record them: the columns of `predictions.parquet`, in the same order.
 
-    The run is finished, and the samples are rendered.
+    The run is finished; `source` has the test samples before the change.
 
     Raises RunError if another process holds the run or it has no checkpoint, DatasetError if a sample is missing.
     """
     shift, n = config.evaluation.shifts[name], config.evaluation.n_shifted
     with folder.held():
         predictor = load(folder.path, trust=None)  # the user has just trained it
-        source = build_source(config.data_of(name))
         samples = source.samples("test")
         samples = samples.select(torch.arange(len(samples))[:n])
         table = predicted(predictor, samples, Photometry(**shift.images.model_dump()), shift.f_factor)

@@ -1,4 +1,4 @@
-"""Tables of a finished run's predictions, which record their origin, so that an up-to-date table is not made again."""
+"""Tables of predictions of a finished run, which record their origin: an up-to-date table is not made again."""
 
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,10 @@ from phd_exp.metrics.rows import Rows
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.predictions import columns
 
+UNCHANGED = Photometry()
 
-def predicted(
-    predictor: Predictor, samples: Batch, change: Photometry = Photometry(), f_factor: float = 1.0
-) -> Columns:
+
+def predicted(predictor: Predictor, samples: Batch, change: Photometry = UNCHANGED, f_factor: float = 1.0) -> Columns:
     """The columns of `predictions.parquet` for these samples.
 
     The network receives their images with this fixed change, and `f_factor` times their focal lengths.

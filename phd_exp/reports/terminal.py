@@ -12,9 +12,11 @@ from phd_exp.evaluation.point_errors import ErrorKey, Quantity
 from phd_exp.records.errors import one_line
 from phd_exp.reports.paper_tables import DIGITS, making_command
 from phd_exp.reports.runs import Report, Run
+from phd_exp.reports.shift_tables import DETAILS
 from phd_exp.reports.table import NOTHING, Table, TableCell
 
 WIDTH = 118  # columns, also if the output is not a terminal and rich would fall back to 80
+TONES = {"": "", "off": "yellow", "broken": "red"}
 OF_A_STAR = "* marks numbers that a terminal prints in bold."
 
 
@@ -22,6 +24,7 @@ def print_report(report: Report, tables: Sequence[Table]) -> None:
     """Print all tables, missing runs, notes, and every run with its state."""
     console = Console(width=max(WIDTH, Console().width), highlight=False)
     starred = not console.is_terminal
+    tables = [table for table in tables if table.kind != DETAILS]  # long; their files and pages have them
     for table in tables:
         _print(console, table.title, style="bold")
         console.print(_grid(table, starred))
@@ -77,7 +80,7 @@ def _grid(table: Table, starred: bool) -> Grid:
 
 
 def _cell(cell: TableCell, starred: bool) -> Text:
-    text = Text("*" if cell.bold and starred else "")
+    text = Text("*" if cell.bold and starred else "", style=TONES[cell.tone])
     text.append(cell.ours, style="bold" if cell.bold else "")
     if cell.spread:
         text.append(f" {cell.spread}")
