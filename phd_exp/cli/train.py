@@ -16,7 +16,6 @@ from phd_exp.records.runs import RunFolder
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.render import ensure_rendered
 from phd_exp.training.config import RenderedConfig, RunConfig, check
-from phd_exp.training.config.sections import DataConfig
 
 if TYPE_CHECKING:
     from phd_exp.inference.trained import TrainedRun
@@ -57,8 +56,6 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
         require_possible(checked, folder)
         if several is not None:
             several[0].missing(several[1], 0, 0)  # refuses another data set before hours of training
-        for name in checked.evaluation.shifts:
-            _missing(checked.data_of(name), 0)  # likewise
         announce(checked, folder, overrides)
         if isinstance(data, RenderedConfig):
             place = DatasetFolder(data.folder)
@@ -89,7 +86,10 @@ def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> Non
     from phd_exp.training.network import has_gpu
 
     data, epochs = checked.data, checked.trainer.max_epochs
-    n_missing = _missing(data)
+    n_missing = 0
+    if isinstance(data, RenderedConfig):
+        place = DatasetFolder(data.folder)
+        n_missing = sum(map(len, place.missing(data.spec, data.n_training_split, data.n_test).values()))
     render = f"{n_missing} images to render, then " if n_missing else ""
     network = f"{checked.backbone['_target_'].rpartition('.')[2]}{checked.backbone.get('depth', '')}"
     images = "all" if data.n_train is None else data.n_train
@@ -100,14 +100,6 @@ def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> Non
         words = " ".join([*(word for word in overrides if not word.startswith("preset=")), "preset=small"])
         print("  the authors' protocol takes many hours without a GPU: an estimate follows the first batches")
         print(f"  in about ten minutes: python -m phd_exp {words}", flush=True)
-
-
-def _missing(data: DataConfig, n_training_split: int | None = None) -> int:
-    """The number of samples to render. Raises DatasetError if another data set is in their folder."""
-    if not isinstance(data, RenderedConfig):
-        return 0
-    n = data.n_training_split if n_training_split is None else n_training_split
-    return sum(map(len, DatasetFolder(data.folder).missing(data.spec, n, data.n_test).values()))
 
 
 def _several_views(checked: RunConfig) -> tuple[DatasetFolder, DatasetSpec, int] | None:
@@ -123,29 +115,29 @@ def _record_views(
     run: RunFolder, scenes: DatasetFolder, spec: DatasetSpec, n: int, workers: int | None, cores: int
 ) -> None:
     """Render the missing views of `n` scenes and record the run's predictions of them, once."""
-    from phd_exp.inference.several_views import is_recorded, record_views
+    from phd_exp.inference.several_views import record_views
+    from phd_exp.inference.tables import is_recorded, origin_of
 
-    if is_recorded(run, spec, n):
-        return
-    ensure_rendered(scenes, spec, 0, n * spec.views, workers, cores)
-    if record_views(run, scenes, spec, n):
+    origin = origin_of(run, data=spec.fingerprint(), scenes=n)
+    if not is_recorded(run.views, origin):
+        ensure_rendered(scenes, spec, 0, n * spec.views, workers, cores)
+        record_views(run, scenes, spec, n, origin)
         count = "1 scene" if n == 1 else f"{n} scenes"
         print(f"{run.views}: {count} seen by {spec.views} cameras each")
 
 
 def _record_shifts(run: RunFolder, checked: RunConfig, cores: int) -> None:
     """Render the missing samples of each shift and record the run's predictions of them, once."""
-    from phd_exp.inference.shifts import is_recorded, record_shift
+    from phd_exp.inference.tables import is_recorded, origin_of_shift, record
     from phd_exp.training.build import build_source
 
-    for name in checked.evaluation.shifts:
-        if is_recorded(run, checked, name):
-            continue
-        data = checked.data_of(name)
-        if isinstance(data, RenderedConfig):
-            ensure_rendered(DatasetFolder(data.folder), data.spec, 0, data.n_test, data.workers, cores)
-        record_shift(run, checked, name, build_source(data))
-        print(f"{run.shift(name)}: recorded", flush=True)
+    for name, shift in checked.evaluation.shifts.items():
+        file, origin, data = run.shift(name), origin_of_shift(run, checked, name), checked.data_of(name)
+        if not is_recorded(file, origin):
+            if isinstance(data, RenderedConfig):
+                ensure_rendered(DatasetFolder(data.folder), data.spec, 0, data.n_test, data.workers, cores)
+            record(run, file, build_source(data), origin, {}, shift)
+            print(f"{file}: recorded", flush=True)
 
 
 def _number(value: Any) -> str:

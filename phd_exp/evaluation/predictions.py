@@ -106,27 +106,6 @@ def evaluate(table: pa.Table | Columns, window: int = 200, resamples: int = 200)
     )
 
 
-def scores(
-    table: pa.Table | Columns, regions: Mapping[str, float], resamples: int = 200
-) -> tuple[dict[str, Band], int]:
-    """The scores of `evaluate` alone, and the number of samples left out.
-
-    Predictions of a distribution also have, for each name and credible level of `regions`, the per cent of truths
-    inside. Raises RunError as `evaluate` does.
-    """
-    recorded = arrays(table)
-    if "a" not in recorded:
-        columns, left_out = _finite(recorded, ERRORS)
-        return _scores(_point_scores, columns, resamples)[0], left_out
-    columns, left_out = _finite(recorded, OF_A_DISTRIBUTION)
-    inside = {name: 100.0 * (columns["level"] <= level) for name, level in regions.items()}
-
-    def statistic(columns: Mapping[str, Tensor], weight: Tensor) -> dict[str, Tensor]:
-        return _distribution_scores(columns, weight) | {name: _mean(columns[name], weight) for name in inside}
-
-    return _scores(statistic, columns | inside, resamples)[0], left_out
-
-
 def fit_temperature(held_out_table: pa.Table | Columns) -> Temperature:
     """The temperatures fitted on predictions of samples that were held out of training.
 

@@ -1,19 +1,25 @@
-"""Measures a run's predictions of shifted test samples."""
+"""Measures a run's predictions of its test samples at home and under shifts."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
+import torch
+from torch import Tensor
 
-from phd_exp.evaluation.parquet import Columns, read_table
-from phd_exp.evaluation.predictions import scores
+from phd_exp.evaluation.parquet import Columns, read_table, require_columns
+from phd_exp.evaluation.point_errors import RESAMPLES, SEED
+from phd_exp.evaluation.predictions import ERRORS, band_of
 from phd_exp.evaluation.reference import Band
+from phd_exp.metrics.bootstrap import bands, means
+from phd_exp.metrics.calibration_scores import COLUMNS, calibration_scores, ordered
 from phd_exp.records.errors import one_line
+from phd_exp.records.runs import HOME
 
-LEVELS = (50, 90, 99)
-"""Credible levels whose coverage is measured, per cent."""
+MEASURED = (*COLUMNS, *ERRORS, "nll")
 
 
 @dataclass(frozen=True)
@@ -21,9 +27,9 @@ class ShiftScores:
     """The scores of n samples; `left_out` further samples had values that are not finite.
 
     Attributes:
-        change: the change of the samples in words; empty for the unchanged ones.
-        scores: those of an `Evaluation`, and the coverage in per cent: `inside_50`, `inside_90`, `inside_99` of the
-            credible regions, `inside_conformal` of the conformal 90 % region, if there are held-out samples.
+        change: the shift in words; empty at home.
+        scores: means of `MEASURED`, the `calibration_scores`, and the per cent of truths inside credible regions:
+            `inside_50`, `inside_90`, `inside_99`, and `inside_conformal` if there are enough held-out samples.
     """
 
     change: str
@@ -32,28 +38,36 @@ class ShiftScores:
     scores: dict[str, Band]
 
 
-def shift_scores(table: Columns, held_out: Columns | None, change: str = "") -> ShiftScores:
-    """The scores of a table of predictions. Raises RunError if a column is missing, or no sample is finite."""
-    regions = {f"inside_{level}": level / 100 for level in LEVELS}
-    if held_out and (threshold := conformal_threshold(held_out, 0.9)) is not None:
-        regions["inside_conformal"] = threshold
-    found, left_out = scores(table, regions)
-    return ShiftScores(change, len(table["x"]) - left_out, left_out, found)
+def shift_scores(folder: Path, home: Columns, held_out: Columns | None) -> dict[str, ShiftScores]:
+    """Name of each shift in a folder -> its scores, `home` first; empty without a shift, or for point estimates.
 
-
-def read_shift(file: Path, held_out: Columns | None) -> ShiftScores:
-    """The scores of a recorded table. Raises RunError if it cannot be read."""
-    table = read_table(file)  # checks the file
-    said = pq.read_schema(file).metadata or {}
-    return shift_scores(table, held_out, one_line(said.get(b"shift", b"").decode(errors="replace")))
-
-
-def conformal_threshold(held_out: Columns, coverage: float) -> float | None:
-    """The level whose credible regions contain new truths of the same distribution with at least this probability.
-
-    It is the ceil((n + 1) coverage)-th smallest level of the n odd rows of the held-out samples; None if n is too
-    small, or if the predictions have no level.
+    Raises RunError if a table cannot be read or lacks a column.
     """
-    levels = np.sort(held_out.get("level", np.empty(0))[1::2])
-    rank = math.ceil((len(levels) + 1) * coverage)
-    return float(levels[rank - 1]) if rank <= len(levels) else None
+    found, levels = {}, {"50": 0.5, "90": 0.9, "99": 0.99}
+    if held_out and (threshold := conformal_threshold(held_out.get("level", np.empty(0)), 0.9)) is not None:
+        levels["conformal"] = threshold
+    for file in sorted(folder.glob("*.parquet")) if "level" in home else ():
+        table, said = read_table(file), pq.read_schema(file).metadata or {}
+        found[file.stem] = _scores(table, levels, one_line(said.get(b"shift", b"").decode(errors="replace")))
+    return {HOME: _scores(home, levels), **found} if found else {}
+
+
+def conformal_threshold(levels: np.ndarray, coverage: float) -> float | None:
+    """The ceil((n + 1) coverage)-th smallest of the n odd held-out levels; None for too few."""
+    odd = np.sort(levels[1::2])
+    rank = math.ceil((len(odd) + 1) * coverage)
+    return float(odd[rank - 1]) if rank <= len(odd) else None
+
+
+def _scores(table: Columns, levels: Mapping[str, float], change: str = "") -> ShiftScores:
+    require_columns(MEASURED, table)
+    columns = {name: torch.from_numpy(table[name]) for name in MEASURED}
+    finite = torch.stack(list(columns.values())).isfinite().all(0)
+    columns = {name: column[finite] for name, column in columns.items()}
+    columns |= {f"inside_{name}": 100.0 * (columns["level"] <= level) for name, level in levels.items()}
+    found = {name: band_of(interval) for name, interval in bands(_statistic, columns, RESAMPLES, SEED).items()}
+    return ShiftScores(change, int(finite.sum()), int((~finite).sum()), found)
+
+
+def _statistic(columns: Mapping[str, Tensor], counts: Tensor) -> dict[str, Tensor]:
+    return means(columns, counts) | calibration_scores(ordered(columns, counts))

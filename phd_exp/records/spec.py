@@ -6,15 +6,7 @@ import re
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    SerializerFunctionWrapHandler,
-    StrictBool,
-    model_serializer,
-)
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StrictBool, model_serializer
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 
@@ -62,9 +54,6 @@ class DatasetSpec(BaseModel):
         saturation_range: bounds of the saturation of every colour; near 0 it is grey.
         half_hidden: whether a panel in front of the cylinder hides half of it. It replaces the cube of `occluders`.
 
-    The last two keys are younger than the first data sets. At their defaults they are not written, so that
-    fingerprints and manifests stay as they were.
-
     Raises:
         pydantic.ValidationError: a missing or unknown key, a wrong type, a value out of range.
 
@@ -91,7 +80,8 @@ class DatasetSpec(BaseModel):
     half_hidden: StrictBool = False
 
     @model_serializer(mode="wrap")
-    def _without_defaults(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _without_defaults(self, serialize: Any) -> dict[str, Any]:
+        # younger keys at their defaults are not written: fingerprints and manifests stay as they were
         fields = type(self).model_fields
         return {key: value for key, value in serialize(self).items() if getattr(self, key) != fields[key].default}
 

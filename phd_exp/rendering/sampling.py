@@ -12,7 +12,6 @@ from phd_exp.records.scenes import (
     Backdrop,
     Lamp,
     LampName,
-    Material,
     Pose,
     Quaternion,
     Scene,
@@ -31,8 +30,7 @@ GENERATOR_VERSION = 2
 SIZE = 0.2  # m: height and diameter of the cylinder, side of the cube, diameter of the sphere
 CLEARANCE = 0.5  # m: least depth of an object in a further view
 MOST_TRIES = 10_000
-PANEL = (0.2, 0.4, 0.02)  # m
-PANEL_DEPTHS = (0.6, 0.8)  # bounds of a panel's depth over the cylinder's
+PANEL = (0.2, 0.4, 0.02)  # m: wider than half of the largest silhouette at its depth
 Stream = np.random.Generator
 
 
@@ -85,8 +83,8 @@ def sample_scene(spec: DatasetSpec, split: Split, index: int) -> Scene:
         pose, look, size = (stream(Purpose.OBJECT + 10 * place + part) for part in (POSE, LOOK, SCALE))
         objects.append(_object(spec, shape, f, pose, look, size))
     if spec.half_hidden:
-        objects = [item for item in objects if item.shape != "cube"]
-        objects.append(_panel(spec, objects[0].position, stream(Purpose.PANEL)))
+        panel = _panel(spec, objects[0].position, f, stream(Purpose.PANEL))
+        objects = [*(item for item in objects if item.shape != panel.shape), panel]
     scene = Scene(
         f=f,
         S=spec.sensor_size,
@@ -159,27 +157,22 @@ def _object(spec: DatasetSpec, shape: Shape, f: float, pose: Stream, look: Strea
         dimensions=(SIZE, SIZE, SIZE),
         scale=_uniform(size, spec.scale_range),
         colour=_colour(spec, look),
-        material=_material(look),
+        material="metal" if look.random() < 0.5 else "rubber",
     )
 
 
-def _panel(spec: DatasetSpec, hidden: Vector, rng: Stream) -> SceneObject:
-    """A thin panel parallel to the image, with an edge through the line of sight to the centre of the hidden object.
+def _panel(spec: DatasetSpec, hidden: Vector, f: float, rng: Stream) -> SceneObject:
+    """A panel parallel to the image, with an edge through the line of sight to the centre of the hidden object.
 
-    The silhouette of an object that is symmetric about its centre is symmetric too, up to perspective. Any line
-    through its middle halves it.
+    A convex object that is symmetric about its centre has a symmetric silhouette, up to perspective: the edge halves
+    it.
     """
-    angle, depth = _uniform(rng, (0.0, math.tau)), _uniform(rng, PANEL_DEPTHS)
+    panel = _object(spec, "cube", f, rng, rng, rng)
+    angle, depth = _uniform(rng, (0.0, math.tau)), _uniform(rng, (0.6, 0.8))
     x, y, z = (depth * coordinate for coordinate in hidden)
-    return SceneObject(
-        shape="cube",
-        position=(x + 0.5 * PANEL[0] * math.cos(angle), y + 0.5 * PANEL[0] * math.sin(angle), z),
-        rotation=about_axis((0.0, 0.0, 1.0), angle),
-        dimensions=PANEL,
-        scale=1.0,
-        colour=_colour(spec, rng),
-        material=_material(rng),
-    )
+    middle = (x + 0.5 * PANEL[0] * math.cos(angle), y + 0.5 * PANEL[0] * math.sin(angle), z)
+    changes = {"position": middle, "rotation": about_axis((0.0, 0.0, 1.0), angle), "dimensions": PANEL, "scale": 1.0}
+    return panel.model_copy(update=changes)
 
 
 def _position(spec: DatasetSpec, f: float, rng: Stream) -> tuple[float, float, float]:
@@ -191,14 +184,10 @@ def _position(spec: DatasetSpec, f: float, rng: Stream) -> tuple[float, float, f
 
 
 def _colour(spec: DatasetSpec, rng: Stream) -> tuple[float, float, float]:
-    """sRGB of any hue, not too dark to show shading; by default not too grey, which would merge with the backdrop."""
+    """sRGB of any hue; by default not too grey, which would merge with the backdrop; not too dark to show shading."""
     hue, saturation, value = rng.random(), _uniform(rng, spec.saturation_range), _uniform(rng, (0.45, 0.95))
     r, g, b = colorsys.hsv_to_rgb(hue, saturation, value)
     return r, g, b
-
-
-def _material(rng: Stream) -> Material:
-    return "metal" if rng.random() < 0.5 else "rubber"
 
 
 def _lamps(spec: DatasetSpec, rng: Stream) -> tuple[Lamp, ...]:

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,10 +17,10 @@ from phd_exp.evaluation.fusion import FusionScores, fusion_scores
 from phd_exp.evaluation.parquet import Columns
 from phd_exp.evaluation.predictions import Evaluation, evaluate, fit_temperature, recalibrated
 from phd_exp.evaluation.several_views import read_views
-from phd_exp.evaluation.shifts import ShiftScores, read_shift, shift_scores
+from phd_exp.evaluation.shifts import ShiftScores, shift_scores
 from phd_exp.records.errors import UserError, one_line
 from phd_exp.records.files import write_atomic
-from phd_exp.records.runs import HOME, RunFolder
+from phd_exp.records.runs import RunFolder
 from phd_exp.reports.gallery import Gallery, images_folder, make_gallery
 from phd_exp.reports.table import file_stem
 
@@ -49,7 +49,7 @@ class Measured:
     Attributes:
         before: evaluation of the recorded predictions.
         after: evaluation of the recalibrated predictions; None without held-out samples.
-        shifts: scores of the unchanged test samples, `home`, and of each shift; empty without a shift.
+        shifts: scores at home and under each shift; empty without a shift.
         images: a digest of data set and true positions, equal for runs tested on the same images.
     """
 
@@ -77,7 +77,7 @@ def measure(
         found["gallery"] = notes.attempt(lambda: make_gallery(predictions, config))
         if found["before"] and (left_out := found["before"].left_out):
             notes.append(f"{left_out} test samples are left out: a prediction was not finite")
-        found["shifts"] = _shifts(folder, predictions, held_out, notes)
+        found["shifts"] = notes.attempt(lambda: shift_scores(folder.shifts, predictions, held_out)) or {}
     if folder.views.exists():
         found["fusion"] = notes.attempt(lambda: fusion_scores(read_views(folder.views)))
     return Measured(**found, notes=notes)
@@ -86,17 +86,6 @@ def measure(
 def _recalibrated(predictions: Columns, held_out: Columns) -> dict[str, Any]:
     temperature = fit_temperature(held_out)
     return {"temperature": temperature, "after": evaluate(recalibrated(predictions, temperature))}
-
-
-def _shifts(
-    folder: RunFolder, predictions: Columns, held_out: Columns | None, notes: Notes
-) -> dict[str, ShiftScores]:
-    makers: dict[str, Callable[[], ShiftScores]] = {
-        file.stem: partial(read_shift, file, held_out) for file in sorted(folder.shifts.glob("*.parquet"))
-    }
-    if makers:
-        makers = {HOME: partial(shift_scores, predictions, held_out)} | makers
-    return {name: found for name, make in makers.items() if (found := notes.attempt(make))}
 
 
 def _images(folder: RunFolder, table: Columns) -> str:

@@ -1,147 +1,89 @@
-"""Tests under distribution shift: a matrix of runs by shifts, and every score of a run."""
+"""Tests under distribution shift: for each score a matrix of runs by shifts, first the share inside 90 % regions."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import groupby
 
-from phd_exp.evaluation.reference import Band
-from phd_exp.evaluation.shifts import ShiftScores
 from phd_exp.records.choices import in_words
 from phd_exp.records.runs import HOME
+from phd_exp.reports.quantities import quantity
 from phd_exp.reports.runs import Report, Run
 from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem, printable
 
-DETAILS = "shift_details"  # the kind of the tables of all scores
-AXES = {"variants": "other data sets", "scenes": "other scenes", "images": "changed images and focal lengths"}
-"""Axis of shifts -> its name in a title."""
+AXES = {"variants": "data sets", "scenes": "scenes", "images": "images and focal lengths"}
+"""Axis of the shifts -> its name in a title."""
+MAIN = "inside_90"
 WANTED, LEAST = 90, 80  # per cent inside the 90 % region: of a calibrated run, and below which the promise is broken
-COLUMNS = {
-    "projected_error_mm": ("projected (mm)", 1),
-    "depth_error_mm": ("depth (mm)", 0),
-    "nll": ("NLL", 2),
-    "inside_50": ("in 50 %", 0),
-    "inside_90": ("in 90 %", 0),
-    "inside_99": ("in 99 %", 0),
-    "inside_conformal": ("in conformal 90 %", 0),
-    "depth_ence": ("depth ENCE", 2),
-    "projected_ence": ("projected ENCE", 2),
-    "depth_sharpness_mm": ("depth sd (mm)", 0),
-    "projected_sharpness_mrad": ("projected sd (mrad)", 2),
-}
-"""Score -> its heading and its decimals."""
+DETAILS = (
+    *("inside_50", "inside_99", "inside_conformal", "projected_error_mm", "depth_error_mm", "nll"),
+    *("depth_ence", "projected_ence", "depth_sharpness_mm", "projected_sharpness_mrad"),
+)
 OF_THE_MATRIX = (
-    f"A cell: per cent of truths inside the predicted 90 % region. Arrow: its 95 % interval lacks {WANTED}; "
-    f"two arrows: fewer than {LEAST} % are inside. Home: the unchanged test samples. The tables of each run have all "
-    "scores, with intervals."
+    f"Per cent of truths inside the predicted 90 % region. Arrow: the 95 % interval excludes {WANTED} %; two: fewer "
+    f"than {LEAST} % are inside. Home: the unchanged test samples. The files and the site have all scores."
 )
-OF_THE_DETAILS = (
-    "In brackets: 95 % bootstrap intervals over test samples. In 50, 90 and 99 %: per cent of truths inside these "
-    "credible regions. Conformal: inside the region whose level is the 90 % quantile of held-out samples. sd: root "
-    "mean square of the predicted standard deviation."
-)
+OF_THE_DETAILS = "In brackets: 95 % bootstrap intervals over test samples. Home: the unchanged test samples."
 
 
 def shift_tables(report: Report) -> list[Table]:
-    """For every preset, a matrix per axis of shifts; then the scores of every run with a shift."""
+    """For every preset with shifts a matrix for each score and each axis."""
     runs = [run for run in report.runs if run.measured.shifts]
-    of_presets = [(preset, list(alike)) for preset, alike in groupby(runs, key=lambda run: run.preset)]
-    matrices = [matrix(preset, alike, axis) for preset, alike in of_presets for axis in AXES]
-    return [*(table for table in matrices if len(table.columns) > 1), *map(shift_details, runs)]
+    presets = [list(alike) for _, alike in groupby(runs, key=lambda run: run.preset)]
+    keys = [(key, axis) for key in (MAIN, *DETAILS) for axis in AXES]
+    tables = [_matrix(alike, key, axis) for alike in presets for key, axis in keys]
+    return [table for table in tables if len(table.columns) > 1]
 
 
-def matrix(preset: str, runs: Sequence[Run], axis: str) -> Table:
-    """The share of truths inside the 90 % region: a row for each run, a column for each shift of an axis."""
-    changes: dict[str, set[str]] = {}
-    for run in runs:
-        for name, found in run.measured.shifts.items():
-            if name != HOME and _axis(found) == axis:
-                changes.setdefault(name, set()).add(found.change)
-    names = [HOME, *sorted(changes)]
+def _matrix(runs: Sequence[Run], key: str, axis: str) -> Table:
+    """A row for each run of a preset, a column for each shift of an axis."""
+    found = sorted((name, shift.change) for run in runs for name, shift in run.measured.shifts.items())
+    changes = {name: change for name, change in found if change and _axis(change) == axis}
+    preset, names = runs[0].preset, (HOME, *changes)
+    labels = [(run, run.config.get("camera.focal_length", "")) for run in runs]
+    rows = [
+        TableRow((run.data, camera, run.name), tuple(_cell(run, name, key) for name in names))
+        for run, camera in labels
+    ]
     return Table(
-        stem=file_stem("shifts", preset, axis),
+        stem=file_stem("shifts", key, preset, axis),
         kind="shifts",
-        title=f"Inside the 90 % region, {in_words(preset)}: {AXES[axis]}",
+        title=f"{quantity(key).axis} under shift, {in_words(preset)}: {AXES[axis]}",
         stub=("trained on", "camera", "run"),
         columns=tuple(map(printable, names)),
-        groups=tuple(
-            tuple(
-                TableRow((run.data, _camera(run), run.name), tuple(_share(run, name) for name in names)) for run in of
-            )
-            for _, of in groupby(runs, key=lambda run: run.data)
+        groups=tuple(tuple(alike) for _, alike in groupby(rows, key=lambda row: row.stub[0])),
+        notes=(
+            OF_THE_MATRIX if key == MAIN else OF_THE_DETAILS,
+            *(f"{printable(name)}: {change}." for name, change in changes.items()),
         ),
-        notes=(OF_THE_MATRIX, *(f"{printable(name)}: {' or '.join(sorted(changes[name]))}" for name in names[1:])),
-        preset=preset,
-        numbers=tuple(
-            {"preset": preset, "axis": axis, "data": run.data, "model": run.model, "run": run.name}
-            | {"camera": _camera(run), "shift": name, "inside_90": band.value, "low": band.low, "high": band.high}
-            for run in runs
-            for name in names
-            if (band := _inside(run, name))
-        ),
-    )
-
-
-def shift_details(run: Run) -> Table:
-    """Every score of a run: a row for each shift."""
-    shifts = run.measured.shifts
-    by_axis = [[HOME], *([name for name in shifts if name != HOME and _axis(shifts[name]) == axis] for axis in AXES)]
-    return Table(
-        stem=file_stem("shift", run.preset, run.data, run.model, run.name),
-        kind=DETAILS,
-        title=f"Shifts, {in_words(run.preset)}: {run.title}, {run.name}, camera={_camera(run)}",
-        stub=("tested on", "samples"),
-        columns=tuple(heading for heading, _ in COLUMNS.values()),
-        groups=tuple(tuple(_row(name, shifts[name]) for name in names) for names in by_axis if names),
-        notes=(OF_THE_DETAILS, *_left_out(shifts)),
         below="95 %",
-        preset=run.preset,
+        preset=preset,
+        reading="" if key == MAIN else "details",
         numbers=tuple(
-            {"preset": run.preset, "data": run.data, "model": run.model, "run": run.name, "camera": _camera(run)}
-            | {"shift": name, "change": found.change, "n": found.n, "left_out": found.left_out}
-            | {"quantity": key, "value": band.value, "low": band.low, "high": band.high}
-            for name, found in shifts.items()
-            for key, band in found.scores.items()
+            {"preset": preset, "data": run.data, "model": run.model, "run": run.name, "camera": camera}
+            | {"axis": axis, "shift": name, "n": shifts[name].n, "left_out": shifts[name].left_out}
+            | {"quantity": key}
+            | vars(shifts[name].scores[key])
+            for run, camera in labels
+            for name in names
+            if key in (shifts := run.measured.shifts)[name].scores
         ),
     )
 
 
-def _axis(found: ShiftScores) -> str:
-    if not found.change.startswith("data."):
-        return "images"
-    return "variants" if "data.variant=" in found.change else "scenes"
+def _axis(change: str) -> str:
+    if change.startswith("data."):
+        return "variants" if "data.variant=" in change else "scenes"
+    return "images"
 
 
-def _camera(run: Run) -> str:
-    return run.config.get("camera.focal_length", "")
-
-
-def _inside(run: Run, name: str) -> Band | None:
-    found = run.measured.shifts.get(name)
-    return found.scores.get("inside_90") if found else None
-
-
-def _share(run: Run, name: str) -> TableCell:
-    band = _inside(run, name)
+def _cell(run: Run, name: str, key: str) -> TableCell:
+    band = run.measured.shifts[name].scores.get(key) if name in run.measured.shifts else None
     if band is None:
         return TableCell(NOTHING)
+    value, low, high = map(quantity(key).text, (band.value, band.low, band.high))
+    if key != MAIN:
+        return TableCell(value, below=f"({low}–{high})")
     if band.low <= WANTED <= band.high:
-        return TableCell(f"{band.value:.0f}")
+        return TableCell(value)
     if band.value < LEAST:
-        return TableCell(f"{band.value:.0f}", "↓↓", tone="broken")
-    return TableCell(f"{band.value:.0f}", "↓" if band.value < WANTED else "↑", tone="off")
-
-
-def _row(name: str, found: ShiftScores) -> TableRow:
-    cells = (_cell(found.scores.get(key), digits) for key, (_, digits) in COLUMNS.items())
-    return TableRow((printable(name), str(found.n)), tuple(cells))
-
-
-def _cell(band: Band | None, digits: int) -> TableCell:
-    if band is None:
-        return TableCell(NOTHING)
-    value, low, high = (f"{number:.{digits}f}" for number in (band.value, band.low, band.high))
-    return TableCell(value, below=f"({low}–{high})")
-
-
-def _left_out(shifts: Mapping[str, ShiftScores]) -> list[str]:
-    counts = ", ".join(f"{printable(name)} {found.left_out}" for name, found in shifts.items() if found.left_out)
-    return [f"Left out, because a prediction is not finite: {counts}."] if counts else []
+        return TableCell(value, "↓↓", tone="broken")
+    return TableCell(value, "↓" if band.value < WANTED else "↑", tone="off")

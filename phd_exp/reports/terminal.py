@@ -12,7 +12,6 @@ from phd_exp.evaluation.point_errors import ErrorKey, Quantity
 from phd_exp.records.errors import one_line
 from phd_exp.reports.paper_tables import DIGITS, making_command
 from phd_exp.reports.runs import Report, Run
-from phd_exp.reports.shift_tables import DETAILS
 from phd_exp.reports.table import NOTHING, Table, TableCell
 
 WIDTH = 118  # columns, also if the output is not a terminal and rich would fall back to 80
@@ -21,10 +20,10 @@ OF_A_STAR = "* marks numbers that a terminal prints in bold."
 
 
 def print_report(report: Report, tables: Sequence[Table]) -> None:
-    """Print all tables, missing runs, notes, and every run with its state."""
+    """Print all tables except details, missing runs, notes, and every run with its state."""
     console = Console(width=max(WIDTH, Console().width), highlight=False)
     starred = not console.is_terminal
-    tables = [table for table in tables if table.kind != DETAILS]  # long; their files and pages have them
+    tables = [table for table in tables if table.reading != "details"]
     for table in tables:
         _print(console, table.title, style="bold")
         console.print(_grid(table, starred))

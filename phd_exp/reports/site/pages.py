@@ -16,7 +16,6 @@ from phd_exp.reports.fusion_table import fusion_table, headline
 from phd_exp.reports.paper import PUBLISHED
 from phd_exp.reports.quantities import SCORES, Quantity, quantity
 from phd_exp.reports.runs import Run
-from phd_exp.reports.shift_tables import shift_details
 from phd_exp.reports.site.overview import Drawn, Group
 from phd_exp.reports.table import Table
 
@@ -83,7 +82,6 @@ def run_page(drawn: Drawn, several: bool) -> str:
         scores=_score_rows(run),
         environment=_environment(run),
         charts=drawn.charts,
-        shifts=shift_details(run) if run.measured.shifts else None,
         fusion=fusion_table(run, run.measured.fusion) if run.measured.fusion else None,
     )
 

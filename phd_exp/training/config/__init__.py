@@ -12,7 +12,6 @@ from pydantic import BaseModel, BeforeValidator, Field, StrictBool, ValidationEr
 
 from phd_exp.records.choices import flatten, setting
 from phd_exp.records.errors import ConfigError, gist, shown
-from phd_exp.records.runs import HOME
 from phd_exp.records.spec import DatasetSpec, Shard
 from phd_exp.training.config.sections import (
     CameraConfig,
@@ -126,30 +125,18 @@ class RunConfig(Section):
         return self
 
     def data_of(self, shift: str) -> RenderedConfig | FolderConfig | SourceConfig:
-        """The data whose test samples a shift changes: other rendered scenes, or the run's own data.
-
-        Raises ValueError for keys or values that are not those of a rendered data set.
-        """
-        changes = self.evaluation.shifts[shift].data
-        if not changes:
-            return self.data
-        if not isinstance(self.data, RenderedConfig):
-            raise ValueError(f"expected rendered data, not data={self.data.name}; leave out this shift")
-        own = self.data.spec.model_dump() | {"variant": f"{self.data.name}-{shift}"}
-        sizes = {"n_test": self.evaluation.n_shifted or self.data.n_test}
-        return self.data.model_copy(update=sizes | {"spec": DatasetSpec(**(own | changes))})
-
-    @model_validator(mode="after")
-    def shifts_fit(self) -> "RunConfig":
-        """Refuse shifts to invalid data sets, and the name of the unchanged test samples."""
-        for name in self.evaluation.shifts:
-            try:
-                if name == HOME:
-                    raise ValueError("names the unchanged test samples; expected another name")
-                self.data_of(name)
-            except ValueError as error:
-                raise ValueError(f"evaluation.shifts.{name}.data: {gist(error)}") from None
-        return self
+        """The data whose test samples a shift changes. Raises ConfigError for values that no rendered set has."""
+        changes, data, n = self.evaluation.shifts[shift].data, self.data, self.evaluation.n_shifted
+        try:
+            if not isinstance(data, RenderedConfig):
+                if changes:
+                    raise ValueError(f"data={data.name} is not rendered; leave out this shift")
+                return data
+            named = {"variant": f"{data.name}-{shift}"} if changes else {}
+            spec = DatasetSpec(**(data.spec.model_dump() | named | changes))
+        except ValueError as error:
+            raise ConfigError(f"evaluation.shifts.{shift}.data: {gist(error)}") from None
+        return data.model_copy(update={"spec": spec, "n_test": n or data.n_test})
 
     @model_validator(mode="after")
     def several_views_fit(self) -> "RunConfig":

@@ -183,18 +183,8 @@ class MultiviewConfig(Section):
         return DatasetSpec(**(spec.model_dump() | changes))
 
 
-Times = Annotated[float, Field(ge=0.1, le=10)]
-
-
-class ImageChange(Section):
-    """A fixed change of every image: arguments of `Photometry`."""
-
-    brightness: Times = 1.0
-    contrast: Times = 1.0
-    gamma: Times = 1.0
-    blur: Annotated[float, Field(ge=0, le=20)] = 0.0
-    noise: Annotated[float, Field(ge=0, le=100)] = 0.0
-    jpeg: Annotated[Whole, Field(ge=1, le=100)] = 100
+Times = Annotated[float, Field(ge=0.1, le=100)]
+Change = Literal["brightness", "contrast", "gamma", "blur", "noise", "jpeg"]
 
 
 class ShiftConfig(Section):
@@ -202,12 +192,12 @@ class ShiftConfig(Section):
 
     Attributes:
         data: keys of the rendered data set with other values; none: the run's own test images.
-        images: changes of the images.
+        images: a fixed change of every image: arguments of `Photometry`.
         f_factor: factor of the focal length that the network receives; the images keep the true one.
     """
 
     data: dict[str, Any] = Field(default_factory=dict)
-    images: ImageChange = ImageChange()
+    images: dict[Change, Times] = Field(default_factory=dict)
     f_factor: Times = 1.0
 
 
