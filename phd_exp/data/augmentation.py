@@ -44,7 +44,7 @@ class Photometry:
     white_balance: float = 1.0
     blur: float = 0.0
     noise: float = 0.0
-    jpeg: int = 100
+    jpeg: float | int = 100
 
     @property
     def changes_anything(self) -> bool:

@@ -22,8 +22,8 @@ def record_views(
     Raises as `record`, and DatasetError if the data set is another one.
     """
     data.require(spec)
-    n = {"train": 0, "held_out": 0, "test": scenes * spec.views}
-    source = RenderedSource(data, spec, n, folder.config()["data"]["image_size"])
-    poses = [(*sample.pose.rotation, *sample.pose.translation) for sample in data.records("test", n["test"])]
+    n, side = scenes * spec.views, folder.config()["data"]["image_size"]
+    source = RenderedSource(data, spec, {"train": 0, "held_out": 0, "test": n}, side)
+    poses = [(*sample.pose.rotation, *sample.pose.translation) for sample in data.records("test", n)]
     more = dict(zip((*ROTATION, *TRANSLATION), map(list, zip(*poses, strict=True)), strict=True))
     record(folder, folder.views, source, origin, more, ShiftConfig())

@@ -30,7 +30,7 @@ def shift_tables(report: Report) -> list[Table]:
     presets = [list(alike) for _, alike in groupby(runs, key=lambda run: run.preset)]
     keys = [(key, axis) for key in (MAIN, *DETAILS) for axis in AXES]
     tables = [_matrix(alike, key, axis) for alike in presets for key, axis in keys]
-    return [table for table in tables if len(table.columns) > 1]
+    return [table for table in tables if table.numbers and len(table.columns) > 1]
 
 
 def _matrix(runs: Sequence[Run], key: str, axis: str) -> Table:
@@ -38,18 +38,18 @@ def _matrix(runs: Sequence[Run], key: str, axis: str) -> Table:
     found = sorted((name, shift.change) for run in runs for name, shift in run.measured.shifts.items())
     changes = {name: change for name, change in found if change and _axis(change) == axis}
     preset, names = runs[0].preset, (HOME, *changes)
-    labels = [(run, run.config.get("camera.focal_length", "")) for run in runs]
+    cameras = [run.config.get("camera.focal_length", "") for run in runs]
     rows = [
-        TableRow((run.data, camera, run.name), tuple(_cell(run, name, key) for name in names))
-        for run, camera in labels
+        TableRow((f"{run.data}, {camera}", run.name), tuple(_cell(run, name, key) for name in names))
+        for run, camera in zip(runs, cameras, strict=True)
     ]
     return Table(
         stem=file_stem("shifts", key, preset, axis),
         kind="shifts",
         title=f"{quantity(key).axis} under shift, {in_words(preset)}: {AXES[axis]}",
-        stub=("trained on", "camera", "run"),
+        stub=("trained on, camera", "run"),
         columns=tuple(map(printable, names)),
-        groups=tuple(tuple(alike) for _, alike in groupby(rows, key=lambda row: row.stub[0])),
+        groups=tuple(tuple(alike) for _, alike in groupby(rows, key=lambda row: row.stub[0].partition(",")[0])),
         notes=(
             OF_THE_MATRIX if key == MAIN else OF_THE_DETAILS,
             *(f"{printable(name)}: {change}." for name, change in changes.items()),
@@ -62,9 +62,9 @@ def _matrix(runs: Sequence[Run], key: str, axis: str) -> Table:
             | {"axis": axis, "shift": name, "n": shifts[name].n, "left_out": shifts[name].left_out}
             | {"quantity": key}
             | vars(shifts[name].scores[key])
-            for run, camera in labels
+            for run, camera in zip(runs, cameras, strict=True)
             for name in names
-            if key in (shifts := run.measured.shifts)[name].scores
+            if name in (shifts := run.measured.shifts) and key in shifts[name].scores
         ),
     )
 

@@ -71,8 +71,8 @@ def require_possible(config: RunConfig, folder: RunFolder) -> None:
     """Raise the errors that would stop the run later, before anything is rendered or written.
 
     RunError: the folder holds a run of another configuration, or cannot be written. ConfigError: no GPU, no key of
-    wandb, or values that a part of the model or the data of a shift refuses. DatasetError: a shift has another data set
-    in its folder.
+    wandb, or values that a part of the model or the data of a shift refuses. DatasetError: the folder of a
+    shift's data holds other data.
     """
     require_same_config(folder, config)
     folder.require_writable()

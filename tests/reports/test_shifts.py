@@ -1,5 +1,6 @@
 """The matrix of shifts: every cell recomputed from the recorded tables, and where it appears."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,10 @@ import pytest
 
 from phd_exp.records.runs import RunFolder
 from phd_exp.reports.files import all_tables, write_tables
-from phd_exp.reports.runs import read_report
+from phd_exp.reports.runs import Report, read_report
 from phd_exp.reports.shift_tables import shift_tables
+from phd_exp.reports.site import build
 from phd_exp.reports.terminal import print_report
-from tests.support.recorded import sited
 from tests.support.synthetic import write_run
 
 CHANGES = {
@@ -24,25 +25,35 @@ CHANGES = {
 OVERCONFIDENCE = {"occl": 1.0, "far": 1.6, "dark": 6.0, "f": 0.2}
 
 
-@pytest.fixture
-def runs(tmp_path: Path) -> list[RunFolder]:
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("shifts")
+
+
+@pytest.fixture(scope="module")
+def runs(place: Path) -> list[RunFolder]:
     """Two runs with shifts, of which the second lacks two, and one without."""
     found = []
     for seed, data in enumerate(("default", "occl")):
-        run = write_run(tmp_path / "runs", data, n=150)
+        run = write_run(place / "runs", data, n=150)
         run.write_config(run.config() | {"camera": {"focal_length": "shown"}})
         run.shifts.mkdir()
         for name in list(CHANGES)[: 4 - 2 * seed]:
-            other = write_run(tmp_path / f"{data}-{name}", data, n=120, overconfidence=OVERCONFIDENCE[name])
+            other = write_run(place / f"{data}-{name}", data, n=120, overconfidence=OVERCONFIDENCE[name])
             table = pq.read_table(other.predictions).replace_schema_metadata({"shift": CHANGES[name]})
             pq.write_table(table, run.shift(name))
         found.append(run)
-    write_run(tmp_path / "runs", "scale", n=50)
+    write_run(place / "runs", "scale", "mae_vz", n=50)
     return found
 
 
-def test_every_cell_is_recomputed(runs: list[RunFolder], tmp_path: Path) -> None:
-    tables = shift_tables(read_report(tmp_path / "runs"))
+@pytest.fixture(scope="module")
+def report(runs: list[RunFolder], place: Path) -> Report:
+    return read_report(place / "runs")
+
+
+def test_every_cell_is_recomputed(runs: list[RunFolder], report: Report) -> None:
+    tables = shift_tables(report)
     mains = [table for table in tables if table.reading != "details"]
     assert [table.columns for table in mains] == [("home", "occl"), ("home", "far"), ("home", "dark", "f")]
     for table in mains:
@@ -65,9 +76,9 @@ def test_every_cell_is_recomputed(runs: list[RunFolder], tmp_path: Path) -> None
     assert "far: data.z_range=[5, 7]." in mains[1].notes
 
 
-def test_each_score_has_a_matrix_and_one_csv_has_all(runs: list[RunFolder], tmp_path: Path) -> None:
-    tables = all_tables(read_report(tmp_path / "runs"))
-    folder = write_tables(tables, tmp_path / "report")
+def test_each_score_has_a_matrix_and_one_csv_has_all(runs: list[RunFolder], report: Report, tmp_path: Path) -> None:
+    tables = all_tables(report)
+    folder = write_tables(tables, tmp_path)
     csv = pd.read_csv(folder / "shifts.csv")
     at = csv[(csv["data"] == "default") & (csv["shift"] == "dark")].set_index("quantity")
     frame = pd.read_parquet(runs[0].shift("dark"))
@@ -84,14 +95,13 @@ def test_each_score_has_a_matrix_and_one_csv_has_all(runs: list[RunFolder], tmp_
 
 
 def test_the_terminal_prints_the_matrix_and_the_site_all(
-    runs: list[RunFolder], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    report: Report, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    report = read_report(tmp_path / "runs")
     print_report(report, all_tables(report))
     printed = capsys.readouterr().out
     assert "Inside the 90 % region (%) under shift" in printed
     assert "NLL (nats) under shift" not in printed
-    page = (sited(tmp_path / "runs", tmp_path) / "index.html").read_text()
+    page = build.write_site(report, all_tables(report), [], tmp_path).read_text()
     assert page.count('<td class="n broken">') == sum(
         cell.tone == "broken" for table in shift_tables(report) for row in table.rows for cell in row.cells
     )
@@ -99,12 +109,12 @@ def test_the_terminal_prints_the_matrix_and_the_site_all(
 
 
 def test_a_broken_table_is_a_note_of_its_run(runs: list[RunFolder], tmp_path: Path) -> None:
-    runs[0].shift("far").write_bytes(b"torn")
-    report = read_report(tmp_path / "runs", tmp_path)
-    broken, whole = (run for run in report.runs if run.data in ("default", "occl"))
+    run = RunFolder(tmp_path / "runs" / runs[0].path.relative_to(runs[0].path.parents[3]))
+    shutil.copytree(runs[0].path, run.path)
+    run.shift("far").write_bytes(b"torn")
+    (broken,) = read_report(tmp_path / "runs", tmp_path / "measured").runs
     assert (broken.state, broken.measured.shifts) == ("finished", {})
     assert any("far.parquet" in note for note in broken.notes)
-    assert whole.measured.shifts.keys() == {"home", "occl", "far"}
-    runs[0].shift("far").unlink()
-    again = read_report(tmp_path / "runs", tmp_path).runs[0]
+    run.shift("far").unlink()
+    (again,) = read_report(tmp_path / "runs", tmp_path / "measured").runs
     assert again.measured.shifts.keys() == {"home", "occl", "dark", "f"}, "measured again"
