@@ -39,7 +39,7 @@ class ShiftScores:
 
 
 def shift_scores(folder: Path, home: Columns, held_out: Columns | None) -> dict[str, ShiftScores]:
-    """Name of each shift in a folder -> its scores, `home` first; empty without a shift, or for point estimates.
+    """Name of each shift in a folder -> its scores, and those at `home`; empty without a shift, or for points.
 
     Raises RunError if a table cannot be read or lacks a column.
     """
@@ -49,7 +49,7 @@ def shift_scores(folder: Path, home: Columns, held_out: Columns | None) -> dict[
     for file in sorted(folder.glob("*.parquet")) if "level" in home else ():
         table, said = read_table(file), pq.read_schema(file).metadata or {}
         found[file.stem] = _scores(table, levels, one_line(said.get(b"shift", b"").decode(errors="replace")))
-    return {HOME: _scores(home, levels), **found} if found else {}
+    return found | {HOME: _scores(home, levels)} if found else {}
 
 
 def conformal_threshold(levels: np.ndarray, coverage: float) -> float | None:

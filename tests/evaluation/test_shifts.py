@@ -27,7 +27,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 def test_every_share_is_a_count(run: RunFolder) -> None:
     held_out = read_table(run.held_out)
     found = shift_scores(run.shifts, read_table(run.predictions), held_out)
-    assert list(found) == ["home", "odd"]
+    assert found.keys() == {"home", "odd"}
     odd = np.sort(held_out["level"][1::2])
     for name, file in (("home", run.predictions), ("odd", run.shift("odd"))):
         table = pd.read_parquet(file)
@@ -41,7 +41,7 @@ def test_every_share_is_a_count(run: RunFolder) -> None:
         sharpness = 1000 * np.sqrt(table["depth_variance"].mean())
         assert found[name].scores["depth_sharpness_mm"].value == pytest.approx(sharpness)
         assert (found[name].n, found[name].left_out) == (len(table), 0)
-    home, shifted = (found[name].scores["inside_90"] for name in found)
+    home, shifted = (found[name].scores["inside_90"] for name in ("home", "odd"))
     assert home.low <= 90 <= home.high
     assert shifted.high < 80
 
