@@ -16,7 +16,7 @@ VERBS = {
 OF_VERB = {
     "train": (
         *("model", "data", "preset", "recipe", "without", "experiment"),
-        *("backbone", "camera", "loss", "optimizer", "trainer", "logger", "callbacks"),
+        *("backbone", "camera", "loss", "optimizer", "trainer", "logger", "callbacks", "shift"),
     ),
     "render": ("data", "preset"),
 }

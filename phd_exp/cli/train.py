@@ -20,8 +20,8 @@ from phd_exp.training.config import RenderedConfig, RunConfig, check
 if TYPE_CHECKING:
     from phd_exp.inference.trained import TrainedRun
 
-NAMED = ("preset", "recipe", "data", "data.name", "model", "seed", "experiment")
-"""Choices with a place of their own in a run's name, and `experiment`, which only names several runs."""
+NAMED = ("preset", "recipe", "data", "data.name", "model", "seed", "experiment", "shift")
+"""Choices with a place of their own in a run's name, and groups that change no weight."""
 SHOWN = (
     "test/projected_error_mm",
     "test/depth_error_mm",
@@ -63,6 +63,7 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
     results = train(checked, folder, draw=_draw(), cores=cores, callbacks=callbacks)
     if several is not None and isinstance(data, RenderedConfig):
         _record_views(folder, *several, data.workers, cores)
+    _record_shifts(folder, checked, cores)
     print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
     for key in filter(results.__contains__, SHOWN):
         print(f"  {key} {_number(results[key])} (untrained {_number(results.get(f'untrained/{key}'))})")
@@ -114,14 +115,29 @@ def _record_views(
     run: RunFolder, scenes: DatasetFolder, spec: DatasetSpec, n: int, workers: int | None, cores: int
 ) -> None:
     """Render the missing views of `n` scenes and record the run's predictions of them, once."""
-    from phd_exp.inference.several_views import is_recorded, record_views
+    from phd_exp.inference.several_views import record_views
+    from phd_exp.inference.tables import is_recorded, origin_of
 
-    if is_recorded(run, spec, n):
-        return
-    ensure_rendered(scenes, spec, 0, n * spec.views, workers, cores)
-    if record_views(run, scenes, spec, n):
+    origin = origin_of(run, data=spec.fingerprint(), scenes=n)
+    if not is_recorded(run.views, origin):
+        ensure_rendered(scenes, spec, 0, n * spec.views, workers, cores)
+        record_views(run, scenes, spec, n, origin)
         count = "1 scene" if n == 1 else f"{n} scenes"
         print(f"{run.views}: {count} seen by {spec.views} cameras each")
+
+
+def _record_shifts(run: RunFolder, checked: RunConfig, cores: int) -> None:
+    """Render the missing samples of each shift and record the run's predictions of them, once."""
+    from phd_exp.inference.tables import is_recorded, origin_of_shift, record
+    from phd_exp.training.build import build_source
+
+    for name, shift in checked.evaluation.shifts.items():
+        file, origin, data = run.shift(name), origin_of_shift(run, checked, name), checked.data_of(name)
+        if not is_recorded(file, origin):
+            if isinstance(data, RenderedConfig):
+                ensure_rendered(DatasetFolder(data.folder), data.spec, 0, data.n_test, data.workers, cores)
+            record(run, file, build_source(data), origin, {}, shift)
+            print(f"{file}: recorded", flush=True)
 
 
 def _number(value: Any) -> str:
@@ -140,8 +156,9 @@ def standing(config: dict[str, Any], overrides: list[str]) -> str | None:
             return None
         if status.state == "running":
             return "running" if folder.is_held() else "exited without a result (killed or out of memory)"
-        several = config["evaluation"]["multiview"]["scenes"] > 0
-        is_whole = status.state == "finished" and (folder.views.exists() or not several)
+        files = [folder.views] if config["evaluation"]["multiview"]["scenes"] > 0 else []
+        files += map(folder.shift, config["evaluation"]["shifts"])
+        is_whole = status.state == "finished" and all(file.exists() for file in files)
         return "finished" if is_whole else status.error or "interrupted"
     except (KeyError, TypeError, AttributeError, OSError, RunError):  # the run itself will report it
         return None

@@ -46,7 +46,7 @@ class Photometry:
     white_balance: float = 1.0
     blur: float = 0.0
     noise: float = 0.0
-    jpeg: int = 100
+    jpeg: float | int = 100
 
     @property
     def changes_anything(self) -> bool:
@@ -59,6 +59,12 @@ class Photometry:
         """The images, changed by uniform numbers from -1 to 1."""
         result = [self._changed(one, row) for one, row in zip(image.numpy(), numbers.tolist(), strict=True)]
         return torch.from_numpy(np.stack(result))
+
+    def fixed(self, image: UInt8[Tensor, "batch height width 3"]) -> UInt8[Tensor, "batch height width 3"]:
+        """The images, each changed exactly up to every limit; only noise is drawn. Here, limits may be below 1."""
+        numbers = torch.ones(len(image), self.n_numbers)
+        numbers[:, 9:11] = 2 * torch.rand(len(image), 2, generator=torch.Generator().manual_seed(0)) - 1
+        return self(image, numbers)
 
     def _changed(self, image: NDArray[np.uint8], numbers: list[float]) -> NDArray[np.uint8]:
         picture = Image.fromarray(image)

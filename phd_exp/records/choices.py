@@ -38,6 +38,8 @@ WITHOUT_INFLUENCE = (
     "evaluation.every_n_epochs",
     "evaluation.held_out",
     "evaluation.multiview",
+    "evaluation.shifts",
+    "evaluation.n_shifted",
 )
 """Keys or sections that define how a run is computed, recorded and measured, but not its results' distribution."""
 

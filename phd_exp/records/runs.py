@@ -9,6 +9,7 @@
         predictions.parquet  per test sample: truth, parameters, estimate, errors
         held_out.parquet     the same for held-out training samples, for recalibration
         views.parquet        the same for scenes with several cameras, and their poses, if asked for
+        shifts/              the same for shifted test samples, a table NAME.parquet for each, if asked for
         calibration/         the calibration curves, as data (JSON) and as pictures (PNG)
         checkpoints/         last.ckpt; best.ckpt with callbacks=best_checkpoint
         wandb/               the same for wandb, ready for `wandb sync`; likewise for other loggers
@@ -38,6 +39,7 @@ from phd_exp.records.parsing import parse_json, parse_yaml
 from phd_exp.records.processes import held
 
 LAST_EPOCH = 10**9
+HOME = "home"  # the unchanged test samples, among shifts
 LARGEST = MB  # bytes of a configuration or of a run's numbers
 PACKAGES = ("phd_exp", "torch", "torchvision", "lightning", "hydra-core", "numpy")
 """Packages on which numbers depend, whose versions are recorded."""
@@ -86,6 +88,7 @@ class RunFolder:
         self.predictions = path / "predictions.parquet"
         self.held_out = path / "held_out.parquet"
         self.views = path / "views.parquet"
+        self.shifts = path / "shifts"
         self.results_file = path / "results.json"
         self.metrics_file = path / "metrics.jsonl"
         self.status_file = path / "status.json"
@@ -95,6 +98,10 @@ class RunFolder:
     def curves(self, name: str) -> Path:
         """Calibration curves, of an epoch or "final"; the picture, if there is one, has another suffix."""
         return self.calibration / f"{name}.json"
+
+    def shift(self, name: str) -> Path:
+        """Predictions of shifted test samples."""
+        return self.shifts / f"{name}.parquet"
 
     @property
     def last_checkpoint(self) -> Path:

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StrictBool
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StrictBool, model_serializer
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 
@@ -22,6 +22,7 @@ FocalLength = Annotated[Number, Field(ge=10, le=1e6)]
 # half a metre keeps the camera outside the largest object: a cube of 0.2 m, scaled by 2, reaches 0.35 m
 Distance = Annotated[Number, Field(ge=0.5, le=100)]
 Factor = Annotated[Number, Field(ge=0.1, le=2)]
+Share = Annotated[Number, Field(ge=0, le=1)]
 # beyond a right angle, half the cameras would face the lamps
 Angle = Annotated[Number, Field(ge=0, le=90)]
 Range = AfterValidator(_ascending)
@@ -50,6 +51,8 @@ class DatasetSpec(BaseModel):
         view_angle_range: bounds of the angle between the lines of sight of a further view and the first, degrees.
         image_format: png keeps every pixel, webp and jpeg are small.
         image_quality: of webp and jpeg, per cent.
+        saturation_range: bounds of the saturation of every colour; near 0 it is grey.
+        half_hidden: whether a panel in front of the cylinder hides half of it. It replaces the cube of `occluders`.
 
     Raises:
         pydantic.ValidationError: a missing or unknown key, a wrong type, a value out of range.
@@ -73,6 +76,14 @@ class DatasetSpec(BaseModel):
     view_angle_range: Annotated[tuple[Angle, Angle], Range]
     image_format: ImageFormat
     image_quality: Annotated[int, Field(strict=True, ge=1, le=100)]
+    saturation_range: Annotated[tuple[Share, Share], Range] = (0.45, 0.95)
+    half_hidden: StrictBool = False
+
+    @model_serializer(mode="wrap")
+    def _without_defaults(self, serialize: Any) -> dict[str, Any]:
+        # younger keys at their defaults are not written: fingerprints and manifests stay as they were
+        fields = type(self).model_fields
+        return {key: value for key, value in serialize(self).items() if getattr(self, key) != fields[key].default}
 
     def fingerprint(self) -> str:
         """Sixteen hexadecimal digits that identify the values, the same on every machine."""

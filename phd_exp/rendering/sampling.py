@@ -30,6 +30,7 @@ GENERATOR_VERSION = 2
 SIZE = 0.2  # m: height and diameter of the cylinder, side of the cube, diameter of the sphere
 CLEARANCE = 0.5  # m: least depth of an object in a further view
 MOST_TRIES = 10_000
+PANEL = (0.2, 0.4, 0.02)  # m: wider than half of the largest silhouette at its depth
 Stream = np.random.Generator
 
 
@@ -45,6 +46,7 @@ class Purpose(IntEnum):
     NOISE = 3
     OBJECT = 10  # plus 10 per shape, in the order of SHAPES; then POSE, LOOK or SCALE
     VIEW = 40  # followed by the view's number
+    PANEL = 50
 
 
 SHAPES: tuple[Shape, ...] = get_args(Shape)
@@ -80,6 +82,9 @@ def sample_scene(spec: DatasetSpec, split: Split, index: int) -> Scene:
     for place, shape in enumerate(SHAPES if spec.occluders else SHAPES[:1]):
         pose, look, size = (stream(Purpose.OBJECT + 10 * place + part) for part in (POSE, LOOK, SCALE))
         objects.append(_object(spec, shape, f, pose, look, size))
+    if spec.half_hidden:
+        panel = _panel(spec, objects[0].position, f, stream(Purpose.PANEL))
+        objects = [*(item for item in objects if item.shape != panel.shape), panel]
     scene = Scene(
         f=f,
         S=spec.sensor_size,
@@ -151,9 +156,23 @@ def _object(spec: DatasetSpec, shape: Shape, f: float, pose: Stream, look: Strea
         rotation=uniform_rotation(pose),
         dimensions=(SIZE, SIZE, SIZE),
         scale=_uniform(size, spec.scale_range),
-        colour=_colour(look),
+        colour=_colour(spec, look),
         material="metal" if look.random() < 0.5 else "rubber",
     )
+
+
+def _panel(spec: DatasetSpec, hidden: Vector, f: float, rng: Stream) -> SceneObject:
+    """A panel parallel to the image, with an edge through the line of sight to the centre of the hidden object.
+
+    A convex object that is symmetric about its centre has a symmetric silhouette, up to perspective: the edge halves
+    it.
+    """
+    panel = _object(spec, "cube", f, rng, rng, rng)
+    angle, depth = _uniform(rng, (0.0, math.tau)), _uniform(rng, (0.6, 0.8))
+    x, y, z = (depth * coordinate for coordinate in hidden)
+    middle = (x + 0.5 * PANEL[0] * math.cos(angle), y + 0.5 * PANEL[0] * math.sin(angle), z)
+    changes = {"position": middle, "rotation": about_axis((0.0, 0.0, 1.0), angle), "dimensions": PANEL, "scale": 1.0}
+    return panel.model_copy(update=changes)
 
 
 def _position(spec: DatasetSpec, f: float, rng: Stream) -> tuple[float, float, float]:
@@ -164,9 +183,9 @@ def _position(spec: DatasetSpec, f: float, rng: Stream) -> tuple[float, float, f
     return x, y, z
 
 
-def _colour(rng: Stream) -> tuple[float, float, float]:
-    """sRGB of any hue; not too grey, which would merge with the backdrop, and not too dark to show shading."""
-    hue, saturation, value = rng.random(), _uniform(rng, (0.45, 0.95)), _uniform(rng, (0.45, 0.95))
+def _colour(spec: DatasetSpec, rng: Stream) -> tuple[float, float, float]:
+    """sRGB of any hue; by default not too grey, which would merge with the backdrop; not too dark to show shading."""
+    hue, saturation, value = rng.random(), _uniform(rng, spec.saturation_range), _uniform(rng, (0.45, 0.95))
     r, g, b = colorsys.hsv_to_rgb(hue, saturation, value)
     return r, g, b
 

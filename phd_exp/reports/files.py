@@ -15,6 +15,7 @@ from phd_exp.reports.fusion_table import fusion_tables
 from phd_exp.reports.paper_tables import paper_tables
 from phd_exp.reports.runs import Report
 from phd_exp.reports.searches import search_tables
+from phd_exp.reports.shift_tables import shift_tables
 from phd_exp.reports.table import Table, TableCell, TableRow, write_text
 from phd_exp.reports.variations import variation_tables
 
@@ -36,6 +37,8 @@ SYMBOLS = {
     "×": r"$\times$",
     "≥": r"$\geq$",
     "≤": r"$\leq$",
+    "↓": r"$\downarrow$",
+    "↑": r"$\uparrow$",
     "–": "--",
     "†": r"\textsuperscript{\dag}",
     "‡": r"\textsuperscript{\ddag}",
@@ -51,8 +54,8 @@ OF_CONSTRAINTS = f"""\
 
 
 def all_tables(report: Report) -> list[Table]:
-    """The paper's tables, and the tables of calibration, variations, fusion and searches, if there are any."""
-    makers = (paper_tables, calibration_tables, variation_tables, fusion_tables, search_tables)
+    """The paper's tables; those of calibration, shifts, variations, fusion and searches, if there are any."""
+    makers = (paper_tables, calibration_tables, shift_tables, variation_tables, fusion_tables, search_tables)
     return [table for make in makers for table in make(report)]
 
 

@@ -17,6 +17,7 @@ from phd_exp.evaluation.fusion import FusionScores, fusion_scores
 from phd_exp.evaluation.parquet import Columns
 from phd_exp.evaluation.predictions import Evaluation, evaluate, fit_temperature, recalibrated
 from phd_exp.evaluation.several_views import read_views
+from phd_exp.evaluation.shifts import ShiftScores, shift_scores
 from phd_exp.records.errors import UserError, one_line
 from phd_exp.records.files import write_atomic
 from phd_exp.records.runs import RunFolder
@@ -48,6 +49,7 @@ class Measured:
     Attributes:
         before: evaluation of the recorded predictions.
         after: evaluation of the recalibrated predictions; None without held-out samples.
+        shifts: scores at home and under each shift; empty without a shift.
         images: a digest of data set and true positions, equal for runs tested on the same images.
     """
 
@@ -56,6 +58,7 @@ class Measured:
     temperature: Temperature | None = None
     fusion: FusionScores | None = None
     gallery: Gallery | None = None
+    shifts: dict[str, ShiftScores] = field(default_factory=dict)
     images: str = ""
     notes: list[str] = field(default_factory=list)
 
@@ -74,6 +77,7 @@ def measure(
         found["gallery"] = notes.attempt(lambda: make_gallery(predictions, config))
         if found["before"] and (left_out := found["before"].left_out):
             notes.append(f"{left_out} test samples are left out: a prediction was not finite")
+        found["shifts"] = notes.attempt(lambda: shift_scores(folder.shifts, predictions, held_out)) or {}
     if folder.views.exists():
         found["fusion"] = notes.attempt(lambda: fusion_scores(read_views(folder.views)))
     return Measured(**found, notes=notes)
@@ -121,6 +125,7 @@ def kept_or_measured(
 def _key(folder: RunFolder, config: Mapping[str, str]) -> str:
     """A digest of all inputs of a measurement: the run's tables, its images, this code."""
     files = [folder.predictions, folder.held_out, folder.views, folder.config_file, images_folder(config)]
+    files += sorted(folder.shifts.glob("*.parquet"))
     return hashlib.sha256(json.dumps([_code(), *map(_stamp, files)]).encode()).hexdigest()
 
 

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from phd_exp.records.errors import one_line
 from phd_exp.records.files import write_atomic
@@ -24,12 +24,14 @@ class TableCell:
         spread: its interval, with its marks.
         below: a second line, such as the paper's figure.
         bold: whether `ours` is significantly the best.
+        tone: how bad the number is: "off" for a warning, "broken" for a failure.
     """
 
     ours: str
     spread: str = ""
     below: str = ""
     bold: bool = False
+    tone: Literal["", "off", "broken"] = ""
 
 
 @dataclass(frozen=True)

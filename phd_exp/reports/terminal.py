@@ -15,13 +15,15 @@ from phd_exp.reports.runs import Report, Run
 from phd_exp.reports.table import NOTHING, Table, TableCell
 
 WIDTH = 118  # columns, also if the output is not a terminal and rich would fall back to 80
+TONES = {"": "", "off": "yellow", "broken": "red"}
 OF_A_STAR = "* marks numbers that a terminal prints in bold."
 
 
 def print_report(report: Report, tables: Sequence[Table]) -> None:
-    """Print all tables, missing runs, notes, and every run with its state."""
+    """Print all tables except details, missing runs, notes, and every run with its state."""
     console = Console(width=max(WIDTH, Console().width), highlight=False)
     starred = not console.is_terminal
+    tables = [table for table in tables if table.reading != "details"]
     for table in tables:
         _print(console, table.title, style="bold")
         console.print(_grid(table, starred))
@@ -77,7 +79,7 @@ def _grid(table: Table, starred: bool) -> Grid:
 
 
 def _cell(cell: TableCell, starred: bool) -> Text:
-    text = Text("*" if cell.bold and starred else "")
+    text = Text("*" if cell.bold and starred else "", style=TONES[cell.tone])
     text.append(cell.ours, style="bold" if cell.bold else "")
     if cell.spread:
         text.append(f" {cell.spread}")

@@ -28,7 +28,7 @@ from phd_exp.training.network import build_regressor, naming
 def build_data(config: RunConfig, rank: int = 0) -> PositionData:
     """The data set of a run, or of one of its processes. `setup` opens the images."""
     return PositionData(
-        _source(config.data),
+        build_source(config.data),
         batch_size=config.data.batch_size,
         seed=config.seed,
         rank=rank,
@@ -46,7 +46,8 @@ def build_augmentation(recipe: RecipeConfig) -> Augmentation | None:
     return augmentation if augmentation.changes_anything else None
 
 
-def _source(data: RenderedConfig | FolderConfig | SourceConfig) -> Source:
+def build_source(data: RenderedConfig | FolderConfig | SourceConfig) -> Source:
+    """The source of samples that a `data` section describes. Raises ConfigError, naming the key, for bad values."""
     if isinstance(data, FolderConfig):
         folder = DetectionFolder(data.folder)
         return FolderSource(folder, data.n_train, data.n_held_out, data.n_test, data.image_size)

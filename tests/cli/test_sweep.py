@@ -85,6 +85,12 @@ def test_how_a_run_stands_is_read_before_the_configuration_is_checked(
         raise ValueError("planted")
     found = [standing(job.config, job.overrides) for job in planned]
     assert found == [None, "ValueError: planted", "finished"]
+    (shifted,) = jobs(*planned[2].overrides, "shift=focal_length")
+    assert folder(shifted) == folder(planned[2]), "a shift does not change the run"
+    assert standing(shifted.config, shifted.overrides) == "interrupted"
+    runs[2].shifts.mkdir()
+    runs[2].shift("f_wrong").touch()
+    assert standing(shifted.config, shifted.overrides) == "finished"
     status = runs[1].status()
     assert status is not None
     runs[1].write_status(status.model_copy(update={"state": "running"}))

@@ -150,7 +150,33 @@ def test_several_views_use_the_data_set_multiview(checked: Callable) -> None:
     assert beside == checked("data=multiview", "data.sensor_size=256", "data.seed=3").data.spec
 
 
+@pytest.mark.parametrize("data", ["default", "occl", "scale", "occl_scale"])
+def test_shifts_to_the_variants_are_these_data_sets(checked: Callable, data: str) -> None:
+    config = checked(f"data={data}", "shift=[variants,scenes,images]", "evaluation.n_shifted=9", "data.seed=3")
+    for variant in ("default", "occl", "scale", "occl_scale"):
+        other = config.data_of(variant)
+        assert other.spec == checked(f"data={variant}", "data.seed=3").data.spec
+        assert (other.folder.name, other.n_test) == (variant, 9)
+    for name, key in {
+        "far": "z_range",
+        "long_f": "f_range",
+        "grey": "saturation_range",
+        "hidden": "half_hidden",
+    }.items():
+        own, other = config.data.spec, config.data_of(name).spec
+        assert {key for key in DatasetSpec.model_fields if getattr(own, key) != getattr(other, key)} == {
+            "variant",
+            key,
+        }
+        assert other.variant == f"{data}-{name}"
+    assert config.data_of("dark").spec == config.data.spec
+
+
 def test_older_records_without_several_views_are_valid(composed: Callable[..., dict[str, Any]]) -> None:
     config = composed()
-    del config["evaluation"]["multiview"]
+    for key in ("multiview", "shifts", "n_shifted"):
+        del config["evaluation"][key]
+    for key in ("saturation_range", "half_hidden"):
+        del config["data"][key]
     assert check(config).evaluation.multiview is None
+    assert check(config) == check(composed()).model_copy(update={"evaluation": check(config).evaluation})

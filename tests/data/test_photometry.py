@@ -1,8 +1,12 @@
 """Photometric changes: each does what it is named after, to the share of images that it is drawn for, and no more."""
 
+import io
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from phd_exp.data.augmentation import Photometry
@@ -90,3 +94,39 @@ def test_an_occluder_hides_a_convex_part_by_one_colour_and_the_original_stays() 
         assert len(image[hidden].unique(dim=0)) == 1
         middle = rows.double().mean().round().int(), columns.double().mean().round().int()
         assert hidden[middle]  # the centroid of a convex shape lies inside
+
+
+def compressed(image: np.ndarray, quality: int) -> np.ndarray:
+    stream = io.BytesIO()
+    Image.fromarray((255 * image).round().astype(np.uint8)).save(stream, format="jpeg", quality=quality)
+    return np.asarray(Image.open(stream)) / 255
+
+
+@pytest.mark.parametrize(
+    ("change", "reference", "tolerance"),
+    [
+        ({}, lambda image: image, 0),
+        ({"brightness": 0.5}, lambda image: 0.5 * image, 0.51 / 255),
+        ({"brightness": 2.0}, lambda image: (2 * image).clip(0, 1), 0.51 / 255),
+        ({"contrast": 0.5}, lambda image: 0.5 + 0.5 * (image - 0.5), 0.51 / 255),
+        ({"gamma": 0.5}, np.sqrt, 0.51 / 255),
+        ({"gamma": 2.0}, np.square, 0.51 / 255),
+        ({"blur": 2.0}, lambda image: gaussian_filter(image, (2, 2, 0), mode="nearest"), 0.03),
+        ({"jpeg": 30}, lambda image: compressed(image, 30), 0),
+    ],
+    ids=str,
+)
+def test_a_fixed_change_changes_every_image_alike(change: dict, reference: Callable, tolerance: float) -> None:
+    before = images(5)
+    after = Photometry(**change).fixed(before).double().numpy() / 255
+    for one in after:
+        np.testing.assert_allclose(one, reference(value(before)), atol=tolerance)
+
+
+def test_fixed_noise_differs_between_images_and_not_between_calls() -> None:
+    before = images(8)
+    noise = (Photometry(noise=10.0).fixed(before).double() - before).flatten(1)
+    np.testing.assert_allclose(noise.std(dim=1), 10, rtol=0.06)
+    correlation = np.corrcoef(noise.numpy()) - np.eye(len(noise))
+    assert np.abs(correlation).max() < 0.1
+    assert (noise == (Photometry(noise=10.0).fixed(before).double() - before).flatten(1)).all()

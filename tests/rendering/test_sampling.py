@@ -1,6 +1,7 @@
 """Scenes follow the paper's laws, depend on (seed, split, index) alone, and are paired across variants."""
 
 from collections.abc import Callable
+from colorsys import rgb_to_hsv
 
 import numpy as np
 import pytest
@@ -8,9 +9,9 @@ from scipy import stats
 
 from phd_exp.records.scenes import Scene
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.rays import rotation_matrix
+from phd_exp.rendering.rays import NOTHING, rotation_matrix, trace_pixels, truncation, visibility
 from phd_exp.rendering.sampling import sample_scene
-from tests.support.renders import VARIANTS
+from tests.support.renders import VARIANTS, with_objects
 
 MakeSpec = Callable[..., DatasetSpec]
 MANY = 1000
@@ -135,3 +136,35 @@ def test_light_tells_depth_less_than_its_jitter_hides(make_spec: MakeSpec) -> No
 
     near, far = np.log(light(3.0)), np.log(light(5.0))
     assert abs(np.mean(near - far)) < np.std(near)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_panel_hides_half_of_the_cylinder_and_changes_nothing_else(make_spec: MakeSpec, variant: str) -> None:
+    visible, widths = [], []
+    for index in range(100):
+        plain = sample_scene(make_spec(variant, xy_range=0.5), "test", index)
+        scene = sample_scene(make_spec(variant, xy_range=0.5, half_hidden=True), "test", index)
+        *others, panel = scene.objects
+        assert others == [item for item in plain.objects if item.shape != "cube"], "paired"
+        assert scene.model_copy(update={"objects": plain.objects}) == plain
+        assert 0.6 * plain.objects[0].position[2] <= panel.position[2] <= 0.8 * plain.objects[0].position[2]
+        alone = with_objects(scene, scene.objects[0], panel)
+        if truncation(alone, trace_pixels(alone)) == 0:
+            visible.append(visibility(trace_pixels(alone)))
+            widths.append((trace_pixels(alone).surfaces[1] != NOTHING).mean())
+    assert len(visible) > 50
+    assert np.mean(visible) == pytest.approx(0.5, abs=0.01)
+    np.testing.assert_allclose(visible, 0.5, atol=0.12)  # a cylinder seen along its axis has a frustum's silhouette
+    assert min(widths) > 0.02
+
+
+def test_grey_scenes_have_the_same_hues_and_values(make_spec: MakeSpec) -> None:
+    for index in range(20):
+        plain = sample_scene(make_spec("occl"), "test", index)
+        grey = sample_scene(make_spec("occl", saturation_range=(0.0, 0.1)), "test", index)
+        for before, after in zip(plain.objects, grey.objects, strict=True):
+            (h, s, v), (h_after, s_after, v_after) = (rgb_to_hsv(*item.colour) for item in (before, after))
+            assert 0 <= s_after <= 0.1 < 0.45 <= s <= 0.95
+            assert (s_after / 0.1, v_after) == pytest.approx(((s - 0.45) / 0.5, v), abs=1e-9)
+            assert h_after == pytest.approx(h, abs=1e-6) or abs(h_after - h) > 1 - 1e-6
+            assert after.model_copy(update={"colour": before.colour}) == before

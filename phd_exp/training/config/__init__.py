@@ -11,8 +11,8 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, BeforeValidator, Field, StrictBool, ValidationError, ValidationInfo, model_validator
 
 from phd_exp.records.choices import flatten, setting
-from phd_exp.records.errors import ConfigError, shown
-from phd_exp.records.spec import Shard
+from phd_exp.records.errors import ConfigError, gist, shown
+from phd_exp.records.spec import DatasetSpec, Shard
 from phd_exp.training.config.sections import (
     CameraConfig,
     DataConfig,
@@ -123,6 +123,20 @@ class RunConfig(Section):
                 "images are only ever shrunk"
             )
         return self
+
+    def data_of(self, shift: str) -> RenderedConfig | FolderConfig | SourceConfig:
+        """The data whose test samples a shift changes. Raises ConfigError for values that no rendered set has."""
+        changes, data, n = self.evaluation.shifts[shift].data, self.data, self.evaluation.n_shifted
+        try:
+            if not isinstance(data, RenderedConfig):
+                if changes:
+                    raise ValueError(f"data={data.name} is not rendered; leave out this shift")
+                return data
+            named = {"variant": f"{data.name}-{shift}"} if changes else {}
+            spec = DatasetSpec(**(data.spec.model_dump() | named | changes))
+        except ValueError as error:
+            raise ConfigError(f"evaluation.shifts.{shift}.data: {gist(error)}") from None
+        return data.model_copy(update={"spec": spec, "n_test": n or data.n_test})
 
     @model_validator(mode="after")
     def several_views_fit(self) -> "RunConfig":

@@ -195,6 +195,24 @@ class MultiviewConfig(Section):
         return DatasetSpec(**(spec.model_dump() | changes))
 
 
+Times = Annotated[float, Field(ge=0.1, le=100)]
+Change = Literal["brightness", "contrast", "gamma", "blur", "noise", "jpeg"]
+
+
+class ShiftConfig(Section):
+    """A change of the test samples.
+
+    Attributes:
+        data: keys of the rendered data set with other values; none: the run's own test images.
+        images: a fixed change of every image: arguments of `Photometry`.
+        f_factor: factor of the focal length that the network receives; the images keep the true one.
+    """
+
+    data: dict[str, Any] = Field(default_factory=dict)
+    images: dict[Change, Times] = Field(default_factory=dict)
+    f_factor: Times = 1.0
+
+
 class EvaluationConfig(Section):
     """What is evaluated, and in which epochs."""
 
@@ -203,6 +221,8 @@ class EvaluationConfig(Section):
     every_n_epochs: Count = 1  # default for older run records
     held_out: StrictBool = False  # whether the held-out samples are evaluated too, for callbacks that monitor them
     multiview: MultiviewConfig | None = None  # default for older run records
+    shifts: dict[Name, ShiftConfig] = Field(default_factory=dict)  # default for older run records
+    n_shifted: Count | None = None  # default for older run records
 
     @model_validator(mode="after")
     def calibration_is_evaluated(self) -> "EvaluationConfig":

@@ -3,7 +3,7 @@
 import inspect
 from collections.abc import Mapping
 from importlib import import_module
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, get_args, get_origin
 
 from pydantic import (
     AfterValidator,
@@ -176,7 +176,8 @@ def _valid_keys(model: Any, location: list[str]) -> list[str]:
         if name.startswith("<"):
             model = next(get_args(member)[0] for member in get_args(model) if Tag(name) in get_args(member))
         else:
-            model = model.model_fields[name].annotation
+            # of a mapping from names to sections, the section
+            model = get_args(model)[1] if get_origin(model) is dict else model.model_fields[name].annotation
     model = next((member for member in get_args(model) if inspect.isclass(member)), model)  # of Section | None
     fields = dict(model.model_fields)
     inlined = fields.pop("spec", None)

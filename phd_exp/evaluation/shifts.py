@@ -1,0 +1,73 @@
+"""Measures a run's predictions of its test samples at home and under shifts."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import torch
+from torch import Tensor
+
+from phd_exp.evaluation.parquet import Columns, read_table, require_columns
+from phd_exp.evaluation.point_errors import RESAMPLES, SEED
+from phd_exp.evaluation.predictions import ERRORS, band_of
+from phd_exp.evaluation.reference import Band
+from phd_exp.metrics.bootstrap import bands, means
+from phd_exp.metrics.calibration_scores import COLUMNS, calibration_scores, ordered
+from phd_exp.records.errors import one_line
+from phd_exp.records.runs import HOME
+
+MEASURED = (*COLUMNS, *ERRORS, "nll")
+
+
+@dataclass(frozen=True)
+class ShiftScores:
+    """The scores of n samples; `left_out` further samples had values that are not finite.
+
+    Attributes:
+        change: the shift in words; empty at home.
+        scores: means of `MEASURED`, the `calibration_scores`, and the per cent of truths inside credible regions:
+            `inside_50`, `inside_90`, `inside_99`, and `inside_conformal` if there are enough held-out samples.
+    """
+
+    change: str
+    n: int
+    left_out: int
+    scores: dict[str, Band]
+
+
+def shift_scores(folder: Path, home: Columns, held_out: Columns | None) -> dict[str, ShiftScores]:
+    """Name of each shift in a folder -> its scores, and those at `home`; empty without a shift, or for points.
+
+    Raises RunError if a table cannot be read or lacks a column.
+    """
+    found, levels = {}, {"50": 0.5, "90": 0.9, "99": 0.99}
+    if held_out and (threshold := conformal_threshold(held_out.get("level", np.empty(0)), 0.9)) is not None:
+        levels["conformal"] = threshold
+    for file in sorted(folder.glob("*.parquet")) if "level" in home else ():
+        table, said = read_table(file), pq.read_schema(file).metadata or {}
+        found[file.stem] = _scores(table, levels, one_line(said.get(b"shift", b"").decode(errors="replace")))
+    return found | {HOME: _scores(home, levels)} if found else {}
+
+
+def conformal_threshold(levels: np.ndarray, coverage: float) -> float | None:
+    """The ceil((n + 1) coverage)-th smallest of the n odd held-out levels; None for too few."""
+    odd = np.sort(levels[1::2])
+    rank = math.ceil((len(odd) + 1) * coverage)
+    return float(odd[rank - 1]) if rank <= len(odd) else None
+
+
+def _scores(table: Columns, levels: Mapping[str, float], change: str = "") -> ShiftScores:
+    require_columns(MEASURED, table)
+    columns = {name: torch.from_numpy(table[name]) for name in MEASURED}
+    finite = torch.stack(list(columns.values())).isfinite().all(0)
+    columns = {name: column[finite] for name, column in columns.items()}
+    columns |= {f"inside_{name}": 100.0 * (columns["level"] <= level) for name, level in levels.items()}
+    found = {name: band_of(interval) for name, interval in bands(_statistic, columns, RESAMPLES, SEED).items()}
+    return ShiftScores(change, int(finite.sum()), int((~finite).sum()), found)
+
+
+def _statistic(columns: Mapping[str, Tensor], counts: Tensor) -> dict[str, Tensor]:
+    return means(columns, counts) | calibration_scores(ordered(columns, counts))

@@ -1,0 +1,89 @@
+"""Tests under distribution shift: for each score a matrix of runs by shifts, first the share inside 90 % regions."""
+
+from collections.abc import Sequence
+from itertools import groupby
+
+from phd_exp.records.choices import in_words
+from phd_exp.records.runs import HOME
+from phd_exp.reports.quantities import quantity
+from phd_exp.reports.runs import Report, Run
+from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem, printable
+
+AXES = {"variants": "data sets", "scenes": "scenes", "images": "images and focal lengths"}
+"""Axis of the shifts -> its name in a title."""
+MAIN = "inside_90"
+WANTED, LEAST = 90, 80  # per cent inside the 90 % region: of a calibrated run, and below which the promise is broken
+DETAILS = (
+    *("inside_50", "inside_99", "inside_conformal", "projected_error_mm", "depth_error_mm", "nll"),
+    *("depth_ence", "projected_ence", "depth_sharpness_mm", "projected_sharpness_mrad"),
+)
+OF_THE_MATRIX = (
+    f"Per cent of truths inside the predicted 90 % region. Arrow: the 95 % interval excludes {WANTED} %; two: fewer "
+    f"than {LEAST} % are inside. Home: the unchanged test samples. The files and the site have all scores."
+)
+OF_THE_DETAILS = "In brackets: 95 % bootstrap intervals over test samples. Home: the unchanged test samples."
+
+
+def shift_tables(report: Report) -> list[Table]:
+    """For every preset with shifts a matrix for each score and each axis."""
+    runs = [run for run in report.runs if run.measured.shifts]
+    presets = [list(alike) for _, alike in groupby(runs, key=lambda run: run.preset)]
+    keys = [(key, axis) for key in (MAIN, *DETAILS) for axis in AXES]
+    tables = [_matrix(alike, key, axis) for alike in presets for key, axis in keys]
+    return [table for table in tables if table.numbers and len(table.columns) > 1]
+
+
+def _matrix(runs: Sequence[Run], key: str, axis: str) -> Table:
+    """A row for each run of a preset, a column for each shift of an axis."""
+    found = sorted((name, shift.change) for run in runs for name, shift in run.measured.shifts.items())
+    changes = {name: change for name, change in found if change and _axis(change) == axis}
+    preset, names = runs[0].preset, (HOME, *changes)
+    cameras = [run.config.get("camera.focal_length", "") for run in runs]
+    rows = [
+        TableRow((f"{run.data}, {camera}", run.name), tuple(_cell(run, name, key) for name in names))
+        for run, camera in zip(runs, cameras, strict=True)
+    ]
+    return Table(
+        stem=file_stem("shifts", key, preset, axis),
+        kind="shifts",
+        title=f"{quantity(key).axis} under shift, {in_words(preset)}: {AXES[axis]}",
+        stub=("trained on, camera", "run"),
+        columns=tuple(map(printable, names)),
+        groups=tuple(tuple(alike) for _, alike in groupby(rows, key=lambda row: row.stub[0].partition(",")[0])),
+        notes=(
+            OF_THE_MATRIX if key == MAIN else OF_THE_DETAILS,
+            *(f"{printable(name)}: {change}." for name, change in changes.items()),
+        ),
+        below="95 %",
+        preset=preset,
+        reading="" if key == MAIN else "details",
+        numbers=tuple(
+            {"preset": preset, "data": run.data, "model": run.model, "run": run.name, "camera": camera}
+            | {"axis": axis, "shift": name, "n": shifts[name].n, "left_out": shifts[name].left_out}
+            | {"quantity": key}
+            | vars(shifts[name].scores[key])
+            for run, camera in zip(runs, cameras, strict=True)
+            for name in names
+            if name in (shifts := run.measured.shifts) and key in shifts[name].scores
+        ),
+    )
+
+
+def _axis(change: str) -> str:
+    if change.startswith("data."):
+        return "variants" if "data.variant=" in change else "scenes"
+    return "images"
+
+
+def _cell(run: Run, name: str, key: str) -> TableCell:
+    band = run.measured.shifts[name].scores.get(key) if name in run.measured.shifts else None
+    if band is None:
+        return TableCell(NOTHING)
+    value, low, high = map(quantity(key).text, (band.value, band.low, band.high))
+    if key != MAIN:
+        return TableCell(value, below=f"({low}–{high})")
+    if band.low <= WANTED <= band.high:
+        return TableCell(value)
+    if band.value < LEAST:
+        return TableCell(value, "↓↓", tone="broken")
+    return TableCell(value, "↓" if band.value < WANTED else "↑", tone="off")
