@@ -62,7 +62,9 @@ def test_the_volume_is_that_of_the_positions_up_to_the_level(distribution: Proje
     random = np.random.default_rng(1)
     low, high = region.depth_interval()
     z = random.uniform(low, high, n)
-    widest = np.sqrt(max(np.square(distribution.whiten(torch.from_numpy(border(distribution, level))).numpy()).sum(-1)))
+    widest = np.sqrt(
+        max(np.square(distribution.whiten(torch.from_numpy(border(distribution, level))).numpy()).sum(-1))
+    )
     q = random.uniform(-1.05 * widest, 1.05 * widest, (n, 2))
     A_xy = distribution.A.numpy() / float(distribution.mu_z)
     xy = z[:, None] * distribution.mu_xy.numpy() + np.linalg.solve(A_xy, q.T).T
