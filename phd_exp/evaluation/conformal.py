@@ -109,6 +109,8 @@ def fused_guarantee(file: Path, k: int, coverage: float, temperature: Temperatur
 
 def threshold(scores: Float[np.ndarray, " samples"], coverage: float, samples: str) -> float:
     """The k-th smallest score. Raises RunError with the number of `samples` needed if there are fewer than k."""
+    if not 0 < coverage < 1:
+        raise RunError(f"coverage: got {coverage}; expected a probability between 0 and 1, such as 0.9")
     n, c = len(scores), Fraction(str(coverage))  # exact: 10 * 0.9 is 9
     k = math.ceil((n + 1) * c)
     if k > n:

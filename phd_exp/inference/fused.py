@@ -78,9 +78,8 @@ def fused_region(answer: Mapping[str, Any], guarantees: Mapping[int, dict[str, A
     facts, mean = guarantees[len(answer["file_names"])], np.array(answer["mean"])
     scaled = facts["squared_mahalanobis"] * np.array(answer["covariance"])
     reach, volume = np.sqrt(scaled.diagonal()), 4 / 3 * np.pi * np.sqrt(np.linalg.det(scaled))
-    return {
-        "region": facts | {"extent": rounded(np.stack([mean - reach, mean + reach], -1)), "volume": rounded(volume)}
-    }
+    extent = rounded(np.stack([mean - reach, mean + reach], -1))
+    return {"region": facts | {"extent": extent, "volume": rounded(volume)}}
 
 
 def layout(counts: Sequence[int]) -> tuple[Int[Tensor, "scenes cameras"], Bool[Tensor, "scenes cameras"]]:

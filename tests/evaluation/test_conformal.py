@@ -92,6 +92,12 @@ def test_too_few_samples_are_an_error_with_the_number_needed(coverage: float, ne
         guarantee({name: column[:-1] for name, column in held_out.items()}, coverage, None, None)
 
 
+@pytest.mark.parametrize("coverage", [0.0, 1.0, -1.0, 90.0, math.nan])
+def test_a_coverage_is_between_0_and_1(coverage: float) -> None:
+    with pytest.raises(RunError, match=r"^coverage: got .*; expected a probability between 0 and 1"):
+        threshold(np.ones(100), coverage, "samples")
+
+
 @pytest.mark.parametrize("groups", QUANTITIES)
 @pytest.mark.parametrize("overconfidence", [0.5, 2.0])
 def test_every_group_is_covered(groups: str | None, overconfidence: float) -> None:
