@@ -3,9 +3,9 @@
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from phd_exp.records.detections import Detection
 from phd_exp.records.errors import ConfigError, complaint, nearest
@@ -85,6 +85,8 @@ class RunArguments(Arguments):
     """the folder of a run"""
     recalibrate: bool = False
     """apply the temperatures that fit the run's held-out samples"""
+    coverage: Annotated[float, Field(gt=0, lt=1)] | None = None
+    """probability of regions that contain the true position, guaranteed by held-out samples"""
     trust: str | None = None
     """packages of the user's own parts that the run names, separated by commas; their code is executed"""
 

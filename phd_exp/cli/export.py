@@ -25,7 +25,7 @@ def main(words: list[str]) -> int:
     output_folder(file.parent)
     from phd_exp.inference.onnx import CHECKED, TOLERANCE, export
 
-    deviation = export(predictor, file)
+    deviation = export(predictor, file, arguments.coverage)
     print(f"{file}: {file.stat().st_size / 1e6:.1f} MB")
     print(
         f"  largest relative deviation from torch over {sum(CHECKED)} images, in batches of "

@@ -13,6 +13,7 @@ from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_fol
 from phd_exp.records.detections import Observed, detections_in, observed
 from phd_exp.records.errors import ConfigError, listed
 from phd_exp.records.files import write_atomic
+from phd_exp.records.runs import RunFolder
 
 PLANE = four_numbers("plane=NX,NY,NZ,OFFSET: the points v with normal . v = offset, metres")
 
@@ -66,9 +67,12 @@ def _answers(arguments: FuseArguments, scenes: Sequence[Observed]) -> list[dict[
     # imports of seconds, which follow the checks of the arguments
     import torch
 
+    from phd_exp.evaluation.conformal import fused_guarantee
     from phd_exp.fusion import Plane
-    from phd_exp.inference.fused import fused_answers
+    from phd_exp.inference.fused import fused_answers, fused_region
 
+    if arguments.plane and arguments.coverage:
+        raise ConfigError("coverage: holds for scenes like the run's recorded ones, which have no plane; omit plane=")
     predictor = loaded(arguments)
     if not predictor.is_probabilistic:
         raise ConfigError(
@@ -78,4 +82,9 @@ def _answers(arguments: FuseArguments, scenes: Sequence[Observed]) -> list[dict[
     numbers = torch.tensor(arguments.plane or (), dtype=torch.float64)
     plane = Plane(numbers[:3], numbers[3]) if arguments.plane else None
     detections = [detection for scene in scenes for detection in scene.detections]
-    return fused_answers(scenes, predicted(predictor, detections), predictor, plane)
+    guarantees = {}
+    if arguments.coverage:
+        views, cameras = RunFolder(arguments.run).views, {len(scene.detections) for scene in scenes}
+        guarantees = {k: fused_guarantee(views, k, arguments.coverage, predictor.temperature) for k in cameras}
+    answers = fused_answers(scenes, predicted(predictor, detections), predictor, plane)
+    return [answer | fused_region(answer, guarantees) for answer in answers] if guarantees else answers

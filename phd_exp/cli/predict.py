@@ -4,7 +4,7 @@ import json
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import model_validator
 
@@ -44,6 +44,8 @@ class PredictArguments(RunArguments):
     """LEFT,TOP,RIGHT,BOTTOM of the object, px; by default the whole image"""
     out: Path | None = None
     """a folder for predictions.jsonl and a picture for each line; by default lines are printed"""
+    groups: Literal["spread", "truncation", "focal_length"] | None = None
+    """with coverage=: guarantee it in each of four groups of predictions by this quantity"""
     calibration: bool = False
     """draw the run's calibration curve of depth into the pictures"""
 
@@ -64,6 +66,8 @@ class PredictArguments(RunArguments):
                 f"{next(iter(self.camera))}: belongs to image=FILE; for a folder, write it into each line of "
                 "metadata.jsonl"
             )
+        if self.groups and not self.coverage:
+            raise ValueError("groups: guarantees a coverage; expected coverage=0.9, or another in (0, 1), too")
         if self.calibration and self.out is None:
             raise ValueError("calibration: is drawn into the pictures; expected out=DIR too")
         return self
@@ -82,14 +86,15 @@ def main(words: list[str]) -> int:
         _require_possible(detections, out)
         output_folder(out)
     predictor = loaded(arguments)
+    guarantee = predictor.guarantee(arguments.coverage, arguments.groups) if arguments.coverage else None
     curve = _depth_curve(arguments.run, predictor) if arguments.calibration else None
     if out is not None:
-        _write(predictor, detections, out, curve)
+        _write(predictor, detections, out, curve, guarantee)
         return 0
     from phd_exp.inference.answers import answer
 
     for sighting in predicted(predictor, detections):
-        print(json.dumps(answer(sighting, predictor.temperature), allow_nan=False), flush=True)
+        print(json.dumps(answer(sighting, predictor.temperature, guarantee), allow_nan=False), flush=True)
     return 0
 
 
@@ -100,7 +105,7 @@ def _require_possible(detections: list[Detection], out: Path) -> None:
         raise ConfigError(f"out={out}: holds the images themselves; choose another folder")
 
 
-def _write(predictor: "Predictor", detections: list[Detection], out: Path, curve: dict[str, Any] | None) -> None:
+def _write(predictor: "Predictor", detections: list[Detection], out: Path, curve: Any, guarantee: Any) -> None:
     """Write each line of `predictions.jsonl` before its picture, whose name begins with the line's number."""
     from phd_exp.inference.answers import answer
     from phd_exp.inference.pictures import picture
@@ -111,9 +116,9 @@ def _write(predictor: "Predictor", detections: list[Detection], out: Path, curve
         for number, sighting in enumerate(predicted(predictor, detections), start=1):
             stem = Path(sighting.detection.line.file_name).stem[:LONGEST_STEM]
             name = f"{number:0{len(str(len(detections)))}}-{stem}.png"
-            line = answer(sighting, temperature) | {"picture": name}
+            line = answer(sighting, temperature, guarantee) | {"picture": name}
             lines.write(json.dumps(line, allow_nan=False) + "\n")
-            write_atomic(out / name, picture(sighting, temperature is not None, curve))
+            write_atomic(out / name, picture(sighting, temperature is not None, curve, guarantee))
     print(f"{file}, and a picture for each line", file=sys.stderr)
 
 

@@ -37,7 +37,7 @@ class Batch:
     def __len__(self) -> int:
         return len(self.row)
 
-    def select(self, rows: Int[Tensor, " rows"]) -> "Batch":
+    def select(self, rows: Int[Tensor, " rows"] | slice) -> "Batch":
         """The samples of these rows."""
         return Batch(self.image[rows], self.xyz[rows], self.f[rows], self.S, self.row[rows])
 

@@ -7,13 +7,14 @@ from lightning import LightningDataModule
 from phd_exp.data.batches import Augment, Batch, BatchLoader
 from phd_exp.data.sources import PARTS, Part, Source
 from phd_exp.records.errors import ConfigError
+from phd_exp.records.runs import CHOOSE
 
 
 class PositionData(LightningDataModule):
     """The samples of a source in batches, or the share of one of several processes (`rank` of `world`).
 
     `augment` changes training batches only. The validation evaluates the test samples, which choose nothing, and with
-    `held_out` also the held-out samples.
+    `held_out` also the held-out samples that may choose.
 
     Raises ConfigError if there are too few samples for one batch, or if the processes cannot share them; on `setup`,
     DatasetError if the source lacks samples or an image is damaged.
@@ -57,16 +58,16 @@ class PositionData(LightningDataModule):
         return self.train_batches
 
     def val_dataloader(self) -> list[BatchLoader]:
-        return [self.in_order(part) for part in self.validated]
+        return [self.in_order(part, CHOOSE if part == "held_out" else slice(None)) for part in self.validated]
 
     def test_dataloader(self) -> BatchLoader:
         return self.in_order("test")
 
     predict_dataloader = test_dataloader
 
-    def in_order(self, part: Part) -> BatchLoader:
-        """Every sample of a part once, in the order of the data set."""
-        return self.batches(self.samples[part], shuffle=False)
+    def in_order(self, part: Part, rows: slice = slice(None)) -> BatchLoader:
+        """Every sample of a part, or of some rows, once, in the order of the data set."""
+        return self.batches(self.samples[part].select(rows), shuffle=False)
 
     # Lightning restores the state of a datamodule always, that of a loader in the middle of an epoch only
     def state_dict(self) -> dict[str, int]:
@@ -83,5 +84,6 @@ def _require_shares(source: Source, batch_size: int, world: int) -> None:
             "gradients is that of the batch only if all shares are of one size"
         )
     for part in PARTS:
-        if 0 < (n := source.count(part)) < world:
-            raise ConfigError(f"trainer.devices: got {world}, more than the {n} samples of {part} that there are")
+        rows = range(source.count(part))[CHOOSE if part == "held_out" else slice(None)]
+        if 0 < len(rows) < world:
+            raise ConfigError(f"trainer.devices: got {world}, more than the {len(rows)} samples of {part} in a pass")

@@ -23,7 +23,7 @@ Known = Mapping[str, Sequence[Any]]
 
 
 class Source(ABC):
-    """Abstract base class: samples for training, recalibration and testing, all of one image size.
+    """Abstract base class: samples to train, to choose and guarantee, and to test, all of one image size.
 
     Held-out samples are never used for training; there may be none.
 

@@ -1,1 +1,1 @@
-"""Evaluates recorded predictions: scores, strata, temperatures, fusion. Imports no network."""
+"""Evaluates recorded predictions: scores, strata, temperatures, guarantees, fusion. Imports no network."""

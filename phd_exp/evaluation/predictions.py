@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 import pyarrow as pa
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
@@ -21,6 +22,7 @@ from phd_exp.metrics.errors import MILLIMETRES
 from phd_exp.metrics.scores import DRAWS, energy_score
 from phd_exp.metrics.strata import strata
 from phd_exp.records.errors import RunError
+from phd_exp.records.runs import CHOOSE
 
 ERRORS = ("projected_error_mm", "depth_error_mm")
 OF_A_DISTRIBUTION = (*PARAMETERS, *COLUMNS, *ERRORS, "nll", "energy_score")
@@ -107,13 +109,13 @@ def evaluate(table: pa.Table | Columns, window: int = 200, resamples: int = 200)
 
 
 def fit_temperature(held_out_table: pa.Table | Columns) -> Temperature:
-    """The temperatures fitted on predictions of samples that were held out of training.
+    """The temperatures fitted on predictions of held-out samples, those that may choose.
 
     Raises RunError if a column is missing, or if no temperature fits.
     """
-    columns, _ = _finite(arrays(held_out_table), (*PARAMETERS, *XYZ))
+    distribution, xyz, _ = at_temperature(held_out_table, None, CHOOSE)
     try:
-        return Temperature.fit(_distribution(columns), _positions(columns))
+        return Temperature.fit(distribution, xyz)
     except ValueError as error:
         raise RunError(f"predictions: no temperature fits them ({error})") from None
 
@@ -131,16 +133,27 @@ def recalibrated(table: pa.Table | Columns, temperature: Temperature) -> dict[st
         >>> recalibrated(table | xyz, Temperature(projected=2.0, depth=4.0))["a"].tolist()
         [0.25]
     """
-    recorded = arrays(table)
+    distribution, xyz, kept = at_temperature(table, temperature)
+    changed = distribution_columns(distribution, xyz)
+    changed["energy_score"] = energy_score(draws(distribution, DRAWS, SEED), xyz)
+    return kept | {name: column.numpy() for name, column in changed.items()}
+
+
+def at_temperature(
+    table: pa.Table | Columns, temperature: Temperature | None, rows: slice = slice(None)
+) -> tuple[ProjectedHuber, Float[Tensor, "samples 3"], dict[str, np.ndarray]]:
+    """Predictions (None: as trained), true positions (m) and all columns of the rows with finite parameters.
+
+    Raises RunError if a column is missing, or if no row is finite.
+    """
+    recorded = {name: array[rows] for name, array in arrays(table).items()}
     require_columns((*PARAMETERS, *XYZ), recorded)
     columns = _tensors(recorded, (*PARAMETERS, *XYZ))
     finite = _all_finite(columns, tuple(columns))
     columns = {name: column[finite] for name, column in columns.items()}
-    distribution, xyz = temperature.apply(_distribution(columns)), _positions(columns)
-    changed = distribution_columns(distribution, xyz)
-    changed["energy_score"] = energy_score(draws(distribution, DRAWS, SEED), xyz)
+    distribution = _distribution(columns)
     kept = {name: array[finite.numpy()] for name, array in recorded.items()}
-    return kept | {name: column.numpy() for name, column in changed.items()}
+    return temperature.apply(distribution) if temperature else distribution, _positions(columns), kept
 
 
 def _distribution_scores(columns: Mapping[str, Tensor], weight: Tensor) -> dict[str, Tensor]:
@@ -196,7 +209,7 @@ def _finite(table: Columns, names: tuple[str, ...]) -> tuple[dict[str, Tensor], 
 def _all_finite(columns: Mapping[str, Tensor], names: tuple[str, ...]) -> Tensor:
     """Whether each sample has finite values in these columns. Raises RunError if no sample has."""
     finite = torch.stack([columns[name] for name in names]).isfinite().all(dim=0)
-    if not bool(finite.any()):
+    if len(finite) and not bool(finite.any()):
         raise RunError(
             f"predictions: none of {len(finite)} samples has finite {', '.join(names)}; train longer, or look at nll"
         )

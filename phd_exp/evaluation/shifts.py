@@ -1,23 +1,23 @@
 """Measures a run's predictions of its test samples at home and under shifts."""
 
-import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
+from phd_exp.evaluation.conformal import threshold
 from phd_exp.evaluation.parquet import Columns, read_table, require_columns
 from phd_exp.evaluation.point_errors import RESAMPLES, SEED
 from phd_exp.evaluation.predictions import ERRORS, band_of
 from phd_exp.evaluation.reference import Band
 from phd_exp.metrics.bootstrap import bands, means
 from phd_exp.metrics.calibration_scores import COLUMNS, calibration_scores, ordered
-from phd_exp.records.errors import one_line
-from phd_exp.records.runs import HOME
+from phd_exp.records.errors import RunError, one_line
+from phd_exp.records.runs import GUARANTEE, HOME
 
 MEASURED = (*COLUMNS, *ERRORS, "nll")
 
@@ -44,19 +44,13 @@ def shift_scores(folder: Path, home: Columns, held_out: Columns | None) -> dict[
     Raises RunError if a table cannot be read or lacks a column.
     """
     found, levels = {}, {"50": 0.5, "90": 0.9, "99": 0.99}
-    if held_out and (threshold := conformal_threshold(held_out.get("level", np.empty(0)), 0.9)) is not None:
-        levels["conformal"] = threshold
+    if held_out and "level" in held_out:
+        with suppress(RunError):  # too few samples
+            levels["conformal"] = threshold(held_out["level"][GUARANTEE], 0.9, "held-out samples")
     for file in sorted(folder.glob("*.parquet")) if "level" in home else ():
         table, said = read_table(file), pq.read_schema(file).metadata or {}
         found[file.stem] = _scores(table, levels, one_line(said.get(b"shift", b"").decode(errors="replace")))
     return found | {HOME: _scores(home, levels)} if found else {}
-
-
-def conformal_threshold(levels: np.ndarray, coverage: float) -> float | None:
-    """The ceil((n + 1) coverage)-th smallest of the n odd held-out levels; None for too few."""
-    odd = np.sort(levels[1::2])
-    rank = math.ceil((len(odd) + 1) * coverage)
-    return float(odd[rank - 1]) if rank <= len(odd) else None
 
 
 def _scores(table: Columns, levels: Mapping[str, float], change: str = "") -> ShiftScores:

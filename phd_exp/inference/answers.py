@@ -89,8 +89,8 @@ def _batches(
         yield batch
 
 
-def answer(sighting: Sighting, temperature: Temperature | None) -> dict[str, Any]:
-    """The prediction for a detection, with its errors if the true position is known.
+def answer(sighting: Sighting, temperature: Temperature | None, guarantee: Any = None) -> dict[str, Any]:
+    """The prediction for a detection, its region by a `Guarantee`, and its errors if the position is known.
 
     Lengths are in metres, in the frame of the real camera: x right, y down, z (depth) forward along its axis. This is
     exact for a turned virtual camera too: points and covariance are rotated, and depth quantiles are integrated along
@@ -102,6 +102,10 @@ def answer(sighting: Sighting, temperature: Temperature | None) -> dict[str, Any
         named["box"] = list(line.box)
     if isinstance(prediction, ProjectedHuber):
         named |= _distribution(prediction, view) | {"uncertainty": uncertainty(temperature)}
+        if guarantee:
+            region, facts = guarantee.region(prediction, view.camera.f / view.camera.S)
+            interval = rounded(np.array(region.depth_interval(view.camera.R[:, 2])))
+            named["region"] = facts | {"depth_interval": interval, "volume": rounded(np.array(region.volume))}
     else:
         position = view.camera.to_real(_array(prediction.mode))
         named |= {"position": rounded(position), "uncertainty": "none: this model predicts a position alone"}

@@ -1,8 +1,9 @@
 """Scenes as JSON objects: one position from several cameras, or from one camera and a known plane."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -68,6 +69,17 @@ def fused_answers(
         scores = {name: rounded(value[place].numpy()) for name, value in errors.items() if known}
         answers.append(_answer(scene, fused, place) | origin | scores)
     return answers
+
+
+def fused_region(answer: Mapping[str, Any], guarantees: Mapping[int, dict[str, Any]]) -> dict[str, Any]:
+    """The ellipsoid of a fused answer: its guarantee, the ends of x, y and z (m), and its volume (m^3)."""
+    if answer["status"] != Status.FUSED.name.lower():
+        return {}
+    facts, mean = guarantees[len(answer["file_names"])], np.array(answer["mean"])
+    scaled = facts["squared_mahalanobis"] * np.array(answer["covariance"])
+    reach, volume = np.sqrt(scaled.diagonal()), 4 / 3 * np.pi * np.sqrt(np.linalg.det(scaled))
+    extent = rounded(np.stack([mean - reach, mean + reach], -1))
+    return {"region": facts | {"extent": extent, "volume": rounded(volume)}}
 
 
 def layout(counts: Sequence[int]) -> tuple[Int[Tensor, "scenes cameras"], Bool[Tensor, "scenes cameras"]]:

@@ -18,6 +18,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions.level import PRECISIONS, level_energies
 from phd_exp.inference.answers import LEVELS
 from phd_exp.inference.predictor import Predictor
 from phd_exp.models.heads import Prediction
@@ -78,13 +79,21 @@ def outputs(prediction: Prediction) -> dict[str, Tensor]:
     }
 
 
-def export(predictor: Predictor, file: Path) -> float:
+def export(predictor: Predictor, file: Path, coverage: float | None = None) -> float:
     """Write the file after comparing it with torch; returns the largest relative deviation.
+
+    With a coverage, the metadata has the level of its regions and their energy W at each depth precision a.
 
     Raises ParityError, and writes no file, if that exceeds 1e-5.
     """
+    metadata = _metadata(predictor)
+    if coverage:
+        guarantee = predictor.guarantee(coverage)
+        facts = {"coverage": coverage, "level": guarantee.levels[0], "held_out_samples": guarantee.n[0]}
+        energies = {"a": PRECISIONS.tolist(), "W": level_energies(guarantee.levels[0]).tolist()}
+        metadata["region"] = facts | energies
     model = graph(predictor)
-    model.metadata_props.add(key=METADATA, value=json.dumps(_metadata(predictor)))
+    model.metadata_props.add(key=METADATA, value=json.dumps(metadata))
     content = model.SerializeToString()
     deviation = largest_deviation(predictor, content)
     if not deviation <= TOLERANCE:

@@ -23,11 +23,16 @@ MARGIN = 0.5  # width of the margin around a box, in sizes of the box
 _AMBER = "#ffb000"
 
 
-def picture(sighting: Sighting, recalibrated: bool = False, calibration: Mapping[str, Any] | None = None) -> bytes:
+def picture(
+    sighting: Sighting,
+    recalibrated: bool = False,
+    calibration: Mapping[str, Any] | None = None,
+    guarantee: Any = None,
+) -> bytes:
     """A PNG of the image and the bird's-eye view with level curves of 50, 90 and 99 %, or of a baseline's point.
 
-    A third panel has the calibration curve of depth, if given. The title has the file name, the focal length and
-    whether the prediction is recalibrated.
+    The region of a `Guarantee` has a dashed outline. A third panel has the calibration curve of depth, if given.
+    The title has the file name, the focal length and whether the prediction is recalibrated.
     """
     curves = level_curves(sighting.prediction) if isinstance(sighting.prediction, ProjectedHuber) else None
     panels = 1 + (curves is not None) + (calibration is not None)
@@ -38,6 +43,11 @@ def picture(sighting: Sighting, recalibrated: bool = False, calibration: Mapping
         draw_curve(figure.add_subplot(1, panels, panels), "depth", calibration)
     if curves:
         axes = figure.add_subplot(1, panels, 2)
+        if guarantee:
+            camera = sighting.view.camera
+            on_image, above = guarantee.region(sighting.prediction, camera.f / camera.S)[0].outlines()
+            figure.axes[0].plot(*pixels(sighting.view, on_image).T, "--", color=_AMBER)
+            axes.plot(*above.T, "k--", label=f"{100 * guarantee.coverage:g} % guaranteed")
         draw_birds_eye(axes, curves, _truth(sighting))
         if sighting.view.is_turned:
             axes.set(xlabel="x (m), camera turned to the box", ylabel="z (m), camera turned to the box")

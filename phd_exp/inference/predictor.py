@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -26,6 +26,10 @@ from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import RenderedConfig, RunConfig, check
 from phd_exp.training.config.targets import Trust
 from phd_exp.training.network import build_regressor, load_checkpoint, require_same_shrinking
+
+if TYPE_CHECKING:  # imports of pyarrow
+    from phd_exp.evaluation.conformal import Groups, Guarantee
+    from phd_exp.evaluation.parquet import Columns
 
 WEIGHTS = "regressor."  # prefix of the network's weights in a checkpoint
 BATCH = 64
@@ -76,6 +80,7 @@ class Predictor:
         constant_f: the focal length that the network receives for every image, px; None: the true one.
         temperature: temperatures of recalibrated predictions; None: as trained.
         state: the state of the run, "finished" if it completed.
+        folder: the run, whose held-out samples guarantee regions.
     """
 
     config: RunConfig
@@ -86,6 +91,7 @@ class Predictor:
     device: torch.device
     temperature: Temperature | None
     state: str
+    folder: RunFolder | None = None
 
     @property
     def is_probabilistic(self) -> bool:
@@ -115,6 +121,16 @@ class Predictor:
             for row, (image, K) in enumerate(zip(array, cameras, strict=True))
         ]
         return self.see(views if images.ndim == 4 else views[0])
+
+    def guarantee(self, coverage: float, groups: "Groups | None" = None) -> "Guarantee":
+        """Regions that contain the true position with a probability in (0, 1); see `evaluation.conformal`.
+
+        Raises RunError if the run has too few held-out samples, ConfigError if it predicts no uncertainty.
+        """
+        from phd_exp.evaluation.conformal import guarantee
+
+        assert self.folder is not None
+        return guarantee(_held_out(self.folder, self.regressor), coverage, groups, self.temperature)
 
     def view(
         self, image: UInt8[np.ndarray, "height width 3"], K: Float[np.ndarray, "3 3"], box: Box | None = None
@@ -186,6 +202,7 @@ def load(run: Path, device: str = "auto", recalibrate: bool = False, trust: Trus
         device=place,
         temperature=_temperature(folder, regressor) if recalibrate else None,
         state="unknown" if status is None else status.state,
+        folder=folder,
     )
 
 
@@ -224,16 +241,19 @@ def _load_weights(regressor: Regressor, checkpoint: Path) -> None:
 
 
 def _temperature(folder: RunFolder, regressor: Regressor) -> Temperature:
-    if not issubclass(regressor.head.prediction, ProjectedHuber):
-        raise ConfigError(f"{folder.path}: predicts no uncertainty, so that there is nothing to recalibrate")
-    if not folder.held_out.exists():
-        raise RunError(
-            f"{folder.held_out}: missing; recalibration is fitted on held-out samples: train with data.n_held_out > 0"
-        )
-    from phd_exp.evaluation.parquet import read_table  # imports pyarrow
-    from phd_exp.evaluation.predictions import fit_temperature
+    from phd_exp.evaluation.predictions import fit_temperature  # imports pyarrow
 
-    return fit_temperature(read_table(folder.held_out))
+    return fit_temperature(_held_out(folder, regressor))
+
+
+def _held_out(folder: RunFolder, regressor: Regressor) -> "Columns":
+    if not issubclass(regressor.head.prediction, ProjectedHuber):
+        raise ConfigError(f"{folder.path}: predicts no uncertainty, which recalibrate= and coverage= need")
+    if not folder.held_out.exists():
+        raise RunError(f"{folder.held_out}: missing; recalibrate= and coverage= need a run with data.n_held_out > 0")
+    from phd_exp.evaluation.parquet import read_table
+
+    return read_table(folder.held_out)
 
 
 def _images(images: Any) -> UInt8[np.ndarray, "batch height width 3"]:

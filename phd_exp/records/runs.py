@@ -7,7 +7,7 @@
         metrics.jsonl        one line per epoch
         results.json         the final numbers
         predictions.parquet  per test sample: truth, parameters, estimate, errors
-        held_out.parquet     the same for held-out training samples, for recalibration
+        held_out.parquet     the same for held-out training samples; see `CHOOSE`
         views.parquet        the same for scenes with several cameras, and their poses, if asked for
         shifts/              the same for shifted test samples, a table NAME.parquet for each, if asked for
         calibration/         the calibration curves, as data (JSON) and as pictures (PNG)
@@ -44,6 +44,12 @@ LARGEST = MB  # bytes of a configuration or of a run's numbers
 PACKAGES = ("phd_exp", "torch", "torchvision", "lightning", "hydra-core", "numpy")
 """Packages on which numbers depend, whose versions are recorded."""
 
+CHOOSE, GUARANTEE = slice(0, None, 2), slice(1, None, 2)
+"""Rows of held-out samples, and scenes of several views: even ones choose, odd ones guarantee.
+
+Whatever is chosen by held-out samples (temperatures, epochs, trials of a search, recipes, borders of groups) uses the
+even rows. The odd rows determine the thresholds of conformal regions and nothing else.
+"""
 _NUMBERS: TypeAdapter[dict[str, int | float | None]] = TypeAdapter(dict[str, int | FiniteFloat | None])
 
 State = Literal["running", "finished", "failed", "interrupted"]

@@ -12,7 +12,7 @@ from phd_exp.evaluation.point_errors import COLUMNS, Estimate, MeanErrors, mean_
 from phd_exp.records.choices import flatten, has_influence
 from phd_exp.records.errors import one_line
 from phd_exp.records.files import remove_temporaries
-from phd_exp.records.runs import RunFolder, RunStatus, find_runs
+from phd_exp.records.runs import CHOOSE, RunFolder, RunStatus, find_runs
 from phd_exp.records.searches import Search, read_searches
 from phd_exp.reports.measured import Measured, Notes, kept_or_measured
 from phd_exp.reports.table import file_stem, printable
@@ -33,7 +33,7 @@ class Run:
         overrides: None for a run at its preset's values, else the differences.
         detail: one line on a state other than finished.
         errors, nll: of a finished run; NLL in nats, None for a model without a density.
-        held_out_errors, held_out_nll: the same on its held-out samples.
+        held_out_errors, held_out_nll: the same on its held-out samples that may choose.
         config: every value as text, by its dotted key.
         epochs: epochs trained before each row of `metrics`; 0 is the untrained network.
         metrics: a series per key, None in rows without it.
@@ -142,7 +142,8 @@ def _whole_run(folder: RunFolder, names: tuple[str, str, str, str], kept: Path |
             state, detail = "unreadable", f"{notes[-1]}; delete the folder to run again"
     if folder.held_out.exists():
         held_out = notes.attempt(lambda: read_table(folder.held_out))
-        tested_held_out = notes.attempt(lambda: _errors(held_out, ("mode",))) if held_out else None
+        chosen = {name: column[CHOOSE] for name, column in (held_out or {}).items()}
+        tested_held_out = notes.attempt(lambda: _errors(chosen, ("mode",))) if chosen else None
     measured = notes.attempt(lambda: kept_or_measured(folder, config, predictions, held_out, kept)) or Measured()
     errors, nll = tested or ({}, None)
     held_out_errors, held_out_nll = tested_held_out or ({}, None)

@@ -7,7 +7,7 @@ from warnings import catch_warnings
 from lightning import Callback, LightningModule, Trainer
 
 from phd_exp.evaluation.parquet import read_table
-from phd_exp.records.runs import RunFolder
+from phd_exp.records.runs import CHOOSE, RunFolder
 
 SCORES = ("nll", "depth_error_mm")
 """What a search minimises on the held-out samples: the first that the model has. A baseline has no likelihood."""
@@ -38,4 +38,4 @@ def held_out_score(run: Path) -> tuple[str, float]:
     """The metric that a search minimises and its value for a finished run. Raises RunError."""
     table = read_table(RunFolder(run).held_out)
     name = next(name for name in SCORES if name in table)
-    return f"held_out/{name}", float(table[name].mean())
+    return f"held_out/{name}", float(table[name][CHOOSE].mean())

@@ -64,7 +64,7 @@ WRONG_VALUES = [
     ([*TOGETHER, "trainer.devices=0"], ["trainer.devices: got 0"]),
     (
         [*TOGETHER, "trainer.devices=8", "data.n_held_out=4"],
-        ["trainer.devices: got 8, more than the 4 samples of held_out that there are"],
+        ["trainer.devices: got 8, more than the 2 samples of held_out in a pass"],
     ),
     (["data=folder"], ["data.folder: missing", "data.folder=VALUE"]),
     (["+data.folder=photos"], ["data.folder: unknown key", "expected one of", "sensor_size"]),

@@ -67,6 +67,14 @@ def test_held_out_samples_follow_those_trained_on(folder: DatasetFolder, spec: D
     assert batch.row.tolist() == [0, 1]
 
 
+def test_callbacks_see_the_held_out_samples_that_choose(folder: DatasetFolder, spec: DatasetSpec) -> None:
+    source = RenderedSource(folder, spec, {"train": 2, "held_out": 3, "test": 3}, 64)
+    module = PositionData(source, batch_size=2, seed=0, held_out=True)
+    module.setup()
+    rows = [[batch.row.tolist() for batch in loader] for loader in module.val_dataloader()]
+    assert rows == [[[0, 1], [2]], [[0, 2]]]
+
+
 def test_too_few_samples_are_one_line(folder: DatasetFolder, spec: DatasetSpec) -> None:
     with pytest.raises(DatasetError, match="6 samples asked for, 5 "):
         data(folder, spec, n_train=6)

@@ -114,7 +114,7 @@ def compressed(image: np.ndarray, quality: int) -> np.ndarray:
         ({"blur": 2.0}, lambda image: gaussian_filter(image, (2, 2, 0), mode="nearest"), 0.03),
         ({"jpeg": 30}, lambda image: compressed(image, 30), 0),
     ],
-    ids=str,
+    ids=lambda value: str(value) if isinstance(value, dict) else "",
 )
 def test_a_fixed_change_changes_every_image_alike(change: dict, reference: Callable, tolerance: float) -> None:
     before = images(5)

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from phd_exp.evaluation.parquet import read_table
-from phd_exp.evaluation.shifts import conformal_threshold, shift_scores
+from phd_exp.evaluation.shifts import shift_scores
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder
 from tests.support.synthetic import write_run
@@ -44,18 +44,6 @@ def test_every_share_is_a_count(run: RunFolder) -> None:
     home, shifted = (found[name].scores["inside_90"] for name in ("home", "odd"))
     assert home.low <= 90 <= home.high
     assert shifted.high < 80
-
-
-@pytest.mark.parametrize(("n", "rank"), [(16, None), (17, None), (18, 9), (19, 9), (20, 10), (200, 91)])
-def test_the_conformal_threshold_is_a_quantile_of_the_odd_rows(n: int, rank: int | None) -> None:
-    """Of 9 samples all are needed for 90 %; of fewer no level suffices."""
-    levels = np.random.default_rng(n).permutation(n) / n
-    threshold = conformal_threshold(levels, 0.9)
-    if rank is None:
-        assert threshold is None
-    else:
-        assert threshold is not None
-        assert (levels[1::2] <= threshold).sum() == rank
 
 
 def test_rows_that_are_not_finite_are_counted(run: RunFolder, tmp_path: Path) -> None:

@@ -85,7 +85,7 @@ def test_a_baseline_has_positions_without_uncertainty(
         prediction = predictor.see(predictor.view(image, camera.K, row["box"]))
         assert isinstance(prediction, PointEstimate)
         np.testing.assert_allclose(row["position"], camera.to_real(prediction.mode.numpy()), rtol=1e-5, atol=1e-5)
-    for word, said in (("recalibrate", "nothing to recalibrate"), ("calibration", "no calibration curve of depth")):
+    for word, said in (("recalibrate", "predicts no uncertainty"), ("calibration", "no calibration curve of depth")):
         refused = phd_exp("predict", f"run={baseline.path}", f"folder={photos}", f"{word}=true", "out=more")
         assert refused.status == 1
         assert said in refused.err
@@ -253,7 +253,7 @@ def test_the_import_does_not_wait_for_torch_nor_a_prediction_for_lightning(run: 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ((), "run: missing; export takes run=, recalibrate=, trust=, out="),
+        ((), "run: missing; export takes run=, recalibrate=, coverage=, trust=, out="),
         (("run=nowhere",), "nowhere: no run; expected a folder with config.yaml"),
         (("run=.", "out=."), "out=.: is a folder"),
     ],

@@ -1,0 +1,118 @@
+"""Split-conformal regions: held-out samples that are used for nothing else guarantee a coverage.
+
+The score of a sample is the credible level of its true position. The threshold is the k-th smallest of n scores with
+k = ceil((n + 1) c). A further sample, exchangeable with these, lies in its region of that level with a probability
+from c to c + 1/(n + 1), for any network. Given the n samples, the coverage has the law Beta(k, n + 1 - k).
+
+Source: Vovk, Gammerman and Shafer, "Algorithmic Learning in a Random World" (2005), also for groups (Mondrian).
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from phd_exp.distributions import ProjectedHuber, Temperature
+from phd_exp.distributions.regions import Region
+from phd_exp.evaluation.parquet import Columns, require_columns
+from phd_exp.evaluation.predictions import at_temperature
+from phd_exp.evaluation.several_views import read_views
+from phd_exp.fusion import fuse
+from phd_exp.metrics.errors import squared_mahalanobis
+from phd_exp.records.errors import RunError
+from phd_exp.records.runs import CHOOSE, GUARANTEE
+
+Groups = Literal["spread", "truncation", "focal_length"]
+QUANTITIES: Mapping[Groups | None, Callable[[ProjectedHuber, Tensor], Tensor]] = {
+    None: lambda p, f: torch.zeros_like(p.a),
+    "spread": lambda p, f: p.variance.sum(-1).sqrt(),
+    "truncation": lambda p, f: 1 - (2 * f[..., None] * p.mu_xy).abs().amax(-1),
+    "focal_length": lambda p, f: f,
+}
+"""What a camera knows, given f in sides of the image: the predicted standard deviation of the position (m), the
+distance of the predicted projection from the border of the image (half sides), and f.
+"""
+PARTS = 4  # groups, of equal size among the held-out samples that may choose
+
+
+@dataclass(frozen=True, eq=False)
+class Guarantee:
+    """The levels of the regions with a coverage, by `n` held-out samples each, between `edges` of a quantity."""
+
+    coverage: float
+    groups: Groups | None
+    edges: Float[np.ndarray, " edges"]
+    levels: list[float]
+    n: list[int]
+
+    def region(self, prediction: ProjectedHuber, f: float) -> tuple[Region, dict[str, Any]]:
+        """The region of one prediction, and its guarantee for JSON; f is the focal length in sides of the image."""
+        quantity = QUANTITIES[self.groups](prediction, torch.tensor(f, dtype=torch.float64))
+        place = int(np.searchsorted(self.edges, float(quantity), side="right"))
+        facts = {"coverage": self.coverage, "level": self.levels[place], "held_out_samples": self.n[place]}
+        ends = [None, *self.edges.tolist(), None][place : place + 2]
+        return Region(prediction, self.levels[place]), facts | ({self.groups: ends} if self.groups else {})
+
+
+def guarantee(
+    held_out: Columns, coverage: float, groups: Groups | None, temperature: Temperature | None
+) -> Guarantee:
+    """The guarantee by recorded predictions of held-out samples, recalibrated if a temperature is given.
+
+    Raises RunError if there are too few samples, or too many positions of level 1.
+    """
+
+    def scored(rows: slice) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]:
+        """The levels of the true positions, and the quantities of the groups."""
+        p, xyz, columns = at_temperature(held_out, temperature, rows)
+        require_columns(("f", "S") if groups else (), columns)
+        f = torch.from_numpy(columns["f"] / columns["S"]) if groups else p.a
+        return p.level(xyz).numpy(), QUANTITIES[groups](p, f).numpy()
+
+    (_, chosen), (scores, values) = scored(CHOOSE), scored(GUARANTEE)
+    edges = np.unique(np.quantile(chosen, np.arange(1, PARTS) / PARTS))
+    edges = edges[edges > chosen.min()]  # equal values are one group
+    place = np.searchsorted(edges, values, side="right")
+    parts = [scores[place == group] for group in range(len(edges) + 1)]
+    samples = f"held-out samples{' of each group' if groups else ''}, every second of data.n_held_out"
+    levels = [threshold(part, coverage, samples) for part in parts]
+    if max(levels) == 1:
+        raise RunError(f"coverage: got {coverage}; too many held-out positions have level 1; try recalibrate=true")
+    return Guarantee(coverage, groups, edges, levels, [len(part) for part in parts])
+
+
+def fused_guarantee(file: Path, k: int, coverage: float, temperature: Temperature | None) -> dict[str, Any]:
+    """The squared Mahalanobis distance from the fused mean of k cameras that has the coverage, and its n, for JSON.
+
+    Raises RunError if the run has no recorded scenes of k cameras, or too few that guarantee.
+    """
+    views = read_views(file) if file.exists() else None
+    if views is None or views.views < k:
+        raise RunError(
+            f"{file}: no scenes with {k} cameras, as coverage= needs; train with data=scale "
+            f"evaluation.multiview.scenes=500 evaluation.multiview.views={max(k, 2)}"
+        )
+    views = views.cameras(k).subset(views.columns["scene"][:, 0] % 2 == GUARANTEE.start)
+    fused = fuse(temperature.apply(views.predictions) if temperature else views.predictions, views.pose)
+    distance = squared_mahalanobis(views.truth - fused.mean, fused.covariance)
+    scores = distance[distance.isfinite()].numpy()
+    found = threshold(scores, coverage, "scenes, every second of evaluation.multiview.scenes")
+    return {"coverage": coverage, "squared_mahalanobis": found, "held_out_samples": len(scores)}
+
+
+def threshold(scores: Float[np.ndarray, " samples"], coverage: float, samples: str) -> float:
+    """The k-th smallest score. Raises RunError with the number of `samples` needed if there are fewer than k."""
+    if not 0 < coverage < 1:
+        raise RunError(f"coverage: got {coverage}; expected a probability between 0 and 1, such as 0.9")
+    n, c = len(scores), Fraction(str(coverage))  # exact: 10 * 0.9 is 9
+    k = math.ceil((n + 1) * c)
+    if k > n:
+        raise RunError(f"coverage: got {coverage}; needs at least {math.ceil(c / (1 - c))} {samples}; found {n}")
+    return float(np.partition(scores, k - 1)[k - 1])
