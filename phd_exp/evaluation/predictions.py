@@ -23,7 +23,7 @@ from phd_exp.metrics.strata import strata
 from phd_exp.records.errors import RunError
 
 ERRORS = ("projected_error_mm", "depth_error_mm")
-OF_A_DISTRIBUTION = (*PARAMETERS, *COLUMNS, *ERRORS, "nll", "energy_score")
+OF_A_DISTRIBUTION = (*COLUMNS, *ERRORS, "nll", "energy_score")
 XYZ = ("x", "y", "z")
 QUANTITIES: Mapping[str, tuple[str, str, tuple[float, ...] | int]] = {
     "visibility": ("visibility", "", (0.0, 0.25, 0.5, 0.75, 0.95, 1.0)),
@@ -81,13 +81,14 @@ class Evaluation:
 
 
 def evaluate(table: pa.Table | Columns, window: int = 200, resamples: int = 200) -> Evaluation:
-    """Evaluate predictions: of a distribution if the table has its parameters, else of points, which have no curves.
+    """Evaluate predictions: of a density if the table has its levels, else of points, which have no curves.
 
     Raises RunError if a column is missing, or if no sample has finite values.
     """
     recorded = arrays(table)
-    is_distribution = "a" in recorded
-    columns, left_out = _finite(recorded, OF_A_DISTRIBUTION if is_distribution else ERRORS)
+    is_distribution, is_huber = "level" in recorded, "a" in recorded
+    needed = (*(PARAMETERS if is_huber else ()), *OF_A_DISTRIBUTION) if is_distribution else ERRORS
+    columns, left_out = _finite(recorded, needed)
     statistic: Statistic = _distribution_scores if is_distribution else _point_scores
     scores, drawn = _scores(statistic, columns, resamples)
     found: dict[str, Curve] = {}
@@ -101,7 +102,7 @@ def evaluate(table: pa.Table | Columns, window: int = 200, resamples: int = 200)
         curves=found,
         strata=_strata(statistic, columns, resamples),
         left_out=left_out,
-        reference=calibrated_reference(_distribution(columns)) if is_distribution else {},
+        reference=calibrated_reference(_distribution(columns)) if is_huber else {},
         resampled=drawn,
     )
 

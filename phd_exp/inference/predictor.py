@@ -89,7 +89,7 @@ class Predictor:
 
     @property
     def is_probabilistic(self) -> bool:
-        """Whether it predicts densities; a baseline predicts points."""
+        """Whether it predicts Projected Huber densities, which alone are fused, recalibrated and drawn."""
         return issubclass(self.regressor.head.prediction, ProjectedHuber)
 
     def __call__(
@@ -225,7 +225,9 @@ def _load_weights(regressor: Regressor, checkpoint: Path) -> None:
 
 def _temperature(folder: RunFolder, regressor: Regressor) -> Temperature:
     if not issubclass(regressor.head.prediction, ProjectedHuber):
-        raise ConfigError(f"{folder.path}: predicts no uncertainty, so that there is nothing to recalibrate")
+        raise ConfigError(
+            f"{folder.path}: only Projected Huber densities are recalibrated; expected a run of model=probabilistic"
+        )
     if not folder.held_out.exists():
         raise RunError(
             f"{folder.held_out}: missing; recalibration is fitted on held-out samples: train with data.n_held_out > 0"

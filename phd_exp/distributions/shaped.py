@@ -1,0 +1,329 @@
+"""Densities of other shapes around the parameters (mu_xy, mu_z, A, a) of a Projected Huber density.
+
+With q and t = z/mu_z of that density and s = a (t^e - 1)/e (a log t for e = 0), each is a law of (q + k s, s) in space
+for e = 1, or of the ray q/t and s for e < 1. Seven raw numbers are the same for all, so that only the law differs.
+
+Source: own derivation; tests/distributions/test_heads.py checks every law.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from scipy import special
+from torch import Tensor
+from torch.distributions import Laplace, Normal
+from torch.nn.functional import pad
+
+from phd_exp.distributions import depth, huber, spd
+from phd_exp.distributions.density import Density
+from phd_exp.distributions.level import credible_level
+from phd_exp.distributions.projected_huber import ProjectedHuber
+from phd_exp.distributions.special import log_scaled_normaliser
+from phd_exp.geometry.camera import at_depth
+
+_NODES = 400  # of quadrature over quantiles; relative errors are below 1e-3
+_NORMAL, _LAPLACE = Normal(0.0, 1.0), Laplace(0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Shaped(Density):
+    """A density in front of the camera, or in all space for e = 1; a subclass gives e and the law.
+
+    Unless the subclass changes it, q and s are independent standard normal variables.
+
+    Args:
+        law: provides the parameters.
+        further: raw numbers beyond its seven; the first two are k if e = 1.
+    """
+
+    law: ProjectedHuber
+    further: Float[Tensor, "*batch n"]
+    exponent: ClassVar[int]
+
+    def _log_law(self, q: Tensor, s: Tensor) -> Tensor:
+        return _NORMAL.log_prob(q).sum(-1) + _NORMAL.log_prob(s)
+
+    def _level(self, q: Tensor, s: Tensor) -> Tensor:
+        energy = (q.square().sum(-1) + s.square()) / 2
+        return torch.special.gammainc(torch.full_like(energy, 1.5), energy)
+
+    def _cdf(self, s: Tensor) -> Tensor:
+        return torch.special.ndtr(s)
+
+    def _icdf(self, p: Tensor) -> Tensor:
+        return torch.special.ndtri(p)
+
+    def _draw(self, shape: Sequence[int], generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+        like: Any = {"dtype": self.law.a.dtype, "device": self.law.a.device, "generator": generator}
+        p = torch.rand(*shape, **like).clamp_min(torch.finfo(self.law.a.dtype).eps / 2)
+        return torch.randn(*shape, 2, **like), self._icdf(p)
+
+    @property
+    def _variance(self) -> Tensor:
+        """Of each component of q + k s, and of s."""
+        return torch.ones_like(self.law.a)
+
+    @property
+    def _k(self) -> Tensor:
+        return self.further[..., :2] if self.exponent == 1 else torch.zeros_like(self.law.mu_xy)
+
+    def _s(self, z: Tensor) -> Tensor:
+        t, e = z / self.law.mu_z, self.exponent
+        return self.law.a * ((t**e - 1) / e if e else t.log())
+
+    def _z(self, s: Tensor) -> Tensor:
+        excess, e = s / self.law.a, self.exponent
+        return self.law.mu_z * ((1 + e * excess) ** e if e else excess.exp())
+
+    def _whitened(self, xyz: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The variables of the law, the log of their volume per cubic metre, and where there is a density."""
+        law, e = self.law, self.exponent
+        visible = (xyz[..., 2] > 0) | (e == 1)
+        xyz = torch.where(visible[..., None], xyz, law.mode)  # so that no NaN is multiplied by a zero gradient
+        q, s, t = law.whiten(xyz), self._s(xyz[..., 2]), (xyz[..., 2] / law.mu_z).masked_fill(visible & (e == 1), 1)
+        volume = law.log_det_A + law.a.log() - 3 * law.mu_z.log() + (e - 3) * t.log()
+        return q / t[..., None] + self._k * s[..., None], s, volume, visible
+
+    def log_prob(self, value: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch"]:
+        """Log density of a position (metres), nats per cubic metre; -inf for z <= 0 unless e = 1."""
+        q, s, volume, visible = self._whitened(value)
+        return (self._log_law(q, s) + volume).masked_fill(~visible, -torch.inf)
+
+    def level(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch"]:
+        """The probability of the smallest region that contains a position, of highest density in the law's variables.
+
+        It is uniform on (0, 1) over positions drawn from the density.
+        """
+        q, s, _, visible = self._whitened(xyz)
+        return self._level(q, s).masked_fill(~visible, 1)
+
+    def rsample(
+        self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None
+    ) -> Float[Tensor, "*shape 3"]:
+        """Exact samples."""
+        q, s = self._draw((*sample_shape, *self.law.batch_shape), generator)
+        z, shift = self._z(s), spd.matvec(self._inverse, q - self._k * s[..., None])
+        return at_depth(self.law.mu_xy, z) + pad(
+            shift * (self.law.mu_z if self.exponent == 1 else z)[..., None], (0, 1)
+        )
+
+    @property
+    def _inverse(self) -> Tensor:
+        return spd.inverse(self.law.A, self.law.log_det_A)
+
+    @property
+    def mode(self) -> Float[Tensor, "*batch 3"]:
+        """The position of level 0, the point estimate, metres."""
+        return self.law.mode
+
+    @property
+    def mu_xy(self) -> Float[Tensor, "*batch 2"]:
+        """Mean of (x, y)/z."""
+        return self.law.mu_xy
+
+    @property
+    def projected_covariance(self) -> Float[Tensor, "*batch 2 2"]:
+        """Covariance of (x, y)/z; for e = 1, where it has none, of its linearisation about the mode."""
+        along = spd.matvec(self._inverse, self._k)
+        return self._variance[..., None, None] * (spd.square(self._inverse) + _outer(along))
+
+    @property
+    def depth_mean(self) -> Float[Tensor, "*batch"]:
+        """E[z], metres."""
+        return self.law.mu_z
+
+    @property
+    def depth_variance(self) -> Float[Tensor, "*batch"]:
+        """Var[z], square metres."""
+        return self._variance * (self.law.mu_z / self.law.a).square()
+
+    @property
+    def mean(self) -> Float[Tensor, "*batch 3"]:
+        """Expected position, metres."""
+        return at_depth(self.mu_xy, self.depth_mean)
+
+    @property
+    def covariance_matrix(self) -> Float[Tensor, "*batch 3 3"]:
+        """Covariance of the position, square metres: for e < 1, Var[z] m m^T + E[z^2] Cov[(x, y)/z], m = (mu_xy, 1)."""
+        m, variance = pad(self.mu_xy, (0, 1), value=1), self.depth_variance[..., None, None]
+        if self.exponent == 1:
+            along = m - self.law.a[..., None] * pad(spd.matvec(self._inverse, self._k), (0, 1))
+            across = spd.square(self._inverse * self.law.a[..., None, None])
+            return variance * (_outer(along) + pad(across, (0, 1, 0, 1)))
+        second = variance + self.depth_mean.square()[..., None, None]
+        return variance * _outer(m) + pad(second * self.projected_covariance, (0, 1, 0, 1))
+
+    def depth_cdf(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
+        """P(depth <= z), z in metres."""
+        visible = (z > 0) | (self.exponent == 1)
+        return self._cdf(self._s(torch.where(visible, z, self.law.mu_z))).masked_fill(~visible, 0)
+
+    def depth_icdf(self, p: Float[Tensor, "*#batch"] | float) -> Float[Tensor, "*#batch"]:
+        """The depth z, metres, with P(depth <= z) = p for p in (0, 1)."""
+        return self._z(self._icdf(torch.as_tensor(p).to(self.law.a)))
+
+    @property
+    def depth_median(self) -> Float[Tensor, "*batch"]:
+        """The median of z, metres."""
+        return self.depth_icdf(0.5)
+
+    def depth_crps(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
+        """Continuous ranked probability score of a depth, metres: twice the mean pinball loss of all quantiles."""
+        p, weight = nodes(z)
+        gap = z - self.depth_icdf(p)
+        return 2 * (weight * (p - (gap < 0).to(p)) * gap).sum(0)
+
+
+class Gaussian(Shaped):
+    """A Gaussian in space with any covariance; positions behind the camera have their share of it."""
+
+    exponent = 1
+
+
+class StudentT(Shaped):
+    """Student's t in space with any scale matrix and n = 2 + phi(third further number) degrees of freedom.
+
+    Source: Kotz and Nadarajah, "Multivariate t distributions and their applications" (2004).
+    """
+
+    exponent = 1
+
+    @property
+    def freedom(self) -> Float[Tensor, "*batch"]:
+        """Degrees of freedom n > 2, so that variances exist."""
+        return 2 + spd.positive(self.further[..., 2])
+
+    def _log_law(self, q: Tensor, s: Tensor) -> Tensor:
+        n = self.freedom
+        constant = torch.lgamma((n + 3) / 2) - torch.lgamma(n / 2) - 1.5 * (math.pi * n).log()
+        return constant - (n + 3) / 2 * torch.log1p((q.square().sum(-1) + s.square()) / n)
+
+    def _level(self, q: Tensor, s: Tensor) -> Tensor:
+        squared, n = q.square().sum(-1) + s.square(), self.freedom
+        return _by_scipy(lambda n, x: special.betainc(1.5, n / 2, x), n, squared / (n + squared))
+
+    def _cdf(self, s: Tensor) -> Tensor:
+        return _by_scipy(special.stdtr, self.freedom, s)
+
+    def _icdf(self, p: Tensor) -> Tensor:
+        return _by_scipy(special.stdtrit, self.freedom, p)
+
+    def _draw(self, shape: Sequence[int], generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+        normal, s = super()._draw(shape, generator)
+        n, squared = self.freedom, normal.square().sum(-1)
+        # given s, |q|^2/(n + s^2) + 1 is a power of a uniform variable, which exp(-squared/2) is
+        ratio = (n + s.square()) * torch.expm1(squared / (n + 1)) / squared
+        return normal * ratio.sqrt()[..., None], s
+
+    @property
+    def _variance(self) -> Tensor:
+        return self.freedom / (self.freedom - 2)
+
+
+class LogDepthGaussian(Shaped):
+    """A Gaussian of the ray and, independently, of log z."""
+
+    exponent = 0
+
+    @property
+    def depth_mean(self) -> Float[Tensor, "*batch"]:
+        return self.law.mu_z * torch.exp(self.law.a**-2 / 2)
+
+    @property
+    def depth_variance(self) -> Float[Tensor, "*batch"]:
+        return self.depth_mean.square() * torch.expm1(self.law.a**-2)
+
+
+class InverseDepthLaplace(Shaped):
+    """A Gaussian of the ray and, independently, Laplace's law of 1/z > 0.
+
+    z has no moments: `depth_mean` and `depth_variance` are those of the linearisation of z about mu_z.
+    """
+
+    exponent = -1
+
+    @property
+    def _in_front(self) -> Tensor:
+        return _LAPLACE.cdf(self.law.a)
+
+    def _log_law(self, q: Tensor, s: Tensor) -> Tensor:
+        return _NORMAL.log_prob(q).sum(-1) + _LAPLACE.log_prob(s) - self._in_front.log()
+
+    def _level(self, q: Tensor, s: Tensor) -> Tensor:
+        energy = q.square().sum(-1) / 2 + s.abs()  # a sum of two exponential variables; that of s > 0 ends at a
+        end, decay = torch.minimum(energy, self.law.a), torch.exp(-energy)
+        return (2 - decay - torch.exp(-end) - (energy + end) * decay) / (2 * self._in_front)
+
+    def _cdf(self, s: Tensor) -> Tensor:
+        return _LAPLACE.cdf(s) / self._in_front
+
+    def _icdf(self, p: Tensor) -> Tensor:
+        return _LAPLACE.icdf(p * self._in_front)
+
+    @property
+    def depth_variance(self) -> Float[Tensor, "*batch"]:
+        return 2 * super().depth_variance
+
+
+class Decomposed(Shaped):
+    """Ray and depth of the Projected Huber density, independent of each other: p(x/z, y/z) p(z)/z^2.
+
+    Source: paper, Proposition 1: no density that decomposes in this way satisfies all seven constraints.
+    """
+
+    exponent = 0
+
+    def _energy(self, q: Tensor, s: Tensor) -> Tensor:
+        return huber.huber_energy(q) + depth.depth_energy(s / self.law.a, self.law.a.log())
+
+    def _log_law(self, q: Tensor, s: Tensor) -> Tensor:
+        log_a = self.law.a.log()  # dt = t ds / a
+        normaliser = huber.HUBER_LOG_NORMALISER + log_scaled_normaliser(log_a) + log_a
+        return s / self.law.a - self._energy(q, s) - normaliser
+
+    def _level(self, q: Tensor, s: Tensor) -> Tensor:
+        return credible_level(self._energy(q, s), self.law.a)
+
+    def _cdf(self, s: Tensor) -> Tensor:
+        return depth.depth_cdf(s / self.law.a, self.law.a.log())
+
+    def _icdf(self, p: Tensor) -> Tensor:
+        return self.law.a * depth.depth_icdf(p, self.law.a.log())
+
+    def _draw(self, shape: Sequence[int], generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+        normal, s = super()._draw(shape, generator)
+        q = huber.sample_whitened(s.shape, dtype=s.dtype, device=s.device, generator=generator)
+        return q, s
+
+    @property
+    def _variance(self) -> Tensor:
+        return torch.full_like(self.law.a, huber.HUBER_COVARIANCE)
+
+    @property
+    def depth_mean(self) -> Float[Tensor, "*batch"]:
+        return self.law.depth_mean
+
+    @property
+    def depth_variance(self) -> Float[Tensor, "*batch"]:
+        return self.law.depth_variance
+
+
+def nodes(like: Float[Tensor, "*batch"]) -> tuple[Float[Tensor, "nodes ..."], Float[Tensor, "nodes ..."]]:
+    """Probabilities and weights of a midpoint rule on (0, 1), dense at both ends, to broadcast with a batch."""
+    angle = (torch.arange(_NODES, dtype=like.dtype, device=like.device) + 0.5) * (math.pi / _NODES)
+    angle = angle.reshape(-1, *[1] * like.ndim)
+    return (angle / 2).sin().square(), angle.sin() * (math.pi / 2 / _NODES)
+
+
+def _outer(x: Tensor) -> Tensor:
+    return x[..., :, None] * x[..., None, :]
+
+
+def _by_scipy(function: Callable[..., Any], *values: Tensor) -> Tensor:
+    """A function that torch lacks, without gradients."""
+    found = function(*(value.detach().double().cpu().numpy() for value in values))
+    return torch.as_tensor(found).to(values[-1])
