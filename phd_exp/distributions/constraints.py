@@ -14,10 +14,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from phd_exp.distributions import shaped
 from phd_exp.distributions.point_estimate import PointDensity, PointEstimate
 from phd_exp.distributions.projected_huber import ProjectedHuber
 from phd_exp.distributions.quantiles import LEVELS, Quantiles
-from phd_exp.distributions.shaped import Decomposed, Gaussian, InverseDepthLaplace, LogDepthGaussian, Shaped, StudentT
 from phd_exp.geometry import Camera, Cartesian, Chart, DepthScale, LogDepth, Projected
 
 F_RANGE, Z_RANGE, S = (1200.0, 2000.0), (3.0, 5.0), 224.0
@@ -25,7 +25,7 @@ MIDDLE_F = (F_RANGE[0] * F_RANGE[1]) ** 0.5
 DEPTH = DepthScale.from_ranges(F_RANGE, Z_RANGE)
 SCALE = 0.1
 """Scale of the baselines' residuals, in units of their charts."""
-Density = ProjectedHuber | Shaped | PointDensity
+Density = ProjectedHuber | shaped.Shaped | PointDensity
 
 
 @dataclass(frozen=True)
@@ -60,11 +60,11 @@ def families() -> dict[str, Family]:
 
     return {
         "probabilistic": Family(_projected_huber, _seven_numbers),
-        "gaussian": _shaped(Gaussian),
-        "gaussian_logz": _shaped(LogDepthGaussian),
-        "laplace_inverse": _shaped(InverseDepthLaplace),
-        "decomposed": _shaped(Decomposed),
-        "student_t": _shaped(StudentT),
+        "gaussian": _shaped(shaped.Gaussian),
+        "gaussian_logz": _shaped(shaped.LogDepthGaussian),
+        "laplace_inverse": _shaped(shaped.InverseDepthLaplace),
+        "decomposed": _shaped(shaped.Decomposed),
+        "student_t": _shaped(shaped.StudentT),
         "quantiles": _shaped(Quantiles, _medians_and_gaps),
         "mae_vz": _baseline(Projected(DEPTH)),
         "mae_logz": _baseline(LogDepth(DEPTH)),
@@ -90,7 +90,7 @@ def _medians_and_gaps(n: int, generator: torch.Generator) -> Tensor:
     return torch.cat([2 * uniform[:, :2] - 1, torch.zeros(n, 4), uniform[:, 2:3] - 0.5, gaps], dim=-1)
 
 
-def _shaped(density: type[Shaped], inputs: Callable[[int, torch.Generator], Tensor] = _ten_numbers) -> Family:
+def _shaped(density: type[shaped.Shaped], inputs: Callable[[int, torch.Generator], Tensor] = _ten_numbers) -> Family:
     return Family(lambda raw, camera: density(_projected_huber(raw[..., :7], camera), raw[..., 7:]), inputs)
 
 

@@ -66,6 +66,7 @@ class Quantiles(Shaped):
         normal, s = super()._draw(shape, generator)
         return _interpolated(normal, self._normal_knots, self.knots[..., :2, :])[0], s
 
+    @property
     def _ray(self) -> tuple[Tensor, Tensor]:
         """Mean and variance of q."""
         p, weight = nodes(self.law.mu_xy)
@@ -75,21 +76,11 @@ class Quantiles(Shaped):
 
     @property
     def mu_xy(self) -> Float[Tensor, "*batch 2"]:
-        return self.law.mu_xy + spd.matvec(self._inverse, self._ray()[0])
+        return self.law.mu_xy + spd.matvec(self._spread[0], self._ray[0])
 
     @property
     def projected_covariance(self) -> Float[Tensor, "*batch 2 2"]:
-        return spd.square(self._inverse) * self._ray()[1][..., None]
-
-    @property
-    def depth_mean(self) -> Float[Tensor, "*batch"]:
-        p, weight = nodes(self.law.a)
-        return (weight * self.depth_icdf(p)).sum(0)
-
-    @property
-    def depth_variance(self) -> Float[Tensor, "*batch"]:
-        p, weight = nodes(self.law.a)
-        return (weight * (self.depth_icdf(p) - self.depth_mean).square()).sum(0)
+        return spd.square(self._spread[0]) * self._ray[1][..., None]
 
 
 def _interpolated(x: Tensor, xs: Tensor, ys: Tensor) -> tuple[Tensor, Tensor]:

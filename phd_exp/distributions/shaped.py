@@ -1,7 +1,7 @@
 """Densities of other shapes around the parameters (mu_xy, mu_z, A, a) of a Projected Huber density.
 
-With q and t = z/mu_z of that density and s = a (t^e - 1)/e (a log t for e = 0), each is a law of (q + k s, s) in space
-for e = 1, or of the ray q/t and s for e < 1. Seven raw numbers are the same for all, so that only the law differs.
+With q and t = z/mu_z of that density and s = a (t^e - 1)/e (a log t for e = 0), each is a law of (q + k s, s) in
+space for e = 1, or of the ray q/t and s for e < 1. The seven raw numbers are the same, so that only the law differs.
 
 Source: own derivation; tests/distributions/test_heads.py checks every law.
 """
@@ -62,14 +62,13 @@ class Shaped(Density):
         p = torch.rand(*shape, **like).clamp_min(torch.finfo(self.law.a.dtype).eps / 2)
         return torch.randn(*shape, 2, **like), self._icdf(p)
 
-    @property
-    def _variance(self) -> Tensor:
-        """Of each component of q + k s, and of s."""
-        return torch.ones_like(self.law.a)
+    _variance: ClassVar[Any] = 1.0  # of each component of q + k s
 
     @property
-    def _k(self) -> Tensor:
-        return self.further[..., :2] if self.exponent == 1 else torch.zeros_like(self.law.mu_xy)
+    def _spread(self) -> tuple[Tensor, Tensor]:
+        """A^(-1), and A^(-1) k."""
+        inverse = spd.inverse(self.law.A, self.law.log_det_A)
+        return inverse, spd.matvec(inverse, self.further[..., :2]) if self.exponent == 1 else inverse[..., 0] * 0
 
     def _s(self, z: Tensor) -> Tensor:
         t, e = z / self.law.mu_z, self.exponent
@@ -82,11 +81,13 @@ class Shaped(Density):
     def _whitened(self, xyz: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The variables of the law, the log of their volume per cubic metre, and where there is a density."""
         law, e = self.law, self.exponent
-        visible = (xyz[..., 2] > 0) | (e == 1)
+        volume, visible = law.log_det_A + law.a.log() - 3 * law.mu_z.log(), (xyz[..., 2] > 0) | (e == 1)
         xyz = torch.where(visible[..., None], xyz, law.mode)  # so that no NaN is multiplied by a zero gradient
-        q, s, t = law.whiten(xyz), self._s(xyz[..., 2]), (xyz[..., 2] / law.mu_z).masked_fill(visible & (e == 1), 1)
-        volume = law.log_det_A + law.a.log() - 3 * law.mu_z.log() + (e - 3) * t.log()
-        return q / t[..., None] + self._k * s[..., None], s, volume, visible
+        q, s = law.whiten(xyz), self._s(xyz[..., 2])
+        if e == 1:
+            return q + self.further[..., :2] * s[..., None], s, volume, visible
+        t = xyz[..., 2] / law.mu_z
+        return q / t[..., None], s, volume + (e - 3) * t.log(), visible
 
     def log_prob(self, value: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch"]:
         """Log density of a position (metres), nats per cubic metre; -inf for z <= 0 unless e = 1."""
@@ -106,14 +107,11 @@ class Shaped(Density):
     ) -> Float[Tensor, "*shape 3"]:
         """Exact samples."""
         q, s = self._draw((*sample_shape, *self.law.batch_shape), generator)
-        z, shift = self._z(s), spd.matvec(self._inverse, q - self._k * s[..., None])
-        return at_depth(self.law.mu_xy, z) + pad(
-            shift * (self.law.mu_z if self.exponent == 1 else z)[..., None], (0, 1)
+        z, (inverse, along) = self._z(s), self._spread
+        shift = (self.law.mu_z if self.exponent == 1 else z)[..., None] * (
+            spd.matvec(inverse, q) - along * s[..., None]
         )
-
-    @property
-    def _inverse(self) -> Tensor:
-        return spd.inverse(self.law.A, self.law.log_det_A)
+        return at_depth(self.law.mu_xy, z) + pad(shift, (0, 1))
 
     @property
     def mode(self) -> Float[Tensor, "*batch 3"]:
@@ -128,18 +126,25 @@ class Shaped(Density):
     @property
     def projected_covariance(self) -> Float[Tensor, "*batch 2 2"]:
         """Covariance of (x, y)/z; for e = 1, where it has none, of its linearisation about the mode."""
-        along = spd.matvec(self._inverse, self._k)
-        return self._variance[..., None, None] * (spd.square(self._inverse) + _outer(along))
+        inverse, along = self._spread
+        return torch.as_tensor(self._variance)[..., None, None] * (spd.square(inverse) + _outer(along, along))
 
     @property
     def depth_mean(self) -> Float[Tensor, "*batch"]:
         """E[z], metres."""
-        return self.law.mu_z
+        return self.law.mu_z if self.exponent == 1 else self._expected(lambda z: z)
 
     @property
     def depth_variance(self) -> Float[Tensor, "*batch"]:
         """Var[z], square metres."""
-        return self._variance * (self.law.mu_z / self.law.a).square()
+        if self.exponent == 1:
+            return self._variance * (self.law.mu_z / self.law.a).square()
+        mean = self.depth_mean
+        return self._expected(lambda z: (z - mean).square())
+
+    def _expected(self, function: Callable[[Tensor], Tensor]) -> Tensor:
+        p, weight = nodes(self.law.a)
+        return (weight * function(self.depth_icdf(p))).sum(0)
 
     @property
     def mean(self) -> Float[Tensor, "*batch 3"]:
@@ -148,14 +153,16 @@ class Shaped(Density):
 
     @property
     def covariance_matrix(self) -> Float[Tensor, "*batch 3 3"]:
-        """Covariance of the position, square metres: for e < 1, Var[z] m m^T + E[z^2] Cov[(x, y)/z], m = (mu_xy, 1)."""
-        m, variance = pad(self.mu_xy, (0, 1), value=1), self.depth_variance[..., None, None]
-        if self.exponent == 1:
-            along = m - self.law.a[..., None] * pad(spd.matvec(self._inverse, self._k), (0, 1))
-            across = spd.square(self._inverse * self.law.a[..., None, None])
-            return variance * (_outer(along) + pad(across, (0, 1, 0, 1)))
-        second = variance + self.depth_mean.square()[..., None, None]
-        return variance * _outer(m) + pad(second * self.projected_covariance, (0, 1, 0, 1))
+        """Covariance of the position, square metres.
+
+        With m = (mu_xy, 1) it is Var[z] m m^T + E[z^2] Cov[(x, y)/z], and for e = 1 mu_z^2 instead of E[z^2], and
+        terms for the correlation k.
+        """
+        m, variance = pad(self.mu_xy, (0, 1), value=1), self.depth_variance
+        along = pad(self._spread[1], (0, 1)) * self.law.a[..., None]
+        square = self.law.mu_z.square() if self.exponent == 1 else variance + self.depth_mean.square()
+        ray = pad(square[..., None, None] * self.projected_covariance, (0, 1, 0, 1))
+        return variance[..., None, None] * (_outer(m, m) - _outer(m, along) - _outer(along, m)) + ray
 
     def depth_cdf(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
         """P(depth <= z), z in metres."""
@@ -175,7 +182,7 @@ class Shaped(Density):
         """Continuous ranked probability score of a depth, metres: twice the mean pinball loss of all quantiles."""
         p, weight = nodes(z)
         gap = z - self.depth_icdf(p)
-        return 2 * (weight * (p - (gap < 0).to(p)) * gap).sum(0)
+        return 2 * (weight * torch.maximum(p * gap, (p - 1) * gap)).sum(0)
 
 
 class Gaussian(Shaped):
@@ -229,14 +236,6 @@ class LogDepthGaussian(Shaped):
 
     exponent = 0
 
-    @property
-    def depth_mean(self) -> Float[Tensor, "*batch"]:
-        return self.law.mu_z * torch.exp(self.law.a**-2 / 2)
-
-    @property
-    def depth_variance(self) -> Float[Tensor, "*batch"]:
-        return self.depth_mean.square() * torch.expm1(self.law.a**-2)
-
 
 class InverseDepthLaplace(Shaped):
     """A Gaussian of the ray and, independently, Laplace's law of 1/z > 0.
@@ -265,8 +264,12 @@ class InverseDepthLaplace(Shaped):
         return _LAPLACE.icdf(p * self._in_front)
 
     @property
+    def depth_mean(self) -> Float[Tensor, "*batch"]:
+        return self.law.mu_z
+
+    @property
     def depth_variance(self) -> Float[Tensor, "*batch"]:
-        return 2 * super().depth_variance
+        return 2 * (self.law.mu_z / self.law.a).square()
 
 
 class Decomposed(Shaped):
@@ -276,6 +279,7 @@ class Decomposed(Shaped):
     """
 
     exponent = 0
+    _variance = huber.HUBER_COVARIANCE
 
     def _energy(self, q: Tensor, s: Tensor) -> Tensor:
         return huber.huber_energy(q) + depth.depth_energy(s / self.law.a, self.law.a.log())
@@ -295,21 +299,8 @@ class Decomposed(Shaped):
         return self.law.a * depth.depth_icdf(p, self.law.a.log())
 
     def _draw(self, shape: Sequence[int], generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-        normal, s = super()._draw(shape, generator)
-        q = huber.sample_whitened(s.shape, dtype=s.dtype, device=s.device, generator=generator)
-        return q, s
-
-    @property
-    def _variance(self) -> Tensor:
-        return torch.full_like(self.law.a, huber.HUBER_COVARIANCE)
-
-    @property
-    def depth_mean(self) -> Float[Tensor, "*batch"]:
-        return self.law.depth_mean
-
-    @property
-    def depth_variance(self) -> Float[Tensor, "*batch"]:
-        return self.law.depth_variance
+        _, s = super()._draw(shape, generator)
+        return huber.sample_whitened(s.shape, dtype=s.dtype, device=s.device, generator=generator), s
 
 
 def nodes(like: Float[Tensor, "*batch"]) -> tuple[Float[Tensor, "nodes ..."], Float[Tensor, "nodes ..."]]:
@@ -319,8 +310,8 @@ def nodes(like: Float[Tensor, "*batch"]) -> tuple[Float[Tensor, "nodes ..."], Fl
     return (angle / 2).sin().square(), angle.sin() * (math.pi / 2 / _NODES)
 
 
-def _outer(x: Tensor) -> Tensor:
-    return x[..., :, None] * x[..., None, :]
+def _outer(x: Tensor, y: Tensor) -> Tensor:
+    return x[..., :, None] * y[..., None, :]
 
 
 def _by_scipy(function: Callable[..., Any], *values: Tensor) -> Tensor:

@@ -64,7 +64,7 @@ class Evaluation:
 
     Attributes:
         scores: means of `projected_error_mm` and `depth_error_mm`; of a distribution also of `nll` (nats) and
-            `energy_score_mm`, and the `calibration_scores`.
+            `energy_score_mm`, the share `coverage_90` in its regions of 90 %, and the `calibration_scores`.
         reference: for each score that is a distance from calibration, the median and 95 % interval of calibrated
             predictions with the same uncertainties (`calibrated_reference`): the distance is never zero.
         curves: `metrics.calibration_scores.curves`; x is the predicted variance, credible level, PIT, or share kept.
@@ -146,8 +146,8 @@ def recalibrated(table: pa.Table | Columns, temperature: Temperature) -> dict[st
 
 def _distribution_scores(columns: Mapping[str, Tensor], weight: Tensor) -> dict[str, Tensor]:
     energy = {"energy_score_mm": MILLIMETRES * _mean(columns["energy_score"], weight)}
-    nll = {"nll": _mean(columns["nll"], weight)}
-    return _point_scores(columns, weight) | nll | energy | calibration_scores(ordered(columns, weight))
+    others = {"nll": _mean(columns["nll"], weight), "coverage_90": _mean((columns["level"] <= 0.9).double(), weight)}
+    return _point_scores(columns, weight) | others | energy | calibration_scores(ordered(columns, weight))
 
 
 def _point_scores(columns: Mapping[str, Tensor], weight: Tensor) -> dict[str, Tensor]:

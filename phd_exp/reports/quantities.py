@@ -50,6 +50,7 @@ _ROWS: tuple[tuple[str, str, str, int, str], ...] = (
     ("projected_ence", "Projected ENCE", "", 3, "the same of the variance of (x, y)/z"),
     ("miscalibration_area", "Miscalibration area", "", 3, "between coverage of credible regions and diagonal"),
     ("overconfidence", "Overconfidence", "", 3, _OVERCONFIDENCE),
+    ("coverage_90", "Inside 90 %", "", 3, "share of true positions in the predicted region of 90 %"),
     ("depth_pit_area", "Depth PIT area", "", 3, "between the distribution of the depth’s PIT and the diagonal"),
     ("depth_pit_ks", "Depth PIT distance", "", 3, "the largest gap between those two (Kolmogorov–Smirnov)"),
     ("depth_sharpness_mm", "Depth sharpness", "mm", 1, "root mean square of the predicted deviation of z"),
