@@ -95,10 +95,7 @@ class Shaped(Density):
         return (self._log_law(q, s) + volume).masked_fill(~visible, -torch.inf)
 
     def level(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch"]:
-        """The probability of the smallest region that contains a position, of highest density in the law's variables.
-
-        It is uniform on (0, 1) over positions drawn from the density.
-        """
+        """The probability of the law's smallest region of highest density that contains a position."""
         q, s, _, visible = self._whitened(xyz)
         return self._level(q, s).masked_fill(~visible, 1)
 
@@ -108,10 +105,9 @@ class Shaped(Density):
         """Exact samples."""
         q, s = self._draw((*sample_shape, *self.law.batch_shape), generator)
         z, (inverse, along) = self._z(s), self._spread
-        shift = (self.law.mu_z if self.exponent == 1 else z)[..., None] * (
-            spd.matvec(inverse, q) - along * s[..., None]
-        )
-        return at_depth(self.law.mu_xy, z) + pad(shift, (0, 1))
+        shift = spd.matvec(inverse, q) - along * s[..., None]
+        at = self.law.mu_z if self.exponent == 1 else z
+        return at_depth(self.law.mu_xy, z) + pad(at[..., None] * shift, (0, 1))
 
     @property
     def mode(self) -> Float[Tensor, "*batch 3"]:
@@ -132,19 +128,16 @@ class Shaped(Density):
     @property
     def depth_mean(self) -> Float[Tensor, "*batch"]:
         """E[z], metres."""
-        return self.law.mu_z if self.exponent == 1 else self._expected(lambda z: z)
+        p, weight = nodes(self.law.a)
+        return self.law.mu_z if self.exponent == 1 else (weight * self.depth_icdf(p)).sum(0)
 
     @property
     def depth_variance(self) -> Float[Tensor, "*batch"]:
         """Var[z], square metres."""
         if self.exponent == 1:
             return self._variance * (self.law.mu_z / self.law.a).square()
-        mean = self.depth_mean
-        return self._expected(lambda z: (z - mean).square())
-
-    def _expected(self, function: Callable[[Tensor], Tensor]) -> Tensor:
         p, weight = nodes(self.law.a)
-        return (weight * function(self.depth_icdf(p))).sum(0)
+        return (weight * (self.depth_icdf(p) - self.depth_mean).square()).sum(0)
 
     @property
     def mean(self) -> Float[Tensor, "*batch 3"]:
@@ -153,11 +146,7 @@ class Shaped(Density):
 
     @property
     def covariance_matrix(self) -> Float[Tensor, "*batch 3 3"]:
-        """Covariance of the position, square metres.
-
-        With m = (mu_xy, 1) it is Var[z] m m^T + E[z^2] Cov[(x, y)/z], and for e = 1 mu_z^2 instead of E[z^2], and
-        terms for the correlation k.
-        """
+        """Covariance of the position, m^2: for e < 1 Var[z] m m^T + E[z^2] Cov[(x, y)/z] with m = (mu_xy, 1)."""
         m, variance = pad(self.mu_xy, (0, 1), value=1), self.depth_variance
         along = pad(self._spread[1], (0, 1)) * self.law.a[..., None]
         square = self.law.mu_z.square() if self.exponent == 1 else variance + self.depth_mean.square()

@@ -16,29 +16,19 @@ COLUMNS = ("nll", "depth_crps_mm", "coverage_90", "projected_error_mm", "depth_e
 OF_A_CELL = (
     "A cell: the mean over seeds with its 95 % interval; below it the difference to the probabilistic model with its "
     "95 % interval, a bootstrap over seeds and the shared test images. Bold: better than the probabilistic model by "
-    "that test; never one seed, and never coverage, which is best at 0.9."
+    "that test; never one seed, and never coverage, which is best at 0.9. Breaks: the constraints that the head "
+    "violates, of the seven, as measured."
 )
-OF_THE_CONSTRAINTS = "Breaks: which of the seven constraints the density violates, as measured on its head."
 
 
 def heads_tables(report: Report) -> list[Table]:
     """A table for every preset and data set with runs of the probabilistic model and of other densities."""
-    places = dict.fromkeys((run.preset, run.data) for run in report.runs)
-    found = {place: _densities(report, *place) for place in places}
+    found: dict[tuple[str, str], dict[str, list[Run]]] = {}
+    for run in sorted(report.runs, key=lambda run: (run.model != PROBABILISTIC, run.model, run.seed or 0)):
+        before = run.measured.before
+        if run.state == "finished" and run.overrides is None and before and "nll" in before.scores:
+            found.setdefault((run.preset, run.data), {}).setdefault(run.model, []).append(run)
     return [_table(*place, models) for place, models in found.items() if PROBABILISTIC in models and len(models) > 1]
-
-
-def _densities(report: Report, preset: str, data: str) -> dict[str, list[Run]]:
-    """The runs of each model with a density, in the order of its seeds; the probabilistic model is the first."""
-    models = {run.model for run in report.runs if (run.preset, run.data) == (preset, data) and _scores(run)}
-    return {
-        model: [run for _, run in sorted(report.at_defaults(preset, data, model).items()) if _scores(run)]
-        for model in sorted(models, key=lambda model: (model != PROBABILISTIC, model))
-    }
-
-
-def _scores(run: Run) -> bool:
-    return run.state == "finished" and run.measured.before is not None and "nll" in run.measured.before.scores
 
 
 def _means(runs: Sequence[Run], name: str) -> list[SampleMean]:
@@ -47,15 +37,11 @@ def _means(runs: Sequence[Run], name: str) -> list[SampleMean]:
 
 
 def _table(preset: str, data: str, models: dict[str, list[Run]]) -> Table:
-    broken: dict[str, list[str]] = {}
-    for constraint, row in findings().items():
-        for model, finding in row.items():
-            broken.setdefault(model, []).extend([] if finding.holds else [constraint[0]])
-    rows = []
+    table, rows = findings(), []
     for model, runs in models.items():
-        breaks = ", ".join(broken[model]) or "none" if model in broken else NOTHING
-        cells = tuple(_cell(name, runs, models[PROBABILISTIC]) for name in COLUMNS)
-        rows.append(TableRow((model, breaks, ", ".join(str(run.seed) for run in runs)), cells))
+        broken = ", ".join(name[0] for name, row in table.items() if model in row and not row[model].holds)
+        stub = (model, broken or NOTHING, ", ".join(str(run.seed) for run in runs))
+        rows.append(TableRow(stub, tuple(_cell(name, runs, models[PROBABILISTIC]) for name in COLUMNS)))
     return Table(
         stem=file_stem("heads", preset, data),
         kind="heads",
@@ -63,7 +49,7 @@ def _table(preset: str, data: str, models: dict[str, list[Run]]) -> Table:
         stub=("model", "breaks", "seeds"),
         columns=tuple(SCORES[name].axis for name in COLUMNS),
         groups=(tuple(rows),),
-        notes=(OF_A_CELL, OF_THE_CONSTRAINTS),
+        notes=(OF_A_CELL,),
         below="difference",
         preset=preset,
         numbers=tuple(
@@ -77,12 +63,10 @@ def _table(preset: str, data: str, models: dict[str, list[Run]]) -> Table:
 
 def _cell(name: str, runs: Sequence[Run], reference: Sequence[Run]) -> TableCell:
     means, text = _means(runs, name), SCORES[name].text
-    half_width = interval(means).half_width
-    spread = "" if half_width is None else f"±{text(half_width)}"
-    value = text(interval(means).mean)
+    found = interval(means)
+    spread = "" if found.half_width is None else f"±{text(found.half_width)}"
     if runs is reference or len({run.measured.images for run in (*runs, *reference)}) > 1:
-        return TableCell(value, spread)
+        return TableCell(text(found.mean), spread)
     gap, width = difference(means, _means(reference, name))
-    sign = "+" if gap > 0 else ""
-    bold = gap < -width and name != "coverage_90"
-    return TableCell(value, spread, f"{sign}{text(gap)} ±{text(width)}", bold)
+    below = f"{'+' if gap > 0 else ''}{text(gap)} ±{text(width)}"
+    return TableCell(text(found.mean), spread, below, gap < -width and name != "coverage_90")
