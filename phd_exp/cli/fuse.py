@@ -76,8 +76,8 @@ def _answers(arguments: FuseArguments, scenes: Sequence[Observed]) -> list[dict[
     predictor = loaded(arguments)
     if not predictor.is_probabilistic:
         raise ConfigError(
-            f"{arguments.run}: predicts positions without uncertainty, so they cannot be weighted; "
-            "fuse needs a run of model=probabilistic"
+            f"{arguments.run}: predicts no Projected Huber densities, which fuse needs; expected a run of "
+            "model=probabilistic"
         )
     numbers = torch.tensor(arguments.plane or (), dtype=torch.float64)
     plane = Plane(numbers[:3], numbers[3]) if arguments.plane else None

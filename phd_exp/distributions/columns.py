@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from phd_exp.distributions.projected_huber import ProjectedHuber
+from phd_exp.distributions.shaped import Shaped
 
 Columns = dict[str, Tensor]
 """Name -> one number a sample."""
@@ -28,16 +29,14 @@ def from_columns(columns: Mapping[str, Tensor]) -> ProjectedHuber:
     return ProjectedHuber(torch.stack([mu_x, mu_y], dim=-1), mu_z, A, a)
 
 
-def distribution_columns(distribution: ProjectedHuber, xyz: Float[Tensor, "samples 3"]) -> Columns:
-    """Parameters, `calibration_columns`, mean and median depth (metres), and the NLL of true positions (nats)."""
-    return {
-        **coordinates("mean_", distribution.mean),
-        "median_z": distribution.depth_median,
-        **parameter_columns(distribution),
-        **calibration_columns(distribution, xyz),
-        "nll": -distribution.log_prob(xyz),
-        "projected_precision": distribution.log_det_A.exp(),
-    }
+def distribution_columns(distribution: ProjectedHuber | Shaped, xyz: Float[Tensor, "samples 3"]) -> Columns:
+    """Mean and median depth (metres), `calibration_columns`, the NLL of true positions (nats), and the parameters of
+    a Projected Huber density.
+    """
+    table = coordinates("mean_", distribution.mean) | {"median_z": distribution.depth_median}
+    if isinstance(distribution, ProjectedHuber):
+        table |= parameter_columns(distribution) | {"projected_precision": distribution.log_det_A.exp()}
+    return table | calibration_columns(distribution, xyz) | {"nll": -distribution.log_prob(xyz)}
 
 
 def coordinates(prefix: str, xyz: Float[Tensor, "samples 3"]) -> Columns:
@@ -45,13 +44,13 @@ def coordinates(prefix: str, xyz: Float[Tensor, "samples 3"]) -> Columns:
     return {f"{prefix}{axis}": xyz[:, place] for place, axis in enumerate("xyz")}
 
 
-def draws(distribution: ProjectedHuber, n: int, seed: int) -> Float[Tensor, "n samples 3"]:
+def draws(distribution: ProjectedHuber | Shaped, n: int, seed: int) -> Float[Tensor, "n samples 3"]:
     """n positions from each distribution, the same for the same seed; torch's own random numbers stay untouched."""
-    generator = torch.Generator(device=distribution.a.device).manual_seed(seed)
+    generator = torch.Generator(device=distribution.mode.device).manual_seed(seed)
     return distribution.rsample((n,), generator)
 
 
-def calibration_columns(distribution: ProjectedHuber, xyz: Float[Tensor, "samples 3"]) -> Columns:
+def calibration_columns(distribution: ProjectedHuber | Shaped, xyz: Float[Tensor, "samples 3"]) -> Columns:
     """What is predicted of each error and how the true position (metres) stands to it.
 
     Variances and squared errors are m^2 (of depth, about its mean) and without unit (projected: of x/z plus of y/z);

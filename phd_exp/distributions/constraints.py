@@ -9,15 +9,15 @@ Source: paper, section "Desired constraints for estimated distribution".
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from phd_exp.distributions.huber import huber_energy
+from phd_exp.distributions import shaped
 from phd_exp.distributions.point_estimate import PointDensity, PointEstimate
 from phd_exp.distributions.projected_huber import ProjectedHuber
+from phd_exp.distributions.quantiles import LEVELS, Quantiles
 from phd_exp.geometry import Camera, Cartesian, Chart, DepthScale, LogDepth, Projected
 
 F_RANGE, Z_RANGE, S = (1200.0, 2000.0), (3.0, 5.0), 224.0
@@ -25,42 +25,7 @@ MIDDLE_F = (F_RANGE[0] * F_RANGE[1]) ** 0.5
 DEPTH = DepthScale.from_ranges(F_RANGE, Z_RANGE)
 SCALE = 0.1
 """Scale of the baselines' residuals, in units of their charts."""
-
-
-@dataclass(frozen=True)
-class Decomposed:
-    """The density p(x/z, y/z) p(z)/z^2 of an independent ray and depth, each distributed as in `law`.
-
-    The paper's Proposition 1: no density that decomposes in this way satisfies all seven constraints.
-    """
-
-    law: ProjectedHuber
-
-    def log_prob(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch"]:
-        """Log density of a position (metres), nats per cubic metre: the energy of q does not grow with z."""
-        q = self.law.whiten(xyz)
-        ratio = self.law.mu_z / xyz[..., 2].abs().clamp_min(torch.finfo(xyz.dtype).tiny)
-        change = huber_energy(q) - huber_energy(ratio[..., None] * q)
-        return self.law.log_prob(xyz) + change + 2 * ratio.log()
-
-    def rsample(self, shape: tuple[int, ...], generator: torch.Generator) -> Float[Tensor, "*shape 3"]:
-        """Exact samples: those of `law`, with the offset from the centre multiplied by z/mu_z."""
-        xy, z = self.law.rsample(shape, generator).split((2, 1), dim=-1)
-        centre = z * self.law.mu_xy
-        return torch.cat([centre + (xy - centre) * z / self.law.mu_z[..., None], z], dim=-1)
-
-
-@runtime_checkable
-class Density(Protocol):
-    """A density over positions (metres) with samples: `ProjectedHuber`, `PointDensity` or `Decomposed`."""
-
-    def log_prob(self, xyz: Tensor, /) -> Tensor:
-        """Log density of positions, nats per cubic metre."""
-        ...
-
-    def rsample(self, shape: tuple[int, ...], generator: torch.Generator, /) -> Tensor:
-        """Exact samples."""
-        ...
+Density = ProjectedHuber | shaped.Shaped | PointDensity
 
 
 @dataclass(frozen=True)
@@ -84,7 +49,7 @@ class Finding:
 
 
 def families() -> dict[str, Family]:
-    """The heads: the probabilistic one, a decomposed one, and the four baselines with constant scale in their charts.
+    """The heads: the probabilistic one, the other densities, and the baselines with constant scale in their charts.
 
     A head does not contain the network. With camera=shown the network depends on f, so that the whole model violates
     constraint 2 although its head satisfies it; measure the whole model.
@@ -95,7 +60,12 @@ def families() -> dict[str, Family]:
 
     return {
         "probabilistic": Family(_projected_huber, _seven_numbers),
-        "decomposed": Family(lambda raw, camera: Decomposed(_projected_huber(raw, camera)), _seven_numbers),
+        "gaussian": _shaped(shaped.Gaussian),
+        "gaussian_logz": _shaped(shaped.LogDepthGaussian),
+        "laplace_inverse": _shaped(shaped.InverseDepthLaplace),
+        "decomposed": _shaped(shaped.Decomposed),
+        "student_t": _shaped(shaped.StudentT),
+        "quantiles": _shaped(Quantiles, _medians_and_gaps),
         "mae_vz": _baseline(Projected(DEPTH)),
         "mae_logz": _baseline(LogDepth(DEPTH)),
         "mae_xyz": _baseline(Cartesian(DEPTH)),
@@ -105,6 +75,23 @@ def families() -> dict[str, Family]:
 
 def _projected_huber(raw: Tensor, camera: Camera) -> ProjectedHuber:
     return ProjectedHuber.from_raw(raw, f=camera.f, S=camera.S, mu_z0=DEPTH.mu_z0, validate_args=False)
+
+
+def _ten_numbers(n: int, generator: torch.Generator) -> Tensor:
+    further = torch.randn(n, 3, generator=generator, dtype=torch.float64)
+    return torch.cat([_seven_numbers(n, generator), further], dim=-1)
+
+
+def _medians_and_gaps(n: int, generator: torch.Generator) -> Tensor:
+    """Medians as of `_seven_numbers`, and gaps over four decades, alike for each coordinate."""
+    uniform = torch.rand(n, 6, generator=generator, dtype=torch.float64)
+    gaps = (12 * uniform[:, 3:] - 9).repeat_interleave(len(LEVELS) - 1, dim=-1)
+    gaps = gaps + torch.randn(gaps.shape, generator=generator, dtype=torch.float64) / 2
+    return torch.cat([2 * uniform[:, :2] - 1, torch.zeros(n, 4), uniform[:, 2:3] - 0.5, gaps], dim=-1)
+
+
+def _shaped(density: type[shaped.Shaped], inputs: Callable[[int, torch.Generator], Tensor] = _ten_numbers) -> Family:
+    return Family(lambda raw, camera: density(_projected_huber(raw[..., :7], camera), raw[..., 7:]), inputs)
 
 
 def _seven_numbers(n: int, generator: torch.Generator) -> Tensor:
@@ -208,11 +195,11 @@ def it_vanishes_far_away_and_at_the_camera(family: Family, generator: torch.Gene
     """6: p -> 0 at infinity and as z -> 0.
 
     Measured: the least fall of log p, nats, on the last factor of 1000 of three paths from positions in view: along
-    the ray to 10^9 times the distance, along it to the camera (10^(-12)), and straight to the plane z = 0.
+    the ray to 10^9 times the distance, along it to the camera (10^(-280)), and straight to the plane z = 0.
     """
     density, xyz = family.members(500, generator), _in_view(500, generator)
-    before = torch.tensor([[1e6, 1e6, 1e6], [1e-9, 1e-9, 1e-9], [1.0, 1.0, 1e-9]], dtype=xyz.dtype)
-    last = torch.tensor([[1e9, 1e9, 1e9], [1e-12, 1e-12, 1e-12], [1.0, 1.0, 1e-12]], dtype=xyz.dtype)
+    before = torch.tensor([[1e6, 1e6, 1e6], [1e-277, 1e-277, 1e-277], [1.0, 1.0, 1e-9]], dtype=xyz.dtype)
+    last = torch.tensor([[1e9, 1e9, 1e9], [1e-280, 1e-280, 1e-280], [1.0, 1.0, 1e-12]], dtype=xyz.dtype)
     near, far = (density.log_prob(xyz * factors[:, None]) for factors in (before, last))
     least = float((near - far).min())
     return Finding(least > 1, least)

@@ -17,6 +17,7 @@ from torch.distributions import Distribution, constraints
 from torch.distributions.constraints import Constraint
 
 from phd_exp.distributions import depth, huber, spd
+from phd_exp.distributions.density import Density
 from phd_exp.distributions.level import credible_level
 from phd_exp.distributions.natural import Natural, require, require_positions, require_representable
 from phd_exp.distributions.special import log_scaled_normaliser
@@ -24,7 +25,7 @@ from phd_exp.distributions.special import log_scaled_normaliser
 LARGEST_RAW = 1e9  # squares of larger raw numbers, and their products, would overflow in float32
 
 
-class ProjectedHuber(Distribution):
+class ProjectedHuber(Distribution, Density):
     """A density over positions v = (x, y, z) in the camera frame, zero for z <= 0.
 
     Args:

@@ -25,7 +25,7 @@ from phd_exp.records.errors import RunError
 from phd_exp.records.runs import CHOOSE
 
 ERRORS = ("projected_error_mm", "depth_error_mm")
-OF_A_DISTRIBUTION = (*PARAMETERS, *COLUMNS, *ERRORS, "nll", "energy_score")
+OF_A_DISTRIBUTION = (*COLUMNS, *ERRORS, "nll", "energy_score")
 XYZ = ("x", "y", "z")
 QUANTITIES: Mapping[str, tuple[str, str, tuple[float, ...] | int]] = {
     "visibility": ("visibility", "", (0.0, 0.25, 0.5, 0.75, 0.95, 1.0)),
@@ -66,7 +66,7 @@ class Evaluation:
 
     Attributes:
         scores: means of `projected_error_mm` and `depth_error_mm`; of a distribution also of `nll` (nats) and
-            `energy_score_mm`, and the `calibration_scores`.
+            `energy_score_mm`, the per cent `inside_90` of truths in regions of 90 %, and the `calibration_scores`.
         reference: for each score that is a distance from calibration, the median and 95 % interval of calibrated
             predictions with the same uncertainties (`calibrated_reference`): the distance is never zero.
         curves: `metrics.calibration_scores.curves`; x is the predicted variance, credible level, PIT, or share kept.
@@ -83,13 +83,14 @@ class Evaluation:
 
 
 def evaluate(table: pa.Table | Columns, window: int = 200, resamples: int = 200) -> Evaluation:
-    """Evaluate predictions: of a distribution if the table has its parameters, else of points, which have no curves.
+    """Evaluate predictions: of a density if the table has its levels, else of points, which have no curves.
 
     Raises RunError if a column is missing, or if no sample has finite values.
     """
     recorded = arrays(table)
-    is_distribution = "a" in recorded
-    columns, left_out = _finite(recorded, OF_A_DISTRIBUTION if is_distribution else ERRORS)
+    is_distribution, is_huber = "level" in recorded, "a" in recorded
+    needed = (*(PARAMETERS if is_huber else ()), *OF_A_DISTRIBUTION) if is_distribution else ERRORS
+    columns, left_out = _finite(recorded, needed)
     statistic: Statistic = _distribution_scores if is_distribution else _point_scores
     scores, drawn = _scores(statistic, columns, resamples)
     found: dict[str, Curve] = {}
@@ -103,7 +104,7 @@ def evaluate(table: pa.Table | Columns, window: int = 200, resamples: int = 200)
         curves=found,
         strata=_strata(statistic, columns, resamples),
         left_out=left_out,
-        reference=calibrated_reference(_distribution(columns)) if is_distribution else {},
+        reference=calibrated_reference(_distribution(columns)) if is_huber else {},
         resampled=drawn,
     )
 
@@ -158,8 +159,8 @@ def at_temperature(
 
 def _distribution_scores(columns: Mapping[str, Tensor], weight: Tensor) -> dict[str, Tensor]:
     energy = {"energy_score_mm": MILLIMETRES * _mean(columns["energy_score"], weight)}
-    nll = {"nll": _mean(columns["nll"], weight)}
-    return _point_scores(columns, weight) | nll | energy | calibration_scores(ordered(columns, weight))
+    others = {"nll": _mean(columns["nll"], weight), "inside_90": _mean(100.0 * (columns["level"] <= 0.9), weight)}
+    return _point_scores(columns, weight) | others | energy | calibration_scores(ordered(columns, weight))
 
 
 def _point_scores(columns: Mapping[str, Tensor], weight: Tensor) -> dict[str, Tensor]:

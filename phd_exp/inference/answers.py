@@ -13,7 +13,7 @@ from torch import Tensor
 from phd_exp.data.cache import LARGEST_AT_ONCE
 from phd_exp.data.crops import read_image
 from phd_exp.data.folder import content_of
-from phd_exp.distributions import ProjectedHuber, Temperature
+from phd_exp.distributions import Density, ProjectedHuber, Temperature
 from phd_exp.distributions.along import quantiles_along
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.virtual import intrinsics
@@ -26,6 +26,7 @@ from phd_exp.records.images import pillow_warnings
 
 LEVELS = (50, 90, 99)  # per cent of the credible intervals of depth
 DIGITS = 8
+NONE = "none: this model predicts a position alone"
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +109,8 @@ def answer(sighting: Sighting, temperature: Temperature | None, guarantee: Any =
             named["region"] = facts | {"depth_interval": interval, "volume": rounded(np.array(region.volume))}
     else:
         position = view.camera.to_real(_array(prediction.mode))
-        named |= {"position": rounded(position), "uncertainty": "none: this model predicts a position alone"}
+        none = "not reported: no Projected Huber density" if isinstance(prediction, Density) else NONE
+        named |= {"position": rounded(position), "uncertainty": none}
     camera = Camera(torch.tensor(view.camera.f, dtype=torch.float64), view.camera.S)
     named["out_of_field"] = not bool(camera.contains(prediction.mode))
     return named | (_errors(sighting) if line.z is not None else {})
@@ -154,7 +156,7 @@ def _errors(sighting: Sighting) -> dict[str, Any]:
         "projected_error_mm": MILLIMETRES * projected_error(truth, prediction.mode),
         "depth_error_mm": MILLIMETRES * depth_error(truth, prediction.mode),
     }
-    if isinstance(prediction, ProjectedHuber):
+    if isinstance(prediction, Density):
         errors |= {"credible_level": prediction.level(truth), "nll": -prediction.log_prob(truth)}
     return {name: rounded(value.numpy()) for name, value in errors.items()}
 

@@ -95,7 +95,7 @@ class Predictor:
 
     @property
     def is_probabilistic(self) -> bool:
-        """Whether it predicts densities; a baseline predicts points."""
+        """Whether it predicts Projected Huber densities, which alone are fused, recalibrated and drawn."""
         return issubclass(self.regressor.head.prediction, ProjectedHuber)
 
     def __call__(
@@ -248,7 +248,10 @@ def _temperature(folder: RunFolder, regressor: Regressor) -> Temperature:
 
 def _held_out(folder: RunFolder, regressor: Regressor) -> "Columns":
     if not issubclass(regressor.head.prediction, ProjectedHuber):
-        raise ConfigError(f"{folder.path}: predicts no uncertainty, which recalibrate= and coverage= need")
+        raise ConfigError(
+            f"{folder.path}: no Projected Huber densities, which recalibrate= and coverage= need; expected a run of "
+            "model=probabilistic"
+        )
     if not folder.held_out.exists():
         raise RunError(f"{folder.held_out}: missing; recalibrate= and coverage= need a run with data.n_held_out > 0")
     from phd_exp.evaluation.parquet import read_table

@@ -1,9 +1,10 @@
-"""The loss of the probabilistic model."""
+"""The loss of densities."""
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions import Density, ProjectedHuber
+from phd_exp.distributions.shaped import Shaped
 
 
 class NegativeLogLikelihood(nn.Module):
@@ -20,7 +21,7 @@ class NegativeLogLikelihood(nn.Module):
     make models and data sets comparable.
     """
 
-    prediction = ProjectedHuber
+    prediction = Density
 
-    def forward(self, prediction: ProjectedHuber, xyz: Float[Tensor, "batch 3"]) -> Float[Tensor, " batch"]:
+    def forward(self, prediction: ProjectedHuber | Shaped, xyz: Float[Tensor, "batch 3"]) -> Float[Tensor, " batch"]:
         return -prediction.log_prob(xyz)

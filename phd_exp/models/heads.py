@@ -11,12 +11,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from phd_exp.distributions import PointEstimate, ProjectedHuber
+from phd_exp.distributions import Density, PointEstimate, ProjectedHuber
+from phd_exp.distributions.quantiles import LEVELS, Quantiles
+from phd_exp.distributions.shaped import Shaped
 from phd_exp.distributions.spd import spectral_map
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import Chart, DepthScale
 
-Prediction = ProjectedHuber | PointEstimate
+Prediction = ProjectedHuber | Shaped | PointEstimate
 
 
 @runtime_checkable
@@ -24,7 +26,7 @@ class Head(Protocol):
     """The interface of a head."""
 
     n_outputs: int
-    prediction: type[Prediction]
+    prediction: type[Density | PointEstimate]
 
     def __call__(self, raw: Float[Tensor, "*batch n_outputs"], camera: Camera) -> Prediction: ...
 
@@ -57,10 +59,50 @@ class DistributionHead:
         # not validated for speed: the training step refuses a loss that is not finite
         return ProjectedHuber.from_raw(raw, f=camera.f, S=camera.S, mu_z0=self.mu_z0, validate_args=False)
 
-    def placed(self, raw: Float[Tensor, "*batch 7"], place: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 7"]:
+    def placed(self, raw: Float[Tensor, "*batch n"], place: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch n"]:
         """Raw numbers with the centre nu_p = B v_p shifted by B `place`: the same shift of v_p for every B."""
         B, _ = spectral_map(raw[..., 2:5])
         return torch.cat([raw[..., :2] + (B @ place[..., None]).squeeze(-1), raw[..., 2:]], dim=-1)
+
+
+class ShapedHead:
+    """The seven raw numbers of `DistributionHead` and further ones -> a density of another shape.
+
+    Args:
+        depth: constants of the data set.
+        density: makes the density of the Projected Huber density of the seven numbers, and the further numbers.
+        n_further: their number.
+    """
+
+    prediction = Density
+
+    def __init__(
+        self, depth: DepthScale, density: Callable[[ProjectedHuber, Tensor], Shaped], n_further: int = 0
+    ) -> None:
+        self.seven, self.density = DistributionHead(depth), density
+        self.n_outputs = self.seven.n_outputs + n_further
+        self.placed = self.seven.placed
+
+    def __call__(self, raw: Float[Tensor, "*batch n_outputs"], camera: Camera) -> Shaped:
+        return self.density(self.seven(raw[..., :7], camera), raw[..., 7:])
+
+
+class QuantileHead:
+    """Raw numbers of the medians of v_p and log z, and of the gaps between their quantiles -> `Quantiles`."""
+
+    n_outputs = 3 * len(LEVELS)
+    prediction = Quantiles
+
+    def __init__(self, depth: DepthScale) -> None:
+        self.seven = DistributionHead(depth)
+
+    def __call__(self, raw: Float[Tensor, "*batch n_outputs"], camera: Camera) -> Quantiles:
+        medians = torch.cat([raw[..., :2], torch.zeros_like(raw[..., :4]), raw[..., 2:3]], dim=-1)
+        return Quantiles(self.seven(medians, camera), raw[..., 3:])
+
+    def placed(self, raw: Float[Tensor, "*batch n"], place: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch n"]:
+        """Raw numbers with the medians of v_p shifted by `place`."""
+        return torch.cat([raw[..., :2] + place, raw[..., 2:]], dim=-1)
 
 
 class ChartHead:

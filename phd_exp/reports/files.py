@@ -12,6 +12,7 @@ from phd_exp.distributions.constraints import SCALE, Finding
 from phd_exp.records.files import remove_temporaries
 from phd_exp.reports.calibration_table import calibration_tables
 from phd_exp.reports.fusion_table import fusion_tables
+from phd_exp.reports.heads_table import heads_tables
 from phd_exp.reports.paper_tables import paper_tables
 from phd_exp.reports.runs import Report
 from phd_exp.reports.searches import search_tables
@@ -54,8 +55,16 @@ OF_CONSTRAINTS = f"""\
 
 
 def all_tables(report: Report) -> list[Table]:
-    """The paper's tables; those of calibration, shifts, variations, fusion and searches, if there are any."""
-    makers = (paper_tables, calibration_tables, shift_tables, variation_tables, fusion_tables, search_tables)
+    """The paper's tables, and all others for which there are runs."""
+    makers = (
+        paper_tables,
+        heads_tables,
+        calibration_tables,
+        shift_tables,
+        variation_tables,
+        fusion_tables,
+        search_tables,
+    )
     return [table for make in makers for table in make(report)]
 
 

@@ -12,7 +12,7 @@ from torch.nn.utils import clip_grad_norm_, clip_grad_value_
 from torch.optim.lr_scheduler import LambdaLR
 
 from phd_exp.data.batches import Batch
-from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions import Density
 from phd_exp.distributions.columns import Columns
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import projected
@@ -59,7 +59,7 @@ class PositionModule(LightningModule):
     ) -> None:
         super().__init__()
         self.regressor = regressor
-        is_density = issubclass(regressor.head.prediction, ProjectedHuber)
+        is_density = issubclass(regressor.head.prediction, Density)
         self.loss = loss or (NegativeLogLikelihood() if is_density else MeanAbsoluteError())
         self.make_optimizer = optimizer
         self.constant_f = constant_f

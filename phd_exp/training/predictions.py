@@ -12,7 +12,7 @@ from torch import Tensor
 
 from phd_exp.data.batches import Batch
 from phd_exp.data.sources import Known
-from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions import Density, ProjectedHuber
 from phd_exp.distributions.columns import Columns, coordinates, distribution_columns, draws
 from phd_exp.metrics.calibration import CalibrationCurve, calibration_curve
 from phd_exp.metrics.calibration_scores import exact_scores
@@ -37,11 +37,12 @@ def training_columns(
     prediction: Prediction, xyz: Float[Tensor, "batch 3"], nll: Float[Tensor, " batch"] | None
 ) -> Columns:
     """The metrics of a training batch: errors in millimetres; of a distribution also its NLL (nats; computed unless
-    given) and the precisions a and |A|.
+    given), and of a Projected Huber density the precisions a and |A|.
     """
     table = _errors(prediction, xyz)
-    if isinstance(prediction, ProjectedHuber):
+    if isinstance(prediction, Density):
         table["nll"] = -prediction.log_prob(xyz) if nll is None else nll
+    if isinstance(prediction, ProjectedHuber):
         table["depth_precision"] = prediction.a
         table["projected_precision"] = prediction.log_det_A.exp()
     return table
@@ -63,7 +64,7 @@ def columns(prediction: Prediction, batch: Batch) -> Columns:
     """
     table = {"row": batch.row} | coordinates("", batch.xyz) | coordinates("mode_", prediction.mode)
     table |= _errors(prediction, batch.xyz)
-    if isinstance(prediction, ProjectedHuber):
+    if isinstance(prediction, Density):
         table |= distribution_columns(prediction, batch.xyz)
         # seeded by the sample, so that the score does not depend on the epoch
         drawn = draws(prediction, DRAWS, seed=int(batch.row[0]))
@@ -83,7 +84,7 @@ def calibration_curves(table: Columns, window: int) -> dict[str, CalibrationCurv
 def summary(table: Columns, part: str = "test") -> dict[str, float]:
     """Metrics of the evaluation of a part of the samples: means over the rows, and calibration scores."""
     means = {metric: float(table[column].mean()) for column, metric in MEANS.items() if column in table}
-    scores = exact_scores(table) if "a" in table else {}
+    scores = exact_scores(table) if "level" in table else {}
     return {f"{part}/{name}": value for name, value in means.items()} | {
         f"{part}/calibration/{name}": score for name, score in scores.items()
     }

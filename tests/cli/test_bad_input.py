@@ -52,7 +52,10 @@ WRONG_VALUES = [
     (["evaluation.multiview.angle_range=[60,20]"], ["evaluation.multiview.angle_range", "lower bound"]),
     ([f"{MULTIVIEW}=9", "data=occl"], [MULTIVIEW, "expected data=scale"]),
     ([f"{MULTIVIEW}=9", *FOLDER], ["not of data=", "expected data=scale"]),
-    ([f"{MULTIVIEW}=9", "data=scale", "model=mae_vz"], ["model=mae_vz predicts points", "expected model=prob"]),
+    (
+        [f"{MULTIVIEW}=9", "data=scale", "model=mae_vz"],
+        ["model=mae_vz has no Projected Huber", "expected model=prob"],
+    ),
     (["loss=mae"], ["loss", "PointEstimate", "model=probabilistic", "ProjectedHuber"]),
     (["model=mae_vz", "loss=nll"], ["loss", "ProjectedHuber", "model=mae_vz"]),
     (["loss._target_=torch.optim.Nadam"], ["loss._target_", "cannot be imported"]),

@@ -168,7 +168,7 @@ def test_a_baseline_is_refused(phd_exp: Callable, several: Path, composed: Calla
     refused = phd_exp("fuse", f"run={points.path}", f"folder={several}")
     assert (refused.status, refused.out) == (1, "")
     (line,) = refused.err.splitlines()
-    assert "predicts positions without uncertainty" in line
+    assert "predicts no Projected Huber densities" in line
 
 
 POSE = {"rotation": [1, 0, 0, 0], "translation": [0, 0, 0]}

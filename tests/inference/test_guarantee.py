@@ -198,5 +198,5 @@ def test_a_mistake_is_one_line(
 def test_a_model_without_uncertainty_guarantees_nothing(phd_exp: Callable, make: Callable, photos: Path) -> None:
     baseline = make("model=mae_vz")
     outcome = phd_exp("predict", f"run={baseline.path}", f"folder={photos}", "coverage=0.9")
-    assert "predicts no uncertainty, which recalibrate= and coverage= need" in outcome.err
+    assert "no Projected Huber densities, which recalibrate= and coverage= need" in outcome.err
     assert guarantee(table_of(40, 1), 0.9, None, None).n == [20]

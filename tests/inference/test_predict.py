@@ -85,7 +85,10 @@ def test_a_baseline_has_positions_without_uncertainty(
         prediction = predictor.see(predictor.view(image, camera.K, row["box"]))
         assert isinstance(prediction, PointEstimate)
         np.testing.assert_allclose(row["position"], camera.to_real(prediction.mode.numpy()), rtol=1e-5, atol=1e-5)
-    for word, said in (("recalibrate", "predicts no uncertainty"), ("calibration", "no calibration curve of depth")):
+    for word, said in (
+        ("recalibrate", "no Projected Huber densities"),
+        ("calibration", "no calibration curve of depth"),
+    ):
         refused = phd_exp("predict", f"run={baseline.path}", f"folder={photos}", f"{word}=true", "out=more")
         assert refused.status == 1
         assert said in refused.err

@@ -13,6 +13,7 @@ from phd_exp.geometry.charts import projected
 from phd_exp.models.heads import ChartHead, DistributionHead, Head
 from phd_exp.models.locating import Locating
 from phd_exp.models.regressor import Regressor
+from tests.support.heads import SHAPED
 
 DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
 CAMERA = Camera(torch.tensor([1200.0, 1500.0, 1800.0, 2000.0]), 224.0)
@@ -20,6 +21,7 @@ PLACED: dict[str, Head] = {
     "probabilistic": DistributionHead(DEPTH),
     "mae_vz": ChartHead(DEPTH, Projected),
     "mae_logz": ChartHead(DEPTH, LogDepth),
+    **SHAPED,
 }
 
 

@@ -7,10 +7,11 @@ import torch
 from torchvision.models import resnet18, resnet34, resnet50
 
 from phd_exp.geometry import Camera, Cartesian, DepthScale, LogDepth, Projected
-from phd_exp.losses import MeanAbsoluteError, NegativeLogLikelihood
+from phd_exp.losses import MeanAbsoluteError, NegativeLogLikelihood, Pinball
 from phd_exp.models.backbones import resnet
 from phd_exp.models.heads import ChartHead, DistributionHead, Head
 from phd_exp.models.regressor import Regressor
+from tests.support.heads import SHAPED
 
 DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
 HEADS: dict[str, Head] = {
@@ -18,8 +19,9 @@ HEADS: dict[str, Head] = {
     "mae_vz": ChartHead(DEPTH, Projected),
     "mae_logz": ChartHead(DEPTH, LogDepth),
     "mae_xyz": ChartHead(DEPTH, Cartesian),
+    **SHAPED,
 }
-LOSSES = {"probabilistic": NegativeLogLikelihood()}
+LOSSES = {name: NegativeLogLikelihood() for name in ("probabilistic", *SHAPED)} | {"quantiles": Pinball()}
 
 
 @pytest.fixture

@@ -149,8 +149,8 @@ class RunConfig(Section):
         expected = "or evaluation.multiview.scenes=0"
         if not issubclass(_prediction(self.model.head) or object, ProjectedHuber):
             raise ValueError(
-                f"evaluation.multiview.scenes: model={self.model.name} predicts points, which cannot be fused by "
-                f"their uncertainty; expected model=probabilistic, {expected}"
+                f"evaluation.multiview.scenes: model={self.model.name} has no Projected Huber density, which fusion "
+                f"needs; expected model=probabilistic, {expected}"
             )
         if not isinstance(self.data, RenderedConfig) or self.data.name != SINGLE_VIEW:
             raise ValueError(

@@ -19,7 +19,7 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 
 from phd_exp.records.errors import complaint, in_our_words, in_user_code, nearest, shown
 
-OURS = ("phd_exp.models", "phd_exp.losses", "phd_exp.optimizers", "phd_exp.geometry")
+OURS = tuple(f"phd_exp.{room}" for room in ("models", "losses", "optimizers", "geometry", "distributions"))
 KNOWN = (*OURS, "torch.optim", "lightning")
 Trust = tuple[str, ...] | None
 """None: the user typed the configuration, which may name anything importable. Otherwise it is read from a run folder,

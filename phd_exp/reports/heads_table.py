@@ -1,0 +1,72 @@
+"""Densities of different shapes on the same images, compared with the Projected Huber density by paired tests."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from phd_exp.distributions.constraints import findings
+from phd_exp.evaluation.point_errors import SampleMean, difference
+from phd_exp.records.choices import in_words
+from phd_exp.reports.cells import interval
+from phd_exp.reports.quantities import SCORES
+from phd_exp.reports.runs import PROBABILISTIC, Report, Run
+from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem
+
+COLUMNS = ("nll", "depth_crps_mm", "inside_90", "projected_error_mm", "depth_error_mm")
+OF_A_CELL = (
+    "A cell: the mean over seeds with its 95 % interval; below it the difference to the probabilistic model with its "
+    "95 % interval, a bootstrap over seeds and the shared test images. Bold: better than the probabilistic model by "
+    "that test; never one seed, and never coverage, which is best at 90 %. Breaks: the constraints that the head "
+    "violates, of the seven, as measured."
+)
+
+
+def heads_tables(report: Report) -> list[Table]:
+    """A table for every preset and data set with runs of the probabilistic model and of other densities."""
+    found: dict[tuple[str, str], dict[str, list[Run]]] = {}
+    for run in sorted(report.runs, key=lambda run: (run.model != PROBABILISTIC, run.model, run.seed or 0)):
+        before = run.measured.before
+        if run.state == "finished" and run.overrides is None and before and "nll" in before.scores:
+            found.setdefault((run.preset, run.data), {}).setdefault(run.model, []).append(run)
+    return [_table(*place, models) for place, models in found.items() if PROBABILISTIC in models and len(models) > 1]
+
+
+def _means(runs: Sequence[Run], name: str) -> list[SampleMean]:
+    found = [run.measured.before for run in runs if run.measured.before]
+    return [SampleMean(e.n, e.scores[name].value, None, np.array(e.resampled[name])) for e in found]
+
+
+def _table(preset: str, data: str, models: dict[str, list[Run]]) -> Table:
+    table, rows = findings(), []
+    for model, runs in models.items():
+        broken = ", ".join(name[0] for name, row in table.items() if model in row and not row[model].holds)
+        stub = (model, broken or NOTHING, ", ".join(str(run.seed) for run in runs))
+        rows.append(TableRow(stub, tuple(_cell(name, runs, models[PROBABILISTIC]) for name in COLUMNS)))
+    return Table(
+        stem=file_stem("heads", preset, data),
+        kind="heads",
+        title=f"Densities on {data}, {in_words(preset)}",
+        stub=("model", "breaks", "seeds"),
+        columns=tuple(SCORES[name].axis for name in COLUMNS),
+        groups=(tuple(rows),),
+        notes=(OF_A_CELL,),
+        below="difference",
+        preset=preset,
+        numbers=tuple(
+            {"preset": preset, "data": data, "model": model, "seed": run.seed, "quantity": name, "value": mean.value}
+            for model, runs in models.items()
+            for name in COLUMNS
+            for run, mean in zip(runs, _means(runs, name), strict=True)
+        ),
+    )
+
+
+def _cell(name: str, runs: Sequence[Run], reference: Sequence[Run]) -> TableCell:
+    means, text = _means(runs, name), SCORES[name].text
+    found = interval(means)
+    spread = "" if found.half_width is None else f"±{text(found.half_width)}"
+    if runs is reference or len({run.measured.images for run in (*runs, *reference)}) > 1:
+        return TableCell(text(found.mean), spread)
+    gap, width = difference(means, _means(reference, name))
+    below = f"{'+' if gap > 0 else ''}{text(gap)} ±{text(width)}"
+    return TableCell(text(found.mean), spread, below, gap < -width and name != "inside_90")

@@ -1,0 +1,62 @@
+"""The table of densities: means, paired differences and bold cells against a computation by hand."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from phd_exp.distributions.constraints import findings
+from phd_exp.evaluation.predictions import OF_A_DISTRIBUTION
+from phd_exp.reports.heads_table import COLUMNS, heads_tables
+from phd_exp.reports.runs import read_report
+from tests.support.recorded import predicted, record
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    """Three seeds of four densities on the same images, whose NLL differ and whose levels are uniform."""
+    for seed in range(3):
+        for model, nll in (("probabilistic", -3.0), ("gaussian", -2.0), ("mine", -3.0), ("better", -4.0)):
+            frame = predicted(0).frame
+            random = np.random.default_rng(seed)
+            for name in OF_A_DISTRIBUTION:
+                frame[name] = random.uniform(0, 1, len(frame))
+            frame["nll"] = nll + 0.01 * random.standard_normal(len(frame))
+            frame["level"] = (np.arange(len(frame)) + 0.5) / len(frame)
+            record(tmp_path, "default", model, seed, frame)
+    record(tmp_path, "default", "mae_vz", 0, predicted(1, probabilistic=False).frame)
+    return tmp_path
+
+
+def test_densities_are_compared_with_the_probabilistic_model(runs: Path) -> None:
+    (table,) = heads_tables(read_report(runs))
+    assert [row.stub[0] for row in table.rows] == ["probabilistic", "better", "gaussian", "mine"]
+    assert {row.stub[2] for row in table.rows} == {"0, 1, 2"}
+    broken = [line[0] for line, row in findings().items() if not row["gaussian"].holds]
+    assert [row.stub[1] for row in table.rows] == ["–", "–", ", ".join(broken), "–"]
+    nll, coverage = (COLUMNS.index(name) for name in ("nll", "inside_90"))
+    reference, _, gaussian, mine = (row.cells for row in table.rows)
+    assert reference[nll].ours == "−3.00"
+    assert gaussian[nll].below.startswith("+1.00 ±0.0")
+    assert not gaussian[nll].bold
+    assert not mine[nll].bold
+    assert mine[coverage].ours == "90"
+    of_nll = [line["value"] for line in table.numbers if (line["model"], line["quantity"]) == ("gaussian", "nll")]
+    assert np.mean(of_nll) == pytest.approx(-2, abs=0.01)
+
+
+def test_a_better_density_is_bold_with_several_seeds_only(runs: Path) -> None:
+    def is_bold() -> bool:
+        (table,) = heads_tables(read_report(runs))
+        return next(row.cells[0].bold for row in table.rows if row.stub[0] == "better")
+
+    assert is_bold()
+    for seed in (1, 2):
+        shutil.rmtree(runs / "small" / "default" / "better" / f"seed{seed}")
+    assert not is_bold()
+
+
+def test_a_single_density_has_no_table(tmp_path: Path) -> None:
+    record(tmp_path, "default", "probabilistic", 0, predicted(0).frame)
+    assert heads_tables(read_report(tmp_path)) == []
