@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
@@ -81,8 +81,10 @@ def require_file(out: Path, name: str) -> None:
 class RunArguments(Arguments):
     """The run whose network a verb uses."""
 
-    run: Path
-    """the folder of a run"""
+    run: Annotated[tuple[Path, ...], BeforeValidator(lambda text: [text] if Path(text).exists() else text.split(","))]
+    """the folder of a run; several, separated by commas, or a folder of seeds are an ensemble"""
+    views: Literal["1", "8"] = "1"
+    """8: an ensemble of the eight symmetric views of each image"""
     recalibrate: bool = False
     """apply the temperatures that fit the run's held-out samples"""
     trust: str | None = None
@@ -94,9 +96,11 @@ def loaded(arguments: RunArguments, device: str = "auto") -> "Predictor":
     from phd_exp.inference.predictor import load
 
     trust = tuple(arguments.trust.split(",")) if arguments.trust else ()
-    predictor = load(arguments.run, device, arguments.recalibrate, trust)
+    predictor = load(arguments.run, device, arguments.recalibrate, trust, int(arguments.views))
+    if predictor.note:
+        print(f"note: {predictor.note}", file=sys.stderr)
     if predictor.state != "finished":
-        print(f"note: {arguments.run}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
+        print(f"note: {arguments.run[0]}: a run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
     return predictor
 
 

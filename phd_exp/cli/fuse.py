@@ -72,7 +72,7 @@ def _answers(arguments: FuseArguments, scenes: Sequence[Observed]) -> list[dict[
     predictor = loaded(arguments)
     if not predictor.is_probabilistic:
         raise ConfigError(
-            f"{arguments.run}: predicts positions without uncertainty, so they cannot be weighted; "
+            f"{arguments.run[0]}: predicts positions without uncertainty, so they cannot be weighted; "
             "fuse needs a run of model=probabilistic"
         )
     numbers = torch.tensor(arguments.plane or (), dtype=torch.float64)

@@ -66,6 +66,8 @@ class PredictArguments(RunArguments):
             )
         if self.calibration and self.out is None:
             raise ValueError("calibration: is drawn into the pictures; expected out=DIR too")
+        if self.calibration and (len(self.run), self.views) != (1, "1"):
+            raise ValueError("calibration: is recorded for single runs; expected one run= and no views=8")
         return self
 
 
@@ -82,7 +84,7 @@ def main(words: list[str]) -> int:
         _require_possible(detections, out)
         output_folder(out)
     predictor = loaded(arguments)
-    curve = _depth_curve(arguments.run, predictor) if arguments.calibration else None
+    curve = _depth_curve(arguments.run[0], predictor) if arguments.calibration else None
     if out is not None:
         _write(predictor, detections, out, curve)
         return 0

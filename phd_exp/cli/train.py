@@ -29,6 +29,9 @@ SHOWN = (
     "test/calibration/depth_ence",
     "test/calibration/projected_ence",
     "test/calibration/miscalibration_area",
+    "eight_views/projected_error_mm",
+    "eight_views/depth_error_mm",
+    "eight_views/nll",
 )
 """The numbers that are printed at the end of a run; results.json holds more."""
 SCORES = ("test/nll", "test/depth_error_mm")
@@ -63,6 +66,12 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
     results = train(checked, folder, draw=_draw(), cores=cores, callbacks=callbacks)
     if several is not None and isinstance(data, RenderedConfig):
         _record_views(folder, *several, data.workers, cores)
+    if checked.evaluation.eight_views:
+        from phd_exp.inference.eight_views import record_eight_views
+        from phd_exp.training.build import build_data
+
+        record_eight_views(folder, build_data(checked).source)
+        results = folder.results()
     print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
     for key in filter(results.__contains__, SHOWN):
         print(f"  {key} {_number(results[key])} (untrained {_number(results.get(f'untrained/{key}'))})")
@@ -141,7 +150,8 @@ def standing(config: dict[str, Any], overrides: list[str]) -> str | None:
         if status.state == "running":
             return "running" if folder.is_held() else "exited without a result (killed or out of memory)"
         several = config["evaluation"]["multiview"]["scenes"] > 0
-        is_whole = status.state == "finished" and (folder.views.exists() or not several)
+        wanted = {folder.views: several, folder.eight_views["test"]: config["evaluation"]["eight_views"]}
+        is_whole = status.state == "finished" and all(file.exists() for file, asked in wanted.items() if asked)
         return "finished" if is_whole else status.error or "interrupted"
     except (KeyError, TypeError, AttributeError, OSError, RunError):  # the run itself will report it
         return None

@@ -24,6 +24,10 @@ class PointEstimate:
         """The position in the camera frame, in metres. Named as the point estimate of a distribution is."""
         return self.chart.position(self.coordinates, self.camera)
 
+    def __getitem__(self, row: int) -> "PointEstimate":
+        """One estimate of a batch."""
+        return PointEstimate(self.coordinates[row], self.chart, Camera(self.camera.f[row], self.camera.S))
+
     def residual(self, xyz: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Estimate minus truth, in the coordinates of the chart."""
         return self.coordinates - self.chart.coordinates(xyz, self.camera)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,13 @@ from torch import Tensor
 
 from phd_exp.data.crops import cut
 from phd_exp.data.sources import RenderedSource
-from phd_exp.distributions import ProjectedHuber, Temperature
+from phd_exp.distributions import Mixture, ProjectedHuber, Temperature
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import DepthScale
+from phd_exp.geometry.motion import EIGHT, turned
 from phd_exp.geometry.virtual import Box, VirtualCamera, intrinsics
-from phd_exp.models.heads import Prediction
+from phd_exp.inference.ensembles import held_out_table, members_of, require_alike
+from phd_exp.models.heads import DistributionHead, Prediction
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, DatasetError, RunError, shown
@@ -67,7 +69,10 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Predictor:
-    """A trained network, in float32 whatever the precision of its training.
+    """A trained network, or an ensemble, in float32 whatever the precision of its training.
+
+    The members of an ensemble are networks, and for each the symmetric views of an image. It predicts the Projected
+    Huber distribution that is closest to their mixture.
 
     Args:
         config: the configuration of the run.
@@ -76,6 +81,10 @@ class Predictor:
         constant_f: the focal length that the network receives for every image, px; None: the true one.
         temperature: temperatures of recalibrated predictions; None: as trained.
         state: the state of the run, "finished" if it completed.
+        others: the further networks of an ensemble.
+        views: number of symmetric views of each image, 1 or 8.
+        disagreements: of the members on held-out samples, nats, for `familiar`; empty if they are unknown.
+        note: why they are unknown.
     """
 
     config: RunConfig
@@ -86,6 +95,20 @@ class Predictor:
     device: torch.device
     temperature: Temperature | None
     state: str
+    others: tuple[Regressor, ...] = ()
+    views: int = 1
+    disagreements: Float[np.ndarray, " samples"] = field(default_factory=lambda: np.empty(0))
+    note: str = ""
+
+    @property
+    def networks(self) -> tuple[Regressor, ...]:
+        """The network, or all networks of an ensemble."""
+        return (self.regressor, *self.others)
+
+    @property
+    def is_ensemble(self) -> bool:
+        """Whether it has several members."""
+        return bool(self.others) or self.views > 1
 
     @property
     def is_probabilistic(self) -> bool:
@@ -107,6 +130,19 @@ class Predictor:
         Returns a ProjectedHuber (metres), or a PointEstimate for a baseline. For crops and other cameras see `view`.
         Raises DatasetError if images or f are invalid.
         """
+        return self.predict(*self._seen(self._views(images, f)))
+
+    def mixture(
+        self,
+        images: UInt8[np.ndarray | Tensor, "*batch height width 3"],
+        *,
+        f: float | Sequence[float] | Float[np.ndarray | Tensor, " batch"],
+    ) -> Mixture:
+        """The members' predictions for whole images, as for a call: exact density, moments and levels."""
+        return self.members(*self._seen(self._views(images, f)))
+
+    def _views(self, images: Any, f: Any) -> View | list[View]:
+        """The views of whole images; one for an image without a batch."""
         array = _images(images)
         height, width = array.shape[1:3]
         cameras = [intrinsics(value, value, width / 2, height / 2) for value in _focal_lengths(f, len(array))]
@@ -114,7 +150,7 @@ class Predictor:
             View.of_box(Image.fromarray(image), K, None, self.side, f"image {row}")
             for row, (image, K) in enumerate(zip(array, cameras, strict=True))
         ]
-        return self.see(views if images.ndim == 4 else views[0])
+        return views if images.ndim == 4 else views[0]
 
     def view(
         self, image: UInt8[np.ndarray, "height width 3"], K: Float[np.ndarray, "3 3"], box: Box | None = None
@@ -129,22 +165,61 @@ class Predictor:
 
     def see(self, views: View | Sequence[View]) -> Prediction:
         """Predictions for views, each in the frame of its own virtual camera; for one view, one without a batch."""
+        return self.predict(*self._seen(views))
+
+    def _seen(self, views: View | Sequence[View]) -> tuple[Tensor, Tensor]:
+        """Raw numbers and focal lengths of views."""
         sequence = [views] if isinstance(views, View) else views
         f = torch.tensor([view.camera.f for view in sequence], dtype=torch.float32)
         raw = self.raw(np.stack([view.image for view in sequence]), f)
-        return self.predict(raw, f) if sequence is views else self.predict(raw[0], f[0])
+        return (raw, f) if sequence is views else (raw[0], f[0])
 
     def raw(
         self, images: UInt8[np.ndarray, "batch S S 3"], f: Float[Tensor, " batch"]
-    ) -> Float[Tensor, "batch n_outputs"]:
-        """The raw numbers of the network, on the CPU, computed in batches of 64; f in pixels of its images."""
+    ) -> Float[Tensor, "batch *members n_outputs"]:
+        """The raw numbers of the network, on the CPU, at most 64 images at a time; f in pixels of its images."""
         known = self.camera(f.float().to(self.device)).f
-        batches = zip(torch.from_numpy(images).split(BATCH), known.split(BATCH), strict=True)
-        return torch.cat([self.regressor.raw(image.to(self.device), f).cpu() for image, f in batches])
+        batches = zip(
+            *(values.split(BATCH // self.views) for values in (torch.from_numpy(images), known)), strict=True
+        )
+        return torch.cat([self.outputs(image.to(self.device), f).cpu() for image, f in batches])
+
+    def outputs(
+        self, image: UInt8[Tensor, "batch S S 3"], f: Float[Tensor, " batch"]
+    ) -> Float[Tensor, "batch *members n_outputs"]:
+        """The raw numbers of the network, or of all members of an ensemble, in the frame of each image."""
+        if not self.is_ensemble:
+            return self.regressor.raw(image, f)
+        signs = EIGHT[: self.views]
+        views = torch.stack([turned(image, sign) for sign in signs], dim=1).flatten(0, 1)
+        f = f.repeat_interleave(self.views)
+        raw = torch.stack([network.raw(views, f).unflatten(0, (-1, self.views)) for network in self.networks], dim=1)
+        head = self.regressor.head
+        assert isinstance(head, DistributionHead)  # checked by `load`
+        return head.turned_back(raw, torch.tensor(signs).to(raw)).flatten(1, 2)
+
+    def members(self, raw: Float[Tensor, "*batch members 7"], f: Float[Tensor, "*batch"]) -> Mixture:
+        """The mixture of an ensemble's predictions, in float64, from its raw numbers."""
+        prediction = self.regressor.head(raw.double(), self.camera(f.double()[..., None]))
+        assert isinstance(prediction, ProjectedHuber)  # checked by `load`
+        return Mixture(prediction)
+
+    def familiar(
+        self, raw: Float[Tensor, "batch members 7"], f: Float[Tensor, " batch"]
+    ) -> Float[np.ndarray, " batch"]:
+        """The share of held-out samples on which the members disagree at least as much, counting this one too.
+
+        Small for images unlike the training images; uniform over held-out ones, so that it is a p-value.
+        """
+        larger = self.disagreements >= self.members(raw, f).disagreement.numpy()[:, None]
+        return (1 + larger.sum(axis=1)) / (1 + self.disagreements.size)
 
     def predict(self, raw: Float[Tensor, "*batch n_outputs"], f: Float[Tensor, "*batch"]) -> Prediction:
-        """Predictions from the raw numbers of the network and focal lengths in pixels of its images."""
-        prediction = self.regressor.head(raw, self.camera(f))
+        """Predictions from the raw numbers of the network and focal lengths in pixels of its images.
+
+        Those of an ensemble have a dimension for the members before the last.
+        """
+        prediction = self.members(raw, f).closest if self.is_ensemble else self.regressor.head(raw, self.camera(f))
         if self.temperature is not None and isinstance(prediction, ProjectedHuber):
             return self.temperature.apply(prediction)
         return prediction
@@ -154,20 +229,49 @@ class Predictor:
         return Camera(f, float(self.side)).with_constant_f(self.constant_f)
 
 
-def load(run: Path, device: str = "auto", recalibrate: bool = False, trust: Trust = ()) -> Predictor:
-    """The network of a run's best checkpoint, or its last.
+def load(
+    run: str | Path | Sequence[str | Path],
+    device: str = "auto",
+    recalibrate: bool = False,
+    trust: Trust = (),
+    views: int = 1,
+) -> Predictor:
+    """The network of a run's best checkpoint, or its last; or an ensemble of several runs or views.
 
     Args:
-        run: the run's folder.
+        run: the run's folder; several, or a folder of seeds, for an ensemble.
         device: "auto" chooses a GPU if there is one.
         recalibrate: apply the temperatures that fit the run's predictions of held-out samples.
         trust: packages other than phd_exp whose classes the run may build; None: any.
+        views: 8 for an ensemble of the eight symmetric views of each image.
 
     Raises:
         RunError: the folder holds no usable run.
-        ConfigError: its configuration is invalid, names code that is not trusted, or cannot be recalibrated.
+        ConfigError: its configuration is invalid, names code that is not trusted, or cannot be recalibrated; or the
+            runs do not fit together.
     """
-    folder = RunFolder(Path(run))
+    folders, matters = members_of([run] if isinstance(run, str | Path) else run)
+    predictors = [_load(folder, device, trust) for folder in folders]
+    first, *others = predictors
+    if not others and views == 1:
+        return replace(first, temperature=_temperature(folders, first, 1)) if recalibrate else first
+    require_alike(folders, predictors, matters)
+    states = [predictor.state for predictor in predictors if predictor.state != "finished"]
+    ensemble = replace(
+        first,
+        others=tuple(predictor.regressor for predictor in others),
+        views=views,
+        state=states[0] if states else "finished",
+        temperature=_temperature(folders, first, views) if recalibrate else None,
+    )
+    try:
+        return replace(ensemble, disagreements=held_out_table(folders, views)["disagreement"])
+    except RunError as error:
+        return replace(ensemble, note=f"without `familiar`: {error}")
+
+
+def _load(folder: RunFolder, device: str, trust: Trust) -> Predictor:
+    """The network of one run, as trained."""
     if not folder.config_file.exists():
         raise RunError(f"{folder.path}: no run; expected a folder with config.yaml and checkpoints/last.ckpt")
     config = check(folder.config(), trust)
@@ -184,7 +288,7 @@ def load(run: Path, device: str = "auto", recalibrate: bool = False, trust: Trus
         depth=depth,
         constant_f=constant_f if config.camera.focal_length == "constant" else None,
         device=place,
-        temperature=_temperature(folder, regressor) if recalibrate else None,
+        temperature=None,
         state="unknown" if status is None else status.state,
     )
 
@@ -223,17 +327,12 @@ def _load_weights(regressor: Regressor, checkpoint: Path) -> None:
         raise RunError(f"{checkpoint}: not a whole checkpoint of this network ({reason})") from None
 
 
-def _temperature(folder: RunFolder, regressor: Regressor) -> Temperature:
-    if not issubclass(regressor.head.prediction, ProjectedHuber):
-        raise ConfigError(f"{folder.path}: predicts no uncertainty, so that there is nothing to recalibrate")
-    if not folder.held_out.exists():
-        raise RunError(
-            f"{folder.held_out}: missing; recalibration is fitted on held-out samples: train with data.n_held_out > 0"
-        )
-    from phd_exp.evaluation.parquet import read_table  # imports pyarrow
-    from phd_exp.evaluation.predictions import fit_temperature
+def _temperature(folders: Sequence[RunFolder], predictor: Predictor, views: int) -> Temperature:
+    if not predictor.is_probabilistic:
+        raise ConfigError(f"{folders[0].path}: predicts no uncertainty, so that there is nothing to recalibrate")
+    from phd_exp.evaluation.predictions import fit_temperature  # imports pyarrow
 
-    return fit_temperature(read_table(folder.held_out))
+    return fit_temperature(held_out_table(folders, views))
 
 
 def _images(images: Any) -> UInt8[np.ndarray, "batch height width 3"]:

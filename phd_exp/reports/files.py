@@ -11,6 +11,7 @@ from typing import Any
 from phd_exp.distributions.constraints import SCALE, Finding
 from phd_exp.records.files import remove_temporaries
 from phd_exp.reports.calibration_table import calibration_tables
+from phd_exp.reports.ensembles import ensemble_tables
 from phd_exp.reports.fusion_table import fusion_tables
 from phd_exp.reports.paper_tables import paper_tables
 from phd_exp.reports.runs import Report
@@ -51,8 +52,8 @@ OF_CONSTRAINTS = f"""\
 
 
 def all_tables(report: Report) -> list[Table]:
-    """The paper's tables, and the tables of calibration, variations, fusion and searches, if there are any."""
-    makers = (paper_tables, calibration_tables, variation_tables, fusion_tables, search_tables)
+    """The paper's tables, and those of calibration, ensembles, variations, fusion and searches, if there are any."""
+    makers = (paper_tables, calibration_tables, ensemble_tables, variation_tables, fusion_tables, search_tables)
     return [table for make in makers for table in make(report)]
 
 

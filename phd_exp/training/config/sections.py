@@ -190,6 +190,7 @@ class EvaluationConfig(Section):
     calibration_every_n_epochs: Count
     every_n_epochs: Count = 1  # default for older run records
     held_out: StrictBool = False  # whether the held-out samples are evaluated too, for callbacks that monitor them
+    eight_views: StrictBool = False  # default for older run records
     multiview: MultiviewConfig | None = None  # default for older run records
 
     @model_validator(mode="after")
