@@ -83,12 +83,12 @@ class RunArguments(Arguments):
 
     run: Annotated[tuple[Path, ...], BeforeValidator(lambda text: [text] if Path(text).exists() else text.split(","))]
     """the folder of a run; several, separated by commas, or a folder of seeds are an ensemble"""
-    views: Literal["1", "8"] = "1"
-    """8: an ensemble of the eight symmetric views of each image"""
     recalibrate: bool = False
     """apply the temperatures that fit the run's held-out samples"""
     trust: str | None = None
     """packages of the user's own parts that the run names, separated by commas; their code is executed"""
+    views: Literal["1", "8"] = "1"
+    """8: an ensemble of the eight symmetric views of each image"""
 
 
 def loaded(arguments: RunArguments, device: str = "auto") -> "Predictor":
@@ -100,7 +100,7 @@ def loaded(arguments: RunArguments, device: str = "auto") -> "Predictor":
     if predictor.note:
         print(f"note: {predictor.note}", file=sys.stderr)
     if predictor.state != "finished":
-        print(f"note: {arguments.run[0]}: a run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
+        print(f"note: {arguments.run[0]}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
     return predictor
 
 

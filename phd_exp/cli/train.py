@@ -29,9 +29,6 @@ SHOWN = (
     "test/calibration/depth_ence",
     "test/calibration/projected_ence",
     "test/calibration/miscalibration_area",
-    "eight_views/projected_error_mm",
-    "eight_views/depth_error_mm",
-    "eight_views/nll",
 )
 """The numbers that are printed at the end of a run; results.json holds more."""
 SCORES = ("test/nll", "test/depth_error_mm")
@@ -71,7 +68,6 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
         from phd_exp.training.build import build_data
 
         record_eight_views(folder, build_data(checked).source)
-        results = folder.results()
     print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
     for key in filter(results.__contains__, SHOWN):
         print(f"  {key} {_number(results[key])} (untrained {_number(results.get(f'untrained/{key}'))})")

@@ -130,19 +130,6 @@ class Predictor:
         Returns a ProjectedHuber (metres), or a PointEstimate for a baseline. For crops and other cameras see `view`.
         Raises DatasetError if images or f are invalid.
         """
-        return self.predict(*self._seen(self._views(images, f)))
-
-    def mixture(
-        self,
-        images: UInt8[np.ndarray | Tensor, "*batch height width 3"],
-        *,
-        f: float | Sequence[float] | Float[np.ndarray | Tensor, " batch"],
-    ) -> Mixture:
-        """The members' predictions for whole images, as for a call: exact density, moments and levels."""
-        return self.members(*self._seen(self._views(images, f)))
-
-    def _views(self, images: Any, f: Any) -> View | list[View]:
-        """The views of whole images; one for an image without a batch."""
         array = _images(images)
         height, width = array.shape[1:3]
         cameras = [intrinsics(value, value, width / 2, height / 2) for value in _focal_lengths(f, len(array))]
@@ -150,7 +137,7 @@ class Predictor:
             View.of_box(Image.fromarray(image), K, None, self.side, f"image {row}")
             for row, (image, K) in enumerate(zip(array, cameras, strict=True))
         ]
-        return views if images.ndim == 4 else views[0]
+        return self.see(views if images.ndim == 4 else views[0])
 
     def view(
         self, image: UInt8[np.ndarray, "height width 3"], K: Float[np.ndarray, "3 3"], box: Box | None = None
@@ -165,23 +152,18 @@ class Predictor:
 
     def see(self, views: View | Sequence[View]) -> Prediction:
         """Predictions for views, each in the frame of its own virtual camera; for one view, one without a batch."""
-        return self.predict(*self._seen(views))
-
-    def _seen(self, views: View | Sequence[View]) -> tuple[Tensor, Tensor]:
-        """Raw numbers and focal lengths of views."""
         sequence = [views] if isinstance(views, View) else views
         f = torch.tensor([view.camera.f for view in sequence], dtype=torch.float32)
         raw = self.raw(np.stack([view.image for view in sequence]), f)
-        return (raw, f) if sequence is views else (raw[0], f[0])
+        return self.predict(raw, f) if sequence is views else self.predict(raw[0], f[0])
 
     def raw(
         self, images: UInt8[np.ndarray, "batch S S 3"], f: Float[Tensor, " batch"]
     ) -> Float[Tensor, "batch *members n_outputs"]:
         """The raw numbers of the network, on the CPU, at most 64 images at a time; f in pixels of its images."""
         known = self.camera(f.float().to(self.device)).f
-        batches = zip(
-            *(values.split(BATCH // self.views) for values in (torch.from_numpy(images), known)), strict=True
-        )
+        n = BATCH // self.views
+        batches = zip(torch.from_numpy(images).split(n), known.split(n), strict=True)
         return torch.cat([self.outputs(image.to(self.device), f).cpu() for image, f in batches])
 
     def outputs(
@@ -251,23 +233,16 @@ def load(
             runs do not fit together.
     """
     folders, matters = members_of([run] if isinstance(run, str | Path) else run)
-    predictors = [_load(folder, device, trust) for folder in folders]
-    first, *others = predictors
-    if not others and views == 1:
-        return replace(first, temperature=_temperature(folders, first, 1)) if recalibrate else first
-    require_alike(folders, predictors, matters)
-    states = [predictor.state for predictor in predictors if predictor.state != "finished"]
-    ensemble = replace(
-        first,
-        others=tuple(predictor.regressor for predictor in others),
-        views=views,
-        state=states[0] if states else "finished",
-        temperature=_temperature(folders, first, views) if recalibrate else None,
-    )
-    try:
-        return replace(ensemble, disagreements=held_out_table(folders, views)["disagreement"])
-    except RunError as error:
-        return replace(ensemble, note=f"without `familiar`: {error}")
+    first, *others = predictors = [_load(folder, device, trust) for folder in folders]
+    if others or views > 1:
+        require_alike(folders, predictors, matters)
+        state = next((one.state for one in predictors if one.state != "finished"), "finished")
+        first = replace(first, others=tuple(other.regressor for other in others), views=views, state=state)
+        try:
+            first = replace(first, disagreements=held_out_table(folders, views)["disagreement"])
+        except RunError as error:
+            first = replace(first, note=f"without `familiar`: {error}")
+    return replace(first, temperature=_temperature(folders, first)) if recalibrate else first
 
 
 def _load(folder: RunFolder, device: str, trust: Trust) -> Predictor:
@@ -327,12 +302,12 @@ def _load_weights(regressor: Regressor, checkpoint: Path) -> None:
         raise RunError(f"{checkpoint}: not a whole checkpoint of this network ({reason})") from None
 
 
-def _temperature(folders: Sequence[RunFolder], predictor: Predictor, views: int) -> Temperature:
+def _temperature(folders: Sequence[RunFolder], predictor: Predictor) -> Temperature:
     if not predictor.is_probabilistic:
         raise ConfigError(f"{folders[0].path}: predicts no uncertainty, so that there is nothing to recalibrate")
     from phd_exp.evaluation.predictions import fit_temperature  # imports pyarrow
 
-    return fit_temperature(held_out_table(folders, views))
+    return fit_temperature(held_out_table(folders, predictor.views))
 
 
 def _images(images: Any) -> UInt8[np.ndarray, "batch height width 3"]:

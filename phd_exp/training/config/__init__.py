@@ -89,6 +89,11 @@ class RunConfig(Section):
         made, taken = (_prediction(node) for node in (self.model.head, self.loss))
         if made is None:
             raise ValueError(f"model.head._target_: {self.model.head['_target_']!r} is no head; see conf/model")
+        if self.evaluation.eight_views and not hasattr(made, "log_prob"):
+            raise ValueError(
+                f"evaluation.eight_views: model={self.model.name} predicts points without uncertainty; "
+                "expected model=probabilistic, or evaluation.eight_views=false"
+            )
         if taken is not None and not issubclass(made, taken):
             raise ValueError(
                 f"loss: takes a {taken.__name__}, but model={self.model.name} predicts a {made.__name__}; "
@@ -126,26 +131,19 @@ class RunConfig(Section):
 
     @model_validator(mode="after")
     def several_views_fit(self) -> "RunConfig":
-        """Refuse several or symmetric views for a point estimate, and several for a data set without them."""
-        multiview, eight_views = self.evaluation.multiview, self.evaluation.eight_views
-        several = multiview is not None and multiview.scenes > 0
-        if not several and not eight_views:
+        """Refuse several views for a point estimate, and for a data set without them."""
+        multiview = self.evaluation.multiview
+        if multiview is None or multiview.scenes == 0:
             return self
         from phd_exp.distributions import ProjectedHuber  # imports torch, which takes seconds
 
         expected = "or evaluation.multiview.scenes=0"
-        is_density = issubclass(_prediction(self.model.head) or object, ProjectedHuber)
-        if eight_views and not is_density:
-            raise ValueError(
-                f"evaluation.eight_views: model={self.model.name} predicts points, which cannot disagree in nats; "
-                "expected model=probabilistic, or evaluation.eight_views=false"
-            )
-        if several and not is_density:
+        if not issubclass(_prediction(self.model.head) or object, ProjectedHuber):
             raise ValueError(
                 f"evaluation.multiview.scenes: model={self.model.name} predicts points, which cannot be fused by "
                 f"their uncertainty; expected model=probabilistic, {expected}"
             )
-        if several and (not isinstance(self.data, RenderedConfig) or self.data.name != SINGLE_VIEW):
+        if not isinstance(self.data, RenderedConfig) or self.data.name != SINGLE_VIEW:
             raise ValueError(
                 f"evaluation.multiview.scenes: several cameras see the scenes of data={SINGLE_VIEW}, not of "
                 f"data={self.data.name}; expected data={SINGLE_VIEW}, {expected}"
