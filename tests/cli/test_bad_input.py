@@ -53,6 +53,8 @@ WRONG_VALUES = [
     ([f"{MULTIVIEW}=9", "data=occl"], [MULTIVIEW, "expected data=scale"]),
     ([f"{MULTIVIEW}=9", *FOLDER], ["not of data=", "expected data=scale"]),
     ([f"{MULTIVIEW}=9", "data=scale", "model=mae_vz"], ["model=mae_vz predicts points", "expected model=prob"]),
+    (["evaluation.eight_views=1"], ["evaluation.eight_views", "got 1"]),
+    (["evaluation.eight_views=true", "model=mae_vz"], ["evaluation.eight_views", "model=mae_vz predicts points"]),
     (["loss=mae"], ["loss", "PointEstimate", "model=probabilistic", "ProjectedHuber"]),
     (["model=mae_vz", "loss=nll"], ["loss", "ProjectedHuber", "model=mae_vz"]),
     (["loss._target_=torch.optim.Nadam"], ["loss._target_", "cannot be imported"]),
