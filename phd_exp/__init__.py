@@ -29,11 +29,17 @@ def train(overrides: Sequence[str] = (), config_dir: str | Path | None = None) -
     return trained(list(overrides), config_dir)
 
 
-def load(run: str | Path, device: str = "auto", recalibrate: bool = False, trust: tuple[str, ...] = ()) -> Predictor:
-    """A trained run as a callable from images to predictions; see `phd_exp.inference.predictor.load`."""
+def load(
+    run: str | Path | Sequence[str | Path],
+    device: str = "auto",
+    recalibrate: bool = False,
+    trust: tuple[str, ...] = (),
+    views: int = 1,
+) -> Predictor:
+    """A trained run or an ensemble as a callable from images to predictions; see `inference.predictor.load`."""
     from phd_exp.inference import predictor
 
-    return predictor.load(Path(run), device, recalibrate, trust)
+    return predictor.load(run, device, recalibrate, trust, views)
 
 
 def runs(folder: str | Path = "runs") -> Any:

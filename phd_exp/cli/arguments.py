@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
@@ -81,14 +81,16 @@ def require_file(out: Path, name: str) -> None:
 class RunArguments(Arguments):
     """The run whose network a verb uses."""
 
-    run: Path
-    """the folder of a run"""
+    run: Annotated[tuple[Path, ...], BeforeValidator(lambda text: [text] if Path(text).exists() else text.split(","))]
+    """the folder of a run; several, separated by commas, or a folder of seeds are an ensemble"""
     recalibrate: bool = False
     """apply the temperatures that fit the run's held-out samples"""
     coverage: Annotated[float, Field(gt=0, lt=1)] | None = None
     """probability of regions that contain the true position, guaranteed by held-out samples"""
     trust: str | None = None
     """packages of the user's own parts that the run names, separated by commas; their code is executed"""
+    views: Literal["1", "8"] = "1"
+    """8: an ensemble of the eight symmetric views of each image"""
 
 
 def loaded(arguments: RunArguments, device: str = "auto") -> "Predictor":
@@ -96,9 +98,11 @@ def loaded(arguments: RunArguments, device: str = "auto") -> "Predictor":
     from phd_exp.inference.predictor import load
 
     trust = tuple(arguments.trust.split(",")) if arguments.trust else ()
-    predictor = load(arguments.run, device, arguments.recalibrate, trust)
+    predictor = load(arguments.run, device, arguments.recalibrate, trust, int(arguments.views))
+    if predictor.note:
+        print(f"note: {predictor.note}", file=sys.stderr)
     if predictor.state != "finished":
-        print(f"note: {arguments.run}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
+        print(f"note: {arguments.run[0]}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
     return predictor
 
 

@@ -11,17 +11,19 @@ class ExportArguments(RunArguments):
     """The run and the file; recalibrate=true applies the temperatures fitted on the run's held-out samples."""
 
     out: Path | None = None
-    """the file; by default network.onnx in the run's folder"""
+    """the file; by default network.onnx in the (first) run's folder"""
 
 
 def main(words: list[str]) -> int:
     """Export the network of a run; returns the exit status."""
     arguments = parsed("export", ExportArguments, words)
-    file = arguments.out or arguments.run / "network.onnx"
+    file = arguments.out or arguments.run[0] / "network.onnx"
     if missing := [name for name in ("onnx", "onnxscript", "onnxruntime") if find_spec(name) is None]:
         raise ConfigError(f"export needs {', '.join(missing)}: `pip install 'phd_exp[export]'`")
     require_file(file, "network.onnx")
     predictor = loaded(arguments, "cpu")
+    if predictor.is_ensemble:
+        raise ConfigError("run: got an ensemble; expected one run, without views=8, for each exported file")
     output_folder(file.parent)
     from phd_exp.inference.onnx import CHECKED, TOLERANCE, export
 

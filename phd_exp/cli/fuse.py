@@ -13,7 +13,6 @@ from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_fol
 from phd_exp.records.detections import Observed, detections_in, observed
 from phd_exp.records.errors import ConfigError, listed
 from phd_exp.records.files import write_atomic
-from phd_exp.records.runs import RunFolder
 
 PLANE = four_numbers("plane=NX,NY,NZ,OFFSET: the points v with normal . v = offset, metres")
 
@@ -76,15 +75,17 @@ def _answers(arguments: FuseArguments, scenes: Sequence[Observed]) -> list[dict[
     predictor = loaded(arguments)
     if not predictor.is_probabilistic:
         raise ConfigError(
-            f"{arguments.run}: predicts no Projected Huber densities, which fuse needs; expected a run of "
+            f"{arguments.run[0]}: predicts no Projected Huber densities, which fuse needs; expected a run of "
             "model=probabilistic"
         )
+    if predictor.is_ensemble and arguments.coverage:
+        raise ConfigError("coverage: scenes with several cameras are recorded by single runs; expected one run=")
     numbers = torch.tensor(arguments.plane or (), dtype=torch.float64)
     plane = Plane(numbers[:3], numbers[3]) if arguments.plane else None
     detections = [detection for scene in scenes for detection in scene.detections]
     guarantees = {}
     if arguments.coverage:
-        views, cameras = RunFolder(arguments.run).views, {len(scene.detections) for scene in scenes}
+        views, cameras = predictor.folders[0].views, {len(scene.detections) for scene in scenes}
         guarantees = {k: fused_guarantee(views, k, arguments.coverage, predictor.temperature) for k in cameras}
     answers = fused_answers(scenes, predicted(predictor, detections), predictor, plane)
     return [answer | fused_region(answer, guarantees) for answer in answers] if guarantees else answers

@@ -46,6 +46,8 @@ EXAMPLES = {
         "python -m phd_exp predict run=runs/small/default/probabilistic/seed0 image=photo.jpg f=1550",
         "python -m phd_exp predict run=DIR image=a.jpg fx=900 fy=900 cx=320 cy=240 box=400,30,620,140 out=pictures",
         "python -m phd_exp predict run=DIR folder=photos/test recalibrate=true > predictions.jsonl",
+        "python -m phd_exp predict run=runs/small/default/probabilistic folder=photos/test",
+        "python -m phd_exp predict run=DIR,DIR,DIR views=8 folder=photos/test",
     ],
     "fuse": [
         "python -m phd_exp fuse run=runs/small/scale/probabilistic/seed0 folder=renders/multiview/test",

@@ -70,6 +70,8 @@ class PredictArguments(RunArguments):
             raise ValueError("groups: guarantees a coverage; expected coverage=0.9, or another in (0, 1), too")
         if self.calibration and self.out is None:
             raise ValueError("calibration: is drawn into the pictures; expected out=DIR too")
+        if self.calibration and (len(self.run), self.views) != (1, "1"):
+            raise ValueError("calibration: is recorded for single runs; expected one run= and no views=8")
         return self
 
 
@@ -87,7 +89,7 @@ def main(words: list[str]) -> int:
         output_folder(out)
     predictor = loaded(arguments)
     guarantee = predictor.guarantee(arguments.coverage, arguments.groups) if arguments.coverage else None
-    curve = _depth_curve(arguments.run, predictor) if arguments.calibration else None
+    curve = _depth_curve(arguments.run[0], predictor) if arguments.calibration else None
     if out is not None:
         _write(predictor, detections, out, curve, guarantee)
         return 0

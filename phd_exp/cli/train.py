@@ -64,6 +64,11 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
     if several is not None and isinstance(data, RenderedConfig):
         _record_views(folder, *several, data.workers, cores)
     _record_shifts(folder, checked, cores)
+    if checked.evaluation.eight_views:
+        from phd_exp.inference.eight_views import record_eight_views
+        from phd_exp.training.build import build_data
+
+        record_eight_views(folder, build_data(checked).source)
     print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
     for key in filter(results.__contains__, SHOWN):
         print(f"  {key} {_number(results[key])} (untrained {_number(results.get(f'untrained/{key}'))})")
@@ -156,9 +161,10 @@ def standing(config: dict[str, Any], overrides: list[str]) -> str | None:
             return None
         if status.state == "running":
             return "running" if folder.is_held() else "exited without a result (killed or out of memory)"
-        files = [folder.views] if config["evaluation"]["multiview"]["scenes"] > 0 else []
-        files += map(folder.shift, config["evaluation"]["shifts"])
-        is_whole = status.state == "finished" and all(file.exists() for file in files)
+        wanted = [folder.views] if config["evaluation"]["multiview"]["scenes"] > 0 else []
+        wanted += [folder.eight_views["test"]] if config["evaluation"]["eight_views"] else []
+        wanted += map(folder.shift, config["evaluation"]["shifts"])
+        is_whole = status.state == "finished" and all(file.exists() for file in wanted)
         return "finished" if is_whole else status.error or "interrupted"
     except (KeyError, TypeError, AttributeError, OSError, RunError):  # the run itself will report it
         return None

@@ -131,6 +131,12 @@ class ProjectedHuber(Distribution, Density):
         """The same distribution with a larger batch shape; nothing is copied."""
         return self._of(self._natural.expand(torch.Size(batch_shape)), self._validate_args)
 
+    def __getitem__(self, row: int) -> "ProjectedHuber":
+        """One distribution of a batch."""
+        return self._of(
+            Natural(**{name: value[row] for name, value in vars(self._natural).items()}), self._validate_args
+        )
+
     def tempered(self, projected: float, depth: float) -> "ProjectedHuber":
         """The distribution with A / projected and a / depth in place of A and a, around the same mode."""
         return self._of(self._natural.tempered(projected, depth), self._validate_args)

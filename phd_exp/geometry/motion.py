@@ -3,13 +3,18 @@
 A turn, a mirror and a longer focal length change any image by a homography.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import product
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from phd_exp.geometry.camera import Camera
+
+EIGHT = tuple(product((1.0, -1.0), repeat=3))
+"""The signs of all eight `symmetries`, the identity first."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +72,13 @@ def symmetries(numbers: Float[Tensor, "batch 3"]) -> Motion:
     mirror = torch.diag_embed(torch.cat([sign[:, :2], torch.ones_like(sign[:, :1])], dim=-1))
     R = mirror @ torch.where(numbers[:, 2, None, None] < 0, exchange, identity)
     return Motion(R, torch.ones_like(numbers[:, 0]))
+
+
+def turned(image: UInt8[Tensor, "*batch side side 3"], signs: Iterable[float]) -> UInt8[Tensor, "*batch side side 3"]:
+    """Images after one of the `symmetries`, given its three signs; pixels are moved, none is interpolated."""
+    x, y, exchange = (sign < 0 for sign in signs)
+    image = image.transpose(-3, -2) if exchange else image
+    return image.flip([axis for axis, wanted in ((-2, x), (-3, y)) if wanted]) if x or y else image
 
 
 def small_turns(numbers: Float[Tensor, "batch 4"], largest_zoom: float, camera: Camera) -> Motion:

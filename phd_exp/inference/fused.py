@@ -22,7 +22,7 @@ AGREE = 0.01
 
 def outputs(
     scenes: Sequence[Observed], sightings: Iterable[Sighting]
-) -> tuple[Float[Tensor, "views 7"], Float[Tensor, " views"], Pose]:
+) -> tuple[Float[Tensor, "views *members 7"], Float[Tensor, " views"], Pose]:
     """Network outputs, focal lengths and the poses of the virtual cameras in the world, for each view of the scenes.
 
     No image is kept. A virtual camera is the real one turned, v_virtual = R_v v_camera, so that its pose is

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,11 +14,13 @@ from torch import Tensor
 
 from phd_exp.data.crops import cut
 from phd_exp.data.sources import RenderedSource
-from phd_exp.distributions import ProjectedHuber, Temperature
+from phd_exp.distributions import Mixture, ProjectedHuber, Temperature
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import DepthScale
+from phd_exp.geometry.motion import EIGHT, turned
 from phd_exp.geometry.virtual import Box, VirtualCamera, intrinsics
-from phd_exp.models.heads import Prediction
+from phd_exp.inference.ensembles import held_out_table, members_of, require_alike
+from phd_exp.models.heads import DistributionHead, Prediction
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, DatasetError, RunError, shown
@@ -71,7 +73,10 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Predictor:
-    """A trained network, in float32 whatever the precision of its training.
+    """A trained network, or an ensemble, in float32 whatever the precision of its training.
+
+    The members of an ensemble are networks, and for each the symmetric views of an image. It predicts the Projected
+    Huber distribution that is closest to their mixture.
 
     Args:
         config: the configuration of the run.
@@ -80,7 +85,11 @@ class Predictor:
         constant_f: the focal length that the network receives for every image, px; None: the true one.
         temperature: temperatures of recalibrated predictions; None: as trained.
         state: the state of the run, "finished" if it completed.
-        folder: the run, whose held-out samples guarantee regions.
+        folders: the runs, whose held-out samples guarantee regions.
+        others: the further networks of an ensemble.
+        views: number of symmetric views of each image, 1 or 8.
+        disagreements: of the members on held-out samples, nats, for `familiar`; empty if they are unknown.
+        note: why they are unknown.
     """
 
     config: RunConfig
@@ -91,7 +100,21 @@ class Predictor:
     device: torch.device
     temperature: Temperature | None
     state: str
-    folder: RunFolder | None = None
+    folders: tuple[RunFolder, ...] = ()
+    others: tuple[Regressor, ...] = ()
+    views: int = 1
+    disagreements: Float[np.ndarray, " samples"] = field(default_factory=lambda: np.empty(0))
+    note: str = ""
+
+    @property
+    def networks(self) -> tuple[Regressor, ...]:
+        """The network, or all networks of an ensemble."""
+        return (self.regressor, *self.others)
+
+    @property
+    def is_ensemble(self) -> bool:
+        """Whether it has several members."""
+        return bool(self.others) or self.views > 1
 
     @property
     def is_probabilistic(self) -> bool:
@@ -129,8 +152,7 @@ class Predictor:
         """
         from phd_exp.evaluation.conformal import guarantee
 
-        assert self.folder is not None
-        return guarantee(_held_out(self.folder, self.regressor), coverage, groups, self.temperature)
+        return guarantee(_held_out(self), coverage, groups, self.temperature)
 
     def view(
         self, image: UInt8[np.ndarray, "height width 3"], K: Float[np.ndarray, "3 3"], box: Box | None = None
@@ -152,15 +174,49 @@ class Predictor:
 
     def raw(
         self, images: UInt8[np.ndarray, "batch S S 3"], f: Float[Tensor, " batch"]
-    ) -> Float[Tensor, "batch n_outputs"]:
-        """The raw numbers of the network, on the CPU, computed in batches of 64; f in pixels of its images."""
+    ) -> Float[Tensor, "batch *members n_outputs"]:
+        """The raw numbers of the network, on the CPU, at most 64 images at a time; f in pixels of its images."""
         known = self.camera(f.float().to(self.device)).f
-        batches = zip(torch.from_numpy(images).split(BATCH), known.split(BATCH), strict=True)
-        return torch.cat([self.regressor.raw(image.to(self.device), f).cpu() for image, f in batches])
+        n = BATCH // self.views
+        batches = zip(torch.from_numpy(images).split(n), known.split(n), strict=True)
+        return torch.cat([self.outputs(image.to(self.device), f).cpu() for image, f in batches])
+
+    def outputs(
+        self, image: UInt8[Tensor, "batch S S 3"], f: Float[Tensor, " batch"]
+    ) -> Float[Tensor, "batch *members n_outputs"]:
+        """The raw numbers of the network, or of all members of an ensemble, in the frame of each image."""
+        if not self.is_ensemble:
+            return self.regressor.raw(image, f)
+        signs = EIGHT[: self.views]
+        views = torch.stack([turned(image, sign) for sign in signs], dim=1).flatten(0, 1)
+        f = f.repeat_interleave(self.views)
+        raw = torch.stack([network.raw(views, f).unflatten(0, (-1, self.views)) for network in self.networks], dim=1)
+        head = self.regressor.head
+        assert isinstance(head, DistributionHead)  # checked by `load`
+        return head.turned_back(raw, torch.tensor(signs).to(raw)).flatten(1, 2)
+
+    def members(self, raw: Float[Tensor, "*batch members 7"], f: Float[Tensor, "*batch"]) -> Mixture:
+        """The mixture of an ensemble's predictions, in float64, from its raw numbers."""
+        prediction = self.regressor.head(raw.double(), self.camera(f.double()[..., None]))
+        assert isinstance(prediction, ProjectedHuber)  # checked by `load`
+        return Mixture(prediction)
+
+    def familiar(
+        self, raw: Float[Tensor, "batch members 7"], f: Float[Tensor, " batch"]
+    ) -> Float[np.ndarray, " batch"]:
+        """The share of held-out samples on which the members disagree at least as much, counting this one too.
+
+        Small for images unlike the training images; uniform over held-out ones, so that it is a p-value.
+        """
+        larger = self.disagreements >= self.members(raw, f).disagreement.numpy()[:, None]
+        return (1 + larger.sum(axis=1)) / (1 + self.disagreements.size)
 
     def predict(self, raw: Float[Tensor, "*batch n_outputs"], f: Float[Tensor, "*batch"]) -> Prediction:
-        """Predictions from the raw numbers of the network and focal lengths in pixels of its images."""
-        prediction = self.regressor.head(raw, self.camera(f))
+        """Predictions from the raw numbers of the network and focal lengths in pixels of its images.
+
+        Those of an ensemble have a dimension for the members before the last.
+        """
+        prediction = self.members(raw, f).closest if self.is_ensemble else self.regressor.head(raw, self.camera(f))
         if self.temperature is not None and isinstance(prediction, ProjectedHuber):
             return self.temperature.apply(prediction)
         return prediction
@@ -170,20 +226,47 @@ class Predictor:
         return Camera(f, float(self.side)).with_constant_f(self.constant_f)
 
 
-def load(run: Path, device: str = "auto", recalibrate: bool = False, trust: Trust = ()) -> Predictor:
-    """The network of a run's best checkpoint, or its last.
+def load(
+    run: str | Path | Sequence[str | Path],
+    device: str = "auto",
+    recalibrate: bool = False,
+    trust: Trust = (),
+    views: int = 1,
+) -> Predictor:
+    """The network of a run's best checkpoint, or its last; or an ensemble of several runs or views.
 
     Args:
-        run: the run's folder.
+        run: the run's folder; several, or a folder of seeds, for an ensemble.
         device: "auto" chooses a GPU if there is one.
         recalibrate: apply the temperatures that fit the run's predictions of held-out samples.
         trust: packages other than phd_exp whose classes the run may build; None: any.
+        views: 8 for an ensemble of the eight symmetric views of each image.
 
     Raises:
         RunError: the folder holds no usable run.
-        ConfigError: its configuration is invalid, names code that is not trusted, or cannot be recalibrated.
+        ConfigError: its configuration is invalid, names code that is not trusted, or cannot be recalibrated; or the
+            runs do not fit together.
     """
-    folder = RunFolder(Path(run))
+    folders, matters = members_of([run] if isinstance(run, str | Path) else run)
+    first, *others = predictors = [_load(folder, device, trust) for folder in folders]
+    if others or views > 1:
+        require_alike(folders, predictors, matters)
+        state = next((one.state for one in predictors if one.state != "finished"), "finished")
+        networks = tuple(other.regressor for other in others)
+        first = replace(first, folders=tuple(folders), others=networks, views=views, state=state)
+        try:
+            first = replace(first, disagreements=held_out_table(folders, views)["disagreement"])
+        except RunError as error:
+            first = replace(first, note=f"without `familiar`: {error}")
+    if not recalibrate:
+        return first
+    from phd_exp.evaluation.predictions import fit_temperature  # imports pyarrow
+
+    return replace(first, temperature=fit_temperature(_held_out(first)))
+
+
+def _load(folder: RunFolder, device: str, trust: Trust) -> Predictor:
+    """The network of one run, as trained."""
     if not folder.config_file.exists():
         raise RunError(f"{folder.path}: no run; expected a folder with config.yaml and checkpoints/last.ckpt")
     config = check(folder.config(), trust)
@@ -200,9 +283,9 @@ def load(run: Path, device: str = "auto", recalibrate: bool = False, trust: Trus
         depth=depth,
         constant_f=constant_f if config.camera.focal_length == "constant" else None,
         device=place,
-        temperature=_temperature(folder, regressor) if recalibrate else None,
+        temperature=None,
         state="unknown" if status is None else status.state,
-        folder=folder,
+        folders=(folder,),
     )
 
 
@@ -240,23 +323,14 @@ def _load_weights(regressor: Regressor, checkpoint: Path) -> None:
         raise RunError(f"{checkpoint}: not a whole checkpoint of this network ({reason})") from None
 
 
-def _temperature(folder: RunFolder, regressor: Regressor) -> Temperature:
-    from phd_exp.evaluation.predictions import fit_temperature  # imports pyarrow
-
-    return fit_temperature(_held_out(folder, regressor))
-
-
-def _held_out(folder: RunFolder, regressor: Regressor) -> "Columns":
-    if not issubclass(regressor.head.prediction, ProjectedHuber):
+def _held_out(predictor: Predictor) -> "Columns":
+    """The predictions of held-out samples. Raises ConfigError or RunError if there are none."""
+    if not predictor.is_probabilistic:
         raise ConfigError(
-            f"{folder.path}: no Projected Huber densities, which recalibrate= and coverage= need; expected a run of "
-            "model=probabilistic"
+            f"{predictor.folders[0].path}: no Projected Huber densities, which recalibrate= and coverage= need; "
+            "expected a run of model=probabilistic"
         )
-    if not folder.held_out.exists():
-        raise RunError(f"{folder.held_out}: missing; recalibrate= and coverage= need a run with data.n_held_out > 0")
-    from phd_exp.evaluation.parquet import read_table
-
-    return read_table(folder.held_out)
+    return held_out_table(predictor.folders, predictor.views)
 
 
 def _images(images: Any) -> UInt8[np.ndarray, "batch height width 3"]:

@@ -64,6 +64,20 @@ class DistributionHead:
         B, _ = spectral_map(raw[..., 2:5])
         return torch.cat([raw[..., :2] + (B @ place[..., None]).squeeze(-1), raw[..., 2:]], dim=-1)
 
+    def turned_back(
+        self, raw: Float[Tensor, "*views 7"], signs: Float[Tensor, "*#views 3"]
+    ) -> Float[Tensor, "*views 7"]:
+        """Raw numbers in the frame of an image, given those of its views after `symmetries` of these signs.
+
+        A symmetry R changes nu_p to R nu_p and B to R B R^T: both signs and an exchange of raw numbers, exactly.
+        Source: own derivation (`spectral_map` commutes with R); checked in tests/models/test_symmetric_views.py.
+        """
+        n, b, w = raw.split((2, 3, 2), dim=-1)
+        x, y, exchange = signs.split(1, dim=-1)
+        n, b = n * signs[..., :2], b * torch.cat([x * x, x * y, y * y], dim=-1)
+        n, b = (torch.where(exchange < 0, part.flip(-1), part) for part in (n, b))
+        return torch.cat([n, b, w], dim=-1)
+
 
 class ShapedHead:
     """The seven raw numbers of `DistributionHead` and further ones -> a density of another shape.

@@ -1,6 +1,7 @@
 """What distinguishes runs: their choices, and all other keys that change the distribution of their results."""
 
 import hashlib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ WITHOUT_INFLUENCE = (
     "trainer.progress_bar",
     "trainer.threads",
     "evaluation.calibration_every_n_epochs",
+    "evaluation.eight_views",
     "evaluation.every_n_epochs",
     "evaluation.held_out",
     "evaluation.multiview",
@@ -71,6 +73,16 @@ class RunName:
 def has_influence(key: str) -> bool:
     """Whether a dotted key changes the distribution of a run's results, not only their computation."""
     return not any(key == name or key.startswith(f"{name}.") for name in WITHOUT_INFLUENCE)
+
+
+def first_difference(before: Mapping[str, Any], now: Mapping[str, Any], matters: Callable[[str], bool]) -> str | None:
+    """The first dotted key that matters with two values, "KEY=VALUE, but KEY=VALUE"; None if there is none."""
+    recorded, asked = flatten(dict(before)), flatten(dict(now))
+    for key in sorted(filter(matters, recorded.keys() | asked.keys())):
+        old, new = recorded.get(key, "nothing"), asked.get(key, "nothing")
+        if old != new:
+            return f"{key}={old}, but {key}={new}"
+    return None
 
 
 def flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:

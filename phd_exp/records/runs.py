@@ -8,6 +8,7 @@
         results.json         the final numbers
         predictions.parquet  per test sample: truth, parameters, estimate, errors
         held_out.parquet     the same for held-out training samples; see `CHOOSE`
+        eight_views_*.parquet  the same two from the eight symmetric views of each image, and the views' disagreement
         views.parquet        the same for scenes with several cameras, and their poses, if asked for
         shifts/              the same for shifted test samples, a table NAME.parquet for each, if asked for
         calibration/         the calibration curves, as data (JSON) and as pictures (PNG)
@@ -95,6 +96,7 @@ class RunFolder:
         self.held_out = path / "held_out.parquet"
         self.views = path / "views.parquet"
         self.shifts = path / "shifts"
+        self.eight_views = {part: path / f"eight_views_{part}.parquet" for part in ("held_out", "test")}
         self.results_file = path / "results.json"
         self.metrics_file = path / "metrics.jsonl"
         self.status_file = path / "status.json"

@@ -11,6 +11,7 @@ from typing import Any
 from phd_exp.distributions.constraints import SCALE, Finding
 from phd_exp.records.files import remove_temporaries
 from phd_exp.reports.calibration_table import calibration_tables
+from phd_exp.reports.ensembles import ensemble_tables
 from phd_exp.reports.fusion_table import fusion_tables
 from phd_exp.reports.heads_table import heads_tables
 from phd_exp.reports.paper_tables import paper_tables
@@ -60,6 +61,7 @@ def all_tables(report: Report) -> list[Table]:
         paper_tables,
         heads_tables,
         calibration_tables,
+        ensemble_tables,
         shift_tables,
         variation_tables,
         fusion_tables,

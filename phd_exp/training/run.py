@@ -13,7 +13,7 @@ from phd_exp.data.datamodule import PositionData
 from phd_exp.data.images import SHRINKING
 from phd_exp.data.sources import PARTS, Part
 from phd_exp.distributions.columns import Columns
-from phd_exp.records.choices import flatten, has_influence
+from phd_exp.records.choices import first_difference, has_influence
 from phd_exp.records.dataset import DatasetFolder, checksum
 from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError, RunError, shown
@@ -95,14 +95,11 @@ def require_same_config(folder: RunFolder, config: RunConfig) -> None:
     if not folder.config_file.exists():
         return
     require_same_shrinking(folder, config)
-    recorded, asked = flatten(folder.config()), flatten(config.model_dump(mode="json"))
-    for key in sorted(recorded.keys() | asked.keys()):
-        before, now = recorded.get(key, "nothing"), asked.get(key, "nothing")
-        if before != now and has_influence(key):
-            raise RunError(
-                f"{folder.path}: holds a run with {key}={before}, but {key}={now} is asked for; "
-                "move that folder away, or choose another place by runs=DIR"
-            )
+    if difference := first_difference(folder.config(), config.model_dump(mode="json"), has_influence):
+        raise RunError(
+            f"{folder.path}: holds a run with {difference} is asked for; "
+            "move that folder away, or choose another place by runs=DIR"
+        )
     # the user's own data may change under the same name; a rendered set only grows
     status, manifest = folder.status(), _manifest_hash(config)
     if isinstance(config.data, FolderConfig) and status and manifest not in (None, status.data_manifest):

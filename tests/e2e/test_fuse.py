@@ -181,7 +181,7 @@ LINES = [
     ({"scene": 1, "pose": POSE | {"R": 1}}, "pose.R: unknown key; expected one of rotation, translation"),
 ]
 ARGUMENTS = [
-    (("run=nowhere",), "folder: missing; fuse takes run=, recalibrate=, coverage=, trust=, folder=, plane=, out="),
+    (("run=nowhere",), "folder: missing; fuse takes run=, recalibrate=, coverage=, trust=, views=, folder=, plane=, out="),
     (("run=nowhere", "folder=."), "nowhere: no run; expected a folder with config.yaml"),
     (("run=nowhere", "folder=.", "plane=1,2,3"), "plane: got '1,2,3'; expected plane=NX,NY,NZ,OFFSET"),
     (("run=nowhere", "folder=.", "plane=0,0,0,1"), "a normal that is not zero"),

@@ -167,7 +167,7 @@ MISTAKES: list[tuple[tuple[str, ...], Callable[[RunFolder], Any], str]] = [
     ((*ONE, "coverage=most"), gone, "coverage: got 'most'; expected"),
     ((*ONE, "groups=spread"), gone, "groups: guarantees a coverage; expected coverage=0.9"),
     ((*ONE, "groups=size", "coverage=0.9"), gone, "groups: got 'size'; expected to be 'spread', 'truncation' or"),
-    ((*ONE, "coverage=0.9"), gone, "held_out.parquet: missing; recalibrate= and coverage= need a run with"),
+    ((*ONE, "coverage=0.9"), gone, "held_out.parquet: missing; held-out samples are needed: train with"),
     (("export", "coverage=0.9"), gone, "held_out.parquet: missing"),
     ((*ONE, "coverage=0.999"), lambda run: None, "coverage: got 0.999; needs at least 999 held-out samples, every"),
     ((*ONE, "coverage=0.99", "groups=spread"), lambda run: None, "needs at least 99 held-out samples of each group"),

@@ -256,7 +256,7 @@ def test_the_import_does_not_wait_for_torch_nor_a_prediction_for_lightning(run: 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ((), "run: missing; export takes run=, recalibrate=, coverage=, trust=, out="),
+        ((), "run: missing; export takes run=, recalibrate=, coverage=, trust=, views=, out="),
         (("run=nowhere",), "nowhere: no run; expected a folder with config.yaml"),
         (("run=.", "out=."), "out=.: is a folder"),
     ],

@@ -89,6 +89,11 @@ class RunConfig(Section):
         made, taken = (_prediction(node) for node in (self.model.head, self.loss))
         if made is None:
             raise ValueError(f"model.head._target_: {self.model.head['_target_']!r} is no head; see conf/model")
+        if self.evaluation.eight_views and not hasattr(made, "log_prob"):
+            raise ValueError(
+                f"evaluation.eight_views: model={self.model.name} predicts points without uncertainty; "
+                "expected model=probabilistic, or evaluation.eight_views=false"
+            )
         if taken is not None and not issubclass(made, taken):
             raise ValueError(
                 f"loss: takes a {taken.__name__}, but model={self.model.name} predicts a {made.__name__}; "

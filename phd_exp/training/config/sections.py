@@ -220,6 +220,7 @@ class EvaluationConfig(Section):
     calibration_every_n_epochs: Count
     every_n_epochs: Count = 1  # default for older run records
     held_out: StrictBool = False  # whether the held-out samples are evaluated too, for callbacks that monitor them
+    eight_views: StrictBool = False  # default for older run records
     multiview: MultiviewConfig | None = None  # default for older run records
     shifts: dict[Name, ShiftConfig] = Field(default_factory=dict)  # default for older run records
     n_shifted: Count | None = None  # default for older run records

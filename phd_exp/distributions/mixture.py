@@ -1,0 +1,187 @@
+"""The mixture of an ensemble's predictions, and the single Projected Huber distribution closest to it."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from phd_exp.distributions import spd
+from phd_exp.distributions.depth import depth_mean_energy
+from phd_exp.distributions.huber import RADIAL_NORMALISER
+from phd_exp.distributions.projected_huber import ProjectedHuber
+from phd_exp.distributions.special import scaled_expint, tail_moment
+
+DRAWS = 10_240  # for a level, whose standard error is at most 0.5 / sqrt(DRAWS) = 0.0049
+_AT_ONCE = 512  # draws in memory at a time
+_BISECTIONS = 60
+_STEPS = 15  # of weighted least squares; each removes about two thirds of the error
+_PARTS, _ROUNDS = 16, 8  # an interval is divided into parts, and one of them again
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """Projected Huber distributions with equal weights: density, moments and levels of an ensemble.
+
+    Args:
+        members: its last batch dimension counts the members; the others are the batch of the mixture.
+
+    Examples:
+        >>> raw = torch.tensor([[9.0, 0, 9, 0, 9, 9, 9], [-9, 0, 9, 0, 9, 9, 9]], dtype=torch.float64)
+        >>> Mixture(ProjectedHuber.from_raw(raw, f=1500.0, S=224.0, mu_z0=2.5e-3)).closest
+        ProjectedHuber(batch_shape=())
+    """
+
+    members: ProjectedHuber
+
+    def log_prob(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch"]:
+        """Log density of a position (metres), nats per cubic metre."""
+        return self.members.log_prob(xyz[..., None, :]).logsumexp(-1) - math.log(self.members.batch_shape[-1])
+
+    @property
+    def mean(self) -> Float[Tensor, "*batch 3"]:
+        """Expected position, metres."""
+        return self.members.mean.mean(-2)
+
+    @property
+    def covariance_matrix(self) -> Float[Tensor, "*batch 3 3"]:
+        """Covariance of the position, square metres: the mean of the members' and the covariance of their means."""
+        apart = self.members.mean - self.mean[..., None, :]
+        return (self.members.covariance_matrix + apart[..., :, None] * apart[..., None, :]).mean(-3)
+
+    @property
+    def disagreement(self) -> Float[Tensor, "*batch"]:
+        """The mean KL divergence, nats, of the members' Gaussians from the mixture's: (log|C| - mean log|C_k|) / 2.
+
+        0 if all members are equal, without upper bound; a Gaussian has the mean and covariance of its distribution.
+        Source: own derivation; the traces cancel. It ranks unfamiliar images slightly better than the KL divergence
+        of the members from `closest`.
+        """
+        return (self.covariance_matrix.logdet() - self.members.covariance_matrix.logdet().mean(-1)) / 2
+
+    def depth_cdf(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
+        """P(depth <= z), z in metres; 0 for z <= 0."""
+        return self.members.depth_cdf(z[..., None]).mean(-1)
+
+    def depth_icdf(self, p: Float[Tensor, "*#batch"] | float) -> Float[Tensor, "*#batch"]:
+        """The depth z, metres, with P(depth <= z) = p, for p in (0, 1), by bisection."""
+        p = torch.as_tensor(p, dtype=self.members.a.dtype, device=self.members.a.device)
+        ends = self.members.depth_icdf(p[..., None])
+        low, high = ends.amin(-1), ends.amax(-1)
+        for _ in range(_BISECTIONS):
+            middle = (low + high) / 2
+            is_low = self.depth_cdf(middle) < p
+            low, high = torch.where(is_low, middle, low), torch.where(is_low, high, middle)
+        return high
+
+    def rsample(
+        self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None
+    ) -> Float[Tensor, "*shape 3"]:
+        """Exact samples, differentiable in the members' parameters."""
+        drawn = self.members.rsample(sample_shape, generator)
+        which = torch.rand(drawn.shape[:-1], generator=generator, device=drawn.device).argmax(-1)
+        return drawn.gather(-2, which[..., None, None].expand(*which.shape, 1, 3)).squeeze(-2)
+
+    def level(self, xyz: Float[Tensor, "*batch 3"], seed: int = 0) -> Float[Tensor, "*batch"]:
+        """Credible level of a position: the share of at least 10,240 draws, equally many of each member, whose
+        density is higher. Its standard error is below 0.005.
+        """
+        log_p = self.log_prob(xyz)
+        generator = torch.Generator(device=xyz.device).manual_seed(seed)
+        each = math.ceil(_AT_ONCE / self.members.batch_shape[-1])
+        rounds = DRAWS // _AT_ONCE
+        inside = torch.zeros_like(log_p)
+        for _ in range(rounds):
+            drawn = self.members.rsample((each,), generator).movedim(-2, 0)
+            inside += (self.log_prob(drawn) > log_p).to(log_p).mean((0, 1))
+        return inside / rounds
+
+    @cached_property
+    def closest(self) -> ProjectedHuber:
+        """The Projected Huber distribution p with the least KL(mixture || p): that of maximum E[log p].
+
+        -E[log p] is a function of (A_xy, nu_xy), convex, plus one of (mu_z, a); each has its minimum by itself.
+        Parameters are wanted in float64. Source: own derivation; checked against a general optimiser in
+        tests/distributions/test_mixture.py.
+        """
+        mu_z, a = _closest_depth(self.members)
+        mu_xy, A_xy = _closest_projection(self.members)
+        return ProjectedHuber(mu_xy, mu_z, A_xy * mu_z[..., None, None], a, validate_args=False)
+
+
+def _closest_depth(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """The mu_z and a that minimise the mean of a max(z/mu_z, mu_z/z) + log(mu_z N(a)) over depths of the mixture.
+
+    With far = E[z/mu_z; z > mu_z] and near = E[mu_z/z; z < mu_z] the derivatives vanish where a (far - near) = 1 and
+    a (far + near - 1) is the mean excess energy of a. The first gives a; then the second determines log mu_z.
+    """
+    log_mu, a = members.mu_z.log(), members.a
+    margin = torch.log1p(4 / a)
+    low, high = (log_mu - margin).amin(-1), (log_mu + margin).amax(-1)
+    inner = torch.arange(1, _PARTS, device=a.device).reshape(-1, *[1] * low.ndim)
+    for _ in range(_ROUNDS):
+        step = (high - low) / _PARTS
+        low = low + step * _depth_conditions(low + step * inner, log_mu, a)[0].sum(0)
+        high = low + step
+    middle = low + step / 2
+    return middle.exp(), _depth_conditions(middle, log_mu, a)[1]
+
+
+def _depth_conditions(
+    place: Float[Tensor, "*places"], log_mu: Float[Tensor, "*#places members"], a: Float[Tensor, "*#places members"]
+) -> tuple[Bool[Tensor, "*places"], Float[Tensor, "*places"]]:
+    """Whether log mu_z is larger than `place`, and the best a there."""
+    distance = place[..., None] - log_mu
+    x, s = a * distance.abs().exp(), distance.exp()
+    decay, one = torch.exp(a - x), scaled_expint(1, x)
+    # E[t; t > s] and E[1/t; t < s] for t = z / mu_z of a member, in units of 1 / (1 + g)
+    below = 1 + 1 / a + a * (scaled_expint(3, a) - decay * s.square() * scaled_expint(3, x))
+    far = torch.where(s > 1, decay * (s + 1 / a), below)
+    near = a * torch.where(s < 1, decay * one, 2 * scaled_expint(1, a) - decay * one)
+    norm = 1 + tail_moment(0, a)
+    far, near = (far / s / norm).mean(-1), (near * s / norm).mean(-1)
+    difference, excess = (far - near).clamp_min(torch.finfo(a.dtype).tiny), far + near - 1
+    energy = depth_mean_energy(-difference.log())
+    return excess / difference < energy, energy / excess
+
+
+def _closest_projection(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch 2 2"]]:
+    """The mu_xy and A_xy that minimise the mean of h(|q|) - log|A_xy|, q = A_xy ((x, y) - mu_xy z), over the mixture.
+
+    h(|q|) is at most |q|^2 / (2 max(1, |q_0|)) + constant, with equality at q_0: where that replaces it, mu_xy is a
+    weighted regression and A_xy^(-2) a weighted covariance C, and each such step lowers the mean. The integral is a
+    sum over `_whitened_nodes` at the root mean square of each member's depth.
+    """
+    nodes, weight = (torch.from_numpy(values).to(members.a) for values in _whitened_nodes())
+    z = (members.depth_variance + members.depth_mean.square()).sqrt()[..., None, None]
+    spread = spd.inverse(members.A, members.log_det_A) * members.mu_z[..., None, None]
+    xy = spd.matvec(spread[..., None, :, :], nodes) + z * members.mu_xy[..., None, :]
+    z, weight = z.expand_as(xy[..., :1]).flatten(-3, -2), weight / members.batch_shape[-1]
+    xy, weight = xy.flatten(-3, -2), weight.repeat(members.batch_shape[-1])[:, None]
+    pull = weight.expand_as(z)
+    for _ in range(_STEPS):
+        mu_xy = (pull * z * xy).sum(-2) / (pull * z.square()).sum(-2)
+        off = xy - mu_xy[..., None, :] * z
+        C = ((pull * off)[..., :, None] * off[..., None, :]).sum(-3)
+        log_det = spd.log_det(C)
+        inverse = spd.inverse(C, log_det)
+        q = (off * spd.matvec(inverse[..., None, :, :], off)).sum(-1, keepdim=True).sqrt()
+        pull = weight / q.clamp_min(1)
+    root_det = torch.exp(-log_det / 2)[..., None, None]  # C^(-1/2) by the theorem of Cayley and Hamilton
+    trace = inverse.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    return mu_xy, (inverse + root_det * torch.eye(2).to(C)) / (trace + 2 * root_det).sqrt()
+
+
+def _whitened_nodes() -> tuple[np.ndarray, np.ndarray]:
+    """Gauss rules for the law of q: nodes (48, 2) on six radii, four within 1, in eight directions, and weights."""
+    x, inner = np.polynomial.legendre.leggauss(4)
+    s, outer = np.polynomial.laguerre.laggauss(2)
+    r = np.concatenate([(x + 1) / 2, 1 + s])
+    weight = r * np.concatenate([inner / 2 * np.exp(-(r[:4] ** 2) / 2), outer * np.exp(-0.5)])
+    angle = np.pi / 4 * (np.arange(8) + 0.5)
+    nodes = r[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return nodes.reshape(-1, 2), np.repeat(weight, 8) / (8 * RADIAL_NORMALISER)
