@@ -11,8 +11,9 @@ from pydantic import field_validator
 
 from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_folder, parsed, predicted, require_file
 from phd_exp.records.detections import Observed, detections_in, observed
-from phd_exp.records.errors import ConfigError, listed
+from phd_exp.records.errors import ConfigError, RunError, listed
 from phd_exp.records.files import write_atomic
+from phd_exp.records.runs import RunFolder
 
 PLANE = four_numbers("plane=NX,NY,NZ,OFFSET: the points v with normal . v = offset, metres")
 
@@ -24,6 +25,8 @@ class FuseArguments(RunArguments):
     """images with a metadata.jsonl whose lines have a scene and a pose"""
     plane: Annotated[tuple[float, float, float, float], PLANE] | None = None
     """NX,NY,NZ,OFFSET: the object lies on this plane, metres"""
+    shared_scale: bool = False
+    """estimate one factor that the depths of all views share; its spread is that of the run's recorded scenes"""
     out: Path | None = None
     """a file for the lines; by default they are printed"""
 
@@ -78,4 +81,16 @@ def _answers(arguments: FuseArguments, scenes: Sequence[Observed]) -> list[dict[
     numbers = torch.tensor(arguments.plane or (), dtype=torch.float64)
     plane = Plane(numbers[:3], numbers[3]) if arguments.plane else None
     detections = [detection for scene in scenes for detection in scene.detections]
-    return fused_answers(scenes, predicted(predictor, detections), predictor, plane)
+    shared = _shared_scale(arguments.run) if arguments.shared_scale else None
+    return fused_answers(scenes, predicted(predictor, detections), predictor, plane, shared)
+
+
+def _shared_scale(run: Path) -> float:
+    from phd_exp.evaluation.fusion import shared_scale
+    from phd_exp.evaluation.several_views import read_views
+
+    if not (file := RunFolder(run).views).exists():
+        raise RunError(
+            f"{file}: missing; shared_scale is estimated from it: train with evaluation.multiview.scenes=500"
+        )
+    return float(shared_scale(read_views(file)))

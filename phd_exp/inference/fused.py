@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.fusion import Fused, Plane, Pose, Status, fuse
+from phd_exp.fusion import Fused, Plane, Pose, Status, fuse, fuse_shared
 from phd_exp.inference.answers import Sighting, rounded, uncertainty
 from phd_exp.inference.predictor import Predictor
 from phd_exp.metrics.errors import MILLIMETRES, squared_mahalanobis
@@ -35,7 +35,11 @@ def outputs(
 
 
 def fused_answers(
-    scenes: Sequence[Observed], sightings: Iterable[Sighting], predictor: Predictor, plane: Plane | None
+    scenes: Sequence[Observed],
+    sightings: Iterable[Sighting],
+    predictor: Predictor,
+    plane: Plane | None,
+    shared_scale: float | None = None,
 ) -> list[dict[str, Any]]:
     """The fused position of each scene, with its errors if the true position is known.
 
@@ -46,6 +50,7 @@ def fused_answers(
         sightings: those of their detections, one scene after the other.
         predictor: the probabilistic predictor that made the sightings.
         plane: contains every position, if given.
+        shared_scale: the `deviation` of `fuse_shared`; None for independent views.
 
     Raises DatasetError, before the first sighting is computed, if lines of a scene give different true positions.
     """
@@ -54,7 +59,11 @@ def fused_answers(
     rows, mask = layout([len(scene.detections) for scene in scenes])
     predictions = predictor.predict(raw[rows], f[rows])
     assert isinstance(predictions, ProjectedHuber)
-    fused = fuse(predictions, Pose(pose.R[rows], pose.t[rows]), plane, mask)
+    pose = Pose(pose.R[rows], pose.t[rows])
+    if shared_scale is None:
+        fused = fuse(predictions, pose, plane, mask)
+    else:
+        fused = fuse_shared(predictions, pose, shared_scale, plane, mask)
     errors = {
         "error_mm": MILLIMETRES * (fused.point - truth).norm(dim=-1),
         "squared_mahalanobis": squared_mahalanobis(
@@ -117,4 +126,6 @@ def _answer(scene: Observed, fused: Fused, place: int) -> dict[str, Any]:
         "certificate": fused.certificate[place],
         "surprise": fused.surprise[place, :views],
     }
+    if fused.mixture is not None:
+        numbers["shared_scale"] = fused.mixture.scale[place]
     return named | {name: rounded(value.numpy()) for name, value in numbers.items()}
