@@ -47,7 +47,7 @@ def with_shared_part(own: ProjectedHuber, deviation: float) -> ProjectedHuber:
 
     def at(a: Tensor) -> tuple[ProjectedHuber, ProjectedHuber]:
         views = ProjectedHuber(own.mu_xy, own.mu_z, own.A, a)
-        return views, own_part(views, torch.tensor(deviation).double())[0]
+        return views, own_part(views, torch.tensor(deviation, dtype=torch.float64))[0]
 
     for _ in range(50):
         middle = (low * high).sqrt()
