@@ -34,8 +34,8 @@ def worst_group(
 
     `level` is the credible level of each sample, which counts `weight` times.
     """
-    inside = weight.float()[..., None] * (level[..., None] <= _LEVELS)
-    each = groups.flatten(0, 1)
-    coverage = each @ inside / (each @ weight.float()[..., None])
-    area = (coverage - _LEVELS).abs().mean(-1).unflatten(-1, groups.shape[:2])
-    return area.amax(-2).mean(-1).double()
+    weight = weight.float()[..., None]
+    inside = weight * (level[..., None] <= _LEVELS)
+    # one large product of matrices
+    coverage = torch.tensordot(groups, inside, ([2], [-2])) / torch.tensordot(groups, weight, ([2], [-2]))
+    return (coverage - _LEVELS).abs().mean(-1).amax(0).mean(0).double()

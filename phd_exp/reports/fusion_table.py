@@ -11,7 +11,7 @@ from phd_exp.reports.table import Table, TableCell, TableRow, file_stem
 NAMES: dict[Method, str] = {
     "mode": "Huber, mode",
     "mean": "Huber, mean",
-    "shared": "Huber, shared scale",
+    "shared": "Huber, shared",
     "average": "average",
     "gaussian": "Gaussian",
 }
@@ -32,7 +32,7 @@ OF_A_LINE = (
 )
 OF_METHODS = (
     "Huber: the most likely position under the product of the views' Projected Huber densities, and the mean of that "
-    "product. Shared scale: the mean where all views' depths share an unknown factor, whose spread is estimated "
+    "product. Shared: the mean where all views' depths share an unknown factor, whose spread is estimated "
     "on the other half of the scenes. Average: of the views' modes. Gaussian: the views' means weighted by their "
     "inverse covariances."
 )

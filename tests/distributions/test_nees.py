@@ -1,4 +1,4 @@
-"""Normalised estimation error squared: its definition, its exact expectation and its spread, by samples and theory."""
+"""Normalised estimation error squared: its definition, its exact expectation and spread, by samples and theory."""
 
 import math
 
@@ -12,7 +12,7 @@ from phd_exp.distributions.huber import HUBER_COVARIANCE, RADIAL_NORMALISER
 from phd_exp.metrics.errors import squared_mahalanobis
 from tests.support.random_problems import columns_of, random_problems
 
-N = 200_000
+N = 50_000
 
 
 def moments(a: float) -> tuple[float, float]:
@@ -55,7 +55,7 @@ def test_own_samples_average_3_and_1_per_axis_with_the_exact_spread(a: float) ->
     variance = moments(a)[1] - 1 + fourth / HUBER_COVARIANCE**2 - 4
     deviation = math.sqrt(variance / N)
     assert float(found["nees"].mean()) == pytest.approx(3, abs=4 * deviation)
-    assert float(found["nees"].var()) == pytest.approx(variance, rel=0.15)
+    assert float(found["nees"].var()) == pytest.approx(variance, rel=0.25)
     assert variance > 6  # of chi-squared
     for name in NEES[1:]:
         assert float(found[name].mean()) == pytest.approx(1, abs=4 * float(found[name].std()) / math.sqrt(N)), name
