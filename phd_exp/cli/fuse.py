@@ -26,7 +26,7 @@ class FuseArguments(RunArguments):
     plane: Annotated[tuple[float, float, float, float], PLANE] | None = None
     """NX,NY,NZ,OFFSET: the object lies on this plane, metres"""
     shared_scale: bool = False
-    """estimate one factor that the depths of all views share; its spread is that of the run's recorded scenes"""
+    """estimate one factor that the depths of all views share, as they do in the run's recorded scenes"""
     out: Path | None = None
     """a file for the lines; by default they are printed"""
 
@@ -81,16 +81,19 @@ def _answers(arguments: FuseArguments, scenes: Sequence[Observed]) -> list[dict[
     numbers = torch.tensor(arguments.plane or (), dtype=torch.float64)
     plane = Plane(numbers[:3], numbers[3]) if arguments.plane else None
     detections = [detection for scene in scenes for detection in scene.detections]
-    shared = _shared_scale(arguments.run) if arguments.shared_scale else None
+    shared = _shared_share(arguments.run) if arguments.shared_scale else None
     return fused_answers(scenes, predicted(predictor, detections), predictor, plane, shared)
 
 
-def _shared_scale(run: Path) -> float:
-    from phd_exp.evaluation.fusion import shared_scale
+def _shared_share(run: Path) -> float:
+    import torch
+
+    from phd_exp.evaluation.fusion import shared_share
     from phd_exp.evaluation.several_views import read_views
 
     if not (file := RunFolder(run).views).exists():
         raise RunError(
             f"{file}: missing; shared_scale is estimated from it: train with evaluation.multiview.scenes=500"
         )
-    return float(shared_scale(read_views(file)))
+    views = read_views(file)
+    return float(shared_share(views, torch.ones(views.n, dtype=torch.bool)))

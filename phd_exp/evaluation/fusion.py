@@ -28,6 +28,7 @@ LEVELS = (50, 90, 99)  # per cent of the ellipsoids whose coverage is counted
 ERRORS = ("depth_error_mm", "distance_mm")
 CALIBRATION = (*(f"coverage_{level}" for level in LEVELS), "normalised_squared_error")
 BINS = 20
+MOST_SHARED = 0.99
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,6 @@ class FusionScores:
             gives the position fused from all cameras.
         correlation: intraclass correlation of the views' errors of log depth.
         with_size: correlation of that error, averaged over views, with log size.
-        shared_scale: standard deviation of the part of that error that all views share.
         exact: by `place`, the coverage of the exact densities, whose tails are longer than a Gaussian's.
     """
 
@@ -57,7 +57,6 @@ class FusionScores:
     correlation: Band
     with_size: Band
     exact: dict[str, float]
-    shared_scale: float = 0.0
 
     def band(self, quantity: str, method: Method, cameras: int, on_plane: bool = False) -> Band:
         """The score of the first `cameras` fused by a method, on the ground or in free space."""
@@ -106,20 +105,20 @@ def fusion_scores(views: SeveralViews, resamples: int = 200) -> FusionScores:
         correlation=correlation,
         with_size=with_size,
         exact=exact,
-        shared_scale=float(shared_scale(views)),
     )
 
 
 def _fused(views: SeveralViews) -> dict[Method, dict[tuple[int, bool], Fused]]:
-    """By method, number of cameras, and whether on the ground; the shared scale is fitted on the other scenes."""
+    """By method, number of cameras, and whether on the ground; the shared part is that of the other half."""
     half = torch.arange(views.n) % 2
-    deviation = shared_scale(views, torch.stack([half == 1, half == 0]))[half]
+    share = shared_share(views, torch.stack([half == 1, half == 0]))[half]
     fused: dict[Method, dict[tuple[int, bool], Fused]] = {"mean": {}, "shared": {}}
     for on_plane in (False, True):
         for k in range(1, views.views + 1):
             part, plane = views.cameras(k), views.ground if on_plane else None
-            fused["mean"][k, on_plane] = fuse(part.predictions, part.pose, plane, contradiction=0.0)
-            fused["shared"][k, on_plane] = fuse_shared(part.predictions, part.pose, deviation, plane, None, 0.0)
+            problem = part.predictions, part.pose, plane, None, 0.0
+            fused["mean"][k, on_plane] = fuse(*problem)
+            fused["shared"][k, on_plane] = fuse_shared(*problem, share=share)
     return fused
 
 
@@ -181,13 +180,9 @@ def _common_cause(views: SeveralViews, resamples: int) -> tuple[Band, Band]:
     return band_of(found["of_views"]), band_of(found["with_size"])
 
 
-def shared_scale(views: SeveralViews, chosen: Bool[Tensor, "*sets scenes"] | None = None) -> Float[Tensor, "*sets"]:
-    """The standard deviation of the part of the errors of log depth that all views of a scene share: `fuse_shared`'s.
-
-    Over the chosen scenes; 0 where there are none.
-    """
-    counts = torch.ones(views.n) if chosen is None else chosen
-    return _correlations(_depth_errors(views), counts.double())["between"].nan_to_num().clamp_min(0).sqrt()
+def shared_share(views: SeveralViews, chosen: Bool[Tensor, "*sets scenes"]) -> Float[Tensor, "*sets"]:
+    """The `share` of `fuse_shared` that the chosen scenes have, their intraclass correlation; 0 without scenes."""
+    return _correlations(_depth_errors(views), chosen.double())["of_views"].nan_to_num().clamp(0, MOST_SHARED)
 
 
 def _depth_errors(views: SeveralViews) -> dict[str, Tensor]:
@@ -215,4 +210,4 @@ def _correlations(columns: Mapping[str, Tensor], counts: Tensor) -> dict[str, Te
     within = share @ columns["variance"]
     between = covariance(mean, mean) - within / columns["views"][0]
     pearson = covariance(mean, size) / (covariance(mean, mean) * covariance(size, size)).sqrt()
-    return {"of_views": between / (between + within), "with_size": pearson, "between": between}
+    return {"of_views": between / (between + within), "with_size": pearson}

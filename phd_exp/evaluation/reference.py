@@ -16,15 +16,8 @@ from phd_exp.metrics.ordered import in_order_of
 
 SEED = 1
 _AT_ONCE = 10**6  # positions drawn at a time
-DISTANCES = (
-    "depth_ence",
-    "projected_ence",
-    "miscalibration_area",
-    "depth_pit_area",
-    "depth_pit_ks",
-    "group_miscalibration",
-    "nees",
-)
+_OF_LEVELS = ("miscalibration_area", "depth_pit_area", "depth_pit_ks")
+DISTANCES = ("depth_ence", "projected_ence", *_OF_LEVELS, "group_miscalibration", "nees")
 
 
 @dataclass(frozen=True)
@@ -46,8 +39,7 @@ def calibrated_reference(distribution: ProjectedHuber, simulations: int = 200) -
     """
     (n,) = distribution.batch_shape
     areas, distances = _uniform(n, simulations)
-    found: dict[str, list[float]] = defaultdict(list)
-    found |= {"miscalibration_area": areas, "depth_pit_area": areas, "depth_pit_ks": distances}
+    found = defaultdict(list, zip(_OF_LEVELS, (areas, areas, distances), strict=True))
     each = max(1, _AT_ONCE // n)
     for start in range(0, simulations, each):
         for name, values in _simulated(distribution, min(each, simulations - start), SEED + start).items():

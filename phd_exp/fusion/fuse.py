@@ -33,7 +33,7 @@ class Fused:
         status: `Status` of each problem.
         problems: the problems, `unknowns` their solution, and `excess` the energy of each view above its minimum;
             surprise, mean and covariance are computed from them on demand.
-        mixture: of `fuse_shared`, whose mean and covariance are those of a mixture.
+        shared: of `fuse_shared`: the estimated scale, mean and covariance.
     """
 
     point: Float[Tensor, "*problems 3"]
@@ -43,7 +43,7 @@ class Fused:
     problems: Problems
     unknowns: Float[Tensor, "flat 3"]
     excess: Float[Tensor, "flat cameras"]
-    mixture: "Mixture | None" = None
+    shared: tuple[Tensor, Tensor, Tensor] | None = None
 
     @cached_property
     def surprise(self) -> Float[Tensor, "*problems cameras"]:
@@ -68,8 +68,8 @@ class Fused:
     @cached_property
     @torch.no_grad()
     def _moments(self) -> tuple[Tensor, Tensor]:
-        if self.mixture is not None:
-            return self.mixture.moments()
+        if self.shared is not None:
+            return self.shared[1:]
         problems, fused = self.problems, self.status.cpu().flatten() == Status.FUSED
         alone, alone_mean, alone_covariance = problems.alone()
         u, C, _ = self._quadrature(fused & ~alone)
@@ -109,22 +109,6 @@ class Fused:
             f"problem {', '.join(map(str, index)) or 0}: {Status(int(self.status[tuple(index)])).reason}"
             for index in failed
         ]
-
-
-@dataclass(frozen=True)
-class Mixture:
-    """The problems at several values of a shared scale, along the first dimension; see `fuse_shared`."""
-
-    each: Fused
-    weight: Float[Tensor, "nodes ..."]
-    scale: Float[Tensor, "*problems"]
-
-    def moments(self) -> tuple[Float[Tensor, "*problems 3"], Float[Tensor, "*problems 3 3"]]:
-        """Mean (metres) and covariance (square metres) of the position."""
-        mean = (self.weight[..., None] * self.each.mean).sum(0)
-        off = self.each.mean - mean
-        covariance = self.each.covariance + off[..., :, None] * off[..., None, :]
-        return mean, (self.weight[..., None, None] * covariance).sum(0)
 
 
 @torch.no_grad()

@@ -1,6 +1,7 @@
 """Scenes as JSON objects: one position from several cameras, or from one camera and a known plane."""
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -50,7 +51,7 @@ def fused_answers(
         sightings: those of their detections, one scene after the other.
         predictor: the probabilistic predictor that made the sightings.
         plane: contains every position, if given.
-        shared_scale: the `deviation` of `fuse_shared`; None for independent views.
+        shared_scale: the `share` of `fuse_shared`; None for independent views.
 
     Raises DatasetError, before the first sighting is computed, if lines of a scene give different true positions.
     """
@@ -59,11 +60,8 @@ def fused_answers(
     rows, mask = layout([len(scene.detections) for scene in scenes])
     predictions = predictor.predict(raw[rows], f[rows])
     assert isinstance(predictions, ProjectedHuber)
-    pose = Pose(pose.R[rows], pose.t[rows])
-    if shared_scale is None:
-        fused = fuse(predictions, pose, plane, mask)
-    else:
-        fused = fuse_shared(predictions, pose, shared_scale, plane, mask)
+    way = fuse if shared_scale is None else partial(fuse_shared, share=shared_scale)
+    fused = way(predictions, Pose(pose.R[rows], pose.t[rows]), plane, mask)
     errors = {
         "error_mm": MILLIMETRES * (fused.point - truth).norm(dim=-1),
         "squared_mahalanobis": squared_mahalanobis(
@@ -126,6 +124,6 @@ def _answer(scene: Observed, fused: Fused, place: int) -> dict[str, Any]:
         "certificate": fused.certificate[place],
         "surprise": fused.surprise[place, :views],
     }
-    if fused.mixture is not None:
-        numbers["shared_scale"] = fused.mixture.scale[place]
+    if fused.shared is not None:
+        numbers["shared_scale"] = fused.shared[0][place]
     return named | {name: rounded(value.numpy()) for name, value in numbers.items()}

@@ -11,7 +11,7 @@ from phd_exp.reports.table import Table, TableCell, TableRow, file_stem
 NAMES: dict[Method, str] = {
     "mode": "Huber, mode",
     "mean": "Huber, mean",
-    "shared": "Huber, shared",
+    "shared": "shared",
     "average": "average",
     "gaussian": "Gaussian",
 }
@@ -32,8 +32,8 @@ OF_A_LINE = (
 )
 OF_METHODS = (
     "Huber: the most likely position under the product of the views' Projected Huber densities, and the mean of that "
-    "product. Shared: the mean where all views' depths share an unknown factor, whose spread is estimated "
-    "on the other half of the scenes. Average: of the views' modes. Gaussian: the views' means weighted by their "
+    "product. Shared: the mean where all views' depths share an unknown factor, as much as in the "
+    "other half of the scenes. Average: of the views' modes. Gaussian: the views' means weighted by their "
     "inverse covariances."
 )
 OF_THE_GROUND = (
@@ -134,8 +134,8 @@ def _common_cause(scores: FusionScores) -> str:
         verdict = f"means that together they are {'over' if last.low > 1 else 'under'}confident"
     shared = scores.band("normalised_squared_error", "shared", scores.views)
     return (
-        f"{text}; the fused squared error of {last.value:.2f} {verdict}. With a shared scale, whose log "
-        f"has the deviation {scores.shared_scale:.3f}, it is {shared.value:.2f} ({shared.low:.2f}–{shared.high:.2f})."
+        f"{text}; the fused squared error of {last.value:.2f} {verdict}. With this part shared, it is "
+        f"{shared.value:.2f} ({shared.low:.2f}–{shared.high:.2f})."
     )
 
 

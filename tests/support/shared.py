@@ -1,11 +1,14 @@
 """Scenes whose views share an unknown factor of depth; each view alone and all together are calibrated."""
 
+import math
+
+import numpy as np
 import torch
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions.depth import depth_mean_and_variance
 from phd_exp.fusion import Pose
-from phd_exp.fusion.shared import own_part
 
 CANDIDATES = 400
 
@@ -26,7 +29,7 @@ def sharing_scenes(
     R = torch.stack([torch.stack(row, -1) for row in rows], -2).expand(n, cameras, 3, 3)
     middle = torch.tensor([0.0, 0.0, 4.0]).double()
     pose = Pose(R, middle - R @ middle)
-    own = a * torch.exp(0.2 * torch.randn(n, cameras, generator=random).double())
+    own = torch.full((n, cameras), a).double()
     matrix = A * torch.eye(2).double().expand(n, cameras, 2, 2)
     unit = ProjectedHuber(torch.zeros(n, cameras, 2).double(), torch.ones(n, cameras).double(), matrix, own)
     drawn = unit.rsample((CANDIDATES,), random)  # (A^(-1) q, t)
@@ -42,19 +45,16 @@ def sharing_scenes(
 
 
 def with_shared_part(own: ProjectedHuber, deviation: float) -> ProjectedHuber:
-    """The predictions whose `own_part` this is, by bisection of a; mu_z and A follow from the ratios."""
-    low, high = own.a / 1000, own.a * 1.0
+    """The predictions with the mean and covariance of e^s v, for v of these densities."""
+    growth = math.exp(deviation**2)
+    known = torch.linspace(-8, 14, 20001).double()  # log a
 
-    def at(a: Tensor) -> tuple[ProjectedHuber, ProjectedHuber]:
-        views = ProjectedHuber(own.mu_xy, own.mu_z, own.A, a)
-        return views, own_part(views, torch.tensor(deviation, dtype=torch.float64))[0]
+    def mean_and_ratio(log_a: Tensor) -> tuple[Tensor, Tensor]:
+        mean, variance = depth_mean_and_variance(log_a)
+        return mean, variance / mean**2
 
-    for _ in range(50):
-        middle = (low * high).sqrt()
-        below = at(middle)[1].a < own.a
-        low, high = torch.where(below, middle, low), torch.where(below, high, middle)
-    views, part = at(low)
-    change = own.mu_z / part.mu_z
-    return ProjectedHuber(
-        own.mu_xy, own.mu_z * change, own.A * (own.A[..., 0, 0] / part.A[..., 0, 0])[..., None, None], views.a
-    )
+    mean, ratio = mean_and_ratio(own.a.log())
+    wanted = (1 + ratio) * growth - 1
+    log_a = torch.from_numpy(np.interp(-wanted.numpy(), -mean_and_ratio(known)[1].numpy(), known.numpy()))
+    change = mean / mean_and_ratio(log_a)[0] * math.sqrt(growth)
+    return ProjectedHuber(own.mu_xy, own.mu_z * change, own.A * (change / growth)[..., None, None], log_a.exp())
