@@ -11,8 +11,9 @@ from pydantic import field_validator
 
 from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_folder, parsed, predicted, require_file
 from phd_exp.records.detections import Observed, detections_in, observed
-from phd_exp.records.errors import ConfigError, listed
+from phd_exp.records.errors import ConfigError, RunError, listed
 from phd_exp.records.files import write_atomic
+from phd_exp.records.runs import RunFolder
 
 PLANE = four_numbers("plane=NX,NY,NZ,OFFSET: the points v with normal . v = offset, metres")
 
@@ -24,6 +25,8 @@ class FuseArguments(RunArguments):
     """images with a metadata.jsonl whose lines have a scene and a pose"""
     plane: Annotated[tuple[float, float, float, float], PLANE] | None = None
     """NX,NY,NZ,OFFSET: the object lies on this plane, metres"""
+    shared_scale: bool = False
+    """estimate one factor that the depths of all views share, as they do in the run's recorded scenes"""
     out: Path | None = None
     """a file for the lines; by default they are printed"""
 
@@ -70,8 +73,8 @@ def _answers(arguments: FuseArguments, scenes: Sequence[Observed]) -> list[dict[
     from phd_exp.fusion import Plane
     from phd_exp.inference.fused import fused_answers, fused_region
 
-    if arguments.plane and arguments.coverage:
-        raise ConfigError("coverage: holds for scenes like the run's recorded ones, which have no plane; omit plane=")
+    if arguments.coverage and (arguments.plane or arguments.shared_scale):
+        raise ConfigError("coverage: holds for views that are fused alone; omit plane= and shared_scale=")
     predictor = loaded(arguments)
     if not predictor.is_probabilistic:
         raise ConfigError(
@@ -87,5 +90,20 @@ def _answers(arguments: FuseArguments, scenes: Sequence[Observed]) -> list[dict[
     if arguments.coverage:
         views, cameras = predictor.folders[0].views, {len(scene.detections) for scene in scenes}
         guarantees = {k: fused_guarantee(views, k, arguments.coverage, predictor.temperature) for k in cameras}
-    answers = fused_answers(scenes, predicted(predictor, detections), predictor, plane)
+    shared = _shared_share(predictor.folders[0]) if arguments.shared_scale else None
+    answers = fused_answers(scenes, predicted(predictor, detections), predictor, plane, shared)
     return [answer | fused_region(answer, guarantees) for answer in answers] if guarantees else answers
+
+
+def _shared_share(run: RunFolder) -> float:
+    import torch
+
+    from phd_exp.evaluation.fusion import shared_share
+    from phd_exp.evaluation.several_views import read_views
+
+    if not (file := run.views).exists():
+        raise RunError(
+            f"{file}: missing; shared_scale is estimated from it: train with evaluation.multiview.scenes=500"
+        )
+    views = read_views(file)
+    return float(shared_share(views, torch.ones(views.n, dtype=torch.bool)))

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from phd_exp.distributions.huber import HUBER_COVARIANCE
 from phd_exp.distributions.projected_huber import ProjectedHuber
 from phd_exp.distributions.shaped import Shaped
 
@@ -13,6 +14,7 @@ Columns = dict[str, Tensor]
 """Name -> one number a sample."""
 
 PARAMETERS = ("mu_x", "mu_y", "mu_z", "A_xx", "A_xy", "A_yy", "a")
+NEES = ("nees", "nees_x", "nees_y", "nees_z")
 
 
 def parameter_columns(distribution: ProjectedHuber) -> Columns:
@@ -68,3 +70,17 @@ def calibration_columns(distribution: ProjectedHuber | Shaped, xyz: Float[Tensor
         "depth_pit": distribution.depth_cdf(z),
         "depth_crps": distribution.depth_crps(z),
     }
+
+
+def nees_columns(distribution: ProjectedHuber, xyz: Float[Tensor, "*draws samples 3"]) -> Columns:
+    """The normalised estimation error squared of positions (metres): `nees`, and `nees_x`, `nees_y`, `nees_z`.
+
+    With e the error of the mean: e . C^(-1) e = (z - E[z])^2/Var[z] + |q|^2/c, of expectation 3, and e_i^2/C_ii, of
+    expectation 1. They are not chi-squared: their tails are longer.
+
+    Source: own derivation (e is linear in the independent t and q); checked in tests/distributions/test_nees.py.
+    """
+    squared = (xyz - distribution.mean).square()
+    across = distribution.whiten(xyz).square().sum(-1) / HUBER_COVARIANCE
+    axes = (squared / distribution.variance).unbind(-1)
+    return dict(zip(NEES, (squared[..., 2] / distribution.depth_variance + across, *axes), strict=True))

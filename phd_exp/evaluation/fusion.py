@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import stats
 from torch import Tensor
 
@@ -14,19 +14,21 @@ from phd_exp.evaluation.point_errors import SEED
 from phd_exp.evaluation.predictions import band_of
 from phd_exp.evaluation.reference import Band
 from phd_exp.evaluation.several_views import SeveralViews
-from phd_exp.fusion import Plane, Pose, Status, average, fuse, gaussian_fusion
+from phd_exp.fusion import Fused, Plane, Pose, Status, average, fuse, fuse_shared, gaussian_fusion
 from phd_exp.metrics.bootstrap import bands, means
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, squared_mahalanobis
 from phd_exp.records.errors import RunError
 
-Method = Literal["mode", "mean", "average", "gaussian"]
-"""Projected Huber fusion, its mode and its mean; the average of the modes; inverse-covariance fusion."""
-METHODS: tuple[Method, ...] = ("mode", "mean", "average", "gaussian")
-PROBABILISTIC: tuple[Method, ...] = ("mean", "gaussian")  # the methods with a covariance
+Method = Literal["mode", "mean", "shared", "average", "gaussian"]
+"""Projected Huber fusion, its mode, its mean, and its mean by `fuse_shared`; the average of the modes;
+inverse-covariance fusion."""
+METHODS: tuple[Method, ...] = ("mode", "mean", "shared", "average", "gaussian")
+PROBABILISTIC: tuple[Method, ...] = ("mean", "shared", "gaussian")  # the methods with a covariance
 LEVELS = (50, 90, 99)  # per cent of the ellipsoids whose coverage is counted
 ERRORS = ("depth_error_mm", "distance_mm")
 CALIBRATION = (*(f"coverage_{level}" for level in LEVELS), "normalised_squared_error")
 BINS = 20
+MOST_SHARED = 0.99
 
 
 @dataclass(frozen=True)
@@ -72,21 +74,20 @@ def fusion_scores(views: SeveralViews, resamples: int = 200) -> FusionScores:
     No scene is refused for views that contradict each other (`contradiction=0`): that would remove the largest
     errors.
     """
-    fused = {}
-    for on_plane in (False, True):
-        for k in range(1, views.views + 1):
-            part, plane = views.cameras(k), views.ground if on_plane else None
-            fused[k, on_plane] = fuse(part.predictions, part.pose, plane, contradiction=0.0)
-    sound = torch.stack([found.status == Status.FUSED for found in fused.values()]).all(0)
-    sound &= torch.stack([found.covariance.isfinite().all(-1).all(-1) for found in fused.values()]).all(0)
+    fused = _fused(views)
+    every = [found for places in fused.values() for found in places.values()]
+    sound = torch.stack([found.status == Status.FUSED for found in every]).all(0)
+    sound &= torch.stack([found.covariance.isfinite().all(-1).all(-1) for found in every]).all(0)
     if not bool(sound.any()):
         raise RunError("several views: not one scene can be fused; train longer")
     kept = views.subset(sound)
     columns: dict[str, Tensor] = {}
     exact: dict[str, float] = {}
-    for (k, on_plane), found in fused.items():
+    for (k, on_plane), found in fused["mean"].items():
         estimates = _baselines(kept.cameras(k), kept.ground if on_plane else None)
-        estimates |= {"mode": (found.point[sound], None), "mean": (found.mean[sound], found.covariance[sound])}
+        estimates["mode"] = found.point[sound], None
+        for name, way in fused.items():
+            estimates[name] = way[k, on_plane].mean[sound], way[k, on_plane].covariance[sound]
         for method in METHODS:
             for quantity, column in _columns(kept, *estimates[method], on_plane).items():
                 columns[place(quantity, method, k, on_plane)] = column
@@ -94,7 +95,7 @@ def fusion_scores(views: SeveralViews, resamples: int = 200) -> FusionScores:
         for level, share in zip(LEVELS, shares.tolist(), strict=True):
             exact[place(f"coverage_{level}", "mean", k, on_plane)] = 100 * share
     correlation, with_size = _common_cause(kept, resamples)
-    surprise = fused[views.views, False].surprise[sound].flatten()
+    surprise = fused["mean"][views.views, False].surprise[sound].flatten()
     return FusionScores(
         n=kept.n,
         views=kept.views,
@@ -105,6 +106,20 @@ def fusion_scores(views: SeveralViews, resamples: int = 200) -> FusionScores:
         with_size=with_size,
         exact=exact,
     )
+
+
+def _fused(views: SeveralViews) -> dict[Method, dict[tuple[int, bool], Fused]]:
+    """By method, number of cameras, and whether on the ground; the shared part is that of the other half."""
+    half = torch.arange(views.n) % 2
+    share = shared_share(views, torch.stack([half == 1, half == 0]))[half]
+    fused: dict[Method, dict[tuple[int, bool], Fused]] = {"mean": {}, "shared": {}}
+    for on_plane in (False, True):
+        for k in range(1, views.views + 1):
+            part, plane = views.cameras(k), views.ground if on_plane else None
+            problem = part.predictions, part.pose, plane, None, 0.0
+            fused["mean"][k, on_plane] = fuse(*problem)
+            fused["shared"][k, on_plane] = fuse_shared(*problem, share=share)
+    return fused
 
 
 def _baselines(views: SeveralViews, plane: Plane | None) -> dict[Method, tuple[Tensor, Tensor | None]]:
@@ -161,15 +176,23 @@ def _columns(
 
 def _common_cause(views: SeveralViews, resamples: int) -> tuple[Band, Band]:
     """The correlation of two views' errors of log depth, and that of their average with log size."""
+    found = bands(_correlations, _depth_errors(views), resamples, SEED)
+    return band_of(found["of_views"]), band_of(found["with_size"])
+
+
+def shared_share(views: SeveralViews, chosen: Bool[Tensor, "*sets scenes"]) -> Float[Tensor, "*sets"]:
+    """The `share` of `fuse_shared` that the chosen scenes have, their intraclass correlation; 0 without scenes."""
+    return _correlations(_depth_errors(views), chosen.double())["of_views"].nan_to_num().clamp(0, MOST_SHARED)
+
+
+def _depth_errors(views: SeveralViews) -> dict[str, Tensor]:
     error = (views.predictions.mu_z / views.xyz[..., 2]).log()
-    columns = {
+    return {
         "mean": error.mean(-1),
         "variance": error.var(-1),
         "size": views.columns["scale"][:, 0].log(),
         "views": torch.full((views.n,), views.views, dtype=torch.float64),
     }
-    found = bands(_correlations, columns, resamples, SEED)
-    return band_of(found["of_views"]), band_of(found["with_size"])
 
 
 def _correlations(columns: Mapping[str, Tensor], counts: Tensor) -> dict[str, Tensor]:

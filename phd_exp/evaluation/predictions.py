@@ -11,22 +11,23 @@ from jaxtyping import Float
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.columns import PARAMETERS, distribution_columns, draws, from_columns
+from phd_exp.distributions.columns import NEES, PARAMETERS, distribution_columns, draws, from_columns, nees_columns
 from phd_exp.distributions.temperature import Temperature
 from phd_exp.evaluation.parquet import Columns, arrays, require_columns
 from phd_exp.evaluation.point_errors import SEED
-from phd_exp.evaluation.reference import Band, calibrated_reference
+from phd_exp.evaluation.reference import Band, calibrated_reference, groups_of
 from phd_exp.metrics.bootstrap import Interval, Statistic, bands, interval, resampled
 from phd_exp.metrics.calibration_scores import COLUMNS, abscissae, calibration_scores, curves, ordered
 from phd_exp.metrics.errors import MILLIMETRES
+from phd_exp.metrics.groups import worst_group
 from phd_exp.metrics.scores import DRAWS, energy_score
 from phd_exp.metrics.strata import strata
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import CHOOSE
 
-ERRORS = ("projected_error_mm", "depth_error_mm")
-OF_A_DISTRIBUTION = (*COLUMNS, *ERRORS, "nll", "energy_score")
 XYZ = ("x", "y", "z")
+ERRORS = ("projected_error_mm", "depth_error_mm")
+OF_A_DISTRIBUTION = (*XYZ, *COLUMNS, *ERRORS, "nll", "energy_score")
 QUANTITIES: Mapping[str, tuple[str, str, tuple[float, ...] | int]] = {
     "visibility": ("visibility", "", (0.0, 0.25, 0.5, 0.75, 0.95, 1.0)),
     "truncation": ("truncation", "", (0.0, 0.05, 0.25, 0.5, 1.0)),
@@ -66,9 +67,10 @@ class Evaluation:
 
     Attributes:
         scores: means of `projected_error_mm` and `depth_error_mm`; of a distribution also of `nll` (nats) and
-            `energy_score_mm`, the per cent `inside_90` of truths in regions of 90 %, and the `calibration_scores`.
-        reference: for each score that is a distance from calibration, the median and 95 % interval of calibrated
-            predictions with the same uncertainties (`calibrated_reference`): the distance is never zero.
+            `energy_score_mm`, the per cent `inside_90` of truths in regions of 90 %, and the `calibration_scores`; of
+            Projected Huber densities the means of `nees_columns`, and `group_miscalibration`.
+        reference: for NEES and each score that is a distance from calibration, the median and 95 % interval of
+            calibrated predictions with the same uncertainties (`calibrated_reference`): a distance is never zero.
         curves: `metrics.calibration_scores.curves`; x is the predicted variance, credible level, PIT, or share kept.
         resampled: each score on resampled test images, the same images for all runs with equal n.
     """
@@ -92,19 +94,24 @@ def evaluate(table: pa.Table | Columns, window: int = 200, resamples: int = 200)
     needed = (*(PARAMETERS if is_huber else ()), *OF_A_DISTRIBUTION) if is_distribution else ERRORS
     columns, left_out = _finite(recorded, needed)
     statistic: Statistic = _distribution_scores if is_distribution else _point_scores
-    scores, drawn = _scores(statistic, columns, resamples)
-    found: dict[str, Curve] = {}
+    whole, found, reference = statistic, {}, {}
+    if is_huber:
+        distribution = _distribution(columns)
+        columns |= nees_columns(distribution, _positions(columns))
+        whole = partial(_distribution_scores, groups=groups_of(distribution))
+        reference = calibrated_reference(distribution)
     if is_distribution:
         x = abscissae(columns, window)
         intervals = bands(partial(curves, window=window), columns, resamples, SEED)
         found = {name: _curve(x[name], interval) for name, interval in intervals.items()}
+    scores, drawn = _scores(whole, columns, resamples)
     return Evaluation(
         n=len(columns[ERRORS[0]]),
         scores=scores,
         curves=found,
         strata=_strata(statistic, columns, resamples),
         left_out=left_out,
-        reference=calibrated_reference(_distribution(columns)) if is_huber else {},
+        reference=reference,
         resampled=drawn,
     )
 
@@ -157,10 +164,15 @@ def at_temperature(
     return temperature.apply(distribution) if temperature else distribution, _positions(columns), kept
 
 
-def _distribution_scores(columns: Mapping[str, Tensor], weight: Tensor) -> dict[str, Tensor]:
+def _distribution_scores(
+    columns: Mapping[str, Tensor], weight: Tensor, groups: Tensor | None = None
+) -> dict[str, Tensor]:
     energy = {"energy_score_mm": MILLIMETRES * _mean(columns["energy_score"], weight)}
     others = {"nll": _mean(columns["nll"], weight), "inside_90": _mean(100.0 * (columns["level"] <= 0.9), weight)}
-    return _point_scores(columns, weight) | others | energy | calibration_scores(ordered(columns, weight))
+    nees = {name: _mean(columns[name], weight) for name in NEES if name in columns}
+    worst = {} if groups is None else {"group_miscalibration": worst_group(columns["level"], groups, weight)}
+    calibration = calibration_scores(ordered(columns, weight))
+    return _point_scores(columns, weight) | others | energy | calibration | nees | worst
 
 
 def _point_scores(columns: Mapping[str, Tensor], weight: Tensor) -> dict[str, Tensor]:

@@ -1,5 +1,6 @@
 """The distances from calibration of a calibrated model: they are not zero for finitely many samples."""
 
+from collections import defaultdict
 from dataclasses import dataclass
 from functools import cache
 
@@ -7,14 +8,16 @@ import torch
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.columns import draws
+from phd_exp.distributions.columns import draws, nees_columns, parameter_columns
 from phd_exp.metrics.calibration import ence_of, miscalibration_area, uniform_distance
 from phd_exp.metrics.calibration_scores import ence_bins
+from phd_exp.metrics.groups import similar_groups, worst_group
 from phd_exp.metrics.ordered import in_order_of
 
 SEED = 1
 _AT_ONCE = 10**6  # positions drawn at a time
-DISTANCES = ("depth_ence", "projected_ence", "miscalibration_area", "depth_pit_area", "depth_pit_ks")
+_OF_LEVELS = ("miscalibration_area", "depth_pit_area", "depth_pit_ks")
+DISTANCES = ("depth_ence", "projected_ence", *_OF_LEVELS, "group_miscalibration", "nees")
 
 
 @dataclass(frozen=True)
@@ -27,25 +30,29 @@ class Band:
 
 
 def calibrated_reference(distribution: ProjectedHuber, simulations: int = 200) -> dict[str, Band]:
-    """Median and 95 % interval of the `DISTANCES` if the truths were drawn from the predictions themselves.
+    """Median and 95 % interval of the `DISTANCES` and NEES if the truths were drawn from the predictions themselves.
 
-    ENCE depends on the predicted densities, so positions are drawn from them. Credible levels and PITs of a
+    ENCE and NEES depend on the predicted densities, so positions are drawn from them. Credible levels and PITs of a
     calibrated model are uniform for any prediction: their distances depend on the number of samples alone.
 
     Source: the simulated null distribution of a test statistic; coverage in tests/evaluation/test_reference.py.
     """
     (n,) = distribution.batch_shape
     areas, distances = _uniform(n, simulations)
-    found: dict[str, list[float]] = {"depth_ence": [], "projected_ence": []}
-    found |= {"miscalibration_area": areas, "depth_pit_area": areas, "depth_pit_ks": distances}
+    found = defaultdict(list, zip(_OF_LEVELS, (areas, areas, distances), strict=True))
     each = max(1, _AT_ONCE // n)
     for start in range(0, simulations, each):
-        for name, values in _ence(distribution, min(each, simulations - start), SEED + start).items():
+        for name, values in _simulated(distribution, min(each, simulations - start), SEED + start).items():
             found[name] += values.tolist()
-    return {name: _band(found[name]) for name in DISTANCES}
+    return {name: _band(values) for name, values in found.items()}
 
 
-def _ence(distribution: ProjectedHuber, simulations: int, seed: int) -> dict[str, Tensor]:
+def groups_of(distribution: ProjectedHuber) -> Tensor:
+    """The groups of samples with similar parameters, as of `similar_groups`."""
+    return similar_groups(torch.stack(list(parameter_columns(distribution).values()), -1))
+
+
+def _simulated(distribution: ProjectedHuber, simulations: int, seed: int) -> dict[str, Tensor]:
     drawn = draws(distribution, simulations, seed)
     z = drawn[..., 2]
     off_centre = drawn[..., :2] / z[..., None] - distribution.mu_xy
@@ -56,7 +63,9 @@ def _ence(distribution: ProjectedHuber, simulations: int, seed: int) -> dict[str
             off_centre.square().sum(-1),
         ),
     }
-    found = {}
+    found = {name: values.mean(-1) for name, values in nees_columns(distribution, drawn).items()}
+    levels = torch.rand(z.shape, generator=torch.Generator().manual_seed(seed))
+    found["group_miscalibration"] = worst_group(levels, groups_of(distribution), torch.ones_like(levels))
     for name, (variance, error) in pairs.items():
         order = in_order_of(variance, {"variance": variance, "error": error}, torch.ones_like(error))
         found[name] = ence_of(order, "variance", "error", ence_bins(order))

@@ -9,5 +9,6 @@ from phd_exp.fusion.fuse import Fused, fuse
 from phd_exp.fusion.gaussian import average, gaussian_fusion
 from phd_exp.fusion.pose import Plane, Pose
 from phd_exp.fusion.problems import Status
+from phd_exp.fusion.shared import fuse_shared
 
-__all__ = ["Fused", "Plane", "Pose", "Status", "average", "fuse", "gaussian_fusion"]
+__all__ = ["Fused", "Plane", "Pose", "Status", "average", "fuse", "fuse_shared", "gaussian_fusion"]

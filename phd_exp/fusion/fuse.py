@@ -33,6 +33,7 @@ class Fused:
         status: `Status` of each problem.
         problems: the problems, `unknowns` their solution, and `excess` the energy of each view above its minimum;
             surprise, mean and covariance are computed from them on demand.
+        shared: of `fuse_shared`: the estimated scale, mean and covariance.
     """
 
     point: Float[Tensor, "*problems 3"]
@@ -42,6 +43,7 @@ class Fused:
     problems: Problems
     unknowns: Float[Tensor, "flat 3"]
     excess: Float[Tensor, "flat cameras"]
+    shared: tuple[Tensor, Tensor, Tensor] | None = None
 
     @cached_property
     def surprise(self) -> Float[Tensor, "*problems cameras"]:
@@ -66,6 +68,8 @@ class Fused:
     @cached_property
     @torch.no_grad()
     def _moments(self) -> tuple[Tensor, Tensor]:
+        if self.shared is not None:
+            return self.shared[1:]
         problems, fused = self.problems, self.status.cpu().flatten() == Status.FUSED
         alone, alone_mean, alone_covariance = problems.alone()
         u, C, _ = self._quadrature(fused & ~alone)

@@ -1,6 +1,7 @@
 """Scenes as JSON objects: one position from several cameras, or from one camera and a known plane."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.fusion import Fused, Plane, Pose, Status, fuse
+from phd_exp.fusion import Fused, Plane, Pose, Status, fuse, fuse_shared
 from phd_exp.inference.answers import Sighting, rounded, uncertainty
 from phd_exp.inference.predictor import Predictor
 from phd_exp.metrics.errors import MILLIMETRES, squared_mahalanobis
@@ -36,7 +37,11 @@ def outputs(
 
 
 def fused_answers(
-    scenes: Sequence[Observed], sightings: Iterable[Sighting], predictor: Predictor, plane: Plane | None
+    scenes: Sequence[Observed],
+    sightings: Iterable[Sighting],
+    predictor: Predictor,
+    plane: Plane | None,
+    shared_scale: float | None = None,
 ) -> list[dict[str, Any]]:
     """The fused position of each scene, with its errors if the true position is known.
 
@@ -47,6 +52,7 @@ def fused_answers(
         sightings: those of their detections, one scene after the other.
         predictor: the probabilistic predictor that made the sightings.
         plane: contains every position, if given.
+        shared_scale: the `share` of `fuse_shared`; None for independent views.
 
     Raises DatasetError, before the first sighting is computed, if lines of a scene give different true positions.
     """
@@ -55,7 +61,8 @@ def fused_answers(
     rows, mask = layout([len(scene.detections) for scene in scenes])
     predictions = predictor.predict(raw[rows], f[rows])
     assert isinstance(predictions, ProjectedHuber)
-    fused = fuse(predictions, Pose(pose.R[rows], pose.t[rows]), plane, mask)
+    way = fuse if shared_scale is None else partial(fuse_shared, share=shared_scale)
+    fused = way(predictions, Pose(pose.R[rows], pose.t[rows]), plane, mask)
     errors = {
         "error_mm": MILLIMETRES * (fused.point - truth).norm(dim=-1),
         "squared_mahalanobis": squared_mahalanobis(
@@ -129,4 +136,6 @@ def _answer(scene: Observed, fused: Fused, place: int) -> dict[str, Any]:
         "certificate": fused.certificate[place],
         "surprise": fused.surprise[place, :views],
     }
+    if fused.shared is not None:
+        numbers["shared_scale"] = fused.shared[0][place]
     return named | {name: rounded(value.numpy()) for name, value in numbers.items()}

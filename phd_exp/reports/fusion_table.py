@@ -11,6 +11,7 @@ from phd_exp.reports.table import Table, TableCell, TableRow, file_stem
 NAMES: dict[Method, str] = {
     "mode": "Huber, mode",
     "mean": "Huber, mean",
+    "shared": "shared",
     "average": "average",
     "gaussian": "Gaussian",
 }
@@ -31,7 +32,9 @@ OF_A_LINE = (
 )
 OF_METHODS = (
     "Huber: the most likely position under the product of the views' Projected Huber densities, and the mean of that "
-    "product. Average: of the views' modes. Gaussian: the views' means weighted by their inverse covariances."
+    "product. Shared: the mean where all views' depths share an unknown factor, as much as in the "
+    "other half of the scenes. Average: of the views' modes. Gaussian: the views' means weighted by their "
+    "inverse covariances."
 )
 OF_THE_GROUND = (
     "Ground: every position is also known to lie on a plane through the true one with the normal (0, cos 30°, "
@@ -129,7 +132,11 @@ def _common_cause(scores: FusionScores) -> str:
     verdict = "does not differ from 1 by more than chance"
     if last.low > 1 or last.high < 1:
         verdict = f"means that together they are {'over' if last.low > 1 else 'under'}confident"
-    return f"{text}; the fused squared error of {last.value:.2f} {verdict}."
+    shared = scores.band("normalised_squared_error", "shared", scores.views)
+    return (
+        f"{text}; the fused squared error of {last.value:.2f} {verdict}. With this part shared, it is "
+        f"{shared.value:.2f} ({shared.low:.2f}–{shared.high:.2f})."
+    )
 
 
 def headline(scores: FusionScores) -> str:

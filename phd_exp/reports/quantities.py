@@ -39,6 +39,8 @@ class Quantity:
 
 _RISK = "mean error of the predictions kept when the least certain are dropped first, averaged over the share kept"
 _EXCESS = "0 if predicted variance ranks the errors perfectly, 1 if no better than chance"
+_WORST_GROUP = "largest mean gap between coverage and diagonal in groups of samples with similar predictions"
+_NEES = "squared error of the mean over the predicted covariance; 3 if calibrated, more if overconfident"
 _OVERCONFIDENCE = "mean credible level of the truths minus 1/2; negative if underconfident"
 _ROWS: tuple[tuple[str, str, str, int, str], ...] = (
     ("projected_error_mm", "Projected error", "mm", 1, "distance of the estimate from the true viewing ray"),
@@ -56,6 +58,11 @@ _ROWS: tuple[tuple[str, str, str, int, str], ...] = (
     ("overconfidence", "Overconfidence", "", 3, _OVERCONFIDENCE),
     ("depth_pit_area", "Depth PIT area", "", 3, "between the distribution of the depth’s PIT and the diagonal"),
     ("depth_pit_ks", "Depth PIT distance", "", 3, "the largest gap between those two (Kolmogorov–Smirnov)"),
+    ("group_miscalibration", "Worst-group miscalibration", "", 3, _WORST_GROUP),
+    ("nees", "NEES", "", 2, _NEES),
+    ("nees_x", "NEES of x", "", 2, "squared error of the mean of x over its variance, 1 if calibrated"),
+    ("nees_y", "NEES of y", "", 2, "the same of y"),
+    ("nees_z", "NEES of z", "", 2, "the same of z"),
     ("depth_sharpness_mm", "Depth sharpness", "mm", 1, "root mean square of the predicted deviation of z"),
     ("projected_sharpness_mrad", "Projected sharpness", "mrad", 2, "the same of x/z and y/z"),
     ("depth_risk_coverage_area", "Depth risk–coverage area", "mm", 1, _RISK),

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.columns import Columns, distribution_columns, draws
+from phd_exp.distributions.columns import Columns, coordinates, distribution_columns, draws
 from phd_exp.evaluation.predictions import evaluate
 from phd_exp.metrics.bootstrap import bands
 from phd_exp.metrics.calibration_scores import calibration_scores, ordered
@@ -25,7 +25,7 @@ def columns() -> Columns:
     prediction = ProjectedHuber.from_raw(raw, f=f, S=224.0, mu_z0=2.5e-3)
     xyz = draws(prediction, 1, seed=2)[0]
     errors = {name: f / 1000 for name in ("projected_error_mm", "depth_error_mm", "energy_score")}
-    known = {"f": f, "z": xyz[:, 2], "visibility": torch.rand(N, generator=generator)}
+    known = coordinates("", xyz) | {"f": f, "visibility": torch.rand(N, generator=generator)}
     return distribution_columns(prediction, xyz) | errors | known
 
 

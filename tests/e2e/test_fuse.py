@@ -16,6 +16,7 @@ from phd_exp.__main__ import main
 from phd_exp.geometry import intrinsics
 from phd_exp.records.runs import RunFolder
 from tests.e2e.conftest import QUICK
+from tests.support.several import write_views
 from tests.support.untrained import SMALL, read_lines, untrained
 
 VIEWS, SCENES = 3, 2
@@ -163,6 +164,24 @@ def test_recalibration_reaches_the_fused_covariance(phd_exp: Callable, run: RunF
     assert after[0]["covariance"] != before[0]["covariance"]
 
 
+def test_a_shared_scale_is_estimated_with_the_spread_of_the_runs_own_scenes(
+    phd_exp: Callable, run: RunFolder, several: Path
+) -> None:
+    words = ("fuse", f"run={run.path}", f"folder={several}")
+    refused = phd_exp(*words, "shared_scale=true")
+    assert (refused.status, refused.out) == (1, "")
+    (line,) = refused.err.splitlines()
+    assert "views.parquet: missing; shared_scale is estimated from it: train with evaluation.multiview" in line
+    write_views(run.views, 40, a=30.0, common=0.1)
+    before, after = read_lines(phd_exp(*words).out), read_lines(phd_exp(*words, "shared_scale=true").out)
+    run.views.unlink()
+    for alone, shared in zip(before, after, strict=True):
+        assert shared.keys() - alone.keys() == {"shared_scale"}
+        assert shared["status"] == "fused"
+        assert shared["shared_scale"] > 0
+        assert shared["covariance"] != alone["covariance"]
+
+
 def test_a_baseline_is_refused(phd_exp: Callable, several: Path, composed: Callable, tmp_path: Path) -> None:
     points = untrained(tmp_path / "points", composed(*SMALL, "model=mae_vz"))
     refused = phd_exp("fuse", f"run={points.path}", f"folder={several}")
@@ -181,7 +200,10 @@ LINES = [
     ({"scene": 1, "pose": POSE | {"R": 1}}, "pose.R: unknown key; expected one of rotation, translation"),
 ]
 ARGUMENTS = [
-    (("run=nowhere",), "folder: missing; fuse takes run=, recalibrate=, coverage=, trust=, views=, folder=, plane=, out="),
+    (
+        ("run=nowhere",),
+        "folder: missing; fuse takes run=, recalibrate=, coverage=, trust=, views=, folder=, plane=, ",
+    ),
     (("run=nowhere", "folder=."), "nowhere: no run; expected a folder with config.yaml"),
     (("run=nowhere", "folder=.", "plane=1,2,3"), "plane: got '1,2,3'; expected plane=NX,NY,NZ,OFFSET"),
     (("run=nowhere", "folder=.", "plane=0,0,0,1"), "a normal that is not zero"),

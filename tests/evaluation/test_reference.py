@@ -5,39 +5,67 @@ import pytest
 import torch
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.columns import distribution_columns, draws
-from phd_exp.evaluation.reference import DISTANCES, calibrated_reference
+from phd_exp.distributions.columns import NEES, distribution_columns, draws, nees_columns
+from phd_exp.evaluation.reference import DISTANCES, calibrated_reference, groups_of
 from phd_exp.metrics.calibration_scores import exact_scores
+from phd_exp.metrics.groups import worst_group
 from tests.support.synthetic import calibrated, truths
 
 TIMES = 100
+REFERENCED = dict.fromkeys([*DISTANCES, *NEES])
+
+
+def scores_of(prediction: ProjectedHuber, xyz: torch.Tensor) -> dict[str, float]:
+    columns = distribution_columns(prediction, xyz)
+    found = exact_scores(columns)
+    found["group_miscalibration"] = float(worst_group(columns["level"], groups_of(prediction), torch.ones(len(xyz))))
+    return found | {name: float(column.mean()) for name, column in nees_columns(prediction, xyz).items()}
 
 
 def test_calibrated_models_lie_in_the_interval_95_times_of_100() -> None:
     n = 60
     prediction = calibrated(truths(n, seed=1)[0], a=20.0, A=600.0, overconfidence=1.0, seed=3)
     reference = calibrated_reference(prediction, simulations=200)
-    inside, below = dict.fromkeys(DISTANCES, 0), dict.fromkeys(DISTANCES, 0)
-    drawn = draws(prediction, TIMES, seed=5).flatten(0, 1)
-    often = (prediction.mu_xy.repeat(TIMES, 1), prediction.mu_z.repeat(TIMES))
-    often += (prediction.A.repeat(TIMES, 1, 1), prediction.a.repeat(TIMES))
-    columns = distribution_columns(ProjectedHuber(*often), drawn)
-    for time in range(TIMES):
-        scores = exact_scores({name: column[time * n : (time + 1) * n] for name, column in columns.items()})
+    inside, below = dict.fromkeys(REFERENCED, 0), dict.fromkeys(REFERENCED, 0)
+    for xyz in draws(prediction, TIMES, seed=5):
+        scores = scores_of(prediction, xyz)
         for name, band in reference.items():
             inside[name] += band.low <= scores[name] <= band.high
             below[name] += scores[name] < band.value
     slack = 4 * np.sqrt(np.array([0.95 * 0.05, 0.25]) / TIMES)
-    for name in DISTANCES:
+    assert reference.keys() == REFERENCED.keys()
+    for name in REFERENCED:
         assert inside[name] / TIMES == pytest.approx(0.95, abs=slack[0]), name
         assert below[name] / TIMES == pytest.approx(0.5, abs=slack[1]), name
 
 
 def test_overconfident_models_lie_above_it() -> None:
     prediction = calibrated(truths(250, seed=1)[0], a=20.0, A=600.0, overconfidence=2.0, seed=3)
-    scores = exact_scores(distribution_columns(prediction, truths(250, seed=1)[0]))
+    scores = scores_of(prediction, truths(250, seed=1)[0])
     reference = calibrated_reference(prediction)
-    assert all(scores[name] > reference[name].high for name in DISTANCES)
+    assert all(scores[name] > reference[name].high for name in REFERENCED)
+
+
+def test_regions_wrong_in_opposite_ways_are_found_though_all_together_are_right() -> None:
+    """Levels of the one half are those of three times too precise, of the other half the rest of uniform ones."""
+    n = 1000
+    prediction = calibrated(truths(n, seed=1)[0], a=20.0, A=600.0, overconfidence=1.0, seed=3)
+    groups, one = groups_of(prediction), torch.ones(n)
+    reference = calibrated_reference(prediction)["group_miscalibration"]
+    level = torch.linspace(0.5 / n, 1 - 0.5 / n, n)
+    shuffled = level[torch.randperm(n, generator=torch.Generator().manual_seed(0))]
+    assert reference.low <= worst_group(shuffled, groups, one) <= reference.high
+    # half of the samples, those to the left, get the levels above 0.5 three times as often
+    odds = torch.where(prediction.mu_xy[:, 0] < 0, 0.5, -0.5) + torch.randn(
+        n, generator=torch.Generator().manual_seed(1)
+    )
+    opposite = torch.empty(n).scatter(0, odds.argsort(), level)
+    assert torch.equal(opposite.sort().values, level)
+    assert worst_group(opposite, groups, one) > 2 * reference.high
+    # blind groups of a tenth do not find it: each is a sample of all levels
+    blind = torch.stack([torch.randperm(n, generator=torch.Generator().manual_seed(k)) for k in range(30)])
+    blind = (blind[:, None] < torch.linspace(0.1, 1, 10)[:, None] * n).float()
+    assert worst_group(opposite, blind, one) < reference.high
 
 
 def test_one_sample_and_the_seed() -> None:

@@ -233,7 +233,7 @@ def test_the_fusion_table_holds_the_scores(found: list[Table], several: Run) -> 
     assert row.cells[1].ours == f"{band.value:.{0 if band.value >= 100 else 1}f}"
     assert re.fullmatch(r"\(\d+(\.\d)?–\d+(\.\d)?\)", row.cells[1].spread)
     assert bold(table) == 0
-    assert re.fullmatch(r"8[78]\.\d", table.groups[4][2].cells[0].below)
+    assert re.fullmatch(r"8[78]\.\d", table.groups[4][3].cells[0].below)
 
 
 def test_the_fusion_table_explains_common_errors(found: list[Table], several: Run) -> None:

@@ -8,7 +8,7 @@ from phd_exp.evaluation.reference import Band
 from phd_exp.reports.fusion_table import NAMES, alone
 from phd_exp.reports.site.charts import Chart, Trace, axis, curve_line, identity, line, square
 
-COLOURS: dict[Method, int] = {"mode": 1, "mean": 2, "average": 3, "gaussian": 4}
+COLOURS: dict[Method, int] = {"mode": 1, "mean": 2, "average": 3, "gaussian": 4, "shared": 5}
 DASH = {False: "solid", True: "dash"}
 MAIN, ASIDE = "line", "aside"
 """Roles: lines that the comparison of two runs includes, and lines that it omits."""
