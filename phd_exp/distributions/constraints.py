@@ -9,6 +9,7 @@ Source: paper, section "Desired constraints for estimated distribution".
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from jaxtyping import Float
@@ -232,6 +233,7 @@ CONSTRAINTS: dict[str, Callable[[Family, torch.Generator], Finding]] = {
 }
 
 
+@cache
 def findings(seed: int = 0) -> dict[str, dict[str, Finding]]:
     """Every constraint on every family, by the names of both."""
     return {
