@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from phd_exp.distributions.constraints import findings
-from phd_exp.evaluation.predictions import OF_A_DISTRIBUTION
+from phd_exp.evaluation.predictions import OF_A_DISTRIBUTION, XYZ
 from phd_exp.reports.heads_table import COLUMNS, heads_tables
 from phd_exp.reports.runs import read_report
 from tests.support.recorded import predicted, record
@@ -20,7 +20,7 @@ def runs(tmp_path: Path) -> Path:
         for model, nll in (("probabilistic", -3.0), ("gaussian", -2.0), ("mine", -3.0), ("better", -4.0)):
             frame = predicted(0).frame
             random = np.random.default_rng(seed)
-            for name in OF_A_DISTRIBUTION:
+            for name in OF_A_DISTRIBUTION[len(XYZ) :]:
                 frame[name] = random.uniform(0, 1, len(frame))
             frame["nll"] = nll + 0.01 * random.standard_normal(len(frame))
             frame["level"] = (np.arange(len(frame)) + 0.5) / len(frame)
