@@ -24,8 +24,8 @@ FIELD = 512  # side of the field of standard normal numbers from which the noise
 class Photometry:
     """Random changes of light, colour and image quality, each up to a limit.
 
-    Half of the images change in brightness, contrast, gamma and white balance together, with factors log-uniform
-    between 1/limit and the limit. A quarter each is blurred, gets noise, or is compressed, uniformly up to the limit.
+    Brightness, contrast, gamma and white balance change by factors that are log-uniform between 1/limit and the
+    limit. A quarter of the images each is blurred, gets noise, or is compressed, uniformly up to the limit.
 
     Args:
         occluders: share of the images in which a polygon of one colour hides a part.
@@ -38,7 +38,7 @@ class Photometry:
         jpeg: lowest JPEG quality; 100 for none.
     """
 
-    n_numbers: ClassVar[int] = 14
+    n_numbers: ClassVar[int] = 13
     occluders: float = 0.0
     brightness: float = 1.0
     contrast: float = 1.0
@@ -54,7 +54,7 @@ class Photometry:
         return self != Photometry()
 
     def __call__(
-        self, image: UInt8[Tensor, "batch height width 3"], numbers: Float[Tensor, "batch 14"]
+        self, image: UInt8[Tensor, "batch height width 3"], numbers: Float[Tensor, "batch 13"]
     ) -> UInt8[Tensor, "batch height width 3"]:
         """The images, changed by uniform numbers from -1 to 1."""
         result = [self._changed(one, row) for one, row in zip(image.numpy(), numbers.tolist(), strict=True)]
@@ -63,20 +63,20 @@ class Photometry:
     def fixed(self, image: UInt8[Tensor, "batch height width 3"]) -> UInt8[Tensor, "batch height width 3"]:
         """The images, each changed exactly up to every limit; only noise is drawn. Here, limits may be below 1."""
         numbers = torch.ones(len(image), self.n_numbers)
-        numbers[:, 9:11] = 2 * torch.rand(len(image), 2, generator=torch.Generator().manual_seed(0)) - 1
+        numbers[:, 8:10] = 2 * torch.rand(len(image), 2, generator=torch.Generator().manual_seed(0)) - 1
         return self(image, numbers)
 
     def _changed(self, image: NDArray[np.uint8], numbers: list[float]) -> NDArray[np.uint8]:
         picture = Image.fromarray(image)
-        if numbers[12] < 2 * self.occluders - 1:
-            _hide_a_part(picture, seed=int(2**32 * (numbers[13] + 1)))
-        if numbers[0] > 0:
-            picture = picture.point(self._tone(numbers[1:7]))
-        if self.blur and (blur := _strength(numbers[7])):
+        if numbers[11] < 2 * self.occluders - 1:
+            _hide_a_part(picture, seed=int(2**32 * (numbers[12] + 1)))
+        if (self.brightness, self.contrast, self.gamma, self.white_balance) != (1, 1, 1, 1):
+            picture = picture.point(self._tone(numbers[:6]))
+        if self.blur and (blur := _strength(numbers[6])):
             picture = picture.filter(ImageFilter.GaussianBlur(self.blur * blur))
-        if self.noise and (noise := _strength(numbers[8])):
-            picture = Image.fromarray(_noisy(np.asarray(picture), self.noise * noise, numbers[9:11]))
-        if self.jpeg < 100 and (loss := _strength(numbers[11])):
+        if self.noise and (noise := _strength(numbers[7])):
+            picture = Image.fromarray(_noisy(np.asarray(picture), self.noise * noise, numbers[8:10]))
+        if self.jpeg < 100 and (loss := _strength(numbers[10])):
             picture = _compressed(picture, round(100 - (100 - self.jpeg) * loss))
         return np.asarray(picture)
 
@@ -149,7 +149,7 @@ class Augmentation:
         """Whether any change can be drawn."""
         return self.symmetries or self.largest_zoom > 1 or self.colours or self.photometry.changes_anything
 
-    def __call__(self, batch: Batch, numbers: Float[Tensor, "batch 24"]) -> Batch:
+    def __call__(self, batch: Batch, numbers: Float[Tensor, "batch 23"]) -> Batch:
         """The samples, changed by uniform numbers from -1 to 1.
 
         A rotation and zoom that would move the object out of the image is skipped; the symmetry is kept.
