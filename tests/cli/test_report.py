@@ -39,10 +39,10 @@ def test_several_views_are_printed_and_written_where_they_are_recorded_and_both_
     runs = runs.rename(tmp_path / "elsewhere")
     out = tmp_path / "for the paper"
     views = runs / "small" / "occl" / "probabilistic" / "seed0" / "views.parquet"
-    write_views(views, 20)
+    write_views(views, 6)
     outcome = phd_exp("report", "out=for the paper", "runs=elsewhere")
     assert (outcome.status, outcome.err) == (0, "")
-    assert "Fusion, preset small, probabilistic on occl, seed0: 20 scenes seen by 4 cameras" in outcome.out
+    assert "Fusion, preset small, probabilistic on occl, seed0: 6 scenes seen by 4 cameras" in outcome.out
     assert (out / "tables" / "fusion-small-occl-probabilistic-seed0.tex").exists()
     assert 'id="of-fusion"' in (out / "site" / "index.html").read_text()
     assert not (tmp_path / "report").exists()

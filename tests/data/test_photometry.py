@@ -30,8 +30,8 @@ def images(n: int = N) -> torch.Tensor:
 @pytest.mark.parametrize(
     ("limits", "share"),
     [
-        ({"brightness": 2.0}, 1), ({"contrast": 2.0}, 1), ({"gamma": 2.0}, 1),
-        ({"white_balance": 1.5}, 1), ({"blur": 3.0}, 1 / 4), ({"noise": 20.0}, 1 / 4), ({"jpeg": 20}, 1 / 4),
+        ({"brightness": 2.0}, 1.0), ({"contrast": 2.0}, 1.0), ({"gamma": 2.0}, 1.0),
+        ({"white_balance": 1.5}, 1.0), ({"blur": 3.0}, 1 / 4), ({"noise": 20.0}, 1 / 4), ({"jpeg": 20}, 1 / 4),
         ({"occluders": 0.3}, 0.3),
     ],
     ids=lambda value: "" if isinstance(value, float) else next(iter(value)),

@@ -104,7 +104,7 @@ def test_given_the_scale_the_point_is_that_of_a_generic_solver_and_the_joint_ene
         assert energy((u + w) / 2, (r + q) / 2) <= (energy(u, r) + energy(w, q)) / 2 + 1e-9
 
 
-@pytest.mark.parametrize("cameras", [2, 4])
+@pytest.mark.parametrize("cameras", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_its_regions_hold_where_errors_are_shared_and_those_of_independent_views_do_not(cameras: int) -> None:
     """Cameras 0.1 rad apart: rays do not determine the distance."""
     n = 1000

@@ -173,7 +173,7 @@ MISTAKES: list[tuple[tuple[str, ...], Callable[[RunFolder], Any], str]] = [
     ((*ONE, "coverage=0.99", "groups=spread"), lambda run: None, "needs at least 99 held-out samples of each group"),
     (("fuse", "folder=test", "coverage=0.9"), gone, "views.parquet: no scenes with 2 cameras, as coverage= needs"),
     (("fuse", "folder=test", "coverage=0.99"), lambda run: None, "needs at least 99 scenes, every second of"),
-    (("fuse", "folder=test", "coverage=0.9", "plane=0,0,1,3"), gone, "coverage: holds for views that are fused alone"),
+    (("fuse", "folder=test", "coverage=0.9", "plane=0,0,1,3"), gone, "coverage: holds for views that are fused"),
 ]  # fmt: skip
 
 
