@@ -99,8 +99,6 @@ def loaded(arguments: RunArguments, device: str = "auto") -> "Predictor":
 
     trust = tuple(arguments.trust.split(",")) if arguments.trust else ()
     predictor = load(arguments.run, device, arguments.recalibrate, trust, int(arguments.views))
-    if predictor.note:
-        print(f"note: {predictor.note}", file=sys.stderr)
     if predictor.state != "finished":
         print(f"note: {arguments.run[0]}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
     return predictor

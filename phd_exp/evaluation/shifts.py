@@ -3,13 +3,16 @@
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
 from phd_exp.evaluation.conformal import threshold
+from phd_exp.evaluation.familiar import ALARM, Familiarity
 from phd_exp.evaluation.parquet import Columns, read_table, require_columns
 from phd_exp.evaluation.point_errors import RESAMPLES, SEED
 from phd_exp.evaluation.predictions import ERRORS, band_of
@@ -29,7 +32,8 @@ class ShiftScores:
     Attributes:
         change: the shift in words; empty at home.
         scores: means of `MEASURED`, the `calibration_scores`, and the per cent of truths inside credible regions:
-            `inside_50`, `inside_90`, `inside_99`, and `inside_conformal` if there are enough held-out samples.
+            `inside_50`, `inside_90`, `inside_99`; with enough held-out samples also `inside_conformal`, the per cent
+            `unfamiliar` with a p-value below `familiar.ALARM`, and `auroc`, of the distance against that at home.
     """
 
     change: str
@@ -43,19 +47,33 @@ def shift_scores(folder: Path, home: Columns, held_out: Columns | None) -> dict[
 
     Raises RunError if a table cannot be read or lacks a column.
     """
-    found, levels = {}, {"50": 0.5, "90": 0.9, "99": 0.99}
+    found, levels, rated = {}, {"50": 0.5, "90": 0.9, "99": 0.99}, _unrated
     if held_out and "level" in held_out:
         with suppress(RunError):  # too few samples
             levels["conformal"] = threshold(held_out["level"][GUARANTEE], 0.9, "held-out samples")
+            rated = partial(_rated, Familiarity(held_out), home)
     for file in sorted(folder.glob("*.parquet")) if "level" in home else ():
         table, said = read_table(file), pq.read_schema(file).metadata or {}
-        found[file.stem] = _scores(table, levels, one_line(said.get(b"shift", b"").decode(errors="replace")))
-    return found | {HOME: _scores(home, levels)} if found else {}
+        change = one_line(said.get(b"shift", b"").decode(errors="replace"))
+        found[file.stem] = _scores(table, levels, rated(table), change)
+    return found | {HOME: _scores(home, levels, rated(home))} if found else {}
 
 
-def _scores(table: Columns, levels: Mapping[str, float], change: str = "") -> ShiftScores:
+def _unrated(table: Columns) -> Columns:
+    return {}
+
+
+def _rated(familiarity: Familiarity, home: Columns, table: Columns) -> Columns:
+    """Whether each sample is unfamiliar (per cent), and the share of samples at home that are more familiar."""
+    usual, distance = np.sort(familiarity.distance(home)), familiarity.distance(table)
+    below = sum(np.searchsorted(usual, distance, side) for side in ("left", "right"))  # ties count half
+    unfamiliar = 100.0 * (familiarity.p_value(distance) < ALARM)
+    return {"unfamiliar": unfamiliar, "auroc": np.asarray(below / (2 * len(usual)))}
+
+
+def _scores(table: Columns, levels: Mapping[str, float], rated: Columns, change: str = "") -> ShiftScores:
     require_columns(MEASURED, table)
-    columns = {name: torch.from_numpy(table[name]) for name in MEASURED}
+    columns = {name: torch.from_numpy({**table, **rated}[name]) for name in (*MEASURED, *rated)}
     finite = torch.stack(list(columns.values())).isfinite().all(0)
     columns = {name: column[finite] for name, column in columns.items()}
     columns |= {f"inside_{name}": 100.0 * (columns["level"] <= level) for name, level in levels.items()}

@@ -33,8 +33,8 @@ NONE = "none: this model predicts a position alone"
 class Sighting:
     """A detection, its image, and its prediction in the frame of the view's virtual camera (float64).
 
-    `raw` holds the outputs of the network, from which `Predictor.predict` makes the prediction; `familiar` is of an
-    ensemble with held-out samples.
+    `raw` holds the outputs of the network, from which `Predictor.predict` makes the prediction; `familiar` is of runs
+    with held-out samples.
     """
 
     detection: Detection
@@ -55,7 +55,7 @@ def sightings(predictor: Predictor, detections: Sequence[Detection]) -> Iterator
         raw = predictor.raw(np.stack([view.image for _, _, view in batch]), f).double()
         # a batch takes an ensemble less time than its images one by one
         predictions = predictor.predict(raw, f) if predictor.is_ensemble else None
-        familiar = predictor.familiar(raw, f).tolist() if predictor.disagreements.size else [None] * len(batch)
+        familiar = predictor.familiar(raw, f)
         for row, (detection, image, view) in enumerate(batch):
             if not bool(raw[row].isfinite().all()):
                 raise RunError(
@@ -64,7 +64,9 @@ def sightings(predictor: Predictor, detections: Sequence[Detection]) -> Iterator
             prediction = (
                 predictions[row] if isinstance(predictions, ProjectedHuber) else predictor.predict(raw[row], f[row])
             )
-            yield Sighting(detection, image, view, raw[row], prediction, familiar[row])
+            yield Sighting(
+                detection, image, view, raw[row], prediction, None if familiar is None else float(familiar[row])
+            )
 
 
 def _batches(

@@ -2,7 +2,9 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +17,7 @@ from torch import Tensor
 from phd_exp.data.crops import cut
 from phd_exp.data.sources import RenderedSource
 from phd_exp.distributions import Mixture, ProjectedHuber, Temperature
+from phd_exp.distributions.columns import parameter_columns
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.geometry.motion import EIGHT, turned
@@ -31,6 +34,7 @@ from phd_exp.training.network import build_regressor, load_checkpoint, require_s
 
 if TYPE_CHECKING:  # imports of pyarrow
     from phd_exp.evaluation.conformal import Groups, Guarantee
+    from phd_exp.evaluation.familiar import Familiarity
     from phd_exp.evaluation.parquet import Columns
 
 WEIGHTS = "regressor."  # prefix of the network's weights in a checkpoint
@@ -88,8 +92,6 @@ class Predictor:
         folders: the runs, whose held-out samples guarantee regions.
         others: the further networks of an ensemble.
         views: number of symmetric views of each image, 1 or 8.
-        disagreements: of the members on held-out samples, nats, for `familiar`; empty if they are unknown.
-        note: why they are unknown.
     """
 
     config: RunConfig
@@ -103,8 +105,6 @@ class Predictor:
     folders: tuple[RunFolder, ...] = ()
     others: tuple[Regressor, ...] = ()
     views: int = 1
-    disagreements: Float[np.ndarray, " samples"] = field(default_factory=lambda: np.empty(0))
-    note: str = ""
 
     @property
     def networks(self) -> tuple[Regressor, ...]:
@@ -201,15 +201,32 @@ class Predictor:
         assert isinstance(prediction, ProjectedHuber)  # checked by `load`
         return Mixture(prediction)
 
-    def familiar(
-        self, raw: Float[Tensor, "batch members 7"], f: Float[Tensor, " batch"]
-    ) -> Float[np.ndarray, " batch"]:
-        """The share of held-out samples on which the members disagree at least as much, counting this one too.
+    @cached_property
+    def familiarity(self) -> "Familiarity | None":
+        """The measure of `familiar`; None if it has no, or too few, recorded predictions of held-out samples."""
+        if not self.is_probabilistic:
+            return None
+        from phd_exp.evaluation.familiar import Familiarity
 
-        Small for images unlike the training images; uniform over held-out ones, so that it is a p-value.
+        with suppress(RunError):
+            return Familiarity(_held_out(self), self.temperature)
+        return None
+
+    def familiar(
+        self, raw: Float[Tensor, "batch *members 7"], f: Float[Tensor, " batch"]
+    ) -> Float[np.ndarray, " batch"] | None:
+        """How usual the predictions are among held-out ones, as p-values, see `evaluation.familiar`; None if unknown.
+
+        Small for images unlike the training images.
         """
-        larger = self.disagreements >= self.members(raw, f).disagreement.numpy()[:, None]
-        return (1 + larger.sum(axis=1)) / (1 + self.disagreements.size)
+        prediction = self.predict(raw.double(), f.double())
+        if self.familiarity is None or not isinstance(prediction, ProjectedHuber):
+            return None
+        columns = parameter_columns(prediction) | {"f": f.double(), "S": torch.full_like(f, self.side)}
+        if self.is_ensemble:
+            columns["disagreement"] = self.members(raw, f).disagreement
+        distance = self.familiarity.distance({name: column.numpy() for name, column in columns.items()})
+        return self.familiarity.p_value(distance)
 
     def predict(self, raw: Float[Tensor, "*batch n_outputs"], f: Float[Tensor, "*batch"]) -> Prediction:
         """Predictions from the raw numbers of the network and focal lengths in pixels of its images.
@@ -254,10 +271,6 @@ def load(
         state = next((one.state for one in predictors if one.state != "finished"), "finished")
         networks = tuple(other.regressor for other in others)
         first = replace(first, folders=tuple(folders), others=networks, views=views, state=state)
-        try:
-            first = replace(first, disagreements=held_out_table(folders, views)["disagreement"])
-        except RunError as error:
-            first = replace(first, note=f"without `familiar`: {error}")
     if not recalibrate:
         return first
     from phd_exp.evaluation.predictions import fit_temperature  # imports pyarrow

@@ -50,6 +50,8 @@ _ROWS: tuple[tuple[str, str, str, int, str], ...] = (
     ("inside_90", "Inside the 90 % region", "%", 0, "the same"),
     ("inside_99", "Inside the 99 % region", "%", 0, "the same"),
     ("inside_conformal", "Inside the conformal 90 % region", "%", 0, "the same, of the level held-out samples give"),
+    ("unfamiliar", "Unfamiliar", "%", 1, "share of samples whose familiarity is below 0.05; 5 % at home"),
+    ("auroc", "AUROC of familiarity", "", 2, "how well it separates the samples from those at home"),
     ("depth_crps_mm", "CRPS of depth", "mm", 1, "continuous ranked probability score of the depth’s law"),
     ("energy_score_mm", "Energy score", "mm", 1, "the same of the position in space"),
     ("depth_ence", "Depth ENCE", "", 3, "expected normalised calibration error of the depth’s variance"),

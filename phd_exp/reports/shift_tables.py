@@ -14,8 +14,8 @@ AXES = {"variants": "data sets", "scenes": "scenes", "images": "images and focal
 MAIN = "inside_90"
 WANTED, LEAST = 90, 80  # per cent inside the 90 % region: of a calibrated run, and below which the promise is broken
 DETAILS = (
-    *("inside_50", "inside_99", "inside_conformal", "projected_error_mm", "depth_error_mm", "nll"),
-    *("depth_ence", "projected_ence", "depth_sharpness_mm", "projected_sharpness_mrad"),
+    *("inside_50", "inside_99", "inside_conformal", "unfamiliar", "auroc", "nll", "projected_error_mm"),
+    *("depth_error_mm", "depth_ence", "projected_ence", "depth_sharpness_mm", "projected_sharpness_mrad"),
 )
 OF_THE_MATRIX = (
     f"Per cent of truths inside the predicted 90 % region. Arrow: the 95 % interval excludes {WANTED} %; two: fewer "

@@ -58,11 +58,12 @@ def _errors(prediction: Prediction, xyz: Tensor) -> Columns:
 
 @torch.no_grad()
 def columns(prediction: Prediction, batch: Batch) -> Columns:
-    """A batch as a table: truth, estimate and errors; of a distribution also parameters, moments and scores.
+    """A batch as a table: camera, truth, estimate, errors; of a distribution also parameters, moments and scores.
 
     Positions, `depth_crps` and `energy_score` are in metres, in the camera frame; see `distribution_columns`.
     """
-    table = {"row": batch.row} | coordinates("", batch.xyz) | coordinates("mode_", prediction.mode)
+    table = {"row": batch.row, "f": batch.f, "S": torch.full_like(batch.f, batch.S)}
+    table |= coordinates("", batch.xyz) | coordinates("mode_", prediction.mode)
     table |= _errors(prediction, batch.xyz)
     if isinstance(prediction, Density):
         table |= distribution_columns(prediction, batch.xyz)
@@ -93,11 +94,11 @@ def summary(table: Columns, part: str = "test") -> dict[str, float]:
 def write_parquet(file: Path, table: Columns, known: Known, said: Mapping[str, str] | None = None) -> None:
     """Write the columns and the metadata of their samples, in the order of the data set.
 
-    `said` goes into the metadata of the schema.
+    The metadata may have f and S of the stored images. `said` goes into the metadata of the schema.
     """
     rows = table["row"].long().tolist()
     arrays = {name: pa.array([values[row] for row in rows]) for name, values in known.items()}
-    arrays |= {name: pa.array(column.numpy()) for name, column in table.items() if name not in UNRECORDED}
+    arrays |= {name: pa.array(column.numpy()) for name, column in table.items() if name not in (*UNRECORDED, *known)}
     buffer = io.BytesIO()
     pq.write_table(pa.table(arrays, metadata=dict(said or {})), buffer)
     write_atomic(file, buffer.getvalue())

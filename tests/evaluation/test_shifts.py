@@ -5,7 +5,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import stats
 
+from phd_exp.evaluation.familiar import Familiarity
 from phd_exp.evaluation.parquet import read_table
 from phd_exp.evaluation.shifts import shift_scores
 from phd_exp.records.errors import RunError
@@ -41,6 +43,12 @@ def test_every_share_is_a_count(run: RunFolder) -> None:
         sharpness = 1000 * np.sqrt(table["depth_variance"].mean())
         assert found[name].scores["depth_sharpness_mm"].value == pytest.approx(sharpness)
         assert (found[name].n, found[name].left_out) == (len(table), 0)
+        distance = Familiarity(held_out).distance(read_table(file))
+        usual = Familiarity(held_out).distance(read_table(run.predictions))
+        auroc = stats.mannwhitneyu(distance, usual).statistic / (len(distance) * len(usual))
+        assert found[name].scores["auroc"].value == pytest.approx(auroc)
+        alarms = Familiarity(held_out).p_value(distance) < 0.05
+        assert found[name].scores["unfamiliar"].value == pytest.approx(100 * alarms.mean())
     home, shifted = (found[name].scores["inside_90"] for name in ("home", "odd"))
     assert home.low <= 90 <= home.high
     assert shifted.high < 80

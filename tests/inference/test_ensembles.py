@@ -21,6 +21,7 @@ from phd_exp.training.predictions import columns, write_parquet
 from tests.support.untrained import SIDE, SMALL, read_lines, untrained, write_photos
 
 OWN = ("data=folder", "data.folder=photos")
+N = 48  # held-out samples
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +30,7 @@ def first(composed: Callable, tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("ensembles")
     write_photos(place / "photos", 3)
     folder = untrained(place / "run", composed(*SMALL, *OWN))
-    record(folder, 20, "")
+    record(folder, N, "")
     return place
 
 
@@ -50,7 +51,7 @@ def make(first: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callab
             content = torch.load(folder.last_checkpoint, weights_only=True)
             content["state_dict"]["regressor.last.weight"].mul_(factor)
             torch.save(content, folder.last_checkpoint)
-            record(folder, 20, "")
+            record(folder, N, "")
         return folder
 
     return made
@@ -62,7 +63,8 @@ def record(folder: RunFolder, n: int, names: str) -> None:
     images, f = pictures(n), torch.full((n,), 250.0)
     batch = Batch(images, torch.tensor([[0.0, 0.0, 3.0]]).expand(n, 3), f, float(SIDE), torch.arange(n))
     table = columns(predictor.predict(predictor.raw(images.numpy(), f), f), batch)
-    write_parquet(folder.held_out, table, {"file_name": [f"{names}{row}" for row in range(n)]})
+    known = {"f": f.tolist(), "S": [float(SIDE)] * n, "file_name": [f"{names}{row}" for row in range(n)]}
+    write_parquet(folder.held_out, table, known)
 
 
 def pictures(n: int) -> torch.Tensor:
@@ -93,7 +95,7 @@ def test_eight_views_are_predictions_of_turned_images_in_the_frame_of_the_image(
     """An ensemble of views turns with its image."""
     run = make("a")
     predictor, images, f = package.load(run.path, views=8), pictures(2), torch.full((2,), 250.0)
-    assert "evaluation.eight_views=true" in predictor.note
+    assert predictor.familiarity is None, "held-out samples were not predicted from eight views"
     raw = predictor.raw(images.numpy(), f)
     assert raw.shape == (2, 8, 7)
     torch.testing.assert_close(raw[:, 0], package.load(run.path).raw(images.numpy(), f))
@@ -105,20 +107,18 @@ def test_eight_views_are_predictions_of_turned_images_in_the_frame_of_the_image(
         torch.testing.assert_close(other.mean, mean @ R.T, rtol=1e-5, atol=1e-6)
 
 
-def test_familiar_is_the_share_of_held_out_samples_with_more_disagreement(make: Callable, phd_exp: Callable) -> None:
+def test_familiar_is_uniform_over_held_out_samples(make: Callable, phd_exp: Callable) -> None:
     runs = [make("a"), make("b", seed=1, factor=1.5)]
     words = ("predict", f"run={runs[0].path},{runs[1].path}", "folder=photos")
     outcome = phd_exp(*words)
     assert (outcome.status, outcome.err) == (0, "")
     lines = read_lines(outcome.out)
-    predictor = package.load([run.path for run in runs])
-    held_out = np.sort(predictor.disagreements)
-    f = torch.full((20,), 250.0)
-    own = predictor.familiar(predictor.raw(pictures(20).numpy(), f), f)
-    # each sample and itself, up to the rounding of records, which may exchange neighbours
-    np.testing.assert_allclose(np.sort(own), (1 + np.arange(1, 21)) / 21, atol=1.1 / 21)
-    assert len(held_out) == 20
-    assert all(1 / 21 <= line["familiar"] <= 1 for line in lines)
+    f = torch.full((N,), 250.0)
+    for predictor in (package.load([run.path for run in runs]), package.load(runs[0].path)):
+        own = predictor.familiar(predictor.raw(pictures(N).numpy(), f), f)[1::2]
+        # each sample and itself, up to the rounding of records, which may exchange neighbours
+        np.testing.assert_allclose(np.sort(own), (1 + np.arange(1, N // 2 + 1)) / (N // 2 + 1), atol=1.1 / (N // 2))
+    assert all(1 / (N // 2 + 1) <= line["familiar"] <= 1 for line in lines)
     recalibrated = read_lines(phd_exp(*words, "recalibrate=true").out)
     assert recalibrated[0]["familiar"] == lines[0]["familiar"]
     assert recalibrated[0]["mode"] == lines[0]["mode"]
@@ -133,11 +133,10 @@ def test_a_folder_of_seeds_is_one_ensemble_of_its_finished_runs(make: Callable) 
     assert len(package.load("runs").networks) == 2
 
 
-def test_held_out_samples_that_differ_are_a_note(make: Callable, phd_exp: Callable) -> None:
-    make("a"), record(make("b", seed=1), 20, "other")
+def test_familiar_needs_the_same_held_out_samples(make: Callable, phd_exp: Callable) -> None:
+    make("a"), record(make("b", seed=1), N, "other")
     outcome = phd_exp("predict", "run=runs/a,runs/b", "folder=photos")
-    assert outcome.status == 0
-    assert "note: without `familiar`: predictions: those of an ensemble are of different samples" in outcome.err
+    assert (outcome.status, outcome.err) == (0, "")
     assert "familiar" not in json.loads(outcome.out.splitlines()[0])
 
 
