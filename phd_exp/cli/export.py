@@ -22,8 +22,6 @@ def main(words: list[str]) -> int:
         raise ConfigError(f"export needs {', '.join(missing)}: `pip install 'phd_exp[export]'`")
     require_file(file, "network.onnx")
     predictor = loaded(arguments, "cpu")
-    if predictor.is_ensemble:
-        raise ConfigError("run: got an ensemble; expected one run, without views=8, for each exported file")
     output_folder(file.parent)
     from phd_exp.inference.onnx import CHECKED, TOLERANCE, export
 

@@ -7,14 +7,14 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from phd_exp.distributions import spd
 from phd_exp.distributions.depth import depth_mean_energy
 from phd_exp.distributions.huber import RADIAL_NORMALISER
 from phd_exp.distributions.projected_huber import ProjectedHuber
-from phd_exp.distributions.special import scaled_expint, tail_moment
+from phd_exp.distributions.special import scaled_expints, tail_moment
 
 DRAWS = 10_240  # for a level, whose standard error is at most 0.5 / sqrt(DRAWS) = 0.0049
 _AT_ONCE = 512  # draws in memory at a time
@@ -120,33 +120,31 @@ def _closest_depth(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch"], Fl
     a (far + near - 1) is the mean excess energy of a. The first gives a; then the second determines log mu_z.
     """
     log_mu, a = members.mu_z.log(), members.a
+    E_1, E_3 = scaled_expints((1, 3), a)
+    norm = 1 + tail_moment(0, a)
+
+    def conditions(place: Tensor) -> tuple[Tensor, Tensor]:
+        """Whether log mu_z is larger than `place`, and the best a there."""
+        distance = place[..., None] - log_mu
+        x, s = a * distance.abs().exp(), distance.exp()
+        decay, (one, three) = torch.exp(a - x), scaled_expints((1, 3), x)
+        # E[t; t > s] and E[1/t; t < s] for t = z / mu_z of a member, in units of 1 / (1 + g)
+        far = torch.where(s > 1, decay * (s + 1 / a), 1 + 1 / a + a * (E_3 - decay * s.square() * three))
+        near = a * torch.where(s < 1, decay * one, 2 * E_1 - decay * one)
+        far, near = (far / s / norm).mean(-1), (near * s / norm).mean(-1)
+        difference, excess = (far - near).clamp_min(torch.finfo(a.dtype).tiny), far + near - 1
+        energy = depth_mean_energy(-difference.log())
+        return excess / difference < energy, energy / excess
+
     margin = torch.log1p(4 / a)
     low, high = (log_mu - margin).amin(-1), (log_mu + margin).amax(-1)
     inner = torch.arange(1, _PARTS, device=a.device).reshape(-1, *[1] * low.ndim)
     for _ in range(_ROUNDS):
         step = (high - low) / _PARTS
-        low = low + step * _depth_conditions(low + step * inner, log_mu, a)[0].sum(0)
+        low = low + step * conditions(low + step * inner)[0].sum(0)
         high = low + step
     middle = low + step / 2
-    return middle.exp(), _depth_conditions(middle, log_mu, a)[1]
-
-
-def _depth_conditions(
-    place: Float[Tensor, "*places"], log_mu: Float[Tensor, "*#places members"], a: Float[Tensor, "*#places members"]
-) -> tuple[Bool[Tensor, "*places"], Float[Tensor, "*places"]]:
-    """Whether log mu_z is larger than `place`, and the best a there."""
-    distance = place[..., None] - log_mu
-    x, s = a * distance.abs().exp(), distance.exp()
-    decay, one = torch.exp(a - x), scaled_expint(1, x)
-    # E[t; t > s] and E[1/t; t < s] for t = z / mu_z of a member, in units of 1 / (1 + g)
-    below = 1 + 1 / a + a * (scaled_expint(3, a) - decay * s.square() * scaled_expint(3, x))
-    far = torch.where(s > 1, decay * (s + 1 / a), below)
-    near = a * torch.where(s < 1, decay * one, 2 * scaled_expint(1, a) - decay * one)
-    norm = 1 + tail_moment(0, a)
-    far, near = (far / s / norm).mean(-1), (near * s / norm).mean(-1)
-    difference, excess = (far - near).clamp_min(torch.finfo(a.dtype).tiny), far + near - 1
-    energy = depth_mean_energy(-difference.log())
-    return excess / difference < energy, energy / excess
+    return middle.exp(), conditions(middle)[1]
 
 
 def _closest_projection(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch 2 2"]]:

@@ -30,7 +30,7 @@ METADATA = "phd_exp"  # the key of the file's metadata: JSON with the run, the i
 DESCRIPTIONS = {
     "image": "(batch, side, side, 3) uint8: RGB images of side x side pixels, principal point in the middle",
     "f": "(batch,) float32: focal length, pixels of these images",
-    "raw": "(batch, n) float32: the outputs of the network",
+    "raw": "(batch, n) float32: the outputs of the network; of an ensemble (batch, members, n)",
     "mode": "(batch, 3) float32: position of highest density, m; camera frame: x right, y down, z forward",
     "mean": "(batch, 3) float32: expected position, m",
     "covariance": "(batch, 3, 3) float32: covariance of the position, m^2",
@@ -55,10 +55,10 @@ class _Deployed(nn.Module):
     def __init__(self, predictor: Predictor) -> None:
         super().__init__()
         self.predictor = predictor
-        self.regressor = predictor.regressor
+        self.networks = nn.ModuleList(predictor.networks)
 
     def forward(self, image: UInt8[Tensor, "batch S S 3"], f: Float[Tensor, " batch"]) -> tuple[Tensor, ...]:
-        raw = self.regressor.raw(image, self.predictor.camera(f).f)
+        raw = self.predictor.outputs(image, self.predictor.camera(f).f)
         answered = outputs(self.predictor.predict(raw.double(), f.double()))
         return (raw, *(value.float() for value in answered.values()))
 
@@ -133,7 +133,9 @@ def graph(predictor: Predictor) -> Any:
 def _names(predictor: Predictor) -> list[str]:
     """The names of the outputs after `raw`."""
     head = predictor.regressor.head
-    return list(outputs(predictor.predict(torch.zeros(1, head.n_outputs).double(), torch.ones(1).double())))
+    members = [len(predictor.networks) * predictor.views] if predictor.is_ensemble else []
+    raw = torch.zeros(1, *members, head.n_outputs, dtype=torch.float64)
+    return list(outputs(predictor.predict(raw, torch.ones(1).double())))
 
 
 def _metadata(predictor: Predictor) -> dict[str, Any]:

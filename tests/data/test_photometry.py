@@ -37,7 +37,7 @@ CHANGES = (
 @pytest.mark.parametrize("share", [0.25, 1.0])
 def test_each_change_is_made_to_its_share_of_images(limits: dict, share: float) -> None:
     changed = Photometry(share=share, **limits)(images(), numbers()).ne(images()).flatten(1).any(1)
-    assert 0.7 * share <= changed.float().mean().item() <= share + 0.08  # the least amounts change no level
+    assert 0.5 * share <= changed.float().mean().item() <= share + 0.08  # the least amounts change no level
     assert not Photometry(share=share).changes_anything
     assert Photometry(**limits).changes_anything
 

@@ -197,15 +197,6 @@ def test_seeds_of_two_configurations_are_no_ensemble(make: Callable, phd_exp: Ca
     assert "optimizer.lr=0.001, but optimizer.lr=0.5 in runs/seed1-00000000" in outcome.err
 
 
-@pytest.mark.parametrize("words", [("run=runs/a,runs/b",), ("run=runs/a", "views=8")], ids=" ".join)
-def test_an_ensemble_is_not_exported(make: Callable, phd_exp: Callable, words: tuple[str, ...]) -> None:
-    make("a"), make("b", seed=1)
-    outcome = phd_exp("export", *words)
-    assert outcome.status == 1
-    assert outcome.err.splitlines()[-1].startswith("error: run: got an ensemble; expected one run")
-    assert not list(Path("runs").rglob("*.onnx"))
-
-
 def test_a_mixture_has_the_members_of_its_predictor(make: Callable) -> None:
     predictor = package.load([make("a").path, make("b", seed=1).path], views=8)
     f = torch.full((1,), 250.0)

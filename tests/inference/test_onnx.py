@@ -21,14 +21,14 @@ DEPTH = DepthScale.from_ranges(f_range=(600.0, 1000.0), z_range=(3.0, 5.0))
 
 
 class Pixels(nn.Module):
-    """Stands in for a regressor: its outputs, from -16 to 16, are the first values of the image."""
+    """Stands in for a regressor: its outputs, from -16 to 16, are the first values of a row of the image."""
 
-    def __init__(self, head: Head) -> None:
+    def __init__(self, head: Head, row: int = 0) -> None:
         super().__init__()
-        self.head = head
+        self.head, self.row = head, row
 
     def raw(self, image: Tensor, f: Tensor | None = None) -> Tensor:
-        return (image[:, 0].flatten(1)[:, : self.head.n_outputs].float() - 128) / 8
+        return (image[:, self.row].flatten(1)[:, : self.head.n_outputs].float() - 128) / 8
 
 
 def predictor(composed: Callable[..., Any], head: Head, **changes: Any) -> Predictor:
@@ -83,6 +83,18 @@ def test_the_distribution_is_that_of_torch(composed: Callable[..., Any]) -> None
     for name, deviation in deviations.items():
         rows = slice(None) if "depth" in name else sound
         assert deviation[rows].max() < 1e-5, name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("networks", "views"), [(3, 1), (1, 8)])
+def test_an_ensemble_is_that_of_torch(composed: Callable[..., Any], networks: int, views: int) -> None:
+    head = DistributionHead(DEPTH)
+    others = tuple(Pixels(head, row) for row in range(1, networks))
+    made = predictor(composed, head, others=others, views=views)
+    images = np.random.default_rng(0).integers(88, 168, (100, SIDE, SIDE, 3), dtype=np.uint8)
+    for name, deviation in worst(made, images, np.linspace(600, 1000, 100, dtype=np.float32)).items():
+        assert np.quantile(deviation, 0.9) < 1e-5, name
+        assert deviation.max() < 1e-3, name
 
 
 @pytest.mark.parametrize(("chart", "constant_f"), [(Projected, None), (LogDepth, 777.0), (Cartesian, None)])
