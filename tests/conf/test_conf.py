@@ -101,7 +101,6 @@ def test_a_model_picks_its_loss_and_camera_and_whether_the_strong_recipe_shows_t
         ("symmetries", {"recipe.augmentation.symmetries"}),
         ("colours", {"recipe.augmentation.colours"}),
         ("exposure", {"recipe.exposure"}),
-        ("photometry", {f"recipe.augmentation.{name}" for name in ("brightness", "gamma", "blur")}),
         ("focal_length", {"camera.focal_length"}),
         ("fine_images", {"data.image_size", "backbone.width", "backbone.stride", "backbone.channels"}),
     ],
