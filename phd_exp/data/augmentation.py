@@ -1,7 +1,6 @@
 """Augmentation: the same scenes through other cameras and in other light, with exact labels."""
 
 import io
-import math
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import ClassVar
@@ -25,11 +24,10 @@ FIELD = 512  # side of the field of standard normal numbers from which the noise
 class Photometry:
     """Random changes of light, colour and image quality, each up to a limit.
 
-    Each change is made to a share of the images, independently of the others, by an amount that is uniform up to its
-    limit. A factor or exponent is that amount or its inverse, with equal probability.
+    Factors and exponents are uniform between 1/limit and the limit. A quarter of the images each is blurred, gets
+    noise, or is compressed, uniformly up to the limit.
 
     Args:
-        share: share of the images to which each change is made.
         occluders: share of the images in which a polygon of one colour hides a part.
         brightness: largest factor of all values; 1 for none.
         contrast: largest factor of the distance from middle grey; 1 for none.
@@ -41,7 +39,6 @@ class Photometry:
     """
 
     n_numbers: ClassVar[int] = 13
-    share: float = 1.0
     occluders: float = 0.0
     brightness: float = 1.0
     contrast: float = 1.0
@@ -54,7 +51,7 @@ class Photometry:
     @property
     def changes_anything(self) -> bool:
         """Whether any change can be drawn."""
-        return self != Photometry(share=self.share)
+        return self != Photometry()
 
     def __call__(
         self, image: UInt8[Tensor, "batch height width 3"], numbers: Float[Tensor, "batch 13"]
@@ -75,32 +72,33 @@ class Photometry:
             _hide_a_part(picture, seed=int(2**32 * (numbers[12] + 1)))
         if (self.brightness, self.contrast, self.gamma, self.white_balance) != (1, 1, 1, 1):
             picture = picture.point(self._tone(numbers[:6]))
-        blur, noise, loss = (abs(self._amount(numbers[place])) for place in (6, 7, 10))
-        if self.blur and blur:
+        if self.blur and (blur := _strength(numbers[6])):
             picture = picture.filter(ImageFilter.GaussianBlur(self.blur * blur))
-        if self.noise and noise:
+        if self.noise and (noise := _strength(numbers[7])):
             picture = Image.fromarray(_noisy(np.asarray(picture), self.noise * noise, numbers[8:10]))
-        if self.jpeg < 100 and loss:
+        if self.jpeg < 100 and (loss := _strength(numbers[10])):
             picture = _compressed(picture, round(100 - (100 - self.jpeg) * loss))
         return np.asarray(picture)
-
-    def _amount(self, number: float) -> float:
-        """Uniform numbers from -1 to 1 -> 0 for those that change nothing, else uniform from -1 to 1."""
-        return math.copysign(max(0.0, 1 - (1 - abs(number)) / self.share), number)
-
-    def _factor(self, limit: float, number: float) -> float:
-        factor = 1 + (limit - 1) * abs(self._amount(number))
-        return factor if number > 0 else 1 / factor
 
     def _tone(self, numbers: list[float]) -> list[int]:
         """Table from the 256 levels of each of the three channels to their new levels."""
         limits = (self.brightness, self.contrast, self.gamma, *[self.white_balance] * 3)
-        brightness, contrast, gamma, *balance = map(self._factor, limits, numbers)
+        brightness, contrast, gamma, *balance = map(_factor, limits, numbers)
         gain = brightness * np.array(balance)
         value = (gain[:, None] * np.arange(256) / 255).clip(0, 1)
         value = (0.5 + contrast * (value - 0.5)).clip(0, 1) ** gamma
         table: list[int] = (255 * value).round().astype(int).ravel().tolist()
         return table
+
+
+def _factor(limit: float, number: float) -> float:
+    """Uniform numbers from -1 to 1 -> uniform from 1/limit to the limit."""
+    return 1 / limit + (limit - 1 / limit) * (number + 1) / 2
+
+
+def _strength(number: float) -> float:
+    """Uniform numbers from -1 to 1 -> 0 for three quarters of them, else uniform from 0 to 1."""
+    return max(0.0, 4 * abs(number) - 3)
 
 
 def _hide_a_part(picture: Image.Image, seed: int) -> None:

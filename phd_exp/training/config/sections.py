@@ -161,7 +161,6 @@ class AugmentationConfig(Section):
     symmetries: StrictBool
     largest_zoom: Annotated[float, Field(ge=1, le=2)]
     colours: StrictBool
-    share: Annotated[float, Field(gt=0, le=1)] = 1.0  # default for older run records
     occluders: Annotated[float, Field(ge=0, le=1)] = 0.0  # default for older run records
     brightness: Factor
     contrast: Factor
