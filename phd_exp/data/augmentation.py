@@ -77,7 +77,9 @@ class Photometry:
         if self.noise and (noise := _strength(numbers[7])):
             picture = Image.fromarray(_noisy(np.asarray(picture), self.noise * noise, numbers[8:10]))
         if self.jpeg < 100 and (loss := _strength(numbers[10])):
-            picture = _compressed(picture, round(100 - (100 - self.jpeg) * loss))
+            compressed = io.BytesIO()
+            picture.save(compressed, format="jpeg", quality=round(100 - (100 - self.jpeg) * loss))
+            picture = Image.open(compressed)
         return np.asarray(picture)
 
     def _tone(self, numbers: list[float]) -> list[int]:
@@ -114,12 +116,6 @@ def _noisy(image: NDArray[np.uint8], deviation: float, place: list[float]) -> ND
     )
     noise = field[top : top + height, left : left + width]
     return (image + deviation * noise).round().clip(0, 255).astype(np.uint8)
-
-
-def _compressed(picture: Image.Image, quality: int) -> Image.Image:
-    stream = io.BytesIO()
-    picture.save(stream, format="jpeg", quality=quality)
-    return Image.open(stream)
 
 
 @cache

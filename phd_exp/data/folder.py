@@ -18,8 +18,7 @@ from phd_exp.geometry.virtual import VirtualCamera, intrinsics
 from phd_exp.records.dataset import sha256
 from phd_exp.records.detections import Detection, DetectionFolder
 from phd_exp.records.errors import ConfigError, DatasetError
-from phd_exp.records.files import read_plain
-from phd_exp.records.images import LARGEST_IMAGE, pillow_warnings
+from phd_exp.records.images import content_of, pillow_warnings
 from phd_exp.records.scenes import Split
 
 CROP_LAYOUT = 2  # version of `cut`, recorded with each cache
@@ -140,11 +139,3 @@ def _crop(detection: Detection, side: int, sizes: dict[Path, tuple[int, int]]) -
             f"box={list(box)}; check x, y, z, the box and the focal length"
         )
     return Crop(detection, camera, xyz)
-
-
-def content_of(file: Path) -> bytes:
-    """The bytes of a file. Raises DatasetError if it cannot be read."""
-    try:
-        return read_plain(file, LARGEST_IMAGE)
-    except OSError as error:
-        raise DatasetError(f"{file}: cannot be read ({error.strerror})") from None

@@ -60,13 +60,23 @@ class Stage:
 def build_stage(bpy: Any) -> Stage:
     """Empty Blender's file and fill it with one of each thing that a scene can contain."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    for material in MATERIALS:
-        paint_surface(bpy.data.materials.new(material).node_tree, material)
+    for material, surface in SURFACES.items():
+        tree = bpy.data.materials.new(material).node_tree
+        shader, info = tree.nodes["Principled BSDF"], tree.nodes.new("ShaderNodeObjectInfo")
+        for key, value in surface.items():
+            shader.inputs[key].default_value = value
+        tree.links.new(info.outputs["Color"], shader.inputs["Base Color"])
     for shape in SHAPES:
         _add(bpy, shape, _new_mesh(bpy, shape))
     for name in LAMP_NAMES:
-        _add(bpy, name, _new_lamp(bpy, name)).visible_camera = False  # a turned camera may face one
-    bpy.context.scene.camera = _add(bpy, "camera", _new_camera(bpy))
+        light = bpy.data.lights.new(name, "AREA")
+        light.shape = "SQUARE"
+        _add(bpy, name, light).visible_camera = False  # a turned camera may face one
+    camera = bpy.data.cameras.new("camera")
+    camera.sensor_fit = "HORIZONTAL"
+    camera.sensor_width = SENSOR_WIDTH
+    camera.clip_start, camera.clip_end = 0.01, 1000.0
+    bpy.context.scene.camera = _add(bpy, "camera", camera)
     world = bpy.context.scene.world = bpy.data.worlds.new("world")
     world.cycles.sampling_method = "NONE"  # an importance map is not worth it for such smooth light
     paint_world(world.node_tree)
@@ -86,20 +96,6 @@ def _new_mesh(bpy: Any, shape: Shape) -> Any:
     mesh.polygons.foreach_set("use_smooth", geometry.smooth)
     mesh.materials.append(None)
     return mesh
-
-
-def _new_lamp(bpy: Any, name: str) -> Any:
-    light = bpy.data.lights.new(name, "AREA")
-    light.shape = "SQUARE"
-    return light
-
-
-def _new_camera(bpy: Any) -> Any:
-    camera = bpy.data.cameras.new("camera")
-    camera.sensor_fit = "HORIZONTAL"
-    camera.sensor_width = SENSOR_WIDTH
-    camera.clip_start, camera.clip_end = 0.01, 1000.0
-    return camera
 
 
 def _place_lamp(handle: Any, lamp: Lamp) -> None:
@@ -132,15 +128,6 @@ def _facing(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     right = np.cross([0.0, 1.0, 0.0], back)
     right /= np.linalg.norm(right)
     return np.column_stack([right, np.cross(back, right), back])
-
-
-def paint_surface(tree: Any, material: Material) -> None:
-    """Make a new material's node tree a surface with the colour of its object."""
-    shader = tree.nodes["Principled BSDF"]
-    for key, value in SURFACES[material].items():
-        shader.inputs[key].default_value = value
-    info = tree.nodes.new("ShaderNodeObjectInfo")
-    tree.links.new(info.outputs["Color"], shader.inputs["Base Color"])
 
 
 def paint_world(tree: Any) -> None:
