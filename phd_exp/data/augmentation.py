@@ -169,7 +169,7 @@ class Augmentation:
 def _rearranged(
     image: UInt8[Tensor, "batch side side 3"], signs: Float[Tensor, "batch 3"], colours: Int[Tensor, "batch 3"]
 ) -> UInt8[Tensor, "batch side side 3"]:
-    """The images `warped` by `symmetries` of these signs, without interpolation; with the channels in that order.
+    """The images `moved` by `symmetries` of these signs, without interpolation; with the channels in that order.
 
     One image at a time: indexing the batch once per reflection is ten times slower.
     """
@@ -182,14 +182,10 @@ def _rearranged(
 
 
 def moved(batch: Batch, motion: Motion) -> Batch:
-    """The samples after a motion of the cameras."""
-    return Batch(warped(batch, motion), motion.position(batch.xyz), motion.camera(batch.camera).f, batch.S, batch.row)
-
-
-def warped(batch: Batch, motion: Motion) -> UInt8[Tensor, "batch height width 3"]:
-    """The images after a motion, interpolated bilinearly; pixels beyond the border repeat it."""
+    """The samples after a motion of the cameras: images interpolated bilinearly, the border repeated beyond it."""
     side = batch.image.shape[1]
     origin = motion.origin(middles(side, side).to(batch.f), batch.camera)
     images = batch.image.permute(0, 3, 1, 2).to(origin.dtype)
     values = grid_sample(images, origin, mode="bilinear", padding_mode="border", align_corners=False)
-    return values.round().to(torch.uint8).permute(0, 2, 3, 1)
+    image = values.round().to(torch.uint8).permute(0, 2, 3, 1)
+    return Batch(image, motion.position(batch.xyz), motion.camera(batch.camera).f, batch.S, batch.row)

@@ -105,7 +105,7 @@ def _locked(folder: DatasetFolder, shard: Shard | None) -> Iterator[None]:
 def _seal_if_last(folder: DatasetFolder, wanted: Wanted, shard: Shard) -> bool:
     with held(folder.render_lock) as alone:
         known = known_samples(folder)
-        left = missing(known, wanted)
+        left = len(missing(known, wanted))
         if alone and not left:
             seal(folder, known)
             outcome = f"shard {shard} was the last; the data set is sealed"
@@ -130,12 +130,7 @@ def render_missing(
 
     The caller holds the locks. Each record is written to the journal as soon as its image is on disk.
     """
-    samples = [
-        (split, index)
-        for split in SPLITS
-        for index in range(wanted[split])
-        if index not in known[split] and (shard is None or shard.holds(index))
-    ]
+    samples = [(split, index) for split, index in missing(known, wanted) if shard is None or shard.holds(index)]
     if not samples:
         return 0
     workers = workers or worker_count(len(samples), cores)

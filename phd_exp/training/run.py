@@ -3,6 +3,7 @@
 import logging
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
 
@@ -218,15 +219,12 @@ def _circumstances(config: RunConfig, data: PositionData, trainer: Trainer) -> d
 
 
 def _manifest_hash(config: RunConfig) -> str | None:
-    if isinstance(config.data, FolderConfig):
-        try:
+    with suppress(OSError):  # the data of a finished run may be gone
+        if isinstance(config.data, FolderConfig):
             return DetectionFolder(config.data.folder).fingerprint()
-        except OSError:  # the data of a finished run may be gone
-            return None
-    if not isinstance(config.data, RenderedConfig):
-        return None
-    manifest = DatasetFolder(config.data.folder).manifest_path
-    return checksum(manifest) if manifest.is_file() else None
+        if isinstance(config.data, RenderedConfig):
+            return checksum(DatasetFolder(config.data.folder).manifest_path)
+    return None
 
 
 def _quiet_lightning() -> None:

@@ -106,10 +106,5 @@ def _progress(config: RunConfig) -> list[Callback]:
     """A progress bar on a terminal, lines elsewhere, nothing with trainer.progress_bar=false."""
     if not config.trainer.progress_bar:
         return []
-    bar = TQDMProgressBar() if on_a_terminal() else None
+    bar = TQDMProgressBar() if sys.stderr.isatty() else None
     return [bar, Progress(bar)] if bar else [Progress()]
-
-
-def on_a_terminal() -> bool:
-    """Whether a progress bar can be drawn."""
-    return sys.stderr.isatty()

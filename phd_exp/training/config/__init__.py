@@ -12,9 +12,10 @@ from pydantic import BaseModel, BeforeValidator, Field, StrictBool, ValidationEr
 
 from phd_exp.records.choices import flatten, setting
 from phd_exp.records.errors import ConfigError, gist, shown
+from phd_exp.records.parsing import Record
 from phd_exp.records.spec import DatasetSpec, Shard
 from phd_exp.training.config import sections
-from phd_exp.training.config.sections import FolderConfig, RenderedConfig, Section, SourceConfig
+from phd_exp.training.config.sections import FolderConfig, RenderedConfig, SourceConfig
 from phd_exp.training.config.targets import Target, TrainingTarget, TrainingTargets, Trust, describe, is_typed, locate
 
 __all__ = ["FolderConfig", "RenderConfig", "RenderedConfig", "RunConfig", "SourceConfig", "check", "check_render"]
@@ -24,7 +25,7 @@ SINGLE_VIEW = "scale"  # the data set whose runs can be evaluated on several vie
 Checked = TypeVar("Checked", bound=BaseModel)
 
 
-class RenderConfig(Section):
+class RenderConfig(Record):
     """The configuration of `render`: the data, and the keys of conf/render.yaml."""
 
     data: RenderedConfig
@@ -34,7 +35,7 @@ class RenderConfig(Section):
     masks: sections.Folder | None
 
 
-class RunConfig(Section):
+class RunConfig(Record):
     """The configuration of one run."""
 
     seed: Annotated[sections.Whole, Field(ge=0, lt=2**32)]
