@@ -71,13 +71,10 @@ class FolderSource(Source):
 
     def samples(self, part: Part) -> Batch:
         crops = self.crops[part]
-        return Batch(
-            image=torch.from_numpy(self._images(crops, part)),
-            xyz=torch.from_numpy(np.stack([crop.xyz for crop in crops]).astype(np.float32)),
-            f=torch.tensor([crop.camera.f for crop in crops], dtype=torch.float32),
-            S=float(self.side),
-            row=torch.arange(len(crops)),
-        )
+        xyz = torch.from_numpy(np.stack([crop.xyz for crop in crops]).astype(np.float32))
+        f = torch.tensor([crop.camera.f for crop in crops], dtype=torch.float32)
+        image = torch.from_numpy(self._images(crops, part))
+        return Batch(image, xyz, f, float(self.side), torch.arange(len(crops)))
 
     def known(self, part: Part) -> Known:
         crops = self.crops[part]

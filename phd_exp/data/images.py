@@ -37,14 +37,9 @@ def cached_images(
             raise DatasetError(f"{error}; {remedy}") from None
         array[row] = shrunk(np.asarray(image), image_size)
 
-    return cached(
-        folder.cache / f"{split}-{len(records)}x{image_size}.npy",
-        {"shrinking": SHRINKING, "images": sha256("".join(record.sha256 for record in records).encode())},
-        (len(records), image_size, image_size, 3),
-        range(len(records)),
-        fill,
-        f"decoding {split} images once",
-    )
+    n, file = len(records), folder.cache / f"{split}-{len(records)}x{image_size}.npy"
+    key = {"shrinking": SHRINKING, "images": sha256("".join(record.sha256 for record in records).encode())}
+    return cached(file, key, (n, image_size, image_size, 3), range(n), fill, f"decoding {split} images once")
 
 
 def shrunk(pixels: UInt8[np.ndarray, "height width 3"], side: int) -> UInt8[np.ndarray, "side side 3"]:

@@ -67,13 +67,9 @@ class RenderedSource(Source):
     def samples(self, part: Part) -> Batch:
         split, of_split, rows = self._records(part)
         images, records = cached_images(self.folder, split, of_split, self.side), of_split[rows]
-        return Batch(
-            image=torch.from_numpy(images[rows]),
-            xyz=torch.tensor([(record.x, record.y, record.z) for record in records], dtype=torch.float32),
-            f=torch.tensor([self.zoom * record.f for record in records], dtype=torch.float32),
-            S=float(self.side),
-            row=torch.arange(len(records)),
-        )
+        xyz = torch.tensor([(record.x, record.y, record.z) for record in records], dtype=torch.float32)
+        f = torch.tensor([self.zoom * record.f for record in records], dtype=torch.float32)
+        return Batch(torch.from_numpy(images[rows]), xyz, f, float(self.side), torch.arange(len(records)))
 
     def known(self, part: Part) -> Known:
         names = ("file_name", "f", "S", "scale", "visibility", "truncation", "scene", "view")

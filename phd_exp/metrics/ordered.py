@@ -61,23 +61,18 @@ def in_order_of(
 
     Raises ValueError for no samples, or for samples that are not finite.
     """
-    require_finite(quantity, *columns.values())
+    for column in (quantity, *columns.values()):
+        bad = int((~column.isfinite()).sum())
+        if len(column) == 0 or bad:
+            raise ValueError(
+                f"samples: got {len(column)}, {bad} of them not finite; expected at least one, all finite"
+            )
     quantity = quantity.double()
     if weight is None:
         weight = torch.ones_like(quantity)
     points, group = quantity.unique(return_inverse=True)
     sums = {name: _pooled(weight * column.double(), group, len(points)) for name, column in columns.items()}
     return Ordered(points, _pooled(weight, group, len(points)), sums)
-
-
-def require_finite(*columns: Float[Tensor, "... samples"]) -> None:
-    """Raise ValueError for no samples, or for samples that are not finite."""
-    for column in columns:
-        bad = int((~column.isfinite()).sum())
-        if len(column) == 0 or bad:
-            raise ValueError(
-                f"samples: got {len(column)}, {bad} of them not finite; expected at least one, all finite"
-            )
 
 
 def _pooled(values: Tensor, bin: Tensor, bins: int) -> Tensor:

@@ -89,6 +89,7 @@ class RunFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.checkpoints = path / "checkpoints"
+        self.last_checkpoint = self.checkpoints / "last.ckpt"  # from which a run resumes
         self.calibration = path / "calibration"
         self.predictions = path / "predictions.parquet"
         self.held_out = path / "held_out.parquet"
@@ -108,11 +109,6 @@ class RunFolder:
     def shift(self, name: str) -> Path:
         """Predictions of shifted test samples."""
         return self.shifts / f"{name}.parquet"
-
-    @property
-    def last_checkpoint(self) -> Path:
-        """The checkpoint from which a run resumes."""
-        return self.checkpoints / "last.ckpt"
 
     @property
     def best_checkpoint(self) -> Path:

@@ -9,7 +9,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from phd_exp.records.scenes import Backdrop, Lamp, LampName, Material, Pose, Scene, SceneObject, Shape
+from phd_exp.records.scenes import Backdrop, Lamp, LampName, Material, Scene, SceneObject, Shape
 from phd_exp.rendering.meshes import build_mesh
 from phd_exp.rendering.pixels import linear
 from phd_exp.rendering.rays import rotation_matrix
@@ -17,8 +17,6 @@ from phd_exp.rendering.rays import rotation_matrix
 TO_BLENDER = np.diag([1.0, -1.0, -1.0])
 SENSOR_WIDTH = 36.0  # mm; arbitrary, because the focal length has the same unit
 SHAPES: tuple[Shape, ...] = get_args(Shape)
-MATERIALS: tuple[Material, ...] = get_args(Material)
-LAMP_NAMES: tuple[LampName, ...] = get_args(LampName)
 # Inputs of Principled BSDF. Rubber is matt with a faint sheen; metal reflects the lamps as soft boxes and its
 # neighbours as blurs.
 SURFACES: dict[Material, dict[str, float]] = {
@@ -39,7 +37,9 @@ class Stage:
         """Arrange everything as in a scene."""
         objects = self._data.objects
         objects["camera"].data.lens = scene.f * SENSOR_WIDTH / scene.S
-        objects["camera"].matrix_world = _camera_matrix(scene.pose)
+        # p_scene = R^T (p_camera - translation), with Blender's axes in both frames
+        back = rotation_matrix(scene.pose.rotation).T
+        objects["camera"].matrix_world = _matrix(back @ TO_BLENDER, -back @ np.array(scene.pose.translation))
         for shape in SHAPES:
             objects[shape].hide_render = True
         for item in scene.objects:
@@ -68,7 +68,7 @@ def build_stage(bpy: Any) -> Stage:
         tree.links.new(info.outputs["Color"], shader.inputs["Base Color"])
     for shape in SHAPES:
         _add(bpy, shape, _new_mesh(bpy, shape))
-    for name in LAMP_NAMES:
+    for name in get_args(LampName):
         light = bpy.data.lights.new(name, "AREA")
         light.shape = "SQUARE"
         _add(bpy, name, light).visible_camera = False  # a turned camera may face one
@@ -105,12 +105,6 @@ def _place_lamp(handle: Any, lamp: Lamp) -> None:
     handle.matrix_world = _matrix(TO_BLENDER @ _facing(TO_BLENDER @ forward), position)
     handle.data.energy = lamp.power
     handle.data.size = lamp.side
-
-
-def _camera_matrix(pose: Pose) -> list[list[float]]:
-    """p_scene = R^T (p_camera - translation), with Blender's axes in both frames."""
-    back = rotation_matrix(pose.rotation).T
-    return _matrix(back @ TO_BLENDER, -back @ np.array(pose.translation))
 
 
 def _matrix(linear: NDArray[np.float64], place: NDArray[np.float64]) -> list[list[float]]:

@@ -105,9 +105,8 @@ class PositionModule(LightningModule):
         self._require_finite(total, losses, batch, "train")
         with torch.no_grad():
             nll = losses if isinstance(self.loss, NegativeLogLikelihood) else None
-            self.training_rows.update(
-                {"loss": losses.expand(len(batch))} | training_columns(prediction, batch.xyz, nll)
-            )
+            table = training_columns(prediction, batch.xyz, nll)
+            self.training_rows.update({"loss": losses.expand(len(batch))} | table)
         return total
 
     def on_train_epoch_end(self) -> None:
