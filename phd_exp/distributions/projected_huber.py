@@ -140,9 +140,8 @@ class ProjectedHuber(Distribution, Density):
 
     def __getitem__(self, row: int) -> "ProjectedHuber":
         """One distribution of a batch."""
-        return self._of(
-            Natural(**{name: value[row] for name, value in vars(self._natural).items()}), self._validate_args
-        )
+        chosen = {name: value[row] for name, value in vars(self._natural).items()}
+        return self._of(Natural(**chosen), self._validate_args)
 
     def tempered(self, projected: float, depth: float) -> "ProjectedHuber":
         """The distribution with A / projected and a / depth in place of A and a, around the same mode."""

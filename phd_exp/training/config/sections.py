@@ -9,8 +9,6 @@ from phd_exp.records.parsing import Record
 from phd_exp.records.spec import Angle, DatasetSpec, Range
 from phd_exp.training.config.targets import Target, TrainingTarget
 
-MULTIVIEW = "multiview"  # the data set whose scenes are rendered from several cameras
-
 Whole = Annotated[int, Field(strict=True)]
 Natural = Annotated[Whole, Field(ge=0)]
 Count = Annotated[Whole, Field(ge=1)]
@@ -186,7 +184,7 @@ class MultiviewConfig(Record):
 
     def spec_beside(self, spec: DatasetSpec) -> DatasetSpec:
         """The data set of several views that otherwise equals `spec`."""
-        changes = {"variant": MULTIVIEW, "views": self.views, "view_angle_range": self.angle_range}
+        changes = {"variant": "multiview", "views": self.views, "view_angle_range": self.angle_range}
         return DatasetSpec(**(spec.model_dump() | changes))
 
 
