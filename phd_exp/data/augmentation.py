@@ -77,7 +77,9 @@ class Photometry:
         if self.noise and (noise := _strength(numbers[7])):
             picture = Image.fromarray(_noisy(np.asarray(picture), self.noise * noise, numbers[8:10]))
         if self.jpeg < 100 and (loss := _strength(numbers[10])):
-            picture = _compressed(picture, round(100 - (100 - self.jpeg) * loss))
+            compressed = io.BytesIO()
+            picture.save(compressed, format="jpeg", quality=round(100 - (100 - self.jpeg) * loss))
+            picture = Image.open(compressed)
         return np.asarray(picture)
 
     def _tone(self, numbers: list[float]) -> list[int]:
@@ -119,12 +121,6 @@ def _noisy(image: NDArray[np.uint8], deviation: float, place: list[float]) -> ND
     )
     noise = field[top : top + height, left : left + width]
     return (image + deviation * noise).round().clip(0, 255).astype(np.uint8)
-
-
-def _compressed(picture: Image.Image, quality: int) -> Image.Image:
-    stream = io.BytesIO()
-    picture.save(stream, format="jpeg", quality=quality)
-    return Image.open(stream)
 
 
 @cache
@@ -178,7 +174,7 @@ class Augmentation:
 def _rearranged(
     image: UInt8[Tensor, "batch side side 3"], signs: Float[Tensor, "batch 3"], colours: Int[Tensor, "batch 3"]
 ) -> UInt8[Tensor, "batch side side 3"]:
-    """The images `warped` by `symmetries` of these signs, without interpolation; with the channels in that order.
+    """The images `moved` by `symmetries` of these signs, without interpolation; with the channels in that order.
 
     One image at a time: indexing the batch once per reflection is ten times slower.
     """
@@ -191,14 +187,10 @@ def _rearranged(
 
 
 def moved(batch: Batch, motion: Motion) -> Batch:
-    """The samples after a motion of the cameras."""
-    return Batch(warped(batch, motion), motion.position(batch.xyz), motion.camera(batch.camera).f, batch.S, batch.row)
-
-
-def warped(batch: Batch, motion: Motion) -> UInt8[Tensor, "batch height width 3"]:
-    """The images after a motion, interpolated bilinearly; pixels beyond the border repeat it."""
+    """The samples after a motion of the cameras: images interpolated bilinearly, the border repeated beyond it."""
     side = batch.image.shape[1]
     origin = motion.origin(middles(side, side).to(batch.f), batch.camera)
     images = batch.image.permute(0, 3, 1, 2).to(origin.dtype)
     values = grid_sample(images, origin, mode="bilinear", padding_mode="border", align_corners=False)
-    return values.round().to(torch.uint8).permute(0, 2, 3, 1)
+    image = values.round().to(torch.uint8).permute(0, 2, 3, 1)
+    return Batch(image, motion.position(batch.xyz), motion.camera(batch.camera).f, batch.S, batch.row)

@@ -43,10 +43,8 @@ class Batch:
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> "Batch":
         """The same samples on a device."""
-        moved = {
-            name: getattr(self, name).to(device, non_blocking=non_blocking) for name in ("image", "xyz", "f", "row")
-        }
-        return replace(self, **moved)
+        names = ("image", "xyz", "f", "row")
+        return replace(self, **{name: getattr(self, name).to(device, non_blocking=non_blocking) for name in names})
 
 
 @runtime_checkable

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -39,11 +40,19 @@ def cached(
         shape: of the array.
         jobs: arguments of the calls to `fill`, which run in several threads.
         fill: decodes one job into the array.
-        words: description of the progress bar.
+        words: description of the progress bar, which a terminal shows.
         largest: pixels of the largest image; bounds the number of threads.
 
     If the folder cannot be written, the images are decoded into memory, and a line says so.
     """
+
+    def fill_all(array: np.ndarray) -> None:
+        console = Console(stderr=True)
+        with ThreadPoolExecutor(max(1, min(DECODERS, LARGEST_AT_ONCE // largest))) as pool:
+            done = pool.map(partial(fill, array), jobs)
+            for _ in track(done, words, len(jobs), console=console, transient=True, disable=not console.is_terminal):
+                pass
+
     key_file, unfinished = file.with_suffix(".json"), file.with_suffix(".unfinished")
     waiting = f"{file.parent}: another process decodes images; waiting for it"
     try:
@@ -53,7 +62,7 @@ def cached(
                 return kept
             unfinished.unlink(missing_ok=True)  # if it is a link, writing would overwrite its target
             mapped = np.lib.format.open_memmap(unfinished, mode="w+", dtype=np.uint8, shape=shape)
-            _fill_all(mapped, jobs, fill, words, largest)
+            fill_all(mapped)
             mapped.flush()
             unfinished.replace(file)
             write_atomic(key_file, json.dumps(key) + "\n")
@@ -62,18 +71,8 @@ def cached(
         why = f"{file.parent}: decoded images cannot be kept here ({error.strerror})"
         announce(f"{why}; they are decoded into memory, each run anew")
         array = np.empty(shape, dtype=np.uint8)
-        _fill_all(array, jobs, fill, words, largest)
+        fill_all(array)
         return array
-
-
-def _fill_all(array: np.ndarray, jobs: Sequence[Job], fill: Fill, words: str, largest: int) -> None:
-    """Do all jobs in several threads, with a progress bar on a terminal."""
-    with ThreadPoolExecutor(max(1, min(DECODERS, LARGEST_AT_ONCE // largest))) as pool:
-        done = pool.map(lambda job: fill(array, job), jobs)
-        console = Console(stderr=True)
-        quiet = not console.is_terminal
-        for _ in track(done, words, len(jobs), console=console, transient=True, disable=quiet):
-            pass
 
 
 def _kept(file: Path, key_file: Path, key: dict[str, Any], shape: tuple[int, ...]) -> np.ndarray | None:

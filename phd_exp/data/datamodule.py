@@ -37,7 +37,15 @@ class PositionData(LightningDataModule):
                 f"data: batch_size={batch_size} is larger than the {source.count('train')} training samples there "
                 "are: not one batch is full; choose a smaller data.batch_size"
             )
-        _require_shares(source, batch_size, world)
+        if batch_size % world:
+            raise ConfigError(
+                f"trainer.devices: got {world}, which does not divide batch_size={batch_size}: the mean of the "
+                "shares' gradients is that of the batch only if all shares are of one size"
+            )
+        for part in PARTS:
+            n = len(range(source.count(part))[CHOOSE if part == "held_out" else slice(None)])
+            if 0 < n < world:
+                raise ConfigError(f"trainer.devices: got {world}, more than the {n} samples of {part} in a pass")
         self.source = source
         self.augment = augment
         self.validated: tuple[Part, ...] = ("test", "held_out") if held_out else ("test",)
@@ -75,15 +83,3 @@ class PositionData(LightningDataModule):
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
         self.train_dataloader().load_state_dict(state_dict)
-
-
-def _require_shares(source: Source, batch_size: int, world: int) -> None:
-    if batch_size % world:
-        raise ConfigError(
-            f"trainer.devices: got {world}, which does not divide batch_size={batch_size}: the mean of the shares' "
-            "gradients is that of the batch only if all shares are of one size"
-        )
-    for part in PARTS:
-        rows = range(source.count(part))[CHOOSE if part == "held_out" else slice(None)]
-        if 0 < len(rows) < world:
-            raise ConfigError(f"trainer.devices: got {world}, more than the {len(rows)} samples of {part} in a pass")

@@ -18,8 +18,7 @@ from phd_exp.geometry.virtual import VirtualCamera, intrinsics
 from phd_exp.records.dataset import sha256
 from phd_exp.records.detections import Detection, DetectionFolder
 from phd_exp.records.errors import ConfigError, DatasetError
-from phd_exp.records.files import read_plain
-from phd_exp.records.images import LARGEST_IMAGE, pillow_warnings
+from phd_exp.records.images import content_of, pillow_warnings
 from phd_exp.records.scenes import Split
 
 CROP_LAYOUT = 2  # version of `cut`, recorded with each cache
@@ -72,13 +71,10 @@ class FolderSource(Source):
 
     def samples(self, part: Part) -> Batch:
         crops = self.crops[part]
-        return Batch(
-            image=torch.from_numpy(self._images(crops, part)),
-            xyz=torch.from_numpy(np.stack([crop.xyz for crop in crops]).astype(np.float32)),
-            f=torch.tensor([crop.camera.f for crop in crops], dtype=torch.float32),
-            S=float(self.side),
-            row=torch.arange(len(crops)),
-        )
+        xyz = torch.from_numpy(np.stack([crop.xyz for crop in crops]).astype(np.float32))
+        f = torch.tensor([crop.camera.f for crop in crops], dtype=torch.float32)
+        image = torch.from_numpy(self._images(crops, part))
+        return Batch(image, xyz, f, float(self.side), torch.arange(len(crops)))
 
     def known(self, part: Part) -> Known:
         crops = self.crops[part]
@@ -140,11 +136,3 @@ def _crop(detection: Detection, side: int, sizes: dict[Path, tuple[int, int]]) -
             f"box={list(box)}; check x, y, z, the box and the focal length"
         )
     return Crop(detection, camera, xyz)
-
-
-def content_of(file: Path) -> bytes:
-    """The bytes of a file. Raises DatasetError if it cannot be read."""
-    try:
-        return read_plain(file, LARGEST_IMAGE)
-    except OSError as error:
-        raise DatasetError(f"{file}: cannot be read ({error.strerror})") from None

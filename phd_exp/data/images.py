@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
@@ -31,25 +30,16 @@ def cached_images(
 
     def fill(array: np.ndarray, row: int) -> None:
         record = records[row]
-        array[row] = decode(folder.split_folder(split) / record.file_name, record, image_size)
+        try:
+            image = recorded_image(folder.split_folder(split) / record.file_name, record)
+        except DatasetError as error:
+            remedy = "delete the file and run `python -m phd_exp render` to make it again"
+            raise DatasetError(f"{error}; {remedy}") from None
+        array[row] = shrunk(np.asarray(image), image_size)
 
-    return cached(
-        folder.cache / f"{split}-{len(records)}x{image_size}.npy",
-        {"shrinking": SHRINKING, "images": sha256("".join(record.sha256 for record in records).encode())},
-        (len(records), image_size, image_size, 3),
-        range(len(records)),
-        fill,
-        f"decoding {split} images once",
-    )
-
-
-def decode(file: Path, record: SampleRecord, image_size: int) -> np.ndarray:
-    """One image as (image_size, image_size, 3), uint8. Raises DatasetError if the file is not as recorded."""
-    try:
-        image = recorded_image(file, record)
-    except DatasetError as error:
-        raise DatasetError(f"{error}; delete the file and run `python -m phd_exp render` to make it again") from None
-    return shrunk(np.asarray(image), image_size)
+    n, file = len(records), folder.cache / f"{split}-{len(records)}x{image_size}.npy"
+    key = {"shrinking": SHRINKING, "images": sha256("".join(record.sha256 for record in records).encode())}
+    return cached(file, key, (n, image_size, image_size, 3), range(n), fill, f"decoding {split} images once")
 
 
 def shrunk(pixels: UInt8[np.ndarray, "height width 3"], side: int) -> UInt8[np.ndarray, "side side 3"]:

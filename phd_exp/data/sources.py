@@ -65,34 +65,24 @@ class RenderedSource(Source):
         self.constant_f = self.zoom * float(np.sqrt(spec.f_range[0] * spec.f_range[1]))
 
     def samples(self, part: Part) -> Batch:
-        split, rows = self._place(part)
-        of_split = self._records(split)
+        split, of_split, rows = self._records(part)
         images, records = cached_images(self.folder, split, of_split, self.side), of_split[rows]
-        return Batch(
-            image=torch.from_numpy(images[rows]),
-            xyz=torch.tensor([(record.x, record.y, record.z) for record in records], dtype=torch.float32),
-            f=torch.tensor([self.zoom * record.f for record in records], dtype=torch.float32),
-            S=float(self.side),
-            row=torch.arange(len(records)),
-        )
+        xyz = torch.tensor([(record.x, record.y, record.z) for record in records], dtype=torch.float32)
+        f = torch.tensor([self.zoom * record.f for record in records], dtype=torch.float32)
+        return Batch(torch.from_numpy(images[rows]), xyz, f, float(self.side), torch.arange(len(records)))
 
     def known(self, part: Part) -> Known:
         names = ("file_name", "f", "S", "scale", "visibility", "truncation", "scene", "view")
-        split, rows = self._place(part)
-        records = self._records(split)[rows]
-        return {name: [getattr(record, name) for record in records] for name in names}
+        _, records, rows = self._records(part)
+        return {name: [getattr(record, name) for record in records[rows]] for name in names}
 
     def count(self, part: Part) -> int:
         return self.n[part]
 
-    def _place(self, part: Part) -> tuple[Split, slice]:
-        """The split of a part, and its samples there."""
+    def _records(self, part: Part) -> tuple[Split, list[SampleRecord], slice]:
+        """The split of a part, all records of it that the run uses, and the rows of the part among them."""
         if part == "test":
-            return "test", slice(0, self.n["test"])
+            return "test", self.folder.records("test", self.n["test"]), slice(None)
+        records = self.folder.records("train", self.n["train"] + self.n["held_out"])
         start = self.n["train"] if part == "held_out" else 0
-        return "train", slice(start, start + self.n[part])
-
-    def _records(self, split: Split) -> list[SampleRecord]:
-        """All records of a split that the run uses."""
-        n = self.n["test"] if split == "test" else self.n["train"] + self.n["held_out"]
-        return self.folder.records(split, n)
+        return "train", records, slice(start, start + self.n[part])

@@ -55,10 +55,6 @@ def families() -> dict[str, Family]:
     A head does not contain the network. With camera=shown the network depends on f, so that the whole model violates
     constraint 2 although its head satisfies it; measure the whole model.
     """
-
-    def constant(camera: Camera) -> Camera:
-        return Camera(torch.full_like(camera.f, MIDDLE_F), camera.S)
-
     return {
         "probabilistic": Family(_projected_huber, _seven_numbers),
         "gaussian": _shaped(shaped.Gaussian),
@@ -70,7 +66,7 @@ def families() -> dict[str, Family]:
         "mae_vz": _baseline(Projected(DEPTH)),
         "mae_logz": _baseline(LogDepth(DEPTH)),
         "mae_xyz": _baseline(Cartesian(DEPTH)),
-        "mae_constf": _baseline(Projected(DEPTH), constant),
+        "mae_constf": _baseline(Projected(DEPTH), MIDDLE_F),
     }
 
 
@@ -105,9 +101,9 @@ def _seven_numbers(n: int, generator: torch.Generator) -> Tensor:
     return torch.stack([*nu_p.T, b_raw, torch.zeros_like(b), b_raw, w_1, w_2], dim=-1)
 
 
-def _baseline(chart: Chart, used: Callable[[Camera], Camera] = lambda camera: camera) -> Family:
+def _baseline(chart: Chart, constant_f: float | None = None) -> Family:
     return Family(
-        lambda raw, camera: PointDensity(PointEstimate(raw, chart, used(camera)), SCALE),
+        lambda raw, camera: PointDensity(PointEstimate(raw, chart, camera.with_constant_f(constant_f)), SCALE),
         lambda n, generator: chart.coordinates(_in_view(n, generator), _camera(n)),
     )
 

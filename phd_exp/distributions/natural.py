@@ -122,17 +122,6 @@ def require(name: str, value: Tensor, constraint: Constraint) -> None:
         )
 
 
-def require_representable(mode: Float[Tensor, "*batch 3"], *covariances: Tensor) -> None:
-    """Raise ValueError if a mode or covariance is not finite."""
-    parts = [mode, *(covariance.flatten(-2) for covariance in covariances)]
-    overflow = ~torch.cat(parts, dim=-1).isfinite().all(-1)
-    if bool(overflow.any()):
-        raise ValueError(
-            f"parameters: mode or covariance of {int(overflow.sum())} of {overflow.numel()} distributions "
-            f"overflow in {mode.dtype}; expected parameters nearer to 1"
-        )
-
-
 def require_positions(xyz: Tensor, batch_shape: torch.Size) -> None:
     """Raise ValueError unless these are positions for a batch of this shape, without NaN."""
     if xyz.ndim == 0 or xyz.shape[-1] != 3:

@@ -19,7 +19,7 @@ from torch.distributions.constraints import Constraint
 from phd_exp.distributions import depth, huber, spd
 from phd_exp.distributions.density import Density
 from phd_exp.distributions.level import credible_level
-from phd_exp.distributions.natural import Natural, require, require_positions, require_representable
+from phd_exp.distributions.natural import Natural, require, require_positions
 from phd_exp.distributions.special import log_scaled_normaliser
 
 LARGEST_RAW = 1e9  # squares of larger raw numbers, and their products, would overflow in float32
@@ -124,8 +124,15 @@ class ProjectedHuber(Distribution, Density):
 
     def _require_representable(self) -> None:
         """Raise ValueError if mode or covariances overflow in the data type, unless validation is off."""
-        if self._validate_args:
-            require_representable(self.mode, self.covariance_matrix, self.projected_covariance)
+        if not self._validate_args:
+            return
+        parts = [self.mode, self.covariance_matrix.flatten(-2), self.projected_covariance.flatten(-2)]
+        overflow = ~torch.cat(parts, dim=-1).isfinite().all(-1)
+        if bool(overflow.any()):
+            raise ValueError(
+                f"parameters: mode or covariance of {int(overflow.sum())} of {overflow.numel()} distributions "
+                f"overflow in {self.mode.dtype}; expected parameters nearer to 1"
+            )
 
     def expand(self, batch_shape: Sequence[int], _instance: Distribution | None = None) -> "ProjectedHuber":
         """The same distribution with a larger batch shape; nothing is copied."""
@@ -133,9 +140,8 @@ class ProjectedHuber(Distribution, Density):
 
     def __getitem__(self, row: int) -> "ProjectedHuber":
         """One distribution of a batch."""
-        return self._of(
-            Natural(**{name: value[row] for name, value in vars(self._natural).items()}), self._validate_args
-        )
+        chosen = {name: value[row] for name, value in vars(self._natural).items()}
+        return self._of(Natural(**chosen), self._validate_args)
 
     def tempered(self, projected: float, depth: float) -> "ProjectedHuber":
         """The distribution with A / projected and a / depth in place of A and a, around the same mode."""

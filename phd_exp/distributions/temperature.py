@@ -51,14 +51,11 @@ class Temperature:
                     "temperatures are fitted to finite predictions and positions with z > 0, at least one, but "
                     f"{int((~values.isfinite()).sum())} of {values.numel()} numbers are not finite"
                 )
-
-        def projected_slope(r: Tensor) -> Tensor:  # r d/dr of the mean of h(r |q|) - 2 log r
-            return torch.minimum(r * radius, (r * radius).square()).mean() - 2
-
-        def depth_slope(r: Tensor) -> Tensor:  # of r a max(t, 1/t) + log N(r a): actual minus predicted energies
-            return (r * energy - depth_mean_energy(log_a + r.log())).mean()
-
-        return cls(projected=_temperature(projected_slope), depth=_temperature(depth_slope))
+        # the slopes are r d/dr of the mean of h(r |q|) - 2 log r
+        projected = _temperature(lambda r: torch.minimum(r * radius, (r * radius).square()).mean() - 2)
+        # and of r a max(t, 1/t) + log N(r a): actual minus predicted energies
+        depth = _temperature(lambda r: (r * energy - depth_mean_energy(log_a + r.log())).mean())
+        return cls(projected, depth)
 
     def apply(self, distribution: ProjectedHuber) -> ProjectedHuber:
         """The same predictions at these temperatures; mu_xy and mu_z stay."""

@@ -150,22 +150,17 @@ def fuse(
     with one_thread():
         problems = Problems.posed(predictions, pose, plane, mask)
         n, cameras = problems.mask.shape
-        u, certificate, excess = np.zeros((n, 3)), np.empty((n, 3)), np.zeros((n, cameras))
-        status = problems.status
-        solve(*problems.views, problems.free_slope.numpy(), status.numpy(), u, certificate, excess)
-        ruled_out = _improbable(torch.from_numpy(excess), problems, contradiction).sum(-1)
-        status[(status == Status.FUSED) & (2 * ruled_out >= problems.mask.sum(-1))] = Status.CONTRADICTION
-        subgradient, _, distance = torch.from_numpy(certificate).unbind(-1)
-        shaped = status.reshape(predictions.batch_shape[:-1]).to(predictions.a.device)
-        return Fused(
-            _entered(problems.in_world(torch.from_numpy(u)), shaped),
-            _entered(distance, shaped),
-            _entered(subgradient, shaped),
-            shaped,
-            problems,
-            torch.from_numpy(u),
-            torch.from_numpy(excess),
-        )
+        u, certificate, excess = (torch.zeros(n, size, dtype=torch.float64) for size in (3, 3, cameras))
+        filled = (values.numpy() for values in (problems.status, u, certificate, excess))
+        solve(*problems.views, problems.free_slope.numpy(), *filled)
+        ruled_out = _improbable(excess, problems, contradiction).sum(-1)
+        contradicted = (problems.status == Status.FUSED) & (2 * ruled_out >= problems.mask.sum(-1))
+        problems.status[contradicted] = Status.CONTRADICTION
+        status = problems.status.reshape(predictions.batch_shape[:-1]).to(predictions.a.device)
+        subgradient, _, distance = certificate.unbind(-1)
+        results = problems.in_world(u), distance, subgradient
+        point, distance, subgradient = (_entered(values, status) for values in results)
+        return Fused(point, distance, subgradient, status, problems, u, excess)
 
 
 def _improbable(

@@ -92,10 +92,8 @@ class Problems:
         origin = average(pose.into_world(mode), mask)
         directions = torch.eye(3, dtype=torch.float64).expand(len(origin), 3, 3)
         if plane is not None:
-            plane = Plane(
-                _flat("plane.normal", plane.normal, shape[:-1], event=1, cameras=0),
-                _flat("plane.offset", plane.offset, shape[:-1], cameras=0),
-            )
+            normal = _flat("plane.normal", plane.normal, shape[:-1], event=1, cameras=0)
+            plane = Plane(normal, _flat("plane.offset", plane.offset, shape[:-1], cameras=0))
             origin, directions = plane.nearest(origin), pad(plane.directions, (0, 1))
         at_origin = (measure @ pose.into_camera(origin[:, None])[..., None]).squeeze(-1)
         free_slope = measure @ pose.R
@@ -103,19 +101,10 @@ class Problems:
         finite = 0 * (free_slope.sum((-2, -1)) + at_origin.sum(-1) + a) == 0
         valid = finite & (a > 0) & (mode[..., 2] > 0)
         free_slope = torch.where(mask[..., None, None], free_slope, 0)
-        return cls(
-            predictions,
-            pose,
-            mask,
-            origin,
-            directions,
-            3 if plane is None else 2,
-            free_slope if plane is None else free_slope @ directions[:, None],
-            free_slope,
-            torch.where(mask[..., None], at_origin, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)),
-            torch.where(mask, a, 0),
-            _status(mask, valid, pose.is_rigid, plane),
-        )
+        slope, dimensions = (free_slope, 3) if plane is None else (free_slope @ directions[:, None], 2)
+        at_origin = torch.where(mask[..., None], at_origin, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+        a, status = torch.where(mask, a, 0), _status(mask, valid, pose.is_rigid, plane)
+        return cls(predictions, pose, mask, origin, directions, dimensions, slope, free_slope, at_origin, a, status)
 
     @property
     def views(self) -> list[Float[np.ndarray, "problems ..."]]:

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from phd_exp.data.cache import LARGEST_AT_ONCE
 from phd_exp.data.crops import read_image
-from phd_exp.data.folder import content_of
 from phd_exp.distributions import Density, ProjectedHuber, Temperature
 from phd_exp.distributions.along import quantiles_along
 from phd_exp.geometry.camera import Camera
@@ -22,7 +21,7 @@ from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
 from phd_exp.models.heads import Prediction
 from phd_exp.records.detections import Detection
 from phd_exp.records.errors import DatasetError, RunError
-from phd_exp.records.images import pillow_warnings
+from phd_exp.records.images import content_of, pillow_warnings
 
 LEVELS = (50, 90, 99)  # per cent of the credible intervals of depth
 DIGITS = 8

@@ -66,17 +66,13 @@ def resampled(
     drawn: dict[str, list[Tensor]] = {name: [] for name in values}
     each = max(1, _AT_ONCE // n)
     for start in range(0, resamples, each):
-        counts = _counts(n, min(each, resamples - start), generator)
+        # how often each of n samples is drawn when n are drawn with replacement
+        rows = torch.randint(n, (min(each, resamples - start), n), generator=generator)
+        counts = torch.zeros(rows.shape, dtype=torch.float64)
+        counts.scatter_add_(1, rows, torch.ones_like(counts))
         for name, found in statistic(columns, counts).items():
             drawn[name].append(found.double())
     return {name: value[0] for name, value in values.items()}, {k: torch.cat(v) for k, v in drawn.items()}
-
-
-def _counts(n: int, resamples: int, generator: torch.Generator) -> Float[Tensor, "resamples n"]:
-    """How often each of n samples is drawn when n are drawn with replacement: a row per resample."""
-    drawn = torch.randint(n, (resamples, n), generator=generator)
-    zeros = torch.zeros(resamples, n, dtype=torch.float64)
-    return zeros.scatter_add_(1, drawn, torch.ones_like(zeros))
 
 
 def interval(value: Tensor, drawn: Tensor, confidence: float = 0.95) -> Interval:

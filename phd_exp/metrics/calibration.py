@@ -86,8 +86,8 @@ def ence(
 
 def ence_of(ordered: Ordered, variance: str, squared_error: str, bins: int) -> Float[Tensor, "*batch"]:
     """`ence` of samples in the order of their variance."""
-    count = ordered.pooled_count(bins)
-    ratio = ordered.pooled(squared_error, bins) / ordered.pooled(variance, bins)
+    count = ordered.pooled(ordered.count, bins)
+    ratio = ordered.pooled(ordered.sums[squared_error], bins) / ordered.pooled(ordered.sums[variance], bins)
     gap = (1 - ratio.sqrt()).abs().masked_fill(count == 0, 0)
     return (count * gap).sum(-1) / count.sum(-1)
 

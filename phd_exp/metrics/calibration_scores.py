@@ -6,15 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from phd_exp.metrics.calibration import (
-    CalibrationCurve,
-    calibration_curve,
-    coverage,
-    ence_of,
-    miscalibration_area,
-    overconfidence,
-    uniform_distance,
-)
+from phd_exp.metrics import calibration
 from phd_exp.metrics.errors import MILLIMETRES
 from phd_exp.metrics.ordered import Ordered, in_order_of
 from phd_exp.metrics.scores import risk_at, risk_coverage
@@ -94,10 +86,10 @@ def calibration_scores(orders: Mapping[str, Ordered]) -> dict[str, Float[Tensor,
     """
     level, pit = orders["by_level"], orders["by_depth_pit"]
     scores = {
-        "miscalibration_area": miscalibration_area(level),
-        "overconfidence": overconfidence(level),
-        "depth_pit_area": miscalibration_area(pit),
-        "depth_pit_ks": uniform_distance(pit),
+        "miscalibration_area": calibration.miscalibration_area(level),
+        "overconfidence": calibration.overconfidence(level),
+        "depth_pit_area": calibration.miscalibration_area(pit),
+        "depth_pit_ks": calibration.uniform_distance(pit),
         "depth_crps_mm": MILLIMETRES * level.mean("depth_crps"),
         "depth_sharpness_mm": MILLIMETRES * orders["depth_by_variance"].mean("depth_variance").sqrt(),
         "projected_sharpness_mrad": MILLIRADIANS
@@ -106,10 +98,9 @@ def calibration_scores(orders: Mapping[str, Ordered]) -> dict[str, Float[Tensor,
     for name, unit in UNITS.items():
         by_variance, by_error = orders[f"{name}_by_variance"], orders[f"{name}_by_error"]
         bins = ence_bins(by_variance)
-        scores[f"{name}_ence"] = ence_of(by_variance, f"{name}_variance", f"{name}_squared_error", bins)
-        curve = risk_coverage(by_variance, by_error, f"{name}_error")
-        scores[f"{name}_risk_coverage_area"] = unit * curve.area
-        scores[f"{name}_risk_coverage_excess"] = curve.excess
+        scores[f"{name}_ence"] = calibration.ence_of(by_variance, f"{name}_variance", f"{name}_squared_error", bins)
+        area, scores[f"{name}_risk_coverage_excess"] = risk_coverage(by_variance, by_error, f"{name}_error")
+        scores[f"{name}_risk_coverage_area"] = unit * area
     return scores
 
 
@@ -142,8 +133,8 @@ def curves(
     """
     orders, x = ordered(columns, weight), abscissae(columns, window)
     y = {
-        "coverage": coverage(orders["by_level"], x["coverage"]),
-        "depth_pit": coverage(orders["by_depth_pit"], x["depth_pit"]),
+        "coverage": calibration.coverage(orders["by_level"], x["coverage"]),
+        "depth_pit": calibration.coverage(orders["by_depth_pit"], x["depth_pit"]),
     }
     for name, unit in UNITS.items():
         risk = risk_at(orders[f"{name}_by_variance"], f"{name}_error", x[f"{name}_risk_coverage"])
@@ -152,8 +143,8 @@ def curves(
     return y
 
 
-def _calibration(columns: Mapping[str, Tensor], name: str, window: int) -> CalibrationCurve:
-    return calibration_curve(columns[f"{name}_variance"], columns[f"{name}_squared_error"], window)
+def _calibration(columns: Mapping[str, Tensor], name: str, window: int) -> calibration.CalibrationCurve:
+    return calibration.calibration_curve(columns[f"{name}_variance"], columns[f"{name}_squared_error"], window)
 
 
 def _window_means(columns: Mapping[str, Tensor], name: str, weight: Tensor, window: int) -> Tensor:

@@ -44,17 +44,10 @@ class Ordered:
         """The mean of a column over all samples."""
         return self.sums[name].sum(-1) / self.count.sum(-1)
 
-    def pooled(self, name: str, bins: int) -> Float[Tensor, "*batch bins"]:
-        """The sum of a column over bins of about equally many samples; the middle of a group decides its bin."""
-        return _pooled(self.sums[name], self._bin(bins), bins)
-
-    def pooled_count(self, bins: int) -> Float[Tensor, "*batch bins"]:
-        """The number of samples in each of these bins."""
-        return _pooled(self.count, self._bin(bins), bins)
-
-    def _bin(self, bins: int) -> Tensor:
+    def pooled(self, values: Float[Tensor, "*batch groups"], bins: int) -> Float[Tensor, "*batch bins"]:
+        """The sum of values over bins of about equally many samples; the middle of a group decides its bin."""
         middle = (self.up_to - self.count / 2) / self.total
-        return (bins * middle.nan_to_num(0)).long().clamp_max(bins - 1)
+        return _pooled(values, (bins * middle.nan_to_num(0)).long().clamp_max(bins - 1), bins)
 
 
 def in_order_of(
@@ -68,23 +61,18 @@ def in_order_of(
 
     Raises ValueError for no samples, or for samples that are not finite.
     """
-    require_finite(quantity, *columns.values())
+    for column in (quantity, *columns.values()):
+        bad = int((~column.isfinite()).sum())
+        if len(column) == 0 or bad:
+            raise ValueError(
+                f"samples: got {len(column)}, {bad} of them not finite; expected at least one, all finite"
+            )
     quantity = quantity.double()
     if weight is None:
         weight = torch.ones_like(quantity)
     points, group = quantity.unique(return_inverse=True)
     sums = {name: _pooled(weight * column.double(), group, len(points)) for name, column in columns.items()}
     return Ordered(points, _pooled(weight, group, len(points)), sums)
-
-
-def require_finite(*columns: Float[Tensor, "... samples"]) -> None:
-    """Raise ValueError for no samples, or for samples that are not finite."""
-    for column in columns:
-        bad = int((~column.isfinite()).sum())
-        if len(column) == 0 or bad:
-            raise ValueError(
-                f"samples: got {len(column)}, {bad} of them not finite; expected at least one, all finite"
-            )
 
 
 def _pooled(values: Tensor, bin: Tensor, bins: int) -> Tensor:

@@ -1,6 +1,6 @@
 """Scores of predictions: the energy score, and whether predicted uncertainty ranks the errors."""
 
-from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -30,49 +30,27 @@ def energy_score(
         raise ValueError(f"an energy score needs at least 2 draws, not {n}")
     to_truth = (samples - truth).norm(dim=-1).mean(0)
     rows = samples.reshape(n, -1, 3).movedim(0, 1).split(_CHUNK)
-    pairs = torch.cat([_pair_distances(row) for row in rows]).reshape(truth.shape[:-1])
+    # differences rather than products of matrices, which lose the digits of near draws
+    distances = partial(torch.cdist, compute_mode="donot_use_mm_for_euclid_dist")
+    pairs = torch.cat([distances(row, row).sum((-2, -1)) for row in rows]).reshape(truth.shape[:-1])
     return to_truth - pairs / (2 * n * (n - 1))
 
 
-def _pair_distances(samples: Float[Tensor, "rows draws 3"]) -> Float[Tensor, " rows"]:
-    # differences rather than products of matrices, which lose the digits of near draws
-    return torch.cdist(samples, samples, compute_mode="donot_use_mm_for_euclid_dist").sum((-2, -1))
+def risk_coverage(
+    by_uncertainty: Ordered, by_error: Ordered, error: str
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """The area under the risk-coverage curve, and its excess, of samples ordered by uncertainty and by error.
 
+    The curve is the mean of the column `error` of the most certain samples (risk) against their share of all samples
+    (coverage); see `risk_at`. The area is the mean of the risk over the coverages 1/n, 2/n, ..., 1, in the unit of
+    the error. Samples of equal uncertainty count as if in random order. With the oracle that sorts by the error
+    itself, the lower bound, the excess is (area - oracle) / (random - oracle): 0 if uncertainty ranks the errors
+    perfectly, 1 if at random.
 
-@dataclass(frozen=True)
-class RiskCoverage:
-    """The mean error of the most certain samples (risk) against their share of all samples (coverage).
-
-    Areas are means of the risk over the coverages 1/n, 2/n, ..., 1: sorted by predicted uncertainty, by the error
-    itself (an oracle, the lower bound), and in random order.
-    """
-
-    coverage: Float[Tensor, "*batch points"]
-    risk: Float[Tensor, "*batch points"]
-    area: Float[Tensor, "*batch"]
-    oracle_area: Float[Tensor, "*batch"]
-    random_area: Float[Tensor, "*batch"]
-
-    @property
-    def excess(self) -> Float[Tensor, "*batch"]:
-        """(area - oracle) / (random - oracle): 0 if uncertainty ranks the errors perfectly, 1 if at random."""
-        return (self.area - self.oracle_area) / (self.random_area - self.oracle_area)
-
-
-def risk_coverage(by_uncertainty: Ordered, by_error: Ordered, error: str) -> RiskCoverage:
-    """The risk-coverage curve of samples ordered by their uncertainty and by their error, the column `error`.
-
-    Samples of equal uncertainty count as if in random order.
     Source: Geifman and El-Yaniv, "Selective classification for deep neural networks" (2017).
     """
-    kept = by_uncertainty.up_to
-    return RiskCoverage(
-        coverage=kept / by_uncertainty.total,
-        risk=by_uncertainty.sums[error].cumsum(-1) / kept,
-        area=_area_under_risk(by_uncertainty, error),
-        oracle_area=_area_under_risk(by_error, error),
-        random_area=by_uncertainty.mean(error),
-    )
+    area, oracle = _area_under_risk(by_uncertainty, error), _area_under_risk(by_error, error)
+    return area, (area - oracle) / (by_uncertainty.mean(error) - oracle)
 
 
 def risk_at(ordered: Ordered, error: str, coverage: Float[Tensor, " points"]) -> Float[Tensor, "*batch points"]:

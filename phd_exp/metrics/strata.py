@@ -32,7 +32,11 @@ def strata(
     """
     values = values.double()
     known = values[~values.isnan()]
-    borders = _quantiles(known, edges) if isinstance(edges, int) else [float(edge) for edge in edges]
+    if isinstance(edges, int):
+        shares = torch.linspace(0, 1, edges + 1, dtype=torch.float64)
+        borders = known.quantile(shares).unique().tolist() if len(known) else []  # fewer if many values are equal
+    else:
+        borders = [float(edge) for edge in edges]
     if not borders:
         return _named([(f"{name} unknown", values.isnan())])
     rule = f".{_decimals(borders)}f" if isinstance(edges, int) else "g"
@@ -46,15 +50,6 @@ def strata(
     parts.append((f"{name} above {words[-1]}{suffix}", values > borders[-1]))
     parts.append((f"{name} unknown", values.isnan()))
     return _named(parts)
-
-
-def _quantiles(known: Tensor, n: int) -> list[float]:
-    """n + 1 borders of parts of equal size; fewer if many values are equal."""
-    if len(known) == 0:
-        return []
-    shares = torch.linspace(0, 1, n + 1, dtype=torch.float64)
-    borders: list[float] = known.quantile(shares).unique().tolist()
-    return borders
 
 
 def _decimals(borders: Sequence[float]) -> int:

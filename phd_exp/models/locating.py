@@ -52,7 +52,8 @@ class Locating(Backbone):
         block, counts = BLOCKS[depth]
         widths = [width * 2**stage for stage in range(len(counts))]
         outputs = [n * block.expansion for n in widths]
-        self.stem = _stem(width, stride)
+        convolution = nn.Conv2d(3, width, 7, stride, padding=3, bias=False)
+        self.stem = nn.Sequential(convolution, _norm(width), nn.ReLU(inplace=True))
         self.stages = nn.ModuleList(
             _stage(block, count, n_in, n, stride=1 if n == width else 2)
             for count, n_in, n in zip(counts, [width, *outputs], widths, strict=False)
@@ -96,11 +97,6 @@ class Locating(Backbone):
             place=(weight * places.flatten(2)).sum(-1),
             log_heat=log_heat.unflatten(-1, scores.shape[-2:]),
         )
-
-
-def _stem(width: int, stride: int) -> nn.Sequential:
-    convolution = nn.Conv2d(3, width, 7, stride, padding=3, bias=False)
-    return nn.Sequential(convolution, _norm(width), nn.ReLU(inplace=True))
 
 
 def _stage(block: type[BasicBlock | Bottleneck], count: int, n_in: int, width: int, stride: int) -> nn.Sequential:

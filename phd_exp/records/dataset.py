@@ -15,10 +15,11 @@ import hashlib
 from pathlib import Path
 from typing import Annotated, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from phd_exp.records.errors import DatasetError, gist
 from phd_exp.records.files import read_jsonl, read_plain, require_plain, write_atomic
+from phd_exp.records.parsing import Record
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec, ImageFormat, Shard
 
@@ -26,19 +27,15 @@ SPLITS: tuple[Split, ...] = get_args(Split)
 SUFFIXES: dict[ImageFormat, str] = {"png": ".png", "webp": ".webp", "jpeg": ".jpg"}
 
 
-class Seal(BaseModel):
+class Seal(Record):
     """Number of finished samples of a split, and the checksum of its `metadata.jsonl`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     n: Annotated[int, Field(ge=0)]
     metadata_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
-class Manifest(BaseModel):
+class Manifest(Record):
     """What made a data set: `generator` is the version of the sampling code, `renderer` the path tracer."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     generator: int
     renderer: str

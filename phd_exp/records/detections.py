@@ -14,13 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidator, ValidationError, model_validator
+from pydantic import AfterValidator, Field, PlainValidator, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
 from phd_exp.records.dataset import SPLITS, checksum, sha256
 from phd_exp.records.errors import UNPRINTABLE, DatasetError, complaint, gist, nearest, shown
 from phd_exp.records.files import read_jsonl
-from phd_exp.records.parsing import parse_json
+from phd_exp.records.parsing import Record, parse_json
 from phd_exp.records.scenes import Pose, SampleRecord, Split
 from phd_exp.records.spec import Number, Positive
 
@@ -48,7 +48,7 @@ FocalLength = Annotated[Positive, Field(le=1e6), AfterValidator(_in_pixels)]
 Metres = Annotated[Number, Field(ge=-1e6, le=1e6)]
 
 
-class DetectionLine(BaseModel):
+class DetectionLine(Record):
     """One line of `metadata.jsonl`; pixels count from the top left corner of the stored image.
 
     Attributes:
@@ -61,8 +61,6 @@ class DetectionLine(BaseModel):
         scene: lines with the same scene show the same object at the same time.
         pose: of the camera, in the world that the cameras of a scene share.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     file_name: Annotated[str, Field(min_length=1, max_length=1000)]
     f: FocalLength | None = None

@@ -53,6 +53,14 @@ def decoding(file: Path) -> Iterator[None]:
         raise DatasetError(f"{file}: cannot be read as an image ({gist(error)}); replace it") from None
 
 
+def content_of(file: Path) -> bytes:
+    """The bytes of an image file. Raises DatasetError if it cannot be read."""
+    try:
+        return read_plain(file, LARGEST_IMAGE)
+    except OSError as error:
+        raise DatasetError(f"{file}: cannot be read ({error.strerror})") from None
+
+
 def recorded_image(path: Path, record: SampleRecord) -> Image.Image:
     """The image of a rendered sample, checked against its record and decoded.
 
@@ -60,10 +68,7 @@ def recorded_image(path: Path, record: SampleRecord) -> Image.Image:
         DatasetError: it cannot be read, has another checksum, or is no RGB image of the recorded size; the caller
             adds the remedy.
     """
-    try:
-        content = read_plain(path, LARGEST_IMAGE)
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror})") from None
+    content = content_of(path)
     if sha256(content) != record.sha256:
         raise DatasetError(f"{path}: its checksum is not the recorded one")
     try:

@@ -4,8 +4,15 @@ import json
 from typing import Any
 
 import yaml
+from pydantic import BaseModel, ConfigDict
 
 MOST_DIGITS = 300  # digits of an integer; a float holds 308
+
+
+class Record(BaseModel):
+    """Base class of records and configurations: immutable; an unknown or missing key is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 def parse_json(text: str) -> Any:

@@ -10,7 +10,6 @@ from contextlib import contextmanager, nullcontext, suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 HOME = Path(__file__).resolve().parents[2]
@@ -83,9 +82,7 @@ class Child:
     def __enter__(self) -> "Child":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.connection.close()
         self._end()
 
@@ -95,11 +92,14 @@ class Child:
             self.connection.send(message)
 
     def receive(self) -> Any:
-        """Wait for the next message. Raises EOFError, which says how the process ended, if it ended instead."""
+        """Wait for the next message. Raises it if it is an exception, and EOFError if the process ended instead."""
         try:
-            return self.connection.recv()
+            message = self.connection.recv()
         except (EOFError, ConnectionResetError):
             raise EOFError(f"process {self.process.pid} {self._end()}") from None
+        if isinstance(message, Exception):
+            raise message
+        return message
 
     def _end(self) -> str:
         try:

@@ -32,11 +32,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
+from pydantic import AwareDatetime, Field, FiniteFloat, TypeAdapter, ValidationError
 
 from phd_exp.records.errors import RunError, gist
 from phd_exp.records.files import MB, read_jsonl, read_plain, write_atomic
-from phd_exp.records.parsing import parse_json, parse_yaml
+from phd_exp.records.parsing import Record, parse_json, parse_yaml
 from phd_exp.records.processes import held
 
 LAST_EPOCH = 10**9
@@ -56,13 +56,11 @@ _NUMBERS: TypeAdapter[dict[str, int | float | None]] = TypeAdapter(dict[str, int
 State = Literal["running", "finished", "failed", "interrupted"]
 
 
-class RunStatus(BaseModel):
+class RunStatus(Record):
     """State of a run, and the software and machine it ran on; times in UTC.
 
     `custom` are the user's own classes and functions, with the files that define them.
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     state: State
     started: AwareDatetime
@@ -91,6 +89,7 @@ class RunFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.checkpoints = path / "checkpoints"
+        self.last_checkpoint = self.checkpoints / "last.ckpt"  # from which a run resumes
         self.calibration = path / "calibration"
         self.predictions = path / "predictions.parquet"
         self.held_out = path / "held_out.parquet"
@@ -110,11 +109,6 @@ class RunFolder:
     def shift(self, name: str) -> Path:
         """Predictions of shifted test samples."""
         return self.shifts / f"{name}.parquet"
-
-    @property
-    def last_checkpoint(self) -> Path:
-        """The checkpoint from which a run resumes."""
-        return self.checkpoints / "last.ckpt"
 
     @property
     def best_checkpoint(self) -> Path:

@@ -7,7 +7,9 @@ object's local frame has its origin at the object's centre; a cylinder's axis is
 import math
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, Field
+
+from phd_exp.records.parsing import Record
 
 Split = Literal["train", "test"]
 Shape = Literal["cylinder", "cube", "sphere"]
@@ -32,13 +34,7 @@ def _unit(quaternion: tuple[float, float, float, float]) -> tuple[float, float, 
 Quaternion = Annotated[tuple[Finite, Finite, Finite, Finite], AfterValidator(_unit)]
 
 
-class _Described(BaseModel):
-    """Immutable; an unknown or missing key in a file is an error."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class SceneObject(_Described):
+class SceneObject(Record):
     """One rigid object.
 
     Attributes:
@@ -58,7 +54,7 @@ class SceneObject(_Described):
     material: Material
 
 
-class Lamp(_Described):
+class Lamp(Record):
     """A square area lamp: its position and the point that it faces (scene frame, m), side (m), power (W)."""
 
     name: LampName
@@ -68,7 +64,7 @@ class Lamp(_Described):
     power: Positive
 
 
-class Backdrop(_Described):
+class Backdrop(Record):
     """The light-grey background: linear brightness level (1 - falloff |p - centre|^2).
 
     p is the place in the image in units of its side, x right and y down from the top left corner. The backdrop
@@ -80,7 +76,7 @@ class Backdrop(_Described):
     centre: tuple[Finite, Finite]
 
 
-class Pose(_Described):
+class Pose(Record):
     """Pose of a camera, the map from the scene's frame to the camera's: p_camera = R p_scene + translation.
 
     Attributes:
@@ -105,7 +101,7 @@ def _one_of_each(objects: tuple[SceneObject, ...]) -> tuple[SceneObject, ...]:
 Objects = Annotated[tuple[SceneObject, ...], Field(min_length=1), AfterValidator(_one_of_each)]
 
 
-class Scene(_Described):
+class Scene(Record):
     """The renderer's input for one image.
 
     Attributes:
@@ -125,7 +121,7 @@ class Scene(_Described):
     noise_seed: Seed
 
 
-class SampleRecord(_Described):
+class SampleRecord(Record):
     """One line of `metadata.jsonl`: the image's name, the network's targets, and the scene.
 
     Attributes:

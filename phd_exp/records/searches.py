@@ -8,19 +8,18 @@ runs/.search/NAME/
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, FiniteFloat, ValidationError
+from pydantic import FiniteFloat, ValidationError
 
 from phd_exp.records.errors import gist
 from phd_exp.records.files import read_plain, write_atomic
+from phd_exp.records.parsing import Record
 from phd_exp.records.processes import announce
 
 TrialState = Literal["finished", "pruned", "failed", "running"]
 
 
-class Trial(BaseModel):
+class Trial(Record):
     """One trial: its overrides, the folder of its run, and the held-out score; of a pruned one, the last score."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     number: int
     state: TrialState
@@ -29,15 +28,13 @@ class Trial(BaseModel):
     value: FiniteFloat | None = None
 
 
-class Search(BaseModel):
+class Search(Record):
     """All trials of a search.
 
     Attributes:
         objective: the metric that is minimised.
         importances: share of each key in the variance of the objective, as Optuna estimates it.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str
     objective: str

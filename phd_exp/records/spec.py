@@ -6,7 +6,9 @@ import re
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StrictBool, model_serializer
+from pydantic import AfterValidator, Field, StrictBool, model_serializer
+
+from phd_exp.records.parsing import Record
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 
@@ -30,7 +32,7 @@ ImageFormat = Literal["png", "webp", "jpeg"]
 SHARD = "expected INDEX/COUNT with 0 <= INDEX < COUNT"
 
 
-class DatasetSpec(BaseModel):
+class DatasetSpec(Record):
     """Everything that a sample depends on, except its split and index. It does not hold the number of samples.
 
     Positions have the distribution z ~ U(z_range) and x, y ~ (S z / f) xy_range U(-1/2, 1/2).
@@ -59,8 +61,6 @@ class DatasetSpec(BaseModel):
 
     Source: paper, section "Dataset".
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     variant: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
     seed: Annotated[int, Field(strict=True, ge=0, lt=2**63)]

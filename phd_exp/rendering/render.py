@@ -21,10 +21,9 @@ from collections.abc import Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from itertools import islice
 from multiprocessing.connection import Connection, wait
-from pathlib import Path
 
 from phd_exp.records.dataset import SPLITS, DatasetFolder
-from phd_exp.records.errors import RenderError, UserError, writing
+from phd_exp.records.errors import RenderError, writing
 from phd_exp.records.files import open_journal
 from phd_exp.records.processes import Child, announce, duration, held, usable_cores
 from phd_exp.records.scenes import SampleRecord, Split
@@ -106,7 +105,7 @@ def _locked(folder: DatasetFolder, shard: Shard | None) -> Iterator[None]:
 def _seal_if_last(folder: DatasetFolder, wanted: Wanted, shard: Shard) -> bool:
     with held(folder.render_lock) as alone:
         known = known_samples(folder)
-        left = missing(known, wanted)
+        left = len(missing(known, wanted))
         if alone and not left:
             seal(folder, known)
             outcome = f"shard {shard} was the last; the data set is sealed"
@@ -131,12 +130,7 @@ def render_missing(
 
     The caller holds the locks. Each record is written to the journal as soon as its image is on disk.
     """
-    samples = [
-        (split, index)
-        for split in SPLITS
-        for index in range(wanted[split])
-        if index not in known[split] and (shard is None or shard.holds(index))
-    ]
+    samples = [(split, index) for split, index in missing(known, wanted) if shard is None or shard.holds(index)]
     if not samples:
         return 0
     workers = workers or worker_count(len(samples), cores)
@@ -177,24 +171,18 @@ def render_all(
         while busy:
             for connection in wait(list(busy)):
                 assert isinstance(connection, Connection)
-                yield _answer(busy[connection], log)
+                try:
+                    record = busy[connection].receive()
+                except EOFError as death:
+                    raise RenderError(
+                        f"a render worker: {death}; finished images are kept, and the same command resumes "
+                        f"(its last words: {log})"
+                    ) from None
+                yield record
                 if (following := next(todo, None)) is None:
                     del busy[connection]
                 else:
                     busy[connection].send(following)
-
-
-def _answer(child: Child, log: Path) -> SampleRecord:
-    try:
-        answer: SampleRecord | UserError = child.receive()
-    except EOFError as death:
-        raise RenderError(
-            f"a render worker: {death}; finished images are kept, and the same command resumes "
-            f"(its last words: {log})"
-        ) from None
-    if isinstance(answer, UserError):
-        raise answer
-    return answer
 
 
 def worker_count(samples: int, cores: int | None = None) -> int:

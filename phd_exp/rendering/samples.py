@@ -36,13 +36,11 @@ def describe(spec: DatasetSpec, split: Split, index: int, scene: Scene, hits: Hi
     """The record of a sample, given the scene, what the rays of its pixels hit, and the image's checksum."""
     number, view = scene_and_view(spec, index)
     cylinder = scene.objects[0]
-    x, y, z = in_camera_frame(np.array(cylinder.position), scene.pose).tolist()
+    position = in_camera_frame(np.array(cylinder.position), scene.pose).tolist()
     return SampleRecord(
         **{key: getattr(scene, key) for key in Scene.model_fields},
+        **dict(zip("xyz", position, strict=True)),
         file_name=image_name(index, spec.image_format),
-        x=x,
-        y=y,
-        z=z,
         scale=cylinder.scale,
         visibility=visibility(hits),
         truncation=truncation(scene, hits),
@@ -80,9 +78,5 @@ def box_around(mask: Mask, margin: int) -> Box:
     """The smallest box around the true pixels of a mask (S, S) and a margin, clipped to the image."""
     side = mask.shape[0]
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    return Box(
-        left=max(int(columns[0]) - margin, 0),
-        top=max(int(rows[0]) - margin, 0),
-        right=min(int(columns[-1]) + 1 + margin, side),
-        bottom=min(int(rows[-1]) + 1 + margin, side),
-    )
+    left, top, right, bottom = columns[0] - margin, rows[0] - margin, columns[-1] + margin, rows[-1] + margin
+    return Box(*np.clip([left, top, right + 1, bottom + 1], 0, side).tolist())

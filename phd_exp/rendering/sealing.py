@@ -63,9 +63,9 @@ def _known_of(folder: DatasetFolder, split: Split) -> dict[int, SampleRecord]:
     return {record.index: record for record in reversed(records) if record.file_name in images}
 
 
-def missing(known: Known, wanted: Wanted) -> int:
-    """Number of wanted samples that are not known."""
-    return sum(index not in known[split] for split in SPLITS for index in range(wanted[split]))
+def missing(known: Known, wanted: Wanted) -> list[tuple[Split, int]]:
+    """Split and index of each wanted sample that is not known."""
+    return [(split, index) for split in SPLITS for index in range(wanted[split]) if index not in known[split]]
 
 
 def seal(folder: DatasetFolder, known: Known) -> None:

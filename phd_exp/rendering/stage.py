@@ -9,7 +9,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from phd_exp.records.scenes import Backdrop, Lamp, LampName, Material, Pose, Scene, SceneObject, Shape
+from phd_exp.records.scenes import Backdrop, Lamp, LampName, Material, Scene, SceneObject, Shape
 from phd_exp.rendering.meshes import build_mesh
 from phd_exp.rendering.pixels import linear
 from phd_exp.rendering.rays import rotation_matrix
@@ -17,8 +17,6 @@ from phd_exp.rendering.rays import rotation_matrix
 TO_BLENDER = np.diag([1.0, -1.0, -1.0])
 SENSOR_WIDTH = 36.0  # mm; arbitrary, because the focal length has the same unit
 SHAPES: tuple[Shape, ...] = get_args(Shape)
-MATERIALS: tuple[Material, ...] = get_args(Material)
-LAMP_NAMES: tuple[LampName, ...] = get_args(LampName)
 # Inputs of Principled BSDF. Rubber is matt with a faint sheen; metal reflects the lamps as soft boxes and its
 # neighbours as blurs.
 SURFACES: dict[Material, dict[str, float]] = {
@@ -39,7 +37,9 @@ class Stage:
         """Arrange everything as in a scene."""
         objects = self._data.objects
         objects["camera"].data.lens = scene.f * SENSOR_WIDTH / scene.S
-        objects["camera"].matrix_world = _camera_matrix(scene.pose)
+        # p_scene = R^T (p_camera - translation), with Blender's axes in both frames
+        back = rotation_matrix(scene.pose.rotation).T
+        objects["camera"].matrix_world = _matrix(back @ TO_BLENDER, -back @ np.array(scene.pose.translation))
         for shape in SHAPES:
             objects[shape].hide_render = True
         for item in scene.objects:
@@ -60,13 +60,23 @@ class Stage:
 def build_stage(bpy: Any) -> Stage:
     """Empty Blender's file and fill it with one of each thing that a scene can contain."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    for material in MATERIALS:
-        paint_surface(bpy.data.materials.new(material).node_tree, material)
+    for material, surface in SURFACES.items():
+        tree = bpy.data.materials.new(material).node_tree
+        shader, info = tree.nodes["Principled BSDF"], tree.nodes.new("ShaderNodeObjectInfo")
+        for key, value in surface.items():
+            shader.inputs[key].default_value = value
+        tree.links.new(info.outputs["Color"], shader.inputs["Base Color"])
     for shape in SHAPES:
         _add(bpy, shape, _new_mesh(bpy, shape))
-    for name in LAMP_NAMES:
-        _add(bpy, name, _new_lamp(bpy, name)).visible_camera = False  # a turned camera may face one
-    bpy.context.scene.camera = _add(bpy, "camera", _new_camera(bpy))
+    for name in get_args(LampName):
+        light = bpy.data.lights.new(name, "AREA")
+        light.shape = "SQUARE"
+        _add(bpy, name, light).visible_camera = False  # a turned camera may face one
+    camera = bpy.data.cameras.new("camera")
+    camera.sensor_fit = "HORIZONTAL"
+    camera.sensor_width = SENSOR_WIDTH
+    camera.clip_start, camera.clip_end = 0.01, 1000.0
+    bpy.context.scene.camera = _add(bpy, "camera", camera)
     world = bpy.context.scene.world = bpy.data.worlds.new("world")
     world.cycles.sampling_method = "NONE"  # an importance map is not worth it for such smooth light
     paint_world(world.node_tree)
@@ -88,20 +98,6 @@ def _new_mesh(bpy: Any, shape: Shape) -> Any:
     return mesh
 
 
-def _new_lamp(bpy: Any, name: str) -> Any:
-    light = bpy.data.lights.new(name, "AREA")
-    light.shape = "SQUARE"
-    return light
-
-
-def _new_camera(bpy: Any) -> Any:
-    camera = bpy.data.cameras.new("camera")
-    camera.sensor_fit = "HORIZONTAL"
-    camera.sensor_width = SENSOR_WIDTH
-    camera.clip_start, camera.clip_end = 0.01, 1000.0
-    return camera
-
-
 def _place_lamp(handle: Any, lamp: Lamp) -> None:
     """An area lamp shines along its local -z."""
     position = np.array(lamp.position)
@@ -109,12 +105,6 @@ def _place_lamp(handle: Any, lamp: Lamp) -> None:
     handle.matrix_world = _matrix(TO_BLENDER @ _facing(TO_BLENDER @ forward), position)
     handle.data.energy = lamp.power
     handle.data.size = lamp.side
-
-
-def _camera_matrix(pose: Pose) -> list[list[float]]:
-    """p_scene = R^T (p_camera - translation), with Blender's axes in both frames."""
-    back = rotation_matrix(pose.rotation).T
-    return _matrix(back @ TO_BLENDER, -back @ np.array(pose.translation))
 
 
 def _matrix(linear: NDArray[np.float64], place: NDArray[np.float64]) -> list[list[float]]:
@@ -132,15 +122,6 @@ def _facing(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     right = np.cross([0.0, 1.0, 0.0], back)
     right /= np.linalg.norm(right)
     return np.column_stack([right, np.cross(back, right), back])
-
-
-def paint_surface(tree: Any, material: Material) -> None:
-    """Make a new material's node tree a surface with the colour of its object."""
-    shader = tree.nodes["Principled BSDF"]
-    for key, value in SURFACES[material].items():
-        shader.inputs[key].default_value = value
-    info = tree.nodes.new("ShaderNodeObjectInfo")
-    tree.links.new(info.outputs["Color"], shader.inputs["Base Color"])
 
 
 def paint_world(tree: Any) -> None:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -86,10 +87,7 @@ class PositionModule(LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def configure_gradient_clipping(
-        self,
-        optimizer: torch.optim.Optimizer,
-        gradient_clip_val: float | None = None,
-        gradient_clip_algorithm: str | None = None,
+        self, optimizer: Any, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
     ) -> None:
         # not Lightning's, which refuses fused optimizers for the sake of a scaler that bfloat16 does not need
         if gradient_clip_val:
@@ -107,9 +105,8 @@ class PositionModule(LightningModule):
         self._require_finite(total, losses, batch, "train")
         with torch.no_grad():
             nll = losses if isinstance(self.loss, NegativeLogLikelihood) else None
-            self.training_rows.update(
-                {"loss": losses.expand(len(batch))} | training_columns(prediction, batch.xyz, nll)
-            )
+            table = training_columns(prediction, batch.xyz, nll)
+            self.training_rows.update({"loss": losses.expand(len(batch))} | table)
         return total
 
     def on_train_epoch_end(self) -> None:

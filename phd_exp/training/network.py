@@ -19,7 +19,8 @@ from phd_exp.models.regressor import FocalLengthInput, Regressor
 from phd_exp.records.errors import ConfigError, RunError, gist, in_user_code
 from phd_exp.records.files import require_plain
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.config import RenderedConfig, RunConfig, TrainerConfig
+from phd_exp.training.config import RenderedConfig, RunConfig
+from phd_exp.training.config.sections import TrainerConfig
 from phd_exp.training.config.targets import custom_parts
 
 ADVICE = "delete it to begin the run again"

@@ -1,22 +1,27 @@
 """Training one run with several processes, which end together.
 
 Lightning would start the command of this process again, which in a sweep is the whole sweep. Here each process is a
-`Child` that runs `rank.py`, whatever launcher runs the job.
+`Child` that runs this module, whatever launcher runs the job. It exits when the connection to its parent closes, and
+so when its parent dies.
 """
 
+import os
 import socket
-from contextlib import ExitStack
-from multiprocessing.connection import wait
+import sys
+import threading
+import traceback
+from contextlib import ExitStack, suppress
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
-from phd_exp.records.errors import RunError
-from phd_exp.records.processes import Child
+import torch.distributed as dist
+
+from phd_exp.records.errors import RunError, UserError
+from phd_exp.records.processes import Child, parent
+from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import RunConfig
 from phd_exp.training.recorder import Draw
-
-Share = tuple[RunConfig, Path, Draw | None, int, int]
-"""The task of one process: the run, its folder, how curves are drawn, the number of threads, and the rank."""
 
 
 def train_together(config: RunConfig, folder: Path, draw: Draw | None, threads: int) -> dict[str, Any]:
@@ -34,29 +39,58 @@ def train_together(config: RunConfig, folder: Path, draw: Draw | None, threads: 
         ranks: dict[Any, tuple[int, Child]] = {}
         for rank in range(world):
             of_rank = environment | {"RANK": str(rank), "LOCAL_RANK": str(rank)}
-            child = stack.enter_context(Child("phd_exp.training.rank", of_rank))
+            child = stack.enter_context(Child("phd_exp.training.ranks", of_rank))
             child.send((config, folder, draw, max(1, threads // world), rank))
             ranks[child.connection] = (rank, child)
         try:
             while ranks:
                 for connection in wait(list(ranks)):
                     rank, child = ranks.pop(connection)
-                    results[rank] = _received(child, f"rank {rank} of {world}")
-        except BaseException:
+                    results[rank] = child.receive()
+        except EOFError as death:
+            raise RunError(
+                f"rank {rank} of {world}: {death}; the others were ended, and the same command goes on from the last "
+                "checkpoint"
+            ) from None
+        finally:
             for _, child in ranks.values():
                 child.process.kill()  # at once: Gloo would print that it lost a peer
-            raise
     return results[0]
 
 
-def _received(child: Child, name: str) -> dict[str, Any]:
+def main() -> None:
+    """Train as one of the processes, and send back the results or the error."""
+    connection = parent()
+    sys.path.append(os.getcwd())  # for the user's own parts
+    share = connection.recv()
+    threading.Thread(target=_exit_with_parent, args=(connection,), daemon=True).start()
+    connection.send(_outcome(*share))
+    if dist.is_initialized():
+        dist.destroy_process_group()
+
+
+def _outcome(
+    config: RunConfig, folder: Path, draw: Draw | None, threads: int, rank: int
+) -> dict[str, Any] | Exception:
+    from phd_exp.training.run import run  # imports of seconds, in which the parent may die
+
     try:
-        outcome = child.receive()
-    except EOFError as death:
-        raise RunError(
-            f"{name}: {death}; the others were ended, and the same command goes on from the last checkpoint"
-        ) from None
-    if isinstance(outcome, Exception):
-        raise outcome
-    results: dict[str, Any] = outcome
-    return results
+        return run(config, RunFolder(folder), draw, threads, rank)
+    except UserError as error:
+        return error
+    except Exception as error:  # it may not pickle, its traceback does
+        last = traceback.format_exception_only(error)[-1].strip()
+        fault = RuntimeError(f"rank {rank} of {config.trainer.devices} failed with {last}")
+        fault.add_note(traceback.format_exc())
+        return fault
+
+
+def _exit_with_parent(connection: Connection) -> None:
+    """Exit at once when the connection closes; nothing else arrives through it."""
+    with suppress(EOFError, OSError):
+        connection.recv()
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main()

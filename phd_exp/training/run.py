@@ -3,6 +3,7 @@
 import logging
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
 
@@ -16,7 +17,7 @@ from phd_exp.distributions.columns import Columns
 from phd_exp.records.choices import first_difference, has_influence
 from phd_exp.records.dataset import DatasetFolder, checksum
 from phd_exp.records.detections import DetectionFolder
-from phd_exp.records.errors import ConfigError, RunError, shown
+from phd_exp.records.errors import ConfigError, RunError, gist, shown
 from phd_exp.records.files import remove_temporaries
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import build_data, build_module
@@ -183,8 +184,7 @@ def _fit(trainer: Trainer, module: PositionModule, data: PositionData, recorder:
     except (KeyError, ValueError, TypeError, AttributeError, RuntimeError, IndexError) as error:
         if recorder.begun:
             raise
-        reason = " ".join(str(error).split())[:120]
-        raise RunError(f"{checkpoint}: not a checkpoint of this run ({reason}); {ADVICE}") from None
+        raise RunError(f"{checkpoint}: not a checkpoint of this run ({gist(error)}); {ADVICE}") from None
 
 
 def _ends_an_epoch(checkpoint: Mapping[str, Any]) -> bool:
@@ -218,15 +218,12 @@ def _circumstances(config: RunConfig, data: PositionData, trainer: Trainer) -> d
 
 
 def _manifest_hash(config: RunConfig) -> str | None:
-    if isinstance(config.data, FolderConfig):
-        try:
+    with suppress(OSError):  # the data of a finished run may be gone
+        if isinstance(config.data, FolderConfig):
             return DetectionFolder(config.data.folder).fingerprint()
-        except OSError:  # the data of a finished run may be gone
-            return None
-    if not isinstance(config.data, RenderedConfig):
-        return None
-    manifest = DatasetFolder(config.data.folder).manifest_path
-    return checksum(manifest) if manifest.is_file() else None
+        if isinstance(config.data, RenderedConfig):
+            return checksum(DatasetFolder(config.data.folder).manifest_path)
+    return None
 
 
 def _quiet_lightning() -> None:

@@ -5,7 +5,6 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
 from typing import Any
 
 from hydra.utils import instantiate
@@ -40,7 +39,7 @@ def require_possible_loggers(loggers: Mapping[str, Any]) -> None:
 
 @contextmanager
 def tracked(config: RunConfig, folder: RunFolder, rank: int) -> Iterator[list[Logger]]:
-    """The loggers of a run, in the process of rank 0 alone.
+    """The loggers of a run, in the process of rank 0 alone; finished on exit, as failed after an exception.
 
     What an interrupted run has sent to their folders is removed: the record sends it again.
     """
@@ -49,12 +48,11 @@ def tracked(config: RunConfig, folder: RunFolder, rank: int) -> Iterator[list[Lo
         for name, node in config.logger.items() if rank == 0 else ():
             shutil.rmtree(folder.path / name, ignore_errors=True)
             begin = _wandb if node["_target_"] == WANDB else _logger
-            loggers.append(stack.enter_context(begin(name, node, config, folder)))
+            loggers.append(begin(name, node, config, folder, stack))
         yield loggers
 
 
-@contextmanager
-def _logger(name: str, node: dict[str, Any], config: RunConfig, folder: RunFolder) -> Iterator[Logger]:
+def _logger(name: str, node: dict[str, Any], config: RunConfig, folder: RunFolder, stack: ExitStack) -> Logger:
     os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")  # files need no database, and outlive MLflow
     with naming(f"logger.{name}", node):
         takes_folder = "save_dir" in inspect.signature(locate(node["_target_"], None)).parameters
@@ -63,58 +61,37 @@ def _logger(name: str, node: dict[str, Any], config: RunConfig, folder: RunFolde
         if not isinstance(logger, Logger):
             raise ValueError(f"makes a {type(logger).__name__}; expected a Logger of Lightning")
         logger.log_hyperparams(flatten(config.model_dump(mode="json")))
-    try:
-        yield logger
-    except BaseException:
-        logger.finalize("failed")
-        raise
-    logger.finalize("success")
+
+    def finish(kind: object, *error: object) -> None:
+        logger.finalize("failed" if kind else "success")
+
+    stack.push(finish)
+    return logger
 
 
-@contextmanager
-def _wandb(name: str, node: dict[str, Any], config: RunConfig, folder: RunFolder) -> Iterator[Logger]:
-    """A run of wandb that is finished on exit, as failed after an exception.
-
-    An unfinished one would receive the metrics of the next run of a sweep.
-    """
+def _wandb(name: str, node: dict[str, Any], config: RunConfig, folder: RunFolder, stack: ExitStack) -> Logger:
+    """A run of wandb; an unfinished one would receive the metrics of the next run of a sweep."""
     import wandb
 
     arguments = {key: value for key, value in node.items() if key not in ("_target_", "offline")}
-    with _everything_in(folder.path / name):
-        if node.get("offline"):
-            os.environ["WANDB_ERROR_REPORTING"] = "false"  # it uses the network
-        run = wandb.init(  # as a context it would print a traceback
-            name="/".join(folder.path.parts[-4:]),
-            dir=folder.path.absolute(),  # the service may have another working folder
-            mode="offline" if node.get("offline") else "online",
-            config=config.model_dump(mode="json"),
-            settings=wandb.Settings(silent=True, console="off"),
-            **arguments,
-        )
-        try:
-            yield WandbLogger(experiment=run)
-        except BaseException:
-            run.finish(exit_code=1)
-            raise
-        run.finish()
-
-
-@contextmanager
-def _everything_in(place: Path) -> Iterator[None]:
-    """Make wandb write its logs and caches to `place` instead of the home folder.
-
-    The wandb service reads these variables when it starts, so each run starts and stops one.
-    """
-    import wandb
-
-    set_here = [name for name in ("WANDB_DATA_DIR", "WANDB_CACHE_DIR") if name not in os.environ]
-    os.environ.update(dict.fromkeys(set_here, str(place.absolute())))
-    try:
-        yield
-    finally:
-        wandb.teardown()
-        for name in set_here:
-            del os.environ[name]
+    # else the service would write to the home folder; it reads them when it starts, so each run starts and stops one
+    place = str((folder.path / name).absolute())
+    for variable in {"WANDB_DATA_DIR", "WANDB_CACHE_DIR"} - os.environ.keys():
+        os.environ[variable] = place
+        stack.callback(os.environ.pop, variable)
+    stack.callback(wandb.teardown)
+    if node.get("offline"):
+        os.environ["WANDB_ERROR_REPORTING"] = "false"  # it uses the network
+    run = wandb.init(  # as a context it would print a traceback
+        name="/".join(folder.path.parts[-4:]),
+        dir=folder.path.absolute(),  # the service may have another working folder
+        mode="offline" if node.get("offline") else "online",
+        config=config.model_dump(mode="json"),
+        settings=wandb.Settings(silent=True, console="off"),
+        **arguments,
+    )
+    stack.push(lambda kind, *_: run.finish(exit_code=1 if kind else 0))
+    return WandbLogger(experiment=run)
 
 
 def send_results(loggers: Sequence[Logger], results: Mapping[str, Any]) -> None:

@@ -50,7 +50,9 @@ def build_trainer(config: RunConfig, recorder: Recorder, callbacks: Sequence[Cal
     ]
     if config.trainer.devices == 1:  # several processes would stop at different batches
         ours.append(StopBetweenBatches(folder.last_checkpoint))
-    ours += _progress(config)
+    if config.trainer.progress_bar:  # a bar on a terminal, lines elsewhere
+        bar = TQDMProgressBar() if sys.stderr.isatty() else None
+        ours += [bar, Progress(bar)] if bar else [Progress()]
     arguments: dict[str, Any] = {
         "accelerator": config.trainer.accelerator,
         "devices": config.trainer.devices,
@@ -100,16 +102,3 @@ def build_callbacks(config: RunConfig, folder: RunFolder) -> list[Callback]:
             callback.dirpath = str(folder.checkpoints)
         found.append(callback)
     return found
-
-
-def _progress(config: RunConfig) -> list[Callback]:
-    """A progress bar on a terminal, lines elsewhere, nothing with trainer.progress_bar=false."""
-    if not config.trainer.progress_bar:
-        return []
-    bar = TQDMProgressBar() if on_a_terminal() else None
-    return [bar, Progress(bar)] if bar else [Progress()]
-
-
-def on_a_terminal() -> bool:
-    """Whether a progress bar can be drawn."""
-    return sys.stderr.isatty()

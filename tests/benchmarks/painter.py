@@ -26,7 +26,7 @@ from phd_exp.rendering.blender import Renderer, Settings, load_bpy, silence
 from phd_exp.rendering.pixels import encoded
 from phd_exp.rendering.samples import fast_settings, make_sample
 from phd_exp.rendering.sampling import sample_scene
-from phd_exp.rendering.stage import MATERIALS, SHAPES, Stage, build_stage
+from phd_exp.rendering.stage import SHAPES, SURFACES, Stage, build_stage
 
 Paint = Callable[[Scene, int, Path], None]
 
@@ -80,7 +80,7 @@ def _write_base_scene(bpy: Any, base: Path, side: int, samples: int) -> None:
         scene.cycles.samples = samples
         scene.cycles.use_denoising = False
         _add_flat_material(bpy)
-        for name in (*MATERIALS, "flat"):
+        for name in (*SURFACES, "flat"):
             bpy.data.materials[name].use_fake_user = True  # or the file would not keep what nothing wears yet
         bpy.ops.wm.save_as_mainfile(filepath=str(base))
 

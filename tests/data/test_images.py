@@ -66,7 +66,7 @@ def test_stripes_change_nothing(monkeypatch: pytest.MonkeyPatch, stripe: int) ->
 
 def test_decodes_once(folder: DatasetFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     first = cached_images(folder, "train", folder.records("train"), 32)
-    monkeypatch.setattr(images, "decode", lambda *_: pytest.fail("decoded again"))
+    monkeypatch.setattr(images, "recorded_image", lambda *_: pytest.fail("decoded again"))
     np.testing.assert_array_equal(cached_images(folder, "train", folder.records("train"), 32), first)
 
 
@@ -109,10 +109,9 @@ def test_a_damaged_image_is_one_line_and_leaves_no_cache(folder: DatasetFolder, 
 
 def test_what_is_no_image_is_one_line(folder: DatasetFolder) -> None:
     record = folder.records("train")[0].model_copy(update={"sha256": sha256(b"no image")})
-    file = folder.image_path("train", 0)
-    file.write_bytes(b"no image")
+    folder.image_path("train", 0).write_bytes(b"no image")
     with pytest.raises(DatasetError, match="cannot be decoded"):
-        images.decode(file, record, 32)
+        cached_images(folder, "train", [record], 32)
 
 
 def test_two_processes_may_decode_at_once(folder: DatasetFolder) -> None:

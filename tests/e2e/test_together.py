@@ -27,7 +27,7 @@ TOGETHER = ("trainer=ddp", "trainer.accelerator=cpu")
 
 
 def descendants(process: int) -> list[int]:
-    """The processes that a process started and that run phd_exp.training.rank, in the order of their ranks."""
+    """The processes that a process started and that run phd_exp.training.ranks, in the order of their ranks."""
     found = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -35,7 +35,7 @@ def descendants(process: int) -> list[int]:
             words = (stat.parent / "cmdline").read_text().split("\0")
         except (OSError, IndexError):
             continue
-        if parent == process and "phd_exp.training.rank" in words:
+        if parent == process and "phd_exp.training.ranks" in words:
             found.append(int(stat.parent.name))
     return sorted(found)
 

@@ -5,16 +5,17 @@ import pytest
 import torch
 
 from phd_exp.metrics.ordered import in_order_of
-from phd_exp.metrics.scores import RiskCoverage, energy_score, risk_at, risk_coverage
+from phd_exp.metrics.scores import energy_score, risk_at, risk_coverage
 
 
 def numbers(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def curve_of(uncertainty: torch.Tensor, error: torch.Tensor) -> RiskCoverage:
+def area_and_excess(uncertainty: torch.Tensor, error: torch.Tensor) -> tuple[float, float]:
     columns = {"error": error}
-    return risk_coverage(in_order_of(uncertainty, columns), in_order_of(error, columns), "error")
+    area, excess = risk_coverage(in_order_of(uncertainty, columns), in_order_of(error, columns), "error")
+    return area.item(), excess.item()
 
 
 def test_energy_score_equals_a_loop_over_pairs() -> None:
@@ -45,24 +46,16 @@ def test_energy_score_keeps_the_digits_of_near_draws() -> None:
 
 def test_risk_coverage_equals_a_loop() -> None:
     uncertainty, error = numbers(200).exp(), numbers(200, seed=1).square()
-    curve = curve_of(uncertainty, error)
-    ordered = error.numpy()[np.argsort(uncertainty.numpy())]
-    risk = [ordered[: k + 1].mean() for k in range(200)]
-    best = np.sort(error.numpy())
-    np.testing.assert_allclose(curve.risk, risk)
-    np.testing.assert_allclose(curve.coverage, np.arange(1, 201) / 200)
-    assert curve.area.item() == pytest.approx(np.mean(risk))
-    assert curve.oracle_area.item() == pytest.approx(np.mean([best[: k + 1].mean() for k in range(200)]))
-    assert curve.random_area.item() == pytest.approx(error.mean().item())
-
-
-def test_risk_at_a_coverage_is_on_the_curve() -> None:
-    uncertainty, error = numbers(200).exp(), numbers(200, seed=1).square()
-    curve = curve_of(uncertainty, error)
-    ordered = in_order_of(uncertainty, {"error": error})
-    torch.testing.assert_close(risk_at(ordered, "error", curve.coverage), curve.risk)
-    first = curve.risk[0].item()  # less than one sample is that sample
-    assert risk_at(ordered, "error", torch.tensor([1e-3])).item() == pytest.approx(first)
+    ordered, best = error.numpy()[np.argsort(uncertainty.numpy())], np.sort(error.numpy())
+    risk, least = (np.array([errors[: k + 1].mean() for k in range(200)]) for errors in (ordered, best))
+    area, excess = area_and_excess(uncertainty, error)
+    assert area == pytest.approx(risk.mean())
+    assert excess == pytest.approx((risk.mean() - least.mean()) / (error.mean().item() - least.mean()))
+    by_uncertainty = in_order_of(uncertainty, {"error": error})
+    coverage = torch.arange(1, 201, dtype=torch.float64) / 200
+    np.testing.assert_allclose(risk_at(by_uncertainty, "error", coverage), risk)
+    # less than one sample is that sample
+    assert risk_at(by_uncertainty, "error", torch.tensor([1e-3])).item() == pytest.approx(risk[0])
 
 
 def test_ties_count_as_if_in_random_order() -> None:
@@ -74,13 +67,13 @@ def test_ties_count_as_if_in_random_order() -> None:
         order = shuffled[np.argsort(uncertainty.numpy()[shuffled], kind="stable")]
         areas.append(np.mean(np.cumsum(error.numpy()[order]) / np.arange(1, 61)))
     standard_error = np.std(areas) / 4000**0.5
-    assert curve_of(uncertainty, error).area.item() == pytest.approx(np.mean(areas), abs=4 * standard_error)
+    assert area_and_excess(uncertainty, error)[0] == pytest.approx(np.mean(areas), abs=4 * standard_error)
 
 
 def test_excess_is_zero_for_an_oracle_and_one_for_a_random_order() -> None:
     error = numbers(4000).square()
-    assert curve_of(3 * error + 1, error).excess.item() == pytest.approx(0)
-    assert curve_of(torch.ones(4000), error).excess.item() == pytest.approx(1)
-    assert curve_of(numbers(4000, seed=5), error).excess.item() == pytest.approx(1, abs=0.05)
-    assert curve_of(-error, error).excess.item() > 1.5
-    assert curve_of(error + numbers(4000, seed=6).abs(), error).excess.item() < 0.5
+    assert area_and_excess(3 * error + 1, error)[1] == pytest.approx(0)
+    assert area_and_excess(torch.ones(4000), error)[1] == pytest.approx(1)
+    assert area_and_excess(numbers(4000, seed=5), error)[1] == pytest.approx(1, abs=0.05)
+    assert area_and_excess(-error, error)[1] > 1.5
+    assert area_and_excess(error + numbers(4000, seed=6).abs(), error)[1] < 0.5

@@ -107,7 +107,7 @@ def test_a_kill_while_sealing_loses_nothing(
         monkeypatch.setattr(sealing, "write_atomic", dying)
         with pytest.raises(KeyboardInterrupt):
             render_shard(SECOND)
-        assert sealing.missing(sealing.known_samples(folder), {"train": N_TRAIN, "test": N_TEST}) == 0
+        assert sealing.missing(sealing.known_samples(folder), {"train": N_TRAIN, "test": N_TEST}) == []
     monkeypatch.setattr(sealing, "write_atomic", whole)
     assert render_shard(SECOND)
     assert contents(folder) == contents(small)

@@ -4,6 +4,7 @@ import json
 import math
 import os
 import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -225,7 +226,7 @@ def test_progress_is_a_bar_on_a_terminal_and_lines_elsewhere(
     composed: Callable, monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
     terminal: bool, words: tuple[str, ...], kinds: list[type],
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(build, "on_a_terminal", lambda: terminal)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
     config = check(composed("preset=smoke", "trainer=cpu", *words))
     trainer = build.build_trainer(config, Recorder(RunFolder(tmp_path), config.evaluation, None, []))
     found = [type(callback) for callback in trainer.callbacks]  # type: ignore[attr-defined]

@@ -12,69 +12,46 @@ from pydantic import BaseModel, BeforeValidator, Field, StrictBool, ValidationEr
 
 from phd_exp.records.choices import flatten, setting
 from phd_exp.records.errors import ConfigError, gist, shown
+from phd_exp.records.parsing import Record
 from phd_exp.records.spec import DatasetSpec, Shard
-from phd_exp.training.config.sections import (
-    CameraConfig,
-    DataConfig,
-    EvaluationConfig,
-    Folder,
-    FolderConfig,
-    ModelConfig,
-    Name,
-    Natural,
-    RecipeConfig,
-    RenderedConfig,
-    Section,
-    SourceConfig,
-    TrainerConfig,
-    Whole,
-    kind_of_data,
-)
+from phd_exp.training.config import sections
+from phd_exp.training.config.sections import FolderConfig, RenderedConfig, SourceConfig
 from phd_exp.training.config.targets import Target, TrainingTarget, TrainingTargets, Trust, describe, is_typed, locate
 
-__all__ = [
-    "FolderConfig",
-    "RenderConfig",
-    "RenderedConfig",
-    "RunConfig",
-    "SourceConfig",
-    "TrainerConfig",
-    "check",
-    "check_render",
-]
+__all__ = ["FolderConfig", "RenderConfig", "RenderedConfig", "RunConfig", "SourceConfig", "check", "check_render"]
 
 SINGLE_VIEW = "scale"  # the data set whose runs can be evaluated on several views
 
 Checked = TypeVar("Checked", bound=BaseModel)
 
 
-class RenderConfig(Section):
+class RenderConfig(Record):
     """The configuration of `render`: the data, and the keys of conf/render.yaml."""
 
     data: RenderedConfig
     shard: Annotated[Shard, BeforeValidator(Shard.parse)] | None
     verify: StrictBool
-    rerender: Natural
-    masks: Folder | None
+    rerender: sections.Natural
+    masks: sections.Folder | None
 
 
-class RunConfig(Section):
+class RunConfig(Record):
     """The configuration of one run."""
 
-    seed: Annotated[Whole, Field(ge=0, lt=2**32)]
-    runs: Folder
-    preset: Name
-    data: DataConfig
-    model: ModelConfig
-    camera: CameraConfig
-    recipe: RecipeConfig
+    seed: Annotated[sections.Whole, Field(ge=0, lt=2**32)]
+    runs: sections.Folder
+    preset: sections.Name
+    data: sections.DataConfig
+    model: sections.ModelConfig
+    camera: sections.CameraConfig
+    recipe: sections.RecipeConfig
     backbone: Target
     loss: TrainingTarget
     optimizer: TrainingTarget
-    trainer: TrainerConfig
+    trainer: sections.TrainerConfig
     logger: TrainingTargets
     callbacks: TrainingTargets = Field(default_factory=dict)
-    evaluation: EvaluationConfig
+    evaluation: sections.EvaluationConfig
 
     @property
     def setting(self) -> str:
@@ -181,7 +158,7 @@ def check(config: dict[str, Any], trust: Trust = None) -> RunConfig:
 
 def check_render(config: dict[str, Any]) -> RenderConfig:
     """The configuration of `render`, given that of a run; other keys of a run are not checked."""
-    if kind_of_data(config.get("data")) != "<rendered>":
+    if sections.kind_of_data(config.get("data")) != "<rendered>":
         raise ConfigError(
             "data=folder: there is nothing to render, these are your own images; leave out `render` to train on them"
         )

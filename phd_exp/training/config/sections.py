@@ -3,12 +3,11 @@
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, StrictBool, Tag, model_validator
+from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, StrictBool, Tag, model_validator
 
+from phd_exp.records.parsing import Record
 from phd_exp.records.spec import Angle, DatasetSpec, Range
 from phd_exp.training.config.targets import Target, TrainingTarget
-
-MULTIVIEW = "multiview"  # the data set whose scenes are rendered from several cameras
 
 Whole = Annotated[int, Field(strict=True)]
 Natural = Annotated[Whole, Field(ge=0)]
@@ -27,13 +26,7 @@ def _named(folder: Any) -> Any:
 Folder = Annotated[Path, Field(strict=False), BeforeValidator(_named)]
 
 
-class Section(BaseModel):
-    """Base class of all sections: immutable, without unknown keys."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class SizesConfig(Section):
+class SizesConfig(Record):
     """How much of a data set a run uses; None: all samples."""
 
     n_train: Count | None
@@ -114,14 +107,14 @@ DataConfig = Annotated[
 ]
 
 
-class ModelConfig(Section):
+class ModelConfig(Record):
     """The head, which decides what the model predicts, and the model's name in the run's folder."""
 
     name: Name
     head: Target
 
 
-class CameraConfig(Section):
+class CameraConfig(Record):
     """How the model uses the focal length. known: geometry only; shown: also an input of the network; constant: one
     value for all cameras. Focal lengths are known within the factors 1 - f_error and 1 + f_error.
     """
@@ -139,7 +132,7 @@ class CameraConfig(Section):
         return self
 
 
-class TrainerConfig(Section):
+class TrainerConfig(Record):
     """Length, hardware and arithmetic of the training; threads=None: one per core.
 
     Further keys are arguments of Lightning's Trainer; `training/trainer.py` checks them.
@@ -155,7 +148,7 @@ class TrainerConfig(Section):
     progress_bar: StrictBool
 
 
-class AugmentationConfig(Section):
+class AugmentationConfig(Record):
     """The arguments of `Augmentation` and of its `Photometry`."""
 
     symmetries: StrictBool
@@ -171,7 +164,7 @@ class AugmentationConfig(Section):
     jpeg: Annotated[Whole, Field(ge=1, le=100)]
 
 
-class RecipeConfig(Section):
+class RecipeConfig(Record):
     """How a network is trained, whatever it predicts."""
 
     name: Name
@@ -182,7 +175,7 @@ class RecipeConfig(Section):
     augmentation: AugmentationConfig
 
 
-class MultiviewConfig(Section):
+class MultiviewConfig(Record):
     """Evaluation on several views after the training: the number of scenes of the variant `multiview`, 0 for none."""
 
     scenes: Natural
@@ -191,7 +184,7 @@ class MultiviewConfig(Section):
 
     def spec_beside(self, spec: DatasetSpec) -> DatasetSpec:
         """The data set of several views that otherwise equals `spec`."""
-        changes = {"variant": MULTIVIEW, "views": self.views, "view_angle_range": self.angle_range}
+        changes = {"variant": "multiview", "views": self.views, "view_angle_range": self.angle_range}
         return DatasetSpec(**(spec.model_dump() | changes))
 
 
@@ -199,7 +192,7 @@ Times = Annotated[float, Field(ge=0.1, le=100)]
 Change = Literal["brightness", "contrast", "gamma", "blur", "noise", "jpeg"]
 
 
-class ShiftConfig(Section):
+class ShiftConfig(Record):
     """A change of the test samples.
 
     Attributes:
@@ -213,7 +206,7 @@ class ShiftConfig(Section):
     f_factor: Times = 1.0
 
 
-class EvaluationConfig(Section):
+class EvaluationConfig(Record):
     """What is evaluated, and in which epochs."""
 
     calibration_window: Count

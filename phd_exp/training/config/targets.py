@@ -5,16 +5,8 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import Annotated, Any, get_args, get_origin
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    PydanticSchemaGenerationError,
-    Tag,
-    TypeAdapter,
-    ValidationError,
-    ValidationInfo,
-)
+from pydantic import AfterValidator, BaseModel, ConfigDict, Tag, TypeAdapter, ValidationError, ValidationInfo
+from pydantic.errors import PydanticSchemaGenerationError
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from phd_exp.records.errors import complaint, in_our_words, in_user_code, nearest, shown
@@ -38,35 +30,27 @@ def check_target(node: dict[str, Any], trust: Trust, where: str = "") -> dict[st
     target, prefix = locate(node.get("_target_"), trust, where), f"{where}." if where else ""
     if not isinstance(node.get("_partial_", False), bool):
         raise _error(f"{prefix}_partial_", f"got {shown(node['_partial_'])}; expected a bool")
-    parameters = _parameters(target)
+    parameters, takes_any = _parameters(target)
     for key, value in node.items():
         if key in ("_target_", "_partial_"):
             continue
         path = f"{prefix}{key}"
         _check_nodes(path, value, trust)
-        if parameters is None or (key not in parameters and _VARIABLE in _kinds(parameters)):
-            continue
-        if key not in parameters:
+        if key in parameters and not is_node(value):
+            _check_value(path, value, parameters[key].annotation)
+        elif key not in parameters and not takes_any:
             taken = f"{node['_target_']} takes {', '.join(parameters)}"
             raise _error(path, f"unknown key{nearest(key, parameters)}; {taken}")
-        if not is_node(value):
-            _check_value(path, value, parameters[key].annotation)
     return node
 
 
-_VARIABLE = inspect.Parameter.VAR_KEYWORD
-
-
-def _parameters(target: Any) -> Mapping[str, inspect.Parameter] | None:
-    """The parameters of a class or function; None if it has no signature, as some built-in ones."""
+def _parameters(target: Any) -> tuple[Mapping[str, inspect.Parameter], bool]:
+    """The parameters of a class or function, and whether it takes further keys, or has no signature."""
     try:
-        return inspect.signature(target).parameters
-    except ValueError:
-        return None
-
-
-def _kinds(parameters: Mapping[str, inspect.Parameter]) -> set[Any]:
-    return {parameter.kind for parameter in parameters.values()}
+        parameters = inspect.signature(target).parameters
+    except ValueError:  # some built-in ones
+        return {}, True
+    return parameters, any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
 
 
 def _check_nodes(path: str, value: Any, trust: Trust) -> None:
@@ -88,15 +72,11 @@ def custom_parts(config: Any) -> dict[str, str]:
     """The classes and functions that a checked configuration names outside this project and the libraries it is made
     of, with the files that define them.
     """
-    if isinstance(config, dict):
-        found = {name: file for value in config.values() for name, file in custom_parts(value).items()}
-        name = config.get("_target_")
-        if name and not _is_below(name, KNOWN):
-            found[name] = str(getattr(inspect.getmodule(locate(name, None)), "__file__", "built in"))
-        return found
-    if isinstance(config, list):
-        return {name: file for value in config for name, file in custom_parts(value).items()}
-    return {}
+    parts = config.values() if isinstance(config, dict) else config if isinstance(config, list) else ()
+    found = {name: file for part in parts for name, file in custom_parts(part).items()}
+    if is_node(config) and (name := config["_target_"]) and not _is_below(name, KNOWN):
+        found[name] = str(getattr(inspect.getmodule(locate(name, None)), "__file__", "built in"))
+    return found
 
 
 def _is_below(name: str, packages: tuple[str, ...]) -> bool:
