@@ -40,7 +40,7 @@ class PositionModule(LightningModule):
             a density, mean absolute error for a point estimate.
         optimizer: parameters -> optimizer.
         constant_f: focal length in pixels that the model uses for every sample; None: the true one.
-        f_error: largest relative error of the focal lengths that the model uses.
+        f_error: standard deviation of the relative error of the focal lengths that the model uses.
         localisation: weight of the localisation loss; 0 for a backbone that does not locate the object.
         schedule: number of steps -> factor of the learning rate at each; see `factor`.
 
@@ -78,8 +78,8 @@ class PositionModule(LightningModule):
         camera = batch.camera.with_constant_f(self.constant_f)
         if not self.f_error:
             return camera
-        share = relative_error(batch.row, self.current_epoch if self.training else 0)
-        return Camera(camera.f * (1 + self.f_error * share), camera.S)
+        error = standard_error(batch.row, self.current_epoch if self.training else 0)
+        return Camera(camera.f * (self.f_error * error).exp(), camera.S)
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         optimizer = self.make_optimizer(self.regressor.parameters())
@@ -163,8 +163,8 @@ class PositionModule(LightningModule):
         )
 
 
-def relative_error(row: Int[Tensor, " batch"], epoch: int) -> Float[Tensor, " batch"]:
-    """A number from -1 to 1 for each sample and epoch, evenly spread over samples and over epochs.
+def standard_error(row: Int[Tensor, " batch"], epoch: int) -> Float[Tensor, " batch"]:
+    """A standard normal number for each sample and epoch, evenly spread over samples and over epochs.
 
     It depends on (row, epoch) alone, so a resumed or distributed run trains on the same numbers.
 
@@ -172,7 +172,7 @@ def relative_error(row: Int[Tensor, " batch"], epoch: int) -> Float[Tensor, " ba
     tests/training/test_f_error.py.
     """
     place = row.double() * GOLDEN + epoch * math.sqrt(2)
-    return (2 * place.frac() - 1).float()
+    return torch.special.ndtri(place.frac().clamp(1e-6, 1 - 1e-6)).float()
 
 
 def factor(schedule: str, warmup_steps: int, steps: int) -> Callable[[int], float]:

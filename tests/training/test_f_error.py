@@ -10,21 +10,21 @@ from phd_exp.data.batches import Batch
 from phd_exp.records.errors import ConfigError
 from phd_exp.training.build import build_data, build_module
 from phd_exp.training.config import check
-from phd_exp.training.module import relative_error
+from phd_exp.training.module import standard_error
 
 ROWS = torch.arange(8000)
 
 
-def test_the_errors_are_uniform_over_the_samples_of_an_epoch_and_over_the_epochs_of_a_sample() -> None:
+def test_the_errors_are_normal_over_the_samples_of_an_epoch_and_over_the_epochs_of_a_sample() -> None:
     for epoch in (0, 7, 49):
-        assert kstest(relative_error(ROWS, epoch), "uniform", (-1, 2)).statistic < 0.01
+        assert kstest(standard_error(ROWS, epoch), "norm").statistic < 0.01
     for row in (0, 13, 7999):
-        over_epochs = torch.stack([relative_error(ROWS[row : row + 1], epoch) for epoch in range(50)])
-        assert kstest(over_epochs.flatten(), "uniform", (-1, 2)).statistic < 0.05
+        over_epochs = torch.stack([standard_error(ROWS[row : row + 1], epoch) for epoch in range(50)])
+        assert kstest(over_epochs.flatten(), "norm").statistic < 0.05
 
 
 def test_the_errors_of_an_epoch_do_not_follow_the_order_of_the_samples() -> None:
-    shares = relative_error(ROWS, 3)
+    shares = standard_error(ROWS, 3)
     assert abs(float(torch.corrcoef(torch.stack([shares, ROWS.float()]))[0, 1])) < 0.01
 
 
@@ -35,8 +35,8 @@ def test_the_model_receives_focal_lengths_within_the_error_and_the_labels_stay(c
     xyz = torch.tensor([0.1, 0.0, 4.0]).expand(n, 3)
     batch = Batch(torch.zeros(n, 8, 8, 3, dtype=torch.uint8), xyz, torch.full((n,), 1500.0), 8.0, torch.arange(n))
     known = module.eval().camera(batch).f
-    assert ((known / 1500 - 1).abs() <= 0.05 * (1 + 1e-6)).all()
-    assert known.std() / 1500 == pytest.approx(0.05 / 3**0.5, rel=0.1)
+    assert (known / 1500).log().std() == pytest.approx(0.05, rel=0.1)
+    assert (known / 1500).log().mean() == pytest.approx(0, abs=0.005)
     assert torch.equal(known, module.eval().camera(batch).f)
     assert torch.equal(batch.camera.f, torch.full((n,), 1500.0))
     shifted = batch.select(torch.arange(32, n))

@@ -116,7 +116,7 @@ class ModelConfig(Record):
 
 class CameraConfig(Record):
     """How the model uses the focal length. known: geometry only; shown: also an input of the network; constant: one
-    value for all cameras. Focal lengths are known within the factors 1 - f_error and 1 + f_error.
+    value for all cameras. log f is known up to a normal error of standard deviation f_error.
     """
 
     focal_length: Literal["known", "shown", "constant"]
