@@ -35,8 +35,8 @@ def test_the_model_receives_focal_lengths_within_the_error_and_the_labels_stay(c
     xyz = torch.tensor([0.1, 0.0, 4.0]).expand(n, 3)
     batch = Batch(torch.zeros(n, 8, 8, 3, dtype=torch.uint8), xyz, torch.full((n,), 1500.0), 8.0, torch.arange(n))
     known = module.eval().camera(batch).f
-    assert (known / 1500).log().std() == pytest.approx(0.05, rel=0.1)
-    assert (known / 1500).log().mean() == pytest.approx(0, abs=0.005)
+    assert (known / 1500).log().std() == pytest.approx(0.05, rel=0.15)
+    assert (known / 1500).log().mean() == pytest.approx(0, abs=0.01)
     assert torch.equal(known, module.eval().camera(batch).f)
     assert torch.equal(batch.camera.f, torch.full((n,), 1500.0))
     shifted = batch.select(torch.arange(32, n))
