@@ -85,9 +85,7 @@ def _predicted(
 def origin_of(folder: RunFolder, **choices: Any) -> dict[str, str]:
     """The metadata of a table: the choices that made it, and the start of its run."""
     status = folder.status()
-    return {key: str(value) for key, value in choices.items()} | {
-        "run": "" if status is None else str(status.started)
-    }
+    return {key: str(value) for key, value in choices.items()} | {"run": str(status.started) if status else ""}
 
 
 def origin_of_shift(folder: RunFolder, config: RunConfig, name: str) -> dict[str, str]:
