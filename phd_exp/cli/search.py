@@ -165,12 +165,11 @@ class _Search:
         except Pruned as pruned:
             print(f"{run}: {pruned}", flush=True)
             self.study.tell(trial, state=optuna.trial.TrialState.PRUNED)
-        except ConfigError:
-            self.study.tell(trial, state=optuna.trial.TrialState.FAIL)
-            raise
         except UserError as error:
-            print_errors(str(error).splitlines())
             self.study.tell(trial, state=optuna.trial.TrialState.FAIL)
+            if isinstance(error, ConfigError):
+                raise
+            print_errors(str(error).splitlines())
 
     def _write(self) -> Search:
         """Write the record of the search."""

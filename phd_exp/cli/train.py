@@ -13,7 +13,6 @@ from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import RunError
 from phd_exp.records.processes import usable_cores
 from phd_exp.records.runs import RunFolder
-from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.render import ensure_rendered
 from phd_exp.training.config import RenderedConfig, RunConfig, check
 
@@ -55,20 +54,13 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
     if not skipped:
         require_possible(checked, folder)
         if several is not None:
-            several[0].missing(several[1], 0, 0)  # refuses another data set before hours of training
+            DatasetFolder(several.folder).missing(several.spec, 0, 0)  # refuses another data set before the training
         announce(checked, folder, overrides)
         if isinstance(data, RenderedConfig):
             place = DatasetFolder(data.folder)
             ensure_rendered(place, data.spec, data.n_training_split, data.n_test, data.workers, cores)
     results = train(checked, folder, draw=_draw(), cores=cores, callbacks=callbacks)
-    if several is not None and isinstance(data, RenderedConfig):
-        _record_views(folder, *several, data.workers, cores)
-    _record_shifts(folder, checked, cores)
-    if checked.evaluation.eight_views:
-        from phd_exp.inference.eight_views import record_eight_views
-        from phd_exp.training.build import build_data
-
-        record_eight_views(folder, build_data(checked).source)
+    _record_further(folder, checked, several, cores)
     print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
     for key in filter(results.__contains__, SHOWN):
         print(f"  {key} {_number(results[key])} (untrained {_number(results.get(f'untrained/{key}'))})")
@@ -107,42 +99,37 @@ def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> Non
         print(f"  in about ten minutes: python -m phd_exp {words}", flush=True)
 
 
-def _several_views(checked: RunConfig) -> tuple[DatasetFolder, DatasetSpec, int] | None:
-    """The scenes with several cameras that follow the training: their folder, specification and number."""
+def _several_views(checked: RunConfig) -> RenderedConfig | None:
+    """The scenes with several cameras that follow the training, as test samples of a data set."""
     asked, data = checked.evaluation.multiview, checked.data
     if asked is None or asked.scenes == 0 or not isinstance(data, RenderedConfig):
         return None
     spec = asked.spec_beside(data.spec)
-    return DatasetFolder(data.root / spec.variant), spec, asked.scenes
+    return data.model_copy(update={"spec": spec, "n_test": asked.scenes * spec.views})
 
 
-def _record_views(
-    run: RunFolder, scenes: DatasetFolder, spec: DatasetSpec, n: int, workers: int | None, cores: int
-) -> None:
-    """Render the missing views of `n` scenes and record the run's predictions of them, once."""
-    from phd_exp.inference.several_views import record_views
-    from phd_exp.inference.tables import is_recorded, origin_of
-
-    origin = origin_of(run, data=spec.fingerprint(), scenes=n)
-    if not is_recorded(run.views, origin):
-        ensure_rendered(scenes, spec, 0, n * spec.views, workers, cores)
-        record_views(run, scenes, spec, n, origin)
-        count = "1 scene" if n == 1 else f"{n} scenes"
-        print(f"{run.views}: {count} seen by {spec.views} cameras each")
-
-
-def _record_shifts(run: RunFolder, checked: RunConfig, cores: int) -> None:
-    """Render the missing samples of each shift and record the run's predictions of them, once."""
-    from phd_exp.inference.tables import is_recorded, origin_of_shift, record
+def _record_further(run: RunFolder, checked: RunConfig, several: RenderedConfig | None, cores: int) -> None:
+    """Render the missing samples of several views and shifts, and record the run's predictions of them, once."""
+    from phd_exp.inference import tables
     from phd_exp.training.build import build_source
 
-    for name, shift in checked.evaluation.shifts.items():
-        file, origin, data = run.shift(name), origin_of_shift(run, checked, name), checked.data_of(name)
-        if not is_recorded(file, origin):
+    def record(file: Path, data: Any, origin: dict[str, str], said: str, shift: Any = tables.UNCHANGED) -> None:
+        if not tables.is_recorded(file, origin):
             if isinstance(data, RenderedConfig):
                 ensure_rendered(DatasetFolder(data.folder), data.spec, 0, data.n_test, data.workers, cores)
-            record(run, file, build_source(data), origin, {}, shift)
-            print(f"{file}: recorded", flush=True)
+            tables.record(run, file, build_source(data), origin, shift)
+            print(f"{file}: {said}", flush=True)
+
+    if several:
+        views = several.spec.views
+        n = several.n_test // views
+        scenes = f"{'1 scene' if n == 1 else f'{n} scenes'} seen by {views} cameras each"
+        record(run.views, several, tables.origin_of(run, data=several.spec.fingerprint(), scenes=n), scenes)
+    for name, shift in checked.evaluation.shifts.items():
+        origin = tables.origin_of_shift(run, checked, name)
+        record(run.shift(name), checked.data_of(name), origin, "recorded", shift)
+    if checked.evaluation.eight_views:
+        tables.record_eight_views(run, build_source(checked.data))
 
 
 def _number(value: Any) -> str:

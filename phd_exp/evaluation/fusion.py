@@ -10,12 +10,11 @@ from scipy import stats
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.evaluation.point_errors import SEED
-from phd_exp.evaluation.predictions import band_of
+from phd_exp.evaluation.predictions import scalar_bands
 from phd_exp.evaluation.reference import Band
 from phd_exp.evaluation.several_views import SeveralViews
 from phd_exp.fusion import Fused, Plane, Pose, Status, average, fuse, fuse_shared, gaussian_fusion
-from phd_exp.metrics.bootstrap import bands, means
+from phd_exp.metrics.bootstrap import means
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, squared_mahalanobis
 from phd_exp.records.errors import RunError
 
@@ -94,16 +93,16 @@ def fusion_scores(views: SeveralViews, resamples: int = 200) -> FusionScores:
         shares = found.coverage([level / 100 for level in LEVELS])[sound].mean(0)
         for level, share in zip(LEVELS, shares.tolist(), strict=True):
             exact[place(f"coverage_{level}", "mean", k, on_plane)] = 100 * share
-    correlation, with_size = _common_cause(kept, resamples)
+    causes = scalar_bands(_correlations, _depth_errors(kept), resamples)
     surprise = fused["mean"][views.views, False].surprise[sound].flatten()
     return FusionScores(
         n=kept.n,
         views=kept.views,
         left_out=kept.left_out,
-        bands={at: band_of(found) for at, found in bands(means, columns, resamples, SEED).items()},
+        bands=scalar_bands(means, columns, resamples),
         surprise=[int(count) for count in torch.histc(surprise, BINS, 0, 1)],
-        correlation=correlation,
-        with_size=with_size,
+        correlation=causes["of_views"],
+        with_size=causes["with_size"],
         exact=exact,
     )
 
@@ -172,12 +171,6 @@ def _columns(
             columns[f"coverage_{level}"] = 100.0 * (distance <= stats.chi2.ppf(level / 100, dimensions))
         columns["normalised_squared_error"] = distance / dimensions
     return columns
-
-
-def _common_cause(views: SeveralViews, resamples: int) -> tuple[Band, Band]:
-    """The correlation of two views' errors of log depth, and that of their average with log size."""
-    found = bands(_correlations, _depth_errors(views), resamples, SEED)
-    return band_of(found["of_views"]), band_of(found["with_size"])
 
 
 def shared_share(views: SeveralViews, chosen: Bool[Tensor, "*sets scenes"]) -> Float[Tensor, "*sets"]:

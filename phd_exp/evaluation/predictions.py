@@ -7,14 +7,14 @@ from functools import partial
 import numpy as np
 import pyarrow as pa
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import NEES, PARAMETERS, distribution_columns, draws, from_columns, nees_columns
 from phd_exp.distributions.temperature import Temperature
 from phd_exp.evaluation.parquet import Columns, arrays, require_columns
-from phd_exp.evaluation.point_errors import SEED
+from phd_exp.evaluation.point_errors import RESAMPLES, SEED
 from phd_exp.evaluation.reference import Band, calibrated_reference, groups_of
 from phd_exp.metrics.bootstrap import Interval, Statistic, bands, interval, resampled
 from phd_exp.metrics.calibration_scores import COLUMNS, abscissae, calibration_scores, curves, ordered
@@ -92,7 +92,9 @@ def evaluate(table: pa.Table | Columns, window: int = 200, resamples: int = 200)
     recorded = arrays(table)
     is_distribution, is_huber = "level" in recorded, "a" in recorded
     needed = (*(PARAMETERS if is_huber else ()), *OF_A_DISTRIBUTION) if is_distribution else ERRORS
-    columns, left_out = _finite(recorded, needed)
+    columns, finite = finite_columns(
+        recorded, needed, [name for name, _, _ in QUANTITIES.values() if name in recorded]
+    )
     statistic: Statistic = _distribution_scores if is_distribution else _point_scores
     whole, found, reference = statistic, {}, {}
     if is_huber:
@@ -110,7 +112,7 @@ def evaluate(table: pa.Table | Columns, window: int = 200, resamples: int = 200)
         scores=scores,
         curves=found,
         strata=_strata(statistic, columns, resamples),
-        left_out=left_out,
+        left_out=int((~finite).sum()),
         reference=reference,
         resampled=drawn,
     )
@@ -155,10 +157,7 @@ def at_temperature(
     Raises RunError if a column is missing, or if no row is finite.
     """
     recorded = {name: array[rows] for name, array in arrays(table).items()}
-    require_columns((*PARAMETERS, *XYZ), recorded)
-    columns = _tensors(recorded, (*PARAMETERS, *XYZ))
-    finite = _all_finite(columns, tuple(columns))
-    columns = {name: column[finite] for name, column in columns.items()}
+    columns, finite = finite_columns(recorded, (*PARAMETERS, *XYZ))
     distribution = _distribution(columns)
     kept = {name: array[finite.numpy()] for name, array in recorded.items()}
     return temperature.apply(distribution) if temperature else distribution, _positions(columns), kept
@@ -187,12 +186,16 @@ def _scores(
     statistic: Statistic, columns: Mapping[str, Tensor], resamples: int
 ) -> tuple[dict[str, Band], dict[str, list[float]]]:
     values, drawn = resampled(statistic, columns, resamples, SEED)
-    scores = {name: band_of(interval(value, drawn[name])) for name, value in values.items()}
+    scores = {name: _band(interval(value, drawn[name])) for name, value in values.items()}
     return scores, {name: values.tolist() for name, values in drawn.items()}
 
 
-def band_of(found: Interval) -> Band:
-    """The interval of a scalar as plain numbers."""
+def scalar_bands(statistic: Statistic, columns: Mapping[str, Tensor], resamples: int = RESAMPLES) -> dict[str, Band]:
+    """The 95 % bootstrap intervals of scalars, as plain numbers."""
+    return {name: _band(found) for name, found in bands(statistic, columns, resamples, SEED).items()}
+
+
+def _band(found: Interval) -> Band:
     return Band(float(found.value), float(found.low), float(found.high))
 
 
@@ -210,27 +213,21 @@ def _strata(statistic: Statistic, columns: Mapping[str, Tensor], resamples: int)
     return found
 
 
-def _finite(table: Columns, names: tuple[str, ...]) -> tuple[dict[str, Tensor], int]:
-    """These columns and those of the strata, of samples whose `names` are finite; the number of other samples."""
+def finite_columns(
+    table: Columns, names: Sequence[str], others: Sequence[str] = ()
+) -> tuple[dict[str, Tensor], Bool[Tensor, " samples"]]:
+    """The columns `names` and `others` of the samples whose `names` are finite, and which samples these are.
+
+    Raises RunError if one of `names` is missing, or if no sample is finite.
+    """
     require_columns(names, table)
-    of_strata = [column for column, _, _ in QUANTITIES.values() if column in table]
-    columns = _tensors(table, (*names, *of_strata))
-    finite = _all_finite(columns, names)
-    return {name: column[finite] for name, column in columns.items()}, int((~finite).sum())
-
-
-def _all_finite(columns: Mapping[str, Tensor], names: tuple[str, ...]) -> Tensor:
-    """Whether each sample has finite values in these columns. Raises RunError if no sample has."""
+    columns = {name: torch.from_numpy(np.array(table[name], dtype=np.float64)) for name in (*names, *others)}
     finite = torch.stack([columns[name] for name in names]).isfinite().all(dim=0)
     if len(finite) and not bool(finite.any()):
         raise RunError(
             f"predictions: none of {len(finite)} samples has finite {', '.join(names)}; train longer, or look at nll"
         )
-    return finite
-
-
-def _tensors(table: Columns, names: Sequence[str]) -> dict[str, Tensor]:
-    return {name: torch.from_numpy(np.array(table[name], dtype=np.float64)) for name in names}
+    return {name: column[finite] for name, column in columns.items()}, finite
 
 
 def _distribution(columns: Mapping[str, Tensor]) -> ProjectedHuber:

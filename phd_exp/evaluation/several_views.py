@@ -13,11 +13,11 @@ from torch import Tensor
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import PARAMETERS, from_columns
 from phd_exp.evaluation.parquet import read_table, require_columns
+from phd_exp.evaluation.predictions import XYZ
 from phd_exp.fusion import Plane, Pose
 from phd_exp.records import scenes
 from phd_exp.records.errors import RunError, gist
 
-XYZ = ("x", "y", "z")
 ROTATION = ("pose_w", "pose_x", "pose_y", "pose_z")
 TRANSLATION = ("pose_t_x", "pose_t_y", "pose_t_z")
 """Columns of a camera's pose: the unit quaternion of R, and t (m), of v_camera = R v_scene + t."""

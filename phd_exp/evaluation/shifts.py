@@ -8,16 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
-import torch
-from torch import Tensor
 
 from phd_exp.evaluation.conformal import threshold
 from phd_exp.evaluation.familiar import ALARM, Familiarity
-from phd_exp.evaluation.parquet import Columns, read_table, require_columns
-from phd_exp.evaluation.point_errors import RESAMPLES, SEED
-from phd_exp.evaluation.predictions import ERRORS, band_of
+from phd_exp.evaluation.parquet import Columns, read_table
+from phd_exp.evaluation.predictions import ERRORS, finite_columns, scalar_bands
 from phd_exp.evaluation.reference import Band
-from phd_exp.metrics.bootstrap import bands, means
+from phd_exp.metrics.bootstrap import means
 from phd_exp.metrics.calibration_scores import COLUMNS, calibration_scores, ordered
 from phd_exp.records.errors import RunError, one_line
 from phd_exp.records.runs import GUARANTEE, HOME
@@ -72,14 +69,9 @@ def _rated(familiarity: Familiarity, home: Columns, table: Columns) -> Columns:
 
 
 def _scores(table: Columns, levels: Mapping[str, float], rated: Columns, change: str = "") -> ShiftScores:
-    require_columns(MEASURED, table)
-    columns = {name: torch.from_numpy({**table, **rated}[name]) for name in (*MEASURED, *rated)}
-    finite = torch.stack(list(columns.values())).isfinite().all(0)
-    columns = {name: column[finite] for name, column in columns.items()}
+    columns, finite = finite_columns({**table, **rated}, (*MEASURED, *rated))
     columns |= {f"inside_{name}": 100.0 * (columns["level"] <= level) for name, level in levels.items()}
-    found = {name: band_of(interval) for name, interval in bands(_statistic, columns, RESAMPLES, SEED).items()}
-    return ShiftScores(change, int(finite.sum()), int((~finite).sum()), found)
-
-
-def _statistic(columns: Mapping[str, Tensor], counts: Tensor) -> dict[str, Tensor]:
-    return means(columns, counts) | calibration_scores(ordered(columns, counts))
+    scores = scalar_bands(
+        lambda part, counts: means(part, counts) | calibration_scores(ordered(part, counts)), columns
+    )
+    return ShiftScores(change, int(finite.sum()), int((~finite).sum()), scores)

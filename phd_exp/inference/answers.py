@@ -117,7 +117,7 @@ def answer(sighting: Sighting, temperature: Temperature | None, guarantee: Any =
             interval = rounded(np.array(region.depth_interval(view.camera.R[:, 2])))
             named["region"] = facts | {"depth_interval": interval, "volume": rounded(np.array(region.volume))}
     else:
-        position = view.camera.to_real(_array(prediction.mode))
+        position = view.camera.to_real(prediction.mode.numpy())
         none = "not reported: no Projected Huber density" if isinstance(prediction, Density) else NONE
         named |= {"position": rounded(position), "uncertainty": none}
     if sighting.familiar is not None:
@@ -128,28 +128,21 @@ def answer(sighting: Sighting, temperature: Temperature | None, guarantee: Any =
 
 
 def _distribution(distribution: ProjectedHuber, view: View) -> dict[str, Any]:
-    R = view.camera.R
-    median, *intervals = _depth_quantiles(distribution, R[:, 2])  # the axis of the real camera
+    """Its numbers; those of depth are None if the mode lies 90 degrees or more from the real camera's axis."""
+    R, axis = view.camera.R, view.camera.R[:, 2]
+    median, intervals = None, [None] * len(LEVELS)
+    if axis @ distribution.mode.numpy() > 0:
+        tails = [(1 - level / 100) / 2 for level in LEVELS]
+        p = [0.5, *(end for tail in tails for end in (tail, 1 - tail))]
+        z = quantiles_along(distribution, axis, np.array(p))
+        median, intervals = rounded(z[0]), rounded(z[1:].reshape(-1, 2))
     return {
-        "mode": rounded(view.camera.to_real(_array(distribution.mode))),
-        "mean": rounded(view.camera.to_real(_array(distribution.mean))),
-        "covariance": rounded(R.T @ _array(distribution.covariance_matrix) @ R),
+        "mode": rounded(view.camera.to_real(distribution.mode.numpy())),
+        "mean": rounded(view.camera.to_real(distribution.mean.numpy())),
+        "covariance": rounded(R.T @ distribution.covariance_matrix.numpy() @ R),
         "median_depth": median,
         "depth_interval": dict(zip(map(str, LEVELS), intervals, strict=True)),
     }
-
-
-def _depth_quantiles(distribution: ProjectedHuber, axis: Float[np.ndarray, "3"]) -> list[Any]:
-    """The median of depth along an axis and the interval of each level, for JSON.
-
-    All are None if the mode lies 90 degrees or more from the axis, far out of the field.
-    """
-    if not axis @ _array(distribution.mode) > 0:
-        return [None] * (1 + len(LEVELS))
-    tails = [(1 - level / 100) / 2 for level in LEVELS]
-    p = np.array([0.5, *tails, *(1 - tail for tail in tails)])
-    median, *ends = rounded(quantiles_along(distribution, axis, p))
-    return [median, *map(list, zip(ends[: len(LEVELS)], ends[len(LEVELS) :], strict=True))]
 
 
 def uncertainty(temperature: Temperature | None) -> str:
@@ -170,11 +163,6 @@ def _errors(sighting: Sighting) -> dict[str, Any]:
     if isinstance(prediction, Density):
         errors |= {"credible_level": prediction.level(truth), "nll": -prediction.log_prob(truth)}
     return {name: rounded(value.numpy()) for name, value in errors.items()}
-
-
-def _array(tensor: Tensor) -> Float[np.ndarray, "..."]:
-    array: np.ndarray = tensor.detach().cpu().double().numpy()
-    return array
 
 
 def rounded(values: Float[np.ndarray, "..."]) -> Any:

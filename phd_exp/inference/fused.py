@@ -128,14 +128,8 @@ def _answer(scene: Observed, fused: Fused, place: int) -> dict[str, Any]:
     }
     if status != Status.FUSED:
         named["reason"] = status.reason
-    views = len(scene.detections)
-    numbers = {
-        "point": fused.point[place],
-        "mean": fused.mean[place],
-        "covariance": fused.covariance[place],
-        "certificate": fused.certificate[place],
-        "surprise": fused.surprise[place, :views],
-    }
+    numbers = {name: getattr(fused, name)[place] for name in ("point", "mean", "covariance", "certificate")}
+    numbers["surprise"] = fused.surprise[place, : len(scene.detections)]
     if fused.shared is not None:
         numbers["shared_scale"] = fused.shared[0][place]
     return named | {name: rounded(value.numpy()) for name, value in numbers.items()}

@@ -8,12 +8,9 @@ import numpy as np
 from scipy import stats
 
 from phd_exp.evaluation.point_errors import ErrorKey, SampleMean, difference
+from phd_exp.records.errors import one_line
 from phd_exp.reports.paper import bound_mm, published_mm
-from phd_exp.reports.runs import Report, Run, RunState
-
-IntervalKind = Literal["student_t_over_seeds", "normal_over_samples", "none"]
-GapState = RunState | Literal["missing", "no sample"]
-COVERAGE = 0.95
+from phd_exp.reports.runs import Report, Run
 
 
 @dataclass(frozen=True)
@@ -22,7 +19,7 @@ class Interval:
 
     mean: float
     half_width: float | None
-    kind: IntervalKind
+    kind: Literal["student_t_over_seeds", "normal_over_samples", "none"]
 
     @property
     def ends(self) -> tuple[float, float] | tuple[None, None]:
@@ -33,25 +30,16 @@ class Interval:
 
 
 @dataclass(frozen=True)
-class Gap:
-    """A run that is missing in a table, with the reason."""
-
-    data: str
-    model: str
-    seed: int
-    state: GapState
-    detail: str = ""
-
-
-@dataclass(frozen=True)
 class Cell:
     """One number of a table, millimetres, and its sources.
 
     Attributes:
         means: seed -> mean error, of the finished runs.
         images: digests of the test images; a single one if all runs were tested on the same images.
-        sees_f: whether the focal length is an input of the networks.
-        gaps: seeds that are missing here and that other cells of the table have or that were started.
+        interval: the mean over seeds and its interval; None if no run has finished.
+        published: the paper's figure.
+        bound: the bound on the mean that applies to these runs.
+        gaps: seed -> why it is missing, of the seeds that other cells of the table have or that were started.
     """
 
     preset: str
@@ -60,13 +48,10 @@ class Cell:
     key: ErrorKey
     means: dict[int, SampleMean]
     images: frozenset[str]
-    sees_f: bool
-    gaps: tuple[Gap, ...]
-
-    @property
-    def interval(self) -> Interval | None:
-        """The mean over seeds and its interval; None if no run has finished."""
-        return interval(list(self.means.values())) if self.means else None
+    interval: Interval | None
+    published: float | None
+    bound: float | None
+    gaps: dict[int, str]
 
     @property
     def mean(self) -> float | None:
@@ -79,18 +64,8 @@ class Cell:
         if not self.gaps:
             return "finished"
         if not self.means:
-            return self.gaps[0].state
+            return next(iter(self.gaps.values())).partition(":")[0]
         return f"{len(self.means)} of {len(self.means) + len(self.gaps)} seeds"
-
-    @property
-    def published(self) -> float | None:
-        """The paper's figure, mm."""
-        return published_mm(self.model, self.data, self.key.estimate, self.key.quantity)
-
-    @property
-    def bound(self) -> float | None:
-        """The bound on the mean, mm, that applies to these runs."""
-        return bound_mm(self.model, self.data, self.key.quantity, self.sees_f)
 
     @property
     def ratio(self) -> float | None:
@@ -121,19 +96,20 @@ class Cell:
 def make_cell(report: Report, preset: str, data: str, model: str, key: ErrorKey, seeds: Sequence[int]) -> Cell:
     """The cell of a preset, data set, model and error, for these seeds."""
     runs = report.at_defaults(preset, data, model)
-    gaps = [
-        _gap(runs.get(seed), data, model, seed) for seed in seeds if seed not in runs or key not in runs[seed].errors
-    ]
     measured = {seed: run for seed, run in sorted(runs.items()) if key in run.errors}
+    means = {seed: run.errors[key] for seed, run in measured.items()}
+    sees_f = any(run.config.get("camera.focal_length") == "shown" for run in measured.values())
     return Cell(
         preset=preset,
         data=data,
         model=model,
         key=key,
-        means={seed: run.errors[key] for seed, run in measured.items()},
+        means=means,
         images=frozenset(run.measured.images for run in measured.values()),
-        sees_f=any(run.config.get("camera.focal_length") == "shown" for run in measured.values()),
-        gaps=tuple(gaps),
+        interval=interval(list(means.values())) if means else None,
+        published=published_mm(model, data, key.estimate, key.quantity),
+        bound=bound_mm(model, data, key.quantity, sees_f),
+        gaps={seed: _reason(runs.get(seed)) for seed in seeds if seed not in measured},
     )
 
 
@@ -149,21 +125,19 @@ def interval(means: Sequence[SampleMean]) -> Interval:
         41.0
     """
     values = np.array([mean.value for mean in means])
-    tail = (1 + COVERAGE) / 2
-    k = len(values)
+    k, error = len(values), means[0].standard_error
     if k > 1:
-        half_width = stats.t.ppf(tail, k - 1) * values.std(ddof=1) / np.sqrt(k)
+        half_width = stats.t.ppf(0.975, k - 1) * values.std(ddof=1) / np.sqrt(k)
         return Interval(float(values.mean()), float(half_width), "student_t_over_seeds")
-    error = means[0].standard_error
     if error is None:
         return Interval(means[0].value, None, "none")
-    return Interval(means[0].value, float(stats.norm.ppf(tail)) * error, "normal_over_samples")
+    return Interval(means[0].value, float(stats.norm.ppf(0.975)) * error, "normal_over_samples")
 
 
-def _gap(run: Run | None, data: str, model: str, seed: int) -> Gap:
-    """Why a run has no error."""
+def _reason(run: Run | None) -> str:
+    """Why a run has no error: a state, and details."""
     if run is None:
-        return Gap(data, model, seed, "missing")
-    if run.state != "finished":
-        return Gap(data, model, seed, run.state, run.detail)
-    return Gap(data, model, seed, "no sample", "none of its test samples lies in the central half")
+        return "missing"
+    if run.state == "finished":
+        return "no sample: none of its test samples lies in the central half"
+    return f"{run.state}: {one_line(run.detail)}" if run.detail else run.state

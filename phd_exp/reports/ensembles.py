@@ -9,8 +9,9 @@ from torch import Tensor
 
 from phd_exp.evaluation.ensembles import ensemble_table
 from phd_exp.evaluation.parquet import Columns, read_table
-from phd_exp.evaluation.point_errors import SEED
-from phd_exp.metrics.bootstrap import Interval, bands, means
+from phd_exp.evaluation.predictions import scalar_bands
+from phd_exp.evaluation.reference import Band
+from phd_exp.metrics.bootstrap import means
 from phd_exp.records.choices import in_words
 from phd_exp.reports.measured import Notes
 from phd_exp.reports.runs import Report, Run
@@ -49,7 +50,8 @@ def ensemble_tables(report: Report) -> list[Table]:
             preset=preset,
             numbers=tuple(
                 {"preset": preset, "data": data, "model": model, "overrides": hashed, "prediction": kind}
-                | {"quantity": name, "value": float(band.value), "low": float(band.low), "high": float(band.high)}
+                | {"quantity": name}
+                | vars(band)
                 for _, data, model, hashed, kind, scores in lines
                 for name, band in scores.items()
             ),
@@ -63,19 +65,19 @@ def _configuration(run: Run) -> tuple[str, str, str, str]:
     return run.preset, run.data, run.model, run.name.partition("-")[2]
 
 
-def _scores(runs: Sequence[Run]) -> dict[str, Mapping[str, Interval]]:
+def _scores(runs: Sequence[Run]) -> dict[str, Mapping[str, Band]]:
     """Kind of prediction -> its scores; empty without an ensemble."""
     runs = [run for run in runs if run.nll is not None]
     seeds = [read_table(run.folder.predictions) for run in runs]
     tables = {f"{k} seeds": ensemble_table(seeds[:k]) for k in SIZES if k <= len(seeds)}
     eight = {run.name.partition("-")[0]: run.folder.eight_views["test"] for run in runs}
     tables |= {f"eight views, {seed}": read_table(file) for seed, file in eight.items() if file.exists()}
-    one = [_columns(table) for table in seeds] if tables else []
-    columns = (
-        {"one network": {name: torch.stack([seed[name] for seed in one]).mean(0) for name in SCORES}} if one else {}
-    )
+    if not tables:
+        return {}
+    one = [_columns(table) for table in seeds]
+    columns = {"one network": {name: torch.stack([seed[name] for seed in one]).mean(0) for name in SCORES}}
     columns |= {kind: _columns(table) for kind, table in tables.items()}
-    return {kind: bands(means, of, 200, SEED) for kind, of in columns.items()}
+    return {kind: scalar_bands(means, of) for kind, of in columns.items()}
 
 
 def _columns(table: Columns) -> dict[str, Tensor]:
@@ -83,6 +85,6 @@ def _columns(table: Columns) -> dict[str, Tensor]:
     return {"nll": nll, "inside_90": 100.0 * (level <= 0.9).double(), "level": level}
 
 
-def _cell(name: str, band: Interval) -> TableCell:
-    value, low, high = (SCORES[name][1].format(float(number)) for number in vars(band).values())
+def _cell(name: str, band: Band) -> TableCell:
+    value, low, high = map(SCORES[name][1].format, vars(band).values())
     return TableCell(value, f"({low} to {high})")

@@ -1,8 +1,9 @@
 """Fusion of several cameras as a table: a column per number of cameras, a line per method."""
 
 import math
+from collections.abc import Mapping
 
-from phd_exp.evaluation.fusion import CALIBRATION, ERRORS, LEVELS, METHODS, PROBABILISTIC, FusionScores, Method, place
+from phd_exp.evaluation.fusion import CALIBRATION, ERRORS, LEVELS, PROBABILISTIC, FusionScores, Method, place
 from phd_exp.evaluation.reference import Band
 from phd_exp.records.choices import in_words
 from phd_exp.reports.runs import Report, Run
@@ -77,17 +78,18 @@ def fusion_table(run: Run, scores: FusionScores) -> Table:
 def _rows(scores: FusionScores, quantity: str, on_plane: bool) -> list[TableRow]:
     label = QUANTITIES[quantity] + (ON_GROUND if on_plane else "")
     rows = []
-    for method in METHODS if quantity in ERRORS else PROBABILISTIC:
-        name = NAMES[method] if quantity in ERRORS else alone(method)
+    for method, name in names_of(quantity).items():
         places = [place(quantity, method, k, on_plane) for k in range(1, scores.views + 1)]
         cells = tuple(_cell(quantity, scores.bands[at], scores.exact.get(at)) for at in places)
         rows.append(TableRow((label, name), cells))
     return rows
 
 
-def alone(method: Method) -> str:
-    """The name of a method in a chart or group with one line per density."""
-    return NAMES[method].removesuffix(", mean")
+def names_of(quantity: str) -> Mapping[Method, str]:
+    """The methods that have a quantity, and their names."""
+    if quantity in ERRORS:
+        return NAMES
+    return {method: NAMES[method].removesuffix(", mean") for method in PROBABILISTIC}
 
 
 def _cell(quantity: str, band: Band, exact: float | None) -> TableCell:

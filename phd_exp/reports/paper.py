@@ -78,22 +78,17 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Bound:
-    """A line of bounds on depth error: data set -> text."""
-
-    label: str
-    depth: dict[str, str]
-
-
-@dataclass(frozen=True)
 class Layout:
-    """One of the paper's tables: columns, groups of lines, and the bounds below them."""
+    """One of the paper's tables: columns, groups of lines, and below them bounds on depth error.
+
+    `bounds` maps the label of a line to the bound on each data set.
+    """
 
     name: TableName
     title: str
     columns: tuple[Column, ...]
     groups: tuple[tuple[Line, ...], ...]
-    bounds: tuple[Bound, ...]
+    bounds: Mapping[str, Mapping[str, float]]
     note: str
 
     @property
@@ -127,11 +122,11 @@ TABLE_1 = Layout(
     title="Table 1",
     columns=tuple(Column(data) for data in _DATA),
     groups=_groups(("mae_vz", "mae_logz", "probabilistic"), ("projected", "depth")),
-    bounds=(
-        Bound("bound, with f", {"scale": f"{UNKNOWN_SIZE:.0f}"}),
-        Bound("apparent size, without f", {"scale": f"{UNKNOWN_SIZE_AND_F:.0f}"}),
-        Bound("guess without the image", dict.fromkeys(_DATA, f"{GUESS:.0f}")),
-    ),
+    bounds={
+        "bound, with f": {"scale": UNKNOWN_SIZE},
+        "apparent size, without f": {"scale": UNKNOWN_SIZE_AND_F},
+        "guess without the image": dict.fromkeys(_DATA, GUESS),
+    },
     note="On scale the size factor ~ U(0.8, 1.2) is unknown and the image gives size / z: 291 mm is nearly exact for "
     "a network that sees f (camera=shown); from apparent size alone a network that does not see f has 336 mm. On "
     "occl_scale no bound is known: which object hides which tells depth. The paper's 400 mm of depth for 20 % of "
@@ -142,10 +137,7 @@ TABLE_2 = Layout(
     title="Table 2",
     columns=(Column("default", "projected"), Column("default", "depth")),
     groups=_groups(("mae_xyz", "mae_constf", "probabilistic"), (None,)),
-    bounds=(
-        Bound("apparent size, f unknown", {"default": f"{UNKNOWN_F:.0f}"}),
-        Bound("guess without the image", {"default": f"{GUESS:.0f}"}),
-    ),
+    bounds={"apparent size, f unknown": {"default": UNKNOWN_F}, "guess without the image": {"default": GUESS}},
     note="mae_xyz and mae_constf do not use f ~ U(1200, 2000) px. From apparent size alone (weak perspective) their "
     "depth error is at least 331 mm; perspective also tells f and z apart, so an estimator can be better.",
 )

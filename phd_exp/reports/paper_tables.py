@@ -1,13 +1,13 @@
 """The paper's two tables in both readings, for every preset with any of their runs."""
 
 import shlex
-from collections.abc import Iterable, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 
 from phd_exp.evaluation.point_errors import READINGS, ErrorKey, Quantity, Reading
 from phd_exp.records.choices import PLAIN_RECIPE, in_words, preset_and_recipe
 from phd_exp.records.errors import one_line
-from phd_exp.reports.cells import Cell, Gap, make_cell
-from phd_exp.reports.paper import ASSUMED, BELOW_BOUND, LAYOUTS, OF_A_BOUND, Bound, Column, Layout, Line, TableName
+from phd_exp.reports.cells import Cell, make_cell
+from phd_exp.reports.paper import ASSUMED, BELOW_BOUND, LAYOUTS, OF_A_BOUND, Column, Layout, Line, TableName
 from phd_exp.reports.runs import PROBABILISTIC, Report
 from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem
 
@@ -15,7 +15,6 @@ DIGITS: dict[Quantity, int] = {"projected": 1, "depth": 0}  # decimals of a mill
 MOST_DIGITS = 4
 ONE_SEED = "†"
 FEWER_SEEDS = "‡"
-DEFAULT_RUNS = "runs"
 
 IN_WORDS: dict[Reading, str] = {
     "whole": "the whole field of view",
@@ -66,18 +65,15 @@ def _table(
         key = ErrorKey(line.estimate, reading, quantity)
         return make_cell(report, preset, column.data, line.model, key, seeds)
 
-    measured = [[[cell(line, column) for column in columns] for line in group] for group in groups]
-    cells = [one for group in measured for line in group for one in line]
-    best = {id(one) for one in _best([one for line in measured[0] for one in line])}
-    gaps = dict.fromkeys(gap for one in cells for gap in one.gaps)
+    measured = [[(line, [cell(line, column) for column in columns]) for line in group] for group in groups]
+    cells = [one for group in measured for _, row in group for one in row]
+    best = _best([one for _, row in measured[0] for one in row])
+    gaps = dict.fromkeys((reason, one.model, one.data, n) for one in cells for n, reason in one.gaps.items())
     left_out = _left_out(layout, data, models)
-    can_be_made = left_out or any(gap.state != "no sample" for gap in gaps)
+    can_be_made = left_out or any(not reason.startswith("no sample") for reason, *_ in gaps)
     by_line = layout.columns[0].quantity is None
-    bounds = [row for bound in layout.bounds if (row := _bound_row(bound, columns, by_line))]
-    rows = [
-        tuple(_row(line, found, best) for line, found in zip(group, part, strict=True))
-        for group, part in zip(groups, measured, strict=True)
-    ]
+    bounds = [row for bound in layout.bounds.items() if (row := _bound_row(*bound, columns, by_line))]
+    rows = [tuple(_row(line, row, best) for line, row in group) for group in measured]
     return Table(
         stem=file_stem(layout.name, preset, reading),
         kind="tables",
@@ -103,18 +99,15 @@ def _left_out(layout: Layout, data: Set[str], models: Set[str]) -> list[str]:
     return [f"Left out of {layout.title}, without a run: {names}."] if names else []
 
 
-def _best(cells: Sequence[Cell]) -> list[Cell]:
-    """For each data set and error, the cell that is significantly better than every other, if there is one."""
-    columns: dict[tuple[str, Quantity], list[Cell]] = {}
+def _best(cells: Sequence[Cell]) -> set[int]:
+    """The ids of the cells that are significantly better than every other of their data set and error."""
+    best = set()
     for cell in cells:
-        if cell.means:
-            columns.setdefault((cell.data, cell.key.quantity), []).append(cell)
-    return [
-        cell
-        for column in columns.values()
-        for cell in column
-        if len(column) > 1 and all(cell.beats(other) for other in column if other is not cell)
-    ]
+        column = [one for one in cells if (one.data, one.key.quantity) == (cell.data, cell.key.quantity)]
+        others = [one for one in column if one.means and one is not cell]
+        if cell.means and others and all(map(cell.beats, others)):
+            best.add(id(cell))
+    return best
 
 
 def _row(line: Line, cells: Sequence[Cell], best: set[int]) -> TableRow:
@@ -154,10 +147,11 @@ def _number(value: float, quantity: Quantity) -> str:
     return f"{value:.{DIGITS[quantity]}f}"
 
 
-def _bound_row(bound: Bound, columns: Sequence[Column], by_line: bool) -> TableRow | None:
-    """The row of a bound; None if no column has it."""
-    texts = [NOTHING if c.quantity == "projected" else bound.depth.get(c.data, NOTHING) for c in columns]
-    stub = (bound.label, "depth") if by_line else (bound.label,)
+def _bound_row(label: str, bounds: Mapping[str, float], columns: Sequence[Column], by_line: bool) -> TableRow | None:
+    """The row of a bound on depth error; None if no column has it."""
+    known = {data: f"{bound:.0f}" for data, bound in bounds.items()}
+    texts = [NOTHING if c.quantity == "projected" else known.get(c.data, NOTHING) for c in columns]
+    stub = (label, "depth") if by_line else (label,)
     return TableRow(stub, tuple(map(TableCell, texts))) if set(texts) != {NOTHING} else None
 
 
@@ -181,16 +175,15 @@ def _samples(cells: Sequence[Cell]) -> str:
     return f", {' to '.join(map(str, dict.fromkeys([counts[0], counts[-1]])))} test samples"
 
 
-def gap_lines(gaps: Iterable[Gap]) -> list[str]:
-    """The missing runs of a table: a line for each reason, model and set of seeds."""
+def gap_lines(gaps: Iterable[tuple[str, str, str, int]]) -> list[str]:
+    """The missing runs of a table, given as (reason, model, data set, seed): a line a reason, model and seeds."""
     seeds: dict[tuple[str, str, str], list[int]] = {}
-    for gap in gaps:
-        reason = f"{gap.state}: {one_line(gap.detail)}" if gap.detail else gap.state
-        seeds.setdefault((reason, gap.model, gap.data), []).append(gap.seed)
+    for reason, model, data, seed in gaps:
+        seeds.setdefault((reason, model, data), []).append(seed)
     lacking: dict[tuple[str, str, str], list[str]] = {}
-    for (reason, model, data), found in seeds.items():
+    for (reason, model, data_set), found in seeds.items():
         numbers = f"seed{'s' if len(found) > 1 else ''} {', '.join(map(str, found))}"
-        lacking.setdefault((reason, model, numbers), []).append(data)
+        lacking.setdefault((reason, model, numbers), []).append(data_set)
     return [
         f"{model} on {', '.join(data)} ({numbers}): {reason}" for (reason, model, numbers), data in lacking.items()
     ]
@@ -204,6 +197,6 @@ def making_command(report: Report, preset: str, name: TableName, seeds: Iterable
         words.append(f"recipe={recipe}")
     if list(seeds) != [0]:
         words.append(f"seed={','.join(map(str, seeds))}")
-    if report.folder.as_posix() != DEFAULT_RUNS:
+    if report.folder.as_posix() != "runs":
         words.append(f"runs={report.folder}")
     return one_line(shlex.join(["python", "-m", "phd_exp", "-m", *words]))

@@ -84,8 +84,3 @@ METRICS = {
     "projected_precision": Quantity("Mean |A|", "", 0, "predicted precision of (x, y)/z"),
 }
 """Key of metrics.jsonl, after `train/` or `test/` -> quantity, in the order of a page."""
-
-
-def quantity(key: str) -> Quantity:
-    """The quantity of a score; an unknown key is its own label."""
-    return SCORES.get(key) or Quantity(key.replace("_", " "), "", 3, "")

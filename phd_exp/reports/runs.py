@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,7 +19,6 @@ from phd_exp.reports.table import file_stem, printable
 
 RunState = Literal["finished", "running", "interrupted", "failed", "unreadable"]
 PROBABILISTIC = "probabilistic"
-ESTIMATES: tuple[Estimate, ...] = tuple(COLUMNS)
 LEAF = re.compile(r"seed(0|[1-9][0-9]{0,8})(-[0-9a-f]{8})?")
 
 
@@ -117,26 +116,27 @@ def read_report(runs: Path, kept: Path | None = None, progress: Callable[[str], 
 
 def _read_run(folder: RunFolder, kept: Path | None) -> Run:
     notes = Notes()
-    preset, data, model, name = (printable(part) for part in folder.path.parts[-4:])
-    run = notes.attempt(lambda: _whole_run(folder, (preset, data, model, name), kept, notes))
-    return run or Run(folder, preset, data, model, name, detail=notes[-1], notes=notes)
+    preset, data, model, name = map(printable, folder.path.parts[-4:])
+    run = Run(folder, preset, data, model, name)
+    return notes.attempt(lambda: _whole_run(run, kept, notes)) or replace(run, detail=notes[-1], notes=notes)
 
 
-def _whole_run(folder: RunFolder, names: tuple[str, str, str, str], kept: Path | None, notes: Notes) -> Run:
-    leaf = LEAF.fullmatch(names[3])
+def _whole_run(run: Run, kept: Path | None, notes: Notes) -> Run:
+    folder, leaf = run.folder, LEAF.fullmatch(run.name)
     status = notes.attempt(folder.status)
     state, detail = _state(folder, status)
     if status is None and notes:
         detail = notes[-1]
     if leaf is None:
-        state, detail = "unreadable", f"{names[3]}: expected a folder named seed<k> or seed<k>-<hash>"
-    config = notes.attempt(lambda: _config(folder)) or {}
+        state, detail = "unreadable", f"{run.name}: expected a folder named seed<k> or seed<k>-<hash>"
+    values = notes.attempt(lambda: flatten(folder.config())) or {}
+    config = {key: "" if value is None else str(value) for key, value in values.items()}
     rows = notes.attempt(folder.metrics) or []
     predictions = held_out = tested = tested_held_out = None
     if state == "finished" or folder.predictions.exists():
         predictions = notes.attempt(lambda: read_table(folder.predictions))
     if state == "finished":
-        estimates = ESTIMATES if names[2] == PROBABILISTIC else ("mode",)
+        estimates: Sequence[Estimate] = tuple(COLUMNS) if run.model == PROBABILISTIC else ("mode",)
         tested = notes.attempt(lambda: _errors(predictions, estimates)) if predictions else None
         if tested is None:
             state, detail = "unreadable", f"{notes[-1]}; delete the folder to run again"
@@ -147,9 +147,8 @@ def _whole_run(folder: RunFolder, names: tuple[str, str, str, str], kept: Path |
     measured = notes.attempt(lambda: kept_or_measured(folder, config, predictions, held_out, kept)) or Measured()
     errors, nll = tested or ({}, None)
     held_out_errors, held_out_nll = tested_held_out or ({}, None)
-    return Run(
-        folder,
-        *names,
+    return replace(
+        run,
         seed=int(leaf[1]) if leaf else None,
         state=state,
         overrides=_overrides(folder) if leaf and leaf[2] else None,
@@ -182,10 +181,6 @@ def _state(folder: RunFolder, status: RunStatus | None) -> tuple[RunState, str]:
     except OSError as error:  # a read-only folder
         return "running", f"or interrupted: its lock cannot be tried ({error.strerror})"
     return ("running", "") if alive else ("interrupted", "the same command resumes it")
-
-
-def _config(folder: RunFolder) -> dict[str, str]:
-    return {key: "" if value is None else str(value) for key, value in flatten(folder.config()).items()}
 
 
 def _series(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[float | None]]:

@@ -5,7 +5,7 @@ from itertools import groupby
 
 from phd_exp.records.choices import in_words
 from phd_exp.records.runs import HOME
-from phd_exp.reports.quantities import quantity
+from phd_exp.reports.quantities import SCORES
 from phd_exp.reports.runs import Report, Run
 from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem, printable
 
@@ -46,7 +46,7 @@ def _matrix(runs: Sequence[Run], key: str, axis: str) -> Table:
     return Table(
         stem=file_stem("shifts", key, preset, axis),
         kind="shifts",
-        title=f"{quantity(key).axis} under shift, {in_words(preset)}: {AXES[axis]}",
+        title=f"{SCORES[key].axis} under shift, {in_words(preset)}: {AXES[axis]}",
         stub=("trained on, camera", "run"),
         columns=tuple(map(printable, names)),
         groups=tuple(tuple(alike) for _, alike in groupby(rows, key=lambda row: row.stub[0].partition(",")[0])),
@@ -79,7 +79,7 @@ def _cell(run: Run, name: str, key: str) -> TableCell:
     band = run.measured.shifts[name].scores.get(key) if name in run.measured.shifts else None
     if band is None:
         return TableCell(NOTHING)
-    value, low, high = map(quantity(key).text, (band.value, band.low, band.high))
+    value, low, high = map(SCORES[key].text, (band.value, band.low, band.high))
     if key != MAIN:
         return TableCell(value, below=f"({low}–{high})")
     if band.low <= WANTED <= band.high:

@@ -61,7 +61,7 @@ def test_gaps_are_named_and_the_rest_is_averaged(tmp_path: Path) -> None:
     record(tmp_path, "occl", "probabilistic", 1)
     cell = made(tmp_path, (0, 1, 2))
     assert list(cell.means) == [0]
-    assert [(gap.seed, gap.state) for gap in cell.gaps] == [(1, "unreadable"), (2, "missing")]
+    assert [(seed, reason.split(":")[0]) for seed, reason in cell.gaps.items()] == [(1, "unreadable"), (2, "missing")]
     assert cell.state == "1 of 3 seeds"
     assert cell.interval is not None
 

@@ -37,7 +37,7 @@ def write_site(report: Report, tables: Sequence[Table], figures: Sequence[str], 
     several = len(report.runs) > 1
     drawn = [_write_run(site, place, run, several) for place, run in enumerate(report.runs)]
     groups = overview_groups(drawn, report.searches)
-    charts = {key: asdict(chart) for group in groups.values() for key, chart in group.charts.items()}
+    charts = {key: asdict(chart) for group, _ in groups.values() for key, chart in group.items()}
     write_text(site / "data" / "overview.js", as_script("overview", {"charts": charts}))
     write_text(site / "compare.html", comparison_page(report.runs))
     write_text(site / "index.html", overview_page([one.run for one in drawn], tables, groups, figures))

@@ -6,7 +6,7 @@ is for the script: its `role`, and `low` and `high` of an interval, drawn as a b
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from phd_exp.evaluation.predictions import Curve
@@ -25,7 +25,7 @@ class Chart:
     title: str
     label: str
     data: list[Trace]
-    layout: dict[str, Any] = field(default_factory=dict)
+    layout: dict[str, Any]
 
 
 def axis(title: str, log: bool = False, **more: Any) -> dict[str, Any]:

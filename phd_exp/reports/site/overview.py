@@ -11,7 +11,10 @@ from phd_exp.reports.site.charts import DASHES, Chart, Trace, identity, square
 
 COLOURS = 7
 CALIBRATION = ("depth_calibration", "projected_calibration", "coverage", "depth_pit")
-LEARNING = ("projected_error_mm", "depth_error_mm", "nll", "depth_precision", "projected_precision")
+LEARNING = tuple(
+    f"learning_{key}"
+    for key in ("projected_error_mm", "depth_error_mm", "nll", "depth_precision", "projected_precision")
+)
 
 
 @dataclass(frozen=True)
@@ -29,27 +32,19 @@ class Drawn:
         return cls(run, charts, place % COLOURS + 1, DASHES[place // COLOURS % len(DASHES)])
 
 
-@dataclass(frozen=True)
-class Group:
-    """Charts that share a legend of these runs."""
-
-    charts: dict[str, Chart]
-    runs: list[Drawn]
+Groups = dict[str, tuple[dict[str, Chart], list[Drawn]]]
+"""Name -> charts that share a legend, and the runs of that legend."""
 
 
-def overview_groups(runs: Sequence[Drawn], searches: Sequence[Search] = ()) -> dict[str, Group]:
+def overview_groups(runs: Sequence[Drawn], searches: Sequence[Search] = ()) -> Groups:
     """Calibration and learning curves with a line per run, and the charts of searches, without empty groups."""
-    groups = {
-        "calibration": ("calibration", "before", CALIBRATION),
-        "learning": ("learning", "test", tuple(f"learning_{key}" for key in LEARNING)),
-    }
-    found = {}
-    for name, (section, role, keys) in groups.items():
-        charts = {f"{name}_{key}": chart for key in keys if (chart := _overlaid(runs, section, key, role))}
+    found: Groups = {}
+    for name, role, keys in (("calibration", "before", CALIBRATION), ("learning", "test", LEARNING)):
+        charts = {f"{name}_{key}": chart for key in keys if (chart := _overlaid(runs, name, key, role))}
         if charts:
-            found[name] = Group(charts, [one for one in runs if set(keys) & one.charts.get(section, {}).keys()])
+            found[name] = charts, [one for one in runs if set(keys) & one.charts.get(name, {}).keys()]
     if charts := {key: chart for search in searches for key, chart in search_charts(search).items()}:
-        found["search"] = Group(charts, [])
+        found["search"] = charts, []
     return found
 
 

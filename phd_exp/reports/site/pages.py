@@ -2,39 +2,21 @@
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
+from collections.abc import Sequence
+from dataclasses import asdict
+from datetime import UTC
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from phd_exp.evaluation.reference import Band
 from phd_exp.records.processes import duration
 from phd_exp.reports.fusion_table import fusion_table, headline
 from phd_exp.reports.paper import PUBLISHED
-from phd_exp.reports.quantities import SCORES, Quantity, quantity
+from phd_exp.reports.quantities import SCORES
 from phd_exp.reports.runs import Run
-from phd_exp.reports.site.overview import Drawn, Group
+from phd_exp.reports.site.overview import Drawn, Groups
 from phd_exp.reports.table import Table
-
-
-@dataclass(frozen=True)
-class ScoreRow:
-    """One line of a run's table of numbers."""
-
-    key: str
-    quantity: Quantity
-    before: Band
-    after: Band | None
-    reference: Band | None
-    paper: float | None
-
-
-def _moment(moment: datetime) -> str:
-    return f"{moment.astimezone(UTC):%Y-%m-%d %H:%M} UTC"
-
 
 _ENVIRONMENT = Environment(
     loader=FileSystemLoader(Path(__file__).parent / "templates"),
@@ -43,13 +25,11 @@ _ENVIRONMENT = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_ENVIRONMENT.filters |= {"moment": _moment, "duration": duration}
-_ENVIRONMENT.globals |= {"score": quantity, "headline": headline}
+_ENVIRONMENT.filters |= {"moment": lambda at: f"{at.astimezone(UTC):%Y-%m-%d %H:%M} UTC", "duration": duration}
+_ENVIRONMENT.globals |= {"score": SCORES.__getitem__, "headline": headline}
 
 
-def overview_page(
-    runs: Sequence[Run], tables: Sequence[Table], groups: Mapping[str, Group], figures: Sequence[str]
-) -> str:
+def overview_page(runs: Sequence[Run], tables: Sequence[Table], groups: Groups, figures: Sequence[str]) -> str:
     """`index.html`: the list of runs, the tables, the charts of all runs."""
     kinds: dict[str, list[Table]] = {}
     for table in tables:
@@ -101,8 +81,8 @@ def comparison_page(runs: Sequence[Run]) -> str:
     return template.render(root="", several=True, runs=runs, quantities=quantities)
 
 
-def _score_rows(run: Run) -> list[ScoreRow]:
-    """In the order of `SCORES`."""
+def _score_rows(run: Run) -> list[dict[str, Any]]:
+    """The lines of a run's table of numbers, in the order of `SCORES`."""
     before, after = run.measured.before, run.measured.after
     if before is None:
         return []
@@ -110,9 +90,8 @@ def _score_rows(run: Run) -> list[ScoreRow]:
     paper = {f"{name}_error_mm": value for name, value in published.items()}
     recalibrated = after.scores if after else {}
     return [
-        ScoreRow(
-            name, score, before.scores[name], recalibrated.get(name), before.reference.get(name), paper.get(name)
-        )
+        {"key": name, "quantity": score, "before": before.scores[name], "after": recalibrated.get(name)}
+        | {"reference": before.reference.get(name), "paper": paper.get(name)}
         for name, score in SCORES.items()
         if name in before.scores
     ]
@@ -124,7 +103,7 @@ def run_script(drawn: Drawn) -> str:
     content = {
         "preset": run.preset, "data": run.data, "model": run.model, "run": run.name, "title": run.title,
         "images": run.measured.images, "config": dict(run.config),
-        "scores": {row.key: asdict(row.before) for row in _score_rows(run)},
+        "scores": {row["key"]: asdict(row["before"]) for row in _score_rows(run)},
         "resampled": {
             name: [float(f"{value:.6g}") for value in values]
             for name, values in (before.resampled if before else {}).items()

@@ -1,15 +1,17 @@
-"""The charts of one run: calibration, training, and errors by stratum."""
+"""The charts of one run: calibration, training, errors by stratum, and several cameras."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from phd_exp.evaluation.fusion import BINS, ERRORS, LEVELS, FusionScores, Method
 from phd_exp.evaluation.predictions import Curve, Evaluation, Stratum
+from phd_exp.evaluation.reference import Band
 from phd_exp.reports.figures import decades
-from phd_exp.reports.quantities import METRICS, Quantity, quantity
+from phd_exp.reports.fusion_table import ON_GROUND, names_of
+from phd_exp.reports.quantities import METRICS, SCORES, Quantity
 from phd_exp.reports.runs import Run
 from phd_exp.reports.site.charts import DASHES, Chart, Trace, axis, bars, curve_line, identity, line, square
-from phd_exp.reports.site.fusion_charts import fusion_charts
 
 
 def run_charts(run: Run) -> dict[str, dict[str, Chart]]:
@@ -94,26 +96,35 @@ def _in_words(kind: _Kind, curve: Curve) -> str:
     return f"The surer half has {half:.3g}, all predictions have {curve.y[-1]:.3g}."
 
 
+_OVER_EPOCHS = ("depth_ence", "projected_ence", "miscalibration_area", "depth_pit_area")
+
+
 def learning_charts(run: Run) -> dict[str, Chart]:
-    """A chart per metric: training and test split over the epochs."""
-    charts = {f"learning_{key}": _learning_chart(run, key, metric) for key, metric in METRICS.items()}
-    charts["learning_calibration"] = _calibration_over_epochs(run)
-    return {key: chart for key, chart in charts.items() if chart}
+    """A chart per metric, of training and test split over the epochs, and one of the errors of calibration."""
+    charts = {}
+    for key, metric in METRICS.items():
+        traces = [
+            line(split, run.epochs, run.metrics[f"{split}/{key}"], colour, dash=dash, role=split)
+            for split, colour, dash in (("test", 1, "solid"), ("train", 2, "dot"))
+            if f"{split}/{key}" in run.metrics
+        ]
+        if traces:
+            title, y = f"{metric.label} over training", axis(metric.axis, log=key not in ("nll", "loss"))
+            charts[f"learning_{key}"] = _over_epochs(title, metric.axis, y, traces, [metric] * len(traces))
+    if known := [key for key in _OVER_EPOCHS if f"test/calibration/{key}" in run.metrics]:
+        traces = [
+            line(SCORES[key].label, run.epochs, run.metrics[f"test/calibration/{key}"], i + 1, dash=DASHES[i])
+            for i, key in enumerate(known)
+        ]
+        title, y = "Calibration over training", axis("calibration error", rangemode="tozero")
+        scores = [SCORES[key] for key in known]
+        charts["learning_calibration"] = _over_epochs(title, "Calibration errors", y, traces, scores)
+    return charts
 
 
-def _learning_chart(run: Run, key: str, metric: Quantity) -> Chart | None:
-    splits = {split: run.metrics.get(f"{split}/{key}") for split in ("test", "train")}
-    traces = [
-        line(split, run.epochs, values, colour, dash=dash, role=split)
-        for (split, values), colour, dash in zip(splits.items(), (1, 2), ("solid", "dot"), strict=True)
-        if values is not None
-    ]
-    if not traces:
-        return None
-    log = key not in ("nll", "loss")
-    layout = {"xaxis": axis("epochs of training"), "yaxis": axis(metric.axis, log)}
-    courses = "; ".join(_course(trace, metric) for trace in traces)
-    return Chart(f"{metric.label} over training", f"{metric.axis} over the epochs: {courses}.", traces, layout)
+def _over_epochs(title: str, what: str, y: Trace, traces: list[Trace], scores: Sequence[Quantity]) -> Chart:
+    label = f"{what} over the epochs: {'; '.join(map(_course, traces, scores))}."
+    return Chart(title, label, traces, {"xaxis": axis("epochs of training"), "yaxis": y})
 
 
 def _course(trace: Trace, metric: Quantity) -> str:
@@ -122,22 +133,6 @@ def _course(trace: Trace, metric: Quantity) -> str:
         return f"{trace['name']}: no values"
     (start, first), (end, last) = known[0], known[-1]
     return f"{trace['name']} from {metric.text(first)} at epoch {start:g} to {metric.text(last)} at epoch {end:g}"
-
-
-_OVER_EPOCHS = ("depth_ence", "projected_ence", "miscalibration_area", "depth_pit_area")
-
-
-def _calibration_over_epochs(run: Run) -> Chart | None:
-    known = [key for key in _OVER_EPOCHS if f"test/calibration/{key}" in run.metrics]
-    if not known:
-        return None
-    traces = [
-        line(quantity(key).label, run.epochs, run.metrics[f"test/calibration/{key}"], i + 1, dash=DASHES[i])
-        for i, key in enumerate(known)
-    ]
-    courses = "; ".join(_course(trace, quantity(key)) for trace, key in zip(traces, known, strict=True))
-    layout = {"xaxis": axis("epochs of training"), "yaxis": axis("calibration error", rangemode="tozero")}
-    return Chart("Calibration over training", f"Calibration errors over the epochs: {courses}.", traces, layout)
 
 
 def strata_charts(evaluation: Evaluation) -> dict[str, Chart]:
@@ -152,7 +147,7 @@ def strata_charts(evaluation: Evaluation) -> dict[str, Chart]:
 
 
 def _strata_chart(strata: Sequence[Stratum], name: str, key: str, colour: int) -> Chart:
-    score = quantity(key)
+    score = SCORES[key]
     bands = [stratum.scores[key] for stratum in strata]
     # an en dash between two numbers
     labels = [re.sub(r"(?<=\d)-(?=\d)", "–", stratum.label.removeprefix(f"{name} ")) for stratum in strata]
@@ -165,3 +160,81 @@ def _strata_chart(strata: Sequence[Stratum], name: str, key: str, colour: int) -
         "yaxis": axis(name) | {"type": "category", "autorange": "reversed"},
     }
     return Chart(f"{score.label} by {name}", f"{score.label} by {name}: {'; '.join(values)}.", [trace], layout)
+
+
+COLOURS: dict[Method, int] = {"mode": 1, "mean": 2, "average": 3, "gaussian": 4, "shared": 5}
+DASH = {False: "solid", True: "dash"}
+MAIN, ASIDE = "line", "aside"
+"""Roles: lines that the comparison of two runs includes, and lines that it omits."""
+
+
+def fusion_charts(scores: FusionScores) -> dict[str, Chart]:
+    """Charts of a run that recorded several views."""
+    squared = "Fused: squared error over predicted", "squared error / predicted"
+    return {
+        "fusion_depth_error_mm": _errors(scores, "depth_error_mm", "Depth error by cameras", "mean depth error (mm)"),
+        "fusion_distance_mm": _errors(
+            scores, "distance_mm", "Distance from the truth by cameras", "mean distance (mm)"
+        ),
+        "fusion_squared_error": _errors(scores, "normalised_squared_error", *squared),
+        "fusion_coverage": _coverage(scores),
+        "fusion_surprise": _surprise(scores),
+    }
+
+
+def _errors(scores: FusionScores, quantity: str, title: str, unit: str) -> Chart:
+    """An error against the number of cameras: a line for each method, in free space and on the ground."""
+    traces, cameras = [], range(1, scores.views + 1)
+    for on_plane in (False, True):
+        for method, name in names_of(quantity).items():
+            curve = _curve(cameras, [scores.band(quantity, method, k, on_plane) for k in cameras])
+            role = MAIN if method == "mean" and not on_plane else ASIDE
+            name += ON_GROUND if on_plane else ""
+            traces.append(curve_line(name, curve, COLOURS[method], DASH[on_plane], role))
+    courses = "; ".join(f"{trace['name']} from {trace['y'][0]:.3g} to {trace['y'][-1]:.3g}" for trace in traces)
+    text, y = f"{unit} against the number of cameras", axis(unit, log=True)
+    if quantity not in ERRORS:
+        text = "Squared error of the fused position over its prediction, 1 where calibrated"
+        y = axis(unit, rangemode="tozero")
+        traces.insert(0, line("calibrated", (1.0, scores.views), (1.0, 1.0), 0, dash="dash", role=ASIDE))
+    return Chart(title, f"{text}: {courses}.", traces, {"xaxis": axis("cameras", dtick=1), "yaxis": y})
+
+
+def _curve(x: Iterable[float], bands: list[Band], unit: float = 1.0) -> Curve:
+    ends = ([getattr(band, end) / unit for band in bands] for end in ("value", "low", "high"))
+    return Curve([float(value) for value in x], *ends)
+
+
+def _coverage(scores: FusionScores) -> Chart:
+    traces = [identity(0.0, 1.0, "Gaussian")]
+    for k in (1, scores.views):
+        for method, alone in names_of("coverage").items():
+            bands = [scores.band(f"coverage_{level}", method, k) for level in LEVELS]
+            curve = _curve([level / 100 for level in LEVELS], bands, unit=100)
+            name = f"{alone}, {k} camera{'s' if k > 1 else ''}"
+            role = MAIN if (k, method) == (scores.views, "mean") else ASIDE
+            traces.append(curve_line(name, curve, COLOURS[method], DASH[k == 1], role))
+    shares = "; ".join(
+        f"{trace['name']}: {', '.join(f'{100 * y:.0f} %' for y in trace['y'])}" for trace in traces[1:]
+    )
+    layout = {"xaxis": axis("share of a Gaussian inside"), "yaxis": axis("share of truths inside")}
+    label = f"Share of true positions inside the ellipsoids of {', '.join(map(str, LEVELS))} %: {shares}."
+    return Chart("Fused: coverage of ellipsoids", label, traces, square(layout, 0.0, 1.0))
+
+
+def _surprise(scores: FusionScores) -> Chart:
+    total = sum(scores.surprise) or 1
+    x = [(place + 0.5) / BINS for place in range(BINS)]
+    trace = line("views", x, [count / total for count in scores.surprise], 1)
+    trace["line"]["shape"] = "hvh"
+    layout = {
+        "xaxis": axis("credible level of the fused position", range=[0, 1]),
+        "yaxis": axis("share of views", rangemode="tozero"),
+    }
+    label = (
+        f"Histogram of the credible level that each view gives the position fused from all {scores.views}: "
+        f"{100 * scores.surprise[-1] / total:.1f} % of the views find it beyond their "
+        f"{100 * (1 - 1 / BINS):.0f} % region. It is low where fusion follows a view, and high where a view is "
+        "outvoted."
+    )
+    return Chart("Surprise of the views", label, [trace], layout)
