@@ -25,6 +25,7 @@ def report_of(runs: list[RunFolder]) -> Report:
     return Report(Path(), tuple(Run(run, *run.path.parts[-4:], state="finished", nll=0.0) for run in runs))
 
 
+@pytest.mark.slow
 def test_two_seeds_and_their_eight_views(phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_own_parts(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)

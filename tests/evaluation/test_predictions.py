@@ -30,7 +30,7 @@ def predictions(n: int) -> tuple[ProjectedHuber, np.ndarray]:
     return ProjectedHuber.from_raw(raw, f=f, S=224.0, mu_z0=2.5e-3), f.numpy()
 
 
-OF_SHIFTS = ("inside_50", "inside_99", "inside_conformal")
+OF_SHIFTS = ("inside_50", "inside_99", "inside_conformal", "unfamiliar", "auroc")
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,8 @@ import pytest
 from tests.support.browser import Visit
 from tests.support.site_runs import OWNED
 
+pytestmark = pytest.mark.xdist_group("browser")  # one worker makes its report
+
 RUN = "runs/small-default-probabilistic-seed0.html"
 OTHER = "small-occl-probabilistic-seed0"
 FAILED = "runs/small-occl-mae_vz-seed0.html"
