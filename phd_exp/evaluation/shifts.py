@@ -48,7 +48,8 @@ def shift_scores(folder: Path, home: Columns, held_out: Columns | None) -> dict[
     if held_out and "level" in held_out:
         with suppress(RunError):  # too few samples
             levels["conformal"] = threshold(held_out["level"][GUARANTEE], 0.9, "held-out samples")
-            rated = partial(_rated, Familiarity(held_out), home)
+            familiarity = Familiarity(held_out)
+            rated = partial(_rated, familiarity, np.sort(familiarity.distance(home)))
     for file in sorted(folder.glob("*.parquet")) if "level" in home else ():
         table, said = read_table(file), pq.read_schema(file).metadata or {}
         change = one_line(said.get(b"shift", b"").decode(errors="replace"))
@@ -60,9 +61,9 @@ def _unrated(table: Columns) -> Columns:
     return {}
 
 
-def _rated(familiarity: Familiarity, home: Columns, table: Columns) -> Columns:
-    """Whether each sample is unfamiliar (per cent), and the share of samples at home that are more familiar."""
-    usual, distance = np.sort(familiarity.distance(home)), familiarity.distance(table)
+def _rated(familiarity: Familiarity, usual: np.ndarray, table: Columns) -> Columns:
+    """Whether each sample is unfamiliar (per cent), and the share of `usual` distances, at home, that are smaller."""
+    distance = familiarity.distance(table)
     below = sum(np.searchsorted(usual, distance, side) for side in ("left", "right"))  # ties count half
     unfamiliar = 100.0 * (familiarity.p_value(distance) < ALARM)
     return {"unfamiliar": unfamiliar, "auroc": np.asarray(below / (2 * len(usual)))}

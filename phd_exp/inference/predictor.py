@@ -219,9 +219,10 @@ class Predictor:
 
         Small for images unlike the training images.
         """
-        prediction = self.predict(raw.double(), f.double())
-        if self.familiarity is None or not isinstance(prediction, ProjectedHuber):
+        if self.familiarity is None:
             return None
+        prediction = self.predict(raw.double(), f.double())
+        assert isinstance(prediction, ProjectedHuber)  # only those have a familiarity
         columns = parameter_columns(prediction) | {"f": f.double(), "S": torch.full_like(f, self.side)}
         if self.is_ensemble:
             columns["disagreement"] = self.members(raw, f).disagreement

@@ -49,7 +49,7 @@ def train_together(config: RunConfig, folder: Path, draw: Draw | None, threads: 
                     results[rank] = child.receive()
         except EOFError as death:
             raise RunError(
-                f"rank {rank} of {world}: {death}; the others were ended, and the same command goes on from the last "
+                f"rank {rank} of {world}: {death}; the others were stopped; the same command resumes from the last "
                 "checkpoint"
             ) from None
         finally:
