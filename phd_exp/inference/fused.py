@@ -23,17 +23,18 @@ AGREE = 0.01
 
 def outputs(
     scenes: Sequence[Observed], sightings: Iterable[Sighting]
-) -> tuple[Float[Tensor, "views *members 7"], Float[Tensor, " views"], Pose]:
-    """Network outputs, focal lengths and the poses of the virtual cameras in the world, for each view of the scenes.
+) -> tuple[Float[Tensor, "views *members 7"], Float[Tensor, " views"], Pose, list[float | None]]:
+    """Network outputs, focal lengths, poses of the virtual cameras in the world, and `familiar`, for each view.
 
     No image is kept. A virtual camera is the real one turned, v_virtual = R_v v_camera, so that its pose is
     (R_v R, R_v t).
     """
-    views = [(sighting.raw, sighting.view.camera) for sighting in sightings]
-    R = torch.stack([torch.from_numpy(camera.R) for _, camera in views])
+    views = [(sighting.raw, sighting.view.camera, sighting.familiar) for sighting in sightings]
+    raw, cameras, familiar = zip(*views, strict=True)
+    R = torch.stack([torch.from_numpy(camera.R) for camera in cameras])
     real = Pose.from_scene([pose for scene in scenes for pose in scene.poses])
-    f = torch.tensor([camera.f for _, camera in views], dtype=torch.float64)
-    return torch.stack([raw for raw, _ in views]), f, Pose(R @ real.R, (R @ real.t[..., None]).squeeze(-1))
+    f = torch.tensor([camera.f for camera in cameras], dtype=torch.float64)
+    return torch.stack(raw), f, Pose(R @ real.R, (R @ real.t[..., None]).squeeze(-1)), list(familiar)
 
 
 def fused_answers(
@@ -57,7 +58,7 @@ def fused_answers(
     Raises DatasetError, before the first sighting is computed, if lines of a scene give different true positions.
     """
     truth = torch.stack([_true_position(scene) for scene in scenes])
-    raw, f, pose = outputs(scenes, sightings)
+    raw, f, pose, familiar = outputs(scenes, sightings)
     rows, mask = layout([len(scene.detections) for scene in scenes])
     predictions = predictor.predict(raw[rows], f[rows])
     assert isinstance(predictions, ProjectedHuber)
@@ -74,7 +75,9 @@ def fused_answers(
     for place, scene in enumerate(scenes):
         known = bool(truth[place].isfinite().all())
         scores = {name: rounded(value[place].numpy()) for name, value in errors.items() if known}
-        answers.append(_answer(scene, fused, place) | origin | scores)
+        p_values = [familiar[row] for row in rows[place][mask[place]].tolist()]
+        unusual = {} if None in p_values else {"familiar": rounded(np.array(p_values))}
+        answers.append(_answer(scene, fused, place) | origin | unusual | scores)
     return answers
 
 

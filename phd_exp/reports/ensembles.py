@@ -62,7 +62,7 @@ def ensemble_tables(report: Report) -> list[Table]:
 
 
 def _configuration(run: Run) -> tuple[str, str, str, str]:
-    return run.preset, run.data, run.model, run.name.partition("-")[2]
+    return run.preset, run.data, run.model, run.digest
 
 
 def _scores(runs: Sequence[Run]) -> dict[str, Mapping[str, Band]]:

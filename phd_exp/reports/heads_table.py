@@ -22,12 +22,12 @@ OF_A_CELL = (
 
 
 def heads_tables(report: Report) -> list[Table]:
-    """A table for every preset and data set with runs of the probabilistic model and of other densities."""
-    found: dict[tuple[str, str], dict[str, list[Run]]] = {}
-    for run in sorted(report.runs, key=lambda run: (run.model != PROBABILISTIC, run.model, run.seed or 0)):
+    """A table for every preset, data set and overrides with runs of `probabilistic` and of other densities."""
+    found: dict[tuple[str, str, str], dict[str, list[Run]]] = {}
+    for run in sorted(report.runs, key=lambda run: (run.digest, run.model != PROBABILISTIC)):
         before = run.measured.before
-        if run.state == "finished" and run.overrides is None and before and "nll" in before.scores:
-            found.setdefault((run.preset, run.data), {}).setdefault(run.model, []).append(run)
+        if run.state == "finished" and before and "nll" in before.scores:
+            found.setdefault((run.preset, run.data, run.digest), {}).setdefault(run.model, []).append(run)
     return [_table(*place, models) for place, models in found.items() if PROBABILISTIC in models and len(models) > 1]
 
 
@@ -36,16 +36,16 @@ def _means(runs: Sequence[Run], name: str) -> list[SampleMean]:
     return [SampleMean(e.n, e.scores[name].value, None, np.array(e.resampled[name])) for e in found]
 
 
-def _table(preset: str, data: str, models: dict[str, list[Run]]) -> Table:
+def _table(preset: str, data: str, digest: str, models: dict[str, list[Run]]) -> Table:
     table, rows = findings(), []
     for model, runs in models.items():
         broken = ", ".join(name[0] for name, row in table.items() if model in row and not row[model].holds)
         stub = (model, broken or NOTHING, ", ".join(str(run.seed) for run in runs))
         rows.append(TableRow(stub, tuple(_cell(name, runs, models[PROBABILISTIC]) for name in COLUMNS)))
     return Table(
-        stem=file_stem("heads", preset, data),
+        stem=file_stem("heads", preset, data, *([digest] if digest else [])),
         kind="heads",
-        title=f"Densities on {data}, {in_words(preset)}",
+        title=f"Densities on {data}, {in_words(preset)}" + (f", overrides {digest}" if digest else ""),
         stub=("model", "breaks", "seeds"),
         columns=tuple(SCORES[name].axis for name in COLUMNS),
         groups=(tuple(rows),),
@@ -53,7 +53,8 @@ def _table(preset: str, data: str, models: dict[str, list[Run]]) -> Table:
         below="difference",
         preset=preset,
         numbers=tuple(
-            {"preset": preset, "data": data, "model": model, "seed": run.seed, "quantity": name, "value": mean.value}
+            {"preset": preset, "data": data, "model": model, "overrides": digest, "seed": run.seed}
+            | {"quantity": name, "value": mean.value}
             for model, runs in models.items()
             for name in COLUMNS
             for run, mean in zip(runs, _means(runs, name), strict=True)

@@ -69,6 +69,11 @@ class Run:
         return f"{self.preset}/{self.data}/{self.model}/{self.name}"
 
     @property
+    def digest(self) -> str:
+        """The hash of the overrides in its name, equal for all seeds and models with the same ones; else empty."""
+        return self.name.partition("-")[2]
+
+    @property
     def slug(self) -> str:
         """The path as a file name."""
         return file_stem(*self.folder.path.parts[-4:])

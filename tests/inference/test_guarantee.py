@@ -118,7 +118,12 @@ def test_fused_regions_are_ellipsoids_that_recorded_scenes_guarantee(
 ) -> None:
     outcome = phd_exp("fuse", f"run={run.path}", f"folder={photos}", "coverage=0.9")
     assert outcome.status == 0, outcome.err
+    alone = {
+        line["file_name"]: line["familiar"]
+        for line in read_lines(phd_exp("predict", f"run={run.path}", f"folder={photos}").out)
+    }
     for row in read_lines(outcome.out):
+        assert row["familiar"] == [alone[name] for name in row["file_names"]]
         region = row["region"]
         facts = fused_guarantee(run.views, 2, 0.9, None)
         assert facts.items() <= region.items()

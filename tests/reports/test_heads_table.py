@@ -57,6 +57,18 @@ def test_a_better_density_is_bold_with_several_seeds_only(runs: Path) -> None:
     assert not is_bold()
 
 
+def test_runs_with_the_same_overrides_have_a_table_of_their_own(runs: Path) -> None:
+    for model in ("probabilistic", "gaussian"):
+        for seed in (0, 1):
+            folder = runs / "small" / "default" / model / f"seed{seed}"
+            folder.rename(folder.with_name(f"{folder.name}-0123abcd"))
+    plain, changed = heads_tables(read_report(runs))
+    assert [row.stub[0] for row in changed.rows] == ["probabilistic", "gaussian"]
+    assert {row.stub[2] for row in changed.rows} == {"0, 1"}
+    assert changed.title == f"{plain.title}, overrides 0123abcd"
+    assert {line["overrides"] for line in changed.numbers} == {"0123abcd"}
+
+
 def test_a_single_density_has_no_table(tmp_path: Path) -> None:
     record(tmp_path, "default", "probabilistic", 0, predicted(0).frame)
     assert heads_tables(read_report(tmp_path)) == []
