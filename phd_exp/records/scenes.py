@@ -1,7 +1,8 @@
 """A scene as data, and a line of `metadata.jsonl`, which describes an image.
 
 Camera frame: x right, y down, z forward, metres. A scene's own frame is the camera frame of its first view. An
-object's local frame has its origin at the object's centre; a cylinder's axis is the local z axis.
+object's local frame has its origin at the object's centre; a cylinder's axis is the local z axis. A mesh's local frame
+has its origin at the reference point and Blender's axes, z up: (x, -z, y) of glTF and OBJ, (x, y, z) of PLY and STL.
 """
 
 import math
@@ -13,6 +14,8 @@ from phd_exp.records.parsing import Record
 
 Split = Literal["train", "test"]
 Shape = Literal["cylinder", "cube", "sphere"]
+MeshName = Annotated[str, Field(pattern=r"^mesh[0-9]*$")]
+"""`mesh` is the user's object, `mesh1` and so on are distractors."""
 Material = Literal["rubber", "metal"]
 LampName = Literal["key", "fill", "back"]
 
@@ -42,10 +45,10 @@ class SceneObject(Record):
         rotation: unit quaternion (w, x, y, z) from local axes to the scene's.
         dimensions: extent along the local axes at scale 1, m.
         scale: factor on all three dimensions.
-        colour: sRGB.
+        colour: sRGB; with `material`, of the solids and of meshes without a material.
     """
 
-    shape: Shape
+    shape: Shape | MeshName
     position: tuple[Finite, Finite, Positive]
     rotation: Quaternion
     dimensions: tuple[Positive, Positive, Positive]
@@ -76,6 +79,46 @@ class Backdrop(Record):
     centre: tuple[Finite, Finite]
 
 
+class Sky(Record):
+    """A panorama that lights the scene: a file, or the name of one of Blender's skies.
+
+    It is turned by `turn` radians about the vertical; `brightness` is the mean of its radiance over all directions.
+    """
+
+    file: str
+    turn: Finite
+    brightness: Positive
+
+
+class Photo(Record):
+    """A square of a photograph.
+
+    Its side is in units of the photograph's shorter side, its place the shares of the free width and height on the
+    left and above.
+    """
+
+    file: str
+    side: Share
+    place: tuple[Share, Share]
+    flipped: bool
+
+
+class Surroundings(Record):
+    """The world around an object.
+
+    Attributes:
+        pitch: angle by which the first camera looks down, radians.
+        background: None: the backdrop.
+        ground: a point of a horizontal plane that shows shadows alone, scene frame, m.
+        shake: path of the image during the exposure, right and down, px.
+    """
+
+    pitch: Finite
+    background: Sky | Photo | None
+    ground: Vector | None
+    shake: tuple[Finite, Finite]
+
+
 class Pose(Record):
     """Pose of a camera, the map from the scene's frame to the camera's: p_camera = R p_scene + translation.
 
@@ -93,12 +136,20 @@ FIRST_VIEW = Pose(rotation=(1.0, 0.0, 0.0, 0.0), translation=(0.0, 0.0, 0.0))
 
 def _one_of_each(objects: tuple[SceneObject, ...]) -> tuple[SceneObject, ...]:
     shapes = [item.shape for item in objects]
-    if shapes[0] != "cylinder" or len(set(shapes)) < len(shapes):
-        raise ValueError(f"a scene is a cylinder first, then other shapes, each once; these are {shapes}")
+    if shapes[0] not in ("cylinder", "mesh") or len(set(shapes)) < len(shapes):
+        raise ValueError(f"a scene is a cylinder or mesh first, then other shapes, each once; these are {shapes}")
     return objects
 
 
 Objects = Annotated[tuple[SceneObject, ...], Field(min_length=1), AfterValidator(_one_of_each)]
+
+
+def _is_none(value: object) -> bool:
+    return value is None
+
+
+# not written for other scenes, whose records stay as they were
+OfMesh = Annotated[Surroundings | None, Field(exclude_if=_is_none)]
 
 
 class Scene(Record):
@@ -108,8 +159,9 @@ class Scene(Record):
         f: focal length, px; the principal point is the middle of the image.
         S: side of the square image, px.
         pose: pose of the camera.
-        objects: the cylinder first.
+        objects: the cylinder or mesh first.
         noise_seed: seed of the path tracer.
+        surroundings: of a mesh.
     """
 
     f: Positive
@@ -119,6 +171,7 @@ class Scene(Record):
     lamps: tuple[Lamp, ...]
     backdrop: Backdrop
     noise_seed: Seed
+    surroundings: OfMesh = None
 
 
 class SampleRecord(Record):
@@ -126,7 +179,7 @@ class SampleRecord(Record):
 
     Attributes:
         file_name: the image, in the folder of the line's file (the key of Hugging Face `imagefolder`).
-        x, y, z: centre of the cylinder, camera frame, m.
+        x, y, z: centre of the cylinder, or reference point of the mesh, camera frame, m.
         f, S: focal length and side of the image, px.
         scale: size factor of the cylinder.
         visibility: visible pixels of the cylinder over those visible without other objects; 0 if there are none.
@@ -155,6 +208,7 @@ class SampleRecord(Record):
     lamps: tuple[Lamp, ...]
     backdrop: Backdrop
     noise_seed: Seed
+    surroundings: OfMesh = None
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
     @property

@@ -11,12 +11,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from phd_exp.records.errors import RenderError
 from phd_exp.records.scenes import Scene
+from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.pixels import Light, read_light
+from phd_exp.rendering.rays import NO_MESHES
 from phd_exp.rendering.stage import build_stage
+from phd_exp.rendering.surroundings import World
+
+if TYPE_CHECKING:
+    from phd_exp.rendering.triangles import Meshes
 
 X_LIBRARIES = "libx11-6 libxext6 libxfixes3 libxi6 libxrender1 libxkbcommon0 libsm6 libice6 libgl1"
 
@@ -82,10 +88,13 @@ class Renderer:
 
     Blender has one state per process: a second renderer in the same process replaces the first one's scene.
 
-    Raises RenderError if bpy or a library it needs is missing.
+    Attributes:
+        meshes: the triangles of the objects that `spec` names.
+
+    Raises RenderError if bpy or a library it needs is missing, or if a mesh cannot be used.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, spec: DatasetSpec | None = None) -> None:
         memory = Path("/dev/shm")  # a folder in memory, where the system has one
         place = memory if os.access(memory, os.W_OK) else Path(tempfile.gettempdir())
         self._output = place / f"phd_exp-{uuid.uuid4().hex}.exr"
@@ -95,15 +104,25 @@ class Renderer:
             self._scene = self._bpy.context.scene
             _configure_image(self._scene)
             _configure_tracer(self._scene.cycles, settings)
+            self.meshes: "Meshes" = NO_MESHES
+            self._world: World | None = None
+            if spec is not None and spec.mesh is not None:
+                from phd_exp.rendering.importing import import_meshes  # numba, which takes a second to import
+
+                self.meshes, self._world = import_meshes(self._bpy, spec), World(self._bpy, spec)
+                _configure_for_meshes(self._scene)
 
     def render(self, scene: Scene, box: Box | None = None) -> Light:
         """Linear light of a box of pixels (height, width, 3), by default of all (S, S, 3); rows from the top.
 
-        An image is white from 1 upwards. A pure function of the scene, the box and the settings.
+        An image is white from 1 upwards. A pure function of the scene, the box and the settings. With meshes, the
+        result (height, width, 4) includes the opacity, by which light is multiplied.
         """
         box = box or Box(0, 0, scene.S, scene.S)
         self._frame(box, scene.S)
-        self._stage.show(scene)
+        self._stage.show(scene, self.meshes)
+        if self._world is not None:
+            self._world.show(scene)
         self._scene.cycles.seed = scene.noise_seed
         self._scene.render.filepath = str(self._output)
         try:
@@ -112,7 +131,8 @@ class Renderer:
             content = self._output.read_bytes()
         finally:
             self._output.unlink(missing_ok=True)
-        return read_light(content, box.bottom - box.top, box.right - box.left)
+        channels = 4 if self.meshes else 3
+        return read_light(content, box.bottom - box.top, box.right - box.left, channels)
 
     def _frame(self, box: Box, side: int) -> None:
         """Set the box as fractions of the image from the bottom left corner, which Blender truncates to whole pixels.
@@ -159,6 +179,13 @@ def _configure_tracer(cycles: Any, settings: Settings) -> None:
     cycles.denoising_quality = "FAST"  # HIGH takes a quarter longer for half a dB
     cycles.denoising_input_passes = "RGB"  # albedo and normals made FAST worse
     cycles.denoising_prefilter = "NONE"
+
+
+def _configure_for_meshes(scene: Any) -> None:
+    """Change the options for textures, which may be transparent, and backgrounds that are added later."""
+    scene.render.image_settings.color_mode = "RGBA"
+    scene.cycles.transparent_max_bounces = 8
+    scene.cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"  # 1 dB on textures
 
 
 @contextmanager

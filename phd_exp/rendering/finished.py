@@ -16,7 +16,7 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer, renderer_version, require_bpy
 from phd_exp.rendering.pixels import file_of
 from phd_exp.rendering.progress import shown_progress
-from phd_exp.rendering.rays import cylinder_mask, trace_pixels
+from phd_exp.rendering.rays import NO_MESHES, cylinder_mask, trace_pixels
 from phd_exp.rendering.samples import fast_settings, make_sample
 from phd_exp.rendering.sampling import GENERATOR_VERSION
 from phd_exp.rendering.sealing import other_make
@@ -91,7 +91,7 @@ def _rendered_again(folder: DatasetFolder, spec: DatasetSpec, records: list[Samp
         return
     names = ", ".join(f"{record.split}/{record.file_name}" for record in records)
     announce(f"rendering {len(records)} samples again: {names}")
-    renderer = Renderer(fast_settings(spec))
+    renderer = Renderer(fast_settings(spec), spec)
     for record in records:
         image, again = make_sample(renderer, spec, record.split, record.index)
         path = folder.split_folder(record.split) / record.file_name
@@ -102,20 +102,22 @@ def _rendered_again(folder: DatasetFolder, spec: DatasetSpec, records: list[Samp
             yield f"{path}: rendering it again gives another image; delete the data set, and `render` makes it again"
 
 
-def write_masks(folder: DatasetFolder, masks: Path) -> int:
-    """Write `<masks>/<split>/<index>.png`, white where the cylinder is visible, for all samples; returns how many.
+def write_masks(folder: DatasetFolder, spec: DatasetSpec, masks: Path) -> int:
+    """Write `<masks>/<split>/<index>.png`, white where the object is visible, for all samples; returns how many.
 
-    The masks have one bit per pixel and follow from the records, without Blender.
+    The masks have one bit per pixel and follow from the records, without Blender, which only reads meshes.
 
-    Raises DatasetError if there is no data set, or a broken one, RenderError if the masks cannot be written.
+    Raises DatasetError if there is no data set, or a broken one, RenderError if the masks cannot be written, or if a
+    mesh cannot be read.
     """
+    meshes = NO_MESHES if spec.mesh is None else Renderer(fast_settings(spec), spec).meshes
     records = [record for split in SPLITS for record in folder.records(split)]
     with writing(masks, instead="masks=FOLDER"):
         for split in SPLITS:
             (masks / split).mkdir(parents=True, exist_ok=True)
         with shown_progress(len(records), "drawing masks") as advance:
             for record in records:
-                image = Image.fromarray(cylinder_mask(trace_pixels(record.shown)))
+                image = Image.fromarray(cylinder_mask(trace_pixels(record.shown, meshes)))
                 path = (masks / record.split / record.file_name).with_suffix(".png")
                 write_atomic(path, file_of(image, "png"))
                 advance()

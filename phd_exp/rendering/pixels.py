@@ -48,23 +48,23 @@ def file_of(image: Image.Image, image_format: ImageFormat, **options: Any) -> by
     return stream.getvalue()
 
 
-def read_light(content: bytes, height: int, width: int) -> NDArray[np.float64]:
-    """Linear light (height, width, 3), rows from the top, from an OpenEXR file with the settings of `Renderer`.
+def read_light(content: bytes, height: int, width: int, channels: int = 3) -> NDArray[np.float64]:
+    """Linear light (height, width, channels), rows from the top, from an OpenEXR file with the settings of `Renderer`.
 
-    The file has three channels of half floats in uncompressed blocks of one row. In background mode, Blender returns
-    pixels through files only, and only OpenEXR keeps the light of an overexposed pixel.
+    The file has half floats in uncompressed blocks of one row; a fourth channel is the opacity. In background mode,
+    Blender returns pixels through files only, and only OpenEXR keeps the light of an overexposed pixel.
 
     Raises ValueError if the file has another format or size.
 
     Source: "OpenEXR file layout" in the OpenEXR documentation. The rows are at the end of the file; each has its
-    number and length (int32), then blue, green and red.
+    number and length (int32), then opacity, blue, green and red.
     """
-    row = np.dtype([("number", "<i4"), ("length", "<i4"), ("light", "<f2", (3, width))])
+    row = np.dtype([("number", "<i4"), ("length", "<i4"), ("light", "<f2", (channels, width))])
     begin = len(content) - height * row.itemsize
     if content[:4] != b"\x76\x2f\x31\x01" or begin <= 0:
         raise ValueError(f"not an uncompressed OpenEXR file of {width} x {height} pixels")
     rows = np.frombuffer(content, row, count=height, offset=begin)
     steps = np.diff(rows["number"])
-    if (rows["length"] != 6 * width).any() or (steps != 1).any():
+    if (rows["length"] != 2 * channels * width).any() or (steps != 1).any():
         raise ValueError(f"an OpenEXR file, but not of {height} rows of {width} pixels in half floats")
     return rows["light"][:, ::-1].transpose(0, 2, 1).astype(np.float64)

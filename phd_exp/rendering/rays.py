@@ -7,17 +7,23 @@ parameter at which the line enters.
 
 import math
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from phd_exp.records.scenes import Pose, Scene, SceneObject
 
+if TYPE_CHECKING:  # numba takes a second to import
+    from phd_exp.rendering.triangles import Meshes
+
 Image = NDArray[np.float64]
 Labels = NDArray[np.int8]
 Mask = NDArray[np.bool_]
 
 FACES = 8  # at most that many smooth faces on one object
+NO_MESHES: "Meshes" = MappingProxyType({})
 NOTHING = 0  # the label of a ray that hits no object
 
 
@@ -40,10 +46,16 @@ class Hits:
         return np.take_along_axis(self.surfaces, nearest[None], axis=0)[0]
 
 
-def trace_pixels(scene: Scene) -> Hits:
+def trace_pixels(scene: Scene, meshes: "Meshes" = NO_MESHES) -> Hits:
     """The hits (S, S) of the rays through the middles (c + 1/2, r + 1/2) of all pixels (column c, row r)."""
     hits = _no_hits(scene, (scene.S, scene.S))
     for number, item in enumerate(scene.objects):
+        if item.shape in meshes:
+            everywhere = range(scene.S), range(scene.S)
+            depths = meshes[item.shape].depths(*_mesh_in_camera(scene, item), *everywhere)
+            hits.depths[number] = depths
+            hits.surfaces[number] = np.where(np.isfinite(depths), 1 + FACES * number, NOTHING)
+            continue
         rows, columns = (_clipped(span, scene.S) for span in window(scene, item))
         if rows and columns:
             x, y = pixel_middles(rows, columns)
@@ -78,14 +90,18 @@ def visibility(hits: Hits) -> float:
     return float(cylinder_mask(hits).sum() / alone) if alone else 0.0
 
 
-def truncation(scene: Scene, hits: Hits) -> float:
+def truncation(scene: Scene, hits: Hits, meshes: "Meshes" = NO_MESHES) -> float:
     """Share of the cylinder's pixels, in an image without borders or other objects, that lie outside this image.
 
     1 if the cylinder has no pixels at all.
     """
-    cylinder = scene.model_copy(update={"objects": scene.objects[:1]})
-    everywhere = trace_points(cylinder, *pixel_middles(*window(scene, scene.objects[0])))
-    whole = (everywhere.surfaces[0] != NOTHING).sum()
+    if (item := scene.objects[0]).shape in meshes:
+        mesh, place = meshes[item.shape], _mesh_in_camera(scene, item)
+        whole = np.isfinite(mesh.depths(*place, *mesh.silhouette(*place))).sum()
+    else:
+        cylinder = scene.model_copy(update={"objects": scene.objects[:1]})
+        everywhere = trace_points(cylinder, *pixel_middles(*window(scene, item)))
+        whole = (everywhere.surfaces[0] != NOTHING).sum()
     return float(1 - (hits.surfaces[0] != NOTHING).sum() / whole) if whole else 1.0
 
 
@@ -132,6 +148,12 @@ def _shadow(off_axis: float, z: float, radius: float, scene: Scene) -> range:
 
 def _clipped(span: range, side: int) -> range:
     return range(max(span.start, 0), min(span.stop, side))
+
+
+def _mesh_in_camera(scene: Scene, item: SceneObject) -> tuple[Image, Image, float, int]:
+    """The arguments of `Triangles.depths` that place a mesh in a scene's camera."""
+    rotation = rotation_matrix(scene.pose.rotation) @ rotation_matrix(item.rotation)
+    return item.scale * rotation, in_camera_frame(np.array(item.position), scene.pose), scene.f, scene.S
 
 
 def _cast(scene: Scene, number: int, x: Image, y: Image) -> tuple[Image, Labels]:

@@ -47,6 +47,8 @@ class Purpose(IntEnum):
     OBJECT = 10  # plus 10 per shape, in the order of SHAPES; then POSE, LOOK or SCALE
     VIEW = 40  # followed by the view's number
     PANEL = 50
+    SURROUNDINGS = 60
+    DISTRACTORS = 70  # followed by the number of each
 
 
 SHAPES: tuple[Shape, ...] = get_args(Shape)
@@ -75,13 +77,13 @@ def sample_scene(spec: DatasetSpec, split: Split, index: int) -> Scene:
     number, view = scene_and_view(spec, index)
 
     def stream(purpose: int) -> Stream:
-        return _stream(spec, split, number, purpose)
+        return stream_of(spec, split, number, purpose)
 
     f = _uniform(stream(Purpose.CAMERA), spec.f_range)
     objects = []
     for place, shape in enumerate(SHAPES if spec.occluders else SHAPES[:1]):
         pose, look, size = (stream(Purpose.OBJECT + 10 * place + part) for part in (POSE, LOOK, SCALE))
-        objects.append(_object(spec, shape, f, pose, look, size))
+        objects.append(draw_object(spec, shape, f, pose, look, size))
     if spec.half_hidden:
         panel = _panel(spec, objects[0].position, f, stream(Purpose.PANEL))
         objects = [*(item for item in objects if item.shape != panel.shape), panel]
@@ -94,7 +96,7 @@ def sample_scene(spec: DatasetSpec, split: Split, index: int) -> Scene:
         backdrop=_backdrop(stream(Purpose.BACKDROP)),
         noise_seed=_seed(stream(Purpose.NOISE)),
     )
-    return _seen_again(scene, spec, _stream(spec, split, number, Purpose.VIEW, view)) if view else scene
+    return _seen_again(scene, spec, stream_of(spec, split, number, Purpose.VIEW, view)) if view else scene
 
 
 def about_axis(axis: Vector, angle: float) -> Quaternion:
@@ -118,7 +120,8 @@ def uniform_rotation(rng: Stream) -> Quaternion:
     )
 
 
-def _stream(spec: DatasetSpec, split: Split, scene: int, *purpose: int) -> Stream:
+def stream_of(spec: DatasetSpec, split: Split, scene: int, *purpose: int) -> Stream:
+    """The random numbers for a purpose, the same whatever else is drawn."""
     key = (get_args(Split).index(split), scene, *map(int, purpose))
     return np.random.default_rng(np.random.SeedSequence(entropy=spec.seed, spawn_key=key))
 
@@ -149,7 +152,8 @@ def _pose(objects: tuple[SceneObject, ...], spec: DatasetSpec, f: float, rng: St
     raise ValueError(f"no camera sees all {len(objects)} objects: lower view_angle_range")
 
 
-def _object(spec: DatasetSpec, shape: Shape, f: float, pose: Stream, look: Stream, size: Stream) -> SceneObject:
+def draw_object(spec: DatasetSpec, shape: str, f: float, pose: Stream, look: Stream, size: Stream) -> SceneObject:
+    """An object as large as the cylinder, whose pose, look and scale come from three streams."""
     return SceneObject(
         shape=shape,
         position=_position(spec, f, pose),
@@ -167,7 +171,7 @@ def _panel(spec: DatasetSpec, hidden: Vector, f: float, rng: Stream) -> SceneObj
     A convex object that is symmetric about its centre has a symmetric silhouette, up to perspective: the edge halves
     it.
     """
-    panel = _object(spec, "cube", f, rng, rng, rng)
+    panel = draw_object(spec, "cube", f, rng, rng, rng)
     angle, depth = _uniform(rng, (0.0, math.tau)), _uniform(rng, (0.6, 0.8))
     x, y, z = (depth * coordinate for coordinate in hidden)
     middle = (x + 0.5 * PANEL[0] * math.cos(angle), y + 0.5 * PANEL[0] * math.sin(angle), z)

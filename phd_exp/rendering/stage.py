@@ -4,6 +4,7 @@ Blender's camera looks along -z with y up, ours along z with y down: p_blender =
 Blender's module or its objects; this file does not import it.
 """
 
+from collections.abc import Iterable
 from typing import Any, get_args
 
 import numpy as np
@@ -33,25 +34,30 @@ class Stage:
     def __init__(self, bpy: Any) -> None:
         self._data = bpy.data
 
-    def show(self, scene: Scene) -> None:
-        """Arrange everything as in a scene."""
+    def show(self, scene: Scene, meshes: Iterable[str]) -> None:
+        """Arrange everything as in a scene; `meshes` are the names of imported objects."""
         objects = self._data.objects
         objects["camera"].data.lens = scene.f * SENSOR_WIDTH / scene.S
         # p_scene = R^T (p_camera - translation), with Blender's axes in both frames
         back = rotation_matrix(scene.pose.rotation).T
-        objects["camera"].matrix_world = _matrix(back @ TO_BLENDER, -back @ np.array(scene.pose.translation))
-        for shape in SHAPES:
+        objects["camera"].matrix_world = matrix_of(back @ TO_BLENDER, -back @ np.array(scene.pose.translation))
+        for shape in (*SHAPES, *meshes):
             objects[shape].hide_render = True
         for item in scene.objects:
             self._place_object(objects[item.shape], item)
+        for name in get_args(LampName):
+            objects[name].hide_render = not scene.lamps
         for lamp in scene.lamps:
             _place_lamp(objects[lamp.name], lamp)
         show_backdrop(self._data.worlds["world"].node_tree.nodes, scene.backdrop)
 
     def _place_object(self, handle: Any, item: SceneObject) -> None:
         handle.hide_render = False
-        stretch = 0.5 * item.scale * np.array(item.dimensions)
-        handle.matrix_world = _matrix(rotation_matrix(item.rotation) * stretch, np.array(item.position))
+        size = 0.5 * np.array(item.dimensions) if item.shape in SHAPES else np.ones(3)
+        stretch = item.scale * size
+        handle.matrix_world = matrix_of(rotation_matrix(item.rotation) * stretch, np.array(item.position))
+        if handle.data.materials[0] is not None:  # its own
+            return
         handle.color = (*(linear(channel) for channel in item.colour), 1.0)
         handle.material_slots[0].link = "OBJECT"
         handle.material_slots[0].material = self._data.materials[item.material]
@@ -102,12 +108,12 @@ def _place_lamp(handle: Any, lamp: Lamp) -> None:
     """An area lamp shines along its local -z."""
     position = np.array(lamp.position)
     forward = np.array(lamp.towards) - position
-    handle.matrix_world = _matrix(TO_BLENDER @ _facing(TO_BLENDER @ forward), position)
+    handle.matrix_world = matrix_of(TO_BLENDER @ _facing(TO_BLENDER @ forward), position)
     handle.data.energy = lamp.power
     handle.data.size = lamp.side
 
 
-def _matrix(linear: NDArray[np.float64], place: NDArray[np.float64]) -> list[list[float]]:
+def matrix_of(linear: NDArray[np.float64], place: NDArray[np.float64]) -> list[list[float]]:
     """Blender's matrix, by columns, of the map p = linear local + place in our axes."""
     matrix = np.eye(4)
     matrix[:3, :3] = TO_BLENDER @ linear

@@ -24,7 +24,7 @@ def serve(connection: Connection) -> None:
         answer: SampleRecord | UserError
         try:
             with writing(folder.root):
-                renderer = renderer or Renderer(fast_settings(spec))
+                renderer = renderer or Renderer(fast_settings(spec), spec)
                 image, answer = make_sample(renderer, spec, split, index)
                 write_atomic(folder.image_path(split, index, spec.image_format), image)
         except UserError as error:

@@ -115,7 +115,7 @@ class RunConfig(Record):
                     raise ValueError(f"data={data.name} is not rendered; leave out this shift")
                 return data
             named = {"variant": f"{data.name}-{shift}"} if changes else {}
-            spec = DatasetSpec(**(data.spec.model_dump() | named | changes))
+            spec = DatasetSpec(**(dict(data.spec) | named | changes))
         except ValueError as error:
             raise ConfigError(f"evaluation.shifts.{shift}.data: {gist(error)}") from None
         return data.model_copy(update={"spec": spec, "n_test": n or data.n_test})
