@@ -15,7 +15,8 @@ from phd_exp.training.config import RenderConfig, RunConfig
 LINE = re.compile(r"( *)(\w+):(?: +([^#]*?))?(?: *# *(.*))?")
 """A line of YAML: indentation, key, value and comment."""
 FILES = {"train": {"config": "", "trainer/auto": "trainer.", "recipe/paper": ""}, "render": {"render": ""}}
-"""Verb -> the files of conf/ that explain its keys, with what precedes these; data/default.yaml and data/object.yaml follow for both."""
+"""Verb -> the files of conf/ that explain its keys, with what precedes these; those of DATA follow for both."""
+DATA = {"data/default": "data.", "data/object": "data."}
 NAMES = {int: "int", float: "float", bool: "bool", NoneType: "null", tuple: "list"}
 Key = tuple[str, str, str, str]
 """Name, type, default and description."""
@@ -24,10 +25,7 @@ Key = tuple[str, str, str, str]
 def keys_of(verb: str) -> list[Key]:
     """All keys of a verb, except the arguments of the classes that its groups choose."""
     if verb in FILES:
-        files, model = (
-            FILES[verb] | {"data/default": "data.", "data/object": "data."},
-            RunConfig if verb == "train" else RenderConfig,
-        )
+        files, model = FILES[verb] | DATA, RunConfig if verb == "train" else RenderConfig
         return [key for file, prefix in files.items() for key in _in(file, prefix, model)]
     arguments: type[BaseModel] = getattr(import_module(f"phd_exp.cli.{verb}"), f"{verb.title()}Arguments")
     return [

@@ -1,8 +1,8 @@
 """A scene as data, and a line of `metadata.jsonl`, which describes an image.
 
 Camera frame: x right, y down, z forward, metres. A scene's own frame is the camera frame of its first view. An
-object's local frame has its origin at the object's centre; a cylinder's axis is the local z axis. A mesh's local frame
-has its origin at the reference point and Blender's axes, z up: (x, -z, y) of glTF and OBJ, (x, y, z) of PLY and STL.
+object's local frame has its origin at the object's centre; a cylinder's axis is the local z axis. That of a mesh has
+its origin at the reference point and Blender's axes, z up: (x, -z, y) of glTF and OBJ, (x, y, z) of PLY and STL.
 """
 
 import math
@@ -14,8 +14,7 @@ from phd_exp.records.parsing import Record
 
 Split = Literal["train", "test"]
 Shape = Literal["cylinder", "cube", "sphere"]
-MeshName = Annotated[str, Field(pattern=r"^mesh[0-9]*$")]
-"""`mesh` is the user's object, `mesh1` and so on are distractors."""
+MeshName = Annotated[str, Field(pattern=r"^mesh[0-9]*$")]  # `mesh` is the user's object, the others are distractors
 Material = Literal["rubber", "metal"]
 LampName = Literal["key", "fill", "back"]
 
@@ -45,7 +44,7 @@ class SceneObject(Record):
         rotation: unit quaternion (w, x, y, z) from local axes to the scene's.
         dimensions: extent along the local axes at scale 1, m.
         scale: factor on all three dimensions.
-        colour: sRGB; with `material`, of the solids and of meshes without a material.
+        colour: sRGB; as the material, of a mesh without its own.
     """
 
     shape: Shape | MeshName
@@ -79,42 +78,27 @@ class Backdrop(Record):
     centre: tuple[Finite, Finite]
 
 
-class Sky(Record):
-    """A panorama that lights the scene: a file, or the name of one of Blender's skies.
-
-    It is turned by `turn` radians about the vertical; `brightness` is the mean of its radiance over all directions.
-    """
-
-    file: str
-    turn: Finite
-    brightness: Positive
-
-
-class Photo(Record):
-    """A square of a photograph.
-
-    Its side is in units of the photograph's shorter side, its place the shares of the free width and height on the
-    left and above.
-    """
-
-    file: str
-    side: Share
-    place: tuple[Share, Share]
-    flipped: bool
-
-
 class Surroundings(Record):
-    """The world around an object.
+    """The world around a mesh.
 
     Attributes:
         pitch: angle by which the first camera looks down, radians.
-        background: None: the backdrop.
-        ground: a point of a horizontal plane that shows shadows alone, scene frame, m.
+        file: a sky, which also lights the scene, or a photograph; None: the backdrop.
+        turn: of a sky about the vertical, radians.
+        brightness: factor of a sky's light.
+        square: of a photograph: shares of the free space on the left and above, side in units of the shorter side.
+        flipped: whether the photograph's left and right are exchanged.
+        ground: a point of the plane on which the object stands, scene frame, m.
         shake: path of the image during the exposure, right and down, px.
     """
 
     pitch: Finite
-    background: Sky | Photo | None
+    file: str | None
+    is_sky: bool
+    turn: Finite
+    brightness: Positive
+    square: tuple[Share, Share, Share]
+    flipped: bool
     ground: Vector | None
     shake: tuple[Finite, Finite]
 
@@ -141,15 +125,9 @@ def _one_of_each(objects: tuple[SceneObject, ...]) -> tuple[SceneObject, ...]:
     return objects
 
 
+# not written for cylinders, whose records stay as they were
+OfMesh = Annotated[Surroundings | None, Field(exclude_if=lambda value: value is None)]
 Objects = Annotated[tuple[SceneObject, ...], Field(min_length=1), AfterValidator(_one_of_each)]
-
-
-def _is_none(value: object) -> bool:
-    return value is None
-
-
-# not written for other scenes, whose records stay as they were
-OfMesh = Annotated[Surroundings | None, Field(exclude_if=_is_none)]
 
 
 class Scene(Record):

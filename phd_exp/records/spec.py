@@ -10,7 +10,6 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, StrictBool, model_serializer, model_validator
 
 from phd_exp.records.assets import BLENDERS_SKIES, Asset, backdrops_asset, mesh_asset
-from phd_exp.records.errors import listed
 from phd_exp.records.parsing import Record
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -28,23 +27,19 @@ FocalLength = Annotated[Number, Field(ge=10, le=1e6)]
 Distance = Annotated[Number, Field(ge=0.5, le=100)]
 Factor = Annotated[Number, Field(ge=0.1, le=2)]
 Share = Annotated[Number, Field(ge=0, le=1)]
-OF_OBJECTS = set(
-    "unit reference upright pitch_range backdrops ground distractors distractor_meshes motion_blur".split()
-)
-"""The keys that require a mesh."""
 # beyond a right angle, half the cameras would face the lamps
 Angle = Annotated[Number, Field(ge=0, le=90)]
 Range = AfterValidator(_ascending)
 
 
-def _a_point(given: Any) -> Any:
+def _point(given: Any) -> Any:
     if given not in ("origin", "centroid") and not (isinstance(given, (list, tuple)) and len(given) == 3):
         raise ValueError("expected origin, centroid or [x, y, z] in units of the file")
     return given
 
 
-Point = tuple[Number, Number, Number]
-Reference = Annotated[Literal["origin", "centroid"] | Point, BeforeValidator(_a_point)]
+Reference = Annotated[Literal["origin", "centroid"] | tuple[Number, Number, Number], BeforeValidator(_point)]
+Mesh = BeforeValidator(mesh_asset)
 ImageFormat = Literal["png", "webp", "jpeg"]
 SHARD = "expected INDEX/COUNT with 0 <= INDEX < COUNT"
 
@@ -72,15 +67,15 @@ class DatasetSpec(Record):
         image_quality: of webp and jpeg, per cent.
         saturation_range: bounds of the saturation of every colour; near 0 it is grey.
         half_hidden: whether a panel in front of the cylinder hides half of it. It replaces the cube of `occluders`.
-        mesh: the object instead of the cylinder.
+        mesh: the object instead of the cylinder. The following keys are for meshes alone.
         unit: metres per unit of the meshes' files.
-        reference: the point of the mesh whose position is predicted: the file's origin, the centroid of its surface,
-            or a point in the file's units and axes.
+        reference: the point whose position is predicted: the file's origin, the centroid of the surface, or a point
+            in the file's units and axes.
         upright: whether the object is only turned about the vertical.
         pitch_range: bounds of the angle by which the first camera looks down, degrees.
-        backdrops: Blender's own skies, or the user's photographs and skies; None: the grey backdrop.
-        ground: whether an upright object stands on a plane, which shows its shadow.
-        distractors: how many of the three solids and the `distractor_meshes` are added.
+        backdrops: Blender's skies, or the user's photographs and skies; None: the grey backdrop.
+        ground: whether the object stands on a plane, which shows its shadow.
+        distractors: number of other objects, of the three solids and `distractor_meshes`.
         motion_blur: the longest path of the image during the exposure, px.
 
     Raises:
@@ -105,7 +100,7 @@ class DatasetSpec(Record):
     image_quality: Annotated[int, Field(strict=True, ge=1, le=100)]
     saturation_range: Annotated[tuple[Share, Share], Range] = (0.45, 0.95)
     half_hidden: StrictBool = False
-    mesh: Annotated[Asset | None, BeforeValidator(mesh_asset)] = None
+    mesh: Annotated[Asset | None, Mesh] = None
     unit: Annotated[Number, Field(gt=0, le=1000)] = 1.0
     reference: Reference = "origin"
     upright: StrictBool = False
@@ -113,32 +108,29 @@ class DatasetSpec(Record):
     backdrops: Annotated[Literal["hdri"] | Asset | None, BeforeValidator(backdrops_asset)] = None
     ground: StrictBool = False
     distractors: Annotated[int, Field(strict=True, ge=0, le=12)] = 0
-    distractor_meshes: tuple[Annotated[Asset, BeforeValidator(mesh_asset)], ...] = ()
+    distractor_meshes: tuple[Annotated[Asset, Mesh], ...] = ()
     motion_blur: Annotated[Number, Field(ge=0, le=64)] = 0.0
 
     @model_validator(mode="after")
     def _parts_fit(self) -> "DatasetSpec":
-        """Refuse keys of objects without a mesh, and what cannot stand on the ground."""
-        if self.mesh is None and (keys := self.model_dump().keys() & OF_OBJECTS):
-            raise ValueError(f"{listed(sorted(keys))}: for objects alone; expected data=object data.mesh=FILE")
+        keys, n_others = list(type(self).model_fields), 3 + len(self.distractor_meshes)
+        if self.mesh is None and (given := set(keys[keys.index("unit") :]) & self.model_dump().keys()):
+            raise ValueError(f"{min(given)}: for meshes alone; expected data=object data.mesh=FILE")
         if self.mesh is not None and self.occluders:
             raise ValueError("occluders: for the cylinder alone; expected data.distractors=2")
-        if self.distractors > (most := 3 + len(self.distractor_meshes)):
-            raise ValueError(f"distractors: got {self.distractors}; expected at most 3 and distractor_meshes: {most}")
-        if self.distractors and self.views > 1:
-            raise ValueError("distractors: may stand behind a further camera; expected views=1, or 0 distractors")
-        # the camera stays above the ground at the image's upper border
+        if self.distractors > n_others or (self.distractors and self.views > 1):
+            raise ValueError(f"distractors: got {self.distractors}; expected at most {n_others}, and 0 if views > 1")
+        # the camera is above the ground at the upper border of the image
         steepest = math.degrees(math.atan(self.sensor_size / 2 / self.f_range[0]))
         if self.ground and not (self.upright and self.views == 1 and self.pitch_range[0] > steepest):
-            raise ValueError(
-                f"ground: expected upright=true, views=1 and pitch_range from {steepest + 1:.0f} degrees"
-            )
+            raise ValueError(f"ground: expected upright=true, views=1, pitch_range above {steepest:.3g} degrees")
         return self
 
     def backdrop_files(self, split: str) -> list[str]:
         """Names of the backdrops of a split: every fourth is for test samples alone."""
         names = self.backdrops.files if isinstance(self.backdrops, Asset) else BLENDERS_SKIES
-        return [name for number, name in enumerate(names) if (number % 4 == 3) == (split == "test")]
+        of_split = [name for number, name in enumerate(names) if (number % 4 == 3) == (split == "test")]
+        return of_split if self.backdrops else []
 
     @model_serializer(mode="wrap")
     def _without_defaults(self, serialize: Any) -> dict[str, Any]:

@@ -11,18 +11,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from phd_exp.records.errors import RenderError
 from phd_exp.records.scenes import Scene
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.importing import import_meshes
 from phd_exp.rendering.pixels import Light, read_light
-from phd_exp.rendering.rays import NO_MESHES
 from phd_exp.rendering.stage import build_stage
 from phd_exp.rendering.surroundings import World
-
-if TYPE_CHECKING:
-    from phd_exp.rendering.triangles import Meshes
+from phd_exp.rendering.triangles import Meshes
 
 X_LIBRARIES = "libx11-6 libxext6 libxfixes3 libxi6 libxrender1 libxkbcommon0 libsm6 libice6 libgl1"
 
@@ -88,10 +86,8 @@ class Renderer:
 
     Blender has one state per process: a second renderer in the same process replaces the first one's scene.
 
-    Attributes:
-        meshes: the triangles of the objects that `spec` names.
-
-    Raises RenderError if bpy or a library it needs is missing, or if a mesh cannot be used.
+    `meshes` are those of the specification. Raises RenderError if bpy or a library it needs is missing, or a mesh
+    cannot be used.
     """
 
     def __init__(self, settings: Settings, spec: DatasetSpec | None = None) -> None:
@@ -104,25 +100,22 @@ class Renderer:
             self._scene = self._bpy.context.scene
             _configure_image(self._scene)
             _configure_tracer(self._scene.cycles, settings)
-            self.meshes: "Meshes" = NO_MESHES
-            self._world: World | None = None
-            if spec is not None and spec.mesh is not None:
-                from phd_exp.rendering.importing import import_meshes  # numba, which takes a second to import
-
-                self.meshes, self._world = import_meshes(self._bpy, spec), World(self._bpy, spec)
+            self.meshes: Meshes = import_meshes(self._bpy, spec) if spec else {}
+            self._world = World(self._bpy, spec) if spec and spec.mesh else None
+            if self.meshes:
                 _configure_for_meshes(self._scene)
 
     def render(self, scene: Scene, box: Box | None = None) -> Light:
         """Linear light of a box of pixels (height, width, 3), by default of all (S, S, 3); rows from the top.
 
-        An image is white from 1 upwards. A pure function of the scene, the box and the settings. With meshes, the
-        result (height, width, 4) includes the opacity, by which light is multiplied.
+        An image is white from 1 upwards. A pure function of the scene, the box and the settings. With meshes, a
+        fourth channel is the opacity, by which the light is multiplied.
         """
         box = box or Box(0, 0, scene.S, scene.S)
         self._frame(box, scene.S)
         self._stage.show(scene, self.meshes)
-        if self._world is not None:
-            self._world.show(scene)
+        if self._world and scene.surroundings:
+            self._world.show(scene.surroundings)
         self._scene.cycles.seed = scene.noise_seed
         self._scene.render.filepath = str(self._output)
         try:
@@ -131,8 +124,7 @@ class Renderer:
             content = self._output.read_bytes()
         finally:
             self._output.unlink(missing_ok=True)
-        channels = 4 if self.meshes else 3
-        return read_light(content, box.bottom - box.top, box.right - box.left, channels)
+        return read_light(content, box.bottom - box.top, box.right - box.left, 4 if self.meshes else 3)
 
     def _frame(self, box: Box, side: int) -> None:
         """Set the box as fractions of the image from the bottom left corner, which Blender truncates to whole pixels.
@@ -182,10 +174,10 @@ def _configure_tracer(cycles: Any, settings: Settings) -> None:
 
 
 def _configure_for_meshes(scene: Any) -> None:
-    """Change the options for textures, which may be transparent, and backgrounds that are added later."""
+    """Change the options for transparent backgrounds and for textures, which may be transparent too."""
     scene.render.image_settings.color_mode = "RGBA"
     scene.cycles.transparent_max_bounces = 8
-    scene.cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"  # 1 dB on textures
+    scene.cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"  # a decibel better on textures
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Work on a finished data set: verify it against its manifest and specification, and draw masks of its cylinders."""
+"""Work on a finished data set: verify it against its manifest and specification, and draw masks of its objects."""
 
 import random
 from collections.abc import Iterator
@@ -16,10 +16,11 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer, renderer_version, require_bpy
 from phd_exp.rendering.pixels import file_of
 from phd_exp.rendering.progress import shown_progress
-from phd_exp.rendering.rays import NO_MESHES, cylinder_mask, trace_pixels
+from phd_exp.rendering.rays import cylinder_mask, trace_pixels
 from phd_exp.rendering.samples import fast_settings, make_sample
 from phd_exp.rendering.sampling import GENERATOR_VERSION
 from phd_exp.rendering.sealing import other_make
+from phd_exp.rendering.triangles import NO_MESHES
 
 
 def verify(folder: DatasetFolder, spec: DatasetSpec, rerender: int, seed: int | None = None) -> int:
@@ -105,12 +106,12 @@ def _rendered_again(folder: DatasetFolder, spec: DatasetSpec, records: list[Samp
 def write_masks(folder: DatasetFolder, spec: DatasetSpec, masks: Path) -> int:
     """Write `<masks>/<split>/<index>.png`, white where the object is visible, for all samples; returns how many.
 
-    The masks have one bit per pixel and follow from the records, without Blender, which only reads meshes.
+    The masks have one bit per pixel and follow from the records; only meshes need Blender, which reads them.
 
-    Raises DatasetError if there is no data set, or a broken one, RenderError if the masks cannot be written, or if a
+    Raises DatasetError if there is no data set, or a broken one, RenderError if the masks cannot be written, or a
     mesh cannot be read.
     """
-    meshes = NO_MESHES if spec.mesh is None else Renderer(fast_settings(spec), spec).meshes
+    meshes = Renderer(fast_settings(spec), spec).meshes if spec.mesh else NO_MESHES
     records = [record for split in SPLITS for record in folder.records(split)]
     with writing(masks, instead="masks=FOLDER"):
         for split in SPLITS:

@@ -49,7 +49,7 @@ def file_of(image: Image.Image, image_format: ImageFormat, **options: Any) -> by
 
 
 def read_light(content: bytes, height: int, width: int, channels: int = 3) -> NDArray[np.float64]:
-    """Linear light (height, width, channels), rows from the top, from an OpenEXR file with the settings of `Renderer`.
+    """Linear light (height, width, channels), rows from the top, from an OpenEXR file of a `Renderer`.
 
     The file has half floats in uncompressed blocks of one row; a fourth channel is the opacity. In background mode,
     Blender returns pixels through files only, and only OpenEXR keeps the light of an overexposed pixel.

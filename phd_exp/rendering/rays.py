@@ -7,23 +7,18 @@ parameter at which the line enters.
 
 import math
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from phd_exp.records.scenes import Pose, Scene, SceneObject
-
-if TYPE_CHECKING:  # numba takes a second to import
-    from phd_exp.rendering.triangles import Meshes
+from phd_exp.rendering.triangles import NO_MESHES, Meshes
 
 Image = NDArray[np.float64]
 Labels = NDArray[np.int8]
 Mask = NDArray[np.bool_]
 
 FACES = 8  # at most that many smooth faces on one object
-NO_MESHES: "Meshes" = MappingProxyType({})
 NOTHING = 0  # the label of a ray that hits no object
 
 
@@ -46,15 +41,13 @@ class Hits:
         return np.take_along_axis(self.surfaces, nearest[None], axis=0)[0]
 
 
-def trace_pixels(scene: Scene, meshes: "Meshes" = NO_MESHES) -> Hits:
+def trace_pixels(scene: Scene, meshes: Meshes = NO_MESHES) -> Hits:
     """The hits (S, S) of the rays through the middles (c + 1/2, r + 1/2) of all pixels (column c, row r)."""
     hits = _no_hits(scene, (scene.S, scene.S))
     for number, item in enumerate(scene.objects):
         if item.shape in meshes:
-            everywhere = range(scene.S), range(scene.S)
-            depths = meshes[item.shape].depths(*_mesh_in_camera(scene, item), *everywhere)
-            hits.depths[number] = depths
-            hits.surfaces[number] = np.where(np.isfinite(depths), 1 + FACES * number, NOTHING)
+            hits.depths[number] = mesh_depths(scene, item, meshes)
+            hits.surfaces[number] = np.where(np.isfinite(hits.depths[number]), 1 + FACES * number, NOTHING)
             continue
         rows, columns = (_clipped(span, scene.S) for span in window(scene, item))
         if rows and columns:
@@ -90,19 +83,25 @@ def visibility(hits: Hits) -> float:
     return float(cylinder_mask(hits).sum() / alone) if alone else 0.0
 
 
-def truncation(scene: Scene, hits: Hits, meshes: "Meshes" = NO_MESHES) -> float:
+def truncation(scene: Scene, hits: Hits, meshes: Meshes = NO_MESHES) -> float:
     """Share of the cylinder's pixels, in an image without borders or other objects, that lie outside this image.
 
     1 if the cylinder has no pixels at all.
     """
     if (item := scene.objects[0]).shape in meshes:
-        mesh, place = meshes[item.shape], _mesh_in_camera(scene, item)
-        whole = np.isfinite(mesh.depths(*place, *mesh.silhouette(*place))).sum()
+        whole = np.isfinite(mesh_depths(scene, item, meshes, whole=True)).sum()
     else:
-        cylinder = scene.model_copy(update={"objects": scene.objects[:1]})
+        cylinder = scene.model_copy(update={"objects": (item,)})
         everywhere = trace_points(cylinder, *pixel_middles(*window(scene, item)))
         whole = (everywhere.surfaces[0] != NOTHING).sum()
     return float(1 - (hits.surfaces[0] != NOTHING).sum() / whole) if whole else 1.0
+
+
+def mesh_depths(scene: Scene, item: SceneObject, meshes: Meshes, *, whole: bool = False) -> Image:
+    """Depths of a mesh in the image, or in the box of its `whole` silhouette, see `Triangles.depths`."""
+    turn = item.scale * rotation_matrix(scene.pose.rotation) @ rotation_matrix(item.rotation)
+    shift = in_camera_frame(np.array(item.position), scene.pose)
+    return meshes[item.shape].depths(turn, shift, scene.f, scene.S, whole=whole)
 
 
 def pixel_middles(rows: range, columns: range) -> tuple[Image, Image]:
@@ -148,12 +147,6 @@ def _shadow(off_axis: float, z: float, radius: float, scene: Scene) -> range:
 
 def _clipped(span: range, side: int) -> range:
     return range(max(span.start, 0), min(span.stop, side))
-
-
-def _mesh_in_camera(scene: Scene, item: SceneObject) -> tuple[Image, Image, float, int]:
-    """The arguments of `Triangles.depths` that place a mesh in a scene's camera."""
-    rotation = rotation_matrix(scene.pose.rotation) @ rotation_matrix(item.rotation)
-    return item.scale * rotation, in_camera_frame(np.array(item.position), scene.pose), scene.f, scene.S
 
 
 def _cast(scene: Scene, number: int, x: Image, y: Image) -> tuple[Image, Labels]:

@@ -78,7 +78,12 @@ def ensure_rendered(
                     return True
                 begin(folder, spec)
             known = known_samples(folder)
-            rendered = render_missing(folder, spec, wanted, known, workers, shard, cores)
+            try:
+                rendered = render_missing(folder, spec, wanted, known, workers, shard, cores)
+            except RenderError:
+                if not any(known.values()):  # the next command may have another specification
+                    folder.manifest_path.unlink(missing_ok=True)
+                raise
             if shard is None:
                 seal(folder, known)
                 return True

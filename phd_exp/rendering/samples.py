@@ -2,27 +2,22 @@
 
 An image takes its light from the path tracer, its smooth edges from geometry (`antialias`), and its backdrop from a
 formula. The tracer renders only the box around the objects, and of that only the pixels that show an object are
-used. The box therefore leaves no seam that could reveal where the objects are. The path tracer renders the whole
-image of a user's mesh, whose texture needs many rays everywhere.
+used. The box therefore leaves no seam that could reveal where the objects are.
 """
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from phd_exp.records.assets import Asset
 from phd_exp.records.dataset import image_name, sha256
-from phd_exp.records.scenes import Backdrop, Photo, SampleRecord, Scene, Split
+from phd_exp.records.scenes import Backdrop, SampleRecord, Scene, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.antialias import smoothed
 from phd_exp.rendering.blender import Box, Renderer, Settings
+from phd_exp.rendering.objects import sample_object_scene
 from phd_exp.rendering.pixels import Light, Pixels, encode, encoded
 from phd_exp.rendering.rays import NOTHING, Hits, Mask, in_camera_frame, trace_pixels, truncation, visibility
 from phd_exp.rendering.sampling import sample_scene, scene_and_view
 from phd_exp.rendering.surroundings import photo_light, shaken
-
-if TYPE_CHECKING:
-    from phd_exp.rendering.triangles import Meshes
 
 MARGIN = 4  # px around the objects: the denoiser is less accurate along the border of its image
 
@@ -34,25 +29,17 @@ def fast_settings(spec: DatasetSpec) -> Settings:
 
 def make_sample(renderer: Renderer, spec: DatasetSpec, split: Split, index: int) -> tuple[bytes, SampleRecord]:
     """The image file and the record of one sample."""
-    scene = draw_scene(spec, split, index, renderer.meshes)
-    hits = trace_pixels(scene, renderer.meshes)
-    pixels = take_picture(renderer, scene, hits) if spec.mesh is None else photograph(renderer, scene, spec)
-    image = encode(pixels, spec)
-    shares = visibility(hits), truncation(scene, hits, renderer.meshes)
+    meshes = renderer.meshes
+    scene = sample_object_scene(spec, split, index, meshes) if meshes else sample_scene(spec, split, index)
+    hits = trace_pixels(scene, meshes)
+    picture = photograph(renderer, scene, spec) if meshes else take_picture(renderer, scene, hits)
+    image = encode(picture, spec)
+    shares = {"visibility": visibility(hits), "truncation": truncation(scene, hits, meshes)}
     return image, describe(spec, split, index, scene, shares, sha256(image))
 
 
-def draw_scene(spec: DatasetSpec, split: Split, index: int, meshes: "Meshes") -> Scene:
-    """The scene of a sample, of the cylinder or of the mesh."""
-    if spec.mesh is None:
-        return sample_scene(spec, split, index)
-    from phd_exp.rendering.objects import sample_object_scene  # numba, which takes a second to import
-
-    return sample_object_scene(spec, split, index, meshes)
-
-
 def describe(
-    spec: DatasetSpec, split: Split, index: int, scene: Scene, shares: tuple[float, float], checksum: str
+    spec: DatasetSpec, split: Split, index: int, scene: Scene, shares: dict[str, float], checksum: str
 ) -> SampleRecord:
     """The record of a sample, given the scene, its visibility and truncation, and the image's checksum."""
     number, view = scene_and_view(spec, index)
@@ -61,10 +48,9 @@ def describe(
     return SampleRecord(
         **{key: getattr(scene, key) for key in Scene.model_fields},
         **dict(zip("xyz", position, strict=True)),
+        **shares,
         file_name=image_name(index, spec.image_format),
         scale=cylinder.scale,
-        visibility=shares[0],
-        truncation=shares[1],
         index=index,
         split=split,
         seed=spec.seed,
@@ -88,15 +74,13 @@ def take_picture(renderer: Renderer, scene: Scene, hits: Hits) -> Pixels:
 
 
 def photograph(renderer: Renderer, scene: Scene, spec: DatasetSpec) -> Pixels:
-    """Image (S, S, 3) of a scene with a mesh, all of it by the path tracer, before its background; sRGB."""
-    assert scene.surroundings is not None
-    background = scene.surroundings.background
-    if isinstance(background, Photo) and isinstance(spec.backdrops, Asset):
-        behind = photo_light(background, spec.backdrops.path(background.file), scene.S)
-    else:  # hidden by a sky
-        behind = backdrop_light(scene.backdrop, scene.S)
+    """Image (S, S, 3) of a scene with a mesh: the path tracer renders all of it, since textures need its filter."""
+    around, behind = scene.surroundings, backdrop_light(scene.backdrop, scene.S)
+    assert around is not None
+    if around.file and not around.is_sky and isinstance(spec.backdrops, Asset):
+        behind = photo_light(spec.backdrops.path(around.file), around, scene.S)
     light, opacity = np.split(renderer.render(scene), [3], axis=-1)
-    return encoded(shaken(light + (1 - opacity) * behind, scene.surroundings.shake))
+    return encoded(shaken(light + (1 - opacity) * behind, around.shake))
 
 
 def backdrop_light(backdrop: Backdrop, side: int) -> Light:
