@@ -23,7 +23,7 @@ from itertools import islice
 from multiprocessing.connection import Connection, wait
 
 from phd_exp.records.dataset import SPLITS, DatasetFolder
-from phd_exp.records.errors import RenderError, writing
+from phd_exp.records.errors import RenderError, UserError, writing
 from phd_exp.records.files import open_journal
 from phd_exp.records.processes import Child, announce, duration, held, usable_cores
 from phd_exp.records.scenes import SampleRecord, Split
@@ -80,7 +80,7 @@ def ensure_rendered(
             known = known_samples(folder)
             try:
                 rendered = render_missing(folder, spec, wanted, known, workers, shard, cores)
-            except RenderError:
+            except UserError:
                 if not any(known.values()):  # the next command may have another specification
                     folder.manifest_path.unlink(missing_ok=True)
                 raise

@@ -18,6 +18,7 @@ from phd_exp.rendering.pixels import Light, Pixels, encode, encoded
 from phd_exp.rendering.rays import NOTHING, Hits, Mask, in_camera_frame, trace_pixels, truncation, visibility
 from phd_exp.rendering.sampling import sample_scene, scene_and_view
 from phd_exp.rendering.surroundings import photo_light, shaken
+from phd_exp.rendering.triangles import Meshes
 
 MARGIN = 4  # px around the objects: the denoiser is less accurate along the border of its image
 
@@ -34,23 +35,23 @@ def make_sample(renderer: Renderer, spec: DatasetSpec, split: Split, index: int)
     hits = trace_pixels(scene, meshes)
     picture = photograph(renderer, scene, spec) if meshes else take_picture(renderer, scene, hits)
     image = encode(picture, spec)
-    shares = {"visibility": visibility(hits), "truncation": truncation(scene, hits, meshes)}
-    return image, describe(spec, split, index, scene, shares, sha256(image))
+    return image, describe(spec, split, index, scene, hits, sha256(image), meshes)
 
 
 def describe(
-    spec: DatasetSpec, split: Split, index: int, scene: Scene, shares: dict[str, float], checksum: str
+    spec: DatasetSpec, split: Split, index: int, scene: Scene, hits: Hits, checksum: str, meshes: Meshes
 ) -> SampleRecord:
-    """The record of a sample, given the scene, its visibility and truncation, and the image's checksum."""
+    """The record of a sample, given the scene, what the rays of its pixels hit, and the image's checksum."""
     number, view = scene_and_view(spec, index)
     cylinder = scene.objects[0]
     position = in_camera_frame(np.array(cylinder.position), scene.pose).tolist()
     return SampleRecord(
         **{key: getattr(scene, key) for key in Scene.model_fields},
         **dict(zip("xyz", position, strict=True)),
-        **shares,
         file_name=image_name(index, spec.image_format),
         scale=cylinder.scale,
+        visibility=visibility(hits),
+        truncation=truncation(scene, hits, meshes),
         index=index,
         split=split,
         seed=spec.seed,

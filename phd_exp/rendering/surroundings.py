@@ -91,6 +91,6 @@ def shaken(light: Light, path: tuple[float, float]) -> Light:
     """The mean of an image (S, S, 3) along a straight path right and down, px, around its place."""
     if not (length := math.hypot(*path)):
         return light
-    places = np.linspace(-0.5, 0.5, math.ceil(length) + 1)
-    shifts = [(share * path[1], share * path[0], 0.0) for share in places]
+    n = math.ceil(length) + 1
+    shifts = [(share * path[1], share * path[0], 0.0) for share in (np.arange(n) + 0.5) / n - 0.5]
     return np.mean([ndimage.shift(light, shift, order=1, mode="nearest") for shift in shifts], axis=0)

@@ -1,0 +1,67 @@
+"""An object from its mesh to a run record and back by `predict`."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from phd_exp.records.dataset import DatasetFolder
+from tests.e2e.runs import only_run
+from tests.support.meshes import solid, write_mesh
+from tests.support.untrained import read_lines
+
+SMALL = ("preset=smoke", "data=object", "data.sensor_size=64", "data.f_range=[343,571]", "data.samples_per_pixel=1")
+FEW = ("data.n_train=4", "data.n_held_out=0", "data.n_test=2", "data.workers=1")
+
+
+@pytest.fixture(scope="module")
+def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_mesh(tmp_path_factory.mktemp("part") / "part.glb", solid("cylinder"), per_metre=1000)
+
+
+def test_an_object_is_rendered_masked_and_verified(phd_exp: Callable, part: Path, tmp_path: Path) -> None:
+    """A wrong unit leaves nothing behind that would refuse the right one."""
+    words = ("render", *SMALL, *FEW, f"data.mesh={part}", "data.backdrops=null", "data.xy_range=0.3")
+    wrong = phd_exp(*words)
+    assert (wrong.status, wrong.err.count("error: ")) == (1, 1)
+    assert "longest side is 200 m; expected 0.001 to 20 m; set data.unit=0.001" in wrong.err
+    made = phd_exp(*words, "data.unit=0.001", f"masks={tmp_path / 'masks'}")
+    assert made.status == 0, made.err
+    checked = phd_exp(*words, "data.unit=0.001", "verify=true", "rerender=2")
+    assert (checked.status, "all 6 samples are as they were rendered" in checked.out) == (0, True), checked.err
+    folder = DatasetFolder(tmp_path / "renders" / "object")
+    for record in folder.records("train"):
+        mask = np.asarray(Image.open(tmp_path / "masks" / "train" / record.file_name))
+        assert mask.sum() > 20
+        image = np.asarray(Image.open(folder.image_path("train", record.index))).astype(float)
+        assert (
+            np.ptp(image[~mask].mean(axis=-1))
+            < 100
+            < 3 * np.abs(image[mask].mean(axis=0) - image[~mask].mean(axis=0)).max()
+        )
+    write_mesh(part, solid("cube"), per_metre=1000)
+    changed = phd_exp(*words, "data.unit=0.001")
+    write_mesh(part, solid("cylinder"), per_metre=1000)
+    assert (changed.status, "holds a data set with mesh=" in changed.err) == (1, True)
+
+
+@pytest.mark.slow
+def test_a_run_on_an_object_predicts_its_test_images(phd_exp: Callable, part: Path, tmp_path: Path) -> None:
+    quick = (
+        "recipe=strong",
+        "data.n_train=16",
+        "data.batch_size=8",
+        "trainer.progress_bar=false",
+        "trainer.threads=1",
+    )
+    words = (*SMALL, *FEW, *quick, f"data.mesh={part}", "data.unit=0.001", "data.distractors=2", "logger=none")
+    done = phd_exp(*words)
+    assert done.status == 0, done.err
+    run = only_run(tmp_path / "runs")
+    assert (run.results()["data"], run.results()["n_test"]) == ("object", 2)
+    part.unlink()  # predictions need the images alone
+    answer = phd_exp("predict", f"run={run.path}", f"folder={tmp_path / 'renders' / 'object' / 'test'}")
+    assert answer.status == 0, answer.err
+    assert len(read_lines(answer.out)) == 2

@@ -1,0 +1,76 @@
+"""The user's files are identified by their contents and refused before Blender reads them."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from phd_exp.records.assets import mesh_asset
+from phd_exp.records.errors import ConfigError
+from phd_exp.training.config import check_render
+
+STANDING = ("data.mesh=part.glb", "data.upright=true", "data.ground=true")
+
+
+@pytest.fixture
+def refused(composed: Callable[..., dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable:
+    """The line that refuses a data set of a mesh."""
+    monkeypatch.chdir(tmp_path)
+    Path("part.glb").write_bytes(b"glTF")
+    with open("large.stl", "wb") as stream:
+        stream.truncate(84 + 50 * 10_000_000)
+    Path("few").mkdir()
+    Path("few", "a.jpg").touch()
+
+    def line(*overrides: str) -> str:
+        with pytest.raises(ConfigError) as error:
+            check_render(
+                {
+                    "data": composed("data=object", *overrides)["data"],
+                    "shard": None,
+                    "verify": False,
+                    "rerender": 0,
+                    "masks": None,
+                }
+            )
+        assert "\n" not in str(error.value)
+        return str(error.value)
+
+    return line
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ((), "data.mesh: got ''; expected a file of a mesh: .glb, .gltf, .obj, .ply, .stl"),
+        (("data.mesh=part.step",), "data.mesh: got 'part.step'; expected a file of a mesh"),
+        (("data.mesh=none.glb",), "data.mesh: got 'none.glb'; cannot be used (No such file or directory)"),
+        (("data.mesh=large.stl",), "500 MB; expected at most 128 MB); simplify it"),
+        (("data.mesh=part.glb", "data.backdrops=few"), "data.backdrops: got 'few'; expected a folder with at least 4"),
+        (("data.mesh=part.glb", "data.reference=middle"), "data.reference: got 'middle'; expected origin, centroid or [x,"),
+        (("data.mesh=part.glb", "data.unit=0"), "data.unit: got 0; expected to be greater than 0"),
+        (("data.mesh=part.glb", "data.distractors=4"), "distractors: got 4; expected at most 3"),
+        (("data.mesh=part.glb", "data.distractors=1", "data.views=2"), "and 0 if views > 1"),
+        (("data.mesh=part.glb", "data.occluders=true"), "occluders: for the cylinder alone; expected data.distractors=2"),
+        ((*STANDING, "data.pitch_range=[5,30]"), "ground: expected upright=true, views=1, pitch_range above 5.33 degrees"),
+        (("data=default", "+data.unit=2.0"), "unit: for meshes alone; expected data=object data.mesh=FILE"),
+    ],
+)  # fmt: skip
+def test_bad_values_are_one_line(refused: Callable, overrides: tuple[str, ...], message: str) -> None:
+    assert message in refused(*overrides)
+
+
+def test_a_mesh_is_its_contents_and_those_of_the_files_it_names(tmp_path: Path) -> None:
+    for folder in (tmp_path / "one", tmp_path / "two"):
+        (folder / "textures").mkdir(parents=True)
+        (folder / "a.obj").write_text("mtllib a.mtl\n")
+        (folder / "a.mtl").write_text("map_Kd -s 1 1 1 textures/wood.png\n")
+        (folder / "textures" / "wood.png").write_bytes(b"brown")
+        (folder / "unrelated.png").write_bytes(b"")
+    one, two = (mesh_asset(str(tmp_path / folder / "a.obj")) for folder in ("one", "two"))
+    assert list(one.files) == ["a.obj", "a.mtl", "textures/wood.png"]
+    assert one == two
+    assert one.path("a.mtl") == tmp_path / "one" / "a.mtl"
+    (tmp_path / "two" / "textures" / "wood.png").write_bytes(b"black wood")
+    assert mesh_asset(tmp_path / "two" / "a.obj") != one

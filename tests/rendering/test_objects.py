@@ -1,0 +1,279 @@
+"""Scenes of a mesh: its size, pose and surroundings, and its silhouette against geometry and Blender."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy import stats
+
+from phd_exp.records.errors import RenderError
+from phd_exp.records.scenes import Scene, Surroundings
+from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.blender import Renderer, Settings, load_bpy
+from phd_exp.rendering.objects import REACH, sample_object_scene, upright_rotation
+from phd_exp.rendering.rays import NOTHING, cylinder_mask, rotation_matrix, trace_pixels, truncation, visibility
+from phd_exp.rendering.sampling import sample_scene
+from phd_exp.rendering.surroundings import photo_light, shaken
+from phd_exp.rendering.triangles import Triangles
+from tests.support.meshes import solid, write_mesh
+
+MakeSpec = Callable[..., DatasetSpec]
+SKIES = {"night", "city", "interior", "forest", "studio", "sunset", "sunrise", "courtyard"}
+AT_MIDDLES = Settings(samples=1, denoised=False, at_middles=True)
+UNLIKELY = 1e-3
+
+
+@pytest.fixture(scope="module")
+def of_mesh(make_spec: MakeSpec, tmp_path_factory: pytest.TempPathFactory) -> MakeSpec:
+    """The data set of a cylinder as a mesh, with some values changed."""
+    file = write_mesh(tmp_path_factory.mktemp("mesh") / "part.stl", solid("cylinder"))
+    return lambda **changes: make_spec("object", mesh=str(file), **changes)
+
+
+@pytest.fixture(scope="module")
+def meshes() -> dict[str, Triangles]:
+    return {"mesh": solid("cylinder"), "mesh1": solid("cube", 0.1)}
+
+
+def drawn(spec: DatasetSpec, n: int, meshes: dict[str, Triangles], split: Any = "train") -> list[Scene]:
+    return [sample_object_scene(spec, split, index, meshes) for index in range(n)]
+
+
+def test_a_cylinder_as_a_mesh_is_the_analytic_cylinder(of_mesh: MakeSpec, meshes: dict[str, Triangles]) -> None:
+    """The scenes are paired; silhouettes differ by at most 5 pixels, so visibility and truncation agree."""
+    spec, cut = of_mesh(), 0
+    for index in range(30):
+        plain, scene = sample_scene(spec, "train", index), sample_object_scene(spec, "train", index, meshes)
+        paired = ("position", "rotation", "scale", "colour", "material")
+        assert [getattr(scene.objects[0], key) for key in paired] == [
+            getattr(plain.objects[0], key) for key in paired
+        ]
+        hits, exact = trace_pixels(scene, meshes), trace_pixels(plain)
+        mask = cylinder_mask(exact)
+        assert (cylinder_mask(hits) != mask).sum() <= 5
+        assert truncation(scene, hits, meshes) == pytest.approx(truncation(plain, exact), abs=10 / mask.sum())
+        both = mask & cylinder_mask(hits)
+        error = np.abs(hits.depths[0][both] - exact.depths[0][both])
+        assert np.quantile(error, 0.99) < 1e-3, "except where rays graze"
+        cut += truncation(scene, hits, meshes) > 0
+    assert cut > 3
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".gltf", ".obj", ".ply", ".stl"])
+def test_every_format_gives_the_same_object_whatever_its_unit(
+    make_spec: MakeSpec, tmp_path: Path, suffix: str
+) -> None:
+    """The reference point is in the file's axes and units; Blender draws what geometry says."""
+    middle = (0.03, -0.02, 0.05)
+    file = write_mesh(tmp_path / f"part{suffix}", solid("cylinder", 0.2, middle), per_metre=1000)
+    x, y, z = (1000 * value for value in middle)
+    point = (x, z, -y) if suffix in (".glb", ".gltf", ".obj") else (x, y, z)
+    small: dict[str, Any] = {"sensor_size": 112, "f_range": (600.0, 1000.0), "backdrops": None, "unit": 0.001}
+    for reference, away in ((point, (0, 0, 0)), ("centroid", (0, 0, 0)), ("origin", middle)):
+        spec = make_spec("object", mesh=str(file), reference=reference, **small)
+        renderer = Renderer(AT_MIDDLES, spec)
+        vertices = renderer.meshes["mesh"].vertices
+        expected = solid("cylinder", 0.2, away).vertices
+        assert [vertices.min(axis=0), vertices.max(axis=0)] == [
+            pytest.approx(expected.min(axis=0), abs=1e-6),
+            pytest.approx(expected.max(axis=0), abs=1e-6),
+        ]
+    for index in range(2):
+        scene = sample_object_scene(spec, "train", index, renderer.meshes)
+        opaque = renderer.render(scene)[..., 3] > 0.5
+        assert (opaque != (trace_pixels(scene, renderer.meshes).surfaces[0] != NOTHING)).sum() <= 5
+
+
+def test_depths_are_those_of_rays(meshes: dict[str, Triangles]) -> None:
+    """A cube's depth in its local frame, from slabs; both are exact."""
+    turn = rotation_matrix((0.5, 0.5, -0.5, 0.5)) @ rotation_matrix((0.8, 0.0, 0.6, 0.0))
+    depths = solid("cube").depths(turn, np.array([0.02, -0.01, 1.0]), f=300.0, S=101)
+    rays = np.stack([*np.meshgrid(*(2 * [(np.arange(101) - 50) / 300.0])), np.ones((101, 101))], axis=-1) @ turn
+    origin = -turn.T @ np.array([0.02, -0.01, 1.0])
+    with np.errstate(divide="ignore"):
+        one, two = (-0.1 - origin) / rays, (0.1 - origin) / rays
+    enter, leave = np.minimum(one, two).max(axis=-1), np.maximum(one, two).min(axis=-1)
+    np.testing.assert_allclose(depths, np.where(enter <= leave, enter, np.inf), rtol=1e-9)
+    assert 2000 < np.isfinite(depths).sum() < 9000
+
+
+def test_an_upright_object_is_only_turned_about_the_vertical(of_mesh: MakeSpec, meshes: dict[str, Triangles]) -> None:
+    scenes = drawn(of_mesh(upright=True, ground=True, pitch_range=(10.0, 40.0)), 300, meshes)
+    pitches, turns = [], []
+    for scene in scenes:
+        assert scene.surroundings is not None
+        pitch, item = scene.surroundings.pitch, scene.objects[0]
+        up = np.array([0.0, -np.cos(pitch), -np.sin(pitch)])
+        assert rotation_matrix(item.rotation)[:, 2] == pytest.approx(up)
+        level = rotation_matrix(item.rotation)[:, 0]
+        turns.append(np.arctan2(level[0], level @ np.cross([1.0, 0.0, 0.0], up)) % (2 * np.pi))
+        pitches.append(np.degrees(pitch))
+        assert np.array(scene.surroundings.ground) == pytest.approx(np.array(item.position) - 0.1 * up)
+        assert np.array(scene.surroundings.ground) @ up < 0, "below the camera"
+    assert stats.kstest(pitches, stats.uniform(10, 30).cdf).pvalue > UNLIKELY
+    assert stats.kstest(turns, stats.uniform(0, 2 * np.pi).cdf).pvalue > UNLIKELY
+    assert rotation_matrix(upright_rotation(0.0, 0.0))[:, 2] == pytest.approx([0, -1, 0])
+
+
+def test_test_images_have_other_skies_and_skies_replace_the_lamps(
+    of_mesh: MakeSpec, meshes: dict[str, Triangles]
+) -> None:
+    spec = of_mesh()
+    files = {
+        split: {scene.surroundings.file for scene in drawn(spec, 100, meshes, split)} for split in ("train", "test")
+    }
+    assert (len(files["train"]), len(files["test"])) == (6, 2)
+    assert files["train"] | files["test"] == SKIES
+    assert all(scene.lamps == () for scene in drawn(spec, 5, meshes))
+    assert all(len(scene.lamps) == 3 for scene in drawn(of_mesh(backdrops=None), 5, meshes))
+    assert drawn(spec, 5, meshes) == drawn(spec, 5, meshes)
+
+
+def test_photographs_are_split_by_file(of_mesh: MakeSpec, meshes: dict[str, Triangles], tmp_path: Path) -> None:
+    for number in range(9):
+        (tmp_path / f"{number}.{'exr' if number == 5 else 'jpg'}").write_bytes(bytes([number]))
+    spec = of_mesh(backdrops=str(tmp_path))
+    scenes = {split: drawn(spec, 200, meshes, split) for split in ("train", "test")}
+    names = {split: {scene.surroundings.file for scene in found} for split, found in scenes.items()}
+    assert names == {"test": {"3.jpg", "7.jpg"}, "train": {f"{k}.jpg" for k in (0, 1, 2, 4, 6, 8)} | {"5.exr"}}
+    assert all(
+        scene.surroundings.is_sky == (scene.lamps == ()) == (scene.surroundings.file == "5.exr")
+        for scene in scenes["train"]
+    )
+    (tmp_path / "0.jpg").write_bytes(b"another")
+    assert of_mesh(backdrops=str(tmp_path)).fingerprint() != spec.fingerprint()
+
+
+def around(**changes: Any) -> Surroundings:
+    plain = {
+        "pitch": 0,
+        "file": "a.png",
+        "is_sky": False,
+        "turn": 0,
+        "brightness": 1,
+        "ground": None,
+        "shake": (0, 0),
+    }
+    return Surroundings(**{**plain, "square": (0.5, 0.0, 0.5), "flipped": False, **changes})
+
+
+def test_a_photograph_is_cropped_and_flipped(tmp_path: Path) -> None:
+    ramp = np.broadcast_to(np.arange(256, dtype=np.uint8), (64, 256))
+    Image.fromarray(ramp).save(tmp_path / "a.png")
+    light = photo_light(tmp_path / "a.png", around(), 16)  # columns 112 to 144
+    assert light.shape == (16, 16, 3)
+    middles = 112 + 2 * np.arange(16) + 0.5
+    assert light[3, :, 1] == pytest.approx(((middles / 255 + 0.055) / 1.055) ** 2.4, abs=0.005)
+    assert photo_light(tmp_path / "a.png", around(flipped=True), 16) == pytest.approx(light[:, ::-1])
+
+
+def test_a_shaken_image_is_a_mean_along_the_path() -> None:
+    light = np.zeros((33, 33, 3))
+    light[16, 16] = 1.0
+    moved = shaken(light, (6.0, 3.0))
+    rows, columns = np.mgrid[:33, :33]
+    for axis, length in ((rows, 3.0), (columns, 6.0)):
+        mean = (moved[..., 0] * axis).sum()
+        assert (moved[..., 0].sum(), mean) == pytest.approx((1.0, 16.0))
+        assert (moved[..., 0] * (axis - mean) ** 2).sum() == pytest.approx(length**2 / 12, abs=0.25)
+    assert shaken(light, (0.0, 0.0)) is light
+
+
+def test_distractors_are_other_objects_each_once(of_mesh: MakeSpec, meshes: dict[str, Triangles]) -> None:
+    plain = of_mesh()
+    spec = plain.model_copy(update={"distractors": 3})
+    seen = set()
+    for scene, alone in zip(drawn(spec, 40, meshes), drawn(plain, 40, meshes), strict=True):
+        names = [item.shape for item in scene.objects]
+        assert (names[0], len(set(names))) == ("mesh", 4)
+        assert scene.model_copy(update={"objects": scene.objects[:1]}) == alone, "paired"
+        seen |= set(names)
+    assert seen == {"mesh", "mesh1", "cylinder", "cube", "sphere"}
+    hidden = plain.model_copy(update={"half_hidden": True})
+    shares = [visibility(trace_pixels(scene, meshes)) for scene in drawn(hidden, 40, meshes)]
+    whole = [truncation(scene, trace_pixels(scene, meshes), meshes) == 0 for scene in drawn(hidden, 40, meshes)]
+    np.testing.assert_allclose(np.array(shares)[whole], 0.5, atol=0.13)
+    double = {"mesh": solid("cylinder", 0.4)}
+    for small, large in zip(drawn(hidden, 9, meshes), drawn(hidden, 9, double), strict=True):
+        assert np.array(large.objects[1].dimensions) == pytest.approx(2 * np.array(small.objects[1].dimensions))
+    assert meshes["mesh"].radius == pytest.approx(REACH)
+
+
+def test_records_of_cylinders_stay_as_they_were(
+    make_spec: MakeSpec, of_mesh: MakeSpec, meshes: dict[str, Triangles]
+) -> None:
+    plain = make_spec()
+    assert "surroundings" not in sample_scene(plain, "train", 0).model_dump_json()
+    assert not {"mesh", "unit", "backdrops"} & plain.model_dump().keys()
+    scene = drawn(of_mesh(), 1, meshes)[0]
+    assert Scene.model_validate_json(scene.model_dump_json()) == scene
+    spec = of_mesh()
+    stored = DatasetSpec.model_validate_json(spec.model_dump_json())
+    assert (stored, stored.fingerprint()) == (spec, spec.fingerprint())
+    with pytest.raises(ValueError, match="no record says where part"):
+        stored.mesh.path("part.stl")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "changes", "message"),
+    [
+        ("none.obj", b"v 0 0 0\n", {}, "has 0 faces; expected 1 to 1000000"),
+        ("text.glb", b"not a mesh", {}, "none|text.glb: .*glTF"),
+        ("text.stl", b"not a mesh", {}, "text.stl: .*Failed to read"),
+        ("short.ply", b"ply\nformat ascii 1.0\nelement face 10000000\nend_header\n", {}, "short.ply: "),
+        ("cup.stl", solid("cylinder", 200.0), {}, r"longest side is 200 m; .* set data\.unit=0\.001"),
+        ("cup.stl", solid("cylinder", 1e-4), {}, r"longest side is 0\.0001 m; .* set data\.unit=1000"),
+        ("cup.stl", solid("cylinder", 2.2), {}, r"reaches 1\.56 m from its reference point; expected at most 1\.5 m"),
+        ("cup.stl", solid("cylinder", 1.2), {"scale_range": (0.5, 2.0)}, r"reaches 1\.7 m"),
+    ],
+)  # fmt: skip
+def test_an_unusable_mesh_is_one_line(
+    make_spec: MakeSpec, tmp_path: Path, name: str, content: Any, changes: dict[str, Any], message: str
+) -> None:
+    file = tmp_path / name
+    file.write_bytes(content) if isinstance(content, bytes) else write_mesh(file, content)
+    spec = make_spec("object", mesh=str(file), **changes)
+    with pytest.raises(RenderError, match=message) as error:
+        Renderer(AT_MIDDLES, spec)
+    assert "\n" not in str(error.value)
+    assert str(error.value).startswith(f"data.mesh: {name}: ")
+
+
+def test_a_texture_is_part_of_the_mesh_and_must_be_there(make_spec: MakeSpec, tmp_path: Path) -> None:
+    file = write_mesh(tmp_path / "part.obj", solid("cube"))
+    file.write_text("mtllib part.mtl\n" + file.read_text().replace("f ", "usemtl wood\nf ", 1))
+    (tmp_path / "part.mtl").write_text("newmtl wood\nmap_Kd wood.png\n")
+    with pytest.raises(RenderError, match=r"its texture wood\.png is missing; put it where the file names it"):
+        Renderer(AT_MIDDLES, make_spec("object", mesh=str(file)))
+    Image.new("RGB", (8, 8), (200, 0, 0)).save(tmp_path / "wood.png")
+    spec = make_spec("object", mesh=str(file), backdrops=None, sensor_size=56, f_range=(300.0, 500.0), xy_range=0.2)
+    assert list(spec.mesh.files) == ["part.obj", "part.mtl", "wood.png"]
+    renderer = Renderer(AT_MIDDLES, spec)
+    scene = sample_object_scene(spec, "train", 0, renderer.meshes)
+    red, green, _, opacity = renderer.render(scene)[28, 28]
+    assert (opacity, red > 5 * green) == (1.0, True)
+    Image.new("RGB", (8, 8), (0, 200, 0)).save(tmp_path / "wood.png")
+    assert make_spec("object", mesh=str(file)).mesh != spec.mesh
+
+
+def test_skies_light_the_scene_and_turn_with_the_camera(of_mesh: MakeSpec) -> None:
+    """A camera that looks down sees what a panorama has below; a brighter sky lights more."""
+    spec = of_mesh(sensor_size=32, f_range=(40.0, 40.0), xy_range=0.0)
+    renderer = Renderer(Settings(samples=16, denoised=False, at_middles=False), spec)
+    scene = sample_object_scene(spec, "train", 0, renderer.meshes)
+
+    def corner(**changes: Any) -> np.ndarray:
+        seen = scene.surroundings.model_copy(update={"file": "sunrise", **changes})
+        return renderer.render(scene.model_copy(update={"surroundings": seen}))
+
+    plain, bright = corner(brightness=1.0), corner(brightness=2.0)
+    assert bright.mean() == pytest.approx(2 * plain.mean() - plain[..., 3].mean() / 4, rel=0.05)
+    assert (plain[..., 3] == 1).all()
+    panorama = load_bpy().data.images["sunrise.exr"]
+    rows = np.array(panorama.pixels[:]).reshape(512, 1024, 4)[..., :3].mean(axis=(1, 2))
+    for pitch, half in ((np.pi / 2, rows[:128]), (-np.pi / 2, rows[-128:])):
+        shown = corner(pitch=pitch, brightness=1.0)[:4, :, :3].mean()
+        assert half.min() <= shown <= half.max()
