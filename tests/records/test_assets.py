@@ -47,16 +47,28 @@ def refused(composed: Callable[..., dict[str, Any]], tmp_path: Path, monkeypatch
         (("data.mesh=part.step",), "data.mesh: got 'part.step'; expected a file of a mesh"),
         (("data.mesh=none.glb",), "data.mesh: got 'none.glb'; cannot be used (No such file or directory)"),
         (("data.mesh=large.stl",), "500 MB; expected at most 128 MB); simplify it"),
-        (("data.mesh=part.glb", "data.backdrops=few"), "data.backdrops: got 'few'; expected a folder with at least 4"),
-        (("data.mesh=part.glb", "data.reference=middle"), "data.reference: got 'middle'; expected origin, centroid or [x,"),
+        (
+            ("data.mesh=part.glb", "data.backdrops=few"),
+            "data.backdrops: got 'few'; expected a folder with at least 4",
+        ),
+        (
+            ("data.mesh=part.glb", "data.reference=middle"),
+            "data.reference: got 'middle'; expected origin, centroid or [x,",
+        ),
         (("data.mesh=part.glb", "data.unit=0"), "data.unit: got 0; expected to be greater than 0"),
         (("data.mesh=part.glb", "data.distractors=4"), "distractors: got 4; expected at most 3"),
         (("data.mesh=part.glb", "data.distractors=1", "data.views=2"), "and 0 if views > 1"),
-        (("data.mesh=part.glb", "data.occluders=true"), "occluders: for the cylinder alone; expected data.distractors=2"),
-        ((*STANDING, "data.pitch_range=[5,30]"), "ground: expected upright=true, views=1, pitch_range above 5.33 degrees"),
+        (
+            ("data.mesh=part.glb", "data.occluders=true"),
+            "occluders: for the cylinder alone; expected data.distractors=2",
+        ),
+        (
+            (*STANDING, "data.pitch_range=[5,30]"),
+            "ground: expected upright=true, views=1, pitch_range above 5.33 degrees",
+        ),
         (("data=default", "+data.unit=2.0"), "unit: for meshes alone; expected data=object data.mesh=FILE"),
     ],
-)  # fmt: skip
+)
 def test_bad_values_are_one_line(refused: Callable, overrides: tuple[str, ...], message: str) -> None:
     assert message in refused(*overrides)
 
