@@ -28,6 +28,7 @@ EXAMPLES = {
         "python -m phd_exp preset=small data=occl seed=1",
         "python -m phd_exp preset=small recipe=strong data=occl",
         "python -m phd_exp data.n_train=256 data.n_test=64 trainer.max_epochs=1",
+        "python -m phd_exp data=object data.mesh=part.glb preset=small recipe=strong",
         "python -m phd_exp data=folder data.folder=photos preset=small",
         "python -m phd_exp -m preset=small model=probabilistic,mae_vz data=default,occl",
         "python -m phd_exp -m experiment=table1,table2 preset=small seed=0,1,2",

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from itertools import zip_longest
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -33,9 +34,16 @@ def checked(composed: Callable[..., dict[str, Any]]) -> Callable[..., RunConfig]
 
 
 @pytest.mark.parametrize("words", TOGETHER, ids=" ".join)
-def test_every_choice_of_every_group_is_a_valid_configuration(checked: Callable, words: tuple[str, ...]) -> None:
+def test_every_choice_of_every_group_is_a_valid_configuration(
+    checked: Callable, words: tuple[str, ...], tmp_path: Path
+) -> None:
     """The first of all groups, the second of all, and so on."""
-    checked(*words, *(["data.folder=photos", "data.n_held_out=1"] if "data=folder" in words else []))
+    (tmp_path / "part.glb").touch()
+    own = {
+        "data=folder": ["data.folder=photos", "data.n_held_out=1"],
+        "data=object": [f"data.mesh={tmp_path}/part.glb"],
+    }
+    checked(*words, *(word for choice in words for word in own.get(choice, [])))
 
 
 def test_every_file_begins_with_a_comment() -> None:

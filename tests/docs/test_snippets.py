@@ -84,6 +84,9 @@ def _write_files(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> N
     """Write the files that a page shows, and go there."""
     monkeypatch.chdir(folder)
     monkeypatch.syspath_prepend(folder)
+    for own in ("part.glb", "cup.stl", *(f"rooms/{number}.jpg" for number in range(4))):
+        (folder / own).parent.mkdir(exist_ok=True)
+        (folder / own).touch()
     for block in blocks(page) if page.suffix == ".md" else ():
         if block.file is not None:
             (folder / block.file).parent.mkdir(parents=True, exist_ok=True)

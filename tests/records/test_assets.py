@@ -10,7 +10,8 @@ from phd_exp.records.assets import mesh_asset
 from phd_exp.records.errors import ConfigError
 from phd_exp.training.config import check_render
 
-STANDING = ("data.mesh=part.glb", "data.upright=true", "data.ground=true")
+PART = "data.mesh=part.glb"
+STANDING = (PART, "data.upright=true", "data.ground=true")
 
 
 @pytest.fixture
@@ -51,21 +52,15 @@ def refused(composed: Callable[..., dict[str, Any]], tmp_path: Path, monkeypatch
             ("data.mesh=part.glb", "data.backdrops=few"),
             "data.backdrops: got 'few'; expected a folder with at least 4",
         ),
-        (
-            ("data.mesh=part.glb", "data.reference=middle"),
-            "data.reference: got 'middle'; expected origin, centroid or [x,",
-        ),
-        (("data.mesh=part.glb", "data.unit=0"), "data.unit: got 0; expected to be greater than 0"),
-        (("data.mesh=part.glb", "data.distractors=4"), "distractors: got 4; expected at most 3"),
-        (("data.mesh=part.glb", "data.distractors=1", "data.views=2"), "and 0 if views > 1"),
+        (("data.mesh=part.glb", "data.reference=middle"), "data.reference: got 'middle'; expected origin, centroid"),
+        ((PART, "data.unit=0"), "data.unit: got 0; expected to be greater than 0"),
+        ((PART, "data.distractors=4"), "distractors: got 4; expected at most 3"),
+        ((PART, "data.distractors=1", "data.views=2"), "and 0 if views > 1"),
         (
             ("data.mesh=part.glb", "data.occluders=true"),
             "occluders: for the cylinder alone; expected data.distractors=2",
         ),
-        (
-            (*STANDING, "data.pitch_range=[5,30]"),
-            "ground: expected upright=true, views=1, pitch_range above 5.33 degrees",
-        ),
+        ((*STANDING, "data.pitch_range=[5,30]"), "ground: expected upright=true, views=1, pitch_range above 5.33"),
         (("data=default", "+data.unit=2.0"), "unit: for meshes alone; expected data=object data.mesh=FILE"),
     ],
 )
