@@ -52,12 +52,12 @@ def _one_object(bpy: Any, path: Path) -> Any:
     if missing := [Path(image.filepath).name for image in bpy.data.images if image.filepath and not image.size[0]]:
         raise ValueError(f"its texture {listed(missing)} is missing; put it where the file names it")
     bpy.context.view_layer.update()
-    whole = parts[0]
+    whole, others = parts[0], added - set(parts)
     with bpy.context.temp_override(active_object=whole, selected_editable_objects=parts):
         bpy.ops.object.join()
     whole.modifiers.clear()
     whole.animation_data_clear()
-    for item in added - set(parts):
+    for item in others:
         bpy.data.objects.remove(item)
     if not any(whole.data.materials):
         whole.data.materials.clear()

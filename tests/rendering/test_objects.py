@@ -1,5 +1,6 @@
 """Scenes of a mesh: its size, pose and surroundings, and its silhouette against geometry and Blender."""
 
+import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -88,6 +89,38 @@ def test_every_format_gives_the_same_object_whatever_its_unit(
         scene = sample_object_scene(spec, "train", index, renderer.meshes)
         opaque = renderer.render(scene)[..., 3] > 0.5
         assert (opaque != (trace_pixels(scene, renderer.meshes).surfaces[0] != NOTHING)).sum() <= 5
+
+
+@pytest.mark.parametrize(
+    ("nodes", "low", "high"),
+    [
+        (
+            [{"children": [1], "rotation": [0, 0, 0.5**0.5, 0.5**0.5]}, {"mesh": 0, "translation": [1, 0, 0]}],
+            (-0.1, -0.1, 0.9),
+            (0.1, 0.1, 1.1),
+        ),
+        (
+            [{"mesh": 0, "translation": [0, 0, 1]}, {"mesh": 0, "scale": [-1, 2, 1]}, {"children": [0, 1]}],
+            (-0.1, -1.1, -0.2),
+            (0.1, 0.1, 0.2),
+        ),
+    ],
+    ids=["a turned parent", "two instances, one mirrored"],
+)
+def test_the_parts_of_a_file_are_one_object(
+    make_spec: MakeSpec, tmp_path: Path, nodes: Any, low: Any, high: Any
+) -> None:
+    """The axes of glTF are (x, y, z) = (x, z, -y) of the local frame."""
+    file = write_mesh(tmp_path / "part.gltf", solid("cube"))
+    roots = [number for number in range(len(nodes)) if not any(number in node.get("children", ()) for node in nodes)]
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"nodes": nodes, "scenes": [{"nodes": roots}]}))
+    spec = make_spec("object", mesh=str(file), backdrops=None, sensor_size=112, f_range=(300.0, 500.0))
+    renderer = Renderer(AT_MIDDLES, spec)
+    vertices = renderer.meshes["mesh"].vertices
+    assert [*vertices.min(axis=0), *vertices.max(axis=0)] == pytest.approx([*low, *high], abs=1e-6)
+    scene = sample_object_scene(spec, "train", 0, renderer.meshes)
+    opaque = renderer.render(scene)[..., 3] > 0.5
+    assert (opaque != (trace_pixels(scene, renderer.meshes).surfaces[0] != NOTHING)).sum() <= 5
 
 
 def test_depths_are_those_of_rays(meshes: dict[str, Triangles]) -> None:
