@@ -49,14 +49,9 @@ def test_an_object_is_rendered_masked_and_verified(phd_exp: Callable, part: Path
 
 @pytest.mark.slow
 def test_a_run_on_an_object_predicts_its_test_images(phd_exp: Callable, part: Path, tmp_path: Path) -> None:
-    quick = (
-        "recipe=strong",
-        "data.n_train=16",
-        "data.batch_size=8",
-        "trainer.progress_bar=false",
-        "trainer.threads=1",
-    )
+    quick = ("recipe=strong", "data.n_train=16", "data.batch_size=8", "data.image_size=64", "trainer.threads=1")
     words = (*SMALL, *FEW, *quick, f"data.mesh={part}", "data.unit=0.001", "data.distractors=2", "logger=none")
+    words += ("trainer.progress_bar=false",)
     done = phd_exp(*words)
     assert done.status == 0, done.err
     run = only_run(tmp_path / "runs")
