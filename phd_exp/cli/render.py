@@ -29,4 +29,4 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> None:
         return  # other shards are missing
     print(f"{folder.root}: {n_train} training and {n_test} test samples are there")
     if checked.masks is not None:
-        print(f"{checked.masks}: {write_masks(folder, data.spec, checked.masks)} masks")
+        print(f"{checked.masks}: {write_masks(folder, checked.masks, data.spec)} masks")

@@ -103,15 +103,16 @@ def _rendered_again(folder: DatasetFolder, spec: DatasetSpec, records: list[Samp
             yield f"{path}: rendering it again gives another image; delete the data set, and `render` makes it again"
 
 
-def write_masks(folder: DatasetFolder, spec: DatasetSpec, masks: Path) -> int:
+def write_masks(folder: DatasetFolder, masks: Path, spec: DatasetSpec | None = None) -> int:
     """Write `<masks>/<split>/<index>.png`, white where the object is visible, for all samples; returns how many.
 
-    The masks have one bit per pixel and follow from the records; only meshes need Blender, which reads them.
+    The masks have one bit per pixel and follow from the records, without Blender; only a mesh needs it, and `spec`,
+    which knows the place of the mesh.
 
     Raises DatasetError if there is no data set, or a broken one, RenderError if the masks cannot be written, or a
     mesh cannot be read.
     """
-    meshes = Renderer(fast_settings(spec), spec).meshes if spec.mesh else NO_MESHES
+    meshes = Renderer(fast_settings(spec), spec).meshes if spec and spec.mesh else NO_MESHES
     records = [record for split in SPLITS for record in folder.records(split)]
     with writing(masks, instead="masks=FOLDER"):
         for split in SPLITS:

@@ -90,13 +90,11 @@ def _require_size(mesh: Triangles, spec: DatasetSpec) -> None:
     """Raise ValueError if a mesh is implausibly small or large, or may reach half of the way to the camera."""
     longest, reach, nearest = max(mesh.dimensions), spec.scale_range[1] * mesh.radius, spec.z_range[0]
     unit = spec.unit * (1000 if longest < SIZES[0] else 0.001)
-    advice = f"set data.unit={unit:g}, or scale the file"
-    if not SIZES[0] <= longest <= SIZES[1]:
-        raise ValueError(f"its longest side is {longest:.3g} m; expected {SIZES[0]:g} to {SIZES[1]:g} m; {advice}")
-    if reach > nearest / 2:
+    if not (SIZES[0] <= longest <= SIZES[1] and reach <= nearest / 2):
         raise ValueError(
-            f"reaches {reach:.3g} m from its reference point; expected at most {nearest / 2:g} m, half of the least "
-            f"depth; {advice}, or set data.z_range"
+            f"its longest side is {longest:.3g} m, its farthest point {reach:.3g} m from the reference point; expected "
+            f"{SIZES[0]:g} to {SIZES[1]:g} m, and half of the least depth, {nearest / 2:g} m; set data.unit={unit:g}, or "
+            "data.z_range"
         )
 
 

@@ -260,10 +260,15 @@ def test_records_of_cylinders_stay_as_they_were(
         ("text.glb", b"not a mesh", {}, "none|text.glb: .*glTF"),
         ("text.stl", b"not a mesh", {}, "text.stl: .*Failed to read"),
         ("short.ply", b"ply\nformat ascii 1.0\nelement face 10000000\nend_header\n", {}, "short.ply: "),
-        ("cup.stl", solid("cylinder", 200.0), {}, r"longest side is 200 m; .* set data\.unit=0\.001"),
-        ("cup.stl", solid("cylinder", 1e-4), {}, r"longest side is 0\.0001 m; .* set data\.unit=1000"),
-        ("cup.stl", solid("cylinder", 2.2), {}, r"reaches 1\.56 m from its reference point; expected at most 1\.5 m"),
-        ("cup.stl", solid("cylinder", 1.2), {"scale_range": (0.5, 2.0)}, r"reaches 1\.7 m"),
+        ("cup.stl", solid("cylinder", 200.0), {}, r"longest side is 200 m, .* set data\.unit=0\.001"),
+        ("cup.stl", solid("cylinder", 1e-4), {}, r"longest side is 0\.0001 m, .* set data\.unit=1000"),
+        (
+            "cup.stl",
+            solid("cylinder", 2.2),
+            {},
+            r"farthest point 1\.56 m from the .* half of the least depth, 1\.5 m",
+        ),
+        ("cup.stl", solid("cylinder", 1.2), {"scale_range": (0.5, 2.0)}, r"farthest point 1\.7 m"),
     ],
 )
 def test_an_unusable_mesh_is_one_line(
