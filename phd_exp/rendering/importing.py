@@ -92,9 +92,9 @@ def _require_size(mesh: Triangles, spec: DatasetSpec) -> None:
     unit = spec.unit * (1000 if longest < SIZES[0] else 0.001)
     if not (SIZES[0] <= longest <= SIZES[1] and reach <= nearest / 2):
         raise ValueError(
-            f"its longest side is {longest:.3g} m, its farthest point {reach:.3g} m from the reference point; expected "
-            f"{SIZES[0]:g} to {SIZES[1]:g} m, and half of the least depth, {nearest / 2:g} m; set data.unit={unit:g}, or "
-            "data.z_range"
+            f"its longest side is {longest:.3g} m, its farthest point {reach:.3g} m from the reference; expected "
+            f"{SIZES[0]:g} to {SIZES[1]:g} m, and at most half of the least depth, {nearest / 2:g} m; set "
+            f"data.unit={unit:g}, or data.z_range"
         )
 
 
