@@ -300,6 +300,26 @@ def test_a_texture_is_part_of_the_mesh_and_must_be_there(make_spec: MakeSpec, tm
     assert make_spec("object", mesh=str(file)).mesh != spec.mesh
 
 
+def test_vertices_keep_their_colours(make_spec: MakeSpec, tmp_path: Path) -> None:
+    mesh, axes = solid("cube"), "".join(f"property float {axis}\n" for axis in "xyz")
+    colours = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    faces = f"element face {len(mesh.corners)}\nproperty list uchar int vertex_indices\nend_header\n"
+    rows = [*(f"{x} {y} {z} 0 200 0" for x, y, z in mesh.vertices), *(f"3 {a} {b} {c}" for a, b, c in mesh.corners)]
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(mesh.vertices)}\n{axes}{colours}{faces}"
+    (tmp_path / "part.ply").write_text(head + "\n".join(rows) + "\n")
+    spec = make_spec(
+        "object",
+        mesh=str(tmp_path / "part.ply"),
+        backdrops=None,
+        sensor_size=56,
+        f_range=(300.0, 500.0),
+        xy_range=0.2,
+    )
+    renderer = Renderer(AT_MIDDLES, spec)
+    red, green, _, opacity = renderer.render(sample_object_scene(spec, "train", 0, renderer.meshes))[28, 28]
+    assert (opacity, green > 5 * red) == (1.0, True)
+
+
 def test_skies_light_the_scene_and_turn_with_the_camera(of_mesh: MakeSpec) -> None:
     """A camera that looks down sees what a panorama has below; a brighter sky lights more."""
     spec = of_mesh(sensor_size=32, f_range=(40.0, 40.0), xy_range=0.0)
