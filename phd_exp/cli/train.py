@@ -159,7 +159,8 @@ def standing(config: dict[str, Any], overrides: list[str]) -> str | None:
 
 def run_name(config: RunConfig, overrides: list[str]) -> RunName:
     """The name of a run; all other overrides that can change a number go into its hash."""
-    return RunName(config.setting, config.data.name, config.model.name, config.seed, _hashed(overrides))
+    preset = setting(config.preset, config.recipe.name)
+    return RunName(preset, config.data.name, config.model.name, config.seed, _hashed(overrides))
 
 
 def _hashed(overrides: list[str]) -> tuple[str, ...]:

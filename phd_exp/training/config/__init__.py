@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, Field, StrictBool, ValidationError, ValidationInfo, model_validator
 
-from phd_exp.records.choices import flatten, setting
+from phd_exp.records.choices import flatten
 from phd_exp.records.errors import ConfigError, gist, shown
 from phd_exp.records.parsing import Record
 from phd_exp.records.spec import DatasetSpec, Shard
@@ -52,11 +52,6 @@ class RunConfig(Record):
     logger: TrainingTargets
     callbacks: TrainingTargets = Field(default_factory=dict)
     evaluation: sections.EvaluationConfig
-
-    @property
-    def setting(self) -> str:
-        """Preset and recipe in one word, the first level of the run's folder."""
-        return setting(self.preset, self.recipe.name)
 
     @model_validator(mode="after")
     def parts_fit(self, info: ValidationInfo) -> "RunConfig":
