@@ -11,8 +11,7 @@ from pydantic import model_validator
 from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_folder, parsed, predicted
 from phd_exp.records.detections import Detection, detection_of, detections_in
 from phd_exp.records.errors import ConfigError, RunError
-from phd_exp.records.files import read_plain, write_atomic
-from phd_exp.records.parsing import parse_json
+from phd_exp.records.files import write_atomic
 from phd_exp.records.runs import RunFolder
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
@@ -129,21 +128,20 @@ def _depth_curve(run: Path, predictor: "Predictor") -> dict[str, Any]:
 
     Raises RunError if there is none, as for a baseline.
     """
+    import torch
+
+    from phd_exp.evaluation.parquet import read_table
+    from phd_exp.evaluation.predictions import recalibrated
+    from phd_exp.metrics.calibration import calibration_curve
+
+    file = RunFolder(run).predictions
+    table = read_table(file) if file.exists() else {}
     if predictor.temperature is not None:
-        import torch
-
-        from phd_exp.evaluation.parquet import read_table
-        from phd_exp.evaluation.predictions import recalibrated
-        from phd_exp.metrics.calibration import calibration_curve
-
-        table = recalibrated(read_table(RunFolder(run).predictions), predictor.temperature)
+        table = recalibrated(table, predictor.temperature)
+    try:
         variance, error = (torch.from_numpy(table[f"depth_{name}"]) for name in ("variance", "squared_error"))
         return calibration_curve(variance, error, predictor.config.evaluation.calibration_window).as_data()
-    file = RunFolder(run).curves("final")
-    try:
-        curve = parse_json(read_plain(file).decode())["depth"]
-        if {"predicted", "empirical", "window", "left_out"} <= curve.keys():
-            return dict(curve)
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
-        pass
-    raise RunError(f"{file}: no calibration curve of depth; expected a finished run of a model with a density")
+    except (KeyError, ValueError):
+        raise RunError(
+            f"{file}: no calibration curve of depth; expected a finished run of a model with a density"
+        ) from None

@@ -69,6 +69,11 @@ class RenderedConfig(SizesConfig):
         """The folder of the data set."""
         return self.root / self.spec.variant
 
+    def changed(self, changes: dict[str, Any], n_test: int) -> "RenderedConfig":
+        """The first `n_test` test samples of the data set with other values. Raises ValueError for wrong ones."""
+        spec = DatasetSpec(**(self.spec.model_dump() | changes))
+        return self.model_copy(update={"spec": spec, "n_test": n_test})
+
 
 class FolderConfig(SizesConfig):
     """A folder of the user's own images; `name` names its runs."""
@@ -181,11 +186,6 @@ class MultiviewConfig(Record):
     scenes: Natural
     views: Annotated[Whole, Field(ge=2, le=64)]
     angle_range: Annotated[tuple[Angle, Angle], Range]
-
-    def spec_beside(self, spec: DatasetSpec) -> DatasetSpec:
-        """The data set of several views that otherwise equals `spec`."""
-        changes = {"variant": "multiview", "views": self.views, "view_angle_range": self.angle_range}
-        return DatasetSpec(**(spec.model_dump() | changes))
 
 
 Times = Annotated[float, Field(ge=0.1, le=100)]
