@@ -82,7 +82,7 @@ def build_module(config: RunConfig, data: PositionData) -> PositionModule:
         )
     schedule = partial(factor, recipe.schedule, recipe.warmup_steps)
     module = PositionModule(
-        regressor, loss, optimizer, constant_f, recipe.localisation, schedule, config.camera.f_error
+        regressor, loss, optimizer, constant_f, recipe.localisation, schedule, config.camera.f_error, recipe.coarse
     )
     if custom_parts({"head": config.model.head, "backbone": config.backbone, "loss": config.loss}):
         _try_out(module, config, data.source)
