@@ -207,7 +207,7 @@ def detections_in(
             break
     if others and not found:
         names = f"one of {listed(sorted(others))}" if all(others) else "no object=, since metadata.jsonl names none"
-        raise DatasetError(f"{folder}: no object {shown(object_name)} here; expected {names}")
+        raise DatasetError(f"{folder}: no object {shown(str(object_name))} here; expected {names}")
     if not found or len(found) < (n or 0):
         raise DatasetError(f"{files[0]}: {n or 'some'} detections asked for{asked_by}, {len(found)} found")
     return found

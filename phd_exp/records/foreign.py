@@ -44,17 +44,19 @@ def _bop(folder: Path) -> Iterator[Entry]:
     """The visible instances; positions are those of the models' origins, boxes contain what a detector could find."""
     for file in sorted(folder.glob("*/scene_gt.json")):
         cameras, infos, scene = (_json(file.with_name(f"scene_{name}.json")) for name in ("camera", "gt_info", "gt"))
-        images = _images(file.with_name("rgb")) or _images(file.with_name("gray"))
-        with _reading(file):
-            items = [(image, *item) for image, objects in scene.items() for item in enumerate(objects)]
-        for image, number, item in items:
-            with _reading(where := f"{file}, image {image}, object {number}"):
-                info, camera, model = infos[image][number], cameras[image], item["obj_id"]
+        kind = "rgb" if file.with_name("rgb").exists() else "gray"
+        images = _images(file.with_name(kind))
+        with _reading(f"{file} and scene_gt_info.json"):
+            pairs = {image: list(zip(items, infos[image], strict=True)) for image, items in scene.items()}
+            objects = [(image, *found) for image, items in pairs.items() for found in enumerate(items)]
+        for image, number, (item, info) in objects:
+            with _reading(where := f"{file.parent}, image {image}, object {number}"):
+                camera, model = cameras[image], item["obj_id"]
                 left, top, width, height = info["bbox_visib"]
                 if width < 0:  # invisible objects have the box -1, -1, -1, -1
                     continue
                 values = {
-                    "file_name": f"{file.parent.name}/{images[f'{int(image):06d}']}",
+                    "file_name": f"{file.parent.name}/{images[f'{kind}/{int(image):06d}']}",
                     "box": [left, top, left + width + 1, top + height + 1],  # a width is last minus first column
                     **dict(zip("xyz", (value / METRE for value in item["cam_t_m2c"]), strict=True)),
                     "visibility": info["visib_fract"],
@@ -88,7 +90,7 @@ def _kitti(folder: Path) -> Iterator[Entry]:
                 truncated, occluded, _, *box, h, _, _, x, y, z, _ = map(float, words[:14])
                 left, top, right, bottom = (value + CORNER for value in box)
                 values = {
-                    "file_name": images[file.stem],
+                    "file_name": images[f"image_2/{file.stem}"],
                     "box": [left, top, right, bottom],
                     **dict(zip("xyz", np.add(t, (x, y - h / 2, z)).tolist(), strict=True)),
                     "visibility": VISIBILITY.get(occluded),
@@ -147,8 +149,8 @@ def _json(file: Path) -> Any:
 
 
 def _images(folder: Path) -> dict[str, str]:
-    """Stem -> path of the images of a folder, in its parent."""
-    return {file.stem: f"{folder.name}/{file.name}" for file in sorted(folder.glob("*.*"))}
+    """Path without suffix -> path of the images of a folder, in its parent."""
+    return {f"{folder.name}/{file.stem}": f"{folder.name}/{file.name}" for file in sorted(folder.glob("*.*"))}
 
 
 def _pinhole(K: Sequence[float]) -> dict[str, float]:
