@@ -43,7 +43,7 @@ def format_of(folder: Path) -> tuple[list[Path], Callable[[Path], Iterator[Entry
 def _bop(folder: Path) -> Iterator[Entry]:
     """The visible instances; positions are those of the models' origins, boxes contain what a detector could find."""
     for file in sorted(folder.glob("*/scene_gt.json")):
-        cameras, infos, scene = (_json(file.with_name(f"scene_{name}.json")) for name in ("camera", "gt_info", "gt"))
+        cameras, infos, scene = (_read(file.with_name(f"scene_{name}.json")) for name in ("camera", "gt_info", "gt"))
         kind = "rgb" if file.with_name("rgb").exists() else "gray"
         images = _images(file.with_name(kind))
         with _reading(f"{file} and scene_gt_info.json"):
@@ -79,10 +79,10 @@ def _kitti(folder: Path) -> Iterator[Entry]:
     for file in sorted(folder.glob("label_2/*.txt")):
         calibration = folder / "calib" / file.name
         with _reading(f"{calibration}, P2"):
-            rows = dict(line.split(":", 1) for line in _lines(calibration) if ":" in line)
+            rows = dict(line.split(":", 1) for line in _read(calibration, str.splitlines) if ":" in line)
             K, last = np.split(np.array(rows["P2"].split(), dtype=float).reshape(3, 4), [3], axis=1)
             camera, t = _pinhole(K.ravel().tolist()), np.linalg.solve(K, last).ravel()
-        for number, line in enumerate(_lines(file), start=1):
+        for number, line in enumerate(_read(file, str.splitlines), start=1):
             with _reading(where := f"{file}, line {number}"):
                 name, *words = line.split() or ["DontCare"]
                 if name == "DontCare":
@@ -102,7 +102,7 @@ def _kitti(folder: Path) -> Iterator[Entry]:
 def _coco(folder: Path) -> Iterator[Entry]:
     """All annotations except crowds."""
     file = _instances(folder)
-    content = _json(file)
+    content = _read(file)
     with _reading(file):
         images = {image["id"]: image for image in content["images"]}
         names = {category["id"]: str(category["name"]) for category in content["categories"]}
@@ -138,14 +138,9 @@ def _reading(where: Path | str) -> Iterator[None]:
         raise DatasetError(f"{where}: cannot be read ({reason}); {rule}") from None
 
 
-def _lines(file: Path) -> list[str]:
+def _read(file: Path, parse: Callable[[str], Any] = parse_json) -> Any:
     with _reading(file):
-        return read_plain(file, LARGEST).decode().splitlines()
-
-
-def _json(file: Path) -> Any:
-    with _reading(file):
-        return parse_json(read_plain(file, LARGEST).decode())
+        return parse(read_plain(file, LARGEST).decode())
 
 
 def _images(folder: Path) -> dict[str, str]:

@@ -93,8 +93,8 @@ def _write_mask(record: SampleRecord, number: int, hits: Hits, target: Path) -> 
     file = target / "mask_visib" / f"{record.index:06d}_{number:06d}.png"
     write_atomic(file, file_of(Image.fromarray(np.uint8(255) * mask), "png"))
     return {
-        "bbox_obj": _box(whole, columns.start, rows.start) if mask.any() else [-1] * 4,
-        "bbox_visib": _box(mask) if mask.any() else [-1] * 4,
+        "bbox_obj": _box(whole, columns.start, rows.start),
+        "bbox_visib": _box(mask),
         "px_count_all": int(whole.sum()),
         "px_count_valid": int(np.isfinite(hits.depths[number]).sum()),
         "px_count_visib": int(mask.sum()),
@@ -103,9 +103,11 @@ def _write_mask(record: SampleRecord, number: int, hits: Hits, target: Path) -> 
 
 
 def _box(mask: Mask, left: int = 0, top: int = 0) -> list[int]:
-    """First column and row, and the differences to the last ones."""
+    """First column and row, and the differences to the last ones; -1 if there is no pixel."""
     rows, columns = np.nonzero(mask)
-    return [int(columns.min()) + left, int(rows.min()) + top, int(np.ptp(columns)), int(np.ptp(rows))]
+    if not len(rows):
+        return [-1] * 4
+    return [int(value) for value in (columns.min() + left, rows.min() + top, np.ptp(columns), np.ptp(rows))]
 
 
 def _write_model(shape: Shape, size: np.ndarray, folder: Path) -> dict[str, Any]:
