@@ -11,7 +11,12 @@ import torch
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import coordinates, distribution_columns, draws
 from phd_exp.evaluation.predictions import (
-    ERRORS, OF_DISTANCE, Evaluation, evaluate, fit_temperature, recalibrated,
+    ERRORS,
+    OF_DISTANCE,
+    Evaluation,
+    evaluate,
+    fit_temperature,
+    recalibrated,
 )  # fmt: skip
 from phd_exp.metrics.calibration import calibration_curve
 from phd_exp.metrics.calibration_scores import exact_scores
