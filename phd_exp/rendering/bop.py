@@ -23,20 +23,13 @@ from phd_exp.records.files import write_atomic
 from phd_exp.records.foreign import CORNER, METRE
 from phd_exp.records.images import content_of
 from phd_exp.records.scenes import SampleRecord, Shape
+from phd_exp.rendering import rays
 from phd_exp.rendering.meshes import build_mesh
 from phd_exp.rendering.pixels import file_of
 from phd_exp.rendering.progress import shown_progress
-from phd_exp.rendering.rays import (
-    Hits,
-    Mask,
-    cylinder_mask,
-    in_camera_frame,
-    rotation_matrix,
-    silhouette,
-    trace_pixels,
-)
 
 NUMBERS: dict[Shape, int] = {"cylinder": 1, "cube": 2, "sphere": 3}
+ROUND_ABOUT = {"cylinder": [[0, 0, 1]], "cube": [], "sphere": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}
 
 
 def write_bop(folder: DatasetFolder, bop: Path) -> int:
@@ -56,40 +49,40 @@ def write_bop(folder: DatasetFolder, bop: Path) -> int:
             for record in images:
                 content = content_of(folder.split_folder(split) / record.file_name)
                 write_atomic(target / "rgb" / record.file_name, content)
-                hits, numbers = trace_pixels(record.shown), range(len(record.objects))
+                hits, numbers = rays.trace_pixels(record.shown), range(len(record.objects))
                 tables["gt"][record.index] = [_pose(record, number) for number in numbers]
                 tables["gt_info"][record.index] = [_write_mask(record, number, hits, target) for number in numbers]
                 tables["camera"][record.index] = _camera(record, several)
                 advance()
             for name, table in tables.items():
-                _write_json(target / f"scene_{name}.json", table)
+                write_atomic(target / f"scene_{name}.json", json.dumps(table))
         (bop / "models").mkdir(parents=True, exist_ok=True)
         sizes = {item.shape: METRE * np.array(item.dimensions) for record in records for item in record.objects}
         models = {NUMBERS[shape]: _write_model(shape, size, bop / "models") for shape, size in sizes.items()}
-        _write_json(bop / "models" / "models_info.json", models)
+        write_atomic(bop / "models" / "models_info.json", json.dumps(models))
     return len(records)
 
 
 def _camera(record: SampleRecord, several: bool) -> dict[str, Any]:
     f, middle = record.f, record.S / 2 - CORNER
     camera = {"cam_K": [f, 0, middle, 0, f, middle, 0, 0, 1], "depth_scale": 1.0}
-    world = {"cam_R_w2c": rotation_matrix(record.pose.rotation).ravel().tolist()}
+    world = {"cam_R_w2c": rays.rotation_matrix(record.pose.rotation).ravel().tolist()}
     return camera | (world | {"cam_t_w2c": [METRE * value for value in record.pose.translation]} if several else {})
 
 
 def _pose(record: SampleRecord, number: int) -> dict[str, Any]:
-    item, rotation = record.objects[number], rotation_matrix(record.pose.rotation)
+    item, rotation = record.objects[number], rays.rotation_matrix(record.pose.rotation)
     return {
         "obj_id": NUMBERS[item.shape],
-        "cam_R_m2c": (rotation @ rotation_matrix(item.rotation)).ravel().tolist(),
-        "cam_t_m2c": (METRE * in_camera_frame(np.array(item.position), record.pose)).tolist(),
+        "cam_R_m2c": (rotation @ rays.rotation_matrix(item.rotation)).ravel().tolist(),
+        "cam_t_m2c": (METRE * rays.in_camera_frame(np.array(item.position), record.pose)).tolist(),
         "scale": item.scale,
     }
 
 
-def _write_mask(record: SampleRecord, number: int, hits: Hits, target: Path) -> dict[str, Any]:
+def _write_mask(record: SampleRecord, number: int, hits: rays.Hits, target: Path) -> dict[str, Any]:
     """Write the mask of an object; returns its boxes and pixels, of which those outside the image are not visible."""
-    mask, (whole, rows, columns) = cylinder_mask(hits, number), silhouette(record.shown, number)
+    mask, (whole, rows, columns) = rays.cylinder_mask(hits, number), rays.silhouette(record.shown, number)
     file = target / "mask_visib" / f"{record.index:06d}_{number:06d}.png"
     write_atomic(file, file_of(Image.fromarray(np.uint8(255) * mask), "png"))
     return {
@@ -102,7 +95,7 @@ def _write_mask(record: SampleRecord, number: int, hits: Hits, target: Path) -> 
     }
 
 
-def _box(mask: Mask, left: int = 0, top: int = 0) -> list[int]:
+def _box(mask: rays.Mask, left: int = 0, top: int = 0) -> list[int]:
     """First column and row, and the differences to the last ones; -1 if there is no pixel."""
     rows, columns = np.nonzero(mask)
     if not len(rows):
@@ -111,35 +104,23 @@ def _box(mask: Mask, left: int = 0, top: int = 0) -> list[int]:
 
 
 def _write_model(shape: Shape, size: np.ndarray, folder: Path) -> dict[str, Any]:
-    """Write the triangles of a shape as PLY; returns its size and its symmetries."""
+    """Write the triangles of a shape as PLY; returns its size, and the rotations that do not change it."""
     mesh = build_mesh(shape)
     vertices = np.array(mesh.vertices) * size / 2
     faces = [(3, face[0], *edge) for face in mesh.faces for edge in pairwise(face[1:])]
-    axes = "".join(f"property float {axis}\n" for axis in "xyz")
-    header = f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\n{axes}element face {len(faces)}\n"
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz")
+    header += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     rows = (" ".join(map(str, row)) for row in (*vertices.round(6).tolist(), *faces))
-    text = f"{header}property list uchar int vertex_indices\nend_header\n" + "\n".join(rows) + "\n"
-    write_atomic(folder / f"obj_{NUMBERS[shape]:06d}.ply", text)
+    write_atomic(folder / f"obj_{NUMBERS[shape]:06d}.ply", header + "\n".join(rows) + "\n")
     info = {"diameter": float(2 * np.linalg.norm(vertices, axis=1).max())}  # all are symmetric about their centre
     for axis, value in zip("xyz", size.tolist(), strict=True):
         info |= {f"min_{axis}": -value / 2, f"size_{axis}": value}
-    return info | _symmetries(shape, size)
-
-
-def _symmetries(shape: Shape, size: np.ndarray) -> dict[str, Any]:
-    """Rotations that do not change a shape: about axes, and those of a cube that also keep the size or axis."""
-    axes = {"cylinder": [[0, 0, 1]], "cube": [], "sphere": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}[shape]
     kept = np.array([1, 1, 2]) if shape == "cylinder" else size
-    turns = np.tile(np.eye(4), (24, 1, 1))
+    turns = np.tile(np.eye(4), (24, 1, 1))  # those of a cube, of which the identity is the only one with trace 4
     turns[:, :3, :3] = Rotation.create_group("O").as_matrix().round()
-    keeps = (np.isclose(abs(turns[:, :3, :3]) @ kept, kept)).all(axis=1) & (np.trace(turns, axis1=1, axis2=2) < 4)
-    return {
+    keeps = np.isclose(abs(turns[:, :3, :3]) @ kept, kept).all(axis=1) & (turns.trace(axis1=1, axis2=2) < 4)
+    return info | {
         "symmetries_discrete": turns[keeps].reshape(-1, 16).tolist(),
-        "symmetries_continuous": [{"axis": axis, "offset": [0, 0, 0]} for axis in axes],
+        "symmetries_continuous": [{"axis": axis, "offset": [0, 0, 0]} for axis in ROUND_ABOUT[shape]],
     }
-
-
-def _write_json(file: Path, table: dict[int, Any]) -> None:
-    """Write one entry a line, as the BOP toolkit does."""
-    lines = ",\n".join(f'  "{key}": {json.dumps(value)}' for key, value in table.items())
-    write_atomic(file, f"{{\n{lines}\n}}\n")
