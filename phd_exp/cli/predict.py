@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import model_validator
 
 from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_folder, parsed, predicted
-from phd_exp.records.detections import Detection, detection_of, detections_in
+from phd_exp.records.detections import Detection, NumberOrName, detection_of, detections_in
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import write_atomic
 from phd_exp.records.runs import RunFolder
@@ -28,7 +28,9 @@ class PredictArguments(RunArguments):
     image: Path | None = None
     """one image, with its camera as f= or fx= and fy="""
     folder: Path | None = None
-    """images with a metadata.jsonl, instead of image="""
+    """images with a metadata.jsonl, or as BOP, KITTI or COCO, instead of image="""
+    object: NumberOrName | None = None
+    """with folder=: BOP's obj_id, KITTI's type or COCO's category; by default all objects"""
     f: float | None = None
     """focal length, px"""
     fx: float | None = None
@@ -65,6 +67,8 @@ class PredictArguments(RunArguments):
                 f"{next(iter(self.camera))}: belongs to image=FILE; for a folder, write it into each line of "
                 "metadata.jsonl"
             )
+        if self.object and self.image:
+            raise ValueError("object: selects detections of folder=DIR; leave it out for image=FILE")
         if self.groups and not self.coverage:
             raise ValueError("groups: guarantees a coverage; expected coverage=0.9, or another in (0, 1), too")
         if self.calibration and self.out is None:
@@ -79,7 +83,7 @@ def main(words: list[str]) -> int:
     arguments = parsed("predict", PredictArguments, words)
     out = arguments.out
     if arguments.folder is not None:
-        detections = detections_in(arguments.folder)
+        detections = detections_in(arguments.folder, object_name=arguments.object)
     else:
         assert arguments.image is not None  # checked by `one_source`
         detections = [detection_of(arguments.image, arguments.camera)]

@@ -21,6 +21,7 @@ from phd_exp.records.errors import ConfigError, DatasetError
 from phd_exp.records.images import content_of, pillow_warnings
 from phd_exp.records.scenes import Split
 
+KNOWN = ("scale", "visibility", "truncation")  # values that are recorded with the predictions
 CROP_LAYOUT = 2  # version of `cut`, recorded with each cache
 
 
@@ -56,7 +57,7 @@ class FolderSource(Source):
         n_train = len(training) - n_held_out
         if n_train < 1:
             raise ConfigError(
-                f"data.n_held_out: got {n_held_out}, but {folder.metadata_path('train')} has {len(training)} "
+                f"data.n_held_out: got {n_held_out}, but {folder.root / 'train'} has {len(training)} "
                 "detections in all; expected fewer than that"
             )
         self.crops: dict[Part, list[Crop]] = {
@@ -84,7 +85,7 @@ class FolderSource(Source):
             "f": [crop.camera.f for crop in crops],
             "S": [self.side] * len(crops),
         }
-        rendered = {name: [getattr(line, name) for line in lines] for name in ("scale", "visibility")}
+        rendered = {name: [getattr(line, name) for line in lines] for name in KNOWN}
         return columns | {name: values for name, values in rendered.items() if values != [None] * len(lines)}
 
     def count(self, part: Part) -> int:

@@ -5,11 +5,13 @@
         <split>/...               the images, next to it or in subfolders
         .cache/                   crops, decoded once
 
-`DetectionLine` describes a line. Lines with the same `scene` form one `Observed`.
+`DetectionLine` describes a line. Lines with the same `scene` form one `Observed`. A folder without
+`metadata.jsonl` may have annotations in another format (`foreign.py`), which become lines too.
 """
 
+import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,8 +20,9 @@ from pydantic import AfterValidator, Field, PlainValidator, ValidationError, mod
 from pydantic_core import ErrorDetails
 
 from phd_exp.records.dataset import SPLITS, checksum, sha256
-from phd_exp.records.errors import UNPRINTABLE, DatasetError, complaint, gist, nearest, shown
+from phd_exp.records.errors import UNPRINTABLE, DatasetError, complaint, gist, listed, nearest, shown
 from phd_exp.records.files import read_jsonl
+from phd_exp.records.foreign import Entry, format_of
 from phd_exp.records.parsing import Record, parse_json
 from phd_exp.records.scenes import Pose, SampleRecord, Split
 from phd_exp.records.spec import Number, Positive
@@ -42,7 +45,7 @@ def _in_pixels(f: float) -> float:
     return f
 
 
-SceneName = Annotated[int | str, PlainValidator(_name)]
+NumberOrName = Annotated[int | str, PlainValidator(_name)]
 Pixels = Annotated[Number, Field(ge=-1e6, le=1e6)]
 FocalLength = Annotated[Positive, Field(le=1e6), AfterValidator(_in_pixels)]
 Metres = Annotated[Number, Field(ge=-1e6, le=1e6)]
@@ -57,7 +60,7 @@ class DetectionLine(Record):
         cx, cy: principal point, px; by default the middle of the image.
         box: left, top, right, bottom of the detection, px; by default the whole image.
         x, y, z: true position in the camera frame (x right, y down, z forward), m.
-        scale, visibility: as in a rendered data set; recorded with the predictions.
+        scale, visibility, truncation: as in a rendered data set; recorded with the predictions.
         scene: lines with the same scene show the same object at the same time.
         pose: of the camera, in the world that the cameras of a scene share.
     """
@@ -74,7 +77,8 @@ class DetectionLine(Record):
     z: Annotated[Number, Field(ge=1e-6, le=1e6)] | None = None
     scale: Positive | None = None
     visibility: Annotated[Number, Field(ge=0, le=1)] | None = None
-    scene: SceneName | None = None
+    truncation: Annotated[Number, Field(ge=0, le=1)] | None = None
+    scene: NumberOrName | None = None
     pose: Pose | None = None
 
     @model_validator(mode="before")
@@ -155,9 +159,10 @@ class Detection:
 
 @dataclass(frozen=True)
 class DetectionFolder:
-    """A folder of the user's own images, with a subfolder for each split."""
+    """A folder of the user's own images, with a subfolder for each split; `object_name` selects detections."""
 
     root: Path
+    object_name: int | str | None = None
 
     @property
     def cache(self) -> Path:
@@ -170,20 +175,51 @@ class DetectionFolder:
 
     def detections(self, split: Split, n: int | None = None) -> list[Detection]:
         """The detections of a split, as `detections_in` reads them."""
-        return detections_in(self.root / split, n, f" (data.n_{split})")
+        return detections_in(self.root / split, n, f" (data.n_{split})", self.object_name)
 
     def fingerprint(self) -> str:
-        """Checksum of both `metadata.jsonl`, without the images. Raises OSError if one cannot be read."""
-        return sha256("".join(checksum(self.metadata_path(split)) for split in SPLITS).encode())
+        """Checksum of the annotations of both splits, without the images. Raises OSError if one cannot be read."""
+        files = [file for split in SPLITS for file in annotations(self.root / split)[0]]
+        return sha256("".join(map(checksum, files)).encode())
 
 
-def detections_in(folder: Path, n: int | None = None, asked_by: str = "") -> list[Detection]:
-    """The first n detections of a folder's `metadata.jsonl`, all by default, in the order of the lines.
+def detections_in(
+    folder: Path, n: int | None = None, asked_by: str = "", object_name: int | str | None = None
+) -> list[Detection]:
+    """The first n detections of a folder's annotations, all by default, in their order.
+
+    `object_name` selects those of one object: BOP's `obj_id`, KITTI's type, or COCO's category.
 
     Raises:
-        DatasetError: the file cannot be read, a line is not a detection, or there are fewer than n.
+        DatasetError: a file cannot be read, an entry is not a detection, there are fewer than n, or no such object.
         CorruptFileError: a line is not text.
     """
+    found: list[Detection] = []
+    others = set()
+    files, read = annotations(folder)
+    for where, name, values in read(folder):
+        if object_name is not None and name != str(object_name):
+            others.add(name)
+            continue
+        line = _line(values, where)
+        found.append(Detection(line, _inside(folder, line.file_name, where), where))
+        if len(found) == n:
+            break
+    if others and not found:
+        names = f"one of {listed(sorted(others))}" if all(others) else "no object=, since metadata.jsonl names none"
+        raise DatasetError(f"{folder}: no object {shown(str(object_name))} here; expected {names}")
+    if not found or len(found) < (n or 0):
+        raise DatasetError(f"{files[0]}: {n or 'some'} detections asked for{asked_by}, {len(found)} found")
+    return found
+
+
+def annotations(folder: Path) -> tuple[list[Path], Callable[[Path], Iterator[Entry]]]:
+    """The files that describe a folder's images, and their reader; `metadata.jsonl` comes before other formats."""
+    metadata = folder / "metadata.jsonl"
+    return (not os.path.lexists(metadata) and format_of(folder)) or ([metadata], _entries)
+
+
+def _entries(folder: Path) -> Iterator[Entry]:
     path = folder / "metadata.jsonl"
     try:
         lines = read_jsonl(path, str.strip, sealed=True)
@@ -192,17 +228,13 @@ def detections_in(folder: Path, n: int | None = None, asked_by: str = "") -> lis
             f"{path}: cannot be read ({error.strerror}); expected one JSON object a line, "
             "see `Your own images` in README.md"
         ) from None
-    numbered = [(f"{path}, line {number}", text) for number, text in enumerate(lines, start=1) if text][:n]
-    if not numbered or len(numbered) < (n or 0):
-        raise DatasetError(f"{path}: {n or 'some'} detections asked for{asked_by}, {len(numbered)} found")
-    found = []
-    for where, text in numbered:
+    for number, text in enumerate(lines, start=1):
+        where = f"{path}, line {number}"
         try:
-            line = _line(parse_json(text), where)
+            if text:
+                yield where, "", parse_json(text)
         except ValueError as error:
             raise DatasetError(f"{where}: not JSON ({error}); expected one object a line") from None
-        found.append(Detection(line, _inside(folder, line.file_name, where), where))
-    return found
 
 
 def detection_of(file: Path, values: Mapping[str, Any]) -> Detection:

@@ -105,7 +105,7 @@ def require_same_config(folder: RunFolder, config: RunConfig) -> None:
     status, manifest = folder.status(), _manifest_hash(config)
     if isinstance(config.data, FolderConfig) and status and manifest not in (None, status.data_manifest):
         raise RunError(
-            f"{folder.path}: holds a run on {config.data.folder} as it was before its metadata.jsonl changed; "
+            f"{folder.path}: holds a run on {config.data.folder} as it was before its annotations changed; "
             "move that run's folder away, or choose another place by runs=DIR"
         )
 

@@ -16,10 +16,13 @@ from phd_exp.data.datamodule import PositionData
 from phd_exp.data.folder import FolderSource
 from phd_exp.data.sources import RenderedSource
 from phd_exp.geometry import projected
-from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.dataset import SPLITS, DatasetFolder
 from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError, DatasetError
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.training.build import build_source
+from phd_exp.training.config import check
+from tests.support.foreign import write_kitti
 
 BOXED: dict[str, Any] = {"file_name": "wide.jpg", "fx": 300.0, "fy": 320.0, "cx": 70.0, "cy": 40.0, "z": 2.0}
 
@@ -117,6 +120,20 @@ def test_what_is_held_out_follows_what_is_trained_on(
     assert torch.equal(held_out.xyz, there.xyz)
     ratio = (own.samples("train").xyz[:, 2] / own.samples("train").f).double()
     assert own.depth.mu_z0 == pytest.approx(math.sqrt(ratio.max() * ratio.min())), "of those trained on alone"
+
+
+def test_a_type_of_kitti_is_a_source(composed: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
+    for split in SPLITS:
+        write_kitti(tmp_path / split)
+    words = ("preset=smoke", "data=folder", f"data.folder={tmp_path}", "data.batch_size=2", "data.object=Car")
+    own = build_source(check(composed(*words)).data)
+    assert own.count("train") == 2
+    assert own.known("train")["truncation"] == [0.25, 0]
+    assert own.known("test")["visibility"] == [1 / 3, None]
+    for row, detection in zip(
+        own.samples("test").xyz, DetectionFolder(tmp_path, "Car").detections("test"), strict=True
+    ):
+        assert float(row.norm()) == pytest.approx(float(np.linalg.norm(detection.position)))
 
 
 def test_something_must_be_left_to_train_on(photos: DetectionFolder) -> None:

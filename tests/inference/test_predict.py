@@ -16,8 +16,10 @@ from PIL import Image
 import phd_exp as package
 from phd_exp.distributions import PointEstimate, ProjectedHuber
 from phd_exp.inference import pictures
+from phd_exp.records.detections import detections_in
 from phd_exp.records.errors import DatasetError, RunError
 from phd_exp.records.runs import RunFolder
+from tests.support.foreign import WRITERS
 from tests.support.untrained import SMALL, read_lines, untrained, virtual_cameras, write_photos
 
 
@@ -92,6 +94,20 @@ def test_a_baseline_has_positions_without_uncertainty(
         refused = phd_exp("predict", f"run={baseline.path}", f"folder={photos}", f"{word}=true", "out=more")
         assert refused.status == 1
         assert said in refused.err
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_other_formats_are_predicted_as_lines(phd_exp: Callable, run: RunFolder, tmp_path: Path, name: str) -> None:
+    """The same answers as for a metadata.jsonl that says the same."""
+    folder = WRITERS[name](tmp_path / "test")
+    words = ("predict", f"run={run.path}", f"folder={folder}")
+    found = phd_exp(*words)
+    assert (found.status, found.err) == (0, "")
+    lines = [detection.line.model_dump_json(exclude_none=True) for detection in detections_in(folder)]
+    (folder / "metadata.jsonl").write_text("\n".join(lines))
+    assert found.out == phd_exp(*words).out
+    refused = phd_exp("predict", f"run={run.path}", "image=a.png", "f=900", "object=5")
+    assert refused.err == "error: object: selects detections of folder=DIR; leave it out for image=FILE\n"
 
 
 def test_one_image_is_the_line_of_a_folder_and_is_drawn(

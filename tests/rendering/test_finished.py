@@ -162,7 +162,7 @@ def test_a_mask_for_every_sample(rendered: DatasetFolder, tmp_path: Path) -> Non
 def test_masks_that_cannot_be_written_are_one_line(small: DatasetFolder, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(RenderError, match=r"masks=.*: lies in the data set itself"):
-        require_elsewhere(small, small.root / "train" / "masks")
+        require_elsewhere(small, masks=small.root / "train" / "masks")
     with pytest.raises(RenderError, match=r"cannot be written .* choose another masks=FOLDER"):
         write_masks(small, tmp_path / "file" / "masks")
     with pytest.raises(DatasetError, match="no data set here"):

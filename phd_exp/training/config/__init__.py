@@ -33,6 +33,7 @@ class RenderConfig(Record):
     verify: StrictBool
     rerender: sections.Natural
     masks: sections.Folder | None
+    bop: sections.Folder | None
 
 
 class RunConfig(Record):

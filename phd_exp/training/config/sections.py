@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, StrictBool, Tag, model_validator
 
+from phd_exp.records.detections import NumberOrName
 from phd_exp.records.parsing import Record
 from phd_exp.records.spec import Angle, DatasetSpec, Range
 from phd_exp.training.config.targets import Target, TrainingTarget
@@ -76,10 +77,11 @@ class RenderedConfig(SizesConfig):
 
 
 class FolderConfig(SizesConfig):
-    """A folder of the user's own images; `name` names its runs."""
+    """A folder of the user's own images; `name` names its runs, `object` selects detections."""
 
     name: Name
     folder: Folder
+    object: NumberOrName | None = None  # default for older run records
 
 
 class SourceConfig(SizesConfig):
