@@ -14,7 +14,7 @@ from phd_exp.data.datamodule import PositionData
 from phd_exp.data.images import SHRINKING
 from phd_exp.data.sources import PARTS, Part
 from phd_exp.distributions.columns import Columns
-from phd_exp.records.choices import first_difference
+from phd_exp.records.choices import first_difference, flatten
 from phd_exp.records.dataset import DatasetFolder, checksum
 from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError, RunError, gist, shown
@@ -96,7 +96,10 @@ def require_same_config(folder: RunFolder, config: RunConfig) -> None:
     if not folder.config_file.exists():
         return
     require_same_shrinking(folder, config)
-    if difference := first_difference(folder.config(), config.model_dump(mode="json")):
+    asked = flatten(config.model_dump(mode="json"))
+    chosen = flatten(config.model_dump(mode="json", exclude_defaults=True))
+    younger = {key: value for key, value in asked.items() if key not in chosen}  # may be absent in an older record
+    if difference := first_difference(younger | flatten(folder.config()), asked):
         raise RunError(
             f"{folder.path}: holds a run with {difference} is asked for; "
             "move that folder away, or choose another place by runs=DIR"
