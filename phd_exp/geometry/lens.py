@@ -69,7 +69,7 @@ class Lens:
         s = np.linalg.norm(q, axis=-1, keepdims=True)
         if self.is_fisheye:
             return np.concatenate([q * np.sinc(s / np.pi), np.cos(s)], axis=-1)
-        return np.concatenate([q, np.ones_like(s)], axis=-1)
+        return np.concatenate([q, 1 + 0 * s], axis=-1)
 
     @cached_property
     def _radial(self) -> tuple[float, Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:

@@ -138,7 +138,7 @@ def require_no_fold(K: Float[np.ndarray, "3 3"], lens: Lens, width: int, height:
 
     A circular fisheye, whose 180 degrees end inside the image, does not.
     """
-    corners = _border((0, 0, width, height), 2)
+    corners = _border((0.0, 0.0, float(width), float(height)), 2)
     if lens.limit < np.pi and np.isnan(rays(K, corners, lens)).any():
         way = (K[:2, 2] + np.linspace(0, 1, 1001)[:, None, None] * (corners - K[:2, 2])).reshape(-1, 2)
         x, y, z = rays(K, way, lens).T
