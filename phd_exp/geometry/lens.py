@@ -1,11 +1,11 @@
 """Lenses: a direction to its place in the image, and back.
 
-A lens moves the place q of a direction: (x, y)/z in a pinhole, and in a fisheye the angle to the axis times the unit
-vector along (x, y). With u = |q|^2 and t = (p2, p1), the place becomes
+A pinhole shows a direction at the bare place b = (x, y)/z; for a fisheye, b is the angle to the axis times the unit
+vector along (x, y). With r^2 = |b|^2 and p = (p2, p1), a lens moves b to
 
-    q (1 + k1 u + k2 u^2 + k3 u^3) / (1 + k4 u + k5 u^2 + k6 u^3) + u t + 2 (t.q) q,
+    b (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6) + r^2 p + 2 (p.b) b,
 
-and in a fisheye q (1 + k1 u + k2 u^2 + k3 u^3 + k4 u^4).
+and a fisheye moves b to b (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8).
 """
 
 import math
@@ -56,8 +56,8 @@ class Lens:
         """The place ((u - cx)/fx, (v - cy)/fy) of directions; NaN from the `limit` on."""
         across = np.linalg.norm(xyz[..., :2], axis=-1, keepdims=True)
         angle = np.arctan2(across, xyz[..., 2:])
-        q = (angle if self.is_fisheye else np.tan(angle)) * (xyz[..., :2] / np.maximum(across, TINY))
-        return np.where(angle < self.limit, self._moved(q), np.nan)
+        bare = (angle if self.is_fisheye else np.tan(angle)) * (xyz[..., :2] / np.maximum(across, TINY))
+        return np.where(angle < self.limit, self._moved(bare), np.nan)
 
     @np.errstate(all="ignore")
     def undistort(self, place: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
@@ -65,43 +65,43 @@ class Lens:
 
         Its z is one; for a fisheye, its length is.
         """
-        q = place if self.is_pinhole else self._unmoved(place)
-        s = np.linalg.norm(q, axis=-1, keepdims=True)
+        bare = place if self.is_pinhole else self._unmoved(place)
+        s = np.linalg.norm(bare, axis=-1, keepdims=True)
         if self.is_fisheye:
-            return np.concatenate([q * np.sinc(s / np.pi), np.cos(s)], axis=-1)
-        return np.concatenate([q, 1 + 0 * s], axis=-1)
+            return np.concatenate([bare * np.sinc(s / np.pi), np.cos(s)], axis=-1)
+        return np.concatenate([bare, 1 + 0 * s], axis=-1)
 
     @cached_property
     def _radial(self) -> tuple[float, Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """The `limit`; and from the axis to there |q|, and the distance of its place, which grows."""
+        """The `limit`; and from the axis to there |b|, and the distance of its place, which grows."""
         widest = math.pi if self.is_fisheye else math.pi / 2
         angle = np.linspace(0, widest, ANGLES, endpoint=False)
         s = angle if self.is_fisheye else np.tan(angle)
-        q = np.stack([s, 0 * s], axis=-1)
-        distance = (self._moved(q) - self._moved(-q))[:, 0] / 2  # without the tangential terms, which are even
+        bare = np.stack([s, 0 * s], axis=-1)
+        distance = (self._moved(bare) - self._moved(-bare))[:, 0] / 2  # without the tangential terms, which are even
         falls = np.flatnonzero(~(np.diff(distance) > 0))
         n = falls[0] + 1 if len(falls) else ANGLES
         return float(angle[n - 1]) if len(falls) else widest, s[:n], distance[:n]
 
     @np.errstate(all="ignore")  # powers overflow near 90 degrees
-    def _moved(self, q: Inexact[np.ndarray, "*batch 2"]) -> Inexact[np.ndarray, "*batch 2"]:
-        u, k = (q * q).sum(axis=-1, keepdims=True), (*self.coefficients, *[0.0] * 8)
+    def _moved(self, bare: Inexact[np.ndarray, "*batch 2"]) -> Inexact[np.ndarray, "*batch 2"]:
+        r2, k = (bare * bare).sum(axis=-1, keepdims=True), (*self.coefficients, *[0.0] * 8)
         if self.is_fisheye:
-            return q * Polynomial((1.0, *k[:4]))(u)
-        t, ratio = np.array([k[3], k[2]]), Polynomial((1.0, k[0], k[1], k[4]))(u) / Polynomial((1.0, *k[5:8]))(u)
-        return q * (ratio + 2 * (q @ t)[..., None]) + u * t
+            return bare * Polynomial((1.0, *k[:4]))(r2)
+        p, ratio = np.array([k[3], k[2]]), Polynomial((1.0, k[0], k[1], k[4]))(r2) / Polynomial((1.0, *k[5:8]))(r2)
+        return bare * (ratio + 2 * (bare @ p)[..., None]) + r2 * p
 
     def _unmoved(self, place: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         _, s, distance = self._radial
         far = np.linalg.norm(place, axis=-1, keepdims=True)
-        q = place * (np.interp(far, distance, s) / np.maximum(far, TINY))
+        bare = place * (np.interp(far, distance, s) / np.maximum(far, TINY))
         for _ in range(STEPS):
-            (a, c), (b, d) = (np.moveaxis(self._moved(q + 1j * TINY * e).imag / TINY, -1, 0) for e in np.eye(2))
-            x, y = np.moveaxis(self._moved(q) - place, -1, 0)
-            q = q - np.stack([d * x - b * y, a * y - c * x], axis=-1) / (a * d - b * c)[..., None]
-        error = np.linalg.norm(self._moved(q) - place, axis=-1, keepdims=True)
-        found = (error <= CLOSE * (1 + far)) & (np.linalg.norm(q, axis=-1, keepdims=True) <= s[-1])
-        return np.where(found, q, np.nan)
+            (a, c), (b, d) = (np.moveaxis(self._moved(bare + 1j * TINY * e).imag / TINY, -1, 0) for e in np.eye(2))
+            x, y = np.moveaxis(self._moved(bare) - place, -1, 0)
+            bare = bare - np.stack([d * x - b * y, a * y - c * x], axis=-1) / (a * d - b * c)[..., None]
+        error = np.linalg.norm(self._moved(bare) - place, axis=-1, keepdims=True)
+        found = (error <= CLOSE * (1 + far)) & (np.linalg.norm(bare, axis=-1, keepdims=True) <= s[-1])
+        return np.where(found, bare, np.nan)
 
 
 PINHOLE = Lens()
