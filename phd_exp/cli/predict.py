@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # imports of seconds, which follow the checks of the argument
     from phd_exp.inference.predictor import Predictor
 
 BOX = four_numbers("box=LEFT,TOP,RIGHT,BOTTOM in pixels")
-OF_A_CAMERA = ("f", "fx", "fy", "cx", "cy", "box")
+OF_A_CAMERA = ("f", "fx", "fy", "cx", "cy", "camera", "box")
 LONGEST_STEM = 50  # characters of an image's name in the name of its picture
 
 
@@ -26,7 +26,7 @@ class PredictArguments(RunArguments):
     """The run, the images and their cameras; lengths in pixels of the image file."""
 
     image: Path | None = None
-    """one image, with its camera as f= or fx= and fy="""
+    """one image, with its camera as f=, fx= and fy=, or camera="""
     folder: Path | None = None
     """images with a metadata.jsonl, or as BOP, KITTI or COCO, instead of image="""
     object: NumberOrName | None = None
@@ -41,6 +41,8 @@ class PredictArguments(RunArguments):
     """column of the principal point, px; by default the middle"""
     cy: float | None = None
     """row of the principal point, px; by default the middle"""
+    camera: str | None = None
+    """instead of f=, a camera file of ROS or OpenCV, with the lens"""
     box: Annotated[tuple[float, float, float, float], BOX] | None = None
     """LEFT,TOP,RIGHT,BOTTOM of the object, px; by default the whole image"""
     out: Path | None = None
@@ -51,7 +53,7 @@ class PredictArguments(RunArguments):
     """draw the run's calibration curve of depth into the pictures"""
 
     @property
-    def camera(self) -> dict[str, Any]:
+    def of_camera(self) -> dict[str, Any]:
         """The keys of a camera that were given."""
         return {key: getattr(self, key) for key in OF_A_CAMERA if getattr(self, key) is not None}
 
@@ -60,11 +62,11 @@ class PredictArguments(RunArguments):
         """Require either an image with its camera, or a folder with both."""
         if (self.image is None) == (self.folder is None):
             raise ValueError(
-                "predict: expected either image=FILE with f=PIXELS, or folder=DIR with a metadata.jsonl in it"
+                "predict: expected either image=FILE with f=PIXELS or camera=FILE, or folder=DIR with metadata.jsonl"
             )
-        if self.folder is not None and self.camera:
+        if self.folder is not None and self.of_camera:
             raise ValueError(
-                f"{next(iter(self.camera))}: belongs to image=FILE; for a folder, write it into each line of "
+                f"{next(iter(self.of_camera))}: belongs to image=FILE; for a folder, write it into each line of "
                 "metadata.jsonl"
             )
         if self.object and self.image:
@@ -86,7 +88,7 @@ def main(words: list[str]) -> int:
         detections = detections_in(arguments.folder, object_name=arguments.object)
     else:
         assert arguments.image is not None  # checked by `one_source`
-        detections = [detection_of(arguments.image, arguments.camera)]
+        detections = [detection_of(arguments.image, arguments.of_camera)]
     if out is not None:
         _require_possible(detections, out)
         output_folder(out)

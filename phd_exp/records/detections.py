@@ -19,6 +19,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field, PlainValidator, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
+from phd_exp.records.cameras import SHORTEST, Calibration, read_camera
 from phd_exp.records.dataset import SPLITS, checksum, sha256
 from phd_exp.records.errors import UNPRINTABLE, DatasetError, complaint, gist, listed, nearest, shown
 from phd_exp.records.files import read_jsonl
@@ -28,7 +29,6 @@ from phd_exp.records.scenes import Pose, SampleRecord, Split
 from phd_exp.records.spec import Number, Positive
 
 DISTORTION = re.compile(r"[kp][1-8]|.*distort.*|dist(_?coeff.*)?|.*fisheye.*", re.IGNORECASE)
-SHORTEST = 0.01  # focal length, px; a shorter one is probably in metres
 LARGEST_BOX = 3
 """Sides of a box over the longer side of its image; the part outside the image is grey and holds no information."""
 
@@ -45,6 +45,7 @@ def _in_pixels(f: float) -> float:
     return f
 
 
+FileName = Annotated[str, Field(min_length=1, max_length=1000)]
 NumberOrName = Annotated[int | str, PlainValidator(_name)]
 Pixels = Annotated[Number, Field(ge=-1e6, le=1e6)]
 FocalLength = Annotated[Positive, Field(le=1e6), AfterValidator(_in_pixels)]
@@ -58,6 +59,7 @@ class DetectionLine(Record):
         file_name: the image, relative to the folder of the line's file.
         f: focal length, px; or fx and fy if pixels are not square.
         cx, cy: principal point, px; by default the middle of the image.
+        camera: instead of these, a camera file, relative to the folder of the line's file.
         box: left, top, right, bottom of the detection, px; by default the whole image.
         x, y, z: true position in the camera frame (x right, y down, z forward), m.
         scale, visibility, truncation: as in a rendered data set; recorded with the predictions.
@@ -65,16 +67,17 @@ class DetectionLine(Record):
         pose: of the camera, in the world that the cameras of a scene share.
     """
 
-    file_name: Annotated[str, Field(min_length=1, max_length=1000)]
+    file_name: FileName
     f: FocalLength | None = None
     fx: FocalLength | None = None
     fy: FocalLength | None = None
     cx: Pixels | None = None
     cy: Pixels | None = None
+    camera: FileName | None = None
     box: tuple[Pixels, Pixels, Pixels, Pixels] | None = None
     x: Metres | None = None
     y: Metres | None = None
-    z: Annotated[Number, Field(ge=1e-6, le=1e6)] | None = None
+    z: Metres | None = None
     scale: Positive | None = None
     visibility: Annotated[Number, Field(ge=0, le=1)] | None = None
     truncation: Annotated[Number, Field(ge=0, le=1)] | None = None
@@ -93,8 +96,11 @@ class DetectionLine(Record):
     @model_validator(mode="after")
     def belongs_together(self) -> "DetectionLine":
         """Refuse half a camera, half a position, and an empty box."""
-        if (self.f is None) == (self.fx is None and self.fy is None):
-            raise ValueError("expected either f, or fx and fy (focal length in pixels)")
+        cameras = [given for given in (self.f, self.fx or self.fy, self.camera) if given]
+        if len(cameras) != 1 or (self.camera and self.cx is not None):
+            raise ValueError("expected either f, or fx and fy (focal length in pixels), or camera (a file) alone")
+        if not self.camera and self.z is not None and self.z < 1e-6:  # a fisheye may show what is behind
+            raise ValueError(f"z: got {self.z:g}; expected to be greater than or equal to 0.000001")
         for names in (("fx", "fy"), ("cx", "cy"), ("x", "y", "z")):
             given = [name for name in names if getattr(self, name) is not None]
             if 0 < len(given) < len(names):
@@ -106,11 +112,12 @@ class DetectionLine(Record):
 
 @dataclass(frozen=True)
 class Detection:
-    """One line, the image that it names, and the place of the line, for messages."""
+    """One line, the image that it names, the place of the line, for messages, and the content of its camera file."""
 
     line: DetectionLine
     file: Path
     where: str
+    calibration: Calibration | None = None
 
     @property
     def position(self) -> tuple[float, float, float]:
@@ -121,24 +128,19 @@ class Detection:
         return x, y, z
 
     def focal_lengths_and_centre(self, width: int, height: int) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy for an image of that size, px."""
-        line = self.line
+        """fx, fy, cx, cy for an image of that size, px. Raises DatasetError if the camera file has another size."""
+        line, file = self.line, self.calibration
+        if file:
+            if (file.width or width, file.height or height) != (width, height):
+                raise DatasetError(
+                    f"{self.where}: camera={line.camera}: is for images of {file.width} x {file.height} pixels; this "
+                    f"image has {width} x {height}; scale size, camera matrix and image alike"
+                )
+            return file.K[0], file.K[4], file.K[2] + 0.5, file.K[5] + 0.5  # our pixels count from their corner
         fx, fy = (value for value in (line.f or line.fx, line.f or line.fy) if value)  # a line has f or both
         cx = width / 2 if line.cx is None else line.cx
         cy = height / 2 if line.cy is None else line.cy
         return fx, fy, cx, cy
-
-    def require_in_sight(self, width: int, height: int) -> None:
-        """Raise DatasetError if the position projects so far outside the image that the image cannot show it."""
-        x, y, z = self.position
-        fx, fy, cx, cy = self.focal_lengths_and_centre(width, height)
-        column, row = cx + fx * x / z, cy + fy * y / z
-        longest = LARGEST_BOX * max(width, height)
-        if abs(column - width / 2) > longest or abs(row - height / 2) > longest:
-            raise DatasetError(
-                f"{self.where}: the position {[x, y, z]} is seen at [{column:.0f}, {row:.0f}], far outside the image "
-                f"of {width} x {height} pixels; check x, y, z (metres) and the focal length (pixels)"
-            )
 
     def box(self, width: int, height: int) -> tuple[float, float, float, float]:
         """The box in an image of that size, px. Raises DatasetError if it lies outside the image or is too large."""
@@ -195,6 +197,7 @@ def detections_in(
         CorruptFileError: a line is not text.
     """
     found: list[Detection] = []
+    cameras: dict[str, Calibration] = {}
     others = set()
     files, read = annotations(folder)
     for where, name, values in read(folder):
@@ -202,7 +205,10 @@ def detections_in(
             others.add(name)
             continue
         line = _line(values, where)
-        found.append(Detection(line, _inside(folder, line.file_name, where), where))
+        if line.camera and line.camera not in cameras:
+            cameras[line.camera] = read_camera(_inside(folder, line.camera, where, "camera"))
+        file = _inside(folder, line.file_name, where)
+        found.append(Detection(line, file, where, cameras.get(line.camera or "")))
         if len(found) == n:
             break
     if others and not found:
@@ -246,7 +252,8 @@ def detection_of(file: Path, values: Mapping[str, Any]) -> Detection:
         >>> detection_of(Path("photo.jpg"), {"f": 900.0}).focal_lengths_and_centre(640, 480)
         (900.0, 900.0, 320.0, 240.0)
     """
-    return Detection(_line({"file_name": file.name, **values}, str(file)), file, str(file))
+    line = _line({"file_name": file.name, **values}, str(file))
+    return Detection(line, file, str(file), read_camera(Path(line.camera)) if line.camera else None)
 
 
 @dataclass(frozen=True)
@@ -287,17 +294,17 @@ def _line(values: Any, where: str) -> DetectionLine:
         raise DatasetError(f"{where}: {_complaint(error.errors(include_url=False)[0])}") from None
 
 
-def _inside(folder: Path, name: str, where: str) -> Path:
-    """The image file; a stranger's data set must not read files outside its folder."""
+def _inside(folder: Path, name: str, where: str, key: str = "file_name") -> Path:
+    """The file; a stranger's data set must not read files outside its folder."""
     try:
         if UNPRINTABLE.search(name):
             raise ValueError("control characters")
         leaves = Path(name).is_absolute() or ".." in Path(name).parts
         leaves = leaves or not (folder / name).resolve().is_relative_to(folder.resolve())
     except (ValueError, OSError, RuntimeError) as error:  # also a link to itself, or too long a name
-        raise DatasetError(f"{where}: file_name={shown(name)} is no file name ({gist(error)})") from None
+        raise DatasetError(f"{where}: {key}={shown(name)} is no file name ({gist(error)})") from None
     if leaves:
-        raise DatasetError(f"{where}: file_name={name!r} leaves {folder}; expected a path below it")
+        raise DatasetError(f"{where}: {key}={name!r} leaves {folder}; expected a path below it")
     return folder / name
 
 
@@ -305,7 +312,7 @@ def _complaint(problem: ErrorDetails) -> str:
     """The fault of a line: the key, the value, and what was expected."""
     key = ".".join(str(part) for part in problem["loc"])
     if problem["type"] == "extra_forbidden" and DISTORTION.fullmatch(key):
-        return f"{key}: a distorted image is no pinhole image; undistort the images first, then leave out {key}"
+        return f"{key}: a line describes no lens; expected camera, a calibration file of ROS or OpenCV"
     if problem["type"] == "extra_forbidden":
         known = (Pose if key.startswith("pose.") else DetectionLine).model_fields
         return f"{key}: unknown key{nearest(key, known)}; expected one of {', '.join(known)}"

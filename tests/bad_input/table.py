@@ -217,7 +217,7 @@ LABELS = [
     label("NaN", r"x: got nan; expected to be a finite number", x=float("nan")),
     label("a focal length in metres", r"f: got 0\.004; expected a focal length in pixels, at least 0\.01", f=0.004),
     label("no position", r"x, y, z are missing; .*", x=None, y=None, z=None),
-    label("millimetres across", r"the position \[-200\.0, .*\] is seen at .*, far outside the image .*; check x, y, z \(metres\) .*", x=-200),
+    label("millimetres across", r"the position \[-200\.0, .*\] is far outside the image of .*; check x, y, z \(m\) and the camera", x=-200),
 ]  # fmt: skip
 
 FORMATS = [
@@ -228,7 +228,7 @@ FORMATS = [
 ]  # fmt: skip
 
 CAMERAS = [
-    camera("none", (), r"photos/test/0\.png: expected either f, or fx and fy \(focal length in pixels\)"),
+    camera("none", (), r"photos/test/0\.png: expected either f, or fx and fy \(focal length in pixels\), or camera \(a file\) alone"),
     camera("NaN", ("f=nan",), r"photos/test/0\.png: f: got nan; expected to be a finite number"),
     camera("beyond all numbers", ("f=1e400",), r"photos/test/0\.png: f: got inf; expected to be a finite number"),
     camera("text", ("f=wide",), r"f: got 'wide'; expected a valid number, .*"),

@@ -135,7 +135,7 @@ def test_metadata(tmp_path: Path, examples: int) -> None:
             for detection in detections_in(tmp_path):
                 assert detection.file.resolve().is_relative_to(tmp_path.resolve())
                 with suppress(UserError):
-                    detection.require_in_sight(100, 100)
+                    detection.focal_lengths_and_centre(100, 100)
                     detection.box(100, 100)
 
     holds_for(examples, law, BYTES)

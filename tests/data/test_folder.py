@@ -169,6 +169,36 @@ def test_a_changed_line_is_never_served_the_old_crop(photos: DetectionFolder, ke
     np.testing.assert_array_equal(after[2], before[2])
 
 
+def test_a_camera_file_gives_the_lens_and_a_changed_one_new_crops(photos: DetectionFolder) -> None:
+    """The label of a position is its place in the view, and a position that the lens cannot show is refused."""
+    numbers = {
+        "K": [300, 0, 69.5, 0, 320, 39.5, 0, 0, 1],
+        "width": 160,
+        "height": 90,
+        "distortion_model": "equidistant",
+    }
+    line = {"fx": None, "fy": None, "cx": None, "cy": None, "camera": "lens.yaml"}
+    before = images(photos)
+    change_line(photos, **line)
+    crops = []
+    for k1 in (0.0, 0.3):
+        (photos.root / "train" / "lens.yaml").write_text(json.dumps(numbers | {"D": [k1, 0, 0, 0]}))
+        crops.append(images(photos))
+        crop = source(photos).crops["train"][0]
+        np.testing.assert_allclose(crop.camera.to_real(crop.xyz), [0.1, 0.0, 2.0], atol=1e-12)
+        angle = math.atan(0.1 / 2)
+        place = [70 + 300 * angle * (1 + k1 * angle**2), 40]
+        np.testing.assert_allclose(crop.camera.real_pixels(crop.xyz[:2] / crop.xyz[2]), place, atol=1e-9)
+    assert not np.array_equal(crops[0][0], before[0])
+    assert not np.array_equal(crops[0][0], crops[1][0])
+    np.testing.assert_array_equal(crops[1][1:], before[1:])
+    change_line(photos, z=-2.0)
+    with pytest.raises(
+        DatasetError, match=r"line 1: the position \[0.1, 0.0, -2.0\] is far outside the image of 160 x 90"
+    ):
+        source(photos)
+
+
 def test_a_changed_image_of_the_same_name_and_time_is_never_served_from_the_cache(photos: DetectionFolder) -> None:
     import os
 

@@ -177,7 +177,7 @@ BAD = [
     (("coco", lambda folder: (folder.parent / "annotations/instances_test.json").write_text("[]")), "cannot be"),
     (coco(lambda content: content.pop("images")), "'images' is missing"),
     (coco(lambda content: content.pop("camera")), "annotation 1: cannot be read .'camera' is missing"),
-    (coco(lambda content: content["camera"].update(k1=0.1)), "annotation 1: k1: a distorted image is no pinhole"),
+    (coco(lambda content: content["camera"].update(k1=0.1)), "annotation 1: k1: a line describes no lens"),
     (coco(lambda content: content["annotations"][0].update(bbox=[1, 2, 3])), "annotation 0: cannot be read"),
     (coco(lambda content: content["annotations"][0].update(bbox=[1, 2, 0, 3])), "annotation 0: box=.* positive size"),
     (coco(lambda content: content["annotations"][0].update(image_id=1)), "annotation 0: .*1 is missing"),
