@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from phd_exp.records.detections import Detection
-from phd_exp.records.errors import ConfigError, complaint, nearest
+from phd_exp.records.errors import ConfigError, complaint, nearest, writing
 from phd_exp.records.files import remove_temporaries
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
@@ -65,11 +65,9 @@ def four_numbers(expected: str) -> BeforeValidator:
 
 def output_folder(out: Path) -> None:
     """Make a folder to write into. Raises ConfigError if that is impossible."""
-    try:
+    with writing(out, "out=", ConfigError):
         out.mkdir(parents=True, exist_ok=True)
         remove_temporaries(out)  # of a killed process
-    except OSError as error:
-        raise ConfigError(f"{out}: cannot be written ({error.strerror}); choose another by out=") from None
 
 
 def require_file(out: Path, name: str) -> None:

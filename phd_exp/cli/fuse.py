@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from pydantic import field_validator
 
 from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_folder, parsed, predicted, require_file
-from phd_exp.records.detections import Observed, detections_in, observed
+from phd_exp.records.detections import NumberOrName, Observed, annotations, detections_in, observed
 from phd_exp.records.errors import ConfigError, RunError, listed
 from phd_exp.records.files import write_atomic
 from phd_exp.records.runs import RunFolder
@@ -22,7 +22,9 @@ class FuseArguments(RunArguments):
     """The run and the scenes; the plane holds the v with (nx, ny, nz) . v = offset, world frame, metres."""
 
     folder: Path
-    """images with a metadata.jsonl whose lines have a scene and a pose"""
+    """images with a metadata.jsonl whose lines have a scene and a pose, or as BOP with poses of the cameras"""
+    object: NumberOrName | None = None
+    """BOP's obj_id; by default all objects"""
     plane: Annotated[tuple[float, float, float, float], PLANE] | None = None
     """NX,NY,NZ,OFFSET: the object lies on this plane, metres"""
     shared_scale: bool = False
@@ -43,11 +45,11 @@ def main(words: list[str]) -> int:
     """Fuse the predictions of each scene; returns the exit status, which is 1 if a scene has no result."""
     arguments = parsed("fuse", FuseArguments, words)
     out = arguments.out
-    detections = detections_in(arguments.folder)
+    detections = detections_in(arguments.folder, object_name=arguments.object)
     scenes = observed(detections)
     if out is not None:
         require_file(out, "fused.jsonl")
-        inputs = [arguments.folder / "metadata.jsonl", *(detection.file for detection in detections)]
+        inputs = [*annotations(arguments.folder)[0], *(detection.file for detection in detections)]
         if out.resolve() in {file.resolve() for file in inputs}:
             raise ConfigError(f"out={out}: is one of the files that are read; choose another")
         output_folder(out.parent)

@@ -40,7 +40,7 @@ EXAMPLES = {
         "python -m phd_exp render data=occl data.n_train=100 data.n_test=20 data.workers=1",
         "python -m phd_exp -m render data=scale data.workers=1 shard=0/4,1/4,2/4,3/4 hydra/launcher=joblib",
         "python -m phd_exp render data=scale verify=true",
-        "python -m phd_exp render data=occl masks=masks/occl",
+        "python -m phd_exp render data=occl masks=masks/occl bop=bop/occl",
     ],
     "report": ["python -m phd_exp report", "python -m phd_exp report runs=some/folder out=another"],
     "predict": [

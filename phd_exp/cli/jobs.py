@@ -79,9 +79,7 @@ class Job:
             if at_home:
                 raise
             return failure(stop)
-        except OmegaConfBaseException as error:  # an interpolation of an unknown key
-            return refusal(ConfigError(" ".join(str(error).split())))
-        except ConfigError as error:
+        except (ConfigError, OmegaConfBaseException) as error:  # the latter: an interpolation of an unknown key
             return refusal(error)
         except Exception as error:
             return failure(error)
@@ -98,9 +96,10 @@ class Job:
         return self.task(plain(config), overrides, self.cores or usable_cores())
 
 
-def refusal(error: ConfigError) -> Ending:
-    """The ending of a job whose configuration is wrong."""
-    return failure(error)._replace(exit_status=2)
+def refusal(error: Exception, config_name: str = "config") -> Ending:
+    """The ending of a job whose configuration is wrong; `error` is ours or one of `REFUSED`."""
+    refused = error if isinstance(error, ConfigError) else ConfigError(explain(error, config_name))
+    return failure(refused)._replace(exit_status=2)
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
@@ -128,8 +127,7 @@ def launch(task: Task, words: list[str], config_name: str = "config", standing: 
         sys.argv = [sys.argv[0], *_options_last(words)]
         hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=config_name)(job)()
     except (*REFUSED, ConfigError) as error:
-        refused = error if isinstance(error, ConfigError) else ConfigError(explain(error, config_name))
-        job.endings.append(refusal(refused))
+        job.endings.append(refusal(error, config_name))
         print_errors(job.endings[-1].lines)
     return max((ending.exit_status for ending in job.endings), default=0)
 

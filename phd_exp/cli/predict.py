@@ -9,17 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import model_validator
 
 from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_folder, parsed, predicted
-from phd_exp.records.detections import Detection, detection_of, detections_in
+from phd_exp.records.detections import Detection, NumberOrName, detection_of, detections_in
 from phd_exp.records.errors import ConfigError, RunError
-from phd_exp.records.files import read_plain, write_atomic
-from phd_exp.records.parsing import parse_json
+from phd_exp.records.files import write_atomic
 from phd_exp.records.runs import RunFolder
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
     from phd_exp.inference.predictor import Predictor
 
 BOX = four_numbers("box=LEFT,TOP,RIGHT,BOTTOM in pixels")
-OF_A_CAMERA = ("f", "fx", "fy", "cx", "cy", "box")
+OF_A_CAMERA = ("f", "fx", "fy", "cx", "cy", "camera", "box")
 LONGEST_STEM = 50  # characters of an image's name in the name of its picture
 
 
@@ -27,9 +26,11 @@ class PredictArguments(RunArguments):
     """The run, the images and their cameras; lengths in pixels of the image file."""
 
     image: Path | None = None
-    """one image, with its camera as f= or fx= and fy="""
+    """one image, with its camera as f=, fx= and fy=, or camera="""
     folder: Path | None = None
-    """images with a metadata.jsonl, instead of image="""
+    """images with a metadata.jsonl, or as BOP, KITTI or COCO, instead of image="""
+    object: NumberOrName | None = None
+    """with folder=: BOP's obj_id, KITTI's type or COCO's category; by default all objects"""
     f: float | None = None
     """focal length, px"""
     fx: float | None = None
@@ -40,6 +41,8 @@ class PredictArguments(RunArguments):
     """column of the principal point, px; by default the middle"""
     cy: float | None = None
     """row of the principal point, px; by default the middle"""
+    camera: str | None = None
+    """instead of f=, a camera file of ROS or OpenCV, with the lens"""
     box: Annotated[tuple[float, float, float, float], BOX] | None = None
     """LEFT,TOP,RIGHT,BOTTOM of the object, px; by default the whole image"""
     out: Path | None = None
@@ -50,7 +53,7 @@ class PredictArguments(RunArguments):
     """draw the run's calibration curve of depth into the pictures"""
 
     @property
-    def camera(self) -> dict[str, Any]:
+    def of_camera(self) -> dict[str, Any]:
         """The keys of a camera that were given."""
         return {key: getattr(self, key) for key in OF_A_CAMERA if getattr(self, key) is not None}
 
@@ -59,13 +62,15 @@ class PredictArguments(RunArguments):
         """Require either an image with its camera, or a folder with both."""
         if (self.image is None) == (self.folder is None):
             raise ValueError(
-                "predict: expected either image=FILE with f=PIXELS, or folder=DIR with a metadata.jsonl in it"
+                "predict: expected either image=FILE with f=PIXELS or camera=FILE, or folder=DIR with metadata.jsonl"
             )
-        if self.folder is not None and self.camera:
+        if self.folder is not None and self.of_camera:
             raise ValueError(
-                f"{next(iter(self.camera))}: belongs to image=FILE; for a folder, write it into each line of "
+                f"{next(iter(self.of_camera))}: belongs to image=FILE; for a folder, write it into each line of "
                 "metadata.jsonl"
             )
+        if self.object and self.image:
+            raise ValueError("object: selects detections of folder=DIR; leave it out for image=FILE")
         if self.groups and not self.coverage:
             raise ValueError("groups: guarantees a coverage; expected coverage=0.9, or another in (0, 1), too")
         if self.calibration and self.out is None:
@@ -80,10 +85,10 @@ def main(words: list[str]) -> int:
     arguments = parsed("predict", PredictArguments, words)
     out = arguments.out
     if arguments.folder is not None:
-        detections = detections_in(arguments.folder)
+        detections = detections_in(arguments.folder, object_name=arguments.object)
     else:
         assert arguments.image is not None  # checked by `one_source`
-        detections = [detection_of(arguments.image, arguments.camera)]
+        detections = [detection_of(arguments.image, arguments.of_camera)]
     if out is not None:
         _require_possible(detections, out)
         output_folder(out)
@@ -129,21 +134,20 @@ def _depth_curve(run: Path, predictor: "Predictor") -> dict[str, Any]:
 
     Raises RunError if there is none, as for a baseline.
     """
+    import torch
+
+    from phd_exp.evaluation.parquet import read_table
+    from phd_exp.evaluation.predictions import recalibrated
+    from phd_exp.metrics.calibration import calibration_curve
+
+    file = RunFolder(run).predictions
+    table = read_table(file) if file.exists() else {}
     if predictor.temperature is not None:
-        import torch
-
-        from phd_exp.evaluation.parquet import read_table
-        from phd_exp.evaluation.predictions import recalibrated
-        from phd_exp.metrics.calibration import calibration_curve
-
-        table = recalibrated(read_table(RunFolder(run).predictions), predictor.temperature)
+        table = recalibrated(table, predictor.temperature)
+    try:
         variance, error = (torch.from_numpy(table[f"depth_{name}"]) for name in ("variance", "squared_error"))
         return calibration_curve(variance, error, predictor.config.evaluation.calibration_window).as_data()
-    file = RunFolder(run).curves("final")
-    try:
-        curve = parse_json(read_plain(file).decode())["depth"]
-        if {"predicted", "empirical", "window", "left_out"} <= curve.keys():
-            return dict(curve)
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
-        pass
-    raise RunError(f"{file}: no calibration curve of depth; expected a finished run of a model with a density")
+    except (KeyError, ValueError):
+        raise RunError(
+            f"{file}: no calibration curve of depth; expected a finished run of a model with a density"
+        ) from None

@@ -4,6 +4,8 @@ from typing import Any
 
 from phd_exp.cli.jobs import launch
 from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.errors import ConfigError
+from phd_exp.rendering.bop import write_bop
 from phd_exp.rendering.finished import require_elsewhere, verify, write_masks
 from phd_exp.rendering.render import ensure_rendered
 from phd_exp.training.config import check_render
@@ -18,8 +20,11 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> None:
     """Run one job of rendering."""
     checked = check_render(config)
     data, folder = checked.data, DatasetFolder(checked.data.folder)
-    if checked.masks is not None:
-        require_elsewhere(folder, checked.masks)
+    require_elsewhere(folder, masks=checked.masks, bop=checked.bop)
+    if checked.bop and data.spec.image_format == "webp":
+        raise ConfigError("data.image_format: got webp; BOP has no such images; expected png or jpeg, or no bop=")
+    if checked.bop and data.spec.mesh:
+        raise ConfigError("bop: got a folder; objects from meshes are not written as BOP; leave out bop=")
     if checked.verify:
         n = verify(folder, data.spec, checked.rerender)
         print(f"{folder.root}: all {n} samples are as they were rendered")
@@ -30,3 +35,5 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> None:
     print(f"{folder.root}: {n_train} training and {n_test} test samples are there")
     if checked.masks is not None:
         print(f"{checked.masks}: {write_masks(folder, checked.masks, data.spec)} masks")
+    if checked.bop is not None:
+        print(f"{checked.bop}: {write_bop(folder, checked.bop)} images as BOP")

@@ -5,7 +5,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from phd_exp.cli.arguments import Arguments, parsed
-from phd_exp.records.errors import UserError
+from phd_exp.records.errors import UserError, writing
 
 
 class ReportArguments(Arguments):
@@ -24,12 +24,9 @@ def main(words: list[str]) -> int:
         raise UserError(f"{folders.runs}: no such folder; train first, or name another by runs=DIR")
     from phd_exp.threads import one_thread  # imports torch
 
-    try:
-        with one_thread():  # tables of a few thousand rows are too small to share
-            _report(folders.runs, folders.out)
-    except OSError as error:
-        place = error.filename or folders.out
-        raise UserError(f"{place}: cannot be written ({error.strerror}); choose another folder by out=DIR") from None
+    # tables of a few thousand rows are too small for several threads
+    with writing(folders.out, "out=DIR", UserError), one_thread():
+        _report(folders.runs, folders.out)
     return 0
 
 

@@ -17,10 +17,10 @@ from phd_exp.cli.frame import print_errors
 from phd_exp.cli.jobs import composed
 from phd_exp.cli.train import run_name, task
 from phd_exp.records.errors import ConfigError, RunError, UserError, gist
-from phd_exp.records.files import read_plain
+from phd_exp.records.files import read_plain, write_atomic
 from phd_exp.records.parsing import parse_yaml
 from phd_exp.records.processes import held, usable_cores
-from phd_exp.records.searches import Search, Trial, TrialState, search_folder, write_search
+from phd_exp.records.searches import RECORD, SEARCHES, Search, Trial, TrialState
 from phd_exp.training.config import check
 
 if TYPE_CHECKING:  # optional
@@ -64,12 +64,12 @@ def main(words: list[str]) -> int:
     config = check(composed(fixed, arguments.config_dir))
     if config.data.n_held_out == 0:
         raise ConfigError("data.n_held_out: got 0; a search is judged by held-out samples, expected at least 1")
-    folder = search_folder(config.runs, file.stem)
+    folder = config.runs / SEARCHES / file.stem
     folder.mkdir(parents=True, exist_ok=True)
     with held(folder / ".lock") as free:
         if not free:
             raise RunError(f"{folder}: another process works on this search; wait for it or stop it")
-        _Search(file.stem, space, fixed, arguments.config_dir, folder).run(arguments.trials)
+        _Search(space, fixed, arguments.config_dir, folder).run(arguments.trials)
     return 0
 
 
@@ -106,15 +106,15 @@ def distributions(space: Mapping[str, str]) -> dict[str, Any]:
 class _Search:
     """A study of Optuna whose trials are runs."""
 
-    def __init__(self, name: str, space: Space, fixed: list[str], config_dir: Path | None, folder: Path) -> None:
+    def __init__(self, space: Space, fixed: list[str], config_dir: Path | None, folder: Path) -> None:
         import optuna
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        self.name, self.fixed, self.config_dir, self.folder = name, fixed, config_dir, folder
+        self.fixed, self.config_dir, self.folder = fixed, config_dir, folder
         self.space = distributions(space.space)
         self.study = optuna.create_study(
             storage=f"sqlite:///{folder.absolute() / 'study.db'}",
-            study_name=name,
+            study_name=folder.name,
             pruner=instantiate(space.pruner),
             load_if_exists=True,
         )
@@ -192,6 +192,6 @@ class _Search:
             for trial in self.study.trials
         ]
         objective = self.study.user_attrs.get("objective", "held_out/nll")
-        search = Search(name=self.name, objective=objective, trials=trials, importances=importances)
-        write_search(self.folder, search)
+        search = Search(name=self.folder.name, objective=objective, trials=trials, importances=importances)
+        write_atomic(self.folder / RECORD, search.model_dump_json(indent=2) + "\n")
         return search

@@ -10,8 +10,8 @@ import os
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
@@ -32,16 +32,11 @@ MOST_JOBS = 10_000
 SECONDS_BETWEEN_LOOKS = 1.0
 
 
-@dataclass(frozen=True)
-class Combination:
-    """The overrides of one job and the whole configuration, not checked yet."""
+class Combination(NamedTuple):
+    """The whole configuration of one job, not checked yet, and its overrides."""
 
-    overrides: list[str]
     config: dict[str, Any]
-
-    def standing(self, job: Job) -> str | None:
-        """The state of this job on disk."""
-        return job.standing(self.config, self.overrides) if job.standing else None
+    overrides: list[str]
 
 
 def sweep(job: Job, config: DictConfig, context: HydraContext, arguments: list[str]) -> list[float | None]:
@@ -50,7 +45,7 @@ def sweep(job: Job, config: DictConfig, context: HydraContext, arguments: list[s
     A failed job does not stop the others, with any launcher. `job.endings` receives the endings.
     """
     master, jobs = plan([*config.hydra.overrides.hydra, *arguments], config.hydra.job.config_name)
-    finished = [combination.standing(job) == "finished" for combination in jobs]
+    finished = [job.standing is not None and job.standing(*combination) == "finished" for combination in jobs]
     tail = f", {sum(finished)} of them finished already" if job.standing else ""
     print(f"{_counted(len(jobs))}{tail}", flush=True)
     endings = [
@@ -86,7 +81,7 @@ def _run(job: Job, master: DictConfig, jobs: list[Combination], context: HydraCo
 
 def _recorded(job: Job, combination: Combination) -> Ending | None:
     """The ending of a job according to its record, once it no longer runs. None without a record."""
-    while (standing := combination.standing(job)) == "running":
+    while (standing := job.standing and job.standing(*combination)) == "running":
         time.sleep(SECONDS_BETWEEN_LOOKS)
     if standing in (None, "finished"):
         return Ending("finished") if standing else None
@@ -111,7 +106,7 @@ def plan(words: list[str], config_name: str) -> tuple[DictConfig, list[Combinati
             with open_dict(composed):
                 del composed["hydra"]
             config = plain(composed)
-            jobs.setdefault(json.dumps(config, sort_keys=True), Combination(overrides, config))
+            jobs.setdefault(json.dumps(config, sort_keys=True), Combination(config, overrides))
     if not jobs:
         raise ConfigError(f"{_given(words)}: not one combination; does a glob(...) match nothing?")
     return master, list(jobs.values())

@@ -50,17 +50,15 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
 
     data = checked.data
     folder = RunFolder(run_name(checked, overrides).folder(checked.runs))
-    several, skipped = _several_views(checked), folder.is_finished()
+    skipped = folder.is_finished()
     if not skipped:
         require_possible(checked, folder)
-        if several is not None:
-            DatasetFolder(several.folder).missing(several.spec, 0, 0)  # refuses another data set before the training
         announce(checked, folder, overrides)
         if isinstance(data, RenderedConfig):
             place = DatasetFolder(data.folder)
             ensure_rendered(place, data.spec, data.n_training_split, data.n_test, data.workers, cores)
     results = train(checked, folder, draw=_draw(), cores=cores, callbacks=callbacks)
-    _record_further(folder, checked, several, cores)
+    _record_further(folder, checked, cores)
     print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
     for key in filter(results.__contains__, SHOWN):
         print(f"  {key} {_number(results[key])} (untrained {_number(results.get(f'untrained/{key}'))})")
@@ -99,16 +97,7 @@ def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> Non
         print(f"  in about ten minutes: python -m phd_exp {words}", flush=True)
 
 
-def _several_views(checked: RunConfig) -> RenderedConfig | None:
-    """The scenes with several cameras that follow the training, as test samples of a data set."""
-    asked, data = checked.evaluation.multiview, checked.data
-    if asked is None or asked.scenes == 0 or not isinstance(data, RenderedConfig):
-        return None
-    spec = asked.spec_beside(data.spec)
-    return data.model_copy(update={"spec": spec, "n_test": asked.scenes * spec.views})
-
-
-def _record_further(run: RunFolder, checked: RunConfig, several: RenderedConfig | None, cores: int) -> None:
+def _record_further(run: RunFolder, checked: RunConfig, cores: int) -> None:
     """Render the missing samples of several views and shifts, and record the run's predictions of them, once."""
     from phd_exp.inference import tables
     from phd_exp.training.build import build_source
@@ -120,7 +109,7 @@ def _record_further(run: RunFolder, checked: RunConfig, several: RenderedConfig 
             tables.record(run, file, build_source(data), origin, shift)
             print(f"{file}: {said}", flush=True)
 
-    if several:
+    if several := checked.several_views:
         views = several.spec.views
         n = several.n_test // views
         scenes = f"{'1 scene' if n == 1 else f'{n} scenes'} seen by {views} cameras each"
@@ -159,7 +148,8 @@ def standing(config: dict[str, Any], overrides: list[str]) -> str | None:
 
 def run_name(config: RunConfig, overrides: list[str]) -> RunName:
     """The name of a run; all other overrides that can change a number go into its hash."""
-    return RunName(config.setting, config.data.name, config.model.name, config.seed, _hashed(overrides))
+    preset = setting(config.preset, config.recipe.name)
+    return RunName(preset, config.data.name, config.model.name, config.seed, _hashed(overrides))
 
 
 def _hashed(overrides: list[str]) -> tuple[str, ...]:

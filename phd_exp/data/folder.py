@@ -11,16 +11,17 @@ from jaxtyping import Float
 
 from phd_exp.data.batches import Batch
 from phd_exp.data.cache import cached
-from phd_exp.data.crops import cut, image_size, read_image
+from phd_exp.data.crops import cut, facing, image_size, read_image
 from phd_exp.data.sources import Known, Part, Source
 from phd_exp.geometry.charts import DepthScale
-from phd_exp.geometry.virtual import VirtualCamera, intrinsics
+from phd_exp.geometry.virtual import VirtualCamera
 from phd_exp.records.dataset import sha256
-from phd_exp.records.detections import Detection, DetectionFolder
+from phd_exp.records.detections import LARGEST_BOX, Detection, DetectionFolder
 from phd_exp.records.errors import ConfigError, DatasetError
 from phd_exp.records.images import content_of, pillow_warnings
 from phd_exp.records.scenes import Split
 
+KNOWN = ("scale", "visibility", "truncation")  # values that are recorded with the predictions
 CROP_LAYOUT = 2  # version of `cut`, recorded with each cache
 
 
@@ -56,7 +57,7 @@ class FolderSource(Source):
         n_train = len(training) - n_held_out
         if n_train < 1:
             raise ConfigError(
-                f"data.n_held_out: got {n_held_out}, but {folder.metadata_path('train')} has {len(training)} "
+                f"data.n_held_out: got {n_held_out}, but {folder.root / 'train'} has {len(training)} "
                 "detections in all; expected fewer than that"
             )
         self.crops: dict[Part, list[Crop]] = {
@@ -84,7 +85,7 @@ class FolderSource(Source):
             "f": [crop.camera.f for crop in crops],
             "S": [self.side] * len(crops),
         }
-        rendered = {name: [getattr(line, name) for line in lines] for name in ("scale", "visibility")}
+        rendered = {name: [getattr(line, name) for line in lines] for name in KNOWN}
         return columns | {name: values for name, values in rendered.items() if values != [None] * len(lines)}
 
     def count(self, part: Part) -> int:
@@ -106,13 +107,17 @@ class FolderSource(Source):
             for row in rows[file]:
                 array[row] = cut(image, crops[row].camera)
 
-        # the pixels depend on the files, and on camera, box and side, which determine the homography
-        content = [checksums[crop.detection.file].encode() + crop.camera.homography.tobytes() for crop in crops]
+        content = [checksums[crop.detection.file].encode() + _key(crop.camera) for crop in crops]
         key = {"layout": CROP_LAYOUT, "crops": sha256(b"".join(content))}
         kept = self.folder.cache / f"crops-{part}-{len(crops)}x{self.side}.npy"
         largest = max((math.prod(self.sizes[file]) for file in rows), default=1)
         shape, words = (len(crops), self.side, self.side, 3), f"decoding {part.replace('_', '-')} images once"
         return cached(kept, key, shape, list(rows), fill, words, largest)
+
+
+def _key(camera: VirtualCamera) -> bytes:
+    """What, next to the file, determines the pixels: the lens; and camera, box and side by their homography."""
+    return camera.homography.tobytes() + (b"" if camera.lens.is_pinhole else repr(camera.lens).encode())
 
 
 def _crop(detection: Detection, side: int, sizes: dict[Path, tuple[int, int]]) -> Crop:
@@ -123,16 +128,12 @@ def _crop(detection: Detection, side: int, sizes: dict[Path, tuple[int, int]]) -
     except DatasetError as error:
         raise DatasetError(f"{detection.where}: {error}") from None
     size = sizes[detection.file]
-    box = detection.box(*size)
-    try:
-        camera = VirtualCamera.of_box(intrinsics(*detection.focal_lengths_and_centre(*size)), box, float(side))
-    except ValueError as error:
-        raise DatasetError(f"{detection.where}: box={list(box)}: {error}") from None
-    detection.require_in_sight(*size)
+    camera = facing(detection, size, side)
     xyz = camera.to_virtual(np.array(detection.position))
-    if not xyz[2] > 0:
+    off_centre = camera.real_pixels(xyz[:2] / xyz[2]) - np.array(size) / 2 if xyz[2] > 0 else np.nan
+    if not np.all(np.abs(off_centre) <= LARGEST_BOX * max(size)):
         raise DatasetError(
-            f"{detection.where}: the position {list(detection.position)} lies 90 degrees or more from the middle of "
-            f"box={list(box)}; check x, y, z, the box and the focal length"
+            f"{detection.where}: the position {list(detection.position)} is far outside the image of {size[0]} x "
+            f"{size[1]} pixels, or 90 degrees or more from the middle of its box; check x, y, z (m) and the camera"
         )
     return Crop(detection, camera, xyz)

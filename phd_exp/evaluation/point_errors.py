@@ -24,7 +24,7 @@ from phd_exp.metrics.bootstrap import means, resampled
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
 from phd_exp.records.errors import RunError
 
-Estimate = Literal["mode", "mean", "median"]
+Estimate = Literal["mode", "mean", "median", "eight views"]
 Reading = Literal["whole", "central"]
 Quantity = Literal["projected", "depth"]
 
@@ -43,7 +43,10 @@ _ERRORS = {"projected": projected_error, "depth": depth_error}
 
 @dataclass(frozen=True)
 class ErrorKey:
-    """An error: its point estimate, its test samples, and whether it is along the true ray or across it."""
+    """An error: its point estimate, its test samples, and whether it is along the true ray or across it.
+
+    The estimate of eight views is the mode of the ensemble of an image's eight symmetric views.
+    """
 
     estimate: Estimate
     reading: Reading

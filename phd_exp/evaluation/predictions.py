@@ -27,6 +27,7 @@ from phd_exp.records.runs import CHOOSE
 
 XYZ = ("x", "y", "z")
 ERRORS = ("projected_error_mm", "depth_error_mm")
+OF_DISTANCE = ("ale_m", "relative_error")  # younger than the first records
 OF_A_DISTRIBUTION = (*XYZ, *COLUMNS, *ERRORS, "nll", "energy_score")
 QUANTITIES: Mapping[str, tuple[str, str, tuple[float, ...] | int]] = {
     "visibility": ("visibility", "", (0.0, 0.25, 0.5, 0.75, 0.95, 1.0)),
@@ -66,7 +67,7 @@ class Evaluation:
     """The evaluation of n samples; `left_out` further samples had values that are not finite.
 
     Attributes:
-        scores: means of `projected_error_mm` and `depth_error_mm`; of a distribution also of `nll` (nats) and
+        scores: means of `ERRORS` and, if recorded, of `OF_DISTANCE`; of a distribution also of `nll` (nats) and
             `energy_score_mm`, the per cent `inside_90` of truths in regions of 90 %, and the `calibration_scores`; of
             Projected Huber densities the means of `nees_columns`, and `group_miscalibration`.
         reference: for NEES and each score that is a distance from calibration, the median and 95 % interval of
@@ -92,6 +93,7 @@ def evaluate(table: pa.Table | Columns, window: int = 200, resamples: int = 200)
     recorded = arrays(table)
     is_distribution, is_huber = "level" in recorded, "a" in recorded
     needed = (*(PARAMETERS if is_huber else ()), *OF_A_DISTRIBUTION) if is_distribution else ERRORS
+    needed += tuple(name for name in OF_DISTANCE if name in recorded)
     columns, finite = finite_columns(
         recorded, needed, [name for name, _, _ in QUANTITIES.values() if name in recorded]
     )
@@ -175,7 +177,7 @@ def _distribution_scores(
 
 
 def _point_scores(columns: Mapping[str, Tensor], weight: Tensor) -> dict[str, Tensor]:
-    return {name: _mean(columns[name], weight) for name in ERRORS}
+    return {name: _mean(columns[name], weight) for name in (*ERRORS, *OF_DISTANCE) if name in columns}
 
 
 def _mean(column: Tensor, weight: Tensor) -> Tensor:

@@ -34,6 +34,7 @@ from the top left corner of the image; the centre of the pixel in column c and r
 
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import Cartesian, Chart, DepthScale, LogDepth, Projected, compensated_depth, projected
+from phd_exp.geometry.lens import Lens
 from phd_exp.geometry.virtual import VirtualCamera, intrinsics
 
 __all__ = [
@@ -41,6 +42,7 @@ __all__ = [
     "Cartesian",
     "Chart",
     "DepthScale",
+    "Lens",
     "LogDepth",
     "Projected",
     "VirtualCamera",

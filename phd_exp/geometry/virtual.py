@@ -1,7 +1,8 @@
 """Virtual cameras: square cameras that face a box in the image of a real camera.
 
 The principal point of a crop may lie anywhere. A turn of the camera about its centre towards the box moves it to the
-middle. A turn changes any image by a homography, so that the labels of the turned camera are exact.
+middle. A turn changes any image by a homography, so that the labels of the turned camera are exact. It is a
+pinhole whatever the lens of the real camera.
 """
 
 from dataclasses import dataclass
@@ -9,21 +10,27 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from phd_exp.geometry.lens import PINHOLE, Lens
+
+BORDER = 33  # places along a side of a box whose rays a lens bends
+GRID = 33  # places along a side of the virtual image, where the map to the real image is measured
+
 Box = tuple[float, float, float, float]
 """Left, top, right, bottom: pixels of the real image, counted from its top left corner."""
 
 
 @dataclass(frozen=True, eq=False)
 class VirtualCamera:
-    """A real camera turned about its centre, with a square image and the principal point in its middle.
+    """A real camera turned about its centre, with a square pinhole image and the principal point in its middle.
 
     Args:
-        K: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] of the real camera, pixels; it has no distortion.
+        K: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] of the real camera, pixels.
         R: rotation from the frame of the real camera to that of the virtual one.
         f: focal length of the virtual camera, pixels.
         S: side of the virtual image, pixels.
+        lens: of the real camera.
 
-    Source: own derivation; both cameras are pinholes with one centre.
+    Source: own derivation; both cameras have one centre.
 
     Examples:
         >>> K = intrinsics(900.0, 900.0, 320.0, 240.0)
@@ -36,29 +43,37 @@ class VirtualCamera:
     R: Float[np.ndarray, "3 3"]
     f: float
     S: float
+    lens: Lens = PINHOLE
 
     @classmethod
-    def of_box(cls, K: Float[np.ndarray, "3 3"], box: Box, S: float) -> "VirtualCamera":
-        """The virtual camera that faces the middle of a box and whose image just contains its four corners.
+    def of_box(cls, K: Float[np.ndarray, "3 3"], box: Box, S: float, lens: Lens = PINHOLE) -> "VirtualCamera":
+        """The virtual camera that faces the middle of a box and whose image just contains its border.
 
         R is the smallest rotation that maps the ray through the middle of the box to the optical axis, and
-        f = S / (2 max(|x|, |y|) / z) over the corners (x, y, z) of the box in the virtual frame.
+        f = S / (2 max(|x|, |y|) / z) over the border (x, y, z) of the box in the virtual frame; its corners decide,
+        unless a lens bends the border.
 
         Raises:
-            ValueError: the box is so wide that a part of the virtual image is 90 degrees or more from the optical
-                axis of either camera, where there is no pinhole image.
+            ValueError: the middle of the box has no ray; or the box is so wide that a part of the virtual image is 90
+                degrees or more from its optical axis, or, except for a fisheye, from that of the real camera.
         """
         left, top, right, bottom = box
-        middle = rays(K, np.array([(left + right) / 2, (top + bottom) / 2]))
+        middle = rays(K, np.array([(left + right) / 2, (top + bottom) / 2]), lens)
+        border = rays(K, _border(box, 2 if lens.is_pinhole else BORDER), lens)
+        border = border[np.isfinite(border).all(axis=-1)]
+        if not (np.isfinite(middle).all() and len(border)):
+            raise ValueError(f"box={list(box)}: its middle or its whole border lies beyond the field of the lens")
         R = smallest_rotation(middle / np.linalg.norm(middle))
-        corners = rays(K, np.array([[left, top], [right, top], [left, bottom], [right, bottom]])) @ R.T
-        if not (corners[:, 2] > 0).all():
-            raise ValueError("its corners are 90 degrees or more from its middle; no pinhole image shows that")
-        half_width = np.abs(corners[:, :2] / corners[:, 2:]).max()
+        border = border @ R.T
+        if not (border[:, 2] > 0).all():
+            raise ValueError(f"box={list(box)}: its corners are 90 degrees or more from its middle")
+        half_width = np.abs(border[:, :2] / border[:, 2:]).max()
         seen = np.array([[x, y, 1.0] for x in (-half_width, half_width) for y in (-half_width, half_width)])
-        if not (seen @ R[:, 2] > 0).all():  # z in the frame of the real camera, from R^T
-            raise ValueError("a square view of it reaches 90 degrees or more from the axis of its camera")
-        return cls(K, R, f=float(S / (2 * half_width)), S=float(S))
+        if not (lens.is_fisheye or (seen @ R[:, 2] > 0).all()):  # z in the frame of the real camera, from R^T
+            raise ValueError(
+                f"box={list(box)}: a square view of it reaches 90 degrees or more from the camera's axis"
+            )
+        return cls(K, R, f=float(S / (2 * half_width)), S=float(S), lens=lens)
 
     def to_virtual(self, xyz: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Positions (metres) of the frame of the real camera in that of the virtual one: R xyz."""
@@ -68,9 +83,20 @@ class VirtualCamera:
         """Positions (metres) of the frame of the virtual camera in that of the real one: R^T xyz."""
         return xyz @ self.R
 
+    def real_pixels(self, xy_over_z: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """Pixels of the real image at (x, y)/z of the virtual camera; NaN where the real camera sees nothing."""
+        xyz = np.concatenate([xy_over_z, np.ones_like(xy_over_z[..., :1])], axis=-1)
+        return self.K[:2, 2] + np.diagonal(self.K)[:2] * self.lens.distort(self.to_real(xyz))
+
+    @property
+    def grid(self) -> Float[np.ndarray, "places places 2"]:
+        """Pixels of the real image at places from edge to edge of the virtual image."""
+        along = np.linspace(-self.S / 2, self.S / 2, GRID) / self.f
+        return self.real_pixels(np.stack(np.meshgrid(along, along), axis=-1))
+
     @property
     def homography(self) -> Float[np.ndarray, "3 3"]:
-        """H = K_v R K^-1, from homogeneous pixels of the real image to those of the virtual one."""
+        """H = K_v R K^-1, from homogeneous pixels of a real image without distortion to those of the virtual one."""
         return intrinsics(self.f, self.f, self.S / 2, self.S / 2) @ self.R @ np.linalg.inv(self.K)
 
     @property
@@ -78,8 +104,13 @@ class VirtualCamera:
         """The fewest and the most pixels of the real image along one pixel of the virtual image.
 
         These are the extreme singular values of the Jacobian of the map H^-1: (u, v) -> (p, q) = (X, Y)/W, over
-        the middle and the corners of the virtual image.
+        the middle and the corners of the virtual image; through a lens, of finite differences on a grid.
         """
+        if not self.lens.is_pinhole:
+            jacobians = np.stack(np.gradient(self.grid, self.S / (GRID - 1), axis=(0, 1)), axis=-1)
+            jacobians = jacobians[np.isfinite(jacobians).all(axis=(-2, -1))]
+            values = np.linalg.svd(jacobians, compute_uv=False)
+            return float(values.min()), float(values.max())
         back = np.linalg.inv(self.homography)
         places = [(0.5, 0.5), (0, 0), (0, 1), (1, 0), (1, 1)]
         densities = []
@@ -95,10 +126,36 @@ def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, 
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def rays(K: Float[np.ndarray, "3 3"], pixel: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
-    """Position at depth one that projects to a pixel: ((u - cx)/fx, (v - cy)/fy, 1)."""
-    xy = (pixel - K[:2, 2]) / np.diagonal(K)[:2]
-    return np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
+def rays(
+    K: Float[np.ndarray, "3 3"], pixel: Float[np.ndarray, "*batch 2"], lens: Lens = PINHOLE
+) -> Float[np.ndarray, "*batch 3"]:
+    """Position that projects to a pixel: `Lens.undistort` of ((u - cx)/fx, (v - cy)/fy)."""
+    return lens.undistort((pixel - K[:2, 2]) / np.diagonal(K)[:2])
+
+
+def require_no_fold(K: Float[np.ndarray, "3 3"], lens: Lens, width: int, height: int) -> None:
+    """Raise ValueError if, on the way from its middle to a corner of an image, a lens folds over.
+
+    A circular fisheye, whose 180 degrees end inside the image, does not.
+    """
+    corners = _border((0.0, 0.0, float(width), float(height)), 2)
+    if lens.limit < np.pi and np.isnan(rays(K, corners, lens)).any():
+        way = (K[:2, 2] + np.linspace(0, 1, 1001)[:, None, None] * (corners - K[:2, 2])).reshape(-1, 2)
+        x, y, z = rays(K, way, lens).T
+        angle = np.arctan2(np.hypot(x, y), z)
+        pixel = way[np.nanargmax(angle)].round(1).tolist()
+        fold = np.nanmax(angle) if lens.limit == np.pi / 2 else lens.limit  # the former of tangential terms alone
+        raise ValueError(
+            f"the lens folds over inside the image of {width} x {height} pixels, {np.degrees(fold):.1f} degrees from "
+            f"its axis, at pixel {pixel}; check its coefficients"
+        )
+
+
+def _border(box: Box, n: int) -> Float[np.ndarray, "places 2"]:
+    """Places along the four sides of a box, n a side, from corner to corner."""
+    left, top, right, bottom = box
+    x, y = np.linspace(left, right, n), np.linspace(top, bottom, n)
+    return np.array([*((u, v) for u in x for v in (top, bottom)), *((u, v) for u in (left, right) for v in y)])
 
 
 def smallest_rotation(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:

@@ -11,11 +11,10 @@ from PIL import Image
 from torch import Tensor
 
 from phd_exp.data.cache import LARGEST_AT_ONCE
-from phd_exp.data.crops import read_image
+from phd_exp.data.crops import cut, facing, read_image
 from phd_exp.distributions import Density, ProjectedHuber, Temperature
 from phd_exp.distributions.along import quantiles_along
 from phd_exp.geometry.camera import Camera
-from phd_exp.geometry.virtual import intrinsics
 from phd_exp.inference.predictor import BATCH, Predictor, View
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
 from phd_exp.models.heads import Prediction
@@ -85,13 +84,12 @@ def _batches(
                 with pillow_warnings():
                     image = read_image(detection.file, content_of(detection.file))
                 pixels += image.width * image.height
-            K = intrinsics(*detection.focal_lengths_and_centre(*image.size))
-            view = View.of_box(image, K, detection.box(*image.size), predictor.side, detection.where)
+            camera = facing(detection, image.size, predictor.side)
         except DatasetError:
             if batch:
                 yield batch  # the predictions before the invalid image are not lost
             raise
-        batch.append((detection, image, view))
+        batch.append((detection, image, View(cut(image, camera), camera)))
         if len(batch) == BATCH or pixels > LARGEST_AT_ONCE:
             yield batch
             batch, pixels = [], 0

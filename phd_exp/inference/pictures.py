@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.level_curves import LevelCurves, level_curves
 from phd_exp.inference.answers import Sighting
-from phd_exp.inference.predictor import View
 from phd_exp.records.errors import one_line
 from phd_exp.reports.figures import draw_birds_eye, draw_curve, encoded
 
@@ -46,7 +45,7 @@ def picture(
         if guarantee:
             camera = sighting.view.camera
             on_image, above = guarantee.region(sighting.prediction, camera.f / camera.S)[0].outlines()
-            figure.axes[0].plot(*pixels(sighting.view, on_image).T, "--", color=_AMBER)
+            figure.axes[0].plot(*camera.real_pixels(on_image).T, "--", color=_AMBER)
             axes.plot(*above.T, "k--", label=f"{100 * guarantee.coverage:g} % guaranteed")
         draw_birds_eye(axes, curves, _truth(sighting))
         if sighting.view.is_turned:
@@ -57,15 +56,15 @@ def picture(
 
 
 def _title(sighting: Sighting, recalibrated: bool) -> str:
-    line = sighting.detection.line
-    name = one_line(line.file_name)
+    name = one_line(sighting.detection.line.file_name)
     name = name if len(name) <= LONGEST_NAME else f"...{name[-LONGEST_NAME:]}"
-    f = f"f = {line.f:g} px" if line.f else f"f = {line.fx:g}, {line.fy:g} px"
-    return ", ".join([name, f, *(["recalibrated"] if recalibrated else [])])
+    fx, fy = np.diagonal(sighting.view.camera.K)[:2]
+    f = f"{fx:g}" if fx == fy else f"{fx:g}, {fy:g}"
+    return ", ".join([name, f"f = {f} px", *(["recalibrated"] if recalibrated else [])])
 
 
 def _draw_image(axes: Axes, sighting: Sighting, curves: LevelCurves | None) -> None:
-    view, image = sighting.view, sighting.image
+    camera, image = sighting.view.camera, sighting.image
     left, top, right, bottom = sighting.detection.box(*image.size)
     across, down = MARGIN * (right - left), MARGIN * (bottom - top)
     region = (
@@ -79,20 +78,15 @@ def _draw_image(axes: Axes, sighting: Sighting, curves: LevelCurves | None) -> N
     left, top, right, bottom = region
     axes.imshow(np.asarray(shown), extent=(left, right, bottom, top))
     for thickness, points in zip((1.6, 1.1, 0.7), curves.projected if curves else (), strict=False):
-        axes.plot(*pixels(view, points).T, color=_AMBER, linewidth=thickness)
+        axes.plot(*camera.real_pixels(points).T, color=_AMBER, linewidth=thickness)
     mode = sighting.prediction.mode.numpy()
-    axes.plot(*pixels(view, mode[:2] / mode[2]), "x", color=_AMBER, markersize=6)
+    axes.plot(*camera.real_pixels(mode[:2] / mode[2]), "x", color=_AMBER, markersize=6)
     truth = _truth(sighting)
     if truth is not None:
-        axes.plot(*pixels(view, truth[:2] / truth[2]), "o", color="white", markeredgecolor="black", markersize=4)
+        axes.plot(
+            *camera.real_pixels(truth[:2] / truth[2]), "o", color="white", markeredgecolor="black", markersize=4
+        )
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="column (px)", ylabel="row (px)")
-
-
-def pixels(view: View, xy_over_z: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*points 2"]:
-    """Pixels of the real image at (x, y)/z of the virtual camera; NaN behind the real camera."""
-    rays = np.concatenate([xy_over_z, np.ones_like(xy_over_z[..., :1])], axis=-1)
-    real = view.camera.to_real(rays) @ view.camera.K.T
-    return np.where(real[..., 2:] > 0, real[..., :2] / real[..., 2:], np.nan)
 
 
 def _truth(sighting: Sighting) -> Float[np.ndarray, "3"] | None:

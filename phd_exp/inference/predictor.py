@@ -66,7 +66,7 @@ class View:
         try:
             camera = VirtualCamera.of_box(K, (left, top, right, bottom), float(side))
         except ValueError as error:
-            raise DatasetError(f"{where}: box={[left, top, right, bottom]}: {error}") from None
+            raise DatasetError(f"{where}: {error}") from None
         return cls(cut(image, camera), camera)
 
     @property

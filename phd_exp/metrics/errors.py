@@ -28,6 +28,14 @@ def depth_error(xyz: Float[Tensor, "*batch 3"], estimate: Float[Tensor, "*batch 
     return (along_true_ray(xyz, estimate).norm(dim=-1) - xyz.norm(dim=-1)).abs()
 
 
+def distance_error(xyz: Float[Tensor, "*batch 3"], estimate: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    """| |v^| - |v| |: the error of the distance from the camera, in metres.
+
+    Source: ALE of MonoLoco (Bertoni et al. 2019, `monoloco/eval/eval_kitti.py`) is its mean.
+    """
+    return (estimate.norm(dim=-1) - xyz.norm(dim=-1)).abs()
+
+
 def squared_mahalanobis(
     error: Float[Tensor, "*batch n"],
     covariance: Float[Tensor, "*batch n n"],

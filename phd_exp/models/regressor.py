@@ -104,7 +104,9 @@ class Regressor(nn.Module):
         """The raw numbers for the head, in the precision of the last layer; f (px) is needed if it is an input."""
         return self.numbers(self.see(image), f)
 
-    def see(self, image: UInt8[Tensor, "batch height width 3"]) -> BackboneOutput:
+    def see(
+        self, image: UInt8[Tensor, "batch height width 3"] | Float[Tensor, "batch height width 3"]
+    ) -> BackboneOutput:
         """The output of the backbone."""
         width = image.shape[2]
         # row by row: four times faster than three colours at a time, which do not fill vector units

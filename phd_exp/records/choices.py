@@ -75,7 +75,9 @@ def has_influence(key: str) -> bool:
     return not any(key == name or key.startswith(f"{name}.") for name in WITHOUT_INFLUENCE)
 
 
-def first_difference(before: Mapping[str, Any], now: Mapping[str, Any], matters: Callable[[str], bool]) -> str | None:
+def first_difference(
+    before: Mapping[str, Any], now: Mapping[str, Any], matters: Callable[[str], bool] = has_influence
+) -> str | None:
     """The first dotted key that matters with two values, "KEY=VALUE, but KEY=VALUE"; None if there is none."""
     recorded, asked = flatten(dict(before)), flatten(dict(now))
     for key in sorted(filter(matters, recorded.keys() | asked.keys())):

@@ -17,6 +17,7 @@ from typing import Annotated, get_args
 
 from pydantic import Field, ValidationError
 
+from phd_exp.records.choices import first_difference
 from phd_exp.records.errors import DatasetError, gist
 from phd_exp.records.files import read_jsonl, read_plain, require_plain, write_atomic
 from phd_exp.records.parsing import Record
@@ -146,12 +147,11 @@ class DatasetFolder:
         Raises DatasetError if it holds none, or one with another specification; names the first key that differs.
         """
         manifest = self.manifest
-        for (key, here), (_, asked) in zip(manifest.spec, spec, strict=True):
-            if here != asked:
-                raise DatasetError(
-                    f"{self.root}: holds a data set with {key}={here}, but {key}={asked} is asked for; "
-                    "move the folder away or choose another data.root"
-                )
+        if difference := first_difference(dict(manifest.spec), dict(spec)):
+            raise DatasetError(
+                f"{self.root}: holds a data set with {difference} is asked for; move the folder away or choose "
+                "another data.root"
+            )
         return manifest
 
 

@@ -5,11 +5,13 @@
         <split>/...               the images, next to it or in subfolders
         .cache/                   crops, decoded once
 
-`DetectionLine` describes a line. Lines with the same `scene` form one `Observed`.
+`DetectionLine` describes a line. Lines with the same `scene` form one `Observed`. A folder without
+`metadata.jsonl` may have annotations in another format (`foreign.py`), which become lines too.
 """
 
+import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,15 +19,16 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field, PlainValidator, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
+from phd_exp.records.cameras import SHORTEST, Calibration, read_camera
 from phd_exp.records.dataset import SPLITS, checksum, sha256
-from phd_exp.records.errors import UNPRINTABLE, DatasetError, complaint, gist, nearest, shown
+from phd_exp.records.errors import UNPRINTABLE, DatasetError, complaint, gist, listed, nearest, shown
 from phd_exp.records.files import read_jsonl
+from phd_exp.records.foreign import Entry, format_of
 from phd_exp.records.parsing import Record, parse_json
 from phd_exp.records.scenes import Pose, SampleRecord, Split
 from phd_exp.records.spec import Number, Positive
 
 DISTORTION = re.compile(r"[kp][1-8]|.*distort.*|dist(_?coeff.*)?|.*fisheye.*", re.IGNORECASE)
-SHORTEST = 0.01  # focal length, px; a shorter one is probably in metres
 LARGEST_BOX = 3
 """Sides of a box over the longer side of its image; the part outside the image is grey and holds no information."""
 
@@ -42,7 +45,8 @@ def _in_pixels(f: float) -> float:
     return f
 
 
-SceneName = Annotated[int | str, PlainValidator(_name)]
+FileName = Annotated[str, Field(min_length=1, max_length=1000)]
+NumberOrName = Annotated[int | str, PlainValidator(_name)]
 Pixels = Annotated[Number, Field(ge=-1e6, le=1e6)]
 FocalLength = Annotated[Positive, Field(le=1e6), AfterValidator(_in_pixels)]
 Metres = Annotated[Number, Field(ge=-1e6, le=1e6)]
@@ -55,26 +59,29 @@ class DetectionLine(Record):
         file_name: the image, relative to the folder of the line's file.
         f: focal length, px; or fx and fy if pixels are not square.
         cx, cy: principal point, px; by default the middle of the image.
+        camera: instead of these, a camera file, relative to the folder of the line's file.
         box: left, top, right, bottom of the detection, px; by default the whole image.
         x, y, z: true position in the camera frame (x right, y down, z forward), m.
-        scale, visibility: as in a rendered data set; recorded with the predictions.
+        scale, visibility, truncation: as in a rendered data set; recorded with the predictions.
         scene: lines with the same scene show the same object at the same time.
         pose: of the camera, in the world that the cameras of a scene share.
     """
 
-    file_name: Annotated[str, Field(min_length=1, max_length=1000)]
+    file_name: FileName
     f: FocalLength | None = None
     fx: FocalLength | None = None
     fy: FocalLength | None = None
     cx: Pixels | None = None
     cy: Pixels | None = None
+    camera: FileName | None = None
     box: tuple[Pixels, Pixels, Pixels, Pixels] | None = None
     x: Metres | None = None
     y: Metres | None = None
-    z: Annotated[Number, Field(ge=1e-6, le=1e6)] | None = None
+    z: Metres | None = None
     scale: Positive | None = None
     visibility: Annotated[Number, Field(ge=0, le=1)] | None = None
-    scene: SceneName | None = None
+    truncation: Annotated[Number, Field(ge=0, le=1)] | None = None
+    scene: NumberOrName | None = None
     pose: Pose | None = None
 
     @model_validator(mode="before")
@@ -89,8 +96,11 @@ class DetectionLine(Record):
     @model_validator(mode="after")
     def belongs_together(self) -> "DetectionLine":
         """Refuse half a camera, half a position, and an empty box."""
-        if (self.f is None) == (self.fx is None and self.fy is None):
-            raise ValueError("expected either f, or fx and fy (focal length in pixels)")
+        cameras = [given for given in (self.f, self.fx or self.fy, self.camera) if given]
+        if len(cameras) != 1 or (self.camera and self.cx is not None):
+            raise ValueError("expected either f, or fx and fy (focal length in pixels), or camera (a file) alone")
+        if not self.camera and self.z is not None and self.z < 1e-6:  # a fisheye may show what is behind
+            raise ValueError(f"z: got {self.z:g}; expected to be greater than or equal to 0.000001")
         for names in (("fx", "fy"), ("cx", "cy"), ("x", "y", "z")):
             given = [name for name in names if getattr(self, name) is not None]
             if 0 < len(given) < len(names):
@@ -102,11 +112,12 @@ class DetectionLine(Record):
 
 @dataclass(frozen=True)
 class Detection:
-    """One line, the image that it names, and the place of the line, for messages."""
+    """One line, the image that it names, the place of the line, for messages, and the content of its camera file."""
 
     line: DetectionLine
     file: Path
     where: str
+    calibration: Calibration | None = None
 
     @property
     def position(self) -> tuple[float, float, float]:
@@ -117,24 +128,19 @@ class Detection:
         return x, y, z
 
     def focal_lengths_and_centre(self, width: int, height: int) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy for an image of that size, px."""
-        line = self.line
+        """fx, fy, cx, cy for an image of that size, px. Raises DatasetError if the camera file has another size."""
+        line, file = self.line, self.calibration
+        if file:
+            if (file.width or width, file.height or height) != (width, height):
+                raise DatasetError(
+                    f"{self.where}: camera={line.camera}: is for images of {file.width} x {file.height} pixels; this "
+                    f"image has {width} x {height}; scale size, camera matrix and image alike"
+                )
+            return file.K[0], file.K[4], file.K[2] + 0.5, file.K[5] + 0.5  # our pixels count from their corner
         fx, fy = (value for value in (line.f or line.fx, line.f or line.fy) if value)  # a line has f or both
         cx = width / 2 if line.cx is None else line.cx
         cy = height / 2 if line.cy is None else line.cy
         return fx, fy, cx, cy
-
-    def require_in_sight(self, width: int, height: int) -> None:
-        """Raise DatasetError if the position projects so far outside the image that the image cannot show it."""
-        x, y, z = self.position
-        fx, fy, cx, cy = self.focal_lengths_and_centre(width, height)
-        column, row = cx + fx * x / z, cy + fy * y / z
-        longest = LARGEST_BOX * max(width, height)
-        if abs(column - width / 2) > longest or abs(row - height / 2) > longest:
-            raise DatasetError(
-                f"{self.where}: the position {[x, y, z]} is seen at [{column:.0f}, {row:.0f}], far outside the image "
-                f"of {width} x {height} pixels; check x, y, z (metres) and the focal length (pixels)"
-            )
 
     def box(self, width: int, height: int) -> tuple[float, float, float, float]:
         """The box in an image of that size, px. Raises DatasetError if it lies outside the image or is too large."""
@@ -155,9 +161,10 @@ class Detection:
 
 @dataclass(frozen=True)
 class DetectionFolder:
-    """A folder of the user's own images, with a subfolder for each split."""
+    """A folder of the user's own images, with a subfolder for each split; `object_name` selects detections."""
 
     root: Path
+    object_name: int | str | None = None
 
     @property
     def cache(self) -> Path:
@@ -170,20 +177,55 @@ class DetectionFolder:
 
     def detections(self, split: Split, n: int | None = None) -> list[Detection]:
         """The detections of a split, as `detections_in` reads them."""
-        return detections_in(self.root / split, n, f" (data.n_{split})")
+        return detections_in(self.root / split, n, f" (data.n_{split})", self.object_name)
 
     def fingerprint(self) -> str:
-        """Checksum of both `metadata.jsonl`, without the images. Raises OSError if one cannot be read."""
-        return sha256("".join(checksum(self.metadata_path(split)) for split in SPLITS).encode())
+        """Checksum of the annotations of both splits, without the images. Raises OSError if one cannot be read."""
+        files = [file for split in SPLITS for file in annotations(self.root / split)[0]]
+        return sha256("".join(map(checksum, files)).encode())
 
 
-def detections_in(folder: Path, n: int | None = None, asked_by: str = "") -> list[Detection]:
-    """The first n detections of a folder's `metadata.jsonl`, all by default, in the order of the lines.
+def detections_in(
+    folder: Path, n: int | None = None, asked_by: str = "", object_name: int | str | None = None
+) -> list[Detection]:
+    """The first n detections of a folder's annotations, all by default, in their order.
+
+    `object_name` selects those of one object: BOP's `obj_id`, KITTI's type, or COCO's category.
 
     Raises:
-        DatasetError: the file cannot be read, a line is not a detection, or there are fewer than n.
+        DatasetError: a file cannot be read, an entry is not a detection, there are fewer than n, or no such object.
         CorruptFileError: a line is not text.
     """
+    found: list[Detection] = []
+    cameras: dict[str, Calibration] = {}
+    others = set()
+    files, read = annotations(folder)
+    for where, name, values in read(folder):
+        if object_name is not None and name != str(object_name):
+            others.add(name)
+            continue
+        line = _line(values, where)
+        if line.camera and line.camera not in cameras:
+            cameras[line.camera] = read_camera(_inside(folder, line.camera, where, "camera"))
+        file = _inside(folder, line.file_name, where)
+        found.append(Detection(line, file, where, cameras.get(line.camera or "")))
+        if len(found) == n:
+            break
+    if others and not found:
+        names = f"one of {listed(sorted(others))}" if all(others) else "no object=, since metadata.jsonl names none"
+        raise DatasetError(f"{folder}: no object {shown(str(object_name))} here; expected {names}")
+    if not found or len(found) < (n or 0):
+        raise DatasetError(f"{files[0]}: {n or 'some'} detections asked for{asked_by}, {len(found)} found")
+    return found
+
+
+def annotations(folder: Path) -> tuple[list[Path], Callable[[Path], Iterator[Entry]]]:
+    """The files that describe a folder's images, and their reader; `metadata.jsonl` comes before other formats."""
+    metadata = folder / "metadata.jsonl"
+    return (not os.path.lexists(metadata) and format_of(folder)) or ([metadata], _entries)
+
+
+def _entries(folder: Path) -> Iterator[Entry]:
     path = folder / "metadata.jsonl"
     try:
         lines = read_jsonl(path, str.strip, sealed=True)
@@ -192,17 +234,13 @@ def detections_in(folder: Path, n: int | None = None, asked_by: str = "") -> lis
             f"{path}: cannot be read ({error.strerror}); expected one JSON object a line, "
             "see `Your own images` in README.md"
         ) from None
-    numbered = [(f"{path}, line {number}", text) for number, text in enumerate(lines, start=1) if text][:n]
-    if not numbered or len(numbered) < (n or 0):
-        raise DatasetError(f"{path}: {n or 'some'} detections asked for{asked_by}, {len(numbered)} found")
-    found = []
-    for where, text in numbered:
+    for number, text in enumerate(lines, start=1):
+        where = f"{path}, line {number}"
         try:
-            line = _line(parse_json(text), where)
+            if text:
+                yield where, "", parse_json(text)
         except ValueError as error:
             raise DatasetError(f"{where}: not JSON ({error}); expected one object a line") from None
-        found.append(Detection(line, _inside(folder, line.file_name, where), where))
-    return found
 
 
 def detection_of(file: Path, values: Mapping[str, Any]) -> Detection:
@@ -214,7 +252,8 @@ def detection_of(file: Path, values: Mapping[str, Any]) -> Detection:
         >>> detection_of(Path("photo.jpg"), {"f": 900.0}).focal_lengths_and_centre(640, 480)
         (900.0, 900.0, 320.0, 240.0)
     """
-    return Detection(_line({"file_name": file.name, **values}, str(file)), file, str(file))
+    line = _line({"file_name": file.name, **values}, str(file))
+    return Detection(line, file, str(file), read_camera(Path(line.camera)) if line.camera else None)
 
 
 @dataclass(frozen=True)
@@ -255,17 +294,17 @@ def _line(values: Any, where: str) -> DetectionLine:
         raise DatasetError(f"{where}: {_complaint(error.errors(include_url=False)[0])}") from None
 
 
-def _inside(folder: Path, name: str, where: str) -> Path:
-    """The image file; a stranger's data set must not read files outside its folder."""
+def _inside(folder: Path, name: str, where: str, key: str = "file_name") -> Path:
+    """The file; a stranger's data set must not read files outside its folder."""
     try:
         if UNPRINTABLE.search(name):
             raise ValueError("control characters")
         leaves = Path(name).is_absolute() or ".." in Path(name).parts
         leaves = leaves or not (folder / name).resolve().is_relative_to(folder.resolve())
     except (ValueError, OSError, RuntimeError) as error:  # also a link to itself, or too long a name
-        raise DatasetError(f"{where}: file_name={shown(name)} is no file name ({gist(error)})") from None
+        raise DatasetError(f"{where}: {key}={shown(name)} is no file name ({gist(error)})") from None
     if leaves:
-        raise DatasetError(f"{where}: file_name={name!r} leaves {folder}; expected a path below it")
+        raise DatasetError(f"{where}: {key}={name!r} leaves {folder}; expected a path below it")
     return folder / name
 
 
@@ -273,7 +312,7 @@ def _complaint(problem: ErrorDetails) -> str:
     """The fault of a line: the key, the value, and what was expected."""
     key = ".".join(str(part) for part in problem["loc"])
     if problem["type"] == "extra_forbidden" and DISTORTION.fullmatch(key):
-        return f"{key}: a distorted image is no pinhole image; undistort the images first, then leave out {key}"
+        return f"{key}: a line describes no lens; expected camera, a calibration file of ROS or OpenCV"
     if problem["type"] == "extra_forbidden":
         known = (Pose if key.startswith("pose.") else DetectionLine).model_fields
         return f"{key}: unknown key{nearest(key, known)}; expected one of {', '.join(known)}"

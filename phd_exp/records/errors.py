@@ -46,15 +46,15 @@ class CorruptFileError(UserError):
 
 
 @contextmanager
-def writing(folder: Path, instead: str = "data.root") -> Iterator[None]:
-    """Convert an OSError in the body, a read-only folder or a full disk, to a RenderError.
+def writing(folder: Path, instead: str = "data.root", kind: type[UserError] = RenderError) -> Iterator[None]:
+    """Convert an OSError in the body, a read-only folder or a full disk, to a UserError of a `kind`.
 
     `instead` is the key by which to choose another folder.
     """
     try:
         yield
     except OSError as error:
-        raise RenderError(
+        raise kind(
             f"{error.filename or folder}: cannot be written ({error.strerror or error}); make room, allow writing, "
             f"or choose another {instead}"
         ) from error
@@ -72,19 +72,12 @@ def nearest(key: str, valid: Iterable[str]) -> str:
     return f", did you mean {close[0]!r}?" if close else ""
 
 
-def in_our_words(message: str) -> str:
-    """A message of pydantic in the words of this project's messages."""
-    return (
-        message.removeprefix("Value error, ")
-        .replace("Input should be", "expected to be")
-        .replace("expected to be a valid", "expected a valid")
-    )
-
-
 def complaint(key: str, problem: ErrorDetails) -> str:
     """Pydantic's error as a message: the key, its value unless that is a whole section, and what was expected."""
-    given = f"got {shown(problem['input'])}; " if key and not isinstance(problem["input"], dict) else ""
-    return ": ".join(filter(None, [key, given + in_our_words(problem["msg"])]))
+    given = "" if isinstance(problem["input"], dict) else f"got {shown(problem['input'])}; "
+    expected = problem["msg"].removeprefix("Value error, ").replace("Input should be", "expected to be")
+    reason = given + expected.replace("expected to be a valid", "expected a valid")
+    return f"{key}: {reason}" if key else reason
 
 
 def gist(error: BaseException) -> str:

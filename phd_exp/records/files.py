@@ -3,7 +3,6 @@
 import errno
 import fcntl
 import os
-import re
 import stat
 import uuid
 from collections.abc import Callable
@@ -17,7 +16,7 @@ from phd_exp.records.parsing import parse_json
 
 Parsed = TypeVar("Parsed")
 
-_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{32}\.tmp", re.DOTALL)  # names of the temporary files of `write_atomic`
+_TEMPORARIES = f".?*.{'[0-9a-f]' * 32}.tmp"  # names of the temporary files of `write_atomic`
 MB = 10**6
 LARGEST_RECORD = 16 * MB  # bytes of a file that is read as a whole; the project's own files have a few thousand
 LONGEST_LINE = MB  # bytes of a line of a journal; the line of a sample has about two thousand
@@ -81,8 +80,8 @@ def write_atomic(path: Path | str, data: bytes | str) -> None:
 
 def remove_temporaries(folder: Path) -> None:
     """Remove the temporary files in `folder` that killed calls of `write_atomic` left."""
-    for path in folder.glob(".*.tmp"):
-        if _TEMPORARY.fullmatch(path.name) and path.is_file() and not path.is_symlink():
+    for path in folder.glob(_TEMPORARIES):
+        if path.is_file() and not path.is_symlink():
             # OSError: its writer lives, or has renamed it since
             with suppress(OSError), open(path, "r+b") as stream:
                 fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -34,7 +34,7 @@ from typing import Any, Literal
 import yaml
 from pydantic import AwareDatetime, Field, FiniteFloat, TypeAdapter, ValidationError
 
-from phd_exp.records.errors import RunError, gist
+from phd_exp.records.errors import RunError, gist, writing
 from phd_exp.records.files import MB, read_jsonl, read_plain, write_atomic
 from phd_exp.records.parsing import Record, parse_json, parse_yaml
 from phd_exp.records.processes import held
@@ -187,17 +187,13 @@ class RunFolder:
     @contextmanager
     def held(self) -> Iterator[None]:
         """Hold the folder exclusively. Raises RunError if another process holds it, or it cannot be written."""
-        try:
+        lock = ExitStack()
+        with writing(self.path, "runs=DIR", RunError):
             self.path.mkdir(parents=True, exist_ok=True)
             for place in self.path.iterdir():
                 if place.is_symlink():  # in a stranger's run, it would redirect what is written
                     raise RunError(f"{place}: is a link; put the file or folder itself in its place")
-            lock = ExitStack()
             free = lock.enter_context(held(self.path / ".lock"))
-        except OSError as error:
-            raise RunError(
-                f"{self.path}: cannot be written ({error.strerror}); choose another folder by runs=DIR"
-            ) from None
         with lock:
             if not free:
                 raise RunError(f"{self.path}: another process is working on this run; wait for it or stop it")

@@ -11,10 +11,11 @@ from typing import Literal
 from pydantic import FiniteFloat, ValidationError
 
 from phd_exp.records.errors import gist
-from phd_exp.records.files import read_plain, write_atomic
+from phd_exp.records.files import read_plain
 from phd_exp.records.parsing import Record
 from phd_exp.records.processes import announce
 
+SEARCHES, RECORD = ".search", "search.json"
 TrialState = Literal["finished", "pruned", "failed", "running"]
 
 
@@ -52,20 +53,10 @@ class Search(Record):
         return min(self.finished, key=lambda found: found[0], default=(0.0, None))[1]
 
 
-def search_folder(runs: Path, name: str) -> Path:
-    """The folder of a search."""
-    return runs / ".search" / name
-
-
-def write_search(folder: Path, search: Search) -> None:
-    """Write the record. Raises OSError."""
-    write_atomic(folder / "search.json", search.model_dump_json(indent=2) + "\n")
-
-
 def read_searches(runs: Path) -> list[Search]:
     """All searches below a folder of runs; a line on standard error names a record that cannot be read."""
     found = []
-    for file in sorted(search_folder(runs, "").glob("*/search.json")):
+    for file in sorted(runs.glob(f"{SEARCHES}/*/{RECORD}")):
         try:
             found.append(Search.model_validate_json(read_plain(file)))
         except (OSError, ValidationError) as error:

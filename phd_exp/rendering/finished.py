@@ -126,7 +126,8 @@ def write_masks(folder: DatasetFolder, masks: Path, spec: DatasetSpec | None = N
     return len(records)
 
 
-def require_elsewhere(folder: DatasetFolder, masks: Path) -> None:
-    """Raise RenderError if masks would lie inside the data set, where loaders would take them for samples."""
-    if masks.absolute().is_relative_to(folder.root):
-        raise RenderError(f"masks={masks}: lies in the data set itself; expected a folder outside {folder.root}")
+def require_elsewhere(folder: DatasetFolder, **places: Path | None) -> None:
+    """Raise RenderError if a place to write to lies inside the data set, where loaders would take it for samples."""
+    for key, place in places.items():
+        if place and place.absolute().is_relative_to(folder.root):
+            raise RenderError(f"{key}={place}: lies in the data set itself; expected a folder outside {folder.root}")

@@ -3,8 +3,6 @@
 import math
 from dataclasses import dataclass
 
-from phd_exp.records.scenes import Shape
-
 Point = tuple[float, float, float]
 Face = tuple[int, ...]
 
@@ -22,7 +20,7 @@ class Mesh:
     smooth: list[bool]
 
 
-def build_mesh(shape: Shape) -> Mesh:
+def build_mesh(shape: str) -> Mesh:
     """The mesh of a shape without bevels, the same solid as in `rays`."""
     return {"cylinder": _cylinder, "cube": _cube, "sphere": _sphere}[shape]()
 

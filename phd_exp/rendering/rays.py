@@ -72,9 +72,9 @@ def _no_hits(scene: Scene, shape: tuple[int, ...]) -> Hits:
     return Hits(np.full(shape, np.inf), np.full(shape, NOTHING, np.int8))
 
 
-def cylinder_mask(hits: Hits) -> Mask:
-    """Pixels (S, S) that show the cylinder, the scene's first object; rows from the top."""
-    return (hits.surfaces[0] != NOTHING) & (hits.depths[0] <= hits.depths.min(axis=0))
+def cylinder_mask(hits: Hits, number: int = 0) -> Mask:
+    """Pixels (S, S) that show the cylinder, the scene's first object, or another one; rows from the top."""
+    return (hits.surfaces[number] != NOTHING) & (hits.depths[number] <= hits.depths.min(axis=0))
 
 
 def visibility(hits: Hits) -> float:
@@ -91,9 +91,7 @@ def truncation(scene: Scene, hits: Hits, meshes: Meshes = NO_MESHES) -> float:
     if (item := scene.objects[0]).shape in meshes:
         whole = np.isfinite(mesh_depths(scene, item, meshes, whole=True)).sum()
     else:
-        cylinder = scene.model_copy(update={"objects": (item,)})
-        everywhere = trace_points(cylinder, *pixel_middles(*window(scene, item)))
-        whole = (everywhere.surfaces[0] != NOTHING).sum()
+        whole = silhouette(scene)[0].sum()
     return float(1 - (hits.surfaces[0] != NOTHING).sum() / whole) if whole else 1.0
 
 
@@ -102,6 +100,13 @@ def mesh_depths(scene: Scene, item: SceneObject, meshes: Meshes, *, whole: bool 
     turn = item.scale * rotation_matrix(scene.pose.rotation) @ rotation_matrix(item.rotation)
     shift = in_camera_frame(np.array(item.position), scene.pose)
     return meshes[item.shape].depths(turn, shift, scene.f, scene.S, whole=whole)
+
+
+def silhouette(scene: Scene, number: int = 0) -> tuple[Mask, range, range]:
+    """Pixels of an object in an image without borders or other objects, in the rows and columns of its `window`."""
+    rows, columns = window(scene, scene.objects[number])
+    alone = scene.model_copy(update={"objects": scene.objects[number : number + 1]})
+    return trace_points(alone, *pixel_middles(rows, columns)).surfaces[0] != NOTHING, rows, columns
 
 
 def pixel_middles(rows: range, columns: range) -> tuple[Image, Image]:

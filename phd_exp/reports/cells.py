@@ -109,7 +109,7 @@ def make_cell(report: Report, preset: str, data: str, model: str, key: ErrorKey,
         interval=interval(list(means.values())) if means else None,
         published=published_mm(model, data, key.estimate, key.quantity),
         bound=bound_mm(model, data, key.quantity, sees_f),
-        gaps={seed: _reason(runs.get(seed)) for seed in seeds if seed not in measured},
+        gaps={seed: _reason(runs.get(seed), key) for seed in seeds if seed not in measured},
     )
 
 
@@ -134,10 +134,12 @@ def interval(means: Sequence[SampleMean]) -> Interval:
     return Interval(means[0].value, float(stats.norm.ppf(0.975)) * error, "normal_over_samples")
 
 
-def _reason(run: Run | None) -> str:
+def _reason(run: Run | None, key: ErrorKey) -> str:
     """Why a run has no error: a state, and details."""
     if run is None:
         return "missing"
+    if run.state == "finished" and key.estimate == "eight views":
+        return "no eight views: repeat its command with evaluation.eight_views=true"
     if run.state == "finished":
         return "no sample: none of its test samples lies in the central half"
     return f"{run.state}: {one_line(run.detail)}" if run.detail else run.state

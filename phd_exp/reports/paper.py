@@ -98,8 +98,8 @@ class Layout:
 
 
 def _groups(models: tuple[str, ...], quantities: tuple[Quantity | None, ...]) -> tuple[tuple[Line, ...], ...]:
-    """The paper's lines, and below them the density's mean and median, which the paper omits."""
-    others: tuple[Estimate, ...] = ("mean", "median")
+    """The paper's lines, and below them the density's mean, median and mode of eight views, which the paper omits."""
+    others: tuple[Estimate, ...] = ("mean", "median", "eight views")
     return (
         tuple(Line(model, "mode", quantity) for model in models for quantity in quantities),
         tuple(Line("probabilistic", estimate, quantity) for estimate in others for quantity in quantities),

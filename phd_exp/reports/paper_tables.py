@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Iterable, Mapping, Sequence, Set
 
-from phd_exp.evaluation.point_errors import READINGS, ErrorKey, Quantity, Reading
+from phd_exp.evaluation.point_errors import COLUMNS, READINGS, ErrorKey, Estimate, Quantity, Reading
 from phd_exp.records.choices import PLAIN_RECIPE, in_words, preset_and_recipe
 from phd_exp.records.errors import one_line
 from phd_exp.reports.cells import Cell, make_cell
@@ -57,7 +57,12 @@ def _table(
     """The table of these seeds, of the data sets and models that a (data set, model) of `choices` has."""
     data, models = ({choice[place] for choice in choices} for place in (0, 1))
     columns = [column for column in layout.columns if column.data in data]
-    groups = [lines for group in layout.groups if (lines := [line for line in group if line.model in models])]
+    estimates = _estimates(report, preset, choices)
+    groups = [
+        lines
+        for group in layout.groups
+        if (lines := [line for line in group if line.model in models and line.estimate in estimates])
+    ]
 
     def cell(line: Line, column: Column) -> Cell:
         quantity = line.quantity or column.quantity
@@ -89,6 +94,12 @@ def _table(
         preset=preset,
         reading=reading,
     )
+
+
+def _estimates(report: Report, preset: str, choices: Set[tuple[str, str]]) -> set[Estimate]:
+    """All estimates, but eight views only if a run has recorded them."""
+    runs = [run for choice in choices for run in report.at_defaults(preset, *choice).values()]
+    return {*COLUMNS, *(key.estimate for run in runs for key in run.errors)}
 
 
 def _left_out(layout: Layout, data: Set[str], models: Set[str]) -> list[str]:

@@ -151,6 +151,9 @@ def _whole_run(run: Run, kept: Path | None, notes: Notes) -> Run:
         tested_held_out = notes.attempt(lambda: _errors(chosen, ("mode",))) if chosen else None
     measured = notes.attempt(lambda: kept_or_measured(folder, config, predictions, held_out, kept)) or Measured()
     errors, nll = tested or ({}, None)
+    if (file := folder.eight_views["test"]).exists() and errors:
+        of_eight, _ = notes.attempt(lambda: _errors(read_table(file), ("mode",))) or ({}, None)
+        errors = {**errors, **{replace(key, estimate="eight views"): mean for key, mean in of_eight.items()}}
     held_out_errors, held_out_nll = tested_held_out or ({}, None)
     return replace(
         run,

@@ -49,7 +49,7 @@ def build_augmentation(recipe: RecipeConfig) -> Augmentation | None:
 def build_source(data: RenderedConfig | FolderConfig | SourceConfig) -> Source:
     """The source of samples that a `data` section describes. Raises ConfigError, naming the key, for bad values."""
     if isinstance(data, FolderConfig):
-        folder = DetectionFolder(data.folder)
+        folder = DetectionFolder(data.folder, data.object)
         return FolderSource(folder, data.n_train, data.n_held_out, data.n_test, data.image_size)
     sizes: dict[Part, int] = {"train": data.n_train, "held_out": data.n_held_out, "test": data.n_test}
     if isinstance(data, RenderedConfig):
@@ -82,7 +82,7 @@ def build_module(config: RunConfig, data: PositionData) -> PositionModule:
         )
     schedule = partial(factor, recipe.schedule, recipe.warmup_steps)
     module = PositionModule(
-        regressor, loss, optimizer, constant_f, recipe.localisation, schedule, config.camera.f_error
+        regressor, loss, optimizer, constant_f, recipe.localisation, schedule, config.camera.f_error, recipe.coarse
     )
     if custom_parts({"head": config.model.head, "backbone": config.backbone, "loss": config.loss}):
         _try_out(module, config, data.source)

@@ -16,7 +16,7 @@ from phd_exp.distributions import Density, ProjectedHuber
 from phd_exp.distributions.columns import Columns, coordinates, distribution_columns, draws
 from phd_exp.metrics.calibration import CalibrationCurve, calibration_curve
 from phd_exp.metrics.calibration_scores import exact_scores
-from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
+from phd_exp.metrics.errors import MILLIMETRES, depth_error, distance_error, projected_error
 from phd_exp.metrics.scores import DRAWS, energy_score
 from phd_exp.models.heads import Prediction
 from phd_exp.records.files import write_atomic
@@ -25,6 +25,8 @@ MEANS = {
     "loss": "loss",
     "projected_error_mm": "projected_error_mm",
     "depth_error_mm": "depth_error_mm",
+    "ale_m": "ale_m",
+    "relative_error": "relative_error",
     "nll": "nll",
     "a": "depth_precision",
     "projected_precision": "projected_precision",
@@ -65,6 +67,8 @@ def columns(prediction: Prediction, batch: Batch) -> Columns:
     table = {"row": batch.row, "f": batch.f, "S": torch.full_like(batch.f, batch.S)}
     table |= coordinates("", batch.xyz) | coordinates("mode_", prediction.mode)
     table |= _errors(prediction, batch.xyz)
+    table["ale_m"] = distance_error(batch.xyz, prediction.mode)
+    table["relative_error"] = 100 * table["ale_m"] / batch.xyz.norm(dim=-1)
     if isinstance(prediction, Density):
         table |= distribution_columns(prediction, batch.xyz)
         # seeded by the sample, so that the score does not depend on the epoch

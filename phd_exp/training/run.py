@@ -14,7 +14,7 @@ from phd_exp.data.datamodule import PositionData
 from phd_exp.data.images import SHRINKING
 from phd_exp.data.sources import PARTS, Part
 from phd_exp.distributions.columns import Columns
-from phd_exp.records.choices import first_difference, has_influence
+from phd_exp.records.choices import first_difference, flatten
 from phd_exp.records.dataset import DatasetFolder, checksum
 from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError, RunError, gist, shown
@@ -72,8 +72,8 @@ def require_possible(config: RunConfig, folder: RunFolder) -> None:
     """Raise the errors that would stop the run later, before anything is rendered or written.
 
     RunError: the folder holds a run of another configuration, or cannot be written. ConfigError: no GPU, no key of
-    wandb, or values that a part of the model or the data of a shift refuses. DatasetError: the folder of a
-    shift's data holds other data.
+    wandb, or values that a part of the model or the data of a shift refuses. DatasetError: the folder of several
+    views or of a shift's data holds other data.
     """
     require_same_config(folder, config)
     folder.require_writable()
@@ -85,7 +85,7 @@ def require_possible(config: RunConfig, folder: RunFolder) -> None:
         raise ConfigError("trainer.accelerator: got 'gpu', but torch sees none here; expected 'cpu' or 'auto'")
     if trainer.accelerator != "cpu" and 0 < found < trainer.devices:
         raise ConfigError(f"trainer.devices: got {trainer.devices}, but torch sees {found} GPUs here")
-    for other in map(config.data_of, config.evaluation.shifts):
+    for other in (config.several_views, *map(config.data_of, config.evaluation.shifts)):
         if isinstance(other, RenderedConfig):
             DatasetFolder(other.folder).missing(other.spec, 0, 0)  # refuses another data set in its folder
     build_module(config, build_data(config))
@@ -96,7 +96,10 @@ def require_same_config(folder: RunFolder, config: RunConfig) -> None:
     if not folder.config_file.exists():
         return
     require_same_shrinking(folder, config)
-    if difference := first_difference(folder.config(), config.model_dump(mode="json"), has_influence):
+    asked = flatten(config.model_dump(mode="json"))
+    chosen = flatten(config.model_dump(mode="json", exclude_defaults=True))
+    younger = {key: value for key, value in asked.items() if key not in chosen}  # may be absent in an older record
+    if difference := first_difference(younger | flatten(folder.config()), asked):
         raise RunError(
             f"{folder.path}: holds a run with {difference} is asked for; "
             "move that folder away, or choose another place by runs=DIR"
@@ -105,7 +108,7 @@ def require_same_config(folder: RunFolder, config: RunConfig) -> None:
     status, manifest = folder.status(), _manifest_hash(config)
     if isinstance(config.data, FolderConfig) and status and manifest not in (None, status.data_manifest):
         raise RunError(
-            f"{folder.path}: holds a run on {config.data.folder} as it was before its metadata.jsonl changed; "
+            f"{folder.path}: holds a run on {config.data.folder} as it was before its annotations changed; "
             "move that run's folder away, or choose another place by runs=DIR"
         )
 

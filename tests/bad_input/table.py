@@ -11,6 +11,7 @@ from PIL import Image
 
 from tests.bad_input import images
 from tests.bad_input.place import HANDMADE, TRAIN, Place
+from tests.support.foreign import WRITERS
 
 RUN = "run=RUN"
 """The run of the place, whose name holds a hash."""
@@ -76,6 +77,15 @@ def label(name: str, said: str, **changes: Any) -> Bad:
 
     where = r"photos/train/metadata\.jsonl, line 1: "
     return Bad(f"label: {name}", spoil, (*LEARN, "runs=others"), where + said)
+
+
+def foreign(form: str, name: str, word: str, said: str, without: str | None = None) -> Bad:
+    def spoil(place: Place) -> None:
+        WRITERS[form](place.root / form / "test")
+        if without:
+            (place.root / form / without).unlink()
+
+    return Bad(f"{form}: {name}", spoil, ("predict", RUN, f"folder={form}/test", word), rf"{form}/test(/|: )?{said}")
 
 
 def camera(name: str, words: tuple[str, ...], said: str) -> Bad:
@@ -207,11 +217,18 @@ LABELS = [
     label("NaN", r"x: got nan; expected to be a finite number", x=float("nan")),
     label("a focal length in metres", r"f: got 0\.004; expected a focal length in pixels, at least 0\.01", f=0.004),
     label("no position", r"x, y, z are missing; .*", x=None, y=None, z=None),
-    label("millimetres across", r"the position \[-200\.0, .*\] is seen at .*, far outside the image .*; check x, y, z \(metres\) .*", x=-200),
+    label("millimetres across", r"the position \[-200\.0, .*\] is far outside the image of .*; check x, y, z \(m\) and the camera", x=-200),
+]  # fmt: skip
+
+FORMATS = [
+    foreign("bop", "an object that there is not", "object=7", r"no object '7' here; expected one of 5"),
+    foreign("kitti", "no calibration", "object=Car", r"calib/000000\.txt: cannot be read \(No such file or directory\); .*", "test/calib/000000.txt"),
+    foreign("kitti", "no images", "object=Car", r"label_2/000000\.txt, line 1: cannot be read \('image_2/000000' is missing\); .*", "test/image_2/000000.png"),
+    foreign("coco", "no images", "object=cup", r"b\.png: cannot be read \(No such file or directory\)", "test/b.png"),
 ]  # fmt: skip
 
 CAMERAS = [
-    camera("none", (), r"photos/test/0\.png: expected either f, or fx and fy \(focal length in pixels\)"),
+    camera("none", (), r"photos/test/0\.png: expected either f, or fx and fy \(focal length in pixels\), or camera \(a file\) alone"),
     camera("NaN", ("f=nan",), r"photos/test/0\.png: f: got nan; expected to be a finite number"),
     camera("beyond all numbers", ("f=1e400",), r"photos/test/0\.png: f: got inf; expected to be a finite number"),
     camera("text", ("f=wide",), r"f: got 'wide'; expected a valid number, .*"),
@@ -309,5 +326,5 @@ FOLDERS = [
 
 
 TABLE = [
-    *CONFIGURATIONS, *PICTURES, *LINES, *LABELS, *CAMERAS, *CHECKPOINTS, *STORED, *RECORDS, *FOLDERS,
+    *CONFIGURATIONS, *PICTURES, *LINES, *LABELS, *FORMATS, *CAMERAS, *CHECKPOINTS, *STORED, *RECORDS, *FOLDERS,
 ]  # fmt: skip

@@ -15,12 +15,13 @@ from phd_exp.cli import train
 from phd_exp.cli.frame import run_verb
 from phd_exp.cli.jobs import launch
 from phd_exp.records.dataset import DatasetFolder
-from phd_exp.records.detections import DetectionLine, detections_in
+from phd_exp.records.detections import DetectionLine, annotations, detections_in
 from phd_exp.records.errors import UserError
 from phd_exp.records.runs import RunFolder, RunStatus
 from phd_exp.records.scenes import SampleRecord
 from phd_exp.reports.runs import read_report
 from phd_exp.training.config import RunConfig, check, check_render
+from tests.support.foreign import WRITERS
 
 EXAMPLES = [20, pytest.param(2000, marks=[pytest.mark.slow, pytest.mark.timeout(1200)])]
 each_number_of_examples = pytest.mark.parametrize("examples", EXAMPLES)
@@ -56,6 +57,10 @@ def spoiled(good: dict[str, Any]) -> Any:
     """A good mapping of which a few values, at any depth, are replaced."""
 
     def changed(node: Any) -> Any:
+        if isinstance(node, list) and node:
+            return st.integers(0, len(node) - 1).flatmap(
+                lambda place: changed(node[place]).map(lambda value: [*node[:place], value, *node[place + 1 :]])
+            )
         if not isinstance(node, dict) or not node:
             return VALUES
         return st.sampled_from(sorted(node, key=str)).flatmap(
@@ -74,6 +79,37 @@ TEXTS = (spoiled(LINE) | objects(DetectionLine.model_fields) | VALUES).map(dumpe
 BYTES = st.binary(max_size=200) | TEXTS.map(str.encode) | TEXTS.flatmap(
     lambda text: st.integers(0, len(text)).map(lambda end: text[:end].encode())
 )  # fmt: skip
+
+
+@each_number_of_examples
+@pytest.mark.parametrize("name", WRITERS)
+def test_other_formats(tmp_path: Path, name: str, examples: int) -> None:
+    """Files whose JSON or text is spoiled at any depth."""
+    folder = WRITERS[name](tmp_path / "test")
+    files = annotations(folder)[0]
+    goods = {file: file.read_bytes() for file in files}
+
+    def law(data: st.DataObject) -> None:
+        file = data.draw(st.sampled_from(files))
+        text = goods[file].decode()
+        spoilt = spoiled(json.loads(text)).map(dumped) if file.suffix == ".json" else changed_words(text)
+        file.write_bytes(data.draw(BYTES | spoilt.map(str.encode)))
+        with suppress(UserError):
+            for detection in detections_in(folder):
+                assert detection.file.resolve().is_relative_to(folder.resolve())
+        file.write_bytes(goods[file])
+
+    holds_for(examples, law, st.data())
+
+
+def changed_words(text: str) -> Any:
+    """A text of which one word is replaced."""
+    words = text.split(" ")
+    places, others = (
+        st.integers(0, len(words) - 1),
+        st.sampled_from(["", "nan", "1e999", "-1", "x", "0", "9" * 400, "\n"]),
+    )
+    return st.builds(lambda place, word: " ".join([*words[:place], word, *words[place + 1 :]]), places, others)
 
 
 STATUS = RunStatus(state="finished", started=1.0, versions={}, git_commit=None, data_manifest=None, machine="x")
@@ -99,7 +135,7 @@ def test_metadata(tmp_path: Path, examples: int) -> None:
             for detection in detections_in(tmp_path):
                 assert detection.file.resolve().is_relative_to(tmp_path.resolve())
                 with suppress(UserError):
-                    detection.require_in_sight(100, 100)
+                    detection.focal_lengths_and_centre(100, 100)
                     detection.box(100, 100)
 
     holds_for(examples, law, BYTES)

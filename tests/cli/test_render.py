@@ -44,21 +44,31 @@ def test_a_data_set_is_rendered_in_shards_and_verified_and_repaired(
     assert ["000001.png" in complaints[0], "000002.png" in complaints[1], len(complaints)] == [True, True, 2]
 
     (images / "000002.png").unlink()
-    repaired = render("masks=masks")
+    repaired = render("masks=masks", "bop=bop")
     assert repaired.status == 0, repaired.err
     assert "rendered 2 images in" in repaired.err
     assert "renders/default: 4 training and 2 test samples are there" in repaired.out
     assert (images / "000002.png").read_bytes() == whole
     assert "masks: 6 masks" in repaired.out
     assert {path.name for path in (tmp_path / "masks" / "test").iterdir()} == {"000000.png", "000001.png"}
+    assert "bop: 6 images as BOP" in repaired.out
+    assert (tmp_path / "bop" / "train" / "000000" / "rgb" / "000002.png").read_bytes() == whole
 
 
-def test_masks_in_the_data_set_itself_are_refused_before_anything_is_rendered(
-    render: Callable, tmp_path: Path
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["masks=renders/default/masks"], "masks=renders/default/masks: lies in the data set itself"),
+        (["bop=renders/default/bop"], "bop=renders/default/bop: lies in the data set itself"),
+        (["bop=bop", "data.image_format=webp"], "data.image_format: got webp; BOP has no such images"),
+    ],
+)
+def test_what_cannot_be_written_is_refused_before_anything_is_rendered(
+    render: Callable, tmp_path: Path, words: list[str], said: str
 ) -> None:
-    refused = render("data=default", "masks=renders/default/masks")
-    assert refused.status == 1
-    assert refused.err.startswith("error: masks=renders/default/masks: lies in the data set itself")
+    refused = render("data=default", *words)
+    assert refused.status in (1, 2)
+    assert refused.err.startswith(f"error: {said}")
     assert not (tmp_path / "renders" / "default").exists()
 
 

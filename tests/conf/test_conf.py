@@ -154,8 +154,7 @@ def test_variants_differ_only_in_the_keys_of_their_files(checked: Callable) -> N
 
 def test_several_views_use_the_data_set_multiview(checked: Callable) -> None:
     config = checked("data=scale", "evaluation.multiview.scenes=9", "data.sensor_size=256", "data.seed=3")
-    beside = config.evaluation.multiview.spec_beside(config.data.spec)
-    assert beside == checked("data=multiview", "data.sensor_size=256", "data.seed=3").data.spec
+    assert config.several_views.spec == checked("data=multiview", "data.sensor_size=256", "data.seed=3").data.spec
 
 
 @pytest.mark.parametrize("data", ["default", "occl", "scale", "occl_scale"])

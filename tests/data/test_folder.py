@@ -16,10 +16,13 @@ from phd_exp.data.datamodule import PositionData
 from phd_exp.data.folder import FolderSource
 from phd_exp.data.sources import RenderedSource
 from phd_exp.geometry import projected
-from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.dataset import SPLITS, DatasetFolder
 from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError, DatasetError
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.training.build import build_source
+from phd_exp.training.config import check
+from tests.support.foreign import write_kitti
 
 BOXED: dict[str, Any] = {"file_name": "wide.jpg", "fx": 300.0, "fy": 320.0, "cx": 70.0, "cy": 40.0, "z": 2.0}
 
@@ -119,6 +122,20 @@ def test_what_is_held_out_follows_what_is_trained_on(
     assert own.depth.mu_z0 == pytest.approx(math.sqrt(ratio.max() * ratio.min())), "of those trained on alone"
 
 
+def test_a_type_of_kitti_is_a_source(composed: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
+    for split in SPLITS:
+        write_kitti(tmp_path / split)
+    words = ("preset=smoke", "data=folder", f"data.folder={tmp_path}", "data.batch_size=2", "data.object=Car")
+    own = build_source(check(composed(*words)).data)
+    assert own.count("train") == 2
+    assert own.known("train")["truncation"] == [0.25, 0]
+    assert own.known("test")["visibility"] == [1 / 3, None]
+    for row, detection in zip(
+        own.samples("test").xyz, DetectionFolder(tmp_path, "Car").detections("test"), strict=True
+    ):
+        assert float(row.norm()) == pytest.approx(float(np.linalg.norm(detection.position)))
+
+
 def test_something_must_be_left_to_train_on(photos: DetectionFolder) -> None:
     with pytest.raises(ConfigError, match=r"data.n_held_out: got 3, but .* has 3 detections"):
         FolderSource(photos, None, 3, None, 48)
@@ -150,6 +167,36 @@ def test_a_changed_line_is_never_served_the_old_crop(photos: DetectionFolder, ke
     after = images(photos)
     assert not np.array_equal(after[0], before[0])
     np.testing.assert_array_equal(after[2], before[2])
+
+
+def test_a_camera_file_gives_the_lens_and_a_changed_one_new_crops(photos: DetectionFolder) -> None:
+    """The label of a position is its place in the view, and a position that the lens cannot show is refused."""
+    numbers = {
+        "K": [300, 0, 69.5, 0, 320, 39.5, 0, 0, 1],
+        "width": 160,
+        "height": 90,
+        "distortion_model": "equidistant",
+    }
+    line = {"fx": None, "fy": None, "cx": None, "cy": None, "camera": "lens.yaml"}
+    before = images(photos)
+    change_line(photos, **line)
+    crops = []
+    for k1 in (0.0, 0.3):
+        (photos.root / "train" / "lens.yaml").write_text(json.dumps(numbers | {"D": [k1, 0, 0, 0]}))
+        crops.append(images(photos))
+        crop = source(photos).crops["train"][0]
+        np.testing.assert_allclose(crop.camera.to_real(crop.xyz), [0.1, 0.0, 2.0], atol=1e-12)
+        angle = math.atan(0.1 / 2)
+        place = [70 + 300 * angle * (1 + k1 * angle**2), 40]
+        np.testing.assert_allclose(crop.camera.real_pixels(crop.xyz[:2] / crop.xyz[2]), place, atol=1e-9)
+    assert not np.array_equal(crops[0][0], before[0])
+    assert not np.array_equal(crops[0][0], crops[1][0])
+    np.testing.assert_array_equal(crops[1][1:], before[1:])
+    change_line(photos, z=-2.0)
+    with pytest.raises(
+        DatasetError, match=r"line 1: the position \[0.1, 0.0, -2.0\] is far outside the image of 160 x 90"
+    ):
+        source(photos)
 
 
 def test_a_changed_image_of_the_same_name_and_time_is_never_served_from_the_cache(photos: DetectionFolder) -> None:

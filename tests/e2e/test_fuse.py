@@ -202,7 +202,7 @@ LINES = [
 ARGUMENTS = [
     (
         ("run=nowhere",),
-        "folder: missing; fuse takes run=, recalibrate=, coverage=, trust=, views=, folder=, plane=, ",
+        "folder: missing; fuse takes run=, recalibrate=, coverage=, trust=, views=, folder=, object=, plane=, ",
     ),
     (("run=nowhere", "folder=."), "nowhere: no run; expected a folder with config.yaml"),
     (("run=nowhere", "folder=.", "plane=1,2,3"), "plane: got '1,2,3'; expected plane=NX,NY,NZ,OFFSET"),

@@ -82,7 +82,7 @@ def test_a_run_on_other_data_is_never_reused(train: Callable, photos: Path, runs
     metadata.write_text(before)
     assert outcome.status == 1
     (line,) = outcome.err.splitlines()
-    assert "as it was before its metadata.jsonl changed" in line
+    assert "as it was before its annotations changed" in line
     run = only_run(tmp_path / "runs")
     config = run.config()
     assert config["data"]["folder"] == str(photos)

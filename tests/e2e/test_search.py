@@ -53,26 +53,26 @@ def test_other_values_are_refused(text: str) -> None:
 
 
 def test_the_best_trial_is_the_best_on_held_out_samples(search: Callable, phd_exp: Callable) -> None:
-    outcome = search("trials=3")
+    outcome = search("trials=2")
     assert outcome.status == 0, outcome.err
     (found,) = read_searches(Path("runs"))
-    assert [trial.state for trial in found.trials] == ["finished"] * 3
+    assert [trial.state for trial in found.trials] == ["finished"] * 2
     for trial in found.trials:
         assert trial.value == pytest.approx(read_table(RunFolder(Path(trial.run)).held_out)["nll"][CHOOSE].mean())
         assert str(RunFolder(Path(trial.run)).config()["optimizer"]["lr"]) == trial.overrides["optimizer.lr"]
     assert found.best is not None
     assert found.best.value == min(trial.value or 0 for trial in found.trials)
     assert found.best.run in outcome.out.splitlines()[-1]
-    more = search("trials=4")
+    more = search("trials=3")
     assert more.out.count("trial ") == 1
-    assert "trial 4/4" in more.out
+    assert "trial 3/3" in more.out
     (longer,) = read_searches(Path("runs"))
-    assert len({trial.overrides["optimizer.lr"] for trial in longer.trials}) == 4, "no value is drawn again"
+    assert len({trial.overrides["optimizer.lr"] for trial in longer.trials}) == 3, "no value is drawn again"
     assert phd_exp("report").status == 0
     page = Path("report/site/index.html").read_text()
-    assert "Search space: 4 finished" in page
+    assert "Search space: 3 finished" in page
     assert "space: importance of keys" in page
-    assert len(Path("report/tables/searches.csv").read_text().splitlines()) == 5
+    assert len(Path("report/tables/searches.csv").read_text().splitlines()) == 4
 
 
 def test_an_interrupted_trial_is_resumed(search: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -90,14 +90,14 @@ def test_an_interrupted_trial_is_resumed(search: Callable, monkeypatch: pytest.M
             signal.raise_signal(signal.SIGTERM)
 
     monkeypatch.setattr(Pruning, "on_validation_end", stop)
-    assert search("trials=3").status == 143
+    assert search("trials=2").status == 143
     (before,) = read_searches(Path("runs"))
     assert [trial.state for trial in before.trials] == ["finished"]
-    outcome = search("trials=3")
+    outcome = search("trials=2")
     assert outcome.status == 0, outcome.err
-    assert next(line for line in outcome.out.splitlines() if line.startswith("trial ")).startswith("trial 2/3")
+    assert next(line for line in outcome.out.splitlines() if line.startswith("trial ")).startswith("trial 2/2")
     (after,) = read_searches(Path("runs"))
-    assert [trial.state for trial in after.trials] == ["finished"] * 3
+    assert [trial.state for trial in after.trials] == ["finished"] * 2
     assert after.trials[0] == before.trials[0]
 
 

@@ -10,7 +10,14 @@ import torch
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import coordinates, distribution_columns, draws
-from phd_exp.evaluation.predictions import Evaluation, evaluate, fit_temperature, recalibrated
+from phd_exp.evaluation.predictions import (
+    ERRORS,
+    OF_DISTANCE,
+    Evaluation,
+    evaluate,
+    fit_temperature,
+    recalibrated,
+)  # fmt: skip
 from phd_exp.metrics.calibration import calibration_curve
 from phd_exp.metrics.calibration_scores import exact_scores
 from phd_exp.metrics.errors import depth_error, projected_error
@@ -44,6 +51,8 @@ def table() -> Callable[..., dict[str, np.ndarray]]:
         values = coordinates("", xyz) | coordinates("mode_", claim.mode) | distribution_columns(claim, xyz)
         values["projected_error_mm"] = 1000 * projected_error(xyz, claim.mode)
         values["depth_error_mm"] = 1000 * depth_error(xyz, claim.mode)
+        values["ale_m"] = (claim.mode.norm(dim=-1) - xyz.norm(dim=-1)).abs()
+        values["relative_error"] = 100 * values["ale_m"] / xyz.norm(dim=-1)
         values["energy_score"] = energy_score(draws(claim, 64, seed=3), xyz)
         visibility = np.linspace(0, 1, N)
         visibility[:10] = math.nan
@@ -63,7 +72,7 @@ def test_scores_are_those_of_the_metrics(perfect: Evaluation, table: Callable) -
     assert perfect.scores.keys() == {name for name in SCORES if name not in OF_SHIFTS}
     exact = exact_scores({name: torch.from_numpy(columns[name]) for name in columns if name != "file_name"})
     assert exact.pop("left_out") == perfect.left_out == 0
-    means = {name: columns[name].mean() for name in ("projected_error_mm", "depth_error_mm", "nll")}
+    means = {name: columns[name].mean() for name in (*ERRORS, *OF_DISTANCE, "nll")}
     for name, value in (exact | means).items():
         assert perfect.scores[name].value == pytest.approx(value), name
     assert perfect.scores["energy_score_mm"].value == pytest.approx(1000 * columns["energy_score"].mean())

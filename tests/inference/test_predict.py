@@ -14,11 +14,16 @@ import torch
 from PIL import Image
 
 import phd_exp as package
+from phd_exp.data.crops import cut
 from phd_exp.distributions import PointEstimate, ProjectedHuber
+from phd_exp.geometry import Lens, VirtualCamera, intrinsics
 from phd_exp.inference import pictures
+from phd_exp.inference.predictor import View
+from phd_exp.records.detections import detections_in
 from phd_exp.records.errors import DatasetError, RunError
 from phd_exp.records.runs import RunFolder
-from tests.support.untrained import SMALL, read_lines, untrained, virtual_cameras, write_photos
+from tests.support.foreign import WRITERS
+from tests.support.untrained import SIDE, SMALL, read_lines, untrained, virtual_cameras, write_photos
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +99,20 @@ def test_a_baseline_has_positions_without_uncertainty(
         assert said in refused.err
 
 
+@pytest.mark.parametrize("name", WRITERS)
+def test_other_formats_are_predicted_as_lines(phd_exp: Callable, run: RunFolder, tmp_path: Path, name: str) -> None:
+    """The same answers as for a metadata.jsonl that says the same."""
+    folder = WRITERS[name](tmp_path / "test")
+    words = ("predict", f"run={run.path}", f"folder={folder}")
+    found = phd_exp(*words)
+    assert (found.status, found.err) == (0, "")
+    lines = [detection.line.model_dump_json(exclude_none=True) for detection in detections_in(folder)]
+    (folder / "metadata.jsonl").write_text("\n".join(lines))
+    assert found.out == phd_exp(*words).out
+    refused = phd_exp("predict", f"run={run.path}", "image=a.png", "f=900", "object=5")
+    assert refused.err == "error: object: selects detections of folder=DIR; leave it out for image=FILE\n"
+
+
 def test_one_image_is_the_line_of_a_folder_and_is_drawn(
     phd_exp: Callable, run: RunFolder, photos: Path, tmp_path: Path
 ) -> None:
@@ -147,6 +166,55 @@ def test_every_line_has_its_own_picture(
     assert len(read_lines((tmp_path / "broken" / "predictions.jsonl").read_text())) == 1
 
 
+def camera_file(path: Path, coefficients: list[float], **changes: Any) -> str:
+    """A camera file for the first photograph, 90 x 120 pixels."""
+    K = [300.0, 0.0, 49.5, 0.0, 310.0, 39.5, 0.0, 0.0, 1.0]
+    values = {"width": 90, "height": 120, "K": K, "D": coefficients, "distortion_model": "plumb_bob"} | changes
+    path.write_text(json.dumps(values))  # JSON is YAML
+    return f"camera={path}"
+
+
+def test_answers_and_curves_go_through_the_lens(
+    phd_exp: Callable, run: RunFolder, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without distortion as with fx, fy, cx, cy; else turned into the frame of the real camera."""
+    marks: list[np.ndarray] = []
+    plot = pictures.Axes.plot
+
+    def kept(self: pictures.Axes, *points: Any, **how: Any) -> Any:
+        marks.extend([np.array(points[:2])] if points[2:] == ("x",) else [])
+        return plot(self, *points, **how)
+
+    monkeypatch.setattr(pictures.Axes, "plot", kept)
+    words = ("predict", f"run={run.path}", f"image={photos / '0.png'}", "box=5,10,60,70")
+    (pinhole,) = read_lines(phd_exp(*words, "fx=300", "fy=310", "cx=50", "cy=40").out)
+    (same,) = read_lines(phd_exp(*words, camera_file(tmp_path / "none.yaml", [0.0] * 5)).out)
+    assert same == pinhole
+    bent = camera_file(tmp_path / "bent.yaml", [-0.9, 0.4, 0.01, -0.02])
+    assert phd_exp(*words, bent, "out=drawn").status == 0
+    (row,) = read_lines((tmp_path / "drawn" / "predictions.jsonl").read_text())
+    K, lens = intrinsics(300.0, 310.0, 50.0, 40.0), Lens((-0.9, 0.4, 0.01, -0.02))
+    camera = VirtualCamera.of_box(K, (5.0, 10.0, 60.0, 70.0), float(SIDE), lens)
+    with Image.open(photos / "0.png") as image:
+        prediction = package.load(run.path).see(View(cut(image.convert("RGB"), camera), camera))
+    assert isinstance(prediction, ProjectedHuber)
+    np.testing.assert_allclose(row["mode"], camera.to_real(prediction.mode.numpy()), rtol=1e-4, atol=1e-5)
+    R, covariance = camera.R, prediction.covariance_matrix.numpy()
+    np.testing.assert_allclose(row["covariance"], R.T @ covariance @ R, rtol=1e-3, atol=1e-5)
+    drawn = K[:2, 2] + np.diagonal(K)[:2] * lens.distort(np.array(row["mode"]))
+    np.testing.assert_allclose(marks[0], drawn, rtol=1e-4)
+    for changes, said in (
+        (
+            {"coefficients": [-30.0, 0.0, 0.0, 0.0]},
+            "the lens folds over inside the image of 90 x 120 pixels, 6.0 degrees",
+        ),
+        ({"coefficients": [0.0] * 5, "width": 180}, "is for images of 180 x 120 pixels; this image has 90 x 120"),
+    ):
+        refused = phd_exp(*words, camera_file(tmp_path / "bad.yaml", **changes))
+        assert (refused.status, refused.out, len(refused.err.splitlines())) == (1, "", 1)
+        assert said in refused.err
+
+
 def test_from_python_arrays_of_any_size(run: RunFolder) -> None:
     predictor = package.load(run.path)
     images = np.random.default_rng(0).integers(0, 256, (3, 64, 64, 3), dtype=np.uint8)
@@ -174,6 +242,7 @@ MISTAKES = [
     (("folder=.",), "metadata.jsonl, line 2: expected either f, or fx and fy"),
     (("folder=dot",), "dot: cannot be read (Is a directory)"),
     (("folder=nowhere",), "nowhere/metadata.jsonl: cannot be read"),
+    (("image=good.png", "camera=no.yaml"), "no.yaml: No such file or directory; expected YAML"),
     (("image=good.png", "f=400", "run=nowhere"), "run: given twice"),
     (("imag=good.png",), "imag: unknown key, did you mean 'image'?"),
     (("good.png",), "good.png: expected key=value"),

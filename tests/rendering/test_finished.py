@@ -121,7 +121,7 @@ def test_an_image_of_another_kind_is_named(
 def test_another_data_set_and_none_are_refused(
     small: DatasetFolder, make_spec: Callable[..., DatasetSpec], tmp_path: Path
 ) -> None:
-    with pytest.raises(DatasetError, match="sensor_size=56, but sensor_size=224 is asked for"):
+    with pytest.raises(DatasetError, match=r"f_range=\(300.0, 500.0\), but f_range=\(1200.0, 2000.0\) is asked for"):
         verify(small, make_spec(), rerender=0)
     with pytest.raises(DatasetError, match="no data set here"):
         verify(DatasetFolder(tmp_path), make_spec(), rerender=0)
@@ -162,7 +162,7 @@ def test_a_mask_for_every_sample(rendered: DatasetFolder, tmp_path: Path) -> Non
 def test_masks_that_cannot_be_written_are_one_line(small: DatasetFolder, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(RenderError, match=r"masks=.*: lies in the data set itself"):
-        require_elsewhere(small, small.root / "train" / "masks")
+        require_elsewhere(small, masks=small.root / "train" / "masks")
     with pytest.raises(RenderError, match=r"cannot be written .* choose another masks=FOLDER"):
         write_masks(small, tmp_path / "file" / "masks")
     with pytest.raises(DatasetError, match="no data set here"):

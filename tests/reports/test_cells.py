@@ -76,22 +76,22 @@ def test_a_cell_without_a_number_has_a_reason(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("seeds", [2, 5])
 def test_equal_models_are_rarely_separated_and_different_ones_often(seeds: int) -> None:
-    """Means of two models on shared images, 200 times: errors of images are shared, those of trainings are not."""
+    """Means of two models on shared images, 100 times: errors of images are shared, those of trainings are not."""
     random = np.random.default_rng(seeds)
-    counts = random.multinomial(80, [1 / 80] * 80, 200) / 80
+    counts = random.multinomial(80, [1 / 80] * 80, 100) / 80
 
     def means(shift: float, images: np.ndarray) -> list[SampleMean]:
         trained = random.normal(100 + shift, 3, (seeds, 1)) + images + random.normal(0, 5, (seeds, 80))
         return [SampleMean(80, errors.mean(), 1.0, counts @ errors) for errors in trained]
 
     separated = {0.0: 0, -30.0: 0}
-    for _ in range(200):
+    for _ in range(100):
         images = random.normal(0, 40, 80)  # hard and easy ones: alike for both models
         for shift in separated:
             gap, half_width = difference(means(shift, images), means(0.0, images))
             separated[shift] += abs(gap) > half_width
-    assert separated[0.0] / 200 <= 0.05 + 4 * np.sqrt(0.05 * 0.95 / 200)
-    assert separated[-30.0] / 200 > 0.85
+    assert separated[0.0] / 100 <= 0.05 + 4 * np.sqrt(0.05 * 0.95 / 100)
+    assert separated[-30.0] / 100 > 0.85
 
 
 def test_one_seed_is_never_separated() -> None:

@@ -135,6 +135,23 @@ def read(runs: Path, name: str = "table1", reading: str = "whole", preset: str =
     return one(paper_tables(read_report(runs)), name, reading, preset)
 
 
+def test_eight_views_have_a_line_if_they_are_recorded(tmp_path: Path) -> None:
+    drawn = predicted(0)
+    folders = [record(tmp_path, "default", "probabilistic", seed, drawn.frame) for seed in (0, 1)]
+    names = [row.stub for row in read(tmp_path).rows]
+    exact = drawn.frame.assign(
+        mode_z=1.01 * drawn.frame["z"], **{f"mode_{axis}": 1.01 * drawn.frame[axis] for axis in "xy"}
+    )
+    exact.to_parquet(folders[0].eight_views["test"])
+    table = read(tmp_path)
+    added = [row for row in table.rows if row.stub not in names]
+    assert [row.stub for row in added] == [("probabilistic (eight views)", error) for error in ("projected", "depth")]
+    truth = drawn.frame[["x", "y", "z"]].to_numpy()
+    assert added[0].cells[0].ours == "0.0"
+    assert added[1].cells[0].ours == f"{10 * np.linalg.norm(truth, axis=1).mean():.0f}"
+    assert "(seed 1): no eight views" in "".join(table.gaps)
+
+
 def peripheral(drawn: Predicted) -> pd.DataFrame:
     """The samples outside the central half."""
     return drawn.frame[(np.abs(drawn.v_p) > 0.5).any(axis=1)]

@@ -77,8 +77,19 @@ def test_a_point_estimate_has_errors_alone(batch: Batch) -> None:
     estimate = PointEstimate(chart.coordinates(batch.xyz, batch.camera), chart, batch.camera)
     table = columns(estimate, batch)
     assert "nll" not in table
-    assert summary(table).keys() == {"test/projected_error_mm", "test/depth_error_mm"}
+    errors = ("projected_error_mm", "depth_error_mm", "ale_m", "relative_error")
+    assert summary(table).keys() == {f"test/{name}" for name in errors}
     assert table["projected_error_mm"].max() < 0.01
+
+
+def test_the_error_of_the_distance_is_measured_from_the_camera(batch: Batch) -> None:
+    """Estimates on a sphere around the camera have none; estimates on the true ray have that of their distance."""
+    chart, distance = Projected(DEPTH), batch.xyz.norm(dim=-1).double()
+    turned = batch.xyz[:, [1, 0, 2]]
+    for estimate, expected in ((turned, 0.0), (1.1 * batch.xyz, 10.0)):
+        table = columns(PointEstimate(chart.coordinates(estimate, batch.camera), chart, batch.camera), batch)
+        torch.testing.assert_close(table["ale_m"], expected / 100 * distance, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(table["relative_error"], 100 * table["ale_m"] / distance, rtol=1e-4, atol=1e-5)
 
 
 def test_curves_of_samples_of_the_distribution_itself_are_calibrated() -> None:

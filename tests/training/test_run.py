@@ -22,6 +22,7 @@ from phd_exp.training.config import check
 from phd_exp.training.module import PositionModule
 from phd_exp.training.progress import Progress
 from phd_exp.training.recorder import Recorder
+from phd_exp.training.run import require_same_config
 from tests.e2e.runs import weights
 from tests.support.recorded import once
 
@@ -83,6 +84,17 @@ def test_every_model_leaves_a_whole_record(run: RunFolder, model: str) -> None:
         assert all(math.isfinite(value) for value in row.values())
     scores = {f"test/calibration/{name}" for name in CALIBRATION}
     assert scores & row.keys() == (scores if model == "probabilistic" else set())
+
+
+def test_a_key_that_an_older_record_lacks_had_its_default(composed: Callable, tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    config = check(composed("preset=smoke", "recipe=strong"))
+    stored = config.model_dump(mode="json")
+    del stored["recipe"]["coarse"]
+    folder.write_config(stored)
+    require_same_config(folder, config)
+    with pytest.raises(RunError, match=r"recipe.coarse=nothing, but recipe.coarse=0.5 is asked for"):
+        require_same_config(folder, check(composed("preset=smoke", "recipe=strong", "recipe.coarse=0.5")))
 
 
 def test_results_are_those_of_the_last_epoch_and_of_the_predictions(run: RunFolder, model: str) -> None:

@@ -10,10 +10,10 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, Field, StrictBool, ValidationError, ValidationInfo, model_validator
 
-from phd_exp.records.choices import flatten, setting
+from phd_exp.records.choices import flatten
 from phd_exp.records.errors import ConfigError, gist, shown
 from phd_exp.records.parsing import Record
-from phd_exp.records.spec import DatasetSpec, Shard
+from phd_exp.records.spec import Shard
 from phd_exp.training.config import sections
 from phd_exp.training.config.sections import FolderConfig, RenderedConfig, SourceConfig
 from phd_exp.training.config.targets import Target, TrainingTarget, TrainingTargets, Trust, describe, is_typed, locate
@@ -33,6 +33,7 @@ class RenderConfig(Record):
     verify: StrictBool
     rerender: sections.Natural
     masks: sections.Folder | None
+    bop: sections.Folder | None
 
 
 class RunConfig(Record):
@@ -52,11 +53,6 @@ class RunConfig(Record):
     logger: TrainingTargets
     callbacks: TrainingTargets = Field(default_factory=dict)
     evaluation: sections.EvaluationConfig
-
-    @property
-    def setting(self) -> str:
-        """Preset and recipe in one word, the first level of the run's folder."""
-        return setting(self.preset, self.recipe.name)
 
     @model_validator(mode="after")
     def parts_fit(self, info: ValidationInfo) -> "RunConfig":
@@ -115,10 +111,18 @@ class RunConfig(Record):
                     raise ValueError(f"data={data.name} is not rendered; leave out this shift")
                 return data
             named = {"variant": f"{data.name}-{shift}"} if changes else {}
-            spec = DatasetSpec(**(dict(data.spec) | named | changes))
+            return data.changed(named | changes, n or data.n_test)
         except ValueError as error:
             raise ConfigError(f"evaluation.shifts.{shift}.data: {gist(error)}") from None
-        return data.model_copy(update={"spec": spec, "n_test": n or data.n_test})
+
+    @property
+    def several_views(self) -> RenderedConfig | None:
+        """The scenes with several cameras that follow the training, as test samples of a data set."""
+        asked, data = self.evaluation.multiview, self.data
+        if asked is None or asked.scenes == 0 or not isinstance(data, RenderedConfig):
+            return None
+        changes = {"variant": "multiview", "views": asked.views, "view_angle_range": asked.angle_range}
+        return data.changed(changes, asked.scenes * asked.views)
 
     @model_validator(mode="after")
     def several_views_fit(self) -> "RunConfig":

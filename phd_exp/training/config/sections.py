@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, StrictBool, Tag, model_validator
 
+from phd_exp.records.detections import NumberOrName
 from phd_exp.records.parsing import Record
 from phd_exp.records.spec import Angle, DatasetSpec, Range
 from phd_exp.training.config.targets import Target, TrainingTarget
@@ -69,12 +70,18 @@ class RenderedConfig(SizesConfig):
         """The folder of the data set."""
         return self.root / self.spec.variant
 
+    def changed(self, changes: dict[str, Any], n_test: int) -> "RenderedConfig":
+        """The first `n_test` test samples of the data set with other values. Raises ValueError for wrong ones."""
+        spec = DatasetSpec(**(dict(self.spec) | changes))
+        return self.model_copy(update={"spec": spec, "n_test": n_test})
+
 
 class FolderConfig(SizesConfig):
-    """A folder of the user's own images; `name` names its runs."""
+    """A folder of the user's own images; `name` names its runs, `object` selects detections."""
 
     name: Name
     folder: Folder
+    object: NumberOrName | None = None  # default for older run records
 
 
 class SourceConfig(SizesConfig):
@@ -172,6 +179,7 @@ class RecipeConfig(Record):
     warmup_steps: Natural
     localisation: Annotated[float, Field(ge=0, le=1000)]
     exposure: StrictBool = False  # default for older run records
+    coarse: Annotated[float, Field(ge=0, le=1)] = 0.0  # default for older run records
     augmentation: AugmentationConfig
 
 
@@ -181,11 +189,6 @@ class MultiviewConfig(Record):
     scenes: Natural
     views: Annotated[Whole, Field(ge=2, le=64)]
     angle_range: Annotated[tuple[Angle, Angle], Range]
-
-    def spec_beside(self, spec: DatasetSpec) -> DatasetSpec:
-        """The data set of several views that otherwise equals `spec`."""
-        changes = {"variant": "multiview", "views": self.views, "view_angle_range": self.angle_range}
-        return DatasetSpec(**(spec.model_dump() | changes))
 
 
 Times = Annotated[float, Field(ge=0.1, le=100)]

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Tag, TypeAdapter, Va
 from pydantic.errors import PydanticSchemaGenerationError
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from phd_exp.records.errors import complaint, in_our_words, in_user_code, nearest, shown
+from phd_exp.records.errors import complaint, in_user_code, nearest, shown
 
 OURS = tuple(f"phd_exp.{room}" for room in ("models", "losses", "optimizers", "geometry", "distributions"))
 KNOWN = (*OURS, "torch.optim", "lightning")
@@ -174,7 +174,7 @@ def _check_value(path: str, value: Any, annotation: Any) -> None:
     try:
         adapter.validate_python(value)
     except ValidationError as error:
-        raise _error(path, f"got {shown(value)}; {in_our_words(error.errors()[0]['msg'])}") from None
+        raise _error(path, complaint("", error.errors()[0])) from None
 
 
 def _error(path: str, reason: str) -> PydanticCustomError:

@@ -1,0 +1,166 @@
+"""Annotations in the formats of BOP, KITTI and COCO, as the values of `DetectionLine`s.
+
+    BOP      <folder>/000000/scene_gt.json, scene_gt_info.json, scene_camera.json, and rgb/000000.png or gray/
+    KITTI    <folder>/label_2/000000.txt, calib/000000.txt, image_2/000000.png
+    COCO     <folder>/../annotations/instances_<name of the folder>.json, and the images in the folder
+
+COCO has no cameras and no positions: `camera`, of an image or at the top for all, has the keys f, or fx and fy, cx
+and cy, and an annotation may have `position` [x, y, z]. BOP and KITTI count pixels from the centre of the first one,
+COCO and a `DetectionLine` from its corner.
+
+Source: bop_toolkit, docs/bop_datasets_format.md (scripts/calc_gt_info.py for the width of a box) and BlenderProc,
+CameraUtility.py (the principal point); readme of KITTI's object development kit; cocodataset.org/#format-data.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from phd_exp.records.errors import DatasetError, gist
+from phd_exp.records.files import MB, read_plain
+from phd_exp.records.parsing import parse_json
+
+Entry = tuple[str, str, dict[str, Any]]
+"""A place for messages, the name of an object, and the values of its `DetectionLine`."""
+CORNER = 0.5  # px from the corner of the first pixel to its centre
+METRE = 1000.0  # mm
+VISIBILITY = {0.0: 1.0, 1.0: 2 / 3, 2.0: 1 / 3}  # of KITTI's levels of occlusion, not measured; level 3 is unknown
+LARGEST = 1000 * MB  # bytes of a file; the instances of COCO's training images have 450 MB
+
+
+def format_of(folder: Path) -> tuple[list[Path], Callable[[Path], Iterator[Entry]]] | None:
+    """The annotation files of a folder and the reader of their format; None if it is none of the three."""
+    if files := sorted(folder.glob("*/scene_*.json")):
+        return files, _bop
+    if files := sorted(folder.glob("label_2/*.txt")):
+        return [*files, *sorted(folder.glob("calib/*.txt"))], _kitti
+    return ([_instances(folder)], _coco) if _instances(folder).exists() else None
+
+
+def _bop(folder: Path) -> Iterator[Entry]:
+    """The visible instances; positions are those of the models' origins, boxes contain what a detector could find."""
+    for file in sorted(folder.glob("*/scene_gt.json")):
+        cameras, infos, scene = (_read(file.with_name(f"scene_{name}.json")) for name in ("camera", "gt_info", "gt"))
+        kind = "rgb" if file.with_name("rgb").exists() else "gray"
+        images = _images(file.with_name(kind))
+        with _reading(f"{file} and scene_gt_info.json"):
+            pairs = {image: list(zip(items, infos[image], strict=True)) for image, items in scene.items()}
+            objects = [(image, *found) for image, items in pairs.items() for found in enumerate(items)]
+        for image, number, (item, info) in objects:
+            with _reading(where := f"{file.parent}, image {image}, object {number}"):
+                camera, model = cameras[image], item["obj_id"]
+                left, top, width, height = info["bbox_visib"]
+                if width < 0:  # invisible objects have the box -1, -1, -1, -1
+                    continue
+                values = {
+                    "file_name": f"{file.parent.name}/{images[f'{kind}/{int(image):06d}']}",
+                    "box": [left, top, left + width + 1, top + height + 1],  # a width is last minus first column
+                    **dict(zip("xyz", (value / METRE for value in item["cam_t_m2c"]), strict=True)),
+                    "visibility": info["visib_fract"],
+                    "scale": item.get("scale"),  # written by `rendering/bop.py`
+                }
+                if "cam_R_w2c" in camera:
+                    translation = [value / METRE for value in camera["cam_t_w2c"]]
+                    values["pose"] = {"rotation": _quaternion(camera["cam_R_w2c"]), "translation": translation}
+                    rank = sum(other["obj_id"] == model for other in scene[image][:number])
+                    values["scene"] = f"{file.parent.name}/{model}/{rank}"
+                yield where, str(model), _pinhole(camera["cam_K"]) | values
+
+
+def _kitti(folder: Path) -> Iterator[Entry]:
+    """All objects except `DontCare`; positions are centres of 3-D boxes in the frame of the left colour camera.
+
+    A label is the centre of the bottom in the frame of the reference camera, which P2 = K [I | t] maps to the image.
+    """
+    images = _images(folder / "image_2")
+    for file in sorted(folder.glob("label_2/*.txt")):
+        calibration = folder / "calib" / file.name
+        with _reading(f"{calibration}, P2"):
+            rows = dict(line.split(":", 1) for line in _read(calibration, str.splitlines) if ":" in line)
+            K, last = np.split(np.array(rows["P2"].split(), dtype=float).reshape(3, 4), [3], axis=1)
+            camera, t = _pinhole(K.ravel().tolist()), np.linalg.solve(K, last).ravel()
+        for number, line in enumerate(_read(file, str.splitlines), start=1):
+            with _reading(where := f"{file}, line {number}"):
+                name, *words = line.split() or ["DontCare"]
+                if name == "DontCare":
+                    continue
+                truncated, occluded, _, *box, h, _, _, x, y, z, _ = map(float, words[:14])
+                left, top, right, bottom = (value + CORNER for value in box)
+                values = {
+                    "file_name": images[f"image_2/{file.stem}"],
+                    "box": [left, top, right, bottom],
+                    **dict(zip("xyz", np.add(t, (x, y - h / 2, z)).tolist(), strict=True)),
+                    "visibility": VISIBILITY.get(occluded),
+                    "truncation": truncated if truncated >= 0 else None,
+                }
+                yield where, name, camera | values
+
+
+def _coco(folder: Path) -> Iterator[Entry]:
+    """All annotations except crowds."""
+    file = _instances(folder)
+    content = _read(file)
+    with _reading(file):
+        images = {image["id"]: image for image in content["images"]}
+        names = {category["id"]: str(category["name"]) for category in content["categories"]}
+        items = list(enumerate(content["annotations"]))
+    for number, item in items:
+        with _reading(where := f"{file}, annotation {number}"):
+            if item.get("iscrowd"):
+                continue
+            image = images[item["image_id"]]
+            values = dict(zip("xyz", item["position"], strict=True)) if "position" in item else {}
+            values |= {"file_name": image["file_name"], "box": edges(item["bbox"])}
+            yield where, names[item["category_id"]], (image.get("camera") or content["camera"]) | values
+
+
+def edges(bbox: Sequence[float]) -> list[float]:
+    """Left, top, right, bottom of COCO's box [x, y, width, height]. Raises ValueError unless it has four numbers."""
+    x, y, width, height = bbox
+    return [x, y, x + width, y + height]
+
+
+def _instances(folder: Path) -> Path:
+    return folder.absolute().parent / "annotations" / f"instances_{folder.absolute().name}.json"
+
+
+@contextmanager
+def _reading(where: Path | str) -> Iterator[None]:
+    """Turn whatever is wrong with a file into one line."""
+    try:
+        yield
+    except (OSError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        reason = f"{gist(error)} is missing" if isinstance(error, KeyError) else gist(error)
+        rule = "see `Standard formats` in docs/guides/own_images.md"
+        raise DatasetError(f"{where}: cannot be read ({reason}); {rule}") from None
+
+
+def _read(file: Path, parse: Callable[[str], Any] = parse_json) -> Any:
+    with _reading(file):
+        return parse(read_plain(file, LARGEST).decode())
+
+
+def _images(folder: Path) -> dict[str, str]:
+    """Path without suffix -> path of the images of a folder, in its parent."""
+    return {f"{folder.name}/{file.stem}": f"{folder.name}/{file.name}" for file in sorted(folder.glob("*.*"))}
+
+
+def _pinhole(K: Sequence[float]) -> dict[str, float]:
+    """fx, fy, cx, cy, given the rows of K."""
+    fx, skew, cx, zero, fy, cy, *last = K
+    if [skew, zero, *last] != [0, 0, 0, 0, 1]:
+        raise ValueError("expected a camera without skew: fx, 0, cx, 0, fy, cy, 0, 0, 1")
+    return {"fx": fx, "fy": fy, "cx": cx + CORNER, "cy": cy + CORNER}
+
+
+def _quaternion(rows: Sequence[float]) -> list[float]:
+    """(w, x, y, z) of a rotation matrix."""
+    from scipy.spatial.transform import Rotation  # imported slowly, and few data sets need it
+
+    rotation = Rotation.from_matrix(np.reshape(rows, (3, 3)))
+    if np.abs(rotation.as_matrix().ravel() - rows).max() > 1e-3:
+        raise ValueError("cam_R_w2c: expected the rows of a rotation matrix")
+    return [float(value) for value in rotation.as_quat(scalar_first=True)]

@@ -1,0 +1,126 @@
+"""Write a rendered data set in the format of BOP, which `records/foreign.py` reads.
+
+    <bop>/models/                  obj_000001.ply (cylinder), 2 (cube), 3 (sphere), and models_info.json, all in mm
+    <bop>/<split>/000000/          all images; of a data set with several views, those of one scene
+        mask_visib/000123_000001.png    white where image 123 shows its object 1
+
+Source: bop_toolkit, docs/bop_datasets_format.md, scripts/calc_gt_info.py and scripts/calc_model_info.py.
+"""
+
+import json
+from collections import defaultdict
+from itertools import groupby, pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from phd_exp.records.dataset import SPLITS, DatasetFolder
+from phd_exp.records.errors import writing
+from phd_exp.records.files import write_atomic
+from phd_exp.records.foreign import CORNER, METRE
+from phd_exp.records.images import content_of
+from phd_exp.records.scenes import SampleRecord
+from phd_exp.rendering import rays
+from phd_exp.rendering.meshes import build_mesh
+from phd_exp.rendering.pixels import file_of
+from phd_exp.rendering.progress import shown_progress
+
+NUMBERS: dict[str, int] = {"cylinder": 1, "cube": 2, "sphere": 3}
+ROUND_ABOUT = {"cylinder": [[0, 0, 1]], "cube": [], "sphere": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}
+
+
+def write_bop(folder: DatasetFolder, bop: Path) -> int:
+    """Write all samples of a data set as BOP, the images byte for byte; returns how many.
+
+    An object has the additional key `scale`, the factor on the size of its model.
+
+    Raises DatasetError if there is no data set, or a broken one, RenderError if files cannot be written.
+    """
+    records = [record for split in SPLITS for record in folder.records(split)]
+    several = folder.manifest.spec.views > 1
+    with writing(bop, instead="bop=FOLDER"), shown_progress(len(records), "writing BOP") as advance:
+        for (split, scene), images in groupby(records, lambda record: (record.split, several * record.scene)):
+            target, tables = bop / split / f"{scene:06d}", defaultdict[str, dict[int, Any]](dict)
+            for name in ("rgb", "mask_visib"):
+                (target / name).mkdir(parents=True, exist_ok=True)
+            for record in images:
+                content = content_of(folder.split_folder(split) / record.file_name)
+                write_atomic(target / "rgb" / record.file_name, content)
+                hits, numbers = rays.trace_pixels(record.shown), range(len(record.objects))
+                tables["gt"][record.index] = [_pose(record, number) for number in numbers]
+                tables["gt_info"][record.index] = [_write_mask(record, number, hits, target) for number in numbers]
+                tables["camera"][record.index] = _camera(record, several)
+                advance()
+            for name, table in tables.items():
+                write_atomic(target / f"scene_{name}.json", json.dumps(table))
+        (bop / "models").mkdir(parents=True, exist_ok=True)
+        sizes = {item.shape: METRE * np.array(item.dimensions) for record in records for item in record.objects}
+        models = {NUMBERS[shape]: _write_model(shape, size, bop / "models") for shape, size in sizes.items()}
+        write_atomic(bop / "models" / "models_info.json", json.dumps(models))
+    return len(records)
+
+
+def _camera(record: SampleRecord, several: bool) -> dict[str, Any]:
+    f, middle = record.f, record.S / 2 - CORNER
+    camera = {"cam_K": [f, 0, middle, 0, f, middle, 0, 0, 1], "depth_scale": 1.0}
+    world = {"cam_R_w2c": rays.rotation_matrix(record.pose.rotation).ravel().tolist()}
+    return camera | (world | {"cam_t_w2c": [METRE * value for value in record.pose.translation]} if several else {})
+
+
+def _pose(record: SampleRecord, number: int) -> dict[str, Any]:
+    item, rotation = record.objects[number], rays.rotation_matrix(record.pose.rotation)
+    return {
+        "obj_id": NUMBERS[item.shape],
+        "cam_R_m2c": (rotation @ rays.rotation_matrix(item.rotation)).ravel().tolist(),
+        "cam_t_m2c": (METRE * rays.in_camera_frame(np.array(item.position), record.pose)).tolist(),
+        "scale": item.scale,
+    }
+
+
+def _write_mask(record: SampleRecord, number: int, hits: rays.Hits, target: Path) -> dict[str, Any]:
+    """Write the mask of an object; returns its boxes and pixels, of which those outside the image are not visible."""
+    mask, (whole, rows, columns) = rays.cylinder_mask(hits, number), rays.silhouette(record.shown, number)
+    file = target / "mask_visib" / f"{record.index:06d}_{number:06d}.png"
+    write_atomic(file, file_of(Image.fromarray(np.uint8(255) * mask), "png"))
+    return {
+        "bbox_obj": _box(whole, columns.start, rows.start),
+        "bbox_visib": _box(mask),
+        "px_count_all": int(whole.sum()),
+        "px_count_valid": int(np.isfinite(hits.depths[number]).sum()),
+        "px_count_visib": int(mask.sum()),
+        "visib_fract": float(mask.sum() / max(whole.sum(), 1)),
+    }
+
+
+def _box(mask: rays.Mask, left: int = 0, top: int = 0) -> list[int]:
+    """First column and row, and the differences to the last ones; -1 if there is no pixel."""
+    rows, columns = np.nonzero(mask)
+    if not len(rows):
+        return [-1] * 4
+    return [int(value) for value in (columns.min() + left, rows.min() + top, np.ptp(columns), np.ptp(rows))]
+
+
+def _write_model(shape: str, size: np.ndarray, folder: Path) -> dict[str, Any]:
+    """Write the triangles of a shape as PLY; returns its size, and the rotations that do not change it."""
+    mesh = build_mesh(shape)
+    vertices = np.array(mesh.vertices) * size / 2
+    faces = [(3, face[0], *edge) for face in mesh.faces for edge in pairwise(face[1:])]
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz")
+    header += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    rows = (" ".join(map(str, row)) for row in (*vertices.round(6).tolist(), *faces))
+    write_atomic(folder / f"obj_{NUMBERS[shape]:06d}.ply", header + "\n".join(rows) + "\n")
+    info = {"diameter": float(2 * np.linalg.norm(vertices, axis=1).max())}  # all are symmetric about their centre
+    for axis, value in zip("xyz", size.tolist(), strict=True):
+        info |= {f"min_{axis}": -value / 2, f"size_{axis}": value}
+    kept = np.array([1, 1, 2]) if shape == "cylinder" else size
+    turns = np.tile(np.eye(4), (24, 1, 1))  # those of a cube, of which the identity is the only one with trace 4
+    turns[:, :3, :3] = Rotation.create_group("O").as_matrix().round()
+    keeps = np.isclose(abs(turns[:, :3, :3]) @ kept, kept).all(axis=1) & (turns.trace(axis1=1, axis2=2) < 4)
+    return info | {
+        "symmetries_discrete": turns[keeps].reshape(-1, 16).tolist(),
+        "symmetries_continuous": [{"axis": axis, "offset": [0, 0, 0]} for axis in ROUND_ABOUT[shape]],
+    }

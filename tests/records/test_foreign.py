@@ -1,0 +1,200 @@
+"""BOP, KITTI and COCO as detections: conventions against the formats' own equations, and each broken in many ways."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from phd_exp.records.dataset import SPLITS
+from phd_exp.records.detections import Detection, DetectionFolder, annotations, detections_in, observed
+from phd_exp.records.errors import DatasetError, UserError
+from tests.support.foreign import BOP, COCO, P2, PEDESTRIAN, TURN, WRITERS
+
+
+@pytest.fixture
+def read(tmp_path: Path) -> Callable[..., list[Detection]]:
+    """The detections of a folder in one of the formats."""
+
+    def read(name: str, object_name: int | str | None = None) -> list[Detection]:
+        if not (tmp_path / "test").exists():
+            WRITERS[name](tmp_path / "test")
+        return detections_in(tmp_path / "test", object_name=object_name)
+
+    return read
+
+
+def pixel(detection: Detection, width: int, height: int) -> tuple[float, float]:
+    """Where the position projects to, from the corner of the image, px."""
+    fx, fy, cx, cy = detection.focal_lengths_and_centre(width, height)
+    x, y, z = detection.position
+    return cx + fx * x / z, cy + fy * y / z
+
+
+def test_bop_positions_project_as_its_equation_says(read: Callable, tmp_path: Path) -> None:
+    """s p_i = K [R, t] p_m of the model's origin, p_i from the centre of a pixel; invisible objects are left out."""
+    found = read("bop")
+    pairs = [("0", 0), ("3", 0), ("3", 1)]
+    for detection, (image, number) in zip(found, pairs, strict=True):
+        t = np.array(BOP["scene_gt.json"][image][number]["cam_t_m2c"])
+        np.testing.assert_allclose(np.array(detection.position) * 1000, t, rtol=1e-15)
+        u, v, s = np.reshape(BOP["scene_camera.json"][image]["cam_K"], (3, 3)) @ t
+        np.testing.assert_allclose(pixel(detection, 120, 90), (u / s + 0.5, v / s + 0.5), rtol=1e-12)
+    assert [detection.file for detection in found] == [
+        tmp_path / "test/000002/rgb" / name for name in ("000000.png", "000003.jpg", "000003.jpg")
+    ]
+    # the first and last column and row of the visible pixels, here with their edges
+    assert [detection.line.box for detection in found] == [(10, 12, 41, 63), (60, 30, 61, 40), (20, 30, 40, 40)]
+    assert [detection.line.visibility for detection in found] == [0.75, 1, 1]
+
+
+def test_bop_cameras_with_poses_form_scenes_of_one_object_each(read: Callable) -> None:
+    plain, first, second = read("bop")
+    assert (plain.line.scene, plain.line.pose) == (None, None)
+    scenes = observed([first, second])
+    assert [scene.scene for scene in scenes] == ["000002/5/0", "000002/5/1"]
+    (pose,) = scenes[0].poses
+    w, x, y, z = pose.rotation
+    np.testing.assert_allclose(Rotation.from_quat([x, y, z, w]).as_matrix().ravel(), TURN, atol=1e-15)
+    assert pose.translation == (0.001, 2.0, 0.003)
+
+
+def test_kitti_positions_project_as_p2_says(read: Callable) -> None:
+    """y = P2 x for the middle of the 3-D box, whose bottom the label names: the baseline of P2 is in the position."""
+    found = read("kitti")
+    P = np.array(P2.split(), dtype=float).reshape(3, 4)
+    h, x, y, z = (float(PEDESTRIAN.split()[place]) for place in (8, 11, 12, 13))
+    u, v, s = P @ (x, y - h / 2, z, 1)
+    np.testing.assert_allclose(pixel(found[0], 1224, 370), (u / s + 0.5, v / s + 0.5), rtol=1e-12)
+    assert found[0].position[2] == pytest.approx(s)  # the depth in the frame of the left colour camera
+    left, top, right, bottom = found[0].box(1224, 370)
+    assert left < u / s < right
+    assert top < v / s < bottom
+    assert (left, bottom) == (712.4 + 0.5, 307.92 + 0.5)
+    assert [(d.line.visibility, d.line.truncation) for d in found] == [(1, 0), (1 / 3, 0.25), (None, 0)]
+
+
+def test_coco_boxes_cameras_and_positions(read: Callable) -> None:
+    cup, spoon = read("coco")
+    assert cup.box(120, 90) == (10.5, 20, 40.5, 60)
+    assert cup.focal_lengths_and_centre(120, 90) == (100, 101, 61, 44)
+    assert spoon.focal_lengths_and_centre(120, 90) == (110, 110, 60, 45)
+    assert cup.position == (0.1, 0, 2)
+    assert spoon.line.z is None
+
+
+@pytest.mark.parametrize(
+    ("name", "selected", "n", "names"),
+    [("bop", 5, 3, "5, 12"), ("kitti", "Car", 2, "Car, Pedestrian"), ("coco", "cup", 1, "cup, spoon")],
+)
+def test_an_object_is_selected(read: Callable, name: str, selected: int | str, n: int, names: str) -> None:
+    assert len(read(name, selected)) == len(read(name, str(selected))) == n
+    visible = names.removesuffix(", 12")
+    with pytest.raises(DatasetError, match=rf"/test: no object 'x' here; expected one of {visible}$"):
+        read(name, "x")
+
+
+def test_a_metadata_jsonl_comes_first_and_has_no_objects(read: Callable, tmp_path: Path) -> None:
+    read("bop")
+    (tmp_path / "test" / "metadata.jsonl").write_text('{"file_name": "a.png", "f": 900}\n')
+    assert [detection.line.f for detection in read("bop")] == [900]
+    with pytest.raises(DatasetError, match=r"no object '5' here; expected no object=, since metadata\.jsonl names"):
+        read("bop", 5)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_the_fingerprint_is_of_all_annotations(name: str, tmp_path: Path) -> None:
+    folder = DetectionFolder(tmp_path)
+    for split in SPLITS:
+        WRITERS[name](tmp_path / split)
+    files = [file for split in SPLITS for file in annotations(tmp_path / split)[0]]
+    prints = [folder.fingerprint()]
+    for file in files:
+        file.write_text(file.read_text() + "\n")
+        prints.append(folder.fingerprint())
+    assert len(set(prints)) == len(prints) == {"bop": 7, "kitti": 5, "coco": 3}[name]
+
+
+def bop(file: str, change: Callable[[Any], Any]) -> tuple[str, Callable[[Path], Any]]:
+    def spoil(folder: Path) -> None:
+        content = json.loads(json.dumps(BOP[file]))
+        change(content)
+        (folder / "000002" / file).write_text(json.dumps(content))
+
+    return "bop", spoil
+
+
+def kitti(folder: str, old: str, new: str) -> tuple[str, Callable[[Path], Any]]:
+    def spoil(root: Path) -> None:
+        file = root / folder / "000000.txt"
+        file.write_text(file.read_text().replace(old, new))
+
+    return "kitti", spoil
+
+
+def coco(change: Callable[[Any], Any]) -> tuple[str, Callable[[Path], Any]]:
+    def spoil(folder: Path) -> None:
+        content = json.loads(json.dumps(COCO))
+        change(content)
+        (folder.parent / "annotations" / "instances_test.json").write_text(json.dumps(content))
+
+    return "coco", spoil
+
+
+GT, INFO, CAMERA = "scene_gt.json", "scene_gt_info.json", "scene_camera.json"
+SKEW = [107.5, 1.0, 60, 0, 108.5, 45, 0, 0, 1]
+BAD = [
+    (("bop", lambda folder: (folder / "000002" / GT).write_text("{")), "cannot be read"),
+    (("bop", lambda folder: (folder / "000002" / CAMERA).unlink()), "No such file"),
+    (bop(GT, lambda gt: gt["3"][0].pop("cam_t_m2c")), "image 3, object 0: cannot be read .'cam_t_m2c' is missing"),
+    (bop(GT, lambda gt: gt["3"][0].update(cam_t_m2c=[0, 1])), "image 3, object 0: "),
+    (bop(GT, lambda gt: gt["3"][0].update(cam_t_m2c=[0, 0, -900])), r"image 3, object 0: z: got -0\.9"),
+    (bop(GT, lambda gt: gt["3"][0].update(cam_t_m2c=[0, 0, float("nan")])), "image 3, object 0: z: got nan"),
+    (bop(GT, lambda gt: gt.update({"4": gt["3"]})), "scene_gt_info.json: cannot be read .'4' is missing"),
+    (bop(GT, lambda gt: gt.update({"3": 1})), "cannot be read"),
+    (bop(INFO, lambda info: info["3"].pop()), "scene_gt_info.json: cannot be read .*shorter"),
+    (bop(CAMERA, lambda camera: camera.pop("3")), "image 3, object 0: cannot be read .'3' is missing"),
+    (bop(INFO, lambda info: info["3"][0].update(visib_fract=2)), "visibility: got 2"),
+    (bop(CAMERA, lambda camera: camera["3"].update(cam_K=SKEW)), "camera without skew"),
+    (bop(CAMERA, lambda camera: camera["3"].update(cam_K=SKEW[:8])), "object 0: cannot be read"),
+    (bop(CAMERA, lambda camera: camera["3"].update(cam_R_w2c=[1, 0, 0, 0, 1, 0, 0, 0.1, 1])), "a rotation matrix"),
+    (bop(CAMERA, lambda camera: camera["3"].pop("cam_t_w2c")), "'cam_t_w2c' is missing"),
+    (("bop", lambda folder: (folder / "000002/rgb/000003.jpg").unlink()), "image 3, .*'rgb/000003' is missing"),
+    (kitti("label_2", "1.47 8.41 0.01", "1.47"), "line 1: cannot be read"),
+    (kitti("label_2", "8.41", "far"), "line 1: cannot be read .could not convert string to float: 'far'"),
+    (kitti("label_2", "8.41", "-8.41"), r"line 1: z: got -8\.4"),
+    (kitti("label_2", "712.40 143.00", "810.73 143.00"), "line 1: box=.* positive size"),
+    (kitti("label_2", "Car 0.25", "Car 1.25"), r"line 3: truncation: got 1\.25"),
+    (kitti("calib", "P2: ", "P2: 1 "), "P2: cannot be read"),
+    (kitti("calib", "P2", "P3"), "P2: cannot be read .'P2' is missing"),
+    (kitti("calib", "7.070493e+02", "0"), "P2: cannot be read .Singular matrix"),
+    (("kitti", lambda folder: (folder / "calib/000000.txt").unlink()), "No such file"),
+    (("kitti", lambda folder: (folder / "image_2/000000.png").unlink()), "'image_2/000000' is missing"),
+    (("kitti", lambda folder: (folder / "label_2/000000.txt").write_bytes(b"\xff")), "cannot be read"),
+    (("coco", lambda folder: (folder.parent / "annotations/instances_test.json").write_text("[]")), "cannot be"),
+    (coco(lambda content: content.pop("images")), "'images' is missing"),
+    (coco(lambda content: content.pop("camera")), "annotation 1: cannot be read .'camera' is missing"),
+    (coco(lambda content: content["camera"].update(k1=0.1)), "annotation 1: k1: a line describes no lens"),
+    (coco(lambda content: content["annotations"][0].update(bbox=[1, 2, 3])), "annotation 0: cannot be read"),
+    (coco(lambda content: content["annotations"][0].update(bbox=[1, 2, 0, 3])), "annotation 0: box=.* positive size"),
+    (coco(lambda content: content["annotations"][0].update(image_id=1)), "annotation 0: .*1 is missing"),
+    (coco(lambda content: content["annotations"][0].update(position=[1, 2])), "annotation 0: cannot be read"),
+    (coco(lambda content: content["images"][1].update(file_name="../b.png")), "file_name='../b.png' leaves"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("broken", "said"), BAD, ids=[f"{broken[0]}: {said[:40]}" for broken, said in BAD])
+def test_a_broken_folder_is_one_line_that_names_the_file(
+    read: Callable, tmp_path: Path, broken: tuple[str, Callable[[Path], Any]], said: str
+) -> None:
+    name, spoil = broken
+    assert read(name)
+    spoil(tmp_path / "test")
+    with pytest.raises(UserError, match=said) as caught:
+        read(name)
+    assert str(caught.value).startswith(str(tmp_path))
+    assert {"bop": "/000002", "kitti": "/000000.txt", "coco": "/instances_test.json"}[name] in str(caught.value)
+    assert "\n" not in str(caught.value)
