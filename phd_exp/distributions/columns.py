@@ -55,20 +55,25 @@ def draws(distribution: ProjectedHuber | Shaped, n: int, seed: int) -> Float[Ten
 def calibration_columns(distribution: ProjectedHuber | Shaped, xyz: Float[Tensor, "samples 3"]) -> Columns:
     """What is predicted of each error and how the true position (metres) stands to it.
 
-    Variances and squared errors are m^2 (of depth, about its mean) and without unit (projected: of x/z plus of y/z);
     `level` is the credible level of the position, `depth_pit` the predicted probability of a smaller depth, and
-    `depth_crps` the score of the depth in metres.
+    `depth_crps` the score of the depth in metres; the others are `squared_error_columns`.
     """
-    z = xyz[:, 2]
-    off_centre = xyz[:, :2] / z[:, None] - distribution.mu_xy
+    return squared_error_columns(distribution, xyz) | {
+        "level": distribution.level(xyz),
+        "depth_pit": distribution.depth_cdf(xyz[:, 2]),
+        "depth_crps": distribution.depth_crps(xyz[:, 2]),
+    }
+
+
+def squared_error_columns(distribution: ProjectedHuber | Shaped, xyz: Float[Tensor, "*draws samples 3"]) -> Columns:
+    """Variances and squared errors: m^2 (of depth, about its mean), and without unit (projected: x/z plus y/z)."""
+    z = xyz[..., 2]
+    off_centre = xyz[..., :2] / z[..., None] - distribution.mu_xy
     return {
         "depth_variance": distribution.depth_variance,
         "depth_squared_error": (z - distribution.depth_mean).square(),
         "projected_variance": distribution.projected_covariance.diagonal(dim1=-2, dim2=-1).sum(-1),
         "projected_squared_error": off_centre.square().sum(-1),
-        "level": distribution.level(xyz),
-        "depth_pit": distribution.depth_cdf(z),
-        "depth_crps": distribution.depth_crps(z),
     }
 
 

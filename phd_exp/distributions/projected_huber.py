@@ -15,12 +15,14 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 from torch.distributions.constraints import Constraint
+from torch.nn.functional import pad
 
 from phd_exp.distributions import depth, huber, spd
 from phd_exp.distributions.density import Density
 from phd_exp.distributions.level import credible_level
 from phd_exp.distributions.natural import Natural, require, require_positions
 from phd_exp.distributions.special import log_scaled_normaliser
+from phd_exp.geometry.camera import at_depth
 
 LARGEST_RAW = 1e9  # squares of larger raw numbers, and their products, would overflow in float32
 
@@ -179,11 +181,6 @@ class ProjectedHuber(Distribution, Density):
     def _A_xy_inverse(self) -> Tensor:
         return spd.inverse(self._natural.A_xy, self._natural.log_det_A_xy)
 
-    @property
-    def _direction(self) -> Tensor:
-        """m = (mu_x, mu_y, 1), metres of position per metre of depth."""
-        return torch.nn.functional.pad(self.mu_xy, (0, 1), value=1)
-
     def whiten(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 2"]:
         """The projection of a position in units of its precision, q = A ((x, y)/z - mu_xy) z/mu_z."""
         return spd.matvec(self._natural.A_xy, xyz[..., :2]) - self._natural.nu_xy * xyz[..., 2:]
@@ -230,12 +227,12 @@ class ProjectedHuber(Distribution, Density):
     @property
     def mode(self) -> Float[Tensor, "*batch 3"]:
         """The position of highest density, mu_z (mu_xy, 1), metres."""
-        return self._direction * self.mu_z[..., None]
+        return at_depth(self.mu_xy, self.mu_z)
 
     @property
     def mean(self) -> Float[Tensor, "*batch 3"]:
         """Expected position, E[z] (mu_xy, 1), metres."""
-        return self._direction * self.depth_mean[..., None]
+        return at_depth(self.mu_xy, self.depth_mean)
 
     @property
     def covariance_matrix(self) -> Float[Tensor, "*batch 3 3"]:
@@ -243,10 +240,10 @@ class ProjectedHuber(Distribution, Density):
 
         Source: own derivation (q and t are independent); checked against samples.
         """
-        direction = self._direction
-        along = self.depth_variance[..., None, None] * direction[..., :, None] * direction[..., None, :]
+        m = pad(self.mu_xy, (0, 1), value=1)
+        along = self.depth_variance[..., None, None] * m[..., :, None] * m[..., None, :]
         across = huber.HUBER_COVARIANCE * spd.square(self._A_xy_inverse)
-        return along + torch.nn.functional.pad(across, (0, 1, 0, 1))
+        return along + pad(across, (0, 1, 0, 1))
 
     @property
     def variance(self) -> Float[Tensor, "*batch 3"]:

@@ -74,7 +74,7 @@ def fusion_scores(views: SeveralViews, resamples: int = 200) -> FusionScores:
     errors.
     """
     fused = _fused(views)
-    every = [found for places in fused.values() for found in places.values()]
+    every = [found for ways in fused.values() for found in ways.values()]
     sound = torch.stack([found.status == Status.FUSED for found in every]).all(0)
     sound &= torch.stack([found.covariance.isfinite().all(-1).all(-1) for found in every]).all(0)
     if not bool(sound.any()):
@@ -82,19 +82,18 @@ def fusion_scores(views: SeveralViews, resamples: int = 200) -> FusionScores:
     kept = views.subset(sound)
     columns: dict[str, Tensor] = {}
     exact: dict[str, float] = {}
-    for (k, on_plane), found in fused["mean"].items():
+    for (k, on_plane), ways in fused.items():
         estimates = _baselines(kept.cameras(k), kept.ground if on_plane else None)
-        estimates["mode"] = found.point[sound], None
-        for name, way in fused.items():
-            estimates[name] = way[k, on_plane].mean[sound], way[k, on_plane].covariance[sound]
+        estimates["mode"] = ways["mean"].point[sound], None
+        estimates |= {name: (found.mean[sound], found.covariance[sound]) for name, found in ways.items()}
         for method in METHODS:
             for quantity, column in _columns(kept, *estimates[method], on_plane).items():
                 columns[place(quantity, method, k, on_plane)] = column
-        shares = found.coverage([level / 100 for level in LEVELS])[sound].mean(0)
+        shares = ways["mean"].coverage([level / 100 for level in LEVELS])[sound].mean(0)
         for level, share in zip(LEVELS, shares.tolist(), strict=True):
             exact[place(f"coverage_{level}", "mean", k, on_plane)] = 100 * share
     causes = scalar_bands(_correlations, _depth_errors(kept), resamples)
-    surprise = fused["mean"][views.views, False].surprise[sound].flatten()
+    surprise = fused[views.views, False]["mean"].surprise[sound].flatten()
     return FusionScores(
         n=kept.n,
         views=kept.views,
@@ -107,17 +106,16 @@ def fusion_scores(views: SeveralViews, resamples: int = 200) -> FusionScores:
     )
 
 
-def _fused(views: SeveralViews) -> dict[Method, dict[tuple[int, bool], Fused]]:
-    """By method, number of cameras, and whether on the ground; the shared part is that of the other half."""
+def _fused(views: SeveralViews) -> dict[tuple[int, bool], dict[Method, Fused]]:
+    """By number of cameras and whether on the ground, and by method; the shared part is that of the other half."""
     half = torch.arange(views.n) % 2
     share = shared_share(views, torch.stack([half == 1, half == 0]))[half]
-    fused: dict[Method, dict[tuple[int, bool], Fused]] = {"mean": {}, "shared": {}}
+    fused: dict[tuple[int, bool], dict[Method, Fused]] = {}
     for on_plane in (False, True):
         for k in range(1, views.views + 1):
             part, plane = views.cameras(k), views.ground if on_plane else None
             problem = part.predictions, part.pose, plane, None, 0.0
-            fused["mean"][k, on_plane] = fuse(*problem)
-            fused["shared"][k, on_plane] = fuse_shared(*problem, share=share)
+            fused[k, on_plane] = {"mean": fuse(*problem), "shared": fuse_shared(*problem, share=share)}
     return fused
 
 

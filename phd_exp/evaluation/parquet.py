@@ -1,11 +1,14 @@
 """Reads tables of predictions: columns of numbers, or a RunError of one line. The files are not trusted."""
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import torch
+from torch import Tensor
 
 from phd_exp.records.errors import RunError, gist
 from phd_exp.records.files import MB, require_plain
@@ -51,6 +54,11 @@ def require_columns(names: Iterable[str], table: Collection[str], what: str = "p
     """Raise RunError if a table lacks one of these columns."""
     if lacking := [name for name in names if name not in table]:
         raise RunError(f"{what}: no column {', '.join(lacking)}, as in older records; run the model again")
+
+
+def stacked(columns: Mapping[str, Any], names: Sequence[str]) -> Tensor:
+    """Columns side by side, arrays or tensors, along a new last dimension."""
+    return torch.from_numpy(np.stack([columns[name] for name in names], axis=-1))
 
 
 def arrays(table: pa.Table | Columns) -> dict[str, np.ndarray]:

@@ -14,12 +14,11 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float64
 from scipy import stats
 from torch import Tensor
 
-from phd_exp.evaluation.parquet import Columns, require_columns
+from phd_exp.evaluation.parquet import Columns, require_columns, stacked
 from phd_exp.metrics.bootstrap import means, resampled
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
 from phd_exp.records.errors import RunError
@@ -88,8 +87,8 @@ def mean_errors(table: Columns, estimates: Sequence[Estimate]) -> MeanErrors:
     for name in needed:
         if not (np.isfinite(table[name]).all() and (name not in ("z", "f", "S") or (table[name] > 0).all())):
             raise RunError(f"predictions: column {name} is not finite everywhere, or not positive")
-    truth = _stacked(table, ("x", "y", "z"))
-    central = in_central_half(truth, _stacked(table, ("f",)), _stacked(table, ("S",)))
+    truth = stacked(table, ("x", "y", "z"))
+    central = in_central_half(truth, stacked(table, ("f",)), stacked(table, ("S",)))
     found: dict[ErrorKey, SampleMean] = {}
     for estimate in estimates:
         points = _points(table, estimate)
@@ -119,13 +118,9 @@ def _mean(values: Tensor) -> SampleMean:
     return SampleMean(n, float(values.mean()), float(values.std() / n**0.5) if n > 1 else None, drawn["mean"].numpy())
 
 
-def _stacked(table: Columns, names: Sequence[str]) -> Tensor:
-    return torch.from_numpy(np.stack([table[name] for name in names], axis=-1))
-
-
 def _points(table: Columns, estimate: Estimate) -> Tensor:
     """The estimate's coordinates; the median is median_z (mu_x, mu_y, 1), on the ray of the projected centre."""
-    points = _stacked(table, COLUMNS[estimate])
+    points = stacked(table, COLUMNS[estimate])
     if estimate == "median":
         points[:, :2] *= points[:, 2:]
     return points

@@ -13,7 +13,7 @@ from torch import Tensor
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import NEES, PARAMETERS, distribution_columns, draws, from_columns, nees_columns
 from phd_exp.distributions.temperature import Temperature
-from phd_exp.evaluation.parquet import Columns, arrays, require_columns
+from phd_exp.evaluation.parquet import Columns, arrays, require_columns, stacked
 from phd_exp.evaluation.point_errors import RESAMPLES, SEED
 from phd_exp.evaluation.reference import Band, calibrated_reference, groups_of
 from phd_exp.metrics.bootstrap import Interval, Statistic, bands, interval, resampled
@@ -101,22 +101,22 @@ def evaluate(table: pa.Table | Columns, window: int = 200, resamples: int = 200)
     whole, found, reference = statistic, {}, {}
     if is_huber:
         distribution = _distribution(columns)
-        columns |= nees_columns(distribution, _positions(columns))
+        columns |= nees_columns(distribution, stacked(columns, XYZ))
         whole = partial(_distribution_scores, groups=groups_of(distribution))
         reference = calibrated_reference(distribution)
     if is_distribution:
         x = abscissae(columns, window)
         intervals = bands(partial(curves, window=window), columns, resamples, SEED)
         found = {name: _curve(x[name], interval) for name, interval in intervals.items()}
-    scores, drawn = _scores(whole, columns, resamples)
+    values, drawn = resampled(whole, columns, resamples, SEED)
     return Evaluation(
         n=len(columns[ERRORS[0]]),
-        scores=scores,
+        scores={name: _band(interval(value, drawn[name])) for name, value in values.items()},
         curves=found,
         strata=_strata(statistic, columns, resamples),
         left_out=int((~finite).sum()),
         reference=reference,
-        resampled=drawn,
+        resampled={name: value.tolist() for name, value in drawn.items()},
     )
 
 
@@ -162,7 +162,7 @@ def at_temperature(
     columns, finite = finite_columns(recorded, (*PARAMETERS, *XYZ))
     distribution = _distribution(columns)
     kept = {name: array[finite.numpy()] for name, array in recorded.items()}
-    return temperature.apply(distribution) if temperature else distribution, _positions(columns), kept
+    return temperature.apply(distribution) if temperature else distribution, stacked(columns, XYZ), kept
 
 
 def _distribution_scores(
@@ -184,14 +184,6 @@ def _mean(column: Tensor, weight: Tensor) -> Tensor:
     return (weight * column).sum(-1) / weight.sum(-1)
 
 
-def _scores(
-    statistic: Statistic, columns: Mapping[str, Tensor], resamples: int
-) -> tuple[dict[str, Band], dict[str, list[float]]]:
-    values, drawn = resampled(statistic, columns, resamples, SEED)
-    scores = {name: _band(interval(value, drawn[name])) for name, value in values.items()}
-    return scores, {name: values.tolist() for name, values in drawn.items()}
-
-
 def scalar_bands(statistic: Statistic, columns: Mapping[str, Tensor], resamples: int = RESAMPLES) -> dict[str, Band]:
     """The 95 % bootstrap intervals of scalars, as plain numbers."""
     return {name: _band(found) for name, found in bands(statistic, columns, resamples, SEED).items()}
@@ -210,7 +202,7 @@ def _strata(statistic: Statistic, columns: Mapping[str, Tensor], resamples: int)
     for quantity, (column, unit, edges) in QUANTITIES.items():
         for stratum in strata(quantity, columns[column], edges, unit) if column in columns else []:
             part = {name: values[stratum.mask] for name, values in columns.items()}
-            scores, _ = _scores(statistic, part, resamples)
+            scores = scalar_bands(statistic, part, resamples)
             found.append(Stratum(quantity, stratum.label, int(stratum.mask.sum()), scores))
     return found
 
@@ -237,7 +229,3 @@ def _distribution(columns: Mapping[str, Tensor]) -> ProjectedHuber:
         return from_columns(columns)
     except ValueError as error:
         raise RunError(f"predictions: parameters are of no distribution ({error})") from None
-
-
-def _positions(columns: Mapping[str, Tensor]) -> Tensor:
-    return torch.stack([columns[name] for name in XYZ], dim=-1)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.columns import draws, nees_columns, parameter_columns
+from phd_exp.distributions.columns import draws, nees_columns, parameter_columns, squared_error_columns
 from phd_exp.metrics.calibration import ence_of, miscalibration_area, uniform_distance
 from phd_exp.metrics.calibration_scores import ence_bins
 from phd_exp.metrics.groups import similar_groups, worst_group
@@ -54,21 +54,14 @@ def groups_of(distribution: ProjectedHuber) -> Tensor:
 
 def _simulated(distribution: ProjectedHuber, simulations: int, seed: int) -> dict[str, Tensor]:
     drawn = draws(distribution, simulations, seed)
-    z = drawn[..., 2]
-    off_centre = drawn[..., :2] / z[..., None] - distribution.mu_xy
-    pairs = {
-        "depth_ence": (distribution.depth_variance, (z - distribution.depth_mean).square()),
-        "projected_ence": (
-            distribution.projected_covariance.diagonal(dim1=-2, dim2=-1).sum(-1),
-            off_centre.square().sum(-1),
-        ),
-    }
     found = {name: values.mean(-1) for name, values in nees_columns(distribution, drawn).items()}
-    levels = torch.rand(z.shape, generator=torch.Generator().manual_seed(seed))
+    levels = torch.rand(drawn.shape[:-1], generator=torch.Generator().manual_seed(seed))
     found["group_miscalibration"] = worst_group(levels, groups_of(distribution), torch.ones_like(levels))
-    for name, (variance, error) in pairs.items():
+    squared = squared_error_columns(distribution, drawn)
+    for name in ("depth", "projected"):
+        variance, error = squared[f"{name}_variance"], squared[f"{name}_squared_error"]
         order = in_order_of(variance, {"variance": variance, "error": error}, torch.ones_like(error))
-        found[name] = ence_of(order, "variance", "error", ence_bins(order))
+        found[f"{name}_ence"] = ence_of(order, "variance", "error", ence_bins(order))
     return found
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import PARAMETERS, from_columns
-from phd_exp.evaluation.parquet import read_table, require_columns
+from phd_exp.evaluation.parquet import read_table, require_columns, stacked
 from phd_exp.evaluation.predictions import XYZ
 from phd_exp.fusion import Plane, Pose
 from phd_exp.records import scenes
@@ -56,7 +56,7 @@ class SeveralViews:
     @cached_property
     def pose(self) -> Pose:
         """The pose of each camera in the scene's world."""
-        rows = self._stacked((*ROTATION, *TRANSLATION)).flatten(0, 1).tolist()
+        rows = stacked(self.columns, (*ROTATION, *TRANSLATION)).flatten(0, 1).tolist()
         flat = Pose.from_scene([scenes.Pose(rotation=row[:4], translation=row[4:]) for row in rows])
         shape = (self.n, self.views)
         return Pose(flat.R.unflatten(0, shape), flat.t.unflatten(0, shape))
@@ -69,7 +69,7 @@ class SeveralViews:
     @property
     def xyz(self) -> Float[Tensor, "scenes views 3"]:
         """True position in the frame of each camera, metres."""
-        return self._stacked(XYZ)
+        return stacked(self.columns, XYZ)
 
     @property
     def truth(self) -> Float[Tensor, "scenes 3"]:
@@ -95,9 +95,6 @@ class SeveralViews:
         """The chosen scenes; the others count as left out."""
         columns = {name: column[chosen] for name, column in self.columns.items()}
         return SeveralViews(columns, self.left_out + int((~chosen).sum()))
-
-    def _stacked(self, names: tuple[str, ...]) -> Float[Tensor, "scenes views n"]:
-        return torch.stack([self.columns[name] for name in names], -1)
 
 
 def read_views(file: Path) -> SeveralViews:

@@ -17,6 +17,7 @@ BLOCKS: dict[int, tuple[type[BasicBlock | Bottleneck], list[int]]] = {
 """Depth -> type of block, and the number of blocks at each of the four resolutions."""
 
 Depth = Literal[10, 18, 34, 50]
+NORM = partial(nn.GroupNorm, 1)  # in place of every BatchNorm
 
 
 class BackboneOutput(NamedTuple):
@@ -102,7 +103,7 @@ def resnet(depth: Depth) -> PooledFeatures:
 
     Source: the authors' training protocol.
     """
-    network = ResNet(*BLOCKS[depth], norm_layer=partial(nn.GroupNorm, 1))
+    network = ResNet(*BLOCKS[depth], norm_layer=NORM)
     n_features = network.fc.in_features
     network.fc = nn.Identity()
     return PooledFeatures(network, n_features)

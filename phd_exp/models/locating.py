@@ -1,6 +1,5 @@
 """A backbone that locates the object: a narrow ResNet, a feature pyramid, and a heat map."""
 
-from functools import partial
 from typing import Annotated, Literal
 
 import torch
@@ -11,9 +10,7 @@ from torch.nn.functional import interpolate, relu
 from torchvision.models.resnet import BasicBlock, Bottleneck
 
 from phd_exp.geometry.camera import middles
-from phd_exp.models.backbones import BLOCKS, Backbone, BackboneOutput, Depth
-
-_norm = partial(nn.GroupNorm, 1)
+from phd_exp.models.backbones import BLOCKS, NORM, Backbone, BackboneOutput, Depth
 
 
 class Locating(Backbone):
@@ -53,7 +50,7 @@ class Locating(Backbone):
         widths = [width * 2**stage for stage in range(len(counts))]
         outputs = [n * block.expansion for n in widths]
         convolution = nn.Conv2d(3, width, 7, stride, padding=3, bias=False)
-        self.stem = nn.Sequential(convolution, _norm(width), nn.ReLU(inplace=True))
+        self.stem = nn.Sequential(convolution, NORM(width), nn.ReLU(inplace=True))
         self.stages = nn.ModuleList(
             _stage(block, count, n_in, n, stride=1 if n == width else 2)
             for count, n_in, n in zip(counts, [width, *outputs], widths, strict=False)
@@ -104,9 +101,9 @@ def _stage(block: type[BasicBlock | Bottleneck], count: int, n_in: int, width: i
     n_out = width * block.expansion
     shortcut = None
     if stride > 1 or n_in != n_out:
-        shortcut = nn.Sequential(nn.Conv2d(n_in, n_out, 1, stride, bias=False), _norm(n_out))
-    first = block(n_in, width, stride, shortcut, norm_layer=_norm)
-    return nn.Sequential(first, *(block(n_out, width, norm_layer=_norm) for _ in range(count - 1)))
+        shortcut = nn.Sequential(nn.Conv2d(n_in, n_out, 1, stride, bias=False), NORM(n_out))
+    first = block(n_in, width, stride, shortcut, norm_layer=NORM)
+    return nn.Sequential(first, *(block(n_out, width, norm_layer=NORM) for _ in range(count - 1)))
 
 
 def localisation_loss(
