@@ -33,6 +33,7 @@ def refused(composed: Callable[..., dict[str, Any]], tmp_path: Path, monkeypatch
                     "verify": False,
                     "rerender": 0,
                     "masks": None,
+                    "bop": None,
                 }
             )
         assert "\n" not in str(error.value)

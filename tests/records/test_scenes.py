@@ -48,7 +48,7 @@ def test_a_scene_is_one_cylinder_and_at_most_one_of_each_other_shape(record: Sam
     fields = record.model_dump()
     (cylinder,) = fields["objects"]
     for objects in ([cylinder, cylinder], [cylinder | {"shape": "cube"}]):
-        with pytest.raises(ValidationError, match="a cylinder first, then other shapes, each once"):
+        with pytest.raises(ValidationError, match="a cylinder or mesh first, then other shapes, each once"):
             SampleRecord.model_validate(fields | {"objects": objects})
     with pytest.raises(ValidationError, match="unit quaternion"):
         SampleRecord.model_validate(fields | {"objects": [cylinder | {"rotation": (1.0, 1.0, 0.0, 0.0)}]})

@@ -9,11 +9,13 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from phd_exp.records.assets import Asset
 from phd_exp.records.spec import DatasetSpec, Shard
 from tests.support.renders import VARIANTS
 
 MakeSpec = Callable[..., DatasetSpec]
-YOUNGER = {"saturation_range", "half_hidden"}
+YOUNGER = {key for key, field in DatasetSpec.model_fields.items() if not field.is_required()}
+MESH = Asset(files={"part.glb": "0" * 64})
 
 
 BAD: dict[str, list[Any]] = {
@@ -68,11 +70,26 @@ def test_a_fingerprint_depends_on_every_value_and_on_nothing_else(make_spec: Mak
         "image_quality": 90,
         "saturation_range": (0.0, 0.1),
         "half_hidden": True,
+        "mesh": Asset(files={"part.glb": "1" * 64}),
     }
-    assert changes.keys() == DatasetSpec.model_fields.keys()
+    of_meshes = {
+        "unit": 0.001,
+        "reference": "centroid",
+        "upright": True,
+        "pitch_range": (10.0, 20.0),
+        "backdrops": "hdri",
+        "ground": True,
+        "distractors": 1,
+        "distractor_meshes": (MESH,),
+        "motion_blur": 2.0,
+    }
+    assert changes.keys() | of_meshes.keys() == DatasetSpec.model_fields.keys()
     prints = {make_spec(**{key: value}).fingerprint() for key, value in changes.items()}
+    standing = {"upright": True, "pitch_range": (20.0, 30.0)}
+    for key, value in of_meshes.items():
+        prints.add(make_spec(mesh=MESH, **{key: value}, **(standing if key == "ground" else {})).fingerprint())
     prints |= {make_spec().fingerprint(), make_spec(f_range=[1200, 2000]).fingerprint()}
-    assert len(prints) == len(changes) + 1
+    assert len(prints) == len(changes) + len(of_meshes) + 1
     assert make_spec().fingerprint() == "1933c9582b94b54b", "the same on every machine, for ever"
 
 

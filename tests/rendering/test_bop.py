@@ -20,6 +20,7 @@ from phd_exp.rendering.bop import NUMBERS, write_bop
 from phd_exp.rendering.rays import FACES, NOTHING, trace_pixels
 from phd_exp.rendering.samples import describe
 from phd_exp.rendering.sampling import sample_scene
+from phd_exp.rendering.triangles import NO_MESHES
 
 SIDE, N = 56, 6
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -47,7 +48,7 @@ def drawn(root: Path, spec: DatasetSpec) -> DatasetFolder:
             Image.fromarray(noise).save(stream, spec.image_format)
             (folder.split_folder(split) / image_name(index, spec.image_format)).write_bytes(stream.getvalue())
             scene = sample_scene(spec, split, index)
-            record = describe(spec, split, index, scene, trace_pixels(scene), sha256(stream.getvalue()))
+            record = describe(spec, split, index, scene, trace_pixels(scene), sha256(stream.getvalue()), NO_MESHES)
             lines += record.model_dump_json() + "\n"
         folder.metadata_path(split).write_text(lines)
         seals[split] = Seal(n=N, metadata_sha256=sha256(lines.encode()))

@@ -13,6 +13,7 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.rays import trace_pixels
 from phd_exp.rendering.samples import describe
 from phd_exp.rendering.sampling import CLEARANCE, sample_scene, scene_and_view
+from phd_exp.rendering.triangles import NO_MESHES
 
 MakeSpec = Callable[..., DatasetSpec]
 SCENES, VIEWS = 200, 4
@@ -44,7 +45,7 @@ def places(scene: Scene) -> np.ndarray:
 
 def told(spec: DatasetSpec, split: Split, index: int) -> SampleRecord:
     scene = sample_scene(spec, split, index)
-    return describe(spec, split, index, scene, trace_pixels(scene), "0" * 64)
+    return describe(spec, split, index, scene, trace_pixels(scene), "0" * 64, NO_MESHES)
 
 
 def test_the_first_view_is_the_sample_of_scale(spec: DatasetSpec, make_spec: MakeSpec) -> None:
