@@ -113,7 +113,7 @@ def write_photos(folder: Path) -> None:
 def handmade_spec() -> DatasetSpec:
     with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
         data = hydra.compose("config", list(HANDMADE)).data
-    return DatasetSpec(**{key: data[key] for key in DatasetSpec.model_fields})
+    return DatasetSpec(**{key: value for key, value in data.items() if key in DatasetSpec.model_fields})
 
 
 def make(root: Path) -> None:
