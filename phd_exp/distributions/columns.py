@@ -14,6 +14,7 @@ Columns = dict[str, Tensor]
 """Name -> one number a sample."""
 
 PARAMETERS = ("mu_x", "mu_y", "mu_z", "A_xx", "A_xy", "A_yy", "a")
+COVARIANCE = ("C_xx", "C_xy", "C_xz", "C_yy", "C_yz", "C_zz")
 NEES = ("nees", "nees_x", "nees_y", "nees_z")
 
 
@@ -33,11 +34,14 @@ def from_columns(columns: Mapping[str, Tensor]) -> ProjectedHuber:
 
 def distribution_columns(distribution: ProjectedHuber | Shaped, xyz: Float[Tensor, "samples 3"]) -> Columns:
     """Mean and median depth (metres), `calibration_columns`, the NLL of true positions (nats), and the parameters of
-    a Projected Huber density.
+    a Projected Huber density, of others the covariance (m^2).
     """
     table = coordinates("mean_", distribution.mean) | {"median_z": distribution.depth_median}
     if isinstance(distribution, ProjectedHuber):
         table |= parameter_columns(distribution) | {"projected_precision": distribution.log_det_A.exp()}
+    else:
+        rows, columns = torch.triu_indices(3, 3)
+        table |= dict(zip(COVARIANCE, distribution.covariance_matrix[:, rows, columns].unbind(-1), strict=True))
     return table | calibration_columns(distribution, xyz) | {"nll": -distribution.log_prob(xyz)}
 
 

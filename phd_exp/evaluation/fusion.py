@@ -9,11 +9,10 @@ from jaxtyping import Bool, Float
 from scipy import stats
 from torch import Tensor
 
-from phd_exp.distributions import ProjectedHuber
-from phd_exp.evaluation.predictions import scalar_bands
+from phd_exp.evaluation.predictions import Evaluation, evaluation_of, scalar_bands
 from phd_exp.evaluation.reference import Band
 from phd_exp.evaluation.several_views import SeveralViews
-from phd_exp.fusion import Fused, Plane, Pose, Status, average, fuse, fuse_shared, gaussian_fusion
+from phd_exp.fusion import Fused, Plane, Status, average, fuse, fuse_shared, gaussian_fusion
 from phd_exp.metrics.bootstrap import means
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, squared_mahalanobis
 from phd_exp.records.errors import RunError
@@ -106,6 +105,24 @@ def fusion_scores(views: SeveralViews, resamples: int = 200) -> FusionScores:
     )
 
 
+def two_cameras(views: SeveralViews, resamples: int = 200) -> Evaluation:
+    """The error of the mean of the first two cameras' product, `fused_error_mm`, a distance in space.
+
+    The product is that of Projected Huber densities, or of Gaussians with the moments of other densities. Raises
+    RunError if no scene can be fused.
+    """
+    pair = views.cameras(2)
+    if pair.is_huber:
+        point = fuse(pair.predictions, pair.pose, contradiction=0.0).mean
+    else:
+        point = gaussian_fusion(*pair.world_moments)[0]
+    error = MILLIMETRES * (point - pair.truth).norm(dim=-1)
+    finite = error.isfinite()
+    if not bool(finite.any()):
+        raise RunError("several views: not one scene can be fused; train longer")
+    return evaluation_of(means, {"fused_error_mm": error[finite]}, views.left_out + int((~finite).sum()), resamples)
+
+
 def _fused(views: SeveralViews) -> dict[tuple[int, bool], dict[Method, Fused]]:
     """By number of cameras and whether on the ground, and by method; the shared part is that of the other half."""
     half = torch.arange(views.n) % 2
@@ -123,19 +140,12 @@ def _baselines(views: SeveralViews, plane: Plane | None) -> dict[Method, tuple[T
     """Position and covariance in the world by the methods that do not use the Projected Huber density."""
     averaged = average(views.pose.into_world(views.predictions.mode))
     try:
-        gaussian = gaussian_fusion(*world_moments(views.predictions, views.pose))
+        gaussian = gaussian_fusion(*views.world_moments)
     except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
         raise RunError(f"several views: a covariance is singular ({error}); train longer") from None
     if plane is not None:
         averaged, gaussian = plane.nearest(averaged), conditioned(*gaussian, plane)
     return {"average": (averaged, None), "gaussian": gaussian}
-
-
-def world_moments(
-    predictions: ProjectedHuber, pose: Pose
-) -> tuple[Float[Tensor, "*views 3"], Float[Tensor, "*views 3 3"]]:
-    """Mean (m) and covariance (m^2) of each view's density in the world: R^T (mean - t) and R^T C R."""
-    return pose.into_world(predictions.mean), pose.R.mT @ predictions.covariance_matrix @ pose.R
 
 
 def conditioned(

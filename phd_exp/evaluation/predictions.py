@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -78,9 +79,9 @@ class Evaluation:
 
     n: int
     scores: dict[str, Band]
-    curves: dict[str, Curve]
-    strata: list[Stratum]
     left_out: int
+    curves: dict[str, Curve] = field(default_factory=dict)
+    strata: list[Stratum] = field(default_factory=list)
     reference: dict[str, Band] = field(default_factory=dict)
     resampled: dict[str, list[float]] = field(default_factory=dict)
 
@@ -108,15 +109,21 @@ def evaluate(table: pa.Table | Columns, window: int = 200, resamples: int = 200)
         x = abscissae(columns, window)
         intervals = bands(partial(curves, window=window), columns, resamples, SEED)
         found = {name: _curve(x[name], interval) for name, interval in intervals.items()}
-    values, drawn = resampled(whole, columns, resamples, SEED)
+    further = {"curves": found, "strata": _strata(statistic, columns, resamples), "reference": reference}
+    return evaluation_of(whole, columns, int((~finite).sum()), resamples, **further)
+
+
+def evaluation_of(
+    statistic: Statistic, columns: Mapping[str, Tensor], left_out: int, resamples: int, **further: Any
+) -> Evaluation:
+    """The scores that a statistic finds in columns of samples, with their bootstrap; `further` are other fields."""
+    values, drawn = resampled(statistic, columns, resamples, SEED)
     return Evaluation(
-        n=len(columns[ERRORS[0]]),
+        n=len(next(iter(columns.values()))),
         scores={name: _band(interval(value, drawn[name])) for name, value in values.items()},
-        curves=found,
-        strata=_strata(statistic, columns, resamples),
-        left_out=int((~finite).sum()),
-        reference=reference,
+        left_out=left_out,
         resampled={name: value.tolist() for name, value in drawn.items()},
+        **further,
     )
 
 

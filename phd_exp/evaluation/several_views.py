@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.columns import PARAMETERS, from_columns
+from phd_exp.distributions.columns import COVARIANCE, PARAMETERS, from_columns
 from phd_exp.evaluation.parquet import read_table, require_columns, stacked
 from phd_exp.evaluation.predictions import XYZ
 from phd_exp.fusion import Plane, Pose
@@ -21,7 +21,9 @@ from phd_exp.records.errors import RunError, gist
 ROTATION = ("pose_w", "pose_x", "pose_y", "pose_z")
 TRANSLATION = ("pose_t_x", "pose_t_y", "pose_t_z")
 """Columns of a camera's pose: the unit quaternion of R, and t (m), of v_camera = R v_scene + t."""
-NEEDED = ("scene", "view", "scale", *XYZ, *ROTATION, *TRANSLATION, *PARAMETERS)
+NEEDED = ("scene", "view", "scale", *XYZ, *ROTATION, *TRANSLATION)
+MOMENTS = ("mean_x", "mean_y", "mean_z", *COVARIANCE)
+"""Further columns of a density that is no Projected Huber density, which has `PARAMETERS`."""
 TILT = math.radians(30)  # angle by which the first camera looks down at the ground; see `SeveralViews.ground`
 AGAIN = "delete it and repeat the command that made it"
 
@@ -31,7 +33,7 @@ class SeveralViews:
     """Predictions of every view of every scene, and the truth.
 
     Args:
-        columns: the columns `NEEDED`, a row per scene and a column per view, float64.
+        columns: `NEEDED`, and `PARAMETERS` or `MOMENTS`; a row per scene and a column per view, float64.
         left_out: number of scenes that were removed because a value is not finite.
     """
 
@@ -48,10 +50,27 @@ class SeveralViews:
         """The number of cameras per scene."""
         return self.columns["view"].shape[1]
 
+    @property
+    def is_huber(self) -> bool:
+        """Whether the predictions are Projected Huber densities."""
+        return PARAMETERS[0] in self.columns
+
     @cached_property
     def predictions(self) -> ProjectedHuber:
-        """The predictions, in the frame of each camera."""
+        """The predictions, in the frame of each camera. Raises RunError if they are other densities."""
+        require_columns(PARAMETERS, self.columns, "several views")
         return from_columns(self.columns)
+
+    @property
+    def world_moments(self) -> tuple[Float[Tensor, "scenes views 3"], Float[Tensor, "scenes views 3 3"]]:
+        """Mean (m) and covariance (m^2) of each view's density in the world: R^T (mean - t) and R^T C R."""
+        if self.is_huber:
+            mean, covariance = self.predictions.mean, self.predictions.covariance_matrix
+        else:
+            mean = stacked(self.columns, MOMENTS[:3])
+            covariance = stacked(self.columns, [f"C_{''.join(sorted(i + j))}" for i in "xyz" for j in "xyz"])
+            covariance = covariance.unflatten(-1, (3, 3))
+        return self.pose.into_world(mean), self.pose.R.mT @ covariance @ self.pose.R
 
     @cached_property
     def pose(self) -> Pose:
@@ -100,8 +119,9 @@ class SeveralViews:
 def read_views(file: Path) -> SeveralViews:
     """The recorded views of a run. Raises RunError if they cannot be read, or are not views of several cameras."""
     table = read_table(file)
-    require_columns(NEEDED, table, file.name)
-    flat = {name: torch.from_numpy(table[name]) for name in NEEDED}
+    needed = (*NEEDED, *(MOMENTS if COVARIANCE[0] in table else PARAMETERS))
+    require_columns(needed, table, file.name)
+    flat = {name: torch.from_numpy(table[name]) for name in needed}
     rows = torch.arange(len(flat["view"]), dtype=torch.float64)
     views = int(flat["view"].max()) + 1
     if views < 2 or len(rows) % views or not bool((flat["scene"] * views + flat["view"] == rows).all()):
@@ -112,7 +132,7 @@ def read_views(file: Path) -> SeveralViews:
         raise RunError(f"{file.name}: of no scene all predictions are finite; train longer")
     found = SeveralViews(columns).subset(finite)
     try:
-        _ = found.predictions, found.pose
+        _ = found.world_moments
     except ValueError as error:
         raise RunError(f"{file.name}: no predictions with poses ({gist(error)}); {AGAIN}") from None
     return found

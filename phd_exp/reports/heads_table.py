@@ -13,6 +13,7 @@ from phd_exp.reports.runs import PROBABILISTIC, Report, Run
 from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem
 
 COLUMNS = ("nll", "depth_crps_mm", "inside_90", "projected_error_mm", "depth_error_mm")
+FUSED = "fused_error_mm"
 OF_A_CELL = (
     "A cell: the mean over seeds with its 95 % interval; below it the difference to the probabilistic model with its "
     "95 % interval, a bootstrap over seeds and the shared test images. Bold: better than the probabilistic model by "
@@ -32,22 +33,27 @@ def heads_tables(report: Report) -> list[Table]:
 
 
 def _means(runs: Sequence[Run], name: str) -> list[SampleMean]:
-    found = [run.measured.before for run in runs if run.measured.before]
+    """One mean a run; none if a run has not recorded the score."""
+    every = [run.measured.pairs if name == FUSED else run.measured.before for run in runs]
+    found = [e for e in every if e and name in e.scores]
+    if len(found) < len(runs):
+        return []
     return [SampleMean(e.n, e.scores[name].value, None, np.array(e.resampled[name])) for e in found]
 
 
 def _table(preset: str, data: str, digest: str, models: dict[str, list[Run]]) -> Table:
     table, rows = findings(), []
+    columns = (*COLUMNS, FUSED) if any(run.measured.pairs for runs in models.values() for run in runs) else COLUMNS
     for model, runs in models.items():
         broken = ", ".join(name[0] for name, row in table.items() if model in row and not row[model].holds)
         stub = (model, broken or NOTHING, ", ".join(str(run.seed) for run in runs))
-        rows.append(TableRow(stub, tuple(_cell(name, runs, models[PROBABILISTIC]) for name in COLUMNS)))
+        rows.append(TableRow(stub, tuple(_cell(name, runs, models[PROBABILISTIC]) for name in columns)))
     return Table(
         stem=file_stem("heads", preset, data, *([digest] if digest else [])),
         kind="heads",
         title=f"Densities on {data}, {in_words(preset)}" + (f", overrides {digest}" if digest else ""),
         stub=("model", "breaks", "seeds"),
-        columns=tuple(SCORES[name].axis for name in COLUMNS),
+        columns=tuple(SCORES[name].axis for name in columns),
         groups=(tuple(rows),),
         notes=(OF_A_CELL,),
         below="difference",
@@ -56,18 +62,21 @@ def _table(preset: str, data: str, digest: str, models: dict[str, list[Run]]) ->
             {"preset": preset, "data": data, "model": model, "overrides": digest, "seed": run.seed}
             | {"quantity": name, "value": mean.value}
             for model, runs in models.items()
-            for name in COLUMNS
-            for run, mean in zip(runs, _means(runs, name), strict=True)
+            for name in columns
+            for run, mean in zip(runs, _means(runs, name), strict=False)
         ),
     )
 
 
 def _cell(name: str, runs: Sequence[Run], reference: Sequence[Run]) -> TableCell:
-    means, text = _means(runs, name), SCORES[name].text
+    means, others, text = _means(runs, name), _means(reference, name), SCORES[name].text
+    if not means:
+        return TableCell(NOTHING)
     found = interval(means)
     spread = "" if found.half_width is None else f"±{text(found.half_width)}"
-    if runs is reference or len({run.measured.images for run in (*runs, *reference)}) > 1:
+    same = {(run.measured.images, mean.n) for run, mean in zip((*runs, *reference), (*means, *others), strict=False)}
+    if runs is reference or len(same) > 1 or not others:
         return TableCell(text(found.mean), spread)
-    gap, width = difference(means, _means(reference, name))
+    gap, width = difference(means, others)
     below = f"{'+' if gap > 0 else ''}{text(gap)} ±{text(width)}"
     return TableCell(text(found.mean), spread, below, gap < -width and name != "inside_90")

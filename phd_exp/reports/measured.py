@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from pydantic import TypeAdapter
 
 from phd_exp.distributions.temperature import Temperature
-from phd_exp.evaluation.fusion import FusionScores, fusion_scores
+from phd_exp.evaluation.fusion import FusionScores, fusion_scores, two_cameras
 from phd_exp.evaluation.parquet import Columns
 from phd_exp.evaluation.predictions import Evaluation, evaluate, fit_temperature, recalibrated
 from phd_exp.evaluation.several_views import read_views
@@ -49,6 +49,7 @@ class Measured:
     Attributes:
         before: evaluation of the recorded predictions.
         after: evaluation of the recalibrated predictions; None without held-out samples.
+        pairs: scores of the positions fused from two cameras; None without a record of several views.
         shifts: scores at home and under each shift; empty without a shift.
         images: a digest of data set and true positions, equal for runs tested on the same images.
     """
@@ -57,6 +58,7 @@ class Measured:
     after: Evaluation | None = None
     temperature: Temperature | None = None
     fusion: FusionScores | None = None
+    pairs: Evaluation | None = None
     gallery: Gallery | None = None
     shifts: dict[str, ShiftScores] = field(default_factory=dict)
     images: str = ""
@@ -78,8 +80,9 @@ def measure(
         if found["before"] and (left_out := found["before"].left_out):
             notes.append(f"{left_out} test samples are left out: a prediction was not finite")
         found["shifts"] = notes.attempt(lambda: shift_scores(folder.shifts, predictions, held_out)) or {}
-    if folder.views.exists():
-        found["fusion"] = notes.attempt(lambda: fusion_scores(read_views(folder.views)))
+    if folder.views.exists() and (views := notes.attempt(lambda: read_views(folder.views))):
+        found["pairs"] = notes.attempt(lambda: two_cameras(views))
+        found["fusion"] = notes.attempt(lambda: fusion_scores(views)) if views.is_huber else None
     return Measured(**found, notes=notes)
 
 

@@ -45,6 +45,7 @@ _OVERCONFIDENCE = "mean credible level of the truths minus 1/2; negative if unde
 _ROWS: tuple[tuple[str, str, str, int, str], ...] = (
     ("projected_error_mm", "Projected error", "mm", 1, "distance of the estimate from the true viewing ray"),
     ("depth_error_mm", "Depth error", "mm", 1, "error along the true viewing ray"),
+    ("fused_error_mm", "Fused error of two cameras", "mm", 1, "distance in space of the mean of their product"),
     ("ale_m", "ALE", "m", 3, "average localisation error: error of the distance from the camera"),
     ("relative_error", "Relative error", "%", 2, "error of the distance from the camera over the distance"),
     ("nll", "NLL", "nats", 2, "mean negative log density at the truth, per cubic metre"),

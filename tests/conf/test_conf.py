@@ -152,9 +152,11 @@ def test_variants_differ_only_in_the_keys_of_their_files(checked: Callable) -> N
         assert other.variant == variant
 
 
-def test_several_views_use_the_data_set_multiview(checked: Callable) -> None:
+def test_several_views_of_scale_are_the_data_set_multiview(checked: Callable) -> None:
     config = checked("data=scale", "evaluation.multiview.scenes=9", "data.sensor_size=256", "data.seed=3")
     assert config.several_views.spec == checked("data=multiview", "data.sensor_size=256", "data.seed=3").data.spec
+    own = checked("evaluation.multiview.scenes=9", "evaluation.multiview.views=2").several_views.spec
+    assert (own.variant, own.scale_range, own.views) == ("default-multiview", (1.0, 1.0), 2)
 
 
 @pytest.mark.parametrize("data", ["default", "occl", "scale", "occl_scale"])

@@ -8,7 +8,8 @@ import pytest
 import torch
 from scipy import stats
 
-from phd_exp.evaluation.fusion import BINS, METHODS, FusionScores, Method, conditioned, fusion_scores
+from phd_exp.distributions.columns import PARAMETERS, from_columns
+from phd_exp.evaluation.fusion import BINS, METHODS, FusionScores, Method, conditioned, fusion_scores, two_cameras
 from phd_exp.evaluation.several_views import read_views
 from phd_exp.fusion import Plane
 from phd_exp.records.errors import RunError
@@ -66,6 +67,27 @@ def test_exact_densities_have_shorter_ellipsoids_and_every_view_counts_once(scor
     assert scores.exact["coverage_90/mean/1/free"] == pytest.approx(87.8, abs=0.7)
     assert scores.exact["coverage_90/mean/4/free"] == pytest.approx(88.8, abs=0.7)
     assert (len(scores.surprise), sum(scores.surprise)) == (BINS, N * 4)
+
+
+def test_the_error_of_two_cameras_is_that_of_the_product_or_of_its_gaussian(
+    scores: FusionScores, calibrated: Path, folder: Path
+) -> None:
+    def error(file: Path) -> float:
+        return two_cameras(read_views(file), resamples=2).scores["fused_error_mm"].value
+
+    assert error(calibrated) == pytest.approx(value(scores, "distance_mm", "mean", 2))
+    table = pd.read_parquet(calibrated)
+    density = from_columns({name: torch.tensor(table[name].to_numpy()) for name in PARAMETERS})
+    covariance = density.covariance_matrix
+    for i, x in enumerate("xyz"):
+        table[f"mean_{x}"] = density.mean[:, i]
+        for j, y in list(enumerate("xyz"))[i:]:
+            table[f"C_{x}{y}"] = covariance[:, i, j]
+    other = folder / "moments.parquet"
+    table.drop(columns=list(PARAMETERS)).to_parquet(other)
+    assert error(other) == pytest.approx(value(scores, "distance_mm", "gaussian", 2))
+    with pytest.raises(RunError, match="no column mu_x"):
+        fusion_scores(read_views(other))
 
 
 def test_overconfident_views_are_detected(overconfident: FusionScores) -> None:

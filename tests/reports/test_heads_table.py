@@ -11,6 +11,7 @@ from phd_exp.evaluation.predictions import OF_A_DISTRIBUTION, XYZ
 from phd_exp.reports.heads_table import COLUMNS, heads_tables
 from phd_exp.reports.runs import read_report
 from tests.support.recorded import predicted, record
+from tests.support.several import write_views
 
 
 @pytest.fixture
@@ -44,6 +45,18 @@ def test_densities_are_compared_with_the_probabilistic_model(runs: Path) -> None
     assert mine[coverage].ours == "90"
     of_nll = [line["value"] for line in table.numbers if (line["model"], line["quantity"]) == ("gaussian", "nll")]
     assert np.mean(of_nll) == pytest.approx(-2, abs=0.01)
+
+
+def test_fused_errors_stand_beside_where_every_seed_has_recorded_several_views(runs: Path) -> None:
+    for seed in range(3):
+        for model, a in (("probabilistic", 30.0), ("gaussian", 10.0)):
+            write_views(runs / "small" / "default" / model / f"seed{seed}" / "views.parquet", 40, a=a)
+    (table,) = heads_tables(read_report(runs))
+    cells = {row.stub[0]: row.cells[-1] for row in table.rows}
+    assert table.columns[-1] == "Fused error of two cameras (mm)"
+    assert cells["mine"].ours == "–"
+    assert cells["gaussian"].below.startswith("+")
+    assert float(cells["gaussian"].ours) > float(cells["probabilistic"].ours) > 0
 
 
 def test_a_better_density_is_bold_with_several_seeds_only(runs: Path) -> None:

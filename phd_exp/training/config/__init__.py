@@ -20,7 +20,7 @@ from phd_exp.training.config.targets import Target, TrainingTarget, TrainingTarg
 
 __all__ = ["FolderConfig", "RenderConfig", "RenderedConfig", "RunConfig", "SourceConfig", "check", "check_render"]
 
-SINGLE_VIEW = "scale"  # the data set whose runs can be evaluated on several views
+MULTIVIEW = ("scale", "multiview")  # a data set, and that of its scenes seen by several cameras
 
 Checked = TypeVar("Checked", bound=BaseModel)
 
@@ -121,28 +121,34 @@ class RunConfig(Record):
         asked, data = self.evaluation.multiview, self.data
         if asked is None or asked.scenes == 0 or not isinstance(data, RenderedConfig):
             return None
-        changes = {"variant": "multiview", "views": asked.views, "view_angle_range": asked.angle_range}
+        name = dict([MULTIVIEW]).get(data.name, f"{data.name}-{MULTIVIEW[1]}")
+        changes = {"variant": name, "views": asked.views, "view_angle_range": asked.angle_range}
         return data.changed(changes, asked.scenes * asked.views)
 
     @model_validator(mode="after")
     def several_views_fit(self) -> "RunConfig":
-        """Refuse several views for a point estimate, and for a data set without them."""
+        """Refuse several views for predictions that cannot be fused, and for data that is not rendered."""
         multiview = self.evaluation.multiview
         if multiview is None or multiview.scenes == 0:
             return self
         from phd_exp.distributions import ProjectedHuber  # imports torch, which takes seconds
+        from phd_exp.distributions.shaped import Shaped
 
         expected = "or evaluation.multiview.scenes=0"
-        if not issubclass(_prediction(self.model.head) or object, ProjectedHuber):
+        if not issubclass(_prediction(self.model.head) or object, ProjectedHuber | Shaped):
             raise ValueError(
-                f"evaluation.multiview.scenes: model={self.model.name} has no Projected Huber density, which fusion "
-                f"needs; expected model=probabilistic, {expected}"
+                f"evaluation.multiview.scenes: model={self.model.name} has no density with a covariance, which "
+                f"fusion needs; expected model=probabilistic, {expected}"
             )
-        if not isinstance(self.data, RenderedConfig) or self.data.name != SINGLE_VIEW:
+        if not isinstance(self.data, RenderedConfig) or self.data.spec.views > 1:
             raise ValueError(
-                f"evaluation.multiview.scenes: several cameras see the scenes of data={SINGLE_VIEW}, not of "
-                f"data={self.data.name}; expected data={SINGLE_VIEW}, {expected}"
+                f"evaluation.multiview.scenes: data={self.data.name} is not rendered with one view; expected "
+                f"data=scale, {expected}"
             )
+        try:
+            _ = self.several_views
+        except ValueError as error:
+            raise ValueError(f"evaluation.multiview: {gist(error)}") from None
         return self
 
 
