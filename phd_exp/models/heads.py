@@ -88,7 +88,7 @@ class ShapedHead:
         n_further: their number.
     """
 
-    prediction = Density
+    prediction = Shaped
 
     def __init__(
         self, depth: DepthScale, density: Callable[[ProjectedHuber, Tensor], Shaped], n_further: int = 0
