@@ -12,6 +12,7 @@ from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_fol
 from phd_exp.records.detections import Detection, NumberOrName, detection_of, detections_in
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import write_atomic
+from phd_exp.records.foreign import boxes_in
 from phd_exp.records.runs import RunFolder
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
@@ -30,7 +31,7 @@ class PredictArguments(RunArguments):
     folder: Path | None = None
     """images with a metadata.jsonl, or as BOP, KITTI or COCO, instead of image="""
     object: NumberOrName | None = None
-    """with folder=: BOP's obj_id, KITTI's type or COCO's category; by default all objects"""
+    """with folder= or boxes=: BOP's obj_id, KITTI's type or COCO's category; by default all objects"""
     f: float | None = None
     """focal length, px"""
     fx: float | None = None
@@ -45,6 +46,8 @@ class PredictArguments(RunArguments):
     """instead of f=, a camera file of ROS or OpenCV, with the lens"""
     box: Annotated[tuple[float, float, float, float], BOX] | None = None
     """LEFT,TOP,RIGHT,BOTTOM of the object, px; by default the whole image"""
+    boxes: Path | None = None
+    """instead of box=, a file of COCO results with the boxes of many objects"""
     out: Path | None = None
     """a folder for predictions.jsonl and a picture for each line; by default lines are printed"""
     groups: Literal["spread", "truncation", "focal_length"] | None = None
@@ -69,8 +72,10 @@ class PredictArguments(RunArguments):
                 f"{next(iter(self.of_camera))}: belongs to image=FILE; for a folder, write it into each line of "
                 "metadata.jsonl"
             )
-        if self.object and self.image:
-            raise ValueError("object: selects detections of folder=DIR; leave it out for image=FILE")
+        if self.boxes and (self.box or self.folder):
+            raise ValueError("boxes: the boxes of image=FILE; expected no box= and no folder=")
+        if self.object is not None and self.image and not self.boxes:
+            raise ValueError("object: selects detections of folder=DIR or boxes=FILE; leave it out for one box")
         if self.groups and not self.coverage:
             raise ValueError("groups: guarantees a coverage; expected coverage=0.9, or another in (0, 1), too")
         if self.calibration and self.out is None:
@@ -88,7 +93,8 @@ def main(words: list[str]) -> int:
         detections = detections_in(arguments.folder, object_name=arguments.object)
     else:
         assert arguments.image is not None  # checked by `one_source`
-        detections = [detection_of(arguments.image, arguments.of_camera)]
+        boxes = [{"box": box} for box in boxes_in(arguments.boxes, arguments.object)] if arguments.boxes else [{}]
+        detections = [detection_of(arguments.image, arguments.of_camera | box) for box in boxes]
     if out is not None:
         _require_possible(detections, out)
         output_folder(out)

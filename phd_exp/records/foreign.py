@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from phd_exp.records.errors import DatasetError, gist
+from phd_exp.records.errors import DatasetError, gist, listed
 from phd_exp.records.files import MB, read_plain
 from phd_exp.records.parsing import parse_json
 
@@ -115,6 +115,28 @@ def _coco(folder: Path) -> Iterator[Entry]:
             values = dict(zip("xyz", item["position"], strict=True)) if "position" in item else {}
             values |= {"file_name": image["file_name"], "box": edges(item["bbox"])}
             yield where, names[item["category_id"]], (image.get("camera") or content["camera"]) | values
+
+
+def boxes_in(file: Path, category: int | str | None = None) -> list[list[float]]:
+    """The boxes (left, top, right, bottom, px) of one image's COCO results, `[{"bbox": [...], ...}, ...]`.
+
+    Raises DatasetError if the file cannot be read, has boxes of several images, or none of the category.
+    """
+    items = _read(file)
+    found, others = [], set()
+    with _reading(file):
+        if len({item.get("image_id") for item in items}) > 1:
+            raise ValueError("has boxes of several images; expected those of one")
+    for number, item in enumerate(items):
+        with _reading(f"{file}, box {number}"):
+            if category is None or str(item["category_id"]) == str(category):
+                found.append(edges(item["bbox"]))
+            else:
+                others.add(str(item["category_id"]))
+    if not found:
+        here = f"has category_id {listed(sorted(others))}" if others else "is empty"
+        raise DatasetError(f"{file}: no box to predict: it {here}")
+    return found
 
 
 def edges(bbox: Sequence[float]) -> list[float]:

@@ -110,7 +110,24 @@ def test_other_formats_are_predicted_as_lines(phd_exp: Callable, run: RunFolder,
     (folder / "metadata.jsonl").write_text("\n".join(lines))
     assert found.out == phd_exp(*words).out
     refused = phd_exp("predict", f"run={run.path}", "image=a.png", "f=900", "object=5")
-    assert refused.err == "error: object: selects detections of folder=DIR; leave it out for image=FILE\n"
+    assert refused.err == "error: object: selects detections of folder=DIR or boxes=FILE; leave it out for one box\n"
+
+
+def test_boxes_of_one_photograph_are_predicted_as_single_ones(
+    phd_exp: Callable, run: RunFolder, photos: Path, tmp_path: Path
+) -> None:
+    words = ("predict", f"run={run.path}", f"image={photos / '0.png'}", "f=300")
+    boxes = [[5, 10, 55, 60], [20, 5, 40, 50]]
+    items = [{"image_id": 1, "category_id": place, "bbox": box} for place, box in enumerate(boxes)]
+    (tmp_path / "boxes.json").write_text(json.dumps(items))
+    found = read_lines(phd_exp(*words, "boxes=boxes.json").out)
+    for row, (x, y, w, h) in zip(found, boxes, strict=True):
+        (alone,) = read_lines(phd_exp(*words, f"box={x},{y},{x + w},{y + h}").out)
+        assert row["box"] == alone["box"]
+        np.testing.assert_allclose(row["mode"], alone["mode"], rtol=1e-4)
+    (of_category,) = read_lines(phd_exp(*words, "boxes=boxes.json", "object=0").out)
+    assert of_category["box"] == found[0]["box"]
+    assert "expected no box= and no folder=" in phd_exp(*words, "boxes=boxes.json", "box=5,10,60,70").err
 
 
 def test_one_image_is_the_line_of_a_folder_and_is_drawn(

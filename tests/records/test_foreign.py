@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from phd_exp.records.dataset import SPLITS
 from phd_exp.records.detections import Detection, DetectionFolder, annotations, detections_in, observed
 from phd_exp.records.errors import DatasetError, UserError
+from phd_exp.records.foreign import boxes_in
 from tests.support.foreign import BOP, COCO, P2, PEDESTRIAN, TURN, WRITERS
 
 
@@ -84,6 +85,27 @@ def test_coco_boxes_cameras_and_positions(read: Callable) -> None:
     assert spoon.focal_lengths_and_centre(120, 90) == (110, 110, 60, 45)
     assert cup.position == (0.1, 0, 2)
     assert spoon.line.z is None
+
+
+def test_results_are_the_boxes_of_one_image(tmp_path: Path) -> None:
+    def boxes(*items: dict[str, Any], category: int | None = None) -> list[list[float]]:
+        (file := tmp_path / "boxes.json").write_text(json.dumps(items))
+        return boxes_in(file, category)
+
+    one = {"image_id": 3, "category_id": 1, "bbox": [10, 20, 30.5, 40], "score": 0.9}
+    two = one | {"category_id": 2, "bbox": [0, 0, 5, 5]}
+    assert boxes(one, two) == [[10, 20, 40.5, 60], [0, 0, 5, 5]]
+    assert boxes(one, two, category=2) == [[0, 0, 5, 5]]
+    for items, category, line in [
+        ((one, one | {"image_id": 4}), None, "has boxes of several images; expected those of one"),
+        ((one, two), 3, "no box to predict: it has category_id 1, 2"),
+        ((), None, "no box to predict: it is empty"),
+        ((one, {"image_id": 3}), None, "box 1: cannot be read ..bbox. is missing"),
+        ((one, one | {"bbox": [1, 2, 3]}), None, "box 1: cannot be read .not enough values"),
+        ((1,), None, "cannot be read"),
+    ]:
+        with pytest.raises(DatasetError, match=line):
+            boxes(*items, category=category)
 
 
 @pytest.mark.parametrize(
