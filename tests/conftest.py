@@ -24,8 +24,17 @@ HOOKED = ("geometry", "distributions", "losses", "metrics", "models", "data", "e
 install_import_hook([f"phd_exp.{name}" for name in HOOKED], "beartype.beartype")
 
 
-# two test processes on two cores; more threads would only wait for each other
 torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """Torch computes on one thread, whatever the test before has set.
+
+    Two test processes have two cores: more threads would wait for each other, far longer than they compute.
+    """
+    yield
+    torch.set_num_threads(1)
 
 
 @dataclass(frozen=True)

@@ -209,12 +209,14 @@ def it_is_continuous(family: Family, generator: torch.Generator) -> Finding:
     """
     density = family.members(2000, generator)
     one, other = _in_view(2000, generator), _in_view(2000, generator)
+    low, high = density.log_prob(one), density.log_prob(other)
     for _ in range(60):
         middle = (one + other) / 2
-        values = [density.log_prob(place) for place in (one, middle, other)]
-        first = ((values[1] - values[0]).abs() > (values[2] - values[1]).abs())[:, None]
-        one, other = torch.where(first, one, middle), torch.where(first, middle, other)
-    jump = (density.log_prob(one) - density.log_prob(other)).abs()
+        between = density.log_prob(middle)
+        first = (between - low).abs() > (high - between).abs()
+        one, other = torch.where(first[:, None], one, middle), torch.where(first[:, None], middle, other)
+        low, high = torch.where(first, low, between), torch.where(first, between, high)
+    jump = (low - high).abs()
     return Finding(bool((jump < 1e-6).all()), float(jump.max()))
 
 

@@ -10,6 +10,7 @@ from phd_exp.evaluation.parquet import read_table
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import CHOOSE, RunFolder
 from phd_exp.records.searches import read_searches
+from phd_exp.reports import figures
 from tests.support.own_parts import QUICK, write_own_parts
 
 optuna = pytest.importorskip("optuna", reason="needs `pip install 'phd_exp[search]'`")
@@ -28,6 +29,7 @@ sampler: {_target_: optuna.samplers.RandomSampler, seed: 1}
 @pytest.fixture
 def search(phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable:
     write_own_parts(tmp_path)
+    monkeypatch.setattr(figures, "draw_calibration", lambda curves, file: None)
     (tmp_path / "my_conf/backbone/mine.yaml").write_text("_target_: ownnet.Mine\nwidth: 8\n")
     (tmp_path / "space.yaml").write_text(SPACE)
     monkeypatch.syspath_prepend(tmp_path)

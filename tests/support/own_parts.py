@@ -108,6 +108,7 @@ QUICK = (
     "preset=smoke",
     "logger=none",
     "trainer.progress_bar=false",
+    "trainer.threads=1",
 )
 """A run of a second, of the parts above."""
 
