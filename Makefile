@@ -44,10 +44,10 @@ lint: $(INSTALLED)  ## ruff, mypy, import contracts, and a check for known bad r
 	$(BIN)/python .ci/audit.py
 
 test: lint  ## lint and the default tests (under 5 minutes on 2 cores)
-	$(BIN)/python -m pytest -n 2 --dist loadgroup
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-all: lint  ## the slow tests too
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -m 'not bench'
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not bench'
 
 bench: $(INSTALLED)  ## quality and speed against named references
 	$(BIN)/python -m pytest tests/benchmarks -m bench

@@ -207,6 +207,7 @@ def test_a_run_without_its_best_checkpoint_uses_the_last(own: Callable) -> None:
     np.testing.assert_allclose(found.mode[:, 2], read_table(run.predictions)["mode_z"], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_every_logger_receives_the_record(own: Callable, tmp_path: Path) -> None:
     pytest.importorskip("tensorboard", reason="needs `pip install 'phd_exp[loggers]'`")
     pytest.importorskip("mlflow", reason="needs `pip install 'phd_exp[loggers]'`")
@@ -240,6 +241,7 @@ def test_training_from_python(own: Callable, tmp_path: Path, monkeypatch: pytest
     assert table["test/nll"][0] == run.results["test/nll"]
 
 
+@pytest.mark.slow
 def test_only_what_is_chosen_is_imported() -> None:
     names = ("wandb", "mlflow", "tensorboard", "optuna", "timm")
     code = f"import sys, phd_exp.training.run; print([name for name in {names} if name in sys.modules])"

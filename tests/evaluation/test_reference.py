@@ -22,6 +22,7 @@ def scores_of(prediction: ProjectedHuber, xyz: torch.Tensor) -> dict[str, float]
     return found | {name: float(column.mean()) for name, column in nees_columns(prediction, xyz).items()}
 
 
+@pytest.mark.slow
 def test_calibrated_models_lie_in_the_interval_95_times_of_100() -> None:
     n = 60
     prediction = calibrated(truths(n, seed=1)[0], a=20.0, A=600.0, overconfidence=1.0, seed=3)

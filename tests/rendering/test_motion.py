@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
@@ -26,6 +27,7 @@ NOISE = 1.0  # grey values: of the tracer, whose random numbers differ, and of i
 RENDER = """
 import sys
 import numpy as np
+import pytest
 from phd_exp.records.scenes import Scene
 from phd_exp.rendering.blender import Renderer, Settings
 from phd_exp.rendering.samples import take_picture
@@ -59,6 +61,7 @@ def difference(picture: np.ndarray, warp: np.ndarray, scene: Scene) -> float:
     return float(np.abs(picture.astype(float) - warp)[within].mean())
 
 
+@pytest.mark.slow
 def test_a_moved_camera_sees_the_warped_picture(make_spec: Callable[..., DatasetSpec], tmp_path: Path) -> None:
     """After a quarter turn, zoom, roll and tilt. A reflection is no motion of a camera."""
     scene = sample_scene(make_spec("occl"), "train", 0)

@@ -138,7 +138,7 @@ def test_light_tells_depth_less_than_its_jitter_hides(make_spec: MakeSpec) -> No
     assert abs(np.mean(near - far)) < np.std(near)
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", ["default", "occl_scale"])
 def test_a_panel_hides_half_of_the_cylinder_and_changes_nothing_else(make_spec: MakeSpec, variant: str) -> None:
     visible, widths = [], []
     for index in range(100):

@@ -17,8 +17,6 @@ from tests.bad_input.images import pipe
 from tests.support.recorded import reported, sited
 from tests.support.synthetic import write_run
 
-pytestmark = pytest.mark.xdist_group("hostile")  # one worker makes its report
-
 Spoil = Callable[[RunFolder], object]
 
 

@@ -1,6 +1,6 @@
 """The site in a real browser, from the file system, without a network.
 
-By default one walk on a phone and one on a desktop; all other pages and interactions are slow.
+By default one walk on a phone; all other pages and interactions are slow.
 """
 
 import re
@@ -11,8 +11,6 @@ import pytest
 
 from tests.support.browser import Visit
 from tests.support.site_runs import OWNED
-
-pytestmark = pytest.mark.xdist_group("browser")  # one worker makes its report
 
 RUN = "runs/small-default-probabilistic-seed0.html"
 OTHER = "small-occl-probabilistic-seed0"
@@ -81,6 +79,7 @@ def test_every_page_opens_and_draws_its_charts(visit: Visit, site: Path) -> None
     assert "{{7*7}}" in text
 
 
+@pytest.mark.slow
 def test_links_and_the_comparison_keep_their_runs(visit: Visit) -> None:
     visit.open("index.html")
     visit.page.get_by_role("link", name="probabilistic on default").first.click()
