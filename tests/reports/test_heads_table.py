@@ -12,6 +12,7 @@ from phd_exp.evaluation.predictions import OF_A_DISTRIBUTION, XYZ
 from phd_exp.evaluation.several_views import read_views
 from phd_exp.reports.heads_table import COLUMNS, heads_tables
 from phd_exp.reports.runs import Report, Run, read_report
+from phd_exp.reports.site.pages import overview_page
 from tests.support.recorded import predicted, record
 from tests.support.several import write_views
 
@@ -64,6 +65,15 @@ def test_fused_errors_stand_beside_where_every_seed_has_recorded_several_views(
     assert cells["mine"].ours == "–"
     assert cells["gaussian"].below.startswith("+")
     assert float(cells["gaussian"].ours) > float(cells["probabilistic"].ours) > 0
+
+
+def test_the_overview_has_the_table(report: Report) -> None:
+    (table,) = heads_tables(report)
+    for kind in ("heads", "ensembles"):
+        page = overview_page(report.runs, [replace(table, kind=kind)], {}, [])
+        assert f'<section id="of-{kind}"' in page
+        assert page.count(f'href="#of-{kind}"') == 1
+        assert table.title in page
 
 
 def test_a_better_density_is_bold_with_several_seeds_only(report: Report) -> None:
