@@ -33,6 +33,7 @@ def main(words: list[str]) -> int:
 def _report(runs: Path, out: Path) -> None:
     # imports of seconds, which follow the check of the arguments
     from phd_exp.reports.files import all_tables, write_tables
+    from phd_exp.reports.lines import run_lines
     from phd_exp.reports.runs import read_report
     from phd_exp.reports.terminal import print_report
 
@@ -45,8 +46,7 @@ def _report(runs: Path, out: Path) -> None:
     print_report(report, tables)
     if not report.runs:
         return
-    if tables:
-        print(f"tables: {write_tables(tables, out)}")
+    print(f"tables: {write_tables(tables, run_lines(report), out)}")
     if not all(map(find_spec, ("matplotlib", "plotly", "jinja2"))):
         print("figures and site were not made: they need `pip install 'phd_exp[report]'`")
         return

@@ -2,6 +2,8 @@
 
 import fcntl
 import os
+import platform
+import re
 import signal
 import subprocess
 import sys
@@ -121,6 +123,29 @@ def usable_cores() -> int:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     granted = os.environ.get("SLURM_CPUS_PER_TASK", "")  # Slurm may grant cores without binding to them
     return min(cores, int(granted)) if granted.isdigit() else cores
+
+
+def cpu_has_bfloat16() -> bool:
+    """Whether this CPU has bfloat16 units; False if the system does not list them."""
+    words = _of_the_cpu().split()
+    return "amx_bf16" in words or "avx512_bf16" in words
+
+
+def machine() -> str:
+    """The number and kind of this machine's processors.
+
+    Examples:
+        >>> machine().partition(" cores of ")[0].isdigit()
+        True
+    """
+    name = re.search(r"model name\s*: (.+)", _of_the_cpu())
+    units = "with" if cpu_has_bfloat16() else "without"
+    return f"{os.cpu_count()} cores of {name[1] if name else platform.machine()} {units} bfloat16 units"
+
+
+def _of_the_cpu() -> str:
+    file = Path("/proc/cpuinfo")
+    return file.read_text() if file.exists() else ""
 
 
 def announce(message: str) -> None:

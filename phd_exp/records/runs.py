@@ -37,7 +37,7 @@ from pydantic import AwareDatetime, Field, FiniteFloat, TypeAdapter, ValidationE
 from phd_exp.records.errors import RunError, gist, writing
 from phd_exp.records.files import MB, read_jsonl, read_plain, write_atomic
 from phd_exp.records.parsing import Record, parse_json, parse_yaml
-from phd_exp.records.processes import held
+from phd_exp.records.processes import held, machine
 
 LAST_EPOCH = 10**9
 HOME = "home"  # the unchanged test samples, among shifts
@@ -209,7 +209,7 @@ class RunFolder:
             git_commit=git_commit(),
             data_manifest=data_manifest,
             custom=dict(custom or {}),
-            machine=f"{platform.machine()}, {os.cpu_count()} cores",
+            machine=machine(),
         )
 
         def ended(state: State, **details: str) -> None:

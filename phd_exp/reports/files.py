@@ -70,8 +70,11 @@ def all_tables(report: Report) -> list[Table]:
     return [table for make in makers for table in make(report)]
 
 
-def write_tables(tables: Sequence[Table], out: Path) -> Path:
-    """Write `<out>/tables/<stem>.{md,tex}` of each table and `<kind>.csv` of each kind; returns that folder."""
+def write_tables(tables: Sequence[Table], runs: Sequence[Mapping[str, Any]], out: Path) -> Path:
+    """Write `<out>/tables/<stem>.{md,tex}` of each table and `<kind>.csv` of each kind; returns that folder.
+
+    `runs` are the lines of `runs.csv`.
+    """
     folder = out / "tables"
     folder.mkdir(parents=True, exist_ok=True)
     remove_temporaries(folder)  # of a killed process
@@ -80,6 +83,7 @@ def write_tables(tables: Sequence[Table], out: Path) -> Path:
         write_text(folder / f"{table.stem}.tex", latex(table))
     for kind, alike in groupby(tables, key=lambda table: table.kind):
         write_text(folder / f"{kind}.csv", tidy([line for table in alike for line in table.numbers]))
+    write_text(folder / "runs.csv", tidy(runs))
     return folder
 
 

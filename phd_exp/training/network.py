@@ -18,6 +18,7 @@ from phd_exp.models.backbones import Backbone, pooled
 from phd_exp.models.regressor import FocalLengthInput, Regressor
 from phd_exp.records.errors import ConfigError, RunError, gist, in_user_code
 from phd_exp.records.files import require_plain
+from phd_exp.records.processes import cpu_has_bfloat16
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import RenderedConfig, RunConfig
 from phd_exp.training.config.sections import TrainerConfig
@@ -83,13 +84,6 @@ def precision(config: TrainerConfig) -> Any:
     if has_gpu(config):
         fast = torch.cuda.is_bf16_supported(including_emulation=False)
     return "bf16-mixed" if config.precision == "bfloat16" or (config.precision == "auto" and fast) else "32-true"
-
-
-def cpu_has_bfloat16() -> bool:
-    """Whether this CPU has bfloat16 units; False if the system does not list them."""
-    flags = Path("/proc/cpuinfo")
-    words = flags.read_text().split() if flags.exists() else []
-    return "amx_bf16" in words or "avx512_bf16" in words
 
 
 def require_same_shrinking(folder: RunFolder, config: RunConfig) -> None:

@@ -1,10 +1,7 @@
 """A table of every ratio that was measured, with the machine, at the end of `make bench`."""
 
-import os
-import platform
 import time
 from collections.abc import Callable
-from pathlib import Path
 from statistics import median
 from typing import NamedTuple
 
@@ -13,7 +10,7 @@ import torch
 from jaxtyping import config as jaxtyping_config
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from phd_exp.training.network import cpu_has_bfloat16
+from phd_exp.records.processes import machine
 
 ROUNDS = 5
 
@@ -74,9 +71,5 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
 
 
 def _machine() -> str:
-    words = Path("/proc/cpuinfo")
-    lines = words.read_text().splitlines() if words.exists() else []
-    name = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine())
-    units = "with" if cpu_has_bfloat16() else "without"
     gpu = f", {torch.cuda.get_device_name()}" if torch.cuda.is_available() else ""
-    return f"{os.cpu_count()} cores of {name} {units} bfloat16 units{gpu}, torch {torch.__version__}"
+    return f"{machine()}{gpu}, torch {torch.__version__}"

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from phd_exp.training.network import cpu_has_bfloat16
+from phd_exp.records.processes import cpu_has_bfloat16
 
 pytestmark = pytest.mark.bench
 HERE = Path(__file__).parent

@@ -65,7 +65,7 @@ def test_a_table_of_one_two_three_and_five_seeds(tmp_path: Path) -> None:
     assert [row.stub for row in table.rows] == [
         ("probabilistic on default", kind) for kind in ("one network", "2 seeds", "3 seeds", "5 seeds")
     ]
-    folder = write_tables([table], tmp_path / "report")
+    folder = write_tables([table], [], tmp_path / "report")
     rows = list(csv.DictReader((folder / "ensembles.csv").read_text().splitlines()))
     found = {(row["prediction"], row["quantity"]): float(row["value"]) for row in rows}
     tables = [read_table(run.predictions) for run in runs[:5]]

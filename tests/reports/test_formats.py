@@ -16,6 +16,7 @@ from rich.console import Console
 from phd_exp.distributions.constraints import Finding
 from phd_exp.reports.files import all_tables, constraints_table, latex, markdown, tidy, write_tables
 from phd_exp.reports.fusion_table import headline
+from phd_exp.reports.lines import run_lines
 from phd_exp.reports.runs import Report, Run, read_report
 from phd_exp.reports.table import Table, TableCell
 from phd_exp.reports.terminal import WIDTH, print_report
@@ -211,14 +212,33 @@ def test_runs_with_overrides_are_listed_apart(tmp_path: Path, capsys: pytest.Cap
 # files, and the table of several views
 
 
-def test_each_table_is_two_files_and_each_kind_one_csv(found: list[Table], tmp_path: Path) -> None:
-    folder = write_tables(found, tmp_path / "new" / "report")
+def test_each_table_is_two_files_and_each_kind_one_csv(found: list[Table], records: Report, tmp_path: Path) -> None:
+    folder = write_tables(found, run_lines(records), tmp_path / "new" / "report")
     assert folder == tmp_path / "new" / "report" / "tables"
     names = {path.name for path in folder.iterdir()}
     assert {"table1-small-whole.md", "table2-small-central.tex", f"{FUSION}.md"} <= names
-    assert {name for name in names if name.endswith(".csv")} == {"tables.csv", "fusion.csv"}
-    assert len(names) == 2 * len(found) + 2
+    assert {name for name in names if name.endswith(".csv")} == {"tables.csv", "fusion.csv", "runs.csv"}
+    assert len(names) == 2 * len(found) + 3
     assert (folder / "table1-small-whole.md").read_text() == markdown(one(found, "table1-small-whole"))
+
+
+def test_each_run_is_lines_from_which_the_tables_follow(found: list[Table], records: Report) -> None:
+    lines = pd.read_csv(io.StringIO(tidy(run_lines(records))), dtype={"overrides": str})
+    cells = pd.read_csv(io.StringIO(tidy([cell for table in found for cell in table.numbers if "table" in cell])))
+    keys = ["preset", "data", "model", "estimate", "reading", "quantity"]
+    means = lines.groupby(keys)["mean"].agg(["mean", "size"])
+    made = cells[cells["n_seeds"] > 0]
+    assert len(made) > 20
+    for cell in made.itertuples():
+        mean, n = means.loc[tuple(getattr(cell, key) for key in keys)]
+        assert (mean, n) == (pytest.approx(cell.mean), cell.n_seeds)
+    run = next(run for run in records.runs if run.nll is not None)
+    own = lines[(lines["preset"] == run.preset) & (lines["data"] == run.data) & (lines["seed"] == run.seed)]
+    assert own[(own["model"] == run.model) & (own["quantity"] == "nll")]["mean"].item() == pytest.approx(run.nll)
+    first = lines[lines["preset"] == "several"].iloc[0]
+    words = dict(word.split("=") for word in first["command"].split()[3:])
+    assert words == {key: str(first[key]) for key in ("preset", "data", "model", "seed")}
+    assert first["machine"] == records.runs[0].status.machine  # type: ignore[union-attr]  # it is there
 
 
 def test_the_fusion_table_holds_the_scores(found: list[Table], several: Run) -> None:
