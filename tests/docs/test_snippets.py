@@ -18,13 +18,19 @@ from phd_exp.cli.jobs import plain
 from phd_exp.training.config import check, check_render
 from tests.docs.pages import PAGES, ROOT, blocks, commands, name
 
+TRAINS = "guides/own_parts.md"
 README, HELP = ROOT / "README.md", ROOT / "phd_exp" / "cli" / "help.py"
 COMMANDS = {tuple(words): page for page in (*PAGES, README) for words in commands(page)}
 COMMANDS |= {tuple(line.partition(" >")[0].split()[3:]): HELP for lines in EXAMPLES.values() for line in lines}
 CHECKS = {"train": ("config", check), "render": ("render", check_render)}
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)], ids=name)
+def of_a_page(page: Path) -> object:
+    """A page that trains networks is slow."""
+    return pytest.param(page, id=name(page), marks=[pytest.mark.slow] if name(page) == TRAINS else [])
+
+
+@pytest.mark.parametrize("page", [of_a_page(page) for page in PAGES if blocks(page)])
 def test_python_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _write_files(page, tmp_path, monkeypatch)
     scope: dict[str, object] = {}

@@ -69,7 +69,7 @@ def grid(views: ProjectedHuber, pose: Pose, centre: Tensor, covariance: Tensor) 
     return mean, (weight[:, None] * (v - mean)).mT @ (v - mean)
 
 
-@pytest.mark.parametrize("angle", [0.1, 0.5])
+@pytest.mark.parametrize("angle", [pytest.param(0.1, marks=pytest.mark.slow), 0.5])
 def test_mean_and_covariance_are_those_of_a_dense_grid(angle: float) -> None:
     views, pose, _ = sharing_scenes(2, 2, deviation=DEVIATION, a=OWN, A=100.0, angle=angle)
     fused = fuse_shared(views, pose, share=SHARE)

@@ -59,7 +59,7 @@ def run(make: Callable[..., RunFolder]) -> RunFolder:
     return make()
 
 
-@pytest.mark.parametrize("groups", [None, "truncation"])
+@pytest.mark.parametrize("groups", [None, pytest.param("truncation", marks=pytest.mark.slow)])
 def test_regions_are_those_of_the_guarantee_along_the_real_axis(
     phd_exp: Callable, run: RunFolder, photos: Path, groups: str | None
 ) -> None:

@@ -55,6 +55,7 @@ def test_quality_is_paid_in_bytes(pictures: list[np.ndarray], make_spec: MakeSpe
         assert errors == sorted(set(errors))
 
 
+@pytest.mark.slow
 def test_webp_files_hold_the_pixels_of_the_png_files(small: DatasetFolder, small_webp: DatasetFolder) -> None:
     spec = small_webp.manifest.spec
     assert spec.image_format == "webp"
