@@ -29,6 +29,7 @@ def test_tables_are_printed_and_written(phd_exp: Callable, runs: Path, tmp_path:
         "table1-small-central.md",
         "table1-small-central.tex",
         "tables.csv",
+        "runs.csv",
     }
     assert not list((tmp_path / "report" / "site" / "runs").glob("*.tmp"))
 
