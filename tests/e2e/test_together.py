@@ -104,7 +104,7 @@ def test_one_killed_ends_all_and_the_same_command_goes_on(
     assert len(ranks) == 2
     assert not any(alive(rank) for rank in ranks)
     (line,) = outcome.err.splitlines()
-    assert f"rank {place} of 2: process {ranks[place]} was killed by SIGKILL; the others were ended" in line
+    assert f"rank {place} of 2: process {ranks[place]} was killed by SIGKILL; the others were stopped" in line
     run = only_run(tmp_path / "runs")
     status = run.status()
     assert status is not None
