@@ -90,9 +90,8 @@ def sweep(begin: Callable) -> Callable[..., tuple[int, list[str], list[str]]]:
     return run
 
 
-@pytest.mark.parametrize(
-    ("launcher", "seeds"), [("joblib", (0, 1, 2, 3, 5)), pytest.param("submitit", (0, 1, 3), marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("launcher", "seeds"), [("joblib", (0, 1, 2, 3, 5)), ("submitit", (0, 1, 3))])
 def test_failures_come_back_and_stop_no_other_job(
     sweep: Callable, tmp_path: Path, launcher: str, seeds: tuple[int, ...]
 ) -> None:

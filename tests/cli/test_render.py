@@ -22,6 +22,7 @@ def render(phd_exp: Callable) -> Callable:
     return lambda *arguments: phd_exp("render", *TINY, *arguments)
 
 
+@pytest.mark.slow
 def test_a_data_set_is_rendered_in_shards_and_verified_and_repaired(
     render: Callable, phd_exp: Callable, tmp_path: Path
 ) -> None:

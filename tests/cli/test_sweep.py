@@ -16,6 +16,10 @@ from phd_exp.records.processes import usable_cores
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import check
 
+EXPERIMENTS = [
+    pytest.param(file.stem, marks=pytest.mark.slow if file.stem in ("heads", "shift") else ())
+    for file in sorted((conf_folder() / "experiment").iterdir())
+]
 SUBMITIT = "hydra_plugins.hydra_submitit_launcher.submitit_launcher"
 
 
@@ -46,7 +50,7 @@ def test_as_many_runs_as_the_words_say(jobs: Callable, words: list[str], n: int)
     assert len(found) == len(set(found)) == n
 
 
-@pytest.mark.parametrize("experiment", sorted(file.stem for file in (conf_folder() / "experiment").iterdir()))
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_an_experiment_says_how_many_runs_it_has_and_changes_nothing_else(jobs: Callable, experiment: str) -> None:
     """The run of (mae_vz, occl) in Table 1 is the run of that model on that data, in the same folder."""
     text = (conf_folder() / "experiment" / f"{experiment}.yaml").read_text()

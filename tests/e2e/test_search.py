@@ -54,6 +54,7 @@ def test_other_values_are_refused(text: str) -> None:
         distributions({"a": text})
 
 
+@pytest.mark.slow
 def test_the_best_trial_is_the_best_on_held_out_samples(search: Callable, phd_exp: Callable) -> None:
     outcome = search("trials=2")
     assert outcome.status == 0, outcome.err
