@@ -10,7 +10,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from phd_exp.cli.jobs import composed, launch
 from phd_exp.records.choices import RunName, has_influence, setting
 from phd_exp.records.dataset import DatasetFolder
-from phd_exp.records.errors import RunError
+from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.processes import usable_cores
 from phd_exp.records.runs import RunFolder
 from phd_exp.rendering.render import ensure_rendered
@@ -30,13 +30,14 @@ SHOWN = (
     "test/calibration/miscalibration_area",
 )
 """The numbers that are printed at the end of a run; results.json holds more."""
+LONG = 1_000_000  # images seen by all trainings of a sweep; from here on their time is estimated
 SCORES = ("test/nll", "test/depth_error_mm")
 """The number that a sweeper receives: the first that the run has. A baseline has no likelihood."""
 
 
 def main(words: list[str]) -> int:
     """Train once, or (-m) for every combination; returns the exit status."""
-    return launch(task, words, standing=standing)
+    return launch(task, words, standing=standing, cost=cost)
 
 
 def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Sequence[Any] = ()) -> float | None:
@@ -74,6 +75,34 @@ def trained(overrides: list[str], config_dir: str | Path | None) -> "TrainedRun"
     config = composed(overrides, config_dir)
     task(config, overrides, usable_cores())
     return TrainedRun(run_name(check(config), overrides).folder(Path(config["runs"])))
+
+
+def cost(configs: list[dict[str, Any]], cores: int) -> float:
+    """The seconds of several long trainings on a CPU, one after another, by the first steps of the first; else 0.
+
+    Rendering and evaluations are not included.
+    """
+    images = [_images_seen(config) for config in configs]
+    if sum(images) < LONG:
+        return 0.0
+    try:
+        first = check(configs[0])
+    except ConfigError:  # the job itself reports it
+        return 0.0
+    from phd_exp.training.duration import seconds_a_step
+    from phd_exp.training.network import has_gpu
+
+    if has_gpu(first.trainer) or not isinstance(first.data, RenderedConfig):
+        return 0.0
+    return seconds_a_step(first, cores) / first.data.batch_size * sum(images)
+
+
+def _images_seen(config: dict[str, Any]) -> int:
+    """The number of images that a training sees, 0 if it is unknown. The configuration is not checked."""
+    try:
+        return int(config["data"]["n_train"]) * int(config["trainer"]["max_epochs"])
+    except (KeyError, TypeError, ValueError):
+        return 0
 
 
 def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> None:

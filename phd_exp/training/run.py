@@ -125,7 +125,7 @@ def run(
 
     Every rank computes and returns the results; rank 0 alone writes the record.
     """
-    _quiet_lightning()
+    quiet_lightning()
     torch.set_num_threads(threads)
     seed_everything(config.seed, verbose=False)
     data = build_data(config, rank)
@@ -229,7 +229,7 @@ def _manifest_hash(config: RunConfig) -> str | None:
     return None
 
 
-def _quiet_lightning() -> None:
+def quiet_lightning() -> None:
     """Silence Lightning's remarks, except a profiler's, and the warnings about intended behaviour."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
@@ -239,5 +239,7 @@ def _quiet_lightning() -> None:
     warnings.filterwarnings("ignore", "Precision .* is not supported by the model summary")
     # an interrupted run resumes in the same folder
     warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
+    # the first steps are timed without an evaluation
+    warnings.filterwarnings("ignore", "You defined a `validation_step` but have no `val_dataloader`")
     # the logged values are already sums over all processes
     warnings.filterwarnings("ignore", "It is recommended to use .*sync_dist=True")

@@ -10,6 +10,7 @@ import hydra
 import pytest
 
 from phd_exp.cli import conf_folder, sweep
+from phd_exp.cli.jobs import Job
 from phd_exp.cli.sweep import Combination, cores_a_job, plan
 from phd_exp.cli.train import run_name, standing
 from phd_exp.records.processes import usable_cores
@@ -133,3 +134,16 @@ def test_cores_are_those_that_this_process_was_given(monkeypatch: pytest.MonkeyP
     for granted, usable in (("3", 3), ("64", 8), ("", 8)):
         monkeypatch.setenv("SLURM_CPUS_PER_TASK", granted)
         assert usable_cores() == usable
+
+
+def test_the_time_of_a_sweep_is_printed_beforehand(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sweep, "usable_cores", lambda: 4)
+    job = Job(lambda *_: None, cost=lambda configs, cores: 7200.0 * len(configs))
+    for cores, line in ((2, "about 3.0 h on 4 cores"), (None, "about 6.0 h on 4 cores")):
+        sweep._print_duration(job, [{}] * 3, cores)
+        assert capsys.readouterr().out == f"{line}, by the first steps of one job\n"
+    sweep._print_duration(Job(job.task), [{}], 2)
+    sweep._print_duration(job, [], 2)
+    assert capsys.readouterr().out == ""

@@ -1,7 +1,7 @@
 """Every file under conf/ composes into a configuration that passes the check."""
 
 from collections.abc import Callable
-from itertools import zip_longest
+from itertools import cycle, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ TOGETHER = [
     tuple(word for word in words if word)
     for words in zip_longest(*(words for group, words in CHOICES.items() if group not in OF_STRONG))
 ] + [(*STRONG, word) for group in OF_STRONG for word in CHOICES[group]]
-TOGETHER += [("recipe=strong", *words) for words in zip(CHOICES["preset"], CHOICES["backbone"], strict=True)]
+TOGETHER += [("recipe=strong", *words) for words in zip(CHOICES["preset"], cycle(CHOICES["backbone"]), strict=False)]
 
 
 @pytest.fixture
