@@ -6,7 +6,7 @@ from phd_exp.cli.jobs import launch
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError
 from phd_exp.rendering.bop import write_bop
-from phd_exp.rendering.finished import require_elsewhere, verify, write_masks
+from phd_exp.rendering.finished import meshes_of, require_elsewhere, verify, write_masks
 from phd_exp.rendering.render import ensure_rendered
 from phd_exp.training.config import check_render
 
@@ -23,8 +23,6 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> None:
     require_elsewhere(folder, masks=checked.masks, bop=checked.bop)
     if checked.bop and data.spec.image_format == "webp":
         raise ConfigError("data.image_format: got webp; BOP has no such images; expected png or jpeg, or no bop=")
-    if checked.bop and data.spec.mesh:
-        raise ConfigError("bop: got a folder; objects from meshes are not written as BOP; leave out bop=")
     if checked.verify:
         n = verify(folder, data.spec, checked.rerender)
         print(f"{folder.root}: all {n} samples are as they were rendered")
@@ -33,7 +31,9 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> None:
     if not ensure_rendered(folder, data.spec, n_train, n_test, data.workers, cores, checked.shard):
         return  # other shards are missing
     print(f"{folder.root}: {n_train} training and {n_test} test samples are there")
-    if checked.masks is not None:
-        print(f"{checked.masks}: {write_masks(folder, checked.masks, data.spec)} masks")
-    if checked.bop is not None:
-        print(f"{checked.bop}: {write_bop(folder, checked.bop)} images as BOP")
+    if checked.masks or checked.bop:
+        meshes = meshes_of(data.spec)
+    if checked.masks:
+        print(f"{checked.masks}: {write_masks(folder, checked.masks, meshes)} masks")
+    if checked.bop:
+        print(f"{checked.bop}: {write_bop(folder, checked.bop, meshes)} images as BOP")

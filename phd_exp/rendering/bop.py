@@ -1,6 +1,7 @@
 """Write a rendered data set in the format of BOP, which `records/foreign.py` reads.
 
-    <bop>/models/                  obj_000001.ply (cylinder), 2 (cube), 3 (sphere), and models_info.json, all in mm
+    <bop>/models/                  obj_000001.ply (cylinder), 2 (cube), 3 (sphere), 4 and more (meshes, whose
+                                   symmetries are unknown), and models_info.json, all in mm
     <bop>/<split>/000000/          all images; of a data set with several views, those of one scene
         mask_visib/000123_000001.png    white where image 123 shows its object 1
 
@@ -15,6 +16,8 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+from scipy.spatial import ConvexHull
+from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 from phd_exp.records.dataset import SPLITS, DatasetFolder
@@ -27,12 +30,18 @@ from phd_exp.rendering import rays
 from phd_exp.rendering.meshes import build_mesh
 from phd_exp.rendering.pixels import file_of
 from phd_exp.rendering.progress import shown_progress
+from phd_exp.rendering.triangles import NO_MESHES, Meshes, Triangles
 
-NUMBERS: dict[str, int] = {"cylinder": 1, "cube": 2, "sphere": 3}
+SOLIDS = ("cylinder", "cube", "sphere")
 ROUND_ABOUT = {"cylinder": [[0, 0, 1]], "cube": [], "sphere": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}
 
 
-def write_bop(folder: DatasetFolder, bop: Path) -> int:
+def number_of(shape: str) -> int:
+    """The number of an object's model: 1 to 3 for the solids, 4 for `mesh`, 5 for `mesh1`, ..."""
+    return SOLIDS.index(shape) + 1 if shape in SOLIDS else len(SOLIDS) + 1 + int(shape.removeprefix("mesh") or 0)
+
+
+def write_bop(folder: DatasetFolder, bop: Path, meshes: Meshes = NO_MESHES) -> int:
     """Write all samples of a data set as BOP, the images byte for byte; returns how many.
 
     An object has the additional key `scale`, the factor on the size of its model.
@@ -49,16 +58,23 @@ def write_bop(folder: DatasetFolder, bop: Path) -> int:
             for record in images:
                 content = content_of(folder.split_folder(split) / record.file_name)
                 write_atomic(target / "rgb" / record.file_name, content)
-                hits, numbers = rays.trace_pixels(record.shown), range(len(record.objects))
+                hits, numbers = rays.trace_pixels(record.shown, meshes), range(len(record.objects))
                 tables["gt"][record.index] = [_pose(record, number) for number in numbers]
-                tables["gt_info"][record.index] = [_write_mask(record, number, hits, target) for number in numbers]
+                silhouettes = [rays.silhouette(record.shown, number, meshes) for number in numbers]
+                tables["gt_info"][record.index] = [
+                    _write_mask(record, number, hits, silhouette, target)
+                    for number, silhouette in enumerate(silhouettes)
+                ]
                 tables["camera"][record.index] = _camera(record, several)
                 advance()
             for name, table in tables.items():
                 write_atomic(target / f"scene_{name}.json", json.dumps(table))
         (bop / "models").mkdir(parents=True, exist_ok=True)
         sizes = {item.shape: METRE * np.array(item.dimensions) for record in records for item in record.objects}
-        models = {NUMBERS[shape]: _write_model(shape, size, bop / "models") for shape, size in sizes.items()}
+        models = {
+            number_of(shape): _write_model(shape, size, meshes.get(shape), bop / "models")
+            for shape, size in sizes.items()
+        }
         write_atomic(bop / "models" / "models_info.json", json.dumps(models))
     return len(records)
 
@@ -73,16 +89,18 @@ def _camera(record: SampleRecord, several: bool) -> dict[str, Any]:
 def _pose(record: SampleRecord, number: int) -> dict[str, Any]:
     item, rotation = record.objects[number], rays.rotation_matrix(record.pose.rotation)
     return {
-        "obj_id": NUMBERS[item.shape],
+        "obj_id": number_of(item.shape),
         "cam_R_m2c": (rotation @ rays.rotation_matrix(item.rotation)).ravel().tolist(),
         "cam_t_m2c": (METRE * rays.in_camera_frame(np.array(item.position), record.pose)).tolist(),
         "scale": item.scale,
     }
 
 
-def _write_mask(record: SampleRecord, number: int, hits: rays.Hits, target: Path) -> dict[str, Any]:
+def _write_mask(
+    record: SampleRecord, number: int, hits: rays.Hits, silhouette: tuple[rays.Mask, range, range], target: Path
+) -> dict[str, Any]:
     """Write the mask of an object; returns its boxes and pixels, of which those outside the image are not visible."""
-    mask, (whole, rows, columns) = rays.cylinder_mask(hits, number), rays.silhouette(record.shown, number)
+    mask, (whole, rows, columns) = rays.cylinder_mask(hits, number), silhouette
     file = target / "mask_visib" / f"{record.index:06d}_{number:06d}.png"
     write_atomic(file, file_of(Image.fromarray(np.uint8(255) * mask), "png"))
     return {
@@ -103,24 +121,32 @@ def _box(mask: rays.Mask, left: int = 0, top: int = 0) -> list[int]:
     return [int(value) for value in (columns.min() + left, rows.min() + top, np.ptp(columns), np.ptp(rows))]
 
 
-def _write_model(shape: str, size: np.ndarray, folder: Path) -> dict[str, Any]:
-    """Write the triangles of a shape as PLY; returns its size, and the rotations that do not change it."""
-    mesh = build_mesh(shape)
-    vertices = np.array(mesh.vertices) * size / 2
-    faces = [(3, face[0], *edge) for face in mesh.faces for edge in pairwise(face[1:])]
+def _write_model(shape: str, size: np.ndarray, mesh: Triangles | None, folder: Path) -> dict[str, Any]:
+    """Write the triangles of a shape as PLY; returns its size, and the rotations that do not change a solid."""
+    if mesh:
+        vertices, faces = METRE * mesh.vertices, [(3, *corners) for corners in mesh.corners.tolist()]
+    else:
+        solid = build_mesh(shape)
+        vertices = np.array(solid.vertices) * size / 2
+        faces = [(3, face[0], *edge) for face in solid.faces for edge in pairwise(face[1:])]
     header = f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\n"
     header += "".join(f"property float {axis}\n" for axis in "xyz")
     header += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     rows = (" ".join(map(str, row)) for row in (*vertices.round(6).tolist(), *faces))
-    write_atomic(folder / f"obj_{NUMBERS[shape]:06d}.ply", header + "\n".join(rows) + "\n")
-    info = {"diameter": float(2 * np.linalg.norm(vertices, axis=1).max())}  # all are symmetric about their centre
-    for axis, value in zip("xyz", size.tolist(), strict=True):
-        info |= {f"min_{axis}": -value / 2, f"size_{axis}": value}
+    write_atomic(folder / f"obj_{number_of(shape):06d}.ply", header + "\n".join(rows) + "\n")
+    outermost = vertices[ConvexHull(vertices, qhull_options="QJ").vertices]  # QJ: a mesh may be flat
+    info: dict[str, Any] = {"diameter": float(pdist(outermost).max())}
+    for axis, values in zip("xyz", vertices.T, strict=True):
+        info |= {f"min_{axis}": float(values.min()), f"size_{axis}": float(np.ptp(values))}
+    return info | ({} if mesh else _symmetries(shape, size))
+
+
+def _symmetries(shape: str, size: np.ndarray) -> dict[str, Any]:
     kept = np.array([1, 1, 2]) if shape == "cylinder" else size
     turns = np.tile(np.eye(4), (24, 1, 1))  # those of a cube, of which the identity is the only one with trace 4
     turns[:, :3, :3] = Rotation.create_group("O").as_matrix().round()
     keeps = np.isclose(abs(turns[:, :3, :3]) @ kept, kept).all(axis=1) & (turns.trace(axis1=1, axis2=2) < 4)
-    return info | {
+    return {
         "symmetries_discrete": turns[keeps].reshape(-1, 16).tolist(),
         "symmetries_continuous": [{"axis": axis, "offset": [0, 0, 0]} for axis in ROUND_ABOUT[shape]],
     }

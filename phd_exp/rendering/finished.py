@@ -20,7 +20,7 @@ from phd_exp.rendering.rays import cylinder_mask, trace_pixels
 from phd_exp.rendering.samples import fast_settings, make_sample
 from phd_exp.rendering.sampling import GENERATOR_VERSION
 from phd_exp.rendering.sealing import other_make
-from phd_exp.rendering.triangles import NO_MESHES
+from phd_exp.rendering.triangles import NO_MESHES, Meshes
 
 
 def verify(folder: DatasetFolder, spec: DatasetSpec, rerender: int, seed: int | None = None) -> int:
@@ -103,16 +103,18 @@ def _rendered_again(folder: DatasetFolder, spec: DatasetSpec, records: list[Samp
             yield f"{path}: rendering it again gives another image; delete the data set, and `render` makes it again"
 
 
-def write_masks(folder: DatasetFolder, masks: Path, spec: DatasetSpec | None = None) -> int:
+def meshes_of(spec: DatasetSpec) -> Meshes:
+    """The meshes of a data set, read by Blender. Raises RenderError if one cannot be read."""
+    return Renderer(fast_settings(spec), spec).meshes if spec.mesh else NO_MESHES
+
+
+def write_masks(folder: DatasetFolder, masks: Path, meshes: Meshes = NO_MESHES) -> int:
     """Write `<masks>/<split>/<index>.png`, white where the object is visible, for all samples; returns how many.
 
-    The masks have one bit per pixel and follow from the records, without Blender; only a mesh needs it, and `spec`,
-    which knows the place of the mesh.
+    The masks have one bit per pixel and follow from the records, without Blender.
 
-    Raises DatasetError if there is no data set, or a broken one, RenderError if the masks cannot be written, or a
-    mesh cannot be read.
+    Raises DatasetError if there is no data set, or a broken one, RenderError if the masks cannot be written.
     """
-    meshes = Renderer(fast_settings(spec), spec).meshes if spec and spec.mesh else NO_MESHES
     records = [record for split in SPLITS for record in folder.records(split)]
     with writing(masks, instead="masks=FOLDER"):
         for split in SPLITS:

@@ -46,7 +46,7 @@ def trace_pixels(scene: Scene, meshes: Meshes = NO_MESHES) -> Hits:
     hits = _no_hits(scene, (scene.S, scene.S))
     for number, item in enumerate(scene.objects):
         if item.shape in meshes:
-            hits.depths[number] = mesh_depths(scene, item, meshes)
+            hits.depths[number] = meshes[item.shape].depths(*_placed(scene, item), scene.f, scene.S)
             hits.surfaces[number] = np.where(np.isfinite(hits.depths[number]), 1 + FACES * number, NOTHING)
             continue
         rows, columns = (_clipped(span, scene.S) for span in window(scene, item))
@@ -88,25 +88,26 @@ def truncation(scene: Scene, hits: Hits, meshes: Meshes = NO_MESHES) -> float:
 
     1 if the cylinder has no pixels at all.
     """
-    if (item := scene.objects[0]).shape in meshes:
-        whole = np.isfinite(mesh_depths(scene, item, meshes, whole=True)).sum()
-    else:
-        whole = silhouette(scene)[0].sum()
+    whole = silhouette(scene, 0, meshes)[0].sum()
     return float(1 - (hits.surfaces[0] != NOTHING).sum() / whole) if whole else 1.0
 
 
-def mesh_depths(scene: Scene, item: SceneObject, meshes: Meshes, *, whole: bool = False) -> Image:
-    """Depths of a mesh in the image, or in the box of its `whole` silhouette, see `Triangles.depths`."""
-    turn = item.scale * rotation_matrix(scene.pose.rotation) @ rotation_matrix(item.rotation)
-    shift = in_camera_frame(np.array(item.position), scene.pose)
-    return meshes[item.shape].depths(turn, shift, scene.f, scene.S, whole=whole)
-
-
-def silhouette(scene: Scene, number: int = 0) -> tuple[Mask, range, range]:
-    """Pixels of an object in an image without borders or other objects, in the rows and columns of its `window`."""
-    rows, columns = window(scene, scene.objects[number])
+def silhouette(scene: Scene, number: int = 0, meshes: Meshes = NO_MESHES) -> tuple[Mask, range, range]:
+    """Pixels of an object in an image without borders or other objects, and the rows and columns of these pixels."""
+    item = scene.objects[number]
+    if item.shape in meshes:
+        place = (*_placed(scene, item), scene.f, scene.S)
+        rows, columns = meshes[item.shape].window(*place)
+        return np.isfinite(meshes[item.shape].depths(*place, window=(rows, columns))), rows, columns
+    rows, columns = window(scene, item)
     alone = scene.model_copy(update={"objects": scene.objects[number : number + 1]})
     return trace_points(alone, *pixel_middles(rows, columns)).surfaces[0] != NOTHING, rows, columns
+
+
+def _placed(scene: Scene, item: SceneObject) -> tuple[Image, Image]:
+    """The map of an object's local frame to the camera's: a scaled rotation (3, 3), and a shift (3,), m."""
+    turn = item.scale * rotation_matrix(scene.pose.rotation) @ rotation_matrix(item.rotation)
+    return turn, in_camera_frame(np.array(item.position), scene.pose)
 
 
 def pixel_middles(rows: range, columns: range) -> tuple[Image, Image]:

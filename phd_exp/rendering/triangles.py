@@ -35,22 +35,32 @@ class Triangles:
         areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
         return np.average((a + b + c) / 3, axis=0, weights=areas + 1e-300)
 
-    def depths(self, turn: Depths, shift: Depths, f: float, S: int, *, whole: bool = False) -> Depths:
-        """Depth z of the surface in the middles of pixels (S, S), m; infinity where a ray misses it.
+    def window(self, turn: Depths, shift: Depths, f: float, S: int) -> tuple[range, range]:
+        """Rows and columns of the bounding box of its silhouette, possibly outside the image (S, S)."""
+        x, y, _ = self._seen(turn, shift, f, S)
+        columns, rows = (range(math.floor(values.min()), math.ceil(values.max()) + 1) for values in (x, y))
+        return rows, columns
 
-        With `whole`, the pixels are all of the silhouette's bounding box instead of the image's. The mesh lies in
-        front of the camera, to whose frame `turn` (3, 3) and `shift` (3,) map the local one.
+    def depths(
+        self, turn: Depths, shift: Depths, f: float, S: int, window: tuple[range, range] | None = None
+    ) -> Depths:
+        """Depth z of the surface in the middles of pixels, m; infinity where a ray misses it.
+
+        The pixels are those of the image (S, S), or of the rows and columns of a window. The mesh lies in front of
+        the camera, to whose frame `turn` (3, 3) and `shift` (3,) map the local one.
         """
         from phd_exp.rendering.rasterizing import lower_depths
 
-        x, y, z = (self.vertices @ turn.T + shift).T
-        x, y, size = f * x / z + S / 2 - 0.5, f * y / z + S / 2 - 0.5, (S, S)
-        if whole:  # moved by whole pixels
-            x, y = x - math.floor(x.min()), y - math.floor(y.min())
-            size = (math.ceil(y.max()) + 1, math.ceil(x.max()) + 1)
-        result = np.full(size, np.inf)
-        lower_depths(x, y, 1 / z, self.corners, result)
+        rows, columns = window or (range(S), range(S))
+        x, y, z = self._seen(turn, shift, f, S)
+        result = np.full((len(rows), len(columns)), np.inf)
+        lower_depths(x - columns.start, y - rows.start, 1 / z, self.corners, result)
         return result
+
+    def _seen(self, turn: Depths, shift: Depths, f: float, S: int) -> tuple[Depths, Depths, Depths]:
+        """Columns and rows of the vertices, counted from the middle of the first pixel, and their depths z, m."""
+        x, y, z = (self.vertices @ turn.T + shift).T
+        return f * x / z + S / 2 - 0.5, f * y / z + S / 2 - 0.5, z
 
 
 Meshes = Mapping[str, Triangles]
