@@ -31,7 +31,7 @@ JOBS ?= 4
 MORE ?=
 TABLES := preset=$(PRESET) recipe=$(RECIPE) $(MORE)
 
-tables: $(INSTALLED)  ## both tables, JOBS runs at once; PRESET=paper needs a GPU; resumes after an interruption
+tables: $(INSTALLED)  ## both tables, JOBS runs at once; PRESET=paper needs a GPU, PRESET=full JOBS=2 a night on two cores; resumes
 	$(BIN)/python -m phd_exp -m render data=default,occl,scale,occl_scale $(TABLES)
 	$(BIN)/python -m phd_exp -m experiment=table1,table2 $(TABLES) hydra/launcher=joblib hydra.launcher.n_jobs=$(JOBS)
 	$(BIN)/python -m phd_exp report
