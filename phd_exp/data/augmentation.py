@@ -22,7 +22,7 @@ FIELD = 512  # side of the field of standard normal numbers from which the noise
 
 @dataclass(frozen=True)
 class Photometry:
-    """Random changes of light, colour and image quality, each up to a limit.
+    """Random changes of light, colour and image quality, each up to a limit; masks do not follow `occluders`.
 
     Factors and exponents are uniform between 1/limit and the limit. A quarter of the images each is blurred, gets
     noise, or is compressed, uniformly up to the limit.
@@ -168,12 +168,17 @@ class Augmentation:
             batch, signs = moved(batch, motion), torch.ones_like(signs)
         else:
             batch = replace(batch, xyz=symmetry.position(batch.xyz))
-        return replace(batch, image=_rearranged(batch.image, signs, colours))
+        image, mask = _rearranged(batch.image, signs, colours), batch.mask
+        if mask is not None:
+            mask = _rearranged(mask[..., None], signs, colours[:, :1] * 0)[..., 0]
+        return replace(batch, image=image, mask=mask)
 
 
 def _rearranged(
-    image: UInt8[Tensor, "batch side side 3"], signs: Float[Tensor, "batch 3"], colours: Int[Tensor, "batch 3"]
-) -> UInt8[Tensor, "batch side side 3"]:
+    image: UInt8[Tensor, "batch side side channels"],
+    signs: Float[Tensor, "batch 3"],
+    colours: Int[Tensor, "batch channels"],
+) -> UInt8[Tensor, "batch side side channels"]:
     """The images `moved` by `symmetries` of these signs, without interpolation; with the channels in that order.
 
     One image at a time: indexing the batch once per reflection is ten times slower.
@@ -188,9 +193,20 @@ def _rearranged(
 
 def moved(batch: Batch, motion: Motion) -> Batch:
     """The samples after a motion of the cameras: images interpolated bilinearly, the border repeated beyond it."""
-    side = batch.image.shape[1]
-    origin = motion.origin(middles(side, side).to(batch.f), batch.camera)
-    images = batch.image.permute(0, 3, 1, 2).to(origin.dtype)
-    values = grid_sample(images, origin, mode="bilinear", padding_mode="border", align_corners=False)
-    image = values.round().to(torch.uint8).permute(0, 2, 3, 1)
-    return Batch(image, motion.position(batch.xyz), motion.camera(batch.camera).f, batch.S, batch.row)
+
+    def resampled(images: UInt8[Tensor, "batch side side channels"]) -> UInt8[Tensor, "batch side side channels"]:
+        side = images.shape[1]
+        origin = motion.origin(middles(side, side).to(batch.f), batch.camera)
+        values = grid_sample(
+            images.permute(0, 3, 1, 2).to(origin.dtype), origin, padding_mode="border", align_corners=False
+        )
+        return values.round().to(torch.uint8).permute(0, 2, 3, 1)
+
+    mask = None if batch.mask is None else resampled(batch.mask[..., None])[..., 0]
+    return replace(
+        batch,
+        image=resampled(batch.image),
+        xyz=motion.position(batch.xyz),
+        f=motion.camera(batch.camera).f,
+        mask=mask,
+    )

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -28,6 +28,8 @@ class Batch:
     """Side of `image` in pixels."""
     row: Int[Tensor, " batch"]
     """Index of each sample in its split."""
+    mask: UInt8[Tensor, "batch rows columns"] | None = None
+    """Share of each cell of the image that shows the object, from 0 to 255, if it is known."""
 
     @property
     def camera(self) -> Camera:
@@ -39,12 +41,13 @@ class Batch:
 
     def select(self, rows: Int[Tensor, " rows"] | slice) -> "Batch":
         """The samples of these rows."""
-        return Batch(self.image[rows], self.xyz[rows], self.f[rows], self.S, self.row[rows])
+        mask = None if self.mask is None else self.mask[rows]
+        return Batch(self.image[rows], self.xyz[rows], self.f[rows], self.S, self.row[rows], mask)
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> "Batch":
         """The same samples on a device."""
-        names = ("image", "xyz", "f", "row")
-        return replace(self, **{name: getattr(self, name).to(device, non_blocking=non_blocking) for name in names})
+        parts: dict[str, Any] = {name: part for name, part in vars(self).items() if isinstance(part, Tensor)}
+        return replace(self, **{name: part.to(device, non_blocking=non_blocking) for name, part in parts.items()})
 
 
 @runtime_checkable

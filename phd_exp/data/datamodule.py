@@ -1,5 +1,6 @@
 """A data set as a LightningDataModule."""
 
+from dataclasses import replace
 from functools import partial
 
 from lightning import LightningDataModule
@@ -13,8 +14,9 @@ from phd_exp.records.runs import CHOOSE
 class PositionData(LightningDataModule):
     """The samples of a source in batches, or the share of one of several processes (`rank` of `world`).
 
-    `augment` changes training batches only. The validation evaluates the test samples, which choose nothing, and with
-    `held_out` also the held-out samples that may choose.
+    `augment` changes training batches only. With `masks`, these have the masks of the source, if it has any. The
+    validation evaluates the test samples, which choose nothing, and with `held_out` also the held-out samples that
+    may choose.
 
     Raises ConfigError if there are too few samples for one batch, or if the processes cannot share them; on `setup`,
     DatasetError if the source lacks samples or an image is damaged.
@@ -30,6 +32,7 @@ class PositionData(LightningDataModule):
         world: int = 1,
         augment: Augment | None = None,
         held_out: bool = False,
+        masks: bool = False,
     ) -> None:
         super().__init__()
         if batch_size > source.count("train"):
@@ -48,6 +51,7 @@ class PositionData(LightningDataModule):
                 raise ConfigError(f"trainer.devices: got {world}, more than the {n} samples of {part} in a pass")
         self.source = source
         self.augment = augment
+        self.masks = masks
         self.validated: tuple[Part, ...] = ("test", "held_out") if held_out else ("test",)
         self.batches = partial(BatchLoader, batch_size=batch_size, seed=seed, rank=rank, world=world)
         self.samples: dict[Part, Batch] = {}
@@ -58,6 +62,8 @@ class PositionData(LightningDataModule):
         for part in PARTS:
             if part not in self.samples and self.source.count(part):
                 self.samples[part] = self.source.samples(part)
+                if self.masks and part == "train":
+                    self.samples[part] = replace(self.samples[part], mask=self.source.training_masks())
         if self.train_batches is None:
             self.train_batches = self.batches(self.samples["train"], shuffle=True, augment=self.augment)
 

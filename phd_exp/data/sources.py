@@ -6,13 +6,17 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
+from torch import Tensor
 
 from phd_exp.data.batches import Batch
 from phd_exp.data.images import cached_images
+from phd_exp.data.masks import cached_masks
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.finished import meshes_of
 
 Part = Literal["train", "held_out", "test"]
 """A part of the samples of a run; the first two are taken from the training split."""
@@ -46,6 +50,10 @@ class Source(ABC):
     def count(self, part: Part) -> int:
         """The number of samples of a part."""
 
+    def training_masks(self) -> UInt8[Tensor, "samples rows columns"] | None:
+        """Share of each cell of the training images that shows the object, from 0 to 255; None: it is not known."""
+        return None
+
 
 class RenderedSource(Source):
     """The first samples of each split of a rendered data set, shrunk to `side` x `side` pixels.
@@ -58,6 +66,7 @@ class RenderedSource(Source):
 
     def __init__(self, folder: DatasetFolder, spec: DatasetSpec, n: Mapping[Part, int], side: int) -> None:
         self.folder = folder
+        self.spec = spec
         self.n = n
         self.side = side
         self.zoom = side / spec.sensor_size
@@ -78,6 +87,10 @@ class RenderedSource(Source):
 
     def count(self, part: Part) -> int:
         return self.n[part]
+
+    def training_masks(self) -> UInt8[Tensor, "samples rows columns"]:
+        split, records, rows = self._records("train")
+        return torch.from_numpy(cached_masks(self.folder, split, records, meshes_of(self.spec))[rows])
 
     def _records(self, part: Part) -> tuple[Split, list[SampleRecord], slice]:
         """The split of a part, all records of it that the run uses, and the rows of the part among them."""

@@ -74,7 +74,7 @@ def symmetries(numbers: Float[Tensor, "batch 3"]) -> Motion:
     return Motion(R, torch.ones_like(numbers[:, 0]))
 
 
-def turned(image: UInt8[Tensor, "*batch side side 3"], signs: Iterable[float]) -> UInt8[Tensor, "*batch side side 3"]:
+def turned(image: UInt8[Tensor, "*batch side side n"], signs: Iterable[float]) -> UInt8[Tensor, "*batch side side n"]:
     """Images after one of the `symmetries`, given its three signs; pixels are moved, none is interpolated."""
     x, y, exchange = (sign < 0 for sign in signs)
     image = image.transpose(-3, -2) if exchange else image

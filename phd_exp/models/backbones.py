@@ -24,12 +24,14 @@ class BackboneOutput(NamedTuple):
     """The output of a backbone.
 
     A backbone that locates the object also returns `place`, its projected position v_p, and `log_heat`, the log
-    probabilities of the cells of a grid over the image.
+    probabilities of the cells of a grid over the image. One that segments it returns `log_odds`, those of each cell
+    showing the object.
     """
 
     features: Float[Tensor, "batch n_features"]
     place: Float[Tensor, "batch 2"] | None = None
     log_heat: Float[Tensor, "batch rows columns"] | None = None
+    log_odds: Float[Tensor, "batch rows columns"] | None = None
 
 
 class Backbone(nn.Module):
@@ -38,10 +40,12 @@ class Backbone(nn.Module):
     Attributes:
         n_features: number of features of an image.
         locates: whether the output has a place.
+        segments: whether the output has log odds.
     """
 
     n_features: int
     locates: bool
+    segments: bool = False
 
     def forward(self, pixels: Float[Tensor, "batch 3 height width"]) -> BackboneOutput:
         raise NotImplementedError

@@ -1,12 +1,13 @@
 """A backbone that locates the object: a narrow ResNet, a feature pyramid, and a heat map."""
 
+import math
 from typing import Annotated, Literal
 
 import torch
 from annotated_types import Ge, Gt, MultipleOf
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor, nn
-from torch.nn.functional import interpolate, relu
+from torch.nn.functional import binary_cross_entropy_with_logits, interpolate, relu
 from torchvision.models.resnet import BasicBlock, Bottleneck
 
 from phd_exp.geometry.camera import middles
@@ -24,6 +25,9 @@ class Locating(Backbone):
     centre, and the offset of the centre from that of the cell; `place` is the mean position. The features are those
     of the level, averaged with the same probabilities, and the mean of the last stage.
 
+    With `segments`, the map also holds the probability that each cell shows the object. The features then include
+    those of the level averaged with these probabilities too, and the area, centre and shape of the visible part.
+
     The map and its means are computed in float32: bfloat16 would round places to a tenth of a pixel.
 
     Args:
@@ -31,6 +35,7 @@ class Locating(Backbone):
         width: channels of its first stage. At 12, torch's convolutions write beyond their memory on some CPUs.
         stride: of the first convolution.
         channels: of the pyramid.
+        segments: whether the map holds the visible part of the object.
 
     Source: the pyramid is Lin et al., "Feature pyramid networks for object detection" (2017); the mean over a map,
     Sun et al., "Integral human pose regression" (2018).
@@ -44,6 +49,7 @@ class Locating(Backbone):
         width: Annotated[int, Gt(0), MultipleOf(8)],
         stride: Literal[2, 4],
         channels: Annotated[int, Ge(1)],
+        segments: bool = False,
     ) -> None:
         super().__init__()
         block, counts = BLOCKS[depth]
@@ -61,11 +67,12 @@ class Locating(Backbone):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
         self.lateral = nn.ModuleList(nn.Conv2d(n, channels, 1) for n in outputs[1:])
         self.smooth = nn.Conv2d(channels, channels, 3, padding=1)
-        self.map = nn.Conv2d(channels, 3, 1)
+        self.map = nn.Conv2d(channels, 4 if segments else 3, 1)
         # a uniform map: the place is the centre of the image, as for a network whose last layer is zero
         nn.init.zeros_(self.map.weight)
         nn.init.zeros_(self.map.bias)  # type: ignore[arg-type]  # it has one
-        self.n_features = channels + outputs[-1]
+        self.segments = segments
+        self.n_features = channels + outputs[-1] + (channels + 6 if segments else 0)
 
     def forward(self, pixels: Float[Tensor, "batch 3 height width"]) -> BackboneOutput:
         stages, level = [], self.stem(pixels)
@@ -85,14 +92,18 @@ class Locating(Backbone):
         return relu(self.smooth(relu(finest)))
 
     def _read(self, finest: Tensor, last: Tensor) -> BackboneOutput:
-        scores = self.map(finest)
-        log_heat = scores[:, 0].flatten(1).log_softmax(-1)
+        score, offset, log_odds = self.map(finest).split([1, 2, int(self.segments)], dim=1)
+        cells = middles(*score.shape[-2:]).movedim(-1, 0).to(score)
+        log_heat = score.flatten(1).log_softmax(-1)
         weight = log_heat.exp()[:, None]
-        places = middles(*scores.shape[-2:]).movedim(-1, 0).to(scores) + scores[:, 1:]
+        features = [(weight * finest.flatten(2)).sum(-1), last.mean((2, 3))]
+        if self.segments:
+            features += _of_segment(log_odds.sigmoid().flatten(1), finest.flatten(2), cells.flatten(1))
         return BackboneOutput(
-            features=torch.cat([(weight * finest.flatten(2)).sum(-1), last.mean((2, 3))], dim=-1),
-            place=(weight * places.flatten(2)).sum(-1),
-            log_heat=log_heat.unflatten(-1, scores.shape[-2:]),
+            features=torch.cat(features, dim=-1),
+            place=(weight * (cells + offset).flatten(2)).sum(-1),
+            log_heat=log_heat.unflatten(-1, score.shape[-2:]),
+            log_odds=log_odds[:, 0] if self.segments else None,
         )
 
 
@@ -104,6 +115,34 @@ def _stage(block: type[BasicBlock | Bottleneck], count: int, n_in: int, width: i
         shortcut = nn.Sequential(nn.Conv2d(n_in, n_out, 1, stride, bias=False), NORM(n_out))
     first = block(n_in, width, stride, shortcut, norm_layer=NORM)
     return nn.Sequential(first, *(block(n_out, width, norm_layer=NORM) for _ in range(count - 1)))
+
+
+def _of_segment(
+    probability: Float[Tensor, "batch cells"],
+    level: Float[Tensor, "batch channels cells"],
+    cells: Float[Tensor, "2 cells"],
+) -> list[Tensor]:
+    """Means of a level over a region, and the region's log area, centre, and covariance over that of a disk.
+
+    The disk has the same area, so that all numbers are of the order of one.
+    """
+    area = 4 * probability.mean(-1, keepdim=True) + 1e-4  # in units in which the image reaches from -1 to 1
+    weight = probability / probability.sum(-1, keepdim=True).clamp_min(1e-4)
+    centre = weight @ cells.T
+    x, y = (cells - centre[:, :, None]).unbind(1)
+    covariance = torch.stack([(weight * product).sum(-1) for product in (x * x, x * y, y * y)], dim=-1)
+    return [(weight[:, None] * level).sum(-1), area.log(), centre, 4 * math.pi * covariance / area]
+
+
+def segmentation_loss(
+    log_odds: Float[Tensor, "batch rows columns"], mask: UInt8[Tensor, "batch mask_rows mask_columns"]
+) -> Float[Tensor, ""]:
+    """The mean cross entropy between log odds and the true shares of the cells of a mask (0 to 255), in nats.
+
+    Where the mask's cells are larger or smaller, the log odds are averaged or repeated.
+    """
+    odds = interpolate(log_odds[:, None], size=mask.shape[1:], mode="area")[:, 0]
+    return binary_cross_entropy_with_logits(odds, mask.to(odds) / 255)
 
 
 def localisation_loss(

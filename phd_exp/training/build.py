@@ -35,6 +35,7 @@ def build_data(config: RunConfig, rank: int = 0) -> PositionData:
         world=config.trainer.devices,
         augment=build_augmentation(config.recipe),
         held_out=config.evaluation.held_out and config.data.n_held_out > 0,
+        masks=config.recipe.segmentation > 0,
     )
 
 
@@ -75,14 +76,26 @@ def build_module(config: RunConfig, data: PositionData) -> PositionModule:
         loss = instantiate(config.loss, _partial_=not isclass(locate(config.loss["_target_"], None)))
     constant_f = data.source.constant_f if config.camera.focal_length == "constant" else None
     recipe = config.recipe
-    if recipe.localisation and not regressor.backbone.locates:
-        raise ConfigError(
-            f"recipe.localisation: got {recipe.localisation}, but this backbone does not say where the object is; "
-            "expected 0, or a backbone that does, as in conf/recipe/strong.yaml"
-        )
+    backbone = regressor.backbone
+    for key, weight, does in (
+        ("localisation", recipe.localisation, backbone.locates),
+        ("segmentation", recipe.segmentation, backbone.segments),
+    ):
+        if weight and not does:
+            raise ConfigError(
+                f"recipe.{key}: got {weight}, but this backbone has no map of the object; expected 0, or a backbone "
+                "that has one, as in conf/recipe_at_backbone/locating.yaml"
+            )
     schedule = partial(factor, recipe.schedule, recipe.warmup_steps)
     module = PositionModule(
-        regressor, loss, optimizer, constant_f, recipe.localisation, schedule, config.camera.f_error, recipe.coarse
+        regressor,
+        loss,
+        optimizer,
+        constant_f,
+        recipe.localisation,
+        schedule,
+        config.camera.f_error,
+        recipe.segmentation,
     )
     if custom_parts({"head": config.model.head, "backbone": config.backbone, "loss": config.loss}):
         _try_out(module, config, data.source)

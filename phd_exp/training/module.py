@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 from lightning import LightningModule
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
@@ -20,7 +20,7 @@ from phd_exp.geometry.charts import projected
 from phd_exp.losses import MeanAbsoluteError, NegativeLogLikelihood
 from phd_exp.metrics.rows import Rows
 from phd_exp.models.heads import Prediction
-from phd_exp.models.locating import localisation_loss
+from phd_exp.models.locating import localisation_loss, segmentation_loss
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.errors import RunError, listed
 from phd_exp.training.predictions import columns, summary, training_columns
@@ -42,8 +42,8 @@ class PositionModule(LightningModule):
         constant_f: focal length in pixels that the model uses for every sample; None: the true one.
         f_error: standard deviation of the relative error of the focal lengths that the model uses.
         localisation: weight of the localisation loss; 0 for a backbone that does not locate the object.
+        segmentation: weight of the segmentation loss; 0 for a backbone that does not segment the object.
         schedule: number of steps -> factor of the learning rate at each; see `factor`.
-        coarse: share of the epochs, the first ones, that train on images of half the side.
 
     Attributes:
         table: the rows of the last evaluation, see `training.predictions.columns`.
@@ -58,7 +58,7 @@ class PositionModule(LightningModule):
         localisation: float = 0.0,
         schedule: Callable[[int], Callable[[int], float]] = lambda steps: lambda step: 1.0,
         f_error: float = 0.0,
-        coarse: float = 0.0,
+        segmentation: float = 0.0,
     ) -> None:
         super().__init__()
         self.regressor = regressor
@@ -69,7 +69,7 @@ class PositionModule(LightningModule):
         self.localisation = localisation
         self.schedule = schedule
         self.f_error = f_error
-        self.coarse = coarse
+        self.segmentation = segmentation
         self.training_rows, self.evaluation_rows, self.held_out_rows = Rows(), Rows(), Rows()
         self.table: Columns = {}
 
@@ -98,14 +98,15 @@ class PositionModule(LightningModule):
             clip(self.parameters(), gradient_clip_val)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        is_coarse = self.current_epoch < self.coarse * (self.trainer.max_epochs or 0)
-        output = self.regressor.see(halved(batch.image) if is_coarse else batch.image)
+        output = self.regressor.see(batch.image)
         prediction = self.regressor.prediction(output, self.camera(batch))
         losses = self.loss(prediction, batch.xyz)
         total = losses.mean()
         if self.localisation and output.log_heat is not None:
             place = projected(batch.xyz, batch.camera)
             total = total + self.localisation * localisation_loss(output.log_heat, place)
+        if self.segmentation and output.log_odds is not None and batch.mask is not None:
+            total = total + self.segmentation * segmentation_loss(output.log_odds, batch.mask)
         self._require_finite(total, losses, batch, "train")
         with torch.no_grad():
             nll = losses if isinstance(self.loss, NegativeLogLikelihood) else None
@@ -165,13 +166,6 @@ class PositionModule(LightningModule):
             f"{listed([names[row] if names else str(row) for row in rows])}; the last checkpoint is whole: lower "
             "optimizer.lr, or look at these images"
         )
-
-
-def halved(image: UInt8[Tensor, "batch height width 3"]) -> Float[Tensor, "batch height/2 width/2 3"]:
-    """The means of blocks of two by two pixels."""
-    rows = image.flatten(2)
-    pairs = (rows[:, ::2].float() + rows[:, 1::2]).unflatten(2, (-1, 3))
-    return (pairs[:, :, ::2] + pairs[:, :, 1::2]) / 4
 
 
 def standard_error(row: Int[Tensor, " batch"], epoch: int) -> Float[Tensor, " batch"]:

@@ -106,6 +106,7 @@ def test_a_model_picks_its_loss_and_camera_and_whether_the_strong_recipe_shows_t
         ("muon", {"optimizer._target_", "optimizer.orthogonal_lr", "optimizer.momentum", "optimizer.fused"}),
         ("schedule", {"recipe.schedule", "recipe.warmup_steps"}),
         ("localisation", {"recipe.localisation"}),
+        ("segmentation", {"recipe.segmentation", "backbone.segments"}),
         ("symmetries", {"recipe.augmentation.symmetries"}),
         ("colours", {"recipe.augmentation.colours"}),
         ("exposure", {"recipe.exposure"}),

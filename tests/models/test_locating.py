@@ -1,5 +1,6 @@
 """The backbone that keeps where things are, and heads that take what it says."""
 
+import math
 from collections.abc import Callable
 
 import pytest
@@ -11,7 +12,7 @@ from phd_exp.geometry import Camera, Cartesian, DepthScale, LogDepth, Projected
 from phd_exp.geometry.camera import middles
 from phd_exp.geometry.charts import projected
 from phd_exp.models.heads import ChartHead, DistributionHead, Head
-from phd_exp.models.locating import Locating
+from phd_exp.models.locating import Locating, _of_segment
 from phd_exp.models.regressor import Regressor
 from tests.support.heads import SHAPED
 
@@ -31,9 +32,9 @@ def images() -> torch.Tensor:
     return torch.randint(0, 256, (4, 64, 64, 3), generator=generator, dtype=torch.uint8)
 
 
-def locating(depth: int = 10) -> Locating:
+def locating(depth: int = 10, segments: bool = False) -> Locating:
     torch.manual_seed(0)
-    return Locating(depth, width=8, stride=2, channels=6)
+    return Locating(depth, width=8, stride=2, channels=6, segments=segments)
 
 
 @pytest.mark.parametrize("depth", [10, 18, 50])
@@ -92,10 +93,34 @@ def test_the_recipe_costs_no_more_than_the_authors_network(preset: str, composed
     assert operations("strong") < 1.3 * operations("paper")
 
 
+def test_a_segment_adds_its_means_and_its_shape_to_the_features() -> None:
+    network = locating(segments=True)
+    with torch.no_grad():
+        network.map.bias[3] = -40  # nothing is visible: means of the whole map, an area of nearly zero
+        seen = network(torch.randn(2, 3, 64, 96))
+    assert seen.features.shape == (2, network.n_features)
+    assert network.n_features == 6 + 64 + 6 + 6
+    assert seen.log_odds is not None
+    assert seen.log_odds.shape == (2, 16, 24)
+    assert seen.features.isfinite().all()
+
+
+@pytest.mark.parametrize("stretch", [1.0, 2.0])
+def test_the_shape_of_an_ellipse(stretch: float) -> None:
+    cells, centre, radius = middles(200, 200).flatten(0, 1).T, torch.tensor([[0.2], [-0.1]]), 0.2
+    x, y = (cells - centre).double() / radius
+    inside = ((x / stretch).square() + y.square() < 1).float()[None]
+    mean, area, found, covariance = _of_segment(inside, cells[None] + 1, cells)
+    assert_close(area.exp().item(), math.pi * radius**2 * stretch, rtol=0.01, atol=0)
+    assert_close(found, centre.T, rtol=0, atol=1e-3)
+    assert_close(mean, centre.T + 1, rtol=0, atol=1e-3)
+    assert_close(covariance, torch.tensor([[stretch, 0, 1 / stretch]]), rtol=0, atol=0.02)
+
+
 def test_what_it_reads_is_float32_under_autocast() -> None:
     with torch.autocast("cpu", torch.bfloat16):
-        seen = locating()(torch.randn(1, 3, 64, 64))
-    assert {None if part is None else part.dtype for part in seen} == {torch.float32}
+        seen = locating(segments=True)(torch.randn(1, 3, 64, 64))
+    assert {part.dtype for part in seen} == {torch.float32}
 
 
 @pytest.mark.parametrize("name", PLACED)

@@ -39,9 +39,10 @@ def test_bfloat16_only_on_hardware_with_units_for_it(
     assert network.precision(checked("trainer=auto").trainer) == expected
 
 
-def test_the_localisation_loss_requires_a_backbone_with_a_map(checked: Callable) -> None:
-    config = checked("recipe.localisation=1")
-    with pytest.raises(ConfigError, match=r"^recipe\.localisation: got 1\.0, but this backbone does not say where"):
+@pytest.mark.parametrize("loss", ["localisation", "segmentation"])
+def test_the_losses_of_a_map_require_a_backbone_that_has_one(checked: Callable, loss: str) -> None:
+    config = checked(f"recipe.{loss}=1")
+    with pytest.raises(ConfigError, match=rf"^recipe\.{loss}: got 1\.0, but this backbone has no map of the object"):
         build_module(config, build_data(config))
 
 

@@ -90,11 +90,15 @@ def test_a_key_that_an_older_record_lacks_had_its_default(composed: Callable, tm
     folder = RunFolder(tmp_path)
     config = check(composed("preset=smoke", "recipe=strong"))
     stored = config.model_dump(mode="json")
-    del stored["recipe"]["coarse"]
+    del stored["recipe"]["augmentation"]["occluders"]
     folder.write_config(stored)
     require_same_config(folder, config)
-    with pytest.raises(RunError, match=r"recipe.coarse=nothing, but recipe.coarse=0.5 is asked for"):
-        require_same_config(folder, check(composed("preset=smoke", "recipe=strong", "recipe.coarse=0.5")))
+    with pytest.raises(
+        RunError, match=r"recipe.augmentation.occluders=nothing, but recipe.augmentation.occluders=0.5 is"
+    ):
+        require_same_config(
+            folder, check(composed("preset=smoke", "recipe=strong", "recipe.augmentation.occluders=0.5"))
+        )
 
 
 def test_results_are_those_of_the_last_epoch_and_of_the_predictions(run: RunFolder, model: str) -> None:

@@ -179,7 +179,7 @@ class RecipeConfig(Record):
     warmup_steps: Natural
     localisation: Annotated[float, Field(ge=0, le=1000)]
     exposure: StrictBool = False  # default for older run records
-    coarse: Annotated[float, Field(ge=0, le=1)] = 0.0  # default for older run records
+    segmentation: Annotated[float, Field(ge=0, le=1000)] = 0.0  # default for older run records
     augmentation: AugmentationConfig
 
 
