@@ -22,7 +22,7 @@ from phd_exp.records.images import content_of, pillow_warnings
 from phd_exp.records.scenes import Split
 
 KNOWN = ("scale", "visibility", "truncation")  # values that are recorded with the predictions
-CROP_LAYOUT = 2  # version of `cut`, recorded with each cache
+CROP_LAYOUT = 3  # version of `cut`, recorded with each cache
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ from jaxtyping import Float
 from phd_exp.geometry.lens import PINHOLE, Lens
 
 BORDER = 33  # places along a side of a box whose rays a lens bends
-GRID = 33  # places along a side of the virtual image, where the map to the real image is measured
 
 Box = tuple[float, float, float, float]
 """Left, top, right, bottom: pixels of the real image, counted from its top left corner."""
@@ -89,36 +88,15 @@ class VirtualCamera:
         return self.K[:2, 2] + np.diagonal(self.K)[:2] * self.lens.distort(self.to_real(xyz))
 
     @property
-    def grid(self) -> Float[np.ndarray, "places places 2"]:
-        """Pixels of the real image at places from edge to edge of the virtual image."""
-        along = np.linspace(-self.S / 2, self.S / 2, GRID) / self.f
+    def corners(self) -> Float[np.ndarray, "places places 2"]:
+        """Pixels of the real image at the corners of the pixels of the virtual image."""
+        along = (np.arange(int(self.S) + 1) - self.S / 2) / self.f
         return self.real_pixels(np.stack(np.meshgrid(along, along), axis=-1))
 
     @property
     def homography(self) -> Float[np.ndarray, "3 3"]:
         """H = K_v R K^-1, from homogeneous pixels of a real image without distortion to those of the virtual one."""
         return intrinsics(self.f, self.f, self.S / 2, self.S / 2) @ self.R @ np.linalg.inv(self.K)
-
-    @property
-    def densities(self) -> tuple[float, float]:
-        """The fewest and the most pixels of the real image along one pixel of the virtual image.
-
-        These are the extreme singular values of the Jacobian of the map H^-1: (u, v) -> (p, q) = (X, Y)/W, over
-        the middle and the corners of the virtual image; through a lens, of finite differences on a grid.
-        """
-        if not self.lens.is_pinhole:
-            jacobians = np.stack(np.gradient(self.grid, self.S / (GRID - 1), axis=(0, 1)), axis=-1)
-            jacobians = jacobians[np.isfinite(jacobians).all(axis=(-2, -1))]
-            values = np.linalg.svd(jacobians, compute_uv=False)
-            return float(values.min()), float(values.max())
-        back = np.linalg.inv(self.homography)
-        places = [(0.5, 0.5), (0, 0), (0, 1), (1, 0), (1, 1)]
-        densities = []
-        for u, v in places:
-            X = back @ np.array([u * self.S, v * self.S, 1.0])
-            jacobian = (back[:2, :2] - np.outer(X[:2] / X[2], back[2, :2])) / X[2]
-            densities.extend(np.linalg.svd(jacobian, compute_uv=False).tolist())
-        return min(densities), max(densities)
 
 
 def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:

@@ -12,7 +12,8 @@ import pytest
 import torch
 from PIL import ExifTags, Image
 
-from phd_exp.data.crops import GREY, cut, image_size, pillow_warnings, read_image
+from phd_exp.data.areas import GREY
+from phd_exp.data.crops import cut, image_size, pillow_warnings, read_image
 from phd_exp.data.images import shrunk
 from phd_exp.geometry import Camera
 from phd_exp.geometry.virtual import Box, VirtualCamera, intrinsics, rays
@@ -108,7 +109,7 @@ COSTLY = [
 
 def limited(size: tuple[int, int], camera: VirtualCamera) -> None:
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (used + 225_000_000,) * 2)
+    resource.setrlimit(resource.RLIMIT_AS, (used + 270_000_000,) * 2)
     assert cut(Image.new("RGB", size), camera).shape == (64, 64, 3)
 
 
@@ -147,8 +148,8 @@ KINDS: dict[str, tuple[bytes, tuple[int, int, int]]] = {
     "black and white": (saved(Image.new("1", (4, 3), 1)), (255, 255, 255)),
     "16 bits": (saved(Image.fromarray(np.full((3, 4), 0x4D80, dtype=np.uint16))), (0x4D, 0x4D, 0x4D)),
     "palette": (saved(RED.convert("P")), (255, 0, 0)),
-    "palette with a transparent colour": (saved(Image.new("P", (4, 3), 0), transparency=0), GREY),
-    "transparent": (saved(Image.new("RGBA", (4, 3), (255, 0, 0, 0))), GREY),
+    "palette with a transparent colour": (saved(Image.new("P", (4, 3), 0), transparency=0), 3 * (GREY,)),
+    "transparent": (saved(Image.new("RGBA", (4, 3), (255, 0, 0, 0))), 3 * (GREY,)),
     "opaque": (saved(Image.new("RGBA", (4, 3), (255, 0, 0, 255))), (255, 0, 0)),
     "half transparent grey": (saved(Image.new("LA", (4, 3), (0, 128))), (64, 64, 64)),
     "CMYK": (saved(Image.new("CMYK", (4, 3), (0, 255, 255, 0)), "tiff"), (255, 0, 0)),

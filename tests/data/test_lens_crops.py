@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from phd_exp.data.crops import GREY, cut
+from phd_exp.data.areas import GREY
+from phd_exp.data.crops import cut
 from phd_exp.geometry.lens import Lens
 from phd_exp.geometry.virtual import VirtualCamera, intrinsics, rays
 from tests.support.opencv import projected

@@ -1,0 +1,52 @@
+"""Views of an image whose pixels are means over areas: plain functions of torch, which exported graphs share."""
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+GREY = 128  # all colours of transparent pixels and of those beyond the edges of an image
+TIES = 1e6  # means are rounded to 1/TIES first, so that halves are exact whatever the order of the sums
+
+
+def sums(image: UInt8[Tensor, "height width bands"]) -> Float[Tensor, "height+1 width+1 bands"]:
+    """Exact sums of an image, less grey, over the rectangle from its top left corner to every corner of a pixel."""
+    height, width, bands = image.shape
+    table = torch.zeros(height + 1, width + 1, bands, dtype=torch.float64, device=image.device)
+    table[1:, 1:] = image
+    table[1:, 1:] -= GREY
+    return table.cumsum_(0).cumsum_(1)
+
+
+def area_means(
+    table: Float[Tensor, "bottom right bands"], corners: Float[Tensor, "*views lower further 2"]
+) -> UInt8[Tensor, "*views rows columns bands"]:
+    """The views whose pixels have their corners at these places (column, row) of an image, given its `sums`.
+
+    Each pixel is the mean over an upright rectangle about the middle of its corners. The rectangle has the extent of
+    the pixel along both axes (the root of the sum of squares of its two edges), and at least that of a pixel of the
+    image, so that views of more pixels are interpolated linearly. Beyond the image, and at NaN, all is grey.
+    """
+    a, b = corners[..., :-1, :-1, :], corners[..., :-1, 1:, :]
+    c, d = corners[..., 1:, :-1, :], corners[..., 1:, 1:, :]
+    across, down = (b + d - a - c) / 2, (c + d - a - b) / 2
+    side = (across.square() + down.square()).sqrt().clamp_min(1)
+    middle = (a + b + c + d) / 4
+    (left, top), (right, bottom) = ((middle + sign * side / 2).unbind(-1) for sign in (-1, 1))
+    total = _at(table, right, bottom) - _at(table, left, bottom) - _at(table, right, top) + _at(table, left, top)
+    mean = GREY + total / side.prod(-1, keepdim=True)
+    # NaN is beyond the image, and has no sum but an area
+    mean = mean.nan_to_num(float(GREY))
+    return ((mean * TIES).round() / TIES).round().clamp(0, 255).to(torch.uint8)
+
+
+def _at(
+    table: Float[Tensor, "bottom right bands"], x: Float[Tensor, "*views rows columns"], y: Tensor
+) -> Float[Tensor, "*views rows columns bands"]:
+    """The table at corners between pixels: linear along both axes, as the sums are inside a pixel."""
+    x, y = (value.nan_to_num(-1.0).clamp(0, size - 1) for value, size in ((x, table.shape[1]), (y, table.shape[0])))
+    column, row = x.floor().long(), y.floor().long()
+    next_column, next_row = (column + 1).clamp_max(table.shape[1] - 1), (row + 1).clamp_max(table.shape[0] - 1)
+    x, y = (x - column)[..., None], (y - row)[..., None]
+    upper = table[row, column] * (1 - x) + table[row, next_column] * x
+    lower = table[next_row, column] * (1 - x) + table[next_row, next_column] * x
+    return upper * (1 - y) + lower * y
