@@ -12,6 +12,8 @@ class ExportArguments(RunArguments):
 
     out: Path | None = None
     """the file; by default network.onnx in the (first) run's folder"""
+    photographs: bool = False
+    """the inputs are a photograph, its camera matrix and boxes, and the graph crops as predict does"""
 
 
 def main(words: list[str]) -> int:
@@ -23,12 +25,12 @@ def main(words: list[str]) -> int:
     require_file(file, "network.onnx")
     predictor = loaded(arguments, "cpu")
     output_folder(file.parent)
-    from phd_exp.inference.onnx import CHECKED, TOLERANCE, export
+    from phd_exp.inference.deployed import BATCHES, PHOTOGRAPHS
+    from phd_exp.inference.onnx import TOLERANCE, export
 
-    deviation = export(predictor, file, arguments.coverage)
+    deviation = export(predictor, file, arguments.coverage, arguments.photographs)
     print(f"{file}: {file.stat().st_size / 1e6:.1f} MB")
-    print(
-        f"  largest relative deviation from torch over {sum(CHECKED)} images, in batches of "
-        f"{', '.join(map(str, CHECKED))}: {deviation:.1e} (at most {TOLERANCE:g})"
-    )
+    numbers = ", ".join(str(n) for n in ([n for _, _, n in PHOTOGRAPHS] if arguments.photographs else BATCHES))
+    what = "photographs with {} boxes" if arguments.photographs else "images in batches of {}"
+    print(f"  largest relative deviation from torch, {what.format(numbers)}: {deviation:.1e} (at most {TOLERANCE:g})")
     return 0

@@ -3,6 +3,7 @@
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
+from torch.nn.functional import pad
 
 GREY = 128  # all colours of transparent pixels and of those beyond the edges of an image
 TIES = 1e6  # means are rounded to 1/TIES first, so that halves are exact whatever the order of the sums
@@ -10,10 +11,8 @@ TIES = 1e6  # means are rounded to 1/TIES first, so that halves are exact whatev
 
 def sums(image: UInt8[Tensor, "height width bands"]) -> Float[Tensor, "height+1 width+1 bands"]:
     """Exact sums of an image, less grey, over the rectangle from its top left corner to every corner of a pixel."""
-    height, width, bands = image.shape
-    table = torch.zeros(height + 1, width + 1, bands, dtype=torch.float64, device=image.device)
-    table[1:, 1:] = image
-    table[1:, 1:] -= GREY
+    # float32 holds bytes exactly, in half the memory of the sums
+    table = pad(image.float().sub_(GREY), (0, 0, 1, 0, 1, 0)).double()
     return table.cumsum_(0).cumsum_(1)
 
 

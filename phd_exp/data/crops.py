@@ -52,8 +52,9 @@ def read_image(file: Path, content: bytes) -> Image.Image:
         return _as_rgb(file, image)
 
 
-def facing(detection: Detection, size: tuple[int, int], side: int) -> VirtualCamera:
-    """The virtual camera that faces a detection in an image of that width and height.
+def facing(detection: Detection, size: tuple[int, int], side: int, largest_f: float = np.inf) -> VirtualCamera:
+    """The virtual camera that faces a detection in an image of that width and height; its box, if it has one, is
+    viewed with a focal length up to `largest_f`.
 
     Raises DatasetError if the box is too wide, the camera file is for another size, or its lens folds over inside.
     """
@@ -61,7 +62,7 @@ def facing(detection: Detection, size: tuple[int, int], side: int) -> VirtualCam
     lens = Lens(file.D[:8], file.model == "equidistant") if file else PINHOLE
     try:
         require_no_fold(K, lens, *size)
-        return VirtualCamera.of_box(K, box, float(side), lens)
+        return VirtualCamera.of_box(K, box, float(side), lens, largest_f if detection.line.box else np.inf)
     except ValueError as error:
         raise DatasetError(f"{detection.where}: {error}") from None
 

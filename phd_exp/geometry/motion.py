@@ -109,13 +109,19 @@ def _rotation(roll: Float[Tensor, " batch"], tilt: Float[Tensor, "batch 2"]) -> 
     """Roll about z after a turn of the axis by the tangents `tilt` towards x and y."""
     z = torch.cat([tilt, torch.ones_like(tilt[:, :1])], dim=-1)
     z = z / z.norm(dim=-1, keepdim=True)
-    a, b, c = z.unbind(-1)
-    # the rotation without roll that maps z to the axis, as in `virtual.smallest_rotation`
-    rows = [
-        torch.stack([1 - a * a / (1 + c), -a * b / (1 + c), -a], dim=-1),
-        torch.stack([-a * b / (1 + c), 1 - b * b / (1 + c), -b], dim=-1),
-        z,
-    ]
     cos, sin, zero = roll.cos(), roll.sin(), torch.zeros_like(roll)
     turn = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1], dim=-1).unflatten(-1, (3, 3))
-    return turn @ torch.stack(rows, dim=-2)
+    return turn @ smallest_rotation(z)
+
+
+def smallest_rotation(direction: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """The rotation about an axis in the image plane (no roll) that maps a unit vector (z > 0) to (0, 0, 1).
+
+    For (a, b, c) it is [[1 - a^2/(1+c), -ab/(1+c), -a], [-ab/(1+c), 1 - b^2/(1+c), -b], [a, b, c]].
+
+    Source: Rodrigues' formula for the axis (b, -a, 0).
+    """
+    a, b, c = direction.unbind(-1)
+    first = torch.stack([1 - a * a / (1 + c), -a * b / (1 + c), -a], dim=-1)
+    second = torch.stack([-a * b / (1 + c), 1 - b * b / (1 + c), -b], dim=-1)
+    return torch.stack([first, second, direction], dim=-2)

@@ -8,9 +8,11 @@ pinhole whatever the lens of the real camera.
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from phd_exp.geometry.lens import PINHOLE, Lens
+from phd_exp.geometry.motion import smallest_rotation
 
 BORDER = 33  # places along a side of a box whose rays a lens bends
 
@@ -45,12 +47,14 @@ class VirtualCamera:
     lens: Lens = PINHOLE
 
     @classmethod
-    def of_box(cls, K: Float[np.ndarray, "3 3"], box: Box, S: float, lens: Lens = PINHOLE) -> "VirtualCamera":
+    def of_box(
+        cls, K: Float[np.ndarray, "3 3"], box: Box, S: float, lens: Lens = PINHOLE, largest_f: float = np.inf
+    ) -> "VirtualCamera":
         """The virtual camera that faces the middle of a box and whose image just contains its border.
 
         R is the smallest rotation that maps the ray through the middle of the box to the optical axis, and
         f = S / (2 max(|x|, |y|) / z) over the border (x, y, z) of the box in the virtual frame; its corners decide,
-        unless a lens bends the border.
+        unless a lens bends the border. If f exceeds `largest_f`, the image is as wide as that permits.
 
         Raises:
             ValueError: the middle of the box has no ray; or the box is so wide that a part of the virtual image is 90
@@ -62,11 +66,11 @@ class VirtualCamera:
         border = border[np.isfinite(border).all(axis=-1)]
         if not (np.isfinite(middle).all() and len(border)):
             raise ValueError(f"box={list(box)}: its middle or its whole border lies beyond the field of the lens")
-        R = smallest_rotation(middle / np.linalg.norm(middle))
+        R = smallest_rotation(torch.from_numpy(middle / np.linalg.norm(middle))).numpy()
         border = border @ R.T
         if not (border[:, 2] > 0).all():
             raise ValueError(f"box={list(box)}: its corners are 90 degrees or more from its middle")
-        half_width = np.abs(border[:, :2] / border[:, 2:]).max()
+        half_width = max(np.abs(border[:, :2] / border[:, 2:]).max(), S / (2 * largest_f))
         seen = np.array([[x, y, 1.0] for x in (-half_width, half_width) for y in (-half_width, half_width)])
         if not (lens.is_fisheye or (seen @ R[:, 2] > 0).all()):  # z in the frame of the real camera, from R^T
             raise ValueError(
@@ -134,15 +138,3 @@ def _border(box: Box, n: int) -> Float[np.ndarray, "places 2"]:
     left, top, right, bottom = box
     x, y = np.linspace(left, right, n), np.linspace(top, bottom, n)
     return np.array([*((u, v) for u in x for v in (top, bottom)), *((u, v) for u in (left, right) for v in y)])
-
-
-def smallest_rotation(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation about an axis in the image plane (no roll) that maps a unit vector (z > 0) to (0, 0, 1).
-
-    For (a, b, c) it is [[1 - a^2/(1+c), -ab/(1+c), -a], [-ab/(1+c), 1 - b^2/(1+c), -b], [a, b, c]].
-
-    Source: Rodrigues' formula for the axis (b, -a, 0).
-    """
-    a, b, c = direction
-    first, second = [1 - a * a / (1 + c), -a * b / (1 + c), -a], [-a * b / (1 + c), 1 - b * b / (1 + c), -b]
-    return np.array([first, second, [a, b, c]])

@@ -84,7 +84,7 @@ def _batches(
                 with pillow_warnings():
                     image = read_image(detection.file, content_of(detection.file))
                 pixels += image.width * image.height
-            camera = facing(detection, image.size, predictor.side)
+            camera = facing(detection, image.size, predictor.side, predictor.largest_f)
         except DatasetError:
             if batch:
                 yield batch  # the predictions before the invalid image are not lost

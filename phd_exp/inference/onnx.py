@@ -1,8 +1,4 @@
-"""A run as an ONNX file: uint8 images in, positions with their uncertainty out.
-
-The graph is traced from the classes that `predict` uses. The network computes in float32 and everything after it in
-float64; outputs are float32. `DESCRIPTIONS` describes inputs and outputs.
-"""
+"""A run as an ONNX file: images in, positions with their uncertainty out. `DESCRIPTIONS` describes all names."""
 
 import json
 import logging
@@ -14,88 +10,60 @@ from typing import Any
 import numpy as np
 import onnxruntime
 import torch
-from jaxtyping import Float, UInt8
-from torch import Tensor, nn
+from torch import Tensor
 
-from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.level import PRECISIONS, level_energies
-from phd_exp.inference.answers import LEVELS
+from phd_exp.inference.deployed import Deployed, OfImages, OfPhotographs
 from phd_exp.inference.predictor import Predictor
-from phd_exp.models.heads import Prediction
 from phd_exp.records.errors import UserError
 from phd_exp.records.files import write_atomic
 from phd_exp.records.runs import versions
 
 METADATA = "phd_exp"  # the key of the file's metadata: JSON with the run, the image size and `DESCRIPTIONS`
 DESCRIPTIONS = {
-    "image": "(batch, side, side, 3) uint8: RGB images of side x side pixels, principal point in the middle",
-    "f": "(batch,) float32: focal length, pixels of these images",
-    "raw": "(batch, n) float32: the outputs of the network; of an ensemble (batch, members, n)",
-    "mode": "(batch, 3) float32: position of highest density, m; camera frame: x right, y down, z forward",
-    "mean": "(batch, 3) float32: expected position, m",
-    "covariance": "(batch, 3, 3) float32: covariance of the position, m^2",
-    "median_depth": "(batch,) float32: median of z, m",
-    "depth_interval": "(batch, 3, 2) float32: lower and upper end of the central 50, 90 and 99 % intervals of z, m",
-    "position": "(batch, 3) float32: estimated position of a baseline, m; camera frame as above",
+    "image": "(n, side, side, 3) uint8: RGB images of side x side pixels, principal point in the middle",
+    "f": "(n,) float32: focal length, pixels of these images",
+    "photograph": "(height, width, 3) uint8: one RGB image of any size, without distortion",
+    "K": "(3, 3) float64: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] of the photograph, pixels",
+    "boxes": "(n, 4) float64: left, top, right, bottom of each object in the photograph, pixels",
+    "raw": "(n, k) float32: the outputs of the network; of an ensemble (n, members, k)",
+    "mode": "(n, 3) float32: position of highest density, m; camera frame: x right, y down, z forward",
+    "mean": "(n, 3) float32: expected position, m",
+    "covariance": "(n, 3, 3) float32: covariance of the position, m^2",
+    "median_depth": "(n,) float32: median of z, m",
+    "depth_interval": "(n, 3, 2) float32: lower and upper end of the central 50, 90 and 99 % intervals of z, m",
+    "ray": "(n, 3) float32: unit vector from the camera through the middle of each box",
+    "median_along_ray": "(n,) float32: median of the position's coordinate along the ray, m",
+    "interval_along_ray": "(n, 3, 2) float32: central 50, 90 and 99 % intervals of that coordinate, m",
+    "position": "(n, 3) float32: estimated position of a baseline, m; camera frame as above",
 }
 OPSET = 18
 TOLERANCE = 1e-5
 SMALL = 0.01  # size of an output of the network below which it is compared absolutely
-CHECKED = (1, 7, 56)  # batches of images on which the file is compared with torch
-FOCAL_LENGTHS = (5.0, 9.0)  # range for the comparison, in sides of the image
 
 
 class ParityError(UserError):
     """The exported file and torch disagree."""
 
 
-class _Deployed(nn.Module):
-    """The whole predictor, from images to answers."""
-
-    def __init__(self, predictor: Predictor) -> None:
-        super().__init__()
-        self.predictor = predictor
-        self.networks = nn.ModuleList(predictor.networks)
-
-    def forward(self, image: UInt8[Tensor, "batch S S 3"], f: Float[Tensor, " batch"]) -> tuple[Tensor, ...]:
-        raw = self.predictor.outputs(image, self.predictor.camera(f).f)
-        answered = outputs(self.predictor.predict(raw.double(), f.double()))
-        return (raw, *(value.float() for value in answered.values()))
-
-
-def outputs(prediction: Prediction) -> dict[str, Tensor]:
-    """The outputs of the graph for a batch of predictions, after `raw`."""
-    if not isinstance(prediction, ProjectedHuber):
-        return {"position": prediction.mode}
-    tails = torch.tensor([(1 - level / 100) / 2 for level in LEVELS], dtype=torch.float64)
-    p = torch.cat([tails.new_tensor([0.5]), tails, 1 - tails])
-    z = prediction.depth_icdf(p[:, None])  # all at once, for a small graph
-    return {
-        "mode": prediction.mode,
-        "mean": prediction.mean,
-        "covariance": prediction.covariance_matrix,
-        "median_depth": z[0],
-        "depth_interval": torch.stack([z[1 : 1 + len(LEVELS)], z[1 + len(LEVELS) :]]).permute(2, 1, 0),
-    }
-
-
-def export(predictor: Predictor, file: Path, coverage: float | None = None) -> float:
+def export(predictor: Predictor, file: Path, coverage: float | None = None, photographs: bool = False) -> float:
     """Write the file after comparing it with torch; returns the largest relative deviation.
 
     With a coverage, the metadata has the level of its regions and their energy W at each depth precision a.
 
     Raises ParityError, and writes no file, if that exceeds 1e-5.
     """
-    metadata = _metadata(predictor)
+    deployed = (OfPhotographs if photographs else OfImages)(predictor).eval()
+    model = graph(deployed)
+    metadata = _metadata(deployed)
     if coverage:
         guarantee = predictor.guarantee(coverage)
         facts = {"coverage": coverage, "level": guarantee.levels[0], "held_out_samples": guarantee.n[0]}
         energies = {"a": PRECISIONS.tolist(), "W": level_energies(guarantee.levels[0]).tolist()}
         metadata["region"] = facts | energies
-    model = graph(predictor)
     model.metadata_props.add(key=METADATA, value=json.dumps(metadata))
     content = model.SerializeToString()
-    deviation = largest_deviation(predictor, content)
+    deviation = largest_deviation(deployed, content)
     if not deviation <= TOLERANCE:
         raise ParityError(
             f"{file}: not written: it deviates from torch by {deviation:.2g}, more than {TOLERANCE:g}; "
@@ -105,20 +73,18 @@ def export(predictor: Predictor, file: Path, coverage: float | None = None) -> f
     return deviation
 
 
-def graph(predictor: Predictor) -> Any:
-    """The network and its answers as a graph, for batches of any size."""
-    side = predictor.side
-    examples = torch.zeros(2, side, side, 3, dtype=torch.uint8), torch.tensor(FOCAL_LENGTHS) * side
-    batch = torch.export.Dim("batch", min=1)
+def graph(deployed: Deployed) -> Any:
+    """The network and its answers as a graph, for any number of images or boxes."""
+    *_, (examples, _, _) = deployed.cases()
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of torch and onnxscript about their own old names
         program = torch.onnx.export(
-            _Deployed(predictor).eval(),
+            deployed,
             examples,
-            input_names=["image", "f"],
-            output_names=["raw", *_names(predictor)],
-            dynamic_shapes={"image": {0: batch}, "f": {0: batch}},
+            input_names=deployed.inputs,
+            output_names=["raw", *_names(deployed)],
+            dynamic_shapes=deployed.dynamic_shapes,
             opset_version=OPSET,
             dynamo=True,
             verbose=False,
@@ -130,15 +96,14 @@ def graph(predictor: Predictor) -> Any:
     return program.model_proto
 
 
-def _names(predictor: Predictor) -> list[str]:
+def _names(deployed: Deployed) -> list[str]:
     """The names of the outputs after `raw`."""
-    head = predictor.regressor.head
-    members = [len(predictor.networks) * predictor.views] if predictor.is_ensemble else []
-    raw = torch.zeros(1, *members, head.n_outputs, dtype=torch.float64)
-    return list(outputs(predictor.predict(raw, torch.ones(1).double())))
+    inputs, _, prediction = next(deployed.cases())
+    return list(deployed.answers(prediction, *inputs))
 
 
-def _metadata(predictor: Predictor) -> dict[str, Any]:
+def _metadata(deployed: Deployed) -> dict[str, Any]:
+    predictor = deployed.predictor
     config, temperature = predictor.config, predictor.temperature
     run = {"preset": config.preset, "data": config.data.name, "model": config.model.name, "seed": config.seed}
     return {
@@ -146,39 +111,31 @@ def _metadata(predictor: Predictor) -> dict[str, Any]:
         "run": run,
         "side": predictor.side,
         "temperature": asdict(temperature) if temperature else None,
-        **{name: DESCRIPTIONS[name] for name in ("image", "f", "raw", *_names(predictor))},
+        **{name: DESCRIPTIONS[name] for name in (*deployed.inputs, "raw", *_names(deployed))},
     }
 
 
-def largest_deviation(predictor: Predictor, content: bytes) -> float:
-    """The largest relative deviation of the file from torch, over 64 images in three batches.
+def largest_deviation(deployed: Deployed, content: bytes) -> float:
+    """The largest relative deviation of the file from `predict` over all `cases`.
 
-    Relative to the largest value of each output of the network over all images, at least `SMALL`, and to the largest
+    Relative to the largest value of each output of the network over all cases, at least `SMALL`, and to the largest
     element of each vector or matrix that follows.
     """
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    n, side = sum(CHECKED), predictor.side
-    images = pictures(n, side)
-    f = (side * np.linspace(*FOCAL_LENGTHS, n)).astype(np.float32)
-    parts = np.split(np.arange(n), np.cumsum(CHECKED)[:-1])
-    runs = [session.run(None, {"image": images[rows], "f": f[rows]}) for rows in parts]
-    raw, *answered = (np.concatenate(values) for values in zip(*runs, strict=True))
-    expected = torch.cat([predictor.raw(images[rows], torch.from_numpy(f[rows])) for rows in parts])
-    size = np.maximum(np.abs(expected.numpy()).max(axis=0), SMALL)
-    there = outputs(predictor.predict(expected.double(), torch.from_numpy(f).double()))
-    deviations = [_relative(here, value) for here, value in zip(answered, there.values(), strict=True)]
-    return max(float((np.abs(raw - expected.numpy()) / size).max()), *deviations)
+    found, expected, deviations = [], [], []
+    for inputs, raw, prediction in deployed.cases():
+        given = {name: value.numpy() for name, value in zip(deployed.inputs, inputs, strict=True)}
+        here, *answered = session.run(None, given)
+        there = deployed.answers(prediction, *inputs).values()
+        deviations += [_relative(value, other) for value, other in zip(answered, there, strict=True)]
+        found.append(here)
+        expected.append(raw.numpy())
+    raw_here, raw_there = np.concatenate(found), np.concatenate(expected)
+    size = np.maximum(np.abs(raw_there).max(axis=0), SMALL)
+    return max(float((np.abs(raw_here - raw_there) / size).max()), *deviations)
 
 
 def _relative(here: np.ndarray, there: Tensor) -> float:
     expected = there.numpy().reshape(len(there), -1)
     size = np.abs(expected).max(axis=1, keepdims=True)
     return float((np.abs(here.reshape(expected.shape) - expected) / size).max())
-
-
-def pictures(n: int, side: int) -> UInt8[np.ndarray, "n side side 3"]:
-    """Images with shapes large and small, the same every time: coarse noise enlarged, and fine noise over it."""
-    draw = np.random.default_rng(0)
-    coarse = draw.integers(0, 256, (n, 8, 8, 3)).repeat(-(-side // 8), axis=1).repeat(-(-side // 8), axis=2)
-    fine = draw.normal(0, 12, (n, side, side, 3))
-    return (coarse[:, :side, :side] + fine).clip(0, 255).astype(np.uint8)

@@ -56,15 +56,24 @@ class View:
 
     @classmethod
     def of_box(
-        cls, image: Image.Image, K: Float[np.ndarray, "3 3"], box: Box | None, side: int, where: str
+        cls,
+        image: Image.Image,
+        K: Float[np.ndarray, "3 3"],
+        box: Box | None,
+        side: int,
+        where: str,
+        largest_f: float = np.inf,
     ) -> "View":
         """The view of a box in an RGB image (None: all of it), `side` pixels a side.
+
+        A small box is viewed with a focal length of `largest_f` pixels, and the pixels around it.
 
         Raises DatasetError, naming `where`, if the box is too wide.
         """
         left, top, right, bottom = map(float, (0, 0, *image.size) if box is None else box)
+        largest_f = np.inf if box is None else largest_f
         try:
-            camera = VirtualCamera.of_box(K, (left, top, right, bottom), float(side))
+            camera = VirtualCamera.of_box(K, (left, top, right, bottom), float(side), largest_f=largest_f)
         except ValueError as error:
             raise DatasetError(f"{where}: {error}") from None
         return cls(cut(image, camera), camera)
@@ -121,6 +130,17 @@ class Predictor:
         """Whether it predicts Projected Huber densities, which alone are fused, recalibrated and drawn."""
         return issubclass(self.regressor.head.prediction, ProjectedHuber)
 
+    @property
+    def largest_f(self) -> float:
+        """The largest focal length at which boxes are viewed, px: that of the training images.
+
+        Infinity for a network trained on the user's own images, whose boxes decided.
+        """
+        data = self.config.data
+        if not isinstance(data, RenderedConfig):
+            return math.inf
+        return data.spec.f_range[1] * self.side / data.spec.sensor_size
+
     def __call__(
         self,
         images: UInt8[np.ndarray | Tensor, "*batch height width 3"],
@@ -163,7 +183,7 @@ class Predictor:
         Raises DatasetError if the image is invalid or the box is outside the field of every pinhole camera.
         """
         (array,) = _images(image[None])
-        return View.of_box(Image.fromarray(array), K, box, self.side, "image")
+        return View.of_box(Image.fromarray(array), K, box, self.side, "image", self.largest_f)
 
     def see(self, views: View | Sequence[View]) -> Prediction:
         """Predictions for views, each in the frame of its own virtual camera; for one view, one without a batch."""

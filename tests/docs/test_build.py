@@ -69,7 +69,7 @@ def test_styles_load_nothing_from_elsewhere(site: Path) -> None:
 def test_shapes_stand_in_the_reference(site: Path) -> None:
     for package, shape in (
         ("distributions", 'mu_xy: Float[Tensor, "*batch 2"]'),
-        ("metrics", 'levels: Float[Tensor, "samples"]'),
+        ("metrics", 'at: Float[Tensor, "points"]'),
     ):
         texts = [page.read_text() for page in (site / "api" / package).glob("*.html")]
         assert any(shape in html.unescape(re.sub(r"<[^>]+>", "", text)) for text in texts)

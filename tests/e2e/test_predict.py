@@ -88,6 +88,9 @@ def exported(run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
         # a checked shape would be fixed in the graph
         patch.setattr("jaxtyping.config.jaxtyping_disable", True)
         assert main(["export", f"run={run.path}", f"out={file}"]) == 0
+        assert (
+            main(["export", f"run={run.path}", f"out={file.with_name('photographs.onnx')}", "photographs=true"]) == 0
+        )
     return file
 
 
@@ -96,35 +99,39 @@ def test_the_lines_of_the_guide_deploy_it_without_torch(
     phd_exp: Callable, exported: Path, run: RunFolder, tmp_path: Path
 ) -> None:
     (indented,) = re.findall(r"\n\n((?:    .*\n|\n)*    import onnxruntime\n(?:    .*\n|\n)*)", GUIDE.read_text())
-    shutil.copy(exported, tmp_path / "network.onnx")
+    shutil.copy(exported.with_name("photographs.onnx"), tmp_path / "network.onnx")
     draw = np.random.default_rng(1)
     coarse = Image.fromarray(draw.integers(0, 256, (6, 6, 3), dtype=np.uint8))
     coarse.resize((150, 150), Image.Resampling.BICUBIC).save(tmp_path / "photo.png")
     block = "import sys\nfor name in ('torch', 'phd_exp', 'onnx', 'scipy'): sys.modules[name] = None\n"
-    tell = "import json\nprint(json.dumps([x[0].tolist() for x in (mode, mean, covariance, median, interval)]))\n"
+    tell = "import json\nprint(json.dumps([x.tolist() for x in (mode, mean, covariance, median, interval)]))\n"
     (tmp_path / "deployed.py").write_text(block + textwrap.dedent(indented) + tell)
     done = subprocess.run(
         [sys.executable, "-P", "-c", "import sys; sys.path.insert(0, '.'); exec(open('deployed.py').read())"],
         cwd=tmp_path, env={}, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    (row,) = read_lines(phd_exp("predict", f"run={run.path}", "image=photo.png", "f=1550").out)
-    row["depth_interval"] = list(row["depth_interval"].values())
+    command = ("predict", f"run={run.path}", "image=photo.png", "f=1550")
     keys = ("mode", "mean", "covariance", "median_depth", "depth_interval")
-    for key, here in zip(keys, json.loads(done.stdout.splitlines()[-1]), strict=True):
-        size = np.abs(row[key]).max()
-        assert np.abs(np.array(here) - row[key]).max() < 1e-5 * size
+    here = json.loads(done.stdout.splitlines()[-1])
+    # off the middle of the photograph, depth is not the coordinate along the ray
+    for number, (words, shared) in enumerate([("box=20,15,90,140", keys[:3]), ("box=0,0,150,150", keys)]):
+        (row,) = read_lines(phd_exp(*command, words).out)
+        row["depth_interval"] = list(row["depth_interval"].values())
+        for key, values in zip(shared, here, strict=False):
+            assert np.abs(np.array(values[number]) - row[key]).max() < 1e-5 * np.abs(row[key]).max()
 
 
 @pytest.mark.slow
 def test_the_exported_file_describes_its_inputs_and_outputs(exported: Path) -> None:
     import onnxruntime
 
-    session = onnxruntime.InferenceSession(exported)
-    said = json.loads(session.get_modelmeta().custom_metadata_map["phd_exp"])
-    names = [value.name for value in (*session.get_inputs(), *session.get_outputs())]
-    assert {*names} <= said.keys()
-    assert (said["side"], said["temperature"]) == (SIDE, None)
+    for file in (exported, exported.with_name("photographs.onnx")):
+        session = onnxruntime.InferenceSession(file)
+        said = json.loads(session.get_modelmeta().custom_metadata_map["phd_exp"])
+        names = [value.name for value in (*session.get_inputs(), *session.get_outputs())]
+        assert {*names} <= said.keys()
+        assert (said["side"], said["temperature"]) == (SIDE, None)
 
 
 @pytest.mark.slow
@@ -134,12 +141,13 @@ def test_an_export_that_deviates_is_refused_and_leaves_no_file(
     from onnx import load_from_string
 
     from phd_exp.inference import onnx
+    from phd_exp.inference.deployed import OfImages
 
     predictor, other = (package.load(run.path, device="cpu") for _ in range(2))
-    assert onnx.largest_deviation(predictor, exported.read_bytes()) < onnx.TOLERANCE
+    assert onnx.largest_deviation(OfImages(predictor), exported.read_bytes()) < onnx.TOLERANCE
     with torch.no_grad():
         other.regressor.last.bias.add_(1e-3)
-    assert onnx.largest_deviation(other, exported.read_bytes()) > onnx.TOLERANCE
+    assert onnx.largest_deviation(OfImages(other), exported.read_bytes()) > onnx.TOLERANCE
     monkeypatch.setattr(onnx, "graph", lambda _: load_from_string(exported.read_bytes()))
     monkeypatch.setattr(onnx, "largest_deviation", lambda *_: 2e-5)
     outcome = phd_exp("export", f"run={run.path}", "out=here.onnx")

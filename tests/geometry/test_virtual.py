@@ -4,8 +4,10 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
-from phd_exp.geometry.virtual import Box, VirtualCamera, intrinsics, rays, smallest_rotation
+from phd_exp.geometry.motion import smallest_rotation
+from phd_exp.geometry.virtual import Box, VirtualCamera, intrinsics, rays
 
 S = 96.0
 
@@ -103,7 +105,8 @@ def test_corners_of_pixels_are_mapped_by_the_homography(case: tuple) -> None:
 
 @pytest.mark.parametrize("direction", [(0, 0, 1), (0.6, 0, 0.8), (0, -0.6, 0.8), (0.48, 0.64, 0.6)])
 def test_smallest_rotation_takes_the_direction_to_the_axis(direction: tuple[float, ...]) -> None:
-    np.testing.assert_allclose(smallest_rotation(np.array(direction, dtype=float)) @ direction, [0, 0, 1], atol=1e-15)
+    vector = torch.tensor(direction, dtype=torch.float64)
+    np.testing.assert_allclose(smallest_rotation(vector) @ vector, [0, 0, 1], atol=1e-15)
 
 
 def test_refuses_what_no_pinhole_image_shows() -> None:

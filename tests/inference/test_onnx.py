@@ -47,16 +47,17 @@ def predictor(composed: Callable[..., Any], head: Head, **changes: Any) -> Predi
 def worst(made: Predictor, images: np.ndarray, f: np.ndarray) -> dict[str, np.ndarray]:
     """For each output, the deviation of the graph from torch in each row, relative to its largest element."""
     from phd_exp.inference import onnx
+    from phd_exp.inference.deployed import OfImages, answers
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("jaxtyping.config.jaxtyping_disable", True)  # a shape that is checked is a fixed one in a graph
-        content = onnx.graph(made).SerializeToString()
+        content = onnx.graph(OfImages(made)).SerializeToString()
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     assert [given.name for given in session.get_inputs()] == ["image", "f"]
     raw, *here = session.run(None, {"image": images, "f": f})
     expected = made.raw(images, torch.from_numpy(f)).double()
     np.testing.assert_array_equal(raw, expected.numpy())
-    there = onnx.outputs(made.predict(expected, torch.from_numpy(f).double()))
+    there = answers(made.predict(expected, torch.from_numpy(f).double()))
     assert [out.name for out in session.get_outputs()] == ["raw", *there]
     deviations = {}
     for value, (name, tensor) in zip(here, there.items(), strict=True):

@@ -1,0 +1,146 @@
+"""The predictor as a network of its own, from images, or from a photograph with boxes, to positions with uncertainty.
+
+An exported graph is traced from it. The network computes in float32, everything before and after it in float64.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image
+from torch import Tensor, nn
+from torch.export import Dim
+
+from phd_exp.data.areas import area_means, sums
+from phd_exp.distributions import ProjectedHuber
+from phd_exp.geometry.facing import facing, pixel_corners
+from phd_exp.geometry.virtual import intrinsics
+from phd_exp.inference.answers import LEVELS
+from phd_exp.inference.predictor import Predictor, View
+from phd_exp.models.heads import Prediction
+
+FOCAL_LENGTHS = (5.0, 9.0)  # range for the comparison with torch, in sides of the image
+NUMBER = Dim("n", min=1)
+BATCHES = (1, 7, 56)  # images in each batch of the comparison
+PHOTOGRAPHS = ((150, 150, 1), (180, 240, 7), (301, 199, 24))  # width, height and number of boxes
+
+
+class Deployed(nn.Module, ABC):
+    """Abstract base class: the inputs of a graph -> the raw numbers of the network, and the answers, in float32."""
+
+    inputs: tuple[str, ...]
+    dynamic_shapes: tuple[dict[int, Dim] | None, ...]
+    """Of each input: the dimensions whose size is free."""
+
+    def __init__(self, predictor: Predictor) -> None:
+        super().__init__()
+        self.predictor = predictor
+        self.networks = nn.ModuleList(predictor.networks)
+
+    @abstractmethod
+    def cases(self) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Prediction]]:
+        """Inputs on which the graph is compared with `predict`: inputs, raw numbers, predictions in float64."""
+
+    @abstractmethod
+    def answers(self, prediction: Prediction, *inputs: Tensor) -> dict[str, Tensor]:
+        """The outputs after the raw numbers, in float64."""
+
+
+class OfImages(Deployed):
+    """Images (batch, side, side, 3) of the network's size, with the principal point in the middle, and f (batch,)."""
+
+    inputs = ("image", "f")
+    dynamic_shapes = ({0: NUMBER}, {0: NUMBER})
+
+    def forward(self, image: UInt8[Tensor, "batch S S 3"], f: Float[Tensor, " batch"]) -> tuple[Tensor, ...]:
+        raw = self.predictor.outputs(image, self.predictor.camera(f).f)
+        answers = self.answers(self.predictor.predict(raw.double(), f.double()), image, f)
+        return (raw, *(value.float() for value in answers.values()))
+
+    def answers(self, prediction: Prediction, *inputs: Tensor) -> dict[str, Tensor]:
+        return answers(prediction)
+
+    def cases(self) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Prediction]]:
+        n, side = sum(BATCHES), self.predictor.side
+        images = torch.from_numpy(pictures(n, side, side))
+        f = (side * torch.linspace(*FOCAL_LENGTHS, n)).float()
+        for rows in torch.arange(n).split(list(BATCHES)):
+            raw = self.predictor.raw(images[rows].numpy(), f[rows])
+            yield (images[rows], f[rows]), raw, self.predictor.predict(raw.double(), f[rows].double())
+
+
+class OfPhotographs(Deployed):
+    """A photograph (height, width, 3) of any size, K (3, 3), and boxes (n, 4): left, top, right, bottom, px.
+
+    The crops are those of `predict`, and positions are in the frame of the photograph's camera.
+    """
+
+    inputs = ("photograph", "K", "boxes")
+    dynamic_shapes = ({0: Dim("height", min=1), 1: Dim("width", min=1)}, None, {0: NUMBER})
+
+    def forward(
+        self, photograph: UInt8[Tensor, "height width 3"], K: Float[Tensor, "3 3"], boxes: Float[Tensor, "boxes 4"]
+    ) -> tuple[Tensor, ...]:
+        R, f = facing(K, boxes, self.predictor.side, self.predictor.largest_f)
+        image = area_means(sums(photograph), pixel_corners(K, R, f, self.predictor.side))
+        raw = self.predictor.outputs(image, self.predictor.camera(f.float()).f)
+        answers = self.answers(self.predictor.predict(raw.double(), f.float().double()), photograph, K, boxes)
+        return (raw, *(value.float() for value in answers.values()))
+
+    def answers(self, prediction: Prediction, *inputs: Tensor) -> dict[str, Tensor]:
+        _, K, boxes = inputs
+        R, _ = facing(K, boxes, self.predictor.side, self.predictor.largest_f)
+        here = answers(prediction)
+        for name in ("mode", "mean", "position"):
+            if name in here:
+                here[name] = (R.mT @ here[name][..., None])[..., 0]
+        if "covariance" in here:
+            here["covariance"] = R.mT @ here["covariance"] @ R
+            here["median_along_ray"], here["interval_along_ray"] = (
+                here.pop("median_depth"),
+                here.pop("depth_interval"),
+            )
+        return here | {"ray": R[:, 2]}
+
+    def cases(self) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Prediction]]:
+        draw, predictor = np.random.default_rng(1), self.predictor
+        for width, height, n in PHOTOGRAPHS:
+            (photograph,) = pictures(1, height, width)
+            f = max(width, height) * draw.uniform(1, 2)
+            K = intrinsics(f, 1.1 * f, 0.45 * width, 0.55 * height)
+            middle, half = draw.uniform(0.1, 0.9, (n, 2)), draw.uniform(0.05, 0.3, (n, 2))
+            boxes = np.concatenate([middle - half, middle + half], axis=1) * np.tile([width, height], 2)
+            views = [
+                View.of_box(Image.fromarray(photograph), K, tuple(box), predictor.side, "", predictor.largest_f)
+                for box in boxes.tolist()
+            ]
+            known = torch.tensor([view.camera.f for view in views], dtype=torch.float32)
+            raw = predictor.raw(np.stack([view.image for view in views]), known)
+            inputs = torch.from_numpy(photograph), torch.from_numpy(K), torch.from_numpy(boxes)
+            yield inputs, raw, predictor.predict(raw.double(), known.double())
+
+
+def answers(prediction: Prediction) -> dict[str, Tensor]:
+    """The answers for a batch of predictions, in the frame of their cameras."""
+    if not isinstance(prediction, ProjectedHuber):
+        return {"position": prediction.mode}
+    tails = torch.tensor([(1 - level / 100) / 2 for level in LEVELS], dtype=torch.float64)
+    p = torch.cat([tails.new_tensor([0.5]), tails, 1 - tails])
+    z = prediction.depth_icdf(p[:, None])  # all at once, for a small graph
+    return {
+        "mode": prediction.mode,
+        "mean": prediction.mean,
+        "covariance": prediction.covariance_matrix,
+        "median_depth": z[0],
+        "depth_interval": torch.stack([z[1 : 1 + len(LEVELS)], z[1 + len(LEVELS) :]]).permute(2, 1, 0),
+    }
+
+
+def pictures(n: int, height: int, width: int) -> UInt8[np.ndarray, "n height width 3"]:
+    """Images with shapes large and small, the same every time: coarse noise enlarged, and fine noise over it."""
+    draw = np.random.default_rng(0)
+    coarse = draw.integers(0, 256, (n, 8, 8, 3)).repeat(-(-height // 8), axis=1).repeat(-(-width // 8), axis=2)
+    fine = draw.normal(0, 12, (n, height, width, 3))
+    return (coarse[:, :height, :width] + fine).clip(0, 255).astype(np.uint8)
