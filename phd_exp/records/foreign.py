@@ -182,7 +182,8 @@ def _quaternion(rows: Sequence[float]) -> list[float]:
     """(w, x, y, z) of a rotation matrix."""
     from scipy.spatial.transform import Rotation  # imported slowly, and few data sets need it
 
-    rotation = Rotation.from_matrix(np.reshape(rows, (3, 3)))
-    if np.abs(rotation.as_matrix().ravel() - rows).max() > 1e-3:
+    R = np.reshape(rows, (3, 3))
+    # NaN is refused too, before scipy, which accepts it with a warning
+    if not np.abs(R @ R.T - np.eye(3)).max() <= 1e-3:
         raise ValueError("cam_R_w2c: expected the rows of a rotation matrix")
-    return [float(value) for value in rotation.as_quat(scalar_first=True)]
+    return [float(value) for value in Rotation.from_matrix(R).as_quat(scalar_first=True)]

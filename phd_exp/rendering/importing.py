@@ -3,6 +3,8 @@
 Functions receive Blender's module; this file does not import it.
 """
 
+import io
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -41,10 +43,11 @@ def import_meshes(bpy: Any, spec: DatasetSpec) -> Meshes:
 def _one_object(bpy: Any, path: Path) -> Any:
     """Read a file and join its parts, in the pose of rest; lamps, cameras and empties are removed."""
     before, suffix = set(bpy.data.objects), path.suffix.lower()
-    if suffix in (".glb", ".gltf"):
-        bpy.ops.import_scene.gltf(filepath=str(path), disable_bone_shape=True)
-    else:
-        getattr(bpy.ops.wm, f"{suffix[1:]}_import")(filepath=str(path))
+    with redirect_stdout(io.StringIO()):  # on which Blender tells how far it is
+        if suffix in (".glb", ".gltf"):
+            bpy.ops.import_scene.gltf(filepath=str(path), disable_bone_shape=True)
+        else:
+            getattr(bpy.ops.wm, f"{suffix[1:]}_import")(filepath=str(path))
     added = set(bpy.data.objects) - before
     parts = sorted((item for item in added if item.type == "MESH" and item.data.polygons), key=lambda item: item.name)
     if not 0 < (faces := sum(len(part.data.polygons) for part in parts)) <= MOST_FACES:
@@ -53,8 +56,9 @@ def _one_object(bpy: Any, path: Path) -> Any:
         raise ValueError(f"its texture {listed(missing)} is missing; put it where the file names it")
     bpy.context.view_layer.update()
     whole, others = parts[0], added - set(parts)
-    with bpy.context.temp_override(active_object=whole, selected_editable_objects=parts):
-        bpy.ops.object.join()
+    if len(parts) > 1:
+        with bpy.context.temp_override(active_object=whole, selected_editable_objects=parts):
+            bpy.ops.object.join()
     whole.modifiers.clear()
     whole.animation_data_clear()
     for item in others:

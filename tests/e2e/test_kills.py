@@ -107,7 +107,8 @@ def test_killed_at_any_moment_it_leaves_whole_files_and_ends_as_undisturbed(
     moments, kills, torn = random.Random(0), 0, 0
     before: dict[str, bytes] = {}
     most = min(6, len(whole) + 1)  # a file is seen without its name, and with it
-    while kills < KILLS[verb]:
+    # under load the moment of a write may be missed
+    while kills < KILLS[verb] or (not torn and kills < 5 * KILLS[verb]):
         process = begun(command(out))
         if kill_amid_writing(process, out, most, moments):
             kills += 1

@@ -75,6 +75,22 @@ def test_answers_are_in_the_frame_of_the_real_camera(phd_exp: Callable, run: Run
         assert np.abs((real.mean(axis=0) - row["mean"]) / scale).max() < 0.02
 
 
+def test_small_boxes_are_viewed_at_the_largest_focal_length_of_the_training_renders(
+    phd_exp: Callable, make: Callable[..., RunFolder], run: RunFolder, tmp_path: Path
+) -> None:
+    """A network of own images has learned from boxes; there they decide. A whole image is viewed as it is."""
+    rendered = make("data=default")
+    image, K = np.zeros((100, 200, 3), np.uint8), intrinsics(400.0, 400.0, 100.0, 50.0)
+    largest_f = 2000 * SIDE / 224
+    for folder, f in ((rendered, largest_f), (run, pytest.approx(400 * SIDE / 8, rel=0.01))):
+        assert package.load(folder.path).view(image, K, (50.0, 40.0, 58.0, 48.0)).camera.f == f
+    assert package.load(rendered.path).view(image, 10 * K - np.diag([0, 0, 9])).camera.f > largest_f
+    Image.fromarray(image).save(tmp_path / "photo.png")
+    words = ("predict", f"run={rendered.path}", "image=photo.png", "fx=400", "fy=400", "box=50,40,58,48")
+    (answer,) = read_lines(phd_exp(*words).out)
+    assert np.isfinite(answer["mode"]).all()
+
+
 def test_a_baseline_has_positions_without_uncertainty(
     phd_exp: Callable, baseline: RunFolder, photos: Path, tmp_path: Path
 ) -> None:

@@ -183,6 +183,8 @@ BAD = [
     (bop(CAMERA, lambda camera: camera["3"].update(cam_K=SKEW)), "camera without skew"),
     (bop(CAMERA, lambda camera: camera["3"].update(cam_K=SKEW[:8])), "object 0: cannot be read"),
     (bop(CAMERA, lambda camera: camera["3"].update(cam_R_w2c=[1, 0, 0, 0, 1, 0, 0, 0.1, 1])), "a rotation matrix"),
+    (bop(CAMERA, lambda camera: camera["3"].update(cam_R_w2c=[np.nan, -1, 0, 1, 0, 0, 0, 0, 1])), "a rotation matrix"),
+    (bop(CAMERA, lambda camera: camera["3"].update(cam_R_w2c=[1, 0, 0, 0, 1, 0, 0, 0, -1])), "Non-positive determinant"),
     (bop(CAMERA, lambda camera: camera["3"].pop("cam_t_w2c")), "'cam_t_w2c' is missing"),
     (("bop", lambda folder: (folder / "000002/rgb/000003.jpg").unlink()), "image 3, .*'rgb/000003' is missing"),
     (kitti("label_2", "1.47 8.41 0.01", "1.47"), "line 1: cannot be read"),
