@@ -32,6 +32,7 @@ class Muon(Optimizer):
         lr: learning rate of Adam.
         orthogonal_lr: learning rate of the orthogonal steps.
         momentum: weight of the previous mean of gradients.
+        weight_decay: each orthogonal step first multiplies the weights by 1 - orthogonal_lr weight_decay.
 
     Examples:
         >>> network = nn.Sequential(nn.Conv2d(3, 8, 3), nn.Conv2d(8, 8, 3))
@@ -49,13 +50,15 @@ class Muon(Optimizer):
         lr: Annotated[float, Gt(0)],
         orthogonal_lr: Annotated[float, Gt(0)],
         momentum: Annotated[float, Ge(0), Lt(1)] = 0.95,
+        weight_decay: Annotated[float, Ge(0)] = 0.0,
     ) -> None:
         convolutions: list[nn.Parameter] = []
         others: list[nn.Parameter] = []
         for weight in params:
             (convolutions if _mixes_features(weight) else others).append(weight)
         groups = [{"params": others, "lr": lr}, {"params": convolutions, "lr": orthogonal_lr}]
-        super().__init__([group for group in groups if group["params"]], {"momentum": momentum})
+        defaults = {"momentum": momentum, "weight_decay": weight_decay}
+        super().__init__([group for group in groups if group["params"]], defaults)
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
@@ -68,6 +71,7 @@ class Muon(Optimizer):
             if not weights:
                 continue
             if _mixes_features(weights[0]):
+                torch._foreach_mul_(weights, 1 - group["lr"] * group["weight_decay"])
                 self._orthogonal_step(weights, group["lr"], group["momentum"])
             else:
                 self._adam_step(weights, group["lr"])

@@ -103,7 +103,8 @@ def test_a_model_picks_its_loss_and_camera_and_whether_the_strong_recipe_shows_t
 @pytest.mark.parametrize(
     ("part", "keys"),
     [
-        ("muon", {"optimizer._target_", "optimizer.orthogonal_lr", "optimizer.momentum", "optimizer.fused"}),
+        ("muon", {f"optimizer.{key}" for key in ("_target_", "orthogonal_lr", "momentum", "weight_decay", "fused")}),
+        ("weight_decay", {"optimizer.weight_decay"}),
         ("schedule", {"recipe.schedule", "recipe.warmup_steps"}),
         ("localisation", {"recipe.localisation"}),
         ("segmentation", {"recipe.segmentation", "backbone.segments"}),

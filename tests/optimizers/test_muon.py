@@ -38,22 +38,23 @@ def test_no_gradient_is_no_step() -> None:
     assert torch.equal(orthogonal(torch.zeros(4, 6)), torch.zeros(4, 6))
 
 
-def test_a_convolution_steps_as_a_matrix_of_torchs_muon() -> None:
-    gradients = torch.randn(3, 16, 8 * 9, generator=torch.Generator().manual_seed(2))
-    ours, theirs = nn.Parameter(torch.zeros(16, 8, 3, 3)), nn.Parameter(torch.zeros(16, 72))
-    mine = Muon([ours], lr=1.0, orthogonal_lr=0.01)
-    torchs = torch.optim.Muon([theirs], lr=0.01, weight_decay=0.0, adjust_lr_fn="match_rms_adamw")
+@pytest.mark.parametrize("decay", [0.0, 5.0])
+def test_a_convolution_steps_as_a_matrix_of_torchs_muon(decay: float) -> None:
+    start, *gradients = torch.randn(4, 16, 8 * 9, generator=torch.Generator().manual_seed(2))
+    ours, theirs = nn.Parameter(start.view(16, 8, 3, 3).clone()), nn.Parameter(start.clone())
+    mine = Muon([ours], lr=1.0, orthogonal_lr=0.01, weight_decay=decay)
+    torchs = torch.optim.Muon([theirs], lr=0.01, weight_decay=decay, adjust_lr_fn="match_rms_adamw")
     for gradient in gradients:
         ours.grad, theirs.grad = gradient.view_as(ours).clone(), gradient.clone()
         mine.step()
         torchs.step()
     difference = ours.detach().flatten(1) - theirs.detach()
-    assert difference.norm() < 0.02 * theirs.norm()  # theirs iterates in bfloat16
+    assert difference.norm() < 0.02 * (theirs.detach() - start).norm()  # theirs iterates in bfloat16
 
 
 def test_all_else_steps_as_adam_does() -> None:
     one, other = network(), network()
-    mine = Muon(one.parameters(), lr=0.01, orthogonal_lr=1e-30)  # a step of nothing in the middle
+    mine = Muon(one.parameters(), lr=0.01, orthogonal_lr=1e-30, weight_decay=1.0)  # a step of nothing in the middle
     adam = torch.optim.Adam([p for p in other.parameters() if p is not other[1].weight], lr=0.01, fused=True)
     descend(one, mine, steps=5)
     descend(other, adam, steps=5)
