@@ -71,8 +71,8 @@ class Evaluation:
         scores: means of `ERRORS` and, if recorded, of `OF_DISTANCE`; of a distribution also of `nll` (nats) and
             `energy_score_mm`, the per cent `inside_90` of truths in regions of 90 %, and the `calibration_scores`; of
             Projected Huber densities the means of `nees_columns`, and `group_miscalibration`.
-        reference: for NEES and each score that is a distance from calibration, the median and 95 % interval of
-            calibrated predictions with the same uncertainties (`calibrated_reference`): a distance is never zero.
+        reference: of each score of `REFERENCED`, the median and 95 % interval for calibrated predictions with equal
+            uncertainties (`calibrated_reference`): a distance from calibration is never zero.
         curves: `metrics.calibration_scores.curves`; x is the predicted variance, credible level, PIT, or share kept.
         resampled: each score on resampled test images, the same images for all runs with equal n.
     """

@@ -1,4 +1,4 @@
-"""The distances from calibration of a calibrated model: they are not zero for finitely many samples."""
+"""The scores that a calibrated model would have: for finitely many samples, no distance from calibration is zero."""
 
 from collections import defaultdict
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.columns import draws, nees_columns, parameter_columns, squared_error_columns
+from phd_exp.distributions.columns import NEES, draws, nees_columns, parameter_columns, squared_error_columns
 from phd_exp.metrics.calibration import ence_of, miscalibration_area, uniform_distance
 from phd_exp.metrics.calibration_scores import ence_bins
 from phd_exp.metrics.groups import similar_groups, worst_group
@@ -16,8 +16,8 @@ from phd_exp.metrics.ordered import in_order_of
 
 SEED = 1
 _AT_ONCE = 10**6  # positions drawn at a time
-_OF_LEVELS = ("miscalibration_area", "depth_pit_area", "depth_pit_ks")
-DISTANCES = ("depth_ence", "projected_ence", *_OF_LEVELS, "group_miscalibration", "nees")
+_OF_LEVELS = ("inside_90", "miscalibration_area", "depth_pit_area", "depth_pit_ks")
+REFERENCED = ("depth_ence", "projected_ence", *_OF_LEVELS, "group_miscalibration", "depth_crps_mm", *NEES)
 
 
 @dataclass(frozen=True)
@@ -30,16 +30,16 @@ class Band:
 
 
 def calibrated_reference(distribution: ProjectedHuber, simulations: int = 200) -> dict[str, Band]:
-    """Median and 95 % interval of the `DISTANCES` and NEES if the truths were drawn from the predictions themselves.
+    """Median and 95 % interval of the scores `REFERENCED` if the truths were drawn from the predictions themselves.
 
-    ENCE and NEES depend on the predicted densities, so positions are drawn from them. Credible levels and PITs of a
-    calibrated model are uniform for any prediction: their distances depend on the number of samples alone.
+    ENCE, CRPS and NEES depend on the predicted densities, so positions are drawn from them. Credible levels and PITs
+    of a calibrated model are uniform for any prediction: their scores depend on the number of samples alone.
 
     Source: the simulated null distribution of a test statistic; coverage in tests/evaluation/test_reference.py.
     """
     (n,) = distribution.batch_shape
-    areas, distances = _uniform(n, simulations)
-    found = defaultdict(list, zip(_OF_LEVELS, (areas, areas, distances), strict=True))
+    inside, areas, distances = _uniform(n, simulations)
+    found = defaultdict(list, zip(_OF_LEVELS, (inside, areas, areas, distances), strict=True))
     each = max(1, _AT_ONCE // n)
     for start in range(0, simulations, each):
         for name, values in _simulated(distribution, min(each, simulations - start), SEED + start).items():
@@ -55,6 +55,7 @@ def groups_of(distribution: ProjectedHuber) -> Tensor:
 def _simulated(distribution: ProjectedHuber, simulations: int, seed: int) -> dict[str, Tensor]:
     drawn = draws(distribution, simulations, seed)
     found = {name: values.mean(-1) for name, values in nees_columns(distribution, drawn).items()}
+    found["depth_crps_mm"] = 1000 * distribution.depth_crps(drawn[..., 2]).mean(-1)
     levels = torch.rand(drawn.shape[:-1], generator=torch.Generator().manual_seed(seed))
     found["group_miscalibration"] = worst_group(levels, groups_of(distribution), torch.ones_like(levels))
     squared = squared_error_columns(distribution, drawn)
@@ -66,15 +67,17 @@ def _simulated(distribution: ProjectedHuber, simulations: int, seed: int) -> dic
 
 
 @cache
-def _uniform(n: int, simulations: int) -> tuple[list[float], list[float]]:
-    """Miscalibration areas and Kolmogorov-Smirnov distances of n uniform levels."""
+def _uniform(n: int, simulations: int) -> tuple[list[float], list[float], list[float]]:
+    """Per cent up to 0.9, miscalibration areas and Kolmogorov-Smirnov distances of n uniform levels."""
     generator = torch.Generator().manual_seed(SEED)
-    areas, distances = [], []
+    inside, areas, distances = [], [], []
     for _ in range(simulations):
-        order = in_order_of(torch.rand(n, generator=generator, dtype=torch.float64), {})
+        levels = torch.rand(n, generator=generator, dtype=torch.float64)
+        order = in_order_of(levels, {})
+        inside.append(100 * float((levels <= 0.9).double().mean()))
         areas.append(float(miscalibration_area(order)))
         distances.append(float(uniform_distance(order)))
-    return areas, distances
+    return inside, areas, distances
 
 
 def _band(values: list[float]) -> Band:

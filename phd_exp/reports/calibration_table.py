@@ -1,16 +1,16 @@
-"""Distances from calibration, each with the value of a calibrated model that predicts the same uncertainties."""
+"""Scores of calibration, each with the interval of a calibrated model that predicts the same uncertainties."""
 
 from phd_exp.evaluation.predictions import Evaluation
-from phd_exp.evaluation.reference import DISTANCES
 from phd_exp.records.choices import in_words
 from phd_exp.reports.quantities import SCORES
 from phd_exp.reports.runs import Report, Run
 from phd_exp.reports.table import Table, TableCell, TableRow, file_stem
 
+COLUMNS = ("depth_ence", "projected_ence", "miscalibration_area", "depth_pit_area", "group_miscalibration", "nees")
 OF_A_CELL = (
-    "A cell: the distance of the run's predictions; below it the 95 % interval of calibrated predictions with the "
-    "same uncertainties (truths simulated from them). Finitely many samples never give zero: a "
-    "value above that interval is miscalibrated, a value inside it is not distinguishable from calibrated."
+    "A cell: the score of the run's predictions; below it the 95 % interval of calibrated predictions with the same "
+    "uncertainties (truths simulated from them). Finitely many samples never give zero: a value above that interval "
+    "is miscalibrated, a value inside it is not distinguishable from calibrated. Coverage and CRPS: calibration.csv."
 )
 
 
@@ -26,7 +26,7 @@ def calibration_tables(report: Report) -> list[Table]:
             kind="calibration",
             title=f"Calibration, {in_words(preset)}: distances on the test samples",
             stub=("run",),
-            columns=tuple(SCORES[name].label for name in DISTANCES),
+            columns=tuple(SCORES[name].label for name in COLUMNS),
             groups=tuple(tuple(_row(run, *kind) for kind in kinds.items()) for run, kinds in runs),
             notes=(OF_A_CELL,),
             below="calibrated",
@@ -34,10 +34,10 @@ def calibration_tables(report: Report) -> list[Table]:
             numbers=tuple(
                 {"preset": preset, "data": run.data, "model": run.model, "run": run.name, "predictions": kind}
                 | {"quantity": name, "value": evaluation.scores[name].value}
-                | dict(zip(("calibrated", "low", "high"), vars(evaluation.reference[name]).values(), strict=True))
+                | dict(zip(("calibrated", "low", "high"), vars(reference).values(), strict=True))
                 for run, kinds in runs
                 for kind, evaluation in kinds.items()
-                for name in DISTANCES
+                for name, reference in evaluation.reference.items()
             ),
         )
         for preset, runs in found.items()
@@ -53,7 +53,7 @@ def _evaluations(run: Run) -> dict[str, Evaluation]:
 def _row(run: Run, kind: str, evaluation: Evaluation) -> TableRow:
     label = f"{run.title}, {run.name}{', recalibrated' if kind == 'recalibrated' else ''}"
     cells = []
-    for name in DISTANCES:
+    for name in COLUMNS:
         text, reference = SCORES[name].text, evaluation.reference[name]
         below = f"({text(reference.low)}–{text(reference.high)})"
         cells.append(TableCell(text(evaluation.scores[name].value), below=below))

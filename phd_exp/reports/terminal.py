@@ -70,7 +70,7 @@ def _grid(table: Table, starred: bool) -> Grid:
     for heading in table.stub:
         grid.add_column(heading, overflow="fold", min_width=12)
     for heading in table.columns:
-        grid.add_column(heading, justify="right", no_wrap=True)
+        grid.add_column(heading, justify="right")
     for group in table.groups:
         for row in group:
             cells = [*map(Text, row.stub), *(_cell(cell, starred) for cell in row.cells)]
@@ -79,7 +79,7 @@ def _grid(table: Table, starred: bool) -> Grid:
 
 
 def _cell(cell: TableCell, starred: bool) -> Text:
-    text = Text("*" if cell.bold and starred else "", style=TONES[cell.tone])
+    text = Text("*" if cell.bold and starred else "", style=TONES[cell.tone], no_wrap=True)
     text.append(cell.ours, style="bold" if cell.bold else "")
     if cell.spread:
         text.append(f" {cell.spread}")

@@ -5,19 +5,19 @@ import pytest
 import torch
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.columns import NEES, distribution_columns, draws, nees_columns
-from phd_exp.evaluation.reference import DISTANCES, calibrated_reference, groups_of
+from phd_exp.distributions.columns import distribution_columns, draws, nees_columns
+from phd_exp.evaluation.reference import REFERENCED, calibrated_reference, groups_of
 from phd_exp.metrics.calibration_scores import exact_scores
 from phd_exp.metrics.groups import worst_group
 from tests.support.synthetic import calibrated, truths
 
 TIMES = 100
-REFERENCED = dict.fromkeys([*DISTANCES, *NEES])
 
 
 def scores_of(prediction: ProjectedHuber, xyz: torch.Tensor) -> dict[str, float]:
     columns = distribution_columns(prediction, xyz)
     found = exact_scores(columns)
+    found["inside_90"] = 100 * float((columns["level"] <= 0.9).double().mean())
     found["group_miscalibration"] = float(worst_group(columns["level"], groups_of(prediction), torch.ones(len(xyz))))
     return found | {name: float(column.mean()) for name, column in nees_columns(prediction, xyz).items()}
 
@@ -34,7 +34,7 @@ def test_calibrated_models_lie_in_the_interval_95_times_of_100() -> None:
             inside[name] += band.low <= scores[name] <= band.high
             below[name] += scores[name] < band.value
     slack = 4 * np.sqrt(np.array([0.95 * 0.05, 0.25]) / TIMES)
-    assert reference.keys() == REFERENCED.keys()
+    assert reference.keys() == set(REFERENCED)
     for name in REFERENCED:
         assert inside[name] / TIMES == pytest.approx(0.95, abs=slack[0]), name
         assert below[name] / TIMES == pytest.approx(0.5, abs=slack[1]), name
@@ -44,7 +44,8 @@ def test_overconfident_models_lie_above_it() -> None:
     prediction = calibrated(truths(250, seed=1)[0], a=20.0, A=600.0, overconfidence=2.0, seed=3)
     scores = scores_of(prediction, truths(250, seed=1)[0])
     reference = calibrated_reference(prediction)
-    assert all(scores[name] > reference[name].high for name in REFERENCED)
+    assert all(scores[name] > reference[name].high for name in REFERENCED if name != "inside_90")
+    assert scores["inside_90"] < reference["inside_90"].low
 
 
 def test_regions_wrong_in_opposite_ways_are_found_though_all_together_are_right() -> None:
@@ -73,5 +74,6 @@ def test_one_sample_and_the_seed() -> None:
     prediction = calibrated(truths(1, seed=1)[0], a=20.0, A=600.0, overconfidence=1.0, seed=3)
     first, again = (calibrated_reference(prediction, simulations=50) for _ in range(2))
     assert first == again
+    assert first.pop("inside_90").high == 100
     assert all(0 < band.low <= band.value <= band.high for band in first.values())
     assert torch.isfinite(torch.tensor([band.high for band in first.values()])).all()
