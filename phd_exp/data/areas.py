@@ -32,9 +32,7 @@ def area_means(
     middle = (a + b + c + d) / 4
     (left, top), (right, bottom) = ((middle + sign * side / 2).unbind(-1) for sign in (-1, 1))
     total = _at(table, right, bottom) - _at(table, left, bottom) - _at(table, right, top) + _at(table, left, top)
-    mean = GREY + total / side.prod(-1, keepdim=True)
-    # NaN is beyond the image, and has no sum but an area
-    mean = mean.nan_to_num(float(GREY))
+    mean = (GREY + total / side.prod(-1, keepdim=True)).nan_to_num(float(GREY))  # where a corner is NaN
     return ((mean * TIES).round() / TIES).round().clamp(0, 255).to(torch.uint8)
 
 
