@@ -1,0 +1,172 @@
+"""Write the tables of results in README and guides from the files of this folder.
+
+    python docs/results/write.py                  # after the results have changed
+    python docs/results/write.py --check          # exit status 1 if a page differs from them
+    python docs/results/write.py --take report    # first take the numbers of a report
+
+`runs.csv` and `calibration.csv` hold lines of the same files in `<report>/tables/`; a run taken again replaces
+its lines. A table stands between `<!-- results: NAME -->` and `<!-- end -->`.
+"""
+
+import argparse
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+PAGES = ("README.md", "docs/guides/tables.md")
+BLOCK = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+KEYS = {"runs": ["preset", "data", "model", "seed", "overrides"], "calibration": ["preset", "data", "model", "run"]}
+DATA = ("default", "occl", "scale", "occl_scale")
+NOTHING = "–"
+PRESET = "full+strong"
+PAPER = ("2.4 / 48", "13.0 / 168", "1.6 / 347", "17.0 / 350")  # the probabilistic model
+PAPERS_TABLE_2 = {"mae_xyz": "13.0 / 327", "mae_constf": "10.8 / 325", "probabilistic": "2.4 / 48"}
+
+
+def take(report: Path) -> None:
+    """Add the lines of a report; they replace those of the same runs."""
+    for name, keys in KEYS.items():
+        new, old = read(report / "tables" / f"{name}.csv"), read(HERE / f"{name}.csv")
+        taken = set(new[keys].itertuples(index=False, name=None))
+        stays = [run not in taken for run in old[keys].itertuples(index=False, name=None)]
+        both = pd.concat([old[stays], new]).sort_values(keys, kind="stable")
+        both.to_csv(HERE / f"{name}.csv", index=False, lineterminator="\n")
+
+
+def read(file: Path) -> pd.DataFrame:
+    return pd.read_csv(file, dtype=str, keep_default_na=False)
+
+
+def chosen(lines: pd.DataFrame, **choice: str) -> pd.DataFrame:
+    for key, value in choice.items():
+        lines = lines[lines[key] == value]
+    return lines
+
+
+def mean_error(runs: pd.DataFrame, quantity: str, digits: int, **choice: str) -> str:
+    """The mean over seeds ± its 95 % interval; with one seed (†), the interval over test images."""
+    found = chosen(runs, quantity=f"{quantity}_error_mm", **choice)
+    if found.empty:
+        return NOTHING
+    means = found["mean"].astype(float)
+    if len(means) == 1:
+        half, mark = float(found["high"].iloc[0]) - means.iloc[0], "†"
+    else:
+        half, mark = stats.t.ppf(0.975, len(means) - 1) * means.std() / np.sqrt(len(means)), ""
+    return f"{means.mean():.{digits}f} ± {half:.{digits}f}{mark}"
+
+
+def both_errors(runs: pd.DataFrame, **choice: str) -> str:
+    """Projected and depth error."""
+    found = [mean_error(runs, quantity, digits, **choice) for quantity, digits in (("projected", 1), ("depth", 0))]
+    return NOTHING if NOTHING in found else " / ".join(found)
+
+
+def line(*cells: str) -> str:
+    return f"| {' | '.join(cells)} |\n"
+
+
+def row(label: str, cells: list[str], *further: str) -> str:
+    """A line, empty without any result."""
+    return "" if set(cells) == {NOTHING} else line(label, *cells, *further)
+
+
+def heading(*columns: str) -> str:
+    return line("", *columns) + f"|---|{'---:|' * len(columns)}\n"
+
+
+def summary(runs: pd.DataFrame) -> str:
+    """The probabilistic model in the central half: presets, recipes, one view and eight."""
+    labels = {
+        (PRESET, "mode"): "`preset=full recipe=strong`",
+        (PRESET, "eight views"): "the same network, mean of eight symmetric views",
+        ("full", "mode"): "`preset=full recipe=paper`",
+        ("small+strong", "mode"): "`preset=small recipe=strong`",
+    }
+    of_all = {"model": "probabilistic", "reading": "central", "overrides": ""}
+    table = heading(*DATA) + line("paper: ResNet-50, 8,000 images, 50 epochs", *PAPER)
+    for (preset, estimate), label in labels.items():
+        choice = {"preset": preset, "estimate": estimate, **of_all}
+        table += row(label, [both_errors(runs, data=data, **choice) for data in DATA])
+    return table
+
+
+def models(runs: pd.DataFrame) -> str:
+    """Table 1: every model in the whole field and in the central half."""
+    table = heading(*DATA)
+    for reading, label in {"whole": "*whole field*", "central": "*central half*"}.items():
+        table += line(label, *([""] * len(DATA)))
+        rows = [("mae_vz", "mode"), ("mae_logz", "mode"), ("probabilistic", "mode"), ("probabilistic", "eight views")]
+        for model, estimate in rows:
+            choice = {"preset": PRESET, "reading": reading, "model": model, "estimate": estimate, "overrides": ""}
+            label = f"`{model}`{', eight views' if estimate == 'eight views' else ''}"
+            table += row(label, [both_errors(runs, data=data, **choice) for data in DATA])
+    return table + line("paper, `probabilistic`", *PAPER)
+
+
+def focal_length(runs: pd.DataFrame) -> str:
+    """Table 2: models with different knowledge of the focal length, on `default`."""
+    choice = {"preset": PRESET, "data": "default", "estimate": "mode", "overrides": ""}
+    table = heading("whole field", "central half", "paper")
+    for model, papers in PAPERS_TABLE_2.items():
+        cells = [both_errors(runs, model=model, reading=reading, **choice) for reading in ("whole", "central")]
+        table += row(f"`{model}`", cells, papers)
+    return table
+
+
+def calibration(scores: pd.DataFrame) -> str:
+    """Means over seeds of the scores of calibration, and of the interval that calibrated predictions have."""
+    columns = {
+        "inside_90": ("inside the 90 % region (%)", 1),
+        "miscalibration_area": ("miscalibration area", 3),
+        "depth_pit_area": ("PIT area of depth", 3),
+        "depth_ence": ("ENCE of depth", 2),
+        "projected_ence": ("ENCE of projection", 2),
+        "depth_crps_mm": ("CRPS of depth (mm)", 1),
+    }
+    table = heading(*(label for label, _ in columns.values()))
+    for data in DATA:
+        for kind in ("as trained", "recalibrated"):
+            found = chosen(scores, preset=PRESET, data=data, model="probabilistic", predictions=kind)
+            found = found[found["run"].str.fullmatch(r"seed\d+")]
+            cells = [NOTHING if found.empty else score(found, name, digits) for name, (_, digits) in columns.items()]
+            table += row(f"`{data}`, {kind}", cells)
+    return table
+
+
+def score(lines: pd.DataFrame, quantity: str, digits: int) -> str:
+    means = chosen(lines, quantity=quantity)[["value", "low", "high"]].astype(float).mean()
+    return f"{means['value']:.{digits}f} ({means['low']:.{digits}f} to {means['high']:.{digits}f})"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true")
+    parser.add_argument("--take", type=Path, metavar="REPORT")
+    arguments = parser.parse_args()
+    if arguments.take:
+        take(arguments.take)
+    of_runs: list[Callable[[pd.DataFrame], str]] = [summary, models, focal_length]
+    tables = {table.__name__: table(read(HERE / "runs.csv")) for table in of_runs}
+    tables["calibration"] = calibration(read(HERE / "calibration.csv"))
+    differs = False
+    for name in PAGES:
+        before = (ROOT / name).read_text()
+        after = BLOCK.sub(lambda block: f"{block[1]}\n{tables[block[2]]}\n{block[3]}", before)
+        differs |= before != after
+        if before != after and arguments.check:
+            print(f"{name}: differs from docs/results; run python docs/results/write.py", file=sys.stderr)
+        elif before != after:
+            (ROOT / name).write_text(after)
+    return int(arguments.check and differs)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

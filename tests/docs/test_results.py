@@ -1,0 +1,56 @@
+"""The tables of results are those of docs/results, and a run that is taken again replaces its lines."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from tests.docs.pages import ROOT
+
+PAGES = ("README.md", "docs/guides/tables.md")
+KEY = {"preset": "full+strong", "data": "default", "model": "probabilistic", "seed": "0"}
+
+
+def write(folder: Path, *words: str) -> subprocess.CompletedProcess:
+    command = [sys.executable, "docs/results/write.py", *words]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True)
+
+
+@pytest.fixture
+def copied(tmp_path: Path) -> Path:
+    """The pages and the results in another folder."""
+    shutil.copytree(ROOT / "docs" / "results", tmp_path / "docs" / "results")
+    for page in PAGES:
+        (tmp_path / page).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / page, tmp_path / page)
+    return tmp_path
+
+
+def test_the_pages_have_the_results_of_the_files() -> None:
+    found = write(ROOT, "--check")
+    assert (found.returncode, found.stderr) == (0, "")
+
+
+def test_a_run_taken_again_replaces_its_numbers(copied: Path) -> None:
+    results, report = copied / "docs" / "results", copied / "report"
+    (report / "tables").mkdir(parents=True)
+    shutil.copy(results / "calibration.csv", report / "tables")
+    lines = pd.read_csv(results / "runs.csv", dtype=str, keep_default_na=False)
+    again = lines[(lines[list(KEY)] == pd.Series(KEY)).all(axis=1) & (lines["overrides"] == "")]
+    again.assign(mean="123456.0").to_csv(report / "tables" / "runs.csv", index=False)
+    assert write(copied, "--take", "report").returncode == 0
+    after = pd.read_csv(results / "runs.csv", dtype=str, keep_default_na=False)
+    assert len(after) == len(lines)
+    assert (after["mean"] == "123456.0").sum() == len(again) > 0
+    assert all("1234" not in (ROOT / page).read_text() != (copied / page).read_text() for page in PAGES)
+
+
+def test_a_page_that_differs_is_named(copied: Path) -> None:
+    page = copied / "README.md"
+    page.write_text(page.read_text().replace("| `preset=full recipe=strong` | ", "| `preset=full recipe=strong` | 0"))
+    found = write(copied, "--check")
+    assert found.returncode == 1
+    assert found.stderr == "README.md: differs from docs/results; run python docs/results/write.py\n"
