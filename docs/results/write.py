@@ -14,9 +14,13 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
-from scipy import stats
+
+from phd_exp.evaluation.point_errors import SampleMean
+from phd_exp.reports.cells import interval
+from phd_exp.reports.paper import PUBLISHED
+from phd_exp.reports.paper_tables import DIGITS
+from phd_exp.reports.table import NOTHING
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
@@ -24,10 +28,7 @@ PAGES = ("README.md", "docs/guides/tables.md")
 BLOCK = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 KEYS = {"runs": ["preset", "data", "model", "seed", "overrides"], "calibration": ["preset", "data", "model", "run"]}
 DATA = ("default", "occl", "scale", "occl_scale")
-NOTHING = "–"
 PRESET = "full+strong"
-PAPER = ("2.4 / 48", "13.0 / 168", "1.6 / 347", "17.0 / 350")  # the probabilistic model
-PAPERS_TABLE_2 = {"mae_xyz": "13.0 / 327", "mae_constf": "10.8 / 325", "probabilistic": "2.4 / 48"}
 
 
 def take(report: Path) -> None:
@@ -50,23 +51,28 @@ def chosen(lines: pd.DataFrame, **choice: str) -> pd.DataFrame:
     return lines
 
 
-def mean_error(runs: pd.DataFrame, quantity: str, digits: int, **choice: str) -> str:
+def error(runs: pd.DataFrame, quantity: str, digits: int, **choice: str) -> str:
     """The mean over seeds ± its 95 % interval; with one seed (†), the interval over test images."""
     found = chosen(runs, quantity=f"{quantity}_error_mm", **choice)
     if found.empty:
         return NOTHING
-    means = found["mean"].astype(float)
-    if len(means) == 1:
-        half, mark = float(found["high"].iloc[0]) - means.iloc[0], "†"
-    else:
-        half, mark = stats.t.ppf(0.975, len(means) - 1) * means.std() / np.sqrt(len(means)), ""
-    return f"{means.mean():.{digits}f} ± {half:.{digits}f}{mark}"
+    numbers = found[["n_test", "mean", "high"]].astype(float)
+    over_seeds = interval([SampleMean(int(n), mean, None) for n, mean, _ in numbers.itertuples(index=False)])
+    half, mark = over_seeds.half_width, ""
+    if half is None:
+        half, mark = numbers["high"].iloc[0] - over_seeds.mean, "†"
+    return f"{over_seeds.mean:.{digits}f} ± {half:.{digits}f}{mark}"
 
 
 def both_errors(runs: pd.DataFrame, **choice: str) -> str:
     """Projected and depth error."""
-    found = [mean_error(runs, quantity, digits, **choice) for quantity, digits in (("projected", 1), ("depth", 0))]
+    found = [error(runs, quantity, digits, **choice) for quantity, digits in DIGITS.items()]
     return NOTHING if NOTHING in found else " / ".join(found)
+
+
+def published(model: str, data: str) -> str:
+    """Both errors of the paper."""
+    return " / ".join(f"{PUBLISHED[model, data][quantity]:.{digits}f}" for quantity, digits in DIGITS.items())
 
 
 def line(*cells: str) -> str:
@@ -76,6 +82,11 @@ def line(*cells: str) -> str:
 def row(label: str, cells: list[str], *further: str) -> str:
     """A line, empty without any result."""
     return "" if set(cells) == {NOTHING} else line(label, *cells, *further)
+
+
+def paper(label: str) -> str:
+    """The paper's errors of the probabilistic model."""
+    return line(label, *(published("probabilistic", data) for data in DATA))
 
 
 def heading(*columns: str) -> str:
@@ -91,7 +102,9 @@ def summary(runs: pd.DataFrame) -> str:
         ("small+strong", "mode"): "`preset=small recipe=strong`",
     }
     of_all = {"model": "probabilistic", "reading": "central", "overrides": ""}
-    table = heading(*DATA) + line("paper: ResNet-50, 8,000 images, 50 epochs", *PAPER)
+    table = heading(*DATA) + line(
+        "paper: ResNet-50, 8,000 images, 50 epochs", *(published("probabilistic", data) for data in DATA)
+    )
     for (preset, estimate), label in labels.items():
         choice = {"preset": preset, "estimate": estimate, **of_all}
         table += row(label, [both_errors(runs, data=data, **choice) for data in DATA])
@@ -108,16 +121,16 @@ def models(runs: pd.DataFrame) -> str:
             choice = {"preset": PRESET, "reading": reading, "model": model, "estimate": estimate, "overrides": ""}
             label = f"`{model}`{', eight views' if estimate == 'eight views' else ''}"
             table += row(label, [both_errors(runs, data=data, **choice) for data in DATA])
-    return table + line("paper, `probabilistic`", *PAPER)
+    return table + paper("paper, `probabilistic`")
 
 
 def focal_length(runs: pd.DataFrame) -> str:
     """Table 2: models with different knowledge of the focal length, on `default`."""
     choice = {"preset": PRESET, "data": "default", "estimate": "mode", "overrides": ""}
     table = heading("whole field", "central half", "paper")
-    for model, papers in PAPERS_TABLE_2.items():
+    for model in ("mae_xyz", "mae_constf", "probabilistic"):
         cells = [both_errors(runs, model=model, reading=reading, **choice) for reading in ("whole", "central")]
-        table += row(f"`{model}`", cells, papers)
+        table += row(f"`{model}`", cells, published(model, "default"))
     return table
 
 
@@ -160,12 +173,14 @@ def main() -> int:
     for name in PAGES:
         before = (ROOT / name).read_text()
         after = BLOCK.sub(lambda block: f"{block[1]}\n{tables[block[2]]}\n{block[3]}", before)
-        differs |= before != after
-        if before != after and arguments.check:
+        if before == after:
+            continue
+        if arguments.check:
             print(f"{name}: differs from docs/results; run python docs/results/write.py", file=sys.stderr)
-        elif before != after:
+            differs = True
+        else:
             (ROOT / name).write_text(after)
-    return int(arguments.check and differs)
+    return int(differs)
 
 
 if __name__ == "__main__":

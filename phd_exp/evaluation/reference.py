@@ -11,6 +11,7 @@ from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import NEES, draws, nees_columns, parameter_columns, squared_error_columns
 from phd_exp.metrics.calibration import ence_of, miscalibration_area, uniform_distance
 from phd_exp.metrics.calibration_scores import ence_bins
+from phd_exp.metrics.errors import MILLIMETRES
 from phd_exp.metrics.groups import similar_groups, worst_group
 from phd_exp.metrics.ordered import in_order_of
 
@@ -55,7 +56,7 @@ def groups_of(distribution: ProjectedHuber) -> Tensor:
 def _simulated(distribution: ProjectedHuber, simulations: int, seed: int) -> dict[str, Tensor]:
     drawn = draws(distribution, simulations, seed)
     found = {name: values.mean(-1) for name, values in nees_columns(distribution, drawn).items()}
-    found["depth_crps_mm"] = 1000 * distribution.depth_crps(drawn[..., 2]).mean(-1)
+    found["depth_crps_mm"] = MILLIMETRES * distribution.depth_crps(drawn[..., 2]).mean(-1)
     levels = torch.rand(drawn.shape[:-1], generator=torch.Generator().manual_seed(seed))
     found["group_miscalibration"] = worst_group(levels, groups_of(distribution), torch.ones_like(levels))
     squared = squared_error_columns(distribution, drawn)
