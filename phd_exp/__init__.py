@@ -36,10 +36,10 @@ def load(
     trust: tuple[str, ...] = (),
     views: int = 1,
 ) -> Predictor:
-    """A trained run or an ensemble as a callable from images to predictions; see `inference.predictor.load`."""
-    from phd_exp.inference import predictor
+    """A trained run or an ensemble as a callable from images to predictions; see `inference.loading.load`."""
+    from phd_exp.inference import loading
 
-    return predictor.load(run, device, recalibrate, trust, views)
+    return loading.load(run, device, recalibrate, trust, views)
 
 
 def runs(folder: str | Path = "runs") -> Any:

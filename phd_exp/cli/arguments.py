@@ -93,7 +93,7 @@ class RunArguments(Arguments):
 
 def loaded(arguments: RunArguments, device: str = "auto") -> "Predictor":
     """The predictor of a run, with a note on standard error if the run is not finished."""
-    from phd_exp.inference.predictor import load
+    from phd_exp.inference.loading import load
 
     trust = tuple(arguments.trust.split(",")) if arguments.trust else ()
     predictor = load(arguments.run, device, arguments.recalibrate, trust, int(arguments.views))

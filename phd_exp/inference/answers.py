@@ -15,7 +15,8 @@ from phd_exp.data.crops import cut, facing, read_image
 from phd_exp.distributions import Density, ProjectedHuber, Temperature
 from phd_exp.distributions.along import quantiles_along
 from phd_exp.geometry.camera import Camera
-from phd_exp.inference.predictor import BATCH, Predictor, View
+from phd_exp.inference.predictor import BATCH, Predictor
+from phd_exp.inference.views import View
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
 from phd_exp.models.heads import Prediction
 from phd_exp.records.detections import Detection

@@ -18,7 +18,8 @@ from phd_exp.distributions import ProjectedHuber
 from phd_exp.geometry.facing import facing, pixel_corners
 from phd_exp.geometry.virtual import intrinsics
 from phd_exp.inference.answers import LEVELS
-from phd_exp.inference.predictor import Predictor, View
+from phd_exp.inference.predictor import Predictor
+from phd_exp.inference.views import View
 from phd_exp.models.heads import Prediction
 
 FOCAL_LENGTHS = (5.0, 9.0)  # range for the comparison with torch, in sides of the image

@@ -16,7 +16,8 @@ from phd_exp.data.augmentation import Photometry
 from phd_exp.data.sources import PARTS, Known, Part, RenderedSource, Source
 from phd_exp.distributions.columns import Columns
 from phd_exp.evaluation.several_views import ROTATION, TRANSLATION
-from phd_exp.inference.predictor import BATCH, load
+from phd_exp.inference.loading import load
+from phd_exp.inference.predictor import BATCH
 from phd_exp.metrics.rows import Rows
 from phd_exp.records.choices import flatten
 from phd_exp.records.runs import RunFolder

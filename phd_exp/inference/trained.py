@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from phd_exp.evaluation.parquet import read_table
-from phd_exp.inference.predictor import Predictor, load
+from phd_exp.inference.loading import load
+from phd_exp.inference.predictor import Predictor
 from phd_exp.records.choices import preset_and_recipe
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder, find_runs

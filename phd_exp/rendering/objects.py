@@ -68,13 +68,17 @@ def upright_rotation(pitch: float, turn: float) -> Quaternion:
 def _distractors(
     spec: DatasetSpec, split: Split, number: int, f: float, meshes: Meshes, without: set[str]
 ) -> list[SceneObject]:
-    """Random ones of the three solids, as large as the object, and the further meshes, each at most once."""
+    """Random ones of the three solids, as large as the object, and the further meshes, each at most once.
+
+    They lie anywhere in the image, also where `xy_range` keeps the object near the middle.
+    """
     names = [*SHAPES, *(name for name in meshes if name != "mesh")]
+    anywhere = spec.model_copy(update={"xy_range": 1.0})
     side = SIZE * meshes["mesh"].radius / REACH
     items, order = [], stream_of(spec, split, number, Purpose.DISTRACTORS).permutation(len(names))
     for place in order[: spec.distractors].tolist():
         rng = stream_of(spec, split, number, Purpose.DISTRACTORS, place)
-        item = draw_object(spec, names[place], f, rng, rng, rng)
+        item = draw_object(anywhere, names[place], f, rng, rng, rng)
         own = meshes[item.shape].dimensions if item.shape in meshes else (side, side, side)
         items.append(item.model_copy(update={"dimensions": own}))
     return [item for item in items if item.shape not in without]

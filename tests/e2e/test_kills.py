@@ -20,8 +20,8 @@ KILLS = {"report": 20, "predict": 20, "export": 5}
 PATIENCE = 300.0  # s
 VERBS = {
     "report": ["phd_exp.cli.report", "phd_exp.reports.paper_figures", "phd_exp.reports.site.build"],
-    "predict": ["phd_exp.cli.predict", "phd_exp.inference.predictor", "phd_exp.inference.pictures"],
-    "export": ["phd_exp.cli.export", "phd_exp.inference.predictor", "phd_exp.inference.onnx"],
+    "predict": ["phd_exp.cli.predict", "phd_exp.inference.loading", "phd_exp.inference.pictures"],
+    "export": ["phd_exp.cli.export", "phd_exp.inference.loading", "phd_exp.inference.onnx"],
 }
 """What a process that is started to be killed has imported before."""
 

@@ -18,7 +18,7 @@ from phd_exp.data.crops import cut
 from phd_exp.distributions import PointEstimate, ProjectedHuber
 from phd_exp.geometry import Lens, VirtualCamera, intrinsics
 from phd_exp.inference import pictures
-from phd_exp.inference.predictor import View
+from phd_exp.inference.views import View
 from phd_exp.records.detections import detections_in
 from phd_exp.records.errors import DatasetError, RunError
 from phd_exp.records.runs import RunFolder

@@ -228,6 +228,10 @@ def test_distractors_are_other_objects_each_once(of_mesh: MakeSpec, meshes: dict
         assert scene.model_copy(update={"objects": scene.objects[:1]}) == alone, "paired"
         seen |= set(names)
     assert seen == {"mesh", "mesh1", "cylinder", "cube", "sphere"}
+    narrow = drawn(spec.model_copy(update={"xy_range": 0.0}), 20, meshes)
+    spread = np.array([[item.position[0] / item.position[2] * scene.f for item in scene.objects] for scene in narrow])
+    assert not spread[:, 0].any(), "the object is in the middle"
+    assert 0.3 < np.abs(spread[:, 1:]).max() / spec.sensor_size < 0.5, "and the others anywhere"
     hidden = plain.model_copy(update={"half_hidden": True})
     shares = [visibility(trace_pixels(scene, meshes)) for scene in drawn(hidden, 20, meshes)]
     whole = [truncation(scene, trace_pixels(scene, meshes), meshes) == 0 for scene in drawn(hidden, 20, meshes)]

@@ -1,0 +1,116 @@
+"""From the folders of trained runs to a `Predictor`."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from phd_exp.data.sources import RenderedSource
+from phd_exp.geometry.charts import DepthScale
+from phd_exp.inference.ensembles import members_of, require_alike
+from phd_exp.inference.predictor import Predictor
+from phd_exp.models.regressor import Regressor
+from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.errors import RunError
+from phd_exp.records.runs import RunFolder
+from phd_exp.training.config import RenderedConfig, RunConfig, check
+from phd_exp.training.config.targets import Trust
+from phd_exp.training.network import build_regressor, load_checkpoint, require_same_shrinking
+
+WEIGHTS = "regressor."  # prefix of the network's weights in a checkpoint
+
+
+def load(
+    run: str | Path | Sequence[str | Path],
+    device: str = "auto",
+    recalibrate: bool = False,
+    trust: Trust = (),
+    views: int = 1,
+) -> Predictor:
+    """The network of a run's best checkpoint, or its last; or an ensemble of several runs or views.
+
+    Args:
+        run: the run's folder; several, or a folder of seeds, for an ensemble.
+        device: "auto" chooses a GPU if there is one.
+        recalibrate: apply the temperatures that fit the run's predictions of held-out samples.
+        trust: packages other than phd_exp whose classes the run may build; None: any.
+        views: 8 for an ensemble of the eight symmetric views of each image.
+
+    Raises:
+        RunError: the folder holds no usable run.
+        ConfigError: its configuration is invalid, names code that is not trusted, or cannot be recalibrated; or the
+            runs do not fit together.
+    """
+    folders, matters = members_of([run] if isinstance(run, str | Path) else run)
+    first, *others = predictors = [_load(folder, device, trust) for folder in folders]
+    if others or views > 1:
+        require_alike(folders, predictors, matters)
+        state = next((one.state for one in predictors if one.state != "finished"), "finished")
+        networks = tuple(other.regressor for other in others)
+        first = replace(first, folders=tuple(folders), others=networks, views=views, state=state)
+    if not recalibrate:
+        return first
+    from phd_exp.evaluation.predictions import fit_temperature  # imports pyarrow
+
+    return replace(first, temperature=fit_temperature(first.held_out()))
+
+
+def _load(folder: RunFolder, device: str, trust: Trust) -> Predictor:
+    """The network of one run, as trained."""
+    if not folder.config_file.exists():
+        raise RunError(f"{folder.path}: no run; expected a folder with config.yaml and checkpoints/last.ckpt")
+    config = check(folder.config(), trust)
+    require_same_shrinking(folder, config)
+    depth, constant_f = _constants(folder, config)
+    place = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)
+    regressor = build_regressor(config, depth, is_new=False)
+    _load_weights(regressor, folder.best_checkpoint)
+    status = folder.status()
+    return Predictor(
+        config=config,
+        regressor=regressor.requires_grad_(False).eval().to(place),
+        side=config.data.image_size,
+        depth=depth,
+        constant_f=constant_f if config.camera.focal_length == "constant" else None,
+        device=place,
+        temperature=None,
+        state="unknown" if status is None else status.state,
+        folders=(folder,),
+    )
+
+
+def _constants(folder: RunFolder, config: RunConfig) -> tuple[DepthScale, float]:
+    """Depth scale and constant f of the run's data: as recorded, or from the specification of a rendered data set."""
+    if isinstance(config.data, RenderedConfig):
+        data = config.data
+        source = RenderedSource(DatasetFolder(data.folder), data.spec, {}, data.image_size)
+        return source.depth, source.constant_f
+    file = folder.constants_file
+    if not file.exists():
+        raise RunError(f"{file}: missing, so that the depth scale of its data is unknown; train the run again")
+    values = folder.constants()
+    try:
+        constant_f = float(values["constant_f"])
+        if not 0 < constant_f < math.inf:
+            raise ValueError(f"constant_f must be positive and finite, but is {constant_f}")
+        return DepthScale(*(float(values[name]) for name in ("mu_z0", "D", "z_centre"))), constant_f
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise RunError(f"{file}: not the constants of a run ({error})") from None
+
+
+def _load_weights(regressor: Regressor, checkpoint: Path) -> None:
+    """Load the network's weights from a checkpoint; only tensors are read."""
+    if not checkpoint.exists():
+        raise RunError(f"{checkpoint}: missing; the run has not trained a whole epoch yet")
+    content = load_checkpoint(checkpoint)
+    try:
+        state: dict[str, Any] = content["state_dict"]
+        regressor.load_state_dict(
+            {name.removeprefix(WEIGHTS): value for name, value in state.items() if name.startswith(WEIGHTS)}
+        )
+    except Exception as error:  # torch raises many kinds for other weights, or none
+        reason = " ".join(str(error).split())[:120]
+        raise RunError(f"{checkpoint}: not a whole checkpoint of this network ({reason})") from None
