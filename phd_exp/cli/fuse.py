@@ -10,9 +10,10 @@ from typing import Annotated, Any
 from pydantic import field_validator
 
 from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_folder, parsed, predicted, require_file
-from phd_exp.records.detections import NumberOrName, Observed, annotations, detections_in, observed
+from phd_exp.records.detections import NumberOrName
 from phd_exp.records.errors import ConfigError, RunError, listed
 from phd_exp.records.files import write_atomic
+from phd_exp.records.own_images import Observed, annotations, detections_in, observed
 from phd_exp.records.runs import RunFolder
 
 PLANE = four_numbers("plane=NX,NY,NZ,OFFSET: the points v with normal . v = offset, metres")

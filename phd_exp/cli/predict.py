@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import model_validator
 
 from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_folder, parsed, predicted
-from phd_exp.records.detections import Detection, NumberOrName, detection_of, detections_in
+from phd_exp.records.detections import Detection, NumberOrName, detection_of
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import write_atomic
 from phd_exp.records.foreign import boxes_in
+from phd_exp.records.own_images import detections_in
 from phd_exp.records.runs import RunFolder
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments

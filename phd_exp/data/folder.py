@@ -16,9 +16,10 @@ from phd_exp.data.sources import Known, Part, Source
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.geometry.virtual import VirtualCamera
 from phd_exp.records.dataset import sha256
-from phd_exp.records.detections import LARGEST_BOX, Detection, DetectionFolder
+from phd_exp.records.detections import LARGEST_BOX, Detection
 from phd_exp.records.errors import ConfigError, DatasetError
 from phd_exp.records.images import content_of, pillow_warnings
+from phd_exp.records.own_images import DetectionFolder
 from phd_exp.records.scenes import Split
 
 KNOWN = ("scale", "visibility", "truncation")  # values that are recorded with the predictions

@@ -14,8 +14,8 @@ from phd_exp.fusion import Fused, Plane, Pose, Status, fuse, fuse_shared
 from phd_exp.inference.answers import Sighting, rounded, uncertainty
 from phd_exp.inference.predictor import Predictor
 from phd_exp.metrics.errors import MILLIMETRES, squared_mahalanobis
-from phd_exp.records.detections import Observed
 from phd_exp.records.errors import DatasetError
+from phd_exp.records.own_images import Observed
 
 AGREE = 0.01
 """Largest distance between the true positions that lines of a scene give, relative to that from the camera."""

@@ -16,8 +16,8 @@ from phd_exp.data.folder import FolderSource
 from phd_exp.data.sources import Part, RenderedSource, Source
 from phd_exp.geometry.camera import Camera
 from phd_exp.records.dataset import DatasetFolder
-from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError
+from phd_exp.records.own_images import DetectionFolder
 from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig, SourceConfig
 from phd_exp.training.config.sections import RecipeConfig
 from phd_exp.training.config.targets import custom_parts, locate

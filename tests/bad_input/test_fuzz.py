@@ -15,8 +15,9 @@ from phd_exp.cli import train
 from phd_exp.cli.frame import run_verb
 from phd_exp.cli.jobs import launch
 from phd_exp.records.dataset import DatasetFolder
-from phd_exp.records.detections import DetectionLine, annotations, detections_in
+from phd_exp.records.detections import DetectionLine
 from phd_exp.records.errors import UserError
+from phd_exp.records.own_images import annotations, detections_in
 from phd_exp.records.runs import RunFolder, RunStatus
 from phd_exp.records.scenes import SampleRecord
 from phd_exp.reports.runs import read_report

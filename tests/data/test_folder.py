@@ -17,8 +17,8 @@ from phd_exp.data.folder import FolderSource
 from phd_exp.data.sources import RenderedSource
 from phd_exp.geometry import projected
 from phd_exp.records.dataset import SPLITS, DatasetFolder
-from phd_exp.records.detections import DetectionFolder
 from phd_exp.records.errors import ConfigError, DatasetError
+from phd_exp.records.own_images import DetectionFolder
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.training.build import build_source
 from phd_exp.training.config import check

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from phd_exp.data.folder import FolderSource
-from phd_exp.records.detections import DetectionFolder
+from phd_exp.records.own_images import DetectionFolder
 from tests.e2e.runs import only_run
 from tests.support.untrained import read_lines, virtual_cameras, write_photos
 

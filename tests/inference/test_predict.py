@@ -19,8 +19,8 @@ from phd_exp.distributions import PointEstimate, ProjectedHuber
 from phd_exp.geometry import Lens, VirtualCamera, intrinsics
 from phd_exp.inference import pictures
 from phd_exp.inference.views import View
-from phd_exp.records.detections import detections_in
 from phd_exp.records.errors import DatasetError, RunError
+from phd_exp.records.own_images import detections_in
 from phd_exp.records.runs import RunFolder
 from tests.support.foreign import WRITERS
 from tests.support.untrained import SIDE, SMALL, read_lines, untrained, virtual_cameras, write_photos

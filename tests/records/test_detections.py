@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 
 from phd_exp.records.dataset import DatasetFolder
-from phd_exp.records.detections import Detection, DetectionFolder
+from phd_exp.records.detections import Detection
 from phd_exp.records.errors import DatasetError, UserError
+from phd_exp.records.own_images import DetectionFolder
 
 GOOD: dict[str, Any] = {"file_name": "a.png", "f": 900.0, "x": 0.1, "y": -0.2, "z": 4.0}
 PLACED = {"x": 0.1, "y": -0.2, "z": 4.0}
@@ -167,3 +168,9 @@ def test_the_fingerprint_is_of_both_splits(read: Callable, folder: DetectionFold
             folder.metadata_path(split).write_text(json.dumps(GOOD | {"f": f}) + "\n")  # type: ignore[arg-type]
             seen.add(folder.fingerprint())
     assert len(seen) == 4
+    camera = folder.root / "test" / "camera.yaml"
+    folder.metadata_path("test").write_text('{"file_name": "a.png", "camera": "camera.yaml"}\n')
+    for text in ("K: 1", "K: 2"):
+        camera.write_text(text)
+        seen.add(folder.fingerprint())
+    assert len(seen) == 6, "of the camera files too"

@@ -10,9 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from phd_exp.records.dataset import SPLITS
-from phd_exp.records.detections import Detection, DetectionFolder, annotations, detections_in, observed
+from phd_exp.records.detections import Detection
 from phd_exp.records.errors import DatasetError, UserError
 from phd_exp.records.foreign import boxes_in
+from phd_exp.records.own_images import DetectionFolder, annotations, detections_in, observed
 from tests.support.foreign import BOP, COCO, P2, PEDESTRIAN, TURN, WRITERS
 
 

@@ -13,7 +13,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from phd_exp.records.dataset import SPLITS, DatasetFolder, Manifest, Seal, image_name, sha256
-from phd_exp.records.detections import detections_in, observed
+from phd_exp.records.own_images import detections_in, observed
 from phd_exp.records.scenes import SampleRecord
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.bop import number_of, write_bop

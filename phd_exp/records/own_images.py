@@ -1,0 +1,163 @@
+"""The user's own images: `metadata.jsonl` lists detections, each with its image, camera and true position.
+
+    <folder>/
+        <split>/metadata.jsonl    one JSON object per line
+        <split>/...               the images, next to it or in subfolders
+        .cache/                   crops, decoded once
+
+`DetectionLine` describes a line. Lines with the same `scene` form one `Observed`. A folder without
+`metadata.jsonl` may have annotations in another format (`foreign.py`), which become lines too.
+"""
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from phd_exp.records.cameras import Calibration, read_camera
+from phd_exp.records.dataset import SPLITS, checksum, sha256
+from phd_exp.records.detections import Detection, line_of
+from phd_exp.records.errors import UNPRINTABLE, DatasetError, gist, listed, shown
+from phd_exp.records.files import read_jsonl
+from phd_exp.records.foreign import Entry, format_of
+from phd_exp.records.parsing import parse_json
+from phd_exp.records.scenes import Pose, Split
+
+
+@dataclass(frozen=True)
+class DetectionFolder:
+    """A folder of the user's own images, with a subfolder for each split; `object_name` selects detections."""
+
+    root: Path
+    object_name: int | str | None = None
+
+    @property
+    def cache(self) -> Path:
+        """The folder of decoded crops."""
+        return self.root / ".cache"
+
+    def metadata_path(self, split: Split) -> Path:
+        """The lines of a split."""
+        return self.root / split / "metadata.jsonl"
+
+    def detections(self, split: Split, n: int | None = None) -> list[Detection]:
+        """The detections of a split, as `detections_in` reads them."""
+        return detections_in(self.root / split, n, f" (data.n_{split})", self.object_name)
+
+    def fingerprint(self) -> str:
+        """Checksum of the annotations and camera files of both splits, without the images.
+
+        Raises OSError if a file cannot be read, DatasetError if a line is not JSON.
+        """
+        files = [file for split in SPLITS for file in (*annotations(self.root / split)[0], *self._cameras(split))]
+        return sha256("".join(map(checksum, files)).encode())
+
+    def _cameras(self, split: Split) -> list[Path]:
+        """The camera files that the lines of a split name."""
+        path = self.metadata_path(split)
+        lines = [values for _, _, values in _entries(path.parent)] if path.exists() else []
+        names = {line["camera"] for line in lines if isinstance(line, dict) and isinstance(line.get("camera"), str)}
+        return [_inside(path.parent, name, str(path), "camera") for name in sorted(names)]
+
+
+def detections_in(
+    folder: Path, n: int | None = None, asked_by: str = "", object_name: int | str | None = None
+) -> list[Detection]:
+    """The first n detections of a folder's annotations, all by default, in their order.
+
+    `object_name` selects those of one object: BOP's `obj_id`, KITTI's type, or COCO's category.
+
+    Raises:
+        DatasetError: a file cannot be read, an entry is not a detection, there are fewer than n, or no such object.
+        CorruptFileError: a line is not text.
+    """
+    found: list[Detection] = []
+    cameras: dict[str, Calibration] = {}
+    others = set()
+    files, read = annotations(folder)
+    for where, name, values in read(folder):
+        if object_name is not None and name != str(object_name):
+            others.add(name)
+            continue
+        line = line_of(values, where)
+        if line.camera and line.camera not in cameras:
+            cameras[line.camera] = read_camera(_inside(folder, line.camera, where, "camera"))
+        file = _inside(folder, line.file_name, where)
+        found.append(Detection(line, file, where, cameras.get(line.camera or "")))
+        if len(found) == n:
+            break
+    if others and not found:
+        names = f"one of {listed(sorted(others))}" if all(others) else "no object=, since metadata.jsonl names none"
+        raise DatasetError(f"{folder}: no object {shown(str(object_name))} here; expected {names}")
+    if not found or len(found) < (n or 0):
+        raise DatasetError(f"{files[0]}: {n or 'some'} detections asked for{asked_by}, {len(found)} found")
+    return found
+
+
+def annotations(folder: Path) -> tuple[list[Path], Callable[[Path], Iterator[Entry]]]:
+    """The files that describe a folder's images, and their reader; `metadata.jsonl` comes before other formats."""
+    metadata = folder / "metadata.jsonl"
+    return (not os.path.lexists(metadata) and format_of(folder)) or ([metadata], _entries)
+
+
+def _entries(folder: Path) -> Iterator[Entry]:
+    path = folder / "metadata.jsonl"
+    try:
+        lines = read_jsonl(path, str.strip, sealed=True)
+    except OSError as error:
+        raise DatasetError(
+            f"{path}: cannot be read ({error.strerror}); expected one JSON object a line, "
+            "see `Your own images` in README.md"
+        ) from None
+    for number, text in enumerate(lines, start=1):
+        where = f"{path}, line {number}"
+        try:
+            if text:
+                yield where, "", parse_json(text)
+        except ValueError as error:
+            raise DatasetError(f"{where}: not JSON ({error}); expected one object a line") from None
+
+
+@dataclass(frozen=True)
+class Observed:
+    """One scene: at least one detection of its object, and the pose of each detection's camera."""
+
+    scene: int | str
+    detections: tuple[Detection, ...]
+    poses: tuple[Pose, ...]
+
+
+def observed(detections: Sequence[Detection]) -> list[Observed]:
+    """The scenes of detections, in the order in which they first appear.
+
+    Raises DatasetError if a line has no scene, or no pose.
+    """
+    views: dict[int | str, list[tuple[Detection, Pose]]] = {}
+    for detection in detections:
+        scene, pose = detection.line.scene, detection.line.pose
+        if scene is None:
+            raise DatasetError(
+                f"{detection.where}: scene is missing; expected the same number or name on all lines that show the "
+                "same object at the same time"
+            )
+        if pose is None:
+            raise DatasetError(
+                f"{detection.where}: pose is missing; expected the rotation [w, x, y, z] and translation of its "
+                "camera, R v + t from the world to the camera"
+            )
+        views.setdefault(scene, []).append((detection, pose))
+    return [Observed(scene, *map(tuple, zip(*pairs, strict=True))) for scene, pairs in views.items()]
+
+
+def _inside(folder: Path, name: str, where: str, key: str = "file_name") -> Path:
+    """The file; a stranger's data set must not read files outside its folder."""
+    try:
+        if UNPRINTABLE.search(name):
+            raise ValueError("control characters")
+        leaves = Path(name).is_absolute() or ".." in Path(name).parts
+        leaves = leaves or not (folder / name).resolve().is_relative_to(folder.resolve())
+    except (ValueError, OSError, RuntimeError) as error:  # also a link to itself, or too long a name
+        raise DatasetError(f"{where}: {key}={shown(name)} is no file name ({gist(error)})") from None
+    if leaves:
+        raise DatasetError(f"{where}: {key}={name!r} leaves {folder}; expected a path below it")
+    return folder / name
