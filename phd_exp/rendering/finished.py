@@ -18,7 +18,7 @@ from phd_exp.rendering.pixels import file_of
 from phd_exp.rendering.progress import shown_progress
 from phd_exp.rendering.rays import cylinder_mask, trace_pixels
 from phd_exp.rendering.samples import fast_settings, make_sample
-from phd_exp.rendering.sampling import GENERATOR_VERSION
+from phd_exp.rendering.sampling import generator_version
 from phd_exp.rendering.sealing import other_make
 from phd_exp.rendering.triangles import NO_MESHES, Meshes
 
@@ -39,8 +39,8 @@ def verify(folder: DatasetFolder, spec: DatasetSpec, rerender: int, seed: int | 
     if rerender and other_make(manifest):
         raise DatasetError(
             f"{folder.root}: made by generator {manifest.generator} with {manifest.renderer}, this is generator "
-            f"{GENERATOR_VERSION} with {renderer_version()}: its images cannot be compared; verify files alone by "
-            "rerender=0"
+            f"{generator_version(spec)} with {renderer_version()}: its images cannot be compared; verify files alone "
+            "by rerender=0"
         )
     wrong: list[str] = []
     sound: list[SampleRecord] = []

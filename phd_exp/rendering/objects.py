@@ -68,13 +68,14 @@ def upright_rotation(pitch: float, turn: float) -> Quaternion:
 def _distractors(
     spec: DatasetSpec, split: Split, number: int, f: float, meshes: Meshes, without: set[str]
 ) -> list[SceneObject]:
-    """Random ones of the three solids, as large as the object, and the further meshes, each at most once.
+    """Random ones of the three solids and of the further meshes, each at most once, anywhere in the image.
 
-    They lie anywhere in the image, also where `xy_range` keeps the object near the middle.
+    The bounding boxes of the solids have the surface of the object's.
     """
     names = [*SHAPES, *(name for name in meshes if name != "mesh")]
     anywhere = spec.model_copy(update={"xy_range": 1.0})
-    side = SIZE * meshes["mesh"].radius / REACH
+    a, b, c = meshes["mesh"].dimensions
+    side = math.sqrt((a * b + b * c + c * a) / 3)
     items, order = [], stream_of(spec, split, number, Purpose.DISTRACTORS).permutation(len(names))
     for place in order[: spec.distractors].tolist():
         rng = stream_of(spec, split, number, Purpose.DISTRACTORS, place)

@@ -23,9 +23,10 @@ from phd_exp.records.scenes import (
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.rays import rotation_matrix
 
-# Increment it when the same specification starts to give other scenes or other pixels. Folders of another version are
-# refused, not continued with samples that do not match.
+# Increment one when the same specification starts to give other scenes or other pixels. Folders of another version
+# are refused, not continued with samples that do not match.
 GENERATOR_VERSION = 2
+OBJECT_VERSION = 3  # of data sets with a mesh
 
 SIZE = 0.2  # m: height and diameter of the cylinder, side of the cube, diameter of the sphere
 CLEARANCE = 0.5  # m: least depth of an object in a further view
@@ -62,6 +63,11 @@ LAMPS: tuple[tuple[LampName, tuple[float, float, float], float, float], ...] = (
     ("fill", (0.80, -0.20, -0.56), 9.0, 1300.0),
     ("back", (0.42, -0.66, 0.62), 6.0, 3000.0),
 )
+
+
+def generator_version(spec: DatasetSpec) -> int:
+    """The version of the scenes and pixels of a specification."""
+    return GENERATOR_VERSION if spec.mesh is None else OBJECT_VERSION
 
 
 def scene_and_view(spec: DatasetSpec, index: int) -> tuple[int, int]:

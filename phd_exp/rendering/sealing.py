@@ -13,7 +13,7 @@ from phd_exp.records.files import read_jsonl, remove_temporaries, write_atomic
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import renderer_version
-from phd_exp.rendering.sampling import GENERATOR_VERSION
+from phd_exp.rendering.sampling import generator_version
 
 Wanted = dict[Split, int]
 Known = dict[Split, dict[int, SampleRecord]]
@@ -28,7 +28,7 @@ def begin(folder: DatasetFolder, spec: DatasetSpec) -> None:
     for split in SPLITS:
         folder.split_folder(split).mkdir(exist_ok=True)
     if not folder.manifest_path.exists():
-        manifest = Manifest(generator=GENERATOR_VERSION, renderer=renderer_version(), spec=spec, splits={})
+        manifest = Manifest(generator=generator_version(spec), renderer=renderer_version(), spec=spec, splits={})
         folder.write_manifest(manifest)
     for key, theirs, ours in other_make(folder.manifest):
         raise DatasetError(
@@ -39,7 +39,8 @@ def begin(folder: DatasetFolder, spec: DatasetSpec) -> None:
 
 def other_make(manifest: Manifest) -> list[tuple[str, int | str, int | str]]:
     """Differences between the programs that made a data set and the present ones: key, their version, ours."""
-    made = (("generator", manifest.generator, GENERATOR_VERSION), ("renderer", manifest.renderer, renderer_version()))
+    generator = generator_version(manifest.spec)
+    made = (("generator", manifest.generator, generator), ("renderer", manifest.renderer, renderer_version()))
     return [(key, theirs, ours) for key, theirs, ours in made if theirs != ours]
 
 

@@ -228,6 +228,9 @@ def test_distractors_are_other_objects_each_once(of_mesh: MakeSpec, meshes: dict
         assert scene.model_copy(update={"objects": scene.objects[:1]}) == alone, "paired"
         seen |= set(names)
     assert seen == {"mesh", "mesh1", "cylinder", "cube", "sphere"}
+    for side in (0.2, 0.4):
+        (scene,) = drawn(spec.model_copy(update={"distractors": 1}), 1, {"mesh": solid("cylinder", side)})
+        assert scene.objects[1].dimensions == pytest.approx([side] * 3), "as large as the object"
     narrow = drawn(spec.model_copy(update={"xy_range": 0.0}), 20, meshes)
     spread = np.array([[item.position[0] / item.position[2] * scene.f for item in scene.objects] for scene in narrow])
     assert not spread[:, 0].any(), "the object is in the middle"
