@@ -4,8 +4,8 @@
     python docs/results/write.py --check          # exit status 1 if a page differs from them
     python docs/results/write.py --take report    # first take the numbers of a report
 
-`runs.csv` and `calibration.csv` hold lines of the same files in `<report>/tables/`; a run taken again replaces
-its lines. A table stands between `<!-- results: NAME -->` and `<!-- end -->`.
+`runs.csv`, `tables.csv` and `calibration.csv` hold lines of the same files in `<report>/tables/`; what is taken
+again replaces its lines. A table stands between `<!-- results: NAME -->` and `<!-- end -->`.
 """
 
 import argparse
@@ -16,8 +16,6 @@ from pathlib import Path
 
 import pandas as pd
 
-from phd_exp.evaluation.point_errors import SampleMean
-from phd_exp.reports.cells import interval
 from phd_exp.reports.paper import PUBLISHED
 from phd_exp.reports.paper_tables import DIGITS
 from phd_exp.reports.table import NOTHING
@@ -26,7 +24,11 @@ HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 PAGES = ("README.md", "docs/guides/tables.md")
 BLOCK = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
-KEYS = {"runs": ["preset", "data", "model", "seed", "overrides"], "calibration": ["preset", "data", "model", "run"]}
+KEYS = {
+    "runs": ["preset", "data", "model", "seed", "overrides"],
+    "tables": ["preset", "table", "data", "model", "estimate", "reading", "quantity"],
+    "calibration": ["preset", "data", "model", "run"],
+}
 DATA = ("default", "occl", "scale", "occl_scale")
 PRESET = "full+strong"
 
@@ -51,22 +53,20 @@ def chosen(lines: pd.DataFrame, **choice: str) -> pd.DataFrame:
     return lines
 
 
-def error(runs: pd.DataFrame, quantity: str, digits: int, **choice: str) -> str:
-    """The mean over seeds ± its 95 % interval; with one seed (†), the interval over test images."""
-    found = chosen(runs, quantity=f"{quantity}_error_mm", **choice)
-    if found.empty:
+def error(cells: pd.DataFrame, quantity: str, digits: int, **choice: str) -> str:
+    """A mean ± its 95 % interval, over seeds or, with one (†), over test images; bold if a paired test says best."""
+    found = chosen(cells, quantity=f"{quantity}_error_mm", **choice)
+    if found.empty or not found["mean"].iloc[0]:
         return NOTHING
-    numbers = found[["n_test", "mean", "high"]].astype(float)
-    over_seeds = interval([SampleMean(int(n), mean, None) for n, mean, _ in numbers.itertuples(index=False)])
-    half, mark = over_seeds.half_width, ""
-    if half is None:
-        half, mark = numbers["high"].iloc[0] - over_seeds.mean, "†"
-    return f"{over_seeds.mean:.{digits}f} ± {half:.{digits}f}{mark}"
+    cell = found.iloc[0]
+    mark = "†" if cell["n_seeds"] == "1" else ""
+    text = f"{float(cell['mean']):.{digits}f} ± {float(cell['high']) - float(cell['mean']):.{digits}f}{mark}"
+    return f"**{text}**" if cell["best"] == "True" else text
 
 
-def both_errors(runs: pd.DataFrame, **choice: str) -> str:
+def both_errors(cells: pd.DataFrame, **choice: str) -> str:
     """Projected and depth error."""
-    found = [error(runs, quantity, digits, **choice) for quantity, digits in DIGITS.items()]
+    found = [error(cells, quantity, digits, **choice) for quantity, digits in DIGITS.items()]
     return NOTHING if NOTHING in found else " / ".join(found)
 
 
@@ -93,7 +93,7 @@ def heading(*columns: str) -> str:
     return line("", *columns) + f"|---|{'---:|' * len(columns)}\n"
 
 
-def summary(runs: pd.DataFrame) -> str:
+def summary(cells: pd.DataFrame) -> str:
     """The probabilistic model in the central half: presets, recipes, one view and eight."""
     labels = {
         (PRESET, "mode"): "`preset=full recipe=strong`",
@@ -101,36 +101,36 @@ def summary(runs: pd.DataFrame) -> str:
         ("full", "mode"): "`preset=full recipe=paper`",
         ("small+strong", "mode"): "`preset=small recipe=strong`",
     }
-    of_all = {"model": "probabilistic", "reading": "central", "overrides": ""}
+    of_all = {"model": "probabilistic", "reading": "central", "table": "table1"}
     table = heading(*DATA) + line(
         "paper: ResNet-50, 8,000 images, 50 epochs", *(published("probabilistic", data) for data in DATA)
     )
     for (preset, estimate), label in labels.items():
         choice = {"preset": preset, "estimate": estimate, **of_all}
-        table += row(label, [both_errors(runs, data=data, **choice) for data in DATA])
+        table += row(label, [both_errors(cells, data=data, **choice) for data in DATA])
     return table
 
 
-def models(runs: pd.DataFrame) -> str:
+def models(cells: pd.DataFrame) -> str:
     """Table 1: every model in the whole field and in the central half."""
     table = heading(*DATA)
     for reading, label in {"whole": "*whole field*", "central": "*central half*"}.items():
         table += line(label, *([""] * len(DATA)))
         rows = [("mae_vz", "mode"), ("mae_logz", "mode"), ("probabilistic", "mode"), ("probabilistic", "eight views")]
         for model, estimate in rows:
-            choice = {"preset": PRESET, "reading": reading, "model": model, "estimate": estimate, "overrides": ""}
+            choice = {"preset": PRESET, "reading": reading, "model": model, "estimate": estimate, "table": "table1"}
             label = f"`{model}`{', eight views' if estimate == 'eight views' else ''}"
-            table += row(label, [both_errors(runs, data=data, **choice) for data in DATA])
+            table += row(label, [both_errors(cells, data=data, **choice) for data in DATA])
     return table + paper("paper, `probabilistic`")
 
 
-def focal_length(runs: pd.DataFrame) -> str:
+def focal_length(cells: pd.DataFrame) -> str:
     """Table 2: models with different knowledge of the focal length, on `default`."""
-    choice = {"preset": PRESET, "data": "default", "estimate": "mode", "overrides": ""}
+    choice = {"preset": PRESET, "data": "default", "estimate": "mode", "table": "table2"}
     table = heading("whole field", "central half", "paper")
     for model in ("mae_xyz", "mae_constf", "probabilistic"):
-        cells = [both_errors(runs, model=model, reading=reading, **choice) for reading in ("whole", "central")]
-        table += row(f"`{model}`", cells, published(model, "default"))
+        both = [both_errors(cells, model=model, reading=reading, **choice) for reading in ("whole", "central")]
+        table += row(f"`{model}`", both, published(model, "default"))
     return table
 
 
@@ -166,8 +166,8 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.take:
         take(arguments.take)
-    of_runs: list[Callable[[pd.DataFrame], str]] = [summary, models, focal_length]
-    tables = {table.__name__: table(read(HERE / "runs.csv")) for table in of_runs}
+    of_cells: list[Callable[[pd.DataFrame], str]] = [summary, models, focal_length]
+    tables = {table.__name__: table(read(HERE / "tables.csv")) for table in of_cells}
     tables["calibration"] = calibration(read(HERE / "calibration.csv"))
     differs = False
     for name in PAGES:

@@ -1,4 +1,4 @@
-"""The tables of results are those of docs/results, and a run that is taken again replaces its lines."""
+"""The tables of results are those of docs/results, and what is taken again replaces its lines."""
 
 import shutil
 import subprocess
@@ -11,7 +11,7 @@ import pytest
 from tests.docs.pages import ROOT
 
 PAGES = ("README.md", "docs/guides/tables.md")
-KEY = {"preset": "full+strong", "data": "default", "model": "probabilistic", "seed": "0"}
+KEY = {"preset": "full+strong", "data": "default", "model": "probabilistic", "table": "table1"}
 
 
 def write(folder: Path, *words: str) -> subprocess.CompletedProcess:
@@ -34,15 +34,16 @@ def test_the_pages_have_the_results_of_the_files() -> None:
     assert (found.returncode, found.stderr) == (0, "")
 
 
-def test_a_run_taken_again_replaces_its_numbers(copied: Path) -> None:
-    results, report = copied / "docs" / "results", copied / "report"
-    (report / "tables").mkdir(parents=True)
-    shutil.copy(results / "calibration.csv", report / "tables")
-    lines = pd.read_csv(results / "runs.csv", dtype=str, keep_default_na=False)
-    again = lines[(lines[list(KEY)] == pd.Series(KEY)).all(axis=1) & (lines["overrides"] == "")]
-    again.assign(mean="123456.0").to_csv(report / "tables" / "runs.csv", index=False)
+def test_numbers_taken_again_replace_the_old_ones(copied: Path) -> None:
+    results, taken = copied / "docs" / "results", copied / "report" / "tables"
+    taken.mkdir(parents=True)
+    for name in ("runs", "calibration"):
+        shutil.copy(results / f"{name}.csv", taken)
+    lines = pd.read_csv(results / "tables.csv", dtype=str, keep_default_na=False)
+    again = lines[(lines[list(KEY)] == pd.Series(KEY)).all(axis=1)]
+    again.assign(mean="123456.0").to_csv(taken / "tables.csv", index=False)
     assert write(copied, "--take", "report").returncode == 0
-    after = pd.read_csv(results / "runs.csv", dtype=str, keep_default_na=False)
+    after = pd.read_csv(results / "tables.csv", dtype=str, keep_default_na=False)
     assert len(after) == len(lines)
     assert (after["mean"] == "123456.0").sum() == len(again) > 0
     assert all("1234" not in (ROOT / page).read_text() != (copied / page).read_text() for page in PAGES)
