@@ -19,7 +19,7 @@ class Interval:
 
     mean: float
     half_width: float | None
-    kind: Literal["student_t_over_seeds", "normal_over_samples", "none"]
+    kind: Literal["seeds_and_samples", "samples", "none"]
 
     @property
     def ends(self) -> tuple[float, float] | tuple[None, None]:
@@ -116,22 +116,24 @@ def make_cell(report: Report, preset: str, data: str, model: str, key: ErrorKey,
 def interval(means: Sequence[SampleMean]) -> Interval:
     """The mean over seeds with its 95 % interval.
 
-    k >= 2 seeds with standard deviation s: mean ± t s / sqrt(k), t the 97.5 % quantile of Student's law with k - 1
-    degrees of freedom, the scatter of trainings. One seed: mean ± 1.96 standard errors over its test samples, the
-    scatter of test sets. One sample: no interval.
+    Half widths of two sources are added in quadrature. The scatter of test sets: 1.96 standard errors over the test
+    samples, averaged over seeds, since these share them. The scatter of trainings, with k >= 2 seeds of standard
+    deviation s: t s / sqrt(k), t the 97.5 % quantile of Student's law with k - 1 degrees of freedom. With one seed
+    only the former is known; with one sample besides, there is no interval.
 
     Examples:
         >>> interval([SampleMean(100, 40.0, 1.0), SampleMean(100, 42.0, 1.0)]).mean
         41.0
     """
     values = np.array([mean.value for mean in means])
-    k, error = len(values), means[0].standard_error
+    k, errors = len(values), [mean.standard_error for mean in means]
+    of_samples = stats.norm.ppf(0.975) * np.mean([error or 0.0 for error in errors])
     if k > 1:
-        half_width = stats.t.ppf(0.975, k - 1) * values.std(ddof=1) / np.sqrt(k)
-        return Interval(float(values.mean()), float(half_width), "student_t_over_seeds")
-    if error is None:
+        of_seeds = stats.t.ppf(0.975, k - 1) * values.std(ddof=1) / np.sqrt(k)
+        return Interval(float(values.mean()), float(np.hypot(of_seeds, of_samples)), "seeds_and_samples")
+    if errors[0] is None:
         return Interval(means[0].value, None, "none")
-    return Interval(means[0].value, float(stats.norm.ppf(0.975)) * error, "normal_over_samples")
+    return Interval(means[0].value, float(of_samples), "samples")
 
 
 def _reason(run: Run | None, key: ErrorKey) -> str:

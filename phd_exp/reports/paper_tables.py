@@ -12,7 +12,6 @@ from phd_exp.reports.runs import PROBABILISTIC, Report
 from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem
 
 DIGITS: dict[Quantity, int] = {"projected": 1, "depth": 0}  # decimals of a millimetre, as in the paper
-MOST_DIGITS = 4
 ONE_SEED = "†"
 FEWER_SEEDS = "‡"
 
@@ -31,9 +30,9 @@ OF_A_CELL = (
 )
 OF_THE_SPLITS = "Held-out training samples chose the recipe and fitted the temperatures. Test samples chose nothing."
 OF_AN_INTERVAL = {
-    "student_t_over_seeds": "±: 95 % interval of the mean over seeds, Student's t.",
-    "normal_over_samples": f"±{ONE_SEED}: one seed; 1.96 standard errors over its test samples. It does not say how "
-    "another training would differ.",
+    "seeds_and_samples": "±: 95 % interval of the mean, over seeds (Student's t) and test samples.",
+    "samples": f"±{ONE_SEED}: one seed; 1.96 standard errors over its test samples. It does not say how another "
+    "training would differ.",
     "none": "No ±: one seed, one test sample.",
 }
 OF_FEWER_SEEDS = f"{FEWER_SEEDS}: fewer seeds than other cells of this table."
@@ -144,10 +143,7 @@ def _spread(cell: Cell) -> str:
         return marks
     if len(cell.means) == 1:
         marks = ONE_SEED + marks
-    digits = DIGITS[cell.key.quantity]
-    while digits < MOST_DIGITS and 0 < half_width < 0.5 * 10.0**-digits:
-        digits += 1  # a small interval must not print as zero
-    return f"±{half_width:.{digits}f}{marks}"
+    return f"±{_number(half_width, cell.key.quantity)}{marks}"
 
 
 def _is_below(cell: Cell) -> bool:
