@@ -66,6 +66,20 @@ def test_defaults_are_the_authors_protocol(checked: Callable) -> None:
     assert build_augmentation(recipe) is None
 
 
+def test_own_objects_train_longer_before_skies_that_are_turned(checked: Callable, tmp_path: Path) -> None:
+    (tmp_path / "part.glb").touch()
+    own = ("data=object", f"data.mesh={tmp_path}/part.glb")
+    for words, epochs, zoom in [
+        (("preset=small", "recipe=strong", *own), 90, 1.2),
+        (("preset=small", *own), 90, 1.0),
+        (("preset=full", "recipe=strong", *own), 42, 1.2),
+        (("preset=small", "recipe=strong"), 30, 1.0),
+        (("preset=small", "recipe=strong", *own, "trainer.max_epochs=2"), 2, 1.2),
+    ]:
+        config = checked(*words)
+        assert (config.trainer.max_epochs, config.recipe.augmentation.largest_zoom) == (epochs, zoom), words
+
+
 @pytest.mark.parametrize(
     ("preset", "depth", "width", "stride"), [("paper", 50, 32, 2), ("small", 10, 16, 4), ("smoke", 10, 16, 4)]
 )
