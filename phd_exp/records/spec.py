@@ -29,6 +29,7 @@ Factor = Annotated[Number, Field(ge=0.1, le=2)]
 Share = Annotated[Number, Field(ge=0, le=1)]
 # beyond a right angle, half the cameras would face the lamps
 Angle = Annotated[Number, Field(ge=0, le=90)]
+Pitch = Annotated[Number, Field(ge=-90, le=90)]
 Range = AfterValidator(_ascending)
 
 
@@ -72,7 +73,7 @@ class DatasetSpec(Record):
         reference: the point whose position is predicted: the file's origin, the centroid of the surface, or a point
             in the file's units and axes.
         upright: whether the object is only turned about the vertical.
-        pitch_range: bounds of the angle by which the first camera looks down, degrees.
+        pitch_range: bounds of the angle by which the first camera looks down, degrees; negative: up.
         backdrops: Blender's skies, or the user's photographs and skies; None: the grey backdrop.
         ground: whether the object stands on a plane, which shows its shadow.
         distractors: number of other objects, of the three solids and `distractor_meshes`.
@@ -104,7 +105,7 @@ class DatasetSpec(Record):
     unit: Annotated[Number, Field(gt=0, le=1000)] = 1.0
     reference: Reference = "origin"
     upright: StrictBool = False
-    pitch_range: Annotated[tuple[Angle, Angle], Range] = (0.0, 0.0)
+    pitch_range: Annotated[tuple[Pitch, Pitch], Range] = (0.0, 0.0)
     backdrops: Annotated[Literal["hdri"] | Asset | None, BeforeValidator(backdrops_asset)] = None
     ground: StrictBool = False
     distractors: Annotated[int, Field(strict=True, ge=0, le=12)] = 0

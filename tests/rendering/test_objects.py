@@ -154,6 +154,11 @@ def test_an_upright_object_is_only_turned_about_the_vertical(of_mesh: MakeSpec, 
     assert rotation_matrix(upright_rotation(0.0, 0.0))[:, 2] == pytest.approx([0, -1, 0])
 
 
+def test_cameras_look_from_below_too(of_mesh: MakeSpec, meshes: dict[str, Triangles]) -> None:
+    pitches = [s.surroundings.pitch for s in drawn(of_mesh(pitch_range=(-90, 90)), 300, meshes) if s.surroundings]
+    assert stats.kstest(np.degrees(pitches), stats.uniform(-90, 180).cdf).pvalue > UNLIKELY
+
+
 def test_test_images_have_other_skies_and_skies_replace_the_lamps(
     of_mesh: MakeSpec, meshes: dict[str, Triangles]
 ) -> None:
