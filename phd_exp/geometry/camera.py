@@ -59,15 +59,6 @@ class Camera:
         inside = (self.f[..., None] * xyz[..., :2]).abs() <= xyz[..., 2:] * (self.S / 2)
         return inside.all(dim=-1) & (xyz[..., 2] > 0)
 
-    def scaled(self, factor: float) -> "Camera":
-        """The camera of the same image resized by a factor, which multiplies f and S.
-
-        Raises ValueError if the factor is not positive or not finite.
-        """
-        if not (math.isfinite(factor) and factor > 0):
-            raise ValueError(f"factor must be positive and finite, but is {factor}")
-        return Camera(self.f * factor, self.S * factor)
-
     def with_constant_f(self, constant_f: float | None) -> "Camera":
         """The cameras with one focal length (pixels) for all; None keeps their own.
 

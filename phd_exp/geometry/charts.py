@@ -59,15 +59,7 @@ class DepthScale:
 
     @classmethod
     def from_samples(cls, z: Float[Tensor, " samples"], f: Float[Tensor, " samples"]) -> "DepthScale":
-        """The constants of a data set with these depths (metres) and focal lengths (pixels).
-
-        Raises ValueError if there are no samples, or some z or f is not positive.
-        """
-        if z.numel() == 0:
-            raise ValueError("z and f must hold at least one sample, but are empty")
-        for name, value in (("z", z), ("f", f)):
-            if not bool((value > 0).all()):
-                raise ValueError(f"{name} must be positive, but its smallest value is {value.min().item()}")
+        """The constants of a data set, at least one sample, with these depths (metres) and focal lengths (pixels)."""
         extremes = (*torch.aminmax((z / f).double()), *torch.aminmax(z))
         return cls._from_extremes(*(value.item() for value in extremes))
 

@@ -48,9 +48,8 @@ def test_contains(xyz: tuple[float, ...], inside: bool) -> None:
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])
-def test_scaled_moves_pixels_in_proportion(factor: float) -> None:
-    resized = CAMERA.scaled(factor)
-    assert factor * CAMERA.S == resized.S
+def test_pixels_of_a_resized_image_move_in_proportion(factor: float) -> None:
+    resized = Camera(factor * CAMERA.f, factor * CAMERA.S)
     torch.testing.assert_close(resized.project(XYZ), factor * CAMERA.project(XYZ))
     assert torch.equal(resized.contains(XYZ), CAMERA.contains(XYZ))
 
@@ -74,5 +73,3 @@ def test_refuses_what_is_not_positive_and_finite(bad: float) -> None:
         Camera(torch.tensor([1500.0, bad]), 224.0)
     with pytest.raises(ValueError, match=f"S, the side of the image in pixels, must be positive.*{bad}"):
         camera(1500.0, bad)
-    with pytest.raises(ValueError, match="factor must be positive"):
-        CAMERA.scaled(bad)

@@ -104,7 +104,7 @@ def test_images_and_cameras_may_shrink_together(camera: Camera, xyz: torch.Tenso
     """The full density does not change when an image, f, S and mu_z0 are resized together."""
     raw = torch.linspace(-1, 1, 28).view(4, 7)
     whole = DistributionHead(DEPTH)(raw, camera).log_prob(xyz)
-    half = DistributionHead(DEPTH.scaled(0.5))(raw, camera.scaled(0.5)).log_prob(xyz)
+    half = DistributionHead(DEPTH.scaled(0.5))(raw, Camera(camera.f / 2, camera.S / 2)).log_prob(xyz)
     torch.testing.assert_close(half, whole)
 
 
