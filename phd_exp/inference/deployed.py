@@ -15,8 +15,7 @@ from torch.export import Dim
 
 from phd_exp.data.areas import area_means, sums
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.geometry.facing import facing, pixel_corners
-from phd_exp.geometry.virtual import intrinsics
+from phd_exp.geometry.virtual import facing, intrinsics, pixel_corners
 from phd_exp.inference.answers import LEVELS
 from phd_exp.inference.predictor import Predictor
 from phd_exp.inference.views import View
