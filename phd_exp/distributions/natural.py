@@ -76,16 +76,6 @@ class Natural:
             log_a=log_a,
         )
 
-    def tempered(self, projected: float, depth: float) -> "Natural":
-        """The parameters with A / projected and a / depth in place of A and a; mu_xy and mu_z stay."""
-        return type(self)(
-            A_xy=self.A_xy / projected,
-            nu_xy=self.nu_xy / projected,
-            log_det_A_xy=self.log_det_A_xy - 2 * math.log(projected),
-            log_mu_z=self.log_mu_z,
-            log_a=self.log_a - math.log(depth),
-        )
-
     @property
     def batch_shape(self) -> torch.Size:
         """The common batch shape of the parameters."""

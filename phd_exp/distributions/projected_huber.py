@@ -7,6 +7,7 @@ With q = A_xy (x, y) - nu_xy z and t = z / mu_z,
 q and t are independent, and v is linear in (q, t). Every statistic below follows from that.
 """
 
+import math
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -147,7 +148,10 @@ class ProjectedHuber(Distribution, Density):
 
     def tempered(self, projected: float, depth: float) -> "ProjectedHuber":
         """The distribution with A / projected and a / depth in place of A and a, around the same mode."""
-        return self._of(self._natural.tempered(projected, depth), self._validate_args)
+        n = self._natural
+        log_det_A_xy, log_a = n.log_det_A_xy - 2 * math.log(projected), n.log_a - math.log(depth)
+        tempered = Natural(n.A_xy / projected, n.nu_xy / projected, log_det_A_xy, n.log_mu_z, log_a)
+        return self._of(tempered, self._validate_args)
 
     def __repr__(self) -> str:
         return f"ProjectedHuber(batch_shape={tuple(self.batch_shape)})"
