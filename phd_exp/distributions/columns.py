@@ -33,8 +33,11 @@ def from_columns(columns: Mapping[str, Tensor]) -> ProjectedHuber:
 
 
 def distribution_columns(distribution: ProjectedHuber | Shaped, xyz: Float[Tensor, "samples 3"]) -> Columns:
-    """Mean and median depth (metres), `calibration_columns`, the NLL of true positions (nats), and the parameters of
-    a Projected Huber density, of others the covariance (m^2).
+    """Mean and median depth (metres), the parameters of a Projected Huber density, of others the covariance (m^2),
+    `squared_error_columns`, and how true positions (metres) stand to the prediction.
+
+    `level` is the credible level of the position, `depth_pit` the predicted probability of a smaller depth,
+    `depth_crps` the score of the depth in metres, and `nll` is in nats.
     """
     table = coordinates("mean_", distribution.mean) | {"median_z": distribution.depth_median}
     if isinstance(distribution, ProjectedHuber):
@@ -42,7 +45,13 @@ def distribution_columns(distribution: ProjectedHuber | Shaped, xyz: Float[Tenso
     else:
         rows, columns = torch.triu_indices(3, 3)
         table |= dict(zip(COVARIANCE, distribution.covariance_matrix[:, rows, columns].unbind(-1), strict=True))
-    return table | calibration_columns(distribution, xyz) | {"nll": -distribution.log_prob(xyz)}
+    table |= squared_error_columns(distribution, xyz)
+    return table | {
+        "level": distribution.level(xyz),
+        "depth_pit": distribution.depth_cdf(xyz[:, 2]),
+        "depth_crps": distribution.depth_crps(xyz[:, 2]),
+        "nll": -distribution.log_prob(xyz),
+    }
 
 
 def coordinates(prefix: str, xyz: Float[Tensor, "samples 3"]) -> Columns:
@@ -54,19 +63,6 @@ def draws(distribution: ProjectedHuber | Shaped, n: int, seed: int) -> Float[Ten
     """n positions from each distribution, the same for the same seed; torch's own random numbers stay untouched."""
     generator = torch.Generator(device=distribution.mode.device).manual_seed(seed)
     return distribution.rsample((n,), generator)
-
-
-def calibration_columns(distribution: ProjectedHuber | Shaped, xyz: Float[Tensor, "samples 3"]) -> Columns:
-    """What is predicted of each error and how the true position (metres) stands to it.
-
-    `level` is the credible level of the position, `depth_pit` the predicted probability of a smaller depth, and
-    `depth_crps` the score of the depth in metres; the others are `squared_error_columns`.
-    """
-    return squared_error_columns(distribution, xyz) | {
-        "level": distribution.level(xyz),
-        "depth_pit": distribution.depth_cdf(xyz[:, 2]),
-        "depth_crps": distribution.depth_crps(xyz[:, 2]),
-    }
 
 
 def squared_error_columns(distribution: ProjectedHuber | Shaped, xyz: Float[Tensor, "*draws samples 3"]) -> Columns:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.columns import calibration_columns, draws
+from phd_exp.distributions.columns import distribution_columns, draws
 
 Columns = Mapping[str, torch.Tensor]
 
@@ -37,6 +37,6 @@ def claimed() -> Callable[..., Columns]:
         truth, xyz = drawn(n)
         xyz = xyz * (1 + shift * truth.depth_variance.sqrt() / xyz[:, 2])[:, None]  # along the ray
         claim = truth.tempered(1 / overconfidence, 1 / overconfidence)
-        return calibration_columns(claim, xyz)
+        return distribution_columns(claim, xyz)
 
     return columns

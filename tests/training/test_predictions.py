@@ -8,7 +8,7 @@ import torch
 
 from phd_exp.data.batches import Batch
 from phd_exp.distributions import PointEstimate, ProjectedHuber
-from phd_exp.distributions.columns import calibration_columns
+from phd_exp.distributions.columns import distribution_columns
 from phd_exp.geometry import DepthScale, Projected
 from phd_exp.metrics.rows import Rows
 from phd_exp.training.predictions import calibration_curves, columns, summary, write_parquet
@@ -102,7 +102,7 @@ def test_curves_of_samples_of_the_distribution_itself_are_calibrated() -> None:
     f = torch.full((n,), 1500.0, dtype=torch.float64)
     prediction = ProjectedHuber.from_raw(raw, f=f, S=224.0, mu_z0=DEPTH.mu_z0)
     torch.manual_seed(3)
-    table = calibration_columns(prediction, prediction.sample())
+    table = distribution_columns(prediction, prediction.sample())
     for name, curve in calibration_curves(table, window=4000).items():
         ratio = curve.empirical / curve.predicted
         assert ((ratio > 0.85) & (ratio < 1.15)).all(), (name, ratio.min(), ratio.max())
