@@ -1,16 +1,15 @@
-"""Evaluates a table of predictions: scores, curves and strata with bootstrap intervals; recalibrates it."""
+"""Evaluates tables of predictions: scores, curves and strata with bootstrap intervals; recalibrates or mixes them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions import Mixture, ProjectedHuber
 from phd_exp.distributions.columns import NEES, PARAMETERS, distribution_columns, draws, from_columns, nees_columns
 from phd_exp.distributions.temperature import Temperature
 from phd_exp.evaluation.parquet import Columns, require_columns, stacked
@@ -85,7 +84,7 @@ class Evaluation:
     resampled: dict[str, list[float]] = field(default_factory=dict)
 
 
-def evaluate(table: Columns, window: int = 200, resamples: int = 200) -> Evaluation:
+def evaluate(table: Columns, resamples: int = RESAMPLES) -> Evaluation:
     """Evaluate predictions: of a density if the table has its levels, else of points, which have no curves.
 
     Raises RunError if a column is missing, or if no sample has finite values.
@@ -102,24 +101,21 @@ def evaluate(table: Columns, window: int = 200, resamples: int = 200) -> Evaluat
         whole = partial(_distribution_scores, groups=groups_of(distribution))
         reference = calibrated_reference(distribution)
     if is_distribution:
-        x = abscissae(columns, window)
-        intervals = bands(partial(curves, window=window), columns, resamples, SEED)
+        x = abscissae(columns)
+        intervals = bands(curves, columns, resamples, SEED)
         found = {name: Curve(x[name].tolist(), *(y.tolist() for y in band)) for name, band in intervals.items()}
-    further = {"curves": found, "strata": _strata(statistic, columns, resamples), "reference": reference}
-    return evaluation_of(whole, columns, int((~finite).sum()), resamples, **further)
+    scored = evaluation_of(whole, columns, int((~finite).sum()), resamples)
+    return replace(scored, curves=found, strata=_strata(statistic, columns, resamples), reference=reference)
 
 
-def evaluation_of(
-    statistic: Statistic, columns: Mapping[str, Tensor], left_out: int, resamples: int, **further: Any
-) -> Evaluation:
-    """The scores that a statistic finds in columns of samples, with their bootstrap; `further` are other fields."""
+def evaluation_of(statistic: Statistic, columns: Mapping[str, Tensor], left_out: int, resamples: int) -> Evaluation:
+    """The scores that a statistic finds in columns of samples, with their bootstrap."""
     values, drawn = resampled(statistic, columns, resamples, SEED)
     return Evaluation(
         n=len(next(iter(columns.values()))),
         scores={name: Band(*map(float, interval(value, drawn[name]))) for name, value in values.items()},
         left_out=left_out,
         resampled={name: value.tolist() for name, value in drawn.items()},
-        **further,
     )
 
 
@@ -154,6 +150,23 @@ def recalibrated(table: Columns, temperature: Temperature) -> dict[str, np.ndarr
     return kept | {name: column.numpy() for name, column in changed.items()}
 
 
+def ensemble_table(tables: Sequence[Columns]) -> Columns:
+    """The scores and parameters of the ensemble's closest distributions, and the members' `disagreement` (nats).
+
+    Raises RunError if a column is missing, or the tables are of different samples.
+    """
+    for table in tables:
+        require_columns((*PARAMETERS, *XYZ), table)
+        names = [name for name in (*XYZ, "file_name") if name in table]
+        if not all(name in tables[0] and np.array_equal(table[name], tables[0][name]) for name in names):
+            raise RunError("predictions: those of an ensemble are of different samples; train on one data set")
+    columns = {name: torch.tensor(np.stack([table[name] for table in tables], axis=-1)) for name in PARAMETERS}
+    mixture = Mixture(from_columns(columns))
+    scores = distribution_columns(mixture.closest, stacked(tables[0], XYZ)) | {"disagreement": mixture.disagreement}
+    kept = {name: tables[0][name] for name in (*XYZ, "f", "S") if name in tables[0]}
+    return kept | {name: column.numpy() for name, column in scores.items()}
+
+
 def at_temperature(
     table: Columns, temperature: Temperature | None, rows: slice = slice(None)
 ) -> tuple[ProjectedHuber, Float[Tensor, "samples 3"], dict[str, np.ndarray]]:
@@ -175,9 +188,9 @@ def _distribution_scores(
     recorded["energy_score_mm"] = MILLIMETRES * columns["energy_score"]
     scores = _point_scores(columns, weight) | means(recorded, weight) | calibration_scores(ordered(columns, weight))
     scores |= means({name: columns[name] for name in NEES if name in columns}, weight)
-    return (
-        scores if groups is None else scores | {"group_miscalibration": worst_group(columns["level"], groups, weight)}
-    )
+    if groups is not None:
+        scores["group_miscalibration"] = worst_group(columns["level"], groups, weight)
+    return scores
 
 
 def _point_scores(columns: Mapping[str, Tensor], weight: Tensor) -> dict[str, Tensor]:
