@@ -36,8 +36,8 @@ class Familiarity:
     def __init__(self, held_out: Columns, temperature: Temperature | None = None) -> None:
         distribution, _, kept = at_temperature(held_out, temperature)
         require_columns(("f", "S"), kept)
-        changed = {name: column.numpy() for name, column in parameter_columns(distribution).items()}
-        features = _features(kept | changed)
+        columns = kept | {name: column.numpy() for name, column in parameter_columns(distribution).items()}
+        features = _features(columns)
         chosen = features[CHOOSE]
         if len(chosen) < FEWEST:
             raise RunError(f"familiar: needs at least {2 * FEWEST} held-out samples; found {len(features)}")
@@ -45,20 +45,17 @@ class Familiarity:
         variance, axes = np.linalg.eigh(np.cov(chosen.T))
         self.whiten = axes / np.sqrt(np.maximum(variance, _LEAST_VARIANCE))
         self.tree = KDTree((chosen - self.middle) @ self.whiten)
-        self.usual = np.sort(self._distance(features[GUARANTEE]))
+        self.usual = np.sort(self.distance(columns)[GUARANTEE])
 
     def distance(self, columns: Columns) -> Float[np.ndarray, " samples"]:
         """The score of predictions with these parameters, f and S (px); larger for less familiar ones."""
-        return self._distance(_features(columns))
+        nearest: np.ndarray = self.tree.query((_features(columns) - self.middle) @ self.whiten, [NEIGHBOURS])[0]
+        return nearest[:, 0]
 
     def p_value(self, distance: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
         """The share of held-out samples at least as far away; below 0.05 for 5 % of familiar samples."""
         n = len(self.usual)
         return (1 + n - np.searchsorted(self.usual, distance)) / (1 + n)
-
-    def _distance(self, features: Float[np.ndarray, "samples features"]) -> Float[np.ndarray, " samples"]:
-        nearest: np.ndarray = self.tree.query((features - self.middle) @ self.whiten, [NEIGHBOURS])[0]
-        return nearest[:, 0]
 
 
 def _features(columns: Columns) -> Float[np.ndarray, "samples features"]:

@@ -43,7 +43,8 @@ def read_table(file: Path) -> Columns:
             _require_small(file, metadata)
             # a text that repeats in every row is kept once in memory
             texts = [name for name in TEXTS if name in metadata.schema.to_arrow_schema().names]
-            return arrays(pq.ParquetFile(stream, metadata=metadata, read_dictionary=texts).read())
+            table = pq.ParquetFile(stream, metadata=metadata, read_dictionary=texts).read()
+            return {name: _values(name, table[name].to_numpy()) for name in table.column_names}
     except FileNotFoundError:
         raise RunError(f"{file.name}: missing, though the run has finished") from None
     except (pa.ArrowException, OSError, KeyError, TypeError, ValueError) as error:
@@ -61,14 +62,10 @@ def stacked(columns: Mapping[str, Any], names: Sequence[str]) -> Tensor:
     return torch.from_numpy(np.stack([columns[name] for name in names], axis=-1))
 
 
-def arrays(table: pa.Table | Columns) -> dict[str, np.ndarray]:
-    """The columns of a table as arrays. Raises ValueError or TypeError for a column of other values than numbers."""
-    if isinstance(table, pa.Table):
-        table = {name: table[name].to_numpy() for name in table.column_names}
-    return {name: column if name in TEXTS else _numbers(name, column) for name, column in table.items()}
-
-
-def _numbers(name: str, column: np.ndarray) -> np.ndarray:
+def _values(name: str, column: np.ndarray) -> np.ndarray:
+    """The texts or numbers of a column. Raises ValueError or TypeError for other values."""
+    if name in TEXTS:
+        return column
     if column.dtype == object and any(not isinstance(value, int | float | None) for value in column):
         raise TypeError(f"column {name!r} holds {type(column[0]).__name__}; expected numbers")
     return np.array(column, dtype=np.float64)

@@ -91,7 +91,9 @@ def mean_errors(table: Columns, estimates: Sequence[Estimate]) -> MeanErrors:
     central = in_central_half(truth, stacked(table, ("f",)), stacked(table, ("S",)))
     found: dict[ErrorKey, SampleMean] = {}
     for estimate in estimates:
-        points = _points(table, estimate)
+        points = stacked(table, COLUMNS[estimate])
+        if estimate == "median":  # median_z (mu_x, mu_y, 1), on the ray of the projected centre
+            points[:, :2] *= points[:, 2:]
         for quantity in QUANTITIES:
             values = MILLIMETRES * _ERRORS[quantity](truth, points)
             found[ErrorKey(estimate, "whole", quantity)] = _mean(values)
@@ -116,14 +118,6 @@ def _mean(values: Tensor) -> SampleMean:
     n = len(values)
     _, drawn = resampled(means, {"mean": values}, RESAMPLES, SEED)
     return SampleMean(n, float(values.mean()), float(values.std() / n**0.5) if n > 1 else None, drawn["mean"].numpy())
-
-
-def _points(table: Columns, estimate: Estimate) -> Tensor:
-    """The estimate's coordinates; the median is median_z (mu_x, mu_y, 1), on the ray of the projected centre."""
-    points = stacked(table, COLUMNS[estimate])
-    if estimate == "median":
-        points[:, :2] *= points[:, 2:]
-    return points
 
 
 def difference(one: Sequence[SampleMean], other: Sequence[SampleMean]) -> tuple[float, float]:

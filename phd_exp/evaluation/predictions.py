@@ -1,23 +1,21 @@
-"""Evaluates a table of predictions: scores, curves and strata with bootstrap intervals; recalibrates it."""
+"""Evaluates tables of predictions: scores, curves and strata with bootstrap intervals; recalibrates or mixes them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions import Mixture, ProjectedHuber
 from phd_exp.distributions.columns import NEES, PARAMETERS, distribution_columns, draws, from_columns, nees_columns
 from phd_exp.distributions.temperature import Temperature
-from phd_exp.evaluation.parquet import Columns, arrays, require_columns, stacked
+from phd_exp.evaluation.parquet import Columns, require_columns, stacked
 from phd_exp.evaluation.point_errors import RESAMPLES, SEED
 from phd_exp.evaluation.reference import Band, calibrated_reference, groups_of
-from phd_exp.metrics.bootstrap import Interval, Statistic, bands, interval, resampled
+from phd_exp.metrics.bootstrap import Statistic, bands, interval, means, resampled
 from phd_exp.metrics.calibration_scores import COLUMNS, abscissae, calibration_scores, curves, ordered
 from phd_exp.metrics.errors import MILLIMETRES
 from phd_exp.metrics.groups import worst_group
@@ -86,18 +84,15 @@ class Evaluation:
     resampled: dict[str, list[float]] = field(default_factory=dict)
 
 
-def evaluate(table: pa.Table | Columns, window: int = 200, resamples: int = 200) -> Evaluation:
+def evaluate(table: Columns, resamples: int = RESAMPLES) -> Evaluation:
     """Evaluate predictions: of a density if the table has its levels, else of points, which have no curves.
 
     Raises RunError if a column is missing, or if no sample has finite values.
     """
-    recorded = arrays(table)
-    is_distribution, is_huber = "level" in recorded, "a" in recorded
+    is_distribution, is_huber = "level" in table, "a" in table
     needed = (*(PARAMETERS if is_huber else ()), *OF_A_DISTRIBUTION) if is_distribution else ERRORS
-    needed += tuple(name for name in OF_DISTANCE if name in recorded)
-    columns, finite = finite_columns(
-        recorded, needed, [name for name, _, _ in QUANTITIES.values() if name in recorded]
-    )
+    needed += tuple(name for name in OF_DISTANCE if name in table)
+    columns, finite = finite_columns(table, needed, [name for name, _, _ in QUANTITIES.values() if name in table])
     statistic: Statistic = _distribution_scores if is_distribution else _point_scores
     whole, found, reference = statistic, {}, {}
     if is_huber:
@@ -106,40 +101,37 @@ def evaluate(table: pa.Table | Columns, window: int = 200, resamples: int = 200)
         whole = partial(_distribution_scores, groups=groups_of(distribution))
         reference = calibrated_reference(distribution)
     if is_distribution:
-        x = abscissae(columns, window)
-        intervals = bands(partial(curves, window=window), columns, resamples, SEED)
-        found = {name: _curve(x[name], interval) for name, interval in intervals.items()}
-    further = {"curves": found, "strata": _strata(statistic, columns, resamples), "reference": reference}
-    return evaluation_of(whole, columns, int((~finite).sum()), resamples, **further)
+        x = abscissae(columns)
+        intervals = bands(curves, columns, resamples, SEED)
+        found = {name: Curve(x[name].tolist(), *(y.tolist() for y in band)) for name, band in intervals.items()}
+    scored = evaluation_of(whole, columns, int((~finite).sum()), resamples)
+    return replace(scored, curves=found, strata=_strata(statistic, columns, resamples), reference=reference)
 
 
-def evaluation_of(
-    statistic: Statistic, columns: Mapping[str, Tensor], left_out: int, resamples: int, **further: Any
-) -> Evaluation:
-    """The scores that a statistic finds in columns of samples, with their bootstrap; `further` are other fields."""
+def evaluation_of(statistic: Statistic, columns: Mapping[str, Tensor], left_out: int, resamples: int) -> Evaluation:
+    """The scores that a statistic finds in columns of samples, with their bootstrap."""
     values, drawn = resampled(statistic, columns, resamples, SEED)
     return Evaluation(
         n=len(next(iter(columns.values()))),
-        scores={name: _band(interval(value, drawn[name])) for name, value in values.items()},
+        scores={name: Band(*map(float, interval(value, drawn[name]))) for name, value in values.items()},
         left_out=left_out,
         resampled={name: value.tolist() for name, value in drawn.items()},
-        **further,
     )
 
 
-def fit_temperature(held_out_table: pa.Table | Columns) -> Temperature:
+def fit_temperature(held_out: Columns) -> Temperature:
     """The temperatures fitted on predictions of held-out samples, those that may choose.
 
     Raises RunError if a column is missing, or if no temperature fits.
     """
-    distribution, xyz, _ = at_temperature(held_out_table, None, CHOOSE)
+    distribution, xyz, _ = at_temperature(held_out, None, CHOOSE)
     try:
         return Temperature.fit(distribution, xyz)
     except ValueError as error:
         raise RunError(f"predictions: no temperature fits them ({error})") from None
 
 
-def recalibrated(table: pa.Table | Columns, temperature: Temperature) -> dict[str, np.ndarray]:
+def recalibrated(table: Columns, temperature: Temperature) -> dict[str, np.ndarray]:
     """The same columns for A / projected and a / depth: modes are unchanged, all uncertainties and scores change.
 
     Drops samples whose parameters are not finite. Raises RunError if a column is missing, or if no sample is left.
@@ -158,14 +150,31 @@ def recalibrated(table: pa.Table | Columns, temperature: Temperature) -> dict[st
     return kept | {name: column.numpy() for name, column in changed.items()}
 
 
+def ensemble_table(tables: Sequence[Columns]) -> Columns:
+    """The scores and parameters of the ensemble's closest distributions, and the members' `disagreement` (nats).
+
+    Raises RunError if a column is missing, or the tables are of different samples.
+    """
+    for table in tables:
+        require_columns((*PARAMETERS, *XYZ), table)
+        names = [name for name in (*XYZ, "file_name") if name in table]
+        if not all(name in tables[0] and np.array_equal(table[name], tables[0][name]) for name in names):
+            raise RunError("predictions: those of an ensemble are of different samples; train on one data set")
+    columns = {name: torch.tensor(np.stack([table[name] for table in tables], axis=-1)) for name in PARAMETERS}
+    mixture = Mixture(from_columns(columns))
+    scores = distribution_columns(mixture.closest, stacked(tables[0], XYZ)) | {"disagreement": mixture.disagreement}
+    kept = {name: tables[0][name] for name in (*XYZ, "f", "S") if name in tables[0]}
+    return kept | {name: column.numpy() for name, column in scores.items()}
+
+
 def at_temperature(
-    table: pa.Table | Columns, temperature: Temperature | None, rows: slice = slice(None)
+    table: Columns, temperature: Temperature | None, rows: slice = slice(None)
 ) -> tuple[ProjectedHuber, Float[Tensor, "samples 3"], dict[str, np.ndarray]]:
     """Predictions (None: as trained), true positions (m) and all columns of the rows with finite parameters.
 
     Raises RunError if a column is missing, or if no row is finite.
     """
-    recorded = {name: array[rows] for name, array in arrays(table).items()}
+    recorded = {name: array[rows] for name, array in table.items()}
     columns, finite = finite_columns(recorded, (*PARAMETERS, *XYZ))
     distribution = _distribution(columns)
     kept = {name: array[finite.numpy()] for name, array in recorded.items()}
@@ -175,42 +184,30 @@ def at_temperature(
 def _distribution_scores(
     columns: Mapping[str, Tensor], weight: Tensor, groups: Tensor | None = None
 ) -> dict[str, Tensor]:
-    energy = {"energy_score_mm": MILLIMETRES * _mean(columns["energy_score"], weight)}
-    others = {"nll": _mean(columns["nll"], weight), "inside_90": _mean(100.0 * (columns["level"] <= 0.9), weight)}
-    nees = {name: _mean(columns[name], weight) for name in NEES if name in columns}
-    worst = {} if groups is None else {"group_miscalibration": worst_group(columns["level"], groups, weight)}
-    calibration = calibration_scores(ordered(columns, weight))
-    return _point_scores(columns, weight) | others | energy | calibration | nees | worst
+    recorded = {"nll": columns["nll"], "inside_90": 100.0 * (columns["level"] <= 0.9)}
+    recorded["energy_score_mm"] = MILLIMETRES * columns["energy_score"]
+    scores = _point_scores(columns, weight) | means(recorded, weight) | calibration_scores(ordered(columns, weight))
+    scores |= means({name: columns[name] for name in NEES if name in columns}, weight)
+    if groups is not None:
+        scores["group_miscalibration"] = worst_group(columns["level"], groups, weight)
+    return scores
 
 
 def _point_scores(columns: Mapping[str, Tensor], weight: Tensor) -> dict[str, Tensor]:
-    return {name: _mean(columns[name], weight) for name in (*ERRORS, *OF_DISTANCE) if name in columns}
-
-
-def _mean(column: Tensor, weight: Tensor) -> Tensor:
-    return (weight * column).sum(-1) / weight.sum(-1)
+    return means({name: columns[name] for name in (*ERRORS, *OF_DISTANCE) if name in columns}, weight)
 
 
 def scalar_bands(statistic: Statistic, columns: Mapping[str, Tensor], resamples: int = RESAMPLES) -> dict[str, Band]:
     """The 95 % bootstrap intervals of scalars, as plain numbers."""
-    return {name: _band(found) for name, found in bands(statistic, columns, resamples, SEED).items()}
-
-
-def _band(found: Interval) -> Band:
-    return Band(float(found.value), float(found.low), float(found.high))
-
-
-def _curve(x: Tensor, interval: Interval) -> Curve:
-    return Curve(x.tolist(), interval.value.tolist(), interval.low.tolist(), interval.high.tolist())
+    return {name: Band(*map(float, found)) for name, found in bands(statistic, columns, resamples, SEED).items()}
 
 
 def _strata(statistic: Statistic, columns: Mapping[str, Tensor], resamples: int) -> list[Stratum]:
     found = []
     for quantity, (column, unit, edges) in QUANTITIES.items():
-        for stratum in strata(quantity, columns[column], edges, unit) if column in columns else []:
-            part = {name: values[stratum.mask] for name, values in columns.items()}
-            scores = scalar_bands(statistic, part, resamples)
-            found.append(Stratum(quantity, stratum.label, int(stratum.mask.sum()), scores))
+        for label, mask in strata(quantity, columns[column], edges, unit).items() if column in columns else ():
+            part = {name: values[mask] for name, values in columns.items()}
+            found.append(Stratum(quantity, label, int(mask.sum()), scalar_bands(statistic, part, resamples)))
     return found
 
 

@@ -17,8 +17,10 @@ from phd_exp.metrics.ordered import in_order_of
 
 SEED = 1
 _AT_ONCE = 10**6  # positions drawn at a time
-_OF_LEVELS = ("inside_90", "miscalibration_area", "depth_pit_area", "depth_pit_ks")
-REFERENCED = ("depth_ence", "projected_ence", *_OF_LEVELS, "group_miscalibration", "depth_crps_mm", *NEES)
+REFERENCED = (
+    *("depth_ence", "projected_ence", "inside_90", "miscalibration_area", "depth_pit_area", "depth_pit_ks"),
+    *("group_miscalibration", "depth_crps_mm", *NEES),
+)
 
 
 @dataclass(frozen=True)
@@ -39,13 +41,13 @@ def calibrated_reference(distribution: ProjectedHuber, simulations: int = 200) -
     Source: the simulated null distribution of a test statistic; coverage in tests/evaluation/test_reference.py.
     """
     (n,) = distribution.batch_shape
-    inside, areas, distances = _uniform(n, simulations)
-    found = defaultdict(list, zip(_OF_LEVELS, (inside, areas, areas, distances), strict=True))
+    found = defaultdict(list, _uniform(n, simulations))
     each = max(1, _AT_ONCE // n)
     for start in range(0, simulations, each):
         for name, values in _simulated(distribution, min(each, simulations - start), SEED + start).items():
             found[name] += values.tolist()
-    return {name: _band(values) for name, values in found.items()}
+    shares = torch.tensor([0.5, 0.025, 0.975], dtype=torch.float64)
+    return {name: Band(*torch.tensor(values).double().quantile(shares).tolist()) for name, values in found.items()}
 
 
 def groups_of(distribution: ProjectedHuber) -> Tensor:
@@ -68,8 +70,8 @@ def _simulated(distribution: ProjectedHuber, simulations: int, seed: int) -> dic
 
 
 @cache
-def _uniform(n: int, simulations: int) -> tuple[list[float], list[float], list[float]]:
-    """Per cent up to 0.9, miscalibration areas and Kolmogorov-Smirnov distances of n uniform levels."""
+def _uniform(n: int, simulations: int) -> dict[str, list[float]]:
+    """The scores of n uniform levels and PITs."""
     generator = torch.Generator().manual_seed(SEED)
     inside, areas, distances = [], [], []
     for _ in range(simulations):
@@ -78,10 +80,4 @@ def _uniform(n: int, simulations: int) -> tuple[list[float], list[float], list[f
         inside.append(100 * float((levels <= 0.9).double().mean()))
         areas.append(float(miscalibration_area(order)))
         distances.append(float(uniform_distance(order)))
-    return inside, areas, distances
-
-
-def _band(values: list[float]) -> Band:
-    shares = torch.tensor([0.025, 0.5, 0.975], dtype=torch.float64)
-    low, value, high = torch.tensor(values).double().quantile(shares).tolist()
-    return Band(value, low, high)
+    return {"inside_90": inside, "miscalibration_area": areas, "depth_pit_area": areas, "depth_pit_ks": distances}

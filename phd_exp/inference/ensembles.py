@@ -57,8 +57,8 @@ def held_out_table(folders: Sequence[RunFolder], views: int) -> "Columns":
         if not file.exists():
             wanted = "data.n_held_out > 0" + (" and evaluation.eight_views=true" if views > 1 else "")
             raise RunError(f"{file}: missing; held-out samples are needed: train with {wanted}")
-    from phd_exp.evaluation.ensembles import ensemble_table  # imports pyarrow
-    from phd_exp.evaluation.parquet import read_table
+    from phd_exp.evaluation.parquet import read_table  # imports pyarrow
+    from phd_exp.evaluation.predictions import ensemble_table
 
     tables = [read_table(file) for file in files]
     return tables[0] if len(tables) == 1 else ensemble_table(tables)

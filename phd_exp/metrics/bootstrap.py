@@ -5,7 +5,7 @@ and evaluates many resamples at a time.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -16,9 +16,8 @@ Statistic = Callable[[Mapping[str, Tensor], Tensor], Mapping[str, Tensor]]
 _AT_ONCE = 10**6  # counts held in memory at a time
 
 
-@dataclass(frozen=True)
-class Interval:
-    """A statistic of the samples, and the bounds that contain it in most resamples."""
+class Interval(NamedTuple):
+    """A statistic of the samples, and the bounds that contain it in 95 % of the resamples."""
 
     value: Float[Tensor, "*points"]
     low: Float[Tensor, "*points"]
@@ -26,18 +25,14 @@ class Interval:
 
 
 def bands(
-    statistic: Statistic,
-    columns: Mapping[str, Float[Tensor, " samples"]],
-    resamples: int,
-    seed: int,
-    confidence: float = 0.95,
+    statistic: Statistic, columns: Mapping[str, Float[Tensor, " samples"]], resamples: int, seed: int
 ) -> dict[str, Interval]:
-    """Percentile intervals of scalars, and of curves at each of their points; equal for equal seeds.
+    """95 % percentile intervals of scalars, and of curves at each of their points; equal for equal seeds.
 
     They do not test calibration: a distance from calibration cannot be negative and resampling adds noise to it, so
     close to perfect calibration all resamples may lie above the value. The interval is then extended to contain it.
 
-    Raises ValueError for no samples, fewer than one resample, or a confidence outside (0, 1).
+    Raises ValueError for no samples, or fewer than one resample.
     Source: Efron and Tibshirani, "An introduction to the bootstrap" (1993), chapter 13.
 
     Examples:
@@ -45,10 +40,8 @@ def bands(
         >>> float(band.value), bool(band.low < band.value < band.high)
         (49.5, True)
     """
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence: got {confidence}; expected a number between 0 and 1")
     values, drawn = resampled(statistic, columns, resamples, seed)
-    return {name: interval(value, drawn[name], confidence) for name, value in values.items()}
+    return {name: interval(value, drawn[name]) for name, value in values.items()}
 
 
 def resampled(
@@ -75,9 +68,9 @@ def resampled(
     return {name: value[0] for name, value in values.items()}, {k: torch.cat(v) for k, v in drawn.items()}
 
 
-def interval(value: Tensor, drawn: Tensor, confidence: float = 0.95) -> Interval:
-    """The percentile interval of resampled values, extended to contain the value itself."""
-    tails = torch.tensor([(1 - confidence) / 2, (1 + confidence) / 2], dtype=torch.float64)
+def interval(value: Tensor, drawn: Tensor) -> Interval:
+    """The 95 % percentile interval of resampled values, extended to contain the value itself."""
+    tails = torch.tensor([0.025, 0.975], dtype=torch.float64)
     # a resample may lack every sample that a point needs
     low, high = torch.nanquantile(drawn, tails, dim=0)
     return Interval(value, torch.minimum(low, value), torch.maximum(high, value))

@@ -25,6 +25,7 @@ COLUMNS = (
 MILLIRADIANS = 1000.0  # unit of x/z and y/z, which are angles where they are small
 MOST_BINS = 10
 FEWEST_IN_A_BIN = 100
+WINDOW = 200  # samples averaged in a calibration curve, as in the paper
 STEPS = 100  # points of coverage, PIT and risk; a calibration curve has from as many to twice as many
 UNITS = {"depth": MILLIMETRES, "projected": MILLIRADIANS}
 
@@ -109,19 +110,19 @@ def ence_bins(samples: Ordered) -> int:
     return max(1, min(MOST_BINS, int(samples.total.max()) // FEWEST_IN_A_BIN))
 
 
-def abscissae(columns: Mapping[str, Float[Tensor, " samples"]], window: int) -> dict[str, Tensor]:
+def abscissae(columns: Mapping[str, Float[Tensor, " samples"]]) -> dict[str, Tensor]:
     """The x of each of the `curves`: name -> (points,)."""
     shares = torch.linspace(0, 1, STEPS + 1, dtype=torch.float64)
     x = {"coverage": shares, "depth_pit": shares}
     for name in UNITS:
         x[f"{name}_risk_coverage"] = shares[1:]
-        curve = _calibration(columns, name, window)
-        x[f"{name}_calibration"] = curve.predicted[:: _stride(len(curve.predicted))]
+        curve, stride = _calibration(columns, name)
+        x[f"{name}_calibration"] = curve.predicted[::stride]
     return x
 
 
 def curves(
-    columns: Mapping[str, Float[Tensor, " samples"]], weight: Float[Tensor, "resamples samples"], window: int
+    columns: Mapping[str, Float[Tensor, " samples"]], weight: Float[Tensor, "resamples samples"]
 ) -> dict[str, Tensor]:
     """The y of each curve, each sample counted `weight` times: name -> (resamples, points).
 
@@ -131,7 +132,7 @@ def curves(
 
     Raises ValueError for no samples, or for samples that are not finite.
     """
-    orders, x = ordered(columns, weight), abscissae(columns, window)
+    orders, x = ordered(columns, weight), abscissae(columns)
     y = {
         "coverage": calibration.coverage(orders["by_level"], x["coverage"]),
         "depth_pit": calibration.coverage(orders["by_depth_pit"], x["depth_pit"]),
@@ -139,24 +140,22 @@ def curves(
     for name, unit in UNITS.items():
         risk = risk_at(orders[f"{name}_by_variance"], f"{name}_error", x[f"{name}_risk_coverage"])
         y[f"{name}_risk_coverage"] = unit * risk
-        y[f"{name}_calibration"] = _window_means(columns, name, weight, window)
+        y[f"{name}_calibration"] = _window_means(columns, name, weight)
     return y
 
 
-def _calibration(columns: Mapping[str, Tensor], name: str, window: int) -> calibration.CalibrationCurve:
-    return calibration.calibration_curve(columns[f"{name}_variance"], columns[f"{name}_squared_error"], window)
+def _calibration(columns: Mapping[str, Tensor], name: str) -> tuple[calibration.CalibrationCurve, int]:
+    """The curve, of whose points every n-th is kept, and n."""
+    variance, squared_error = columns[f"{name}_variance"], columns[f"{name}_squared_error"]
+    curve = calibration.calibration_curve(variance, squared_error, WINDOW)
+    return curve, max(1, len(curve.predicted) // STEPS)
 
 
-def _window_means(columns: Mapping[str, Tensor], name: str, weight: Tensor, window: int) -> Tensor:
+def _window_means(columns: Mapping[str, Tensor], name: str, weight: Tensor) -> Tensor:
     """The mean squared error of each window of `calibration_curve`, whose samples are drawn anew."""
-    curve = _calibration(columns, name, window)
+    curve, stride = _calibration(columns, name)
     order = columns[f"{name}_variance"].double().argsort(stable=True)
     counts = weight[:, order]
     errors = counts * columns[f"{name}_squared_error"].double()[order]
-    stride = _stride(len(curve.predicted))
     pooled_errors, pooled_counts = torch.nn.functional.avg_pool1d(torch.stack([errors, counts]), curve.window, stride)
     return pooled_errors / pooled_counts
-
-
-def _stride(points: int) -> int:
-    return max(1, points // STEPS)

@@ -2,14 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from itertools import groupby
+from itertools import groupby, starmap
 
 import torch
 from torch import Tensor
 
-from phd_exp.evaluation.ensembles import ensemble_table
 from phd_exp.evaluation.parquet import Columns, read_table
-from phd_exp.evaluation.predictions import scalar_bands
+from phd_exp.evaluation.predictions import ensemble_table, scalar_bands
 from phd_exp.evaluation.reference import Band
 from phd_exp.metrics.bootstrap import means
 from phd_exp.records.choices import in_words
@@ -31,7 +30,6 @@ def ensemble_tables(report: Report) -> list[Table]:
     """A table for every preset with two seeds of one configuration, or with a record of eight views."""
     configurations = groupby(sorted(report.runs, key=_configuration), key=_configuration)
     scored = [(named, Notes().attempt(partial(_scores, list(runs)))) for named, runs in configurations]
-    found = [(*named, kind, scores) for named, kinds in scored for kind, scores in (kinds or {}).items()]
     return [
         Table(
             stem=file_stem("ensembles", preset),
@@ -41,10 +39,10 @@ def ensemble_tables(report: Report) -> list[Table]:
             columns=tuple(label for label, _ in SCORES.values()),
             groups=tuple(
                 tuple(
-                    TableRow((runs, kind), tuple(_cell(*score) for score in scores.items()))
-                    for *_, kind, scores in of
+                    TableRow((f"{model} on {data} {hashed}".rstrip(), kind), tuple(starmap(_cell, scores.items())))
+                    for kind, scores in kinds.items()
                 )
-                for runs, of in groupby(lines, key=lambda line: f"{line[2]} on {line[1]} {line[3]}".rstrip())
+                for (_, data, model, hashed), kinds in found
             ),
             notes=(OF_A_LINE,),
             preset=preset,
@@ -52,12 +50,13 @@ def ensemble_tables(report: Report) -> list[Table]:
                 {"preset": preset, "data": data, "model": model, "overrides": hashed, "prediction": kind}
                 | {"quantity": name}
                 | vars(band)
-                for _, data, model, hashed, kind, scores in lines
+                for (_, data, model, hashed), kinds in found
+                for kind, scores in kinds.items()
                 for name, band in scores.items()
             ),
         )
         for preset in report.presets
-        if (lines := [line for line in found if line[0] == preset])
+        if (found := [(named, kinds) for named, kinds in scored if kinds and named[0] == preset])
     ]
 
 

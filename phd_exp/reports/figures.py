@@ -14,27 +14,18 @@ from phd_exp.distributions.level_curves import LevelCurves, on_image
 from phd_exp.records.files import write_atomic
 
 LABELS = {"depth": ("Depth", "m²"), "projected": ("Projected position", "no unit")}
-_CELL, _LEFT, _RIGHT, _BOTTOM, _TOP = 4.2, 0.8, 0.2, 0.6, 0.4
-"""Side of the square for one curve, and its margins, inches."""
 
 
 def draw_calibration(curves: Mapping[str, Mapping[str, Any]], file: Path) -> None:
-    """Draw calibration curves, empirical against predicted, both axes logarithmic, the identity dashed.
+    """Draw the two calibration curves, empirical against predicted, both axes logarithmic, the identity dashed.
 
     Source: paper, Figure "correlation between predicted variance and empirical variance".
     """
-    n = len(curves)
-    figure = Figure(figsize=(_CELL * n, _CELL))
+    figure = Figure(figsize=(8.4, 4.2))
     # fixed margins: `layout="constrained"`, which measures the labels, takes half of the drawing time
-    figure.subplots_adjust(
-        left=_LEFT / (_CELL * n),
-        right=1 - _RIGHT / (_CELL * n),
-        bottom=_BOTTOM / _CELL,
-        top=1 - _TOP / _CELL,
-        wspace=(_LEFT + _RIGHT) / (_CELL - _LEFT - _RIGHT),
-    )
-    for place, (name, curve) in enumerate(curves.items()):
-        draw_curve(figure.add_subplot(1, n, place + 1), name, curve)
+    figure.subplots_adjust(left=0.095, right=0.976, bottom=0.143, top=0.905, wspace=0.3125)
+    for axes, (name, curve) in zip(figure.subplots(1, 2), curves.items(), strict=True):
+        draw_curve(axes, name, curve)
     write_atomic(file, encoded(figure, "png", dpi=120))
 
 

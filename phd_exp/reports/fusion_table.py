@@ -19,9 +19,7 @@ NAMES: dict[Method, str] = {
 QUANTITIES = {
     "depth_error_mm": "depth (mm)",
     "distance_mm": "distance (mm)",
-    "coverage_50": "inside 50 %",
-    "coverage_90": "inside 90 %",
-    "coverage_99": "inside 99 %",
+    **{f"coverage_{level}": f"inside {level} %" for level in LEVELS},
     "normalised_squared_error": "squared error",
 }
 ON_GROUND = ", ground"

@@ -96,16 +96,16 @@ def make_gallery(table: Columns, config: Mapping[str, str]) -> Gallery:
     """Choose and draw the pictures. Raises RunError if the table lacks a column."""
     require_columns(NEEDED, table)
     if "nll" in table:
-        key, ranked_by, error = "nll", "negative log density at the truth", table["nll"]
+        ranked_by, error = "negative log density at the truth", table["nll"]
     else:
-        key, ranked_by = "", "distance from the truth"
+        ranked_by = "distance from the truth"
         error = np.linalg.norm([table[f"mode_{axis}"] - table[axis] for axis in "xyz"], axis=0)
     order = np.argsort(error, kind="stable")  # NaN comes last, as the worst
     each = min(EACH, len(order) // 2) or 1
     source = images_folder(config)
 
     def pictures(rows: np.ndarray) -> list[Picture]:
-        return [_picture({name: table[name][row] for name in table}, key, source) for row in rows]
+        return [_picture({name: table[name][row] for name in table}, source) for row in rows]
 
     return Gallery(ranked_by, pictures(order[:each]), pictures(order[::-1][:each]), _why_no_images(source))
 
@@ -116,14 +116,14 @@ def _why_no_images(source: Path | None) -> str:
     return "" if source.is_dir() else f"{source}: no images here any more; the panels show positions alone."
 
 
-def _picture(row: Mapping[str, Any], key: str, source: Path | None) -> Picture:
+def _picture(row: Mapping[str, Any], source: Path | None) -> Picture:
     truth, mode = (np.array([row[prefix + axis] for axis in "xyz"]) for prefix in ("", "mode_"))
     f, S = float(row["f"]), float(row["S"])
     curves = curves_of(row)
     outlines = [on_image(points, f, S) for points in curves.projected] if curves else []
     with np.errstate(all="ignore"):  # a record may contain any number
         on = [on_image(at[:2] / at[2], f, S) for at in (truth, mode)]
-    facts = _facts(row, key)
+    facts = _facts(row)
     image = load_image(source, str(row["file_name"])) if source else None
     return Picture(
         name=str(row["file_name"]),
@@ -150,8 +150,8 @@ def curves_of(row: Mapping[str, Any]) -> LevelCurves | None:
         return None
 
 
-def _facts(row: Mapping[str, Any], key: str) -> list[tuple[str, str]]:
-    errors = [name for name in (key, "projected_error_mm", "depth_error_mm") if name in row]
+def _facts(row: Mapping[str, Any]) -> list[tuple[str, str]]:
+    errors = [name for name in ("nll", "projected_error_mm", "depth_error_mm") if name in row]
     facts = [(SCORES[name].label, f"{SCORES[name].text(row[name])} {SCORES[name].unit}") for name in errors]
     known = [(name, *_FACTS[name]) for name in _FACTS if name in row]
     return facts + [(label, f"{row[name]:.{digits}f} {unit}".strip()) for name, label, unit, digits in known]

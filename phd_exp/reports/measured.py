@@ -102,15 +102,9 @@ _ADAPTER: TypeAdapter[Measured] = TypeAdapter(Measured)
 
 
 def kept_or_measured(
-    folder: RunFolder,
-    config: Mapping[str, str],
-    predictions: Columns | None,
-    held_out: Columns | None,
-    kept: Path | None,
+    folder: RunFolder, config: Mapping[str, str], measuring: Callable[[], Measured], kept: Path
 ) -> Measured:
-    """The stored measurements if the run has not changed; else measures, and stores them in `kept` if given."""
-    if kept is None:
-        return measure(folder, config, predictions, held_out)
+    """The measurements stored in the folder `kept` if the run has not changed; else measures, and stores them."""
     file = kept / f"{file_stem(*folder.path.parts[-4:])}.json"
     key = _key(folder, config)
     try:
@@ -119,7 +113,7 @@ def kept_or_measured(
             return _ADAPTER.validate_python(content["measured"])
     except (OSError, ValueError, LookupError, TypeError):
         pass  # nothing is stored, or another version stored it
-    measured = measure(folder, config, predictions, held_out)
+    measured = measuring()
     with suppress(OSError):  # then the next report measures again
         write_atomic(file, json.dumps({"key": key, "measured": asdict(measured)}))
     return measured

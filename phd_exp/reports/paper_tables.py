@@ -3,12 +3,12 @@
 import shlex
 from collections.abc import Iterable, Mapping, Sequence, Set
 
-from phd_exp.evaluation.point_errors import COLUMNS, READINGS, ErrorKey, Estimate, Quantity, Reading
+from phd_exp.evaluation.point_errors import COLUMNS, READINGS, ErrorKey, Quantity, Reading
 from phd_exp.records.choices import PLAIN_RECIPE, in_words, preset_and_recipe
 from phd_exp.records.errors import one_line
 from phd_exp.reports.cells import Cell, make_cell
 from phd_exp.reports.paper import ASSUMED, BELOW_BOUND, LAYOUTS, OF_A_BOUND, Column, Layout, Line, TableName
-from phd_exp.reports.runs import PROBABILISTIC, Report
+from phd_exp.reports.runs import PROBABILISTIC, Report, Run
 from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem
 
 DIGITS: dict[Quantity, int] = {"projected": 1, "depth": 0}  # decimals of a millimetre, as in the paper
@@ -43,20 +43,23 @@ def paper_tables(report: Report) -> list[Table]:
     tables = []
     for preset in report.presets:
         for layout in LAYOUTS:
-            begun = {choice: report.at_defaults(preset, *choice) for choice in layout.choices}
-            seeds = sorted({seed for runs in begun.values() for seed in runs})
-            choices = {choice for choice, runs in begun.items() if runs}
-            tables += [_table(report, preset, layout, reading, choices, seeds) for reading in READINGS if seeds]
+            begun = {choice: runs for choice in layout.choices if (runs := report.at_defaults(preset, *choice))}
+            tables += [_table(report, preset, layout, reading, begun) for reading in READINGS if begun]
     return tables
 
 
 def _table(
-    report: Report, preset: str, layout: Layout, reading: Reading, choices: Set[tuple[str, str]], seeds: Sequence[int]
+    report: Report, preset: str, layout: Layout, reading: Reading, begun: Mapping[tuple[str, str], Mapping[int, Run]]
 ) -> Table:
-    """The table of these seeds, of the data sets and models that a (data set, model) of `choices` has."""
-    data, models = ({choice[place] for choice in choices} for place in (0, 1))
+    """The table of the seeds, data sets and models of `begun`: (data set, model) -> seed -> run.
+
+    It has all estimates, but eight views only if a run has recorded them.
+    """
+    seeds = sorted({seed for runs in begun.values() for seed in runs})
+    data, models = ({choice[place] for choice in begun} for place in (0, 1))
     columns = [column for column in layout.columns if column.data in data]
-    estimates = _estimates(report, preset, choices)
+    recorded = {key.estimate for runs in begun.values() for run in runs.values() for key in run.errors}
+    estimates = {*COLUMNS, *recorded}
     groups = [
         lines
         for group in layout.groups
@@ -93,12 +96,6 @@ def _table(
         preset=preset,
         reading=reading,
     )
-
-
-def _estimates(report: Report, preset: str, choices: Set[tuple[str, str]]) -> set[Estimate]:
-    """All estimates, but eight views only if a run has recorded them."""
-    runs = [run for choice in choices for run in report.at_defaults(preset, *choice).values()]
-    return {*COLUMNS, *(key.estimate for run in runs for key in run.errors)}
 
 
 def _left_out(layout: Layout, data: Set[str], models: Set[str]) -> list[str]:

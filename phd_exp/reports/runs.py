@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +15,7 @@ from phd_exp.records.errors import one_line
 from phd_exp.records.files import remove_temporaries
 from phd_exp.records.runs import CHOOSE, RunFolder, RunStatus, find_runs
 from phd_exp.records.searches import Search, read_searches
-from phd_exp.reports.measured import Measured, Notes, kept_or_measured
+from phd_exp.reports.measured import Measured, Notes, kept_or_measured, measure
 from phd_exp.reports.table import file_stem, printable
 
 RunState = Literal["finished", "running", "interrupted", "failed", "unreadable"]
@@ -129,9 +130,7 @@ def _read_run(folder: RunFolder, kept: Path | None) -> Run:
 def _whole_run(run: Run, kept: Path | None, notes: Notes) -> Run:
     folder, leaf = run.folder, LEAF.fullmatch(run.name)
     status = notes.attempt(folder.status)
-    state, detail = _state(folder, status)
-    if status is None and notes:
-        detail = notes[-1]
+    state, detail = _state(folder, status) if status else ("unreadable", notes[-1])
     if leaf is None:
         state, detail = "unreadable", f"{run.name}: expected a folder named seed<k> or seed<k>-<hash>"
     values = notes.attempt(lambda: flatten(folder.config())) or {}
@@ -149,10 +148,12 @@ def _whole_run(run: Run, kept: Path | None, notes: Notes) -> Run:
         held_out = notes.attempt(lambda: read_table(folder.held_out))
         chosen = {name: column[CHOOSE] for name, column in (held_out or {}).items()}
         tested_held_out = notes.attempt(lambda: _errors(chosen, ("mode",))) if chosen else None
-    measured = notes.attempt(lambda: kept_or_measured(folder, config, predictions, held_out, kept)) or Measured()
+    measuring = partial(measure, folder, config, predictions, held_out)
+    stored = partial(kept_or_measured, folder, config, measuring, kept) if kept else measuring
+    measured = notes.attempt(stored) or Measured()
     errors, nll = tested or ({}, None)
     if (file := folder.eight_views["test"]).exists() and errors:
-        of_eight, _ = notes.attempt(lambda: _errors(read_table(file), ("mode",))) or ({}, None)
+        of_eight = notes.attempt(lambda: mean_errors(read_table(file), ("mode",))) or {}
         errors = {**errors, **{replace(key, estimate="eight views"): mean for key, mean in of_eight.items()}}
     held_out_errors, held_out_nll = tested_held_out or ({}, None)
     return replace(
@@ -179,9 +180,7 @@ def _errors(table: Columns, estimates: Sequence[Estimate]) -> tuple[MeanErrors, 
     return mean_errors(table, estimates), nll if math.isfinite(nll) else None
 
 
-def _state(folder: RunFolder, status: RunStatus | None) -> tuple[RunState, str]:
-    if status is None:
-        return "unreadable", "status.json: missing"
+def _state(folder: RunFolder, status: RunStatus) -> tuple[RunState, str]:
     if status.state != "running":
         return status.state, status.error or ""
     try:

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from phd_exp.evaluation.ensembles import ensemble_table
 from phd_exp.evaluation.parquet import read_table
+from phd_exp.evaluation.predictions import ensemble_table
 from phd_exp.records.runs import RunFolder, find_runs
 from phd_exp.reports import ensembles
 from phd_exp.reports.files import write_tables

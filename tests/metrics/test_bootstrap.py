@@ -32,8 +32,6 @@ def test_interval_of_a_mean_has_the_width_of_theory() -> None:
     assert (band.high - band.low).item() == pytest.approx(2 * 1.96 * x.std().item() / 2000**0.5, rel=0.06)
     curve = bands(means, {"x": x}, resamples=2000, seed=0)["curve"]
     torch.testing.assert_close(curve.high, band.high * torch.tensor([1.0, 2.0, 3.0]).double())
-    half = bands(means, {"x": x}, resamples=2000, seed=0, confidence=0.5)["mean"]
-    assert (half.high - half.low).item() == pytest.approx(2 * 0.6745 * x.std().item() / 2000**0.5, rel=0.08)
 
 
 def test_intervals_contain_the_truth_as_often_as_they_claim() -> None:
@@ -69,7 +67,7 @@ def test_an_interval_contains_its_value_where_resampling_adds_noise() -> None:
     assert band.low == band.value < band.high
 
 
-@pytest.mark.parametrize(("n", "resamples", "confidence"), [(0, 10, 0.9), (5, 0, 0.9), (5, 10, 1.0)])
-def test_bad_arguments_are_refused(n: int, resamples: int, confidence: float) -> None:
-    with pytest.raises(ValueError, match=r"a bootstrap needs|confidence: got 1\.0"):
-        bands(means, {"x": torch.ones(n)}, resamples, 0, confidence)
+@pytest.mark.parametrize(("n", "resamples"), [(0, 10), (5, 0)])
+def test_bad_arguments_are_refused(n: int, resamples: int) -> None:
+    with pytest.raises(ValueError, match="a bootstrap needs"):
+        bands(means, {"x": torch.ones(n)}, resamples, 0)

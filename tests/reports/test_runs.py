@@ -11,8 +11,8 @@ import pytest
 from phd_exp.evaluation.point_errors import ErrorKey
 from phd_exp.records.choices import RunName
 from phd_exp.records.runs import RunFolder
-from phd_exp.reports import measured as measured_module
-from phd_exp.reports.measured import Measured
+from phd_exp.reports import runs as runs_module
+from phd_exp.reports.measured import Measured, measure
 from phd_exp.reports.runs import Run, read_report
 from tests.support.recorded import predicted, record
 from tests.support.synthetic import write_run
@@ -132,13 +132,12 @@ def test_a_run_is_measured_again_where_it_has_changed(tmp_path: Path, monkeypatc
     for data in ("default", "occl"):
         write_run(runs, data, "mae_vz", n=40, epochs=2)
     measured: list[str] = []
-    real = measured_module.measure
 
     def counted(folder: RunFolder, *rest: Any) -> Measured:
         measured.append(folder.path.parent.parent.name)
-        return real(folder, *rest)
+        return measure(folder, *rest)
 
-    monkeypatch.setattr(measured_module, "measure", counted)
+    monkeypatch.setattr(runs_module, "measure", counted)
     first = read_report(runs, kept)
     predictions = first.runs[1].folder.predictions
     again = read_report(runs, kept)

@@ -15,7 +15,6 @@ Trace = dict[str, Any]
 Numbers = Sequence[float | None]
 
 DASHES = ("solid", "dash", "dot", "dashdot")
-POINTS = 120  # most points of a curve; more would only make pages larger
 
 
 @dataclass(frozen=True)
@@ -83,18 +82,4 @@ def _rounded(values: Numbers) -> list[float | None]:
 
 def curve_line(name: str, curve: Curve, colour: int, dash: str, role: str) -> Trace:
     """A curve with its band."""
-    chosen = thinned(len(curve.x))
-    x, y, low, high = ([values[i] for i in chosen] for values in (curve.x, curve.y, curve.low, curve.high))
-    return line(name, x, y, colour, dash=dash, role=role, low=low, high=high)
-
-
-def thinned(n: int, points: int = POINTS) -> list[int]:
-    """Indices of at most `points` of n values, including the first and the last.
-
-    Examples:
-        >>> thinned(9, points=3)
-        [0, 4, 8]
-    """
-    if n <= points:
-        return list(range(n))
-    return [round(i * (n - 1) / (points - 1)) for i in range(points)]
+    return line(name, curve.x, curve.y, colour, dash=dash, role=role, low=curve.low, high=curve.high)

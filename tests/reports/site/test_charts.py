@@ -1,4 +1,4 @@
-"""Chart data is safe in a page and has a limited size."""
+"""Chart data is safe in a page."""
 
 import json
 
@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from phd_exp.reports.figures import decades
-from phd_exp.reports.site.charts import POINTS, thinned
 from phd_exp.reports.site.pages import as_script
 
 
@@ -22,15 +21,6 @@ def test_a_script_holds_any_text(text: str) -> None:
 def test_numbers_that_json_lacks_are_null() -> None:
     script = as_script("a", {"x": [float("nan"), float("inf"), -float("inf"), 1.5]})
     assert script == 'phdExp.receive("a", {"x":[null,null,null,1.5]});\n'
-
-
-@pytest.mark.parametrize("n", [0, 1, 2, POINTS, POINTS + 1, 5 * POINTS + 3])
-def test_a_thinned_curve_keeps_its_ends(n: int) -> None:
-    kept = thinned(n)
-    assert len(kept) == min(n, POINTS)
-    assert kept == sorted(set(kept))
-    assert kept[:1] == list(range(n))[:1]
-    assert kept[-1:] == list(range(n))[-1:]
 
 
 def test_decades_contain_all_positive_values() -> None:
