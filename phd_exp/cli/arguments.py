@@ -53,12 +53,10 @@ def four_numbers(expected: str) -> BeforeValidator:
 
     def read(text: Any) -> tuple[float, ...]:
         try:
-            numbers = tuple(map(float, str(text).strip("[]()").split(",")))
+            a, b, c, d = map(float, str(text).strip("[]()").split(","))
         except ValueError:
-            numbers = ()
-        if len(numbers) != 4:
-            raise ValueError(f"expected {expected}")
-        return numbers
+            raise ValueError(f"expected {expected}") from None
+        return a, b, c, d
 
     return BeforeValidator(read)
 
