@@ -118,21 +118,14 @@ def _without_missing(node: Any) -> Any:
     return {key: _without_missing(value) for key, value in node.items() if value != MISSING}
 
 
-def launch(
-    task: Task,
-    words: list[str],
-    config_name: str = "config",
-    standing: Standing | None = None,
-    cost: Cost | None = None,
-) -> int:
-    """Run a task through Hydra, once or (-m) for every combination; returns the exit status.
+def launch(job: Job, words: list[str], config_name: str = "config") -> int:
+    """Run a job through Hydra, once or (-m) for every combination; returns the exit status.
 
-    `words` follow the verb; they change the configuration in `conf/<config_name>.yaml`. `standing` and `cost` are
-    those of the `Job`. Raises RunError if a launcher fails.
+    `words` follow the verb; they change the configuration in `conf/<config_name>.yaml`. Raises RunError if a launcher
+    fails.
     """
     # Hydra would print errors over several lines, and exit
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    job = Job(task, standing, cost)
     try:
         sys.argv = [sys.argv[0], *_options_last(words)]
         hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=config_name)(job)()
