@@ -20,7 +20,6 @@ from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.geometry.motion import EIGHT, turned
 from phd_exp.geometry.virtual import Box, VirtualCamera, intrinsics
-from phd_exp.inference.ensembles import held_out_table
 from phd_exp.inference.views import View, focal_lengths, image_batch
 from phd_exp.models.heads import DistributionHead, Prediction
 from phd_exp.models.regressor import Regressor
@@ -123,7 +122,20 @@ class Predictor:
                 f"{self.folders[0].path}: no Projected Huber densities, which recalibrate= and coverage= need; "
                 "expected a run of model=probabilistic"
             )
-        return held_out_table(self.folders, self.views)
+        if len(self.folders) > 1 and self.views > 1:
+            raise RunError(
+                f"views={self.views}: held-out predictions of several views are recorded for single runs alone"
+            )
+        files = [folder.held_out if self.views == 1 else folder.eight_views["held_out"] for folder in self.folders]
+        for file in files:
+            if not file.exists():
+                wanted = "data.n_held_out > 0" + (" and evaluation.eight_views=true" if self.views > 1 else "")
+                raise RunError(f"{file}: missing; held-out samples are needed: train with {wanted}")
+        from phd_exp.evaluation.ensembles import ensemble_table  # imports pyarrow
+        from phd_exp.evaluation.parquet import read_table
+
+        tables = [read_table(file) for file in files]
+        return tables[0] if len(tables) == 1 else ensemble_table(tables)
 
     def guarantee(self, coverage: float, groups: "Groups | None" = None) -> "Guarantee":
         """Regions that contain the true position with a probability in (0, 1); see `evaluation.conformal`.
