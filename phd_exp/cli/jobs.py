@@ -28,24 +28,17 @@ REFUSED = (HydraException, OmegaConfBaseException, ValueError, TypeError, Arithm
 """The errors that a bad override raises; ValueError for a group set to null, TypeError for one set to numbers."""
 HOME = uuid.uuid4().hex  # names this process: another process that imports this module has another value
 
-Task = Callable[[dict[str, Any], list[str], int], float | None]
-"""Takes the resolved configuration, its overrides and the number of cores to use; returns the score, if any."""
-Standing = Callable[[dict[str, Any], list[str]], str | None]
-"""The state on disk of the job with a configuration and overrides: "finished", "running" (in any process), the error
-that ended it, or None without a record.
-"""
-Cost = Callable[[list[dict[str, Any]], int], float]
-"""The seconds of the jobs with these configurations, one after another, on that many cores; 0 if it is not known."""
-
 
 @dataclass(frozen=True)
 class Job:
     """A task that Hydra calls. A launcher may pickle it and run it on another machine.
 
     Attributes:
-        task: the work of a job.
-        standing: the state of a job on disk; None if the verb records nothing.
-        cost: the time of jobs on this machine; None if the verb cannot estimate it.
+        task: takes the resolved configuration, its overrides and the number of cores; returns the score, if any.
+        standing: the state on disk of the job with a configuration and overrides: "finished", "running" (in any
+            process), the error that ended it, or None without a record. None if the verb records nothing.
+        cost: the seconds of the jobs with these configurations, one after another, on that many cores; 0 if it is not
+            known. None if the verb cannot estimate it.
         endings: of all jobs, in the launcher's own process.
         n_jobs: the number of jobs of the sweep.
         cores: the number of cores for each; None: all that its process may use.
@@ -53,9 +46,9 @@ class Job:
         home: the launcher's own process.
     """
 
-    task: Task
-    standing: Standing | None = None
-    cost: Cost | None = None
+    task: Callable[[dict[str, Any], list[str], int], float | None]
+    standing: Callable[[dict[str, Any], list[str]], str | None] | None = None
+    cost: Callable[[list[dict[str, Any]], int], float] | None = None
     endings: list[Ending] = field(default_factory=list)
     n_jobs: int = 1
     cores: int | None = None
