@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import model_validator
 
-from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_folder, parsed, predicted
+from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_folder, predicted
 from phd_exp.records.detections import Detection, NumberOrName, detection_of
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import write_atomic
@@ -88,7 +88,7 @@ class PredictArguments(RunArguments):
 
 def main(words: list[str]) -> int:
     """Predict each detection; returns the exit status."""
-    arguments = parsed("predict", PredictArguments, words)
+    arguments = PredictArguments.parsed("predict", words)
     out = arguments.out
     if arguments.folder is not None:
         detections = detections_in(arguments.folder, object_name=arguments.object)
