@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
@@ -15,37 +15,35 @@ if TYPE_CHECKING:  # imports of seconds, which follow the checks of the argument
     from phd_exp.inference.answers import Sighting
     from phd_exp.inference.predictor import Predictor
 
-Arguments_ = TypeVar("Arguments_", bound="Arguments")
-
 
 class Arguments(BaseModel):
     """Arguments of a verb; a key without a default is required. Each has a description, for --help."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
-
-def parsed(verb: str, model: type[Arguments_], words: Sequence[str]) -> Arguments_:
-    """The arguments of `key=value` words. Raises ConfigError, in one line, for the first that is invalid."""
-    keys = ", ".join(f"{key}=" for key in model.model_fields)
-    takes = f"{verb} takes {keys} (see `python -m phd_exp {verb} --help`)"
-    values: dict[str, str] = {}
-    for word in words:
-        key, _, value = word.partition("=")
-        if not value:
-            raise ConfigError(f"{word}: expected key=value; {takes}")
-        if key in values:
-            raise ConfigError(f"{key}: given twice")
-        values[key] = value
-    try:
-        return model.model_validate(values)
-    except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        key = ".".join(map(str, problem["loc"]))
-        ours = {
-            "extra_forbidden": f"{key}: unknown key{nearest(key, model.model_fields)}; {takes}",
-            "missing": f"{key}: missing; {takes}",
-        }
-        raise ConfigError(ours.get(problem["type"]) or complaint(key, problem)) from None
+    @classmethod
+    def parsed(cls, verb: str, words: Sequence[str]) -> Self:
+        """The arguments of `key=value` words. Raises ConfigError, in one line, for the first that is invalid."""
+        keys = ", ".join(f"{key}=" for key in cls.model_fields)
+        takes = f"{verb} takes {keys} (see `python -m phd_exp {verb} --help`)"
+        values: dict[str, str] = {}
+        for word in words:
+            key, _, value = word.partition("=")
+            if not value:
+                raise ConfigError(f"{word}: expected key=value; {takes}")
+            if key in values:
+                raise ConfigError(f"{key}: given twice")
+            values[key] = value
+        try:
+            return cls.model_validate(values)
+        except ValidationError as error:
+            problem = error.errors(include_url=False)[0]
+            key = ".".join(map(str, problem["loc"]))
+            ours = {
+                "extra_forbidden": f"{key}: unknown key{nearest(key, cls.model_fields)}; {takes}",
+                "missing": f"{key}: missing; {takes}",
+            }
+            raise ConfigError(ours.get(problem["type"]) or complaint(key, problem)) from None
 
 
 def four_numbers(expected: str) -> BeforeValidator:
@@ -53,12 +51,10 @@ def four_numbers(expected: str) -> BeforeValidator:
 
     def read(text: Any) -> tuple[float, ...]:
         try:
-            numbers = tuple(map(float, str(text).strip("[]()").split(",")))
+            a, b, c, d = map(float, str(text).strip("[]()").split(","))
         except ValueError:
-            numbers = ()
-        if len(numbers) != 4:
-            raise ValueError(f"expected {expected}")
-        return numbers
+            raise ValueError(f"expected {expected}") from None
+        return a, b, c, d
 
     return BeforeValidator(read)
 

@@ -3,7 +3,7 @@
 from importlib.util import find_spec
 from pathlib import Path
 
-from phd_exp.cli.arguments import RunArguments, loaded, output_folder, parsed, require_file
+from phd_exp.cli.arguments import RunArguments, loaded, output_folder, require_file
 from phd_exp.records.errors import ConfigError
 
 
@@ -18,7 +18,7 @@ class ExportArguments(RunArguments):
 
 def main(words: list[str]) -> int:
     """Export the network of a run; returns the exit status."""
-    arguments = parsed("export", ExportArguments, words)
+    arguments = ExportArguments.parsed("export", words)
     file = arguments.out or arguments.run[0] / "network.onnx"
     if missing := [name for name in ("onnx", "onnxscript", "onnxruntime") if find_spec(name) is None]:
         raise ConfigError(f"export needs {', '.join(missing)}: `pip install 'phd_exp[export]'`")

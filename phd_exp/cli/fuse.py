@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import field_validator
 
-from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_folder, parsed, predicted, require_file
+from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_folder, predicted, require_file
 from phd_exp.records.detections import NumberOrName
 from phd_exp.records.errors import ConfigError, RunError, listed
 from phd_exp.records.files import write_atomic
@@ -44,7 +44,7 @@ class FuseArguments(RunArguments):
 
 def main(words: list[str]) -> int:
     """Fuse the predictions of each scene; returns the exit status, which is 1 if a scene has no result."""
-    arguments = parsed("fuse", FuseArguments, words)
+    arguments = FuseArguments.parsed("fuse", words)
     out = arguments.out
     detections = detections_in(arguments.folder, object_name=arguments.object)
     scenes = observed(detections)

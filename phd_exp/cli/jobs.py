@@ -28,24 +28,17 @@ REFUSED = (HydraException, OmegaConfBaseException, ValueError, TypeError, Arithm
 """The errors that a bad override raises; ValueError for a group set to null, TypeError for one set to numbers."""
 HOME = uuid.uuid4().hex  # names this process: another process that imports this module has another value
 
-Task = Callable[[dict[str, Any], list[str], int], float | None]
-"""Takes the resolved configuration, its overrides and the number of cores to use; returns the score, if any."""
-Standing = Callable[[dict[str, Any], list[str]], str | None]
-"""The state on disk of the job with a configuration and overrides: "finished", "running" (in any process), the error
-that ended it, or None without a record.
-"""
-Cost = Callable[[list[dict[str, Any]], int], float]
-"""The seconds of the jobs with these configurations, one after another, on that many cores; 0 if it is not known."""
-
 
 @dataclass(frozen=True)
 class Job:
     """A task that Hydra calls. A launcher may pickle it and run it on another machine.
 
     Attributes:
-        task: the work of a job.
-        standing: the state of a job on disk; None if the verb records nothing.
-        cost: the time of jobs on this machine; None if the verb cannot estimate it.
+        task: takes the resolved configuration, its overrides and the number of cores; returns the score, if any.
+        standing: the state on disk of the job with a configuration and overrides: "finished", "running" (in any
+            process), the error that ended it, or None without a record. None if the verb records nothing.
+        cost: the seconds of the jobs with these configurations, one after another, on that many cores; 0 if it is not
+            known. None if the verb cannot estimate it.
         endings: of all jobs, in the launcher's own process.
         n_jobs: the number of jobs of the sweep.
         cores: the number of cores for each; None: all that its process may use.
@@ -53,9 +46,9 @@ class Job:
         home: the launcher's own process.
     """
 
-    task: Task
-    standing: Standing | None = None
-    cost: Cost | None = None
+    task: Callable[[dict[str, Any], list[str], int], float | None]
+    standing: Callable[[dict[str, Any], list[str]], str | None] | None = None
+    cost: Callable[[list[dict[str, Any]], int], float] | None = None
     endings: list[Ending] = field(default_factory=list)
     n_jobs: int = 1
     cores: int | None = None
@@ -118,21 +111,14 @@ def _without_missing(node: Any) -> Any:
     return {key: _without_missing(value) for key, value in node.items() if value != MISSING}
 
 
-def launch(
-    task: Task,
-    words: list[str],
-    config_name: str = "config",
-    standing: Standing | None = None,
-    cost: Cost | None = None,
-) -> int:
-    """Run a task through Hydra, once or (-m) for every combination; returns the exit status.
+def launch(job: Job, words: list[str], config_name: str = "config") -> int:
+    """Run a job through Hydra, once or (-m) for every combination; returns the exit status.
 
-    `words` follow the verb; they change the configuration in `conf/<config_name>.yaml`. `standing` and `cost` are
-    those of the `Job`. Raises RunError if a launcher fails.
+    `words` follow the verb; they change the configuration in `conf/<config_name>.yaml`. Raises RunError if a launcher
+    fails.
     """
     # Hydra would print errors over several lines, and exit
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    job = Job(task, standing, cost)
     try:
         sys.argv = [sys.argv[0], *_options_last(words)]
         hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=config_name)(job)()

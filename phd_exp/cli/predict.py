@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import model_validator
 
-from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_folder, parsed, predicted
+from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_folder, predicted
 from phd_exp.records.detections import Detection, NumberOrName, detection_of
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import write_atomic
@@ -88,7 +88,7 @@ class PredictArguments(RunArguments):
 
 def main(words: list[str]) -> int:
     """Predict each detection; returns the exit status."""
-    arguments = parsed("predict", PredictArguments, words)
+    arguments = PredictArguments.parsed("predict", words)
     out = arguments.out
     if arguments.folder is not None:
         detections = detections_in(arguments.folder, object_name=arguments.object)
@@ -97,7 +97,10 @@ def main(words: list[str]) -> int:
         boxes = [{"box": box} for box in boxes_in(arguments.boxes, arguments.object)] if arguments.boxes else [{}]
         detections = [detection_of(arguments.image, arguments.of_camera | box) for box in boxes]
     if out is not None:
-        _require_possible(detections, out)
+        if find_spec("matplotlib") is None:
+            raise ConfigError("out: pictures need `pip install 'phd_exp[report]'`; without out= there is JSON alone")
+        if out.resolve() in {detection.file.resolve().parent for detection in detections}:
+            raise ConfigError(f"out={out}: holds the images themselves; choose another folder")
         output_folder(out)
     predictor = loaded(arguments)
     guarantee = predictor.guarantee(arguments.coverage, arguments.groups) if arguments.coverage else None
@@ -110,13 +113,6 @@ def main(words: list[str]) -> int:
     for sighting in predicted(predictor, detections):
         print(json.dumps(answer(sighting, predictor.temperature, guarantee), allow_nan=False), flush=True)
     return 0
-
-
-def _require_possible(detections: list[Detection], out: Path) -> None:
-    if find_spec("matplotlib") is None:
-        raise ConfigError("out: pictures need `pip install 'phd_exp[report]'`; without out= there is JSON alone")
-    if out.resolve() in {detection.file.resolve().parent for detection in detections}:
-        raise ConfigError(f"out={out}: holds the images themselves; choose another folder")
 
 
 def _write(predictor: "Predictor", detections: list[Detection], out: Path, curve: Any, guarantee: Any) -> None:

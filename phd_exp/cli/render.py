@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from phd_exp.cli.jobs import launch
+from phd_exp.cli.jobs import Job, launch
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError
 from phd_exp.rendering.bop import write_bop
@@ -13,7 +13,7 @@ from phd_exp.training.config import check_render
 
 def main(words: list[str]) -> int:
     """Render once, or (-m) every combination; returns the exit status."""
-    return launch(task, words, config_name="render")
+    return launch(Job(task), words, "render")
 
 
 def task(config: dict[str, Any], overrides: list[str], cores: int) -> None:

@@ -4,7 +4,7 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-from phd_exp.cli.arguments import Arguments, parsed
+from phd_exp.cli.arguments import Arguments
 from phd_exp.records.errors import UserError, writing
 
 
@@ -19,7 +19,7 @@ class ReportArguments(Arguments):
 
 def main(words: list[str]) -> int:
     """Print and write the report; returns the exit status."""
-    folders = parsed("report", ReportArguments, words)
+    folders = ReportArguments.parsed("report", words)
     if not folders.runs.is_dir():
         raise UserError(f"{folders.runs}: no such folder; train first, or name another by runs=DIR")
     from phd_exp.threads import one_thread  # imports torch

@@ -12,7 +12,7 @@ from hydra.errors import HydraException
 from hydra.utils import instantiate
 from pydantic import BaseModel, ConfigDict, Field
 
-from phd_exp.cli.arguments import Arguments, parsed
+from phd_exp.cli.arguments import Arguments
 from phd_exp.cli.frame import print_errors
 from phd_exp.cli.jobs import composed
 from phd_exp.cli.train import run_name, task
@@ -55,7 +55,7 @@ def main(words: list[str]) -> int:
         raise ConfigError("search needs Optuna: `pip install 'phd_exp[search]'`")
     file, keys = Path(words[0]), SearchArguments.model_fields
     ours = [word for word in words[1:] if word.partition("=")[0] in keys]
-    arguments = parsed("search", SearchArguments, ours)
+    arguments = SearchArguments.parsed("search", ours)
     try:
         space = Space.model_validate(parse_yaml(read_plain(file).decode()))
     except (OSError, ValueError) as error:

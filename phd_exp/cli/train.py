@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from phd_exp.cli.jobs import composed, launch
+from phd_exp.cli.jobs import Job, composed, launch
 from phd_exp.records.choices import RunName, has_influence, setting
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, RunError
@@ -37,7 +37,7 @@ SCORES = ("test/nll", "test/depth_error_mm")
 
 def main(words: list[str]) -> int:
     """Train once, or (-m) for every combination; returns the exit status."""
-    return launch(task, words, standing=standing, cost=cost)
+    return launch(Job(task, standing, cost), words)
 
 
 def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Sequence[Any] = ()) -> float | None:

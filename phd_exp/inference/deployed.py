@@ -9,7 +9,6 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image
 from torch import Tensor, nn
 from torch.export import Dim
 
@@ -18,7 +17,6 @@ from phd_exp.distributions import ProjectedHuber
 from phd_exp.geometry.virtual import facing, intrinsics, pixel_corners
 from phd_exp.inference.answers import LEVELS
 from phd_exp.inference.predictor import Predictor
-from phd_exp.inference.views import View
 from phd_exp.models.heads import Prediction
 
 FOCAL_LENGTHS = (5.0, 9.0)  # range for the comparison with torch, in sides of the image
@@ -43,9 +41,9 @@ class Deployed(nn.Module, ABC):
     def cases(self) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Prediction]]:
         """Inputs on which the graph is compared with `predict`: inputs, raw numbers, predictions in float64."""
 
-    @abstractmethod
     def answers(self, prediction: Prediction, *inputs: Tensor) -> dict[str, Tensor]:
         """The outputs after the raw numbers, in float64."""
+        return answers(prediction)
 
 
 class OfImages(Deployed):
@@ -58,9 +56,6 @@ class OfImages(Deployed):
         raw = self.predictor.outputs(image, self.predictor.camera(f).f)
         answers = self.answers(self.predictor.predict(raw.double(), f.double()), image, f)
         return (raw, *(value.float() for value in answers.values()))
-
-    def answers(self, prediction: Prediction, *inputs: Tensor) -> dict[str, Tensor]:
-        return answers(prediction)
 
     def cases(self) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Prediction]]:
         n, side = sum(BATCHES), self.predictor.side
@@ -98,10 +93,8 @@ class OfPhotographs(Deployed):
                 here[name] = (R.mT @ here[name][..., None])[..., 0]
         if "covariance" in here:
             here["covariance"] = R.mT @ here["covariance"] @ R
-            here["median_along_ray"], here["interval_along_ray"] = (
-                here.pop("median_depth"),
-                here.pop("depth_interval"),
-            )
+            here["median_along_ray"] = here.pop("median_depth")
+            here["interval_along_ray"] = here.pop("depth_interval")
         return here | {"ray": R[:, 2]}
 
     def cases(self) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Prediction]]:
@@ -112,10 +105,7 @@ class OfPhotographs(Deployed):
             K = intrinsics(f, 1.1 * f, 0.45 * width, 0.55 * height)
             middle, half = draw.uniform(0.1, 0.9, (n, 2)), draw.uniform(0.05, 0.3, (n, 2))
             boxes = np.concatenate([middle - half, middle + half], axis=1) * np.tile([width, height], 2)
-            views = [
-                View.of_box(Image.fromarray(photograph), K, tuple(box), predictor.side, "", predictor.largest_f)
-                for box in boxes.tolist()
-            ]
+            views = [predictor.view(photograph, K, tuple(box)) for box in boxes.tolist()]
             known = torch.tensor([view.camera.f for view in views], dtype=torch.float32)
             raw = predictor.raw(np.stack([view.image for view in views]), known)
             inputs = torch.from_numpy(photograph), torch.from_numpy(K), torch.from_numpy(boxes)

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion import Fused, Plane, Pose, Status, fuse, fuse_shared
@@ -59,7 +60,10 @@ def fused_answers(
     """
     truth = torch.stack([_true_position(scene) for scene in scenes])
     raw, f, pose, familiar = outputs(scenes, sightings)
-    rows, mask = layout([len(scene.detections) for scene in scenes])
+    # the views of each scene, padded to the most cameras, and which of them exist
+    counts = [len(scene.detections) for scene in scenes]
+    rows = pad_sequence(torch.arange(sum(counts)).split(counts), batch_first=True)
+    mask = torch.arange(rows.shape[1]) < torch.tensor(counts)[:, None]
     predictions = predictor.predict(raw[rows], f[rows])
     assert isinstance(predictions, ProjectedHuber)
     way = fuse if shared_scale is None else partial(fuse_shared, share=shared_scale)
@@ -90,15 +94,6 @@ def fused_region(answer: Mapping[str, Any], guarantees: Mapping[int, dict[str, A
     reach, volume = np.sqrt(scaled.diagonal()), 4 / 3 * np.pi * np.sqrt(np.linalg.det(scaled))
     extent = rounded(np.stack([mean - reach, mean + reach], -1))
     return {"region": facts | {"extent": extent, "volume": rounded(volume)}}
-
-
-def layout(counts: Sequence[int]) -> tuple[Int[Tensor, "scenes cameras"], Bool[Tensor, "scenes cameras"]]:
-    """The index of each scene's cameras in a sequence of views, padded, and the mask of cameras that exist."""
-    n = torch.tensor(counts)
-    place = torch.arange(int(n.max()))
-    mask = place < n[:, None]
-    first = n.cumsum(0) - n
-    return torch.where(mask, first[:, None] + place, 0), mask
 
 
 def _true_position(scene: Observed) -> Float[Tensor, "3"]:

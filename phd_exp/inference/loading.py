@@ -1,7 +1,7 @@
-"""From the folders of trained runs to a `Predictor`."""
+"""From the folders of trained runs to a `Predictor`: of one network, or of an ensemble whose members fit together."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,17 +10,20 @@ import torch
 
 from phd_exp.data.sources import RenderedSource
 from phd_exp.geometry.charts import DepthScale
-from phd_exp.inference.ensembles import members_of, require_alike
 from phd_exp.inference.predictor import Predictor
+from phd_exp.models.heads import DistributionHead
 from phd_exp.models.regressor import Regressor
+from phd_exp.records.choices import first_difference, has_influence
 from phd_exp.records.dataset import DatasetFolder
-from phd_exp.records.errors import RunError
+from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import RenderedConfig, RunConfig, check
 from phd_exp.training.config.targets import Trust
 from phd_exp.training.network import build_regressor, load_checkpoint, require_same_shrinking
 
 WEIGHTS = "regressor."  # prefix of the network's weights in a checkpoint
+OF_THE_INPUT = ("data.", "camera.", "model.head.")  # keys in which the members of an ensemble agree
+SIZES = ("data.n_train", "data.n_held_out", "data.n_test", "data.batch_size")  # of the data, in which they may differ
 
 
 def load(
@@ -44,10 +47,10 @@ def load(
         ConfigError: its configuration is invalid, names code that is not trusted, or cannot be recalibrated; or the
             runs do not fit together.
     """
-    folders, matters = members_of([run] if isinstance(run, str | Path) else run)
+    folders, matters = _members([run] if isinstance(run, str | Path) else run)
     first, *others = predictors = [_load(folder, device, trust) for folder in folders]
     if others or views > 1:
-        require_alike(folders, predictors, matters)
+        _require_alike(predictors, matters)
         state = next((one.state for one in predictors if one.state != "finished"), "finished")
         networks = tuple(other.regressor for other in others)
         first = replace(first, folders=tuple(folders), others=networks, views=views, state=state)
@@ -56,6 +59,35 @@ def load(
     from phd_exp.evaluation.predictions import fit_temperature  # imports pyarrow
 
     return replace(first, temperature=fit_temperature(first.held_out()))
+
+
+def _members(runs: Sequence[str | Path]) -> tuple[list[RunFolder], Callable[[str], bool]]:
+    """The runs to load, and which keys of theirs must be equal. A folder of seeds stands for its finished runs."""
+    folders = [RunFolder(Path(run)) for run in runs]
+    if len(folders) == 1 and not folders[0].config_file.exists():
+        seeds = [RunFolder(path) for path in sorted(folders[0].path.glob("seed*"))]
+        if finished := [seed for seed in seeds if seed.is_finished()]:
+            return finished, lambda key: has_influence(key) and key != "seed"
+    return folders, lambda key: has_influence(key) and key.startswith(OF_THE_INPUT) and key not in SIZES
+
+
+def _require_alike(predictors: Sequence[Predictor], matters: Callable[[str], bool]) -> None:
+    """Raise ConfigError unless the runs are members of one ensemble."""
+    first, place = predictors[0], predictors[0].folders[0].path
+    before = first.config.model_dump(mode="json")
+    for other in predictors:
+        difference = first_difference(before, other.config.model_dump(mode="json"), matters)
+        if difference is None and (first.depth, first.constant_f) != (other.depth, other.constant_f):
+            difference = f"constants.json with {first.depth}, but {other.depth}"
+        if difference:
+            raise ConfigError(
+                f"run: {place} has {difference} in {other.folders[0].path}; expected runs on one kind of data with "
+                "one camera and image size, and a folder of seeds with one configuration"
+            )
+    if not isinstance(first.regressor.head, DistributionHead):
+        raise ConfigError(
+            f"{place}: predicts no uncertainty, so that it joins no ensemble; expected model=probabilistic"
+        )
 
 
 def _load(folder: RunFolder, device: str, trust: Trust) -> Predictor:

@@ -42,16 +42,12 @@ TOLERANCE = 1e-5
 SMALL = 0.01  # size of an output of the network below which it is compared absolutely
 
 
-class ParityError(UserError):
-    """The exported file and torch disagree."""
-
-
 def export(predictor: Predictor, file: Path, coverage: float | None = None, photographs: bool = False) -> float:
     """Write the file after comparing it with torch; returns the largest relative deviation.
 
     With a coverage, the metadata has the level of its regions and their energy W at each depth precision a.
 
-    Raises ParityError, and writes no file, if that exceeds 1e-5.
+    Raises UserError, and writes no file, if that exceeds 1e-5.
     """
     deployed = (OfPhotographs if photographs else OfImages)(predictor).eval()
     model = graph(deployed)
@@ -65,7 +61,7 @@ def export(predictor: Predictor, file: Path, coverage: float | None = None, phot
     content = model.SerializeToString()
     deviation = largest_deviation(deployed, content)
     if not deviation <= TOLERANCE:
-        raise ParityError(
+        raise UserError(
             f"{file}: not written: it deviates from torch by {deviation:.2g}, more than {TOLERANCE:g}; "
             "another version of onnxruntime or torch may do better"
         )

@@ -48,7 +48,7 @@ def picture(
             figure.axes[0].plot(*camera.real_pixels(on_image).T, "--", color=_AMBER)
             axes.plot(*above.T, "k--", label=f"{100 * guarantee.coverage:g} % guaranteed")
         draw_birds_eye(axes, curves, _truth(sighting))
-        if sighting.view.is_turned:
+        if not np.array_equal(sighting.view.camera.R, np.eye(3)):
             axes.set(xlabel="x (m), camera turned to the box", ylabel="z (m), camera turned to the box")
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph", UserWarning)  # letters that the font lacks

@@ -13,17 +13,17 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
+from phd_exp.data.crops import cut
 from phd_exp.distributions import Mixture, ProjectedHuber, Temperature
 from phd_exp.distributions.columns import parameter_columns
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.geometry.motion import EIGHT, turned
-from phd_exp.geometry.virtual import Box, intrinsics
-from phd_exp.inference.ensembles import held_out_table
+from phd_exp.geometry.virtual import Box, VirtualCamera, intrinsics
 from phd_exp.inference.views import View, focal_lengths, image_batch
 from phd_exp.models.heads import DistributionHead, Prediction
 from phd_exp.models.regressor import Regressor
-from phd_exp.records.errors import ConfigError, RunError
+from phd_exp.records.errors import ConfigError, DatasetError, RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import RenderedConfig, RunConfig
 
@@ -109,10 +109,9 @@ class Predictor:
         """
         array = image_batch(images)
         height, width = array.shape[1:3]
-        cameras = [intrinsics(value, value, width / 2, height / 2) for value in focal_lengths(f, len(array))]
         views = [
-            View.of_box(Image.fromarray(image), K, None, self.side, f"image {row}")
-            for row, (image, K) in enumerate(zip(array, cameras, strict=True))
+            self.view(image, intrinsics(value, value, width / 2, height / 2))
+            for image, value in zip(array, focal_lengths(f, len(array)), strict=True)
         ]
         return self.see(views if images.ndim == 4 else views[0])
 
@@ -123,7 +122,20 @@ class Predictor:
                 f"{self.folders[0].path}: no Projected Huber densities, which recalibrate= and coverage= need; "
                 "expected a run of model=probabilistic"
             )
-        return held_out_table(self.folders, self.views)
+        if len(self.folders) > 1 and self.views > 1:
+            raise RunError(
+                f"views={self.views}: held-out predictions of several views are recorded for single runs alone"
+            )
+        files = [folder.held_out if self.views == 1 else folder.eight_views["held_out"] for folder in self.folders]
+        for file in files:
+            if not file.exists():
+                wanted = "data.n_held_out > 0" + (" and evaluation.eight_views=true" if self.views > 1 else "")
+                raise RunError(f"{file}: missing; held-out samples are needed: train with {wanted}")
+        from phd_exp.evaluation.parquet import read_table  # imports pyarrow
+        from phd_exp.evaluation.predictions import ensemble_table
+
+        tables = [read_table(file) for file in files]
+        return tables[0] if len(tables) == 1 else ensemble_table(tables)
 
     def guarantee(self, coverage: float, groups: "Groups | None" = None) -> "Guarantee":
         """Regions that contain the true position with a probability in (0, 1); see `evaluation.conformal`.
@@ -139,11 +151,20 @@ class Predictor:
     ) -> View:
         """The network's input for a box (left, top, right, bottom, px; None: all) in an image of a camera K.
 
-        Predictions for it are in the frame of `view.camera`; `view.camera.to_real` maps them back.
+        A small box is viewed with a focal length of `largest_f` pixels, and the pixels around it. Predictions are in
+        the frame of `view.camera`; `view.camera.to_real` maps them back.
+
         Raises DatasetError if the image is invalid or the box is outside the field of every pinhole camera.
         """
         (array,) = image_batch(image[None])
-        return View.of_box(Image.fromarray(array), K, box, self.side, "image", self.largest_f)
+        whole = (0, 0, array.shape[1], array.shape[0])
+        left, top, right, bottom = map(float, whole if box is None else box)
+        largest_f = math.inf if box is None else self.largest_f
+        try:
+            camera = VirtualCamera.of_box(K, (left, top, right, bottom), float(self.side), largest_f=largest_f)
+        except ValueError as error:
+            raise DatasetError(f"image: {error}") from None
+        return View(cut(Image.fromarray(array), camera), camera)
 
     def see(self, views: View | Sequence[View]) -> Prediction:
         """Predictions for views, each in the frame of its own virtual camera; for one view, one without a batch."""

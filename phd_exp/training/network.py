@@ -80,9 +80,7 @@ def precision(config: TrainerConfig) -> Any:
 
     Without such units bfloat16 is three times slower than float32 on a CPU (resnet18, 112 px).
     """
-    fast = cpu_has_bfloat16()
-    if has_gpu(config):
-        fast = torch.cuda.is_bf16_supported(including_emulation=False)
+    fast = torch.cuda.is_bf16_supported(including_emulation=False) if has_gpu(config) else cpu_has_bfloat16()
     return "bf16-mixed" if config.precision == "bfloat16" or (config.precision == "auto" and fast) else "32-true"
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from phd_exp.cli import train
 from phd_exp.cli.frame import run_verb
-from phd_exp.cli.jobs import launch
+from phd_exp.cli.jobs import Job, launch
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.detections import DetectionLine
 from phd_exp.records.errors import UserError
@@ -215,7 +215,7 @@ def test_overrides(
         train.run_name(check(config), overrides)
 
     def verb(words: list[str]) -> int:
-        return launch(task, words, standing=train.standing)
+        return launch(Job(task, train.standing), words)
 
     def law(words: list[str]) -> None:
         capfd.readouterr()

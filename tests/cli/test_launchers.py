@@ -17,7 +17,7 @@ from hydra.core.plugins import Plugins
 from hydra.experimental.callback import Callback
 
 from phd_exp.cli.frame import run_verb
-from phd_exp.cli.jobs import launch
+from phd_exp.cli.jobs import Job, launch
 from phd_exp.records.errors import UserError
 
 LAUNCHERS = {
@@ -57,7 +57,7 @@ def standing(config: dict[str, Any], overrides: list[str]) -> str | None:
 
 
 def main(words: list[str]) -> int:
-    return run_verb(lambda rest: launch(task, rest, standing=standing), words)
+    return run_verb(lambda rest: launch(Job(task, standing), rest), words)
 
 
 class Scores(Callback):

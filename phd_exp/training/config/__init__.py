@@ -20,8 +20,6 @@ from phd_exp.training.config.targets import Target, TrainingTarget, TrainingTarg
 
 __all__ = ["FolderConfig", "RenderConfig", "RenderedConfig", "RunConfig", "SourceConfig", "check", "check_render"]
 
-MULTIVIEW = ("scale", "multiview")  # a data set, and that of its scenes seen by several cameras
-
 Checked = TypeVar("Checked", bound=BaseModel)
 
 
@@ -121,7 +119,7 @@ class RunConfig(Record):
         asked, data = self.evaluation.multiview, self.data
         if asked is None or asked.scenes == 0 or not isinstance(data, RenderedConfig):
             return None
-        name = dict([MULTIVIEW]).get(data.name, f"{data.name}-{MULTIVIEW[1]}")
+        name = "multiview" if data.name == "scale" else f"{data.name}-multiview"
         changes = {"variant": name, "views": asked.views, "view_angle_range": asked.angle_range}
         return data.changed(changes, asked.scenes * asked.views)
 
