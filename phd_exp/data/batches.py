@@ -113,20 +113,17 @@ class BatchLoader:
             self.next_batch += 1
             rows = order[start : start + self.batch_size]
             batch = self.samples.select(rows[self.rank :: self.world])
-            yield self.augment(batch, self._numbers(signs[rows], number)) if self.augment else batch
+            if self.augment:
+                numbers = self._random(self.epoch, number).uniform(-1, 1, (len(rows), self.augment.n_numbers))
+                numbers[:, :3] = signs[rows] * np.abs(numbers[:, :3])
+                batch = self.augment(batch, torch.from_numpy(numbers[self.rank :: self.world]))
+            yield batch
 
     def order(self, epoch: int) -> Int[Tensor, " samples"]:
         """The rows in the order of an epoch."""
         if not self.shuffle:
             return torch.arange(len(self.samples))
         return torch.from_numpy(self._random(epoch).permutation(len(self.samples)))
-
-    def _numbers(self, signs: NDArray[np.int64], number: int) -> Float[Tensor, "share n_numbers"]:
-        """This process's share of the random numbers of a batch, given the signs of the first three of each row."""
-        assert self.augment is not None
-        numbers = self._random(self.epoch, number).uniform(-1, 1, (len(signs), self.augment.n_numbers))
-        numbers[:, :3] = signs * np.abs(numbers[:, :3])
-        return torch.from_numpy(numbers[self.rank :: self.world])
 
     def signs(self, epoch: int) -> NDArray[np.int64]:
         """The signs (samples, 3) of an epoch: every eight epochs, each sample gets all eight in random order."""

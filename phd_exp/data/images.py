@@ -1,4 +1,4 @@
-"""The images of a rendered data set, checked and shrunk."""
+"""The images of a rendered data set, checked and shrunk, and masks of where they show the object."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -12,9 +12,14 @@ from phd_exp.records.dataset import DatasetFolder, sha256
 from phd_exp.records.errors import DatasetError
 from phd_exp.records.images import recorded_image
 from phd_exp.records.scenes import SampleRecord, Split
+from phd_exp.rendering.rays import cylinder_mask, trace_pixels
+from phd_exp.rendering.triangles import Meshes
 
 SHRINKING = 2  # version of `shrunk`, recorded with each run and cache. Version 1 was exact for integer factors only.
 _LARGEST_STRIPE = 1 << 22  # values converted to float64 at once
+CELLS = 28  # cells along each side of a mask: 8 x 8 pixels of a render of 224
+RAYS = 4  # along each side of a cell
+DRAWING = 1  # version of `mask`, recorded with each cache
 
 
 def cached_images(
@@ -38,8 +43,32 @@ def cached_images(
         array[row] = shrunk(np.asarray(image), image_size)
 
     n, file = len(records), folder.cache / f"{split}-{len(records)}x{image_size}.npy"
-    key = {"shrinking": SHRINKING, "images": sha256("".join(record.sha256 for record in records).encode())}
+    key = {"shrinking": SHRINKING, "images": _checksum(records)}
     return cached(file, key, (n, image_size, image_size, 3), range(n), fill, f"decoding {split} images once")
+
+
+def cached_masks(folder: DatasetFolder, split: Split, records: Sequence[SampleRecord], meshes: Meshes) -> np.ndarray:
+    """The masks of the records as a memory-mapped array (n, CELLS, CELLS), uint8; see `mask`."""
+
+    def fill(array: np.ndarray, row: int) -> None:
+        array[row] = mask(records[row], meshes)
+
+    n, file = len(records), folder.cache / f"{split}-{len(records)}-masks.npy"
+    key = {"masks": DRAWING, "images": _checksum(records)}
+    return cached(file, key, (n, CELLS, CELLS), range(n), fill, f"drawing {split} masks once")
+
+
+def _checksum(records: Sequence[SampleRecord]) -> str:
+    return sha256("".join(record.sha256 for record in records).encode())
+
+
+def mask(record: SampleRecord, meshes: Meshes) -> np.ndarray:
+    """The share of each cell of the image that shows the object, from 0 to 255: (CELLS, CELLS), uint8."""
+    side = CELLS * RAYS
+    scene = record.shown.model_copy(update={"S": side, "f": record.f * side / record.S})
+    shown = cylinder_mask(trace_pixels(scene, meshes))
+    share = shown.reshape(CELLS, RAYS, CELLS, RAYS).mean((1, 3))
+    return np.rint(255 * share).astype(np.uint8)
 
 
 def shrunk(pixels: UInt8[np.ndarray, "height width 3"], side: int) -> UInt8[np.ndarray, "side side 3"]:

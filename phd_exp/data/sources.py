@@ -10,8 +10,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from phd_exp.data.batches import Batch
-from phd_exp.data.images import cached_images
-from phd_exp.data.masks import cached_masks
+from phd_exp.data.images import cached_images, cached_masks
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.scenes import SampleRecord, Split

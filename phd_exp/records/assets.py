@@ -1,13 +1,12 @@
 """The user's files that a data set is made from: meshes with their textures, and backdrops."""
 
-import hashlib
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field
 
-from phd_exp.records.files import MB, require_plain
+from phd_exp.records.files import MB, checksum, require_plain
 from phd_exp.records.parsing import Record
 
 LARGEST_MESH = 128 * MB  # bytes of a file, which has about a million faces as text
@@ -80,5 +79,4 @@ def _asset(folder: Path, files: list[Path]) -> Asset:
 
 @cache  # a configuration is checked more than once
 def _checksum(path: Path, changed_ns: int) -> str:
-    with open(path, "rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    return checksum(path)

@@ -19,7 +19,7 @@ from pydantic import Field, ValidationError
 
 from phd_exp.records.choices import first_difference
 from phd_exp.records.errors import DatasetError, gist
-from phd_exp.records.files import read_jsonl, read_plain, require_plain, write_atomic
+from phd_exp.records.files import read_jsonl, read_plain, write_atomic
 from phd_exp.records.parsing import Record
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec, ImageFormat, Shard
@@ -163,10 +163,3 @@ def image_name(index: int, image_format: ImageFormat = "png") -> str:
 def sha256(data: bytes) -> str:
     """Checksum, as records and manifests hold it."""
     return hashlib.sha256(data).hexdigest()
-
-
-def checksum(file: Path) -> str:
-    """The same for a plain file of any size. Raises OSError if it cannot be read."""
-    require_plain(file)
-    with open(file, "rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -2,6 +2,7 @@
 
 import errno
 import fcntl
+import hashlib
 import os
 import stat
 import uuid
@@ -41,6 +42,13 @@ def read_plain(path: Path, largest: int = LARGEST_RECORD) -> bytes:
     """The bytes of a plain file. Raises OSError if it cannot be read, or as `require_plain` does."""
     require_plain(path, largest)
     return path.read_bytes()
+
+
+def checksum(path: Path) -> str:
+    """SHA-256 of a plain file of any size. Raises OSError if it cannot be read."""
+    require_plain(path)
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def write_atomic(path: Path | str, data: bytes | str) -> None:

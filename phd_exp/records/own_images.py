@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from phd_exp.records.cameras import Calibration, read_camera
-from phd_exp.records.dataset import SPLITS, checksum, sha256
+from phd_exp.records.dataset import SPLITS, sha256
 from phd_exp.records.detections import Detection, line_of
 from phd_exp.records.errors import UNPRINTABLE, DatasetError, gist, listed, shown
-from phd_exp.records.files import read_jsonl
+from phd_exp.records.files import checksum, read_jsonl
 from phd_exp.records.foreign import Entry, format_of
 from phd_exp.records.parsing import parse_json
 from phd_exp.records.scenes import Pose, Split

@@ -6,7 +6,7 @@ its origin at the reference point and Blender's axes, z up: (x, -z, y) of glTF a
 """
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import AfterValidator, Field
 
@@ -14,6 +14,7 @@ from phd_exp.records.parsing import Record
 
 Split = Literal["train", "test"]
 Shape = Literal["cylinder", "cube", "sphere"]
+SHAPES: tuple[Shape, ...] = get_args(Shape)
 MeshName = Annotated[str, Field(pattern=r"^mesh[0-9]*$")]  # `mesh` is the user's object, the others are distractors
 Material = Literal["rubber", "metal"]
 LampName = Literal["key", "fill", "back"]

@@ -11,6 +11,7 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from phd_exp.records.scenes import Scene
 from phd_exp.rendering.pixels import Light
@@ -36,10 +37,8 @@ def smoothed(light: Light, surfaces: Labels, scene: Scene) -> Light:
 
 def edges(surfaces: Labels, reach: int) -> Mask:
     """Pixels (S, S) with another surface within `reach` columns and rows."""
-    low, high = surfaces, surfaces
-    for axis in (0, 1):
-        low, high = _extreme(np.minimum, low, reach, axis), _extreme(np.maximum, high, reach, axis)
-    return np.asarray(low != high)
+    size = 2 * reach + 1
+    return np.asarray(ndimage.minimum_filter(surfaces, size) != ndimage.maximum_filter(surfaces, size))
 
 
 @cache  # the same for every picture
@@ -72,17 +71,6 @@ def _donors(surfaces: Labels, seen: Labels, x: Light, y: Light) -> tuple[NDArray
         row[hit], column[hit] = near[0][found], near[1][found]
         lost = tuple(axis[~found] for axis in lost)
     return row, column
-
-
-def _extreme(ufunc: np.ufunc, values: Labels, reach: int, axis: int) -> Labels:
-    """The largest or smallest value within `reach` along one axis of the image."""
-    result = values.copy()
-    towards = np.moveaxis(result, axis, 0)
-    source = np.moveaxis(values, axis, 0)
-    for step in range(1, reach + 1):
-        ufunc(towards[step:], source[:-step], out=towards[step:])
-        ufunc(towards[:-step], source[step:], out=towards[:-step])
-    return result
 
 
 _STEPS = range(-REACH, REACH + 1)

@@ -18,7 +18,7 @@ from phd_exp.records.scenes import Scene
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.importing import import_meshes
 from phd_exp.rendering.pixels import Light, read_light
-from phd_exp.rendering.stage import build_stage
+from phd_exp.rendering.stage import build_stage, show_scene
 from phd_exp.rendering.surroundings import World
 from phd_exp.rendering.triangles import Meshes
 
@@ -96,7 +96,7 @@ class Renderer:
         self._output = place / f"phd_exp-{uuid.uuid4().hex}.exr"
         with silence():
             self._bpy = load_bpy()
-            self._stage = build_stage(self._bpy)
+            build_stage(self._bpy)
             self._scene = self._bpy.context.scene
             _configure_image(self._scene)
             _configure_tracer(self._scene.cycles, settings)
@@ -113,7 +113,7 @@ class Renderer:
         """
         box = box or Box(0, 0, scene.S, scene.S)
         self._frame(box, scene.S)
-        self._stage.show(scene, self.meshes)
+        show_scene(self._bpy, scene, self.meshes)
         if self._world and scene.surroundings:
             self._world.show(scene.surroundings)
         self._scene.cycles.seed = scene.noise_seed

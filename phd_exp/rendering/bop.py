@@ -25,20 +25,19 @@ from phd_exp.records.errors import writing
 from phd_exp.records.files import write_atomic
 from phd_exp.records.foreign import CORNER, METRE
 from phd_exp.records.images import content_of
-from phd_exp.records.scenes import SampleRecord
+from phd_exp.records.scenes import SHAPES, SampleRecord
 from phd_exp.rendering import rays
 from phd_exp.rendering.meshes import build_mesh
 from phd_exp.rendering.pixels import file_of
 from phd_exp.rendering.progress import shown_progress
 from phd_exp.rendering.triangles import NO_MESHES, Meshes, Triangles
 
-SOLIDS = ("cylinder", "cube", "sphere")
 ROUND_ABOUT = {"cylinder": [[0, 0, 1]], "cube": [], "sphere": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}
 
 
 def number_of(shape: str) -> int:
     """The number of an object's model: 1 to 3 for the solids, 4 for `mesh`, 5 for `mesh1`, ..."""
-    return SOLIDS.index(shape) + 1 if shape in SOLIDS else len(SOLIDS) + 1 + int(shape.removeprefix("mesh") or 0)
+    return SHAPES.index(shape) + 1 if shape in SHAPES else len(SHAPES) + 1 + int(shape.removeprefix("mesh") or 0)
 
 
 def write_bop(folder: DatasetFolder, bop: Path, meshes: Meshes = NO_MESHES) -> int:
@@ -60,10 +59,8 @@ def write_bop(folder: DatasetFolder, bop: Path, meshes: Meshes = NO_MESHES) -> i
                 write_atomic(target / "rgb" / record.file_name, content)
                 hits, numbers = rays.trace_pixels(record.shown, meshes), range(len(record.objects))
                 tables["gt"][record.index] = [_pose(record, number) for number in numbers]
-                silhouettes = [rays.silhouette(record.shown, number, meshes) for number in numbers]
                 tables["gt_info"][record.index] = [
-                    _write_mask(record, number, hits, silhouette, target)
-                    for number, silhouette in enumerate(silhouettes)
+                    _write_mask(record, number, hits, meshes, target) for number in numbers
                 ]
                 tables["camera"][record.index] = _camera(record, several)
                 advance()
@@ -96,11 +93,10 @@ def _pose(record: SampleRecord, number: int) -> dict[str, Any]:
     }
 
 
-def _write_mask(
-    record: SampleRecord, number: int, hits: rays.Hits, silhouette: tuple[rays.Mask, range, range], target: Path
-) -> dict[str, Any]:
+def _write_mask(record: SampleRecord, number: int, hits: rays.Hits, meshes: Meshes, target: Path) -> dict[str, Any]:
     """Write the mask of an object; returns its boxes and pixels, of which those outside the image are not visible."""
-    mask, (whole, rows, columns) = rays.cylinder_mask(hits, number), silhouette
+    mask = rays.cylinder_mask(hits, number)
+    whole, rows, columns = rays.silhouette(record.shown, number, meshes)
     file = target / "mask_visib" / f"{record.index:06d}_{number:06d}.png"
     write_atomic(file, file_of(Image.fromarray(np.uint8(255) * mask), "png"))
     return {

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from PIL import Image
 
-from phd_exp.records.dataset import SPLITS, DatasetFolder, Seal, checksum
+from phd_exp.records.dataset import SPLITS, DatasetFolder, Seal
 from phd_exp.records.errors import DatasetError, RenderError, UserError, writing
-from phd_exp.records.files import write_atomic
+from phd_exp.records.files import checksum, write_atomic
 from phd_exp.records.images import recorded_image
 from phd_exp.records.processes import announce
 from phd_exp.records.scenes import SampleRecord, Split

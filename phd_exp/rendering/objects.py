@@ -5,10 +5,10 @@ import math
 import numpy as np
 
 from phd_exp.records.assets import PHOTOS
-from phd_exp.records.scenes import Quaternion, Scene, SceneObject, Split, Surroundings, Vector
+from phd_exp.records.scenes import SHAPES, Quaternion, Scene, SceneObject, Split, Surroundings, Vector
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.rays import rotation_matrix
-from phd_exp.rendering.sampling import SHAPES, SIZE, Purpose, draw_object, sample_scene, scene_and_view, stream_of
+from phd_exp.rendering.sampling import SIZE, Purpose, draw_object, sample_scene, stream_of
 from phd_exp.rendering.triangles import Meshes
 
 REACH = SIZE * 0.5**0.5  # m, from the cylinder's centre to its rim
@@ -21,7 +21,7 @@ def sample_object_scene(spec: DatasetSpec, split: Split, index: int, meshes: Mes
 
     It is paired with that of `sample_scene`: the pose, the lamps and the panel are the cylinder's.
     """
-    scene, (number, _) = sample_scene(spec, split, index), scene_and_view(spec, index)
+    scene, number = sample_scene(spec, split, index), index // spec.views
     cylinder, *panel = scene.objects
     mesh = meshes["mesh"]
     around, turn = _surroundings(spec, split, number)

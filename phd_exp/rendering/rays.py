@@ -49,7 +49,7 @@ def trace_pixels(scene: Scene, meshes: Meshes = NO_MESHES) -> Hits:
             hits.depths[number] = meshes[item.shape].depths(*_placed(scene, item), scene.f, scene.S)
             hits.surfaces[number] = np.where(np.isfinite(hits.depths[number]), 1 + FACES * number, NOTHING)
             continue
-        rows, columns = (_clipped(span, scene.S) for span in window(scene, item))
+        rows, columns = (range(max(span.start, 0), min(span.stop, scene.S)) for span in window(scene, item))
         if rows and columns:
             x, y = pixel_middles(rows, columns)
             place = (number, slice(rows.start, rows.stop), slice(columns.start, columns.stop))
@@ -149,10 +149,6 @@ def _shadow(off_axis: float, z: float, radius: float, scene: Scene) -> range:
     angle, width = math.atan2(off_axis, z), math.asin(radius / math.hypot(off_axis, z))
     first, last = (scene.f * math.tan(min(max(angle + side, -1.5), 1.5)) + scene.S / 2 for side in (-width, width))
     return range(math.floor(first), math.ceil(last))
-
-
-def _clipped(span: range, side: int) -> range:
-    return range(max(span.start, 0), min(span.stop, side))
 
 
 def _cast(scene: Scene, number: int, x: Image, y: Image) -> tuple[Image, Labels]:

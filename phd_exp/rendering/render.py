@@ -32,6 +32,8 @@ from phd_exp.rendering.blender import require_bpy
 from phd_exp.rendering.progress import shown_progress
 from phd_exp.rendering.sealing import Known, Wanted, begin, known_samples, missing, seal
 
+Samples = Sequence[tuple[Split, int]]
+"""Split and index of each sample."""
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # of each worker
 FEWEST_PER_WORKER = 8  # starting one more process costs about as much as rendering this many images
 WAITING = "waiting for it to finish"
@@ -63,8 +65,6 @@ def ensure_rendered(
         DatasetError: the folder holds another data set, or a broken one.
         RenderError: bpy is missing, a worker died, the folder cannot be written.
     """
-    if workers is not None and workers < 1:
-        raise RenderError(f"workers={workers}: expected a number of processes, at least 1")
     if not any(folder.missing(spec, n_train, n_test).values()):
         return True
     require_bpy()
@@ -78,8 +78,11 @@ def ensure_rendered(
                     return True
                 begin(folder, spec)
             known = known_samples(folder)
+            samples = [sample for sample in missing(known, wanted) if shard is None or shard.holds(sample[1])]
             try:
-                rendered = render_missing(folder, spec, wanted, known, workers, shard, cores)
+                if samples:
+                    workers = workers or worker_count(len(samples), cores)
+                    _render(folder, spec, samples, known, workers, shard)
             except UserError:
                 if not any(known.values()):  # the next command may have another specification
                     folder.manifest_path.unlink(missing_ok=True)
@@ -87,7 +90,7 @@ def ensure_rendered(
             if shard is None:
                 seal(folder, known)
                 return True
-        if not rendered:
+        if not samples:
             announce(f"{folder.root}: nothing left to render in shard {shard}")
         return _seal_if_last(folder, wanted, shard)
 
@@ -122,23 +125,13 @@ def _seal_if_last(folder: DatasetFolder, wanted: Wanted, shard: Shard) -> bool:
     return alone and not left
 
 
-def render_missing(
-    folder: DatasetFolder,
-    spec: DatasetSpec,
-    wanted: Wanted,
-    known: Known,
-    workers: int | None = None,
-    shard: Shard | None = None,
-    cores: int | None = None,
-) -> int:
-    """Render the wanted samples, all or those of a shard, that `known` lacks; adds them and returns their number.
+def _render(
+    folder: DatasetFolder, spec: DatasetSpec, samples: Samples, known: Known, workers: int, shard: Shard | None
+) -> None:
+    """Render samples and add them to `known`.
 
     The caller holds the locks. Each record is written to the journal as soon as its image is on disk.
     """
-    samples = [(split, index) for split, index in missing(known, wanted) if shard is None or shard.holds(index)]
-    if not samples:
-        return 0
-    workers = workers or worker_count(len(samples), cores)
     announce(_first_words(folder, spec, len(samples), workers, resumed=any(known.values())))
     begun = time.monotonic()
     title = spec.variant if shard is None else f"{spec.variant} {shard}"
@@ -151,13 +144,12 @@ def render_missing(
             advance()
     seconds = time.monotonic() - begun
     announce(f"rendered {len(samples)} images in {duration(seconds)}, {len(samples) / seconds:.1f} a second")
-    return len(samples)
 
 
 def render_all(
-    folder: DatasetFolder, spec: DatasetSpec, samples: Sequence[tuple[Split, int]], workers: int
+    folder: DatasetFolder, spec: DatasetSpec, samples: Samples, workers: int
 ) -> Generator[SampleRecord, None, None]:
-    """Render samples, given by split and index, and yield each record as soon as its image is on disk.
+    """Render samples and yield each record as soon as its image is on disk.
 
     Each worker renders one sample at a time and gets the next after the consumer has processed its last record, so
     that a kill loses at most one sample per worker. If the consumer stops early or a worker fails, no further sample

@@ -16,7 +16,7 @@ from phd_exp.rendering.blender import Box, Renderer, Settings
 from phd_exp.rendering.objects import sample_object_scene
 from phd_exp.rendering.pixels import Light, Pixels, encode, encoded
 from phd_exp.rendering.rays import NOTHING, Hits, Mask, in_camera_frame, trace_pixels, truncation, visibility
-from phd_exp.rendering.sampling import sample_scene, scene_and_view
+from phd_exp.rendering.sampling import sample_scene
 from phd_exp.rendering.surroundings import photo_light, shaken
 from phd_exp.rendering.triangles import Meshes
 
@@ -42,7 +42,7 @@ def describe(
     spec: DatasetSpec, split: Split, index: int, scene: Scene, hits: Hits, checksum: str, meshes: Meshes
 ) -> SampleRecord:
     """The record of a sample, given the scene, what the rays of its pixels hit, and the image's checksum."""
-    number, view = scene_and_view(spec, index)
+    number, view = divmod(index, spec.views)
     cylinder = scene.objects[0]
     position = in_camera_frame(np.array(cylinder.position), scene.pose).tolist()
     return SampleRecord(

@@ -3,12 +3,14 @@
 import colorsys
 import math
 from enum import IntEnum
+from functools import partial
 from typing import get_args
 
 import numpy as np
 
 from phd_exp.records.scenes import (
     FIRST_VIEW,
+    SHAPES,
     Backdrop,
     Lamp,
     LampName,
@@ -16,7 +18,6 @@ from phd_exp.records.scenes import (
     Quaternion,
     Scene,
     SceneObject,
-    Shape,
     Split,
     Vector,
 )  # fmt: skip
@@ -52,7 +53,6 @@ class Purpose(IntEnum):
     DISTRACTORS = 70  # followed by the number of each
 
 
-SHAPES: tuple[Shape, ...] = get_args(Shape)
 POSE, LOOK, SCALE = range(3)
 
 # (name, direction from the middle of the scene, side in m, power in W). The lamps are far away: across two metres of
@@ -70,21 +70,13 @@ def generator_version(spec: DatasetSpec) -> int:
     return GENERATOR_VERSION if spec.mesh is None else OBJECT_VERSION
 
 
-def scene_and_view(spec: DatasetSpec, index: int) -> tuple[int, int]:
-    """Number of the scene that a sample shows, within its split, and of the view."""
-    return divmod(index, spec.views)
-
-
 def sample_scene(spec: DatasetSpec, split: Split, index: int) -> Scene:
     """Draw the scene of one sample, a pure function of the three arguments.
 
     Source: paper, section "Dataset"; lamps after CLEVR (key, fill and back area lamps with jitter).
     """
-    number, view = scene_and_view(spec, index)
-
-    def stream(purpose: int) -> Stream:
-        return stream_of(spec, split, number, purpose)
-
+    number, view = divmod(index, spec.views)
+    stream = partial(stream_of, spec, split, number)
     f = _uniform(stream(Purpose.CAMERA), spec.f_range)
     objects = []
     for place, shape in enumerate(SHAPES if spec.occluders else SHAPES[:1]):
@@ -102,7 +94,7 @@ def sample_scene(spec: DatasetSpec, split: Split, index: int) -> Scene:
         backdrop=_backdrop(stream(Purpose.BACKDROP)),
         noise_seed=_seed(stream(Purpose.NOISE)),
     )
-    return _seen_again(scene, spec, stream_of(spec, split, number, Purpose.VIEW, view)) if view else scene
+    return _seen_again(scene, spec, stream(Purpose.VIEW, view)) if view else scene
 
 
 def about_axis(axis: Vector, angle: float) -> Quaternion:

@@ -4,20 +4,19 @@ Blender's camera looks along -z with y up, ours along z with y down: p_blender =
 Blender's module or its objects; this file does not import it.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from phd_exp.records.scenes import Backdrop, Lamp, LampName, Material, Scene, SceneObject, Shape
+from phd_exp.records.scenes import SHAPES, Backdrop, Lamp, LampName, Material, Scene, SceneObject, Shape
 from phd_exp.rendering.meshes import build_mesh
 from phd_exp.rendering.pixels import linear
 from phd_exp.rendering.rays import rotation_matrix
 
 TO_BLENDER = np.diag([1.0, -1.0, -1.0])
 SENSOR_WIDTH = 36.0  # mm; arbitrary, because the focal length has the same unit
-SHAPES: tuple[Shape, ...] = get_args(Shape)
 # Inputs of Principled BSDF. Rubber is matt with a faint sheen; metal reflects the lamps as soft boxes and its
 # neighbours as blurs.
 SURFACES: dict[Material, dict[str, float]] = {
@@ -28,42 +27,38 @@ SURFACES: dict[Material, dict[str, float]] = {
 SURROUNDINGS = (0.10, 0.75)
 
 
-class Stage:
-    """The parts of Blender's open file that change from scene to scene, found by name."""
-
-    def __init__(self, bpy: Any) -> None:
-        self._data = bpy.data
-
-    def show(self, scene: Scene, meshes: Iterable[str]) -> None:
-        """Arrange everything as in a scene; `meshes` are the names of imported objects."""
-        objects = self._data.objects
-        objects["camera"].data.lens = scene.f * SENSOR_WIDTH / scene.S
-        # p_scene = R^T (p_camera - translation), with Blender's axes in both frames
-        back = rotation_matrix(scene.pose.rotation).T
-        objects["camera"].matrix_world = matrix_of(back @ TO_BLENDER, -back @ np.array(scene.pose.translation))
-        for shape in (*SHAPES, *meshes):
-            objects[shape].hide_render = True
-        for item in scene.objects:
-            self._place_object(objects[item.shape], item)
-        for name in get_args(LampName):
-            objects[name].hide_render = not scene.lamps
-        for lamp in scene.lamps:
-            _place_lamp(objects[lamp.name], lamp)
-        show_backdrop(self._data.worlds["world"].node_tree.nodes, scene.backdrop)
-
-    def _place_object(self, handle: Any, item: SceneObject) -> None:
-        handle.hide_render = False
-        size = 0.5 * np.array(item.dimensions) if item.shape in SHAPES else np.ones(3)
-        stretch = item.scale * size
-        handle.matrix_world = matrix_of(rotation_matrix(item.rotation) * stretch, np.array(item.position))
-        if handle.data.materials[0] is not None:  # its own
-            return
-        handle.color = (*(linear(channel) for channel in item.colour), 1.0)
-        handle.material_slots[0].link = "OBJECT"
-        handle.material_slots[0].material = self._data.materials[item.material]
+def show_scene(bpy: Any, scene: Scene, meshes: Iterable[str] = ()) -> None:
+    """Arrange everything on the stage as in a scene; `meshes` are the names of imported objects."""
+    objects = bpy.data.objects
+    objects["camera"].data.lens = scene.f * SENSOR_WIDTH / scene.S
+    # p_scene = R^T (p_camera - translation), with Blender's axes in both frames
+    back = rotation_matrix(scene.pose.rotation).T
+    objects["camera"].matrix_world = matrix_of(back @ TO_BLENDER, -back @ np.array(scene.pose.translation))
+    for shape in (*SHAPES, *meshes):
+        objects[shape].hide_render = True
+    for item in scene.objects:
+        _place_object(bpy, item)
+    for name in get_args(LampName):
+        objects[name].hide_render = not scene.lamps
+    for lamp in scene.lamps:
+        _place_lamp(objects[lamp.name], lamp)
+    show_backdrop(bpy.data.worlds["world"].node_tree.nodes, scene.backdrop)
 
 
-def build_stage(bpy: Any) -> Stage:
+def _place_object(bpy: Any, item: SceneObject) -> None:
+    handle = bpy.data.objects[item.shape]
+    handle.hide_render = False
+    size = 0.5 * np.array(item.dimensions) if item.shape in SHAPES else np.ones(3)
+    stretch = item.scale * size
+    handle.matrix_world = matrix_of(rotation_matrix(item.rotation) * stretch, np.array(item.position))
+    if handle.data.materials[0] is not None:  # its own
+        return
+    handle.color = (*(linear(channel) for channel in item.colour), 1.0)
+    handle.material_slots[0].link = "OBJECT"
+    handle.material_slots[0].material = bpy.data.materials[item.material]
+
+
+def build_stage(bpy: Any) -> None:
     """Empty Blender's file and fill it with one of each thing that a scene can contain."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     for material, surface in SURFACES.items():
@@ -85,8 +80,7 @@ def build_stage(bpy: Any) -> Stage:
     bpy.context.scene.camera = _add(bpy, "camera", camera)
     world = bpy.context.scene.world = bpy.data.worlds.new("world")
     world.cycles.sampling_method = "NONE"  # an importance map is not worth it for such smooth light
-    paint_world(world.node_tree)
-    return Stage(bpy)
+    _paint_world(world.node_tree)
 
 
 def _add(bpy: Any, name: str, data: Any) -> Any:
@@ -130,17 +124,14 @@ def _facing(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.column_stack([right, np.cross(back, right), back])
 
 
-def paint_world(tree: Any) -> None:
+def _paint_world(tree: Any) -> None:
     """Make a new world's node tree the backdrop for the camera, and the surroundings for all other rays.
 
     The backdrop is no surface: it receives no shadow and no light from the objects, which could reveal where they
     are, and it costs no samples.
     """
     tree.nodes.clear()
-    output = tree.nodes.new("ShaderNodeOutputWorld")
-    shader = tree.nodes.new("ShaderNodeBackground")
-    mix = tree.nodes.new("ShaderNodeMix")
-    rays = tree.nodes.new("ShaderNodeLightPath")
+    output, shader, mix, rays = new_nodes(tree, "OutputWorld", "Background", "Mix", "LightPath")
     tree.links.new(rays.outputs["Is Camera Ray"], mix.inputs["Factor"])
     tree.links.new(_surroundings_nodes(tree), mix.inputs["A"])
     tree.links.new(_backdrop_nodes(tree), mix.inputs["B"])
@@ -149,12 +140,14 @@ def paint_world(tree: Any) -> None:
     shader.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
 
 
+def new_nodes(tree: Any, *kinds: str) -> Iterator[Any]:
+    """Add a shader node of each kind to a node tree."""
+    return (tree.nodes.new(f"ShaderNode{kind}") for kind in kinds)
+
+
 def _backdrop_nodes(tree: Any) -> Any:
     """level + slope |window - centre|^2, with slope = -level falloff; `show_backdrop` finds the nodes by name."""
-    window = tree.nodes.new("ShaderNodeTexCoord")
-    offset = tree.nodes.new("ShaderNodeVectorMath")
-    square = tree.nodes.new("ShaderNodeVectorMath")
-    line = tree.nodes.new("ShaderNodeMath")
+    window, offset, square, line = new_nodes(tree, "TexCoord", "VectorMath", "VectorMath", "Math")
     offset.name, line.name = "offset", "line"
     offset.operation, square.operation, line.operation = "SUBTRACT", "DOT_PRODUCT", "MULTIPLY_ADD"
     tree.links.new(window.outputs["Window"], offset.inputs[0])
@@ -174,9 +167,7 @@ def show_backdrop(nodes: Any, backdrop: Backdrop) -> None:
 
 def _surroundings_nodes(tree: Any) -> Any:
     """Brightness by the height of a direction, from straight below to straight above."""
-    direction = tree.nodes.new("ShaderNodeTexCoord")
-    split = tree.nodes.new("ShaderNodeSeparateXYZ")
-    ramp = tree.nodes.new("ShaderNodeMapRange")
+    direction, split, ramp = new_nodes(tree, "TexCoord", "SeparateXYZ", "MapRange")
     ramp.inputs["From Min"].default_value, ramp.inputs["From Max"].default_value = -1.0, 1.0
     ramp.inputs["To Min"].default_value, ramp.inputs["To Max"].default_value = SURROUNDINGS
     tree.links.new(direction.outputs["Generated"], split.inputs["Vector"])

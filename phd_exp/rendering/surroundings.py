@@ -19,7 +19,7 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.pixels import Light, linear
 from phd_exp.rendering.rays import rotation_matrix
 from phd_exp.rendering.sampling import about_axis
-from phd_exp.rendering.stage import matrix_of
+from phd_exp.rendering.stage import matrix_of, new_nodes
 
 GROUND = 1000.0  # m: side of the plane
 IMPORTANCE_MAP = 512  # px: that of a sky's own resolution, 1024, would take a second for each image
@@ -68,7 +68,7 @@ class World:
 def _paint_sky(tree: Any) -> None:
     tree.nodes.clear()
     kinds = ("TexCoord", "Mapping", "TexEnvironment", "Background", "OutputWorld")
-    directions, turn, panorama, light, output = (tree.nodes.new(f"ShaderNode{kind}") for kind in kinds)
+    directions, turn, panorama, light, output = new_nodes(tree, *kinds)
     turn.name, panorama.name, light.name = "turn", "panorama", "light"
     tree.links.new(directions.outputs["Generated"], turn.inputs["Vector"])
     tree.links.new(turn.outputs["Vector"], panorama.inputs["Vector"])

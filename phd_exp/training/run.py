@@ -15,9 +15,9 @@ from phd_exp.data.images import SHRINKING
 from phd_exp.data.sources import PARTS, Part
 from phd_exp.distributions.columns import Columns
 from phd_exp.records.choices import first_difference, flatten
-from phd_exp.records.dataset import DatasetFolder, checksum
+from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, RunError, gist, shown
-from phd_exp.records.files import remove_temporaries
+from phd_exp.records.files import checksum, remove_temporaries
 from phd_exp.records.own_images import DetectionFolder
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import build_data, build_module

@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from phd_exp.records.scenes import Scene
+from phd_exp.records.scenes import SHAPES, Scene
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer, Settings, load_bpy, silence
 from phd_exp.rendering.pixels import encoded
 from phd_exp.rendering.samples import fast_settings, make_sample
 from phd_exp.rendering.sampling import sample_scene
-from phd_exp.rendering.stage import SHAPES, SURFACES, Stage, build_stage
+from phd_exp.rendering.stage import SURFACES, build_stage, show_scene
 
 Paint = Callable[[Scene, int, Path], None]
 
@@ -55,7 +55,7 @@ def conventional(spec: DatasetSpec, folder: Path, samples: int) -> Paint:
     def paint(scene: Scene, index: int, path: Path) -> None:
         with silence():
             bpy.ops.wm.open_mainfile(filepath=str(base))
-        Stage(bpy).show(scene)
+        show_scene(bpy, scene)
         bpy.context.scene.cycles.seed = scene.noise_seed
         _shoot(bpy, path)
         _flatten(bpy)

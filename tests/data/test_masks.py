@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from phd_exp.data.datamodule import PositionData
-from phd_exp.data.masks import CELLS, mask
+from phd_exp.data.images import CELLS, mask
 from phd_exp.data.sources import RenderedSource
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.spec import DatasetSpec

@@ -113,11 +113,6 @@ def test_an_image_that_cannot_be_written_is_one_line(
     ]
 
 
-def test_no_workers_is_refused(folder: DatasetFolder, small_spec: DatasetSpec) -> None:
-    with pytest.raises(RenderError, match="workers=0: expected"):
-        ensure_rendered(folder, small_spec, 1, 1, workers=0)
-
-
 def test_few_samples_take_few_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("phd_exp.rendering.render.usable_cores", lambda: 16)
     assert [worker_count(tasks) for tasks in (1, 8, 9, 64, 10_000)] == [1, 1, 2, 8, 16]
