@@ -17,7 +17,6 @@ from phd_exp.fusion.pose import Plane, Pose
 from phd_exp.fusion.problems import Problems, Status
 from phd_exp.threads import one_thread
 
-_NO_LEVELS = np.empty(0)
 # `kernels` and `moments` are imported in the functions that use them: importing numba takes a second
 
 
@@ -72,7 +71,7 @@ class Fused:
             return self.shared[1:]
         problems, fused = self.problems, self.status.cpu().flatten() == Status.FUSED
         alone, alone_mean, alone_covariance = problems.alone()
-        u, C, _ = self._quadrature(fused & ~alone)
+        u, C, _ = self._quadrature(fused & ~alone, np.empty(0))
         mean = problems.in_world(u)
         covariance = problems.directions @ C @ problems.directions.mT
         mean[alone], covariance[alone] = alone_mean, alone_covariance
@@ -91,7 +90,7 @@ class Fused:
         return _entered(self._quadrature(fused, radii)[2], self.status)
 
     def _quadrature(
-        self, chosen: Bool[Tensor, " flat"], radii: Float[np.ndarray, " levels"] = _NO_LEVELS
+        self, chosen: Bool[Tensor, " flat"], radii: Float[np.ndarray, " levels"]
     ) -> tuple[Float[Tensor, "flat 3"], Float[Tensor, "flat 3 3"], Float[Tensor, "flat levels"]]:
         """The results of `moments` for the chosen problems, NaN for the others."""
         from phd_exp.fusion.kernels import all_moments

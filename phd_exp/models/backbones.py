@@ -44,7 +44,7 @@ class Backbone(nn.Module):
     """
 
     n_features: int
-    locates: bool
+    locates: bool = False
     segments: bool = False
 
     def forward(self, pixels: Float[Tensor, "batch 3 height width"]) -> BackboneOutput:
@@ -53,8 +53,6 @@ class Backbone(nn.Module):
 
 class PooledFeatures(Backbone):
     """A network from images to feature vectors, or to feature maps, which are averaged over the image."""
-
-    locates = False
 
     def __init__(self, network: nn.Module, n_features: int) -> None:
         super().__init__()

@@ -4,8 +4,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from phd_exp.optimizers import Muon
-from phd_exp.optimizers.muon import orthogonal
+from phd_exp.optimizers.muon import Muon, orthogonal
 
 
 def network() -> nn.Sequential:
