@@ -91,6 +91,7 @@ class Surroundings(Record):
         flipped: whether the photograph's left and right are exchanged.
         ground: a point of the plane on which the object stands, scene frame, m.
         shake: path of the image during the exposure, right and down, px.
+        span: factor of the field of view in which the camera shows a sky; its light comes from the true directions.
     """
 
     pitch: Finite
@@ -102,6 +103,7 @@ class Surroundings(Record):
     flipped: bool
     ground: Vector | None
     shake: tuple[Finite, Finite]
+    span: Positive
 
 
 class Pose(Record):

@@ -13,6 +13,7 @@ from phd_exp.rendering.triangles import Meshes
 
 REACH = SIZE * 0.5**0.5  # m, from the cylinder's centre to its rim
 BRIGHTNESS = (0.5, 2.0)  # factors of a sky's light
+LARGEST_SPAN = 8.0  # of a sky: 8 degrees, all that a long lens sees, are 23 pixels of Blender's panoramas
 LEAST_SIDE = 0.4  # of a photograph's square, in units of its shorter side
 
 
@@ -54,6 +55,7 @@ def _surroundings(spec: DatasetSpec, split: Split, number: int) -> tuple[Surroun
         flipped=bool(rng.random() < 0.5),
         ground=None,
         shake=(path * math.cos(direction), path * math.sin(direction)),
+        span=LARGEST_SPAN ** rng.random(),
     )
     return around, object_turn
 

@@ -63,13 +63,25 @@ class World:
         nodes["light"].inputs["Strength"].default_value = around.brightness
         # a panorama's vertical is z, the level camera's is Blender's y
         nodes["turn"].inputs["Rotation"].default_value = (math.pi / 2 - around.pitch, 0.0, around.turn)
+        nodes["span"].inputs[1].default_value = around.span - 1
 
 
 def _paint_sky(tree: Any) -> None:
+    """Light from a panorama; `_show_sky` finds the nodes by name.
+
+    For rays of the camera, which looks along -z, x and y of a direction are first multiplied by the span.
+    """
     tree.nodes.clear()
-    kinds = ("TexCoord", "Mapping", "TexEnvironment", "Background", "OutputWorld")
-    directions, turn, panorama, light, output = new_nodes(tree, *kinds)
-    turn.name, panorama.name, light.name = "turn", "panorama", "light"
+    directions, turn, panorama, light, output = new_nodes(
+        tree, "TexCoord", "Mapping", "TexEnvironment", "Background", "OutputWorld"
+    )
+    rays, span, scale = new_nodes(tree, "LightPath", "Math", "CombineXYZ")
+    turn.name, panorama.name, light.name, span.name = "turn", "panorama", "light", "span"
+    span.operation, span.inputs[2].default_value, scale.inputs["Z"].default_value = "MULTIPLY_ADD", 1.0, 1.0
+    tree.links.new(rays.outputs["Is Camera Ray"], span.inputs[0])
+    for axis in "XY":
+        tree.links.new(span.outputs["Value"], scale.inputs[axis])
+    tree.links.new(scale.outputs["Vector"], turn.inputs["Scale"])
     tree.links.new(directions.outputs["Generated"], turn.inputs["Vector"])
     tree.links.new(turn.outputs["Vector"], panorama.inputs["Vector"])
     tree.links.new(panorama.outputs["Color"], light.inputs["Color"])

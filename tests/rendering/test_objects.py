@@ -197,6 +197,7 @@ def around(**changes: Any) -> Surroundings:
         "brightness": 1,
         "ground": None,
         "shake": (0, 0),
+        "span": 1,
     }
     return Surroundings(**{**plain, "square": (0.5, 0.0, 0.5), "flipped": False, **changes})
 
@@ -350,6 +351,25 @@ def test_skies_light_the_scene_and_turn_with_the_camera(of_mesh: MakeSpec) -> No
     for pitch, half in ((np.pi / 2, rows[:128]), (-np.pi / 2, rows[-128:])):
         shown = corner(pitch=pitch, brightness=1.0)[:4, :, :3].mean()
         assert half.min() <= shown <= half.max()
+
+
+def test_a_sky_spans_a_wider_field_but_lights_from_where_it_is(of_mesh: MakeSpec) -> None:
+    """Behind the object is what a lens of that much shorter focal length shows; the object's light is the same."""
+    spec = of_mesh(sensor_size=32, f_range=(60.0, 60.0), xy_range=0.0)
+    renderer = Renderer(AT_MIDDLES, spec)
+    scene = sample_object_scene(spec, "train", 0, renderer.meshes)
+
+    def shown(f: float, span: float) -> np.ndarray:
+        seen = scene.surroundings.model_copy(update={"file": "city", "span": span})
+        return renderer.render(scene.model_copy(update={"surroundings": seen, "f": f}))[..., :3]
+
+    narrow, wide = shown(60.0, 1.0), shown(60.0, 4.0)
+    border, middle = slice(None, 4), (16, 16)
+    np.testing.assert_allclose(wide[border], shown(15.0, 1.0)[border], rtol=0.02, atol=0.01)
+    assert np.abs(wide - narrow)[border].mean() > 0.05 * narrow[border].mean(), "and it is another part of the sky"
+    np.testing.assert_allclose(wide[middle], narrow[middle], rtol=0.02)
+    spans = np.log([one.surroundings.span for one in drawn(spec, 300, renderer.meshes)]) / np.log(8)
+    assert stats.kstest(spans, "uniform").pvalue > UNLIKELY
 
 
 def write_ball(folder: Path, side: int = 160) -> Path:
