@@ -115,7 +115,7 @@ class Renderer:
         self._frame(box, scene.S)
         show_scene(self._bpy, scene, self.meshes)
         if self._world and scene.surroundings:
-            self._world.show(scene.surroundings)
+            self._world.show(scene.surroundings, scene.pose)
         self._scene.cycles.seed = scene.noise_seed
         self._scene.render.filepath = str(self._output)
         try:

@@ -14,12 +14,12 @@ from scipy import ndimage
 
 from phd_exp.records.assets import Asset
 from phd_exp.records.images import FORMATS, content_of, decoding, pillow_warnings
-from phd_exp.records.scenes import Surroundings
+from phd_exp.records.scenes import Pose, Surroundings
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.pixels import Light, linear
 from phd_exp.rendering.rays import rotation_matrix
 from phd_exp.rendering.sampling import about_axis
-from phd_exp.rendering.stage import matrix_of, new_nodes
+from phd_exp.rendering.stage import TO_BLENDER, matrix_of, new_nodes
 
 GROUND = 1000.0  # m: side of the plane
 IMPORTANCE_MAP = 512  # px: that of a sky's own resolution, 1024, would take a second for each image
@@ -39,19 +39,19 @@ class World:
         self._ground = bpy.context.object
         self._ground.is_shadow_catcher = True
 
-    def show(self, around: Surroundings) -> None:
-        """Arrange the sky and the ground. Without a sky, the background is transparent."""
+    def show(self, around: Surroundings, pose: Pose) -> None:
+        """Arrange the sky and the ground for a camera. Without a sky, the background is transparent."""
         scene = self._bpy.context.scene
         scene.render.film_transparent = not around.is_sky
         scene.world = self._sky if around.is_sky else self._studio
         if around.is_sky and around.file:
-            self._show_sky(around, around.file)
+            self._show_sky(around, around.file, pose)
         self._ground.hide_render = around.ground is None
         if around.ground is not None:
             level = rotation_matrix(about_axis((1.0, 0.0, 0.0), math.pi / 2 + around.pitch))
             self._ground.matrix_world = matrix_of(level, np.array(around.ground))
 
-    def _show_sky(self, around: Surroundings, file: str) -> None:
+    def _show_sky(self, around: Surroundings, file: str, pose: Pose) -> None:
         nodes, images = self._sky.node_tree.nodes, self._bpy.data.images
         folder = Path(self._bpy.utils.system_resource("DATAFILES", path="studiolights/world"))
         backdrops = self._spec.backdrops
@@ -63,26 +63,30 @@ class World:
         nodes["light"].inputs["Strength"].default_value = around.brightness
         # a panorama's vertical is z, the level camera's is Blender's y
         nodes["turn"].inputs["Rotation"].default_value = (math.pi / 2 - around.pitch, 0.0, around.turn)
-        nodes["span"].inputs[1].default_value = around.span - 1
+        axis = TO_BLENDER @ rotation_matrix(pose.rotation)[2]  # of the camera
+        nodes["along"].inputs[1].default_value = axis
+        nodes["span"].inputs[1].default_value = (1 / around.span - 1) * axis
 
 
 def _paint_sky(tree: Any) -> None:
     """Light from a panorama; `_show_sky` finds the nodes by name.
 
-    For rays of the camera, which looks along -z, x and y of a direction are first multiplied by the span.
+    For rays of the camera, the part of a direction along the camera's axis is first divided by the span.
     """
     tree.nodes.clear()
     directions, turn, panorama, light, output = new_nodes(
         tree, "TexCoord", "Mapping", "TexEnvironment", "Background", "OutputWorld"
     )
-    rays, span, scale = new_nodes(tree, "LightPath", "Math", "CombineXYZ")
-    turn.name, panorama.name, light.name, span.name = "turn", "panorama", "light", "span"
-    span.operation, span.inputs[2].default_value, scale.inputs["Z"].default_value = "MULTIPLY_ADD", 1.0, 1.0
-    tree.links.new(rays.outputs["Is Camera Ray"], span.inputs[0])
-    for axis in "XY":
-        tree.links.new(span.outputs["Value"], scale.inputs[axis])
-    tree.links.new(scale.outputs["Vector"], turn.inputs["Scale"])
-    tree.links.new(directions.outputs["Generated"], turn.inputs["Vector"])
+    rays, along, if_camera, span = new_nodes(tree, "LightPath", "VectorMath", "Math", "VectorMath")
+    turn.name, panorama.name, light.name = "turn", "panorama", "light"
+    along.name, span.name = "along", "span"
+    along.operation, if_camera.operation, span.operation = "DOT_PRODUCT", "MULTIPLY", "MULTIPLY_ADD"
+    tree.links.new(directions.outputs["Generated"], along.inputs[0])
+    tree.links.new(along.outputs["Value"], if_camera.inputs[0])
+    tree.links.new(rays.outputs["Is Camera Ray"], if_camera.inputs[1])
+    tree.links.new(if_camera.outputs["Value"], span.inputs[0])
+    tree.links.new(directions.outputs["Generated"], span.inputs[2])
+    tree.links.new(span.outputs["Vector"], turn.inputs["Vector"])
     tree.links.new(turn.outputs["Vector"], panorama.inputs["Vector"])
     tree.links.new(panorama.outputs["Color"], light.inputs["Color"])
     tree.links.new(light.outputs["Background"], output.inputs["Surface"])

@@ -12,13 +12,13 @@ from PIL import Image
 from scipy import stats
 
 from phd_exp.records.errors import RenderError
-from phd_exp.records.scenes import Scene, Surroundings
+from phd_exp.records.scenes import Pose, Scene, Surroundings
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer, Settings, load_bpy
 from phd_exp.rendering.objects import REACH, sample_object_scene, upright_rotation
 from phd_exp.rendering.rays import NOTHING, cylinder_mask, rotation_matrix, trace_pixels, truncation, visibility
 from phd_exp.rendering.samples import fast_settings, make_sample
-from phd_exp.rendering.sampling import sample_scene
+from phd_exp.rendering.sampling import about_axis, sample_scene
 from phd_exp.rendering.surroundings import photo_light, shaken
 from phd_exp.rendering.triangles import Triangles
 from tests.support.meshes import solid, write_mesh
@@ -359,15 +359,19 @@ def test_a_sky_spans_a_wider_field_but_lights_from_where_it_is(of_mesh: MakeSpec
     renderer = Renderer(AT_MIDDLES, spec)
     scene = sample_object_scene(spec, "train", 0, renderer.meshes)
 
-    def shown(f: float, span: float) -> np.ndarray:
+    def shown(f: float, span: float, **changes: Any) -> np.ndarray:
         seen = scene.surroundings.model_copy(update={"file": "city", "span": span})
-        return renderer.render(scene.model_copy(update={"surroundings": seen, "f": f}))[..., :3]
+        return renderer.render(scene.model_copy(update={"surroundings": seen, "f": f} | changes))[..., :3]
 
     narrow, wide = shown(60.0, 1.0), shown(60.0, 4.0)
     border, middle = slice(None, 4), (16, 16)
     np.testing.assert_allclose(wide[border], shown(15.0, 1.0)[border], rtol=0.02, atol=0.01)
     assert np.abs(wide - narrow)[border].mean() > 0.05 * narrow[border].mean(), "and it is another part of the sky"
     np.testing.assert_allclose(wide[middle], narrow[middle], rtol=0.02)
+    away = Pose(rotation=about_axis((0.6, 0.8, 0.0), 1.0), translation=(0.0, 0.0, 0.0))  # as a further view turns
+    np.testing.assert_allclose(
+        shown(60.0, 4.0, pose=away)[border], shown(15.0, 1.0, pose=away)[border], rtol=0.02, atol=0.01
+    )
     spans = np.log([one.surroundings.span for one in drawn(spec, 300, renderer.meshes)]) / np.log(8)
     assert stats.kstest(spans, "uniform").pvalue > UNLIKELY
 
