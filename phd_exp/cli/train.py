@@ -58,6 +58,9 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
         if isinstance(data, RenderedConfig):
             place = DatasetFolder(data.folder)
             ensure_rendered(place, data.spec, data.n_training_split, data.n_test, data.workers, cores)
+            if checked.recipe.augmentation.backdrops:
+                empty = data.spec.without_objects
+                ensure_rendered(DatasetFolder(data.root / empty.variant), empty, data.n_train, 0, data.workers, cores)
     results = train(checked, folder, draw=_draw(), cores=cores, callbacks=callbacks)
     _record_further(folder, checked, cores)
     print(f"{folder.path}: {'finished already' if skipped else 'finished'}")

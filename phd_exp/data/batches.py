@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -54,8 +54,10 @@ class Batch:
 class Augment(Protocol):
     """A random change of samples that keeps their labels exact."""
 
-    n_numbers: ClassVar[int]
-    """Number of random numbers per sample."""
+    @property
+    def n_numbers(self) -> int:
+        """Number of random numbers per sample."""
+        ...
 
     def __call__(self, batch: Batch, numbers: Float[Tensor, "batch n_numbers"]) -> Batch:
         """The samples, changed by uniform numbers from -1 to 1."""

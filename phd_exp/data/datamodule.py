@@ -5,6 +5,7 @@ from functools import partial
 
 from lightning import LightningDataModule
 
+from phd_exp.data.backdrops import BackdropExchange
 from phd_exp.data.batches import Augment, Batch, BatchLoader
 from phd_exp.data.sources import PARTS, Part, Source
 from phd_exp.records.errors import ConfigError
@@ -14,9 +15,9 @@ from phd_exp.records.runs import CHOOSE
 class PositionData(LightningDataModule):
     """The samples of a source in batches, or the share of one of several processes (`rank` of `world`).
 
-    `augment` changes training batches only. With `masks`, these have the masks of the source, if it has any. The
-    validation evaluates the test samples, which choose nothing, and with `held_out` also the held-out samples that
-    may choose.
+    `augment` changes training batches only; the share `backdrops` of their samples is shown before other backdrops
+    first. With `masks`, these batches have the masks of the source, if it has any. The validation evaluates the test
+    samples, which choose nothing, and with `held_out` also the held-out samples that may choose.
 
     Raises ConfigError if there are too few samples for one batch, or if the processes cannot share them; on `setup`,
     DatasetError if the source lacks samples or an image is damaged.
@@ -33,8 +34,14 @@ class PositionData(LightningDataModule):
         augment: Augment | None = None,
         held_out: bool = False,
         masks: bool = False,
+        backdrops: float = 0.0,
     ) -> None:
         super().__init__()
+        if backdrops and not source.has_backdrops:
+            raise ConfigError(
+                f"recipe.augmentation.backdrops: got {backdrops}, but what these images show behind their objects is "
+                "not known; expected 0, or data=object"
+            )
         if batch_size > source.count("train"):
             raise ConfigError(
                 f"data: batch_size={batch_size} is larger than the {source.count('train')} training samples there "
@@ -52,6 +59,7 @@ class PositionData(LightningDataModule):
         self.source = source
         self.augment = augment
         self.masks = masks
+        self.backdrops = backdrops
         self.validated: tuple[Part, ...] = ("test", "held_out") if held_out else ("test",)
         self.batches = partial(BatchLoader, batch_size=batch_size, seed=seed, rank=rank, world=world)
         self.samples: dict[Part, Batch] = {}
@@ -65,7 +73,10 @@ class PositionData(LightningDataModule):
                 if self.masks and part == "train":
                     self.samples[part] = replace(self.samples[part], mask=self.source.training_masks())
         if self.train_batches is None:
-            self.train_batches = self.batches(self.samples["train"], shuffle=True, augment=self.augment)
+            augment = self.augment
+            if self.backdrops:
+                augment = BackdropExchange(self.source.training_backdrops(), self.backdrops, augment)
+            self.train_batches = self.batches(self.samples["train"], shuffle=True, augment=augment)
 
     def train_dataloader(self) -> BatchLoader:
         assert self.train_batches is not None, "setup comes first"

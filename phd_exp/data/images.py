@@ -12,7 +12,7 @@ from phd_exp.records.dataset import DatasetFolder, sha256
 from phd_exp.records.errors import DatasetError
 from phd_exp.records.images import recorded_image
 from phd_exp.records.scenes import SampleRecord, Split
-from phd_exp.rendering.rays import cylinder_mask, trace_pixels
+from phd_exp.rendering.rays import NOTHING, cylinder_mask, trace_pixels
 from phd_exp.rendering.triangles import Meshes
 
 SHRINKING = 2  # version of `shrunk`, recorded with each run and cache. Version 1 was exact for integer factors only.
@@ -56,6 +56,20 @@ def cached_masks(folder: DatasetFolder, split: Split, records: Sequence[SampleRe
     n, file = len(records), folder.cache / f"{split}-{len(records)}-masks.npy"
     key = {"masks": DRAWING, "images": _checksum(records)}
     return cached(file, key, (n, CELLS, CELLS), range(n), fill, f"drawing {split} masks once")
+
+
+def cached_clearings(
+    folder: DatasetFolder, split: Split, records: Sequence[SampleRecord], meshes: Meshes, image_size: int
+) -> np.ndarray:
+    """The share of each pixel of the images that shows no object, 0 to 255: (n, image_size, image_size), uint8."""
+
+    def fill(array: np.ndarray, row: int) -> None:
+        clear = trace_pixels(records[row].shown, meshes).first == NOTHING
+        array[row] = shrunk(np.repeat(255 * clear[..., None].astype(np.uint8), 3, axis=-1), image_size)[..., 0]
+
+    n, file = len(records), folder.cache / f"{split}-{len(records)}x{image_size}-clear.npy"
+    key = {"shrinking": SHRINKING, "masks": DRAWING, "images": _checksum(records)}
+    return cached(file, key, (n, image_size, image_size), range(n), fill, f"drawing {split} backdrops once")
 
 
 def _checksum(records: Sequence[SampleRecord]) -> str:

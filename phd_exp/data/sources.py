@@ -9,8 +9,9 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
+from phd_exp.data.backdrops import Backdrops
 from phd_exp.data.batches import Batch
-from phd_exp.data.images import cached_images, cached_masks
+from phd_exp.data.images import cached_clearings, cached_images, cached_masks
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.scenes import SampleRecord, Split
@@ -36,6 +37,8 @@ class Source(ABC):
 
     depth: DepthScale
     constant_f: float
+    has_backdrops = False
+    """Whether `training_backdrops` can be called."""
 
     @abstractmethod
     def samples(self, part: Part) -> Batch:
@@ -53,6 +56,10 @@ class Source(ABC):
         """Share of each cell of the training images that shows the object, from 0 to 255; None: it is not known."""
         return None
 
+    def training_backdrops(self) -> Backdrops:
+        """What the training images show behind their objects."""
+        raise NotImplementedError
+
 
 class RenderedSource(Source):
     """The first samples of each split of a rendered data set, shrunk to `side` x `side` pixels.
@@ -66,6 +73,7 @@ class RenderedSource(Source):
     def __init__(self, folder: DatasetFolder, spec: DatasetSpec, n: Mapping[Part, int], side: int) -> None:
         self.folder = folder
         self.spec = spec
+        self.has_backdrops = spec.mesh is not None
         self.n = n
         self.side = side
         self.zoom = side / spec.sensor_size
@@ -90,6 +98,14 @@ class RenderedSource(Source):
     def training_masks(self) -> UInt8[Tensor, "samples rows columns"]:
         split, records, rows = self._records("train")
         return torch.from_numpy(cached_masks(self.folder, split, records, meshes_of(self.spec))[rows])
+
+    def training_backdrops(self) -> Backdrops:
+        split, records, rows = self._records("train")
+        empty = self.spec.without_objects
+        folder = DatasetFolder(self.folder.root.with_name(empty.variant))
+        images = cached_images(folder, split, folder.records(split, self.n["train"]), self.side)
+        clear = cached_clearings(self.folder, split, records[rows], meshes_of(self.spec), self.side)
+        return Backdrops(torch.from_numpy(images), torch.from_numpy(clear))
 
     def _records(self, part: Part) -> tuple[Split, list[SampleRecord], slice]:
         """The split of a part, all records of it that the run uses, and the rows of the part among them."""

@@ -78,6 +78,7 @@ class DatasetSpec(Record):
         ground: whether the object stands on a plane, which shows its shadow.
         distractors: number of other objects, of the three solids and `distractor_meshes`.
         motion_blur: the longest path of the image during the exposure, px.
+        empty: whether the images show the scenes without their objects.
 
     Raises:
         pydantic.ValidationError: a missing or unknown key, a wrong type, a value out of range.
@@ -111,6 +112,7 @@ class DatasetSpec(Record):
     distractors: Annotated[int, Field(strict=True, ge=0, le=12)] = 0
     distractor_meshes: tuple[Annotated[Asset, Mesh], ...] = ()
     motion_blur: Annotated[Number, Field(ge=0, le=64)] = 0.0
+    empty: StrictBool = False
 
     @model_validator(mode="after")
     def _parts_fit(self) -> "DatasetSpec":
@@ -126,6 +128,11 @@ class DatasetSpec(Record):
         if self.ground and not (self.upright and self.views == 1 and self.pitch_range[0] > steepest):
             raise ValueError(f"ground: expected upright=true, views=1, pitch_range above {steepest:.3g} degrees")
         return self
+
+    @property
+    def without_objects(self) -> "DatasetSpec":
+        """The data set of the same images without their objects."""
+        return self.model_copy(update={"variant": f"{self.variant}-backdrops", "empty": True})
 
     def backdrop_files(self, split: str) -> list[str]:
         """Names of the backdrops of a split: every fourth is for test samples alone."""

@@ -188,7 +188,7 @@ def worker_count(samples: int, cores: int | None = None) -> int:
 
 
 def _first_words(folder: DatasetFolder, spec: DatasetSpec, n: int, workers: int, *, resumed: bool) -> str:
-    objects, pixels = 3 if spec.occluders else 1, (spec.sensor_size / 224) ** 2
+    objects, pixels = 1 + max(2 * spec.occluders, spec.distractors), (spec.sensor_size / 224) ** 2
     seconds = SECONDS_PER_OBJECT * objects * pixels * max(spec.samples_per_pixel / 3, 1.0)
     left = f"the remaining {n}" if resumed else f"{n}"
     return (

@@ -33,7 +33,8 @@ def make_sample(renderer: Renderer, spec: DatasetSpec, split: Split, index: int)
     meshes = renderer.meshes
     scene = sample_object_scene(spec, split, index, meshes) if meshes else sample_scene(spec, split, index)
     hits = trace_pixels(scene, meshes)
-    picture = photograph(renderer, scene, spec) if meshes else take_picture(renderer, scene, hits)
+    shown = scene.model_copy(update={"objects": ()}) if spec.empty else scene
+    picture = photograph(renderer, shown, spec) if meshes else take_picture(renderer, scene, hits)
     image = encode(picture, spec)
     return image, describe(spec, split, index, scene, hits, sha256(image), meshes)
 

@@ -36,12 +36,13 @@ def build_data(config: RunConfig, rank: int = 0) -> PositionData:
         augment=build_augmentation(config.recipe),
         held_out=config.evaluation.held_out and config.data.n_held_out > 0,
         masks=config.recipe.segmentation > 0,
+        backdrops=config.recipe.augmentation.backdrops,
     )
 
 
 def build_augmentation(recipe: RecipeConfig) -> Augmentation | None:
     """The augmentation of a recipe; None if it changes nothing."""
-    keys = recipe.augmentation.model_dump()
+    keys = recipe.augmentation.model_dump(exclude={"backdrops"})
     photometry = Photometry(**{field.name: keys.pop(field.name) for field in fields(Photometry)})
     augmentation = Augmentation(**keys, photometry=photometry)
     return augmentation if augmentation.changes_anything else None

@@ -66,18 +66,19 @@ def test_defaults_are_the_authors_protocol(checked: Callable) -> None:
     assert build_augmentation(recipe) is None
 
 
-def test_own_objects_train_longer_before_skies_that_are_turned(checked: Callable, tmp_path: Path) -> None:
+def test_own_objects_train_longer_before_skies_turned_and_exchanged(checked: Callable, tmp_path: Path) -> None:
     (tmp_path / "part.glb").touch()
     own = ("data=object", f"data.mesh={tmp_path}/part.glb")
-    for words, epochs, zoom in [
-        (("preset=small", "recipe=strong", *own), 90, 1.2),
-        (("preset=small", *own), 90, 1.0),
-        (("preset=full", "recipe=strong", *own), 42, 1.2),
-        (("preset=small", "recipe=strong"), 30, 1.0),
-        (("preset=small", "recipe=strong", *own, "trainer.max_epochs=2"), 2, 1.2),
+    for words, expected in [
+        (("preset=small", "recipe=strong", *own), (90, 1.2, 0.5)),
+        (("preset=small", *own), (90, 1.0, 0.0)),
+        (("preset=full", "recipe=strong", *own), (42, 1.2, 0.5)),
+        (("preset=small", "recipe=strong"), (30, 1.0, 0.0)),
+        (("preset=small", "recipe=strong", *own, "trainer.max_epochs=2"), (2, 1.2, 0.5)),
     ]:
         config = checked(*words)
-        assert (config.trainer.max_epochs, config.recipe.augmentation.largest_zoom) == (epochs, zoom), words
+        augmentation = config.recipe.augmentation
+        assert (config.trainer.max_epochs, augmentation.largest_zoom, augmentation.backdrops) == expected, words
 
 
 @pytest.mark.parametrize(

@@ -156,11 +156,12 @@ class TrainerConfig(Record):
 
 
 class AugmentationConfig(Record):
-    """The arguments of `Augmentation` and of its `Photometry`."""
+    """The arguments of `Augmentation` and of its `Photometry`, and the share of `BackdropExchange`."""
 
     symmetries: StrictBool
     largest_zoom: Annotated[float, Field(ge=1, le=2)]
     colours: StrictBool
+    backdrops: Annotated[float, Field(ge=0, le=1)] = 0.0  # default for older run records
     occluders: Annotated[float, Field(ge=0, le=1)] = 0.0  # default for older run records
     brightness: Factor
     contrast: Factor

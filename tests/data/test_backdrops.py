@@ -1,0 +1,102 @@
+"""Training samples before other backdrops: the objects stay, what is behind them changes."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from phd_exp.data.backdrops import N_NUMBERS, BackdropExchange, Backdrops
+from phd_exp.data.batches import Batch
+from phd_exp.data.datamodule import PositionData
+from phd_exp.data.sources import RenderedSource
+from phd_exp.geometry.motion import turned
+from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.errors import ConfigError
+from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.render import ensure_rendered
+from tests.support.meshes import solid, write_mesh
+
+SIDE, N = 32, 40
+
+
+@pytest.fixture(scope="module")
+def source(make_spec: Callable[..., DatasetSpec], tmp_path_factory: pytest.TempPathFactory) -> RenderedSource:
+    """Two rendered samples of a mesh under skies, with a distractor, and what is behind them."""
+    root = tmp_path_factory.mktemp("backdrops")
+    mesh = write_mesh(root / "part.stl", solid("cylinder"))
+    spec = make_spec(
+        "object", mesh=str(mesh), backdrops="hdri", distractors=1, sensor_size=64, f_range=(343.0, 571.0)
+    )
+    for one in (spec, spec.without_objects):
+        ensure_rendered(DatasetFolder(root / one.variant), one, n_train=2, n_test=0, workers=1)
+    return RenderedSource(DatasetFolder(root / "object"), spec, {"train": 2, "held_out": 0, "test": 0}, SIDE)
+
+
+@pytest.fixture
+def batch() -> Batch:
+    torch.manual_seed(0)
+    image = torch.randint(0, 256, (N, SIDE, SIDE, 3), dtype=torch.uint8)
+    return Batch(image, torch.rand(N, 3), torch.rand(N), float(SIDE), torch.randperm(N))
+
+
+def numbers(columns: int) -> torch.Tensor:
+    return 2 * torch.rand(N, columns, generator=torch.Generator().manual_seed(1)) - 1
+
+
+def test_renders_without_objects_are_the_renders_where_no_object_is(source: RenderedSource) -> None:
+    images, found = source.samples("train").image.int(), source.training_backdrops()
+    nothing, object_alone = found.clear == 255, found.clear == 0
+    difference = (found.empty.int() - images).abs().amax(-1)
+    assert nothing.float().mean() > 0.3
+    assert difference[nothing].float().quantile(0.95) < 12  # the denoiser works on a neighbourhood
+    assert difference[object_alone].float().median() > 12
+
+
+def test_an_object_appears_before_the_other_backdrop(source: RenderedSource) -> None:
+    found, samples = source.training_backdrops(), source.samples("train")
+    draw = torch.tensor([[-1.0, 0.5, 1, 1, 1], [-1.0, -0.5, -1, 1, 1]])  # the other sample's, the second one mirrored
+    new = BackdropExchange(found, 0.5, then=None)(samples, draw)
+    for row, other in ((0, found.empty[1]), (1, turned(found.empty[0], (-1.0, 1.0, 1.0)))):
+        nothing, object_alone = found.clear[row] == 255, found.clear[row] == 0
+        assert torch.equal(new.image[row][object_alone], samples.image[row][object_alone])
+        change = new.image[row][nothing].int() - other[nothing].int()
+        rest = samples.image[row][nothing].int() - found.empty[row][nothing].int()
+        inside = (new.image[row][nothing] > 0) & (new.image[row][nothing] < 255)
+        assert torch.equal(change[inside], rest[inside])
+    assert torch.equal(new.xyz, samples.xyz)
+
+
+def test_the_share_is_changed_and_then_augmented(batch: Batch) -> None:
+    class Darken:
+        n_numbers = 2
+
+        def __call__(self, batch: Batch, given: torch.Tensor) -> Batch:
+            assert torch.equal(given, draw[:, :2])
+            return Batch(batch.image // 2, batch.xyz, batch.f, batch.S, batch.row)
+
+    clear = torch.full((N, SIDE, SIDE), 255, dtype=torch.uint8)
+    backdrops = Backdrops(torch.randint(0, 256, batch.image.shape, dtype=torch.uint8), clear)
+    draw = numbers(N_NUMBERS + 2)
+    for share in (0.0, 0.4, 1.0):
+        exchange = BackdropExchange(backdrops, share, Darken())
+        assert exchange.n_numbers == N_NUMBERS + 2
+        changed = (exchange(batch, draw).image != batch.image // 2).any((1, 2, 3))
+        assert changed.float().mean() == pytest.approx(share, abs=0.15)
+
+
+def test_training_batches_alone_get_other_backdrops(source: RenderedSource) -> None:
+    plain, other = (PositionData(source, batch_size=2, backdrops=share) for share in (0.0, 1.0))
+    for data in (plain, other):
+        data.setup()
+    (before,), (after,) = plain.train_dataloader(), other.train_dataloader()
+    assert torch.equal(before.row, after.row)
+    assert not torch.equal(before.image, after.image)
+    assert torch.equal(plain.samples["train"].image, other.samples["train"].image)
+
+
+def test_images_of_unknown_backdrops_are_refused(make_spec: Callable[..., DatasetSpec], tmp_path: Path) -> None:
+    sizes = {"train": 2, "held_out": 0, "test": 0}
+    cylinder = RenderedSource(DatasetFolder(tmp_path), make_spec("default"), sizes, SIDE)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=r"recipe.augmentation.backdrops: got 0.5.*expected 0, or data=object"):
+        PositionData(cylinder, batch_size=2, backdrops=0.5)
