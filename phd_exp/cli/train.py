@@ -1,6 +1,6 @@
 """`python -m phd_exp [train]`: render missing data, train, measure and record a run."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +13,7 @@ from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.processes import usable_cores
 from phd_exp.records.runs import RunFolder
+from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.render import ensure_rendered
 from phd_exp.training.config import RenderedConfig, RunConfig, check
 
@@ -56,11 +57,8 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
         require_possible(checked, folder)
         announce(checked, folder, overrides)
         if isinstance(data, RenderedConfig):
-            place = DatasetFolder(data.folder)
-            ensure_rendered(place, data.spec, data.n_training_split, data.n_test, data.workers, cores)
-            if checked.recipe.augmentation.backdrops:
-                empty = data.spec.without_objects
-                ensure_rendered(DatasetFolder(data.root / empty.variant), empty, data.n_train, 0, data.workers, cores)
+            for place, spec, n_train, n_test in _renders(data, checked):
+                ensure_rendered(place, spec, n_train, n_test, data.workers, cores)
     results = train(checked, folder, draw=_draw(), cores=cores, callbacks=callbacks)
     _record_further(folder, checked, cores)
     print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
@@ -115,8 +113,8 @@ def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> Non
     data, epochs = checked.data, checked.trainer.max_epochs
     n_missing = 0
     if isinstance(data, RenderedConfig):
-        place = DatasetFolder(data.folder)
-        n_missing = sum(map(len, place.missing(data.spec, data.n_training_split, data.n_test).values()))
+        for place, spec, n_train, n_test in _renders(data, checked):
+            n_missing += sum(map(len, place.missing(spec, n_train, n_test).values()))
     render = f"{n_missing} images to render, then " if n_missing else ""
     network = f"{checked.backbone['_target_'].rpartition('.')[2]}{checked.backbone.get('depth', '')}"
     images = "all" if data.n_train is None else data.n_train
@@ -127,6 +125,14 @@ def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> Non
         words = " ".join([*(word for word in overrides if not word.startswith("preset=")), "preset=small"])
         print("  the authors' protocol takes many hours without a GPU: an estimate follows the first batches")
         print(f"  in about ten minutes: python -m phd_exp {words}", flush=True)
+
+
+def _renders(data: RenderedConfig, checked: RunConfig) -> Iterator[tuple[DatasetFolder, DatasetSpec, int, int]]:
+    """The data sets of a training: the folder, the specification, and the number of samples of both splits."""
+    yield DatasetFolder(data.folder), data.spec, data.n_training_split, data.n_test
+    if checked.recipe.augmentation.backdrops:
+        empty = data.spec.without_objects
+        yield DatasetFolder(data.root / empty.variant), empty, data.n_train, 0
 
 
 def _record_further(run: RunFolder, checked: RunConfig, cores: int) -> None:
