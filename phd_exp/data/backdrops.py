@@ -1,15 +1,16 @@
 """Training samples before the backdrops of others, so that no object comes with its backdrop."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from phd_exp.data.batches import Augment, Batch
-from phd_exp.geometry.motion import turned
 
-N_NUMBERS = 5  # per sample, of an exchange alone
+N_NUMBERS = 7  # per sample, of an exchange alone
+FINEST = 4.0  # largest factor by which a backdrop is shown smaller, with finer texture
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,8 +30,8 @@ class Backdrops:
 class BackdropExchange:
     """An augmentation that first shows samples before other backdrops: image + clear (empty' - empty).
 
-    empty' is that of a random sample after a random one of the eight `symmetries`. The sum keeps shadows on the
-    ground and the mixed colours of edges.
+    empty' is that of one of two random samples, the one with more texture, since smooth backdrops are easy; it is
+    `tiled` and perhaps transposed. The sum keeps shadows on the ground and the mixed colours of edges.
 
     Args:
         backdrops: of all training samples.
@@ -42,6 +43,12 @@ class BackdropExchange:
     share: float
     then: Augment | None
 
+    @cached_property
+    def texture(self) -> Float[Tensor, " samples"]:
+        """The mean difference between neighbouring pixels of each backdrop."""
+        rows = ((one[1:].float() - one[:-1].float()).abs().mean() for one in self.backdrops.empty)
+        return torch.stack(list(rows))
+
     @property
     def n_numbers(self) -> int:
         """Number of random numbers per sample; those of `then` come first."""
@@ -49,17 +56,39 @@ class BackdropExchange:
 
     def __call__(self, batch: Batch, numbers: Float[Tensor, "batch n_numbers"]) -> Batch:
         """The samples, changed by uniform numbers from -1 to 1."""
-        image = batch.image.clone()
-        for place, (chosen, other, *signs) in enumerate(numbers[:, -N_NUMBERS:].tolist()):
-            if chosen < 2 * self.share - 1:
-                image[place] = self._before(image[place], int(batch.row[place]), other, signs)
+        image, uniform = batch.image.clone(), (numbers[:, -N_NUMBERS:] + 1) / 2
+        pairs = (len(self.backdrops.empty) * uniform[:, 1:3]).long()
+        others = pairs.gather(1, self.texture[pairs].argmax(dim=1, keepdim=True)).flatten()
+        for place in (uniform[:, 0] < self.share).nonzero().flatten().tolist():
+            look = uniform[place, 3:].tolist()
+            image[place] = self._before(image[place], int(batch.row[place]), int(others[place]), *look)
         batch = replace(batch, image=image)
         return self.then(batch, numbers[:, :-N_NUMBERS]) if self.then else batch
 
     def _before(
-        self, image: UInt8[Tensor, "side side 3"], row: int, other: float, signs: list[float]
+        self,
+        image: UInt8[Tensor, "side side 3"],
+        row: int,
+        other: int,
+        fine: float,
+        down: float,
+        right: float,
+        turn: float,
     ) -> UInt8[Tensor, "side side 3"]:
         empty, clear = self.backdrops.empty, self.backdrops.clear[row, ..., None]
-        new = turned(empty[int(len(empty) * (other + 1) / 2)], signs)
-        change = clear * (new.float() - empty[row].float()) / 255
-        return (image + change).round().clamp(0, 255).to(torch.uint8)
+        new = tiled(empty[other], FINEST**fine, down, right)
+        change = (new.transpose(0, 1) if turn < 0.5 else new).float() - empty[row].float()
+        return change.mul_(clear / 255).add_(image).round_().clamp_(0, 255).to(torch.uint8)
+
+
+def tiled(
+    image: UInt8[Tensor, "side side 3"], fine: float, down: float, right: float
+) -> UInt8[Tensor, "side side 3"]:
+    """The plane that an image and its mirror images tile, shown `fine` times smaller from a place on.
+
+    `down` and `right` are shares of the period, which is two images.
+    """
+    side = len(image)
+    rows, columns = ((torch.arange(side) * fine + 2 * side * start).long() % (2 * side) for start in (down, right))
+    rows, columns = (torch.minimum(place, 2 * side - 1 - place) for place in (rows, columns))
+    return image.index_select(0, rows).index_select(1, columns)
