@@ -70,11 +70,11 @@ def test_own_objects_train_longer_before_skies_turned_and_exchanged(checked: Cal
     (tmp_path / "part.glb").touch()
     own = ("data=object", f"data.mesh={tmp_path}/part.glb")
     for words, expected in [
-        (("preset=small", "recipe=strong", *own), (90, 1.2, 0.5)),
-        (("preset=small", *own), (90, 1.0, 0.0)),
-        (("preset=full", "recipe=strong", *own), (42, 1.2, 0.5)),
+        (("preset=small", "recipe=strong", *own), (150, 1.2, 0.75)),
+        (("preset=small", *own), (150, 1.0, 0.0)),
+        (("preset=full", "recipe=strong", *own), (42, 1.2, 0.75)),
         (("preset=small", "recipe=strong"), (30, 1.0, 0.0)),
-        (("preset=small", "recipe=strong", *own, "trainer.max_epochs=2"), (2, 1.2, 0.5)),
+        (("preset=small", "recipe=strong", *own, "trainer.max_epochs=2"), (2, 1.2, 0.75)),
     ]:
         config = checked(*words)
         augmentation = config.recipe.augmentation

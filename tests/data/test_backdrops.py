@@ -1,16 +1,16 @@
 """Training samples before other backdrops: the objects stay, what is behind them changes."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from phd_exp.data.backdrops import N_NUMBERS, BackdropExchange, Backdrops
+from phd_exp.data.backdrops import FINEST, N_NUMBERS, BackdropExchange, Backdrops, tiled
 from phd_exp.data.batches import Batch
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.sources import RenderedSource
-from phd_exp.geometry.motion import turned
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.spec import DatasetSpec
@@ -55,9 +55,9 @@ def test_renders_without_objects_are_the_renders_where_no_object_is(source: Rend
 
 def test_an_object_appears_before_the_other_backdrop(source: RenderedSource) -> None:
     found, samples = source.training_backdrops(), source.samples("train")
-    draw = torch.tensor([[-1.0, 0.5, 1, 1, 1], [-1.0, -0.5, -1, 1, 1]])  # the other sample's, the second one mirrored
+    draw = torch.tensor([[-1.0, 0.5, 0.5, -1, -1, -1, 1], [-1.0, -0.5, -0.5, -1, 0, -1, -1]])
     new = BackdropExchange(found, 0.5, then=None)(samples, draw)
-    for row, other in ((0, found.empty[1]), (1, turned(found.empty[0], (-1.0, 1.0, 1.0)))):
+    for row, other in ((0, found.empty[1]), (1, found.empty[0].flip(0).transpose(0, 1))):
         nothing, object_alone = found.clear[row] == 255, found.clear[row] == 0
         assert torch.equal(new.image[row][object_alone], samples.image[row][object_alone])
         change = new.image[row][nothing].int() - other[nothing].int()
@@ -65,6 +65,28 @@ def test_an_object_appears_before_the_other_backdrop(source: RenderedSource) -> 
         inside = (new.image[row][nothing] > 0) & (new.image[row][nothing] < 255)
         assert torch.equal(change[inside], rest[inside])
     assert torch.equal(new.xyz, samples.xyz)
+
+
+def test_the_backdrop_with_more_texture_is_preferred(batch: Batch) -> None:
+    empty = torch.zeros_like(batch.image)
+    empty[::2] = batch.image[::2]
+    clear = torch.full((N, SIDE, SIDE), 255, dtype=torch.uint8)
+    black = replace(batch, image=empty[batch.row])
+    new = BackdropExchange(Backdrops(empty, clear), 1.0, then=None)(black, numbers(N_NUMBERS))
+    assert (new.image != 0).any((1, 2, 3)).float().mean() == pytest.approx(0.75, abs=0.15)
+
+
+def test_an_image_and_its_mirror_images_tile_the_plane() -> None:
+    image = torch.randint(0, 256, (SIDE, SIDE, 3), dtype=torch.uint8)
+    assert torch.equal(tiled(image, 1.0, 0.0, 0.0), image)
+    assert torch.equal(tiled(image, 1.0, 0.5, 0.0), image.flip(0))
+    assert torch.equal(tiled(image, 1.0, 0.0, 0.5), image.flip(1))
+    half = image[::2, ::2]
+    small = tiled(image, 2.0, 0.0, 0.0)
+    assert torch.equal(small[: SIDE // 2, : SIDE // 2], half)
+    assert torch.equal(small[SIDE // 2 :, : SIDE // 2], image[1::2, ::2].flip(0))
+    seen = tiled(image, FINEST, 0.37, 0.81).reshape(-1, 3)
+    assert {tuple(pixel) for pixel in seen.tolist()} <= {tuple(pixel) for pixel in image.reshape(-1, 3).tolist()}
 
 
 def test_the_share_is_changed_and_then_augmented(batch: Batch) -> None:
