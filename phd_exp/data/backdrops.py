@@ -60,25 +60,20 @@ class BackdropExchange:
         pairs = (len(self.backdrops.empty) * uniform[:, 1:3]).long()
         others = pairs.gather(1, self.texture[pairs].argmax(dim=1, keepdim=True)).flatten()
         for place in (uniform[:, 0] < self.share).nonzero().flatten().tolist():
-            look = uniform[place, 3:].tolist()
-            image[place] = self._before(image[place], int(batch.row[place]), int(others[place]), *look)
+            fine, down, right, turn = uniform[place, 3:].tolist()
+            new = tiled(self.backdrops.empty[int(others[place])], FINEST**fine, down, right)
+            new = new.transpose(0, 1) if turn < 0.5 else new
+            image[place] = self._before(new, image[place], int(batch.row[place]))
         batch = replace(batch, image=image)
         return self.then(batch, numbers[:, :-N_NUMBERS]) if self.then else batch
 
     def _before(
-        self,
-        image: UInt8[Tensor, "side side 3"],
-        row: int,
-        other: int,
-        fine: float,
-        down: float,
-        right: float,
-        turn: float,
+        self, new: UInt8[Tensor, "side side 3"], image: UInt8[Tensor, "side side 3"], row: int
     ) -> UInt8[Tensor, "side side 3"]:
-        empty, clear = self.backdrops.empty, self.backdrops.clear[row, ..., None]
-        new = tiled(empty[other], FINEST**fine, down, right)
-        change = (new.transpose(0, 1) if turn < 0.5 else new).float() - empty[row].float()
-        return change.mul_(clear / 255).add_(image).round_().clamp_(0, 255).to(torch.uint8)
+        """The image of a row before a new backdrop."""
+        change = new.float() - self.backdrops.empty[row].float()
+        share = self.backdrops.clear[row, ..., None] / 255
+        return change.mul_(share).add_(image).round_().clamp_(0, 255).to(torch.uint8)
 
 
 def tiled(
