@@ -13,7 +13,6 @@ from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.processes import usable_cores
 from phd_exp.records.runs import RunFolder
-from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.render import ensure_rendered
 from phd_exp.training.config import RenderedConfig, RunConfig, check
 
@@ -50,15 +49,13 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
     # imports of seconds, which follow the check of the configuration
     from phd_exp.training.run import require_possible, train
 
-    data = checked.data
     folder = RunFolder(run_name(checked, overrides).folder(checked.runs))
     skipped = folder.is_finished()
     if not skipped:
         require_possible(checked, folder)
         announce(checked, folder, overrides)
-        if isinstance(data, RenderedConfig):
-            for place, spec, n_train, n_test in _renders(data, checked):
-                ensure_rendered(place, spec, n_train, n_test, data.workers, cores)
+        for data, n_train, n_test in _renders(checked):
+            ensure_rendered(DatasetFolder(data.folder), data.spec, n_train, n_test, data.workers, cores)
     results = train(checked, folder, draw=_draw(), cores=cores, callbacks=callbacks)
     _record_further(folder, checked, cores)
     print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
@@ -111,10 +108,8 @@ def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> Non
     from phd_exp.training.network import has_gpu
 
     data, epochs = checked.data, checked.trainer.max_epochs
-    n_missing = 0
-    if isinstance(data, RenderedConfig):
-        for place, spec, n_train, n_test in _renders(data, checked):
-            n_missing += sum(map(len, place.missing(spec, n_train, n_test).values()))
+    missing = (DatasetFolder(one.folder).missing(one.spec, *counts).values() for one, *counts in _renders(checked))
+    n_missing = sum(len(indices) for of_splits in missing for indices in of_splits)
     render = f"{n_missing} images to render, then " if n_missing else ""
     network = f"{checked.backbone['_target_'].rpartition('.')[2]}{checked.backbone.get('depth', '')}"
     images = "all" if data.n_train is None else data.n_train
@@ -127,12 +122,13 @@ def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> Non
         print(f"  in about ten minutes: python -m phd_exp {words}", flush=True)
 
 
-def _renders(data: RenderedConfig, checked: RunConfig) -> Iterator[tuple[DatasetFolder, DatasetSpec, int, int]]:
-    """The data sets of a training: the folder, the specification, and the number of samples of both splits."""
-    yield DatasetFolder(data.folder), data.spec, data.n_training_split, data.n_test
-    if checked.recipe.augmentation.backdrops:
-        empty = data.spec.without_objects
-        yield DatasetFolder(data.root / empty.variant), empty, data.n_train, 0
+def _renders(checked: RunConfig) -> Iterator[tuple[RenderedConfig, int, int]]:
+    """The rendered data sets of a training, and the number of samples of both splits."""
+    data = checked.data
+    if isinstance(data, RenderedConfig):
+        yield data, data.n_training_split, data.n_test
+        if checked.recipe.augmentation.backdrops:
+            yield data.model_copy(update={"spec": data.spec.without_objects}), data.n_train, 0
 
 
 def _record_further(run: RunFolder, checked: RunConfig, cores: int) -> None:

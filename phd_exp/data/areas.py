@@ -11,8 +11,7 @@ TIES = 1e6  # means are rounded to 1/TIES first, so that halves are exact whatev
 
 def sums(image: UInt8[Tensor, "height width bands"]) -> Float[Tensor, "height+1 width+1 bands"]:
     """Exact sums of an image, less grey, over the rectangle from its top left corner to every corner of a pixel."""
-    # float32 holds bytes exactly, in half the memory of the sums
-    table = pad(image.float().sub_(GREY), (0, 0, 1, 0, 1, 0)).double()
+    table = pad(image, (0, 0, 1, 0, 1, 0), value=GREY).double().sub_(GREY)
     return table.cumsum_(0).cumsum_(1)
 
 

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +18,7 @@ from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.finished import meshes_of
+from phd_exp.rendering.triangles import Meshes
 
 Part = Literal["train", "held_out", "test"]
 """A part of the samples of a run; the first two are taken from the training split."""
@@ -97,15 +99,19 @@ class RenderedSource(Source):
 
     def training_masks(self) -> UInt8[Tensor, "samples rows columns"]:
         split, records, rows = self._records("train")
-        return torch.from_numpy(cached_masks(self.folder, split, records, meshes_of(self.spec))[rows])
+        return torch.from_numpy(cached_masks(self.folder, split, records, self._meshes)[rows])
 
     def training_backdrops(self) -> Backdrops:
         split, records, rows = self._records("train")
         empty = self.spec.without_objects
         folder = DatasetFolder(self.folder.root.with_name(empty.variant))
         images = cached_images(folder, split, folder.records(split, self.n["train"]), self.side)
-        clear = cached_clearings(self.folder, split, records[rows], meshes_of(self.spec), self.side)
+        clear = cached_clearings(self.folder, split, records[rows], self._meshes, self.side)
         return Backdrops(torch.from_numpy(images), torch.from_numpy(clear))
+
+    @cached_property
+    def _meshes(self) -> Meshes:
+        return meshes_of(self.spec)  # starts Blender, which takes seconds
 
     def _records(self, part: Part) -> tuple[Split, list[SampleRecord], slice]:
         """The split of a part, all records of it that the run uses, and the rows of the part among them."""

@@ -109,7 +109,7 @@ COSTLY = [
 
 def limited(size: tuple[int, int], camera: VirtualCamera) -> None:
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (used + 320_000_000,) * 2)
+    resource.setrlimit(resource.RLIMIT_AS, (used + 270_000_000,) * 2)
     assert cut(Image.new("RGB", size), camera).shape == (64, 64, 3)
 
 
