@@ -16,7 +16,7 @@ from phd_exp.training.config import RunConfig, check
 CHOICES = {
     group.name: [f"{group.name}={file.stem}" for file in sorted(group.glob("*.yaml"))]
     for group in sorted(path for path in conf_folder().iterdir() if path.is_dir())
-    if group.name not in ("loss", "recipe_at_backbone", "locating_at_preset")  # chosen by other groups
+    if group.name not in ("loss", "recipe_at_backbone") and not group.name.startswith("locating_")  # of other groups
 }
 STRONG = ("recipe=strong", "preset=small")
 OF_STRONG = ("recipe_at_preset", "without")
@@ -66,19 +66,20 @@ def test_defaults_are_the_authors_protocol(checked: Callable) -> None:
     assert build_augmentation(recipe) is None
 
 
-def test_own_objects_train_longer_before_skies_turned_and_exchanged(checked: Callable, tmp_path: Path) -> None:
+def test_own_objects_have_more_images_wider_networks_and_other_backdrops(checked: Callable, tmp_path: Path) -> None:
     (tmp_path / "part.glb").touch()
     own = ("data=object", f"data.mesh={tmp_path}/part.glb")
     for words, expected in [
-        (("preset=small", "recipe=strong", *own), (150, 1.2, 0.75)),
-        (("preset=small", *own), (150, 1.0, 0.0)),
-        (("preset=full", "recipe=strong", *own), (42, 1.2, 0.75)),
-        (("preset=small", "recipe=strong"), (30, 1.0, 0.0)),
-        (("preset=small", "recipe=strong", *own, "trainer.max_epochs=2"), (2, 1.2, 0.75)),
+        (("preset=small", "recipe=strong", *own), (4800, 100, 24, 1.2, 0.75)),
+        (("preset=small", *own), (4800, 100, None, 1.0, 0.0)),
+        (("preset=full", "recipe=strong", *own), (8000, 42, 16, 1.2, 0.75)),
+        (("preset=small", "recipe=strong"), (3200, 30, 16, 1.0, 0.0)),
+        (("preset=small", "recipe=strong", *own, "backbone.width=8"), (4800, 100, 8, 1.2, 0.75)),
     ]:
         config = checked(*words)
+        size = config.data.n_train, config.trainer.max_epochs, config.backbone.get("width")
         augmentation = config.recipe.augmentation
-        assert (config.trainer.max_epochs, augmentation.largest_zoom, augmentation.backdrops) == expected, words
+        assert (*size, augmentation.largest_zoom, augmentation.backdrops) == expected, words
 
 
 @pytest.mark.parametrize(
