@@ -54,8 +54,9 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
     if not skipped:
         require_possible(checked, folder)
         announce(checked, folder, overrides)
-        for data, n_train, n_test in _renders(checked):
-            ensure_rendered(DatasetFolder(data.folder), data.spec, n_train, n_test, data.workers, cores)
+        for data in _renders(checked):
+            counts = data.n_training_split, data.n_test
+            ensure_rendered(DatasetFolder(data.folder), data.spec, *counts, data.workers, cores)
     results = train(checked, folder, draw=_draw(), cores=cores, callbacks=callbacks)
     _record_further(folder, checked, cores)
     print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
@@ -108,8 +109,10 @@ def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> Non
     from phd_exp.training.network import has_gpu
 
     data, epochs = checked.data, checked.trainer.max_epochs
-    missing = (DatasetFolder(one.folder).missing(one.spec, *counts).values() for one, *counts in _renders(checked))
-    n_missing = sum(len(indices) for of_splits in missing for indices in of_splits)
+    n_missing = 0
+    for one in _renders(checked):
+        missing = DatasetFolder(one.folder).missing(one.spec, one.n_training_split, one.n_test)
+        n_missing += sum(map(len, missing.values()))
     render = f"{n_missing} images to render, then " if n_missing else ""
     network = f"{checked.backbone['_target_'].rpartition('.')[2]}{checked.backbone.get('depth', '')}"
     images = "all" if data.n_train is None else data.n_train
@@ -122,13 +125,13 @@ def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> Non
         print(f"  in about ten minutes: python -m phd_exp {words}", flush=True)
 
 
-def _renders(checked: RunConfig) -> Iterator[tuple[RenderedConfig, int, int]]:
-    """The rendered data sets of a training, and the number of samples of both splits."""
+def _renders(checked: RunConfig) -> Iterator[RenderedConfig]:
+    """The rendered data sets of a training."""
     data = checked.data
     if isinstance(data, RenderedConfig):
-        yield data, data.n_training_split, data.n_test
+        yield data
         if checked.recipe.augmentation.backdrops:
-            yield data.model_copy(update={"spec": data.spec.without_objects}), data.n_train, 0
+            yield data.model_copy(update={"spec": data.spec.without_objects, "n_held_out": 0, "n_test": 0})
 
 
 def _record_further(run: RunFolder, checked: RunConfig, cores: int) -> None:

@@ -16,7 +16,8 @@ from phd_exp.training.config import RunConfig, check
 CHOICES = {
     group.name: [f"{group.name}={file.stem}" for file in sorted(group.glob("*.yaml"))]
     for group in sorted(path for path in conf_folder().iterdir() if path.is_dir())
-    if group.name not in ("loss", "recipe_at_backbone") and not group.name.startswith("locating_")  # of other groups
+    # these are chosen by other groups
+    if group.name not in ("loss", "recipe_at_backbone", "locating_at_preset", "locating_at_data")
 }
 STRONG = ("recipe=strong", "preset=small")
 OF_STRONG = ("recipe_at_preset", "without")
@@ -74,6 +75,7 @@ def test_own_objects_have_more_images_wider_networks_and_other_backdrops(checked
         (("preset=small", *own), (4800, 100, None, 1.0, 0.0)),
         (("preset=full", "recipe=strong", *own), (8000, 42, 16, 1.2, 0.75)),
         (("preset=small", "recipe=strong"), (3200, 30, 16, 1.0, 0.0)),
+        (("preset=small", "recipe=strong", *own, "trainer.max_epochs=2"), (4800, 2, 24, 1.2, 0.75)),
         (("preset=small", "recipe=strong", *own, "backbone.width=8"), (4800, 100, 8, 1.2, 0.75)),
     ]:
         config = checked(*words)
