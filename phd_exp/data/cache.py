@@ -39,7 +39,7 @@ def cached(
         key: everything that the pixels depend on.
         shape: of the array.
         jobs: arguments of the calls to `fill`, which run in several threads.
-        fill: decodes one job into the array.
+        fill: decodes one job into the array; the first before any other.
         words: description of the progress bar, which a terminal shows.
         largest: pixels of the largest image; bounds the number of threads.
 
@@ -48,9 +48,13 @@ def cached(
 
     def fill_all(array: np.ndarray) -> None:
         console = Console(stderr=True)
+        for job in jobs[:1]:  # in this thread: Blender may start here, and not in several threads at once
+            fill(array, job)
         with ThreadPoolExecutor(max(1, min(DECODERS, LARGEST_AT_ONCE // largest))) as pool:
-            done = pool.map(partial(fill, array), jobs)
-            for _ in track(done, words, len(jobs), console=console, transient=True, disable=not console.is_terminal):
+            done = pool.map(partial(fill, array), jobs[1:])
+            for _ in track(
+                done, words, len(jobs) - 1, console=console, transient=True, disable=not console.is_terminal
+            ):
                 pass
 
     key_file, unfinished = file.with_suffix(".json"), file.with_suffix(".unfinished")

@@ -1,6 +1,6 @@
 """The images of a rendered data set, checked and shrunk, and masks of where they show the object."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -47,11 +47,16 @@ def cached_images(
     return cached(file, key, (n, image_size, image_size, 3), range(n), fill, f"decoding {split} images once")
 
 
-def cached_masks(folder: DatasetFolder, split: Split, records: Sequence[SampleRecord], meshes: Meshes) -> np.ndarray:
-    """The masks of the records as a memory-mapped array (n, CELLS, CELLS), uint8; see `mask`."""
+def cached_masks(
+    folder: DatasetFolder, split: Split, records: Sequence[SampleRecord], meshes: Callable[[], Meshes]
+) -> np.ndarray:
+    """The masks of the records as a memory-mapped array (n, CELLS, CELLS), uint8; see `mask`.
+
+    `meshes` is called for every mask that is drawn: it starts Blender the first time, which takes seconds.
+    """
 
     def fill(array: np.ndarray, row: int) -> None:
-        array[row] = mask(records[row], meshes)
+        array[row] = mask(records[row], meshes())
 
     n, file = len(records), folder.cache / f"{split}-{len(records)}-masks.npy"
     key = {"masks": DRAWING, "images": _checksum(records)}
@@ -59,12 +64,19 @@ def cached_masks(folder: DatasetFolder, split: Split, records: Sequence[SampleRe
 
 
 def cached_clearings(
-    folder: DatasetFolder, split: Split, records: Sequence[SampleRecord], meshes: Meshes, image_size: int
+    folder: DatasetFolder,
+    split: Split,
+    records: Sequence[SampleRecord],
+    meshes: Callable[[], Meshes],
+    image_size: int,
 ) -> np.ndarray:
-    """The share of each pixel of the images that shows no object, 0 to 255: (n, image_size, image_size), uint8."""
+    """The share of each pixel of the images that shows no object, 0 to 255: (n, image_size, image_size), uint8.
+
+    `meshes` as for `cached_masks`.
+    """
 
     def fill(array: np.ndarray, row: int) -> None:
-        clear = trace_pixels(records[row].shown, meshes).first == NOTHING
+        clear = trace_pixels(records[row].shown, meshes()).first == NOTHING
         array[row] = shrunk(np.repeat(255 * clear[..., None].astype(np.uint8), 3, axis=-1), image_size)[..., 0]
 
     n, file = len(records), folder.cache / f"{split}-{len(records)}x{image_size}-clear.npy"

@@ -99,14 +99,14 @@ class RenderedSource(Source):
 
     def training_masks(self) -> UInt8[Tensor, "samples rows columns"]:
         split, records, rows = self._records("train")
-        return torch.from_numpy(cached_masks(self.folder, split, records, self._meshes)[rows])
+        return torch.from_numpy(cached_masks(self.folder, split, records, lambda: self._meshes)[rows])
 
     def training_backdrops(self) -> Backdrops:
         split, records, rows = self._records("train")
         empty = self.spec.without_objects
         folder = DatasetFolder(self.folder.root.with_name(empty.variant))
         images = cached_images(folder, split, folder.records(split, self.n["train"]), self.side)
-        clear = cached_clearings(self.folder, split, records[rows], self._meshes, self.side)
+        clear = cached_clearings(self.folder, split, records[rows], lambda: self._meshes, self.side)
         return Backdrops(torch.from_numpy(images), torch.from_numpy(clear))
 
     @cached_property
