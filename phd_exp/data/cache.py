@@ -50,11 +50,10 @@ def cached(
         console = Console(stderr=True)
         for job in jobs[:1]:  # in this thread: Blender may start here, and not in several threads at once
             fill(array, job)
+        rest = jobs[1:]
         with ThreadPoolExecutor(max(1, min(DECODERS, LARGEST_AT_ONCE // largest))) as pool:
-            done = pool.map(partial(fill, array), jobs[1:])
-            for _ in track(
-                done, words, len(jobs) - 1, console=console, transient=True, disable=not console.is_terminal
-            ):
+            done = pool.map(partial(fill, array), rest)
+            for _ in track(done, words, len(rest), console=console, transient=True, disable=not console.is_terminal):
                 pass
 
     key_file, unfinished = file.with_suffix(".json"), file.with_suffix(".unfinished")
