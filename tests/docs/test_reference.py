@@ -27,6 +27,12 @@ def test_every_page_is_in_the_contents_and_there() -> None:
     assert sorted(_files(contents)) == sorted([*map(name, PAGES), "api/index.md"])
 
 
+def test_readme_and_index_list_every_guide() -> None:
+    for page in (ROOT / "README.md", DOCS / "index.md"):
+        listed = set(re.findall(r"^\| \[.*?\]\((?:docs/)?guides/(\S+)\)", page.read_text(), re.MULTILINE))
+        assert listed == {file.name for file in (DOCS / "guides").glob("*.md")}, name(page)
+
+
 def test_the_reference_has_a_page_for_every_module() -> None:
     public = [file for file in PACKAGE.glob("*/**/*.py") if file.relative_to(PACKAGE).parts[0] not in PRIVATE]
     named = [place for text in REFERENCE.values() for place in _DIRECTIVE.findall(text)]
