@@ -74,9 +74,13 @@ def log_det(M: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch"]:
 
 def inverse(M: Float[Tensor, "*batch 2 2"], log_det_M: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2 2"]:
     """The inverse of a symmetric positive definite matrix whose log determinant is known: adj(M) / |M|."""
-    adjugate = torch.stack([M[..., 1, 1], -M[..., 0, 1], -M[..., 1, 0], M[..., 0, 0]], dim=-1)
     root = torch.exp(-log_det_M / 2)[..., None, None]  # of 1/|M|, which may itself overflow
-    return adjugate.unflatten(-1, (2, 2)) * root * root
+    return adjugate(M) * root * root
+
+
+def adjugate(M: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2 2"]:
+    """adj(M) = |M| M^-1, also of a singular matrix."""
+    return torch.stack([M[..., 1, 1], -M[..., 0, 1], -M[..., 1, 0], M[..., 0, 0]], dim=-1).unflatten(-1, (2, 2))
 
 
 def square(M: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2 2"]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from phd_exp.distributions import Density, PointEstimate, ProjectedHuber
 from phd_exp.distributions.quantiles import LEVELS, Quantiles
 from phd_exp.distributions.shaped import Shaped
-from phd_exp.distributions.spd import matvec, spectral_map
+from phd_exp.distributions.spd import adjugate, matvec, spectral_map
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import Chart, DepthScale
 
@@ -156,6 +156,6 @@ class ChartHead:
 
 def _shortening(n: Float[Tensor, "*batch 2"], B: Float[Tensor, "*batch 2 2"], log_det_B: Tensor) -> Tensor:
     """The factor, 1 or less, with which B^-1 n is no longer than `FARTHEST`; a constant for the gradient."""
-    adjugate = torch.eye(2).to(B) * (B[..., 0, 0] + B[..., 1, 1])[..., None, None] - B
+    # compared times |B|, which may underflow
     longest = FARTHEST * log_det_B.exp() + torch.finfo(B.dtype).tiny
-    return longest / torch.maximum(longest, torch.linalg.vector_norm(matvec(adjugate, n.detach()), dim=-1))
+    return longest / torch.maximum(longest, torch.linalg.vector_norm(matvec(adjugate(B), n.detach()), dim=-1))
