@@ -51,7 +51,7 @@ def sightings(predictor: Predictor, detections: Sequence[Detection]) -> Iterator
     """
     for batch in _batches(predictor, detections):
         f = torch.tensor([view.camera.f for _, _, view in batch], dtype=torch.float64)
-        raw = predictor.raw(np.stack([view.image for _, _, view in batch]), f).double()
+        raw = predictor.raw(np.stack([view.image for _, _, view in batch]), f)
         # a batch takes an ensemble less time than its images one by one
         predictions = predictor.predict(raw, f) if predictor.is_ensemble else None
         familiar = predictor.familiar(raw, f)

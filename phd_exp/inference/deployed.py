@@ -54,7 +54,7 @@ class OfImages(Deployed):
 
     def forward(self, image: UInt8[Tensor, "batch S S 3"], f: Float[Tensor, " batch"]) -> tuple[Tensor, ...]:
         raw = self.predictor.outputs(image, self.predictor.camera(f).f)
-        answers = self.answers(self.predictor.predict(raw.double(), f.double()), image, f)
+        answers = self.answers(self.predictor.predict(raw, f), image, f)
         return (raw, *(value.float() for value in answers.values()))
 
     def cases(self) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Prediction]]:
@@ -63,7 +63,7 @@ class OfImages(Deployed):
         f = (side * torch.linspace(*FOCAL_LENGTHS, n)).float()
         for rows in torch.arange(n).split(list(BATCHES)):
             raw = self.predictor.raw(images[rows].numpy(), f[rows])
-            yield (images[rows], f[rows]), raw, self.predictor.predict(raw.double(), f[rows].double())
+            yield (images[rows], f[rows]), raw, self.predictor.predict(raw, f[rows])
 
 
 class OfPhotographs(Deployed):
@@ -81,7 +81,7 @@ class OfPhotographs(Deployed):
         R, f = facing(K, boxes, self.predictor.side, self.predictor.largest_f)
         image = area_means(sums(photograph), pixel_corners(K, R, f, self.predictor.side))
         raw = self.predictor.outputs(image, self.predictor.camera(f.float()).f)
-        answers = self.answers(self.predictor.predict(raw.double(), f.float().double()), photograph, K, boxes)
+        answers = self.answers(self.predictor.predict(raw, f.float()), photograph, K, boxes)
         return (raw, *(value.float() for value in answers.values()))
 
     def answers(self, prediction: Prediction, *inputs: Tensor) -> dict[str, Tensor]:

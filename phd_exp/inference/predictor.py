@@ -222,7 +222,7 @@ class Predictor:
         """
         if self.familiarity is None:
             return None
-        prediction = self.predict(raw.double(), f.double())
+        prediction = self.predict(raw, f)
         assert isinstance(prediction, ProjectedHuber)  # only those have a familiarity
         columns = parameter_columns(prediction) | {"f": f.double(), "S": torch.full_like(f, self.side)}
         if self.is_ensemble:
@@ -231,10 +231,11 @@ class Predictor:
         return self.familiarity.p_value(distance)
 
     def predict(self, raw: Float[Tensor, "*batch n_outputs"], f: Float[Tensor, "*batch"]) -> Prediction:
-        """Predictions from the raw numbers of the network and focal lengths in pixels of its images.
+        """Predictions in float64, from the raw numbers of the network and focal lengths in pixels of its images.
 
         Those of an ensemble have a dimension for the members before the last.
         """
+        raw, f = raw.double(), f.double()
         prediction = self.members(raw, f).closest if self.is_ensemble else self.regressor.head(raw, self.camera(f))
         if self.temperature is not None and isinstance(prediction, ProjectedHuber):
             return self.temperature.apply(prediction)

@@ -31,8 +31,8 @@ GOLDEN = (math.sqrt(5) - 1) / 2
 class PositionModule(LightningModule):
     """Image and camera -> prediction -> loss, with the metrics of both splits logged once per epoch.
 
-    Training runs in the precision of the Trainer. Evaluation always runs in float32, so that logged metrics, recorded
-    predictions, `predict` and an exported network agree.
+    Training runs in the precision of the Trainer. The network is always evaluated in float32, so that logged metrics,
+    recorded predictions, `predict` and an exported network agree.
 
     Args:
         regressor: image and camera -> prediction.
@@ -74,7 +74,9 @@ class PositionModule(LightningModule):
         self.table: Columns = {}
 
     def forward(self, batch: Batch) -> Prediction:
-        return self.regressor(batch.image, self.camera(batch))
+        """Predictions, in float64: a float32 record of a nearly singular A may not be positive definite."""
+        camera = self.camera(batch)
+        return self.regressor.head(self.regressor.raw(batch.image, camera.f).double(), camera)
 
     def camera(self, batch: Batch) -> Camera:
         """The cameras of a batch as the model knows them."""
@@ -142,7 +144,7 @@ class PositionModule(LightningModule):
         self._finish_evaluation(self.evaluation_rows)
 
     def _predict(self, batch: Batch, rows: Rows) -> tuple[Prediction, Tensor]:
-        """Predict a batch in float32 and record its rows; returns the predictions and their losses."""
+        """Predict a batch, with a network in float32, and record its rows; returns the predictions and their losses."""
         with torch.autocast(self.device.type, enabled=False):
             prediction = self(batch)
             losses = self.loss(prediction, batch.xyz)

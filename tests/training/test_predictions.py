@@ -1,5 +1,7 @@
 """A prediction as columns: what the record holds is what the formulas say."""
 
+import math
+from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
@@ -8,9 +10,11 @@ import torch
 
 from phd_exp.data.batches import Batch
 from phd_exp.distributions import PointEstimate, ProjectedHuber
-from phd_exp.distributions.columns import distribution_columns
+from phd_exp.distributions.columns import distribution_columns, from_columns
 from phd_exp.geometry import DepthScale, Projected
 from phd_exp.metrics.rows import Rows
+from phd_exp.training.build import build_data, build_module
+from phd_exp.training.config import check
 from phd_exp.training.predictions import calibration_curves, columns, summary, write_parquet
 
 DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
@@ -47,6 +51,22 @@ def test_columns_rebuild_the_distribution(batch: Batch, distribution: ProjectedH
     torch.testing.assert_close(-rebuilt.log_prob(batch.xyz.double()), table["nll"], rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(rebuilt.depth_variance, table["depth_variance"], rtol=1e-4, atol=0)
     torch.testing.assert_close(rebuilt.depth_median, table["median_z"], rtol=1e-4, atol=0)
+
+
+def test_an_evaluated_precision_that_is_nearly_singular_is_positive_definite_in_the_record(
+    composed: Callable, batch: Batch
+) -> None:
+    """Eigenvalues of B in the ratio of 1e10, which float32 would round to a matrix that is not."""
+    config = check(composed("preset=smoke"))
+    module = build_module(config, build_data(config)).eval()
+    bias = module.regressor.last.bias
+    assert isinstance(bias, torch.nn.Parameter)
+    turn = torch.tensor([[0.8, -0.6], [0.6, 0.8]])
+    M = turn @ torch.diag(torch.tensor([2000.0, math.log(2e-7)])) @ turn.mT
+    bias.data[2:5] = torch.stack([M[0, 0], math.sqrt(2) * M[0, 1], M[1, 1]])
+    with torch.no_grad():
+        table = columns(module(batch), batch)
+    assert (torch.linalg.eigvalsh(from_columns(table).A) > 0).all()
 
 
 def test_summary_is_the_mean_of_the_columns(batch: Batch, distribution: ProjectedHuber) -> None:
