@@ -144,7 +144,7 @@ class PositionModule(LightningModule):
         self._finish_evaluation(self.evaluation_rows)
 
     def _predict(self, batch: Batch, rows: Rows) -> tuple[Prediction, Tensor]:
-        """Predict a batch, with a network in float32, and record its rows; returns the predictions and their losses."""
+        """Predict a batch without autocast and record its rows; returns the predictions and their losses."""
         with torch.autocast(self.device.type, enabled=False):
             prediction = self(batch)
             losses = self.loss(prediction, batch.xyz)
