@@ -85,9 +85,7 @@ def test_equal_runs_are_one_run_and_different_ones_their_mixture(make: Callable)
     f = torch.full((4,), 250.0)
     mixture = together.members(together.raw(images.numpy(), f), f)
     alone = [predictor(images, f=250.0) for predictor in (single, second)]
-    torch.testing.assert_close(
-        mixture.mean, torch.stack([p.mean for p in alone]).mean(0), rtol=1e-4, atol=1e-5
-    )
+    torch.testing.assert_close(mixture.mean, torch.stack([p.mean for p in alone]).mean(0), rtol=1e-4, atol=1e-5)
     same(together(images, f=250.0), mixture.closest)
 
 
