@@ -60,6 +60,22 @@ def _divided_difference(upper: Tensor, lower: Tensor) -> Tensor:
     return torch.where(equal, upper_low.exp(), (linear + exponential) / gap)
 
 
+def conditioned(b: Float[Tensor, "*batch 3"], ratio: float) -> Float[Tensor, "*batch 3"]:
+    """b for which the lesser eigenvalue of `spectral_map` is at least 1/ratio of the greater; others are unchanged.
+
+    The change is a constant for the gradient, so that training can leave the bound.
+    """
+    b_1, b_2, b_3 = b.detach().unbind(-1)
+    half, off = (b_1 - b_3) / 2, b_2 / math.sqrt(2)
+    r = (half.square() + off.square()).sqrt()
+    upper = (b_1 + b_3) / 2 + r
+    log_least = log_positive(upper) - math.log(ratio)
+    least = log_least.clamp_max(0) + torch.expm1(log_least.clamp_min(0))  # the s whose phi(s) this is
+    raised = (least - (upper - 2 * r)).clamp_min(0) / 2
+    cosine, sine = (part / r.clamp_min(torch.finfo(b.dtype).tiny) for part in (half, off))
+    return b + raised[..., None] * torch.stack([1 - cosine, -math.sqrt(2) * sine, 1 + cosine], dim=-1)
+
+
 def matvec(M: Float[Tensor, "*#batch 2 2"], x: Float[Tensor, "*#batch 2"]) -> Float[Tensor, "*#batch 2"]:
     """The product M x."""
     # written out, because a sum over two elements is slower
@@ -74,13 +90,9 @@ def log_det(M: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch"]:
 
 def inverse(M: Float[Tensor, "*batch 2 2"], log_det_M: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2 2"]:
     """The inverse of a symmetric positive definite matrix whose log determinant is known: adj(M) / |M|."""
+    adjugate = torch.stack([M[..., 1, 1], -M[..., 0, 1], -M[..., 1, 0], M[..., 0, 0]], dim=-1)
     root = torch.exp(-log_det_M / 2)[..., None, None]  # of 1/|M|, which may itself overflow
-    return adjugate(M) * root * root
-
-
-def adjugate(M: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2 2"]:
-    """adj(M) = |M| M^-1, also of a singular matrix."""
-    return torch.stack([M[..., 1, 1], -M[..., 0, 1], -M[..., 1, 0], M[..., 0, 0]], dim=-1).unflatten(-1, (2, 2))
+    return adjugate.unflatten(-1, (2, 2)) * root * root
 
 
 def square(M: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2 2"]:

@@ -14,14 +14,14 @@ from torch import Tensor
 from phd_exp.distributions import Density, PointEstimate, ProjectedHuber
 from phd_exp.distributions.quantiles import LEVELS, Quantiles
 from phd_exp.distributions.shaped import Shaped
-from phd_exp.distributions.spd import adjugate, matvec, spectral_map
+from phd_exp.distributions.spd import conditioned, spectral_map
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import Chart, DepthScale
 
 Prediction = ProjectedHuber | Shaped | PointEstimate
 
-FARTHEST = 2.0
-"""Half sides of the image, from the place that a backbone finds to the centre of a density."""
+LARGEST_RATIO = 100.0
+"""Of the precisions of a projected position in two directions. Larger ones, on unusual images, were useless."""
 
 
 @runtime_checkable
@@ -41,7 +41,7 @@ class Head(Protocol):
 
 
 class DistributionHead:
-    """Seven raw numbers -> the Projected Huber distribution.
+    """Seven raw numbers -> the Projected Huber distribution, with eigenvalues of A up to `LARGEST_RATIO` apart.
 
     Examples:
         >>> import torch
@@ -60,17 +60,14 @@ class DistributionHead:
 
     def __call__(self, raw: Float[Tensor, "*batch 7"], camera: Camera) -> ProjectedHuber:
         # not validated for speed: the training step refuses a loss that is not finite
+        n, b, w = raw.split((2, 3, 2), dim=-1)
+        raw = torch.cat([n, conditioned(b, LARGEST_RATIO), w], dim=-1)
         return ProjectedHuber.from_raw(raw, f=camera.f, S=camera.S, mu_z0=self.mu_z0, validate_args=False)
 
     def placed(self, raw: Float[Tensor, "*batch n"], place: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch n"]:
-        """Raw numbers with the centre nu_p = B v_p shifted by B `place`: the same shift of v_p for every B.
-
-        The centre stays within `FARTHEST` of `place`: where B is nearly singular, B^-1 would take it anywhere.
-        """
-        n, b, w = raw.split((2, 3, raw.shape[-1] - 5), dim=-1)
-        B, log_det_B = spectral_map(b)
-        n = n * _shortening(n, B.detach(), log_det_B.detach())[..., None]
-        return torch.cat([n + (B @ place[..., None]).squeeze(-1), b, w], dim=-1)
+        """Raw numbers with the centre nu_p = B v_p shifted by B `place`: the same shift of v_p for every B."""
+        B, _ = spectral_map(conditioned(raw[..., 2:5], LARGEST_RATIO))
+        return torch.cat([raw[..., :2] + (B @ place[..., None]).squeeze(-1), raw[..., 2:]], dim=-1)
 
     def turned_back(
         self, raw: Float[Tensor, "*views 7"], signs: Float[Tensor, "*#views 3"]
@@ -152,10 +149,3 @@ class ChartHead:
         if not self.chart.has_projection:
             return raw
         return torch.cat([raw[..., :2] + place, raw[..., 2:]], dim=-1)
-
-
-def _shortening(n: Float[Tensor, "*batch 2"], B: Float[Tensor, "*batch 2 2"], log_det_B: Tensor) -> Tensor:
-    """The factor, 1 or less, with which B^-1 n is no longer than `FARTHEST`; a constant for the gradient."""
-    # compared times |B|, which may underflow
-    longest = FARTHEST * log_det_B.exp() + torch.finfo(B.dtype).tiny
-    return longest / torch.maximum(longest, torch.linalg.vector_norm(matvec(adjugate(B), n.detach()), dim=-1))

@@ -74,9 +74,7 @@ class PositionModule(LightningModule):
         self.table: Columns = {}
 
     def forward(self, batch: Batch) -> Prediction:
-        """Predictions, in float64: a float32 record of a nearly singular A may not be positive definite."""
-        camera = self.camera(batch)
-        return self.regressor.head(self.regressor.raw(batch.image, camera.f).double(), camera)
+        return self.regressor(batch.image, self.camera(batch))
 
     def camera(self, batch: Batch) -> Camera:
         """The cameras of a batch as the model knows them."""

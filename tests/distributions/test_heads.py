@@ -187,7 +187,6 @@ def test_placed_shifts_the_projection_of_the_whole_density(model: str) -> None:
     """The density at a position is that at the position whose v_p is moved back by `place`, at the same depth."""
     head, place = SHAPED[model], torch.tensor([0.3, -0.2], dtype=torch.float64)
     raw = torch.randn(20, head.n_outputs, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    raw[:, :2] *= 0.1  # no centre is farther away than `FARTHEST`
     camera = Camera(torch.full((20,), 1550.0, dtype=torch.float64), 224.0)
     xyz = torch.rand(20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) + 1
     moved = xyz + torch.nn.functional.pad(place * 224 / (2 * 1550) * xyz[:, 2:], (0, 1))

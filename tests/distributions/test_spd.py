@@ -74,6 +74,28 @@ def test_spectral_map_of_nearly_equal_eigenvalues_in_float32(middle: float) -> N
     torch.testing.assert_close(gradient, expected.expand_as(gradient), rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.parametrize("scale", [5, 30, 100])
+def test_conditioned_raises_the_lesser_eigenvalue_alone(scale: int) -> None:
+    b = scale * torch.randn(1000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    before, after = (torch.linalg.eigh(spd.spectral_map(x)[0]) for x in (b, spd.conditioned(b, 100.0)))
+    far = before.eigenvalues[:, 1] > 100 * before.eigenvalues[:, 0]
+    assert 0 < far.sum() < 1000
+    assert torch.equal(spd.conditioned(b, 100.0)[~far], b[~far])
+    greater = before.eigenvalues[far, 1]
+    torch.testing.assert_close(after.eigenvalues[far], torch.stack([greater / 100, greater], -1), rtol=1e-9, atol=0)
+    same = (before.eigenvectors * after.eigenvectors).sum(-2).abs()[far]
+    torch.testing.assert_close(same, torch.ones_like(same))
+
+
+@pytest.mark.parametrize("b", [(0.0, 0.0, 0.0), (35.0, 11.0, -9.0), (-2e3, 0.0, -2e3), (1e9, 1e9, -1e9)])
+def test_conditioned_has_the_derivative_of_the_identity_in_float32(b: tuple[float, float, float]) -> None:
+    raw = torch.tensor(b, requires_grad=True)
+    conditioned = spd.conditioned(raw, 100.0)
+    assert conditioned.isfinite().all()
+    (gradient,) = torch.autograd.grad(conditioned.sum(), raw)
+    assert torch.equal(gradient, torch.ones(3))
+
+
 def test_positive_has_slope_one_at_zero() -> None:
     s = torch.tensor([-2.0, -1e-3, 0.0, 1e-3, 3.0], dtype=torch.float64, requires_grad=True)
     torch.testing.assert_close(spd.positive(s), torch.where(s < 0, s.exp(), s + 1))

@@ -11,7 +11,7 @@ from torch.testing import assert_close
 from phd_exp.geometry import Camera, Cartesian, DepthScale, LogDepth, Projected
 from phd_exp.geometry.camera import middles
 from phd_exp.geometry.charts import projected
-from phd_exp.models.heads import FARTHEST, ChartHead, DistributionHead, Head
+from phd_exp.models.heads import ChartHead, DistributionHead, Head
 from phd_exp.models.locating import Locating, _of_segment
 from phd_exp.models.regressor import Regressor
 from tests.support.heads import SHAPED
@@ -135,22 +135,12 @@ def test_a_placed_prediction_lies_there(name: str) -> None:
     assert_close(mode[:, 2], head(raw, CAMERA).mode[:, 2])
 
 
-@pytest.mark.parametrize("b", [(35.1, 10.9, -8.7), (-3.0, 0.0, -9.0), (-200.0, 0.0, -200.0)])
-def test_a_nearly_singular_precision_does_not_move_the_centre_away(b: tuple[float, float, float]) -> None:
-    """Once, a network for `occl` had the first of these numbers, and the object 66 km away."""
+def test_a_nearly_singular_precision_does_not_move_the_centre_far_away() -> None:
+    """Once, a network for `occl` had these numbers, and the object 66 km away."""
     head, place = PLACED["probabilistic"], torch.tensor([0.2, -0.5])
-    raw = torch.tensor([3.5, -0.4, *b, -1.2, 3.0], requires_grad=True)
-    placed = head.placed(raw, place)
-    if b[2] > -100:  # else B is zero
-        away = projected(head(placed.double(), CAMERA).mode, CAMERA) - place
-        assert_close(torch.linalg.vector_norm(away, dim=-1), torch.full((4,), FARTHEST).double(), atol=0, rtol=0.03)
-    (gradient,) = torch.autograd.grad(placed.sum(), raw)
-    assert gradient.isfinite().all()
-
-
-def test_a_centre_that_is_near_enough_keeps_its_numbers() -> None:
-    raw = torch.tensor([9.0, -4.0, 35.0, 10.0, 25.0, 8.0, 1.0])
-    assert torch.equal(PLACED["probabilistic"].placed(raw, torch.zeros(2)), raw)
+    placed = head.placed(torch.tensor([3.5, -0.4, 35.1, 10.9, -8.7, -1.2, 3.0]), place)
+    away = projected(head(placed, CAMERA).mode, CAMERA) - place
+    assert torch.linalg.vector_norm(away, dim=-1).max() < 3  # half sides of the image
 
 
 def test_a_chart_without_a_projection_is_not_placed() -> None:

@@ -56,7 +56,7 @@ def test_columns_rebuild_the_distribution(batch: Batch, distribution: ProjectedH
 def test_an_evaluated_precision_that_is_nearly_singular_is_positive_definite_in_the_record(
     composed: Callable, batch: Batch
 ) -> None:
-    """Eigenvalues of B in the ratio of 1e10, which float32 would round to a matrix that is not."""
+    """Raw numbers of eigenvalues of B in the ratio of 1e10: rounded to float32, such a matrix would be indefinite."""
     config = check(composed("preset=smoke"))
     module = build_module(config, build_data(config)).eval()
     bias = module.regressor.last.bias
