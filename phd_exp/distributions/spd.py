@@ -72,7 +72,7 @@ def conditioned(b: Float[Tensor, "*batch 3"], ratio: float) -> Float[Tensor, "*b
     log_least = log_positive(upper) - math.log(ratio)
     least = log_least.clamp_max(0) + torch.expm1(log_least.clamp_min(0))  # the s whose phi(s) this is
     raised = (least - (upper - 2 * r)).clamp_min(0) / 2
-    cosine, sine = (part / r.clamp_min(torch.finfo(b.dtype).tiny) for part in (half, off))
+    cosine, sine = (part / r.masked_fill(r == 0, 1) for part in (half, off))
     return b + raised[..., None] * torch.stack([1 - cosine, -math.sqrt(2) * sine, 1 + cosine], dim=-1)
 
 
