@@ -3,11 +3,13 @@
 import shutil
 import subprocess
 import sys
+from hashlib import sha256
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
+from phd_exp.reports.table import NOTHING
 from tests.docs.pages import ROOT
 
 PAGES = ("README.md", "docs/guides/tables.md")
@@ -47,6 +49,17 @@ def test_numbers_taken_again_replace_the_old_ones(copied: Path) -> None:
     assert len(after) == len(lines)
     assert (after["mean"] == "123456.0").sum() == len(again) > 0
     assert all("1234" not in (ROOT / page).read_text() != (copied / page).read_text() for page in PAGES)
+
+
+def test_a_run_with_the_positions_of_the_authors_has_a_row(copied: Path) -> None:
+    file = copied / "docs" / "results" / "runs.csv"
+    runs = pd.read_csv(file, dtype=str, keep_default_na=False)
+    plain = runs[(runs["model"] == "probabilistic") & (runs["data"] == "occl") & (runs["seed"] == "0")]
+    of_half = plain.assign(overrides=sha256(b"data.xy_range=0.5").hexdigest()[:8], mean="12345.6", high="12346.6")
+    pd.concat([runs, of_half]).to_csv(file, index=False)
+    assert write(copied).returncode == 0
+    (row,) = (line for line in (copied / "README.md").read_text().splitlines() if "data.xy_range=0.5" in line)
+    assert row.split(" | ")[1:] == [NOTHING, "12345.6 ± 1.0† / 12346 ± 1†", NOTHING, f"{NOTHING} |"]
 
 
 def test_a_page_that_differs_is_named(copied: Path) -> None:
