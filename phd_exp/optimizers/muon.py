@@ -1,7 +1,8 @@
 """Muon: each layer steps along its orthogonalised momentum, equally far in all directions of its output."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated
 
 import torch
@@ -78,14 +79,15 @@ class Muon(Optimizer):
         return loss
 
     def _orthogonal_step(self, weights: list[nn.Parameter], lr: float, momentum: float) -> None:
+        ahead = []
         for weight, gradient in zip(weights, _gradients(weights), strict=True):
             state = self.state[weight]
             if not state:
                 state["mean"] = torch.zeros_like(weight)
             state["mean"].lerp_(gradient, 1 - momentum)
-            ahead = torch.lerp(gradient, state["mean"], momentum).flatten(1)
-            scale = 0.2 * math.sqrt(max(ahead.shape))
-            weight.add_(orthogonal(ahead).view(weight.shape), alpha=-lr * scale)
+            ahead.append(torch.lerp(gradient, state["mean"], momentum).flatten(1))
+        for weight, step in zip(weights, orthogonal(ahead), strict=True):
+            weight.add_(step.view(weight.shape), alpha=-lr * 0.2 * math.sqrt(max(step.shape)))
 
     def _adam_step(self, weights: list[nn.Parameter], lr: float) -> None:
         for weight in weights:
@@ -102,24 +104,36 @@ class Muon(Optimizer):
         )  # fmt: skip
 
 
-def orthogonal(matrix: Float[Tensor, "rows columns"]) -> Float[Tensor, "rows columns"]:
-    """Nearly U V^T of a matrix U S V^T: singular values from 0.6 to 1.3, of all above a 500th of the matrix's norm.
+def orthogonal(matrices: Sequence[Float[Tensor, "_ _"]]) -> list[Float[Tensor, "_ _"]]:
+    """Nearly U V^T of each matrix U S V^T: singular values from 0.6 to 1.3, of all above a 500th of its norm.
 
     The Newton-Schulz iteration X <- (a + b X X^T + c (X X^T)^2) X multiplies X by polynomials of G = X X^T only.
-    Their product is accumulated in one matrix of the size of G and multiplied by X at the end.
+    Their product is accumulated in one matrix of the size of G and multiplied by X at the end. Matrices with G of one
+    size are iterated together, since most are so small that calls take longer than arithmetic.
     """
-    tall = matrix.shape[0] > matrix.shape[1]
-    wide = matrix.T if tall else matrix
-    wide = wide / wide.norm().clamp_min(torch.finfo(wide.dtype).tiny)
+    wide = [matrix.T if matrix.shape[0] > matrix.shape[1] else matrix for matrix in matrices]
+    wide = [matrix / matrix.norm().clamp_min(torch.finfo(matrix.dtype).tiny) for matrix in wide]
+    by_size: defaultdict[int, list[int]] = defaultdict(list)
+    for i, matrix in enumerate(wide):
+        by_size[len(matrix)].append(i)
+    results = [*wide]
+    for alike in by_size.values():
+        products = _polynomial(torch.stack([wide[i] @ wide[i].T for i in alike]))
+        for i, product in zip(alike, products, strict=True):
+            result = product @ wide[i]
+            results[i] = result if matrices[i].shape == result.shape else result.T
+    return results
+
+
+def _polynomial(gram: Float[Tensor, "n size size"]) -> Float[Tensor, "n size size"]:
+    """The product of the iteration's polynomials of Gram matrices."""
     a, b, c = _QUINTIC
-    gram = wide @ wide.T
-    product = one = torch.eye(len(gram), dtype=gram.dtype, device=gram.device)
+    product = one = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
     for _ in range(_ROUNDS):
-        factor = torch.addmm(a * one + b * gram, gram, gram, alpha=c)
+        factor = torch.baddbmm(a * one + b * gram, gram, gram, alpha=c)
         product = factor @ product
         gram = factor @ (factor @ gram)
-    result = product @ wide
-    return result.T if tall else result
+    return product
 
 
 def _mixes_features(weight: Tensor) -> bool:

@@ -24,7 +24,7 @@ def descend(model: nn.Module, optimizer: torch.optim.Optimizer, steps: int) -> N
 def test_singular_values_come_near_one_and_vectors_stay(shape: tuple[int, int]) -> None:
     matrix = torch.randn(shape, generator=torch.Generator().manual_seed(1))
     U, S, Vh = torch.linalg.svd(matrix, full_matrices=False)
-    rotated = U.T @ orthogonal(matrix) @ Vh.T
+    rotated = U.T @ orthogonal([matrix])[0] @ Vh.T
     found = rotated.diagonal()
     large = S.norm() / 500 < S
     assert large.sum() >= len(S) - 1
@@ -33,8 +33,15 @@ def test_singular_values_come_near_one_and_vectors_stay(shape: tuple[int, int]) 
     torch.testing.assert_close(rotated, found.diag(), atol=2e-3, rtol=0)
 
 
+def test_matrices_iterated_together_are_those_iterated_alone() -> None:
+    generator = torch.Generator().manual_seed(6)
+    matrices = [torch.randn(shape, generator=generator) for shape in [(8, 72), (16, 8), (8, 8), (72, 8), (16, 144)]]
+    for together, matrix in zip(orthogonal(matrices), matrices, strict=True):
+        torch.testing.assert_close(together, orthogonal([matrix])[0])
+
+
 def test_no_gradient_is_no_step() -> None:
-    assert torch.equal(orthogonal(torch.zeros(4, 6)), torch.zeros(4, 6))
+    assert torch.equal(orthogonal([torch.zeros(4, 6)])[0], torch.zeros(4, 6))
 
 
 @pytest.mark.parametrize("decay", [0.0, 5.0])
