@@ -1,7 +1,6 @@
 """Muon: each layer steps along its orthogonalised momentum, equally far in all directions of its output."""
 
 import math
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated
 
@@ -111,17 +110,16 @@ def orthogonal(matrices: Sequence[Float[Tensor, "_ _"]]) -> list[Float[Tensor, "
     Their product is accumulated in one matrix of the size of G and multiplied by X at the end. Matrices with G of one
     size are iterated together, since most are so small that calls take longer than arithmetic.
     """
-    wide = [matrix.T if matrix.shape[0] > matrix.shape[1] else matrix for matrix in matrices]
-    wide = [matrix / matrix.norm().clamp_min(torch.finfo(matrix.dtype).tiny) for matrix in wide]
-    by_size: defaultdict[int, list[int]] = defaultdict(list)
-    for i, matrix in enumerate(wide):
-        by_size[len(matrix)].append(i)
-    results = [*wide]
-    for alike in by_size.values():
-        products = _polynomial(torch.stack([wide[i] @ wide[i].T for i in alike]))
-        for i, product in zip(alike, products, strict=True):
-            result = product @ wide[i]
-            results[i] = result if matrices[i].shape == result.shape else result.T
+    units = [matrix / matrix.norm().clamp_min(torch.finfo(matrix.dtype).tiny) for matrix in matrices]
+    grams = [unit.T @ unit if unit.shape[0] > unit.shape[1] else unit @ unit.T for unit in units]
+    polynomials = {
+        size: iter(_polynomial(torch.stack([gram for gram in grams if len(gram) == size])))
+        for size in {*map(len, grams)}
+    }
+    results = []
+    for unit, gram in zip(units, grams, strict=True):
+        polynomial = next(polynomials[len(gram)])
+        results.append(polynomial @ unit if len(unit) == len(gram) else unit @ polynomial)
     return results
 
 
