@@ -107,7 +107,7 @@ def summary(cells: pd.DataFrame) -> str:
     """The probabilistic model in the central half: presets, recipes, one view and eight."""
     labels = {
         (PRESET, "mode"): "`preset=full recipe=strong`",
-        (PRESET, "eight views"): "the same network, mean of eight symmetric views",
+        (PRESET, "eight views"): "the same network, eight symmetric views combined",
         (f"{PRESET} {CENTRAL}", "mode"): f"trained and tested with the authors' positions, `{CENTRAL}`",
         ("full", "mode"): "`preset=full recipe=paper`",
         ("small+strong", "mode"): "`preset=small recipe=strong`",

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 
 from phd_exp.cli.jobs import Job, composed, launch
 from phd_exp.records.choices import RunName, has_influence, setting
@@ -57,7 +58,8 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
         for data in _renders(checked):
             counts = data.n_training_split, data.n_test
             ensure_rendered(DatasetFolder(data.folder), data.spec, *counts, data.workers, cores)
-    results = train(checked, folder, draw=_draw(), cores=cores, callbacks=callbacks)
+    words = [str(item.input_line) for item in _unnamed(overrides)]
+    results = train(checked, folder, draw=_draw(), cores=cores, callbacks=callbacks, overrides=words)
     _record_further(folder, checked, cores)
     print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
     for key in filter(results.__contains__, SHOWN):
@@ -190,13 +192,18 @@ def run_name(config: RunConfig, overrides: list[str]) -> RunName:
 
 
 def _hashed(overrides: list[str]) -> tuple[str, ...]:
-    parsed = OverridesParser.create().parse_overrides(overrides)
     # parsed values, because a sweep rewrites them: 1e-3 and 0.001, true and True are one value
     return tuple(
         f"{item.key_or_group}={item.get_value_element_as_str()}"
-        for item in parsed
-        if item.key_or_group not in NAMED and has_influence(item.key_or_group)
+        for item in _unnamed(overrides)
+        if has_influence(item.key_or_group)
     )
+
+
+def _unnamed(overrides: list[str]) -> list[Override]:
+    """The overrides without a place of their own in a run's name."""
+    parsed = OverridesParser.create().parse_overrides(overrides)
+    return [item for item in parsed if item.key_or_group not in NAMED]
 
 
 def _draw() -> Callable[[dict[str, Any], Path], None] | None:

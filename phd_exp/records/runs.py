@@ -24,7 +24,7 @@ import os
 import platform
 import subprocess
 import traceback
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -59,7 +59,8 @@ State = Literal["running", "finished", "failed", "interrupted"]
 class RunStatus(Record):
     """State of a run, and the software and machine it ran on; times in UTC.
 
-    `custom` are the user's own classes and functions, with the files that define them.
+    `custom` are the user's own classes and functions, with the files that define them; `overrides` the words of the
+    command line that are not part of the run's name.
     """
 
     state: State
@@ -71,6 +72,7 @@ class RunStatus(Record):
     git_commit: str | None
     data_manifest: str | None
     custom: dict[str, str] = Field(default_factory=dict)
+    overrides: list[str] = Field(default_factory=list)
     machine: str
 
 
@@ -200,7 +202,9 @@ class RunFolder:
             yield
 
     @contextmanager
-    def recording(self, data_manifest: str | None, custom: Mapping[str, str] | None = None) -> Iterator[None]:
+    def recording(
+        self, data_manifest: str | None, custom: Mapping[str, str] | None = None, overrides: Sequence[str] = ()
+    ) -> Iterator[None]:
         """Record how the enclosed work ends: finished, failed with its traceback, or interrupted."""
         status = RunStatus(
             state="running",
@@ -209,6 +213,7 @@ class RunFolder:
             git_commit=git_commit(),
             data_manifest=data_manifest,
             custom=dict(custom or {}),
+            overrides=list(overrides),
             machine=machine(),
         )
 

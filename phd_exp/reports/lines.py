@@ -35,8 +35,9 @@ def _numbers(run: Run) -> Iterator[dict[str, Any]]:
 
 
 def command_of(run: Run) -> str:
-    """The command line that makes a run; its further overrides are in its `config.yaml`."""
+    """The command line that makes a run."""
     preset, recipe = preset_and_recipe(run.preset)
     words = [f"preset={preset}", f"data={run.data}", f"model={run.model}", f"seed={run.seed}"]
     words += [f"recipe={recipe}"] if recipe != PLAIN_RECIPE else []
+    words += run.status.overrides if run.status else []
     return one_line(shlex.join(["python", "-m", "phd_exp", *words]))

@@ -30,7 +30,7 @@ class Run:
     Attributes:
         preset, data, model, name: names of its folders, printable.
         seed: None if the name of the folder is not that of a run.
-        overrides: None for a run at its preset's values, else the differences.
+        overrides: words of its command line that change results, or their hash if they are unknown; None without any.
         detail: one line on a state other than finished.
         errors, nll: of a finished run; NLL in nats, None for a model without a density.
         held_out_errors, held_out_nll: the same on its held-out samples that may choose.
@@ -96,10 +96,9 @@ class Report:
     def at_defaults(self, preset: str, data: str, model: str) -> dict[int, Run]:
         """Seed -> run, of the runs without overrides that change the law of their results."""
         choice = (preset, data, model)
-        # of two runs of a seed the one without a hash, which sorts first, wins
         return {
             run.seed: run
-            for run in reversed(self.runs)
+            for run in self.runs
             if run.overrides is None and run.seed is not None and (run.preset, run.data, run.model) == choice
         }
 
@@ -160,7 +159,7 @@ def _whole_run(run: Run, kept: Path | None, notes: Notes) -> Run:
         run,
         seed=int(leaf[1]) if leaf else None,
         state=state,
-        overrides=_overrides(folder) if leaf and leaf[2] else None,
+        overrides=_overrides(status, run.digest),
         detail=one_line(detail),
         status=status,
         errors=errors,
@@ -195,26 +194,7 @@ def _series(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[float | None]]:
     return {key: [None if row.get(key) is None else float(row[key]) for row in rows] for key in keys}
 
 
-def _overrides(folder: RunFolder) -> str | None:
-    """The differences of a run from one of its siblings without overrides; None if they do not change results."""
-    for path in sorted(folder.path.parent.glob("seed*")):
-        if "-" not in path.name and (plain := Notes().attempt(RunFolder(path).config)) is not None:
-            changes = _changes(plain, folder.config())
-            return ", ".join(f"{key}={value}" for key, value in changes.items()) or None
-    return "unknown: there is no run without overrides to compare with"
-
-
-def _changes(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
-    """Changed values by dotted key. For a part of another class: its name, and the arguments of both classes."""
-    old, new = flatten(before), flatten(now)
-    changes: dict[str, Any] = {}
-    for key in dict.fromkeys([*old, *new]):
-        if key == "seed" or not has_influence(key) or old.get(key, "nothing") == new.get(key, "nothing"):
-            continue
-        part, _, leaf = key.rpartition(".")
-        made_by = f"{part}._target_"
-        if leaf == "_target_":
-            changes[part] = str(new.get(key)).rpartition(".")[2]
-        elif old.get(made_by) == new.get(made_by) or (key in old and key in new):
-            changes[key] = new.get(key, "nothing")
-    return changes
+def _overrides(status: RunStatus | None, digest: str) -> str | None:
+    words = status.overrides if status else []
+    changing = [word for word in words if has_influence(word.lstrip("+~").partition("=")[0])]
+    return one_line(" ".join(changing)) or digest or None

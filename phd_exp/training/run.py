@@ -35,7 +35,12 @@ UNTRAINED = -1  # the number of the epoch before the first, whose metrics are th
 
 
 def train(
-    config: RunConfig, folder: RunFolder, draw: Draw | None, cores: int, callbacks: Sequence[Callback] = ()
+    config: RunConfig,
+    folder: RunFolder,
+    draw: Draw | None,
+    cores: int,
+    callbacks: Sequence[Callback] = (),
+    overrides: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Train, evaluate and record one run; returns its results. A finished run is not run again.
 
@@ -47,6 +52,7 @@ def train(
         draw: draws calibration curves; None records their data alone.
         cores: number of threads, unless trainer.threads is set.
         callbacks: of Lightning, further ones than the configuration's; with trainer.devices=1 only.
+        overrides: words of the command line, for the record.
 
     Raises RunError if the folder holds a run of another configuration or another process uses it, DatasetError if the
     data set is incomplete.
@@ -59,7 +65,7 @@ def train(
             remove_temporaries(place)  # of a killed process
         folder.write_config(config.model_dump(mode="json"))
         threads = config.trainer.threads or cores
-        with folder.recording(_manifest_hash(config), custom_parts(config.model_dump(mode="json"))):
+        with folder.recording(_manifest_hash(config), custom_parts(config.model_dump(mode="json")), overrides):
             if config.trainer.devices > 1:
                 results = train_together(config, folder.path, draw, threads)
             else:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from PIL import Image
 from phd_exp.evaluation.point_errors import QUANTITIES, ErrorKey
 from phd_exp.records.processes import HOME
 from phd_exp.records.runs import RunFolder
+from phd_exp.reports.lines import command_of
 from phd_exp.reports.runs import read_report
 from phd_exp.training.module import PositionModule
 from tests.e2e.runs import only_run
@@ -118,7 +120,9 @@ def test_the_report_computes_what_training_recorded(run: RunFolder, phd_exp: Cal
     runs = run.path.parents[3]
     (read,) = read_report(runs).runs
     assert (read.state, read.seed, read.notes) == ("finished", 0, [])
-    assert read.overrides is not None
+    assert "trainer.max_epochs=" in (read.overrides or "")
+    again = phd_exp(*shlex.split(command_of(read))[3:])
+    assert (again.status, "finished already" in again.out) == (0, True)
     results = run.results()
     for quantity in QUANTITIES:
         mean = read.errors[ErrorKey("mode", "whole", quantity)]

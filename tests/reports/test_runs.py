@@ -85,38 +85,27 @@ def test_a_lock_that_cannot_be_tried_is_reported(tmp_path: Path, monkeypatch: py
 
 
 def test_runs_with_other_overrides_are_apart_and_say_which(tmp_path: Path) -> None:
-    other = record(tmp_path, "occl", "mae_vz", 0, predicted(1).frame, overrides=("optimizer.lr=0.5",))
-    assert only(tmp_path).overrides == "unknown: there is no run without overrides to compare with"
+    words = ("optimizer.lr=0.5", "+optimizer.foreach=true", "logger=none")
+    other = record(tmp_path, "occl", "mae_vz", 0, predicted(1).frame, overrides=words)
     plain = record(tmp_path, "occl", "mae_vz", 0, predicted(0).frame)
-    config = {"seed": 0, "runs": "runs", "optimizer": {"lr": 0.001, "eps": 1}, "backbone": {"depth": 50}}
-    plain.write_config(config)
-    other.write_config({**config, "runs": "elsewhere", "optimizer": {"lr": 0.5, "eps": 1, "foreach": True}})
     records = read_report(tmp_path)
-    assert [run.overrides for run in records.runs] == [None, "optimizer.lr=0.5, optimizer.foreach=True"]
+    assert [run.overrides for run in records.runs] == [None, "optimizer.lr=0.5 +optimizer.foreach=true"]
     chosen = records.at_defaults("small", "occl", "mae_vz")
     assert list(chosen) == [0]
     assert chosen[0].folder.path == plain.path
+    status = other.status()
+    assert status is not None
+    other.write_status(status.model_copy(update={"overrides": []}))
+    assert read_report(tmp_path).runs[1].overrides == other.path.name.removeprefix("seed0-")
 
 
 def test_settings_of_the_computation_are_not_overrides(tmp_path: Path) -> None:
     """A run with other threads, logger or progress bar enters the tables."""
-    computed = ((None, True, "wandb"), (1, False, "none"))
-    for seed, (threads, bar, logger) in enumerate(computed):
-        overrides = ("trainer.threads=1",) if threads else ()
-        folder = record(tmp_path, "occl", "mae_vz", seed, predicted(seed).frame, overrides=overrides)
-        trainer = {"threads": threads, "progress_bar": bar}
-        folder.write_config({"optimizer": {"lr": 0.1}, "trainer": trainer, "logger": {"kind": logger}})
-    assert list(read_report(tmp_path).at_defaults("small", "occl", "mae_vz")) == [1, 0]
-
-
-def test_another_class_is_named_with_the_arguments_of_both(tmp_path: Path) -> None:
-    plain = {"_target_": "here.Muon", "lr": 0.1, "momentum": 0.9}
-    other = {"_target_": "torch.optim.Adam", "lr": 0.2, "fused": True}
-    for overrides, optimizer, often in (((), plain, 1), (("optimizer=adam",), other, 2)):
-        run = record(tmp_path, "occl", "mae_vz", 0, predicted(0).frame, overrides=overrides)
-        # the frequency of evaluation changes no number
-        run.write_config({"optimizer": optimizer, "evaluation": {"every_n_epochs": often}})
-    assert [run.overrides for run in read_report(tmp_path).runs] == [None, "optimizer=Adam, optimizer.lr=0.2"]
+    folder = record(tmp_path, "occl", "mae_vz", 0, predicted(0).frame)
+    status = folder.status()
+    assert status is not None
+    folder.write_status(status.model_copy(update={"overrides": ["trainer.threads=1", "logger=none"]}))
+    assert list(read_report(tmp_path).at_defaults("small", "occl", "mae_vz")) == [0]
 
 
 @pytest.mark.parametrize("leaf", ["seed", "seedx", "seed00", "seed1-xyz", "seed-1"])

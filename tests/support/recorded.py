@@ -78,7 +78,7 @@ def record(
     """A finished run with these predictions, or without the file."""
     folder = RunFolder(RunName(preset, data, model, seed, overrides).folder(runs))
     folder.path.mkdir(parents=True)
-    with folder.recording(data_manifest=None):
+    with folder.recording(data_manifest=None, overrides=overrides):
         if frame is not None:
             frame.to_parquet(folder.predictions)
     return folder

@@ -60,7 +60,9 @@ def _rewrite(folder: RunFolder) -> None:
     )
     status = json.loads(folder.status_file.read_text())
     texts = dict.fromkeys(("machine", "git_commit", "data_manifest", "traceback", "error"), HOSTILE)
-    folder.status_file.write_text(json.dumps(status | texts | {"versions": {HOSTILE: HOSTILE}}))
+    folder.status_file.write_text(
+        json.dumps(status | texts | {"versions": {HOSTILE: HOSTILE}, "overrides": [HOSTILE]})
+    )
     folder.write_metrics([row | {HOSTILE: 1.0, f"test/{HOSTILE}": float(row["epoch"])} for row in folder.metrics()])
     pd.read_parquet(folder.predictions).assign(file_name=f"{NAME}.png").to_parquet(folder.predictions)
 

@@ -84,7 +84,7 @@ def write_run(
         "visibility": share,
         "truncation": [max(0.0, 0.5 - value) for value in share],
     }
-    with folder.recording(data_manifest="0" * 16):
+    with folder.recording(data_manifest="0" * 16, overrides=overrides):
         spec = {"variant": data, "sensor_size": 224}
         where = {"root": str(root or runs / "renders"), "spec": spec}
         folder.write_config({"seed": seed, "preset": preset, "data": where, "model": {"name": model}})
