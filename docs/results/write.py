@@ -69,8 +69,9 @@ def error(cells: pd.DataFrame, quantity: str, digits: int, **choice: str) -> str
     if found.empty or not found["mean"].iloc[0]:
         return NOTHING
     cell = found.iloc[0]
-    mark = "†" if cell["n_seeds"] == "1" else ""
-    text = f"{float(cell['mean']):.{digits}f} ± {float(cell['high']) - float(cell['mean']):.{digits}f}{mark}"
+    mean, half = float(cell["mean"]), float(cell["high"]) - float(cell["mean"])
+    digits += half < 0.5 * 10**-digits  # an interval is never ± 0
+    text = f"{mean:.{digits}f} ± {half:.{digits}f}{'†' if cell['n_seeds'] == '1' else ''}"
     return f"**{text}**" if cell["best"] == "True" else text
 
 
@@ -108,7 +109,10 @@ def summary(cells: pd.DataFrame) -> str:
     labels = {
         (PRESET, "mode"): "`preset=full recipe=strong`",
         (PRESET, "eight views"): "the same network, eight symmetric views combined",
-        (f"{PRESET} {CENTRAL}", "mode"): f"trained and tested with the authors' positions, `{CENTRAL}`",
+        (
+            f"{PRESET} {CENTRAL}",
+            "mode",
+        ): "`preset=full recipe=strong`, trained and tested with the authors' positions",
         ("full", "mode"): "`preset=full recipe=paper`",
         ("small+strong", "mode"): "`preset=small recipe=strong`",
     }
