@@ -50,13 +50,13 @@ def export(predictor: Predictor, file: Path, coverage: float | None = None, phot
     Raises UserError, and writes no file, if that exceeds 1e-5.
     """
     deployed = (OfPhotographs if photographs else OfImages)(predictor).eval()
-    model = graph(deployed)
     metadata = _metadata(deployed)
     if coverage:
         guarantee = predictor.guarantee(coverage)
         facts = {"coverage": coverage, "level": guarantee.levels[0], "held_out_samples": guarantee.n[0]}
         energies = {"a": PRECISIONS.tolist(), "W": level_energies(guarantee.levels[0]).tolist()}
         metadata["region"] = facts | energies
+    model = graph(deployed)  # last, because it takes half a minute
     model.metadata_props.add(key=METADATA, value=json.dumps(metadata))
     content = model.SerializeToString()
     deviation = largest_deviation(deployed, content)

@@ -1,8 +1,10 @@
 """The tables of results are those of docs/results, and what is taken again replaces its lines."""
 
+import io
+import runpy
 import shutil
-import subprocess
 import sys
+from contextlib import redirect_stderr
 from hashlib import sha256
 from pathlib import Path
 
@@ -16,9 +18,14 @@ PAGES = ("README.md", "docs/guides/tables.md")
 KEY = {"preset": "full+strong", "data": "default", "model": "probabilistic", "table": "table1"}
 
 
-def write(folder: Path, *words: str) -> subprocess.CompletedProcess:
-    command = [sys.executable, "docs/results/write.py", *words]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True)
+def write(folder: Path, *words: object) -> tuple[object, str]:
+    """Exit status and errors of the script, in this process, which has imported what it needs."""
+    script = folder / "docs" / "results" / "write.py"
+    with pytest.MonkeyPatch.context() as patch, redirect_stderr(io.StringIO()) as errors:
+        patch.setattr(sys, "argv", [str(script), *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(str(script), run_name="__main__")
+    return ended.value.code, errors.getvalue()
 
 
 @pytest.fixture
@@ -32,8 +39,7 @@ def copied(tmp_path: Path) -> Path:
 
 
 def test_the_pages_have_the_results_of_the_files() -> None:
-    found = write(ROOT, "--check")
-    assert (found.returncode, found.stderr) == (0, "")
+    assert write(ROOT, "--check") == (0, "")
 
 
 def test_numbers_taken_again_replace_the_old_ones(copied: Path) -> None:
@@ -44,7 +50,7 @@ def test_numbers_taken_again_replace_the_old_ones(copied: Path) -> None:
     lines = pd.read_csv(results / "tables.csv", dtype=str, keep_default_na=False)
     again = lines[(lines[list(KEY)] == pd.Series(KEY)).all(axis=1)]
     again.assign(mean="123456.0").to_csv(taken / "tables.csv", index=False)
-    assert write(copied, "--take", "report").returncode == 0
+    assert write(copied, "--take", copied / "report") == (0, "")
     after = pd.read_csv(results / "tables.csv", dtype=str, keep_default_na=False)
     assert len(after) == len(lines)
     assert (after["mean"] == "123456.0").sum() == len(again) > 0
@@ -58,7 +64,7 @@ def test_a_run_with_the_positions_of_the_authors_has_a_row(copied: Path) -> None
     plain = runs[(runs["model"] == "probabilistic") & (runs["data"] == "occl") & (runs["seed"] == "0")]
     of_half = plain.assign(overrides=sha256(b"data.xy_range=0.5").hexdigest()[:8], mean="12345.6", high="12346.6")
     pd.concat([runs, of_half]).to_csv(file, index=False)
-    assert write(copied).returncode == 0
+    assert write(copied) == (0, "")
     (row,) = (line for line in (copied / "README.md").read_text().splitlines() if "the authors' positions |" in line)
     assert row.split(" | ")[1:] == [NOTHING, "12345.6 ± 1.0† / 12346 ± 1†", NOTHING, f"{NOTHING} |"]
 
@@ -66,6 +72,5 @@ def test_a_run_with_the_positions_of_the_authors_has_a_row(copied: Path) -> None
 def test_a_page_that_differs_is_named(copied: Path) -> None:
     page = copied / "README.md"
     page.write_text(page.read_text().replace("| `preset=full recipe=strong` | ", "| `preset=full recipe=strong` | 0"))
-    found = write(copied, "--check")
-    assert found.returncode == 1
-    assert found.stderr == "README.md: differs from docs/results; run python docs/results/write.py\n"
+    expected = "README.md: differs from docs/results; run python docs/results/write.py\n"
+    assert write(copied, "--check") == (1, expected)
