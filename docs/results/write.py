@@ -109,10 +109,7 @@ def summary(cells: pd.DataFrame) -> str:
     labels = {
         (PRESET, "mode"): "`preset=full recipe=strong`",
         (PRESET, "eight views"): "the same network, eight symmetric views combined",
-        (
-            f"{PRESET} {CENTRAL}",
-            "mode",
-        ): "`preset=full recipe=strong`, trained and tested with the authors' positions",
+        (f"{PRESET} {CENTRAL}", "mode"): "the same recipe, trained and tested with the authors' positions",
         ("full", "mode"): "`preset=full recipe=paper`",
         ("small+strong", "mode"): "`preset=small recipe=strong`",
     }
