@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo tables test test-all lint bench docs notebooks clean
+.PHONY: help install demo tables test test-all lint bench gpu docs notebooks clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -51,6 +51,9 @@ test-all: lint  ## the slow tests too
 
 bench: $(INSTALLED)  ## quality and speed against named references
 	$(BIN)/python -m pytest tests/benchmarks -m bench
+
+gpu: $(INSTALLED)  ## images a second of training at preset=paper on this machine's GPU, and the wait for data
+	$(BIN)/python tests/benchmarks/gpu.py
 
 docs: $(INSTALLED)  ## site/index.html: guides, ideas, and the reference from docstrings
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict  # the variable silences an advertisement of the theme

@@ -12,6 +12,7 @@ import argparse
 import re
 import sys
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import pandas as pd
@@ -32,7 +33,8 @@ KEYS = {
 }
 DATA = ("default", "occl", "scale", "occl_scale")
 PRESET = "full+strong"
-CENTRAL = "data.xy_range=0.5"  # the authors' positions
+CENTRAL = {"full+strong": ("data.xy_range=0.5",), "paper": ("data.xy_range=0.5", "data.image_format=webp")}
+"""Preset -> the overrides of its runs with the authors' positions, one seed each."""
 
 
 def take(report: Path) -> None:
@@ -50,11 +52,20 @@ def read(file: Path) -> pd.DataFrame:
 
 
 def cells_of_tables() -> pd.DataFrame:
-    """The cells of both tables, and those of the runs with the authors' positions, one seed each."""
-    named = RunName(PRESET, "default", "probabilistic", seed=0, overrides=(CENTRAL,)).folder(HERE).name
-    runs = chosen(read(HERE / "runs.csv"), overrides=named.partition("-")[2])
-    runs = runs.assign(preset=runs["preset"] + f" {CENTRAL}", table="table1", n_seeds="1", best="False")
-    return pd.concat([read(HERE / "tables.csv"), runs], ignore_index=True)
+    """The cells of both tables, and those of the runs with the authors' positions."""
+    runs = read(HERE / "runs.csv")
+    central = [
+        chosen(runs, preset=preset, overrides=central_run(preset).partition("-")[2]).assign(
+            preset=f"{preset}, central", table="table1", n_seeds="1", best="False"
+        )
+        for preset in CENTRAL
+    ]
+    return pd.concat([read(HERE / "tables.csv"), *central], ignore_index=True)
+
+
+def central_run(preset: str) -> str:
+    """The name of the run's folder with the authors' positions."""
+    return RunName(preset, "", "", seed=0, overrides=CENTRAL[preset]).folder(HERE).name
 
 
 def chosen(lines: pd.DataFrame, **choice: str) -> pd.DataFrame:
@@ -105,22 +116,49 @@ def heading(*columns: str) -> str:
 
 
 def summary(cells: pd.DataFrame) -> str:
-    """The probabilistic model in the central half: presets, recipes, one view and eight."""
+    """The probabilistic model: positions, presets, recipes, one view and eight."""
     labels = {
-        (PRESET, "mode"): "`preset=full recipe=strong`",
-        (PRESET, "eight views"): "the same network, eight symmetric views combined",
-        (f"{PRESET} {CENTRAL}", "mode"): "the same recipe, trained and tested with the authors' positions",
-        ("full", "mode"): "`preset=full recipe=paper`",
-        ("small+strong", "mode"): "`preset=small recipe=strong`",
+        ("paper, central", "central", "mode"): "authors' positions: `preset=paper recipe=paper`",
+        (f"{PRESET}, central", "central", "mode"): "authors' positions: `preset=full recipe=strong`",
+        (PRESET, "central", "mode"): "central half: `preset=full recipe=strong`",
+        (PRESET, "central", "eight views"): "central half: the same, eight symmetric views combined",
+        (PRESET, "whole", "mode"): "whole field: `preset=full recipe=strong`",
     }
-    of_all = {"model": "probabilistic", "reading": "central", "table": "table1"}
     table = heading(*DATA) + line(
         "paper: ResNet-50, 8,000 images, 50 epochs", *(published("probabilistic", data) for data in DATA)
     )
-    for (preset, estimate), label in labels.items():
-        choice = {"preset": preset, "estimate": estimate, **of_all}
+    for (preset, reading, estimate), label in labels.items():
+        choice = {"preset": preset, "estimate": estimate, "reading": reading}
+        choice |= {"model": "probabilistic", "table": "table1"}
         table += row(label, [both_errors(cells, data=data, **choice) for data in DATA])
     return table
+
+
+def coverage(scores: pd.DataFrame) -> str:
+    """Share inside the 90 % region and NEES of the probabilistic model with the authors' positions."""
+    table = heading("`default`: inside the 90 % region", "NEES", "`occl`: inside the 90 % region", "NEES")
+    labels = {"paper": "`preset=paper recipe=paper`", PRESET: "`preset=full recipe=strong`"}
+    for (preset, label), kind in product(labels.items(), ("as trained", "recalibrated")):
+        choice = {"preset": preset, "run": central_run(preset), "predictions": kind, "model": "probabilistic"}
+        found = [chosen(scores, data=data, **choice) for data in DATA[:2]]
+        cells = [score_of(lines) for lines in found]
+        table += row(f"{label}, {kind}", [cell for pair in cells for cell in pair])
+    ranges = [range_of(scores, "inside_90", 1, " %"), range_of(scores, "nees", 1, "")]
+    return table + line("calibrated predictions, 95 % range", *ranges * 2)
+
+
+def range_of(scores: pd.DataFrame, quantity: str, digits: int, unit: str) -> str:
+    """The mean interval of calibrated predictions."""
+    low, high = chosen(scores, quantity=quantity)[["low", "high"]].astype(float).mean()
+    return f"{low:.{digits}f} to {high:.{digits}f}{unit}"
+
+
+def score_of(lines: pd.DataFrame) -> tuple[str, str]:
+    """Share inside the 90 % region (%), and NEES."""
+    if lines.empty:
+        return NOTHING, NOTHING
+    found = lines.set_index("quantity")["value"].astype(float)
+    return f"{found['inside_90']:.1f} %", f"{found['nees']:.1f}"
 
 
 def models(cells: pd.DataFrame) -> str:
@@ -152,6 +190,8 @@ def calibration(scores: pd.DataFrame) -> str:
         "inside_90": ("inside the 90 % region (%)", 1),
         "miscalibration_area": ("miscalibration area", 3),
         "depth_pit_area": ("PIT area of depth", 3),
+        "nees": ("NEES", 2),
+        "group_miscalibration": ("worst group", 3),
         "depth_ence": ("ENCE of depth", 2),
         "projected_ence": ("ENCE of projection", 2),
         "depth_crps_mm": ("CRPS of depth (mm)", 1),
@@ -181,7 +221,9 @@ def main() -> int:
     of_cells: list[Callable[[pd.DataFrame], str]] = [summary, models, focal_length]
     cells = cells_of_tables()
     tables = {table.__name__: table(cells) for table in of_cells}
-    tables["calibration"] = calibration(read(HERE / "calibration.csv"))
+    of_scores = [calibration, coverage]
+    scores = read(HERE / "calibration.csv")
+    tables |= {table.__name__: table(scores) for table in of_scores}
     differs = False
     for name in PAGES:
         before = (ROOT / name).read_text()

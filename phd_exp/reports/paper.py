@@ -41,7 +41,9 @@ z.
 
 Nearly exact: size and depth scale together, and only the fixed lamps give a little more information.
 """
-UNKNOWN_SIZE_AND_F = 336.0  # the same for a network without the input f ~ U(1200, 2000) px, from apparent size alone
+UNKNOWN_SIZE_F_AFTERWARDS = 336.0
+"""The same for a network that predicts z/f from apparent size alone; f ~ U(1200, 2000) px multiplies its output."""
+UNKNOWN_SIZE_AND_F = 370.0  # the same for an estimate of z that uses no f at all
 UNKNOWN_F = 331.0
 """Lower bound on mean depth error, mm, for known size and unknown f, from apparent size alone.
 
@@ -56,7 +58,9 @@ def bound_mm(model: str, data: str, quantity: Quantity, sees_f: bool) -> float |
     if quantity == "projected":
         return None
     if data == "scale":
-        return UNKNOWN_SIZE if sees_f else UNKNOWN_SIZE_AND_F
+        if model in WITHOUT_F:
+            return UNKNOWN_SIZE_AND_F
+        return UNKNOWN_SIZE if sees_f else UNKNOWN_SIZE_F_AFTERWARDS
     return UNKNOWN_F if data == "default" and model in WITHOUT_F else None
 
 
@@ -124,13 +128,13 @@ TABLE_1 = Layout(
     groups=_groups(("mae_vz", "mae_logz", "probabilistic"), ("projected", "depth")),
     bounds={
         "bound, with f": {"scale": UNKNOWN_SIZE},
-        "apparent size, without f": {"scale": UNKNOWN_SIZE_AND_F},
+        "apparent size, f not an input": {"scale": UNKNOWN_SIZE_F_AFTERWARDS},
         "guess without the image": dict.fromkeys(_DATA, GUESS),
     },
     note="On scale the size factor ~ U(0.8, 1.2) is unknown and the image gives size / z: 291 mm is nearly exact for "
-    "a network that sees f (camera=shown); from apparent size alone a network that does not see f has 336 mm. On "
-    "occl_scale no bound is known: which object hides which tells depth. The paper's 400 mm of depth for 20 % of "
-    "scale is an intuition; 291 mm is its value.",
+    "a network with f as an input (camera=shown). A network without it, whose z/f is multiplied by f, has 336 mm "
+    "from apparent size alone. On occl_scale no bound is known: which object hides which tells depth. The paper's "
+    "400 mm of depth for 20 % of scale is an intuition; 291 mm is its value.",
 )
 TABLE_2 = Layout(
     name="table2",
