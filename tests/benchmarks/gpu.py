@@ -111,12 +111,13 @@ def measured(overrides: list[str], steps: int) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=100, help="training steps that are timed")
+    parser.add_argument("--recipes", nargs="+", choices=list(RECIPES), default=list(RECIPES))
     parser.add_argument("overrides", nargs="*", help="of the configuration, such as data.image_size=64")
-    arguments = parser.parse_args()
+    arguments = parser.parse_intermixed_args()
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU"
     print(json.dumps({"machine": machine(), "gpu": gpu, "torch": torch.__version__}), flush=True)
-    for name, overrides in RECIPES.items():
-        found = measured([*overrides, *arguments.overrides], arguments.steps)
+    for name in arguments.recipes:
+        found = measured([*RECIPES[name], *arguments.overrides], arguments.steps)
         print(json.dumps({"recipe": name} | found), flush=True)
 
 
