@@ -1,7 +1,7 @@
 """What the verbs without Hydra share: arguments `key=value`, places to write to, the predictions of a run."""
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
@@ -102,10 +102,29 @@ def predicted(predictor: "Predictor", detections: Sequence[Detection]) -> Iterab
     """The predictions, with a progress bar for several detections on a terminal."""
     from phd_exp.inference.answers import sightings
 
-    seen = sightings(predictor, detections)
+    seen = _noting_focal_lengths(predictor, sightings(predictor, detections))
     if len(detections) == 1 or not sys.stderr.isatty():
         return seen
     from rich.console import Console
     from rich.progress import track
 
     return track(seen, "predicting", len(detections), console=Console(stderr=True), transient=True)
+
+
+def _noting_focal_lengths(predictor: "Predictor", seen: Iterable["Sighting"]) -> Iterator["Sighting"]:
+    """The predictions; afterwards a note on standard error if the network views some at untrained focal lengths."""
+    low, high = predictor.f_range
+    outside: list[Sighting] = []
+    total = 0
+    for total, sighting in enumerate(seen, start=1):
+        if not 0.999 * low <= sighting.view.camera.f <= 1.001 * high:
+            outside.append(sighting)
+        yield sighting
+    if outside:
+        first = outside[0]
+        print(
+            f"note: f: {len(outside)} of {total} views have a focal length that the network was not trained with, "
+            f"first {first.detection.where} with {first.view.camera.f:.4g} px; expected {low:.4g} to {high:.4g} px in "
+            f"its images of {predictor.side} px; give a box= around the object, or train with another data.f_range",
+            file=sys.stderr,
+        )

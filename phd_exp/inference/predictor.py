@@ -82,15 +82,22 @@ class Predictor:
         return issubclass(self.regressor.head.prediction, ProjectedHuber)
 
     @property
-    def largest_f(self) -> float:
-        """The largest focal length at which boxes are viewed, px: that of the training images.
+    def f_range(self) -> tuple[float, float]:
+        """The focal lengths of the training images, px of the network's image.
 
-        Infinity for a network trained on the user's own images, whose boxes decided.
+        From 0 to infinity for a network trained on the user's own images, whose boxes decided.
         """
         data = self.config.data
         if not isinstance(data, RenderedConfig):
-            return math.inf
-        return data.spec.f_range[1] * self.side / data.spec.sensor_size
+            return 0.0, math.inf
+        low, high = data.spec.f_range
+        zoom = self.side / data.spec.sensor_size
+        return low * zoom, high * zoom
+
+    @property
+    def largest_f(self) -> float:
+        """The largest focal length at which boxes are viewed, px."""
+        return self.f_range[1]
 
     def __call__(
         self,

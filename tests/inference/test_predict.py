@@ -91,6 +91,17 @@ def test_small_boxes_are_viewed_at_the_largest_focal_length_of_the_training_rend
     assert np.isfinite(answer["mode"]).all()
 
 
+@pytest.mark.parametrize(("f", "is_noted"), [(400, True), (1250 / 224 * 200, False), (20_000, True)])
+def test_a_focal_length_outside_the_training_range_is_noted(
+    phd_exp: Callable, make: Callable[..., RunFolder], tmp_path: Path, f: float, is_noted: bool
+) -> None:
+    rendered = make("data=default")
+    Image.fromarray(np.zeros((200, 200, 3), np.uint8)).save(tmp_path / "photo.png")
+    outcome = phd_exp("predict", f"run={rendered.path}", "image=photo.png", f"f={f}")
+    assert (outcome.status, outcome.err.startswith("note: f: 1 of 1 views")) == (0, is_noted)
+    assert ("photo.png" in outcome.err, f"{f * SIDE / 200:.4g} px" in outcome.err) == (is_noted, is_noted)
+
+
 def test_a_baseline_has_positions_without_uncertainty(
     phd_exp: Callable, baseline: RunFolder, photos: Path, tmp_path: Path
 ) -> None:
