@@ -114,17 +114,16 @@ def predicted(predictor: "Predictor", detections: Sequence[Detection]) -> Iterab
 def _noting_focal_lengths(predictor: "Predictor", seen: Iterable["Sighting"]) -> Iterator["Sighting"]:
     """The predictions; afterwards a note on standard error if the network views some at untrained focal lengths."""
     low, high = predictor.f_range
-    outside: list[Sighting] = []
-    total = 0
-    for total, sighting in enumerate(seen, start=1):
-        if not 0.999 * low <= sighting.view.camera.f <= 1.001 * high:
-            outside.append(sighting)
+    outside: list[str] = []
+    for sighting in seen:
+        f = sighting.view.camera.f
+        if not 0.999 * low <= f <= 1.001 * high:
+            outside.append(f"{sighting.detection.where}: {f:.4g} px")
         yield sighting
     if outside:
-        first = outside[0]
         print(
-            f"note: f: {len(outside)} of {total} views have a focal length that the network was not trained with, "
-            f"first {first.detection.where} with {first.view.camera.f:.4g} px; expected {low:.4g} to {high:.4g} px in "
-            f"its images of {predictor.side} px; give a box= around the object, or train with another data.f_range",
+            f"note: f: {len(outside)} view(s) have a focal length that the network was not trained with, first "
+            f"{outside[0]}; expected {low:.4g} to {high:.4g} px in its images of {predictor.side} px; give a box= "
+            "around the object, or train with another data.f_range",
             file=sys.stderr,
         )

@@ -98,7 +98,7 @@ def test_a_focal_length_outside_the_training_range_is_noted(
     rendered = make("data=default")
     Image.fromarray(np.zeros((200, 200, 3), np.uint8)).save(tmp_path / "photo.png")
     outcome = phd_exp("predict", f"run={rendered.path}", "image=photo.png", f"f={f}")
-    assert (outcome.status, outcome.err.startswith("note: f: 1 of 1 views")) == (0, is_noted)
+    assert (outcome.status, outcome.err.startswith("note: f: 1 view")) == (0, is_noted)
     assert ("photo.png" in outcome.err, f"{f * SIDE / 200:.4g} px" in outcome.err) == (is_noted, is_noted)
 
 
