@@ -40,7 +40,10 @@ CENTRAL = {"full+strong": ("data.xy_range=0.5",), "paper": ("data.xy_range=0.5",
 def take(report: Path) -> None:
     """Add the lines of a report; they replace those of the same runs."""
     for name, keys in KEYS.items():
-        new, old = read(report / "tables" / f"{name}.csv"), read(HERE / f"{name}.csv")
+        file = report / "tables" / f"{name}.csv"
+        if not file.exists():  # of runs with overrides alone, which are in no table
+            continue
+        new, old = read(file), read(HERE / f"{name}.csv")
         taken = set(new[keys].itertuples(index=False, name=None))
         stays = [run not in taken for run in old[keys].itertuples(index=False, name=None)]
         both = pd.concat([old[stays], new]).sort_values(keys, kind="stable")

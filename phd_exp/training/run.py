@@ -221,9 +221,13 @@ def _circumstances(config: RunConfig, data: PositionData, trainer: Trainer) -> d
         "epochs": trainer.current_epoch,
         "devices": trainer.world_size,
         "threads": torch.get_num_threads(),  # of each process
-        "device": str(trainer.strategy.root_device),
+        "device": _name_of(trainer.strategy.root_device),
         "precision": str(trainer.precision),
     }
+
+
+def _name_of(device: torch.device) -> str:
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else str(device)
 
 
 def _manifest_hash(config: RunConfig) -> str | None:
