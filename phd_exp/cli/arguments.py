@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from phd_exp.records.detections import Detection
-from phd_exp.records.errors import ConfigError, complaint, nearest, writing
+from phd_exp.records.errors import ConfigError, DatasetError, RunError, complaint, nearest, writing
 from phd_exp.records.files import remove_temporaries
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
@@ -92,10 +92,34 @@ def loaded(arguments: RunArguments, device: str = "auto") -> "Predictor":
     from phd_exp.inference.loading import load
 
     trust = tuple(arguments.trust.split(",")) if arguments.trust else ()
-    predictor = load(arguments.run, device, arguments.recalibrate, trust, int(arguments.views))
+    predictor = load(arguments.run, device, trust=trust, views=int(arguments.views))
     if predictor.state != "finished":
         print(f"note: {arguments.run[0]}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
-    return predictor
+    if predictor.views > 1 and (arguments.recalibrate or arguments.coverage):
+        _record_held_out_views(predictor, trust)
+    return predictor.recalibrated() if arguments.recalibrate else predictor
+
+
+def _record_held_out_views(predictor: "Predictor", trust: tuple[str, ...]) -> None:
+    """Record the eight views of a finished run's held-out samples, unless they are recorded.
+
+    Raises RunError if its data set is not there. Does nothing where `Predictor.held_out` names what is missing.
+    """
+    from phd_exp.inference import tables
+    from phd_exp.training.build import build_source
+    from phd_exp.training.config import SourceConfig
+
+    folder, data = predictor.folders[0], predictor.config.data
+    file = folder.eight_views["held_out"]
+    is_possible = len(predictor.folders) == 1 and predictor.is_probabilistic and predictor.state == "finished"
+    # a source of one's own is code, which a stored configuration does not run
+    if not is_possible or not folder.held_out.exists() or isinstance(data, SourceConfig):
+        return
+    if not tables.is_recorded(file, tables.of_camera(predictor.config)):
+        try:
+            tables.record_held_out_views(predictor, build_source(data), trust)
+        except DatasetError as error:
+            raise RunError(f"{file}: missing, and cannot be recorded without the data set: {error}") from None
 
 
 def predicted(predictor: "Predictor", detections: Sequence[Detection]) -> Iterable["Sighting"]:

@@ -75,9 +75,13 @@ def _answers(arguments: FuseArguments, scenes: Sequence[Observed]) -> list[dict[
     from phd_exp.evaluation.conformal import fused_guarantee
     from phd_exp.fusion import Plane
     from phd_exp.inference.fused import fused_answers, fused_region
+    from phd_exp.inference.tables import require_received
 
     if arguments.coverage and (arguments.plane or arguments.shared_scale):
         raise ConfigError("coverage: holds for views that are fused alone; omit plane= and shared_scale=")
+    single = "coverage: scenes with several cameras are recorded by single runs; expected one run= and no views=8"
+    if arguments.coverage and arguments.views != "1":
+        raise ConfigError(single)
     predictor = loaded(arguments)
     if not predictor.is_probabilistic:
         raise ConfigError(
@@ -85,11 +89,13 @@ def _answers(arguments: FuseArguments, scenes: Sequence[Observed]) -> list[dict[
             "model=probabilistic"
         )
     if predictor.is_ensemble and arguments.coverage:
-        raise ConfigError("coverage: scenes with several cameras are recorded by single runs; expected one run=")
+        raise ConfigError(single)
     numbers = torch.tensor(arguments.plane or (), dtype=torch.float64)
     plane = Plane(numbers[:3], numbers[3]) if arguments.plane else None
     detections = [detection for scene in scenes for detection in scene.detections]
     guarantees = {}
+    if arguments.coverage or arguments.shared_scale:
+        require_received(predictor.folders[0].views, predictor.config)
     if arguments.coverage:
         views, cameras = predictor.folders[0].views, {len(scene.detections) for scene in scenes}
         guarantees = {k: fused_guarantee(views, k, arguments.coverage, predictor.temperature) for k in cameras}

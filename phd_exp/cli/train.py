@@ -152,12 +152,12 @@ def _record_further(run: RunFolder, checked: RunConfig, cores: int) -> None:
         views = several.spec.views
         n = several.n_test // views
         scenes = f"{'1 scene' if n == 1 else f'{n} scenes'} seen by {views} cameras each"
-        record(run.views, several, tables.origin_of(run, data=several.spec.fingerprint(), scenes=n), scenes)
+        record(run.views, several, tables.origin_of(run, checked, data=several.spec.fingerprint(), scenes=n), scenes)
     for name, shift in checked.evaluation.shifts.items():
         origin = tables.origin_of_shift(run, checked, name)
         record(run.shift(name), checked.data_of(name), origin, "recorded", shift)
     if checked.evaluation.eight_views:
-        tables.record_eight_views(run, build_source(checked.data))
+        tables.record_eight_views(run, checked, build_source(checked.data))
 
 
 def _number(value: Any) -> str:

@@ -54,11 +54,7 @@ def load(
         state = next((one.state for one in predictors if one.state != "finished"), "finished")
         networks = tuple(other.regressor for other in others)
         first = replace(first, folders=tuple(folders), others=networks, views=views, state=state)
-    if not recalibrate:
-        return first
-    from phd_exp.evaluation.predictions import fit_temperature  # imports pyarrow
-
-    return replace(first, temperature=fit_temperature(first.held_out()))
+    return first.recalibrated() if recalibrate else first
 
 
 def _members(runs: Sequence[str | Path]) -> tuple[list[RunFolder], Callable[[str], bool]]:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -136,13 +136,21 @@ class Predictor:
         files = [folder.held_out if self.views == 1 else folder.eight_views["held_out"] for folder in self.folders]
         for file in files:
             if not file.exists():
-                wanted = "data.n_held_out > 0" + (" and evaluation.eight_views=true" if self.views > 1 else "")
-                raise RunError(f"{file}: missing; held-out samples are needed: train with {wanted}")
+                remedy = "train with data.n_held_out > 0"
+                if self.views > 1 and self.config.data.n_held_out:
+                    remedy = "repeat the command of the training with evaluation.eight_views=true"
+                raise RunError(f"{file}: missing; held-out samples are needed: {remedy}")
         from phd_exp.evaluation.parquet import read_table  # imports pyarrow
         from phd_exp.evaluation.predictions import ensemble_table
 
         tables = [read_table(file) for file in files]
         return tables[0] if len(tables) == 1 else ensemble_table(tables)
+
+    def recalibrated(self) -> "Predictor":
+        """The same with the temperatures that fit its held-out samples. Raises as `held_out`."""
+        from phd_exp.evaluation.predictions import fit_temperature  # imports pyarrow
+
+        return replace(self, temperature=fit_temperature(self.held_out()))
 
     def guarantee(self, coverage: float, groups: "Groups | None" = None) -> "Guarantee":
         """Regions that contain the true position with a probability in (0, 1); see `evaluation.conformal`.

@@ -1,13 +1,14 @@
 """Further tables of a finished run: predictions of shifted samples, of several views and of turned images.
 
-Shifts and several views record their origin, so that an up-to-date table is not made again.
+Each records its origin, so that an up-to-date table is not made again. The network receives the focal lengths that it
+receives in the evaluations of its training, wrong ones with `camera.f_error`.
 """
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
@@ -15,14 +16,20 @@ import torch
 from phd_exp.data.augmentation import Photometry
 from phd_exp.data.sources import PARTS, Known, Part, RenderedSource, Source
 from phd_exp.distributions.columns import Columns
+from phd_exp.evaluation.parquet import read_table, stacked
+from phd_exp.evaluation.predictions import XYZ
 from phd_exp.evaluation.several_views import ROTATION, TRANSLATION
 from phd_exp.inference.loading import load
-from phd_exp.inference.predictor import BATCH
+from phd_exp.inference.predictor import BATCH, Predictor
 from phd_exp.metrics.rows import Rows
 from phd_exp.records.choices import flatten
+from phd_exp.records.errors import RunError
+from phd_exp.records.processes import announce
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import RenderedConfig, RunConfig
 from phd_exp.training.config.sections import ShiftConfig
+from phd_exp.training.config.targets import Trust
+from phd_exp.training.network import f_factor
 from phd_exp.training.predictions import columns, summary, write_parquet
 
 UNCHANGED = ShiftConfig()
@@ -36,30 +43,46 @@ def record(
     Of several views, the table also has the pose of each. Raises RunError if another process holds the run or it has
     no checkpoint, DatasetError if a sample is missing.
     """
+    predictor = load(folder.path, trust=None)  # the user has trained it
     with folder.held():
-        table, known = _predicted(folder, source, "test", shift), dict(source.known("test"))
-        if shift.f_factor != 1:  # the table has the focal length that the network received
-            known = {name: values for name, values in known.items() if name not in ("f", "S")}
+        table, known = _predicted(predictor, source, "test", shift), dict(source.known("test"))
         if file == folder.views and isinstance(source, RenderedSource):
             known |= _poses(source)
         file.parent.mkdir(exist_ok=True)
         write_parquet(file, table, known, origin)
 
 
-def record_eight_views(folder: RunFolder, source: Source) -> None:
-    """Predict the eight symmetric views of each held-out and test sample of a run's own source, once.
+def record_eight_views(
+    folder: RunFolder, config: RunConfig, source: Source, parts: Sequence[Part] = PARTS[1:], trust: Trust = None
+) -> None:
+    """Predict the eight symmetric views of each sample of a run's own source, once; of held-out and test samples.
 
     The files have the columns of `predictions.parquet`, of the distribution closest to the mixture, and
     `disagreement`. results.json gets the means over test samples, as `eight_views/nll`. Raises as `record`.
     """
+    origin = of_camera(config)
+    wanted = [part for part in parts if source.count(part) and not is_recorded(folder.eight_views[part], origin)]
+    if not wanted:
+        return
+    predictor = load(folder.path, trust=trust, views=8)
     with folder.held():
-        if folder.eight_views["test"].exists():
-            return
-        for part in PARTS[1:]:
-            if source.count(part):
-                table = _predicted(folder, source, part, views=8)
-                write_parquet(folder.eight_views[part], table, source.known(part))
-        folder.write_results(folder.results() | summary(table, "eight_views"))
+        for part in wanted:
+            table = _predicted(predictor, source, part)
+            if part == "test":
+                folder.write_results(folder.results() | summary(table, "eight_views"))
+            write_parquet(folder.eight_views[part], table, source.known(part), origin)
+
+
+def record_held_out_views(predictor: Predictor, source: Source, trust: Trust) -> None:
+    """Record the eight views of a finished run's held-out samples. Raises RunError if they are others by now."""
+    (folder,), part = predictor.folders, PARTS[1]
+    before, now = read_table(folder.held_out), source.samples(part).xyz.double().numpy()
+    if not np.array_equal(now, stacked(before, XYZ).numpy()):
+        raise RunError(
+            f"{folder.held_out}: its samples are not those of {predictor.config.data.name} now; train again"
+        )
+    announce(f"{folder.eight_views[part]}: recording the eight views of {len(now)} held-out samples, once")
+    record_eight_views(folder, predictor.config, source, [part], trust)
 
 
 def _poses(source: RenderedSource) -> Known:
@@ -69,34 +92,50 @@ def _poses(source: RenderedSource) -> Known:
     return dict(zip((*ROTATION, *TRANSLATION), map(list, numbers), strict=True))
 
 
-def _predicted(
-    folder: RunFolder, source: Source, part: Part, shift: ShiftConfig = UNCHANGED, views: int = 1
-) -> Columns:
-    """The run's predictions of a part of the samples; of several symmetric views also their `disagreement`."""
-    predictor, samples = load(folder.path, trust=None, views=views), source.samples(part)  # the user has trained it
+def _predicted(predictor: Predictor, source: Source, part: Part, shift: ShiftConfig = UNCHANGED) -> Columns:
+    """Predictions of a part of the samples; of several symmetric views also their `disagreement`."""
+    samples, f_error = source.samples(part), predictor.config.camera.f_error
     change, table = Photometry(**dict[str, Any](**shift.images)), Rows()
     for rows in torch.arange(len(samples)).split(BATCH):
         batch = samples.select(rows)
-        f = shift.f_factor * batch.f
+        factor = shift.f_factor * f_factor(batch.row, f_error)
+        f = factor * batch.f
         raw = predictor.raw(change.fixed(batch.image).numpy(), f)
-        found = columns(predictor.predict(raw, f), replace(batch, f=f))
+        found = columns(predictor.predict(raw, f), batch, factor)
         if predictor.is_ensemble:
             found["disagreement"] = predictor.members(raw, f).disagreement
         table.update(found)
     return table.columns()
 
 
-def origin_of(folder: RunFolder, **choices: Any) -> dict[str, str]:
+def of_camera(config: RunConfig) -> dict[str, str]:
+    """The origin of the focal lengths that the network received; an earlier version always recorded exact ones."""
+    return {"f_error": str(config.camera.f_error)} if config.camera.f_error else {}
+
+
+def require_received(file: Path, config: RunConfig) -> None:
+    """Raise RunError for a table of an earlier version with exact focal lengths, which makes it too certain."""
+    if file.exists() and not is_recorded(file, of_camera(config)) and config.camera.f_error:
+        raise RunError(
+            f"{file}: recorded with exact focal lengths, but camera.f_error={config.camera.f_error}; repeat the "
+            "command of the training, which records it again"
+        )
+
+
+def origin_of(folder: RunFolder, config: RunConfig, **choices: Any) -> dict[str, str]:
     """The metadata of a table: the choices that made it, and the start of its run."""
     status = folder.status()
-    return {key: str(value) for key, value in choices.items()} | {"run": str(status.started) if status else ""}
+    made = {key: str(value) for key, value in choices.items()} | {"run": str(status.started) if status else ""}
+    return made | of_camera(config)
 
 
 def origin_of_shift(folder: RunFolder, config: RunConfig, name: str) -> dict[str, str]:
     """The metadata of a shift's table."""
     changes, data = flatten(config.evaluation.shifts[name].model_dump(exclude_defaults=True)), config.data_of(name)
     samples = f"{data.spec.fingerprint()}, {data.n_test}" if isinstance(data, RenderedConfig) else data.name
-    return origin_of(folder, shift=", ".join(f"{key}={value}" for key, value in changes.items()), data=samples)
+    return origin_of(
+        folder, config, shift=", ".join(f"{key}={value}" for key, value in changes.items()), data=samples
+    )
 
 
 def is_recorded(file: Path, origin: Mapping[str, str]) -> bool:

@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
 from lightning import LightningModule
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
@@ -23,9 +22,8 @@ from phd_exp.models.heads import Prediction
 from phd_exp.models.locating import localisation_loss, segmentation_loss
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.errors import RunError, listed
+from phd_exp.training.network import f_factor
 from phd_exp.training.predictions import columns, summary, training_columns
-
-GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 class PositionModule(LightningModule):
@@ -79,10 +77,10 @@ class PositionModule(LightningModule):
     def camera(self, batch: Batch) -> Camera:
         """The cameras of a batch as the model knows them."""
         camera = batch.camera.with_constant_f(self.constant_f)
-        if not self.f_error:
-            return camera
-        error = standard_error(batch.row, self.current_epoch if self.training else 0)
-        return Camera(camera.f * (self.f_error * error).exp(), camera.S)
+        return Camera(camera.f * self._f_factor(batch), camera.S) if self.f_error else camera
+
+    def _f_factor(self, batch: Batch) -> Tensor:
+        return f_factor(batch.row, self.f_error, self.current_epoch if self.training else 0)
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         optimizer = self.make_optimizer(self.regressor.parameters())
@@ -146,7 +144,7 @@ class PositionModule(LightningModule):
         with torch.autocast(self.device.type, enabled=False):
             prediction = self(batch)
             losses = self.loss(prediction, batch.xyz)
-        rows.update(columns(prediction, batch) | {"loss": losses.expand(len(batch))})
+        rows.update(columns(prediction, batch, self._f_factor(batch)) | {"loss": losses.expand(len(batch))})
         return prediction, losses
 
     def _finish_evaluation(self, rows: Rows) -> None:
@@ -166,18 +164,6 @@ class PositionModule(LightningModule):
             f"{listed([names[row] if names else str(row) for row in rows])}; the last checkpoint is whole: lower "
             "optimizer.lr, or look at these images"
         )
-
-
-def standard_error(row: Int[Tensor, " batch"], epoch: int) -> Float[Tensor, " batch"]:
-    """A standard normal number for each sample and epoch, evenly spread over samples and over epochs.
-
-    It depends on (row, epoch) alone, so a resumed or distributed run trains on the same numbers.
-
-    Source: multiples of irrational numbers modulo 1 are evenly distributed (Weyl); checked in
-    tests/training/test_f_error.py.
-    """
-    place = row.double() * GOLDEN + epoch * math.sqrt(2)
-    return torch.special.ndtri(place.frac().clamp(1e-6, 1 - 1e-6)).float()
 
 
 def factor(schedule: str, warmup_steps: int, steps: int) -> Callable[[int], float]:

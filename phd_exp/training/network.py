@@ -1,5 +1,6 @@
-"""The network of a configuration and the weights of a checkpoint, without Lightning: shared with prediction."""
+"""The network, its focal lengths and the weights of a checkpoint, without Lightning: shared with prediction."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,7 +11,8 @@ from zipfile import ZIP_STORED, ZipFile
 import torch
 from hydra.errors import HydraException
 from hydra.utils import instantiate
-from torch import nn
+from jaxtyping import Float, Int
+from torch import Tensor, nn
 
 from phd_exp.data.images import SHRINKING
 from phd_exp.geometry.charts import DepthScale
@@ -25,6 +27,7 @@ from phd_exp.training.config.sections import TrainerConfig
 from phd_exp.training.config.targets import custom_parts
 
 ADVICE = "delete it to begin the run again"
+GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 def build_regressor(config: RunConfig, depth: DepthScale, is_new: bool = True) -> Regressor:
@@ -68,6 +71,26 @@ def naming(key: str, node: dict[str, Any]) -> Iterator[None]:
         files = ", ".join(dict.fromkeys(custom_parts(node).values()))
         reason = place or gist(error.__cause__ or error) + (f" ({files})" if files else "")
         raise ConfigError(f"{key}: {reason}") from None
+
+
+def f_factor(row: Int[Tensor, " batch"], f_error: float, epoch: int = 0) -> Float[Tensor, " batch"]:
+    """Focal length that the model receives relative to the true one: exp(f_error e), with the `standard_error` e.
+
+    Evaluations have the errors of epoch 0, so that every record of a sample has the same.
+    """
+    return (f_error * standard_error(row, epoch)).exp()
+
+
+def standard_error(row: Int[Tensor, " batch"], epoch: int) -> Float[Tensor, " batch"]:
+    """A standard normal number for each sample and epoch, evenly spread over samples and over epochs.
+
+    It depends on (row, epoch) alone, so a resumed or distributed run trains on the same numbers.
+
+    Source: multiples of irrational numbers modulo 1 are evenly distributed (Weyl); checked in
+    tests/training/test_f_error.py.
+    """
+    place = row.double() * GOLDEN + epoch * math.sqrt(2)
+    return torch.special.ndtri(place.frac().clamp(1e-6, 1 - 1e-6)).float()
 
 
 def has_gpu(config: TrainerConfig) -> bool:

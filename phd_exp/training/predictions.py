@@ -32,7 +32,7 @@ MEANS = {
     "projected_precision": "projected_precision",
 }
 """Column -> the metric that is its mean."""
-UNRECORDED = ("row", "loss")
+UNRECORDED = ("row", "loss", "f_factor")
 
 
 def training_columns(
@@ -59,12 +59,14 @@ def _errors(prediction: Prediction, xyz: Tensor) -> Columns:
 
 
 @torch.no_grad()
-def columns(prediction: Prediction, batch: Batch) -> Columns:
+def columns(prediction: Prediction, batch: Batch, f_factor: Float[Tensor, " batch"] | float = 1.0) -> Columns:
     """A batch as a table: camera, truth, estimate, errors; of a distribution also parameters, moments and scores.
 
-    Positions, `depth_crps` and `energy_score` are in metres, in the camera frame; see `distribution_columns`.
+    Positions, `depth_crps` and `energy_score` are in metres, in the camera frame; see `distribution_columns`. `f` is
+    the focal length that the model received: `f_factor` times that of the batch.
     """
-    table = {"row": batch.row, "f": batch.f, "S": torch.full_like(batch.f, batch.S)}
+    table = {"row": batch.row, "f": f_factor * batch.f, "S": torch.full_like(batch.f, batch.S)}
+    table["f_factor"] = f_factor * torch.ones_like(batch.f)
     table |= coordinates("", batch.xyz) | coordinates("mode_", prediction.mode)
     table |= _errors(prediction, batch.xyz)
     table["ale_m"] = distance_error(batch.xyz, prediction.mode)
@@ -98,10 +100,13 @@ def summary(table: Columns, part: str = "test") -> dict[str, float]:
 def write_parquet(file: Path, table: Columns, known: Known, said: Mapping[str, str] | None = None) -> None:
     """Write the columns and the metadata of their samples, in the order of the data set.
 
-    The metadata may have f and S of the stored images. `said` goes into the metadata of the schema.
+    The metadata may have f and S of the stored images; f is then recorded in their pixels, as the model received it.
+    `said` goes into the metadata of the schema.
     """
     rows = table["row"].long().tolist()
     arrays = {name: pa.array([values[row] for row in rows]) for name, values in known.items()}
+    if "f" in known:
+        arrays["f"] = pa.array(table["f_factor"].numpy() * [known["f"][row] for row in rows])
     arrays |= {name: pa.array(column.numpy()) for name, column in table.items() if name not in (*UNRECORDED, *known)}
     buffer = io.BytesIO()
     pq.write_table(pa.table(arrays, metadata=dict(said or {})), buffer)

@@ -1,16 +1,27 @@
 """A focal length that is known within some per cent: the errors that the model receives."""
 
+import shutil
 from collections.abc import Callable
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from scipy.stats import kstest
 
+import phd_exp as package
+from phd_exp.cli.train import _record_further
 from phd_exp.data.batches import Batch
-from phd_exp.records.errors import ConfigError
-from phd_exp.training.build import build_data, build_module
-from phd_exp.training.config import check
-from phd_exp.training.module import standard_error
+from phd_exp.data.sources import Part, Source
+from phd_exp.evaluation.parquet import read_table
+from phd_exp.inference import tables
+from phd_exp.records.errors import ConfigError, RunError
+from phd_exp.records.runs import RunFolder
+from phd_exp.training.build import build_data, build_module, build_source
+from phd_exp.training.config import RunConfig, check
+from phd_exp.training.network import f_factor, standard_error
+from phd_exp.training.predictions import write_parquet
+from tests.support.recorded import once
 
 ROWS = torch.arange(8000)
 
@@ -46,3 +57,78 @@ def test_the_model_receives_focal_lengths_within_the_error_and_the_labels_stay(c
 def test_an_error_of_a_focal_length_that_is_not_used_is_refused(composed: Callable) -> None:
     with pytest.raises(ConfigError, match=r"^camera: f_error: got 0\.1; camera=constant uses no focal length"):
         check(composed("preset=smoke", "camera=constant", "camera.f_error=0.1"))
+
+
+F_ERROR = 0.05
+WORDS = (f"camera.f_error={F_ERROR}", "evaluation.eight_views=true", "shift=focal_length", "trainer.max_epochs=1")
+
+
+@pytest.fixture(scope="module")
+def run(run_in: Callable, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A run with all further tables; those of several cameras are of the test samples."""
+
+    def make(path: Path) -> None:
+        run = run_in(path, *WORDS)
+        config = check(run.config())
+        _record_further(run, config, cores=1)
+        source = build_source(config.data)
+        tables.record(run, run.views, source, tables.origin_of(run, config))
+
+    return RunFolder(once(tmp_path_factory, "run with wrong focal lengths", make))
+
+
+def config_and_source(run: RunFolder) -> tuple[RunConfig, Source]:
+    config = check(run.config())
+    return config, build_source(config.data)
+
+
+@pytest.mark.parametrize(
+    ("name", "part", "views", "shift"),
+    [
+        ("predictions.parquet", "test", 1, 1.0),
+        ("held_out.parquet", "held_out", 1, 1.0),
+        ("eight_views_held_out.parquet", "held_out", 8, 1.0),
+        ("eight_views_test.parquet", "test", 8, 1.0),
+        ("views.parquet", "test", 1, 1.0),
+        ("shifts/f_wrong.parquet", "test", 1, 1.05),
+    ],
+)
+def test_every_record_predicts_with_the_focal_lengths_of_the_module(
+    run: RunFolder, name: str, part: Part, views: int, shift: float
+) -> None:
+    """The same wrong focal length for the same sample, and the table has it."""
+    config, source = config_and_source(run)
+    table, samples, predictor = read_table(run.path / name), source.samples(part), package.load(run.path, views=views)
+    module = build_module(config, build_data(config)).eval()
+    f = shift * module.camera(samples).f
+    assert not torch.isclose(f, shift * samples.f, rtol=1e-3).any()
+    np.testing.assert_allclose(table["f"] / table["S"], f / samples.S, rtol=1e-6)
+    expected = predictor.predict(predictor.raw(samples.image.numpy(), f), f)
+    mode = np.column_stack([table[f"mode_{axis}"] for axis in "xyz"])
+    np.testing.assert_allclose(mode, expected.mode.numpy(), rtol=1e-4, atol=1e-5)
+    np.testing.assert_array_equal(table["z"], samples.xyz[:, 2].numpy())
+
+
+def test_tables_of_exact_focal_lengths_are_recorded_again(run: RunFolder, tmp_path: Path) -> None:
+    """An earlier version made such tables, on which a guarantee would be too narrow."""
+    old = RunFolder(Path(shutil.copytree(run.path, tmp_path / "old")))
+    config, source = config_and_source(old)
+    exact = {"f_factor": torch.ones(4), "row": torch.arange(4)}
+    files = old.eight_views["held_out"], old.views
+    for file in files:
+        table = {
+            name: torch.from_numpy(column[:4]) for name, column in read_table(file).items() if name != "file_name"
+        }
+        write_parquet(file, table | exact, {})
+    with pytest.raises(RunError, match=r"views\.parquet: recorded with exact focal lengths, .*records it again"):
+        tables.require_received(old.views, config)
+    tables.record_eight_views(old, config, source)
+    again, right = (read_table(one.eight_views["held_out"]) for one in (old, run))
+    np.testing.assert_array_equal(again["f"], right["f"])
+    tables.require_received(
+        old.views, config.model_copy(update={"camera": config.camera.model_copy(update={"f_error": 0.0})})
+    )
+
+
+def test_without_an_error_every_focal_length_is_exact() -> None:
+    assert torch.equal(f_factor(ROWS, 0.0), torch.ones(len(ROWS)))
