@@ -26,7 +26,7 @@ def train(overrides: Sequence[str] = (), config_dir: str | Path | None = None) -
     """
     from phd_exp.cli.train import trained
 
-    return trained(list(overrides), config_dir)
+    return trained(overrides, config_dir)
 
 
 def load(

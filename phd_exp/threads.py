@@ -1,9 +1,23 @@
-"""Torch's threads, where several of them wait for each other longer than they compute."""
+"""The number of torch's threads: by default, and where several wait for each other longer than they compute."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
+
+
+def default_threads(cores: int) -> int:
+    """One thread a core, fewer if OMP_NUM_THREADS asks for fewer, as torch does by itself.
+
+    Examples:
+        >>> os.environ["OMP_NUM_THREADS"] = "2"
+        >>> default_threads(8), default_threads(1)
+        (2, 1)
+        >>> del os.environ["OMP_NUM_THREADS"]
+    """
+    asked = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()  # one number for each level of nesting
+    return min(cores, int(asked)) if asked.isdecimal() and int(asked) else cores
 
 
 @contextmanager

@@ -32,7 +32,7 @@ class Ending(NamedTuple):
     Attributes:
         state: one or two words.
         lines: the errors, one a line.
-        exit_status: 0 for success.
+        exit_status: 0 for success, 2 for a wrong configuration or wrong arguments.
         value: the number that a sweeper minimizes.
     """
 
@@ -47,7 +47,7 @@ def failure(error: BaseException) -> Ending:
     if isinstance(error, Stopped):
         return Ending("interrupted", (f"stopped by {error}; {RESUMES}",), 128 + error.signum)
     if isinstance(error, UserError):
-        return Ending("failed", tuple(str(error).splitlines()), 1)
+        return Ending("failed", tuple(str(error).splitlines()), 2 if isinstance(error, ConfigError) else 1)
     # torch raises a RuntimeError on a CPU, and a class of the second name on a GPU
     no_memory = type(error).__name__ in ("MemoryError", "OutOfMemoryError")
     if isinstance(error, OSError) and error.strerror:

@@ -23,6 +23,7 @@ from phd_exp.cli.help import OF_VERB
 from phd_exp.records.errors import ConfigError, RunError, nearest
 from phd_exp.records.processes import usable_cores
 
+OMP = "OMP_NUM_THREADS"
 LONGEST = 400  # characters of Hydra's messages that are repeated
 REFUSED = (HydraException, OmegaConfBaseException, ValueError, TypeError, ArithmeticError, RecursionError)
 """The errors that a bad override raises; ValueError for a group set to null, TypeError for one set to numbers."""
@@ -39,21 +40,26 @@ class Job:
             process), the error that ended it, or None without a record. None if the verb records nothing.
         cost: the seconds of the jobs with these configurations, one after another, on that many cores; 0 if it is not
             known. None if the verb cannot estimate it.
+        numbers: the results on disk of the finished job with a configuration and overrides, in words. None if the
+            verb has none.
         endings: of all jobs, in the launcher's own process.
         n_jobs: the number of jobs of the sweep.
         cores: the number of cores for each; None: all that its process may use.
         parent: the process with which a job ends; None: jobs outlive the launcher.
         home: the launcher's own process.
+        omp: the OMP_NUM_THREADS of the launcher's own process.
     """
 
     task: Callable[[dict[str, Any], list[str], int], float | None]
     standing: Callable[[dict[str, Any], list[str]], str | None] | None = None
     cost: Callable[[list[dict[str, Any]], int], float] | None = None
+    numbers: Callable[[dict[str, Any], list[str]], str] | None = None
     endings: list[Ending] = field(default_factory=list)
     n_jobs: int = 1
     cores: int | None = None
     parent: int | None = None
     home: str = HOME
+    omp: str | None = field(default_factory=lambda: os.environ.get(OMP))
 
     def __call__(self, config: DictConfig) -> float | None:
         """Run the job. A single run keeps its ending; other sweepers than ours get the score or an error."""
@@ -83,6 +89,8 @@ class Job:
 
     def _run(self, config: DictConfig) -> float | None:
         composed = HydraConfig.get()
+        if self.cores:  # the share of this job; launchers set the variable by another rule
+            os.environ.pop(OMP, None) if self.omp is None else os.environ.update({OMP: self.omp})
         # with interpolations resolved: the values are part of the run's name
         overrides = list(composed.overrides.task)
         if composed.mode == RunMode.MULTIRUN:
@@ -96,7 +104,7 @@ class Job:
 def refusal(error: Exception, config_name: str = "config") -> Ending:
     """The ending of a job whose configuration is wrong; `error` is ours or one of `REFUSED`."""
     refused = error if isinstance(error, ConfigError) else ConfigError(explain(error, config_name))
-    return failure(refused)._replace(exit_status=2)
+    return failure(refused)
 
 
 def plain(config: DictConfig) -> dict[str, Any]:

@@ -139,11 +139,13 @@ class _Search:
             trial = begun.pop() if begun else self.study.ask(self.space)
             self._run_trial(trial, trials)
             self._write()
-        best = self._write().best
+        search = self._write()
+        best = search.best
         if best is None:
             raise RunError(f"{self.folder}: no trial has finished; each line above says why")
         words = " ".join(f"{key}={value}" for key, value in best.overrides.items())
-        print(f"{self.folder}: best of {len(self.study.trials)} trials: {words}: {best.value:.4g}, {best.run}")
+        score = f"{search.objective} {best.value:.4g}"
+        print(f"{self.folder}: best of {len(self.study.trials)} trials: {words}: {score}, {best.run}")
 
     def _run_trial(self, trial: "optuna.Trial", trials: int) -> None:
         import optuna

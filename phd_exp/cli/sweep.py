@@ -54,7 +54,7 @@ def sweep(job: Job, config: DictConfig, context: HydraContext, arguments: list[s
         ending._replace(state="finished already") if before and ending.exit_status == 0 else ending
         for before, ending in zip(finished, _run(job, master, jobs, context), strict=True)
     ]
-    _print_outcome(jobs, endings)
+    _print_outcome(job, jobs, endings)
     job.endings.extend(endings)
     return [ending.value for ending in endings]
 
@@ -181,19 +181,20 @@ def cores_a_job(launcher: Mapping[str, Any], jobs: int) -> int | None:
     return None
 
 
-def _print_outcome(jobs: list[Combination], endings: list[Ending]) -> None:
+def _print_outcome(job: Job, jobs: list[Combination], endings: list[Ending]) -> None:
     """Print the outcome of each job with the overrides that distinguish it, then every error with all overrides."""
-    shared = set.intersection(*(set(job.overrides) for job in jobs))
-    for job, ending in zip(jobs, endings, strict=True):
-        own = [override for override in job.overrides if override not in shared]
-        print(f"{' '.join(own or job.overrides)}: {ending.state}")
+    shared = set.intersection(*(set(one.overrides) for one in jobs))
+    for one, ending in zip(jobs, endings, strict=True):
+        own = [override for override in one.overrides if override not in shared]
+        numbers = job.numbers(*one) if job.numbers and ending.exit_status == 0 else ""
+        print(f"{' '.join(own or one.overrides)}: {ending.state}{', ' if numbers else ''}{numbers}")
     states = Counter(ending.state for ending in endings)
     print(f"{_counted(len(jobs))}: {', '.join(f'{n} {state}' for state, n in states.items())}", flush=True)
     failed = sum(ending.exit_status > 0 for ending in endings)
     if failed > 1:
         print_errors([f"{failed} jobs failed"])
-    for job, ending in zip(jobs, endings, strict=True):
-        print_errors(f"{' '.join(job.overrides)}: {line}" for line in ending.lines)
+    for one, ending in zip(jobs, endings, strict=True):
+        print_errors(f"{' '.join(one.overrides)}: {line}" for line in ending.lines)
 
 
 def _counted(jobs: int) -> str:

@@ -9,9 +9,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 
 from phd_exp.cli.jobs import Job, composed, launch
-from phd_exp.records.choices import RunName, has_influence, setting
+from phd_exp.records.choices import PLAIN_RECIPE, RunName, has_influence, setting
 from phd_exp.records.dataset import DatasetFolder
-from phd_exp.records.errors import ConfigError, RunError
+from phd_exp.records.errors import ConfigError, RunError, shown
 from phd_exp.records.processes import usable_cores
 from phd_exp.records.runs import RunFolder
 from phd_exp.rendering.render import ensure_rendered
@@ -31,6 +31,12 @@ SHOWN = (
     "test/calibration/miscalibration_area",
 )
 """The numbers that are printed at the end of a run; results.json holds more."""
+SUMMARY = {
+    "test/projected_error_mm": "projected error {} mm",
+    "test/depth_error_mm": "depth error {} mm",
+    "test/nll": "NLL {}",
+}
+"""The numbers of each run at the end of a sweep."""
 LONG = 1_000_000  # images seen by all trainings of a sweep; from here on their time is estimated
 SCORES = ("test/nll", "test/depth_error_mm")
 """The number that a sweeper receives: the first that the run has. A baseline has no likelihood."""
@@ -38,7 +44,7 @@ SCORES = ("test/nll", "test/depth_error_mm")
 
 def main(words: list[str]) -> int:
     """Train once, or (-m) for every combination; returns the exit status."""
-    return launch(Job(task, standing, cost), words)
+    return launch(Job(task, standing, cost, numbers), words)
 
 
 def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Sequence[Any] = ()) -> float | None:
@@ -47,6 +53,7 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
     `callbacks` are Lightning's, in addition to those of the configuration.
     """
     checked = check(config)
+    _require_part(checked, overrides)
     # imports of seconds, which follow the check of the configuration
     from phd_exp.training.run import require_possible, train
 
@@ -69,13 +76,28 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
     return next((results[key] for key in SCORES if results.get(key) is not None), None)
 
 
-def trained(overrides: list[str], config_dir: str | Path | None) -> "TrainedRun":
+def _require_part(checked: RunConfig, overrides: list[str]) -> None:
+    """Raise ConfigError for a part of recipe=strong that is left out of the recipe that has none."""
+    for item in OverridesParser.create().parse_overrides(overrides):
+        if item.key_or_group == "without" and item.value() is not None and checked.recipe.name == PLAIN_RECIPE:
+            raise ConfigError(
+                f"{item.input_line}: leaves a part of recipe=strong out, but recipe={PLAIN_RECIPE} has no such part; "
+                "add recipe=strong"
+            )
+
+
+def trained(overrides: Sequence[str], config_dir: str | Path | None) -> "TrainedRun":
     """Train one run from Python; see `phd_exp.train`."""
     from phd_exp.inference.trained import TrainedRun
 
-    config = composed(overrides, config_dir)
-    task(config, overrides, usable_cores())
-    return TrainedRun(run_name(check(config), overrides).folder(Path(config["runs"])))
+    if isinstance(overrides, str):
+        raise ConfigError(
+            f"overrides: got {shown(overrides)}; expected a list of words, such as [{shown(overrides)}]"
+        )
+    words = list(overrides)
+    config = composed(words, config_dir)
+    task(config, words, usable_cores())
+    return TrainedRun(run_name(check(config), words).folder(Path(config["runs"])))
 
 
 def cost(configs: list[dict[str, Any]], cores: int) -> float:
@@ -167,10 +189,7 @@ def _number(value: Any) -> str:
 def standing(config: dict[str, Any], overrides: list[str]) -> str | None:
     """The state of a configuration's run. The configuration is not checked, because checking it imports torch."""
     try:
-        data = config["data"].get("variant") or config["data"]["name"]
-        preset = setting(config["preset"], config["recipe"]["name"])
-        name = RunName(preset, data, config["model"]["name"], config["seed"], _hashed(overrides))
-        folder = RunFolder(name.folder(Path(config["runs"])))
+        folder = _folder(config, overrides)
         status = folder.status()
         if status is None:
             return None
@@ -181,8 +200,28 @@ def standing(config: dict[str, Any], overrides: list[str]) -> str | None:
         wanted += map(folder.shift, config["evaluation"]["shifts"])
         is_whole = status.state == "finished" and all(file.exists() for file in wanted)
         return "finished" if is_whole else status.error or "interrupted"
-    except (KeyError, TypeError, AttributeError, OSError, RunError):  # the run itself will report it
+    except UNREADABLE:  # the run itself will report it
         return None
+
+
+def numbers(config: dict[str, Any], overrides: list[str]) -> str:
+    """The errors and the NLL of a configuration's finished run, not checked either."""
+    try:
+        results = _folder(config, overrides).results()
+        return ", ".join(text.format(_number(results[key])) for key, text in SUMMARY.items() if key in results)
+    except UNREADABLE:
+        return ""
+
+
+UNREADABLE = (KeyError, TypeError, AttributeError, OSError, RunError)
+"""The errors of a configuration that is not checked, and of a record that cannot be read."""
+
+
+def _folder(config: dict[str, Any], overrides: list[str]) -> RunFolder:
+    data = config["data"].get("variant") or config["data"]["name"]
+    preset = setting(config["preset"], config["recipe"]["name"])
+    name = RunName(preset, data, config["model"]["name"], config["seed"], _hashed(overrides))
+    return RunFolder(name.folder(Path(config["runs"])))
 
 
 def run_name(config: RunConfig, overrides: list[str]) -> RunName:

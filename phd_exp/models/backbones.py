@@ -8,6 +8,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torchvision.models.resnet import BasicBlock, Bottleneck, ResNet
 
+from phd_exp.records.errors import gist
+
 BLOCKS: dict[int, tuple[type[BasicBlock | Bottleneck], list[int]]] = {
     10: (BasicBlock, [1, 1, 1, 1]),
     18: (BasicBlock, [2, 2, 2, 2]),
@@ -73,15 +75,20 @@ def pooled(network: nn.Module, side: int = 224, pretrained: str | None = None) -
         side: side of the images, pixels.
         pretrained: file with the network's weights, as a state dict; None keeps those it has.
 
-    Raises ValueError for any other output.
+    Raises ValueError for any other output, or a file with other content.
 
     Examples:
         >>> pooled(nn.Conv2d(3, 8, 3), side=32).n_features
         8
     """
     if pretrained is not None:
-        state = torch.load(pretrained, "cpu", weights_only=True)
-        network.load_state_dict(state.get("state_dict", state))
+        try:
+            state = torch.load(pretrained, "cpu", weights_only=True)
+            network.load_state_dict(state.get("state_dict", state))
+        except Exception as error:  # torch raises any for another file
+            raise ValueError(
+                f"pretrained: got {pretrained!r}; expected a file with this network's state dict ({gist(error)})"
+            ) from None
     network.eval()
     with torch.no_grad():
         features = network(torch.zeros(2, 3, side, side))

@@ -1,5 +1,6 @@
 """Progress of rendering: a bar in a terminal, a line every ten seconds elsewhere."""
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -35,17 +36,20 @@ def shown_progress(total: int, title: str) -> Iterator[Callable[[], None]]:
 
 
 def _lines(total: int, title: str) -> Callable[[], None]:
-    """Print a line every ten seconds and one at the end, which log files can hold."""
-    done = 0
-    begun = printed = time.monotonic()
+    """Print a line every ten seconds and one at the end, which log files can hold.
+
+    The rate counts from the first image, because Blender and its scene start before it.
+    """
+    done, first, printed = 0, math.inf, time.monotonic()
 
     def advance() -> None:
-        nonlocal done, printed
+        nonlocal done, first, printed
         done, now = done + 1, time.monotonic()
-        if now - printed >= SECONDS_BETWEEN_LINES or done >= total:
+        first = min(first, now)
+        if done >= total or (done > 1 and now - printed >= SECONDS_BETWEEN_LINES):
             printed = now
-            speed = done / max(now - begun, 1e-9)
-            left = duration((total - done) / speed)
-            announce(f"{title}: {done}/{total} images, {speed:.1f} images/s, {left} left")
+            speed = (done - 1) / max(now - first, 1e-9)
+            rate = f", {speed:.1f} images/s, {duration((total - done) / speed)} left" if speed else ""
+            announce(f"{title}: {done}/{total} images{rate}")
 
     return advance

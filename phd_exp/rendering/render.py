@@ -37,7 +37,6 @@ Samples = Sequence[tuple[Split, int]]
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # of each worker
 FEWEST_PER_WORKER = 8  # starting one more process costs about as much as rendering this many images
 WAITING = "waiting for it to finish"
-SECONDS_PER_OBJECT = 0.085  # one core, 224 px, 3 samples a pixel: for the announcement only
 
 
 def ensure_rendered(
@@ -188,11 +187,9 @@ def worker_count(samples: int, cores: int | None = None) -> int:
 
 
 def _first_words(folder: DatasetFolder, spec: DatasetSpec, n: int, workers: int, *, resumed: bool) -> str:
-    objects, pixels = 1 + max(2 * spec.occluders, spec.distractors), (spec.sensor_size / 224) ** 2
-    seconds = SECONDS_PER_OBJECT * objects * pixels * max(spec.samples_per_pixel / 3, 1.0)
     left = f"the remaining {n}" if resumed else f"{n}"
     return (
-        f"rendering {left} images of '{spec.variant}' into {folder.root}, once: about "
-        f"{duration(n * seconds / workers)} with {workers} process{'es' if workers > 1 else ''}; fewer with "
+        f"rendering {left} images of '{spec.variant}' into {folder.root}, once, with {workers} "
+        f"process{'es' if workers > 1 else ''}; the time left follows the first images; fewer with "
         "data.n_train=... data.n_test=...; stop at any time, the same command resumes"
     )

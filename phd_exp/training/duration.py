@@ -8,6 +8,7 @@ from lightning import Callback, LightningModule, Trainer
 from torch.utils.data import DataLoader
 
 from phd_exp.data.batches import Batch
+from phd_exp.threads import default_threads
 from phd_exp.training.build import build_data, build_module
 from phd_exp.training.config import RunConfig
 from phd_exp.training.network import precision
@@ -33,7 +34,7 @@ class _Clock(Callback):
 def seconds_a_step(config: RunConfig, threads: int) -> float:
     """The mean time of the first training steps of a run, measured on random images for five seconds."""
     quiet_lightning()
-    torch.set_num_threads(config.trainer.threads or threads)
+    torch.set_num_threads(config.trainer.threads or default_threads(threads))
     data, clock, n, side = build_data(config), _Clock(), config.data.batch_size, config.data.image_size
     image = torch.randint(0, 256, (n, side, side, 3), dtype=torch.uint8)
     xyz = torch.tensor([0.0, 0.0, data.source.depth.z_centre]).expand(n, 3)

@@ -68,7 +68,8 @@ def naming(key: str, node: dict[str, Any]) -> Iterator[None]:
         place = in_user_code(error)
         if place is None and not isinstance(error, ValueError | TypeError | OSError | RuntimeError | HydraException):
             raise
-        files = ", ".join(dict.fromkeys(custom_parts(node).values()))
+        own = dict.fromkeys(custom_parts(node).values())
+        files = ", ".join(file for file in own if "site-packages" not in file)
         reason = place or gist(error.__cause__ or error) + (f" ({files})" if files else "")
         raise ConfigError(f"{key}: {reason}") from None
 

@@ -20,6 +20,7 @@ from phd_exp.records.errors import ConfigError, RunError, gist, shown
 from phd_exp.records.files import checksum, remove_temporaries
 from phd_exp.records.own_images import DetectionFolder
 from phd_exp.records.runs import RunFolder
+from phd_exp.threads import default_threads
 from phd_exp.training.build import build_data, build_module
 from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig
 from phd_exp.training.config.targets import custom_parts
@@ -50,7 +51,7 @@ def train(
         config: the run.
         folder: the folder of its record.
         draw: draws calibration curves; None records their data alone.
-        cores: number of threads, unless trainer.threads is set.
+        cores: number of threads, unless trainer.threads or OMP_NUM_THREADS is set.
         callbacks: of Lightning, further ones than the configuration's; with trainer.devices=1 only.
         overrides: words of the command line, for the record.
 
@@ -64,7 +65,7 @@ def train(
         for place in (folder.path, folder.checkpoints, folder.calibration):
             remove_temporaries(place)  # of a killed process
         folder.write_config(config.model_dump(mode="json"))
-        threads = config.trainer.threads or cores
+        threads = config.trainer.threads or default_threads(cores)
         with folder.recording(_manifest_hash(config), custom_parts(config.model_dump(mode="json")), overrides):
             if config.trainer.devices > 1:
                 results = train_together(config, folder.path, draw, threads)
@@ -144,6 +145,10 @@ def run(
         recorder = Recorder(folder, config.evaluation, draw, loggers)
         trainer = build_trainer(config, recorder, callbacks)
         _fit(trainer, module, data, recorder)
+        if not folder.last_checkpoint.exists():
+            raise RunError(
+                f"{folder.path}: trained no whole epoch, so there is no run; set other arguments of trainer"
+            )
         if (best := folder.best_checkpoint) != folder.last_checkpoint:
             module.load_state_dict(load_checkpoint(best)["state_dict"])
         tables = {part: _evaluate(trainer, module, data, part) for part in data.samples if part != "train"}

@@ -8,7 +8,7 @@ from typing import Any
 from hydra.utils import instantiate
 from lightning import Trainer
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar, TQDMProgressBar
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar
 
 from phd_exp.records.errors import ConfigError, nearest
 from phd_exp.records.runs import RunFolder
@@ -26,6 +26,7 @@ OWNED = {
     "enable_progress_bar": "set trainer.progress_bar",
     "default_root_dir": "set runs",
     "enable_checkpointing": "set callbacks for further checkpoints; runs resume from their own",
+    "fast_dev_run": "set trainer.max_epochs=1 +trainer.limit_train_batches=1, which leaves a checkpoint",
     "limit_predict_batches": "set data.n_test, since the record has all test samples",
     "num_sanity_val_steps": "leave it out: the untrained network is always evaluated",
     "use_distributed_sampler": "leave it out: batches are divided among the processes already",
@@ -50,9 +51,9 @@ def build_trainer(config: RunConfig, recorder: Recorder, callbacks: Sequence[Cal
     ]
     if config.trainer.devices == 1:  # several processes would stop at different batches
         ours.append(StopBetweenBatches(folder.last_checkpoint))
-    if config.trainer.progress_bar:  # a bar on a terminal, lines elsewhere
-        bar = TQDMProgressBar() if sys.stderr.isatty() else None
-        ours += [bar, Progress(bar)] if bar else [Progress()]
+    if config.trainer.progress_bar:
+        ours.append(Progress(is_terminal=sys.stderr.isatty()))
+    every = [*ours, *build_callbacks(config, folder), *callbacks]
     arguments: dict[str, Any] = {
         "accelerator": config.trainer.accelerator,
         "devices": config.trainer.devices,
@@ -62,8 +63,8 @@ def build_trainer(config: RunConfig, recorder: Recorder, callbacks: Sequence[Cal
         "precision": precision(config.trainer),
         "max_epochs": config.trainer.max_epochs,
         "logger": list(recorder.loggers),
-        "callbacks": [*ours, *build_callbacks(config, folder), *callbacks],
-        "enable_progress_bar": any(isinstance(callback, ProgressBar) for callback in ours),
+        "callbacks": every,
+        "enable_progress_bar": any(isinstance(callback, ProgressBar) for callback in every),  # one of the user
         "check_val_every_n_epoch": config.evaluation.every_n_epochs,
         "log_every_n_steps": 1,  # avoids a warning; metrics are logged once an epoch
         "enable_model_summary": False,

@@ -92,6 +92,12 @@ def test_pretrained_weights_are_loaded_once(own: Callable, tmp_path: Path) -> No
         (["callbacks=early_stopping", "callbacks.early_stopping.monitor=test/loss"], "test samples choose nothing"),
         (["callbacks=early_stopping", "data.n_held_out=0"], "data.n_held_out > 0"),
         (["callbacks=lr_monitor"], "Cannot use `LearningRateMonitor` callback with `Trainer` that has no logger"),
+        (
+            ["+trainer.fast_dev_run=true"],
+            "trainer.fast_dev_run: the run record depends on it; instead set trainer.max_e",
+        ),
+        (["+trainer.limit_train_batches=0"], "trained no whole epoch, so there is no run"),
+        (["backbone=pooled", "+backbone.pretrained=no.pth"], "backbone: pretrained: got 'no.pth'; expected a file"),
         (["+trainer.callbacks=[]"], "trainer.callbacks: the run record depends on it; instead set callbacks=NAME"),
         (["+trainer.gradient_clip=1"], "trainer.gradient_clip: unknown key, did you mean 'gradient_clip_val'?"),
     ],
@@ -163,7 +169,6 @@ def test_a_strangers_configuration_executes_nothing(run: RunFolder, tmp_path: Pa
     [
         "max_steps=3 gradient_clip_val=0.1 detect_anomaly=true profiler=simple enable_model_summary=true",
         "accumulate_grad_batches=2 limit_val_batches=1",
-        "fast_dev_run=true",
         "overfit_batches=1",
     ],
 )

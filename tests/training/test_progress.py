@@ -1,18 +1,24 @@
-"""What a training prints: soon how long it will take, and without a bar a line at least every half minute."""
+"""What a training prints: one bar on a terminal; elsewhere a line soon, and then about every tenth of the run."""
 
+import math
+import os
+import pty
 import re
-from collections.abc import Callable
+import sys
+import threading
+from collections.abc import Callable, Iterator
 from itertools import pairwise
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, TextIO
 
 import pytest
 
 from phd_exp.records.processes import duration
 from phd_exp.training import progress
-from phd_exp.training.progress import BETWEEN_LINES, FIRST_LINE, Progress
+from phd_exp.training.progress import LINES, PATIENCE, Progress, line_epochs
 
-BATCHES, EPOCHS = 100, 10
+BATCHES = 100
 
 
 @pytest.fixture
@@ -21,24 +27,20 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[tuple[float, 
     now = SimpleNamespace(seconds=1000.0)
     monkeypatch.setattr(progress.time, "monotonic", lambda: now.seconds)
 
-    def train(seconds: float, bar: bool = False) -> list[tuple[float, str]]:
+    def train(seconds: float, epochs: int, every: int) -> list[tuple[float, str]]:
         lines: list[tuple[float, str]] = []
         now.seconds = 1000.0
-
-        def keep(line: str) -> None:
-            lines.append((now.seconds - 1000.0, line))
-
-        callback = Progress(SimpleNamespace(print=keep) if bar else None)  # type: ignore[arg-type]
-        callback.say = keep
+        callback = Progress(is_terminal=False)
+        callback.say = lambda line: lines.append((now.seconds - 1000.0, line))  # type: ignore[assignment]
         trainer: Any = SimpleNamespace(
-            max_epochs=EPOCHS, num_training_batches=BATCHES, check_val_every_n_epoch=2,
-            callback_metrics={"test/loss": 3.0},
+            max_epochs=epochs, num_training_batches=BATCHES, check_val_every_n_epoch=every, current_epoch=0,
+            callback_metrics={"train/loss": 4.0, "test/loss": 3.0},
         )  # fmt: skip
         callback.on_train_start(trainer, None)  # type: ignore[arg-type]
-        for trainer.current_epoch in range(EPOCHS):
+        for trainer.current_epoch in range(epochs):
             for batch in range(BATCHES):
                 now.seconds += seconds
-                callback.on_train_batch_end(trainer, None, None, None, batch)  # type: ignore[arg-type]
+                callback.on_train_batch_end(trainer, None, {"loss": 5.0}, None, batch)  # type: ignore[arg-type]
             callback.on_train_epoch_end(trainer, None)  # type: ignore[arg-type]
         return lines
 
@@ -46,21 +48,80 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[tuple[float, 
 
 
 @pytest.mark.parametrize("seconds", [0.01, 0.7, 12.0])
-def test_lines_come_early_and_often_and_say_what_is_left(trained: Callable, seconds: float) -> None:
-    lines = trained(seconds)
+@pytest.mark.parametrize(("epochs", "every"), [(1, 1), (2, 1), (10, 1), (42, 10), (90, 1), (90, 45)])
+def test_lines_come_soon_and_about_every_tenth(trained: Callable, seconds: float, epochs: int, every: int) -> None:
+    lines, whole = trained(seconds, epochs, every), epochs * BATCHES * seconds
     times = [0.0, *(time for time, _ in lines)]
-    assert times[1] <= 2 * seconds + FIRST_LINE
-    gaps = [after - before for before, after in pairwise(times)]
-    assert max(gaps) <= max(BETWEEN_LINES, FIRST_LINE + seconds) + seconds
-    epochs = [line for _, line in lines if re.match(r"epoch \d+/10:", line)]
-    assert len(epochs) == EPOCHS
-    assert ["test/loss 3" in line for line in epochs] == [False, True] * (EPOCHS // 2)
+    assert min(LINES, epochs) <= len(lines) <= 2 * LINES
+    assert times[1] <= max(2 * seconds + PATIENCE, whole / LINES if whole < 2 * PATIENCE else 0) + seconds
+    assert max(after - before for before, after in pairwise(times)) <= max(
+        0.2 * whole, whole / epochs if whole < 60 else 0
+    )
     for time, line in lines:
-        left = EPOCHS * BATCHES * seconds - time
+        left = whole - time
         assert any(line.endswith(f"about {duration(left + rounding)} left") for rounding in (-1e-6, 1e-6))
+    for _, line in lines:
+        number, batch, tested = re.match(
+            rf"epoch (\d+)/{epochs}(, batch \d+/\d+)?: (test/loss 3|loss 5)?", line
+        ).groups()  # type: ignore[union-attr]
+        expected = "test/loss 3" if int(number) % every == 0 else "loss 5"
+        assert tested == (None if batch else expected)
 
 
-def test_with_a_bar_the_estimate_is_printed_once(trained: Callable) -> None:
-    ((time, line),) = trained(36.0, bar=True)
-    assert time == pytest.approx(72)
-    assert line == "epoch 1/10, batch 2/100: about 10.0 h left"
+@pytest.mark.parametrize(("epochs", "every"), [(1, 1), (7, 2), (10, 10), (42, 10), (90, 1), (1000, 7)])
+def test_at_most_ten_epochs_have_a_line_and_most_of_them_are_evaluated(epochs: int, every: int) -> None:
+    found = line_epochs(epochs, every)
+    assert len(found) == min(LINES, epochs)
+    assert max(found) == epochs or max(found) % every == 0
+    tested = math.floor(epochs / every)
+    assert sum(epoch % every == 0 for epoch in found) >= min(tested, LINES // 2)
+
+
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[TextIO, Callable[[], str]]]:
+    """A pseudo-terminal, and what it has received; pytest would replace it as standard error before the test."""
+    ours, theirs = pty.openpty()
+    received = bytearray()
+
+    def read() -> None:
+        while True:
+            try:
+                part = os.read(ours, 4096)
+            except OSError:  # closed
+                return
+            received.extend(part)
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    for name, value in (("TERM", "xterm"), ("COLUMNS", "100")):
+        monkeypatch.setenv(name, value)
+    stream = os.fdopen(theirs, "w")
+
+    def text() -> str:
+        stream.flush()
+        stream.close()
+        reader.join(timeout=10)
+        return received.decode()
+
+    yield stream, text
+    os.close(ours)
+
+
+def test_a_terminal_shows_one_bar_with_loss_errors_and_the_time_left(
+    run_in: Callable,
+    terminal: tuple[TextIO, Callable[[], str]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: Any,
+) -> None:
+    stream, received = terminal
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setattr(progress, "BETWEEN_LOOKS", 0.0)
+    run_in(tmp_path, "model=mae_vz", "trainer.max_epochs=2", "trainer.progress_bar=true", "data.batch_size=4")
+    text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", received())
+    assert "\u2501" in text, "a bar"
+    for number in (1, 2):
+        assert re.search(rf"epoch {number}/2 .* about \d+ s left, loss \d", text), text
+    assert re.search(r"epoch 2/2 .* about 0 s left, loss [\d.e-]+, test errors [\d.e+]+ and [\d.e+]+ mm", text)
+    assert not re.search(r"Predicting|Validation|Epoch 0|epoch 0/|it/s", text)
+    assert "epoch" not in capsys.readouterr().out, "no lines beside the bar"
