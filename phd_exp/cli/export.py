@@ -28,9 +28,10 @@ def main(words: list[str]) -> int:
     from phd_exp.inference.deployed import BATCHES, PHOTOGRAPHS
     from phd_exp.inference.onnx import TOLERANCE, export
 
+    numbers = ", ".join(str(n) for n in ([n for _, _, n in PHOTOGRAPHS] if arguments.photographs else BATCHES))
+    what = f"photographs with {numbers} boxes" if arguments.photographs else f"images in batches of {numbers}"
+    print(f"{file}: converting the network to ONNX, then comparing it with torch on {what}", flush=True)
     deviation = export(predictor, file, arguments.coverage, arguments.photographs)
     print(f"{file}: {file.stat().st_size / 1e6:.1f} MB")
-    numbers = ", ".join(str(n) for n in ([n for _, _, n in PHOTOGRAPHS] if arguments.photographs else BATCHES))
-    what = "photographs with {} boxes" if arguments.photographs else "images in batches of {}"
-    print(f"  largest relative deviation from torch, {what.format(numbers)}: {deviation:.1e} (at most {TOLERANCE:g})")
+    print(f"  largest relative deviation from torch: {deviation:.1e} (at most {TOLERANCE:g})")
     return 0

@@ -17,7 +17,6 @@ from phd_exp.inference.deployed import Deployed, OfImages, OfPhotographs
 from phd_exp.inference.predictor import Predictor
 from phd_exp.records.errors import UserError
 from phd_exp.records.files import write_atomic
-from phd_exp.records.processes import announce
 from phd_exp.records.runs import versions
 
 METADATA = "phd_exp"  # the key of the file's metadata: JSON with the run, the image size and `DESCRIPTIONS`
@@ -57,11 +56,9 @@ def export(predictor: Predictor, file: Path, coverage: float | None = None, phot
         facts = {"coverage": coverage, "level": guarantee.levels[0], "held_out_samples": guarantee.n[0]}
         energies = {"a": PRECISIONS.tolist(), "W": level_energies(guarantee.levels[0]).tolist()}
         metadata["region"] = facts | energies
-    announce(f"{file}: converting the network to ONNX")
     model = graph(deployed)  # last, because it takes half a minute
     model.metadata_props.add(key=METADATA, value=json.dumps(metadata))
     content = model.SerializeToString()
-    announce(f"{file}: comparing it with torch on {'photographs' if photographs else 'images'}")
     deviation = largest_deviation(deployed, content)
     if not deviation <= TOLERANCE:
         raise UserError(

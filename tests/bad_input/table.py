@@ -114,7 +114,7 @@ def stored(name: str, said: str, **changes: Any) -> list[Bad]:
         place.put_config(**changes)
 
     return [
-        Bad(f"stored configuration: {name}, {words[0]}", spoil, words, said, again=words == EXPORT)
+        Bad(f"stored configuration: {name}, {words[0]}", spoil, words, said, 2, again=words == EXPORT)
         for words in (ONE, EXPORT)
     ]
 
@@ -143,7 +143,7 @@ BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
 )
 
 CONFIGURATIONS = [
-    Bad("configuration: a flag that returns the carriage", nothing, ("preset=smoke", "--cfg\r"), r"--cfg: holds control characters; expected printable KEY=VALUE"),
+    Bad("configuration: a flag that returns the carriage", nothing, ("preset=smoke", "--cfg\r"), r"--cfg: holds control characters; expected printable KEY=VALUE", 2),
     configured("a flag that there is not", "--nonsense", r"unrecognized arguments: --nonsense; see `python -m phd_exp --help`"),
     configured("a flag without its value", "-c", r"argument --cfg/-c: expected one argument; .*"),
     configured("a group set to null", "model=null", r"Config group override must be a string or a list\..*"),
@@ -160,7 +160,7 @@ CONFIGURATIONS = [
     configured("a folder without a name", "runs=''", r"runs: got ''; expected the name of a folder"),
     configured("brackets without end", "+a=" + "[" * 2000, r"[^\n]{1,420}"),
     configured("an empty word", "", r".*mismatched input.*"),
-    Bad("configuration: a zero byte", nothing, ("preset=smoke", "runs=a\0b"), r"runs=a\?b: holds control characters; .*"),
+    Bad("configuration: a zero byte", nothing, ("preset=smoke", "runs=a\0b"), r"runs=a\?b: holds control characters; .*", 2),
     *(Bad(f"configuration: {word}", nothing, ("-m", "preset=smoke", word), r"seed=range\(0,.*\): more than 10000 jobs; .*", 2, again="1e9" not in word) for word in ("seed=range(0,1e9)", "seed=range(0,nan)", "seed=range(0,inf)")),
     Bad("configuration: two long ranges", nothing, ("-m", "preset=smoke", "seed=range(0,9999)", "data.seed=range(0,9999)"), r"preset=smoke seed=.*: more than 10000 jobs; .*", 2),
     Bad("configuration: a folder with a long name", nothing, ("preset=smoke", "logger=none", f"runs={'a' * 300}"), r"a{300}.*: File name too long; .*"),

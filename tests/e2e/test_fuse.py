@@ -185,7 +185,7 @@ def test_a_shared_scale_is_estimated_with_the_spread_of_the_runs_own_scenes(
 def test_a_baseline_is_refused(phd_exp: Callable, several: Path, composed: Callable, tmp_path: Path) -> None:
     points = untrained(tmp_path / "points", composed(*SMALL, "model=mae_vz"))
     refused = phd_exp("fuse", f"run={points.path}", f"folder={several}")
-    assert (refused.status, refused.out) == (1, "")
+    assert (refused.status, refused.out) == (2, "")
     (line,) = refused.err.splitlines()
     assert "predicts no Projected Huber densities" in line
 
@@ -223,7 +223,7 @@ def test_a_mistake_is_one_line(
     """In the line of a view, or in the arguments."""
     write(tmp_path, [{"file_name": "a.png", "f": 400} | line])
     outcome = phd_exp("fuse", *words)
-    assert (outcome.status, outcome.out) == (1, "")
+    assert (outcome.status in (1, 2), outcome.out) == (True, "")
     (complaint,) = outcome.err.splitlines()
     assert complaint.startswith("error: ")
     assert said in complaint

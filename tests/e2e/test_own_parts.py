@@ -137,7 +137,7 @@ def test_a_stored_run_builds_foreign_parts_only_on_request(own: Callable, phd_ex
     words = ("predict", f"run={run.path}", "image=x.png", "f=60")
     Image.new("RGB", (32, 32)).save(tmp_path / "x.png")
     refused = phd_exp(*words)
-    assert refused.status == 1
+    assert refused.status == 2
     assert (
         "'ownnet.Mine' is not built from a stored configuration; if you trust this run, add trust=ownnet"
         in refused.err

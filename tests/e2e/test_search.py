@@ -131,7 +131,7 @@ def test_trials_without_prospects_are_pruned(search: Callable, tmp_path: Path) -
 )
 def test_mistakes_are_one_line(search: Callable, words: list[str], message: str) -> None:
     outcome = search(*words)
-    assert outcome.status == 1
+    assert outcome.status == 2
     (line,) = outcome.err.splitlines()
     assert message in line
 
