@@ -4,15 +4,20 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import hydra
 import pytest
+from hydra.types import RunMode
+from omegaconf import OmegaConf
 
 from phd_exp.cli import conf_folder, sweep
+from phd_exp.cli import jobs as launched
+from phd_exp.cli.frame import Ending
 from phd_exp.cli.jobs import Job
 from phd_exp.cli.sweep import Combination, cores_a_job, plan
-from phd_exp.cli.train import run_name, standing
+from phd_exp.cli.train import numbers, run_name, standing
 from phd_exp.records.processes import usable_cores
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import check
@@ -147,3 +152,49 @@ def test_the_time_of_a_sweep_is_printed_beforehand(
     sweep._print_duration(Job(job.task), [{}], 2)
     sweep._print_duration(job, [], 2)
     assert capsys.readouterr().out == ""
+
+
+def test_a_sweep_ends_with_the_errors_of_each_finished_job(
+    jobs: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    planned = jobs("preset=smoke", "model=probabilistic,mae_vz", "seed=0,1")
+    errors = {"test/projected_error_mm": 6.25, "test/depth_error_mm": 142.0}
+    for job in planned[:3]:
+        run = RunFolder(folder(job))
+        run.path.mkdir(parents=True)
+        run.write_results(errors | ({"test/nll": -8.5} if "model=probabilistic" in job.overrides else {}))
+    planned[3].config["seed"] = None  # as a job that is refused
+    endings = [
+        Ending("finished"),
+        Ending("finished already"),
+        Ending("finished"),
+        Ending("failed", ("seed: bad",), 2),
+    ]
+    sweep._print_outcome(Job(lambda *_: None, numbers=numbers), planned, endings)
+    found = capsys.readouterr()
+    said = "projected error 6.25 mm, depth error 142 mm"
+    assert found.out.splitlines()[:4] == [
+        f"model=probabilistic seed=0: finished, {said}, NLL -8.5",
+        f"model=probabilistic seed=1: finished already, {said}, NLL -8.5",
+        f"model=mae_vz seed=0: finished, {said}",
+        "model=mae_vz seed=1: failed",
+    ]
+    assert numbers(planned[3].config, []) == ""
+
+
+@pytest.mark.parametrize(("launcher", "worker", "share", "seen"), [
+    (None, "1", 6, None), ("3", "1", 6, "3"), ("3", "2", None, "2"), (None, "2", None, "2"),
+])  # fmt: skip
+def test_a_job_that_shares_the_cores_has_the_omp_threads_of_its_launcher(
+    monkeypatch: pytest.MonkeyPatch, launcher: str | None, worker: str, share: int | None, seen: str | None
+) -> None:
+    """Launchers set OMP_NUM_THREADS by their number of processes, however many jobs there are."""
+    monkeypatch.delenv(launched.OMP, raising=False)
+    if launcher:
+        monkeypatch.setenv(launched.OMP, launcher)
+    job = Job(lambda *_: os.environ.get(launched.OMP), cores=share)  # type: ignore[arg-type, return-value]
+    here = SimpleNamespace(mode=RunMode.MULTIRUN, overrides=SimpleNamespace(task=[]), job=SimpleNamespace(num=0))
+    monkeypatch.setattr(launched.HydraConfig, "get", lambda: here)
+    monkeypatch.setenv(launched.OMP, worker)
+    assert job._run(OmegaConf.create({})) == seen

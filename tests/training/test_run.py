@@ -22,7 +22,7 @@ from phd_exp.training.config import check
 from phd_exp.training.module import PositionModule
 from phd_exp.training.progress import Progress
 from phd_exp.training.recorder import Recorder
-from phd_exp.training.run import require_same_config
+from phd_exp.training.run import require_same_config, train
 from tests.e2e.runs import weights
 from tests.support.recorded import once
 
@@ -247,3 +247,21 @@ def test_progress_is_a_bar_on_a_terminal_and_lines_elsewhere(
     trainer = build.build_trainer(config, Recorder(RunFolder(tmp_path), config.evaluation, None, []))
     found = [callback for callback in trainer.callbacks if isinstance(callback, ProgressBar | Progress)]  # type: ignore[attr-defined]
     assert [callback.bar is not None for callback in found] == bars
+
+
+@pytest.mark.parametrize(
+    ("asked", "words", "expected"),
+    [("", (), 8), ("3", (), 3), ("3,2", (), 3), ("16", (), 8), ("x", (), 8), ("3", ("trainer.threads=2",), 2)],
+)
+def test_threads_are_those_of_the_configuration_or_of_omp_num_threads_or_the_cores(
+    composed: Callable,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    asked: str,
+    words: tuple[str, ...],
+    expected: int,
+) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", asked)
+    monkeypatch.setattr("phd_exp.training.run.run", lambda config, folder, draw, threads, **_: {"threads": threads})
+    config = check(composed("preset=smoke", f"data.root={tmp_path}", *words))
+    assert train(config, RunFolder(tmp_path / "run"), None, cores=8) == {"threads": expected}
