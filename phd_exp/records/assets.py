@@ -1,5 +1,7 @@
 """The user's files that a data set is made from: meshes with their textures, and backdrops."""
 
+import errno
+import os
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -7,6 +9,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from phd_exp.records.files import MB, checksum, require_plain
+from phd_exp.records.mesh_files import read_mesh
 from phd_exp.records.parsing import Record
 
 LARGEST_MESH = 128 * MB  # bytes of a file, which has about a million faces as text
@@ -44,18 +47,15 @@ def mesh_asset(given: Any) -> Any:
     """A mesh that the user names by its path; others are returned unchanged. Raises ValueError if it is none."""
     if not isinstance(given, (str, Path)):
         return given
-    files = [Path(given)]
-    if files[0].suffix.lower() not in MESHES:
+    path = Path(given)
+    if path.suffix.lower() not in MESHES:
         raise ValueError(f"expected a file of a mesh: {', '.join(MESHES)}")
     try:
-        require_plain(files[0], LARGEST_MESH)
-        for file in files:  # grows: an .obj names an .mtl, which names textures
-            text = file.read_bytes() if file.suffix.lower() in (".gltf", ".obj", ".mtl") else b""
-            near = (path for pattern in ("*", "*/*") for path in sorted(files[0].parent.glob(pattern)) if text)
-            files += [path for path in near if path.name.encode() in text and path.is_file() and path not in files]
+        require_plain(path, LARGEST_MESH)
+        return _asset(path.parent, [path, *read_mesh(path).files])
     except OSError as error:
-        raise ValueError(f"cannot be used ({error.strerror}); simplify it, or give another file") from None
-    return _asset(files[0].parent, files)
+        remedy = "simplify it" if error.errno == errno.EFBIG else "give another file"
+        raise ValueError(f"cannot be used ({error.strerror}); {remedy}") from None
 
 
 def backdrops_asset(given: Any) -> Any:
@@ -73,7 +73,7 @@ def backdrops_asset(given: Any) -> Any:
 
 
 def _asset(folder: Path, files: list[Path]) -> Asset:
-    sums = {str(file.relative_to(folder)): _checksum(file.absolute(), file.stat().st_mtime_ns) for file in files}
+    sums = {os.path.relpath(file, folder): _checksum(file.absolute(), file.stat().st_mtime_ns) for file in files}
     return Asset(files=sums, folder=folder.absolute())
 
 

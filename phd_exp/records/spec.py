@@ -78,6 +78,7 @@ class DatasetSpec(Record):
         ground: whether the object stands on a plane, which shows its shadow.
         distractors: number of other objects, of the three solids and `distractor_meshes`.
         motion_blur: the longest path of the image during the exposure, px.
+        ignore: parts of the meshes' files: the materials, in whose place are random ones.
         empty: whether the images show the scenes without their objects.
 
     Raises:
@@ -112,6 +113,7 @@ class DatasetSpec(Record):
     distractors: Annotated[int, Field(strict=True, ge=0, le=12)] = 0
     distractor_meshes: tuple[Annotated[Asset, Mesh], ...] = ()
     motion_blur: Annotated[Number, Field(ge=0, le=64)] = 0.0
+    ignore: tuple[Literal["materials"], ...] = ()
     empty: StrictBool = False
 
     @model_validator(mode="after")

@@ -4,18 +4,24 @@ Functions receive Blender's module; this file does not import it.
 """
 
 import io
+import tempfile
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from phd_exp.records.errors import RenderError, listed, one_line
+from phd_exp.records.mesh_files import MATERIALS, MeshFile, read_mesh
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.coordinates import require_finite, require_finite_file
 from phd_exp.rendering.triangles import Meshes, Triangles
 
 MOST_FACES = 1_000_000
 SIZES = (0.001, 20.0)  # m: bounds of an object's longest side
+TOLERANCE = 1e-3  # of an object's size, within which what is drawn and what is labelled agree
+PLAIN = "set data.ignore=[materials] for random colours"
 Y_UP = (".glb", ".gltf", ".obj")  # Blender turns their (x, y, z) to (x, -z, y)
 
 
@@ -29,83 +35,159 @@ def import_meshes(bpy: Any, spec: DatasetSpec) -> Meshes:
     for number, asset in enumerate(filter(None, (spec.mesh, *spec.distractor_meshes))):
         file, name = next(iter(asset.files)), f"mesh{number or ''}"
         try:
-            handle = _one_object(bpy, asset.path(file))
+            handle = _one_object(bpy, read_mesh(asset.path(file)), is_plain="materials" in spec.ignore)
             reference = "centroid" if number else spec.reference
             meshes[name] = _in_metres(handle, spec.unit, reference, is_y_up=file.lower().endswith(Y_UP))
+            _require_drawn(bpy, handle, meshes[name])
             _require_size(meshes[name], spec)
-        except (ValueError, RuntimeError) as error:  # Blender's importers raise RuntimeError
-            key, reason = "distractor_meshes" if number else "mesh", str(error).strip().splitlines()[-1]
-            raise RenderError(f"data.{key}: {file}: {one_line(reason)}") from None
+        except (OSError, ValueError, RuntimeError) as error:  # Blender's importers raise RuntimeError
+            lines = [line for line in str(error).splitlines() if line.strip() and not line.startswith("Location:")]
+            key, reason = "distractor_meshes" if number else "mesh", one_line(lines[-1].removeprefix("Error: "))
+            raise RenderError(f"data.{key}: {file}: {reason}") from None
         handle.name = name
     return meshes
 
 
-def _one_object(bpy: Any, path: Path) -> Any:
-    """Read a file and join its parts, in the pose of rest; lamps, cameras and empties are removed."""
-    before, suffix = set(bpy.data.objects), path.suffix.lower()
-    with redirect_stdout(io.StringIO()):  # on which Blender tells how far it is
-        if suffix in (".glb", ".gltf"):
-            bpy.ops.import_scene.gltf(filepath=str(path), disable_bone_shape=True)
-        else:
-            getattr(bpy.ops.wm, f"{suffix[1:]}_import")(filepath=str(path))
-    added = set(bpy.data.objects) - before
+def _one_object(bpy: Any, file: MeshFile, *, is_plain: bool) -> Any:
+    """Import a file and join its parts, in the pose of rest; lamps, cameras and empties are removed.
+
+    If it is to be plain, its materials are removed too.
+    """
+    if file.lost and not is_plain:
+        raise ValueError(f"{listed(file.lost)}; mend it, or {PLAIN}")
+    added = _import(bpy, file)
     parts = sorted((item for item in added if item.type == "MESH" and item.data.polygons), key=lambda item: item.name)
-    if not 0 < (faces := sum(len(part.data.polygons) for part in parts)) <= MOST_FACES:
-        raise ValueError(f"has {faces} faces; expected 1 to {MOST_FACES}; Blender's modifier Decimate removes some")
-    if missing := [Path(image.filepath).name for image in bpy.data.images if image.filepath and not image.size[0]]:
-        raise ValueError(f"its texture {listed(missing)} is missing; put it where the file names it")
+    if not (faces := sum(len(part.data.polygons) for part in parts)):
+        raise ValueError("has no faces; expected a surface of polygons, not points or lines")
+    if faces > MOST_FACES:
+        raise ValueError(
+            f"has {faces} faces; expected at most {MOST_FACES}; Blender's modifier Decimate removes some"
+        )
     bpy.context.view_layer.update()
     whole, others = parts[0], added - set(parts)
     if len(parts) > 1:
         with bpy.context.temp_override(active_object=whole, selected_editable_objects=parts):
             bpy.ops.object.join()
     whole.modifiers.clear()
-    whole.animation_data_clear()
     for item in others:
         bpy.data.objects.remove(item)
-    if not any(whole.data.materials):
+    if is_plain or not any(whole.data.materials):
         whole.data.materials.clear()
-        whole.data.materials.append(_vertex_colours(bpy, whole.data) if whole.data.color_attributes else None)
+        whole.data.materials.append(None if is_plain else _paint(bpy, whole.data, file.texture))
+    if not is_plain and (broken := [i.name for i in bpy.data.images if i.source == "FILE" and not i.size[0]]):
+        raise ValueError(f"its texture {listed(broken)} cannot be read; replace it, or {PLAIN}")
     return whole
+
+
+def _import(bpy: Any, file: MeshFile) -> set[Any]:
+    """Let Blender read the copy of a file; returns the new objects."""
+    before, suffix = set(bpy.data.objects), file.path.suffix.lower()
+    require_finite_file(suffix, file.copy)
+    with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()):  # where Blender reports progress
+        path = Path(folder, file.path.name)
+        path.write_bytes(file.copy)
+        path.with_name(MATERIALS).write_bytes(file.materials)
+        if suffix in (".glb", ".gltf"):
+            bpy.ops.import_scene.gltf(filepath=str(path), disable_bone_shape=True)
+        else:
+            getattr(bpy.ops.wm, f"{suffix[1:]}_import")(filepath=str(path))
+    return set(bpy.data.objects) - before
 
 
 def _in_metres(handle: Any, unit: float, reference: Any, *, is_y_up: bool) -> Triangles:
     """Scale a mesh to metres, move its reference point to the origin, and return its triangles."""
     mesh = handle.data
-    mesh.calc_loop_triangles()
-    local, corners = np.empty(3 * len(mesh.vertices), np.float32), np.empty(3 * len(mesh.loop_triangles), np.int32)
-    mesh.vertices.foreach_get("co", local)
-    mesh.loop_triangles.foreach_get("vertices", corners)
+    local, corners = _geometry(mesh)
+    if not corners.size:
+        raise ValueError(f"is transparent everywhere; expected opaque faces; {PLAIN}")
+    used, places = np.unique(corners, return_inverse=True)
+    far, size = np.abs(local[used]).max(), np.ptp(local[used], axis=0).max()
+    if np.spacing(far) > TOLERANCE * size:
+        raise ValueError(
+            f"measures {size:.3g} units, {far:.3g} from its origin, where digits are lost; move it there"
+        )
     world = np.array(handle.matrix_world)
-    vertices = unit * (local.reshape(-1, 3) @ world[:3, :3].T + world[:3, 3])
-    triangles = Triangles(vertices, corners.reshape(-1, 3))
+    vertices = unit * (local @ world[:3, :3].T + world[:3, 3])
+    require_finite(vertices)
     if reference == "centroid":
-        vertices -= triangles.centroid
+        vertices -= Triangles(vertices, corners).centroid
     elif reference != "origin":
         x, y, z = reference
         vertices -= unit * np.array([x, -z, y] if is_y_up else [x, y, z])
     handle.parent = None
+    handle.matrix_world = np.eye(4).tolist()
     mesh.vertices.foreach_set("co", vertices.astype(np.float32).ravel())
     mesh.update()
-    return triangles
+    return Triangles(vertices[used], places.reshape(-1, 3).astype(np.int32))
+
+
+def _geometry(mesh: Any) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Vertices (n, 3) of Blender's mesh, and the three of each opaque triangle (m, 3)."""
+    mesh.calc_loop_triangles()
+    vertices, n = np.empty((len(mesh.vertices), 3), np.float32), len(mesh.loop_triangles)
+    corners, slots = np.empty((n, 3), np.int32), np.empty(n, np.int32)
+    mesh.vertices.foreach_get("co", vertices.ravel())
+    mesh.loop_triangles.foreach_get("vertices", corners.ravel())
+    mesh.loop_triangles.foreach_get("material_index", slots)
+    opaque = np.array([_is_opaque(material) for material in mesh.materials] or [True])
+    return vertices, corners[opaque[np.minimum(slots, len(opaque) - 1)]]
+
+
+def _is_opaque(material: Any) -> bool:
+    """Whether a material is seen at all: its alpha is not the constant 0."""
+    shaders = [node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED"] if material else []
+    alphas = [shader.inputs["Alpha"] for shader in shaders]
+    return not alphas or any(alpha.is_linked or alpha.default_value > 0 for alpha in alphas)
+
+
+def _require_drawn(bpy: Any, handle: Any, mesh: Triangles) -> None:
+    """Raise ValueError unless the triangles have an area, and Blender draws them where they are."""
+    drawn = handle.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    world, (vertices, corners) = np.array(drawn.matrix_world), _geometry(drawn.data)
+    points = vertices[corners.ravel()] @ world[:3, :3].T + world[:3, 3]
+    gaps = np.abs([np.ptp([side(points, 0), side(mesh.vertices, 0)], 0) for side in (np.min, np.max)])
+    if gaps.max() > TOLERANCE * max(mesh.dimensions):
+        raise ValueError(
+            f"Blender draws it {gaps.max():.3g} m away from its labels; export it without modifiers or poses"
+        )
+    if mesh.areas.sum() <= (TOLERANCE * max(mesh.dimensions)) ** 2:
+        raise ValueError("its faces have no area; expected a surface")
 
 
 def _require_size(mesh: Triangles, spec: DatasetSpec) -> None:
     """Raise ValueError if a mesh is implausibly small or large, or may reach half of the way to the camera."""
-    longest, reach, nearest = max(mesh.dimensions), spec.scale_range[1] * mesh.radius, spec.z_range[0]
-    unit = spec.unit * (1000 if longest < SIZES[0] else 0.001)
-    if not (SIZES[0] <= longest <= SIZES[1] and reach <= nearest / 2):
-        raise ValueError(
-            f"its longest side is {longest:.3g} m, its farthest point {reach:.3g} m from the reference; expected "
-            f"{SIZES[0]:g} to {SIZES[1]:g} m, and at most half of the least depth, {nearest / 2:g} m; set "
-            f"data.unit={unit:g}, or data.z_range"
+    longest, reach, half = max(mesh.dimensions), spec.scale_range[1] * mesh.radius, spec.z_range[0] / 2
+    if (fits := SIZES[0] <= longest <= SIZES[1]) and reach <= half:
+        return
+    central = spec.scale_range[1] * Triangles(mesh.vertices - mesh.centroid, mesh.corners).radius
+    factor = 1 if fits else 1000 if longest < SIZES[0] else 0.001
+    remedies = [] if fits else [f"data.unit={factor * spec.unit:g}"]
+    if factor * reach > half:
+        remedies.append(
+            "data.reference=centroid" if factor * central <= half else f"data.z_range above {2 * reach:.3g} m"
         )
+    raise ValueError(
+        f"its longest side is {longest:.3g} m (data.unit={spec.unit:g}), its farthest point {reach:.3g} m from the "
+        f"reference; expected {SIZES[0]:g} to {SIZES[1]:g} m, and at most half of the least depth, {half:g} m; "
+        f"set {' and '.join(remedies)}"
+    )
 
 
-def _vertex_colours(bpy: Any, mesh: Any) -> Any:
-    material = bpy.data.materials.new("vertices")
+def _paint(bpy: Any, mesh: Any, texture: Path | None) -> Any:
+    """The material of a PLY's texture, or of the colours of vertices; None without either."""
+    if texture is None and not mesh.color_attributes:
+        return None
+    material = bpy.data.materials.new("paint")
     nodes = material.node_tree.nodes
-    colour = nodes.new("ShaderNodeVertexColor")
-    colour.layer_name = mesh.color_attributes[0].name
-    material.node_tree.links.new(colour.outputs["Color"], nodes["Principled BSDF"].inputs["Base Color"])
+    node = nodes.new("ShaderNodeTexImage" if texture else "ShaderNodeVertexColor")
+    if texture:
+        node.image = bpy.data.images.load(str(texture))
+    else:
+        colours = mesh.color_attributes[0]
+        values = np.empty(4 * len(colours.data), np.float32)
+        colours.data.foreach_get("color", values)
+        if values.max() > 1 + TOLERANCE:
+            raise ValueError(f"its colours reach {values.max():.3g}; expected at most 1; {PLAIN}")
+        node.layer_name = colours.name
+    material.node_tree.links.new(node.outputs["Color"], nodes["Principled BSDF"].inputs["Base Color"])
     return material

@@ -29,11 +29,16 @@ class Triangles:
         return float(np.linalg.norm(self.vertices, axis=1).max())
 
     @property
+    def areas(self) -> NDArray[np.float64]:
+        """Area (m,) of each triangle, m^2."""
+        a, b, c = np.moveaxis(self.vertices[self.corners], 1, 0)
+        return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+    @property
     def centroid(self) -> NDArray[np.float64]:
         """Centroid (3,) of the surface, m."""
-        a, b, c = np.moveaxis(self.vertices[self.corners], 1, 0)
-        areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        return np.average((a + b + c) / 3, axis=0, weights=areas + 1e-300)
+        middles = np.add.reduce(np.moveaxis(self.vertices[self.corners], 1, 0)) / 3
+        return np.average(middles, axis=0, weights=self.areas + 1e-300)
 
     def window(self, turn: Depths, shift: Depths, f: float, S: int) -> tuple[range, range]:
         """Rows and columns of the bounding box of its silhouette, possibly outside the image (S, S)."""
