@@ -1,18 +1,21 @@
 """What the file of a mesh names, and a copy of it for Blender, without what moves or is hidden."""
 
-import json
 import os
 import re
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import quote, unquote
 
-from phd_exp.records.parsing import parse_json
+import numpy as np
+from numpy.typing import NDArray
+
+from phd_exp.records.gltf import joined_gltf, keep_default_scene_at_rest, positions, split_gltf
 
 MATERIALS = "materials.mtl"  # which the copy of an OBJ names
-BOM = b"\xef\xbb\xbf"
+_BOM = b"\xef\xbb\xbf"
 _OBJ_LINE = re.compile(rb"^[ \t]*(mtllib|usemtl)\b[ \t]*(.*?)[ \t\r]*$", re.M)
 _NEW_MATERIAL = re.compile(rb"^[ \t]*newmtl[ \t]+(.*?)[ \t\r]*$", re.M)
 _OPTION = rb"-type[ \t]+\w+[ \t]+|-\w+(?:[ \t]+(?:on|off|[rgbmlz]|[-+]?[\d.]+(?:e[-+]?\d+)?)(?=[ \t]))*[ \t]+"
@@ -23,6 +26,7 @@ _PLY_NAMES = {b"r": b"red", b"g": b"green", b"b": b"blue", b"a": b"alpha", b"u":
 _PLY_NAMES |= {b"texture_u": b"s", b"texture_v": b"t"}
 _PLY_NAMES |= {b"diffuse_" + name: name for name in (b"red", b"green", b"blue", b"alpha")}
 """Names that Blender knows of properties of vertices."""
+_PLY_TYPES = {b"char": "i1", b"uchar": "u1", b"int": "i4", b"uint": "u4", b"float": "f4"}  # unlike NumPy's
 
 
 @dataclass
@@ -36,6 +40,7 @@ class MeshFile:
         texture: of a PLY.
         files: the files that it names.
         lost: why parts of its look cannot be drawn.
+        coordinates: returns those of its vertices as arrays (n, 3), unless they are compressed.
     """
 
     path: Path
@@ -44,6 +49,7 @@ class MeshFile:
     texture: Path | None = None
     files: list[Path] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
+    coordinates: Callable[[], list[NDArray[Any]]] = list
 
     def find(self, name: str, folder: Path) -> Path | None:
         """The file that a text in `folder` names, perhaps with Windows' separators or a place on another machine."""
@@ -55,6 +61,16 @@ class MeshFile:
         self.lost.append(f"{name} is missing")
         return None
 
+    def require_finite(self) -> None:
+        """Raise ValueError unless all coordinates are finite 32-bit numbers; Blender reads others as 0."""
+        for points in _of_stranger(self.coordinates, self.path):
+            with np.errstate(over="ignore"):
+                wrong = np.flatnonzero(~np.isfinite(points.astype(np.float32)).all(axis=1))
+            if len(wrong):
+                raise ValueError(
+                    f"vertex {wrong[0] + 1} is at {points[wrong[0]].tolist()}; expected finite coordinates"
+                )
+
 
 def read_mesh(path: Path) -> MeshFile:
     """Read the file of a mesh, and the MTL files of an OBJ.
@@ -63,27 +79,22 @@ def read_mesh(path: Path) -> MeshFile:
         ValueError: it is invalid, or a part of its geometry is missing.
         OSError: a file cannot be read.
     """
-    mesh, suffix = MeshFile(path, path.read_bytes()), path.suffix.lower()
-    read = {".glb": _read_gltf, ".gltf": _read_gltf, ".obj": _read_obj, ".ply": _read_ply, ".stl": _read_stl}[suffix]
-    try:
-        read(mesh)
-    except (AttributeError, LookupError, TypeError, ValueError, struct.error) as error:  # a stranger's structure
-        raise ValueError(f"cannot be read as {suffix} ({error})") from None
+    mesh = MeshFile(path, path.read_bytes())
+    readers = {".glb": _read_gltf, ".gltf": _read_gltf, ".obj": _read_obj, ".ply": _read_ply, ".stl": _read_stl}
+    _of_stranger(lambda: readers[path.suffix.lower()](mesh), path)
     return mesh
 
 
-def split_gltf(content: bytes) -> tuple[dict[str, Any], bytes]:
-    """The document of a glTF file, and the binary chunks of a .glb. Raises ValueError if it is none."""
-    if not content.startswith(b"glTF"):
-        return parse_json(content.decode("utf-8-sig")), b""
-    size, length = struct.unpack_from("<8xII", content)
-    if size != len(content):
-        raise ValueError(f"its header says {size} bytes; it has {len(content)}")
-    return parse_json(content[20 : 20 + length].decode()), content[20 + length :]
+def _of_stranger(read: Callable[[], Any], path: Path) -> Any:
+    """What a function returns; raises ValueError if the structure of a stranger's file is another than it expects."""
+    try:
+        return read()
+    except (AttributeError, LookupError, TypeError, ValueError, struct.error) as error:
+        raise ValueError(f"cannot be read as {path.suffix} ({error})") from None
 
 
 def _read_gltf(mesh: MeshFile) -> None:
-    document, binary = split_gltf(mesh.copy)
+    document, rest = split_gltf(mesh.copy)
     for key in ("buffers", "images"):
         for item in document.get(key, ()):
             uri = item.get("uri", "data:")
@@ -93,48 +104,14 @@ def _read_gltf(mesh: MeshFile) -> None:
             raise ValueError(f"{mesh.lost[0]}; put it where the file names it")
     for texture in document.get("textures", ()):
         if "source" not in texture and "EXT_texture_webp" not in (kinds := texture.get("extensions", {})):
-            mesh.lost.append(f"a texture has no image that is read ({', '.join(kinds)})")
-    _keep_default_scene(document)
-    _keep_rest(document)
-    text = json.dumps(document).encode()
-    if mesh.copy.startswith(b"glTF"):
-        text += b" " * (-len(text) % 4)
-        size = 20 + len(text) + len(binary)
-        text = struct.pack("<4sIII4s", b"glTF", 2, size, len(text), b"JSON") + text + binary
-    mesh.copy = text
-
-
-def _keep_default_scene(document: dict[str, Any]) -> None:
-    """Remove the meshes of nodes that are invisible or outside the default scene, if there is one."""
-    nodes, scenes = document.get("nodes", []), document.get("scenes")
-    children = {child for node in nodes for child in node.get("children", ())}
-    roots = scenes[document.get("scene", 0)].get("nodes", ()) if scenes else set(range(len(nodes))) - children
-    left, drawn = list(roots), set()
-    while left:
-        number = left.pop()
-        node = nodes[number]
-        visible = node.get("extensions", {}).get("KHR_node_visibility", {}).get("visible", True)
-        if visible and number not in drawn:
-            drawn.add(number)
-            left += node.get("children", ())
-    for number, node in enumerate(nodes):
-        for key in ("mesh", "skin", "extensions") if number not in drawn else ():
-            node.pop(key, None)
-
-
-def _keep_rest(document: dict[str, Any]) -> None:
-    """Remove animations and morph targets, and the demand for extensions without which the geometry is complete."""
-    document.pop("animations", None)
-    for item in (*document.get("nodes", ()), *document.get("meshes", ())):
-        item.pop("weights", None)
-        for primitive in item.get("primitives", ()):
-            primitive.pop("targets", None)
-    demanded = document.get("extensionsRequired", ())
-    document["extensionsRequired"] = [name for name in demanded if not re.search("visibility|texture", name)]
+            mesh.lost.append(f"a texture has no image of a known kind ({', '.join(kinds)})")
+    keep_default_scene_at_rest(document)
+    mesh.copy = joined_gltf(document, rest, is_binary=mesh.copy.startswith(b"glTF"))
+    mesh.coordinates = lambda: positions(document, rest)
 
 
 def _read_obj(mesh: MeshFile) -> None:
-    text = mesh.copy.removeprefix(BOM)
+    text = mesh.copy.removeprefix(_BOM).replace(b"\\\n", b"").replace(b"\\\r\n", b"")
     lines = _OBJ_LINE.findall(text)
     used = {name for word, name in lines if word == b"usemtl"}
     named = [os.fsdecode(name) for word, name in lines if word == b"mtllib"]
@@ -142,8 +119,7 @@ def _read_obj(mesh: MeshFile) -> None:
         named = [f"{mesh.path.stem}.mtl"]
     for name in named:
         for part in re.findall(r"\S.*?\.mtl(?=\s|$)|\S.*", name, re.I):  # several on one line
-            if path := mesh.find(part, mesh.path.parent):
-                mesh.materials += _read_mtl(mesh, path)
+            mesh.materials += _read_mtl(mesh, mesh.find(part, mesh.path.parent))
     known = set(_NEW_MATERIAL.findall(mesh.materials))
     if not mesh.lost:
         mesh.lost += [f"no material is named {os.fsdecode(name)!r}" for name in sorted(used - known)]
@@ -151,34 +127,59 @@ def _read_obj(mesh: MeshFile) -> None:
         mesh.lost.append(f"no usemtl says which of {len(known)} materials it has")
     only = b"usemtl %b\n" % known.pop() if not used and len(known) == 1 else b""
     mesh.copy = b"mtllib %b\n" % MATERIALS.encode() + only + re.sub(rb"(?m)^[ \t]*mtllib\b.*$", b"", text)
+    mesh.coordinates = lambda: [_numbers(rb"v", text)]
 
 
-def _read_mtl(mesh: MeshFile, path: Path) -> bytes:
-    """The content of an MTL file with absolute names of textures."""
+def _read_mtl(mesh: MeshFile, path: Path | None) -> bytes:
+    """The content of an MTL file with absolute names of textures; nothing if there is no file."""
 
     def absolute(match: re.Match[bytes]) -> bytes:
-        found = mesh.find(os.fsdecode(match[2]), path.parent)
+        found = mesh.find(os.fsdecode(match[2]), path.parent) if path else None
         return match[1] + os.fsencode(found) if found else match[0]
 
-    return _MAP.sub(absolute, path.read_bytes().removeprefix(BOM)) + b"\n"
+    return _MAP.sub(absolute, path.read_bytes().removeprefix(_BOM)) + b"\n" if path else b""
 
 
 def _read_ply(mesh: MeshFile) -> None:
     head, end, body = mesh.copy.partition(b"end_header")
-    sections = {part.split()[1]: part for part in re.split(rb"(?m)^(?=element\b)", head)}
+    sections = {part.split()[1]: part for part in re.split(rb"(?m)^(?=element\b)", head)[1:]}
     vertex = re.sub(rb"(?m)\w+(?=\s*$)", lambda name: _PLY_NAMES.get(name[0], name[0]), sections[b"vertex"])
     mesh.copy = head.replace(sections[b"vertex"], vertex) + end + body
-    types = dict(reversed(words.split()[-2:]) for words in re.findall(rb"property .+", vertex))
-    for name in re.findall(rb"(?im)^comment[ \t]+TextureFile[ \t]+(.*?)\s*$", head):
-        mesh.texture = mesh.find(os.fsdecode(name), mesh.path.parent)
-        if b"t" not in types:
-            mesh.lost.append(f"vertices have no texture coordinates (s, t) for {os.fsdecode(name)}")
-    if b" red" in sections.get(b"face", b"") and not {b"red", b"t"} & types.keys():
+    kinds = {name: kind for *_, kind, name in map(bytes.split, re.findall(rb"property[^\r\n]+", vertex))}
+    for name in map(os.fsdecode, re.findall(rb"(?im)^comment[ \t]+TextureFile[ \t]+(.*?)\s*$", head)):
+        mesh.texture = mesh.find(name, mesh.path.parent)
+        if b"t" not in kinds:
+            mesh.lost.append(f"vertices have no texture coordinates (s, t) for {name}")
+    if b" red" in sections.get(b"face", b"") and not {b"red", b"t"} & kinds.keys():
         mesh.lost.append("colours of faces are not read; expected colours of vertices")
-    if b"int" in types.get(b"red", b"") and types[b"red"] not in (b"uint8", b"uint16"):
-        mesh.lost.append(f"colours of vertices are of type {types[b'red'].decode()}; expected uchar")
+    if kinds.get(b"red") in (b"char", b"int8", b"short", b"int16", b"int", b"int32", b"uint", b"uint32"):
+        mesh.lost.append(f"colours of vertices are of type {kinds[b'red'].decode()}; expected uchar")
+    if next(iter(sections)) == b"vertex" and b" list " not in vertex:
+        mesh.coordinates = lambda: [_rows(head, kinds, int(vertex.split()[2]), body[body.find(b"\n") + 1 :])]
+
+
+def _rows(head: bytes, kinds: dict[bytes, bytes], n: int, body: bytes) -> NDArray[Any]:
+    """Coordinates (n, 3) of the vertices of a PLY."""
+    if b"format ascii" in head:
+        columns = [list(kinds).index(axis) for axis in (b"x", b"y", b"z")]
+        return np.loadtxt(body.split(b"\n", n)[:n], usecols=columns, ndmin=2)
+    order = ">" if b"big_endian" in head else "<"
+    types = [(name.decode(), order + np.dtype(_PLY_TYPES.get(kind, kind.decode())).str[1:]) for name, kind in kinds.items()]
+    rows = np.frombuffer(body, types, n)
+    return np.stack([rows[axis] for axis in "xyz"], axis=1)
 
 
 def _read_stl(mesh: MeshFile) -> None:
     if b"COLOR=" in mesh.copy[:80]:
         mesh.lost.append("colours of faces (COLOR=) are not read")
+    n = int.from_bytes(mesh.copy[80:84], "little")
+    if len(mesh.copy) == 84 + 50 * n:
+        mesh.coordinates = lambda: [np.ndarray((n, 9), "<f4", mesh.copy, 96, (50, 4)).reshape(-1, 3)]
+    else:
+        mesh.coordinates = lambda: [_numbers(rb"vertex", mesh.copy)]
+
+
+def _numbers(word: bytes, text: bytes) -> NDArray[Any]:
+    """The three numbers (n, 3) after each `word` that begins a line."""
+    lines = re.findall(rb"(?m)^[ \t]*%b[ \t][^\n]*" % word, text)
+    return np.loadtxt(lines, usecols=(1, 2, 3), ndmin=2) if lines else np.empty((0, 3))

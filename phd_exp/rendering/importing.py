@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from phd_exp.records.errors import RenderError, listed, one_line
 from phd_exp.records.mesh_files import MATERIALS, MeshFile, read_mesh
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.coordinates import require_finite, require_finite_file
 from phd_exp.rendering.triangles import Meshes, Triangles
 
 MOST_FACES = 1_000_000
@@ -82,7 +81,7 @@ def _one_object(bpy: Any, file: MeshFile, *, is_plain: bool) -> Any:
 def _import(bpy: Any, file: MeshFile) -> set[Any]:
     """Let Blender read the copy of a file; returns the new objects."""
     before, suffix = set(bpy.data.objects), file.path.suffix.lower()
-    require_finite_file(suffix, file.copy)
+    file.require_finite()
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()):  # where Blender reports progress
         path = Path(folder, file.path.name)
         path.write_bytes(file.copy)
@@ -108,7 +107,6 @@ def _in_metres(handle: Any, unit: float, reference: Any, *, is_y_up: bool) -> Tr
         )
     world = np.array(handle.matrix_world)
     vertices = unit * (local @ world[:3, :3].T + world[:3, 3])
-    require_finite(vertices)
     if reference == "centroid":
         vertices -= Triangles(vertices, corners).centroid
     elif reference != "origin":

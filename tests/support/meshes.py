@@ -2,7 +2,9 @@
 
 import json
 import struct
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -80,3 +82,27 @@ def _document(points: np.ndarray, corners: np.ndarray) -> tuple[dict, bytes]:
         "buffers": [{"byteLength": len(binary)}],
     }
     return document, binary
+
+
+def ply_text(
+    mesh: Triangles,
+    of_vertices: Sequence[str] = (),
+    vertex: str = "",
+    of_faces: Sequence[str] = (),
+    face: str = "",
+    comment: str = "by hand",
+) -> str:
+    """A PLY as text, with further properties of vertices and faces, and their values."""
+    head = ["ply", "format ascii 1.0", f"comment {comment}", f"element vertex {len(mesh.vertices)}"]
+    head += [f"property {words}" for words in ("float x", "float y", "float z", *of_vertices)]
+    head += [f"element face {len(mesh.corners)}", "property list uchar int vertex_indices"]
+    head += [f"property {words}" for words in of_faces]
+    rows = [f"{x!r} {y!r} {z!r} {vertex}".rstrip() for x, y, z in mesh.vertices.tolist()]
+    rows += [f"3 {a} {b} {c} {face}".rstrip() for a, b, c in mesh.corners.tolist()]
+    return "\n".join([*head, "end_header", *rows, ""])
+
+
+def named(document: Any) -> set[str]:
+    """All keys of a document, at any depth."""
+    items = document.values() if isinstance(document, dict) else document if isinstance(document, list) else []
+    return {*(document if isinstance(document, dict) else ()), *(key for item in items for key in named(item))}
