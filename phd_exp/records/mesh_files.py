@@ -143,8 +143,8 @@ def _read_mtl(mesh: MeshFile, path: Path | None) -> bytes:
 def _read_ply(mesh: MeshFile) -> None:
     head, end, body = mesh.copy.partition(b"end_header")
     sections = {part.split()[1]: part for part in re.split(rb"(?m)^(?=element\b)", head)[1:]}
-    vertex = re.sub(rb"(?m)\w+(?=\s*$)", lambda name: _PLY_NAMES.get(name[0], name[0]), sections[b"vertex"])
-    mesh.copy = head.replace(sections[b"vertex"], vertex) + end + body
+    vertex = re.sub(rb"(?m)\w+(?=\s*$)", lambda name: _PLY_NAMES.get(name[0], name[0]), sections.get(b"vertex", b""))
+    mesh.copy = head.replace(sections.get(b"vertex", b""), vertex) + end + body
     kinds = {name: kind for *_, kind, name in map(bytes.split, re.findall(rb"property[^\r\n]+", vertex))}
     for name in map(os.fsdecode, re.findall(rb"(?im)^comment[ \t]+TextureFile[ \t]+(.*?)\s*$", head)):
         mesh.texture = mesh.find(name, mesh.path.parent)
@@ -154,7 +154,7 @@ def _read_ply(mesh: MeshFile) -> None:
         mesh.lost.append("colours of faces are not read; expected colours of vertices")
     if kinds.get(b"red") in (b"char", b"int8", b"short", b"int16", b"int", b"int32", b"uint", b"uint32"):
         mesh.lost.append(f"colours of vertices are of type {kinds[b'red'].decode()}; expected uchar")
-    if next(iter(sections)) == b"vertex" and b" list " not in vertex:
+    if list(sections)[:1] == [b"vertex"] and b" list " not in vertex:
         mesh.coordinates = lambda: [_rows(head, kinds, int(vertex.split()[2]), body[body.find(b"\n") + 1 :])]
 
 
@@ -164,7 +164,9 @@ def _rows(head: bytes, kinds: dict[bytes, bytes], n: int, body: bytes) -> NDArra
         columns = [list(kinds).index(axis) for axis in (b"x", b"y", b"z")]
         return np.loadtxt(body.split(b"\n", n)[:n], usecols=columns, ndmin=2)
     order = ">" if b"big_endian" in head else "<"
-    types = [(name.decode(), order + np.dtype(_PLY_TYPES.get(kind, kind.decode())).str[1:]) for name, kind in kinds.items()]
+    types = [
+        (name.decode(), order + np.dtype(_PLY_TYPES.get(kind, kind.decode())).str[1:]) for name, kind in kinds.items()
+    ]
     rows = np.frombuffer(body, types, n)
     return np.stack([rows[axis] for axis in "xyz"], axis=1)
 

@@ -9,6 +9,7 @@ import pytest
 from phd_exp.records.assets import mesh_asset
 from phd_exp.records.errors import ConfigError
 from phd_exp.training.config import check_render
+from tests.support.meshes import solid, write_mesh
 
 PART = "data.mesh=part.glb"
 STANDING = (PART, "data.upright=true", "data.ground=true")
@@ -18,7 +19,8 @@ STANDING = (PART, "data.upright=true", "data.ground=true")
 def refused(composed: Callable[..., dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable:
     """The line that refuses a data set of a mesh."""
     monkeypatch.chdir(tmp_path)
-    Path("part.glb").write_bytes(b"glTF")
+    write_mesh(Path("part.glb"), solid("cube"))
+    Path("text.glb").write_bytes(b"not a mesh")
     with open("large.stl", "wb") as stream:
         stream.truncate(84 + 50 * 10_000_000)
     Path("few").mkdir()
@@ -47,7 +49,9 @@ def refused(composed: Callable[..., dict[str, Any]], tmp_path: Path, monkeypatch
     [
         ((), "data.mesh: got ''; expected a file of a mesh: .glb, .gltf, .obj, .ply, .stl"),
         (("data.mesh=part.step",), "data.mesh: got 'part.step'; expected a file of a mesh"),
-        (("data.mesh=none.glb",), "data.mesh: got 'none.glb'; cannot be used (No such file or directory)"),
+        (("data.mesh=none.glb",), "data.mesh: got 'none.glb'; cannot be used (No such file or directory); give"),
+        (("data.mesh=text.glb",), "data.mesh: got 'text.glb'; cannot be read as .glb"),
+        ((PART, "data.ignore=[meshes]"), "data.ignore.0: got 'meshes'; expected to be 'materials'"),
         (("data.mesh=large.stl",), "500 MB; expected at most 128 MB); simplify it"),
         (
             ("data.mesh=part.glb", "data.backdrops=few"),

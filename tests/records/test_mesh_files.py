@@ -1,4 +1,4 @@
-"""All that the file of a mesh names is found or lost by name; its copy has no poses, no hidden parts and no bad numbers."""
+"""All that the file of a mesh names is found, or lost by name; its copy neither moves nor hides anything."""
 
 import json
 import os
@@ -35,45 +35,21 @@ def ply_with(texture: str) -> str:
     return ply_text(CUBE, ("float s", "float t"), "0 0", comment=f"TextureFile {texture}")
 
 
+NEAR, OTHER = "paint.png", "C:\\Users\\me\\wood floor.png"
 TEXTURED = {
     "glTF with an escaped name": ("a.gltf", gltf_with("my%20paint.png"), {}, "my paint.png"),
     "glTF with a plain name": ("a.gltf", gltf_with("größe.png"), {}, "größe.png"),
     "glTF with an escaped unicode name": ("a.gltf", gltf_with("gr%C3%B6%C3%9Fe.png"), {}, "größe.png"),
     "glTF, two folders down": ("a.gltf", gltf_with("one/two/paint.png"), {}, "one/two/paint.png"),
-    "glTF, beside its folder": ("in/a.gltf", gltf_with("../paint.png"), {}, "paint.png"),
-    "OBJ, two folders down": (
-        "a.obj",
-        "mtllib one/a.mtl\n",
-        {"one/a.mtl": "map_Kd two/paint.png"},
-        "one/two/paint.png",
-    ),
-    "OBJ with Windows' names": (
-        "a.obj",
-        "mtllib .\\one\\a.mtl\r\n",
-        {"one/a.mtl": "map_Kd t\\p.png\r\n"},
-        "one/t/p.png",
-    ),
-    "OBJ of another machine": (
-        "a.obj",
-        "mtllib a.mtl\n",
-        {"a.mtl": "map_Kd C:\\Users\\me\\wood floor.png"},
-        "wood floor.png",
-    ),
-    "OBJ with two libraries": (
-        "a.obj",
-        "mtllib b.mtl my c.mtl\n",
-        {"b.mtl": "", "my c.mtl": "bump -bm 0.5 1.png"},
-        "1.png",
-    ),
-    "OBJ with options": (
-        "a.obj",
-        "mtllib a.mtl\n",
-        {"a.mtl": "map_Ks -s 1 1 1 -clamp on my paint.png"},
-        "my paint.png",
-    ),
-    "OBJ with the library of its name": ("a.obj", "usemtl x\n", {"a.mtl": "newmtl x\nmap_Kd p.png"}, "p.png"),
+    "glTF, beside its folder": ("in/a.gltf", gltf_with("../paint.png"), {}, NEAR),
+    "OBJ, two folders down": ("a.obj", "mtllib b/a.mtl\n", {"b/a.mtl": "map_Kd c/paint.png"}, "b/c/paint.png"),
+    "OBJ with Windows' names": ("a.obj", "mtllib .\\b\\a.mtl\r\n", {"b/a.mtl": "map_Kd t\\p.png\r\n"}, "b/t/p.png"),
+    "OBJ of another machine": ("a.obj", "mtllib a.mtl\n", {"a.mtl": f"map_Kd {OTHER}"}, "wood floor.png"),
+    "OBJ with two libraries": ("a.obj", "mtllib b.mtl c d.mtl\n", {"b.mtl": "", "c d.mtl": "bump -bm 5 1.png"}, "1.png"),
+    "OBJ with options": ("a.obj", "mtllib a.mtl\n", {"a.mtl": "map_Ks -s 1 1 1 -clamp on a b.png"}, "a b.png"),
+    "OBJ with the library of its name": ("a.obj", "usemtl x\n", {"a.mtl": "newmtl x\nmap_Kd paint.png"}, NEAR),
     "PLY": ("a.ply", ply_with("my paint.png"), {}, "my paint.png"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", TEXTURED.values(), ids=TEXTURED)
@@ -106,6 +82,7 @@ def test_a_binary_gltf_may_name_files(tmp_path: Path) -> None:
 
 
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+RGB = ("red", "green", "blue")
 LOST = {
     "missing library": ("a.obj", "mtllib no.mtl\nusemtl red\n" + OBJ, {}, "no.mtl"),
     "missing library of a mesh without usemtl": ("a.obj", "mtllib no.mtl\n" + OBJ, {}, "no.mtl"),
@@ -113,10 +90,10 @@ LOST = {
     "unknown material": ("a.obj", "mtllib a.mtl\nusemtl red\n" + OBJ, {"a.mtl": "newmtl blue\n"}, "'red'"),
     "several materials": ("a.obj", "mtllib a.mtl\n" + OBJ, {"a.mtl": "newmtl blue\nnewmtl red\n"}, "2 materials"),
     "no coordinates": ("a.ply", ply_text(CUBE, comment="TextureFile p.png"), {"p.png": ""}, "texture coordinates"),
-    "faces": ("a.ply", ply_text(CUBE, of_faces=("uchar red", "uchar green", "uchar blue"), face="1 2 3"), {}, "faces"),
-    "whole numbers": ("a.ply", ply_text(CUBE, ("int red", "int green", "int blue"), "1 2 3"), {}, "type int"),
-    "STL": ("a.stl", "COLOR=\x01\x02\x03\x04".ljust(84, "\0"), {}, "COLOR="),
-    "an unknown image": ("a.gltf", json.dumps({"textures": [{"extensions": {"KHR_texture_basisu": {}}}]}), {}, "basisu"),
+    "faces": ("a.ply", ply_text(CUBE, of_faces=[f"uchar {name}" for name in RGB], face="1 2 3"), {}, "faces"),
+    "whole numbers": ("a.ply", ply_text(CUBE, [f"int {name}" for name in RGB], "1 2 3"), {}, "type int"),
+    "STL": ("a.stl", "COLOR=abcd".ljust(84, "\0"), {}, "COLOR="),
+    "an unknown image": ("a.gltf", json.dumps({"textures": [{"extensions": {"basisu": {}}}]}), {}, "basisu"),
 }  # fmt: skip
 
 
@@ -152,7 +129,7 @@ def test_coordinates_of_text_are_numbers(tmp_path: Path, name: str, text: str, n
     read_mesh(written(tmp_path, name, {name: text})).require_finite()
     mesh = read_mesh(written(tmp_path, name, {name: text.replace("0.125", number)}))
     if (name, number) != ("a.ply", ""):  # a shorter row has still three columns
-        with pytest.raises(ValueError, match="expected finite|cannot be read"):
+        with pytest.raises(ValueError, match=r"expected finite|cannot be read"):
             mesh.require_finite()
 
 

@@ -269,8 +269,8 @@ def test_records_of_cylinders_stay_as_they_were(
 @pytest.mark.parametrize(
     ("name", "content", "changes", "message"),
     [
-        ("none.obj", b"v 0 0 0\n", {}, "has 0 faces; expected 1 to 1000000"),
-        ("text.glb", b"not a mesh", {}, "none|text.glb: .*glTF"),
+        ("none.obj", b"v 0 0 0\n", {}, "has no faces; expected a surface"),
+        ("line.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", {}, "its faces have no area"),
         ("text.stl", b"not a mesh", {}, "text.stl: .*Failed to read"),
         ("short.ply", b"ply\nformat ascii 1.0\nelement face 10000000\nend_header\n", {}, "short.ply: "),
         ("cup.stl", solid("cylinder", 200.0), {}, r"longest side is 200 m, .* set data\.unit=0\.001"),
@@ -281,7 +281,15 @@ def test_records_of_cylinders_stay_as_they_were(
             {},
             r"farthest point 1\.56 m from the .* half of the least depth, 1\.5 m",
         ),
-        ("cup.stl", solid("cylinder", 1.2), {"scale_range": (0.5, 2.0)}, r"farthest point 1\.7 m"),
+        (
+            "cup.stl",
+            solid("cylinder", 1.2),
+            {"scale_range": (0.5, 2.0)},
+            r"farthest point 1\.7 m.* set data\.z_range",
+        ),
+        ("cup.stl", solid("cylinder", 0.2, (50, 0, 0)), {}, r"side is 0\.2 m .* set data\.reference=centroid$"),
+        ("cup.stl", solid("cylinder", 200, (5e4, 0, 0)), {}, r"set data\.unit=0\.001 and data\.reference=centroid$"),
+        ("cup.stl", solid("cylinder", 0.2, (5e4, 0, 0)), {"reference": "centroid"}, r"measures 0\.2 .* move it"),
     ],
 )
 def test_an_unusable_mesh_is_one_line(
@@ -300,7 +308,7 @@ def test_a_texture_is_part_of_the_mesh_and_must_be_there(make_spec: MakeSpec, tm
     file = write_mesh(tmp_path / "part.obj", solid("cube"))
     file.write_text("mtllib part.mtl\n" + file.read_text().replace("f ", "usemtl wood\nf ", 1))
     (tmp_path / "part.mtl").write_text("newmtl wood\nmap_Kd wood.png\n")
-    with pytest.raises(RenderError, match=r"its texture wood\.png is missing; put it where the file names it"):
+    with pytest.raises(RenderError, match=r"part\.obj: wood\.png is missing; .*data\.ignore=\[materials\]"):
         Renderer(AT_MIDDLES, make_spec("object", mesh=str(file)))
     Image.new("RGB", (8, 8), (200, 0, 0)).save(tmp_path / "wood.png")
     spec = make_spec("object", mesh=str(file), backdrops=None, sensor_size=56, f_range=(300.0, 500.0), xy_range=0.2)

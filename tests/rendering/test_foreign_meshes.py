@@ -1,0 +1,193 @@
+"""What is drawn of a mesh is what is labelled, and what its file names is drawn."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from phd_exp.records.errors import RenderError
+from phd_exp.records.gltf import split_gltf
+from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering import importing
+from phd_exp.rendering.blender import Renderer, Settings
+from phd_exp.rendering.objects import sample_object_scene
+from phd_exp.rendering.rays import NOTHING, trace_pixels
+from phd_exp.rendering.triangles import Triangles
+from tests.support.meshes import ply_text, solid, write_mesh
+
+MakeSpec = Callable[..., DatasetSpec]
+Change = Callable[[dict[str, Any]], None]
+CUBE = solid("cube")
+SIZE = pytest.approx((0.2, 0.2, 0.2), abs=1e-6)
+SMALL: dict[str, Any] = {"sensor_size": 56, "f_range": (300.0, 500.0), "xy_range": 0.2, "backdrops": None}
+COLOURS = [f"uchar {name}" for name in ("diffuse_red", "diffuse_green", "diffuse_blue")]
+SHORT = [f"uchar {name}" for name in "rgba"]
+
+
+@pytest.fixture
+def drawn(make_spec: MakeSpec) -> Callable[..., tuple[Renderer, np.ndarray]]:
+    """A renderer of a mesh, and the mean colour of its opaque pixels, which are those of its labels."""
+
+    def drawn(file: Path, **changes: Any) -> tuple[Renderer, np.ndarray]:
+        spec = make_spec("object", mesh=str(file), **SMALL, **changes)
+        renderer = Renderer(Settings(samples=1, denoised=False, at_middles=True), spec)
+        scene = sample_object_scene(spec, "train", 0, renderer.meshes)
+        light = renderer.render(scene)
+        opaque = light[..., 3] > 0.5
+        assert opaque.sum() > 100
+        assert (opaque != (trace_pixels(scene, renderer.meshes).surfaces[0] != NOTHING)).sum() <= 5
+        return renderer, light[opaque][:, :3].mean(axis=0)
+
+    return drawn
+
+
+def scaled_with_targets(document: dict[str, Any]) -> None:
+    document["nodes"] = [{"mesh": 0, "scale": [0.1, 0.1, 0.1]}]
+    document["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": 0}]
+    document["meshes"][0]["weights"] = [1.0]
+
+
+def animated(document: dict[str, Any]) -> None:
+    """To (0.1, 0.1, 0.1), which are numbers of the vertices."""
+    document["accessors"] += [
+        {"bufferView": 1, "componentType": 5126, "count": 1, "type": "SCALAR", "min": [0], "max": [0]},
+        {"bufferView": 0, "componentType": 5126, "count": 1, "type": "VEC3"},
+    ]
+    channel = {"sampler": 0, "target": {"node": 0, "path": "translation"}}
+    document["animations"] = [{"samplers": [{"input": 2, "output": 3}], "channels": [channel]}]
+    document["nodes"] = [{"mesh": 0, "scale": [0.1, 0.1, 0.1]}]
+
+
+def two_scenes(document: dict[str, Any]) -> None:
+    small = {"mesh": 0, "scale": [0.1, 0.1, 0.1]}
+    document |= {"nodes": [small | {"translation": [1, 0, 0]}, small]}
+    document |= {"scenes": [{"nodes": [0]}, {"nodes": [1]}], "scene": 1}
+
+
+def partly_invisible(document: dict[str, Any]) -> None:
+    two_scenes(document)
+    document |= {"scenes": [{"nodes": [0, 1]}], "scene": 0, "extensionsRequired": ["KHR_node_visibility"]}
+    document["nodes"][0]["extensions"] = {"KHR_node_visibility": {"visible": False}}
+
+
+def partly_transparent(document: dict[str, Any]) -> None:
+    """The far part has a material whose alpha is 0."""
+    two_scenes(document)
+    document |= {"scenes": [{"nodes": [0, 1]}], "scene": 0}
+    glass = {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0]}, "alphaMode": "BLEND"}
+    document["materials"] = [glass, {"pbrMetallicRoughness": {"baseColorFactor": [1, 0, 0, 1]}}]
+    (primitive,) = document["meshes"][0]["primitives"]
+    document["meshes"] = [{"primitives": [primitive | {"material": number}]} for number in range(2)]
+    document["nodes"][1]["mesh"] = 1
+
+
+@pytest.mark.parametrize("change", [scaled_with_targets, animated, two_scenes, partly_invisible, partly_transparent])
+def test_what_is_drawn_is_what_is_labelled(tmp_path: Path, drawn: Callable, change: Change) -> None:
+    """Each has one visible cube, of 2 units scaled by 0.1, at the origin."""
+    file = write_mesh(tmp_path / "part.gltf", CUBE, per_metre=10)
+    document, _ = split_gltf(file.read_bytes())
+    change(document)
+    file.write_text(json.dumps(document))
+    renderer, _ = drawn(file)
+    assert renderer.meshes["mesh"].dimensions == SIZE
+    assert renderer.meshes["mesh"].radius == pytest.approx(0.1 * 3**0.5)
+
+
+def test_points_outside_all_faces_do_not_count(tmp_path: Path, drawn: Callable) -> None:
+    file = write_mesh(
+        tmp_path / "part.ply", Triangles(np.concatenate([[[9.0, 9, 9]], CUBE.vertices]), CUBE.corners + 1)
+    )
+    renderer, _ = drawn(file)
+    assert renderer.meshes["mesh"].dimensions == SIZE
+
+
+def red(path: Path) -> None:
+    Image.new("RGB", (8, 8), (200, 0, 0)).save(path)
+
+
+def obj(path: Path, head: str, mtl: str) -> Path:
+    write_mesh(path, CUBE)
+    path.with_suffix(".mtl").write_text(mtl)
+    path.write_text(head + "vt 0 0\n" + path.read_text())
+    return path
+
+
+def test_colours_and_textures_are_drawn(tmp_path: Path, drawn: Callable) -> None:
+    red(tmp_path / "my red.png")
+    files = {
+        "texture_u": ply_text(CUBE, ("float texture_u", "float texture_v"), "0 0", comment="TextureFile my red.png"),
+        "s": ply_text(CUBE, ("float s", "float t"), "0 0", comment="TextureFile my red.png").replace("\n", "\r\n"),
+        "diffuse": ply_text(CUBE, COLOURS, "200 0 0"),
+        "short": ply_text(CUBE, SHORT, "200 0 0 255"),
+    }
+    meshes = [tmp_path / f"{name}.ply" for name in files]
+    for path, text in zip(meshes, files.values(), strict=True):
+        path.write_bytes(text.encode())
+    meshes.append(obj(tmp_path / "no usemtl.obj", "mtllib .\\no usemtl.mtl\n", "newmtl only\nmap_Kd my red.png\n"))
+    for mesh in meshes:
+        renderer, colour = drawn(mesh)
+        assert colour[0] > 5 * max(colour[1:]), mesh.name
+        assert renderer.meshes["mesh"].dimensions == SIZE
+        _, plain = drawn(mesh, ignore=["materials"])
+        assert colour[0] < 5 * max(plain[1:]), "the scene's own colour"
+
+
+REFUSED = [
+    ("lost.obj", "mtllib lost.mtl\nusemtl red\n", "newmtl blue\n", "no material is named 'red'"),
+    ("clear.obj", "mtllib clear.mtl\nusemtl glass\n", "newmtl glass\nd 0\n", "transparent everywhere"),
+    (
+        "broken.obj",
+        "mtllib broken.mtl\nusemtl red\n",
+        "newmtl red\nmap_Kd broken.mtl\n",
+        r"broken\.mtl cannot be read",
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "head", "mtl", "message"), REFUSED)
+def test_materials_are_refused_or_ignored(
+    tmp_path: Path, make_spec: MakeSpec, drawn: Callable, name: str, head: str, mtl: str, message: str
+) -> None:
+    file = obj(tmp_path / name, head, mtl)
+    with pytest.raises(RenderError, match=rf"^data\.mesh: {name}: .*{message}.*data\.ignore=\[materials\]") as error:
+        drawn(file)
+    assert "\n" not in str(error.value)
+    drawn(file, ignore=["materials"])
+
+
+def test_colours_beyond_one_are_refused(tmp_path: Path, drawn: Callable) -> None:
+    file = write_mesh(tmp_path / "a.obj", CUBE)
+    file.write_text(
+        "".join(f"{line} 255 128 0\n" if line[0] == "v" else f"{line}\n" for line in open(file).read().splitlines())
+    )
+    with pytest.raises(RenderError, match="its colours reach"):
+        drawn(file)
+
+
+def test_a_mesh_that_blender_draws_elsewhere_is_refused(
+    tmp_path: Path, drawn: Callable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the reason: here, shape keys that the copy still has."""
+    original = importing._one_object
+
+    def with_shape_keys(*args: Any, **options: Any) -> Any:
+        handle = original(*args, **options)
+        handle.shape_key_add(name="basis")
+        return handle
+
+    monkeypatch.setattr(importing, "_one_object", with_shape_keys)
+    with pytest.raises(RenderError, match=r"Blender draws it .* away from its labels"):
+        drawn(write_mesh(tmp_path / "a.stl", CUBE, per_metre=1000), unit=0.001)
+
+
+def test_the_reason_of_blenders_error_is_told(tmp_path: Path, drawn: Callable) -> None:
+    file = write_mesh(tmp_path / "a.gltf", CUBE)
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"asset": {"version": "1.0"}}))
+    with pytest.raises(RenderError, match="version") as error:
+        drawn(file)
+    assert "Location" not in str(error.value)
+    assert ".py" not in str(error.value)
