@@ -163,11 +163,9 @@ def _rows(head: bytes, kinds: dict[bytes, bytes], n: int, body: bytes) -> NDArra
     if b"format ascii" in head:
         columns = [list(kinds).index(axis) for axis in (b"x", b"y", b"z")]
         return np.loadtxt(body.split(b"\n", n)[:n], usecols=columns, ndmin=2)
-    order = ">" if b"big_endian" in head else "<"
-    types = [
-        (name.decode(), order + np.dtype(_PLY_TYPES.get(kind, kind.decode())).str[1:]) for name, kind in kinds.items()
-    ]
-    rows = np.frombuffer(body, types, n)
+    order: Any = ">" if b"big_endian" in head else "<"
+    types = [np.dtype(_PLY_TYPES.get(kind, kind.decode())).newbyteorder(order) for kind in kinds.values()]
+    rows = np.frombuffer(body, list(zip(map(bytes.decode, kinds), types, strict=True)), n)
     return np.stack([rows[axis] for axis in "xyz"], axis=1)
 
 

@@ -165,8 +165,8 @@ def _require_size(mesh: Triangles, spec: DatasetSpec) -> None:
             "data.reference=centroid" if factor * central <= half else f"data.z_range above {2 * reach:.3g} m"
         )
     raise ValueError(
-        f"its longest side is {longest:.3g} m (data.unit={spec.unit:g}), its farthest point {reach:.3g} m from the "
-        f"reference; expected {SIZES[0]:g} to {SIZES[1]:g} m, and at most half of the least depth, {half:g} m; "
+        f"its longest side is {longest:.3g} m, its farthest point {reach:.3g} m from the reference, with data.unit="
+        f"{spec.unit:g}; expected {SIZES[0]:g} to {SIZES[1]:g} m, and at most half of the least depth, {half:g} m; "
         f"set {' and '.join(remedies)}"
     )
 

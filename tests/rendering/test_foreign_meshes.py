@@ -161,9 +161,8 @@ def test_materials_are_refused_or_ignored(
 
 def test_colours_beyond_one_are_refused(tmp_path: Path, drawn: Callable) -> None:
     file = write_mesh(tmp_path / "a.obj", CUBE)
-    file.write_text(
-        "".join(f"{line} 255 128 0\n" if line[0] == "v" else f"{line}\n" for line in open(file).read().splitlines())
-    )
+    lines = [f"{line} 255 128 0" if line[0] == "v" else line for line in file.read_text().splitlines()]
+    file.write_text("\n".join(lines) + "\n")
     with pytest.raises(RenderError, match="its colours reach"):
         drawn(file)
 

@@ -289,7 +289,12 @@ def test_records_of_cylinders_stay_as_they_were(
         ),
         ("cup.stl", solid("cylinder", 0.2, (50, 0, 0)), {}, r"side is 0\.2 m .* set data\.reference=centroid$"),
         ("cup.stl", solid("cylinder", 200, (5e4, 0, 0)), {}, r"set data\.unit=0\.001 and data\.reference=centroid$"),
-        ("cup.stl", solid("cylinder", 0.2, (5e4, 0, 0)), {"reference": "centroid"}, r"measures 0\.2 .* move it"),
+        (
+            "cup.stl",
+            solid("cylinder", 0.2, (5e4, 0, 0)),
+            {"reference": "centroid"},
+            r"reach 5e\+04 units, .* move it",
+        ),
     ],
 )
 def test_an_unusable_mesh_is_one_line(
