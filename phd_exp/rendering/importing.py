@@ -103,7 +103,8 @@ def _in_metres(handle: Any, unit: float, reference: Any, *, is_y_up: bool) -> Tr
     far, size = np.abs(local[used]).max(), np.ptp(local[used], axis=0).max()
     if np.spacing(far) > TOLERANCE * size:
         raise ValueError(
-            f"measures {size:.3g} units, {far:.3g} from its origin, where digits are lost; move it there"
+            f"its coordinates reach {far:.3g} units, where 32-bit numbers are {np.spacing(far):.2g} apart, but it "
+            f"measures only {size:.3g} units; move it to the origin"
         )
     world = np.array(handle.matrix_world)
     vertices = unit * (local @ world[:3, :3].T + world[:3, 3])

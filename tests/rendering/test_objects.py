@@ -287,7 +287,7 @@ def test_records_of_cylinders_stay_as_they_were(
             {"scale_range": (0.5, 2.0)},
             r"farthest point 1\.7 m.* set data\.z_range",
         ),
-        ("cup.stl", solid("cylinder", 0.2, (50, 0, 0)), {}, r"side is 0\.2 m .* set data\.reference=centroid$"),
+        ("cup.stl", solid("cylinder", 0.2, (50, 0, 0)), {}, r"side is 0\.2 m, .* set data\.reference=centroid$"),
         ("cup.stl", solid("cylinder", 200, (5e4, 0, 0)), {}, r"set data\.unit=0\.001 and data\.reference=centroid$"),
         (
             "cup.stl",
