@@ -95,6 +95,8 @@ def _of_stranger(read: Callable[[], Any], path: Path) -> Any:
 
 def _read_gltf(mesh: MeshFile) -> None:
     document, rest = split_gltf(mesh.copy)
+    if (version := document.get("asset", {}).get("version")) != "2.0":
+        raise ValueError(f"glTF of version {version}; expected 2.0")
     for key in ("buffers", "images"):
         for item in document.get(key, ()):
             uri = item.get("uri", "data:")

@@ -53,7 +53,7 @@ def _one_object(bpy: Any, file: MeshFile, *, is_plain: bool) -> Any:
     If it is to be plain, its materials are removed too.
     """
     if file.lost and not is_plain:
-        raise ValueError(f"{listed(file.lost)}; mend it, or {PLAIN}")
+        raise ValueError(f"{listed(file.lost)}; correct the file, or {PLAIN}")
     added = _import(bpy, file)
     parts = sorted((item for item in added if item.type == "MESH" and item.data.polygons), key=lambda item: item.name)
     if not (faces := sum(len(part.data.polygons) for part in parts)):
@@ -101,6 +101,8 @@ def _in_metres(handle: Any, unit: float, reference: Any, *, is_y_up: bool) -> Tr
         raise ValueError(f"is transparent everywhere; expected opaque faces; {PLAIN}")
     used, places = np.unique(corners, return_inverse=True)
     far, size = np.abs(local[used]).max(), np.ptp(local[used], axis=0).max()
+    if Triangles(local, corners).areas.sum() <= (TOLERANCE * size) ** 2:
+        raise ValueError("its faces have no area; expected a surface")
     if np.spacing(far) > TOLERANCE * size:
         raise ValueError(
             f"its coordinates reach {far:.3g} units, where 32-bit numbers are {np.spacing(far):.2g} apart, but it "
@@ -140,7 +142,7 @@ def _is_opaque(material: Any) -> bool:
 
 
 def _require_drawn(bpy: Any, handle: Any, mesh: Triangles) -> None:
-    """Raise ValueError unless the triangles have an area, and Blender draws them where they are."""
+    """Raise ValueError unless Blender draws the triangles where they are."""
     drawn = handle.evaluated_get(bpy.context.evaluated_depsgraph_get())
     world, (vertices, corners) = np.array(drawn.matrix_world), _geometry(drawn.data)
     points = vertices[corners.ravel()] @ world[:3, :3].T + world[:3, 3]
@@ -149,8 +151,6 @@ def _require_drawn(bpy: Any, handle: Any, mesh: Triangles) -> None:
         raise ValueError(
             f"Blender draws it {gaps.max():.3g} m away from its labels; export it without modifiers or poses"
         )
-    if mesh.areas.sum() <= (TOLERANCE * max(mesh.dimensions)) ** 2:
-        raise ValueError("its faces have no area; expected a surface")
 
 
 def _require_size(mesh: Triangles, spec: DatasetSpec) -> None:

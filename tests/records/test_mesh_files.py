@@ -17,6 +17,7 @@ from phd_exp.rendering.triangles import Triangles
 from tests.support.meshes import named, ply_text, solid, write_mesh
 
 CUBE = solid("cube")
+GLTF = {"asset": {"version": "2.0"}}
 
 
 def written(folder: Path, mesh: str, files: dict[str, str]) -> Path:
@@ -27,8 +28,11 @@ def written(folder: Path, mesh: str, files: dict[str, str]) -> Path:
     return folder / mesh
 
 
-def gltf_with(uri: str) -> str:
-    return json.dumps({"asset": {"version": "2.0"}, "images": [{"uri": uri}], "textures": [{"source": 0}]})
+def gltf_with(uri: str | None) -> str:
+    """A glTF file with a texture, or with one of an unknown kind."""
+    if uri is None:
+        return json.dumps(GLTF | {"textures": [{"extensions": {"KHR_texture_basisu": {}}}]})
+    return json.dumps(GLTF | {"images": [{"uri": uri}], "textures": [{"source": 0}]})
 
 
 def ply_with(texture: str) -> str:
@@ -93,7 +97,7 @@ LOST = {
     "faces": ("a.ply", ply_text(CUBE, of_faces=[f"uchar {name}" for name in RGB], face="1 2 3"), {}, "faces"),
     "whole numbers": ("a.ply", ply_text(CUBE, [f"int {name}" for name in RGB], "1 2 3"), {}, "type int"),
     "STL": ("a.stl", "COLOR=abcd".ljust(84, "\0"), {}, "COLOR="),
-    "an unknown image": ("a.gltf", json.dumps({"textures": [{"extensions": {"basisu": {}}}]}), {}, "basisu"),
+    "an unknown image": ("a.gltf", gltf_with(None), {}, "basisu"),
 }  # fmt: skip
 
 
@@ -172,9 +176,18 @@ def test_the_copy_is_the_default_scene_at_rest(
 
 @pytest.mark.parametrize("suffix", [".glb", ".gltf"])
 @pytest.mark.parametrize(
-    "document", [[], {"nodes": 3}, {"scenes": [{}], "scene": 2}, {"meshes": [{}]}, {"buffers": [{"uri": "no.bin"}]}]
+    "document",
+    [
+        [],
+        {"asset": {"version": "1.0"}},
+        {"nodes": 3},
+        {"scenes": [{}], "scene": 2},
+        {"meshes": [{}]},
+        {"buffers": [{"uri": "no.bin"}]},
+    ],
 )
 def test_a_strange_document_is_one_line(tmp_path: Path, suffix: str, document: Any) -> None:
+    document = GLTF | document if isinstance(document, dict) else document
     (tmp_path / f"a{suffix}").write_bytes(joined_gltf(document, b"", is_binary=suffix == ".glb"))
     with pytest.raises(ValueError, match=rf"cannot be read as {suffix} \("):
         mesh_asset(tmp_path / f"a{suffix}")
