@@ -175,7 +175,7 @@ def _read_stl(mesh: MeshFile) -> None:
     if b"COLOR=" in mesh.copy[:80]:
         mesh.lost.append("colours of faces (COLOR=) are not read")
     n = int.from_bytes(mesh.copy[80:84], "little")
-    if len(mesh.copy) == 84 + 50 * n:
+    if n and len(mesh.copy) == 84 + 50 * n:
         mesh.coordinates = lambda: [np.ndarray((n, 9), "<f4", mesh.copy, 96, (50, 4)).reshape(-1, 3)]
     else:
         mesh.coordinates = lambda: [_numbers(rb"vertex", mesh.copy)]

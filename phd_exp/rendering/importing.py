@@ -39,7 +39,7 @@ def import_meshes(bpy: Any, spec: DatasetSpec) -> Meshes:
             meshes[name] = _in_metres(handle, spec.unit, reference, is_y_up=file.lower().endswith(Y_UP))
             _require_drawn(bpy, handle, meshes[name])
             _require_size(meshes[name], spec)
-        except (OSError, ValueError, RuntimeError) as error:  # Blender's importers raise RuntimeError
+        except (OSError, ValueError, RuntimeError) as error:  # Blender raises RuntimeError
             lines = [line for line in str(error).splitlines() if line.strip() and not line.startswith("Location:")]
             key, reason = "distractor_meshes" if number else "mesh", one_line(lines[-1].removeprefix("Error: "))
             raise RenderError(f"data.{key}: {file}: {reason}") from None
@@ -86,10 +86,13 @@ def _import(bpy: Any, file: MeshFile) -> set[Any]:
         path = Path(folder, file.path.name)
         path.write_bytes(file.copy)
         path.with_name(MATERIALS).write_bytes(file.materials)
-        if suffix in (".glb", ".gltf"):
-            bpy.ops.import_scene.gltf(filepath=str(path), disable_bone_shape=True)
-        else:
-            getattr(bpy.ops.wm, f"{suffix[1:]}_import")(filepath=str(path))
+        try:
+            if suffix in (".glb", ".gltf"):
+                bpy.ops.import_scene.gltf(filepath=str(path), disable_bone_shape=True)
+            else:
+                getattr(bpy.ops.wm, f"{suffix[1:]}_import")(filepath=str(path))
+        except RuntimeError as error:
+            raise ValueError(str(error).replace(folder, "")) from None
     return set(bpy.data.objects) - before
 
 
