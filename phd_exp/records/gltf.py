@@ -64,7 +64,7 @@ def positions(document: Any, rest: bytes) -> list[NDArray[np.float32]]:
     """Coordinates (n, 3) of vertices, except those that are whole numbers or compressed."""
     parts = [part["attributes"] for mesh in document.get("meshes", ()) for part in mesh["primitives"]]
     accessors = [document["accessors"][part["POSITION"]] for part in parts if "POSITION" in part]
-    result = []
+    result: list[NDArray[np.float32]] = []
     for accessor in accessors:
         if accessor["componentType"] == FLOATS and "bufferView" in accessor:
             view = document["bufferViews"][accessor["bufferView"]]

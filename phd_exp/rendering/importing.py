@@ -104,7 +104,7 @@ def _in_metres(handle: Any, unit: float, reference: Any, *, is_y_up: bool) -> Tr
         raise ValueError(f"is transparent everywhere; expected opaque faces; {PLAIN}")
     used, places = np.unique(corners, return_inverse=True)
     far, size = np.abs(local[used]).max(), np.ptp(local[used], axis=0).max()
-    if Triangles(local, corners).areas.sum() <= (TOLERANCE * size) ** 2:
+    if Triangles(local.astype(float), corners).areas.sum() <= (TOLERANCE * size) ** 2:
         raise ValueError("its faces have no area; expected a surface")
     if np.spacing(far) > TOLERANCE * size:
         raise ValueError(
