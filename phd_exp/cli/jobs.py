@@ -27,6 +27,7 @@ OMP = "OMP_NUM_THREADS"
 LONGEST = 400  # characters of Hydra's messages that are repeated
 REFUSED = (HydraException, OmegaConfBaseException, ValueError, TypeError, ArithmeticError, RecursionError)
 """The errors that a bad override raises; ValueError for a group set to null, TypeError for one set to numbers."""
+NO_SCORE = "the sweeper receives no score: only trainings with held-out samples have one; set data.n_held_out above 0"
 HOME = uuid.uuid4().hex  # names this process: another process that imports this module has another value
 
 
@@ -69,6 +70,8 @@ class Job:
             self.endings.append(ending)
         elif ending.exit_status:
             raise RunError("\n".join(ending.lines))
+        elif ending.value is None:
+            print(NO_SCORE, flush=True)
         return ending.value
 
     def end(self, config: DictConfig) -> Ending:

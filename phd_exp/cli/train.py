@@ -38,8 +38,6 @@ SUMMARY = {
 }
 """The numbers of each run at the end of a sweep."""
 LONG = 1_000_000  # images seen by all trainings of a sweep; from here on their time is estimated
-SCORES = ("test/nll", "test/depth_error_mm")
-"""The number that a sweeper receives: the first that the run has. A baseline has no likelihood."""
 
 
 def main(words: list[str]) -> int:
@@ -48,13 +46,14 @@ def main(words: list[str]) -> int:
 
 
 def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Sequence[Any] = ()) -> float | None:
-    """Render missing data, train one run and print its numbers; returns the first of SCORES that it has.
+    """Render missing data, train one run and print its numbers; returns its score, None without held-out samples.
 
     `callbacks` are Lightning's, in addition to those of the configuration.
     """
     checked = check(config)
     _require_part(checked, overrides)
     # imports of seconds, which follow the check of the configuration
+    from phd_exp.training.pruning import held_out_score
     from phd_exp.training.run import require_possible, train
 
     folder = RunFolder(run_name(checked, overrides).folder(checked.runs))
@@ -73,7 +72,7 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
         print(f"  {key} {_number(results[key])} (untrained {_number(results.get(f'untrained/{key}'))})")
     if (folder.calibration / "final.png").exists():
         print(f"  calibration curves: {folder.calibration / 'final.png'}")
-    return next((results[key] for key in SCORES if results.get(key) is not None), None)
+    return held_out_score(folder.path)[1] if folder.held_out.exists() else None
 
 
 def _require_part(checked: RunConfig, overrides: list[str]) -> None:

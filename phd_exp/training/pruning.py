@@ -10,7 +10,7 @@ from phd_exp.evaluation.parquet import read_table
 from phd_exp.records.runs import CHOOSE, RunFolder
 
 SCORES = ("nll", "depth_error_mm")
-"""What a search minimises on the held-out samples: the first that the model has. A baseline has no likelihood."""
+"""What searches and sweepers minimise on held-out samples: the first that the model has. A baseline has no likelihood."""
 
 
 class Pruned(SystemExit):
@@ -35,7 +35,7 @@ class Pruning(Callback):
 
 
 def held_out_score(run: Path) -> tuple[str, float]:
-    """The metric that a search minimises and its value for a finished run. Raises RunError."""
+    """The metric that searches and sweepers minimise, and its mean over the rows `CHOOSE`. Raises RunError."""
     table = read_table(RunFolder(run).held_out)
     name = next(name for name in SCORES if name in table)
     return f"held_out/{name}", float(table[name][CHOOSE].mean())
