@@ -15,6 +15,8 @@ from torch.distributions.constraints import Constraint
 from phd_exp.distributions import spd
 from phd_exp.distributions.special import signed_log1p
 
+LARGEST_RATIO = 100.0
+"""Of the eigenvalues of B, and so of A. Larger ones, on unusual images, were useless."""
 _EVENT_DIMS = {"A_xy": 2, "nu_xy": 1}
 
 
@@ -58,13 +60,13 @@ class Natural:
     ) -> "Natural":
         """From seven raw numbers (n_1, n_2, b_1, b_2, b_3, w_1, w_2) of a network and its camera.
 
-        In the frame of the network nu_p = (n_1, n_2), B = `spectral_map`(b_1, b_2, b_3), a = `positive`(w_1) and
+        In the frame of the network nu_p = (n_1, n_2), B = `precision`(b_1, b_2, b_3), a = `positive`(w_1) and
         log nu_z = sign(w_2) log(1 + |w_2|/a). Then mu_z = nu_z mu_z0 f, A_xy = 2 B / (S mu_z0) and
         nu_xy = nu_p / (mu_z0 f): in both frames, nu_z does not affect the projection.
 
         Source: paper, sections "Parameter remapping" and "Enforcing constraints on distribution parameters".
         """
-        B, log_det_B = spd.spectral_map(raw[..., 2:5])
+        B, log_det_B = precision(raw[..., 2:5])
         log_a = spd.log_positive(raw[..., 5])
         f_in_metres = mu_z0 * f  # the depth at which z_p = 1
         scale = 2 / (S * mu_z0)
@@ -92,6 +94,11 @@ class Natural:
                 for name, value in vars(self).items()
             }
         )
+
+
+def precision(b: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 2 2"], Float[Tensor, "*batch"]]:
+    """B = `spectral_map`(b) and log|B|, with the lesser eigenvalue raised to 1/`LARGEST_RATIO` of the greater."""
+    return spd.spectral_map(spd.conditioned(b, LARGEST_RATIO))
 
 
 def _batch_shape(name: str, value: Tensor) -> torch.Size:

@@ -87,7 +87,10 @@ class ProjectedHuber(Distribution, Density):
         mu_z0: float,
         validate_args: bool | None = None,
     ) -> "ProjectedHuber":
-        """The distribution of the raw numbers (n_1, n_2, b_1, b_2, b_3, w_1, w_2) of a network.
+        """The distribution of the raw numbers (n_1, n_2, b_1, b_2, b_3, w_1, w_2) of a network, as `predict` uses it.
+
+        The lesser eigenvalue of A is raised to at least 1/100 of the greater, a constant for the gradient. The
+        constructor takes any A.
 
         Args:
             raw: the raw numbers.

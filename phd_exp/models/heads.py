@@ -12,16 +12,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from phd_exp.distributions import Density, PointEstimate, ProjectedHuber
+from phd_exp.distributions.natural import precision
 from phd_exp.distributions.quantiles import LEVELS, Quantiles
 from phd_exp.distributions.shaped import Shaped
-from phd_exp.distributions.spd import conditioned, spectral_map
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import Chart, DepthScale
 
 Prediction = ProjectedHuber | Shaped | PointEstimate
-
-LARGEST_RATIO = 100.0
-"""Of the precisions of a projected position in two directions. Larger ones, on unusual images, were useless."""
 
 
 @runtime_checkable
@@ -41,7 +38,7 @@ class Head(Protocol):
 
 
 class DistributionHead:
-    """Seven raw numbers -> the Projected Huber distribution, with eigenvalues of A up to `LARGEST_RATIO` apart.
+    """Seven raw numbers -> the Projected Huber distribution, `ProjectedHuber.from_raw`.
 
     Examples:
         >>> import torch
@@ -60,13 +57,11 @@ class DistributionHead:
 
     def __call__(self, raw: Float[Tensor, "*batch 7"], camera: Camera) -> ProjectedHuber:
         # not validated for speed: the training step refuses a loss that is not finite
-        n, b, w = raw.split((2, 3, 2), dim=-1)
-        raw = torch.cat([n, conditioned(b, LARGEST_RATIO), w], dim=-1)
         return ProjectedHuber.from_raw(raw, f=camera.f, S=camera.S, mu_z0=self.mu_z0, validate_args=False)
 
     def placed(self, raw: Float[Tensor, "*batch n"], place: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch n"]:
         """Raw numbers with the centre nu_p = B v_p shifted by B `place`: the same shift of v_p for every B."""
-        B, _ = spectral_map(conditioned(raw[..., 2:5], LARGEST_RATIO))
+        B, _ = precision(raw[..., 2:5])
         return torch.cat([raw[..., :2] + (B @ place[..., None]).squeeze(-1), raw[..., 2:]], dim=-1)
 
     def turned_back(

@@ -10,7 +10,7 @@ from phd_exp.evaluation.parquet import read_table
 from phd_exp.records.runs import CHOOSE, RunFolder
 
 SCORES = ("nll", "depth_error_mm")
-"""What searches and sweepers minimise on held-out samples: the first that the model has. A baseline has no likelihood."""
+"""What searches and sweepers minimise: the first of them that the model has. A baseline has no likelihood."""
 
 
 class Pruned(SystemExit):

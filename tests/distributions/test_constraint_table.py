@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from phd_exp.distributions import PointEstimate, ProjectedHuber
-from phd_exp.distributions.constraints import CONSTRAINTS, DEPTH, Density, Family, families
+from phd_exp.distributions.constraints import CONSTRAINTS, DEPTH, Density, Family, families, variances_are_free
+from phd_exp.distributions.natural import LARGEST_RATIO
 from phd_exp.distributions.point_estimate import PointDensity
 from phd_exp.distributions.shaped import Decomposed
 from phd_exp.geometry import Camera, Cartesian, Chart, LogDepth, Projected
@@ -15,7 +16,7 @@ from phd_exp.models.heads import DistributionHead
 from phd_exp.models.regressor import FocalLengthInput, Regressor
 
 KEPT = {
-    # every one of them, by construction
+    # every one of them, by construction; the first up to the largest ratio of A's eigenvalues
     "probabilistic": {1, 2, 3, 4, 5, 6, 7},
     # Proposition 1 of the paper: -log p is not convex in v
     "decomposed": {1, 2, 3, 4, 6, 7},
@@ -44,6 +45,24 @@ KEPT = {
 def test_a_model_keeps_the_constraints_that_theory_says_it_keeps(name: str, constraint: str) -> None:
     finding = CONSTRAINTS[constraint](families()[name], torch.Generator().manual_seed(3))
     assert finding.holds == (int(constraint.split()[0]) in KEPT[name]), finding
+
+
+@pytest.mark.parametrize("ratio", [100.0, 1000.0, 10_000.0])
+def test_spreads_of_projection_reach_the_largest_ratio_and_no_farther(ratio: float) -> None:
+    """The nearest of farther ones is off by the same factor in both directions."""
+    finding = variances_are_free(families()["gaussian_logz"], torch.Generator().manual_seed(3), ratio)
+    assert finding.measured == pytest.approx(max(1, ratio / LARGEST_RATIO) ** 0.5, rel=0.7)
+    assert finding.holds == (ratio <= LARGEST_RATIO)
+
+
+@pytest.mark.parametrize("b", [[3.0, 1.0, 2.0], [250.0, 0.0, -5.0], [40.0, 60.0, 40.0], [-9.0, 3.0, 20.0]], ids=str)
+def test_the_measured_head_is_the_shipped_one(b: list[float]) -> None:
+    raw = torch.tensor([[0.3, -0.1, *b, 5.0, 0.2]], dtype=torch.float64)
+    camera = Camera(torch.tensor([1500.0], dtype=torch.float64), 224.0)
+    measured, shipped = families()["probabilistic"].predict(raw, camera), DistributionHead(DEPTH)(raw, camera)
+    torch.testing.assert_close(measured.covariance_matrix, shipped.covariance_matrix)
+    least, most = torch.linalg.eigvalsh(measured.A[0])
+    assert most / least <= LARGEST_RATIO * (1 + 1e-9)
 
 
 CENTRE = torch.tensor([0.05, -0.03, 4.0], dtype=torch.float64)

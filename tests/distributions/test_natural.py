@@ -25,11 +25,12 @@ def loss(raw: torch.Tensor, xyz: torch.Tensor, f: float = F) -> torch.Tensor:
 
 
 def printed_parameters(raw: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """nu_p, B, a and nu_z of seven raw numbers, as printed in the paper."""
+    """nu_p, B, a and nu_z of seven raw numbers, as printed in the paper, with the eigenvalues of B bounded."""
     nu_p, (b_1, b_2, b_3), (w_1, w_2) = raw[:2], raw[2:5], raw[5:]
     off = b_2 / math.sqrt(2)
     s, U = torch.linalg.eigh(torch.stack([torch.stack([b_1, off]), torch.stack([off, b_3])]))
-    B = U @ torch.diag(torch.where(s >= 0, s + 1, s.exp())) @ U.T
+    eigenvalues = torch.where(s >= 0, s + 1, s.exp())
+    B = U @ torch.diag(eigenvalues.clamp_min(eigenvalues[1] / 100)) @ U.T  # the bound is not in the paper
     a = w_1 + 1 if w_1 >= 0 else w_1.exp()
     nu_z = 1 + w_2 / a if w_2 > 0 else 1 / (1 - w_2 / a)
     return nu_p, B, a, nu_z
