@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import MISSING, DictConfig, OmegaConf
@@ -160,8 +161,26 @@ def _options_last(words: list[str]) -> list[str]:
 
     parser = get_args_parser()
     parser.error = refuse  # type: ignore[method-assign]
-    overrides = parser.parse_intermixed_args(words).overrides
-    return [*overrides, *(word for word in words if word not in overrides)]
+    arguments = parser.parse_intermixed_args(words)
+    overrides, options = arguments.overrides, [word for word in words if word not in arguments.overrides]
+    if arguments.multirun and any(word.startswith("experiment=") for word in overrides):
+        overrides = list(map(_for_jobs_alone, overrides))
+    return [*overrides, *options]
+
+
+def _for_jobs_alone(word: str) -> str:
+    """A key's override as a choice of one value, which Hydra applies to jobs alone.
+
+    Before, Hydra composes a configuration without the choices of the experiment, which may lack the key.
+    """
+    name, _, value = word.partition("=")
+    try:
+        overrides = OverridesParser.create().parse_overrides([word, f"{name}=choice({value})"])
+    except HydraException:  # of a deletion, no value, or a mistake, which is reported with the others
+        return word
+    before, after = overrides
+    is_of_job = "." in before.key_or_group and not before.is_hydra_override() and not before.is_sweep_override()
+    return str(after.input_line) if is_of_job else word
 
 
 def explain(error: Exception, config_name: str) -> str:

@@ -1,22 +1,26 @@
 """The scores that a calibrated model would have: for finitely many samples, no distance from calibration is zero."""
 
-from collections import defaultdict
 from dataclasses import dataclass
 from functools import cache
 
 import torch
+from jaxtyping import Float
+from scipy import stats
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.columns import NEES, draws, nees_columns, parameter_columns, squared_error_columns
+from phd_exp.distributions.columns import NEES, Columns, draws, nees_columns, parameter_columns, squared_error_columns
 from phd_exp.metrics.calibration import ence_of, miscalibration_area, uniform_distance
 from phd_exp.metrics.calibration_scores import ence_bins
 from phd_exp.metrics.errors import MILLIMETRES
 from phd_exp.metrics.groups import similar_groups, worst_group
-from phd_exp.metrics.ordered import in_order_of
+from phd_exp.metrics.ordered import Ordered, in_order_of
 
 SEED = 1
-_AT_ONCE = 10**6  # positions drawn at a time
+_SHARES = torch.tensor([0.5, 0.025, 0.975], dtype=torch.float64)
+_AT_ONCE = 10**6  # samples simulated at a time
+_DRAWS, _FEWEST_DRAWS = 400_000, 200
+"""Positions drawn from all predictions, and at least from each."""
 REFERENCED = (
     *("depth_ence", "projected_ence", "inside_90", "miscalibration_area", "depth_pit_area", "depth_pit_ks"),
     *("group_miscalibration", "depth_crps_mm", *NEES),
@@ -32,22 +36,25 @@ class Band:
     high: float
 
 
-def calibrated_reference(distribution: ProjectedHuber, simulations: int = 200) -> dict[str, Band]:
+def calibrated_reference(distribution: ProjectedHuber, simulations: int = 4000) -> dict[str, Band]:
     """Median and 95 % interval of the scores `REFERENCED` if the truths were drawn from the predictions themselves.
 
-    ENCE, CRPS and NEES depend on the predicted densities, so positions are drawn from them. Credible levels and PITs
-    of a calibrated model are uniform for any prediction: their scores depend on the number of samples alone.
+    ENCE, CRPS and NEES depend on the predicted densities, so positions are drawn from them: each simulated test set
+    takes one of many draws from each prediction. Credible levels and PITs of a calibrated model are uniform for any
+    prediction: their scores depend on the number of samples alone. The number inside a region is binomial.
 
     Source: the simulated null distribution of a test statistic; coverage in tests/evaluation/test_reference.py.
     """
     (n,) = distribution.batch_shape
-    found = defaultdict(list, _uniform(n, simulations))
-    each = max(1, _AT_ONCE // n)
-    for start in range(0, simulations, each):
-        for name, values in _simulated(distribution, min(each, simulations - start), SEED + start).items():
-            found[name] += values.tolist()
-    shares = torch.tensor([0.5, 0.025, 0.975], dtype=torch.float64)
-    return {name: Band(*torch.tensor(values).double().quantile(shares).tolist()) for name, values in found.items()}
+    found = {name: [values] for name, values in _uniform(n, simulations).items()}
+    drawn = _scored(distribution, draws(distribution, max(_FEWEST_DRAWS, _DRAWS // n), SEED))
+    groups, generator = groups_of(distribution), torch.Generator().manual_seed(SEED)
+    for size in _sizes(n, simulations):
+        for name, values in _simulated(drawn, groups, size, generator).items():
+            found.setdefault(name, []).append(values)
+    bands = {name: torch.cat(values).double().quantile(_SHARES) for name, values in found.items()}
+    bands["inside_90"] = 100 / n * torch.from_numpy(stats.binom.ppf(_SHARES, n, 0.9))
+    return {name: Band(*bands[name].tolist()) for name in REFERENCED}
 
 
 def groups_of(distribution: ProjectedHuber) -> Tensor:
@@ -55,29 +62,39 @@ def groups_of(distribution: ProjectedHuber) -> Tensor:
     return similar_groups(torch.stack(list(parameter_columns(distribution).values()), -1))
 
 
-def _simulated(distribution: ProjectedHuber, simulations: int, seed: int) -> dict[str, Tensor]:
-    drawn = draws(distribution, simulations, seed)
-    found = {name: values.mean(-1) for name, values in nees_columns(distribution, drawn).items()}
-    found["depth_crps_mm"] = MILLIMETRES * distribution.depth_crps(drawn[..., 2]).mean(-1)
-    levels = torch.rand(drawn.shape[:-1], generator=torch.Generator().manual_seed(seed))
-    found["group_miscalibration"] = worst_group(levels, groups_of(distribution), torch.ones_like(levels))
-    squared = squared_error_columns(distribution, drawn)
+def _scored(distribution: ProjectedHuber, drawn: Float[Tensor, "draws samples 3"]) -> Columns:
+    """What the scores need of each draw, and the predicted variances."""
+    crps = {"depth_crps_mm": MILLIMETRES * distribution.depth_crps(drawn[..., 2])}
+    return nees_columns(distribution, drawn) | squared_error_columns(distribution, drawn) | crps
+
+
+def _simulated(drawn: Columns, groups: Tensor, size: int, generator: torch.Generator) -> Columns:
+    """The scores of test sets that take one of the draws from each prediction."""
+    many, n = drawn["nees"].shape
+    chosen = torch.randint(many, (size, n), generator=generator)
+    found = {name: drawn[name].gather(0, chosen).mean(-1) for name in (*NEES, "depth_crps_mm")}
+    levels = torch.rand(size, n, generator=generator)
+    found["group_miscalibration"] = worst_group(levels, groups, torch.ones_like(levels))
     for name in ("depth", "projected"):
-        variance, error = squared[f"{name}_variance"], squared[f"{name}_squared_error"]
-        order = in_order_of(variance, {"variance": variance, "error": error}, torch.ones_like(error))
+        variance, error = drawn[f"{name}_variance"], drawn[f"{name}_squared_error"].gather(0, chosen)
+        order = in_order_of(variance, {"variance": variance, "error": error})
         found[f"{name}_ence"] = ence_of(order, "variance", "error", ence_bins(order))
     return found
 
 
 @cache
-def _uniform(n: int, simulations: int) -> dict[str, list[float]]:
+def _uniform(n: int, simulations: int) -> Columns:
     """The scores of n uniform levels and PITs."""
-    generator = torch.Generator().manual_seed(SEED)
-    inside, areas, distances = [], [], []
-    for _ in range(simulations):
-        levels = torch.rand(n, generator=generator, dtype=torch.float64)
-        order = in_order_of(levels, {})
-        inside.append(100 * float((levels <= 0.9).double().mean()))
-        areas.append(float(miscalibration_area(order)))
-        distances.append(float(uniform_distance(order)))
-    return {"inside_90": inside, "miscalibration_area": areas, "depth_pit_area": areas, "depth_pit_ks": distances}
+    generator, found = torch.Generator().manual_seed(SEED), []
+    for size in _sizes(n, simulations):
+        levels = torch.rand(size, n, generator=generator, dtype=torch.float64).sort().values
+        order = Ordered(levels, torch.ones_like(levels), {})
+        found.append(torch.stack([miscalibration_area(order), uniform_distance(order)]))
+    areas, distances = torch.cat(found, -1)
+    return {"miscalibration_area": areas, "depth_pit_area": areas, "depth_pit_ks": distances}
+
+
+def _sizes(n: int, simulations: int) -> list[int]:
+    """How many test sets of n samples to simulate at a time."""
+    most = max(1, _AT_ONCE // n)
+    return [min(most, simulations - start) for start in range(0, simulations, most)]

@@ -121,7 +121,7 @@ def miscalibration_area(levels: Levels) -> Float[Tensor, "*batch"]:
     ordered = _in_order(levels)
     share = torch.nn.functional.pad(ordered.share_up_to(), (1, 0))
     edges = torch.nn.functional.pad(torch.nn.functional.pad(ordered.points, (1, 0)), (0, 1), value=1.0)
-    upper, lower = edges[1:] - share, edges[:-1] - share  # p - coverage at both ends of each step
+    upper, lower = edges[..., 1:] - share, edges[..., :-1] - share  # p - coverage at both ends of each step
     return (upper * upper.abs() - lower * lower.abs()).sum(-1) / 2
 
 

@@ -22,7 +22,7 @@ class Ordered:
         sums: name of a column -> its sum over each group.
     """
 
-    points: Float[Tensor, " groups"]
+    points: Float[Tensor, "*#batch groups"]
     count: Float[Tensor, "*batch groups"]
     sums: Mapping[str, Float[Tensor, "*batch groups"]]
 

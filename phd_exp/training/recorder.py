@@ -53,7 +53,7 @@ class Recorder(Checkpoint):
         self.begun = True
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if (trainer.current_epoch + 1) % self.evaluation.calibration_every_n_epochs == 0:
+        if has_curves(trainer.current_epoch + 1, self.evaluation):
             table: Columns = pl_module.table  # type: ignore[assignment]  # a PositionModule's
             self.record_curves(epoch_name(trainer.current_epoch), table, trainer.global_step)
 
@@ -98,6 +98,15 @@ class Recorder(Checkpoint):
         for logger in self.loggers:
             if picture.exists() and hasattr(logger, "log_image"):
                 logger.log_image("test/calibration", [str(picture)], step=step)
+
+
+def has_curves(epochs: int, evaluation: EvaluationConfig) -> bool:
+    """Whether the evaluation after so many epochs is the nearest to a multiple of `calibration_every_n_epochs`.
+
+    Of two equally near ones it is the earlier.
+    """
+    wanted, half = evaluation.calibration_every_n_epochs, evaluation.every_n_epochs / 2
+    return (epochs + half) // wanted > (epochs - half) // wanted
 
 
 def epoch_metrics(trainer: Trainer) -> dict[str, float]:

@@ -46,7 +46,6 @@ WRONG_VALUES = [
     (["trainer.max_epochs=0"], ["trainer.max_epochs", "got 0"]),
     (["trainer.threads=0"], ["trainer.threads", "got 0"]),
     (["evaluation.calibration_window=0"], ["evaluation.calibration_window"]),
-    (["evaluation.every_n_epochs=3"], ["evaluation", "calibration_every_n_epochs=10 is no multiple"]),
     ([f"{MULTIVIEW}=-1"], [MULTIVIEW, "got -1"]),
     (["evaluation.multiview.views=1"], ["evaluation.multiview.views", "got 1"]),
     (["evaluation.multiview.angle_range=[60,20]"], ["evaluation.multiview.angle_range", "lower bound"]),

@@ -159,6 +159,22 @@ def test_other_sweepers_receive_the_score_of_each_job_and_stop_at_an_error(
     assert capfd.readouterr().err.splitlines()[-1] == "error: a mistake"
 
 
+def test_keys_of_a_part_that_an_experiment_chooses_can_be_set(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["task"])
+    found = []
+    job = Job(lambda config, overrides, cores: found.append((config["backbone"]["width"], overrides)))
+    words = ["-m", "experiment=speed", "seed=1", "backbone.width=8", "data.f_range=[1200, 1500]"]
+    assert launch(job, words) == 0, capfd.readouterr().err
+    ((width, overrides),) = found
+    assert width == 8
+    assert overrides[-3:] == ["seed=1", "backbone.width=8", "data.f_range=[1200,1500]"]
+    assert launch(Job(job.task), [*words, "backbone.widt=8"]) == 2
+    assert "backbone.widt: " in capfd.readouterr().err
+
+
 @pytest.mark.slow
 def test_queued_jobs_outlive_a_stopped_launcher(begin: Callable, tmp_path: Path) -> None:
     with begin("submitit", "seed=0,5", "preset=smoke") as launcher:

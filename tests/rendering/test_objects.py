@@ -411,20 +411,24 @@ def write_ball(folder: Path, side: int = 160) -> Path:
 
 
 @pytest.mark.slow
-def test_fifty_thousand_faces_take_a_third_of_a_second_at_38_decibels(make_spec: MakeSpec, tmp_path: Path) -> None:
-    """Three images a second on two cores are 0.67 s of one core for an image; against 1,024 samples of each pixel."""
+def test_fifty_thousand_faces_take_a_sixtieth_of_1024_samples_at_38_decibels(
+    make_spec: MakeSpec, tmp_path: Path
+) -> None:
+    """In processor time of this run: seconds would depend on the machine."""
     spec = make_spec("object", mesh=str(write_ball(tmp_path)), xy_range=0.5)
     renderer = Renderer(fast_settings(spec), spec)
     assert len(renderer.meshes["mesh"].corners) >= 50_000
     make_sample(renderer, spec, "train", 9)  # compiles and loads
-    begun = time.process_time()
-    made = [decoded(make_sample(renderer, spec, "train", index)[0]) for index in range(8)]
-    seconds = (time.process_time() - begun) / 8
-    exact = Renderer(Settings(samples=1024, denoised=False, at_middles=False), spec)
-    decibels = []
-    for index in (0, 1):
-        reference = decoded(make_sample(exact, spec, "train", index)[0]).astype(float)
-        decibels.append(-10 * np.log10(np.mean((made[index] - reference) ** 2) / 255**2))
-    print(f"{seconds:.2f} s, {decibels} dB")
-    assert seconds <= 2 / 3
+
+    def made(by: Renderer) -> tuple[list[np.ndarray], float]:
+        """Two images and their processor time."""
+        begun = time.process_time()
+        images = [decoded(make_sample(by, spec, "train", index)[0]).astype(float) for index in (0, 1)]
+        return images, time.process_time() - begun
+
+    ours, seconds = made(renderer)
+    exact, longer = made(Renderer(Settings(samples=1024, denoised=False, at_middles=False), spec))
+    decibels = [-10 * np.log10(np.mean((a - b) ** 2) / 255**2) for a, b in zip(ours, exact, strict=True)]
+    print(f"{seconds / 2:.2f} s, 1/{longer / seconds:.0f}, {decibels} dB")
+    assert longer / seconds >= 60
     assert min(decibels) >= 38

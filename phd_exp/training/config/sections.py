@@ -221,13 +221,3 @@ class EvaluationConfig(Record):
     multiview: MultiviewConfig | None = None  # default for older run records
     shifts: dict[Name, ShiftConfig] = Field(default_factory=dict)  # default for older run records
     n_shifted: Count | None = None  # default for older run records
-
-    @model_validator(mode="after")
-    def calibration_is_evaluated(self) -> "EvaluationConfig":
-        """Refuse calibration curves in epochs without an evaluation."""
-        if self.calibration_every_n_epochs % self.every_n_epochs:
-            raise ValueError(
-                f"calibration_every_n_epochs={self.calibration_every_n_epochs} is no multiple of "
-                f"every_n_epochs={self.every_n_epochs}: curves are drawn where the test samples are evaluated"
-            )
-        return self
