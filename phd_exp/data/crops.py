@@ -20,6 +20,8 @@ from phd_exp.records.images import FORMATS, LARGEST_IMAGE, decoding, pillow_warn
 PLAIN = ("1", "L", "RGB", "YCbCr", "CMYK")
 WITH_ALPHA = ("P", "PA", "LA", "La", "RGBA", "RGBa")  # a palette may contain a transparent colour
 SIXTEEN_BITS = ("I;16", "I;16L", "I;16B", "I;16N")
+TURNED = range(2, 9)  # EXIF orientations; others than 1 to 8 mean nothing
+TWELVE_BITS = 1 << 12
 ONE_PICTURE = ("JPEG", "MPO")  # formats whose further frames are previews and depth maps
 MARGIN = 1  # pixels around a view of more pixels than the image has, which are interpolated
 
@@ -41,7 +43,7 @@ def read_image(file: Path, content: bytes) -> Image.Image:
     with decoding(file), Image.open(io.BytesIO(content), formats=FORMATS) as image:
         # before loading, during which Pillow rotates a TIFF
         orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
-        if orientation != 1:
+        if orientation in TURNED:
             raise DatasetError(
                 f"{file}: has the EXIF orientation {orientation}, so that its stored pixels are turned; "
                 "turn them for good (`mogrify -auto-orient`), and let f, cx, cy and box refer to the result"
@@ -100,6 +102,11 @@ def _reach(corners: Float[np.ndarray, "rows columns 2"], size: tuple[int, int]) 
 
 def _as_rgb(file: Path, image: Image.Image) -> Image.Image:
     if image.mode in SIXTEEN_BITS:
+        if 0 < (largest := int(np.asarray(image).max())) < TWELVE_BITS:
+            raise DatasetError(
+                f"{file}: the largest of its 16-bit values is {largest}; expected the whole range up to 65535: "
+                "multiply 12-bit values by 16"
+            )
         return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8)).convert("RGB")
     if image.mode in WITH_ALPHA:
         over, ground = image.convert("RGBA"), Image.new("RGB", image.size, (GREY, GREY, GREY))

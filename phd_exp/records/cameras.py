@@ -1,77 +1,237 @@
-"""Camera files: intrinsics and lens of a camera, in the YAML of ROS (`camera_info`) or OpenCV (`FileStorage`)."""
+"""Camera files: size, intrinsics and lens of a camera, from the calibration file of any common tool.
 
+The whole file is searched for the names in `NAMES`. Two values of one quantity are refused: the file then describes
+several cameras.
+
+Source: documentation of OpenCV (FileStorage, calib3d), ROS (camera_info), Kalibr, COLMAP (cameras.txt), nerfstudio
+(transforms.json), librealsense, BOP (camera.json), Open3D, ORB_SLAM, stella_vslam and VINS (camodocal).
+"""
+
+import math
 import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AliasChoices, BeforeValidator, Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
-from phd_exp.records.errors import DatasetError, gist
-from phd_exp.records.files import MB, read_plain
-from phd_exp.records.parsing import Record, parse_yaml
+from phd_exp.records.camera_files import content_of, entries
+from phd_exp.records.errors import DatasetError, complaint, gist, listed, shown
+from phd_exp.records.files import LARGEST_RECORD, MB, read_plain
+from phd_exp.records.parsing import Record
 
+CORNER = 0.5  # px from the corner of the first pixel to its centre
 SHORTEST = 0.01  # focal length, px; a shorter one is probably in metres
 Model = Literal["plumb_bob", "rational_polynomial", "equidistant"]
-COUNTS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
-"""Numbers of coefficients; those after the eighth are of a thin prism and a tilted sensor."""
-
-
-def _values(matrix: Any) -> Any:
-    if not isinstance(matrix, dict):
-        return matrix
-    values, sizes = matrix.get("data"), matrix.get("sizes", [matrix.get("rows"), matrix.get("cols")])
-    if not isinstance(values, list) or sizes not in ([3, 3], [1, len(values)], [len(values), 1], [len(values)]):
-        raise ValueError(f"expected as many numbers in data as rows x cols; rows and cols are {sizes}")
-    return values
-
-
-def _of_opencv(values: dict[str, Any]) -> Model:
-    few = len(values.get("D", ())) < 8
-    return "equidistant" if values.get("fisheye_model") else "plumb_bob" if few else "rational_polynomial"
-
+COEFFICIENTS = {
+    "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
+    "rational_polynomial": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "equidistant": ("k1", "k2", "k3", "k4"),
+}
+NAMES = {
+    "width": "width imagewidth imgwidth w cameracols",
+    "height": "height imageheight imgheight h camerarows",
+    "size": "resolution imagesize",
+    "K": "k m cameramatrix camk intrinsics intrinsicmatrix cameraintrinsics mtx",
+    **{"fx": "fx flx fu mu", "fy": "fy fly fv mv", "cx": "cx ppx cu u0", "cy": "cy ppy cv v0"},
+    "D": "d dist distortion distortioncoef distcoef coef",
+    "model": "distortionmodel cameramodel model modeltype cameratype",
+    "fisheye": "fisheyemodel fisheye isfisheye",
+    **{name: name for name in COEFFICIENTS["rational_polynomial"]},
+}
+"""Quantity -> its names in files, in small letters and digits, without what `_NOT_OF_A_NAME` matches in a list's."""
+MODELS = {
+    "plumb_bob": "plumbbob radtan radialtangential brownconrady opencv radial simpleradial",
+    "rational_polynomial": "rationalpolynomial rational fullopencv full radtan8",
+    "equidistant": "equidistant equi fisheye opencvfisheye kannalabrandt kannalabrandt4 kannalabrandt8 kb4 "
+    "radialfisheye simpleradialfisheye",
+    "none": "none nodistortion inversebrownconrady modifiedbrownconrady",  # those of librealsense are read if zero
+    "": "pinhole perspective simplepinhole rectified",  # of the projection alone
+}
+"""Model -> its names in files, in small letters and digits, without `pinhole` and `distortion` before them."""
+_QUANTITIES = {alias: name for name, aliases in NAMES.items() for alias in aliases.split()}
+_MODELS = {"": "none"} | {alias: model for model, aliases in MODELS.items() for alias in aliases.split()}
+_NOT_OF_A_NAME = re.compile(r"^(left|right)|(left|right|\d+)$|(?<=coef)f?(icient)?s?\d*$")
+_COEFFICIENT, _LENS = re.compile(r"[kps]\d|xi|skew"), re.compile(r"distor|radial|tangential|coef")
+"""Names that belong to a lens even where they are none of `NAMES`."""
 
 Size = Annotated[int, Field(gt=0)]
-Value = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]  # not strict: 1e-05 is a text to PyYAML
-Matrix = Annotated[tuple[Value, ...], BeforeValidator(_values)]
+Value = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+Found = dict[str, tuple[str, Any]]
+"""Quantity -> its key in the file, and its value."""
 
 
-class Calibration(Record, extra="ignore"):
+class Calibration(Record):
     """The content of a camera file, where the centre of the first pixel is (0, 0).
 
     Attributes:
-        width, height: of the images, px; not in every file of OpenCV.
+        width, height: of the images, px; not in every file.
         K: camera matrix, row by row, px.
         D: k1, k2, p1, p2, k3 to k6; or k1 to k4 of a fisheye.
-        fisheye_model, model: of the distortion, as OpenCV's calibration program and ROS name it.
+        model: of the distortion, as ROS names it.
     """
 
-    width: Size | None = Field(None, validation_alias=AliasChoices("image_width", "width"))
-    height: Size | None = Field(None, validation_alias=AliasChoices("image_height", "height"))
-    K: Matrix = Field(validation_alias=AliasChoices("camera_matrix", "K", "k"))
-    D: Matrix = Field(validation_alias=AliasChoices("distortion_coefficients", "D", "d"))
-    fisheye_model: bool = False
-    model: Model = Field(validation_alias="distortion_model", default_factory=_of_opencv)
+    width: Size | None
+    height: Size | None
+    K: tuple[Value, ...]
+    D: tuple[Value, ...]
+    model: Model
 
     @model_validator(mode="after")
-    def belongs_together(self) -> "Calibration":
-        """Refuse skew, and coefficients that do not fit the model."""
-        K, n = self.K, COUNTS[self.model]
+    def has_no_skew(self) -> "Calibration":
+        """Refuse skew, and a focal length that is not in pixels."""
+        K = self.K
         if len(K) != 9 or min(K[0], K[4]) < SHORTEST or (K[1], K[3], *K[6:]) != (0, 0, 0, 0, 1):
-            raise ValueError(f"camera_matrix: got {list(K)}; expected [fx, 0, cx, 0, fy, cy, 0, 0, 1] in pixels")
-        if len(self.D) not in n or any(self.D[8:]):
-            raise ValueError(
-                f"distortion_coefficients: got {list(self.D)}; expected {' or '.join(map(str, n))} for {self.model}, "
-                "zero from the ninth on (no thin prism, no tilted sensor)"
-            )
+            raise ValueError(f"camera matrix: got {list(K)}; expected [fx, 0, cx, 0, fy, cy, 0, 0, 1] in pixels")
         return self
 
 
 def read_camera(path: Path) -> Calibration:
     """The calibration in a camera file. Raises DatasetError, one line that names the file, if there is none."""
+    found: Found = {}
     try:
-        values = parse_yaml(re.sub(r"\A%YAML.*|!!opencv-(nd-)?matrix", "", read_plain(path, MB).decode()))
-        if isinstance(values, dict) and "D" in values:  # of cv2.calibrateCamera, or of cv2.fisheye?
-            values = {"distortion_model": None} | values
-        return Calibration.model_validate(values)
-    except (OSError, ValueError) as error:
-        raise DatasetError(f"{path}: {gist(error)}; expected YAML of ROS (camera_info) or OpenCV") from None
+        # YAML takes seconds a megabyte
+        text = read_plain(path, LARGEST_RECORD if path.suffix == ".json" else MB).decode("utf-8-sig")
+        found = _found(content_of(text))
+        (width, height), (model, D) = _size(found), _lens(found)
+        return Calibration.model_validate(
+            {"width": width, "height": height, "K": _matrix(found), "D": D, "model": model}
+        )
+    except (OSError, ValueError, RecursionError) as error:
+        reason = gist(error)
+        if isinstance(error, ValidationError):
+            problem = error.errors(include_url=False)[0]
+            name, *rest = map(str, problem["loc"] or ("",))
+            reason = complaint(".".join([found.get(name, (name,))[0], *rest]), problem)
+        raise DatasetError(f"{path}: {reason}; see `Lenses` in docs/guides/own_images.md") from None
+
+
+def _found(content: Any) -> Found:
+    """The quantities of a file. Raises ValueError if one has two values, or there is no focal length."""
+    found: Found = {}
+    keys: dict[str, None] = {}
+    for key, value in entries(content):
+        keys[key] = None
+        name = _quantity(key, value)
+        value = _model(key, value) if name == "model" else value
+        if name and value != "" and found.setdefault(name, (key, value))[1] != value:
+            raise ValueError(f"{found[name][0]} and {key} differ; expected the calibration of one camera alone")
+    if not found.keys() & {"K", "fx"}:
+        expected = "camera_matrix, K or intrinsics, or fx, fy, cx, cy"
+        raise ValueError(f"no camera matrix: found {listed(list(keys)) or 'no keys'}; expected {expected}")
+    return found
+
+
+def _quantity(key: str, value: Any) -> str | None:
+    """The quantity with a key, if it is one. Raises ValueError for a part of a lens that is none."""
+    *outer, name = (re.sub(r"[^a-z\d]", "", part) for part in key.lower().split("."))
+    if name in ("type", "cols", "rows"):  # of anything
+        name = "".join(outer[-1:]).rstrip("0123456789") + name
+    is_list = isinstance(value, list | dict)
+    quantity = _QUANTITIES.get(_NOT_OF_A_NAME.sub("", name) if is_list else name)
+    if quantity in ("K", "D") and isinstance(value, int | float):
+        return None
+    of_a_lens = _COEFFICIENT.fullmatch(name) or any(map(_LENS.search, [*outer, name] if is_list else outer))
+    if quantity is None and of_a_lens and _is_given(value):
+        raise ValueError(f"{key}: got {shown(value)}, a part of a lens that is not supported; expected zero")
+    return quantity
+
+
+def _is_given(value: Any) -> bool:
+    """Whether it has a number other than zero."""
+    try:
+        return any(_numbers("", value))
+    except ValueError:
+        return False
+
+
+def _model(key: str, value: Any) -> str:
+    name = re.sub(r"[^a-z\d]", "", str(value).lower())
+    model = _MODELS.get(re.sub(r"^(rs2)?distortion|^pinhole(?=.)", "", name))
+    if model is None:
+        raise ValueError(f"{key}: got {shown(value)}; expected {', '.join(COEFFICIENTS)}, or another name of these")
+    return model
+
+
+def _numbers(key: str, value: Any) -> list[float]:
+    """The numbers of a list, of nested lists, or of a matrix with rows, cols and data; or one number."""
+    if isinstance(value, dict):
+        numbers, sizes = _numbers(key, value["data"]), value.get("sizes", [value.get("rows"), value.get("cols")])
+        if None not in sizes and math.prod(map(int, sizes)) != len(numbers):
+            raise ValueError(f"{key}: got {len(numbers)} numbers in data; expected rows x cols = {sizes}")
+        return numbers
+    if isinstance(value, list):
+        return [number for item in value for number in _numbers(key, item)]
+    try:
+        return [float(value)]  # of a text too: 1e-05 is one to PyYAML
+    except (TypeError, ValueError):
+        raise ValueError(f"{key}: got {shown(value)}; expected numbers") from None
+
+
+def _size(found: Found) -> list[Any]:
+    """Width and height; None if the file has none."""
+    if "size" not in found:
+        return [found.get(name, ("", None))[1] for name in ("width", "height")]
+    size = _numbers(*found["size"])
+    if len(size) != 2:
+        raise ValueError(f"{found['size'][0]}: got {size}; expected width and height")
+    return size
+
+
+def _matrix(found: Found) -> list[float]:
+    """K by rows. COLMAP and nerfstudio, which name the focal length fl_x, count pixels from the corner."""
+    K, names = _numbers(*found["K"]) if "K" in found else [], ("fx", "fy", "cx", "cy")
+    if len(K) == 9 and (K[2], K[5], K[8]) == (0, 0, 1):  # by columns, as Open3D writes it
+        K = [K[3 * column + row] for row in range(3) for column in range(3)]
+    if "fx" not in found and len(K) != 4:
+        return K
+    if missing := [name for name in names if len(K) != 4 and name not in found]:
+        raise ValueError(f"{missing[0]} is missing: found {listed([key for key, _ in found.values()])}")
+    fx, fy, cx, cy = K if len(K) == 4 else (_numbers(*found[name])[0] for name in names)
+    centre = CORNER if "fl" in found.get("fx", ("",))[0].lower() else 0.0
+    rows = [fx, 0.0, cx - centre, 0.0, fy, cy - centre, 0.0, 0.0, 1.0]
+    if len(K) == 9 and rows != K:
+        raise ValueError(f"{found['K'][0]} and {found['fx'][0]} differ; expected the calibration of one camera alone")
+    return rows
+
+
+def _lens(found: Found) -> tuple[str, list[float]]:
+    """The model, and its coefficients, with zeros for those that the file leaves out."""
+    D = _numbers(*found["D"]) if "D" in found else []
+    named = {name: _numbers(*found[name])[0] for name in COEFFICIENTS["rational_polynomial"] if name in found}
+    if found.get("fx", ("",))[0].endswith("mu"):  # VINS numbers the powers of a fisheye's angle
+        named = {f"k{int(name[1:]) - 1}": value for name, value in named.items()}
+    if D and any(named.values()):
+        raise ValueError(f"{found['D'][0]} and {', '.join(named)} are two lenses; expected one")
+    model = _stated_model(found)
+    if model in COEFFICIENTS and not (named or "D" in found):
+        raise ValueError(f"no coefficients of {model}: found {listed([key for key, _ in found.values()])}")
+    if not any([*D, *named.values()]):
+        model = model if model in COEFFICIENTS else "plumb_bob"
+    names = COEFFICIENTS.get(model := model or _model_of_coefficients(found, D, named), ())
+    given = dict(zip([*names, *map(str, range(len(D)))], D, strict=False)) if D else named
+    if (len(D) == 3 and D[2]) or any(value for name, value in given.items() if name not in names):
+        raise ValueError(
+            f"coefficients: got {D or named}; expected {', '.join(names) or 'none'} for {model}, zero beyond"
+        )
+    return model, [given.get(name, 0.0) for name in names]
+
+
+def _stated_model(found: Found) -> str | None:
+    _, model = found.get("model", ("", None))
+    return model or ("equidistant" if _is_fisheye(found) else None)
+
+
+def _is_fisheye(found: Found) -> bool | None:
+    """OpenCV's flag; None if the file has none."""
+    return str(found["fisheye"][1]).lower() in ("1", "1.0", "true") if "fisheye" in found else None
+
+
+def _model_of_coefficients(found: Found, D: list[float], named: dict[str, float]) -> str:
+    """The only model with coefficients of these names, or so many. Raises ValueError if there are two."""
+    is_pinhole = _is_fisheye(found) is False or named.keys() & {"p1", "p2"}
+    if len(D) in (8, 12, 14) or (is_pinhole and "k6" in named):
+        return "rational_polynomial"
+    if len(D) == 5 or (is_pinhole and len(D) <= 4):
+        return "plumb_bob"
+    count = f"{len(D or named)} coefficients of no model"
+    raise ValueError(f"{count}; add distortion_model: plumb_bob (k1, k2, p1, p2) or equidistant (k1, k2, k3, k4)")

@@ -1,5 +1,6 @@
 """One detection in the user's own images: its image, camera and true position, a line of `metadata.jsonl`."""
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,13 +10,15 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field, PlainValidator, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
-from phd_exp.records.cameras import SHORTEST, Calibration, read_camera
+from phd_exp.records.cameras import CORNER, SHORTEST, Calibration, Size, read_camera
 from phd_exp.records.errors import DatasetError, complaint, nearest
 from phd_exp.records.parsing import Record
 from phd_exp.records.scenes import Pose, SampleRecord
 from phd_exp.records.spec import Number, Positive
 
 DISTORTION = re.compile(r"[kp][1-8]|.*distort.*|dist(_?coeff.*)?|.*fisheye.*", re.IGNORECASE)
+WIDEST = 150  # degrees that an image may show, unless through a fisheye
+NORMALISED = 1.5  # px; the largest right or bottom of a box in units of the image, even of one by its middle
 LARGEST_BOX = 3
 """Sides of a box over the longer side of its image; the part outside the image is grey and holds no information."""
 
@@ -46,6 +49,7 @@ class DetectionLine(Record):
         file_name: the image, relative to the folder of the line's file.
         f: focal length, px; or fx and fy if pixels are not square.
         cx, cy: principal point, px; by default the middle of the image.
+        width, height: of the image, px; checked.
         camera: instead of these, a camera file, relative to the folder of the line's file.
         box: left, top, right, bottom of the detection, px; by default the whole image.
         x, y, z: true position in the camera frame (x right, y down, z forward), m.
@@ -60,6 +64,8 @@ class DetectionLine(Record):
     fy: FocalLength | None = None
     cx: Pixels | None = None
     cy: Pixels | None = None
+    width: Size | None = None
+    height: Size | None = None
     camera: FileName | None = None
     box: tuple[Pixels, Pixels, Pixels, Pixels] | None = None
     x: Metres | None = None
@@ -88,7 +94,7 @@ class DetectionLine(Record):
             raise ValueError("expected either f, or fx and fy (focal length in pixels), or camera (a file) alone")
         if not self.camera and self.z is not None and self.z < 1e-6:  # a fisheye may show what is behind
             raise ValueError(f"z: got {self.z:g}; expected to be greater than or equal to 0.000001")
-        for names in (("fx", "fy"), ("cx", "cy"), ("x", "y", "z")):
+        for names in (("fx", "fy"), ("cx", "cy"), ("width", "height"), ("x", "y", "z")):
             given = [name for name in names if getattr(self, name) is not None]
             if 0 < len(given) < len(names):
                 raise ValueError(f"{', '.join(given)} is given alone; expected all of {', '.join(names)}")
@@ -115,18 +121,30 @@ class Detection:
         return x, y, z
 
     def focal_lengths_and_centre(self, width: int, height: int) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy for an image of that size, px. Raises DatasetError if the camera file has another size."""
+        """fx, fy, cx, cy for an image of that size, px.
+
+        Raises DatasetError if the line or the camera file is for another size, or the image would show too much.
+        """
         line, file = self.line, self.calibration
-        if file:
-            if (file.width or width, file.height or height) != (width, height):
+        for name, given in (("", line), (f"camera={line.camera}: ", file)):
+            if given and (given.width or width, given.height or height) != (width, height):
                 raise DatasetError(
-                    f"{self.where}: camera={line.camera}: is for images of {file.width} x {file.height} pixels; this "
-                    f"image has {width} x {height}; scale size, camera matrix and image alike"
+                    f"{self.where}: {name}is for images of {given.width} x {given.height} pixels; this image has "
+                    f"{width} x {height}; scale image, size, camera and boxes alike"
                 )
-            return file.K[0], file.K[4], file.K[2] + 0.5, file.K[5] + 0.5  # our pixels count from their corner
-        fx, fy = (value for value in (line.f or line.fx, line.f or line.fy) if value)  # a line has f or both
-        cx = width / 2 if line.cx is None else line.cx
-        cy = height / 2 if line.cy is None else line.cy
+        if file:
+            fx, fy, cx, cy = file.K[0], file.K[4], file.K[2] + CORNER, file.K[5] + CORNER
+        else:
+            fx, fy = (value for value in (line.f or line.fx, line.f or line.fy) if value)  # a line has f or both
+            cx = width / 2 if line.cx is None else line.cx
+            cy = height / 2 if line.cy is None else line.cy
+        angle = math.degrees(2 * math.atan(max(width / fx, height / fy) / 2))
+        if angle > WIDEST and not (file and file.model == "equidistant"):
+            raise DatasetError(
+                f"{self.where}: with a focal length of {fx:g} x {fy:g} pixels, an image of {width} x {height} pixels "
+                f"shows {angle:.0f} degrees; expected at most {WIDEST}; f in millimetres must be divided by the size "
+                "of a pixel in millimetres"
+            )
         return fx, fy, cx, cy
 
     def box(self, width: int, height: int) -> tuple[float, float, float, float]:
@@ -135,7 +153,9 @@ class Detection:
             return 0.0, 0.0, float(width), float(height)
         left, top, right, bottom = self.line.box
         fault = None
-        if left >= width or top >= height or right <= 0 or bottom <= 0:
+        if max(right, bottom) <= NORMALISED < max(width, height):
+            fault = "seems to be in units of the image; expected pixels of"
+        elif left >= width or top >= height or right <= 0 or bottom <= 0:
             fault = "lies outside"
         elif max(right - left, bottom - top) > LARGEST_BOX * max(width, height):
             fault = f"is more than {LARGEST_BOX} times as large as"
@@ -171,7 +191,7 @@ def _complaint(problem: ErrorDetails) -> str:
     """The fault of a line: the key, the value, and what was expected."""
     key = ".".join(str(part) for part in problem["loc"])
     if problem["type"] == "extra_forbidden" and DISTORTION.fullmatch(key):
-        return f"{key}: a line describes no lens; expected camera, a calibration file of ROS or OpenCV"
+        return f"{key}: a line describes no lens; expected camera, a calibration file"
     if problem["type"] == "extra_forbidden":
         known = (Pose if key.startswith("pose.") else DetectionLine).model_fields
         return f"{key}: unknown key{nearest(key, known)}; expected one of {', '.join(known)}"

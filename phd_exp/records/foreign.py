@@ -1,8 +1,10 @@
 """Annotations in the formats of BOP, KITTI and COCO, as the values of `DetectionLine`s.
 
-    BOP      <folder>/000000/scene_gt.json, scene_gt_info.json, scene_camera.json, and rgb/000000.png or gray/
+    BOP      <folder>/000000/scene_gt.json, scene_gt_info.json, scene_camera.json, and rgb/000000.png or gray/; of
+             several sensors scene_gt_SENSOR.json and so on, and rgb_SENSOR/, gray_SENSOR/ or SENSOR/
     KITTI    <folder>/label_2/000000.txt, calib/000000.txt, image_2/000000.png
-    COCO     <folder>/../annotations/instances_<name of the folder>.json, and the images in the folder
+    COCO     <folder>/../annotations/instances_<name of the folder>.json, and the images in the folder; or one of
+             the other `COCO_FILES`
 
 COCO has no cameras and no positions: `camera`, of an image or at the top for all, has the keys f, or fx and fy, cx
 and cy, and an annotation may have `position` [x, y, z]. BOP and KITTI count pixels from the centre of the first one,
@@ -14,37 +16,71 @@ CameraUtility.py (the principal point); readme of KITTI's object development kit
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
+from os.path import normpath
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from phd_exp.records.cameras import CORNER
 from phd_exp.records.errors import DatasetError, gist, listed
 from phd_exp.records.files import MB, read_plain
 from phd_exp.records.parsing import parse_json
 
 Entry = tuple[str, str, dict[str, Any]]
 """A place for messages, the name of an object, and the values of its `DetectionLine`."""
-CORNER = 0.5  # px from the corner of the first pixel to its centre
 METRE = 1000.0  # mm
 VISIBILITY = {0.0: 1.0, 1.0: 2 / 3, 2.0: 1 / 3}  # of KITTI's levels of occlusion, not measured; level 3 is unknown
 LARGEST = 1000 * MB  # bytes of a file; the instances of COCO's training images have 450 MB
 
 
+COCO_FILES = {
+    "../annotations/instances_{}.json": "",
+    "../../annotations/instances_{}.json": "",  # CVAT
+    "annotations/instances_default.json": "images/default",  # CVAT
+    "_annotations.coco.json": "",  # Roboflow
+    "labels.json": "data",  # FiftyOne
+    "result.json": "",  # Label Studio
+}
+"""Annotations in COCO's format, relative to a folder whose name is {}, and the subfolder of their images."""
+
+
 def format_of(folder: Path) -> tuple[list[Path], Callable[[Path], Iterator[Entry]]] | None:
     """The annotation files of a folder and the reader of their format; None if it is none of the three."""
-    if files := sorted(folder.glob("*/scene_*.json")):
-        return files, _bop
+    if any(folder.glob("*/scene_gt*.json")):
+        return sorted(folder.glob("*/scene_*.json")), _bop
     if files := sorted(folder.glob("label_2/*.txt")):
         return [*files, *sorted(folder.glob("calib/*.txt"))], _kitti
-    return ([_instances(folder)], _coco) if _instances(folder).exists() else None
+    for name, subfolder in COCO_FILES.items():
+        file = Path(normpath(folder.absolute() / name.format(folder.absolute().name)))
+        if file.exists():
+            return [file], partial(_coco, file, subfolder)
+    return None
+
+
+def expected_in(folder: Path) -> str:
+    """What was looked for in a folder without annotations, and what is there."""
+    if not folder.is_dir():
+        return "no such folder"
+    names = sorted(f"{file.name}/" if file.is_dir() else file.name for file in folder.glob("*"))
+    coco = ", ".join(COCO_FILES).format(*[folder.absolute().name] * 2)
+    return (
+        f"no annotations; found {listed(names) or 'nothing'}; expected metadata.jsonl, */scene_gt.json (BOP), "
+        f"label_2/*.txt (KITTI), or one of {coco} (COCO); see `Standard formats` in docs/guides/own_images.md"
+    )
 
 
 def _bop(folder: Path) -> Iterator[Entry]:
     """The visible instances; positions are those of the models' origins, boxes contain what a detector could find."""
-    for file in sorted(folder.glob("*/scene_gt.json")):
-        cameras, infos, scene = (_read(file.with_name(f"scene_{name}.json")) for name in ("camera", "gt_info", "gt"))
-        kind = "rgb" if file.with_name("rgb").exists() else "gray"
+    for file in sorted(folder.glob("*/scene_gt*.json")):
+        sensor = file.stem.removeprefix("scene_gt")
+        if sensor.startswith("_info"):
+            continue
+        parts = (file.with_name(f"scene_{name}{sensor}.json") for name in ("camera", "gt_info", "gt"))
+        cameras, infos, scene = map(_read, parts)
+        kinds = (f"rgb{sensor}", sensor.removeprefix("_"), f"gray{sensor}")
+        kind = next((name for name in kinds if name and file.with_name(name).exists()), kinds[-1])
         images = _images(file.with_name(kind))
         with _reading(f"{file} and scene_gt_info.json"):
             pairs = {image: list(zip(items, infos[image], strict=True)) for image, items in scene.items()}
@@ -99,33 +135,52 @@ def _kitti(folder: Path) -> Iterator[Entry]:
                 yield where, name, camera | values
 
 
-def _coco(folder: Path) -> Iterator[Entry]:
+def _coco(file: Path, subfolder: str, folder: Path) -> Iterator[Entry]:
     """All annotations except crowds."""
-    file = _instances(folder)
     content = _read(file)
     with _reading(file):
-        images = {image["id"]: image for image in content["images"]}
-        names = {category["id"]: str(category["name"]) for category in content["categories"]}
+        images, categories = _by_id(content["images"]), _by_id(content["categories"])
         items = list(enumerate(content["annotations"]))
     for number, item in items:
         with _reading(where := f"{file}, annotation {number}"):
-            if item.get("iscrowd"):
+            if _is_crowd(item):
                 continue
-            image = images[item["image_id"]]
-            values = dict(zip("xyz", item["position"], strict=True)) if "position" in item else {}
-            values |= {"file_name": image["file_name"], "box": edges(item["bbox"])}
-            yield where, names[item["category_id"]], (image.get("camera") or content["camera"]) | values
+            image = images[str(item["image_id"])]
+            values = {name: image[name] for name in ("width", "height") if image.get(name)}
+            values |= dict(zip("xyz", item["position"], strict=True)) if "position" in item else {}
+            name = Path(subfolder, image["file_name"].replace("\\", "/"))
+            values |= {"file_name": str(name), "box": edges(item["bbox"])}
+            camera = image.get("camera") or content["camera"]
+            yield where, str(categories[str(item["category_id"])]["name"]), camera | values
+
+
+def _by_id(items: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """The items by their id as text, since some programs write it as such in one place and not in another."""
+    found = {str(item["id"]): item for item in items}
+    if len(found) < len(items):
+        ids = [str(item["id"]) for item in items]
+        raise ValueError(f"the id {next(id for id in ids if ids.count(id) > 1)} is given twice")
+    return found
+
+
+def _is_crowd(item: dict[str, Any]) -> bool:
+    return bool(int(item.get("iscrowd") or 0))  # also of "0"
 
 
 def boxes_in(file: Path, category: int | str | None = None) -> list[list[float]]:
-    """The boxes (left, top, right, bottom, px) of one image's COCO results, `[{"bbox": [...], ...}, ...]`.
+    """The boxes (left, top, right, bottom, px) of one image's COCO results, `[{"bbox": [...], ...}, ...]`, or of a
+    whole file of COCO.
 
     Raises DatasetError if the file cannot be read, has boxes of several images, or none of the category.
     """
     items = _read(file)
     found, others = [], set()
     with _reading(file):
-        if len({item.get("image_id") for item in items}) > 1:
+        items = items["annotations"] if isinstance(items, dict) else items
+        if not all(isinstance(item, dict) for item in items):
+            raise ValueError("expected a list of {bbox: [x, y, width, height], category_id: ...}")
+        items = [item for item in items if not _is_crowd(item)]
+        if len({str(item.get("image_id")) for item in items}) > 1:
             raise ValueError("has boxes of several images; expected those of one")
     for number, item in enumerate(items):
         with _reading(f"{file}, box {number}"):
@@ -141,12 +196,8 @@ def boxes_in(file: Path, category: int | str | None = None) -> list[list[float]]
 
 def edges(bbox: Sequence[float]) -> list[float]:
     """Left, top, right, bottom of COCO's box [x, y, width, height]. Raises ValueError unless it has four numbers."""
-    x, y, width, height = bbox
+    x, y, width, height = map(float, bbox)
     return [x, y, x + width, y + height]
-
-
-def _instances(folder: Path) -> Path:
-    return folder.absolute().parent / "annotations" / f"instances_{folder.absolute().name}.json"
 
 
 @contextmanager
@@ -162,7 +213,7 @@ def _reading(where: Path | str) -> Iterator[None]:
 
 def _read(file: Path, parse: Callable[[str], Any] = parse_json) -> Any:
     with _reading(file):
-        return parse(read_plain(file, LARGEST).decode())
+        return parse(read_plain(file, LARGEST).decode("utf-8-sig"))
 
 
 def _images(folder: Path) -> dict[str, str]:

@@ -19,7 +19,7 @@ from phd_exp.records.dataset import SPLITS, sha256
 from phd_exp.records.detections import Detection, line_of
 from phd_exp.records.errors import UNPRINTABLE, DatasetError, gist, listed, shown
 from phd_exp.records.files import checksum, read_jsonl
-from phd_exp.records.foreign import Entry, format_of
+from phd_exp.records.foreign import Entry, expected_in, format_of
 from phd_exp.records.parsing import parse_json
 from phd_exp.records.scenes import Pose, Split
 
@@ -103,12 +103,11 @@ def annotations(folder: Path) -> tuple[list[Path], Callable[[Path], Iterator[Ent
 def _entries(folder: Path) -> Iterator[Entry]:
     path = folder / "metadata.jsonl"
     try:
-        lines = read_jsonl(path, str.strip, sealed=True)
+        lines = read_jsonl(path, lambda text: text.removeprefix("\ufeff").strip(), sealed=True)
+    except FileNotFoundError:
+        raise DatasetError(f"{folder}: {expected_in(folder)}") from None
     except OSError as error:
-        raise DatasetError(
-            f"{path}: cannot be read ({error.strerror}); expected one JSON object a line, "
-            "see `Your own images` in README.md"
-        ) from None
+        raise DatasetError(f"{path}: cannot be read ({error.strerror}); expected one JSON object a line") from None
     for number, text in enumerate(lines, start=1):
         where = f"{path}, line {number}"
         try:

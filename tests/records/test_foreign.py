@@ -205,7 +205,7 @@ BAD = [
     (coco(lambda content: content["camera"].update(k1=0.1)), "annotation 1: k1: a line describes no lens"),
     (coco(lambda content: content["annotations"][0].update(bbox=[1, 2, 3])), "annotation 0: cannot be read"),
     (coco(lambda content: content["annotations"][0].update(bbox=[1, 2, 0, 3])), "annotation 0: box=.* positive size"),
-    (coco(lambda content: content["annotations"][0].update(image_id=1)), "annotation 0: .*1 is missing"),
+    (coco(lambda content: content["annotations"][0].update(image_id=1)), "annotation 0: .*'1' is missing"),
     (coco(lambda content: content["annotations"][0].update(position=[1, 2])), "annotation 0: cannot be read"),
     (coco(lambda content: content["images"][1].update(file_name="../b.png")), "file_name='../b.png' leaves"),
 ]  # fmt: skip
