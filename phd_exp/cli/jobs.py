@@ -21,6 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from phd_exp.cli import conf_folder
 from phd_exp.cli.frame import Ending, Stopped, ending_with, failure, print_errors, stopping_on_signals
 from phd_exp.cli.help import OF_VERB
+from phd_exp.cli.paths import quoted
 from phd_exp.records.errors import ConfigError, RunError, nearest
 from phd_exp.records.processes import usable_cores
 
@@ -151,7 +152,7 @@ def composed(overrides: list[str], config_dir: str | Path | None = None) -> dict
 
 
 def _options_last(words: list[str]) -> list[str]:
-    """The words with Hydra's options after the overrides; its parser wants the overrides in one piece.
+    """The words with paths quoted, and Hydra's options after the overrides; its parser wants these in one piece.
 
     Raises ConfigError instead of the parser's usage message of several lines.
     """
@@ -162,7 +163,8 @@ def _options_last(words: list[str]) -> list[str]:
     parser = get_args_parser()
     parser.error = refuse  # type: ignore[method-assign]
     arguments = parser.parse_intermixed_args(words)
-    overrides, options = arguments.overrides, [word for word in words if word not in arguments.overrides]
+    options = [word for word in words if word not in arguments.overrides]
+    overrides = quoted(arguments.overrides, several=arguments.multirun)
     if arguments.multirun and any(word.startswith("experiment=") for word in overrides):
         overrides = list(map(_for_jobs_alone, overrides))
     return [*overrides, *options]

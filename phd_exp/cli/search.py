@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from phd_exp.cli.arguments import Arguments
 from phd_exp.cli.frame import print_errors
 from phd_exp.cli.jobs import composed
+from phd_exp.cli.paths import quoted
 from phd_exp.cli.train import run_name, task
 from phd_exp.records.errors import ConfigError, RunError, UserError, gist
 from phd_exp.records.files import read_plain, write_atomic
@@ -60,7 +61,8 @@ def main(words: list[str]) -> int:
         space = Space.model_validate(parse_yaml(read_plain(file).decode()))
     except (OSError, ValueError) as error:
         raise ConfigError(f"{file}: {gist(error)}; expected `space`, as in docs/guides/search.md") from None
-    fixed = [*space.overrides, *(word for word in words[1:] if word not in ours), "evaluation.held_out=true"]
+    given = [*space.overrides, *(word for word in words[1:] if word not in ours)]
+    fixed = [*quoted(given), "evaluation.held_out=true"]
     config = check(composed(fixed, arguments.config_dir))
     if config.data.n_held_out == 0:
         raise ConfigError("data.n_held_out: got 0; a search is judged by held-out samples, expected at least 1")

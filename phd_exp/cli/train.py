@@ -9,6 +9,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 
 from phd_exp.cli.jobs import Job, composed, launch
+from phd_exp.cli.paths import quoted
 from phd_exp.records.choices import PLAIN_RECIPE, RunName, has_influence, setting
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, RunError, shown
@@ -93,7 +94,7 @@ def trained(overrides: Sequence[str], config_dir: str | Path | None) -> "Trained
         raise ConfigError(
             f"overrides: got {shown(overrides)}; expected a list of words, such as [{shown(overrides)}]"
         )
-    words = list(overrides)
+    words = quoted(overrides)
     config = composed(words, config_dir)
     task(config, words, usable_cores())
     return TrainedRun(run_name(check(config), words).folder(Path(config["runs"])))

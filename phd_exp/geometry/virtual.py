@@ -119,7 +119,10 @@ def rays(
 def facing(
     K: Float[Tensor, "3 3"], boxes: Float[Tensor, "boxes 4"], S: int, largest_f: float
 ) -> tuple[Float[Tensor, "boxes 3 3"], Float[Tensor, " boxes"]]:
-    """R and f of the virtual cameras of boxes in the image of a pinhole: `VirtualCamera.of_box` as a graph."""
+    """R and f of the virtual cameras of boxes in the image of a pinhole: `VirtualCamera.of_box` as a graph.
+
+    f is NaN where that raises ValueError, and for K and boxes that are not finite.
+    """
     left, top, right, bottom = boxes.unbind(-1)
     pixels = [((left + right) / 2, (top + bottom) / 2), (left, top), (right, top), (left, bottom), (right, bottom)]
     places = (torch.stack([torch.stack(pixel, -1) for pixel in pixels], 1) - K[:2, 2]) / K.diagonal()[:2]
@@ -127,7 +130,9 @@ def facing(
     R = smallest_rotation(directions[:, 0] / directions[:, 0].norm(dim=-1, keepdim=True))
     corners = directions[:, 1:] @ R.mT
     half_width = (corners[..., :2] / corners[..., 2:]).abs().amax((1, 2)).clamp_min(S / (2 * largest_f))
-    return R, S / (2 * half_width)
+    nearest = R[:, 2, 2] - half_width * R[:, :2, 2].abs().sum(-1)  # z of a corner of the view in the real frame
+    is_view = (corners[..., 2] > 0).all(-1) & (nearest > 0) & half_width.isfinite()
+    return R, torch.where(is_view, S / (2 * half_width), torch.nan)
 
 
 def pixel_corners(

@@ -4,11 +4,11 @@ An exported graph is traced from it. The network computes in float32, everything
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 from torch.export import Dim
 
@@ -20,7 +20,7 @@ from phd_exp.inference.predictor import Predictor
 from phd_exp.models.heads import Prediction
 
 FOCAL_LENGTHS = (5.0, 9.0)  # range for the comparison with torch, in sides of the image
-NUMBER = Dim("n", min=1)
+NUMBER = Dim("n", min=0)
 BATCHES = (1, 7, 56)  # images in each batch of the comparison
 PHOTOGRAPHS = ((150, 150, 1), (180, 240, 7), (301, 199, 24))  # width, height and number of boxes
 
@@ -45,6 +45,11 @@ class Deployed(nn.Module, ABC):
         """The outputs after the raw numbers, in float64."""
         return answers(prediction)
 
+    def outputs(self, is_valid: Bool[Tensor, " batch"], raw: Tensor, answers: Iterable[Tensor]) -> tuple[Tensor, ...]:
+        """All outputs in float32; NaN in the rows of inputs that are not valid."""
+        values = (raw, *(value.float() for value in answers))
+        return tuple(torch.where(is_valid[(..., *[None] * (value.ndim - 1))], value, torch.nan) for value in values)
+
 
 class OfImages(Deployed):
     """Images (batch, side, side, 3) of the network's size, with the principal point in the middle, and f (batch,)."""
@@ -55,7 +60,7 @@ class OfImages(Deployed):
     def forward(self, image: UInt8[Tensor, "batch S S 3"], f: Float[Tensor, " batch"]) -> tuple[Tensor, ...]:
         raw = self.predictor.outputs(image, self.predictor.camera(f).f)
         answers = self.answers(self.predictor.predict(raw, f), image, f)
-        return (raw, *(value.float() for value in answers.values()))
+        return self.outputs((f > 0) & f.isfinite(), raw, answers.values())
 
     def cases(self) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Prediction]]:
         n, side = sum(BATCHES), self.predictor.side
@@ -82,7 +87,11 @@ class OfPhotographs(Deployed):
         image = area_means(sums(photograph), pixel_corners(K, R, f, self.predictor.side))
         raw = self.predictor.outputs(image, self.predictor.camera(f.float()).f)
         answers = self.answers(self.predictor.predict(raw, f.float()), photograph, K, boxes)
-        return (raw, *(value.float() for value in answers.values()))
+        left, top, right, bottom = boxes.unbind(-1)
+        height, width = photograph.shape[:2]
+        is_inside = (left < width) & (top < height) & (right > 0) & (bottom > 0)
+        is_valid = is_inside & (left < right) & (top < bottom) & f.isfinite() & (K.diagonal() > 0).all()
+        return self.outputs(is_valid, raw, answers.values())
 
     def answers(self, prediction: Prediction, *inputs: Tensor) -> dict[str, Tensor]:
         _, K, boxes = inputs

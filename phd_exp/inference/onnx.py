@@ -22,10 +22,11 @@ from phd_exp.records.runs import versions
 METADATA = "phd_exp"  # the key of the file's metadata: JSON with the run, the image size and `DESCRIPTIONS`
 DESCRIPTIONS = {
     "image": "(n, side, side, 3) uint8: RGB images of side x side pixels, principal point in the middle",
-    "f": "(n,) float32: focal length, pixels of these images",
+    "f": "(n,) float32: focal length, pixels of these images; all outputs are NaN unless it is positive and finite",
     "photograph": "(height, width, 3) uint8: one RGB image of any size, without distortion",
     "K": "(3, 3) float64: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] of the photograph, pixels",
-    "boxes": "(n, 4) float64: left, top, right, bottom of each object in the photograph, pixels",
+    "boxes": "(n, 4) float64: left, top, right, bottom of each object in the photograph, pixels; n may be 0. All "
+    "outputs are NaN for a box without area, reversed, outside the photograph, beyond 90 degrees, or not finite",
     "raw": "(n, k) float32: the outputs of the network; of an ensemble (n, members, k)",
     "mode": "(n, 3) float32: position of highest density, m; camera frame: x right, y down, z forward",
     "mean": "(n, 3) float32: expected position, m",

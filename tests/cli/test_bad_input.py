@@ -138,7 +138,7 @@ BAD_COMMANDS = [
     (["-m", "experiment=glob(nothing*)"], 2, ["experiment=glob(nothing*)", "not one combination"]),
     (["-m", "experiment=null"], 2, ["Config group override must be a string or a list. Got NoneType"]),
     (["logger.wandb.offline=false"], 2, ["logger.wandb.offline: got false, but wandb has no API key"]),
-    (FOLDER, 1, ["photos/train/metadata.jsonl: cannot be read (No such file"]),
+    (FOLDER, 1, ["photos/train: no such folder"]),
     (["data.root=file/renders"], 1, ["file/renders"]),
     (["runs=file/runs"], 1, ["file", "runs=DIR"]),
     (["-m", "runs=file/runs"], 1, ["file/runs/.sweep: Not a directory; mend that, and the same command resumes"]),

@@ -218,13 +218,23 @@ def test_a_decompression_bomb_is_one_line(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("kind", ["jpeg", "png", "tiff", "webp"])
-@pytest.mark.parametrize("orientation", [1, 3, 6])
+@pytest.mark.parametrize("orientation", [0, 1, 3, 6, 9])
 def test_an_orientation_is_neither_applied_nor_ignored(kind: str, orientation: int) -> None:
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = orientation
     content = saved(NOISE, kind, exif=exif)
-    if orientation == 1:
+    if orientation in (0, 1, 9):  # 0 and 9 mean nothing
         assert read_image(Path("a"), content).size == (40, 40)
         return
     with pytest.raises(DatasetError, match=rf"^a: has the EXIF orientation {orientation}.*mogrify -auto-orient"):
         read_image(Path("a"), content)
+
+
+def test_sixteen_bits_with_twelve_in_use_are_refused_instead_of_black() -> None:
+    """Of 16 bits the upper 8 are shown, and nothing is lost of a black image."""
+    ramp = np.arange(4096, dtype=np.uint16).reshape(64, 64)
+    with pytest.raises(DatasetError, match=r"^a: the largest of its 16-bit values is 4095; .* multiply .* by 16"):
+        read_image(Path("a"), saved(Image.fromarray(ramp), "png"))
+    shown = np.asarray(read_image(Path("a"), saved(Image.fromarray(16 * ramp), "png")))
+    np.testing.assert_array_equal(shown[..., 0], ramp >> 4)
+    assert not np.any(read_image(Path("a"), saved(Image.fromarray(0 * ramp), "png")))

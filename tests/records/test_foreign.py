@@ -10,11 +10,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from phd_exp.records.dataset import SPLITS
-from phd_exp.records.detections import Detection
+from phd_exp.records.detections import Detection, detection_of
 from phd_exp.records.errors import DatasetError, UserError
 from phd_exp.records.foreign import boxes_in
 from phd_exp.records.own_images import DetectionFolder, annotations, detections_in, observed
-from tests.support.foreign import BOP, COCO, P2, PEDESTRIAN, TURN, WRITERS
+from tests.support.foreign import BOP, COCO, P2, PEDESTRIAN, TURN, WRITERS, image
 
 
 @pytest.fixture
@@ -40,10 +40,10 @@ def test_bop_positions_project_as_its_equation_says(read: Callable, tmp_path: Pa
     """s p_i = K [R, t] p_m of the model's origin, p_i from the centre of a pixel; invisible objects are left out."""
     found = read("bop")
     pairs = [("0", 0), ("3", 0), ("3", 1)]
-    for detection, (image, number) in zip(found, pairs, strict=True):
-        t = np.array(BOP["scene_gt.json"][image][number]["cam_t_m2c"])
+    for detection, (name, number) in zip(found, pairs, strict=True):
+        t = np.array(BOP["scene_gt.json"][name][number]["cam_t_m2c"])
         np.testing.assert_allclose(np.array(detection.position) * 1000, t, rtol=1e-15)
-        u, v, s = np.reshape(BOP["scene_camera.json"][image]["cam_K"], (3, 3)) @ t
+        u, v, s = np.reshape(BOP["scene_camera.json"][name]["cam_K"], (3, 3)) @ t
         np.testing.assert_allclose(pixel(detection, 120, 90), (u / s + 0.5, v / s + 0.5), rtol=1e-12)
     assert [detection.file for detection in found] == [
         tmp_path / "test/000002/rgb" / name for name in ("000000.png", "000003.jpg", "000003.jpg")
@@ -88,6 +88,86 @@ def test_coco_boxes_cameras_and_positions(read: Callable) -> None:
     assert spoon.line.z is None
 
 
+@pytest.mark.parametrize(
+    ("annotations", "images", "folder"),
+    [
+        ("annotations/instances_val.json", "val", "val"),
+        ("annotations/instances_default.json", "images/default", "images/default"),
+        ("annotations/instances_default.json", "images/default", "."),
+        ("val/_annotations.coco.json", "val", "val"),
+        ("labels.json", "data", "."),
+        ("result.json", "images", "."),
+    ],
+    ids=["COCO", "CVAT, its images", "CVAT", "Roboflow", "FiftyOne", "Label Studio"],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_coco_is_read_in_the_folders_of_other_programs(
+    tmp_path: Path, annotations: str, images: str, folder: str, encoding: str
+) -> None:
+    content = json.loads(json.dumps(COCO))
+    for item in content["images"]:
+        image(tmp_path / images / item["file_name"])
+        item["file_name"] = f"images\\{item['file_name']}" if annotations == "result.json" else item["file_name"]
+    (tmp_path / annotations).parent.mkdir(exist_ok=True)
+    (tmp_path / annotations).write_text(json.dumps(content), encoding)
+    found = detections_in(tmp_path / folder)
+    assert [detection.file for detection in found] == [tmp_path / images / name for name in ("b.png", "a.png")]
+
+
+def test_coco_of_several_programs_means_the_same(tmp_path: Path) -> None:
+    """Identifiers and crowds as text; sizes as text, as numbers, or none."""
+    folder = WRITERS["coco"](tmp_path / "test")
+    expected = [detection.line for detection in detections_in(folder)]
+    content = json.loads(json.dumps(COCO))
+    for item, crowd in zip(content["annotations"], ("0", False, "1"), strict=True):
+        item |= {"image_id": str(item["image_id"]), "category_id": str(item["category_id"]), "iscrowd": crowd}
+    content["images"][0] |= {"width": "120", "height": 90.0}
+    content["images"][1] |= {"width": 0, "height": None}
+    (tmp_path / "annotations/instances_test.json").write_text(json.dumps(content))
+    assert [detection.line for detection in detections_in(folder)] == expected
+
+
+@pytest.mark.parametrize(("width", "height"), [(90, 120), (121, 90), (1200, 900)])
+def test_the_size_of_an_image_is_that_of_its_annotations(read: Callable, width: int, height: int) -> None:
+    _, spoon = read("coco")
+    assert spoon.focal_lengths_and_centre(120, 90)[0] == 110
+    said = f"annotation 1: is for images of 120 x 90 pixels; this image has {width} x {height};"
+    with pytest.raises(DatasetError, match=said):
+        spoon.focal_lengths_and_centre(width, height)
+
+
+@pytest.mark.parametrize("box", [[0.1, 0.1, 0.4, 0.5], [0, 0, 1, 1], [0.9, 0.9, 1.4, 1.3]])
+def test_a_box_in_units_of_the_image_is_refused(box: list[float]) -> None:
+    detection = detection_of(Path("a.png"), {"f": 100.0, "box": box})
+    with pytest.raises(DatasetError, match=r"a\.png: box=.* in units of the image; expected pixels"):
+        detection.box(120, 90)
+
+
+@pytest.mark.parametrize(("sensor", "images"), [("cam1", "rgb_cam1"), ("gray2", "gray2"), ("xyz", "gray_xyz")])
+def test_bop_of_several_sensors_is_read_as_each_of_them(tmp_path: Path, sensor: str, images: str) -> None:
+    scene = WRITERS["bop"](tmp_path / "test") / "000002"
+    plain = [detection.line for detection in detections_in(tmp_path / "test")]
+    for file in scene.glob("scene_*.json"):
+        file.rename(file.with_name(f"{file.stem}_{sensor}.json"))
+    (scene / "rgb").rename(scene / images)
+    found = [detection.line for detection in detections_in(tmp_path / "test")]
+    assert [line.file_name for line in found] == [line.file_name.replace("/rgb/", f"/{images}/") for line in plain]
+    assert [line.model_copy(update={"file_name": ""}) for line in found] == [
+        line.model_copy(update={"file_name": ""}) for line in plain
+    ]
+
+
+def test_a_folder_without_annotations_says_what_is_there_and_what_is_read(tmp_path: Path) -> None:
+    folder = tmp_path / "voc"
+    image(folder / "images" / "a.png")
+    (folder / "a.xml").touch()
+    with pytest.raises(DatasetError) as caught:
+        detections_in(folder)
+    assert str(caught.value).startswith(f"{folder}: no annotations; found a.xml, images/; expected metadata.jsonl, ")
+    layouts = ("*/scene_gt.json (BOP)", "label_2/*.txt (KITTI)", "../annotations/instances_voc.json", "labels.json")
+    assert all(layout in str(caught.value) for layout in layouts)
+
+
 def test_results_are_the_boxes_of_one_image(tmp_path: Path) -> None:
     def boxes(*items: dict[str, Any], category: int | None = None) -> list[list[float]]:
         (file := tmp_path / "boxes.json").write_text(json.dumps(items))
@@ -97,13 +177,17 @@ def test_results_are_the_boxes_of_one_image(tmp_path: Path) -> None:
     two = one | {"category_id": 2, "bbox": [0, 0, 5, 5]}
     assert boxes(one, two) == [[10, 20, 40.5, 60], [0, 0, 5, 5]]
     assert boxes(one, two, category=2) == [[0, 0, 5, 5]]
+    assert boxes(one, two | {"image_id": "3", "bbox": ["0", "0", "5", "5"]}, one | {"iscrowd": 1}) == boxes(one, two)
+    (tmp_path / "coco.json").write_text(json.dumps({"images": [{"id": 3}], "annotations": [one, two]}), "utf-8-sig")
+    assert boxes_in(tmp_path / "coco.json") == boxes(one, two)
     for items, category, line in [
         ((one, one | {"image_id": 4}), None, "has boxes of several images; expected those of one"),
         ((one, two), 3, "no box to predict: it has category_id 1, 2"),
         ((), None, "no box to predict: it is empty"),
         ((one, {"image_id": 3}), None, "box 1: cannot be read ..bbox. is missing"),
         ((one, one | {"bbox": [1, 2, 3]}), None, "box 1: cannot be read .not enough values"),
-        ((1,), None, "cannot be read"),
+        ((1,), None, "cannot be read .expected a list of .bbox: .x, y, width, height."),
+        ((one, one | {"bbox": ["1", "2", "three", "4"]}), None, "box 1: cannot be read .could not convert"),
     ]:
         with pytest.raises(DatasetError, match=line):
             boxes(*items, category=category)
@@ -206,6 +290,8 @@ BAD = [
     (coco(lambda content: content["annotations"][0].update(bbox=[1, 2, 3])), "annotation 0: cannot be read"),
     (coco(lambda content: content["annotations"][0].update(bbox=[1, 2, 0, 3])), "annotation 0: box=.* positive size"),
     (coco(lambda content: content["annotations"][0].update(image_id=1)), "annotation 0: .*'1' is missing"),
+    (coco(lambda content: content["images"][1].update(id="7")), "the id 7 is given twice"),
+    (coco(lambda content: content["annotations"][0].update(iscrowd="no")), "annotation 0: cannot be read .invalid"),
     (coco(lambda content: content["annotations"][0].update(position=[1, 2])), "annotation 0: cannot be read"),
     (coco(lambda content: content["images"][1].update(file_name="../b.png")), "file_name='../b.png' leaves"),
 ]  # fmt: skip
