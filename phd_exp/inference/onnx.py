@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import onnxruntime
 import torch
+from onnx import numpy_helper
 from torch import Tensor
 
 from phd_exp.distributions.level import PRECISIONS, level_energies
@@ -90,7 +91,24 @@ def graph(deployed: Deployed) -> Any:
     results = program.model.graph.outputs
     for value in (value for node in program.model.graph for value in node.outputs if value not in results):
         value.name = f"inner_{value.name}"  # the exporter names a mean within the network "mean" too
-    return program.model_proto
+    return _with_axes_from_the_front(program.model_proto)
+
+
+def _with_axes_from_the_front(model: Any) -> Any:
+    """The graph with positive axes of reductions, since onnxruntime ignores negative ones of an empty batch."""
+    graph = model.graph
+    ranks = {value.name: len(value.type.tensor_type.shape.dim) for value in (*graph.value_info, *graph.input)}
+    constants = {tensor.name: tensor for tensor in graph.initializer}
+    for node in (node for node in graph.node if node.op_type.startswith("Reduce") and len(node.input) > 1):
+        rank, axes = ranks[node.input[0]], constants[node.input[1]]
+        name = node.input[1] = f"{axes.name}_of_{rank}"
+        if name not in constants:
+            constants[name] = numpy_helper.from_array(numpy_helper.to_array(axes) % rank, name)
+            graph.initializer.append(constants[name])
+    used = {name for node in graph.node for name in node.input}
+    for unused in [tensor for tensor in graph.initializer if tensor.name not in used]:
+        graph.initializer.remove(unused)
+    return model
 
 
 def _names(deployed: Deployed) -> list[str]:

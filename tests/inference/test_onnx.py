@@ -106,3 +106,61 @@ def test_baselines_are_points(
     images = np.random.default_rng(0).integers(124, 136, (50, SIDE, SIDE, 3), dtype=np.uint8)
     (deviation,) = worst(made, images, np.linspace(600, 1000, 50, dtype=np.float32)).values()
     assert deviation.max() < 1e-6
+
+
+@pytest.fixture(scope="module")
+def sessions(composed: Callable[..., Any]) -> dict[str, Any]:
+    """The graphs of a baseline, of photographs and of images."""
+    from phd_exp.inference import onnx
+    from phd_exp.inference.deployed import OfImages, OfPhotographs
+
+    made = predictor(composed, ChartHead(DEPTH, Projected))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("jaxtyping.config.jaxtyping_disable", True)
+        graphs = {kind: onnx.graph(kind(made)).SerializeToString() for kind in (OfPhotographs, OfImages)}
+    return {kind.__name__: onnxruntime.InferenceSession(content) for kind, content in graphs.items()}
+
+
+PHOTOGRAPH = np.random.default_rng(0).integers(0, 256, (90, 120, 3), dtype=np.uint8)
+K = np.array([[150.0, 0, 60], [0, 150, 45], [0, 0, 1]])
+BOX = [20.0, 10, 70, 60]
+NO_BOXES = {
+    "no width": [20, 10, 20, 60],
+    "reversed": [70, 60, 20, 10],
+    "outside": [130, 10, 170, 60],
+    "above": [20, -50, 70, -1],
+    "NaN": [np.nan, 10, 70, 60],
+    "infinite": [20, 10, np.inf, 60],
+    "90 degrees from the axis": [-1e5, 10, 1e5, 60],
+}
+
+
+def test_a_graph_answers_no_boxes_with_nothing_and_boxes_that_are_none_with_nan(sessions: dict[str, Any]) -> None:
+    def answers(
+        boxes: list[list[float]], photograph: np.ndarray = PHOTOGRAPH, camera: np.ndarray = K
+    ) -> list[np.ndarray]:
+        given = {"photograph": photograph, "K": camera, "boxes": np.array(boxes, float).reshape(-1, 4)}
+        return sessions["OfPhotographs"].run(None, given)
+
+    alone = answers([BOX])
+    assert all(np.isfinite(value).all() for value in alone)
+    assert [value.shape for value in answers([])] == [(0, *value.shape[1:]) for value in alone]
+    for value, expected in zip(answers([*NO_BOXES.values(), BOX]), alone, strict=True):
+        assert np.isnan(value[:-1]).all()
+        np.testing.assert_array_equal(value[-1:], expected)
+    for photograph in (PHOTOGRAPH[:0], PHOTOGRAPH[:, :0]):
+        assert all(np.isnan(value).all() for value in answers([BOX], photograph))
+    for camera in (K * [[0], [1], [1]], K * np.nan, -K):
+        assert all(np.isnan(value).all() for value in answers([BOX], camera=camera))
+
+
+def test_a_graph_answers_no_images_with_nothing_and_impossible_focal_lengths_with_nan(
+    sessions: dict[str, Any],
+) -> None:
+    f = np.array([700, np.nan, 0, -700, np.inf], dtype=np.float32)
+    images = np.zeros((len(f), SIDE, SIDE, 3), dtype=np.uint8)
+    for value in sessions["OfImages"].run(None, {"image": images, "f": f}):
+        assert np.isfinite(value[0]).all()
+        assert np.isnan(value[1:]).all()
+    empty = sessions["OfImages"].run(None, {"image": images[:0], "f": f[:0]})
+    assert [value.shape for value in empty] == [(0, 3), (0, 3)]
