@@ -44,11 +44,11 @@ class PredictArguments(RunArguments):
     cy: float | None = None
     """row of the principal point, px; by default the middle"""
     camera: str | None = None
-    """instead of f=, a camera file of ROS or OpenCV, with the lens"""
+    """instead of f=, a camera file of ROS, OpenCV, Kalibr, COLMAP or another tool, with the lens"""
     box: Annotated[tuple[float, float, float, float], BOX] | None = None
     """LEFT,TOP,RIGHT,BOTTOM of the object, px; by default the whole image"""
     boxes: Path | None = None
-    """instead of box=, a file of COCO results with the boxes of many objects"""
+    """instead of box=, a file of COCO results, or of COCO, with the boxes of many objects"""
     out: Path | None = None
     """a folder for predictions.jsonl and a picture for each line; by default lines are printed"""
     groups: Literal["spread", "truncation", "focal_length"] | None = None
