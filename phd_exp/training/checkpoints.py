@@ -1,6 +1,7 @@
-"""Checkpoints that are complete or absent, and one when a signal arrives in the middle of an epoch."""
+"""Checkpoints that are complete or absent and name no foreign file, and one when a signal arrives during an epoch."""
 
 import io
+import os
 import signal
 import threading
 from pathlib import Path
@@ -12,18 +13,24 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins.io import CheckpointIO
 
+from phd_exp.records.errors import RunError
 from phd_exp.records.files import write_atomic
+from phd_exp.records.runs import RunFolder
 from phd_exp.training.network import load_checkpoint
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class AtomicCheckpoints(CheckpointIO):
-    """Writes a checkpoint to a temporary file in the same folder and renames it.
+    """The checkpoints of one run: written to a temporary file in the same folder and renamed, never naming a file
+    outside `checkpoints/` when read, and deleted inside the run's folder alone.
 
     Lightning's default writes to the system's folder for temporary files. Moving from there to another file system is
     a copy: a kill during the copy leaves half a checkpoint and a large stray file.
     """
+
+    def __init__(self, folder: RunFolder) -> None:
+        self.folder = folder
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         content = io.BytesIO()
@@ -34,13 +41,46 @@ class AtomicCheckpoints(CheckpointIO):
     def load_checkpoint(
         self, path: Any, map_location: Any = None, weights_only: bool | None = True
     ) -> dict[str, Any]:
-        content = load_checkpoint(Path(path), map_location)
-        # the ModelCheckpoint of the run, which monitors nothing, would delete the file it calls the best
-        states = {key: state for key, state in content.get("callbacks", {}).items() if "'monitor': None" not in key}
-        return content | {"callbacks": states}
+        return at_home(load_checkpoint(Path(path), map_location), self.folder.checkpoints.resolve())
 
     def remove_checkpoint(self, path: Any) -> None:
-        Path(path).unlink(missing_ok=True)
+        """Delete a checkpoint. Raises RunError for a file outside the run's folder, which is somebody else's."""
+        file = Path(path)
+        if not file.parent.resolve().is_relative_to(self.folder.path.resolve()):
+            raise RunError(f"{file}: not deleted, since it is outside {self.folder.path}; move it away yourself")
+        file.unlink(missing_ok=True)
+
+
+def at_home(content: Any, checkpoints: Path) -> Any:
+    """The content of a checkpoint, changed so that each path in it names a file directly in `checkpoints`.
+
+    Callbacks delete and upload the files that they find in a checkpoint, which a stranger may have written. Those of
+    a run that was moved are found again.
+
+    Examples:
+        >>> at_home({"best": "/old/checkpoints/best.ckpt", "monitor": "held_out/loss"}, Path("checkpoints"))
+        {'best': 'checkpoints/best.ckpt', 'monitor': 'held_out/loss'}
+    """
+    if isinstance(content, str) and _is_path(content):
+        name = Path(content).name
+        return str(checkpoints if name in ("..", checkpoints.name) else checkpoints / name)
+    if isinstance(content, dict):  # in place, which keeps its class
+        changed = {at_home(key, checkpoints): at_home(value, checkpoints) for key, value in content.items()}
+        content.clear()
+        content.update(changed)
+    if type(content) in (list, tuple, set):
+        return type(content)(at_home(value, checkpoints) for value in content)
+    return content
+
+
+def _is_path(text: str) -> bool:
+    """Whether a text leads from a root or a home, by an address, upwards, or to something that exists.
+
+    A single word that is the name of a folder here, such as `test`, may be anything else.
+    """
+    if text.startswith(("/", "~")) or "://" in text or ".." in Path(text).parts:
+        return True
+    return os.path.isfile(text) or ("/" in text and os.path.lexists(text))
 
 
 class StopBetweenBatches(Checkpoint):

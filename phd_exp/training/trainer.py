@@ -10,7 +10,7 @@ from lightning import Trainer
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar
 
-from phd_exp.records.errors import ConfigError, nearest
+from phd_exp.records.errors import ConfigError, nearest, shown
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.checkpoints import AtomicCheckpoints, StopBetweenBatches
 from phd_exp.training.config import RunConfig
@@ -59,7 +59,7 @@ def build_trainer(config: RunConfig, recorder: Recorder, callbacks: Sequence[Cal
         "devices": config.trainer.devices,
         "strategy": "ddp" if config.trainer.devices > 1 else "auto",
         # not the environment of a cluster, whose tasks are not the processes of a run
-        "plugins": [LightningEnvironment(), AtomicCheckpoints()],
+        "plugins": [LightningEnvironment(), AtomicCheckpoints(folder)],
         "precision": precision(config.trainer),
         "max_epochs": config.trainer.max_epochs,
         "logger": list(recorder.loggers),
@@ -92,14 +92,22 @@ def trainer_arguments(config: RunConfig) -> dict[str, Any]:
 
 
 def build_callbacks(config: RunConfig, folder: RunFolder) -> list[Callback]:
-    """The callbacks of the configuration; a ModelCheckpoint without a folder writes next to the run's own."""
+    """The callbacks of the configuration; those that write checkpoints write next to the run's own.
+
+    Raises ConfigError for what is no callback, and for one that writes elsewhere.
+    """
     found = []
     for name, node in config.callbacks.items():
         with naming(f"callbacks.{name}", node):
             callback = instantiate(node)
             if not isinstance(callback, Callback):
                 raise ValueError(f"makes a {type(callback).__name__}; expected a lightning.Callback")
-        if isinstance(callback, ModelCheckpoint) and callback.dirpath is None:
-            callback.dirpath = str(folder.checkpoints)
+        if getattr(callback, "dirpath", None) is not None:
+            raise ConfigError(
+                f"callbacks.{name}.dirpath: got {shown(node.get('dirpath'))}; expected null, since checkpoints are "
+                "written to the folder of the run"
+            )
+        if hasattr(callback, "dirpath"):
+            callback.dirpath = str(folder.checkpoints.resolve())
         found.append(callback)
     return found

@@ -10,14 +10,36 @@ import numpy as np
 import pytest
 import torch
 
+from phd_exp.cli import conf_folder
 from phd_exp.cli.train import run_name
 from phd_exp.data.cache import cached
+from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import check
 from tests.bad_input import images
-from tests.bad_input.place import Place
+from tests.bad_input.place import Place, spoil_checkpoint
 from tests.bad_input.table import LEARN, ONE, PREDICT, REPORT, Trap, trap
 
-LONGER = (*(word for word in LEARN if "max_epochs" not in word), "trainer.max_epochs=2")
+READY = sorted(file.stem for file in (conf_folder() / "callbacks").glob("*.yaml"))
+"""The callbacks that are ready to use."""
+OWN = """
+import os
+import lightning
+
+class Keeping(lightning.Callback):
+    best = []
+
+    def state_dict(self):
+        return {"best": self.best}
+
+    def load_state_dict(self, state):
+        self.best = state["best"]
+
+    def on_train_epoch_end(self, trainer, module):
+        for path in self.best:
+            if os.path.exists(path):
+                os.remove(path)
+"""
+"""A user's own callback that deletes what it has kept."""
 
 
 @pytest.fixture
@@ -26,30 +48,46 @@ def command(place: Place, phd_exp: Callable) -> Callable:
     return lambda *words: phd_exp(*(word.replace("RUN", run) for word in words))
 
 
-def go_on(place: Place, composed: Callable[..., dict[str, Any]]) -> None:
-    """Let the run look broken off after the first of two epochs."""
-    words = list(LONGER)
-    place.put_config(trainer__max_epochs=2)
-    place.put_json(place.run.status_file, state="interrupted")
-    place.run.path.rename(place.root / run_name(check(composed(*words)), words).folder(Path("runs")))
+def claimed(state: dict[str, Any], decoy: str) -> dict[str, Any]:
+    """A callback's state as a stranger may write it: whatever path it asks for is a decoy, and every score is bad."""
+    worst = torch.tensor(torch.inf)
+    paths = dict.fromkeys(("best_model_path", "kth_best_model_path", "last_model_path"), decoy)
+    scores = {"best_k_models": {decoy: worst}, "best_model_score": worst, "kth_value": worst}
+    return state | paths | scores | {"best": [decoy]}
 
 
-def test_a_resumed_checkpoint_removes_nothing(
+def test_a_resumed_checkpoint_deletes_nothing_outside_its_run(
     place: Place, command: Callable, composed: Callable[..., dict[str, Any]]
 ) -> None:
-    """Lightning removes what a checkpoint calls the best one before; the way out of the folder is hidden in it."""
-    place.put("diary", "dear")
-    go_on(place, composed)
-    content = torch.load(place.run.last_checkpoint, weights_only=True)
-    state = {"dirpath": str(place.run.checkpoints), "best_model_path": f"{place.run.checkpoints}/{'../' * 6}diary"}
-    assert Path(state["best_model_path"]).exists()
-    names = [name for name in content["callbacks"] if "ModelCheckpoint" in name]
-    place.put_checkpoint(callbacks={name: content["callbacks"][name] | state for name in names})
-    outcome = command(*LONGER)
+    """Lightning deletes what a checkpoint calls the best one before; the way out of the folder is hidden in it."""
+    place.put("own.py", OWN)
+    kinds = (f"callbacks=[{','.join(READY)}]", "+callbacks.own._target_=own.Keeping", "logger=csv")
+    common = [word for word in LEARN if "n_held_out" not in word and "logger" not in word]
+    words = [*common, "data.n_train=4", "data.n_held_out=2", "runs=strange", *kinds]
+    assert command(*words).status == 0
+    (path,) = place.root.glob("strange/*/*/*/seed*")
+    # the run looks interrupted after the first of two epochs
+    run, longer = RunFolder(path), [*words, "trainer.max_epochs=2"]
+    config = run.config()
+    config["trainer"]["max_epochs"] = 2
+    run.write_config(config)
+    place.put_json(run.status_file, state="interrupted")
+    longer.remove("trainer.max_epochs=1")
+    name = run_name(check(composed(*(word for word in longer if "own." not in word))), longer)
+    resumed = RunFolder(path.rename(place.root / name.folder(Path("strange"))))
+    states = torch.load(resumed.last_checkpoint, weights_only=True)["callbacks"]
+    up = f"{resumed.checkpoints.relative_to(place.root)}{'/..' * 6}"
+    decoys = [f"diary{number}" for number in range(len(states))]
+    for decoy, name in zip(decoys, states, strict=True):
+        place.put(decoy, "dear")
+        assert (place.root / f"{up}/{decoy}").exists()
+        home = {"dirpath": str(resumed.checkpoints.relative_to(place.root))} if "dirpath" in states[name] else {}
+        states[name] = claimed(states[name] | home, f"{up}/{decoy}")
+    spoil_checkpoint(resumed.last_checkpoint, callbacks=states)
+    outcome = command(*longer)
     assert outcome.status == 0, outcome.err
-    assert len(names) == 1
-    assert [row["epoch"] for row in place.run.metrics()] == [-1, 0, 1], "the run was resumed"
-    assert (place.root / "diary").read_text() == "dear"
+    assert [row["epoch"] for row in resumed.metrics()] == [-1, 0, 1], "the run was resumed"
+    assert [decoy for decoy in decoys if not (place.root / decoy).exists()] == []
 
 
 def test_a_report_neither_opens_checkpoints_nor_writes_through_links(place: Place, command: Callable) -> None:
