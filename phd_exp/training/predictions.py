@@ -32,6 +32,8 @@ MEANS = {
     "projected_precision": "projected_precision",
 }
 """Column -> the metric that is its mean."""
+TRAINING = ("loss", "projected_error_mm", "depth_error_mm", "nll", "depth_precision", "projected_precision")
+"""The metrics of training batches, of those that the model has."""
 UNRECORDED = ("row", "loss", "f_factor")
 
 

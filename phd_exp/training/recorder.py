@@ -12,10 +12,11 @@ from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
 from phd_exp.distributions.columns import Columns
+from phd_exp.records.errors import ConfigError, nearest, shown
 from phd_exp.records.files import write_atomic
 from phd_exp.records.runs import RunFolder, epoch_name
 from phd_exp.training.config.sections import EvaluationConfig
-from phd_exp.training.predictions import calibration_curves
+from phd_exp.training.predictions import TRAINING, calibration_curves
 
 CalibrationData = dict[str, dict[str, Any]]
 Draw = Callable[[CalibrationData, Path], None]
@@ -50,6 +51,8 @@ class Recorder(Checkpoint):
         self.begun = False
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        evaluated = [key.removeprefix("test/") for key in self.rows[min(self.rows)] if key.startswith("test/")]
+        require_monitored(trainer, evaluated)
         self.begun = True
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -107,6 +110,24 @@ def has_curves(epochs: int, evaluation: EvaluationConfig) -> bool:
     """
     wanted, half = evaluation.calibration_every_n_epochs, evaluation.every_n_epochs / 2
     return (epochs + half) // wanted > (epochs - half) // wanted
+
+
+def require_monitored(trainer: Trainer, evaluated: Sequence[str]) -> None:
+    """Raise ConfigError if a callback monitors what is not logged, before hours of training.
+
+    Callbacks of the user's own may log further metrics: with one of these, the others may monitor anything.
+    """
+    callbacks: list[Any] = trainer.callbacks  # type: ignore[attr-defined]
+    if not all(type(one).__module__.startswith(("lightning.", "phd_exp.")) for one in callbacks):
+        return
+    known = [f"held_out/{name}" for name in evaluated]
+    known += [f"train/{name}" for name in evaluated if name in TRAINING]
+    for one in callbacks:
+        if (monitor := getattr(one, "monitor", None)) is not None and monitor not in known:
+            raise ConfigError(
+                f"callbacks: {type(one).__name__} monitors {shown(monitor)}, which is not logged"
+                f"{nearest(str(monitor), known)}; expected one of {', '.join(known)}"
+            )
 
 
 def epoch_metrics(trainer: Trainer) -> dict[str, float]:

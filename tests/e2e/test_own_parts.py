@@ -20,6 +20,7 @@ from phd_exp.evaluation.parquet import read_table
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import CHOOSE, RunFolder
 from phd_exp.reports import figures
+from phd_exp.training.predictions import TRAINING
 from tests.support.own_parts import QUICK, write_own_parts
 
 RUNS = Path("runs")
@@ -91,6 +92,9 @@ def test_pretrained_weights_are_loaded_once(own: Callable, tmp_path: Path) -> No
         (["+logger.mine._target_=ownnet.Mine"], "logger.mine: makes a Mine; expected a Logger of Lightning ("),
         (["callbacks=early_stopping", "callbacks.early_stopping.monitor=test/loss"], "test samples choose nothing"),
         (["callbacks=early_stopping", "data.n_held_out=0"], "data.n_held_out > 0"),
+        (["callbacks=best_checkpoint", "+callbacks.best_checkpoint.dirpath=."], "got '.'; expected null, since checkpoi"),
+        (["callbacks=early_stopping", "callbacks.early_stopping.monitor=held_out/los"], "did you mean 'held_out/loss'?"),
+        (["callbacks=best_checkpoint", "callbacks.best_checkpoint.monitor=loss"], "'loss', which is not logged"),
         (["callbacks=lr_monitor"], "Cannot use `LearningRateMonitor` callback with `Trainer` that has no logger"),
         (
             ["+trainer.fast_dev_run=true"],
@@ -197,6 +201,7 @@ def test_callbacks_choose_by_held_out_samples(own: Callable) -> None:
     run = run_of(RUNS)
     losses = [row["held_out/loss"] for row in run.metrics() if "held_out/loss" in row]
     assert len(losses) < 40
+    assert {key for key in run.metrics()[-1] if key.startswith("train/")} == {f"train/{name}" for name in TRAINING}
     assert losses[-1] >= min(losses)
     assert run.best_checkpoint.name == "best.ckpt"
     table = read_table(run.held_out)
