@@ -92,8 +92,14 @@ def test_pretrained_weights_are_loaded_once(own: Callable, tmp_path: Path) -> No
         (["+logger.mine._target_=ownnet.Mine"], "logger.mine: makes a Mine; expected a Logger of Lightning ("),
         (["callbacks=early_stopping", "callbacks.early_stopping.monitor=test/loss"], "test samples choose nothing"),
         (["callbacks=early_stopping", "data.n_held_out=0"], "data.n_held_out > 0"),
-        (["callbacks=best_checkpoint", "+callbacks.best_checkpoint.dirpath=."], "got '.'; expected null, since checkpoi"),
-        (["callbacks=early_stopping", "callbacks.early_stopping.monitor=held_out/los"], "did you mean 'held_out/loss'?"),
+        (
+            ["callbacks=best_checkpoint", "+callbacks.best_checkpoint.dirpath=."],
+            "got '.'; expected null, since checkpoi",
+        ),
+        (
+            ["callbacks=early_stopping", "callbacks.early_stopping.monitor=held_out/los"],
+            "did you mean 'held_out/loss'?",
+        ),
         (["callbacks=best_checkpoint", "callbacks.best_checkpoint.monitor=loss"], "'loss', which is not logged"),
         (["callbacks=lr_monitor"], "Cannot use `LearningRateMonitor` callback with `Trainer` that has no logger"),
         (

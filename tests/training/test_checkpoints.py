@@ -58,7 +58,16 @@ def test_a_broken_checkpoint_is_one_line(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
 
 
-PATHS = ["/home/diary", "~/diary", "file:///home/diary", "../diary", "a/../../diary", "diary", "photos/diary", "photos/"]
+PATHS = [
+    "/home/diary",
+    "~/diary",
+    "file:///home/diary",
+    "../diary",
+    "a/../../diary",
+    "diary",
+    "photos/diary",
+    "photos/",
+]
 NO_PATHS = ["", ".", "held_out/loss", "photos", "min", "nothing_here", "a" * 5000, "a\0b"]
 
 
