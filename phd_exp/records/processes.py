@@ -14,6 +14,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from phd_exp.records.errors import one_line
+
 HOME = Path(__file__).resolve().parents[2]
 PATIENCE = 10.0  # seconds that a child gets to finish its work before it is killed
 
@@ -103,6 +105,12 @@ class Child:
             raise message
         return message
 
+    def was_killed(self) -> bool:
+        """Whether a signal has ended the process, or does so within a second."""
+        with suppress(subprocess.TimeoutExpired):
+            return self.process.wait(1.0) < 0
+        return False
+
     def _end(self) -> str:
         try:
             code = self.process.wait(PATIENCE)
@@ -149,8 +157,8 @@ def _of_the_cpu() -> str:
 
 
 def announce(message: str) -> None:
-    """Print one line to standard error."""
-    print(message, file=sys.stderr, flush=True)
+    """Print one line to standard error; names in it may come from a stranger's files."""
+    print(one_line(message), file=sys.stderr, flush=True)
 
 
 def duration(seconds: float) -> str:

@@ -46,16 +46,29 @@ def train_together(config: RunConfig, folder: Path, draw: Draw | None, threads: 
             while ranks:
                 for connection in wait(list(ranks)):
                     rank, child = ranks.pop(connection)
-                    results[rank] = child.receive()
-        except EOFError as death:
-            raise RunError(
-                f"rank {rank} of {world}: {death}; the others were stopped; the same command resumes from the last "
-                "checkpoint"
-            ) from None
+                    results[rank] = _received(child, rank, world)
+        except RuntimeError:
+            # the peer of a killed process fails too, and on a busy machine both are noticed at once
+            for rank, child in ranks.values():
+                if child.was_killed():
+                    _received(child, rank, world)
+            raise
         finally:
             for _, child in ranks.values():
                 child.process.kill()  # at once: Gloo would print that it lost a peer
     return results[0]
+
+
+def _received(child: Child, rank: int, world: int) -> dict[str, Any]:
+    """The results of a process. Raises its error, or RunError if it ended without one."""
+    try:
+        results: dict[str, Any] = child.receive()
+    except EOFError as death:
+        raise RunError(
+            f"rank {rank} of {world}: {death}; the others were stopped; the same command resumes from the last "
+            "checkpoint"
+        ) from None
+    return results
 
 
 def main() -> None:

@@ -8,11 +8,13 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from time import sleep
 
 import pandas as pd
 import pytest
 
 from phd_exp.records.runs import find_runs
+from phd_exp.training import ranks as ranks_module
 from tests.e2e.conftest import QUICK
 from tests.e2e.runs import only_run
 from tests.support.renders import wait_until
@@ -94,10 +96,20 @@ def killing_a_rank() -> Iterator[Callable[[Path, int], list[int]]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("place", [0, 1])
+@pytest.mark.parametrize(("place", "delay"), [(0, 0.0), (1, 0.0), (1, 3.0)])
 def test_one_killed_ends_all_and_the_same_command_goes_on(
-    train: Callable, tmp_path: Path, killing_a_rank: Callable, place: int
+    train: Callable,
+    tmp_path: Path,
+    killing_a_rank: Callable,
+    place: int,
+    delay: float,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """Also on a busy machine, where the parent looks only when the other process has lost its peer."""
+    wait = ranks_module.wait
+    monkeypatch.setattr(
+        ranks_module, "wait", lambda connections: [wait(connections), sleep(delay), wait(connections)][2]
+    )
     words = ("model=mae_vz", "logger=none", "trainer.max_epochs=12", *TOGETHER)
     ranks = killing_a_rank(tmp_path / "runs", place)
     outcome = train(*words)
