@@ -30,15 +30,17 @@ def parse_json(text: str) -> Any:
 def parse_yaml(text: str) -> Any:
     """The content of a YAML text: plain containers and values, never objects.
 
-    Raises ValueError for invalid YAML, a key given twice, too deep nesting, and an alias (`*name`): a few aliases can
-    expand to gigabytes, and this project writes none.
+    Raises ValueError for invalid YAML, a key given twice, too deep nesting, an integer beyond the range of floating
+    point, and an alias (`*name`): a few aliases can expand to gigabytes, and this project writes none.
     """
     try:
         return yaml.load(text, _PlainLoader)
     except RecursionError:
         raise ValueError("nested too deeply") from None
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:
         raise ValueError(str(error)) from None
+    except Exception as error:  # PyYAML raises any for a value that does not fit its tag, as `!!bool x`
+        raise ValueError(f"a value does not fit its tag ({type(error).__name__}: {error})") from None
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -49,10 +51,19 @@ class _PlainLoader(yaml.SafeLoader):
             raise ValueError(f"the alias *{self.peek_event().anchor} stands for another part; write it out")
         return super().compose_node(parent, index)
 
+    def construct_yaml_int(self, node: Any) -> int:
+        value = int(super().construct_yaml_int(node))
+        if abs(value) >= 10**MOST_DIGITS:  # in any base
+            raise ValueError(f"a whole number of more than {MOST_DIGITS} digits")
+        return value
+
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
         _once([(key, None) for key in keys])
         return super().construct_mapping(node, deep)
+
+
+_PlainLoader.add_constructor("tag:yaml.org,2002:int", _PlainLoader.construct_yaml_int)
 
 
 def _whole(digits: str) -> int:
