@@ -25,10 +25,11 @@ def main(words: list[str]) -> int:
     require_file(file, "network.onnx")
     predictor = loaded(arguments, "cpu")
     output_folder(file.parent)
-    from phd_exp.inference.deployed import BATCHES, PHOTOGRAPHS
+    from phd_exp.inference.deployed import PHOTOGRAPHS, batches
     from phd_exp.inference.onnx import TOLERANCE, export
 
-    numbers = ", ".join(str(n) for n in ([n for _, _, n in PHOTOGRAPHS] if arguments.photographs else BATCHES))
+    sizes = [n for _, _, n in PHOTOGRAPHS] if arguments.photographs else batches(predictor.side)
+    numbers = ", ".join(map(str, sizes))
     what = f"photographs with {numbers} boxes" if arguments.photographs else f"images in batches of {numbers}"
     print(f"{file}: converting the network to ONNX, then comparing it with torch on {what}", flush=True)
     deviation = export(predictor, file, arguments.coverage, arguments.photographs)

@@ -16,12 +16,11 @@ from phd_exp.data.areas import area_means, sums
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.geometry.virtual import facing, intrinsics, pixel_corners
 from phd_exp.inference.answers import LEVELS
-from phd_exp.inference.predictor import Predictor
+from phd_exp.inference.predictor import PIXELS, Predictor
 from phd_exp.models.heads import Prediction
 
 FOCAL_LENGTHS = (5.0, 9.0)  # range for the comparison with torch, in sides of the image
 NUMBER = Dim("n", min=0)
-BATCHES = (1, 7, 56)  # images in each batch of the comparison
 PHOTOGRAPHS = ((150, 150, 1), (180, 240, 7), (301, 199, 24))  # width, height and number of boxes
 
 
@@ -63,10 +62,11 @@ class OfImages(Deployed):
         return self.outputs((f > 0) & f.isfinite(), raw, answers.values())
 
     def cases(self) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Prediction]]:
-        n, side = sum(BATCHES), self.predictor.side
+        side = self.predictor.side
+        n = sum(numbers := batches(side))
         images = torch.from_numpy(pictures(n, side, side))
         f = (side * torch.linspace(*FOCAL_LENGTHS, n)).float()
-        for rows in torch.arange(n).split(list(BATCHES)):
+        for rows in torch.arange(n).split(numbers):
             raw = self.predictor.raw(images[rows].numpy(), f[rows])
             yield (images[rows], f[rows]), raw, self.predictor.predict(raw, f[rows])
 
@@ -119,6 +119,16 @@ class OfPhotographs(Deployed):
             raw = predictor.raw(np.stack([view.image for view in views]), known)
             inputs = torch.from_numpy(photograph), torch.from_numpy(K), torch.from_numpy(boxes)
             yield inputs, raw, predictor.predict(raw.double(), known.double())
+
+
+def batches(side: int) -> list[int]:
+    """The number of images in each batch of the comparison with torch, fewer for large images.
+
+    Examples:
+        >>> batches(224), batches(4096)
+        ([1, 7, 56], [1])
+    """
+    return [n for n in (1, 7, 56) if n == 1 or n * side**2 <= PIXELS]
 
 
 def answers(prediction: Prediction) -> dict[str, Tensor]:

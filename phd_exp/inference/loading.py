@@ -15,10 +15,10 @@ from phd_exp.models.heads import DistributionHead
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.choices import first_difference, has_influence
 from phd_exp.records.dataset import DatasetFolder
-from phd_exp.records.errors import ConfigError, RunError
+from phd_exp.records.errors import ConfigError, RunError, UserError, gist
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.config import RenderedConfig, RunConfig, check
-from phd_exp.training.config.targets import Trust
+from phd_exp.training.config.targets import Trust, custom_parts
 from phd_exp.training.network import build_regressor, load_checkpoint, require_same_shrinking
 
 WEIGHTS = "regressor."  # prefix of the network's weights in a checkpoint
@@ -94,8 +94,7 @@ def _load(folder: RunFolder, device: str, trust: Trust) -> Predictor:
     require_same_shrinking(folder, config)
     depth, constant_f = _constants(folder, config)
     place = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)
-    regressor = build_regressor(config, depth, is_new=False)
-    _load_weights(regressor, folder.best_checkpoint)
+    regressor = _regressor(folder, config, depth)
     status = folder.status()
     return Predictor(
         config=config,
@@ -129,16 +128,45 @@ def _constants(folder: RunFolder, config: RunConfig) -> tuple[DepthScale, float]
         raise RunError(f"{file}: not the constants of a run ({error})") from None
 
 
-def _load_weights(regressor: Regressor, checkpoint: Path) -> None:
-    """Load the network's weights from a checkpoint; only tensors are read."""
+def _regressor(folder: RunFolder, config: RunConfig, depth: DepthScale) -> Regressor:
+    """The network with the weights of a checkpoint, of which only tensors are read.
+
+    It is first built without memory, and must fit: a stored configuration may describe a network of any size.
+    """
+    weights = _weights(folder.best_checkpoint)
+    if not custom_parts(config.model_dump(mode="json")):  # the user's own networks may need their numbers
+        with torch.device("meta"):
+            _fill(_built(folder, config, depth), weights, folder.best_checkpoint, assign=True)
+    regressor = _built(folder, config, depth)
+    _fill(regressor, weights, folder.best_checkpoint)
+    return regressor
+
+
+def _built(folder: RunFolder, config: RunConfig, depth: DepthScale) -> Regressor:
+    try:
+        return build_regressor(config, depth, is_new=False)
+    except UserError:
+        raise
+    except Exception as error:  # parts that a stranger has named may raise any
+        reason = f"{type(error).__name__}: {gist(error)}"
+        raise ConfigError(f"{folder.config_file}: describes no network ({reason})") from error
+
+
+def _weights(checkpoint: Path) -> dict[str, Any]:
     if not checkpoint.exists():
         raise RunError(f"{checkpoint}: missing; the run has not trained a whole epoch yet")
-    content = load_checkpoint(checkpoint)
+    state = load_checkpoint(checkpoint).get("state_dict")
+    if not isinstance(state, dict):
+        raise RunError(f"{checkpoint}: not a checkpoint of this network (no state_dict)")
+    return {name.removeprefix(WEIGHTS): value for name, value in state.items() if str(name).startswith(WEIGHTS)}
+
+
+def _fill(regressor: Regressor, weights: dict[str, Any], checkpoint: Path, assign: bool = False) -> None:
     try:
-        state: dict[str, Any] = content["state_dict"]
-        regressor.load_state_dict(
-            {name.removeprefix(WEIGHTS): value for name, value in state.items() if name.startswith(WEIGHTS)}
-        )
+        for name, value in weights.items():
+            if value.nbytes > value.untyped_storage().nbytes():
+                raise ValueError(f"{name}: repeats numbers, which no trained weight does")
+        regressor.load_state_dict(weights, assign=assign)
     except Exception as error:  # torch raises many kinds for other weights, or none
         reason = " ".join(str(error).split())[:120]
         raise RunError(f"{checkpoint}: not a whole checkpoint of this network ({reason})") from None

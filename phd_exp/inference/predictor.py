@@ -33,6 +33,7 @@ if TYPE_CHECKING:  # imports of pyarrow
     from phd_exp.evaluation.parquet import Columns
 
 BATCH = 64
+PIXELS = BATCH * 512**2  # of the images that a network sees at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,9 +192,11 @@ class Predictor:
     def raw(
         self, images: UInt8[np.ndarray, "batch S S 3"], f: Float[Tensor, " batch"]
     ) -> Float[Tensor, "batch *members n_outputs"]:
-        """The raw numbers of the network, on the CPU, at most 64 images at a time; f in pixels of its images."""
+        """The raw numbers of the network, on the CPU, at most 64 images at a time, fewer large ones; f in pixels of
+        its images.
+        """
         known = self.camera(f.float().to(self.device)).f
-        n = BATCH // self.views
+        n = max(1, min(BATCH, PIXELS // self.side**2) // self.views)
         batches = zip(torch.from_numpy(images).split(n), known.split(n), strict=True)
         return torch.cat([self.outputs(image.to(self.device), f).cpu() for image, f in batches])
 

@@ -251,6 +251,12 @@ class Trap:
         return exec, (f"open({self.name!r}, 'w').close()",)
 
 
+def repeat(place: Place) -> None:
+    """A small file that names large weights."""
+    weights = torch.load(place.run.last_checkpoint, weights_only=True)["state_dict"]
+    place.put_checkpoint(state_dict=weights | {"regressor.last.bias": torch.zeros(1).expand(7)})
+
+
 def shrunk(place: Place) -> None:
     """As a packed archive, which could unfold without end."""
     import zipfile
@@ -274,6 +280,7 @@ CHECKPOINTS = [
     *checkpoint("a pipe", lambda place: images.pipe(place.run.last_checkpoint), r"not a whole checkpoint \(a pipe or a device; .*\); .*"),
     *checkpoint("weights of another network", lambda place: place.put_checkpoint(state_dict={"regressor.last.bias": torch.zeros(7)}), r"not a (whole )?checkpoint of this (network|run) \(.*"),
     *checkpoint("weights that are none", lambda place: place.put_checkpoint(state_dict=[1, 2]), r"not a (whole )?checkpoint of this (network|run) \(.*"),
+    *checkpoint("weights that repeat one number", repeat, r"not a whole checkpoint of this network \(regressor\.last\.bias: .*\)")[:2],
     checkpoint("an epoch that never was", lambda place: place.put_checkpoint(epoch=10**12), r"not a checkpoint of this run \(epoch 1000000000000 of 1\); .*")[2],
     checkpoint("an epoch of text", lambda place: place.put_checkpoint(epoch="one"), r"not a checkpoint of this run \(epoch 'one' of 1\); .*")[2],
     checkpoint("loops of another trainer", lambda place: place.put_checkpoint(loops={"fit_loop": 3}), r"not a checkpoint of this run \(.*\); .*")[2],
@@ -288,6 +295,9 @@ STORED = [
     *stored("a variable of the environment", r"data\.folder: got '\$\{oc\.env:HOME\}'; expected a value, .*", data__folder="${oc.env:HOME}"),
     *stored("a resolver", r"backbone\.depth: got '\$\{oc\.decode:18\}'; expected a value, .*", backbone__depth="${oc.decode:18}"),
     *stored("an image without end", r"data\.image_size: got 1000000; expected to be less than or equal to 4096", data__image_size=1_000_000),
+    *stored("an abstract class", r"(backbone: .*|runs/.*/config\.yaml: describes no network \(.*\))", backbone={"_target_": "phd_exp.models.backbones.Backbone"}),
+    *stored("an abstract head", r"(model\.head: .*|runs/.*/config\.yaml: describes no network \(.*\))", model__head={"_target_": "phd_exp.models.heads.Head"}),
+    *stored("a network larger than its weights", r"runs/.*/last\.ckpt: not a whole checkpoint of this network \(.*\)", backbone={"_target_": "phd_exp.models.locating.Locating", "depth": 50, "width": 64_000, "stride": 4, "channels": 64_000}),
     *stored("a wrong type", r"data: got 'x'; expected a valid dictionary.*", data="x"),
     *stored("keys that are no text", r"evaluation\.1: .*[Kk]eys? .*", evaluation={"calibration_window": 200, "calibration_every_n_epochs": 10, 1: 2}),
     Bad("stored configuration: gone", lambda place: place.run.config_file.unlink(), ONE, r"runs/.*seed0-.*: no run; expected a folder with config\.yaml and .*"),

@@ -71,6 +71,9 @@ def test_trust_is_given_to_packages() -> None:
 
 def test_any_keyword_fits_a_function_of_any_keywords() -> None:
     assert check_target({"_target_": "builtins.dict", "anything": 1}, None)
+    for key in ("_recursive_", "_convert_", "_args_"):  # Hydra would read them, and build other objects
+        with pytest.raises(PydanticCustomError, match=f"^{key}: unknown key"):
+            check_target({"_target_": "builtins.dict", key: None}, None)
 
 
 def test_custom_parts_are_listed_with_their_files() -> None:

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Tag, TypeAdapter, Va
 from pydantic.errors import PydanticSchemaGenerationError
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from phd_exp.records.errors import complaint, in_user_code, nearest, shown
+from phd_exp.records.errors import complaint, in_user_code, install, nearest, shown
 
 OURS = tuple(f"phd_exp.{room}" for room in ("models", "losses", "optimizers", "geometry", "distributions"))
 KNOWN = (*OURS, "torch.optim", "lightning")
@@ -38,7 +38,7 @@ def check_target(node: dict[str, Any], trust: Trust, where: str = "") -> dict[st
         _check_nodes(path, value, trust)
         if key in parameters and not is_node(value):
             _check_value(path, value, parameters[key].annotation)
-        elif key not in parameters and not takes_any:
+        elif key not in parameters and (key.startswith("_") or not takes_any):  # Hydra's own, as `_recursive_`
             taken = f"{node['_target_']} takes {', '.join(parameters)}"
             raise _error(path, f"unknown key{nearest(key, parameters)}; {taken}")
     return node
@@ -96,7 +96,8 @@ def locate(name: Any, trust: Trust, where: str = "") -> Any:
     try:
         target = getattr(import_module(module), attribute)
     except Exception as error:  # a module of the user may raise any
-        raise _error(path, f"{name!r} cannot be imported ({in_user_code(error) or error})") from None
+        remedy = install(str(error)) if isinstance(error, ImportError) else ""
+        raise _error(path, f"{name!r} cannot be imported ({in_user_code(error) or error}){remedy}") from None
     if not callable(target):
         raise _error(path, f"{name!r} is a {type(target).__name__}; expected a class or function")
     # an imported name is somebody else's code
