@@ -22,7 +22,7 @@ from phd_exp.cli import conf_folder
 from phd_exp.cli.frame import Ending, Stopped, ending_with, failure, print_errors, stopping_on_signals
 from phd_exp.cli.help import OF_VERB
 from phd_exp.cli.paths import quoted
-from phd_exp.records.errors import ConfigError, RunError, nearest
+from phd_exp.records.errors import ConfigError, RunError, install, nearest
 from phd_exp.records.processes import usable_cores
 
 OMP = "OMP_NUM_THREADS"
@@ -193,7 +193,8 @@ def explain(error: Exception, config_name: str) -> str:
     pattern = r"Could not find '([^']+)/([^']+)' Available options in '[^']+': (.*?) Config search path"
     if choice := re.search(pattern, text):
         group, name, options = choice[1], choice[2], choice[3].split()
-        return f"{group}={name}: no such choice{nearest(name, options)}; expected one of {', '.join(options)}"
+        remedy = f"{nearest(name, options)}{install(name)}"
+        return f"{group}={name}: no such choice{remedy}; expected one of {', '.join(options)}"
     text = re.sub(r" Set the environment variable.*| Config search path:.*", "", text)
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 

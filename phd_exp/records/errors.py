@@ -18,6 +18,12 @@ UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 _PACKAGE = Path(__file__).parents[1]
 _LIBRARIES = (str(_PACKAGE), str(_PACKAGE.parent / "hydra_plugins"), sysconfig.get_path("stdlib"), "<")
 """Beginnings of the file names of this package, the standard library, and code without a file."""
+EXTRAS = {
+    "bpy": "render", "matplotlib": "report", "plotly": "report", "jinja2": "report", "onnx": "export",
+    "onnxscript": "export", "onnxruntime": "export", "optuna": "search", "tensorboard": "loggers",
+    "mlflow": "loggers", "timm": "timm", "joblib": "launchers", "submitit": "launchers", "ray": "ray",
+}  # fmt: skip
+"""Optional package -> the extra of phd_exp that installs it."""
 NAMED = 5  # names that a message lists
 
 
@@ -78,6 +84,13 @@ def complaint(key: str, problem: ErrorDetails) -> str:
     expected = problem["msg"].removeprefix("Value error, ").replace("Input should be", "expected to be")
     reason = given + expected.replace("expected to be a valid", "expected a valid")
     return f"{key}: {reason}" if key else reason
+
+
+def install(text: str) -> str:
+    """`; pip install 'phd_exp[EXTRA]'` if a message about a missing package names an optional one, else empty."""
+    words = re.findall(r"[a-z0-9]+", text)
+    extra = next((EXTRAS[word] for word in words if word in EXTRAS), None)
+    return f"; pip install 'phd_exp[{extra}]'" if extra else ""
 
 
 def gist(error: BaseException) -> str:

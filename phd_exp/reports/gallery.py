@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from phd_exp.distributions.columns import PARAMETERS, from_columns
@@ -121,8 +120,7 @@ def _picture(row: Mapping[str, Any], source: Path | None) -> Picture:
     f, S = float(row["f"]), float(row["S"])
     curves = curves_of(row)
     outlines = [on_image(points, f, S) for points in curves.projected] if curves else []
-    with np.errstate(all="ignore"):  # a record may contain any number
-        on = [on_image(at[:2] / at[2], f, S) for at in (truth, mode)]
+    on = [on_image(at[:2] / at[2], f, S) for at in (truth, mode)]
     facts = _facts(row)
     image = load_image(source, str(row["file_name"])) if source else None
     return Picture(
@@ -213,9 +211,11 @@ def birds_eye_view(curves: LevelCurves, truth: np.ndarray) -> BirdsEye:
 
 def _ticks(low: float, high: float) -> list[tuple[float, str]]:
     """Two to five round numbers in an interval, with as many digits as distinguish them."""
-    found = MaxNLocator(5, steps=[1, 2, 5, 10], min_n_ticks=2).tick_values(low, high)
-    values = [float(value) for value in found if low <= value <= high]
-    digits = max(0, -math.floor(math.log10(values[1] - values[0]) + 1e-9))
+    least = (high - low) / 5
+    power = 10.0 ** math.floor(math.log10(least))
+    step = next((factor * power for factor in (1, 2, 5) if factor * power >= least), 10 * power)
+    digits = max(0, -math.floor(math.log10(step) + 1e-9))
+    values = [step * place for place in range(math.ceil(low / step), math.floor(high / step) + 1)]
     return [(value, f"{value:.{digits}f}".replace("-", "−")) for value in values]
 
 

@@ -18,7 +18,7 @@ from phd_exp.data.images import SHRINKING
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.models.backbones import Backbone, pooled
 from phd_exp.models.regressor import FocalLengthInput, Regressor
-from phd_exp.records.errors import ConfigError, RunError, gist, in_user_code
+from phd_exp.records.errors import ConfigError, RunError, gist, in_user_code, install
 from phd_exp.records.files import require_plain
 from phd_exp.records.processes import cpu_has_bfloat16
 from phd_exp.records.runs import RunFolder
@@ -70,8 +70,9 @@ def naming(key: str, node: dict[str, Any]) -> Iterator[None]:
             raise
         own = dict.fromkeys(custom_parts(node).values())
         files = ", ".join(file for file in own if "site-packages" not in file)
-        reason = place or gist(error.__cause__ or error) + (f" ({files})" if files else "")
-        raise ConfigError(f"{key}: {reason}") from None
+        cause = error.__cause__ or error
+        reason = place or gist(cause) + (f" ({files})" if files else "")
+        raise ConfigError(f"{key}: {reason}{install(str(cause)) if isinstance(cause, ImportError) else ''}") from None
 
 
 def f_factor(row: Int[Tensor, " batch"], f_error: float, epoch: int = 0) -> Float[Tensor, " batch"]:

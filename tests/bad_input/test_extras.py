@@ -1,0 +1,98 @@
+"""Without the packages of the extras each verb works, or names the extra that it lacks on one line."""
+
+import json
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from tests.bad_input.place import HANDMADE, Place
+from tests.bad_input.table import LEARN, ONE
+
+PACKAGES = {
+    "render": ("bpy",),
+    "report": ("matplotlib", "plotly", "jinja2"),
+    "launchers": (
+        "joblib",
+        "submitit",
+        "hydra_plugins.hydra_joblib_launcher",
+        "hydra_plugins.hydra_submitit_launcher",
+    ),
+    "export": ("onnx", "onnxscript", "onnxruntime"),
+    "search": ("optuna",),
+    "loggers": ("tensorboard", "tensorboardX", "mlflow"),
+    "timm": ("timm",),
+    "ray": ("ray", "hydra_plugins.hydra_ray_launcher"),
+}
+OTHERS = (*LEARN, "runs=others")
+SMALLEST = (*HANDMADE, "data.variant=new", "data.n_train=1", "data.n_held_out=0", "data.n_test=1", "data.batch_size=1")
+WORKS: dict[str, tuple[str, ...]] = {"report": ("report",), "train": OTHERS, "predict": ONE}
+"""The first two lack pictures, which they say."""
+LACKS: dict[str, tuple[tuple[str, ...], ...]] = {
+    "render": (("render", *SMALLEST), (*SMALLEST, "logger=none")),
+    "report": ((*ONE, "out=pictures"),),
+    "launchers": (
+        ("-m", *OTHERS, "seed=1,2", "hydra/launcher=joblib"),
+        ("-m", *OTHERS, "hydra/launcher=submitit_local"),
+    ),
+    "export": (("export", "run=RUN"),),
+    "search": (("search", "space.yaml", "trials=1", *OTHERS),),
+    "loggers": ((*LEARN, "runs=a", "logger=tensorboard"), (*LEARN, "runs=b", "logger=mlflow")),
+    "timm": ((*LEARN, "runs=c", "backbone._target_=timm.create_model"),),
+    "ray": (("-m", *OTHERS, "seed=1,2", "hydra/launcher=ray"),),
+}
+COMMANDS = [*WORKS.values(), *(words for several in LACKS.values() for words in several)]
+WITHOUT = """
+import contextlib, importlib.metadata, io, json, sys
+commands, absent = json.loads(sys.argv.pop())
+sys.modules.update(dict.fromkeys(absent))
+found = importlib.metadata.Distribution.from_name
+
+def from_name(name):
+    if name.lower() in absent:
+        raise importlib.metadata.PackageNotFoundError(name)
+    return found(name)
+
+importlib.metadata.Distribution.from_name = from_name
+from phd_exp.__main__ import main
+for words in commands:
+    streams = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(streams[0]), contextlib.redirect_stderr(streams[1]):
+        status = main(words)
+    print(json.dumps([status, *(stream.getvalue() for stream in streams)]))
+"""
+
+
+def test_the_table_has_every_extra() -> None:
+    extras = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    assert {*PACKAGES, "dev"} == set(extras)
+    assert PACKAGES.keys() == LACKS.keys()
+
+
+@pytest.mark.timeout(240)
+def test_without_the_packages_of_all_extras(place: Place) -> None:
+    """In a process of its own: this one has imported some of them."""
+    run = str(place.run.path.relative_to(place.root))
+    place.put("space.yaml", "space: {optimizer.lr: 'interval(0.001,0.01)'}\n")
+    commands = [[word.replace("RUN", run) for word in words] for words in COMMANDS]
+    absent = [name for names in PACKAGES.values() for name in names]
+    code = [sys.executable, "-c", WITHOUT, json.dumps([commands, absent])]
+    answer = subprocess.run(code, capture_output=True, text=True, cwd=place.root)
+    assert answer.returncode == 0, answer.stderr
+    outcomes = {words: json.loads(line) for words, line in zip(COMMANDS, answer.stdout.splitlines(), strict=True)}
+    for verb, words in WORKS.items():
+        status, out, err = outcomes[words]
+        assert (status, err) == (0, ""), (verb, err)
+        assert ("pip install 'phd_exp[report]'" in out) == (verb != "predict"), (verb, out)
+    assert "tables: report/tables" in outcomes[WORKS["report"]][1]
+    for extra, several in LACKS.items():
+        for words in several:
+            status, _, err = outcomes[words]
+            assert status in (1, 2), words
+            (line,) = err.splitlines()
+            assert line.startswith("error: "), words
+            assert f"pip install 'phd_exp[{extra}]'" in line, words
