@@ -3,9 +3,15 @@
 import sys
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from phd_exp.cli.arguments import Arguments
 from phd_exp.records.errors import UserError, writing
+from phd_exp.records.processes import announce
+
+if TYPE_CHECKING:
+    from phd_exp.reports.runs import Report
+    from phd_exp.reports.table import Table
 
 
 class ReportArguments(Arguments):
@@ -34,19 +40,25 @@ def _report(runs: Path, out: Path) -> None:
     # imports of seconds, which follow the check of the arguments
     from phd_exp.reports.files import all_tables, write_tables
     from phd_exp.reports.lines import run_lines
+    from phd_exp.reports.rehearsal import rehearsed
     from phd_exp.reports.runs import read_report
     from phd_exp.reports.terminal import print_report
 
     # on a terminal, one line names the run being measured
     line = "\r\x1b[Kmeasuring {}\r" if sys.stderr.isatty() else ""
-    report = read_report(
-        runs, out / "measured", lambda run: print(line.format(run), end="", file=sys.stderr, flush=True)
+    report = rehearsed(
+        read_report(runs, out / "measured", lambda run: print(line.format(run), end="", file=sys.stderr, flush=True))
     )
     tables = all_tables(report)
     print_report(report, tables)
-    if not report.runs:
-        return
-    print(f"tables: {write_tables(tables, run_lines(report), out)}")
+    if report.runs:
+        print(f"tables: {write_tables(tables, run_lines(report), out)}")
+        _draw(report, tables, out)
+    for note in report.notes:
+        announce(f"note: {note}")
+
+
+def _draw(report: "Report", tables: "list[Table]", out: Path) -> None:
     if not all(map(find_spec, ("matplotlib", "plotly", "jinja2"))):
         print("figures and site were not made: they need `pip install 'phd_exp[report]'`")
         return

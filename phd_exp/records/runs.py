@@ -41,6 +41,8 @@ from phd_exp.records.processes import held, machine
 
 LAST_EPOCH = 10**9
 HOME = "home"  # the unchanged test samples, among shifts
+SECTIONS = ("data", "model", "camera", "recipe", "backbone", "loss", "optimizer", "trainer", "evaluation")
+"""Sections that every configuration has."""
 LARGEST = MB  # bytes of a configuration or of a run's numbers
 PACKAGES = ("phd_exp", "torch", "torchvision", "lightning", "hydra-core", "numpy")
 """Packages on which numbers depend, whose versions are recorded."""

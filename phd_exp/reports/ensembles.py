@@ -12,7 +12,6 @@ from phd_exp.evaluation.predictions import ensemble_table, scalar_bands
 from phd_exp.evaluation.reference import Band
 from phd_exp.metrics.bootstrap import means
 from phd_exp.records.choices import in_words
-from phd_exp.reports.measured import Notes
 from phd_exp.reports.runs import Report, Run
 from phd_exp.reports.table import Table, TableCell, TableRow, file_stem
 
@@ -29,7 +28,11 @@ OF_A_LINE = (
 def ensemble_tables(report: Report) -> list[Table]:
     """A table for every preset with two seeds of one configuration, or with a record of eight views."""
     configurations = groupby(sorted(report.runs, key=_configuration), key=_configuration)
-    scored = [(named, Notes().attempt(partial(_scores, list(runs)))) for named, runs in configurations]
+    attempt = report.notes.attempt
+    scored = [
+        (named, attempt(partial(_scores, list(runs)), f"ensembles of {'/'.join(named)}: "))
+        for named, runs in configurations
+    ]
     return [
         Table(
             stem=file_stem("ensembles", preset),

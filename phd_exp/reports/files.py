@@ -4,6 +4,7 @@ import csv
 import io
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -56,7 +57,7 @@ OF_CONSTRAINTS = f"""\
 
 
 def all_tables(report: Report) -> list[Table]:
-    """The paper's tables, and all others for which there are runs."""
+    """The paper's tables, and all others for which there are runs; the report notes those that cannot be made."""
     makers = (
         paper_tables,
         heads_tables,
@@ -67,7 +68,8 @@ def all_tables(report: Report) -> list[Table]:
         fusion_tables,
         search_tables,
     )
-    return [table for make in makers for table in make(report)]
+    found = (report.notes.attempt(partial(make, report), f"{make.__name__}: ") or [] for make in makers)
+    return [table for tables in found for table in tables]
 
 
 def write_tables(tables: Sequence[Table], runs: Sequence[Mapping[str, Any]], out: Path) -> Path:

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -28,15 +29,19 @@ Found = TypeVar("Found")
 
 
 class Notes(list[str]):
-    """The problems of a run, a line each. This is the boundary of a run: no error in it ends the report."""
+    """Problems, a line each. This is the boundary of a run, search, table or figure: no error ends the report."""
 
-    def attempt(self, read: Callable[[], Found]) -> Found | None:
-        """The result of `read`; None if it raises any exception, which is noted in one line."""
+    def attempt(self, read: Callable[[], Found], what: str = "") -> Found | None:
+        """The result of `read`; None if it raises any exception, which is noted in one line that begins with `what`.
+
+        Numpy's warnings are not shown: a record may contain any number.
+        """
         try:
-            return read()
+            with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
+                return read()
         except Exception as error:
             kind = "" if isinstance(error, UserError) else f"{type(error).__name__}: "
-            line = one_line(f"{kind}{error}")[:500]
+            line = one_line(f"{what}{kind}{error}")[:500]
             if line not in self:
                 self.append(line)
             return None

@@ -13,7 +13,6 @@ from phd_exp.evaluation.parquet import read_table
 from phd_exp.records.files import remove_temporaries, write_atomic
 from phd_exp.reports.figures import LABELS, decades, draw_birds_eye, draw_identity, draw_on_image, encoded
 from phd_exp.reports.gallery import curves_of, images_folder, load_image
-from phd_exp.reports.measured import Notes
 from phd_exp.reports.paper import PUBLISHED
 from phd_exp.reports.runs import PROBABILISTIC, Report, Run
 from phd_exp.reports.table import file_stem
@@ -37,7 +36,7 @@ def write_figures(report: Report, folder: Path) -> list[str]:
         }
         plans |= {file_stem("level_curves", preset, run.data): partial(_level_curves, run) for run in runs}
         for name, draw in plans.items():
-            files = Notes().attempt(partial(_files, draw)) or {}  # an error affects this figure alone
+            files = report.notes.attempt(partial(_files, draw), f"figure {name}: ") or {}
             for kind, content in files.items():
                 write_atomic(folder / f"{name}.{kind}", content)
             names += [name] if files else []

@@ -11,9 +11,9 @@ from typing import Any, Literal
 from phd_exp.evaluation.parquet import Columns, read_table
 from phd_exp.evaluation.point_errors import COLUMNS, Estimate, MeanErrors, mean_errors
 from phd_exp.records.choices import flatten, has_influence
-from phd_exp.records.errors import one_line
+from phd_exp.records.errors import RunError, one_line
 from phd_exp.records.files import remove_temporaries
-from phd_exp.records.runs import CHOOSE, RunFolder, RunStatus, find_runs
+from phd_exp.records.runs import CHOOSE, SECTIONS, RunFolder, RunStatus, find_runs
 from phd_exp.records.searches import Search, read_searches
 from phd_exp.reports.measured import Measured, Notes, kept_or_measured, measure
 from phd_exp.reports.table import file_stem, printable
@@ -82,11 +82,15 @@ class Run:
 
 @dataclass(frozen=True)
 class Report:
-    """All runs and searches under a folder, sorted: read once for the terminal, the files and the pages."""
+    """All runs and searches under a folder, sorted: read once for the terminal, the files and the pages.
+
+    `notes` are the problems of tables, figures and searches, which belong to no page.
+    """
 
     folder: Path
     runs: tuple[Run, ...]
     searches: tuple[Search, ...] = ()
+    notes: Notes = field(default_factory=Notes)
 
     @property
     def presets(self) -> list[str]:
@@ -121,9 +125,13 @@ def read_report(runs: Path, kept: Path | None = None, progress: Callable[[str], 
 
 def _read_run(folder: RunFolder, kept: Path | None) -> Run:
     notes = Notes()
+    return notes.attempt(lambda: _whole_run(unreadable(folder, []), kept, notes)) or unreadable(folder, notes)
+
+
+def unreadable(folder: RunFolder, notes: Sequence[str]) -> Run:
+    """A run of which only the place is shown, and the reasons."""
     preset, data, model, name = map(printable, folder.path.parts[-4:])
-    run = Run(folder, preset, data, model, name)
-    return notes.attempt(lambda: _whole_run(run, kept, notes)) or replace(run, detail=notes[-1], notes=notes)
+    return Run(folder, preset, data, model, name, detail="; ".join(notes[-1:]), notes=notes)
 
 
 def _whole_run(run: Run, kept: Path | None, notes: Notes) -> Run:
@@ -135,6 +143,7 @@ def _whole_run(run: Run, kept: Path | None, notes: Notes) -> Run:
     values = notes.attempt(lambda: flatten(folder.config())) or {}
     config = {key: "" if value is None else str(value) for key, value in values.items()}
     rows = notes.attempt(folder.metrics) or []
+    notes.attempt(lambda: _require_whole(folder, values, rows, state))
     predictions = held_out = tested = tested_held_out = None
     if state == "finished" or folder.predictions.exists():
         predictions = notes.attempt(lambda: read_table(folder.predictions))
@@ -172,6 +181,20 @@ def _whole_run(run: Run, kept: Path | None, notes: Notes) -> Run:
         measured=measured,
         notes=list(dict.fromkeys([*notes, *measured.notes])),
     )
+
+
+def _require_whole(
+    folder: RunFolder, config: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], state: str
+) -> None:
+    """Raise RunError for half a file: a configuration without its last sections, or too few epochs."""
+    sections = {key.partition(".")[0] for key in config}
+    if config and (lacking := [name for name in SECTIONS if name not in sections]):
+        raise RunError(f"{folder.config_file}: incomplete, without {', '.join(lacking)}")
+    if state != "finished" or not folder.results_file.exists():
+        return
+    trained, last = folder.results().get("epochs"), max((row["epoch"] for row in rows), default=-1)
+    if isinstance(trained, int) and last + 1 < trained:
+        raise RunError(f"{folder.metrics_file}: incomplete, with {last + 1} of {trained} epochs")
 
 
 def _errors(table: Columns, estimates: Sequence[Estimate]) -> tuple[MeanErrors, float | None]:

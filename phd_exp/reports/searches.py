@@ -30,7 +30,7 @@ def _table(search: Search) -> Table:
         kind="searches",
         title=one_line(f"Search {search.name}: {counts}"),
         stub=("trial", "overrides"),
-        columns=(search.objective,),
+        columns=(one_line(search.objective),),
         groups=(tuple(_row(value, trial) for value, trial in best),),
         notes=(OF_A_SEARCH,),
         numbers=tuple(

@@ -21,7 +21,7 @@ OF_A_STAR = "* marks numbers that a terminal prints in bold."
 
 def print_report(report: Report, tables: Sequence[Table]) -> None:
     """Print all tables except details, missing runs, notes, and every run with its state."""
-    console = Console(width=max(WIDTH, Console().width), highlight=False)
+    console = Console(width=max(WIDTH, Console().width), highlight=False, markup=False, emoji=False)
     starred = not console.is_terminal
     tables = [table for table in tables if table.reading != "details"]
     for table in tables:
@@ -55,36 +55,40 @@ def _print_runs(console: Console, runs: Sequence[Run]) -> None:
             console.print()
 
 
+def _text(text: str, style: str = "", no_wrap: bool = False) -> Text:
+    """A text that may come from a record: no markup, and nothing that controls the terminal."""
+    return Text(one_line(text), style=style, no_wrap=no_wrap)
+
+
 def _print(console: Console, text: str, style: str = "") -> None:
-    # Text, not str: square brackets from a file are not markup
-    console.print(Text(text, style=style))
+    console.print(_text(text, style))
 
 
 def _print_command(console: Console, before: str, command: str) -> None:
-    console.print(Text(f"{before}: {command}"), soft_wrap=True)  # on one line, to be copied
+    console.print(_text(f"{before}: {command}"), soft_wrap=True)  # on one line, to be copied
 
 
 def _grid(table: Table, starred: bool) -> Grid:
     """The table drawn by rich; significantly best numbers are bold, and starred if the output has no bold."""
     grid = Grid(box=box.SIMPLE_HEAD, show_edge=False)
     for heading in table.stub:
-        grid.add_column(heading, overflow="fold", min_width=12)
+        grid.add_column(_text(heading), overflow="fold", min_width=12)
     for heading in table.columns:
-        grid.add_column(heading, justify="right")
+        grid.add_column(_text(heading), justify="right")
     for group in table.groups:
         for row in group:
-            cells = [*map(Text, row.stub), *(_cell(cell, starred) for cell in row.cells)]
+            cells = [*map(_text, row.stub), *(_cell(cell, starred) for cell in row.cells)]
             grid.add_row(*cells, end_section=row is group[-1])
     return grid
 
 
 def _cell(cell: TableCell, starred: bool) -> Text:
-    text = Text("*" if cell.bold and starred else "", style=TONES[cell.tone], no_wrap=True)
-    text.append(cell.ours, style="bold" if cell.bold else "")
+    text = _text("*" if cell.bold and starred else "", TONES[cell.tone], no_wrap=True)
+    text.append(_text(cell.ours, "bold" if cell.bold else ""))
     if cell.spread:
-        text.append(f" {cell.spread}")
+        text.append(" ").append(_text(cell.spread))
     if cell.below:
-        text.append(f"\n{cell.below}", style="dim")
+        text.append("\n").append(_text(cell.below, "dim"))
     return text
 
 
@@ -96,7 +100,7 @@ def _run_list(runs: Sequence[Run]) -> Grid:
     grid.add_column("state", overflow="fold")
     for run in runs:
         nll = NOTHING if run.nll is None else f"{run.nll:.2f}"
-        grid.add_row(Text(run.path), _error(run, "projected"), _error(run, "depth"), nll, Text(_state(run)))
+        grid.add_row(_text(run.path), _error(run, "projected"), _error(run, "depth"), nll, _text(_state(run)))
     return grid
 
 
@@ -108,4 +112,4 @@ def _error(run: Run, quantity: Quantity) -> str:
 def _state(run: Run) -> str:
     words = f"{run.state}: {run.detail}" if run.detail else run.state
     apart = "" if run.overrides is None else f"; overrides: {run.overrides}"
-    return one_line(words + apart)
+    return words + apart

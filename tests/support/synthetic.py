@@ -11,7 +11,7 @@ from phd_exp.distributions.huber import sample_whitened
 from phd_exp.distributions.point_estimate import PointEstimate
 from phd_exp.geometry.charts import Cartesian, DepthScale
 from phd_exp.records.choices import RunName
-from phd_exp.records.runs import RunFolder
+from phd_exp.records.runs import SECTIONS, RunFolder
 from phd_exp.training.predictions import columns, summary, write_parquet
 
 PRECISION = {"default": (30.0, 900.0), "occl": (12.0, 250.0), "scale": (9.0, 900.0), "occl_scale": (7.0, 200.0)}
@@ -87,7 +87,8 @@ def write_run(
     with folder.recording(data_manifest="0" * 16, overrides=overrides):
         spec = {"variant": data, "sensor_size": 224}
         where = {"root": str(root or runs / "renders"), "spec": spec}
-        folder.write_config({"seed": seed, "preset": preset, "data": where, "model": {"name": model}})
+        sections = {name: {"name": "any"} for name in SECTIONS} | {"data": where, "model": {"name": model}}
+        folder.write_config({"seed": seed, "preset": preset} | sections)
         folder.write_metrics(_history(summary(table), epochs))
         folder.write_results(summary(table))
         write_parquet(folder.predictions, table, known)

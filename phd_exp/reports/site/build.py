@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 from plotly.offline import get_plotlyjs
 
 from phd_exp.records.files import remove_temporaries, write_atomic
 from phd_exp.reports.measured import Measured, Notes
-from phd_exp.reports.runs import Report, Run
+from phd_exp.reports.runs import Report, Run, unreadable
 from phd_exp.reports.site.overview import Drawn, overview_groups
 from phd_exp.reports.site.pages import as_script, comparison_page, overview_page, run_page, run_script
 from phd_exp.reports.site.run_charts import run_charts
@@ -51,12 +52,18 @@ def write_site(report: Report, tables: Sequence[Table], figures: Sequence[str], 
 def _write_run(site: Path, place: int, run: Run, several: bool) -> Drawn:
     """Write the files of a run inside its boundary: its page reports what cannot be drawn."""
     notes = Notes(run.notes)
-    drawn = Drawn.at(place, run, notes.attempt(lambda: run_charts(run)) or {})
-    texts = notes.attempt(lambda: (run_page(drawn, several), run_script(drawn)))
-    if texts is None or len(notes) > len(run.notes):
-        bare = replace(run, notes=notes, measured=Measured() if texts is None else run.measured)
-        drawn = Drawn.at(place, bare, {})
-        texts = run_page(drawn, several), run_script(drawn)
+    charts = notes.attempt(partial(run_charts, run)) or {}
+    whole, place_alone = replace(run, notes=notes), unreadable(run.folder, notes)
+    tries = [Drawn.at(place, whole, charts)]
+    tries += [Drawn.at(place, shown, {}) for shown in (replace(whole, measured=Measured()), place_alone)]
+    drawn, texts = next((one, texts) for one in tries if (texts := notes.attempt(partial(_texts, one, several))))
     write_text(site / "runs" / f"{run.slug}.html", texts[0])
     write_text(site / "data" / f"{run.slug}.js", texts[1])
     return drawn
+
+
+def _texts(drawn: Drawn, several: bool) -> tuple[str, str]:
+    """The page of a run and its data. Raises whatever the run would raise on the pages of all runs."""
+    overview_page([drawn.run], [], overview_groups([drawn]), [])
+    comparison_page([drawn.run])
+    return run_page(drawn, several), run_script(drawn)

@@ -4,7 +4,6 @@ import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
-from datetime import UTC
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ _ENVIRONMENT = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_ENVIRONMENT.filters |= {"moment": lambda at: f"{at.astimezone(UTC):%Y-%m-%d %H:%M} UTC", "duration": duration}
+_ENVIRONMENT.filters |= {"moment": lambda at: f"{at:%Y-%m-%d %H:%M} {at.tzname()}", "duration": duration}
 _ENVIRONMENT.globals |= {"score": SCORES.__getitem__, "headline": headline}
 
 

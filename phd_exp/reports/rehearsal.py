@@ -1,0 +1,45 @@
+"""Shows every run and every search alone, before all together: what one record breaks is broken for it alone."""
+
+import io
+import json
+from contextlib import redirect_stdout
+from dataclasses import asdict, replace
+from functools import partial
+
+from phd_exp.records.searches import Search
+from phd_exp.reports.files import all_tables, tidy
+from phd_exp.reports.lines import run_lines
+from phd_exp.reports.measured import Notes
+from phd_exp.reports.runs import Report, Run, unreadable
+from phd_exp.reports.searches import search_charts
+from phd_exp.reports.terminal import print_report
+
+
+def rehearsed(report: Report) -> Report:
+    """The report, in which a run that cannot be shown is unreadable, and such a search is missing and noted."""
+    runs = tuple(_shown(report, run) for run in report.runs)
+    searches = tuple(search for search in report.searches if _is_shown(report, search))
+    return replace(report, runs=runs, searches=searches)
+
+
+def _shown(report: Report, run: Run) -> Run:
+    notes = Notes()
+    notes.attempt(partial(_show, replace(report, runs=(run,), searches=(), notes=notes)))
+    return unreadable(run.folder, notes) if notes else run
+
+
+def _is_shown(report: Report, search: Search) -> bool:
+    notes = Notes()
+    notes.attempt(partial(_show, replace(report, runs=(), searches=(search,), notes=notes)))
+    report.notes.extend(f"search {search.name} is left out: {note}" for note in notes)
+    return not notes
+
+
+def _show(report: Report) -> None:
+    """Make everything that shows all runs and searches together, except their pages."""
+    tables = all_tables(report)
+    with redirect_stdout(io.StringIO()):
+        print_report(report, tables)
+    tidy([*run_lines(report)])
+    for search in report.searches:
+        json.dumps([asdict(chart) for chart in search_charts(search).values()])
