@@ -27,7 +27,14 @@ PACKAGES = {
     "ray": ("ray", "hydra_plugins.hydra_ray_launcher"),
 }
 OTHERS = (*LEARN, "runs=others")
-SMALLEST = (*HANDMADE, "data.variant=new", "data.n_train=1", "data.n_held_out=0", "data.n_test=1", "data.batch_size=1")
+SMALLEST = (
+    *HANDMADE,
+    "data.variant=new",
+    "data.n_train=1",
+    "data.n_held_out=0",
+    "data.n_test=1",
+    "data.batch_size=1",
+)
 WORKS: dict[str, tuple[str, ...]] = {"report": ("report",), "train": OTHERS, "predict": ONE}
 """The first two lack pictures, which they say."""
 LACKS: dict[str, tuple[tuple[str, ...], ...]] = {
