@@ -9,6 +9,7 @@ import pytest
 
 from phd_exp.cli import conf_folder
 from phd_exp.records.choices import flatten
+from phd_exp.records.runs import SECTIONS
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.training.build import build_augmentation
 from phd_exp.training.config import RunConfig, check
@@ -209,3 +210,8 @@ def test_older_records_without_several_views_are_valid(composed: Callable[..., d
         del config["data"][key]
     assert check(config).evaluation.multiview is None
     assert check(config) == check(composed()).model_copy(update={"evaluation": check(config).evaluation})
+
+
+def test_every_configuration_has_the_sections_that_a_report_expects() -> None:
+    required = {name for name, one in RunConfig.model_fields.items() if one.is_required()}
+    assert set(SECTIONS) == required - {"seed", "runs", "preset", "logger"}  # numbers and names; a logger may be none
