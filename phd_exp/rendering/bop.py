@@ -20,10 +20,11 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
+from phd_exp.records.cameras import CORNER
 from phd_exp.records.dataset import SPLITS, DatasetFolder
 from phd_exp.records.errors import writing
 from phd_exp.records.files import write_atomic
-from phd_exp.records.foreign import CORNER, METRE
+from phd_exp.records.foreign import METRE
 from phd_exp.records.images import content_of
 from phd_exp.records.scenes import SHAPES, SampleRecord
 from phd_exp.rendering import rays
