@@ -18,7 +18,7 @@ from phd_exp.metrics.ordered import Ordered, in_order_of
 
 SEED = 1
 _SHARES = torch.tensor([0.5, 0.025, 0.975], dtype=torch.float64)
-_AT_ONCE = 10**6  # samples simulated at a time
+_AT_ONCE = 200_000  # samples simulated at a time
 _DRAWS, _FEWEST_DRAWS = 400_000, 200
 """Positions drawn from all predictions, and at least from each."""
 REFERENCED = (
@@ -46,14 +46,19 @@ def calibrated_reference(distribution: ProjectedHuber, simulations: int = 4000) 
     Source: the simulated null distribution of a test statistic; coverage in tests/evaluation/test_reference.py.
     """
     (n,) = distribution.batch_shape
-    found = {name: [values] for name, values in _uniform(n, simulations).items()}
-    drawn = _scored(distribution, draws(distribution, max(_FEWEST_DRAWS, _DRAWS // n), SEED))
+    many = min(simulations, max(_FEWEST_DRAWS, _DRAWS // n))
+    scored = _scored(distribution, draws(distribution, many, SEED))
     groups, generator = groups_of(distribution), torch.Generator().manual_seed(SEED)
+    squared = squared_error_columns(distribution, distribution.mode)
+    variances = {name: squared[f"{name}_variance"] for name in ("depth", "projected")}
+    found: dict[str, list[Tensor]] = {name: [values] for name, values in _uniform(n, simulations).items()}
     for size in _sizes(n, simulations):
-        for name, values in _simulated(drawn, groups, size, generator).items():
+        levels = torch.rand(size, n, generator=generator)
+        of_groups = {"group_miscalibration": worst_group(levels, groups, torch.ones_like(levels))}
+        for name, values in (of_groups | _simulated(scored, variances, size, generator)).items():
             found.setdefault(name, []).append(values)
     bands = {name: torch.cat(values).double().quantile(_SHARES) for name, values in found.items()}
-    bands["inside_90"] = 100 / n * torch.from_numpy(stats.binom.ppf(_SHARES, n, 0.9))
+    bands["inside_90"] = 100 * torch.from_numpy(stats.binom.ppf(_SHARES, n, 0.9)) / n
     return {name: Band(*bands[name].tolist()) for name in REFERENCED}
 
 
@@ -63,21 +68,20 @@ def groups_of(distribution: ProjectedHuber) -> Tensor:
 
 
 def _scored(distribution: ProjectedHuber, drawn: Float[Tensor, "draws samples 3"]) -> Columns:
-    """What the scores need of each draw, and the predicted variances."""
+    """The scores of each draw, (samples, draws)."""
     crps = {"depth_crps_mm": MILLIMETRES * distribution.depth_crps(drawn[..., 2])}
-    return nees_columns(distribution, drawn) | squared_error_columns(distribution, drawn) | crps
+    columns = nees_columns(distribution, drawn) | squared_error_columns(distribution, drawn) | crps
+    return {name: column.mT.contiguous() for name, column in columns.items() if column.ndim > 1}
 
 
-def _simulated(drawn: Columns, groups: Tensor, size: int, generator: torch.Generator) -> Columns:
+def _simulated(scored: Columns, variances: Columns, size: int, generator: torch.Generator) -> Columns:
     """The scores of test sets that take one of the draws from each prediction."""
-    many, n = drawn["nees"].shape
-    chosen = torch.randint(many, (size, n), generator=generator)
-    found = {name: drawn[name].gather(0, chosen).mean(-1) for name in (*NEES, "depth_crps_mm")}
-    levels = torch.rand(size, n, generator=generator)
-    found["group_miscalibration"] = worst_group(levels, groups, torch.ones_like(levels))
-    for name in ("depth", "projected"):
-        variance, error = drawn[f"{name}_variance"], drawn[f"{name}_squared_error"].gather(0, chosen)
-        order = in_order_of(variance, {"variance": variance, "error": error})
+    n, many = scored["nees"].shape
+    chosen = torch.randint(many, (n, size), generator=generator)
+    columns = {name: column.gather(-1, chosen).mT for name, column in scored.items()}
+    found = {name: columns[name].mean(-1) for name in (*NEES, "depth_crps_mm")}
+    for name, variance in variances.items():
+        order = in_order_of(variance, {"variance": variance, "error": columns[f"{name}_squared_error"]})
         found[f"{name}_ence"] = ence_of(order, "variance", "error", ence_bins(order))
     return found
 

@@ -3,12 +3,15 @@
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import distribution_columns, draws, nees_columns
 from phd_exp.evaluation.reference import REFERENCED, calibrated_reference, groups_of
+from phd_exp.metrics.calibration import miscalibration_area, uniform_distance
 from phd_exp.metrics.calibration_scores import exact_scores
 from phd_exp.metrics.groups import worst_group
+from phd_exp.metrics.ordered import Ordered
 from tests.support.synthetic import calibrated, truths
 
 TIMES = 100
@@ -26,7 +29,7 @@ def scores_of(prediction: ProjectedHuber, xyz: torch.Tensor) -> dict[str, float]
 def test_calibrated_models_lie_in_the_interval_95_times_of_100() -> None:
     n = 60
     prediction = calibrated(truths(n, seed=1)[0], a=20.0, A=600.0, overconfidence=1.0, seed=3)
-    reference = calibrated_reference(prediction, simulations=200)
+    reference = calibrated_reference(prediction)
     inside, below = dict.fromkeys(REFERENCED, 0), dict.fromkeys(REFERENCED, 0)
     for xyz in draws(prediction, TIMES, seed=5):
         scores = scores_of(prediction, xyz)
@@ -38,6 +41,32 @@ def test_calibrated_models_lie_in_the_interval_95_times_of_100() -> None:
     for name in REFERENCED:
         assert inside[name] / TIMES == pytest.approx(0.95, abs=slack[0]), name
         assert below[name] / TIMES == pytest.approx(0.5, abs=slack[1]), name
+
+
+@pytest.mark.parametrize("n", [1, 60, 2000])
+def test_the_band_of_coverage_has_its_nominal_probability(n: int) -> None:
+    """Neither tail has more than 2.5 %, and each would with the next number."""
+    prediction = calibrated(truths(n, seed=1)[0], a=20.0, A=600.0, overconfidence=1.0, seed=3)
+    band = calibrated_reference(prediction, simulations=1)["inside_90"]
+    law, low, high = stats.binom(n, 0.9), round(n * band.low / 100), round(n * band.high / 100)
+    assert law.cdf(low - 1) <= 0.025 < law.cdf(low)
+    assert law.sf(high) <= 0.025 < law.sf(high - 1)
+    assert law.cdf(high) - law.cdf(low - 1) >= 0.95
+
+
+def test_bands_of_distances_have_their_nominal_probability() -> None:
+    n, times = 500, 4000
+    prediction = calibrated(truths(n, seed=1)[0], a=20.0, A=600.0, overconfidence=1.0, seed=3)
+    reference = calibrated_reference(prediction)
+    levels = torch.rand(times, n, generator=torch.Generator().manual_seed(7), dtype=torch.float64).sort().values
+    ordered = Ordered(levels, torch.ones_like(levels), {})
+    for name, values in {
+        "miscalibration_area": miscalibration_area(ordered),
+        "depth_pit_ks": uniform_distance(ordered),
+    }.items():
+        inside = (values >= reference[name].low) & (values <= reference[name].high)
+        assert float(inside.double().mean()) == pytest.approx(0.95, abs=0.0125), name
+    assert float(miscalibration_area(levels[3])) == pytest.approx(float(miscalibration_area(ordered)[3]))
 
 
 def test_overconfident_models_lie_above_it() -> None:
