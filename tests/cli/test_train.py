@@ -103,5 +103,5 @@ def test_one_word_instead_of_a_list_is_refused() -> None:
 
 
 def test_a_part_is_left_out_of_a_recipe_that_has_parts(composed) -> None:  # type: ignore[no-untyped-def]
-    for words in (["recipe=strong", "without=muon"], ["without=null"], []):
+    for words in (["recipe=strong", "without=muon"], []):
         _require_part(check(composed("preset=smoke", *words)), words)
