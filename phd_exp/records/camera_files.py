@@ -13,12 +13,10 @@ from phd_exp.records.parsing import parse_json, parse_yaml
 COLMAP = {
     "SIMPLE_PINHOLE": "f cx cy",
     "PINHOLE": "fl_x fl_y cx cy",
-    "SIMPLE_RADIAL": "f cx cy k1",
-    "RADIAL": "f cx cy k1 k2",
+    **{"SIMPLE_RADIAL": "f cx cy k1", "SIMPLE_RADIAL_FISHEYE": "f cx cy k1"},
+    **{"RADIAL": "f cx cy k1 k2", "RADIAL_FISHEYE": "f cx cy k1 k2"},
     "OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2",
     "FULL_OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6",
-    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
-    "RADIAL_FISHEYE": "f cx cy k1 k2",
     "OPENCV_FISHEYE": "fl_x fl_y cx cy k1 k2 k3 k4",
 }
 """The parameters of COLMAP's models, named as in nerfstudio's `transforms.json`."""

@@ -12,14 +12,15 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from phd_exp.records.camera_files import content_of, entries
-from phd_exp.records.errors import DatasetError, complaint, gist, listed, shown
+from phd_exp.records.errors import DatasetError, gist, listed, shown
 from phd_exp.records.files import LARGEST_RECORD, MB, read_plain
 from phd_exp.records.parsing import Record
 
 CORNER = 0.5  # px from the corner of the first pixel to its centre
+LARGEST = 1e6  # of any number in a camera file
 SHORTEST = 0.01  # focal length, px; a shorter one is probably in metres
 Model = Literal["plumb_bob", "rational_polynomial", "equidistant"]
 COEFFICIENTS = {
@@ -55,7 +56,6 @@ _COEFFICIENT, _LENS = re.compile(r"[kps]\d|xi|skew"), re.compile(r"distor|radial
 """Names that belong to a lens even where they are none of `NAMES`."""
 
 Size = Annotated[int, Field(gt=0)]
-Value = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Found = dict[str, tuple[str, Any]]
 """Quantity -> its key in the file, and its value."""
 
@@ -72,8 +72,8 @@ class Calibration(Record):
 
     width: Size | None
     height: Size | None
-    K: tuple[Value, ...]
-    D: tuple[Value, ...]
+    K: tuple[float, ...]
+    D: tuple[float, ...]
     model: Model
 
     @model_validator(mode="after")
@@ -87,22 +87,14 @@ class Calibration(Record):
 
 def read_camera(path: Path) -> Calibration:
     """The calibration in a camera file. Raises DatasetError, one line that names the file, if there is none."""
-    found: Found = {}
     try:
         # YAML takes seconds a megabyte
         text = read_plain(path, LARGEST_RECORD if path.suffix == ".json" else MB).decode("utf-8-sig")
         found = _found(content_of(text))
         (width, height), (model, D) = _size(found), _lens(found)
-        return Calibration.model_validate(
-            {"width": width, "height": height, "K": _matrix(found), "D": D, "model": model}
-        )
+        return Calibration(width=width, height=height, K=tuple(_matrix(found)), D=tuple(D), model=model)
     except (OSError, ValueError, RecursionError) as error:
-        reason = gist(error)
-        if isinstance(error, ValidationError):
-            problem = error.errors(include_url=False)[0]
-            name, *rest = map(str, problem["loc"] or ("",))
-            reason = complaint(".".join([found.get(name, (name,))[0], *rest]), problem)
-        raise DatasetError(f"{path}: {reason}; see `Lenses` in docs/guides/own_images.md") from None
+        raise DatasetError(f"{path}: {gist(error)}; see `Lenses` in docs/guides/own_images.md") from None
 
 
 def _found(content: Any) -> Found:
@@ -112,7 +104,8 @@ def _found(content: Any) -> Found:
     for key, value in entries(content):
         keys[key] = None
         name = _quantity(key, value)
-        value = _model(key, value) if name == "model" else value
+        if name == "model":
+            value = _model(key, value)
         if name and value != "" and found.setdefault(name, (key, value))[1] != value:
             raise ValueError(f"{found[name][0]} and {key} differ; expected the calibration of one camera alone")
     if not found.keys() & {"K", "fx"}:
@@ -131,17 +124,9 @@ def _quantity(key: str, value: Any) -> str | None:
     if quantity in ("K", "D") and isinstance(value, int | float):
         return None
     of_a_lens = _COEFFICIENT.fullmatch(name) or any(map(_LENS.search, [*outer, name] if is_list else outer))
-    if quantity is None and of_a_lens and _is_given(value):
+    if quantity is None and of_a_lens and not isinstance(value, str) and re.search("[1-9]", str(value)):
         raise ValueError(f"{key}: got {shown(value)}, a part of a lens that is not supported; expected zero")
     return quantity
-
-
-def _is_given(value: Any) -> bool:
-    """Whether it has a number other than zero."""
-    try:
-        return any(_numbers("", value))
-    except ValueError:
-        return False
 
 
 def _model(key: str, value: Any) -> str:
@@ -162,9 +147,12 @@ def _numbers(key: str, value: Any) -> list[float]:
     if isinstance(value, list):
         return [number for item in value for number in _numbers(key, item)]
     try:
-        return [float(value)]  # of a text too: 1e-05 is one to PyYAML
+        number = float(value)  # of a text too: 1e-05 is one to PyYAML
+        if abs(number) <= LARGEST:
+            return [number]
     except (TypeError, ValueError):
-        raise ValueError(f"{key}: got {shown(value)}; expected numbers") from None
+        pass
+    raise ValueError(f"{key}: got {shown(value)}; expected numbers up to {LARGEST:.0f}")
 
 
 def _size(found: Found) -> list[Any]:
@@ -194,7 +182,7 @@ def _matrix(found: Found) -> list[float]:
     return rows
 
 
-def _lens(found: Found) -> tuple[str, list[float]]:
+def _lens(found: Found) -> tuple[Any, list[float]]:
     """The model, and its coefficients, with zeros for those that the file leaves out."""
     D = _numbers(*found["D"]) if "D" in found else []
     named = {name: _numbers(*found[name])[0] for name in COEFFICIENTS["rational_polynomial"] if name in found}
@@ -202,33 +190,23 @@ def _lens(found: Found) -> tuple[str, list[float]]:
         named = {f"k{int(name[1:]) - 1}": value for name, value in named.items()}
     if D and any(named.values()):
         raise ValueError(f"{found['D'][0]} and {', '.join(named)} are two lenses; expected one")
-    model = _stated_model(found)
+    flag = str(found["fisheye"][1]).lower() in ("1", "1.0", "true") if "fisheye" in found else None
+    model = found.get("model", ("", "equidistant" if flag else None))[1]
     if model in COEFFICIENTS and not (named or "D" in found):
         raise ValueError(f"no coefficients of {model}: found {listed([key for key, _ in found.values()])}")
     if not any([*D, *named.values()]):
         model = model if model in COEFFICIENTS else "plumb_bob"
-    names = COEFFICIENTS.get(model := model or _model_of_coefficients(found, D, named), ())
+    model = model or _only_model(D, named, is_pinhole=flag is False or bool(named.keys() & {"p1", "p2"}))
+    names = COEFFICIENTS.get(model, ())
     given = dict(zip([*names, *map(str, range(len(D)))], D, strict=False)) if D else named
     if (len(D) == 3 and D[2]) or any(value for name, value in given.items() if name not in names):
-        raise ValueError(
-            f"coefficients: got {D or named}; expected {', '.join(names) or 'none'} for {model}, zero beyond"
-        )
+        expected = f"{', '.join(names) or 'none'} for {model}, zero beyond"
+        raise ValueError(f"coefficients: got {D or named}; expected {expected}")
     return model, [given.get(name, 0.0) for name in names]
 
 
-def _stated_model(found: Found) -> str | None:
-    _, model = found.get("model", ("", None))
-    return model or ("equidistant" if _is_fisheye(found) else None)
-
-
-def _is_fisheye(found: Found) -> bool | None:
-    """OpenCV's flag; None if the file has none."""
-    return str(found["fisheye"][1]).lower() in ("1", "1.0", "true") if "fisheye" in found else None
-
-
-def _model_of_coefficients(found: Found, D: list[float], named: dict[str, float]) -> str:
+def _only_model(D: list[float], named: dict[str, float], is_pinhole: bool) -> str:
     """The only model with coefficients of these names, or so many. Raises ValueError if there are two."""
-    is_pinhole = _is_fisheye(found) is False or named.keys() & {"p1", "p2"}
     if len(D) in (8, 12, 14) or (is_pinhole and "k6" in named):
         return "rational_polynomial"
     if len(D) == 5 or (is_pinhole and len(D) <= 4):

@@ -305,7 +305,7 @@ BAD: list[tuple[Any, str]] = [
     (ros(camera_matrix=matrix(MATRIX[:6], 2, 3)), "camera matrix: got [400.5"),
     (ros(camera_matrix=matrix([0.9, *MATRIX[1:4], 0.001, *MATRIX[5:]])), "expected [fx, 0, cx, 0, fy"),
     (ros(camera_matrix=matrix([900, 2, *MATRIX[2:]])), "expected [fx, 0, cx, 0, fy"),
-    (ros(camera_matrix=matrix([float("nan"), *MATRIX[1:]])), "camera_matrix.0: got nan; expected"),
+    (ros(camera_matrix=matrix([float("nan"), *MATRIX[1:]])), "camera_matrix: got nan; expected numbers"),
     (ros(camera_matrix="wide"), "camera_matrix: got 'wide'; expected numbers"),
     (
         ros(distortion_model="thin_plate"),
@@ -315,7 +315,7 @@ BAD: list[tuple[Any, str]] = [
     (ros(distortion_model="none"), "expected none for none"),
     (ros(distortion_coefficients=matrix([0.1] * 12, 1, 12), distortion_model=RATIONAL), "zero beyond"),
     (ros(distortion_coefficients=matrix([0.1] * 3, 1, 3)), "expected k1, k2, p1, p2, k3 for plumb_bob"),
-    (ros(image_width=0), "image_width: got 0; expected to be greater than 0"),
+    (ros(image_width=0), "width: got 0; expected to be greater than 0"),
     (ros(xi=1.2), "xi: got 1.2, a part of a lens that is not supported"),
     (ros(lens={"radial_terms": [0.1]}), "lens.radial_terms: got [0.1], a part of a lens"),
     ({"K": MATRIX, "D": FOUR}, "add distortion_model: plumb_bob (k1, k2, p1, p2) or equidistant"),
