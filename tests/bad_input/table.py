@@ -88,8 +88,8 @@ def foreign(form: str, name: str, word: str, said: str, without: str | None = No
     return Bad(f"{form}: {name}", spoil, ("predict", RUN, f"folder={form}/test", word), rf"{form}/test(/|: )?{said}")
 
 
-def camera(name: str, words: tuple[str, ...], said: str) -> Bad:
-    return Bad(f"intrinsics: {name}", nothing, (*ONE[:3], *words), said)
+def camera(name: str, words: tuple[str, ...], said: str, status: int = 1) -> Bad:
+    return Bad(f"intrinsics: {name}", nothing, (*ONE[:3], *words), said, status)
 
 
 def checkpoint(name: str, spoil: Callable[[Place], Any], said: str) -> list[Bad]:
@@ -232,8 +232,8 @@ CAMERAS = [
     camera("none", (), r"photos/test/0\.png: expected either f, or fx and fy \(focal length in pixels\), or camera \(a file\) alone"),
     camera("NaN", ("f=nan",), r"photos/test/0\.png: f: got nan; expected to be a finite number"),
     camera("beyond all numbers", ("f=1e400",), r"photos/test/0\.png: f: got inf; expected to be a finite number"),
-    camera("text", ("f=wide",), r"f: got 'wide'; expected a valid number, .*"),
-    camera("a box of three numbers", ("f=300", "box=1,2,3"), r"box: got '1,2,3'; expected box=LEFT,TOP,RIGHT,BOTTOM in pixels"),
+    camera("text", ("f=wide",), r"f: got 'wide'; expected a valid number, .*", 2),
+    camera("a box of three numbers", ("f=300", "box=1,2,3"), r"box: got '1,2,3'; expected box=LEFT,TOP,RIGHT,BOTTOM in pixels", 2),
 ]  # fmt: skip
 
 
