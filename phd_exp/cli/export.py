@@ -31,6 +31,8 @@ def main(words: list[str]) -> int:
     sizes = [n for _, _, n in PHOTOGRAPHS] if arguments.photographs else batches(predictor.side)
     numbers = ", ".join(map(str, sizes))
     what = f"photographs with {numbers} boxes" if arguments.photographs else f"images in batches of {numbers}"
+    if arguments.coverage:
+        predictor.guarantee(arguments.coverage)  # is refused, if at all, before the work that is printed
     print(f"{file}: converting the network to ONNX, then comparing it with torch on {what}", flush=True)
     deviation = export(predictor, file, arguments.coverage, arguments.photographs)
     print(f"{file}: {file.stat().st_size / 1e6:.1f} MB")
