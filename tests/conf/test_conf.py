@@ -40,10 +40,10 @@ def test_every_choice_of_every_group_is_a_valid_configuration(
     checked: Callable, words: tuple[str, ...], tmp_path: Path
 ) -> None:
     """The first of all groups, the second of all, and so on."""
-    (tmp_path / "part.glb").touch()
+    (tmp_path / "part.obj").touch()
     own = {
         "data=folder": ["data.folder=photos", "data.n_held_out=1"],
-        "data=object": [f"data.mesh={tmp_path}/part.glb"],
+        "data=object": [f"data.mesh={tmp_path}/part.obj"],
     }
     checked(*words, *(word for choice in words for word in own.get(choice, [])))
 
@@ -69,8 +69,8 @@ def test_defaults_are_the_authors_protocol(checked: Callable) -> None:
 
 
 def test_own_objects_have_more_images_wider_networks_and_other_backdrops(checked: Callable, tmp_path: Path) -> None:
-    (tmp_path / "part.glb").touch()
-    own = ("data=object", f"data.mesh={tmp_path}/part.glb")
+    (tmp_path / "part.obj").touch()
+    own = ("data=object", f"data.mesh={tmp_path}/part.obj")
     for words, expected in [
         (("preset=small", "recipe=strong", *own), (4800, 100, 24, 1.2, 0.75)),
         (("preset=small", *own), (4800, 100, None, 1.0, 0.0)),
