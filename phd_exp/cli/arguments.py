@@ -1,5 +1,6 @@
 """What the verbs without Hydra share: arguments `key=value`, places to write to, the predictions of a run."""
 
+import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -72,10 +73,15 @@ def require_file(out: Path, name: str) -> None:
         raise ConfigError(f"out={out}: is a folder; expected a file, such as {out / name}")
 
 
+Paths = Annotated[
+    tuple[Path, ...], BeforeValidator(lambda text: [text] if os.path.exists(text) else text.split(","))
+]
+
+
 class RunArguments(Arguments):
     """The run whose network a verb uses."""
 
-    run: Annotated[tuple[Path, ...], BeforeValidator(lambda text: [text] if Path(text).exists() else text.split(","))]
+    run: Paths
     """the folder of a run; several, separated by commas, or a folder of seeds are an ensemble"""
     recalibrate: bool = False
     """apply the temperatures that fit the run's held-out samples"""

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import model_validator
 
-from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_folder, predicted
-from phd_exp.records.detections import Detection, NumberOrName, detection_of
+from phd_exp.cli.arguments import Paths, RunArguments, four_numbers, loaded, output_folder, predicted
+from phd_exp.records.detections import Detection, NumberOrName, detections_of
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import write_atomic
 from phd_exp.records.foreign import boxes_in
-from phd_exp.records.own_images import detections_in
+from phd_exp.records.own_images import detections_in, images_in
 from phd_exp.records.runs import RunFolder
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
@@ -27,12 +27,12 @@ LONGEST_STEM = 50  # characters of an image's name in the name of its picture
 class PredictArguments(RunArguments):
     """The run, the images and their cameras; lengths in pixels of the image file."""
 
-    image: Path | None = None
-    """one image, with its camera as f=, fx= and fy=, or camera="""
+    image: Paths | None = None
+    """one image or several, separated by commas, with their camera as f=, fx= and fy=, or camera="""
     folder: Path | None = None
-    """images with a metadata.jsonl, or as BOP, KITTI or COCO, instead of image="""
+    """instead of image=, a folder of images: alone with their camera, or with a metadata.jsonl, BOP, KITTI or COCO"""
     object: NumberOrName | None = None
-    """with folder= or boxes=: BOP's obj_id, KITTI's type or COCO's category; by default all objects"""
+    """with annotations or boxes=: BOP's obj_id, KITTI's type or COCO's category; by default all objects"""
     f: float | None = None
     """focal length, px"""
     fx: float | None = None
@@ -63,19 +63,15 @@ class PredictArguments(RunArguments):
 
     @model_validator(mode="after")
     def one_source(self) -> "PredictArguments":
-        """Require either an image with its camera, or a folder with both."""
+        """Require either images with their camera, or a folder with both."""
         if (self.image is None) == (self.folder is None):
             raise ValueError(
-                "predict: expected either image=FILE with f=PIXELS or camera=FILE, or folder=DIR with metadata.jsonl"
-            )
-        if self.folder is not None and self.of_camera:
-            raise ValueError(
-                f"{next(iter(self.of_camera))}: belongs to image=FILE; for a folder, write it into each line of "
+                "predict: expected either image=FILE or folder=DIR with f=PIXELS or camera=FILE, or folder=DIR with "
                 "metadata.jsonl"
             )
-        if self.boxes and (self.box or self.folder):
-            raise ValueError("boxes: the boxes of image=FILE; expected no box= and no folder=")
-        if self.object is not None and self.image and not self.boxes:
+        if self.boxes and (self.box or self.folder or len(self.image or ()) > 1):
+            raise ValueError("boxes: the boxes of one image=FILE; expected no box=, no folder= and no further image")
+        if self.object is not None and (self.image or self.of_camera) and not self.boxes:
             raise ValueError("object: selects detections of folder=DIR or boxes=FILE; leave it out for one box")
         if self.groups and not self.coverage:
             raise ValueError("groups: guarantees a coverage; expected coverage=0.9, or another in (0, 1), too")
@@ -89,13 +85,7 @@ class PredictArguments(RunArguments):
 def main(words: list[str]) -> int:
     """Predict each detection; returns the exit status."""
     arguments = PredictArguments.parsed("predict", words)
-    out = arguments.out
-    if arguments.folder is not None:
-        detections = detections_in(arguments.folder, object_name=arguments.object)
-    else:
-        assert arguments.image is not None  # checked by `one_source`
-        boxes = [{"box": box} for box in boxes_in(arguments.boxes, arguments.object)] if arguments.boxes else [{}]
-        detections = [detection_of(arguments.image, arguments.of_camera | box) for box in boxes]
+    out, detections = arguments.out, _detections(arguments)
     if out is not None:
         if find_spec("matplotlib") is None:
             raise ConfigError("out: pictures need `pip install 'phd_exp[report]'`; without out= there is JSON alone")
@@ -113,6 +103,17 @@ def main(words: list[str]) -> int:
     for sighting in predicted(predictor, detections):
         print(json.dumps(answer(sighting, predictor.temperature, guarantee), allow_nan=False), flush=True)
     return 0
+
+
+def _detections(arguments: PredictArguments) -> list[Detection]:
+    camera, files = arguments.of_camera, arguments.image
+    if arguments.folder is not None:
+        if not camera:
+            return detections_in(arguments.folder, object_name=arguments.object)
+        files = images_in(arguments.folder)
+    assert files is not None  # checked by `one_source`
+    boxes = boxes_in(arguments.boxes, arguments.object) if arguments.boxes else [{}]
+    return detections_of(files, camera, boxes)
 
 
 def _write(predictor: "Predictor", detections: list[Detection], out: Path, curve: Any, guarantee: Any) -> None:

@@ -25,6 +25,7 @@ from phd_exp.records.images import content_of, pillow_warnings
 
 LEVELS = (50, 90, 99)  # per cent of the credible intervals of depth
 DIGITS = 8
+REPEATED = ("file_name", "box", "score", "category_id")  # of the detection
 NONE = "none: this model predicts a position alone"
 
 
@@ -106,9 +107,7 @@ def answer(sighting: Sighting, temperature: Temperature | None, guarantee: Any =
     the axis of the real camera (`quantiles_along`).
     """
     prediction, view, line = sighting.prediction, sighting.view, sighting.detection.line
-    named: dict[str, Any] = {"file_name": line.file_name}
-    if line.box is not None:
-        named["box"] = list(line.box)
+    named: dict[str, Any] = line.model_dump(include=set(REPEATED), exclude_none=True, mode="json")
     if isinstance(prediction, ProjectedHuber):
         named |= _distribution(prediction, view) | {"uncertainty": uncertainty(temperature)}
         if guarantee:

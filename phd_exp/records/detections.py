@@ -2,8 +2,9 @@
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from os.path import commonpath
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -52,6 +53,7 @@ class DetectionLine(Record):
         width, height: of the image, px; checked.
         camera: instead of these, a camera file, relative to the folder of the line's file.
         box: left, top, right, bottom of the detection, px; by default the whole image.
+        score, category_id: of the detector; `predict` repeats them.
         x, y, z: true position in the camera frame (x right, y down, z forward), m.
         scale, visibility, truncation: as in a rendered data set; recorded with the predictions.
         scene: lines with the same scene show the same object at the same time.
@@ -68,6 +70,8 @@ class DetectionLine(Record):
     height: Size | None = None
     camera: FileName | None = None
     box: tuple[Pixels, Pixels, Pixels, Pixels] | None = None
+    score: Number | None = None
+    category_id: NumberOrName | None = None
     x: Metres | None = None
     y: Metres | None = None
     z: Metres | None = None
@@ -166,17 +170,23 @@ class Detection:
         return left, top, right, bottom
 
 
-def detection_of(file: Path, values: Mapping[str, Any]) -> Detection:
-    """A detection in an image file, with values as in a line of `metadata.jsonl`.
+def detections_of(
+    files: Sequence[Path], camera: Mapping[str, Any], boxes: Sequence[Mapping[str, Any]] = ({},)
+) -> list[Detection]:
+    """The detections in image files of one camera, with values as in lines of `metadata.jsonl`: all boxes in each.
 
-    Raises DatasetError if the values are not a detection.
+    The names of the files begin where their folders differ. Raises DatasetError if the values are not a detection.
 
     Examples:
-        >>> detection_of(Path("photo.jpg"), {"f": 900.0}).focal_lengths_and_centre(640, 480)
+        >>> (detection,) = detections_of([Path("photo.jpg")], {"f": 900.0})
+        >>> detection.focal_lengths_and_centre(640, 480)
         (900.0, 900.0, 320.0, 240.0)
     """
-    line = line_of({"file_name": file.name, **values}, str(file))
-    return Detection(line, file, str(file), read_camera(Path(line.camera)) if line.camera else None)
+    folder = commonpath([file.absolute().parent for file in files])
+    named = [({"file_name": file.absolute().relative_to(folder).as_posix(), **camera}, file) for file in files]
+    lines = [(line_of(values | box, str(file)), file) for values, file in named for box in boxes]
+    calibration = read_camera(Path(camera["camera"])) if "camera" in camera else None
+    return [Detection(line, file, str(file), calibration) for line, file in lines]
 
 
 def line_of(values: Any, where: str) -> DetectionLine:

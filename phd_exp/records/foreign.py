@@ -167,9 +167,9 @@ def _is_crowd(item: dict[str, Any]) -> bool:
     return bool(int(item.get("iscrowd") or 0))  # also of "0"
 
 
-def boxes_in(file: Path, category: int | str | None = None) -> list[list[float]]:
-    """The boxes (left, top, right, bottom, px) of one image's COCO results, `[{"bbox": [...], ...}, ...]`, or of a
-    whole file of COCO.
+def boxes_in(file: Path, category: int | str | None = None) -> list[dict[str, Any]]:
+    """The `box` (left, top, right, bottom, px), `score` and `category_id` of each of one image's COCO results,
+    `[{"bbox": [...], ...}, ...]`, or of a whole file of COCO.
 
     Raises DatasetError if the file cannot be read, has boxes of several images, or none of the category.
     """
@@ -185,7 +185,8 @@ def boxes_in(file: Path, category: int | str | None = None) -> list[list[float]]
     for number, item in enumerate(items):
         with _reading(f"{file}, box {number}"):
             if category is None or str(item["category_id"]) == str(category):
-                found.append(edges(item["bbox"]))
+                given = {key: item[key] for key in ("score", "category_id") if key in item}
+                found.append({"box": edges(item["bbox"]), **given})
             else:
                 others.add(str(item["category_id"]))
     if not found:

@@ -19,6 +19,8 @@ from phd_exp.records.scenes import SampleRecord
 _LATER = (TiffImagePlugin, WebPImagePlugin, Jpeg2KImagePlugin)
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "JPEG2000")
 """Formats that are tried on a file, whatever its name. Pillow has more, such as EPS, whose code Ghostscript runs."""
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".ppm", ".pgm", ".pbm", ".jp2")
+"""Endings of their names, to find the images in a folder with other files."""
 RENDERED = ("PNG", "WEBP", "JPEG")
 LARGEST_IMAGE = 256 * MB  # bytes of an image file
 BROKEN = (

@@ -20,6 +20,7 @@ from phd_exp.records.detections import Detection, line_of
 from phd_exp.records.errors import UNPRINTABLE, DatasetError, gist, listed, shown
 from phd_exp.records.files import checksum, read_jsonl
 from phd_exp.records.foreign import Entry, expected_in, format_of
+from phd_exp.records.images import SUFFIXES
 from phd_exp.records.parsing import parse_json
 from phd_exp.records.scenes import Pose, Split
 
@@ -92,6 +93,16 @@ def detections_in(
     if not found or len(found) < (n or 0):
         raise DatasetError(f"{files[0]}: {n or 'some'} detections asked for{asked_by}, {len(found)} found")
     return found
+
+
+def images_in(folder: Path) -> list[Path]:
+    """The image files of a folder, sorted by name. Raises DatasetError if it has annotations, or no images."""
+    described = annotations(folder)[0][0]
+    if os.path.lexists(described):
+        raise DatasetError(f"{folder}: has annotations, {described}; expected images alone, or no f=, camera= and box=")
+    if files := sorted(file for file in folder.glob("*") if file.suffix.lower() in SUFFIXES):
+        return files
+    raise DatasetError(f"{folder}: no images; expected a folder with files *{', *'.join(SUFFIXES)}")
 
 
 def annotations(folder: Path) -> tuple[list[Path], Callable[[Path], Iterator[Entry]]]:

@@ -145,16 +145,39 @@ def test_boxes_of_one_photograph_are_predicted_as_single_ones(
 ) -> None:
     words = ("predict", f"run={run.path}", f"image={photos / '0.png'}", "f=300")
     boxes = [[5, 10, 55, 60], [20, 5, 40, 50]]
-    items = [{"image_id": 1, "category_id": place, "bbox": box} for place, box in enumerate(boxes)]
+    known = [{"score": 0.5, "category_id": 0}, {"category_id": 1}]
+    items = [{"image_id": 1, "bbox": box} | more for box, more in zip(boxes, known, strict=True)]
     (tmp_path / "boxes.json").write_text(json.dumps(items))
     found = read_lines(phd_exp(*words, "boxes=boxes.json").out)
-    for row, (x, y, w, h) in zip(found, boxes, strict=True):
+    for row, (x, y, w, h), more in zip(found, boxes, known, strict=True):
+        assert {key: row[key] for key in ("score", "category_id") if key in row} == more
         (alone,) = read_lines(phd_exp(*words, f"box={x},{y},{x + w},{y + h}").out)
         assert row["box"] == alone["box"]
         np.testing.assert_allclose(row["mode"], alone["mode"], rtol=1e-4)
     (of_category,) = read_lines(phd_exp(*words, "boxes=boxes.json", "object=0").out)
     assert of_category["box"] == found[0]["box"]
-    assert "expected no box= and no folder=" in phd_exp(*words, "boxes=boxes.json", "box=5,10,60,70").err
+    assert "expected no box=, no folder=" in phd_exp(*words, "boxes=boxes.json", "box=5,10,60,70").err
+    assert "no further image" in phd_exp(*words[:2], "image=0.png,1.png", "f=300", "boxes=boxes.json").err
+
+
+def test_images_of_one_camera_are_predicted_as_single_ones(phd_exp: Callable, run: RunFolder, tmp_path: Path) -> None:
+    """A folder needs no metadata.jsonl; images of several folders are named by theirs."""
+    names = ["a.png", "b.JPG"]
+    for folder in ("in", "more"):
+        (tmp_path / folder).mkdir()
+        for place, name in enumerate(names):
+            Image.new("RGB", (64 + 8 * place, 64), (90 * place, 0, 50)).save(tmp_path / folder / name)
+    (tmp_path / "in" / "notes.txt").write_text("no image")
+    camera = ("f=300", "box=5,10,60,60")
+    alone = [read_lines(phd_exp("predict", f"run={run.path}", f"image=in/{name}", *camera).out)[0] for name in names]
+    assert [row["file_name"] for row in alone] == names
+    for words in (("folder=in",), ("image=in/a.png,in/b.JPG",), ("image=in/a.png,more/b.JPG",)):
+        outcome = phd_exp("predict", f"run={run.path}", *words, *camera)
+        assert (outcome.status, outcome.err) == (0, "")
+        for row, single in zip(read_lines(outcome.out), alone, strict=True):
+            assert Path(row["file_name"]).name == single["file_name"]
+            np.testing.assert_allclose(row["mode"], single["mode"], rtol=1e-4)
+    assert [row["file_name"] for row in read_lines(outcome.out)] == ["in/a.png", "more/b.JPG"]
 
 
 def test_one_image_is_the_line_of_a_folder_and_is_drawn(
@@ -282,11 +305,13 @@ def test_from_python_arrays_of_any_size(run: RunFolder) -> None:
 
 MISTAKES = [
     (("image=good.png", "f=400", "folder=."), "predict: expected either image=FILE"),
-    (("folder=.", "f=400"), "f: belongs to image=FILE"),
+    (("folder=.", "f=400"), ".: has annotations, metadata.jsonl; expected images alone, or no f="),
+    (("folder=dot/..", "f=400", "object=1"), "object: selects detections"),
+    (("folder=nowhere", "camera=c.yaml"), "nowhere: no images; expected a folder with files *.png"),
     (("folder=.",), "metadata.jsonl, line 2: expected either f, or fx and fy"),
     (("folder=dot",), "dot: cannot be read (Is a directory)"),
-    (("folder=nowhere",), "nowhere/metadata.jsonl: cannot be read"),
-    (("image=good.png", "camera=no.yaml"), "no.yaml: No such file or directory; expected YAML"),
+    (("folder=nowhere",), "nowhere: no such folder"),
+    (("image=good.png", "camera=no.yaml"), "no.yaml: No such file or directory"),
     (("image=good.png", "f=400", "run=nowhere"), "run: given twice"),
     (("imag=good.png",), "imag: unknown key, did you mean 'image'?"),
     (("good.png",), "good.png: expected key=value"),

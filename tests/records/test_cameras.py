@@ -10,7 +10,7 @@ import yaml
 
 from phd_exp.geometry import Lens
 from phd_exp.records.cameras import Calibration, read_camera
-from phd_exp.records.detections import detection_of
+from phd_exp.records.detections import detections_of
 from phd_exp.records.errors import DatasetError
 from tests.support.opencv import HALF, projected
 
@@ -261,12 +261,12 @@ def test_a_mark_of_the_byte_order_and_the_suffix_do_not_matter(file: Path, name:
 
 def test_pixels_count_from_the_corner_and_the_size_must_be_that_of_the_image(file: Path) -> None:
     read(file, ros())
-    detection = detection_of(Path("photo.jpg"), {"camera": str(file)})
+    (detection,) = detections_of([Path("photo.jpg")], {"camera": str(file)})
     assert detection.focal_lengths_and_centre(640, 480) == (400.5, 401.2, 320, 240)
     with pytest.raises(DatasetError, match=r"photo\.jpg: camera=.*: is for images of 640 x 480 .* has 320 x 240"):
         detection.focal_lengths_and_centre(320, 240)
     read(file, ros(image_width=None, image_height=None))
-    detection = detection_of(Path("photo.jpg"), {"camera": str(file)})
+    (detection,) = detections_of([Path("photo.jpg")], {"camera": str(file)})
     assert detection.focal_lengths_and_centre(320, 240) == (400.5, 401.2, 320, 240)
 
 
@@ -285,11 +285,11 @@ def test_a_file_that_opencv_writes_now(file: Path) -> None:
 
 def test_a_focal_length_in_millimetres_is_refused_unless_the_lens_is_a_fisheye(file: Path) -> None:
     with pytest.raises(DatasetError, match=r"photo\.jpg: .*18 x 18 pixels.* shows 174 degrees; .*f in millimetres"):
-        detection_of(Path("photo.jpg"), {"f": 18.0}).focal_lengths_and_centre(640, 480)
+        detections_of([Path("photo.jpg")], {"f": 18.0})[0].focal_lengths_and_centre(640, 480)
     K = [80.0, *MATRIX[1:4], 80.0, *MATRIX[5:]]
     for model, D in ((BROWN, FIVE), (KB, FISHEYE)):
         read(file, ros(camera_matrix=matrix(K), distortion_model=model, distortion_coefficients=matrix(D, 1, len(D))))
-        detection = detection_of(Path("photo.jpg"), {"camera": str(file)})
+        (detection,) = detections_of([Path("photo.jpg")], {"camera": str(file)})
         if model == KB:
             assert detection.focal_lengths_and_centre(640, 480)[0] == 80
         else:

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from phd_exp.records.dataset import SPLITS
-from phd_exp.records.detections import Detection, detection_of
+from phd_exp.records.detections import Detection, detections_of
 from phd_exp.records.errors import DatasetError, UserError
 from phd_exp.records.foreign import boxes_in
 from phd_exp.records.own_images import DetectionFolder, annotations, detections_in, observed
@@ -138,7 +138,7 @@ def test_the_size_of_an_image_is_that_of_its_annotations(read: Callable, width: 
 
 @pytest.mark.parametrize("box", [[0.1, 0.1, 0.4, 0.5], [0, 0, 1, 1], [0.9, 0.9, 1.4, 1.3]])
 def test_a_box_in_units_of_the_image_is_refused(box: list[float]) -> None:
-    detection = detection_of(Path("a.png"), {"f": 100.0, "box": box})
+    (detection,) = detections_of([Path("a.png")], {"f": 100.0, "box": box})
     with pytest.raises(DatasetError, match=r"a\.png: box=.* in units of the image; expected pixels"):
         detection.box(120, 90)
 
@@ -169,14 +169,16 @@ def test_a_folder_without_annotations_says_what_is_there_and_what_is_read(tmp_pa
 
 
 def test_results_are_the_boxes_of_one_image(tmp_path: Path) -> None:
-    def boxes(*items: dict[str, Any], category: int | None = None) -> list[list[float]]:
+    def boxes(*items: dict[str, Any], category: int | None = None) -> list[dict[str, Any]]:
         (file := tmp_path / "boxes.json").write_text(json.dumps(items))
         return boxes_in(file, category)
 
     one = {"image_id": 3, "category_id": 1, "bbox": [10, 20, 30.5, 40], "score": 0.9}
     two = one | {"category_id": 2, "bbox": [0, 0, 5, 5]}
-    assert boxes(one, two) == [[10, 20, 40.5, 60], [0, 0, 5, 5]]
-    assert boxes(one, two, category=2) == [[0, 0, 5, 5]]
+    first = {"box": [10, 20, 40.5, 60], "score": 0.9, "category_id": 1}
+    second = {"box": [0, 0, 5, 5], "score": 0.9, "category_id": 2}
+    assert boxes(one, two) == [first, second]
+    assert boxes(one, two, category=2) == [second]
     assert boxes(one, two | {"image_id": "3", "bbox": ["0", "0", "5", "5"]}, one | {"iscrowd": 1}) == boxes(one, two)
     (tmp_path / "coco.json").write_text(json.dumps({"images": [{"id": 3}], "annotations": [one, two]}), "utf-8-sig")
     assert boxes_in(tmp_path / "coco.json") == boxes(one, two)
