@@ -73,9 +73,7 @@ def require_file(out: Path, name: str) -> None:
         raise ConfigError(f"out={out}: is a folder; expected a file, such as {out / name}")
 
 
-Paths = Annotated[
-    tuple[Path, ...], BeforeValidator(lambda text: [text] if os.path.exists(text) else text.split(","))
-]
+Paths = Annotated[tuple[Path, ...], BeforeValidator(lambda text: [text] if os.path.exists(text) else text.split(","))]
 
 
 class RunArguments(Arguments):
