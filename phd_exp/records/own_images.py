@@ -99,9 +99,7 @@ def images_in(folder: Path) -> list[Path]:
     """The image files of a folder, sorted by name. Raises DatasetError if it has annotations, or no images."""
     described = annotations(folder)[0][0]
     if os.path.lexists(described):
-        raise DatasetError(
-            f"{folder}: has annotations, {described}; expected images alone, or no f= and camera="
-        )
+        raise DatasetError(f"{folder}: has annotations, {described}; expected images alone, or no f= and camera=")
     if files := sorted(file for file in folder.glob("*") if file.suffix.lower() in SUFFIXES):
         return files
     raise DatasetError(f"{folder}: no images; expected a folder with files *{', *'.join(SUFFIXES)}")
