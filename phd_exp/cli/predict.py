@@ -129,7 +129,7 @@ def _write(predictor: "Predictor", detections: list[Detection], out: Path, curve
             name = f"{number:0{len(str(len(detections)))}}-{stem}.png"
             line = answer(sighting, temperature, guarantee) | {"picture": name}
             lines.write(json.dumps(line, allow_nan=False) + "\n")
-            write_atomic(out / name, picture(sighting, temperature is not None, curve, guarantee))
+            write_atomic(out / name, picture(sighting, line, curve, guarantee))
     print(f"{file}, and a picture for each line", file=sys.stderr)
 
 

@@ -2,91 +2,159 @@
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.patheffects import withStroke
+from PIL import Image
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.level_curves import LevelCurves, level_curves
 from phd_exp.inference.answers import Sighting
 from phd_exp.records.errors import one_line
 from phd_exp.reports.figures import draw_birds_eye, draw_curve, encoded
+from phd_exp.reports.gallery import close_up
 
 LARGEST = 1024  # pixels along the longer side of the image in the picture
 LONGEST_NAME = 60  # characters of a file name in the title
 MARGIN = 0.5  # width of the margin around a box, in sizes of the box
-_AMBER = "#ffb000"
+_HALO = [withStroke(linewidth=3, foreground="#0000009c")]  # for any background
+_AMBER = {"color": "#ffb000", "markersize": 6, "path_effects": _HALO}
+_WHITE = {"color": "white", "markeredgecolor": "black", "markersize": 4}
+
+Points = Float[np.ndarray, "_ 2"]
+Box = tuple[float, float, float, float]
+"""Left, top, right, bottom, pixels."""
+Mark = tuple[Points, str, dict[str, Any]]
+"""Points of the image, pixels, with the kind of their line and its style."""
 
 
 def picture(
-    sighting: Sighting,
-    recalibrated: bool = False,
-    calibration: Mapping[str, Any] | None = None,
-    guarantee: Any = None,
+    sighting: Sighting, line: Mapping[str, Any], calibration: Mapping[str, Any] | None = None, guarantee: Any = None
 ) -> bytes:
     """A PNG of the image and the bird's-eye view with level curves of 50, 90 and 99 %, or of a baseline's point.
 
-    The region of a `Guarantee` has a dashed outline. A third panel has the calibration curve of depth, if given.
-    The title has the file name, the focal length and whether the prediction is recalibrated.
+    Small curves have a close-up. The region of a `Guarantee` has a dashed outline. The last panel has the calibration
+    curve of depth, if given. The title has the main numbers of `line`, which is the `answer` for the sighting.
     """
     curves = level_curves(sighting.prediction) if isinstance(sighting.prediction, ProjectedHuber) else None
-    panels = 1 + (curves is not None) + (calibration is not None)
-    figure = Figure(figsize=(4.6 if panels == 1 else 4.5 * panels, 4.4), layout="constrained")
-    figure.suptitle(_title(sighting, recalibrated), fontsize=9, parse_math=False)
-    _draw_image(figure.add_subplot(1, panels, 1), sighting, curves)
-    if calibration:
-        draw_curve(figure.add_subplot(1, panels, panels), "depth", calibration)
+    on_image, above = _outlines(sighting, guarantee)
+    marks = _marks(sighting, curves, on_image)
+    enlarged = _enlarged(marks, sighting.detection.box(*sighting.image.size))
+    panels = 1 + (enlarged is not None) + (curves is not None) + (calibration is not None)
+    figure = Figure(figsize=(max(6.0, 4.5 * panels), 4.7), layout="constrained")
+    figure.suptitle(_title(sighting, line), fontsize=9, parse_math=False)
+    axes = iter(figure.subplots(1, panels, squeeze=False).flat)
+    _draw_image(
+        next(axes), sighting.image, _around(sighting), marks, {"-": sighting.detection.line.box, ":": enlarged}
+    )
+    if enlarged:
+        _draw_image(next(axes), sighting.image, enlarged, marks, {"-": sighting.detection.line.box})
     if curves:
-        axes = figure.add_subplot(1, panels, 2)
-        if guarantee:
-            camera = sighting.view.camera
-            on_image, above = guarantee.region(sighting.prediction, camera.f / camera.S)[0].outlines()
-            figure.axes[0].plot(*camera.real_pixels(on_image).T, "--", color=_AMBER)
-            axes.plot(*above.T, "k--", label=f"{100 * guarantee.coverage:g} % guaranteed")
-        draw_birds_eye(axes, curves, _truth(sighting))
-        if not np.array_equal(sighting.view.camera.R, np.eye(3)):
-            axes.set(xlabel="x (m), camera turned to the box", ylabel="z (m), camera turned to the box")
+        _draw_birds_eye(next(axes), sighting, curves, above, guarantee)
+    if calibration:
+        draw_curve(next(axes), "depth", calibration)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph", UserWarning)  # letters that the font lacks
         return encoded(figure, "png", dpi=120)
 
 
-def _title(sighting: Sighting, recalibrated: bool) -> str:
+def _title(sighting: Sighting, line: Mapping[str, Any]) -> str:
+    """File, focal length and whether it is recalibrated; below them the position and the intervals of depth."""
     name = one_line(sighting.detection.line.file_name)
     name = name if len(name) <= LONGEST_NAME else f"...{name[-LONGEST_NAME:]}"
     fx, fy = np.diagonal(sighting.view.camera.K)[:2]
     f = f"{fx:g}" if fx == fy else f"{fx:g}, {fy:g}"
-    return ", ".join([name, f"f = {f} px", *(["recalibrated"] if recalibrated else [])])
+    recalibrated = ["recalibrated"] if line["uncertainty"].startswith("recalibrated") else []
+    known = "mode" if "mode" in line else "position"
+    facts = [f"{known} ({_metres(line[known], ', ')}) m"]
+    if interval := line.get("depth_interval", {}).get("90"):
+        facts.append(f"depth with 90 %: {_metres(interval, ' to ')} m")
+    if region := line.get("region"):
+        facts.append(f"depths of the guaranteed region: {_metres(region['depth_interval'], ' to ')} m")
+    return ", ".join([name, f"f = {f} px", *recalibrated]) + "\n" + ", ".join(facts)
 
 
-def _draw_image(axes: Axes, sighting: Sighting, curves: LevelCurves | None) -> None:
-    camera, image = sighting.view.camera, sighting.image
-    left, top, right, bottom = sighting.detection.box(*image.size)
+def _metres(values: Sequence[float | None], between: str) -> str:
+    return between.join("unknown" if value is None else f"{value:.4g}" for value in values)
+
+
+def _outlines(sighting: Sighting, guarantee: Any) -> tuple[Points | None, Points | None]:
+    """The region of a `Guarantee` on the image, in pixels, and from above, in metres."""
+    if not guarantee:
+        return None, None
+    camera = sighting.view.camera
+    on_image, above = guarantee.region(sighting.prediction, camera.f / camera.S)[0].outlines()
+    return camera.real_pixels(on_image), above
+
+
+def _marks(sighting: Sighting, curves: LevelCurves | None, outline: Points | None) -> list[Mark]:
+    """The level curves, the outline of a region, the mode and the truth on the image."""
+    camera, truth = sighting.view.camera, _truth(sighting)
+    rings = zip((1.6, 1.1, 0.7), curves.projected if curves else (), strict=False)
+    marks = [(camera.real_pixels(points), "-", {"linewidth": width} | _AMBER) for width, points in rings]
+    if outline is not None:
+        marks.append((outline, "--", _AMBER))
+    for point, kind, style in ((sighting.prediction.mode.numpy(), "x", _AMBER), (truth, "o", _WHITE)):
+        if point is not None:
+            marks.append((camera.real_pixels(point[None, :2] / point[2]), kind, style))
+    return marks
+
+
+def _around(sighting: Sighting) -> Box:
+    """The part of the image around the box."""
+    width, height = sighting.image.size
+    left, top, right, bottom = sighting.detection.box(width, height)
     across, down = MARGIN * (right - left), MARGIN * (bottom - top)
-    region = (
-        max(0, math.floor(left - across)),
-        max(0, math.floor(top - down)),
-        min(image.width, math.ceil(right + across)),
-        min(image.height, math.ceil(bottom + down)),
+    return max(0, left - across), max(0, top - down), min(width, right + across), min(height, bottom + down)
+
+
+def _enlarged(marks: Sequence[Mark], box: Box) -> Box | None:
+    """A square around the marks, if they are close together in the box; None for a single point."""
+    points = np.concatenate([points for points, _, _ in marks])
+    square = close_up(points, max(box[2] - box[0], box[3] - box[1])) if len(points) > 1 else None
+    return (square[0], square[1], square[0] + square[2], square[1] + square[2]) if square else None
+
+
+def _draw_image(
+    axes: Axes, image: Image.Image, part: Box, marks: Sequence[Mark], frames: Mapping[str, Box | None]
+) -> None:
+    """A part of the image with the marks, and frames by their line style."""
+    left, top, right, bottom = part
+    inside = (
+        max(0, math.floor(left)),
+        max(0, math.floor(top)),
+        min(image.width, math.ceil(right)),
+        min(image.height, math.ceil(bottom)),
     )
-    shown = image.crop(region)
-    shown.thumbnail((LARGEST, LARGEST))
-    left, top, right, bottom = region
-    axes.imshow(np.asarray(shown), extent=(left, right, bottom, top))
-    for thickness, points in zip((1.6, 1.1, 0.7), curves.projected if curves else (), strict=False):
-        axes.plot(*camera.real_pixels(points).T, color=_AMBER, linewidth=thickness)
-    mode = sighting.prediction.mode.numpy()
-    axes.plot(*camera.real_pixels(mode[:2] / mode[2]), "x", color=_AMBER, markersize=6)
-    truth = _truth(sighting)
-    if truth is not None:
-        axes.plot(
-            *camera.real_pixels(truth[:2] / truth[2]), "o", color="white", markeredgecolor="black", markersize=4
-        )
+    if inside[0] < inside[2] and inside[1] < inside[3]:
+        shown = image.crop(inside)
+        shown.thumbnail((LARGEST, LARGEST))
+        axes.imshow(np.asarray(shown), extent=(inside[0], inside[2], inside[3], inside[1]))
+    for style, frame in frames.items():
+        if frame:
+            corner, size = frame[:2], (frame[2] - frame[0], frame[3] - frame[1])
+            axes.add_patch(
+                Rectangle(corner, *size, fill=False, edgecolor="white", linestyle=style, path_effects=_HALO)
+            )
+    for points, kind, style in marks:
+        axes.plot(*points.T, kind, **style)
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="column (px)", ylabel="row (px)")
+
+
+def _draw_birds_eye(
+    axes: Axes, sighting: Sighting, curves: LevelCurves, outline: Points | None, guarantee: Any
+) -> None:
+    if outline is not None:
+        axes.plot(*outline.T, "k--", label=f"{100 * guarantee.coverage:g} % guaranteed")
+    draw_birds_eye(axes, curves, _truth(sighting))
+    if not np.array_equal(sighting.view.camera.R, np.eye(3)):
+        axes.set(xlabel="x (m), camera turned to the box", ylabel="z (m), camera turned to the box")
 
 
 def _truth(sighting: Sighting) -> Float[np.ndarray, "3"] | None:

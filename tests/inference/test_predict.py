@@ -14,11 +14,13 @@ import torch
 from PIL import Image
 
 import phd_exp as package
-from phd_exp.data.crops import cut
+from phd_exp.data.crops import cut, facing
 from phd_exp.distributions import PointEstimate, ProjectedHuber
 from phd_exp.geometry import Lens, VirtualCamera, intrinsics
 from phd_exp.inference import pictures
+from phd_exp.inference.answers import Sighting, answer
 from phd_exp.inference.views import View
+from phd_exp.records.detections import detections_of
 from phd_exp.records.errors import DatasetError, RunError
 from phd_exp.records.own_images import detections_in
 from phd_exp.records.runs import RunFolder
@@ -227,10 +229,37 @@ def test_every_line_has_its_own_picture(
     files = {row["picture"] for row in rows}
     assert len(files) == len(names)
     assert {file.name for file in (tmp_path / "drawn").iterdir()} == files | {"predictions.jsonl"}
-    assert titles[0] == "a.png, f = 400.5 px"
+    first, second = titles[0].split("\n")
+    assert first == "a.png, f = 400.5 px"
+    assert second.startswith("mode (")
+    assert "depth with 90 %: " in second
     (tmp_path / "in" / names[1]).write_bytes(b"no image")
     assert phd_exp("predict", f"run={run.path}", "folder=in", "out=broken").status == 1
     assert len(read_lines((tmp_path / "broken" / "predictions.jsonl").read_text())) == 1
+
+
+@pytest.mark.parametrize(("precision", "panels"), [(1000.0, 3), (10.0, 2)])
+def test_small_curves_have_a_close_up_and_the_box_a_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, precision: float, panels: int
+) -> None:
+    monkeypatch.setattr(pictures, "encoded", lambda figure, *_, **how: figure)
+    (detection,) = detections_of([tmp_path / "a.png"], {"f": 900.0}, [{"box": [200, 150, 440, 330]}])
+    image = Image.new("RGB", (640, 480))
+    camera = facing(detection, image.size, SIDE)
+    eye = torch.eye(2, dtype=torch.float64)
+    prediction = ProjectedHuber(0 * eye[0], 4 * eye[0, 0], precision * eye, 50 * eye[0, 0])
+    sighting = Sighting(detection, image, View(cut(image, camera), camera), torch.zeros(7), prediction)
+    line = answer(sighting, None)
+    figure: Any = pictures.picture(sighting, line)
+    first, second, *_ = axes = figure.axes
+    assert len(axes) == panels
+    np.testing.assert_allclose(first.patches[0].get_bbox().extents, [200, 150, 440, 330])
+    low, high = line["depth_interval"]["90"]
+    assert f"{low:.4g} to {high:.4g} m" in figure.get_suptitle()
+    if panels == 3:
+        widest = max(np.ptp(ring.get_xdata()) for ring in second.lines)
+        assert widest > np.ptp(second.get_xlim()) / 3
+        np.testing.assert_allclose(first.patches[1].get_bbox().intervalx, second.get_xlim())
 
 
 def camera_file(path: Path, coefficients: list[float], **changes: Any) -> str:
@@ -269,7 +298,7 @@ def test_answers_and_curves_go_through_the_lens(
     R, covariance = camera.R, prediction.covariance_matrix.numpy()
     np.testing.assert_allclose(row["covariance"], R.T @ covariance @ R, rtol=1e-3, atol=1e-5)
     drawn = K[:2, 2] + np.diagonal(K)[:2] * lens.distort(np.array(row["mode"]))
-    np.testing.assert_allclose(marks[0], drawn, rtol=1e-4)
+    np.testing.assert_allclose(marks[0].ravel(), drawn, rtol=1e-4)
     for changes, said in (
         (
             {"coefficients": [-30.0, 0.0, 0.0, 0.0]},
