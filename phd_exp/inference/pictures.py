@@ -145,6 +145,7 @@ def _draw_image(
     for points, kind, style in marks:
         axes.plot(*points.T, kind, **style)
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="column (px)", ylabel="row (px)")
+    axes.locator_params(nbins=5)  # more labels would overlap
 
 
 def _draw_birds_eye(

@@ -2,15 +2,16 @@
 
 from phd_exp.evaluation.predictions import Evaluation
 from phd_exp.records.choices import in_words
-from phd_exp.reports.quantities import SCORES
+from phd_exp.reports.quantities import SCORES, mark
 from phd_exp.reports.runs import Report, Run
 from phd_exp.reports.table import Table, TableCell, TableRow, file_stem
 
 COLUMNS = ("depth_ence", "projected_ence", "miscalibration_area", "depth_pit_area", "group_miscalibration", "nees")
 OF_A_CELL = (
     "A cell: the score of the run's predictions; below it the 95 % interval of calibrated predictions with the same "
-    "uncertainties (truths simulated from them). Finitely many samples never give zero: a value above that interval "
-    "is miscalibrated, a value inside it is not distinguishable from calibrated. Coverage and CRPS: calibration.csv."
+    "uncertainties (truths simulated from them). Finitely many samples never give zero: a value outside that "
+    "interval (↑, ↓) is miscalibrated, a value inside it is not distinguishable from calibrated. Coverage and CRPS: "
+    "calibration.csv."
 )
 
 
@@ -54,7 +55,7 @@ def _row(run: Run, kind: str, evaluation: Evaluation) -> TableRow:
     label = f"{run.title}, {run.name}{', recalibrated' if kind == 'recalibrated' else ''}"
     cells = []
     for name in COLUMNS:
-        text, reference = SCORES[name].text, evaluation.reference[name]
-        below = f"({text(reference.low)}–{text(reference.high)})"
-        cells.append(TableCell(text(evaluation.scores[name].value), below=below))
+        text, value, reference = SCORES[name].text, evaluation.scores[name].value, evaluation.reference[name]
+        below, arrow = f"({text(reference.low)}–{text(reference.high)})", mark(value, reference)
+        cells.append(TableCell(text(value), arrow, below, tone="off" if arrow else ""))
     return TableRow((label,), tuple(cells))

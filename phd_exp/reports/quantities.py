@@ -3,6 +3,8 @@
 import math
 from dataclasses import dataclass
 
+from phd_exp.evaluation.reference import Band
+
 
 @dataclass(frozen=True)
 class Quantity:
@@ -37,6 +39,18 @@ class Quantity:
         return f"{value:.{self.digits}f}".replace("-", "−")
 
 
+def mark(value: float, calibrated: Band | None) -> str:
+    """An arrow for a value above or below the interval of a calibrated model; empty inside it, or without one.
+
+    Examples:
+        >>> [mark(value, Band(0.02, 0.01, 0.04)) for value in (0.005, 0.03, 0.2)]
+        ['↓', '', '↑']
+    """
+    if calibrated is None or calibrated.low <= value <= calibrated.high:
+        return ""
+    return "↑" if value > calibrated.high else "↓"
+
+
 _RISK = "mean error of the predictions kept when the least certain are dropped first, averaged over the share kept"
 _EXCESS = "0 if predicted variance ranks the errors perfectly, 1 if no better than chance"
 _WORST_GROUP = "largest mean gap between coverage and diagonal in groups of samples with similar predictions"
@@ -49,16 +63,22 @@ _ROWS: tuple[tuple[str, str, str, int, str], ...] = (
     ("ale_m", "ALE", "m", 3, "average localisation error: error of the distance from the camera"),
     ("relative_error", "Relative error", "%", 2, "error of the distance from the camera over the distance"),
     ("nll", "NLL", "nats", 2, "mean negative log density at the truth, per cubic metre"),
-    ("inside_50", "Inside the 50 % region", "%", 0, "share of truths inside the credible region"),
-    ("inside_90", "Inside the 90 % region", "%", 0, "the same"),
-    ("inside_99", "Inside the 99 % region", "%", 0, "the same"),
-    ("inside_conformal", "Inside the conformal 90 % region", "%", 0, "the same, of the level held-out samples give"),
+    ("inside_50", "Inside the 50 % region", "%", 1, "share of truths inside the credible region"),
+    ("inside_90", "Inside the 90 % region", "%", 1, "share of truths inside the credible region"),
+    ("inside_99", "Inside the 99 % region", "%", 1, "share of truths inside the credible region"),
+    (
+        "inside_conformal",
+        "Inside the conformal 90 % region",
+        "%",
+        1,
+        "share of truths inside; held-out samples set its level",
+    ),
     ("unfamiliar", "Unfamiliar", "%", 1, "share of samples whose familiarity is below 0.05; 5 % at home"),
     ("auroc", "AUROC of familiarity", "", 2, "how well it separates the samples from those at home"),
     ("depth_crps_mm", "CRPS of depth", "mm", 1, "continuous ranked probability score of the depth’s law"),
-    ("energy_score_mm", "Energy score", "mm", 1, "the same of the position in space"),
+    ("energy_score_mm", "Energy score", "mm", 1, "continuous ranked probability score of the position in space"),
     ("depth_ence", "Depth ENCE", "", 3, "expected normalised calibration error of the depth’s variance"),
-    ("projected_ence", "Projected ENCE", "", 3, "the same of the variance of (x, y)/z"),
+    ("projected_ence", "Projected ENCE", "", 3, "expected normalised calibration error of the variance of (x, y)/z"),
     ("miscalibration_area", "Miscalibration area", "", 3, "between coverage of credible regions and diagonal"),
     ("overconfidence", "Overconfidence", "", 3, _OVERCONFIDENCE),
     ("depth_pit_area", "Depth PIT area", "", 3, "between the distribution of the depth’s PIT and the diagonal"),
@@ -66,10 +86,16 @@ _ROWS: tuple[tuple[str, str, str, int, str], ...] = (
     ("group_miscalibration", "Worst-group miscalibration", "", 3, _WORST_GROUP),
     ("nees", "NEES", "", 2, _NEES),
     ("nees_x", "NEES of x", "", 2, "squared error of the mean of x over its variance, 1 if calibrated"),
-    ("nees_y", "NEES of y", "", 2, "the same of y"),
-    ("nees_z", "NEES of z", "", 2, "the same of z"),
+    ("nees_y", "NEES of y", "", 2, "squared error of the mean of y over its variance, 1 if calibrated"),
+    ("nees_z", "NEES of z", "", 2, "squared error of the mean of z over its variance, 1 if calibrated"),
     ("depth_sharpness_mm", "Depth sharpness", "mm", 1, "root mean square of the predicted deviation of z"),
-    ("projected_sharpness_mrad", "Projected sharpness", "mrad", 2, "the same of x/z and y/z"),
+    (
+        "projected_sharpness_mrad",
+        "Projected sharpness",
+        "mrad",
+        2,
+        "root mean square of the predicted deviation of x/z and y/z",
+    ),
     ("depth_risk_coverage_area", "Depth risk–coverage area", "mm", 1, _RISK),
     ("projected_risk_coverage_area", "Projected risk–coverage area", "mrad", 2, _RISK),
     ("depth_risk_coverage_excess", "Depth risk–coverage excess", "", 3, _EXCESS),
@@ -83,7 +109,9 @@ METRICS = {
     "depth_error_mm": SCORES["depth_error_mm"],
     "nll": SCORES["nll"],
     "loss": Quantity("Loss", "", 3, "what training minimises"),
-    "depth_precision": Quantity("Mean a", "", 1, "predicted precision of the depth"),
-    "projected_precision": Quantity("Mean |A|", "", 0, "predicted precision of (x, y)/z"),
+    "depth_precision": Quantity("Depth precision a", "", 1, "1/a: about the predicted relative error of the depth"),
+    "projected_precision": Quantity(
+        "Projected precision |A|", "", 0, "1/√|A|: about the predicted error of (x, y)/z"
+    ),
 }
 """Key of metrics.jsonl, after `train/` or `test/` -> quantity, in the order of a page."""

@@ -36,7 +36,7 @@ def write_site(report: Report, tables: Sequence[Table], figures: Sequence[str], 
         write_atomic(site / "assets" / asset.name, asset.read_bytes())
     write_atomic(site / "assets" / "plotly.min.js", get_plotlyjs())
     several = len(report.runs) > 1
-    drawn = [_write_run(site, place, run, several) for place, run in enumerate(report.runs)]
+    drawn = [_write_run(site, run, several) for run in report.runs]
     groups = overview_groups(drawn, report.searches)
     charts = {key: asdict(chart) for group, _ in groups.values() for key, chart in group.items()}
     write_text(site / "data" / "overview.js", as_script("overview", {"charts": charts}))
@@ -49,13 +49,12 @@ def write_site(report: Report, tables: Sequence[Table], figures: Sequence[str], 
     return site / "index.html"
 
 
-def _write_run(site: Path, place: int, run: Run, several: bool) -> Drawn:
+def _write_run(site: Path, run: Run, several: bool) -> Drawn:
     """Write the files of a run inside its boundary: its page reports what cannot be drawn."""
     notes = Notes(run.notes)
     charts = notes.attempt(partial(run_charts, run)) or {}
     whole, place_alone = replace(run, notes=notes), unreadable(run.folder, notes)
-    tries = [Drawn.at(place, whole, charts)]
-    tries += [Drawn.at(place, shown, {}) for shown in (replace(whole, measured=Measured()), place_alone)]
+    tries = [Drawn(whole, charts), Drawn(replace(whole, measured=Measured()), {}), Drawn(place_alone, {})]
     drawn, texts = next((one, texts) for one in tries if (texts := notes.attempt(partial(_texts, one, several))))
     write_text(site / "runs" / f"{run.slug}.html", texts[0])
     write_text(site / "data" / f"{run.slug}.js", texts[1])

@@ -1,5 +1,6 @@
-"""Charts of all runs together, from the charts of each: one colour and dash per run, named in the legend."""
+"""Charts of all runs together, from the charts of each. The script gives the first runs a colour and a label."""
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -7,9 +8,8 @@ from phd_exp.records.searches import Search
 from phd_exp.reports.quantities import METRICS
 from phd_exp.reports.runs import Run
 from phd_exp.reports.searches import search_charts
-from phd_exp.reports.site.charts import DASHES, Chart, Trace, identity, square
+from phd_exp.reports.site.charts import Chart, Trace, identity, square
 
-COLOURS = 7
 CALIBRATION = ("depth_calibration", "projected_calibration", "coverage", "depth_pit")
 LEARNING = tuple(
     f"learning_{key}"
@@ -19,25 +19,27 @@ LEARNING = tuple(
 
 @dataclass(frozen=True)
 class Drawn:
-    """A run, its charts by section, and the colour and dash of its lines on pages about all runs."""
+    """A run and its charts by section."""
 
     run: Run
     charts: dict[str, dict[str, Chart]]
-    colour: int
-    dash: str
-
-    @classmethod
-    def at(cls, place: int, run: Run, charts: dict[str, dict[str, Chart]]) -> "Drawn":
-        """The run at a place among all runs; colours change first, then dashes."""
-        return cls(run, charts, place % COLOURS + 1, DASHES[place // COLOURS % len(DASHES)])
 
 
 Groups = dict[str, tuple[dict[str, Chart], list[Drawn]]]
 """Name -> charts that share a legend, and the runs of that legend."""
 
 
+def presets_of(runs: Sequence[Run]) -> list[str]:
+    """The presets, those with most finished runs first; `smoke`, whose networks are too small to learn, is last."""
+    finished = Counter(run.preset for run in runs if run.state == "finished")
+    names = {run.preset for run in runs}
+    return sorted(names, key=lambda name: (name.partition("+")[0] == "smoke", -finished[name], name))
+
+
 def overview_groups(runs: Sequence[Drawn], searches: Sequence[Search] = ()) -> Groups:
     """Calibration and learning curves with a line per run, and the charts of searches, without empty groups."""
+    order = presets_of([one.run for one in runs])
+    runs = sorted(runs, key=lambda one: order.index(one.run.preset))
     found: Groups = {}
     for name, role, keys in (("calibration", "before", CALIBRATION), ("learning", "test", LEARNING)):
         charts = {f"{name}_{key}": chart for key in keys if (chart := _overlaid(runs, name, key, role))}
@@ -86,6 +88,5 @@ def _of_run(trace: Trace, one: Drawn) -> Trace:
         **trace,
         "name": one.run.path,
         "text": one.run.path,
-        "line": {"color": f"var(--series-{one.colour})", "dash": one.dash, "width": 1.75},
         "meta": {"role": trace["meta"]["role"], "preset": one.run.preset, "data": one.run.data},
     }

@@ -1,7 +1,6 @@
 """HTML of the pages; all text from files is escaped."""
 
 import json
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -12,9 +11,9 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from phd_exp.records.processes import duration
 from phd_exp.reports.fusion_table import fusion_table, headline
 from phd_exp.reports.paper import PUBLISHED
-from phd_exp.reports.quantities import SCORES
+from phd_exp.reports.quantities import SCORES, mark
 from phd_exp.reports.runs import Run
-from phd_exp.reports.site.overview import Drawn, Groups
+from phd_exp.reports.site.overview import Drawn, Groups, presets_of
 from phd_exp.reports.table import Table
 
 _ENVIRONMENT = Environment(
@@ -25,7 +24,8 @@ _ENVIRONMENT = Environment(
     lstrip_blocks=True,
 )
 _ENVIRONMENT.filters |= {"moment": lambda at: f"{at:%Y-%m-%d %H:%M} {at.tzname()}", "duration": duration}
-_ENVIRONMENT.globals |= {"score": SCORES.__getitem__, "headline": headline}
+_ENVIRONMENT.globals |= {"score": SCORES.__getitem__, "headline": headline, "mark": mark}
+HEADLINES = ("projected_error_mm", "depth_error_mm", "inside_90", "nll")
 
 
 def overview_page(runs: Sequence[Run], tables: Sequence[Table], groups: Groups, figures: Sequence[str]) -> str:
@@ -33,19 +33,15 @@ def overview_page(runs: Sequence[Run], tables: Sequence[Table], groups: Groups, 
     kinds: dict[str, list[Table]] = {}
     for table in tables:
         kinds.setdefault(table.kind, []).append(table)
-    paper = kinds.get("tables", [])
-    finished = Counter(run.preset for run in runs if run.state == "finished")
-    presets = sorted({table.preset for table in paper}, key=lambda name: -finished[name])
     return _ENVIRONMENT.get_template("overview.html").render(
         root="",
         several=len(runs) > 1,
         runs=runs,
-        papers=[[table for table in paper if table.preset == preset] for preset in presets],
         kinds=kinds,
+        presets=presets_of(runs),
         groups=groups,
         figures=figures,
-        overrides=any(run.overrides for run in runs),
-        finished=finished.total(),
+        finished=sum(run.state == "finished" for run in runs),
         choices={"preset": sorted({run.preset for run in runs}), "data": sorted({run.data for run in runs})},
     )
 
@@ -58,7 +54,8 @@ def run_page(drawn: Drawn, several: bool) -> str:
         several=several,
         run=run,
         measured=run.measured,
-        scores=_score_rows(run),
+        scores=(rows := _score_rows(run)),
+        headlines=[row for row in rows if row["key"] in HEADLINES],
         environment=_environment(run),
         charts=drawn.charts,
         fusion=fusion_table(run, run.measured.fusion) if run.measured.fusion else None,

@@ -106,12 +106,12 @@ def learning_charts(run: Run) -> dict[str, Chart]:
         traces = [
             line(split, run.epochs, run.metrics[f"{split}/{key}"], colour, dash=dash, role=split)
             for split, colour, dash in (("test", 1, "solid"), ("train", 2, "dot"))
-            if f"{split}/{key}" in run.metrics
+            if _is_a_course(run, f"{split}/{key}")
         ]
         if traces:
             title, y = f"{metric.label} over training", axis(metric.axis, log=key not in ("nll", "loss"))
             charts[f"learning_{key}"] = _over_epochs(title, metric.axis, y, traces, [metric] * len(traces))
-    if known := [key for key in _OVER_EPOCHS if f"test/calibration/{key}" in run.metrics]:
+    if known := [key for key in _OVER_EPOCHS if _is_a_course(run, f"test/calibration/{key}")]:
         traces = [
             line(SCORES[key].label, run.epochs, run.metrics[f"test/calibration/{key}"], i + 1, dash=DASHES[i])
             for i, key in enumerate(known)
@@ -120,6 +120,11 @@ def learning_charts(run: Run) -> dict[str, Chart]:
         scores = [SCORES[key] for key in known]
         charts["learning_calibration"] = _over_epochs(title, "Calibration errors", y, traces, scores)
     return charts
+
+
+def _is_a_course(run: Run, key: str) -> bool:
+    """Whether a metric has two values or more, which a failed run may not have."""
+    return sum(value is not None for value in run.metrics.get(key, ())) > 1
 
 
 def _over_epochs(title: str, what: str, y: Trace, traces: list[Trace], scores: Sequence[Quantity]) -> Chart:

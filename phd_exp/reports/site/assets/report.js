@@ -37,10 +37,33 @@ const phdExp = (() => {
     return Object.entries(chosen).every(([key, value]) => !(key in trace.meta) || trace.meta[key] === value);
   }
 
+  const MOST = 8;  // labelled lines of a chart of all runs
+  const COLOURS = 7;
+
+  /** The runs labelled in the shared legend of a figure, in its order; the lines of the others are grey. */
+  function labelled(figure) {
+    const items = figure.closest("section")?.querySelectorAll(".legend.runs li[data-run]:not([hidden])") ?? [];
+    return [...items].map((item) => item.dataset.run);
+  }
+
+  const stroke = (place) => ({ color: `var(--series-${place % COLOURS + 1})`, dash: Object.keys(DASHES)[Math.floor(place / COLOURS)], width: 1.75 });
+  const GREY = { color: "var(--series-0)", dash: "solid", width: 1 };
+
+  /** The visible lines of a figure, in the colours of a shared legend; grey ones first, below the others. */
+  function coloured(figure, chart) {
+    if (!figure.closest("[data-legend=shared]")) return shownOf(chart);
+    const names = labelled(figure);
+    const lines = shownOf(chart).map((trace) => {
+      const place = names.indexOf(trace.text);
+      return place >= 0 ? { ...trace, line: stroke(place) } : trace.text ? { ...trace, line: GREY, opacity: 0.5 } : trace;
+    });
+    return [...lines.filter((line) => line.line === GREY), ...lines.filter((line) => line.line !== GREY)];
+  }
+
   const shownOf = (chart) => chart.data.filter((trace) => visible(trace, filters()));
 
-  function traces(chart) {
-    return shownOf(chart).flatMap((trace) => {
+  function traces(figure, chart) {
+    return coloured(figure, chart).flatMap((trace) => {
       const line = { ...themed(trace), name: escaped(trace.name) };
       const place = trace.meta.role === "points" ? "%{y}: %{x:.4g}" : "%{x:.4g}, %{y:.4g}";
       line.hovertemplate = `${trace.text ? escaped(trace.text) + "<br>" : ""}${place}<extra>${escaped(trace.name)}</extra>`;
@@ -78,11 +101,13 @@ const phdExp = (() => {
     return `rgba(${r}, ${g}, ${b}, 0.16)`;
   }
 
+  const titled = ({ title, type }, name) => escaped(title.text) + (type === LOG ? `${name === "y" ? "<br>" : " "}(log scale)` : "");
+
   function layout(chart) {
     const axis = (name) => {
       const given = chart.layout[`${name}axis`];
       return {
-        ...given, title: { text: escaped(given.title.text), font: { size: 12.5 }, standoff: 8 }, automargin: true,
+        ...given, title: { text: titled(given, name), font: { size: 12.5 }, standoff: 8 }, automargin: true,
         gridcolor: style("--grid"), linecolor: style("--rule"), zeroline: false, ticks: "outside", ticklen: 4, tickangle: 0,
         tickcolor: style("--rule"), ...(given.type === LOG ? logTicks(chart, name) : { exponentformat: "power" }),
       };
@@ -98,16 +123,18 @@ const phdExp = (() => {
     };
   }
 
-  /** Ticks at powers of ten, with more between them for short axes. */
+  /** Ticks at powers of ten, with more between them for short axes, all as decimals or all as powers. */
   function logTicks(chart, name) {
     const values = chart.data.flatMap((trace) => [...trace[name], ...(trace.meta.low ?? [])]).filter((value) => value > 0);
     if (!values.length) return {};
     const [low, high] = [Math.min(...values), Math.max(...values)].map(Math.log10);
     const decades = Array.from({ length: Math.ceil(high) - Math.floor(low) + 1 }, (_, i) => Math.floor(low) + i);
     const every = Math.ceil(decades.length / 7);
-    const steps = high - low > 1.5 ? [1] : high - low > 0.7 ? [1, 2, 5] : [1, 1.5, 2, 3, 4, 5, 7];
+    const length = (high - low) / (name === "x" ? 0.6 : 1);  // labels need more room side by side
+    const steps = length > 2.5 ? [1] : length > 1.1 ? [1, 2, 5] : [1, 1.5, 2, 3, 4, 5, 7];
+    const plain = low >= -3.5 && high <= 5;
     const ticks = decades.filter((_, i) => i % every === 0).flatMap((power) => steps.map((step) => [step, power]));
-    const text = (step, power) => (power >= -2 && power <= 4 ? Number((step * 10 ** power).toPrecision(2)).toLocaleString("en") : `${step === 1 ? "" : `${step}·`}10<sup>${power}</sup>`);
+    const text = (step, power) => (plain ? Number((step * 10 ** power).toPrecision(2)).toLocaleString("en", { maximumFractionDigits: 5 }) : `${step === 1 ? "" : `${step}·`}10<sup>${power}</sup>`);
     return { tickvals: ticks.map(([step, power]) => step * 10 ** power), ticktext: ticks.map(([step, power]) => text(step, power)) };
   }
 
@@ -142,7 +169,7 @@ const phdExp = (() => {
     if (!chart) return Promise.resolve();
     drawn.add(figure);
     legend(figure, chart);
-    return Plotly.react(figure.querySelector(".plot"), traces(chart), layout(chart), {
+    return Plotly.react(figure.querySelector(".plot"), traces(figure, chart), layout(chart), {
       responsive: true, displayModeBar: false, displaylogo: false,
     }).then(() => figure.classList.add("drawn"));
   }
@@ -235,22 +262,34 @@ const phdExp = (() => {
     heading.setAttribute("aria-sort", down ? "descending" : "ascending");
   }
 
-  /** Show only the filtered runs in the shared legend. */
-  function filterLegends() {
-    const chosen = filters();
-    for (const item of document.querySelectorAll(".legend.runs li")) {
-      item.hidden = Object.entries(chosen).some(([key, value]) => item.dataset[key] !== value);
+  /** Show only the filtered runs in the list and in shared legends, which label the first ones. */
+  function filterRuns() {
+    const chosen = Object.entries(filters());
+    for (const item of document.querySelectorAll("[data-preset][data-data]")) {
+      item.hidden = chosen.some(([key, value]) => item.dataset[key] !== value);
+    }
+    for (const list of document.querySelectorAll(".legend.runs")) {
+      const items = [...list.querySelectorAll("li[data-run]:not([hidden])")];
+      items.forEach((item, place) => {
+        item.hidden = place >= MOST;
+        const { color, dash } = stroke(Math.min(place, MOST - 1));
+        Object.assign(item.querySelector("path").style, { stroke: color, strokeDasharray: DASHES[dash] });
+      });
+      const more = list.querySelector(".more");
+      more.hidden = items.length <= MOST;
+      more.textContent = `Grey: ${items.length - MOST} more runs. Choose a preset or a data set above to label them.`;
     }
   }
 
   document.addEventListener("DOMContentLoaded", () => {
+    filterRuns();  // a browser may keep the choice of a page that is loaded again
     watch();
     for (const button of document.querySelectorAll("table.sortable thead button")) {
       button.addEventListener("click", () => sortBy(button.parentElement));
     }
     for (const select of document.querySelectorAll("select[data-filter]")) {
       select.addEventListener("change", () => {
-        filterLegends();
+        filterRuns();
         redraw();
         all().filter((figure) => figure.querySelector("details").open).forEach(tabulate);
       });
