@@ -55,7 +55,7 @@ def run_page(drawn: Drawn, several: bool) -> str:
         run=run,
         measured=run.measured,
         scores=(rows := _score_rows(run)),
-        headlines=[row for row in rows if row["key"] in HEADLINES],
+        headlines=[row for key in HEADLINES for row in rows if row["key"] == key],
         environment=_environment(run),
         charts=drawn.charts,
         fusion=fusion_table(run, run.measured.fusion) if run.measured.fusion else None,

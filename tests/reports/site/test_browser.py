@@ -5,12 +5,15 @@ By default one walk on a phone; all other pages and interactions are slow.
 
 import re
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import pytest
 
 from tests.support.browser import Visit
+from tests.support.recorded import sited
 from tests.support.site_runs import OWNED
+from tests.support.synthetic import write_run
 
 RUN = "runs/small-default-probabilistic-seed0.html"
 OTHER = "small-occl-probabilistic-seed0"
@@ -60,7 +63,19 @@ def test_pages_of_each_kind_open_and_draw_their_charts(visit: Visit) -> None:
     assert charts[0] == 9
     assert charts[1] > 15
     assert charts[2] == charts[1] + SEVERAL  # of the other run
-    assert charts[3] == 1
+    assert charts[3] == 0  # a single evaluation is no curve
+
+
+@pytest.mark.slow
+def test_logarithmic_axes_say_so_and_have_one_format_of_ticks(visit: Visit) -> None:
+    visit.open(RUN)
+    visit.draw()
+    for chart in ("depth_calibration", "projected_calibration", "learning_projected_precision"):
+        figure = visit.page.locator(f"figure[data-chart={chart}]")
+        assert "log scale" in figure.locator(".ytitle").text_content()
+        ticks = figure.locator(".ytick text").evaluate_all("ticks => ticks.map(tick => tick.innerHTML)")
+        assert len(ticks) > 1
+        assert len({"super" in tick or "10<tspan" in tick for tick in ticks}) == 1, ticks
 
 
 @pytest.mark.slow
@@ -142,6 +157,31 @@ def test_the_overview_sorts_runs_and_filters_lines(visit: Visit) -> None:
         f"document.querySelectorAll('[data-chart=calibration_coverage] .scatterlayer .trace').length < {every}"
     )
     assert lines.count() == 2  # the diagonal and one run
+    rows = visit.page.locator("table.runs tbody tr:visible th")
+    assert 0 < rows.count() < visit.page.locator("table.runs tbody tr").count()
+    assert all(" on occl" in text for text in rows.all_inner_texts())
+
+
+@pytest.mark.slow
+def test_at_most_eight_lines_have_a_label(chromium: Any, tmp_path: Path) -> None:
+    """The others are grey; a filter labels others."""
+    for place in range(10):
+        write_run(tmp_path / "runs", ("default", "occl")[place > 7], "mae_vz", seed=place, n=40, epochs=2)
+    visit = Visit(chromium, sited(tmp_path / "runs", tmp_path / "out"))
+    visit.open("index.html")
+    visit.draw()
+    labels = visit.page.locator("#learning .legend li[data-run]:visible")
+    strokes = """[...document.querySelectorAll('[data-chart=learning_depth_error_mm] .scatterlayer .js-line')]
+        .map(line => line.style.stroke + line.style.strokeDasharray)"""
+    every = visit.page.evaluate(strokes)
+    assert (labels.count(), len(every), len(set(every))) == (8, 10, 9)
+    assert "2 more runs" in visit.page.locator("#learning .more").inner_text()
+    visit.page.locator("[data-filter=data]").select_option("occl")
+    visit.page.wait_for_function(f"{strokes}.length === 2")
+    assert len(set(visit.page.evaluate(strokes))) == labels.count() == 2
+    assert not visit.page.locator("#learning .more").is_visible()
+    visit.context.close()
+    assert visit.faults == []
 
 
 @pytest.mark.slow

@@ -9,8 +9,13 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
+from phd_exp.records.runs import RunFolder
+from phd_exp.reports.quantities import SCORES
 from phd_exp.reports.runs import Run, read_report
 from phd_exp.reports.site import build
+from phd_exp.reports.site.overview import presets_of
+from phd_exp.reports.site.pages import overview_page
+from phd_exp.reports.table import Table
 from tests.support.recorded import sited
 from tests.support.site_runs import HOSTILE, OWNED
 from tests.support.synthetic import write_run
@@ -124,6 +129,44 @@ def test_a_run_page_shows_its_numbers_and_pictures(runs: tuple[Run, ...], site: 
     sections = ("gallery", "calibration", "learning", "strata", "numbers")
     places = [page.index(f'id="{name}"') for name in sections]
     assert places == sorted(places)
+
+
+def test_values_outside_the_calibrated_interval_are_marked(site: Path, runs: tuple[Run, ...]) -> None:
+    """In the headlines, which include the coverage, and in the table of all numbers."""
+    marked = {}
+    for slug in ("small-default-probabilistic-seed0", "small-occl-probabilistic-seed0"):
+        (run,) = [run for run in runs if run.slug == slug]
+        before, page = run.measured.before, (site / "runs" / f"{slug}.html").read_text()
+        assert before is not None
+        for key in ("inside_90", "miscalibration_area"):
+            value, band = before.scores[key].value, before.reference[key]
+            arrow = "↓" if value < band.low else "↑" if value > band.high else ""
+            (cell,) = re.findall(f'row">{SCORES[key].label}.*?data-label="Value">(.*?)</td>', page, re.DOTALL)
+            assert [one for one in "↓↑" if one in cell] == [*arrow]
+            marked[slug, key] = arrow
+        headline = page.split('class="headline"')[1].split("</section>")[0]
+        assert re.findall('class="what">([^<]*)', headline)[-2:] == [SCORES["inside_90"].label, SCORES["nll"].label]
+    assert len(set(marked.values())) == 3  # also a value inside
+
+
+def test_tables_of_the_best_preset_are_open_and_those_of_smoke_closed() -> None:
+    counts = {"smoke": 3, "demo": 1, "small": 2}
+    names = [(preset, f"seed{k}") for preset, n in counts.items() for k in range(n)]
+    runs = [
+        Run(RunFolder(Path(preset, name)), preset, "default", "mae_vz", name, state="finished")
+        for preset, name in names
+    ]
+    runs += [
+        Run(RunFolder(Path("full", name)), "full", "default", "mae_vz", name, state="failed") for _, name in names
+    ]
+    presets = presets_of(runs)
+    assert presets == ["small", "demo", "full", "smoke"]
+    tables = [Table("stem", "calibration", preset, (), (), (), (), preset=preset) for preset in sorted(presets)]
+    pattern = r'<details class="preset"( open)?>\s*<summary>Preset <strong>(\w+)'
+    for made, expected in ((tables, [" open", "", "", ""]), (tables[-1:], [""])):
+        found = re.findall(pattern, overview_page(runs, made, {}, []))
+        assert [name for _, name in found] == [name for name in presets if name in {table.preset for table in made}]
+        assert [is_open for is_open, _ in found] == expected
 
 
 def test_recalibration_is_shown_with_held_out_samples(site: Path) -> None:

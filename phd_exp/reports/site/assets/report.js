@@ -101,7 +101,7 @@ const phdExp = (() => {
     return `rgba(${r}, ${g}, ${b}, 0.16)`;
   }
 
-  const titled = ({ title, type }, name) => escaped(title.text) + (type === LOG ? `${name === "y" ? "<br>" : " "}(log scale)` : "");
+  const titled = ({ title, type }, name) => escaped(title.text) + (type === LOG ? `${name === "y" ? "<br>" : ", "}log scale` : "");
 
   function layout(chart) {
     const axis = (name) => {
