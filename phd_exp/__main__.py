@@ -38,9 +38,6 @@ def _run(words: list[str]) -> int:
         verb = _take_verb_from_line()
         if verb and verb not in OF_VERB:  # Hydra completes, and this verb has no groups
             return 0
-    if verb is not None and verb not in VERBS:
-        print(f"error: no verb {verb!r}; expected one of {', '.join(VERBS)}, or key=value", file=sys.stderr)
-        return 2
     if HELP & set(words) or "--version" in words:
         print(text_of(verb) if HELP & set(words) else f"phd_exp {__version__}")
         return 0
@@ -54,10 +51,7 @@ def _run(words: list[str]) -> int:
 def _take_verb(words: list[str]) -> str | None:
     """Remove the verb from the words and return it. It is the first word, or follows -m."""
     place = 1 if words[:1] in (["-m"], ["--multirun"]) else 0
-    word = words[place] if place < len(words) else ""
-    if not word or word in HELP or "=" in word or word.startswith(("-", "~", "+")):
-        return None
-    return words.pop(place)
+    return words.pop(place) if words[place : place + 1] and words[place] in VERBS else None
 
 
 def _take_verb_from_line() -> str | None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from phd_exp.records.detections import Detection
-from phd_exp.records.errors import ConfigError, DatasetError, RunError, complaint, nearest, writing
+from phd_exp.records.errors import ConfigError, DatasetError, RunError, complaint, unknown, writing
 from phd_exp.records.files import remove_temporaries
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
@@ -41,7 +41,7 @@ class Arguments(BaseModel):
             problem = error.errors(include_url=False)[0]
             key = ".".join(map(str, problem["loc"]))
             ours = {
-                "extra_forbidden": f"{key}: unknown key{nearest(key, cls.model_fields)}; {takes}",
+                "extra_forbidden": unknown(key, cls.model_fields, takes),
                 "missing": f"{key}: missing; {takes}",
             }
             raise ConfigError(ours.get(problem["type"]) or complaint(key, problem)) from None

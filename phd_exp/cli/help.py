@@ -80,7 +80,10 @@ def text_of(verb: str | None) -> str:
         words, groups = f"[-m] [group=choice ...] {words}", f"\n\ngroups\n{_choices(OF_VERB[verb])}"
     from phd_exp.cli.keys import keys_of  # pydantic, which the help of the programme does without
 
-    keys = "".join(f"\n  {name}  {kind}, {default}\n      {text}" for name, kind, default, text in keys_of(verb))
+    keys = "".join(
+        f"\n{heading}".rstrip() + "".join(f"\n  {key}  {kind}, {value}\n      {text}" for key, kind, value, text in keys)
+        for heading, keys in keys_of(verb).items()
+    )
     examples = "".join(f"\n  {line}" for line in EXAMPLES[verb])
     usage = f"usage: python -m phd_exp {verb} {words}\n\n{VERBS[verb]}"
     return f"{usage}{groups}\n\nkeys: type, default{keys}\n\nexamples{examples}"

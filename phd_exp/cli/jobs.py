@@ -1,7 +1,6 @@
 """Hydra for the verbs `train` and `render`: a job, and its launch, once or with -m as a sweep."""
 
 import os
-import re
 import sys
 import uuid
 from collections.abc import Callable
@@ -20,15 +19,12 @@ from omegaconf.errors import OmegaConfBaseException
 
 from phd_exp.cli import conf_folder
 from phd_exp.cli.frame import Ending, Stopped, ending_with, failure, print_errors, stopping_on_signals
-from phd_exp.cli.help import OF_VERB
 from phd_exp.cli.paths import quoted
-from phd_exp.records.errors import ConfigError, RunError, install, nearest
+from phd_exp.cli.words import REFUSED, explain, require_overrides
+from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.processes import usable_cores
 
 OMP = "OMP_NUM_THREADS"
-LONGEST = 400  # characters of Hydra's messages that are repeated
-REFUSED = (HydraException, OmegaConfBaseException, ValueError, TypeError, ArithmeticError, RecursionError)
-"""The errors that a bad override raises; ValueError for a group set to null, TypeError for one set to numbers."""
 NO_SCORE = "the sweeper receives no score: only trainings with held-out samples have one; set data.n_held_out above 0"
 HOME = uuid.uuid4().hex  # names this process: another process that imports this module has another value
 
@@ -143,6 +139,7 @@ def launch(job: Job, words: list[str], config_name: str = "config") -> int:
 
 def composed(overrides: list[str], config_dir: str | Path | None = None) -> dict[str, Any]:
     """The configuration of one run, without Hydra's command line. Raises ConfigError for a bad override."""
+    require_overrides(overrides)
     search = [f"hydra.searchpath=[file://{Path(config_dir).absolute()}]"] if config_dir else []
     try:
         with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
@@ -165,6 +162,7 @@ def _options_last(words: list[str]) -> list[str]:
     arguments = parser.parse_intermixed_args(words)
     options = [word for word in words if word not in arguments.overrides]
     overrides = quoted(arguments.overrides, several=arguments.multirun)
+    require_overrides(overrides)
     if arguments.multirun and any(word.startswith("experiment=") for word in overrides):
         overrides = list(map(_for_jobs_alone, overrides))
     return [*overrides, *options]
@@ -183,37 +181,3 @@ def _for_jobs_alone(word: str) -> str:
     before, after = overrides
     is_of_job = "." in before.key_or_group and not before.is_hydra_override() and not before.is_sweep_override()
     return str(after.input_line) if is_of_job else word
-
-
-def explain(error: Exception, config_name: str) -> str:
-    """An error of Hydra as one line: the override, why it is invalid, and the nearest valid one."""
-    text = " ".join(str(error).split())
-    if unknown := re.search(r"Could not override '([^']+)'", text):
-        return _unknown_key(unknown[1].lstrip("+~"), config_name)
-    pattern = r"Could not find '([^']+)/([^']+)' Available options in '[^']+': (.*?) Config search path"
-    if choice := re.search(pattern, text):
-        group, name, options = choice[1], choice[2], choice[3].split()
-        remedy = f"{nearest(name, options)}{install(name)}"
-        return f"{group}={name}: no such choice{remedy}; expected one of {', '.join(options)}"
-    text = re.sub(r" Set the environment variable.*| Config search path:.*", "", text)
-    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
-
-
-def _unknown_key(key: str, config_name: str) -> str:
-    section, _, leaf = key.rpartition(".")
-    if section:
-        group, _, rest = key.partition(".")
-        files = sorted((conf_folder() / group).glob("*.yaml"))
-        # a list of keys, since `in` a DictConfig is false for ???
-        if owners := [f"{group}={file.stem}" for file in files if rest in list(OmegaConf.load(file))]:
-            return f"{key}: not a key of this choice, but of {' or '.join(owners)}; name that choice too"
-    with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
-        config = hydra.compose(config_name)
-    node = OmegaConf.select(config, section) if section else config
-    valid = [str(name) for name in node] if isinstance(node, DictConfig) else []
-    if not section:
-        groups = OF_VERB["render" if config_name == "render" else "train"]
-        if key in groups:
-            return f"{key}: a group; expected {key}=CHOICE, or {key}.KEY=VALUE"
-        valid = sorted({*valid, *groups})
-    return f"{key}: unknown key{nearest(leaf, valid)}; expected one of {', '.join(valid)}"

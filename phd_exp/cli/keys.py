@@ -6,32 +6,48 @@ from importlib import import_module
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
+from omegaconf import MISSING
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from phd_exp.cli import conf_folder
+from phd_exp.records.choices import flatten
+from phd_exp.records.parsing import parse_yaml
 from phd_exp.training.config import RenderConfig, RunConfig
 
 LINE = re.compile(r"( *)(\w+):(?: +([^#]*?))?(?: *# *(.*))?")
 """A line of YAML: indentation, key, value and comment."""
-FILES = {"train": {"config": "", "trainer/auto": "trainer.", "recipe/paper": ""}, "render": {"render": ""}}
-"""Verb -> the files of conf/ that explain its keys, with what precedes these; those of DATA follow for both."""
-DATA = {"data/default": "data.", "data/object": "data."}
+RENDERED = {
+    "data/default": "data: any rendered data set",
+    "data/object": "data=object: further keys, and other defaults than above",
+}
+FILES = {
+    "train": {
+        "config": "",
+        "trainer/auto": "trainer",
+        "camera/known": "camera",
+        "optimizer/adam": "optimizer=adam",
+        "optimizer/muon": "optimizer=muon",
+        "recipe/paper": "recipe=paper",
+        **RENDERED,
+        "data/folder": "data=folder",
+    },
+    "render": {"render": "", **RENDERED},
+}
+"""Verb -> the files of conf/ that explain its keys, with their headings."""
 NAMES = {int: "int", float: "float", bool: "bool", NoneType: "null", tuple: "list"}
 Key = tuple[str, str, str, str]
 """Name, type, default and description."""
 
 
-def keys_of(verb: str) -> list[Key]:
-    """All keys of a verb, except the arguments of the classes that its groups choose."""
+def keys_of(verb: str) -> dict[str, list[Key]]:
+    """Heading -> the keys of a verb, except the arguments of most classes that its groups choose."""
     if verb in FILES:
-        files, model = FILES[verb] | DATA, RunConfig if verb == "train" else RenderConfig
-        return [key for file, prefix in files.items() for key in _in(file, prefix, model)]
+        model = RunConfig if verb == "train" else RenderConfig
+        return {heading: list(_in(file, model)) for file, heading in FILES[verb].items()}
     arguments: type[BaseModel] = getattr(import_module(f"phd_exp.cli.{verb}"), f"{verb.title()}Arguments")
-    return [
-        (name, _type(field.annotation), _default(field), field.description or "")
-        for name, field in arguments.model_fields.items()
-    ]
+    fields = arguments.model_fields.items()
+    return {"": [(name, _type(one.annotation), _default(one), one.description or "") for name, one in fields]}
 
 
 def _default(field: FieldInfo) -> str:
@@ -40,17 +56,26 @@ def _default(field: FieldInfo) -> str:
     return "null" if field.default is None else str(field.default).lower()
 
 
-def _in(file: str, prefix: str, model: type[BaseModel]) -> Iterator[Key]:
+def _in(file: str, model: type[BaseModel]) -> Iterator[Key]:
     """The keys in a file of conf/ that have a comment."""
+    content = (conf_folder() / f"{file}.yaml").read_text()
+    group = file.rpartition("/")[0]
+    prefix = f"{group}." if group and "# @package _global_" not in content else ""
+    by_preset = flatten(parse_yaml((conf_folder() / "preset/paper.yaml").read_text()))
     sections: list[str] = []
-    for text in (conf_folder() / f"{file}.yaml").read_text().splitlines():
+    for text in content.splitlines():
         if not (found := LINE.fullmatch(text)):
             continue
         depth = len(found[1]) // 2
         sections = [*sections[:depth], found[2]]
         name = prefix + ".".join(sections)
-        if found[3] and found[4] and (annotation := _annotation(model, name.split("."))):
-            yield name, _type(annotation), found[3], found[4]
+        if not (found[3] and found[4]):
+            continue
+        default = found[3] if found[3] != MISSING else "set by preset" if name in by_preset else "required"
+        # the arguments of a class have no model
+        of_class = type(parse_yaml(found[3])) if group == "optimizer" else None
+        if annotation := of_class or _annotation(model, name.split(".")):
+            yield name, _type(annotation), default, found[4]
 
 
 def _annotation(annotation: Any, names: list[str]) -> Any:

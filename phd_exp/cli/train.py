@@ -131,6 +131,7 @@ def _images_seen(config: dict[str, Any]) -> int:
 def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> None:
     """Print the work of the run and, if it takes many hours, a shorter alternative."""
     from phd_exp.training.network import has_gpu
+    from phd_exp.training.run import equal_run
 
     data, epochs = checked.data, checked.trainer.max_epochs
     n_missing = 0
@@ -143,6 +144,8 @@ def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> Non
     gpu = has_gpu(checked.trainer)
     print(f"{folder.path}: {render}{epochs} epochs of {network} on {images} images of", end=" ")
     print(f"{data.image_size} px, on {'a GPU' if gpu else 'the CPU'}", flush=True)
+    if equal := equal_run(checked, folder):
+        print(f"  {equal.path} is finished, with an equal configuration: its command uses that run again", flush=True)
     if checked.preset == "paper" and not gpu:
         words = " ".join([*(word for word in overrides if not word.startswith("preset=")), "preset=small"])
         print("  the authors' protocol takes many hours without a GPU: an estimate follows the first batches")

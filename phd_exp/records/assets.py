@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
+from phd_exp.records.errors import listed
 from phd_exp.records.files import MB, checksum, require_plain
 from phd_exp.records.mesh_files import read_mesh
 from phd_exp.records.parsing import Record
@@ -35,6 +36,9 @@ class Asset(Record):
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Asset) and self.files == other.files
+
+    def __str__(self) -> str:
+        return listed([f"{name} (SHA-256 {digest[:8]}...)" for name, digest in self.files.items()])
 
     def path(self, name: str) -> Path:
         """The path of a file. Raises ValueError if the folder is not known."""

@@ -149,8 +149,8 @@ class DatasetFolder:
         manifest = self.manifest
         if difference := first_difference(dict(manifest.spec), dict(spec)):
             raise DatasetError(
-                f"{self.root}: holds a data set with {difference} is asked for; move the folder away or choose "
-                "another data.root"
+                f"{self.root}: holds a data set with {difference} is asked for; move the folder away, or choose "
+                "another data.variant (a new name) or data.root"
             )
         return manifest
 

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field, PlainValidator, ValidationError, mod
 from pydantic_core import ErrorDetails
 
 from phd_exp.records.cameras import CORNER, SHORTEST, Calibration, Size, read_camera
-from phd_exp.records.errors import DatasetError, complaint, nearest
+from phd_exp.records.errors import DatasetError, complaint, unknown
 from phd_exp.records.parsing import Record
 from phd_exp.records.scenes import Pose, SampleRecord
 from phd_exp.records.spec import Number, Positive
@@ -204,5 +204,5 @@ def _complaint(problem: ErrorDetails) -> str:
         return f"{key}: a line describes no lens; expected camera, a calibration file"
     if problem["type"] == "extra_forbidden":
         known = (Pose if key.startswith("pose.") else DetectionLine).model_fields
-        return f"{key}: unknown key{nearest(key, known)}; expected one of {', '.join(known)}"
+        return unknown(key, known)
     return f"{key}: missing" if problem["type"] == "missing" else complaint(key, problem)

@@ -72,10 +72,27 @@ def listed(names: Sequence[str]) -> str:
     return f"{', '.join(names[:NAMED])}{rest}"
 
 
-def nearest(key: str, valid: Iterable[str]) -> str:
-    """`, did you mean 'lr'?` if a valid key resembles the given one, else an empty string."""
-    close = difflib.get_close_matches(key, list(valid), n=1)
-    return f", did you mean {close[0]!r}?" if close else ""
+def nearest(word: str, valid: Iterable[str]) -> str:
+    """`, did you mean 'lr'?` if the end of a valid word resembles that of the given one, else an empty string.
+
+    Examples:
+        >>> nearest("epochs", ["data.n_train", "trainer.max_epochs"])
+        ", did you mean 'trainer.max_epochs'?"
+    """
+    ends = {end_of(name): name for name in reversed(list(valid))}  # of equal ends the first
+    close = difflib.get_close_matches(end_of(word), ends, n=1)
+    return f", did you mean {ends[close[0]]!r}?" if close else ""
+
+
+def end_of(word: str) -> str:
+    """What follows the last `.` or `=` of a word."""
+    return re.split("[.=]", word)[-1]
+
+
+def unknown(key: str, valid: Iterable[str], expected: str = "") -> str:
+    """The message about a key that is none of the valid ones; by default it lists all of these."""
+    names = list(valid)
+    return f"{key}: unknown key{nearest(key, names)}; {expected or 'expected one of ' + ', '.join(names)}"
 
 
 def complaint(key: str, problem: ErrorDetails) -> str:
@@ -131,4 +148,9 @@ def shown(value: object) -> str:
         text = repr(value)
     except (ValueError, RecursionError):  # an integer of thousands of digits, or deep nesting
         return f"<{type(value).__name__}>"
-    return text if len(text) <= LONGEST_VALUE else f"{text[:LONGEST_VALUE]}..."
+    return shortened(text)
+
+
+def shortened(text: str, longest: int = LONGEST_VALUE) -> str:
+    """A text for a message, of a long one the beginning."""
+    return text if len(text) <= longest else f"{text[:longest]}..."

@@ -103,10 +103,7 @@ def require_same_config(folder: RunFolder, config: RunConfig) -> None:
     if not folder.config_file.exists():
         return
     require_same_shrinking(folder, config)
-    asked = flatten(config.model_dump(mode="json"))
-    chosen = flatten(config.model_dump(mode="json", exclude_defaults=True))
-    younger = {key: value for key, value in asked.items() if key not in chosen}  # may be absent in an older record
-    if difference := first_difference(younger | flatten(folder.config()), asked):
+    if difference := _difference(folder, config):
         raise RunError(
             f"{folder.path}: holds a run with {difference} is asked for; "
             "move that folder away, or choose another place by runs=DIR"
@@ -118,6 +115,23 @@ def require_same_config(folder: RunFolder, config: RunConfig) -> None:
             f"{folder.path}: holds a run on {config.data.folder} as it was before its annotations changed; "
             "move that run's folder away, or choose another place by runs=DIR"
         )
+
+
+def _difference(folder: RunFolder, config: RunConfig) -> str | None:
+    """The first key with another value in the run that a folder holds; None if its results are the same."""
+    asked = flatten(config.model_dump(mode="json"))
+    chosen = flatten(config.model_dump(mode="json", exclude_defaults=True))
+    younger = {key: value for key, value in asked.items() if key not in chosen}  # may be absent in an older record
+    return first_difference(younger | flatten(folder.config()), asked)
+
+
+def equal_run(config: RunConfig, folder: RunFolder) -> RunFolder | None:
+    """A finished run next to a folder with the same configuration: other overrides can lead to equal values."""
+    for path in sorted(folder.path.parent.glob(f"seed{config.seed}*")):
+        with suppress(RunError):  # a record that cannot be read
+            if path != folder.path and (other := RunFolder(path)).is_finished() and not _difference(other, config):
+                return other
+    return None
 
 
 def run(

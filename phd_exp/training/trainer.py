@@ -10,7 +10,7 @@ from lightning import Trainer
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar
 
-from phd_exp.records.errors import ConfigError, nearest, shown
+from phd_exp.records.errors import ConfigError, unknown, shown
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.checkpoints import AtomicCheckpoints, StopBetweenBatches
 from phd_exp.training.config import RunConfig
@@ -87,7 +87,7 @@ def trainer_arguments(config: RunConfig) -> dict[str, Any]:
         if key in OWNED:
             raise ConfigError(f"trainer.{key}: the run record depends on it; instead {OWNED[key]}")
         if key not in known:
-            raise ConfigError(f"trainer.{key}: unknown key{nearest(key, known)}; expected one of {', '.join(known)}")
+            raise ConfigError(unknown(f"trainer.{key}", known))
     return given
 
 

@@ -1,6 +1,7 @@
 """Every named bad input: what is wrong, the command that meets it, and the one line that it says."""
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -142,6 +143,19 @@ BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
     f"{name}: &{name} [{','.join([f'*{before}'] * 9)}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
 )
 
+ENDS = {
+    "optimiser.lr=0.01": "optimizer.lr", "lr=0.01": "optimizer.lr", "epochs=3": "trainer.max_epochs",
+    "batch_size=8": "data.batch_size", "n_train=9": "data.n_train", "folder=photos": "data.folder",
+}  # fmt: skip
+"""Words whose key is known by its end, and the key."""
+SPACES = {
+    "model = mae_vz": "model=mae_vz",
+    "model= mae_vz": "model=mae_vz",
+    "model =mae_vz": "model=mae_vz",
+    "-m seed=0, 1": "seed=0,1",
+    "data.z_range=[3, 5]": "'data.z_range=[3,5]'",
+}
+"""Words that a shell splits at spaces, and what was meant."""
 CONFIGURATIONS = [
     Bad("configuration: a flag that returns the carriage", nothing, ("preset=smoke", "--cfg\r"), r"--cfg: holds control characters; expected printable KEY=VALUE", 2),
     configured("a flag that there is not", "--nonsense", r"unrecognized arguments: --nonsense; see `python -m phd_exp --help`"),
@@ -160,7 +174,15 @@ CONFIGURATIONS = [
     configured("a range that is one number", "data.f_range=5", r"data\.f_range: got 5; expected a valid tuple"),
     configured("a folder without a name", "runs=''", r"runs: got ''; expected the name of a folder"),
     configured("brackets without end", "+a=" + "[" * 2000, r"[^\n]{1,420}"),
-    configured("an empty word", "", r".*mismatched input.*"),
+    configured("an empty word", "", r": no KEY=VALUE; .*"),
+    *(configured(f"the end of a key, {word}", word, rf"{word.split('=')[0]}: unknown key, did you mean '{key}'\?; expected one of backbone, .*") for word, key in ENDS.items()),
+    configured("an argument that the files do not name", "trainer.gradient_clip_val=1", r"trainer\.gradient_clip_val: unknown key; .* \+trainer\.gradient_clip_val=VALUE"),
+    configured("a key of another section", "trainer.batch_size=8", r"trainer\.batch_size: unknown key, did you mean 'data\.batch_size'\?; .*"),
+    configured("a key of a part that is not chosen", "callbacks.early_stopping.patience=3", r"callbacks\.early_stopping\.patience: .* of callbacks=early_stopping; name that choice too"),
+    configured("one of several choices", "callbacks=[early_stopping,nosuch]", r"callbacks=nosuch: no such choice; expected one of best_checkpoint, .*lr_monitor"),
+    configured("a choice without its group", "strong", r"strong: no KEY=VALUE, did you mean 'recipe=strong'\?; .*"),
+    configured("no end of a list", "data.n_train=[", r"data\.n_train=\[: .*; expected KEY=VALUE without spaces, or with the value in quotes, .*"),
+    *(Bad(f"configuration: spaces, {text}", nothing, (*text.split(" "), "preset=smoke"), rf"{re.escape(text.removeprefix('-m '))}: has spaces; expected {re.escape(mended)}", 2) for text, mended in SPACES.items()),
     Bad("configuration: a zero byte", nothing, ("preset=smoke", "runs=a\0b"), r"runs=a\?b: holds control characters; .*", 2),
     *(Bad(f"configuration: {word}", nothing, ("-m", "preset=smoke", word), r"seed=range\(0,.*\): more than 10000 jobs; .*", 2, again="1e9" not in word) for word in ("seed=range(0,1e9)", "seed=range(0,nan)", "seed=range(0,inf)")),
     Bad("configuration: two long ranges", nothing, ("-m", "preset=smoke", "seed=range(0,9999)", "data.seed=range(0,9999)"), r"preset=smoke seed=.*: more than 10000 jobs; .*", 2),

@@ -126,7 +126,7 @@ def test_a_wrong_value_is_one_line(tmp_path: Path, arguments: list[str], parts: 
 
 
 BAD_COMMANDS = [
-    (["data.ntrain=3"], 2, ["data.ntrain: unknown key, did you mean 'n_train'?; expected one of n_train, "]),
+    (["data.ntrain=3"], 2, ["data.ntrain: unknown key, did you mean 'data.n_train'?; expected one of n_train, "]),
     (["modle=mae_vz"], 2, ["modle", "did you mean 'model'"]),
     (["model=mae_log"], 2, ["model=mae_log", "did you mean 'mae_logz'", "probabilistic"]),
     (["data.n_train=["], 2, ["viable"]),
@@ -174,5 +174,5 @@ def test_each_thing_wrong_gets_its_own_line(phd_exp: Callable) -> None:
 def test_unknown_verb(phd_exp: Callable) -> None:
     outcome = phd_exp("trian")
     assert outcome.status == 2
-    assert "no verb 'trian'" in outcome.err
+    assert "trian: no KEY=VALUE, did you mean 'train'?" in outcome.err
     assert "train, render, report" in outcome.err

@@ -11,6 +11,7 @@ import pytest
 from phd_exp import __version__ as phd_exp_version
 from phd_exp.cli import conf_folder
 from phd_exp.cli.help import COMPLETION, EXAMPLES, OF_VERB, VERBS
+from phd_exp.cli.keys import keys_of
 
 
 def test_help_within_a_second_and_without_torch() -> None:
@@ -43,6 +44,23 @@ def test_every_verb_has_help_with_examples(phd_exp: Callable) -> None:
         outcome = phd_exp(verb, "--help")
         assert outcome.status == 0
         assert all(example in outcome.out for example in EXAMPLES[verb])
+
+
+@pytest.mark.parametrize("verb", OF_VERB)
+def test_help_lists_every_key_once_for_each_choice(verb: str) -> None:
+    found = {heading: {name: default for name, _, default, _ in keys} for heading, keys in keys_of(verb).items()}
+    assert sum(map(len, found.values())) == sum(map(len, keys_of(verb).values()))
+    assert all("???" not in default for keys in found.values() for default in keys.values())
+    everywhere, (rendered,) = found[""], (keys for heading, keys in found.items() if heading.startswith("data: "))
+    assert {"data.variant", "data.root", "data.f_range"} <= rendered.keys()
+    assert rendered["data.n_train"] == "set by preset"
+    if verb == "train":
+        assert {"seed", "evaluation.shifts"} <= everywhere.keys()
+        assert found["trainer"]["trainer.max_epochs"] == "set by preset"
+        assert {"data.name", "data.object", "data.n_train"} <= found["data=folder"].keys()
+        assert found["data=folder"]["data.folder"] == "required"
+        assert (found["optimizer=adam"]["optimizer.lr"], found["optimizer=muon"]["optimizer.lr"]) == ("0.001", "0.002")
+        assert found["camera"]["camera.f_error"] == "0"
 
 
 def test_help_explains_completion(phd_exp: Callable) -> None:

@@ -57,6 +57,21 @@ def test_one_value_has_one_name(config: RunConfig, one: str, other: str) -> None
     assert run_name(config, [one]) == run_name(config, [other])
 
 
+def test_an_equal_run_is_named_before_the_training(composed, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    base = ["preset=smoke", f"data.root={tmp_path}", f"runs={tmp_path}"]
+    default = check(composed(*base))
+    first = RunFolder(run_name(default, base).folder(tmp_path))
+    with first.recording(None):
+        first.write_config(default.model_dump(mode="json"))
+    for word, is_equal in (("optimizer.lr=0.001", True), ("trainer.threads=1", True), ("optimizer.lr=0.002", False)):
+        checked = check(composed(*base, word))
+        announce(checked, RunFolder(run_name(checked, [*base, word, "data.n_held_out=8"]).folder(tmp_path)), base)
+        assert (f"{first.path} is finished, with an equal configuration" in capsys.readouterr().out) == is_equal
+    (first.path / "config.yaml").write_text("[")
+    announce(default, RunFolder(first.path.with_name("seed0-0")), base)
+    assert "equal" not in capsys.readouterr().out
+
+
 COSTLY = ["model=mae_logz", "data=scale"]
 COST = "11000 images to render, then 50 epochs of resnet50 on 8000 images of 224 px"
 CHEAP = "4200 images to render, then 30 epochs of resnet10 on 3200 images of 64 px, on the CPU"

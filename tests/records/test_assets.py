@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 
 from phd_exp.records.assets import mesh_asset
-from phd_exp.records.errors import ConfigError
+from phd_exp.records.dataset import DatasetFolder, Manifest
+from phd_exp.records.errors import ConfigError, DatasetError
 from phd_exp.training.config import check_render
 from tests.support.meshes import solid, write_mesh
 
@@ -75,6 +76,19 @@ def refused(composed: Callable[..., dict[str, Any]], tmp_path: Path, monkeypatch
 )
 def test_bad_values_are_one_line(refused: Callable, overrides: tuple[str, ...], message: str) -> None:
     assert message in refused(*overrides)
+
+
+def test_a_data_set_of_another_mesh_is_refused_by_name(make_spec: Callable, tmp_path: Path) -> None:
+    specs = []
+    for shape in ("cube", "sphere"):
+        write_mesh(tmp_path / f"{shape}.glb", solid(shape))
+        specs.append(make_spec(mesh=mesh_asset(tmp_path / f"{shape}.glb")))
+    folder = DatasetFolder(tmp_path / "object")
+    folder.root.mkdir()
+    folder.write_manifest(Manifest(generator=1, renderer="a path tracer", spec=specs[0], splits={}))
+    with pytest.raises(DatasetError, match=r"mesh=cube\.glb .*mesh=sphere\.glb .* another data\.variant") as refused:
+        folder.require(specs[1])
+    assert len(str(refused.value)) < len(str(tmp_path)) + 250
 
 
 def test_a_mesh_is_its_contents_and_those_of_the_files_it_names(tmp_path: Path) -> None:

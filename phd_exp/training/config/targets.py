@@ -9,7 +9,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Tag, TypeAdapter, Va
 from pydantic.errors import PydanticSchemaGenerationError
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from phd_exp.records.errors import complaint, in_user_code, install, nearest, shown
+from phd_exp.records.errors import complaint, in_user_code, install, nearest, shown, unknown
 
 OURS = tuple(f"phd_exp.{room}" for room in ("models", "losses", "optimizers", "geometry", "distributions"))
 KNOWN = (*OURS, "torch.optim", "lightning")
@@ -143,9 +143,7 @@ def describe(problem: ErrorDetails, model: type[BaseModel]) -> str:
     if problem["type"] == "target":
         return f"{key}.{context['path']}: {context['reason']}"
     if problem["type"] == "extra_forbidden":
-        valid = _valid_keys(model, place[:-1])
-        unknown = f"{key}: unknown key (value {shown(problem['input'])}){nearest(location[-1], valid)}"
-        return f"{unknown}; expected one of {', '.join(valid)}"
+        return unknown(key, _valid_keys(model, place[:-1]))
     if problem["type"] == "missing":
         return f"{key}: missing; expected {key}=VALUE"
     return complaint(key, problem)

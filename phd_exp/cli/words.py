@@ -1,0 +1,108 @@
+"""What is wrong with a word of Hydra's command line, in one line, and the nearest valid word."""
+
+import re
+import shlex
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+
+import hydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from phd_exp.cli import conf_folder
+from phd_exp.cli.help import OF_VERB, VERBS
+from phd_exp.records.choices import flatten
+from phd_exp.records.errors import ConfigError, end_of, install, nearest, one_line, shortened, unknown
+
+REFUSED = (HydraException, OmegaConfBaseException, ValueError, TypeError, ArithmeticError, RecursionError)
+"""The errors that a bad override raises; ValueError for a group set to null, TypeError for one set to numbers."""
+LONGEST = 400  # characters of Hydra's messages that are repeated
+GRAMMAR = "expected KEY=VALUE without spaces, or with the value in quotes, \"KEY='VALUE'\""
+
+
+def require_overrides(words: Sequence[str]) -> None:
+    """Raise ConfigError for the first word that is no override of Hydra's grammar."""
+    for parts in _rejoined(words):
+        word = "".join(parts)
+        if len(parts) > 1:
+            raise ConfigError(f"{' '.join(parts)}: has spaces; expected {shlex.quote(word)}")
+        if "=" not in word and not word.startswith("~"):
+            choices = [f"{group}={name}" for group in OF_VERB["train"] for name in _choices(group)]
+            remedy = nearest(word, [*VERBS, *choices])
+            verbs = ", ".join(VERBS)
+            raise ConfigError(f"{word}: no KEY=VALUE{remedy}; a verb ({verbs}) is the first word; {GRAMMAR}")
+        try:
+            OverridesParser.create().parse_override(word)
+        except REFUSED as error:
+            reason = re.sub(r" *See https.*", "", one_line(str(error)))
+            raise ConfigError(f"{shortened(word)}: {shortened(reason)}; {GRAMMAR}") from None
+
+
+def _rejoined(words: Sequence[str]) -> Iterator[list[str]]:
+    """The parts of each word that a shell has split at spaces about `=`, after commas and inside brackets."""
+    parts: list[str] = []
+    for word in words:
+        before = "".join(parts)
+        is_open = before.endswith(("=", ",")) or any(before.count(a) > before.count(b) for a, b in ("[]", "{}", "()"))
+        if parts and (word.startswith("=") or (is_open and "=" not in word)):
+            parts.append(word)
+            continue
+        if parts:
+            yield parts
+        parts = [word]
+    if parts:
+        yield parts
+
+
+def explain(error: Exception, config_name: str) -> str:
+    """An error of Hydra as one line: the override, why it is invalid, and the nearest valid one."""
+    text = " ".join(str(error).split())
+    if found := re.search(r"Could not override '([^']+)'", text):
+        return _unknown_key(found[1].lstrip("+~"), config_name)
+    if found := re.search(r"Could not (?:find|load) '([^']+)/([^']+)'", text):
+        group, name = found.groups()
+        options = getattr(error, "options", None) or _choices(group)
+        remedy = f"{nearest(name, options)}{install(name)}"
+        return f"{group}={name}: no such choice{remedy}; expected one of {', '.join(options)}"
+    return shortened(re.sub(r" Set the environment variable.*| Config search path:.*", "", text), LONGEST)
+
+
+def _unknown_key(key: str, config_name: str) -> str:
+    keys = _keys_of_choices()
+    if owners := keys.get(key):
+        return f"{key}: not a key of this choice, but of {' or '.join(owners)}; name that choice too"
+    groups = OF_VERB["render" if config_name == "render" else "train"]
+    if key in groups:
+        return f"{key}: a group; expected {key}=CHOICE, or {key}.KEY=VALUE"
+    with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
+        config = hydra.compose(config_name)
+    top = sorted({*map(str, config), *groups})
+    everything = [*top, *flatten(OmegaConf.to_container(config)), *keys]  # type: ignore[arg-type]
+    section = key.rpartition(".")[0]
+    node = OmegaConf.select(config, section) if section else None
+    if not isinstance(node, DictConfig):
+        return unknown(key, everything, f"expected one of {', '.join(top)}")
+    valid = [str(name) for name in node if not str(name).startswith("_")]
+    near = [f"{section}.{name}" for name in valid] + [name for name in everything if end_of(name) == end_of(key)]
+    takes_more = section == "trainer" or "_target_" in node
+    further = f"; a further argument of its class has a plus sign: +{key}=VALUE" if takes_more else ""
+    return unknown(key, near, f"expected one of {', '.join(valid)}{further}")
+
+
+def _choices(group: str) -> list[str]:
+    return sorted(file.stem for file in (conf_folder() / group).glob("*.yaml"))
+
+
+def _keys_of_choices() -> dict[str, list[str]]:
+    """Dotted key -> the choices of its group whose files set it."""
+    owners: dict[str, list[str]] = defaultdict(list)
+    for group in OF_VERB["train"]:
+        for name in _choices(group):
+            file = conf_folder() / group / f"{name}.yaml"
+            prefix = "" if "# @package _global_" in file.read_text() else f"{group}."
+            for key in flatten(OmegaConf.to_container(OmegaConf.load(file)), prefix):  # type: ignore[arg-type]
+                if key.startswith(f"{group}."):
+                    owners[key].append(f"{group}={name}")
+    return owners
