@@ -40,10 +40,7 @@ class Arguments(BaseModel):
         except ValidationError as error:
             problem = error.errors(include_url=False)[0]
             key = ".".join(map(str, problem["loc"]))
-            ours = {
-                "extra_forbidden": unknown(key, cls.model_fields, takes),
-                "missing": f"{key}: missing; {takes}",
-            }
+            ours = {"extra_forbidden": unknown(key, cls.model_fields, takes), "missing": f"{key}: missing; {takes}"}
             raise ConfigError(ours.get(problem["type"]) or complaint(key, problem)) from None
 
 

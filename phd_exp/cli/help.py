@@ -81,7 +81,8 @@ def text_of(verb: str | None) -> str:
     from phd_exp.cli.keys import keys_of  # pydantic, which the help of the programme does without
 
     keys = "".join(
-        f"\n{heading}".rstrip() + "".join(f"\n  {key}  {kind}, {value}\n      {text}" for key, kind, value, text in keys)
+        f"\n{heading}".rstrip()
+        + "".join(f"\n  {key}  {kind}, {value}\n      {text}" for key, kind, value, text in keys)
         for heading, keys in keys_of(verb).items()
     )
     examples = "".join(f"\n  {line}" for line in EXAMPLES[verb])

@@ -10,7 +10,7 @@ from lightning import Trainer
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar
 
-from phd_exp.records.errors import ConfigError, unknown, shown
+from phd_exp.records.errors import ConfigError, shown, unknown
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.checkpoints import AtomicCheckpoints, StopBetweenBatches
 from phd_exp.training.config import RunConfig

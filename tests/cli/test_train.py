@@ -1,5 +1,6 @@
 """A run's name contains every override that can change a number, and no other; a run first prints its work."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -57,7 +58,9 @@ def test_one_value_has_one_name(config: RunConfig, one: str, other: str) -> None
     assert run_name(config, [one]) == run_name(config, [other])
 
 
-def test_an_equal_run_is_named_before_the_training(composed, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_an_equal_run_is_named_before_the_training(
+    composed: Callable, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     base = ["preset=smoke", f"data.root={tmp_path}", f"runs={tmp_path}"]
     default = check(composed(*base))
     first = RunFolder(run_name(default, base).folder(tmp_path))

@@ -4,6 +4,7 @@ A block whose first line names a file is that file.
 """
 
 import itertools
+import re
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -54,6 +55,18 @@ def test_commands_are_valid(
             _check(verb, single)
     else:
         assert all("=" in word or word.endswith(".yaml") for word in words[1:])
+
+
+@pytest.mark.parametrize("page", [page for page in (*PAGES, README) if commands(page)], ids=str)
+def test_commands_name_their_preset_and_quote_lists(page: Path) -> None:
+    """The default preset takes many hours without a GPU; some shells read brackets as a pattern of file names."""
+    for line in re.findall(r"^(?:    )?(python -m phd_exp .*)$", page.read_text().replace("\\\n", " "), re.MULTILINE):
+        command = line.partition(" #")[0]
+        assert not re.search(r"\s[^\s'\"]*[\[{]", command), command
+        words = command.split()[3:]
+        verb = next((word for word in words[:2] if word in VERBS), "train")
+        if verb in OF_VERB and not any(word.startswith(("--", "experiment=speed")) for word in words):
+            assert any(word.startswith("preset=") for word in words), command
 
 
 def _single_runs(words: list[str]) -> list[tuple[str, ...]]:
