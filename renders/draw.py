@@ -1,26 +1,35 @@
-"""`python renders/draw.py [FOLDER]`: the two pictures of `renders/README.md`, into `renders/` or another folder.
+"""The pictures of `README.md` and `renders/README.md`, into `renders/` or another folder.
 
-`gallery.jpg` shows paired data sets side by side, `camera.png` the camera's axes and where things are in an image.
+python renders/draw.py [FOLDER]               # gallery.jpg: paired data sets; camera.png: the camera's axes
+python renders/draw.py FOLDER RUN IMAGES      # glance.png: a prediction of a run, given its test images
 """
 
 import io
+import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import hydra
 import numpy as np
+from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 from phd_exp.cli import conf_folder
 from phd_exp.cli.jobs import plain
+from phd_exp.distributions.level_curves import LevelCurves
+from phd_exp.evaluation.parquet import read_table
 from phd_exp.records.files import write_atomic
+from phd_exp.records.runs import RunFolder
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer
 from phd_exp.rendering.pixels import file_of
 from phd_exp.rendering.rays import cylinder_mask, trace_pixels
 from phd_exp.rendering.samples import fast_settings, make_sample
+from phd_exp.reports.figures import draw_birds_eye, draw_curve, draw_on_image, encoded
+from phd_exp.reports.gallery import curves_of, load_image
 from phd_exp.training.config import check_render
 
 VARIANTS = ("default", "occl", "scale", "occl_scale")
@@ -31,22 +40,60 @@ QUALITY = 88
 SPLIT: Split = "train"
 ZOOM = 4
 INK, MARK = (20, 20, 20), (200, 0, 60)
+CURVES = "#e06000"  # visible on an image and on white
+LABEL = 28  # px above each row of the gallery
 PIXEL = 96  # px of the drawing that one pixel takes where two of them are explained
 
 
 def draw_gallery(path: Path, specs: Sequence[DatasetSpec], indices: Sequence[int]) -> None:
-    """Write a JPEG of the same samples of every data set, rendered for it: a row a data set, a column a sample.
+    """Write a JPEG of the same samples of every data set, rendered for it: a labelled row each, a column a sample.
 
     Raises:
         RenderError: bpy is missing.
     """
     rows = [[image for image, _ in _samples(spec, indices)] for spec in specs]
     side = max(image.width for row in rows for image in row) + GAP
-    sheet = Image.new("RGB", (len(indices) * side - GAP, len(specs) * side - GAP), "white")
-    for y, row in enumerate(rows):
+    sheet = Image.new("RGB", (len(indices) * side - GAP, len(specs) * (side + LABEL) - GAP), "white")
+    draw = ImageDraw.Draw(sheet)
+    for y, (spec, row) in enumerate(zip(specs, rows, strict=True)):
+        top = y * (side + LABEL) + LABEL
+        draw.text((2, top - 4), f"data={spec.variant}", INK, _font(18), anchor="ls")
         for x, image in enumerate(row):
-            sheet.paste(image, (x * side, y * side))
+            sheet.paste(image, (x * side, top))
     write_atomic(path, file_of(sheet, "jpeg", quality=QUALITY))
+
+
+def draw_glance(path: Path, run: RunFolder, images: Path) -> None:
+    """Write a PNG of a run's prediction with the median score, its truth, and the calibration of all."""
+    table = read_table(run.predictions)
+    place = int(np.argsort(table["nll"])[len(table["nll"]) // 2])
+    row = {name: column[place] for name, column in table.items()}
+    image, curves = load_image(images, str(row["file_name"])), curves_of(row)
+    assert image is not None, row["file_name"]
+    assert curves is not None, "a baseline predicts no region"
+    calibration = json.loads(run.curves("final").read_text())["depth"]
+    write_atomic(path, encoded(glance(row, np.asarray(image), curves, calibration), "png", dpi=110))
+
+
+def glance(row: Mapping[str, Any], image: np.ndarray, curves: LevelCurves, calibration: Mapping[str, Any]) -> Figure:
+    """A prediction on its image and from above, and the calibration of depth; one legend for all three."""
+    figure, truth = Figure(figsize=(12.6, 4.7), layout="constrained"), np.array([row[axis] for axis in "xyz"])
+    seen, above, calibrated = figure.subplots(1, 3)
+    draw_on_image(seen, curves, image, float(row["f"]), float(row["S"]), truth)
+    draw_birds_eye(above, curves, truth)
+    draw_curve(calibrated, "depth", calibration)
+    for *lines, dot in (seen.lines, above.lines):
+        for line in lines:
+            line.set_color(CURVES)
+        dot.set(color="white", markeredgecolor="black")
+    seen.set_title("Prediction on the test image")
+    above.set_title("The same from above; x and z differ in scale")
+    calibrated.set_title("Depth: squared errors and their prediction")
+    handles = [*above.get_legend_handles_labels()[0], *calibrated.get_legend_handles_labels()[0]]
+    for axes in (above, calibrated):
+        axes.get_legend().remove()
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
+    return figure
 
 
 def draw_camera(path: Path, spec: DatasetSpec, index: int) -> None:
@@ -139,7 +186,10 @@ def _spec(variant: str) -> DatasetSpec:
 
 
 if __name__ == "__main__":
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
+    folder, *of_run = [Path(word) for word in sys.argv[1:]] or [Path(__file__).parent]
+    if of_run:
+        draw_glance(folder / "glance.png", RunFolder(of_run[0]), of_run[1])
+        sys.exit()
     specs = [_spec(variant) for variant in VARIANTS]
     draw_gallery(folder / "gallery.jpg", specs, INDICES)
     draw_camera(folder / "camera.png", specs[0], INDICES[4])

@@ -18,7 +18,7 @@ from phd_exp.records.scenes import Scene
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.importing import import_meshes
 from phd_exp.rendering.pixels import Light, read_light
-from phd_exp.rendering.stage import build_stage, show_scene
+from phd_exp.rendering.stage import build_stage, roughen, show_scene
 from phd_exp.rendering.surroundings import World
 from phd_exp.rendering.triangles import Meshes
 
@@ -104,6 +104,7 @@ class Renderer:
             self._world = World(self._bpy, spec) if spec and spec.mesh else None
             if self.meshes:
                 _configure_for_meshes(self._scene)
+                roughen(self._bpy)
 
     def render(self, scene: Scene, box: Box | None = None) -> Light:
         """Linear light of a box of pixels (height, width, 3), by default of all (S, S, 3); rows from the top.

@@ -23,6 +23,9 @@ SURFACES: dict[Material, dict[str, float]] = {
     "rubber": {"Metallic": 0.0, "Roughness": 0.75, "Specular IOR Level": 0.25},
     "metal": {"Metallic": 1.0, "Roughness": 0.24},
 }
+# Of metal in scenes with meshes, whose denoiser uses albedo and normals: where the squared roughness is below 0.075,
+# Cycles takes both from what the surface reflects, and they are as noisy as the image.
+ROUGHER = 0.28
 # Surroundings that metal reflects and the camera does not show: dim below, brighter above.
 SURROUNDINGS = (0.10, 0.75)
 
@@ -81,6 +84,11 @@ def build_stage(bpy: Any) -> None:
     world = bpy.context.scene.world = bpy.data.worlds.new("world")
     world.cycles.sampling_method = "NONE"  # an importance map is not worth it for such smooth light
     _paint_world(world.node_tree)
+
+
+def roughen(bpy: Any) -> None:
+    """Make metal as rough as the denoiser of scenes with meshes needs."""
+    bpy.data.materials["metal"].node_tree.nodes["Principled BSDF"].inputs["Roughness"].default_value = ROUGHER
 
 
 def _add(bpy: Any, name: str, data: Any) -> Any:
