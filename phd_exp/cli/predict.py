@@ -106,12 +106,10 @@ def main(words: list[str]) -> int:
 
 
 def _detections(arguments: PredictArguments) -> list[Detection]:
-    camera, files = arguments.of_camera, arguments.image
-    if arguments.folder is not None:
-        if not camera:
-            return detections_in(arguments.folder, object_name=arguments.object)
-        files = images_in(arguments.folder)
-    assert files is not None  # checked by `one_source`
+    camera, folder = arguments.of_camera, arguments.folder
+    if folder and not camera:
+        return detections_in(folder, object_name=arguments.object)
+    files = images_in(folder) if folder else arguments.image or ()
     boxes = boxes_in(arguments.boxes, arguments.object) if arguments.boxes else [{}]
     return detections_of(files, camera, boxes)
 

@@ -136,11 +136,11 @@ def _draw_image(
         shown = image.crop(inside)
         shown.thumbnail((LARGEST, LARGEST))
         axes.imshow(np.asarray(shown), extent=(inside[0], inside[2], inside[3], inside[1]))
-    for style, frame in frames.items():
+    for dashes, frame in frames.items():
         if frame:
             corner, size = frame[:2], (frame[2] - frame[0], frame[3] - frame[1])
             axes.add_patch(
-                Rectangle(corner, *size, fill=False, edgecolor="white", linestyle=style, path_effects=_HALO)
+                Rectangle(corner, *size, fill=False, edgecolor="white", linestyle=dashes, path_effects=_HALO)
             )
     for points, kind, style in marks:
         axes.plot(*points.T, kind, **style)

@@ -184,7 +184,7 @@ def detections_of(
     """
     folder = commonpath([file.absolute().parent for file in files])
     named = [({"file_name": file.absolute().relative_to(folder).as_posix(), **camera}, file) for file in files]
-    lines = [(line_of(values | box, str(file)), file) for values, file in named for box in boxes]
+    lines = [(line_of({**values, **box}, str(file)), file) for values, file in named for box in boxes]
     calibration = read_camera(Path(camera["camera"])) if "camera" in camera else None
     return [Detection(line, file, str(file), calibration) for line, file in lines]
 
