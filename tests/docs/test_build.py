@@ -77,6 +77,16 @@ def test_shapes_stand_in_the_reference(site: Path) -> None:
 
 def test_formulas_are_drawn_by_the_browser(site: Path) -> None:
     assert (site / "ideas" / "charts.html").read_text().count("<math") >= 8
+    assert (site / "ideas" / "density.html").read_text().count("<math") >= 20
+
+
+def test_the_front_page_shows_a_picture_and_pages_lead_on(site: Path) -> None:
+    front, guide = (site / "index.html").read_text(), (site / "guides" / "train.html").read_text()
+    for picture in re.findall(r'<img [^>]*src="([^":]*)"', front):
+        assert (site / picture).is_file()
+    assert "renders/glance.png" in front
+    assert all(f"md-footer__link--{way}" in guide for way in ("prev", "next"))
+    assert guide.count('name="__palette"') == 3  # the system's colours, light, dark
 
 
 @pytest.fixture
@@ -94,6 +104,37 @@ def test_the_search_finds_a_name_from_the_file_system(visit: Visit) -> None:
     visit.page.wait_for_selector(".md-search-result__item")
     visit.page.click(".md-search-result__item a")
     visit.page.wait_for_url("**/api/distributions/*.html*")
+
+
+@pytest.mark.parametrize(
+    ("word", "page"),
+    [
+        ("confidence", "guides/guarantee"),
+        ("video", "guides/predict"),
+        ("licence", "index"),
+        ("export", "guides/predict"),
+        ("mesh", "guides/own_object"),
+    ],
+)
+def test_the_search_finds_a_guide_before_the_reference(visit: Visit, word: str, page: str) -> None:
+    visit.open("index.html")
+    visit.page.click("input.md-search__input")
+    visit.page.keyboard.type(word)
+    first = visit.page.wait_for_selector(".md-search-result__item a")
+    assert f"{page}.html" in first.get_attribute("href")
+
+
+def test_numbers_of_a_cell_stay_on_one_line(visit: Visit) -> None:
+    visit.page.set_viewport_size({"width": 390, "height": 900})
+    visit.open("guides/tables.html")
+    assert max(visit.page.eval_on_selector_all("td[style*=right]", _LINES)) < 1.5
+
+
+_LINES = """cells => cells.map(cell => {
+  const range = document.createRange();
+  range.selectNodeContents(cell);
+  return range.getBoundingClientRect().height / parseFloat(getComputedStyle(cell).lineHeight);
+})"""
 
 
 @pytest.mark.parametrize("width", [1280, 390])

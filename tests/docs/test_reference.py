@@ -27,6 +27,11 @@ def test_every_page_is_in_the_contents_and_there() -> None:
     assert sorted(_files(contents)) == sorted([*map(name, PAGES), "api/index.md"])
 
 
+def test_the_search_has_words_for_pages_that_exist() -> None:
+    words = runpy.run_path(str(DOCS / ".build" / "finding.py"))["WORDS"]
+    assert set(words) <= set(map(name, PAGES))
+
+
 def test_readme_and_index_list_every_guide() -> None:
     for page in (ROOT / "README.md", DOCS / "index.md"):
         listed = set(re.findall(r"^\| \[.*?\]\((?:docs/)?guides/(\S+)\)", page.read_text(), re.MULTILINE))

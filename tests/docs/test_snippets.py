@@ -19,6 +19,7 @@ from phd_exp.cli.jobs import plain
 from phd_exp.training.config import check, check_render
 from tests.docs.pages import PAGES, ROOT, blocks, commands, name
 
+WIDTH = 86  # characters of code that a page shows at 1280 px
 TRAINS = "guides/own_parts.md"
 README, HELP = ROOT / "README.md", ROOT / "phd_exp" / "cli" / "help.py"
 COMMANDS = {tuple(words): page for page in (*PAGES, README) for words in commands(page)}
@@ -90,6 +91,12 @@ def _check(verb: str, overrides: tuple[str, ...]) -> None:
     config_name, checked = CHECKS[verb]
     with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
         checked(plain(hydra.compose(config_name, list(overrides))))
+
+
+def test_commands_fit_a_page() -> None:
+    for page in PAGES:
+        lines = [line for line in page.read_text().splitlines() if re.match(r" *(python -m phd_exp|make|pip) ", line)]
+        assert [line for line in lines if len(line) > WIDTH] == [], f"{name(page)}: continue with a backslash"
 
 
 def test_every_idea_has_snippets() -> None:
