@@ -64,7 +64,7 @@ def test_an_equal_run_is_named_before_the_training(
     base = ["preset=smoke", f"data.root={tmp_path}", f"runs={tmp_path}"]
     default = check(composed(*base))
     first = RunFolder(run_name(default, base).folder(tmp_path))
-    with first.recording(None):
+    with first.held(), first.recording(None):
         first.write_config(default.model_dump(mode="json"))
     for word, is_equal in (("optimizer.lr=0.001", True), ("trainer.threads=1", True), ("optimizer.lr=0.002", False)):
         checked = check(composed(*base, word))
