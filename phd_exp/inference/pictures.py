@@ -24,8 +24,8 @@ LARGEST = 1024  # pixels along the longer side of the image in the picture
 LONGEST_NAME = 60  # characters of a file name in the title
 MARGIN = 0.5  # width of the margin around a box, in sizes of the box
 _HALO = [withStroke(linewidth=3, foreground="#0000009c")]  # for any background
-_AMBER = {"color": "#ffb000", "markersize": 6, "path_effects": _HALO}
-_WHITE = {"color": "white", "markeredgecolor": "black", "markersize": 4}
+_AMBER: dict[str, Any] = {"color": "#ffb000", "markersize": 6, "path_effects": _HALO}
+_WHITE: dict[str, Any] = {"color": "white", "markeredgecolor": "black", "markersize": 4}
 
 Points = Float[np.ndarray, "_ 2"]
 Box = tuple[float, float, float, float]
@@ -97,7 +97,7 @@ def _marks(sighting: Sighting, curves: LevelCurves | None, outline: Points | Non
     """The level curves, the outline of a region, the mode and the truth on the image."""
     camera, truth = sighting.view.camera, _truth(sighting)
     rings = zip((1.6, 1.1, 0.7), curves.projected if curves else (), strict=False)
-    marks = [(camera.real_pixels(points), "-", {"linewidth": width} | _AMBER) for width, points in rings]
+    marks: list[Mark] = [(camera.real_pixels(points), "-", {"linewidth": width} | _AMBER) for width, points in rings]
     if outline is not None:
         marks.append((outline, "--", _AMBER))
     for point, kind, style in ((sighting.prediction.mode.numpy(), "x", _AMBER), (truth, "o", _WHITE)):
