@@ -148,7 +148,7 @@ def test_no_variable_of_the_environment_is_read(
     monkeypatch.setenv("SECRET", "sesame-7391")
     place.put_config(data__name="${oc.env:SECRET}")
     outcome = command(*ONE)
-    assert outcome.status == 1
+    assert outcome.status == 2
     assert "sesame-7391" not in outcome.err
     command(*REPORT)
     pages = [page.read_text() for page in place.root.glob("report/site/**/*.*") if page.suffix in (".html", ".js")]

@@ -18,6 +18,7 @@ from phd_exp.cli.help import EXAMPLES, OF_VERB, VERBS
 from phd_exp.cli.jobs import plain
 from phd_exp.training.config import check, check_render
 from tests.docs.pages import PAGES, ROOT, blocks, commands, name
+from tests.support.meshes import solid, write_mesh
 
 WIDTH = 86  # characters of code that a page shows at 1280 px
 TRAINS = "guides/own_parts.md"
@@ -110,9 +111,11 @@ def _write_files(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> N
     """Write the files that a page shows, and go there."""
     monkeypatch.chdir(folder)
     monkeypatch.syspath_prepend(folder)
-    for own in ("part.glb", "cup.stl", *(f"rooms/{number}.jpg" for number in range(4))):
-        (folder / own).parent.mkdir(exist_ok=True)
-        (folder / own).touch()
+    for mesh in ("part.glb", "cup.stl"):
+        write_mesh(folder / mesh, solid("cube"))
+    (folder / "rooms").mkdir()
+    for number in range(4):
+        (folder / f"rooms/{number}.jpg").touch()
     for block in blocks(page) if page.suffix == ".md" else ():
         if block.file is not None:
             (folder / block.file).parent.mkdir(parents=True, exist_ok=True)

@@ -46,7 +46,7 @@ def test_densities_are_compared_with_the_probabilistic_model(report: Report) -> 
     assert gaussian[nll].below.startswith("+1.00 ±0.0")
     assert not gaussian[nll].bold
     assert not mine[nll].bold
-    assert mine[coverage].ours == "90"
+    assert mine[coverage].ours == "90.0"
     of_nll = [line["value"] for line in table.numbers if (line["model"], line["quantity"]) == ("gaussian", "nll")]
     assert np.mean(of_nll) == pytest.approx(-2, abs=0.01)
 

@@ -65,7 +65,7 @@ def test_every_cell_is_recomputed(runs: list[RunFolder], report: Report) -> None
                     assert cell.ours == "–"
                     continue
                 inside = (pd.read_parquet(file)["level"] <= 0.9).to_numpy()
-                assert cell.ours == f"{100 * inside.mean():.0f}"
+                assert cell.ours == f"{100 * inside.mean():.1f}"
                 resampled = np.random.default_rng(0).choice(inside, (4000, len(inside))).mean(1)
                 low, high = np.quantile(resampled, [0.01, 0.99])
                 if low > 0.9 or high < 0.9:
