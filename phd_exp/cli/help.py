@@ -92,8 +92,17 @@ def text_of(verb: str | None) -> str:
 
 def _choices(groups: Iterable[str]) -> str:
     """The choices of each group, a line a group."""
-    files = {group: sorted((conf_folder() / group).glob("*.yaml")) for group in groups}
-    return "\n".join(f"  {group:<10} {', '.join(file.stem for file in files[group])}" for group in files)
+    return "\n".join(f"  {group:<10} {', '.join(choices_of(group))}" for group in groups)
+
+
+def choices_of(group: str) -> list[str]:
+    """The choices of a configuration group, sorted."""
+    return sorted(file.stem for file in (conf_folder() / group).glob("*.yaml"))
+
+
+def prefix_of(group: str, content: str) -> str:
+    """What precedes the keys in a file of a group: nothing if the file sets keys of the whole configuration."""
+    return f"{group}." if group and "# @package _global_" not in content else ""
 
 
 _PROGRAMME = """\

@@ -11,6 +11,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from phd_exp.cli import conf_folder
+from phd_exp.cli.help import prefix_of
 from phd_exp.records.choices import flatten
 from phd_exp.records.parsing import parse_yaml
 from phd_exp.training.config import RenderConfig, RunConfig
@@ -60,7 +61,7 @@ def _in(file: str, model: type[BaseModel]) -> Iterator[Key]:
     """The keys in a file of conf/ that have a comment."""
     content = (conf_folder() / f"{file}.yaml").read_text()
     group = file.rpartition("/")[0]
-    prefix = f"{group}." if group and "# @package _global_" not in content else ""
+    prefix = prefix_of(group, content)
     by_preset = flatten(parse_yaml((conf_folder() / "preset/paper.yaml").read_text()))
     sections: list[str] = []
     for text in content.splitlines():

@@ -1,4 +1,4 @@
-"""What is wrong with a word of Hydra's command line, in one line, and the nearest valid word."""
+"""Explains a wrong word of Hydra's command line in one line, with the nearest valid word."""
 
 import re
 import shlex
@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from phd_exp.cli import conf_folder
-from phd_exp.cli.help import OF_VERB, VERBS
+from phd_exp.cli.help import OF_VERB, VERBS, choices_of, prefix_of
 from phd_exp.records.choices import flatten
 from phd_exp.records.errors import ConfigError, end_of, install, nearest, one_line, shortened, unknown
 
@@ -29,7 +29,7 @@ def require_overrides(words: Sequence[str]) -> None:
         if len(parts) > 1:
             raise ConfigError(f"{' '.join(parts)}: has spaces; expected {shlex.quote(word)}")
         if "=" not in word and not word.startswith("~"):
-            choices = [f"{group}={name}" for group in OF_VERB["train"] for name in _choices(group)]
+            choices = [f"{group}={name}" for group in OF_VERB["train"] for name in choices_of(group)]
             remedy = nearest(word, [*VERBS, *choices])
             verbs = ", ".join(VERBS)
             raise ConfigError(f"{word}: no KEY=VALUE{remedy}; a verb ({verbs}) is the first word; {GRAMMAR}")
@@ -63,7 +63,7 @@ def explain(error: Exception, config_name: str) -> str:
         return _unknown_key(found[1].lstrip("+~"), config_name)
     if found := re.search(r"Could not (?:find|load) '([^']+)/([^']+)'", text):
         group, name = found.groups()
-        options = getattr(error, "options", None) or _choices(group)
+        options = getattr(error, "options", None) or choices_of(group)
         remedy = f"{nearest(name, options)}{install(name)}"
         return f"{group}={name}: no such choice{remedy}; expected one of {', '.join(options)}"
     return shortened(re.sub(r" Set the environment variable.*| Config search path:.*", "", text), LONGEST)
@@ -91,17 +91,13 @@ def _unknown_key(key: str, config_name: str) -> str:
     return unknown(key, near, f"expected one of {', '.join(valid)}{further}")
 
 
-def _choices(group: str) -> list[str]:
-    return sorted(file.stem for file in (conf_folder() / group).glob("*.yaml"))
-
-
 def _keys_of_choices() -> dict[str, list[str]]:
     """Dotted key -> the choices of its group whose files set it."""
     owners: dict[str, list[str]] = defaultdict(list)
     for group in OF_VERB["train"]:
-        for name in _choices(group):
+        for name in choices_of(group):
             file = conf_folder() / group / f"{name}.yaml"
-            prefix = "" if "# @package _global_" in file.read_text() else f"{group}."
+            prefix = prefix_of(group, file.read_text())
             for key in flatten(OmegaConf.to_container(OmegaConf.load(file)), prefix):  # type: ignore[arg-type]
                 if key.startswith(f"{group}."):
                     owners[key].append(f"{group}={name}")

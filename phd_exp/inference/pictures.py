@@ -15,6 +15,7 @@ from PIL import Image
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.level_curves import LevelCurves, level_curves
+from phd_exp.geometry.virtual import Box
 from phd_exp.inference.answers import Sighting
 from phd_exp.records.errors import one_line
 from phd_exp.reports.figures import draw_birds_eye, draw_curve, encoded
@@ -28,8 +29,6 @@ _AMBER: dict[str, Any] = {"color": "#ffb000", "markersize": 6, "path_effects": _
 _WHITE: dict[str, Any] = {"color": "white", "markeredgecolor": "black", "markersize": 4}
 
 Points = Float[np.ndarray, "_ 2"]
-Box = tuple[float, float, float, float]
-"""Left, top, right, bottom, pixels."""
 Mark = tuple[Points, str, dict[str, Any]]
 """Points of the image, pixels, with the kind of their line and its style."""
 

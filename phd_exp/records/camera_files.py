@@ -81,7 +81,7 @@ def _of_colmap(words: list[str]) -> dict[str, Any]:
 
 def _of_xml(text: str) -> Any:
     if "<!" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
-        raise ValueError("XML with declarations of its own")
+        raise ValueError("XML with a document type declaration")
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:

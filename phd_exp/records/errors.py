@@ -85,7 +85,7 @@ def nearest(word: str, valid: Iterable[str]) -> str:
 
 
 def end_of(word: str) -> str:
-    """What follows the last `.` or `=` of a word."""
+    """The part of a word after its last `.` or `=`; the whole word without either."""
     return re.split("[.=]", word)[-1]
 
 

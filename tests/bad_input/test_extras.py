@@ -82,7 +82,7 @@ def test_the_table_has_every_extra() -> None:
 
 @pytest.mark.timeout(240)
 def test_without_the_packages_of_all_extras(place: Place) -> None:
-    """In a process of its own: this one has imported some of them."""
+    """Runs in a new process, because this process has already imported some of these packages."""
     run = str(place.run.path.relative_to(place.root))
     place.put("space.yaml", "space: {optimizer.lr: 'interval(0.001,0.01)'}\n")
     commands = [[word.replace("RUN", run) for word in words] for words in COMMANDS]

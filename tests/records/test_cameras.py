@@ -333,7 +333,7 @@ BAD: list[tuple[Any, str]] = [
     ("1 FOV 640 480 400 400 320 240 0.9", "FOV with 5 parameters; expected one of SIMPLE_PINHOLE"),
     ("<calibration><f>900</f></calibration>", "XML of <calibration>; expected <opencv_storage>"),
     ("<a", "XML: "),
-    ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage/>', "XML with declarations of its own"),
+    ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage/>', "XML with a document type declaration"),
     ({"camera_angle_x": 0.7, "frames": []}, "no camera matrix: found camera_angle_x, frames; expected camera_matrix"),
     ("a: [1", "while parsing"),
     ('{"a": ', "Expecting value"),
