@@ -8,13 +8,11 @@ from pathlib import Path
 from shutil import which
 from typing import Any
 
-import hydra
 import pytest
 import torch
 from jaxtyping import install_import_hook
-from omegaconf import OmegaConf
 
-from phd_exp.cli import conf_folder
+from phd_exp.cli import conf_folder, jobs
 from phd_exp.records.spec import DatasetSpec
 
 # before anything is imported: every annotated function of these modules checks its shapes while tests run; numba
@@ -52,11 +50,7 @@ def composed() -> Callable[..., dict[str, Any]]:
 
     @cache
     def compose(*overrides: str) -> dict[str, Any]:
-        with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
-            config = hydra.compose("config", list(overrides))
-        plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-        assert isinstance(plain, dict)
-        return {str(key): value for key, value in plain.items()}
+        return jobs.composed(overrides)
 
     return lambda *overrides: deepcopy(compose(*overrides))
 

@@ -15,7 +15,7 @@ VERBS = {
 }
 OF_VERB = {
     "train": (
-        *("model", "data", "preset", "recipe", "without", "photometry", "experiment"),
+        *("model", "data", "preset", "recipe", "photometry", "experiment"),
         *("backbone", "camera", "loss", "optimizer", "trainer", "logger", "callbacks", "shift"),
     ),
     "render": ("data", "preset"),

@@ -25,6 +25,7 @@ from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.processes import usable_cores
 
 OMP = "OMP_NUM_THREADS"
+SHARED = ("network", "object")  # sections to which others refer; a run has the values themselves
 NO_SCORE = "the sweeper receives no score: only trainings with held-out samples have one; set data.n_held_out above 0"
 HOME = uuid.uuid4().hex  # names this process: another process that imports this module has another value
 
@@ -109,9 +110,9 @@ def refusal(error: Exception, config_name: str = "config") -> Ending:
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
-    """The configuration as plain containers with interpolations resolved and without missing values."""
+    """The configuration as plain containers: interpolations resolved, without missing values and `SHARED`."""
     values = _without_missing(OmegaConf.to_container(config, resolve=True))
-    return {str(key): value for key, value in values.items()}
+    return {str(key): value for key, value in values.items() if key not in SHARED}
 
 
 def _without_missing(node: Any) -> Any:

@@ -135,6 +135,7 @@ def _one_experiment_each(words: list[str], loader: ConfigLoader) -> Iterator[lis
 
 
 def _combinations(words: list[str], master: DictConfig, loader: ConfigLoader) -> list[list[str]]:
+    """The overrides of each job: every combination of values, once with each list of overrides of an experiment."""
     parse = OverridesParser.create(loader).parse_overrides
     given = [item for item in parse(words) if not item.is_hydra_override()]
     keys = {item.key_or_group for item in given}
@@ -145,7 +146,9 @@ def _combinations(words: list[str], master: DictConfig, loader: ConfigLoader) ->
         values[key] = [f"{key}={value}" for value in _values(item)]
     if math.prod(map(len, values.values())) > MOST_JOBS:
         raise ConfigError(f"{_given(words)}: more than {MOST_JOBS} jobs; expected fewer values")
-    return [list(combination) for combination in itertools.product(*values.values())]
+    each = [parse(list(overrides)) for overrides in master.hydra.sweeper.get("each") or [[]]]
+    further = [[str(item.input_line) for item in items if item.key_or_group not in keys] for items in each]
+    return [[*combination, *words] for words in further for combination in itertools.product(*values.values())]
 
 
 def _given(words: list[str]) -> str:

@@ -10,7 +10,7 @@ from hydra.core.override_parser.types import Override
 
 from phd_exp.cli.jobs import Job, composed, launch
 from phd_exp.cli.paths import quoted
-from phd_exp.records.choices import PLAIN_RECIPE, RunName, has_influence, setting
+from phd_exp.records.choices import RunName, has_influence, setting
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, RunError, shown
 from phd_exp.records.processes import usable_cores
@@ -52,7 +52,6 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
     `callbacks` are Lightning's, in addition to those of the configuration.
     """
     checked = check(config)
-    _require_part(checked, overrides)
     # imports of seconds, which follow the check of the configuration
     from phd_exp.training.pruning import held_out_score
     from phd_exp.training.run import require_possible, train
@@ -74,16 +73,6 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
     if (folder.calibration / "final.png").exists():
         print(f"  calibration curves: {folder.calibration / 'final.png'}")
     return held_out_score(folder.path)[1] if folder.held_out.exists() else None
-
-
-def _require_part(checked: RunConfig, overrides: list[str]) -> None:
-    """Raise ConfigError for a part of recipe=strong that is left out of the recipe that has none."""
-    for item in OverridesParser.create().parse_overrides(overrides):
-        if item.key_or_group == "without" and item.value() is not None and checked.recipe.name == PLAIN_RECIPE:
-            raise ConfigError(
-                f"{item.input_line}: leaves a part of recipe=strong out, but recipe={PLAIN_RECIPE} has no such part; "
-                "add recipe=strong"
-            )
 
 
 def trained(overrides: Sequence[str], config_dir: str | Path | None) -> "TrainedRun":

@@ -85,7 +85,7 @@ def build_module(config: RunConfig, data: PositionData) -> PositionModule:
         if weight and not does:
             raise ConfigError(
                 f"recipe.{key}: got {weight}, but this backbone has no map of the object; expected 0, or a backbone "
-                "that has one, as in conf/recipe_at_backbone/locating.yaml"
+                "that has one, as in conf/recipe/strong.yaml"
             )
     schedule = partial(factor, recipe.schedule, recipe.warmup_steps)
     module = PositionModule(

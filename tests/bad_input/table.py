@@ -160,7 +160,6 @@ CONFIGURATIONS = [
     Bad("configuration: a flag that returns the carriage", nothing, ("preset=smoke", "--cfg\r"), r"--cfg: holds control characters; expected printable KEY=VALUE", 2),
     configured("a flag that there is not", "--nonsense", r"unrecognized arguments: --nonsense; see `python -m phd_exp --help`"),
     configured("a flag without its value", "-c", r"argument --cfg/-c: expected one argument; .*"),
-    configured("a part of a recipe that has no parts", "without=muon", r"without=muon: leaves a part of recipe=strong out, .*; add recipe=strong"),
     configured("a group set to null", "model=null", r"Config group override must be a string or a list\..*"),
     configured("a part set to null", "model.head=null", r"model\.head: got None; expected a valid dictionary"),
     configured("a layer as a head", "model.head._target_=torch.nn.Linear", r"model\.head\._target_: 'torch\.nn\.Linear' is no head; .*"),

@@ -15,16 +15,14 @@ import time
 from pathlib import Path
 from typing import Any
 
-import hydra
 import torch
 from lightning import Callback
-from omegaconf import OmegaConf
 from PIL import Image
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 from torchvision.transforms.functional import normalize, pil_to_tensor
 
-from phd_exp.cli import conf_folder
+from phd_exp.cli.jobs import composed
 from phd_exp.data.batches import Batch
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.sources import Known, Part, Source
@@ -177,9 +175,7 @@ def print_peak_memory() -> None:
 
 def main(kind: str, folder: Path, epochs: int, *overrides: str) -> None:
     words = ["logger=none", "trainer.progress_bar=false", *overrides]
-    with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
-        composed = hydra.compose("config", [*words, f"trainer.max_epochs={epochs}"] if epochs else words)
-    config = check(OmegaConf.to_container(composed, resolve=True))  # type: ignore[arg-type]
+    config = check(composed([*words, f"trainer.max_epochs={epochs}"] if epochs else words))
     noise = PositionData(Noise(config), batch_size=config.data.batch_size, seed=0)
     data = build_data(config) if kind == "conventional" else noise
     data.setup()

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import phd_exp as package
-from phd_exp.cli.train import _require_part, announce, cost, run_name
+from phd_exp.cli.train import announce, cost, run_name
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training import duration
@@ -118,8 +118,3 @@ def test_a_step_is_measured_on_random_images(config: RunConfig, monkeypatch: pyt
 def test_one_word_instead_of_a_list_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"^overrides: got 'preset=smoke'; expected a list .*\['preset=smoke'\]$"):
         package.train("preset=smoke")
-
-
-def test_a_part_is_left_out_of_a_recipe_that_has_parts(composed) -> None:  # type: ignore[no-untyped-def]
-    for words in (["recipe=strong", "without=muon"], []):
-        _require_part(check(composed("preset=smoke", *words)), words)

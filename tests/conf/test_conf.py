@@ -1,33 +1,23 @@
 """Every file under conf/ composes into a configuration that passes the check."""
 
 from collections.abc import Callable
-from itertools import cycle, zip_longest
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from phd_exp.cli import conf_folder
-from phd_exp.records.choices import flatten
 from phd_exp.records.runs import SECTIONS
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.training.build import build_augmentation
 from phd_exp.training.config import RunConfig, check
 
 CHOICES = {
     group.name: [f"{group.name}={file.stem}" for file in sorted(group.glob("*.yaml"))]
     for group in sorted(path for path in conf_folder().iterdir() if path.is_dir())
-    # these are chosen by other groups
-    if group.name not in ("loss", "recipe_at_backbone", "locating_at_preset", "locating_at_data")
+    if group.name != "loss"  # chosen by the model
 }
-STRONG = ("recipe=strong", "preset=small")
-OF_STRONG = ("recipe_at_preset", "without")
-"""The groups that require a strong recipe, one choice at a time; choices of all other groups go with each other."""
-TOGETHER = [
-    tuple(word for word in words if word)
-    for words in zip_longest(*(words for group, words in CHOICES.items() if group not in OF_STRONG))
-] + [(*STRONG, word) for group in OF_STRONG for word in CHOICES[group]]
-TOGETHER += [("recipe=strong", *words) for words in zip(CHOICES["preset"], cycle(CHOICES["backbone"]), strict=False)]
+TOGETHER = [tuple(word for word in words if word) for words in zip_longest(*CHOICES.values())]
 
 
 @pytest.fixture
@@ -54,99 +44,13 @@ def test_every_file_begins_with_a_comment() -> None:
         assert lines[0].startswith("# "), file
 
 
-def test_defaults_are_the_authors_protocol(checked: Callable) -> None:
-    config = checked()
-    assert (config.data.n_train, config.data.n_test, config.data.image_size) == (8000, 2000, 224)
-    assert config.data.batch_size == 64
-    assert config.trainer.max_epochs == 50
-    assert config.backbone["depth"] == 50
-    assert config.optimizer["_target_"] == "torch.optim.Adam"
-    assert config.optimizer["lr"] == 1e-3
-    assert config.camera.focal_length == "known"
-    recipe = config.recipe
-    assert (recipe.name, recipe.schedule, recipe.warmup_steps, recipe.localisation) == ("paper", "constant", 0, 0)
-    assert build_augmentation(recipe) is None
-
-
-def test_own_objects_have_more_images_wider_networks_and_other_backdrops(checked: Callable, tmp_path: Path) -> None:
-    (tmp_path / "part.obj").touch()
-    own = ("data=object", f"data.mesh={tmp_path}/part.obj")
-    for words, expected in [
-        (("preset=small", "recipe=strong", *own), (4800, 100, 24, 1.2, 0.75)),
-        (("preset=small", *own), (4800, 100, None, 1.0, 0.0)),
-        (("preset=full", "recipe=strong", *own), (8000, 42, 16, 1.2, 0.75)),
-        (("preset=small", "recipe=strong"), (3200, 30, 16, 1.0, 0.0)),
-        (("preset=small", "recipe=strong", *own, "trainer.max_epochs=2"), (4800, 2, 24, 1.2, 0.75)),
-        (("preset=small", "recipe=strong", *own, "backbone.width=8"), (4800, 100, 8, 1.2, 0.75)),
-    ]:
-        config = checked(*words)
-        size = config.data.n_train, config.trainer.max_epochs, config.backbone.get("width")
-        augmentation = config.recipe.augmentation
-        assert (*size, augmentation.largest_zoom, augmentation.backdrops) == expected, words
-
-
-@pytest.mark.parametrize(
-    ("preset", "depth", "width", "stride"), [("paper", 50, 32, 2), ("small", 10, 16, 4), ("smoke", 10, 16, 4)]
-)
-def test_the_strong_recipe_keeps_the_depth_and_length_of_its_preset(
-    checked: Callable, preset: str, depth: int, width: int, stride: int
-) -> None:
-    config, plain = checked("recipe=strong", f"preset={preset}"), checked(f"preset={preset}")
-    assert plain.evaluation.every_n_epochs == (2 if preset == "small" else 1)
-    assert config.backbone["_target_"].endswith("Locating")
-    assert [config.backbone[key] for key in ("depth", "width", "stride")] == [depth, width, stride]
-    assert config.data.image_size == config.data.spec.sensor_size
-    assert config.trainer.max_epochs == plain.trainer.max_epochs
-
-
-@pytest.mark.parametrize(
-    ("model", "loss", "camera", "strong_camera"),
-    [
-        ("probabilistic", "NegativeLogLikelihood", "known", "shown"),
-        ("mae_vz", "MeanAbsoluteError", "known", "shown"),
-        ("mae_logz", "MeanAbsoluteError", "known", "shown"),
-        ("mae_xyz", "MeanAbsoluteError", "known", "known"),
-        ("mae_constf", "MeanAbsoluteError", "constant", "constant"),
-    ],
-)
-def test_a_model_picks_its_loss_and_camera_and_whether_the_strong_recipe_shows_the_focal_length(
-    checked: Callable, model: str, loss: str, camera: str, strong_camera: str
-) -> None:
-    config = checked(f"model={model}")
-    assert config.model.name == model
-    assert config.loss["_target_"].endswith(loss)
-    assert config.camera.focal_length == camera
-    assert checked("recipe=strong", f"model={model}").camera.focal_length == strong_camera
-
-
-@pytest.mark.parametrize(
-    ("part", "keys"),
-    [
-        ("muon", {f"optimizer.{key}" for key in ("_target_", "orthogonal_lr", "momentum", "weight_decay", "fused")}),
-        ("weight_decay", {"optimizer.weight_decay"}),
-        ("schedule", {"recipe.schedule", "recipe.warmup_steps"}),
-        ("localisation", {"recipe.localisation"}),
-        ("segmentation", {"recipe.segmentation", "backbone.segments"}),
-        ("symmetries", {"recipe.augmentation.symmetries"}),
-        ("colours", {"recipe.augmentation.colours"}),
-        ("exposure", {"recipe.exposure"}),
-        ("focal_length", {"camera.focal_length"}),
-        ("fine_images", {"data.image_size", "backbone.width", "backbone.stride", "backbone.channels"}),
-    ],
-)
-def test_without_removes_one_part_of_the_strong_recipe(composed: Callable, part: str, keys: set) -> None:
-    whole, without = flatten(composed(*STRONG)), flatten(composed(*STRONG, f"without={part}"))
-    changed = {key for key in whole | without if whole.get(key, "none") != without.get(key, "none")}
-    assert changed == keys
-
-
 def test_the_command_line_overrides_all_files(checked: Callable) -> None:
     config = checked("preset=smoke", "backbone=resnet50", "model=mae_vz", "camera=constant", "data.n_train=48")
     assert config.backbone["depth"] == 50
     assert config.camera.focal_length == "constant"
     assert config.data.n_train == 48
     assert config.preset == "smoke"
-    strong = checked(*STRONG, "data.image_size=48", "model=mae_logz", "camera=known")
+    strong = checked("recipe=strong", "preset=small", "data.image_size=48", "model=mae_logz", "camera=known")
     assert (strong.data.image_size, strong.camera.focal_length) == (48, "known")
 
 

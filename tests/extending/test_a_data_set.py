@@ -3,8 +3,9 @@
 from collections.abc import Callable
 from pathlib import Path
 
-import yaml
+from omegaconf import OmegaConf
 
+from phd_exp.cli.jobs import plain
 from phd_exp.rendering.sampling import sample_scene
 from phd_exp.training.config import check_render
 
@@ -19,7 +20,7 @@ def test_a_file_makes_a_data_set(phd_exp: Callable, tmp_path: Path) -> None:
     (tmp_path / "mine" / "data").mkdir(parents=True)
     (tmp_path / "mine" / "data" / "far.yaml").write_text(FAR)
     outcome = phd_exp("render", "--config-dir=mine", "data=far", "preset=smoke", "--cfg", "job", "--resolve")
-    spec = check_render(yaml.safe_load(outcome.out)).data.spec
+    spec = check_render(plain(OmegaConf.create(outcome.out))).data.spec
     scenes = [sample_scene(spec, "train", index) for index in range(20)]
     assert spec.variant == "far"
     assert all(6 <= cylinder.position[2] <= 10 for scene in scenes for cylinder in scene.objects)
