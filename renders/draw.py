@@ -18,6 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from phd_exp.cli import conf_folder
 from phd_exp.cli.jobs import plain
+from phd_exp.config import check_render
 from phd_exp.distributions.level_curves import LevelCurves
 from phd_exp.evaluation.parquet import read_table
 from phd_exp.records.files import write_atomic
@@ -30,7 +31,6 @@ from phd_exp.rendering.rays import cylinder_mask, trace_pixels
 from phd_exp.rendering.samples import fast_settings, make_sample
 from phd_exp.reports.figures import draw_birds_eye, draw_curve, draw_on_image, encoded
 from phd_exp.reports.gallery import curves_of, load_image
-from phd_exp.training.config import check_render
 
 VARIANTS = ("default", "occl", "scale", "occl_scale")
 INDICES = (0, 3, 6, 8, 12, 14)

@@ -106,9 +106,9 @@ def _record_held_out_views(predictor: "Predictor", trust: tuple[str, ...]) -> No
 
     Raises RunError if its data set is not there. Does nothing where `Predictor.held_out` names what is missing.
     """
+    from phd_exp.build import build_source
+    from phd_exp.config import SourceConfig
     from phd_exp.inference import tables
-    from phd_exp.training.build import build_source
-    from phd_exp.training.config import SourceConfig
 
     folder, data = predictor.folders[0], predictor.config.data
     file = folder.eight_views["held_out"]

@@ -12,9 +12,9 @@ from pydantic.fields import FieldInfo
 
 from phd_exp.cli import conf_folder
 from phd_exp.cli.help import prefix_of
+from phd_exp.config import RenderConfig, RunConfig
 from phd_exp.records.choices import flatten
 from phd_exp.records.parsing import parse_yaml
-from phd_exp.training.config import RenderConfig, RunConfig
 
 LINE = re.compile(r"( *)(\w+):(?: +([^#]*?))?(?: *# *(.*))?")
 """A line of YAML: indentation, key, value and comment."""

@@ -3,12 +3,12 @@
 from typing import Any
 
 from phd_exp.cli.jobs import Job, launch
+from phd_exp.config import check_render
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError
 from phd_exp.rendering.bop import write_bop
 from phd_exp.rendering.finished import meshes_of, require_elsewhere, verify, write_masks
 from phd_exp.rendering.render import ensure_rendered
-from phd_exp.training.config import check_render
 
 
 def main(words: list[str]) -> int:

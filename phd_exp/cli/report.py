@@ -28,7 +28,7 @@ def main(words: list[str]) -> int:
     folders = ReportArguments.parsed("report", words)
     if not folders.runs.is_dir():
         raise UserError(f"{folders.runs}: no such folder; train first, or name another by runs=DIR")
-    from phd_exp.threads import one_thread  # imports torch
+    from phd_exp.hardware import one_thread  # imports torch
 
     # tables of a few thousand rows are too small for several threads
     with writing(folders.out, "out=DIR", UserError), one_thread():

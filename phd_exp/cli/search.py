@@ -17,12 +17,12 @@ from phd_exp.cli.frame import print_errors
 from phd_exp.cli.jobs import composed
 from phd_exp.cli.paths import quoted
 from phd_exp.cli.train import run_name, task
+from phd_exp.config import check
 from phd_exp.records.errors import ConfigError, RunError, UserError, gist
 from phd_exp.records.files import read_plain, write_atomic
 from phd_exp.records.parsing import parse_yaml
 from phd_exp.records.processes import held, usable_cores
 from phd_exp.records.searches import RECORD, SEARCHES, Search, Trial, TrialState
-from phd_exp.training.config import check
 
 if TYPE_CHECKING:  # optional
     import optuna

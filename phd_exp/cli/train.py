@@ -10,13 +10,13 @@ from hydra.core.override_parser.types import Override
 
 from phd_exp.cli.jobs import Job, composed, launch
 from phd_exp.cli.paths import quoted
+from phd_exp.config import RenderedConfig, RunConfig, check
 from phd_exp.records.choices import RunName, has_influence, setting
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, RunError, shown
 from phd_exp.records.processes import usable_cores
 from phd_exp.records.runs import RunFolder
 from phd_exp.rendering.render import ensure_rendered
-from phd_exp.training.config import RenderedConfig, RunConfig, check
 
 if TYPE_CHECKING:
     from phd_exp.inference.trained import TrainedRun
@@ -54,7 +54,7 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
     checked = check(config)
     # imports of seconds, which follow the check of the configuration
     from phd_exp.training.pruning import held_out_score
-    from phd_exp.training.run import require_possible, train
+    from phd_exp.training.train import require_possible, train
 
     folder = RunFolder(run_name(checked, overrides).folder(checked.runs))
     skipped = folder.is_finished()
@@ -101,10 +101,10 @@ def cost(configs: list[dict[str, Any]], cores: int) -> float:
         first = check(configs[0])
     except ConfigError:  # the job itself reports it
         return 0.0
+    from phd_exp.hardware import has_gpu
     from phd_exp.training.duration import seconds_a_step
-    from phd_exp.training.network import has_gpu
 
-    if has_gpu(first.trainer) or not isinstance(first.data, RenderedConfig):
+    if has_gpu(first.trainer.accelerator) or not isinstance(first.data, RenderedConfig):
         return 0.0
     return seconds_a_step(first, cores) / first.data.batch_size * sum(images)
 
@@ -119,8 +119,8 @@ def _images_seen(config: dict[str, Any]) -> int:
 
 def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> None:
     """Print the work of the run and, if it takes many hours, a shorter alternative."""
-    from phd_exp.training.network import has_gpu
-    from phd_exp.training.run import equal_run
+    from phd_exp.hardware import has_gpu
+    from phd_exp.training.train import equal_run
 
     data, epochs = checked.data, checked.trainer.max_epochs
     n_missing = 0
@@ -130,7 +130,7 @@ def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> Non
     render = f"{n_missing} images to render, then " if n_missing else ""
     network = f"{checked.backbone['_target_'].rpartition('.')[2]}{checked.backbone.get('depth', '')}"
     images = "all" if data.n_train is None else data.n_train
-    gpu = has_gpu(checked.trainer)
+    gpu = has_gpu(checked.trainer.accelerator)
     print(f"{folder.path}: {render}{epochs} epochs of {network} on {images} images of", end=" ")
     print(f"{data.image_size} px, on {'a GPU' if gpu else 'the CPU'}", flush=True)
     if equal := equal_run(checked, folder):
@@ -152,8 +152,8 @@ def _renders(checked: RunConfig) -> Iterator[RenderedConfig]:
 
 def _record_further(run: RunFolder, checked: RunConfig, cores: int) -> None:
     """Render the missing samples of several views and shifts, and record the run's predictions of them, once."""
+    from phd_exp.build import build_source
     from phd_exp.inference import tables
-    from phd_exp.training.build import build_source
 
     def record(file: Path, data: Any, origin: dict[str, str], said: str, shift: Any = tables.UNCHANGED) -> None:
         if not tables.is_recorded(file, origin):

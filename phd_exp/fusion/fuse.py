@@ -15,7 +15,7 @@ from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.level import credible_level
 from phd_exp.fusion.pose import Plane, Pose
 from phd_exp.fusion.problems import Problems, Status
-from phd_exp.threads import one_thread
+from phd_exp.hardware import one_thread
 
 # `kernels` and `moments` are imported in the functions that use them: importing numba takes a second
 

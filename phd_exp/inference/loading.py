@@ -8,18 +8,17 @@ from typing import Any
 
 import torch
 
-from phd_exp.data.sources import RenderedSource
+from phd_exp.build import build_regressor, require_same_shrinking
+from phd_exp.config import RunConfig, check
+from phd_exp.config.targets import Trust, custom_parts
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.inference.predictor import Predictor
 from phd_exp.models.heads import DistributionHead
 from phd_exp.models.regressor import Regressor
+from phd_exp.models.weights import load_checkpoint
 from phd_exp.records.choices import first_difference, has_influence
-from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, RunError, UserError, gist
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.config import RenderedConfig, RunConfig, check
-from phd_exp.training.config.targets import Trust, custom_parts
-from phd_exp.training.network import build_regressor, load_checkpoint, require_same_shrinking
 
 WEIGHTS = "regressor."  # prefix of the network's weights in a checkpoint
 OF_THE_INPUT = ("data.", "camera.", "model.head.")  # keys in which the members of an ensemble agree
@@ -92,7 +91,7 @@ def _load(folder: RunFolder, device: str, trust: Trust) -> Predictor:
         raise RunError(f"{folder.path}: no run; expected a folder with config.yaml and checkpoints/last.ckpt")
     config = check(folder.config(), trust)
     require_same_shrinking(folder, config)
-    depth, constant_f = _constants(folder, config)
+    depth, constant_f = _constants(folder)
     place = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)
     regressor = _regressor(folder, config, depth)
     status = folder.status()
@@ -109,12 +108,8 @@ def _load(folder: RunFolder, device: str, trust: Trust) -> Predictor:
     )
 
 
-def _constants(folder: RunFolder, config: RunConfig) -> tuple[DepthScale, float]:
-    """Depth scale and constant f of the run's data: as recorded, or from the specification of a rendered data set."""
-    if isinstance(config.data, RenderedConfig):
-        data = config.data
-        source = RenderedSource(DatasetFolder(data.folder), data.spec, {}, data.image_size)
-        return source.depth, source.constant_f
+def _constants(folder: RunFolder) -> tuple[DepthScale, float]:
+    """Depth scale and constant f of the run's data, as recorded."""
     file = folder.constants_file
     if not file.exists():
         raise RunError(f"{file}: missing, so that the depth scale of its data is unknown; train the run again")

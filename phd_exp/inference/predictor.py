@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
+from phd_exp.config import RenderedConfig, RunConfig
 from phd_exp.data.crops import cut
 from phd_exp.distributions import Mixture, ProjectedHuber, Temperature
 from phd_exp.distributions.columns import parameter_columns
@@ -25,7 +26,6 @@ from phd_exp.models.heads import DistributionHead, Prediction
 from phd_exp.models.regressor import Regressor
 from phd_exp.records.errors import ConfigError, DatasetError, RunError
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.config import RenderedConfig, RunConfig
 
 if TYPE_CHECKING:  # imports of pyarrow
     from phd_exp.evaluation.conformal import Groups, Guarantee

@@ -13,6 +13,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
 
+from phd_exp.config import RenderedConfig, RunConfig
+from phd_exp.config.sections import ShiftConfig
+from phd_exp.config.targets import Trust
 from phd_exp.data.augmentation import Photometry
 from phd_exp.data.sources import PARTS, Known, Part, RenderedSource, Source
 from phd_exp.distributions.columns import Columns
@@ -26,10 +29,7 @@ from phd_exp.records.choices import flatten
 from phd_exp.records.errors import RunError
 from phd_exp.records.processes import announce
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.config import RenderedConfig, RunConfig
-from phd_exp.training.config.sections import ShiftConfig
-from phd_exp.training.config.targets import Trust
-from phd_exp.training.network import f_factor
+from phd_exp.training.cameras import f_factor
 from phd_exp.training.predictions import columns, summary, write_parquet
 
 UNCHANGED = ShiftConfig()

@@ -52,9 +52,9 @@ def runs_table(folder: Path) -> Any:
 
 
 def _row(run: RunFolder) -> dict[str, Any]:
-    preset, recipe = preset_and_recipe(run.path.parts[-4])
-    row = {"preset": preset, "recipe": recipe, "data": run.path.parts[-3], "model": run.path.parts[-2]}
-    row |= {"run": run.path.name, "path": str(run.path)}
+    setting, data, model, leaf = run.names
+    preset, recipe = preset_and_recipe(setting)
+    row = {"preset": preset, "recipe": recipe, "data": data, "model": model, "run": leaf, "path": str(run.path)}
     try:
         status = run.status()
         state = status.state if status else "unreadable"

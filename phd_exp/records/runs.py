@@ -106,6 +106,12 @@ class RunFolder:
         self.config_file = path / "config.yaml"
         self.constants_file = path / "constants.json"
 
+    @property
+    def names(self) -> tuple[str, str, str, str]:
+        """Preset (with its recipe), data set, model, and seed with the hash of other overrides: its place's names."""
+        preset, data, model, leaf = self.path.parts[-4:]
+        return preset, data, model, leaf
+
     def curves(self, name: str) -> Path:
         """Calibration curves, of an epoch or "final"; the picture, if there is one, has another suffix."""
         return self.calibration / f"{name}.json"

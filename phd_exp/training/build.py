@@ -1,4 +1,4 @@
-"""Builds data and model of a checked configuration; `network.py` builds the network, `trainer.py` the Trainer."""
+"""Builds what trains a checked configuration: data, augmentation and module; `trainer.py` builds the Trainer."""
 
 from collections.abc import Sequence
 from dataclasses import fields
@@ -10,19 +10,20 @@ import torch
 from hydra.utils import instantiate
 from torch import Tensor
 
+from phd_exp.build import build_regressor, build_source, naming
+from phd_exp.config import RunConfig
+from phd_exp.config.sections import RecipeConfig
+from phd_exp.config.targets import custom_parts, locate
 from phd_exp.data.augmentation import Augmentation, Photometry
 from phd_exp.data.datamodule import PositionData
-from phd_exp.data.folder import FolderSource
-from phd_exp.data.sources import Part, RenderedSource, Source
+from phd_exp.data.sources import Source
 from phd_exp.geometry.camera import Camera
-from phd_exp.records.dataset import DatasetFolder
+from phd_exp.models.backbones import Backbone
 from phd_exp.records.errors import ConfigError
-from phd_exp.records.own_images import DetectionFolder
-from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig, SourceConfig
-from phd_exp.training.config.sections import RecipeConfig
-from phd_exp.training.config.targets import custom_parts, locate
-from phd_exp.training.module import PositionModule, factor
-from phd_exp.training.network import build_regressor, naming
+from phd_exp.training.cameras import CameraPolicy
+from phd_exp.training.module import PositionModule
+from phd_exp.training.objective import Objective
+from phd_exp.training.optimisation import Optimisation, factor
 
 
 def build_data(config: RunConfig, rank: int = 0) -> PositionData:
@@ -48,59 +49,42 @@ def build_augmentation(recipe: RecipeConfig) -> Augmentation | None:
     return augmentation if augmentation.changes_anything else None
 
 
-def build_source(data: RenderedConfig | FolderConfig | SourceConfig) -> Source:
-    """The source of samples that a `data` section describes. Raises ConfigError, naming the key, for bad values."""
-    if isinstance(data, FolderConfig):
-        folder = DetectionFolder(data.folder, data.object)
-        return FolderSource(folder, data.n_train, data.n_held_out, data.n_test, data.image_size)
-    sizes: dict[Part, int] = {"train": data.n_train, "held_out": data.n_held_out, "test": data.n_test}
-    if isinstance(data, RenderedConfig):
-        return RenderedSource(DatasetFolder(data.folder), data.spec, sizes, data.image_size)
-    with naming("data.source", data.source):
-        source = instantiate(data.source, _partial_=True)(n=sizes, side=data.image_size)
-        if not isinstance(source, Source):
-            raise ValueError(f"makes a {type(source).__name__}; expected a phd_exp.data.sources.Source")
-        return source
-
-
 def build_module(config: RunConfig, data: PositionData) -> PositionModule:
     """The network, its loss and its optimizer, initialised from torch's current random state.
 
     Raises ConfigError, naming the key, for values that a part refuses.
     """
-    regressor = build_regressor(config, data.source.depth)
+    recipe, regressor = config.recipe, build_regressor(config, data.source.depth)
     with naming("optimizer", config.optimizer):
         optimizer = instantiate(config.optimizer, _partial_=True)
         optimizer(regressor.parameters())  # refuses bad values before hours of rendering
     with naming("loss", config.loss):
         # a class makes a loss, a function is one
         loss = instantiate(config.loss, _partial_=not isclass(locate(config.loss["_target_"], None)))
+    _require_maps(recipe, regressor.backbone)
     constant_f = data.source.constant_f if config.camera.focal_length == "constant" else None
-    recipe = config.recipe
-    backbone = regressor.backbone
-    for key, weight, does in (
-        ("localisation", recipe.localisation, backbone.locates),
-        ("segmentation", recipe.segmentation, backbone.segments),
-    ):
-        if weight and not does:
-            raise ConfigError(
-                f"recipe.{key}: got {weight}, but this backbone has no map of the object; expected 0, or a backbone "
-                "that has one, as in conf/recipe/strong.yaml"
-            )
-    schedule = partial(factor, recipe.schedule, recipe.warmup_steps)
     module = PositionModule(
         regressor,
-        loss,
-        optimizer,
-        constant_f,
-        recipe.localisation,
-        schedule,
-        config.camera.f_error,
-        recipe.segmentation,
+        Objective(loss, recipe.localisation, recipe.segmentation),
+        CameraPolicy(constant_f, config.camera.f_error),
+        Optimisation(optimizer, partial(factor, recipe.schedule, recipe.warmup_steps)),
     )
     if custom_parts({"head": config.model.head, "backbone": config.backbone, "loss": config.loss}):
         _try_out(module, config, data.source)
     return module
+
+
+def _require_maps(recipe: RecipeConfig, backbone: Backbone) -> None:
+    """Raise ConfigError for the weight of a loss of a map that the backbone lacks."""
+    for key, weight, has_map in (
+        ("localisation", recipe.localisation, backbone.locates),
+        ("segmentation", recipe.segmentation, backbone.segments),
+    ):
+        if weight and not has_map:
+            raise ConfigError(
+                f"recipe.{key}: got {weight}, but this backbone has no map of the object; expected 0, or a backbone "
+                "that has one, as in conf/recipe/strong.yaml"
+            )
 
 
 @torch.no_grad()

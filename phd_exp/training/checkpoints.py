@@ -13,10 +13,10 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins.io import CheckpointIO
 
+from phd_exp.models.weights import load_checkpoint
 from phd_exp.records.errors import RunError
 from phd_exp.records.files import write_atomic
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.network import load_checkpoint
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 

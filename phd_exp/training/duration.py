@@ -7,11 +7,10 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from torch.utils.data import DataLoader
 
+from phd_exp.config import RunConfig
 from phd_exp.data.batches import Batch
-from phd_exp.threads import default_threads
+from phd_exp.hardware import default_threads, precision
 from phd_exp.training.build import build_data, build_module
-from phd_exp.training.config import RunConfig
-from phd_exp.training.network import precision
 from phd_exp.training.run import quiet_lightning
 
 ENOUGH = 5.0  # seconds of steps
@@ -41,7 +40,7 @@ def seconds_a_step(config: RunConfig, threads: int) -> float:
     batch = Batch(image, xyz, torch.full((n,), data.source.constant_f), float(side), torch.arange(n))
     trainer = Trainer(
         accelerator=config.trainer.accelerator,
-        precision=precision(config.trainer),
+        precision=precision(config.trainer.accelerator, config.trainer.precision),
         max_epochs=1,
         logger=False,
         callbacks=[clock],

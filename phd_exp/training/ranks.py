@@ -17,10 +17,10 @@ from typing import Any
 
 import torch.distributed as dist
 
+from phd_exp.config import RunConfig
 from phd_exp.records.errors import RunError, UserError
 from phd_exp.records.processes import Child, parent
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.config import RunConfig
 from phd_exp.training.recorder import Draw
 
 

@@ -11,11 +11,11 @@ from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
+from phd_exp.config.sections import EvaluationConfig
 from phd_exp.distributions.columns import Columns
 from phd_exp.records.errors import ConfigError, nearest, shown
 from phd_exp.records.files import write_atomic
 from phd_exp.records.runs import RunFolder, epoch_name
-from phd_exp.training.config.sections import EvaluationConfig
 from phd_exp.training.predictions import TRAINING, calibration_curves
 
 CalibrationData = dict[str, dict[str, Any]]
@@ -55,9 +55,10 @@ class Recorder(Checkpoint):
         require_monitored(trainer, evaluated)
         self.begun = True
 
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        # before the module's hook, which resets the rows
         if has_curves(trainer.current_epoch + 1, self.evaluation):
-            table: Columns = pl_module.table  # type: ignore[assignment]  # a PositionModule's
+            table = pl_module.evaluation_rows.columns()  # type: ignore[operator, union-attr]  # a PositionModule's
             self.record_curves(epoch_name(trainer.current_epoch), table, trainer.global_step)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:

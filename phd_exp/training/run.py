@@ -1,137 +1,32 @@
-"""One run from its configuration to its record."""
+"""Trains and evaluates one run in this process."""
 
 import logging
 import warnings
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
 
 import torch
 from lightning import Callback, Trainer, seed_everything
 
+from phd_exp.config import RunConfig
+from phd_exp.data.batches import BatchLoader
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.images import SHRINKING
-from phd_exp.data.sources import PARTS, Part
+from phd_exp.data.sources import PARTS
 from phd_exp.distributions.columns import Columns
-from phd_exp.records.choices import first_difference, flatten
-from phd_exp.records.dataset import DatasetFolder
-from phd_exp.records.errors import ConfigError, RunError, gist, shown
-from phd_exp.records.files import checksum, remove_temporaries
-from phd_exp.records.own_images import DetectionFolder
+from phd_exp.metrics.rows import Rows
+from phd_exp.models.weights import ADVICE, load_checkpoint
+from phd_exp.records.errors import RunError, gist, shown
 from phd_exp.records.runs import RunFolder
-from phd_exp.threads import default_threads
 from phd_exp.training.build import build_data, build_module
-from phd_exp.training.config import FolderConfig, RenderedConfig, RunConfig
-from phd_exp.training.config.targets import custom_parts
 from phd_exp.training.module import PositionModule
-from phd_exp.training.network import ADVICE, load_checkpoint, require_same_shrinking
 from phd_exp.training.predictions import summary, write_parquet
-from phd_exp.training.ranks import train_together
 from phd_exp.training.recorder import Draw, Recorder
-from phd_exp.training.tracking import require_possible_loggers, send_results, tracked
-from phd_exp.training.trainer import build_callbacks, build_trainer, trainer_arguments
+from phd_exp.training.tracking import send_results, tracked
+from phd_exp.training.trainer import build_trainer
 
 UNTRAINED = -1  # the number of the epoch before the first, whose metrics are those of the untrained network
-
-
-def train(
-    config: RunConfig,
-    folder: RunFolder,
-    draw: Draw | None,
-    cores: int,
-    callbacks: Sequence[Callback] = (),
-    overrides: Sequence[str] = (),
-) -> dict[str, Any]:
-    """Train, evaluate and record one run; returns its results. A finished run is not run again.
-
-    An interrupted run resumes with its next batch, a killed one after its last whole epoch.
-
-    Args:
-        config: the run.
-        folder: the folder of its record.
-        draw: draws calibration curves; None records their data alone.
-        cores: number of threads, unless trainer.threads or OMP_NUM_THREADS is set.
-        callbacks: of Lightning, further ones than the configuration's; with trainer.devices=1 only.
-        overrides: words of the command line, for the record.
-
-    Raises RunError if the folder holds a run of another configuration or another process uses it, DatasetError if the
-    data set is incomplete.
-    """
-    with folder.held():
-        require_same_config(folder, config)
-        if folder.is_finished():
-            return folder.results()
-        for place in (folder.path, folder.checkpoints, folder.calibration):
-            remove_temporaries(place)  # of a killed process
-        folder.write_config(config.model_dump(mode="json"))
-        threads = config.trainer.threads or default_threads(cores)
-        with folder.recording(_manifest_hash(config), custom_parts(config.model_dump(mode="json")), overrides):
-            if config.trainer.devices > 1:
-                results = train_together(config, folder.path, draw, threads)
-            else:
-                results = run(config, folder, draw, threads, callbacks=callbacks)
-            folder.write_results(results)
-    return folder.results()
-
-
-def require_possible(config: RunConfig, folder: RunFolder) -> None:
-    """Raise the errors that would stop the run later, before anything is rendered or written.
-
-    RunError: the folder holds a run of another configuration, or cannot be written. ConfigError: no GPU, no key of
-    wandb, or values that a part of the model or the data of a shift refuses. DatasetError: the folder of several
-    views or of a shift's data holds other data.
-    """
-    require_same_config(folder, config)
-    folder.require_writable()
-    trainer_arguments(config)
-    require_possible_loggers(config.logger)
-    build_callbacks(config, folder)
-    trainer, found = config.trainer, torch.cuda.device_count()
-    if trainer.accelerator == "gpu" and not torch.cuda.is_available():
-        raise ConfigError("trainer.accelerator: got 'gpu', but torch sees none here; expected 'cpu' or 'auto'")
-    if trainer.accelerator != "cpu" and 0 < found < trainer.devices:
-        raise ConfigError(f"trainer.devices: got {trainer.devices}, but torch sees {found} GPUs here")
-    for other in (config.several_views, *map(config.data_of, config.evaluation.shifts)):
-        if isinstance(other, RenderedConfig):
-            DatasetFolder(other.folder).missing(other.spec, 0, 0)  # refuses another data set in its folder
-    build_module(config, build_data(config))
-
-
-def require_same_config(folder: RunFolder, config: RunConfig) -> None:
-    """Raise RunError if the folder holds a run with other results, naming the first key that differs."""
-    if not folder.config_file.exists():
-        return
-    require_same_shrinking(folder, config)
-    if difference := _difference(folder, config):
-        raise RunError(
-            f"{folder.path}: holds a run with {difference} is asked for; "
-            "move that folder away, or choose another place by runs=DIR"
-        )
-    # the user's own data may change under the same name; a rendered set only grows
-    status, manifest = folder.status(), _manifest_hash(config)
-    if isinstance(config.data, FolderConfig) and status and manifest not in (None, status.data_manifest):
-        raise RunError(
-            f"{folder.path}: holds a run on {config.data.folder} as it was before its annotations changed; "
-            "move that run's folder away, or choose another place by runs=DIR"
-        )
-
-
-def _difference(folder: RunFolder, config: RunConfig) -> str | None:
-    """The first key with another value in the run that a folder holds; None if its results are the same."""
-    asked = flatten(config.model_dump(mode="json"))
-    chosen = flatten(config.model_dump(mode="json", exclude_defaults=True))
-    younger = {key: value for key, value in asked.items() if key not in chosen}  # may be absent in an older record
-    return first_difference(younger | flatten(folder.config()), asked)
-
-
-def equal_run(config: RunConfig, folder: RunFolder) -> RunFolder | None:
-    """A finished run next to a folder with the same configuration: other overrides can lead to equal values."""
-    for path in sorted(folder.path.parent.glob(f"seed{config.seed}*")):
-        with suppress(RunError):  # a record that cannot be read
-            if path != folder.path and (other := RunFolder(path)).is_finished() and not _difference(other, config):
-                return other
-    return None
 
 
 def run(
@@ -165,7 +60,7 @@ def run(
             )
         if (best := folder.best_checkpoint) != folder.last_checkpoint:
             module.load_state_dict(load_checkpoint(best)["state_dict"])
-        tables = {part: _evaluate(trainer, module, data, part) for part in data.samples if part != "train"}
+        tables = {part: evaluate(trainer, module, data.in_order(part)) for part in data.samples if part != "train"}
         untrained = recorder.rows[UNTRAINED].items()
         results = summary(tables["test"])
         results |= {f"untrained/{key}": value for key, value in untrained if "test/" in key}
@@ -189,7 +84,7 @@ def _fit(trainer: Trainer, module: PositionModule, data: PositionData, recorder:
     checkpoint = recorder.folder.last_checkpoint
     if not checkpoint.exists():
         recorder.forget_after(UNTRAINED)
-        recorder.record(UNTRAINED, summary(_evaluate(trainer, module, data, "test")), step=0)
+        recorder.record(UNTRAINED, summary(evaluate(trainer, module, data.in_order("test"))), step=0)
         recorder.send_recorded()
         trainer.fit(module, datamodule=data)
         return
@@ -223,10 +118,12 @@ def _ends_an_epoch(checkpoint: Mapping[str, Any]) -> bool:
         return True
 
 
-def _evaluate(trainer: Trainer, module: PositionModule, data: PositionData, part: Part) -> Columns:
-    """Predictions of the current weights for all samples of a part, gathered from all processes."""
-    trainer.predict(module, dataloaders=data.in_order(part), return_predictions=False)
-    return module.table
+def evaluate(trainer: Trainer, module: PositionModule, loader: BatchLoader) -> Columns:
+    """The rows of all samples of a loader with the current weights, gathered from all processes."""
+    device, rows = trainer.strategy.root_device, Rows()
+    for table in trainer.predict(module, dataloaders=loader) or []:
+        rows.update({name: column.to(device) for name, column in table.items()})  # type: ignore[union-attr]
+    return rows.columns()
 
 
 def _circumstances(config: RunConfig, data: PositionData, trainer: Trainer) -> dict[str, Any]:
@@ -247,15 +144,6 @@ def _circumstances(config: RunConfig, data: PositionData, trainer: Trainer) -> d
 
 def _name_of(device: torch.device) -> str:
     return torch.cuda.get_device_name(device) if device.type == "cuda" else str(device)
-
-
-def _manifest_hash(config: RunConfig) -> str | None:
-    with suppress(OSError):  # the data of a finished run may be gone
-        if isinstance(config.data, FolderConfig):
-            return DetectionFolder(config.data.folder).fingerprint()
-        if isinstance(config.data, RenderedConfig):
-            return checksum(DatasetFolder(config.data.folder).manifest_path)
-    return None
 
 
 def quiet_lightning() -> None:

@@ -10,12 +10,12 @@ from typing import Any
 from hydra.utils import instantiate
 from lightning.pytorch.loggers import Logger, WandbLogger
 
+from phd_exp.build import naming
+from phd_exp.config import RunConfig
+from phd_exp.config.targets import locate
 from phd_exp.records.choices import flatten
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.config import RunConfig
-from phd_exp.training.config.targets import locate
-from phd_exp.training.network import naming
 
 WANDB = "lightning.pytorch.loggers.WandbLogger"
 
@@ -83,7 +83,7 @@ def _wandb(name: str, node: dict[str, Any], config: RunConfig, folder: RunFolder
     if node.get("offline"):
         os.environ["WANDB_ERROR_REPORTING"] = "false"  # it uses the network
     run = wandb.init(  # as a context it would print a traceback
-        name="/".join(folder.path.parts[-4:]),
+        name="/".join(folder.names),
         dir=folder.path.absolute(),  # the service may have another working folder
         mode="offline" if node.get("offline") else "online",
         config=config.model_dump(mode="json"),

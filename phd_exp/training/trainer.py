@@ -10,11 +10,12 @@ from lightning import Trainer
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar
 
+from phd_exp.build import naming
+from phd_exp.config import RunConfig
+from phd_exp.hardware import precision
 from phd_exp.records.errors import ConfigError, shown, unknown
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.checkpoints import AtomicCheckpoints, StopBetweenBatches
-from phd_exp.training.config import RunConfig
-from phd_exp.training.network import naming, precision
 from phd_exp.training.progress import Progress
 from phd_exp.training.recorder import Recorder
 
@@ -60,7 +61,7 @@ def build_trainer(config: RunConfig, recorder: Recorder, callbacks: Sequence[Cal
         "strategy": "ddp" if config.trainer.devices > 1 else "auto",
         # not the environment of a cluster, whose tasks are not the processes of a run
         "plugins": [LightningEnvironment(), AtomicCheckpoints(folder)],
-        "precision": precision(config.trainer),
+        "precision": precision(config.trainer.accelerator, config.trainer.precision),
         "max_epochs": config.trainer.max_epochs,
         "logger": list(recorder.loggers),
         "callbacks": every,

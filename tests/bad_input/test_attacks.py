@@ -12,9 +12,9 @@ import torch
 
 from phd_exp.cli import conf_folder
 from phd_exp.cli.train import run_name
+from phd_exp.config import check
 from phd_exp.data.cache import cached
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.config import check
 from tests.bad_input import images
 from tests.bad_input.place import Place, spoil_checkpoint
 from tests.bad_input.table import LEARN, ONE, PREDICT, REPORT, Trap, trap

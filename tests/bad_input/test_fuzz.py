@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from phd_exp.cli import train
 from phd_exp.cli.frame import run_verb
 from phd_exp.cli.jobs import Job, launch
+from phd_exp.config import RunConfig, check, check_render
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.detections import DetectionLine
 from phd_exp.records.errors import UserError
@@ -21,7 +22,6 @@ from phd_exp.records.own_images import annotations, detections_in
 from phd_exp.records.runs import RunFolder, RunStatus
 from phd_exp.records.scenes import SampleRecord
 from phd_exp.reports.runs import read_report
-from phd_exp.training.config import RunConfig, check, check_render
 from tests.support.foreign import WRITERS
 
 EXAMPLES = [20, pytest.param(2000, marks=[pytest.mark.slow, pytest.mark.timeout(1200)])]

@@ -20,12 +20,12 @@ from torch import Tensor
 from torch.utils.data import IterableDataset
 
 from phd_exp.cli.jobs import composed
+from phd_exp.config import RunConfig, check
 from phd_exp.data.batches import Batch
 from phd_exp.data.datamodule import PositionData
 from phd_exp.records.processes import machine
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import build_augmentation, build_module
-from phd_exp.training.config import RunConfig, check
 from phd_exp.training.recorder import Recorder
 from phd_exp.training.run import quiet_lightning
 from phd_exp.training.trainer import build_trainer

@@ -23,19 +23,19 @@ from torch.utils.data import DataLoader, Dataset
 from torchvision.transforms.functional import normalize, pil_to_tensor
 
 from phd_exp.cli.jobs import composed
+from phd_exp.config import RunConfig, check
 from phd_exp.data.batches import Batch
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.sources import Known, Part, Source
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import DepthScale
+from phd_exp.hardware import precision
 from phd_exp.metrics.errors import depth_error, projected_error
 from phd_exp.models.regressor import IMAGENET_MEAN, IMAGENET_STD
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import build_data, build_module
-from phd_exp.training.config import RunConfig, check
 from phd_exp.training.module import PositionModule
-from phd_exp.training.network import precision
 from phd_exp.training.recorder import Recorder
 from phd_exp.training.trainer import build_trainer
 
@@ -73,7 +73,7 @@ class Bare:
         self.regressor, self.loss = copy.deepcopy(module.regressor), module.loss
         self.optimizer = module.make_optimizer(self.regressor.parameters())
         self.samples, self.batch_size = samples, config.data.batch_size
-        self.mixed = precision(config.trainer) == "bf16-mixed"
+        self.mixed = precision(config.trainer.accelerator, config.trainer.precision) == "bf16-mixed"
 
     def epoch(self) -> int:
         """Train on every sample once; returns the number of samples."""

@@ -13,10 +13,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from phd_exp.cli import conf_folder
 from phd_exp.cli.jobs import plain
+from phd_exp.config import check, check_render
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.config import check, check_render
-from phd_exp.training.run import require_possible
+from phd_exp.training.train import require_possible
 
 NOTHING_TO_RENDER = "data=folder: there is nothing to render, these are your own images"
 FOLDER = ["data=folder", "data.folder=photos"]

@@ -8,9 +8,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from pydantic import BaseModel
 
 from phd_exp.cli.paths import PATHS, quoted
+from phd_exp.config import RenderConfig, RunConfig
+from phd_exp.config.sections import FolderConfig, RenderedConfig
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.training.config import RenderConfig, RunConfig
-from phd_exp.training.config.sections import FolderConfig, RenderedConfig
 
 NAMES = [
     *("box(1).obj", "boîte.obj", "José/部品.glb", "a=b.obj", "a,b.obj", "#1.obj", "[new].obj", "[new]", "{x}.obj"),

@@ -18,9 +18,9 @@ from phd_exp.cli.frame import Ending
 from phd_exp.cli.jobs import Job
 from phd_exp.cli.sweep import Combination, cores_a_job, plan
 from phd_exp.cli.train import numbers, run_name, standing
+from phd_exp.config import check
 from phd_exp.records.processes import usable_cores
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.config import check
 
 EXPERIMENTS = [
     pytest.param(file.stem, marks=pytest.mark.slow if file.stem in ("heads", "shift") else ())

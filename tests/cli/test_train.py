@@ -7,10 +7,10 @@ import pytest
 
 import phd_exp as package
 from phd_exp.cli.train import announce, cost, run_name
+from phd_exp.config import RunConfig, check
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training import duration
-from phd_exp.training.config import RunConfig, check
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def test_a_run_first_prints_its_cost(
     composed, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path,
     gpu: bool, words: list[str], said: str, lines: int,
 ) -> None:  # type: ignore[no-untyped-def]  # fmt: skip
-    monkeypatch.setattr("phd_exp.training.network.has_gpu", lambda trainer: gpu)
+    monkeypatch.setattr("phd_exp.hardware.has_gpu", lambda accelerator: gpu)
     announce(check(composed(*words, f"data.root={tmp_path}")), RunFolder(Path("runs/x")), words)
     first, *rest = capsys.readouterr().out.splitlines()
     assert first.startswith(f"runs/x: {said}")

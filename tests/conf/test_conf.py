@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from phd_exp.cli import conf_folder
+from phd_exp.config import RunConfig, check
 from phd_exp.records.runs import SECTIONS
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.training.config import RunConfig, check
 
 CHOICES = {
     group.name: [f"{group.name}={file.stem}" for file in sorted(group.glob("*.yaml"))]

@@ -15,8 +15,8 @@ import yaml
 
 from phd_exp.cli import conf_folder
 from phd_exp.cli.train import run_name
+from phd_exp.config import check
 from phd_exp.records.choices import flatten
-from phd_exp.training.config import check
 
 with Path(__file__).with_name("golden.csv").open() as lines:
     GOLDEN = list(csv.DictReader(lines))

@@ -11,6 +11,8 @@ import pytest
 import torch
 from PIL import ExifTags, Image
 
+from phd_exp.build import build_source
+from phd_exp.config import check
 from phd_exp.data import folder as folder_module
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.folder import FolderSource
@@ -20,8 +22,6 @@ from phd_exp.records.dataset import SPLITS, DatasetFolder
 from phd_exp.records.errors import ConfigError, DatasetError
 from phd_exp.records.own_images import DetectionFolder
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.training.build import build_source
-from phd_exp.training.config import check
 from tests.support.foreign import write_kitti
 
 BOXED: dict[str, Any] = {"file_name": "wide.jpg", "fx": 300.0, "fy": 320.0, "cx": 70.0, "cy": 40.0, "z": 2.0}

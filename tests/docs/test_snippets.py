@@ -16,7 +16,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from phd_exp.cli import conf_folder
 from phd_exp.cli.help import EXAMPLES, OF_VERB, VERBS
 from phd_exp.cli.jobs import plain
-from phd_exp.training.config import check, check_render
+from phd_exp.config import check, check_render
 from tests.docs.pages import PAGES, ROOT, blocks, commands, name
 from tests.support.meshes import solid, write_mesh
 

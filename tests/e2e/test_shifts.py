@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 import phd_exp as package
+from phd_exp.build import build_source
+from phd_exp.config import check
 from phd_exp.records.runs import RunFolder, find_runs
-from phd_exp.training.build import build_source
-from phd_exp.training.config import check
 from tests.support.own_parts import QUICK, write_own_parts
 
 IMAGES = ("noise", "blur", "dark", "bright", "gamma_half", "gamma_two", "jpeg")

@@ -6,8 +6,8 @@ from pathlib import Path
 from omegaconf import OmegaConf
 
 from phd_exp.cli.jobs import plain
+from phd_exp.config import check_render
 from phd_exp.rendering.sampling import sample_scene
-from phd_exp.training.config import check_render
 
 FAR = """# Cylinders twice as far away.
 defaults: [default, _self_]

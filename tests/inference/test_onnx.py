@@ -8,11 +8,11 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from phd_exp.config import check
 from phd_exp.distributions import Temperature
 from phd_exp.geometry import Cartesian, Chart, DepthScale, LogDepth, Projected
 from phd_exp.inference.predictor import Predictor
 from phd_exp.models.heads import ChartHead, DistributionHead, Head
-from phd_exp.training.config import check
 
 onnxruntime = pytest.importorskip("onnxruntime", reason="needs `pip install 'phd_exp[export]'`")
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
+from phd_exp.config import check_render
 from phd_exp.records.assets import mesh_asset
 from phd_exp.records.dataset import DatasetFolder, Manifest
 from phd_exp.records.errors import ConfigError, DatasetError
-from phd_exp.training.config import check_render
 from tests.support.meshes import solid, write_mesh
 
 PART = "data.mesh=part.glb"

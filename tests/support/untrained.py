@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from PIL import Image
 
+from phd_exp.build import build_regressor
+from phd_exp.config import check
 from phd_exp.data.images import SHRINKING
 from phd_exp.geometry import DepthScale, VirtualCamera, intrinsics
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.config import check
-from phd_exp.training.network import build_regressor
 
 SIDE = 48
 SMALL = ("preset=smoke", f"data.image_size={SIDE}", "trainer.threads=1")

@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
+from phd_exp.config import check
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.runs import RunFolder
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.training.config import check
-from phd_exp.training.run import train
+from phd_exp.training.train import train
 from tests.support.handmade import write_handmade
 from tests.support.recorded import once
 

@@ -8,13 +8,17 @@ from typing import Any
 import pytest
 import torch
 
+from phd_exp import build, hardware
+from phd_exp.config import RunConfig, check
 from phd_exp.data.images import SHRINKING
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.runs import RunFolder
-from phd_exp.training import network
 from phd_exp.training.build import build_data, build_module
-from phd_exp.training.config import RunConfig, check
-from phd_exp.training.module import factor
+from phd_exp.training.optimisation import factor
+
+
+def arithmetic(config: RunConfig) -> str:
+    return hardware.precision(config.trainer.accelerator, config.trainer.precision)
 
 
 @pytest.fixture
@@ -24,19 +28,19 @@ def checked(composed: Callable[..., dict[str, Any]]) -> Callable[..., RunConfig]
 
 @pytest.mark.parametrize(("named", "expected"), [("float32", "32-true"), ("bfloat16", "bf16-mixed")])
 def test_a_named_precision_is_used(checked: Callable, named: str, expected: str) -> None:
-    assert network.precision(checked("trainer=cpu", f"trainer.precision={named}").trainer) == expected
+    assert arithmetic(checked("trainer=cpu", f"trainer.precision={named}")) == expected
 
 
 @pytest.mark.parametrize(("has_units", "expected"), [(True, "bf16-mixed"), (False, "32-true")])
 def test_bfloat16_only_on_hardware_with_units_for_it(
     checked: Callable, monkeypatch: pytest.MonkeyPatch, has_units: bool, expected: str
 ) -> None:
-    monkeypatch.setattr(network, "cpu_has_bfloat16", lambda: has_units)
-    assert network.precision(checked("trainer=cpu").trainer) == expected
-    monkeypatch.setattr(network, "cpu_has_bfloat16", lambda: not has_units)
+    monkeypatch.setattr(hardware, "cpu_has_bfloat16", lambda: has_units)
+    assert arithmetic(checked("trainer=cpu")) == expected
+    monkeypatch.setattr(hardware, "cpu_has_bfloat16", lambda: not has_units)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: has_units)
-    assert network.precision(checked("trainer=auto").trainer) == expected
+    assert arithmetic(checked("trainer=auto")) == expected
 
 
 @pytest.mark.parametrize("loss", ["localisation", "segmentation"])
@@ -74,4 +78,4 @@ def test_images_shrunk_by_another_version_are_refused_where_they_differ(
     config = checked("data.sensor_size=224", f"data.image_size={side}")
     refused = begun and side == 64 and version != SHRINKING
     with pytest.raises(RunError, match="shrunk from 224 to 64 pixels") if refused else nullcontext():
-        network.require_same_shrinking(folder, config)
+        build.require_same_shrinking(folder, config)

@@ -10,16 +10,17 @@ import torch
 from scipy.stats import kstest
 
 import phd_exp as package
+from phd_exp.build import build_source
 from phd_exp.cli.train import _record_further
+from phd_exp.config import RunConfig, check
 from phd_exp.data.batches import Batch
 from phd_exp.data.sources import Part, Source
 from phd_exp.evaluation.parquet import read_table
 from phd_exp.inference import tables
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.build import build_data, build_module, build_source
-from phd_exp.training.config import RunConfig, check
-from phd_exp.training.network import f_factor, standard_error
+from phd_exp.training.build import build_data, build_module
+from phd_exp.training.cameras import f_factor, standard_error
 from phd_exp.training.predictions import write_parquet
 from tests.support.recorded import once
 

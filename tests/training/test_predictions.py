@@ -8,13 +8,13 @@ import pandas as pd
 import pytest
 import torch
 
+from phd_exp.config import check
 from phd_exp.data.batches import Batch
 from phd_exp.distributions import PointEstimate, ProjectedHuber
 from phd_exp.distributions.columns import distribution_columns, from_columns
 from phd_exp.geometry import DepthScale, Projected
 from phd_exp.metrics.rows import Rows
 from phd_exp.training.build import build_data, build_module
-from phd_exp.training.config import check
 from phd_exp.training.predictions import calibration_curves, columns, summary, write_parquet
 
 DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))

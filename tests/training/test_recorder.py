@@ -5,8 +5,8 @@ from fractions import Fraction
 
 import pytest
 
-from phd_exp.training.config import check
-from phd_exp.training.config.sections import EvaluationConfig
+from phd_exp.config import check
+from phd_exp.config.sections import EvaluationConfig
 from phd_exp.training.recorder import has_curves
 
 

@@ -14,15 +14,15 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import ProgressBar
 
+from phd_exp.config import check
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training import trainer as build
 from phd_exp.training.checkpoints import AtomicCheckpoints
-from phd_exp.training.config import check
 from phd_exp.training.module import PositionModule
 from phd_exp.training.progress import Progress
 from phd_exp.training.recorder import Recorder
-from phd_exp.training.run import require_same_config, train
+from phd_exp.training.train import require_same_config, train
 from tests.e2e.runs import weights
 from tests.support.recorded import once
 
@@ -211,7 +211,7 @@ def test_curves_are_recorded_and_drawn(run: RunFolder) -> None:
 def test_a_finished_run_is_not_run_again_and_never_taken_for_another(
     run_in: Callable, whole: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("phd_exp.training.run.run", lambda *_: pytest.fail("run again"))
+    monkeypatch.setattr("phd_exp.training.train.run", lambda *_: pytest.fail("run again"))
     run_in(whole.path, *LONG)
     with pytest.raises(RunError, match=r"holds a run with optimizer.lr=0.002, but optimizer.lr=0.5 is asked"):
         run_in(whole.path, *LONG, "optimizer.lr=0.5")
@@ -262,6 +262,6 @@ def test_threads_are_those_of_the_configuration_or_of_omp_num_threads_or_the_cor
     expected: int,
 ) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", asked)
-    monkeypatch.setattr("phd_exp.training.run.run", lambda config, folder, draw, threads, **_: {"threads": threads})
+    monkeypatch.setattr("phd_exp.training.train.run", lambda config, folder, draw, threads, **_: {"threads": threads})
     config = check(composed("preset=smoke", f"data.root={tmp_path}", *words))
     assert train(config, RunFolder(tmp_path / "run"), None, cores=8) == {"threads": expected}

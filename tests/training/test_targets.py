@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from pydantic_core import PydanticCustomError
 
-from phd_exp.training.config.targets import Trust, check_target, custom_parts
+from phd_exp.config.targets import Trust, check_target, custom_parts
 
 ADAM = "torch.optim.Adam"
 HEAD = "phd_exp.models.heads.ChartHead"

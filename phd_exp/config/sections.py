@@ -5,10 +5,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, StrictBool, Tag, model_validator
 
+from phd_exp.config.targets import Target, TrainingTarget
 from phd_exp.records.detections import NumberOrName
 from phd_exp.records.parsing import Record
 from phd_exp.records.spec import Angle, DatasetSpec, Range
-from phd_exp.training.config.targets import Target, TrainingTarget
 
 Whole = Annotated[int, Field(strict=True)]
 Natural = Annotated[Whole, Field(ge=0)]

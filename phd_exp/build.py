@@ -1,33 +1,40 @@
-"""The network, its focal lengths and the weights of a checkpoint, without Lightning: shared with prediction."""
+"""From a checked configuration to its parts: the network and the source of samples, without Lightning."""
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
-from zipfile import ZIP_STORED, ZipFile
 
-import torch
 from hydra.errors import HydraException
 from hydra.utils import instantiate
-from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import nn
 
+from phd_exp.config import FolderConfig, RenderedConfig, RunConfig, SourceConfig
+from phd_exp.config.targets import custom_parts
+from phd_exp.data.folder import FolderSource
 from phd_exp.data.images import SHRINKING
+from phd_exp.data.sources import Part, RenderedSource, Source
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.models.backbones import Backbone, pooled
 from phd_exp.models.regressor import FocalLengthInput, Regressor
+from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, RunError, gist, in_user_code, install
-from phd_exp.records.files import require_plain
-from phd_exp.records.processes import cpu_has_bfloat16
+from phd_exp.records.own_images import DetectionFolder
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.config import RenderedConfig, RunConfig
-from phd_exp.training.config.sections import TrainerConfig
-from phd_exp.training.config.targets import custom_parts
 
-ADVICE = "delete it to begin the run again"
-GOLDEN = (math.sqrt(5) - 1) / 2
+
+def build_source(data: RenderedConfig | FolderConfig | SourceConfig) -> Source:
+    """The source of samples that a `data` section describes. Raises ConfigError, naming the key, for bad values."""
+    if isinstance(data, FolderConfig):
+        folder = DetectionFolder(data.folder, data.object)
+        return FolderSource(folder, data.n_train, data.n_held_out, data.n_test, data.image_size)
+    sizes: dict[Part, int] = {"train": data.n_train, "held_out": data.n_held_out, "test": data.n_test}
+    if isinstance(data, RenderedConfig):
+        return RenderedSource(DatasetFolder(data.folder), data.spec, sizes, data.image_size)
+    with naming("data.source", data.source):
+        source = instantiate(data.source, _partial_=True)(n=sizes, side=data.image_size)
+        if not isinstance(source, Source):
+            raise ValueError(f"makes a {type(source).__name__}; expected a phd_exp.data.sources.Source")
+        return source
 
 
 def build_regressor(config: RunConfig, depth: DepthScale, is_new: bool = True) -> Regressor:
@@ -75,40 +82,6 @@ def naming(key: str, node: dict[str, Any]) -> Iterator[None]:
         raise ConfigError(f"{key}: {reason}{install(str(cause)) if isinstance(cause, ImportError) else ''}") from None
 
 
-def f_factor(row: Int[Tensor, " batch"], f_error: float, epoch: int = 0) -> Float[Tensor, " batch"]:
-    """Focal length that the model receives relative to the true one: exp(f_error e), with the `standard_error` e.
-
-    Evaluations have the errors of epoch 0, so that every record of a sample has the same.
-    """
-    return (f_error * standard_error(row, epoch)).exp()
-
-
-def standard_error(row: Int[Tensor, " batch"], epoch: int) -> Float[Tensor, " batch"]:
-    """A standard normal number for each sample and epoch, evenly spread over samples and over epochs.
-
-    It depends on (row, epoch) alone, so a resumed or distributed run trains on the same numbers.
-
-    Source: multiples of irrational numbers modulo 1 are evenly distributed (Weyl); checked in
-    tests/training/test_f_error.py.
-    """
-    place = row.double() * GOLDEN + epoch * math.sqrt(2)
-    return torch.special.ndtri(place.frac().clamp(1e-6, 1 - 1e-6)).float()
-
-
-def has_gpu(config: TrainerConfig) -> bool:
-    """Whether a run trains on a GPU."""
-    return config.accelerator != "cpu" and torch.cuda.is_available()
-
-
-def precision(config: TrainerConfig) -> Any:
-    """Lightning's name of the arithmetic: bfloat16 autocast on hardware with bfloat16 units.
-
-    Without such units bfloat16 is three times slower than float32 on a CPU (resnet18, 112 px).
-    """
-    fast = torch.cuda.is_bf16_supported(including_emulation=False) if has_gpu(config) else cpu_has_bfloat16()
-    return "bf16-mixed" if config.precision == "bfloat16" or (config.precision == "auto" and fast) else "32-true"
-
-
 def require_same_shrinking(folder: RunFolder, config: RunConfig) -> None:
     """Raise RunError for a run trained with another version of `shrunk`, whose images differ."""
     data = config.data
@@ -121,24 +94,3 @@ def require_same_shrinking(folder: RunFolder, config: RunConfig) -> None:
             f"{folder.path}: trained with images shrunk from {before} to {after} pixels by an earlier version, which "
             "shifted them; move the folder away and train again"
         )
-
-
-def load_checkpoint(file: Path, map_location: Any = None) -> dict[str, Any]:
-    """The content of a checkpoint: tensors and plain containers. No code in the file is executed.
-
-    Raises RunError, one line, for any other file.
-    """
-    try:
-        require_plain(file)
-        with ZipFile(file) as archive:  # a compressed file may unpack to any size
-            if any(entry.compress_type != ZIP_STORED for entry in archive.infolist()):
-                raise ValueError("its content is compressed, which torch never does")
-        content = torch.load(file, map_location or "cpu", weights_only=True)
-    except UnpicklingError:
-        raise RunError(f"{file}: holds more than tensors and plain values, which is not read; {ADVICE}") from None
-    except Exception as error:  # torch raises any error on other bytes
-        reason = " ".join((getattr(error, "strerror", None) or str(error).split("\n")[0]).split())[:120]
-        raise RunError(f"{file}: not a whole checkpoint ({reason}); {ADVICE}") from None
-    if not isinstance(content, dict):
-        raise RunError(f"{file}: not a checkpoint of a run; {ADVICE}")
-    return content

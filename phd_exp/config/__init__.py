@@ -10,13 +10,13 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, Field, StrictBool, ValidationError, ValidationInfo, model_validator
 
+from phd_exp.config import sections
+from phd_exp.config.sections import FolderConfig, RenderedConfig, SourceConfig
+from phd_exp.config.targets import Target, TrainingTarget, TrainingTargets, Trust, describe, is_typed, locate
 from phd_exp.records.choices import flatten
 from phd_exp.records.errors import ConfigError, gist, shown
 from phd_exp.records.parsing import Record
 from phd_exp.records.spec import Shard
-from phd_exp.training.config import sections
-from phd_exp.training.config.sections import FolderConfig, RenderedConfig, SourceConfig
-from phd_exp.training.config.targets import Target, TrainingTarget, TrainingTargets, Trust, describe, is_typed, locate
 
 __all__ = ["FolderConfig", "RenderConfig", "RenderedConfig", "RunConfig", "SourceConfig", "check", "check_render"]
 

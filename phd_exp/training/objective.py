@@ -1,0 +1,48 @@
+"""What a training minimises: the loss of the predictions, and those of the backbone's maps."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from phd_exp.data.batches import Batch
+from phd_exp.distributions import Density
+from phd_exp.geometry.charts import projected
+from phd_exp.losses import MeanAbsoluteError, NegativeLogLikelihood
+from phd_exp.models.backbones import BackboneOutput
+from phd_exp.models.heads import Prediction
+from phd_exp.models.locating import localisation_loss, segmentation_loss
+
+Loss = Callable[[Prediction, Tensor], Tensor]
+"""Predictions and true positions (batch, 3) -> one number per sample, or their mean."""
+
+
+@dataclass(frozen=True)
+class Objective:
+    """The mean loss, and the weighted losses of the maps.
+
+    Attributes:
+        loss: of the predictions.
+        localisation: weight of the localisation loss; 0 for a backbone that does not locate the object.
+        segmentation: weight of the segmentation loss; 0 for a backbone that does not segment the object.
+    """
+
+    loss: Loss
+    localisation: float = 0.0
+    segmentation: float = 0.0
+
+    def total(self, losses: Tensor, output: BackboneOutput, batch: Batch) -> Float[Tensor, ""]:
+        """The number to minimise, given the losses of the predictions."""
+        total = losses.mean()
+        if self.localisation and output.log_heat is not None:
+            place = projected(batch.xyz, batch.camera)
+            total = total + self.localisation * localisation_loss(output.log_heat, place)
+        if self.segmentation and output.log_odds is not None and batch.mask is not None:
+            total = total + self.segmentation * segmentation_loss(output.log_odds, batch.mask)
+        return total
+
+
+def natural_loss(prediction: type) -> Loss:
+    """The negative log likelihood of a density, the mean absolute error of a point estimate."""
+    return NegativeLogLikelihood() if issubclass(prediction, Density) else MeanAbsoluteError()

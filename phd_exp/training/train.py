@@ -1,0 +1,133 @@
+"""One run from its configuration to its record: whether it may start, and in how many processes it trains."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
+
+import torch
+from lightning import Callback
+
+from phd_exp.build import require_same_shrinking
+from phd_exp.config import FolderConfig, RenderedConfig, RunConfig
+from phd_exp.config.targets import custom_parts
+from phd_exp.hardware import default_threads
+from phd_exp.records.choices import first_difference, flatten
+from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.errors import ConfigError, RunError
+from phd_exp.records.files import checksum, remove_temporaries
+from phd_exp.records.own_images import DetectionFolder
+from phd_exp.records.runs import RunFolder
+from phd_exp.training.build import build_data, build_module
+from phd_exp.training.ranks import train_together
+from phd_exp.training.recorder import Draw
+from phd_exp.training.run import run
+from phd_exp.training.tracking import require_possible_loggers
+from phd_exp.training.trainer import build_callbacks, trainer_arguments
+
+
+def train(
+    config: RunConfig,
+    folder: RunFolder,
+    draw: Draw | None,
+    cores: int,
+    callbacks: Sequence[Callback] = (),
+    overrides: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Train, evaluate and record one run; returns its results. A finished run is not run again.
+
+    An interrupted run resumes with its next batch, a killed one after its last whole epoch.
+
+    Args:
+        config: the run.
+        folder: the folder of its record.
+        draw: draws calibration curves; None records their data alone.
+        cores: number of threads, unless trainer.threads or OMP_NUM_THREADS is set.
+        callbacks: of Lightning, further ones than the configuration's; with trainer.devices=1 only.
+        overrides: words of the command line, for the record.
+
+    Raises RunError if the folder holds a run of another configuration or another process uses it, DatasetError if the
+    data set is incomplete.
+    """
+    with folder.held():
+        require_same_config(folder, config)
+        if folder.is_finished():
+            return folder.results()
+        for place in (folder.path, folder.checkpoints, folder.calibration):
+            remove_temporaries(place)  # of a killed process
+        folder.write_config(config.model_dump(mode="json"))
+        threads = config.trainer.threads or default_threads(cores)
+        with folder.recording(_manifest_hash(config), custom_parts(config.model_dump(mode="json")), overrides):
+            if config.trainer.devices > 1:
+                results = train_together(config, folder.path, draw, threads)
+            else:
+                results = run(config, folder, draw, threads, callbacks=callbacks)
+            folder.write_results(results)
+    return folder.results()
+
+
+def require_possible(config: RunConfig, folder: RunFolder) -> None:
+    """Raise the errors that would stop the run later, before anything is rendered or written.
+
+    RunError: the folder holds a run of another configuration, or cannot be written. ConfigError: no GPU, no key of
+    wandb, or values that a part of the model or the data of a shift refuses. DatasetError: the folder of several
+    views or of a shift's data holds other data.
+    """
+    require_same_config(folder, config)
+    folder.require_writable()
+    trainer_arguments(config)
+    require_possible_loggers(config.logger)
+    build_callbacks(config, folder)
+    trainer, found = config.trainer, torch.cuda.device_count()
+    if trainer.accelerator == "gpu" and not torch.cuda.is_available():
+        raise ConfigError("trainer.accelerator: got 'gpu', but torch sees none here; expected 'cpu' or 'auto'")
+    if trainer.accelerator != "cpu" and 0 < found < trainer.devices:
+        raise ConfigError(f"trainer.devices: got {trainer.devices}, but torch sees {found} GPUs here")
+    for other in (config.several_views, *map(config.data_of, config.evaluation.shifts)):
+        if isinstance(other, RenderedConfig):
+            DatasetFolder(other.folder).missing(other.spec, 0, 0)  # refuses another data set in its folder
+    build_module(config, build_data(config))
+
+
+def require_same_config(folder: RunFolder, config: RunConfig) -> None:
+    """Raise RunError if the folder holds a run with other results, naming the first key that differs."""
+    if not folder.config_file.exists():
+        return
+    require_same_shrinking(folder, config)
+    if difference := _difference(folder, config):
+        raise RunError(
+            f"{folder.path}: holds a run with {difference} is asked for; "
+            "move that folder away, or choose another place by runs=DIR"
+        )
+    # the user's own data may change under the same name; a rendered set only grows
+    status, manifest = folder.status(), _manifest_hash(config)
+    if isinstance(config.data, FolderConfig) and status and manifest not in (None, status.data_manifest):
+        raise RunError(
+            f"{folder.path}: holds a run on {config.data.folder} as it was before its annotations changed; "
+            "move that run's folder away, or choose another place by runs=DIR"
+        )
+
+
+def _difference(folder: RunFolder, config: RunConfig) -> str | None:
+    """The first key with another value in the run that a folder holds; None if its results are the same."""
+    asked = flatten(config.model_dump(mode="json"))
+    chosen = flatten(config.model_dump(mode="json", exclude_defaults=True))
+    younger = {key: value for key, value in asked.items() if key not in chosen}  # may be absent in an older record
+    return first_difference(younger | flatten(folder.config()), asked)
+
+
+def equal_run(config: RunConfig, folder: RunFolder) -> RunFolder | None:
+    """A finished run next to a folder with the same configuration: other overrides can lead to equal values."""
+    for path in sorted(folder.path.parent.glob(f"seed{config.seed}*")):
+        with suppress(RunError):  # a record that cannot be read
+            if path != folder.path and (other := RunFolder(path)).is_finished() and not _difference(other, config):
+                return other
+    return None
+
+
+def _manifest_hash(config: RunConfig) -> str | None:
+    with suppress(OSError):  # the data of a finished run may be gone
+        if isinstance(config.data, FolderConfig):
+            return DetectionFolder(config.data.folder).fingerprint()
+        if isinstance(config.data, RenderedConfig):
+            return checksum(DatasetFolder(config.data.folder).manifest_path)
+    return None
