@@ -62,30 +62,18 @@ def calibration_curve(
     return CalibrationCurve(predicted, empirical, window, left_out=both.shape[1] - finite.shape[1])
 
 
-def ence(
-    predicted_variance: Float[Tensor, " samples"], squared_error: Float[Tensor, " samples"], bins: int
-) -> Float[Tensor, ""]:
+def ence_of(ordered: Ordered, variance: str, squared_error: str, bins: int) -> Float[Tensor, "*batch"]:
     """Expected normalised calibration error: the mean over bins of |RMV - RMSE| / RMV.
 
-    Bins hold about equally many samples, sorted by predicted variance. Samples of equal variance share a bin, and
-    each bin is weighted by its samples. A calibrated model has about 0.4 sqrt((k - 1) bins/n), k the kurtosis of its
-    errors, because errors of n/bins samples scatter.
+    Samples are in the order of their variance, and bins hold about equally many of them. Those of equal variance
+    share a bin, and each bin is weighted by its samples. A calibrated model has about 0.4 sqrt((k - 1) bins/n), k the
+    kurtosis of its errors, because errors of n/bins samples scatter.
 
     Raises ValueError for bins below 1.
     Source: Levi et al., "Evaluating and calibrating uncertainty prediction in regression tasks" (2022).
-
-    Examples:
-        >>> float(ence(torch.ones(4), torch.full((4,), 4.0), bins=2))  # deviations twice as large as predicted
-        1.0
     """
     if bins < 1:
         raise ValueError(f"bins must be at least 1, not {bins}")
-    columns = {"variance": predicted_variance, "squared_error": squared_error}
-    return ence_of(in_order_of(predicted_variance, columns), "variance", "squared_error", bins)
-
-
-def ence_of(ordered: Ordered, variance: str, squared_error: str, bins: int) -> Float[Tensor, "*batch"]:
-    """`ence` of samples in the order of their variance."""
     count = ordered.pooled(ordered.count, bins)
     ratio = ordered.pooled(ordered.sums[squared_error], bins) / ordered.pooled(ordered.sums[variance], bins)
     gap = (1 - ratio.sqrt()).abs().masked_fill(count == 0, 0)

@@ -75,7 +75,7 @@ def ordered(
 def calibration_scores(orders: Mapping[str, Ordered]) -> dict[str, Float[Tensor, "*batch"]]:
     """Every score of samples in the `ORDERS`; 0 is best unless stated otherwise.
 
-    - `depth_ence`, `projected_ence`: expected normalised calibration error (`ence`) in at most 10 bins.
+    - `depth_ence`, `projected_ence`: expected normalised calibration error (`ence_of`) in at most 10 bins.
     - `miscalibration_area` of the credible levels, `depth_pit_area` of the PIT of depth: int |coverage(p) - p| dp.
     - `overconfidence`: mean credible level minus 1/2; negative if underconfident.
     - `depth_pit_ks`: Kolmogorov-Smirnov distance of the PIT of depth from the uniform law.

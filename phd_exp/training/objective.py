@@ -10,9 +10,9 @@ from phd_exp.data.batches import Batch
 from phd_exp.distributions import Density
 from phd_exp.geometry.charts import projected
 from phd_exp.losses import MeanAbsoluteError, NegativeLogLikelihood
+from phd_exp.losses.locating import localisation_loss, segmentation_loss
 from phd_exp.models.backbones import BackboneOutput
 from phd_exp.models.heads import Prediction
-from phd_exp.models.locating import localisation_loss, segmentation_loss
 
 Loss = Callable[[Prediction, Tensor], Tensor]
 """Predictions and true positions (batch, 3) -> one number per sample, or their mean."""

@@ -7,7 +7,7 @@ import torch
 from torch.testing import assert_close
 
 from phd_exp.geometry.camera import middles
-from phd_exp.models.locating import localisation_loss
+from phd_exp.losses.locating import localisation_loss
 
 
 def cells(rows: int, columns: int) -> torch.Tensor:

@@ -3,7 +3,7 @@
 import torch
 from torch.testing import assert_close
 
-from phd_exp.models.locating import segmentation_loss
+from phd_exp.losses.locating import segmentation_loss
 
 MASK = torch.tensor([[[0, 255, 51, 0], [0, 255, 255, 0]]], dtype=torch.uint8)
 

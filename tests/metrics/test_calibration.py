@@ -11,11 +11,12 @@ from scipy import stats
 from phd_exp.metrics.calibration import (
     calibration_curve,
     coverage,
-    ence,
+    ence_of,
     miscalibration_area,
     overconfidence,
     uniform_distance,
 )
+from phd_exp.metrics.ordered import in_order_of
 
 
 def samples(n: int, overconfidence: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -24,6 +25,12 @@ def samples(n: int, overconfidence: float) -> tuple[torch.Tensor, torch.Tensor]:
     variance = 10 ** (3 * torch.rand(n, generator=generator, dtype=torch.float64))
     noise = torch.randn(n, generator=generator, dtype=torch.float64)
     return variance, overconfidence * variance * noise.square()
+
+
+def ence(variance: torch.Tensor, squared_error: torch.Tensor, bins: int) -> torch.Tensor:
+    """The expected normalised calibration error of samples in any order."""
+    ordered = in_order_of(variance, {"variance": variance, "squared_error": squared_error})
+    return ence_of(ordered, "variance", "squared_error", bins)
 
 
 def test_equals_a_sliding_mean() -> None:
