@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from phd_exp.distributions.density import Density
 from phd_exp.distributions.huber import HUBER_COVARIANCE
 from phd_exp.distributions.projected_huber import ProjectedHuber
-from phd_exp.distributions.shaped import Shaped
 
 Columns = dict[str, Tensor]
 """Name -> one number a sample."""
@@ -32,7 +32,7 @@ def from_columns(columns: Mapping[str, Tensor]) -> ProjectedHuber:
     return ProjectedHuber(torch.stack([mu_x, mu_y], dim=-1), mu_z, A, a)
 
 
-def distribution_columns(distribution: ProjectedHuber | Shaped, xyz: Float[Tensor, "samples 3"]) -> Columns:
+def distribution_columns(distribution: Density, xyz: Float[Tensor, "samples 3"]) -> Columns:
     """Mean and median depth (metres), the parameters of a Projected Huber density, of others the covariance (m^2),
     `squared_error_columns`, and how true positions (metres) stand to the prediction.
 
@@ -59,13 +59,13 @@ def coordinates(prefix: str, xyz: Float[Tensor, "samples 3"]) -> Columns:
     return {f"{prefix}{axis}": xyz[:, place] for place, axis in enumerate("xyz")}
 
 
-def draws(distribution: ProjectedHuber | Shaped, n: int, seed: int) -> Float[Tensor, "n samples 3"]:
+def draws(distribution: Density, n: int, seed: int) -> Float[Tensor, "n samples 3"]:
     """n positions from each distribution, the same for the same seed; torch's own random numbers stay untouched."""
     generator = torch.Generator(device=distribution.mode.device).manual_seed(seed)
     return distribution.rsample((n,), generator)
 
 
-def squared_error_columns(distribution: ProjectedHuber | Shaped, xyz: Float[Tensor, "*draws samples 3"]) -> Columns:
+def squared_error_columns(distribution: Density, xyz: Float[Tensor, "*draws samples 3"]) -> Columns:
     """Variances and squared errors: m^2 (of depth, about its mean), and without unit (projected: x/z plus y/z)."""
     z = xyz[..., 2]
     off_centre = xyz[..., :2] / z[..., None] - distribution.mu_xy

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -15,6 +16,8 @@ from phd_exp.geometry.charts import Chart
 class PointEstimate:
     """A position given by its coordinates in a chart, as seen by a camera."""
 
+    has_covariance: ClassVar[bool] = False
+    has_closed_forms: ClassVar[Literal[False]] = False
     coordinates: Float[Tensor, "*batch 3"]
     chart: Chart
     camera: Camera

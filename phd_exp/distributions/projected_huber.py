@@ -9,7 +9,7 @@ q and t are independent, and v is linear in (q, t). Every statistic below follow
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -28,7 +28,7 @@ from phd_exp.geometry.camera import at_depth
 LARGEST_RAW = 1e9  # squares of larger raw numbers, and their products, would overflow in float32
 
 
-class ProjectedHuber(Distribution, Density):
+class ProjectedHuber(Density, Distribution):
     """A density over positions v = (x, y, z) in the camera frame, zero for z <= 0.
 
     Args:
@@ -52,6 +52,7 @@ class ProjectedHuber(Distribution, Density):
     Source: paper, section "Projected Huber distribution".
     """
 
+    has_closed_forms: ClassVar[Literal[True]] = True
     arg_constraints: ClassVar[dict[str, Constraint]] = {
         "mu_xy": constraints.real_vector,
         "mu_z": constraints.positive,
@@ -237,11 +238,6 @@ class ProjectedHuber(Distribution, Density):
         return at_depth(self.mu_xy, self.mu_z)
 
     @property
-    def mean(self) -> Float[Tensor, "*batch 3"]:
-        """Expected position, E[z] (mu_xy, 1), metres."""
-        return at_depth(self.mu_xy, self.depth_mean)
-
-    @property
     def covariance_matrix(self) -> Float[Tensor, "*batch 3 3"]:
         """Covariance of the position, Var[z] m m^T + c A_xy^(-2) with m = (mu_xy, 1), square metres.
 
@@ -267,18 +263,11 @@ class ProjectedHuber(Distribution, Density):
 
     @property
     def depth_mean(self) -> Float[Tensor, "*batch"]:
-        """E[z], metres."""
         return self.mu_z * depth.depth_mean_and_variance(self._natural.log_a)[0]
 
     @property
     def depth_variance(self) -> Float[Tensor, "*batch"]:
-        """Var[z], square metres."""
         return self.mu_z.square() * depth.depth_mean_and_variance(self._natural.log_a)[1]
-
-    @property
-    def depth_median(self) -> Float[Tensor, "*batch"]:
-        """The median of z, metres."""
-        return self.depth_icdf(0.5)
 
     def depth_cdf(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
         """P(depth <= z), z in metres; 0 for z <= 0."""

@@ -8,7 +8,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from phd_exp.distributions import spd
-from phd_exp.distributions.shaped import Shaped, nodes
+from phd_exp.distributions.density import nodes
+from phd_exp.distributions.shaped import Shaped
 
 LEVELS = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 """Probabilities of the predicted quantiles."""

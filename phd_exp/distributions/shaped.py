@@ -9,7 +9,7 @@ Source: own derivation; tests/distributions/test_heads.py checks every law.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -25,7 +25,6 @@ from phd_exp.distributions.projected_huber import ProjectedHuber
 from phd_exp.distributions.special import log_scaled_normaliser
 from phd_exp.geometry.camera import at_depth
 
-_NODES = 400  # of quadrature over quantiles; relative errors are below 1e-3
 _NORMAL, _LAPLACE = Normal(0.0, 1.0), Laplace(0.0, 1.0)
 
 
@@ -40,6 +39,7 @@ class Shaped(Density):
         further: raw numbers beyond its seven; the first two are k if e = 1.
     """
 
+    has_closed_forms: ClassVar[Literal[False]] = False
     law: ProjectedHuber
     further: Float[Tensor, "*batch n"]
     exponent: ClassVar[int]
@@ -102,7 +102,6 @@ class Shaped(Density):
     def rsample(
         self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None
     ) -> Float[Tensor, "*shape 3"]:
-        """Exact samples."""
         q, s = self._draw((*sample_shape, *self.law.batch_shape), generator)
         z, (inverse, along) = self._z(s), self._spread
         shift = spd.matvec(inverse, q) - along * s[..., None]
@@ -111,12 +110,10 @@ class Shaped(Density):
 
     @property
     def mode(self) -> Float[Tensor, "*batch 3"]:
-        """The position of level 0, the point estimate, metres."""
         return self.law.mode
 
     @property
     def mu_xy(self) -> Float[Tensor, "*batch 2"]:
-        """Mean of (x, y)/z."""
         return self.law.mu_xy
 
     @property
@@ -127,51 +124,29 @@ class Shaped(Density):
 
     @property
     def depth_mean(self) -> Float[Tensor, "*batch"]:
-        """E[z], metres."""
-        p, weight = nodes(self.law.a)
-        return self.law.mu_z if self.exponent == 1 else (weight * self.depth_icdf(p)).sum(0)
+        return self.law.mu_z if self.exponent == 1 else super().depth_mean
 
     @property
     def depth_variance(self) -> Float[Tensor, "*batch"]:
-        """Var[z], square metres."""
         if self.exponent == 1:
             return self._variance * (self.law.mu_z / self.law.a).square()
-        p, weight = nodes(self.law.a)
-        return (weight * (self.depth_icdf(p) - self.depth_mean).square()).sum(0)
-
-    @property
-    def mean(self) -> Float[Tensor, "*batch 3"]:
-        """Expected position, metres."""
-        return at_depth(self.mu_xy, self.depth_mean)
+        return super().depth_variance
 
     @property
     def covariance_matrix(self) -> Float[Tensor, "*batch 3 3"]:
-        """Covariance of the position, m^2: for e < 1 Var[z] m m^T + E[z^2] Cov[(x, y)/z] with m = (mu_xy, 1)."""
-        m, variance = pad(self.mu_xy, (0, 1), value=1), self.depth_variance
-        along = pad(self._spread[1], (0, 1)) * self.law.a[..., None]
-        square = self.law.mu_z.square() if self.exponent == 1 else variance + self.depth_mean.square()
-        ray = pad(square[..., None, None] * self.projected_covariance, (0, 1, 0, 1))
-        return variance[..., None, None] * (_outer(m, m) - _outer(m, along) - _outer(along, m)) + ray
+        """Covariance of the position, m^2."""
+        if self.exponent != 1:
+            return super().covariance_matrix
+        m, along = pad(self.mu_xy, (0, 1), value=1), pad(self._spread[1], (0, 1)) * self.law.a[..., None]
+        across = pad(self.law.mu_z.square()[..., None, None] * self.projected_covariance, (0, 1, 0, 1))
+        return self.depth_variance[..., None, None] * (_outer(m, m) - _outer(m, along) - _outer(along, m)) + across
 
     def depth_cdf(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
-        """P(depth <= z), z in metres."""
         visible = (z > 0) | (self.exponent == 1)
         return self._cdf(self._s(torch.where(visible, z, self.law.mu_z))).masked_fill(~visible, 0)
 
     def depth_icdf(self, p: Float[Tensor, "*#batch"] | float) -> Float[Tensor, "*#batch"]:
-        """The depth z, metres, with P(depth <= z) = p for p in (0, 1)."""
         return self._z(self._icdf(torch.as_tensor(p).to(self.law.a)))
-
-    @property
-    def depth_median(self) -> Float[Tensor, "*batch"]:
-        """The median of z, metres."""
-        return self.depth_icdf(0.5)
-
-    def depth_crps(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
-        """Continuous ranked probability score of a depth, metres: twice the mean pinball loss of all quantiles."""
-        p, weight = nodes(z)
-        gap = z - self.depth_icdf(p)
-        return 2 * (weight * torch.maximum(p * gap, (p - 1) * gap)).sum(0)
 
 
 class Gaussian(Shaped):
@@ -290,13 +265,6 @@ class Decomposed(Shaped):
     def _draw(self, shape: Sequence[int], generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
         _, s = super()._draw(shape, generator)
         return huber.sample_whitened(s.shape, dtype=s.dtype, device=s.device, generator=generator), s
-
-
-def nodes(like: Float[Tensor, "*batch"]) -> tuple[Float[Tensor, "nodes ..."], Float[Tensor, "nodes ..."]]:
-    """Probabilities and weights of a midpoint rule on (0, 1), dense at both ends, to broadcast with a batch."""
-    angle = (torch.arange(_NODES, dtype=like.dtype, device=like.device) + 0.5) * (math.pi / _NODES)
-    angle = angle.reshape(-1, *[1] * like.ndim)
-    return (angle / 2).sin().square(), angle.sin() * (math.pi / 2 / _NODES)
 
 
 def _outer(x: Tensor, y: Tensor) -> Tensor:

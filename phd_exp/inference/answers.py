@@ -54,16 +54,14 @@ def sightings(predictor: Predictor, detections: Sequence[Detection]) -> Iterator
         f = torch.tensor([view.camera.f for _, _, view in batch], dtype=torch.float64)
         raw = predictor.raw(np.stack([view.image for _, _, view in batch]), f)
         # a batch takes an ensemble less time than its images one by one
-        predictions = predictor.predict(raw, f) if predictor.is_ensemble else None
+        made = predictor.predict(raw, f) if predictor.is_ensemble else None
         familiar = predictor.familiar(raw, f)
         for row, (detection, image, view) in enumerate(batch):
             if not bool(raw[row].isfinite().all()):
                 raise RunError(
                     f"{detection.where}: the network returns numbers that are not finite; train the run again"
                 )
-            prediction = (
-                predictions[row] if isinstance(predictions, ProjectedHuber) else predictor.predict(raw[row], f[row])
-            )
+            prediction = made[row] if made and made.has_closed_forms else predictor.predict(raw[row], f[row])
             yield Sighting(
                 detection, image, view, raw[row], prediction, None if familiar is None else float(familiar[row])
             )
@@ -108,7 +106,7 @@ def answer(sighting: Sighting, temperature: Temperature | None, guarantee: Any =
     """
     prediction, view, line = sighting.prediction, sighting.view, sighting.detection.line
     named: dict[str, Any] = line.model_dump(include=set(REPEATED), exclude_none=True, mode="json")
-    if isinstance(prediction, ProjectedHuber):
+    if prediction.has_closed_forms:
         named |= _distribution(prediction, view) | {"uncertainty": uncertainty(temperature)}
         if guarantee:
             region, facts = guarantee.region(prediction, view.camera.f / view.camera.S)

@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from torch.export import Dim
 
 from phd_exp.data.areas import area_means, sums
-from phd_exp.distributions import ProjectedHuber
 from phd_exp.geometry.virtual import facing, intrinsics, pixel_corners
 from phd_exp.inference.answers import LEVELS
 from phd_exp.inference.predictor import PIXELS, Predictor
@@ -133,7 +132,7 @@ def batches(side: int) -> list[int]:
 
 def answers(prediction: Prediction) -> dict[str, Tensor]:
     """The answers for a batch of predictions, in the frame of their cameras."""
-    if not isinstance(prediction, ProjectedHuber):
+    if not prediction.has_closed_forms:
         return {"position": prediction.mode}
     tails = torch.tensor([(1 - level / 100) / 2 for level in LEVELS], dtype=torch.float64)
     p = torch.cat([tails.new_tensor([0.5]), tails, 1 - tails])

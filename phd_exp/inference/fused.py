@@ -10,7 +10,6 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion import Fused, Plane, Pose, Status, fuse, fuse_shared
 from phd_exp.inference.answers import Sighting, rounded, uncertainty
 from phd_exp.inference.predictor import Predictor
@@ -65,7 +64,7 @@ def fused_answers(
     rows = pad_sequence(torch.arange(sum(counts)).split(counts), batch_first=True)
     mask = torch.arange(rows.shape[1]) < torch.tensor(counts)[:, None]
     predictions = predictor.predict(raw[rows], f[rows])
-    assert isinstance(predictions, ProjectedHuber)
+    assert predictions.has_closed_forms
     way = fuse if shared_scale is None else partial(fuse_shared, share=shared_scale)
     fused = way(predictions, Pose(pose.R[rows], pose.t[rows]), plane, mask)
     errors = {

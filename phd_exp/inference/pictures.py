@@ -13,7 +13,6 @@ from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from PIL import Image
 
-from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.level_curves import LevelCurves, level_curves
 from phd_exp.geometry.virtual import Box
 from phd_exp.inference.answers import Sighting
@@ -41,7 +40,7 @@ def picture(
     Small curves have a close-up. The region of a `Guarantee` has a dashed outline. The last panel has the calibration
     curve of depth, if given. The title has the main numbers of `line`, which is the `answer` for the sighting.
     """
-    curves = level_curves(sighting.prediction) if isinstance(sighting.prediction, ProjectedHuber) else None
+    curves = level_curves(sighting.prediction) if sighting.prediction.has_closed_forms else None
     on_image, above = _outlines(sighting, guarantee)
     marks = _marks(sighting, curves, on_image)
     enlarged = _enlarged(marks, sighting.detection.box(*sighting.image.size))

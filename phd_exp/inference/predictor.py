@@ -15,7 +15,7 @@ from torch import Tensor
 
 from phd_exp.config import RenderedConfig, RunConfig
 from phd_exp.data.crops import cut
-from phd_exp.distributions import Mixture, ProjectedHuber, Temperature
+from phd_exp.distributions import Mixture, Temperature
 from phd_exp.distributions.columns import parameter_columns
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import DepthScale
@@ -80,7 +80,7 @@ class Predictor:
     @property
     def is_probabilistic(self) -> bool:
         """Whether it predicts Projected Huber densities, which alone are fused, recalibrated and drawn."""
-        return issubclass(self.regressor.head.prediction, ProjectedHuber)
+        return self.regressor.head.prediction.has_closed_forms
 
     @property
     def f_range(self) -> tuple[float, float]:
@@ -217,7 +217,7 @@ class Predictor:
     def members(self, raw: Float[Tensor, "*batch members 7"], f: Float[Tensor, "*batch"]) -> Mixture:
         """The mixture of an ensemble's predictions, in float64, from its raw numbers."""
         prediction = self.regressor.head(raw.double(), self.camera(f.double()[..., None]))
-        assert isinstance(prediction, ProjectedHuber)  # checked by `load`
+        assert prediction.has_closed_forms  # checked by `load`
         return Mixture(prediction)
 
     @cached_property
@@ -241,7 +241,7 @@ class Predictor:
         if self.familiarity is None:
             return None
         prediction = self.predict(raw, f)
-        assert isinstance(prediction, ProjectedHuber)  # only those have a familiarity
+        assert prediction.has_closed_forms  # only those have a familiarity
         columns = parameter_columns(prediction) | {"f": f.double(), "S": torch.full_like(f, self.side)}
         if self.is_ensemble:
             columns["disagreement"] = self.members(raw, f).disagreement
@@ -255,7 +255,7 @@ class Predictor:
         """
         raw, f = raw.double(), f.double()
         prediction = self.members(raw, f).closest if self.is_ensemble else self.regressor.head(raw, self.camera(f))
-        if self.temperature is not None and isinstance(prediction, ProjectedHuber):
+        if self.temperature is not None and prediction.has_closed_forms:
             return self.temperature.apply(prediction)
         return prediction
 

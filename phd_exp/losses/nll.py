@@ -3,8 +3,7 @@
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from phd_exp.distributions import Density, ProjectedHuber
-from phd_exp.distributions.shaped import Shaped
+from phd_exp.distributions import Density
 
 
 class NegativeLogLikelihood(nn.Module):
@@ -12,6 +11,7 @@ class NegativeLogLikelihood(nn.Module):
 
     Examples:
         >>> import torch
+        >>> from phd_exp.distributions import ProjectedHuber
         >>> A = 20 * torch.eye(2).expand(1, 2, 2)
         >>> prediction = ProjectedHuber(torch.zeros(1, 2), torch.tensor([4.0]), A, torch.tensor([20.0]))
         >>> NegativeLogLikelihood()(prediction, torch.tensor([[0.1, 0.0, 4.1]]))
@@ -23,5 +23,5 @@ class NegativeLogLikelihood(nn.Module):
 
     prediction = Density
 
-    def forward(self, prediction: ProjectedHuber | Shaped, xyz: Float[Tensor, "batch 3"]) -> Float[Tensor, " batch"]:
+    def forward(self, prediction: Density, xyz: Float[Tensor, "batch 3"]) -> Float[Tensor, " batch"]:
         return -prediction.log_prob(xyz)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from phd_exp.data.batches import Batch
 from phd_exp.data.sources import Known
-from phd_exp.distributions import Density, ProjectedHuber
+from phd_exp.distributions import Density
 from phd_exp.distributions.columns import Columns, coordinates, distribution_columns, draws
 from phd_exp.metrics.calibration import CalibrationCurve, calibration_curve
 from phd_exp.metrics.calibration_scores import exact_scores
@@ -46,7 +46,7 @@ def training_columns(
     table = _errors(prediction, xyz)
     if isinstance(prediction, Density):
         table["nll"] = -prediction.log_prob(xyz) if nll is None else nll
-    if isinstance(prediction, ProjectedHuber):
+    if prediction.has_closed_forms:
         table["depth_precision"] = prediction.a
         table["projected_precision"] = prediction.log_det_A.exp()
     return table
