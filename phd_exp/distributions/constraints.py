@@ -28,7 +28,7 @@ MIDDLE_F = (F_RANGE[0] * F_RANGE[1]) ** 0.5
 DEPTH = DepthScale.from_ranges(F_RANGE, Z_RANGE)
 SCALE = 0.1
 """Scale of the baselines' residuals, in units of their charts."""
-Density = ProjectedHuber | shaped.Shaped | PointDensity
+Density = ProjectedHuber | shaped.Shaped | Quantiles | PointDensity
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def families() -> dict[str, Family]:
         "laplace_inverse": _shaped(shaped.InverseDepthLaplace),
         "decomposed": _shaped(shaped.Decomposed),
         "student_t": _shaped(shaped.StudentT),
-        "quantiles": _shaped(Quantiles, _medians_and_gaps),
+        "quantiles": _shaped(Quantiles.from_raw, _medians_and_gaps),
         "mae_vz": _baseline(Projected(DEPTH)),
         "mae_logz": _baseline(LogDepth(DEPTH)),
         "mae_xyz": _baseline(Cartesian(DEPTH)),
@@ -89,7 +89,10 @@ def _medians_and_gaps(n: int, generator: torch.Generator) -> Tensor:
     return torch.cat([2 * uniform[:, :2] - 1, torch.zeros(n, 4), uniform[:, 2:3] - 0.5, gaps], dim=-1)
 
 
-def _shaped(density: type[shaped.Shaped], inputs: Callable[[int, torch.Generator], Tensor] = _ten_numbers) -> Family:
+def _shaped(
+    density: Callable[[ProjectedHuber, Tensor], Density],
+    inputs: Callable[[int, torch.Generator], Tensor] = _ten_numbers,
+) -> Family:
     return Family(lambda raw, camera: density(_projected_huber(raw[..., :7], camera), raw[..., 7:]), inputs)
 
 

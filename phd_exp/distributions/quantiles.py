@@ -1,6 +1,8 @@
 """Quantile regression: predicted quantiles of v_p and log z, and the density that interpolates them."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal, final
 
 import torch
 from jaxtyping import Float
@@ -8,80 +10,104 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from phd_exp.distributions import spd
-from phd_exp.distributions.density import nodes
-from phd_exp.distributions.shaped import Shaped
+from phd_exp.distributions.density import Density, nodes
+from phd_exp.distributions.laws import NormalLaw
+from phd_exp.distributions.projected_huber import ProjectedHuber
+from phd_exp.distributions.shaped import Whitening
 
 LEVELS = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 """Probabilities of the predicted quantiles."""
+_LAW = NormalLaw()
 
 
-class Quantiles(Shaped):
+@final
+@dataclass(frozen=True)
+class Quantiles(Density):
     """Independent v_p and log z, each an increasing function of a standard normal variable.
 
     The functions are linear between the quantiles and beyond them. The quantiles are what training fits; the density
     only interpolates them. Regions are balls of the three normal variables.
 
     Args:
-        law: has the medians, B = I and a = 1, so that (q, s) are v_p and log z about their medians.
-        further: raw numbers of the gaps between the quantiles of each variable.
+        medians: the map to v_p and log z, from their medians.
+        knots: the quantiles of v_p and log z, from their medians.
 
     Source: own derivation; quantile regression is Koenker and Bassett's (1978).
     """
 
-    exponent = 0
+    has_closed_forms: ClassVar[Literal[False]] = False
+    medians: Whitening
+    knots: Float[Tensor, "*batch 3 quantiles"]
 
-    @property
-    def knots(self) -> Float[Tensor, "*batch 3 quantiles"]:
-        """The quantiles of v_p and log z, from their medians."""
-        gaps = spd.positive(self.further).unflatten(-1, (3, -1)) * self._normal_knots.diff()
-        knots = pad(gaps.cumsum(-1), (1, 0))
-        return knots - knots[..., [len(LEVELS) // 2]]
-
-    @property
-    def _normal_knots(self) -> Tensor:
-        return torch.special.ndtri(torch.tensor(LEVELS).to(self.further))
+    @classmethod
+    def from_raw(cls, medians: ProjectedHuber, gaps: Float[Tensor, "*batch gaps"]) -> "Quantiles":
+        """From a density that has the medians, B = I and a = 1, and raw numbers of the gaps between quantiles."""
+        size = spd.positive(gaps).unflatten(-1, (3, -1)) * _normal_knots(gaps).diff()
+        knots = pad(size.cumsum(-1), (1, 0))
+        return cls(Whitening(medians, 0), knots - knots[..., [len(LEVELS) // 2]])
 
     def about_medians(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
         """v_p and log z of a position (metres), from their medians."""
-        q, s, _, _ = self._whitened(xyz)
+        q, s, _, _ = self.medians.variables(xyz)
         return torch.cat([q, s[..., None]], dim=-1)
 
-    def _normal(self, q: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        return _interpolated(torch.cat([q, s[..., None]], dim=-1), self.knots, self._normal_knots)
+    def _normal(self, xyz: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Two and one normal variables of a position, and the log of their slope; volume and visibility."""
+        q, s, volume, visible = self.medians.variables(xyz)
+        u, log_slope = _interpolated(torch.cat([q, s[..., None]], dim=-1), self.knots, _normal_knots(self.knots))
+        return u[..., :2], u[..., 2], log_slope.sum(-1), volume, visible
 
-    def _log_law(self, q: Tensor, s: Tensor) -> Tensor:
-        u, log_slope = self._normal(q, s)
-        return super()._log_law(u[..., :2], u[..., 2]) + log_slope.sum(-1)
+    def _quantiles(self, u: Tensor, variables: slice | int) -> Tensor:
+        """The values of some variables, given their normal ones."""
+        return _interpolated(u, _normal_knots(self.knots), self.knots[..., variables, :])[0]
 
-    def _level(self, q: Tensor, s: Tensor) -> Tensor:
-        u, _ = self._normal(q, s)
-        return super()._level(u[..., :2], u[..., 2])
+    def log_prob(self, value: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch"]:
+        *u, log_slope, volume, visible = self._normal(value)
+        return (_LAW.log_prob(*u) + log_slope + volume).masked_fill(~visible, -torch.inf)
 
-    def _cdf(self, s: Tensor) -> Tensor:
-        return super()._cdf(_interpolated(s, self.knots[..., 2, :], self._normal_knots)[0])
+    def level(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch"]:
+        """The probability of the ball of normal variables that contains a position."""
+        *u, _, _, visible = self._normal(xyz)
+        return _LAW.level(*u).masked_fill(~visible, 1)
 
-    def _icdf(self, p: Tensor) -> Tensor:
-        return _interpolated(super()._icdf(p), self._normal_knots, self.knots[..., 2, :])[0]
+    def rsample(
+        self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None
+    ) -> Float[Tensor, "*shape 3"]:
+        a = self.medians.around.a
+        q, s = _LAW.draw((*sample_shape, *a.shape), a, generator)
+        return self.medians.position(self._quantiles(q, slice(2)), self._quantiles(s, 2))
 
-    def _draw(self, shape: Sequence[int], generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-        normal, s = super()._draw(shape, generator)
-        return _interpolated(normal, self._normal_knots, self.knots[..., :2, :])[0], s
+    @property
+    def mode(self) -> Float[Tensor, "*batch 3"]:
+        return self.medians.around.mode
 
     @property
     def _ray(self) -> tuple[Tensor, Tensor]:
-        """Mean and variance of q."""
-        p, weight = nodes(self.law.mu_xy)
-        q = _interpolated(super()._icdf(p), self._normal_knots, self.knots[..., :2, :])[0]
+        """Mean and variance of v_p, from its median."""
+        p, weight = nodes(self.medians.around.mu_xy)
+        q = self._quantiles(_LAW.icdf(p), slice(2))
         mean = (weight * q).sum(0)
         return mean, (weight * (q - mean).square()).sum(0)
 
     @property
     def mu_xy(self) -> Float[Tensor, "*batch 2"]:
-        return self.law.mu_xy + spd.matvec(self._spread[0], self._ray[0])
+        return self.medians.around.mu_xy + spd.matvec(self.medians.spread[0], self._ray[0])
 
     @property
     def projected_covariance(self) -> Float[Tensor, "*batch 2 2"]:
-        return spd.square(self._spread[0]) * self._ray[1][..., None]
+        return spd.square(self.medians.spread[0]) * self._ray[1][..., None]
+
+    def depth_cdf(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
+        s, visible = self.medians.s(z)
+        u, _ = _interpolated(s, self.knots[..., 2, :], _normal_knots(self.knots))
+        return _LAW.cdf(u).masked_fill(~visible, 0)
+
+    def depth_icdf(self, p: Float[Tensor, "*#batch"] | float) -> Float[Tensor, "*#batch"]:
+        return self.medians.z(self._quantiles(_LAW.icdf(torch.as_tensor(p).to(self.knots)), 2))
+
+
+def _normal_knots(like: Tensor) -> Tensor:
+    return torch.special.ndtri(torch.tensor(LEVELS).to(like))
 
 
 def _interpolated(x: Tensor, xs: Tensor, ys: Tensor) -> tuple[Tensor, Tensor]:

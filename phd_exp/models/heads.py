@@ -18,7 +18,7 @@ from phd_exp.distributions.shaped import Shaped
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import Chart, DepthScale
 
-Prediction = ProjectedHuber | Shaped | PointEstimate
+Prediction = ProjectedHuber | Shaped | Quantiles | PointEstimate
 
 
 @runtime_checkable
@@ -112,7 +112,7 @@ class QuantileHead:
 
     def __call__(self, raw: Float[Tensor, "*batch n_outputs"], camera: Camera) -> Quantiles:
         medians = torch.cat([raw[..., :2], torch.zeros_like(raw[..., :4]), raw[..., 2:3]], dim=-1)
-        return Quantiles(self.seven(medians, camera), raw[..., 3:])
+        return Quantiles.from_raw(self.seven(medians, camera), raw[..., 3:])
 
     def placed(self, raw: Float[Tensor, "*batch n"], place: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch n"]:
         """Raw numbers with the medians of v_p shifted by `place`."""

@@ -5,6 +5,8 @@ import pytest
 import torch
 from scipy import stats
 
+from phd_exp.distributions import Density
+from phd_exp.distributions.laws import StudentLaw
 from phd_exp.distributions.shaped import Gaussian, InverseDepthLaplace, LogDepthGaussian, Shaped, StudentT
 from phd_exp.geometry import Camera
 from phd_exp.geometry.charts import projected
@@ -22,7 +24,7 @@ IN_SPACE = ("gaussian", "student_t")
 N = 50_000
 
 
-def density(model: str, seven: str, dtype: torch.dtype = torch.float64) -> Shaped:
+def density(model: str, seven: str, dtype: torch.dtype = torch.float64) -> Density:
     head = SHAPED[model]
     raw = (SEVEN[seven] + (FURTHER if seven != "untrained" else [0.0] * 3))[: head.n_outputs]
     if model == "quantiles":  # medians of v_p and log z, and gaps
@@ -32,7 +34,7 @@ def density(model: str, seven: str, dtype: torch.dtype = torch.float64) -> Shape
 
 
 @pytest.fixture(scope="module", params=[(m, s) for m in SHAPED for s in SEVEN], ids=" ".join)
-def case(request: pytest.FixtureRequest) -> tuple[str, str, Shaped, torch.Tensor]:
+def case(request: pytest.FixtureRequest) -> tuple[str, str, Density, torch.Tensor]:
     law = density(*request.param)
     return (*request.param, law, law.rsample((N,), torch.Generator().manual_seed(1)))
 
@@ -121,11 +123,12 @@ def test_score_of_depth_is_that_of_samples_and_its_slope_that_of_the_definition(
 @pytest.mark.parametrize("seven", SEVEN)
 def test_scores_and_densities_are_those_of_scipy(seven: str) -> None:
     laws = {name: density(name, seven) for name in SHAPED}
-    xyz = laws["gaussian"].law.rsample((50,), torch.Generator().manual_seed(2))
-    z, mu_z, a = xyz[:, 2], *(float(x) for x in (laws["gaussian"].law.mu_z, laws["gaussian"].law.a))
     gaussian, t = laws["gaussian"], laws["student_t"]
-    assert isinstance(t, StudentT)
-    n, covariance = float(t.freedom), t.covariance_matrix.numpy()
+    huber = gaussian.whitening.around
+    xyz = huber.rsample((50,), torch.Generator().manual_seed(2))
+    z, mu_z, a = xyz[:, 2], float(huber.mu_z), float(huber.a)
+    assert isinstance(t.law, StudentLaw)
+    n, covariance = float(t.law.freedom), t.covariance_matrix.numpy()
     theirs = {
         "gaussian": stats.multivariate_normal(gaussian.mode, gaussian.covariance_matrix).logpdf(xyz),
         "student_t": stats.multivariate_t(t.mode, covariance * (n - 2) / n, n).logpdf(xyz),
@@ -144,7 +147,7 @@ def test_scores_and_densities_are_those_of_scipy(seven: str) -> None:
         np.testing.assert_allclose(laws[name].log_prob(xyz), expected, rtol=1e-8, atol=1e-7, err_msg=name)
     decomposed = laws["decomposed"]
     for score in ("depth_cdf", "depth_crps"):
-        ours, exact = (getattr(law, score)(z) for law in (decomposed, decomposed.law))
+        ours, exact = (getattr(law, score)(z) for law in (decomposed, decomposed.whitening.around))
         torch.testing.assert_close(ours, exact, rtol=1e-3, atol=1e-9)
     w = (z - mu_z) * a / mu_z  # the score of a normal law
     normal = torch.distributions.Normal(0.0, 1.0)
@@ -155,8 +158,8 @@ def test_scores_and_densities_are_those_of_scipy(seven: str) -> None:
 def test_many_degrees_of_freedom_are_a_gaussian_and_precise_logs_too() -> None:
     """Limits that the heads share: one Gaussian, in whatever coordinates."""
     gaussian = density("gaussian", "trained")
-    law, k = gaussian.law, torch.zeros(2, dtype=torch.float64)
-    many = StudentT(law, torch.cat([gaussian.further, torch.tensor([1e7])]))
+    law, k = gaussian.whitening.around, torch.zeros(2, dtype=torch.float64)
+    many = StudentT(law, torch.cat([gaussian.whitening.tilt, torch.tensor([1e7])]))
     xyz = gaussian.rsample((100,), torch.Generator().manual_seed(0))
     torch.testing.assert_close(many.log_prob(xyz), gaussian.log_prob(xyz), rtol=0, atol=1e-4)
     torch.testing.assert_close(many.level(xyz), gaussian.level(xyz), rtol=0, atol=1e-5)
@@ -206,3 +209,8 @@ def test_float32_is_near_float64(model: str, seven: str) -> None:
         ours, exact = (getattr(one, name)(xyz.to(one.mode.dtype)).double() for one in (single, law))
         torch.testing.assert_close(ours, exact, rtol=1e-3, atol=2e-3)
     torch.testing.assert_close(single.covariance_matrix.double(), law.covariance_matrix, rtol=1e-3, atol=1e-6)
+
+
+def test_a_density_of_another_shape_is_another_law() -> None:
+    with pytest.raises(TypeError, match="Mine: Shaped is final; derive from Law"):
+        type("Mine", (Shaped,), {})
