@@ -7,7 +7,8 @@ from phd_exp.config import check_render
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError
 from phd_exp.rendering.bop import write_bop
-from phd_exp.rendering.finished import meshes_of, require_elsewhere, verify, write_masks
+from phd_exp.rendering.finished import require_elsewhere, verify
+from phd_exp.rendering.masks import ensure_drawn, meshes_of, write_masks
 from phd_exp.rendering.render import ensure_rendered
 
 
@@ -30,6 +31,7 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> None:
     n_train, n_test = data.n_training_split, data.n_test
     if not ensure_rendered(folder, data.spec, n_train, n_test, data.workers, cores, checked.shard):
         return  # other shards are missing
+    ensure_drawn(folder, data.spec, n_train)  # `ensure_rendered` does not report why it cannot draw
     print(f"{folder.root}: {n_train} training and {n_test} test samples are there")
     if checked.masks or checked.bop:
         meshes = meshes_of(data.spec)

@@ -11,7 +11,8 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from phd_exp.records.files import read_plain, require_plain, write_atomic
+from phd_exp.records.dataset import mapped
+from phd_exp.records.files import read_plain, write_atomic
 from phd_exp.records.parsing import parse_json
 from phd_exp.records.processes import announce, held
 
@@ -39,7 +40,7 @@ def cached(
         key: everything that the pixels depend on.
         shape: of the array.
         jobs: arguments of the calls to `fill`, which run in several threads.
-        fill: decodes one job into the array; the first before any other.
+        fill: decodes one job into the array.
         words: description of the progress bar, which a terminal shows.
         largest: pixels of the largest image; bounds the number of threads.
 
@@ -48,12 +49,9 @@ def cached(
 
     def fill_all(array: np.ndarray) -> None:
         console = Console(stderr=True)
-        for job in jobs[:1]:  # in this thread: Blender may start here, and not in several threads at once
-            fill(array, job)
-        rest = jobs[1:]
         with ThreadPoolExecutor(max(1, min(DECODERS, LARGEST_AT_ONCE // largest))) as pool:
-            done = pool.map(partial(fill, array), rest)
-            for _ in track(done, words, len(rest), console=console, transient=True, disable=not console.is_terminal):
+            done = pool.map(partial(fill, array), jobs)
+            for _ in track(done, words, len(jobs), console=console, transient=True, disable=not console.is_terminal):
                 pass
 
     key_file, unfinished = file.with_suffix(".json"), file.with_suffix(".unfinished")
@@ -64,12 +62,12 @@ def cached(
             if (kept := _kept(file, key_file, key, shape)) is not None:
                 return kept
             unfinished.unlink(missing_ok=True)  # if it is a link, writing would overwrite its target
-            mapped = np.lib.format.open_memmap(unfinished, mode="w+", dtype=np.uint8, shape=shape)
-            fill_all(mapped)
-            mapped.flush()
+            array = np.lib.format.open_memmap(unfinished, mode="w+", dtype=np.uint8, shape=shape)
+            fill_all(array)
+            array.flush()
             unfinished.replace(file)
             write_atomic(key_file, json.dumps(key) + "\n")
-            return _mapped(file)
+            return mapped(file)
     except OSError as error:
         why = f"{file.parent}: decoded images cannot be kept here ({error.strerror})"
         announce(f"{why}; they are decoded into memory, each run anew")
@@ -83,14 +81,7 @@ def _kept(file: Path, key_file: Path, key: dict[str, Any], shape: tuple[int, ...
     try:
         if parse_json(read_plain(key_file).decode()) != key:
             return None
-        require_plain(file)
-        array = _mapped(file)
+        array = mapped(file)
     except (OSError, ValueError):
         return None
-    return array if array.shape == shape and array.dtype == np.uint8 else None
-
-
-def _mapped(file: Path) -> np.ndarray:
-    # copy-on-write: torch requires a writable array, but the file must not change
-    array: np.ndarray = np.load(file, mmap_mode="c", allow_pickle=False)
-    return array
+    return array if array.shape == shape else None

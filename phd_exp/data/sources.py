@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -12,13 +11,11 @@ from torch import Tensor
 
 from phd_exp.data.backdrops import Backdrops
 from phd_exp.data.batches import Batch
-from phd_exp.data.images import cached_clearings, cached_images, cached_masks
+from phd_exp.data.images import cached_clearings, cached_images
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.finished import meshes_of
-from phd_exp.rendering.triangles import Meshes
 
 Part = Literal["train", "held_out", "test"]
 """A part of the samples of a run; the first two are taken from the training split."""
@@ -98,20 +95,13 @@ class RenderedSource(Source):
         return self.n[part]
 
     def training_masks(self) -> UInt8[Tensor, "samples rows columns"]:
-        split, records, rows = self._records("train")
-        return torch.from_numpy(cached_masks(self.folder, split, records, lambda: self._meshes)[rows])
+        return torch.from_numpy(self.folder.drawn("masks.npy", self.n["train"]))
 
     def training_backdrops(self) -> Backdrops:
-        split, records, rows = self._records("train")
-        empty = self.spec.without_objects
-        folder = DatasetFolder(self.folder.root.with_name(empty.variant))
-        images = cached_images(folder, split, folder.records(split, self.n["train"]), self.side)
-        clear = cached_clearings(self.folder, split, records[rows], lambda: self._meshes, self.side)
+        n, folder = self.n["train"], DatasetFolder(self.folder.root.with_name(self.spec.without_objects.variant))
+        images = cached_images(folder, "train", folder.records("train", n), self.side)
+        clear = cached_clearings(self.folder, n, self.side)
         return Backdrops(torch.from_numpy(images), torch.from_numpy(clear))
-
-    @cached_property
-    def _meshes(self) -> Meshes:
-        return meshes_of(self.spec)  # starts Blender, which takes seconds
 
     def _records(self, part: Part) -> tuple[Split, list[SampleRecord], slice]:
         """The split of a part, all records of it that the run uses, and the rows of the part among them."""

@@ -6,26 +6,32 @@
         <split>/metadata.jsonl        one line per sample, sorted by index
         <split>/metadata.partial.jsonl    only while rendering: one line per finished image
         <split>/metadata.partial-0-of-4.jsonl    the same for one of several shards
+        masks.npy                     where each training image shows the object; see `row_shapes`
+        clearings.npy                 of a mesh: where it shows no object
         .cache/                       data that programs derive from the images
 
-`SampleRecord` describes a line.
+`SampleRecord` describes a line. The arrays follow from the lines, and the manifest does not count them.
 """
 
 import hashlib
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, get_args
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
 from phd_exp.records.choices import first_difference
 from phd_exp.records.errors import DatasetError, gist
-from phd_exp.records.files import read_jsonl, read_plain, write_atomic
+from phd_exp.records.files import read_jsonl, read_plain, require_plain, write_atomic
 from phd_exp.records.parsing import Record
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec, ImageFormat, Shard
 
 SPLITS: tuple[Split, ...] = get_args(Split)
 SUFFIXES: dict[ImageFormat, str] = {"png": ".png", "webp": ".webp", "jpeg": ".jpg"}
+CELLS = 28  # cells along each side of a mask: 8 x 8 pixels of a render of 224
 
 
 class Seal(Record):
@@ -127,6 +133,20 @@ class DatasetFolder:
             raise DatasetError(f"{path}: expected samples 0 to {wanted - 1} in order; restore it, or move the folder")
         return records
 
+    def drawn(self, name: str, n: int) -> NDArray[np.uint8]:
+        """The rows of the first `n` training images in an array of `row_shapes`, mapped from the file.
+
+        Raises DatasetError if they are not there.
+        """
+        file, row = self.root / name, row_shapes(self.manifest.spec)[name]
+        with suppress(OSError, ValueError):
+            if len(rows := mapped(file)) >= n and rows.shape[1:] == row:
+                return rows[:n]
+        raise DatasetError(
+            f"{file}: missing, or not an array for {n} training images; write it by "
+            "`python -m phd_exp render data=...`, with the same keys of data"
+        )
+
     def missing(self, spec: DatasetSpec, n_train: int, n_test: int) -> dict[Split, list[int]]:
         """Indices of the wanted samples that are not finished, or whose image or line has gone, by split.
 
@@ -153,6 +173,30 @@ class DatasetFolder:
                 "another data.variant (a new name) or data.root"
             )
         return manifest
+
+
+def row_shapes(spec: DatasetSpec) -> dict[str, tuple[int, int]]:
+    """The shape of a row, of one training image, in each array of a data set.
+
+    A mask (CELLS, CELLS) is the share of each cell of the image that shows the object, from 0 to 255. A clearing
+    (S, S / 8, rounded up) has a bit for each pixel, as `numpy.packbits` places them: 1 where it shows no object.
+    """
+    if spec.empty:
+        return {}
+    of_mesh = {"clearings.npy": (spec.sensor_size, -(-spec.sensor_size // 8))} if spec.mesh else {}
+    return {"masks.npy": (CELLS, CELLS), **of_mesh}
+
+
+def mapped(file: Path) -> NDArray[np.uint8]:
+    """An array of uint8 on disk, mapped into memory. Raises OSError or ValueError if the file holds none.
+
+    What is written into the array, which torch requires to be writable, does not reach the file.
+    """
+    require_plain(file)
+    array: NDArray[np.uint8] = np.lib.format.open_memmap(file, mode="c")
+    if array.dtype != np.uint8:
+        raise ValueError(f"its values are {array.dtype}")
+    return array
 
 
 def image_name(index: int, image_format: ImageFormat = "png") -> str:

@@ -6,7 +6,7 @@ import hashlib
 import os
 import stat
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
@@ -51,8 +51,8 @@ def checksum(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def write_atomic(path: Path | str, data: bytes | str) -> None:
-    """Write `data` to `path` so that a reader finds either the old content or the new.
+def write_atomic(path: Path | str, data: bytes | str | Iterable[bytes]) -> None:
+    """Write `data`, in parts if it is large, to `path` so that a reader finds either the old content or the new.
 
     The bytes are written to a hidden temporary file in the same folder (a rename is atomic within one file system
     only), flushed to the disk, and renamed. The temporary file is removed on any failure. It is locked while its
@@ -73,7 +73,8 @@ def write_atomic(path: Path | str, data: bytes | str) -> None:
         with open(temporary, "xb") as stream:
             with suppress(OSError):  # on a file system without locks, nothing is removed later either
                 fcntl.flock(stream, fcntl.LOCK_SH)
-            stream.write(data.encode() if isinstance(data, str) else data)
+            parts = data.encode() if isinstance(data, str) else data
+            stream.writelines([parts] if isinstance(parts, bytes) else parts)
             stream.flush()
             os.fsync(stream.fileno())
             os.replace(temporary, path)

@@ -1,26 +1,21 @@
-"""Work on a finished data set: verify it against its manifest and specification, and draw masks of its objects."""
+"""Verify a finished data set against its manifest and specification."""
 
 import random
 from collections.abc import Iterator
 from pathlib import Path
 
-from PIL import Image
-
 from phd_exp.records.dataset import SPLITS, DatasetFolder, Seal
-from phd_exp.records.errors import DatasetError, RenderError, UserError, writing
-from phd_exp.records.files import checksum, write_atomic
+from phd_exp.records.errors import DatasetError, RenderError, UserError
+from phd_exp.records.files import checksum
 from phd_exp.records.images import recorded_image
 from phd_exp.records.processes import announce
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer, renderer_version, require_bpy
-from phd_exp.rendering.pixels import file_of
 from phd_exp.rendering.progress import shown_progress
-from phd_exp.rendering.rays import cylinder_mask, trace_pixels
 from phd_exp.rendering.samples import fast_settings, make_sample
 from phd_exp.rendering.sampling import generator_version
 from phd_exp.rendering.sealing import other_make
-from phd_exp.rendering.triangles import NO_MESHES, Meshes
 
 
 def verify(folder: DatasetFolder, spec: DatasetSpec, rerender: int, seed: int | None = None) -> int:
@@ -101,31 +96,6 @@ def _rendered_again(folder: DatasetFolder, spec: DatasetSpec, records: list[Samp
                 yield f"{path}: recorded {key}={old}, rendering it again gives {new}"
         if image != path.read_bytes():
             yield f"{path}: rendering it again gives another image; delete the data set, and `render` makes it again"
-
-
-def meshes_of(spec: DatasetSpec) -> Meshes:
-    """The meshes of a data set, read by Blender. Raises RenderError if one cannot be read."""
-    return Renderer(fast_settings(spec), spec).meshes if spec.mesh else NO_MESHES
-
-
-def write_masks(folder: DatasetFolder, masks: Path, meshes: Meshes = NO_MESHES) -> int:
-    """Write `<masks>/<split>/<index>.png`, white where the object is visible, for all samples; returns how many.
-
-    The masks have one bit per pixel and follow from the records, without Blender.
-
-    Raises DatasetError if there is no data set, or a broken one, RenderError if the masks cannot be written.
-    """
-    records = [record for split in SPLITS for record in folder.records(split)]
-    with writing(masks, instead="masks=FOLDER"):
-        for split in SPLITS:
-            (masks / split).mkdir(parents=True, exist_ok=True)
-        with shown_progress(len(records), "drawing masks") as advance:
-            for record in records:
-                image = Image.fromarray(cylinder_mask(trace_pixels(record.shown, meshes)))
-                path = (masks / record.split / record.file_name).with_suffix(".png")
-                write_atomic(path, file_of(image, "png"))
-                advance()
-    return len(records)
 
 
 def require_elsewhere(folder: DatasetFolder, **places: Path | None) -> None:

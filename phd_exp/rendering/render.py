@@ -18,7 +18,7 @@ finds all work done and seals.
 import math
 import time
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from itertools import islice
 from multiprocessing.connection import Connection, wait
 
@@ -29,6 +29,7 @@ from phd_exp.records.processes import Child, announce, duration, held, usable_co
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec, Shard
 from phd_exp.rendering.blender import require_bpy
+from phd_exp.rendering.masks import ensure_drawn
 from phd_exp.rendering.progress import shown_progress
 from phd_exp.rendering.sealing import Known, Wanted, begin, known_samples, missing, seal
 
@@ -50,6 +51,8 @@ def ensure_rendered(
 ) -> bool:
     """Render those of the first `n_train` and `n_test` samples that are not on disk; returns whether all are there.
 
+    Then draw the masks that training reads. If that is impossible, a training that needs them says so.
+
     An unsharded call waits for other processes in the folder and leaves all samples there. Rendered images are kept,
     whatever happens: the same call resumes, and the finished folder has the same bytes as one rendered without
     interruption.
@@ -65,6 +68,8 @@ def ensure_rendered(
         RenderError: bpy is missing, a worker died, the folder cannot be written.
     """
     if not any(folder.missing(spec, n_train, n_test).values()):
+        with suppress(UserError):
+            ensure_drawn(folder, spec, n_train)
         return True
     require_bpy()
     wanted: Wanted = {"train": n_train, "test": n_test}
@@ -88,10 +93,10 @@ def ensure_rendered(
                 raise
             if shard is None:
                 seal(folder, known)
-                return True
+                return ensure_rendered(folder, spec, n_train, n_test)  # nothing is missing, but masks
         if not samples:
             announce(f"{folder.root}: nothing left to render in shard {shard}")
-        return _seal_if_last(folder, wanted, shard)
+        return _seal_if_last(folder, wanted, shard) and ensure_rendered(folder, spec, n_train, n_test)
 
 
 @contextmanager

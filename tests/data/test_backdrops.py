@@ -53,14 +53,6 @@ def test_renders_without_objects_are_the_renders_where_no_object_is(source: Rend
     assert difference[object_alone].float().median() > 12
 
 
-def test_blender_is_not_started_for_what_is_cached(source: RenderedSource, monkeypatch: pytest.MonkeyPatch) -> None:
-    masks, clear = source.training_masks(), source.training_backdrops().clear
-    monkeypatch.setattr("phd_exp.data.sources.meshes_of", lambda spec: pytest.fail("starts Blender"))
-    again = RenderedSource(source.folder, source.spec, source.n, SIDE)
-    assert torch.equal(again.training_masks(), masks)
-    assert torch.equal(again.training_backdrops().clear, clear)
-
-
 def test_an_object_appears_before_the_other_backdrop(source: RenderedSource) -> None:
     found, samples = source.training_backdrops(), source.samples("train")
     draw = torch.tensor([[-1.0, 0.5, 0.5, -1, -1, -1, 1], [-1.0, -0.5, -0.5, -1, 0, -1, -1]])

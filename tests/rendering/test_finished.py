@@ -14,7 +14,8 @@ from phd_exp.records.dataset import DatasetFolder, Seal, sha256
 from phd_exp.records.errors import DatasetError, RenderError
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering import finished as module
-from phd_exp.rendering.finished import require_elsewhere, verify, write_masks
+from phd_exp.rendering.finished import require_elsewhere, verify
+from phd_exp.rendering.masks import write_masks
 from phd_exp.rendering.rays import cylinder_mask, trace_pixels
 from tests.support.renders import N_TEST, N_TRAIN
 

@@ -1,0 +1,95 @@
+"""Where images show their objects: arrays that training reads, and images of masks.
+
+The masks follow from the records by ray casting; Blender only reads the meshes.
+"""
+
+import io
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from rich.console import Console
+from rich.progress import track
+
+from phd_exp.records.dataset import CELLS, SPLITS, DatasetFolder, row_shapes
+from phd_exp.records.errors import DatasetError, writing
+from phd_exp.records.files import write_atomic
+from phd_exp.records.scenes import SampleRecord
+from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.blender import Renderer
+from phd_exp.rendering.pixels import file_of
+from phd_exp.rendering.progress import shown_progress
+from phd_exp.rendering.rays import NOTHING, cylinder_mask, trace_pixels
+from phd_exp.rendering.samples import fast_settings
+from phd_exp.rendering.triangles import NO_MESHES, Meshes
+
+RAYS = 4  # along each side of a cell
+
+
+def meshes_of(spec: DatasetSpec) -> Meshes:
+    """The meshes of a data set, read by Blender. Raises RenderError if one cannot be read."""
+    return Renderer(fast_settings(spec), spec).meshes if spec.mesh else NO_MESHES
+
+
+def ensure_drawn(folder: DatasetFolder, spec: DatasetSpec, n: int) -> None:
+    """Draw masks, and of a mesh clearings, of all training images, unless those of the first `n` are on disk.
+
+    Raises RenderError if the folder cannot be written or a mesh cannot be read, DatasetError if a record is broken.
+    """
+    if not n or _is_drawn(folder, spec, n):
+        return
+    meshes, records, console = meshes_of(spec), folder.records("train"), Console(stderr=True)
+    for name, row in row_shapes(spec).items():
+        head, words = io.BytesIO(), f"drawing {name.removesuffix('.npy')} once"
+        layout = {"descr": "|u1", "fortran_order": False, "shape": (len(records), *row)}
+        np.lib.format.write_array_header_1_0(head, layout)
+        shown = track(records, words, console=console, transient=True, disable=not console.is_terminal)
+        rows = (DRAW[name](record, meshes).tobytes() for record in shown)
+        with writing(folder.root):
+            write_atomic(folder.root / name, chain([head.getvalue()], rows))
+
+
+def _is_drawn(folder: DatasetFolder, spec: DatasetSpec, n: int) -> bool:
+    try:
+        return all(len(folder.drawn(name, n)) for name in row_shapes(spec))
+    except DatasetError:
+        return False
+
+
+def mask(record: SampleRecord, meshes: Meshes) -> NDArray[np.uint8]:
+    """The share of each cell of the image that shows the object, from 0 to 255: (CELLS, CELLS)."""
+    side = CELLS * RAYS
+    scene = record.shown.model_copy(update={"S": side, "f": record.f * side / record.S})
+    shown = cylinder_mask(trace_pixels(scene, meshes))
+    share = shown.reshape(CELLS, RAYS, CELLS, RAYS).mean((1, 3))
+    return np.rint(255 * share).astype(np.uint8)
+
+
+def clearing(record: SampleRecord, meshes: Meshes) -> NDArray[np.uint8]:
+    """The pixels of the image that show no object, as bits: (S, S/8, rounded up)."""
+    return np.packbits(trace_pixels(record.shown, meshes).first == NOTHING, axis=-1)
+
+
+DRAW = {"masks.npy": mask, "clearings.npy": clearing}
+
+
+def write_masks(folder: DatasetFolder, masks: Path, meshes: Meshes = NO_MESHES) -> int:
+    """Write `<masks>/<split>/<index>.png`, white where the object is visible, for all samples; returns how many.
+
+    The masks have one bit per pixel and follow from the records, without Blender.
+
+    Raises DatasetError if there is no data set, or a broken one, RenderError if the masks cannot be written.
+    """
+    records = [record for split in SPLITS for record in folder.records(split)]
+    with writing(masks, instead="masks=FOLDER"):
+        for split in SPLITS:
+            (masks / split).mkdir(parents=True, exist_ok=True)
+        with shown_progress(len(records), "drawing masks") as advance:
+            for record in records:
+                image = Image.fromarray(cylinder_mask(trace_pixels(record.shown, meshes)))
+                path = (masks / record.split / record.file_name).with_suffix(".png")
+                write_atomic(path, file_of(image, "png"))
+                advance()
+    return len(records)

@@ -1,0 +1,145 @@
+"""Masks and clearings next to the images: what they show, and when they are drawn."""
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from phd_exp.records.dataset import CELLS, DatasetFolder
+from phd_exp.records.errors import DatasetError, RenderError
+from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering import masks
+from phd_exp.rendering.finished import verify
+from phd_exp.rendering.masks import ensure_drawn, mask
+from phd_exp.rendering.rays import NOTHING, cylinder_mask, trace_pixels
+from phd_exp.rendering.render import ensure_rendered
+from phd_exp.rendering.samples import describe
+from phd_exp.rendering.sampling import sample_scene
+from phd_exp.rendering.triangles import NO_MESHES
+from tests.support.meshes import solid, write_mesh
+from tests.support.renders import N_TEST, N_TRAIN
+
+
+@pytest.fixture
+def old(folder: DatasetFolder, small_spec: DatasetSpec, copied: None) -> DatasetFolder:
+    """A data set as earlier versions left it, without masks."""
+    ensure_rendered(folder, small_spec, N_TRAIN, N_TEST)
+    (folder.root / "masks.npy").unlink()
+    return folder
+
+
+@pytest.mark.parametrize("variant", ["default", "occl_scale"])
+def test_a_cell_is_the_share_of_its_pixels_that_show_the_object(
+    variant: str, make_spec: Callable[..., DatasetSpec]
+) -> None:
+    spec = make_spec(variant, sensor_size=224)
+    for index in range(20):
+        scene = sample_scene(spec, "train", index)
+        hits = trace_pixels(scene)
+        found = mask(describe(spec, "train", index, scene, hits, "0" * 64, NO_MESHES), NO_MESHES) / 255
+        share = cylinder_mask(hits).reshape(CELLS, 8, CELLS, 8).mean((1, 3))
+        assert np.abs(found - share).max() < 0.2  # of 16 rays and 64 pixels
+        assert found.sum() == pytest.approx(share.sum(), rel=0.05, abs=0.3)
+
+
+def test_each_image_has_its_mask_and_each_of_a_mesh_its_clearing(
+    make_spec: Callable[..., DatasetSpec], tmp_path: Path
+) -> None:
+    part = write_mesh(tmp_path / "part.stl", solid("cylinder"))
+    spec = make_spec("object", mesh=str(part), distractors=1, sensor_size=60, f_range=(343.0, 571.0))
+    folder, behind = (DatasetFolder(tmp_path / one.variant) for one in (spec, spec.without_objects))
+    ensure_rendered(folder, spec, 2, 1, workers=1)
+    ensure_rendered(behind, spec.without_objects, 2, 0, workers=1)
+    assert not list(behind.root.glob("*.npy"))
+    meshes = masks.meshes_of(spec)
+    cells, bits = folder.drawn("masks.npy", 2), folder.drawn("clearings.npy", 2)
+    for record, shares, clear in zip(folder.records("train"), cells, bits, strict=True):
+        np.testing.assert_array_equal(shares, mask(record, meshes))
+        pixels = np.unpackbits(clear, axis=-1, count=record.S)
+        np.testing.assert_array_equal(pixels, trace_pixels(record.shown, meshes).first == NOTHING)
+
+
+def test_an_older_data_set_gets_them_once_and_is_verified_before_and_after(
+    old: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert verify(old, small_spec, rerender=0) == N_TRAIN + N_TEST
+    ensure_rendered(old, small_spec, 3, 0)
+    np.testing.assert_array_equal(old.drawn("masks.npy", N_TRAIN), small.drawn("masks.npy", N_TRAIN))
+    assert verify(old, small_spec, rerender=0) == N_TRAIN + N_TEST
+    monkeypatch.setattr(masks, "write_atomic", lambda *_: pytest.fail("drawn again"))
+    ensure_rendered(old, small_spec, N_TRAIN, N_TEST)
+
+
+def test_they_grow_with_the_images(folder: DatasetFolder, small_spec: DatasetSpec, copied: None) -> None:
+    ensure_rendered(folder, small_spec, 0, 1)
+    assert not (folder.root / "masks.npy").exists()
+    for n in (3, N_TRAIN):
+        ensure_rendered(folder, small_spec, n, 1)
+        assert len(folder.drawn("masks.npy", n)) == n
+    with pytest.raises(DatasetError, match=r"masks\.npy: missing, or not an array for 13 training images"):
+        folder.drawn("masks.npy", N_TRAIN + 1)
+
+
+def test_an_interrupted_drawing_leaves_nothing(
+    old: DatasetFolder, small_spec: DatasetSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(_: Any, __: Any) -> np.ndarray:
+        raise KeyboardInterrupt
+
+    before = set(old.root.iterdir())
+    monkeypatch.setitem(masks.DRAW, "masks.npy", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        ensure_rendered(old, small_spec, N_TRAIN, N_TEST)
+    assert set(old.root.iterdir()) == before
+
+
+def test_those_of_a_folder_that_cannot_be_written_stop_no_training_that_needs_none(
+    old: DatasetFolder, small_spec: DatasetSpec
+) -> None:
+    (old.root / "masks.npy").mkdir()
+    assert ensure_rendered(old, small_spec, N_TRAIN, N_TEST)
+    with pytest.raises(RenderError, match=r"masks\.npy.*: cannot be written") as error:
+        ensure_drawn(old, small_spec, N_TRAIN)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"no array", "wrong shape", "floats", "objects"])
+def test_a_broken_array_is_drawn_anew(
+    old: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec, content: bytes | str
+) -> None:
+    file = old.root / "masks.npy"
+    shape = (N_TRAIN, CELLS, CELLS)
+    if isinstance(content, bytes):
+        file.write_bytes(content)
+    elif content == "objects":
+        np.save(file, np.full(shape, None), allow_pickle=True)
+    else:
+        np.save(file, np.zeros(shape[:2] if content == "wrong shape" else shape))
+    ensure_rendered(old, small_spec, N_TRAIN, N_TEST)
+    np.testing.assert_array_equal(old.drawn("masks.npy", N_TRAIN), small.drawn("masks.npy", N_TRAIN))
+
+
+def test_two_that_draw_at_once_do_not_meet(old: DatasetFolder, small_spec: DatasetSpec) -> None:
+    racing = [threading.Thread(target=ensure_drawn, args=(old, small_spec, N_TRAIN)) for _ in range(4)]
+    for thread in racing:
+        thread.start()
+    for thread in racing:
+        thread.join()
+    assert len(old.drawn("masks.npy", N_TRAIN)) == N_TRAIN
+    assert not list(old.root.glob(".*.tmp"))
+
+
+def test_those_of_another_data_set_are_removed(
+    old: DatasetFolder, small_spec: DatasetSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ensure_drawn(old, small_spec, N_TRAIN)
+    old.manifest_path.unlink()
+    monkeypatch.setattr("phd_exp.rendering.render.render_all", lambda *_: pytest.fail("stopped"))
+    for split in ("train", "test"):
+        old.metadata_path(split).unlink()  # type: ignore[arg-type]
+    with pytest.raises(pytest.fail.Exception):
+        ensure_rendered(old, small_spec, N_TRAIN, N_TEST)
+    assert not (old.root / "masks.npy").exists()
