@@ -13,11 +13,13 @@ from PIL import Image, ImageDraw, ImageFilter
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from phd_exp.data.batches import Batch
+from phd_exp.data.batches import SIGNS, Batch
 from phd_exp.geometry.camera import middles
 from phd_exp.geometry.motion import Motion, small_turns, symmetries, turned
 
 FIELD = 512  # side of the field of standard normal numbers from which the noise of each image is cut, pixels
+NUMBERS = (6, 1, 1, 2, 1, 1, 1)  # of Photometry: tone, blur, noise, its place in the field, JPEG, occluder, its shape
+TURN, COLOURS = 4, 3  # of Augmentation: numbers of a rotation and zoom, and of an order of the channels
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Photometry:
         jpeg: lowest JPEG quality; 100 for none.
     """
 
-    n_numbers: ClassVar[int] = 13
+    n_numbers: ClassVar[int] = sum(NUMBERS)
     occluders: float = 0.0
     brightness: float = 1.0
     contrast: float = 1.0
@@ -62,21 +64,22 @@ class Photometry:
 
     def fixed(self, image: UInt8[Tensor, "batch height width 3"]) -> UInt8[Tensor, "batch height width 3"]:
         """The images, each changed exactly up to every limit; only noise is drawn. Here, limits may be below 1."""
-        numbers = torch.ones(len(image), self.n_numbers)
-        numbers[:, 8:10] = 2 * torch.rand(len(image), 2, generator=torch.Generator().manual_seed(0)) - 1
-        return self(image, numbers)
+        tone, blur, noise, place, *others = torch.ones(len(image), self.n_numbers).split(NUMBERS, dim=1)
+        place = 2 * torch.rand(place.shape, generator=torch.Generator().manual_seed(0)) - 1
+        return self(image, torch.cat([tone, blur, noise, place, *others], dim=1))
 
     def _changed(self, image: NDArray[np.uint8], numbers: list[float]) -> NDArray[np.uint8]:
+        *tone, blur, noise, top, left, loss, occluder, shape = numbers
         picture = Image.fromarray(image)
-        if numbers[11] < 2 * self.occluders - 1:
-            _hide_a_part(picture, seed=int(2**32 * (numbers[12] + 1)))
+        if occluder < 2 * self.occluders - 1:
+            _hide_a_part(picture, seed=int(2**32 * (shape + 1)))
         if (self.brightness, self.contrast, self.gamma, self.white_balance) != (1, 1, 1, 1):
-            picture = picture.point(self._tone(numbers[:6]))
-        if self.blur and (blur := _strength(numbers[6])):
+            picture = picture.point(self._tone(tone))
+        if self.blur and (blur := _strength(blur)):
             picture = picture.filter(ImageFilter.GaussianBlur(self.blur * blur))
-        if self.noise and (noise := _strength(numbers[7])):
-            picture = Image.fromarray(_noisy(np.asarray(picture), self.noise * noise, numbers[8:10]))
-        if self.jpeg < 100 and (loss := _strength(numbers[10])):
+        if self.noise and (noise := _strength(noise)):
+            picture = Image.fromarray(_noisy(np.asarray(picture), self.noise * noise, [top, left]))
+        if self.jpeg < 100 and (loss := _strength(loss)):
             compressed = io.BytesIO()
             picture.save(compressed, format="jpeg", quality=round(100 - (100 - self.jpeg) * loss))
             picture = Image.open(compressed)
@@ -139,7 +142,7 @@ class Augmentation:
         photometry: changes of light and image quality.
     """
 
-    n_numbers: ClassVar[int] = 10 + Photometry.n_numbers
+    n_numbers: ClassVar[int] = SIGNS + TURN + COLOURS + Photometry.n_numbers
     symmetries: bool
     largest_zoom: float
     colours: bool
@@ -155,15 +158,16 @@ class Augmentation:
 
         A rotation and zoom that would move the object out of the image is skipped; the symmetry is kept.
         """
+        *of_camera, of_light = numbers.split([SIGNS, TURN, COLOURS, Photometry.n_numbers], dim=1)
         if self.photometry.changes_anything:
-            batch = replace(batch, image=self.photometry(batch.image, numbers[:, 10:]))
-        numbers = numbers.to(batch.f)
+            batch = replace(batch, image=self.photometry(batch.image, of_light))
+        signs, turn, order = (part.to(batch.f) for part in of_camera)
         camera = batch.camera
-        signs = numbers[:, :3] if self.symmetries else torch.ones_like(numbers[:, :3])
-        colours = numbers[:, 7:10].argsort(dim=-1) if self.colours else torch.arange(3).expand(len(batch), 3)
+        signs = signs if self.symmetries else torch.ones_like(signs)
+        colours = order.argsort(dim=-1) if self.colours else torch.arange(COLOURS).expand_as(order)
         symmetry = symmetries(signs)
         if self.largest_zoom > 1:
-            motion = small_turns(numbers[:, 3:7], self.largest_zoom, camera).after(symmetry)
+            motion = small_turns(turn, self.largest_zoom, camera).after(symmetry)
             motion = motion.where(motion.camera(camera).contains(motion.position(batch.xyz)), symmetry)
             batch, signs = moved(batch, motion), torch.ones_like(signs)
         else:
@@ -183,12 +187,9 @@ def _rearranged(
 
     One image at a time: indexing the batch once per reflection is ten times slower.
     """
-    result = torch.empty_like(image)
-    for one, new, row, order in zip(image, result, signs.tolist(), colours.tolist(), strict=True):
-        moved_pixels = turned(one, row)
-        for channel, old in enumerate(order):
-            new[..., channel] = moved_pixels[..., old]
-    return result
+    turns = (turned(one, row) for one, row in zip(image, signs.tolist(), strict=True))
+    orders = zip(turns, colours.tolist(), strict=True)
+    return torch.stack([torch.stack([pixels[..., old] for old in order], dim=-1) for pixels, order in orders])
 
 
 def moved(batch: Batch, motion: Motion) -> Batch:

@@ -1,4 +1,4 @@
-"""Training samples before the backdrops of others, so that no object comes with its backdrop."""
+"""Exchange the backdrops of training images, so that a network cannot learn which object has which backdrop."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from phd_exp.data.batches import Augment, Batch
 
-N_NUMBERS = 7  # per sample, of an exchange alone
+NUMBERS = (1, 2, 4)  # per sample: whether it changes; two samples; zoom, two shifts and transposition of the backdrop
 FINEST = 4.0  # largest factor by which a backdrop is shown smaller, with finer texture
 
 
@@ -52,36 +52,35 @@ class BackdropExchange:
     @property
     def n_numbers(self) -> int:
         """Number of random numbers per sample; those of `then` come first."""
-        return N_NUMBERS + (self.then.n_numbers if self.then else 0)
+        return sum(NUMBERS) + (self.then.n_numbers if self.then else 0)
 
     def __call__(self, batch: Batch, numbers: Float[Tensor, "batch n_numbers"]) -> Batch:
         """The samples, changed by uniform numbers from -1 to 1."""
-        image, uniform = batch.image.clone(), (numbers[:, -N_NUMBERS:] + 1) / 2
-        pairs = (len(self.backdrops.empty) * uniform[:, 1:3]).long()
+        of_then, own = numbers.split([numbers.shape[1] - sum(NUMBERS), sum(NUMBERS)], dim=1)
+        changes, pairs, views = ((own + 1) / 2).split(NUMBERS, dim=1)
+        pairs = (len(self.backdrops.empty) * pairs).long()
         others = pairs.gather(1, self.texture[pairs].argmax(dim=1, keepdim=True)).flatten()
-        for place in (uniform[:, 0] < self.share).nonzero().flatten().tolist():
-            fine, down, right, turn = uniform[place, 3:].tolist()
-            new = tiled(self.backdrops.empty[int(others[place])], FINEST**fine, down, right)
-            new = new.transpose(0, 1) if turn < 0.5 else new
-            image[place] = self._before(new, image[place], int(batch.row[place]))
+        image = batch.image.clone()
+        for place in (changes[:, 0] < self.share).nonzero().flatten().tolist():
+            fine, down, right, turn = views[place].tolist()
+            new, row = tiled(self.backdrops.empty[others[place]], FINEST**fine, down, right), batch.row[place]
+            change = (new.transpose(0, 1) if turn < 0.5 else new).float() - self.backdrops.empty[row].float()
+            share = self.backdrops.clear[row, ..., None] / 255
+            image[place] = change.mul_(share).add_(image[place]).round_().clamp_(0, 255)
         batch = replace(batch, image=image)
-        return self.then(batch, numbers[:, :-N_NUMBERS]) if self.then else batch
-
-    def _before(
-        self, new: UInt8[Tensor, "side side 3"], image: UInt8[Tensor, "side side 3"], row: int
-    ) -> UInt8[Tensor, "side side 3"]:
-        """The image of a row before a new backdrop."""
-        change = new.float() - self.backdrops.empty[row].float()
-        share = self.backdrops.clear[row, ..., None] / 255
-        return change.mul_(share).add_(image).round_().clamp_(0, 255).to(torch.uint8)
+        return self.then(batch, of_then) if self.then else batch
 
 
 def tiled(
     image: UInt8[Tensor, "side side 3"], fine: float, down: float, right: float
 ) -> UInt8[Tensor, "side side 3"]:
-    """The plane that an image and its mirror images tile, shown `fine` times smaller from a place on.
+    """A view, as large as the image, of the plane that the image and its mirror images tile.
 
-    `down` and `right` are shares of the period, which is two images.
+    It begins at the place (`down`, `right`), in units of the tiling's period, which is two images. Pixels are picked
+    without interpolation.
+
+    Args:
+        fine: how many times smaller the view shows the image; more is finer texture.
     """
     side = len(image)
     rows, columns = ((torch.arange(side) * fine + 2 * side * start).long() % (2 * side) for start in (down, right))

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from phd_exp.geometry.camera import Camera
 
-OCTANTS = 8  # combinations of three signs
+SIGNS = 3  # the first random numbers of a row, whose signs are stratified
+OCTANTS = 2**SIGNS
 
 
 @dataclass(frozen=True)
@@ -41,13 +42,17 @@ class Batch:
 
     def select(self, rows: Int[Tensor, " rows"] | slice) -> "Batch":
         """The samples of these rows."""
-        mask = None if self.mask is None else self.mask[rows]
-        return Batch(self.image[rows], self.xyz[rows], self.f[rows], self.S, self.row[rows], mask)
+        return replace(self, **{name: part[rows] for name, part in self._tensors.items()})
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> "Batch":
         """The same samples on a device."""
-        parts: dict[str, Any] = {name: part for name, part in vars(self).items() if isinstance(part, Tensor)}
-        return replace(self, **{name: part.to(device, non_blocking=non_blocking) for name, part in parts.items()})
+        return replace(
+            self, **{key: part.to(device, non_blocking=non_blocking) for key, part in self._tensors.items()}
+        )
+
+    @property
+    def _tensors(self) -> dict[str, Any]:
+        return {name: part for name, part in vars(self).items() if isinstance(part, Tensor)}
 
 
 @runtime_checkable
@@ -117,7 +122,7 @@ class BatchLoader:
             batch = self.samples.select(rows[self.rank :: self.world])
             if self.augment:
                 numbers = self._random(self.epoch, number).uniform(-1, 1, (len(rows), self.augment.n_numbers))
-                numbers[:, :3] = signs[rows] * np.abs(numbers[:, :3])
+                numbers[:, :SIGNS] = signs[rows] * np.abs(numbers[:, :SIGNS])
                 batch = self.augment(batch, torch.from_numpy(numbers[self.rank :: self.world]))
             yield batch
 
@@ -132,7 +137,7 @@ class BatchLoader:
         block, place = divmod(epoch, OCTANTS)
         orders = np.tile(np.arange(OCTANTS), (len(self.samples), 1))
         octant = self._random(block, 0, 0).permuted(orders, axis=1)[:, place]
-        return 1 - 2 * ((octant[:, None] >> np.arange(3)) & 1)
+        return 1 - 2 * ((octant[:, None] >> np.arange(SIGNS)) & 1)
 
     def _random(self, *place: int) -> np.random.Generator:
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=place))

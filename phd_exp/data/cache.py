@@ -67,7 +67,7 @@ def cached(
             array.flush()
             unfinished.replace(file)
             write_atomic(key_file, json.dumps(key) + "\n")
-            return mapped(file)
+            return mapped(file, shape)
     except OSError as error:
         why = f"{file.parent}: decoded images cannot be kept here ({error.strerror})"
         announce(f"{why}; they are decoded into memory, each run anew")
@@ -79,9 +79,7 @@ def cached(
 def _kept(file: Path, key_file: Path, key: dict[str, Any], shape: tuple[int, ...]) -> np.ndarray | None:
     """The stored array; None if it is missing, broken, or of another key or shape."""
     try:
-        if parse_json(read_plain(key_file).decode()) != key:
-            return None
-        array = mapped(file)
+        is_kept = parse_json(read_plain(key_file).decode()) == key
+        return mapped(file, shape) if is_kept else None
     except (OSError, ValueError):
         return None
-    return array if array.shape == shape else None

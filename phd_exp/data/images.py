@@ -90,10 +90,6 @@ def shrunk(pixels: UInt8[np.ndarray, "height width bands"], side: int) -> UInt8[
 @lru_cache(maxsize=16)
 def _overlaps(n: int, side: int) -> csr_array:
     """Overlap of output pixel i with input pixel x, in units of 1/side input pixels; each row sums to n."""
-    first = np.arange(side) * n // side
-    x = first[:, None] + np.arange(n // side + 2)
-    i = np.arange(side)[:, None]
+    i, x = np.arange(side)[:, None], np.arange(n)
     length = np.minimum((i + 1) * n, (x + 1) * side) - np.maximum(i * n, x * side)
-    kept = length > 0
-    rows = np.broadcast_to(i, x.shape)[kept]
-    return csr_array((length[kept].astype(float), (rows, x[kept])), shape=(side, n))
+    return csr_array(length.clip(0).astype(float))

@@ -6,15 +6,13 @@
         <split>/metadata.jsonl        one line per sample, sorted by index
         <split>/metadata.partial.jsonl    only while rendering: one line per finished image
         <split>/metadata.partial-0-of-4.jsonl    the same for one of several shards
-        masks.npy                     where each training image shows the object; see `row_shapes`
-        clearings.npy                 of a mesh: where it shows no object
+        masks.npy, clearings.npy      where training images show the object, and no object (`rendering/masks.py`)
         .cache/                       data that programs derive from the images
 
-`SampleRecord` describes a line. The arrays follow from the lines, and the manifest does not count them.
+`SampleRecord` describes a line. The arrays follow from the lines; the manifest does not count them.
 """
 
 import hashlib
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, get_args
 
@@ -134,18 +132,17 @@ class DatasetFolder:
         return records
 
     def drawn(self, name: str, n: int) -> NDArray[np.uint8]:
-        """The rows of the first `n` training images in an array of `row_shapes`, mapped from the file.
+        """The rows of the first `n` training images in `masks.npy` or `clearings.npy`, mapped into memory.
 
         Raises DatasetError if they are not there.
         """
-        file, row = self.root / name, row_shapes(self.manifest.spec)[name]
-        with suppress(OSError, ValueError):
-            if len(rows := mapped(file)) >= n and rows.shape[1:] == row:
-                return rows[:n]
-        raise DatasetError(
-            f"{file}: missing, or not an array for {n} training images; write it by "
-            "`python -m phd_exp render data=...`, with the same keys of data"
-        )
+        S = self.manifest.spec.sensor_size
+        row = (CELLS, CELLS) if name == "masks.npy" else (S, -(-S // 8))
+        try:
+            return mapped(self.root / name, (n, *row))
+        except (OSError, ValueError) as error:
+            remedy = "write it by `python -m phd_exp render data=...`, with the same keys of data"
+            raise DatasetError(f"{self.root / name}: {gist(error)}; {remedy}") from None
 
     def missing(self, spec: DatasetSpec, n_train: int, n_test: int) -> dict[Split, list[int]]:
         """Indices of the wanted samples that are not finished, or whose image or line has gone, by split.
@@ -175,28 +172,16 @@ class DatasetFolder:
         return manifest
 
 
-def row_shapes(spec: DatasetSpec) -> dict[str, tuple[int, int]]:
-    """The shape of a row, of one training image, in each array of a data set.
+def mapped(file: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """The first rows, of this shape together, of an array on disk; mapped into memory, writable as torch requires.
 
-    A mask (CELLS, CELLS) is the share of each cell of the image that shows the object, from 0 to 255. A clearing
-    (S, S / 8, rounded up) has a bit for each pixel, as `numpy.packbits` places them: 1 where it shows no object.
-    """
-    if spec.empty:
-        return {}
-    of_mesh = {"clearings.npy": (spec.sensor_size, -(-spec.sensor_size // 8))} if spec.mesh else {}
-    return {"masks.npy": (CELLS, CELLS), **of_mesh}
-
-
-def mapped(file: Path) -> NDArray[np.uint8]:
-    """An array of uint8 on disk, mapped into memory. Raises OSError or ValueError if the file holds none.
-
-    What is written into the array, which torch requires to be writable, does not reach the file.
+    What is written does not reach the file. Raises OSError or ValueError if the file does not hold such rows.
     """
     require_plain(file)
     array: NDArray[np.uint8] = np.lib.format.open_memmap(file, mode="c")
-    if array.dtype != np.uint8:
-        raise ValueError(f"its values are {array.dtype}")
-    return array
+    if array.dtype != np.uint8 or array.shape[1:] != shape[1:] or len(array) < shape[0]:
+        raise ValueError(f"holds {array.dtype} {array.shape}; expected uint8 {shape}")
+    return array[: shape[0]]
 
 
 def image_name(index: int, image_format: ImageFormat = "png") -> str:

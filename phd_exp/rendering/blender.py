@@ -18,7 +18,7 @@ from phd_exp.records.scenes import Scene
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.importing import import_meshes
 from phd_exp.rendering.pixels import Light, read_light
-from phd_exp.rendering.stage import build_stage, roughen, show_scene
+from phd_exp.rendering.stage import ROUGHER, build_stage, show_scene
 from phd_exp.rendering.surroundings import World
 from phd_exp.rendering.triangles import Meshes
 
@@ -103,8 +103,7 @@ class Renderer:
             self.meshes: Meshes = import_meshes(self._bpy, spec) if spec else {}
             self._world = World(self._bpy, spec) if spec and spec.mesh else None
             if self.meshes:
-                _configure_for_meshes(self._scene)
-                roughen(self._bpy)
+                _configure_for_meshes(self._bpy)
 
     def render(self, scene: Scene, box: Box | None = None) -> Light:
         """Linear light of a box of pixels (height, width, 3), by default of all (S, S, 3); rows from the top.
@@ -174,8 +173,10 @@ def _configure_tracer(cycles: Any, settings: Settings) -> None:
     cycles.denoising_prefilter = "NONE"
 
 
-def _configure_for_meshes(scene: Any) -> None:
+def _configure_for_meshes(bpy: Any) -> None:
     """Change the options for transparent backgrounds and for textures, which may be transparent too."""
+    scene, metal = bpy.context.scene, bpy.data.materials["metal"]
+    metal.node_tree.nodes["Principled BSDF"].inputs["Roughness"].default_value = ROUGHER
     scene.render.image_settings.color_mode = "RGBA"
     scene.cycles.transparent_max_bounces = 8
     scene.cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"  # a decibel better on textures

@@ -4,6 +4,7 @@ The masks follow from the records by ray casting; Blender only reads the meshes.
 """
 
 import io
+from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from PIL import Image
 from rich.console import Console
 from rich.progress import track
 
-from phd_exp.records.dataset import CELLS, SPLITS, DatasetFolder, row_shapes
+from phd_exp.records.dataset import CELLS, SPLITS, DatasetFolder
 from phd_exp.records.errors import DatasetError, writing
 from phd_exp.records.files import write_atomic
 from phd_exp.records.scenes import SampleRecord
@@ -38,24 +39,19 @@ def ensure_drawn(folder: DatasetFolder, spec: DatasetSpec, n: int) -> None:
 
     Raises RenderError if the folder cannot be written or a mesh cannot be read, DatasetError if a record is broken.
     """
-    if not n or _is_drawn(folder, spec, n):
-        return
+    names = [] if spec.empty or n == 0 else ["masks.npy", "clearings.npy"] if spec.mesh else ["masks.npy"]
+    with suppress(DatasetError):
+        if all(len(folder.drawn(name, n)) for name in names):
+            return
     meshes, records, console = meshes_of(spec), folder.records("train"), Console(stderr=True)
-    for name, row in row_shapes(spec).items():
-        head, words = io.BytesIO(), f"drawing {name.removesuffix('.npy')} once"
-        layout = {"descr": "|u1", "fortran_order": False, "shape": (len(records), *row)}
-        np.lib.format.write_array_header_1_0(head, layout)
+    for name in names:
+        words, draw, head = f"drawing {name.removesuffix('.npy')} once", DRAW[name], io.BytesIO()
+        shape = (len(records), *draw(records[0], meshes).shape)
+        np.lib.format.write_array_header_1_0(head, {"descr": "|u1", "fortran_order": False, "shape": shape})
         shown = track(records, words, console=console, transient=True, disable=not console.is_terminal)
-        rows = (DRAW[name](record, meshes).tobytes() for record in shown)
+        rows = (draw(record, meshes).tobytes() for record in shown)
         with writing(folder.root):
             write_atomic(folder.root / name, chain([head.getvalue()], rows))
-
-
-def _is_drawn(folder: DatasetFolder, spec: DatasetSpec, n: int) -> bool:
-    try:
-        return all(len(folder.drawn(name, n)) for name in row_shapes(spec))
-    except DatasetError:
-        return False
 
 
 def mask(record: SampleRecord, meshes: Meshes) -> NDArray[np.uint8]:

@@ -7,12 +7,13 @@ another process writes it.
 
 from contextlib import suppress
 
-from phd_exp.records.dataset import SPLITS, DatasetFolder, Manifest, Seal, row_shapes, sha256
+from phd_exp.records.dataset import SPLITS, DatasetFolder, Manifest, Seal, sha256
 from phd_exp.records.errors import CorruptFileError, DatasetError
 from phd_exp.records.files import read_jsonl, remove_temporaries, write_atomic
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import renderer_version
+from phd_exp.rendering.masks import DRAW
 from phd_exp.rendering.sampling import generator_version
 
 Wanted = dict[Split, int]
@@ -28,7 +29,7 @@ def begin(folder: DatasetFolder, spec: DatasetSpec) -> None:
     for split in SPLITS:
         folder.split_folder(split).mkdir(exist_ok=True)
     if not folder.manifest_path.exists():
-        for name in row_shapes(spec):  # of another data set that was here
+        for name in DRAW:  # of another data set that was here
             (folder.root / name).unlink(missing_ok=True)
         manifest = Manifest(generator=generator_version(spec), renderer=renderer_version(), spec=spec, splits={})
         folder.write_manifest(manifest)

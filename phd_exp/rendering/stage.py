@@ -86,11 +86,6 @@ def build_stage(bpy: Any) -> None:
     _paint_world(world.node_tree)
 
 
-def roughen(bpy: Any) -> None:
-    """Make metal as rough as the denoiser of scenes with meshes needs."""
-    bpy.data.materials["metal"].node_tree.nodes["Principled BSDF"].inputs["Roughness"].default_value = ROUGHER
-
-
 def _add(bpy: Any, name: str, data: Any) -> Any:
     handle = bpy.data.objects.new(name, data)
     bpy.context.scene.collection.objects.link(handle)
@@ -110,7 +105,7 @@ def _place_lamp(handle: Any, lamp: Lamp) -> None:
     """An area lamp shines along its local -z."""
     position = np.array(lamp.position)
     forward = np.array(lamp.towards) - position
-    handle.matrix_world = matrix_of(TO_BLENDER @ _facing(TO_BLENDER @ forward), position)
+    handle.matrix_world = matrix_of(TO_BLENDER @ _aimed_along(TO_BLENDER @ forward), position)
     handle.data.energy = lamp.power
     handle.data.size = lamp.side
 
@@ -124,7 +119,7 @@ def matrix_of(linear: NDArray[np.float64], place: NDArray[np.float64]) -> list[l
     return columns
 
 
-def _facing(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+def _aimed_along(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     """A rotation (3, 3) whose -z axis is `direction`, with x level."""
     back = -direction / np.linalg.norm(direction)
     right = np.cross([0.0, 1.0, 0.0], back)

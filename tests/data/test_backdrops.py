@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from phd_exp.data.backdrops import FINEST, N_NUMBERS, BackdropExchange, Backdrops, tiled
+from phd_exp.data.backdrops import FINEST, NUMBERS, BackdropExchange, Backdrops, tiled
 from phd_exp.data.batches import Batch
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.sources import RenderedSource
@@ -72,7 +72,7 @@ def test_the_backdrop_with_more_texture_is_preferred(batch: Batch) -> None:
     empty[::2] = batch.image[::2]
     clear = torch.full((N, SIDE, SIDE), 255, dtype=torch.uint8)
     black = replace(batch, image=empty[batch.row])
-    new = BackdropExchange(Backdrops(empty, clear), 1.0, then=None)(black, numbers(N_NUMBERS))
+    new = BackdropExchange(Backdrops(empty, clear), 1.0, then=None)(black, numbers(sum(NUMBERS)))
     assert (new.image != 0).any((1, 2, 3)).float().mean() == pytest.approx(0.75, abs=0.15)
 
 
@@ -99,10 +99,10 @@ def test_the_share_is_changed_and_then_augmented(batch: Batch) -> None:
 
     clear = torch.full((N, SIDE, SIDE), 255, dtype=torch.uint8)
     backdrops = Backdrops(torch.randint(0, 256, batch.image.shape, dtype=torch.uint8), clear)
-    draw = numbers(N_NUMBERS + 2)
+    draw = numbers(sum(NUMBERS) + 2)
     for share in (0.0, 0.4, 1.0):
         exchange = BackdropExchange(backdrops, share, Darken())
-        assert exchange.n_numbers == N_NUMBERS + 2
+        assert exchange.n_numbers == sum(NUMBERS) + 2
         changed = (exchange(batch, draw).image != batch.image // 2).any((1, 2, 3))
         assert changed.float().mean() == pytest.approx(share, abs=0.15)
 
