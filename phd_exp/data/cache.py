@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -59,8 +60,9 @@ def cached(
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with held(file.parent / "decoding.lock", waiting=waiting):  # concurrent runs of a sweep decode once
-            if (kept := _kept(file, key_file, key, shape)) is not None:
-                return kept
+            with suppress(OSError, ValueError):  # missing, broken, or of another key or shape
+                if parse_json(read_plain(key_file).decode()) == key:
+                    return mapped(file, shape)
             unfinished.unlink(missing_ok=True)  # if it is a link, writing would overwrite its target
             array = np.lib.format.open_memmap(unfinished, mode="w+", dtype=np.uint8, shape=shape)
             fill_all(array)
@@ -74,12 +76,3 @@ def cached(
         array = np.empty(shape, dtype=np.uint8)
         fill_all(array)
         return array
-
-
-def _kept(file: Path, key_file: Path, key: dict[str, Any], shape: tuple[int, ...]) -> np.ndarray | None:
-    """The stored array; None if it is missing, broken, or of another key or shape."""
-    try:
-        is_kept = parse_json(read_plain(key_file).decode()) == key
-        return mapped(file, shape) if is_kept else None
-    except (OSError, ValueError):
-        return None

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import track
 
 from phd_exp.records.dataset import CELLS, SPLITS, DatasetFolder
-from phd_exp.records.errors import DatasetError, writing
+from phd_exp.records.errors import DatasetError, UserError, writing
 from phd_exp.records.files import write_atomic
 from phd_exp.records.scenes import SampleRecord
 from phd_exp.records.spec import DatasetSpec
@@ -52,6 +52,12 @@ def ensure_drawn(folder: DatasetFolder, spec: DatasetSpec, n: int) -> None:
         rows = (draw(record, meshes).tobytes() for record in shown)
         with writing(folder.root):
             write_atomic(folder.root / name, chain([head.getvalue()], rows))
+
+
+def draw_if_possible(folder: DatasetFolder, spec: DatasetSpec, n: int) -> None:
+    """`ensure_drawn` for trainings that may not need masks; those that do report that they are missing."""
+    with suppress(UserError):
+        ensure_drawn(folder, spec, n)
 
 
 def mask(record: SampleRecord, meshes: Meshes) -> NDArray[np.uint8]:

@@ -18,7 +18,7 @@ finds all work done and seals.
 import math
 import time
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from itertools import islice
 from multiprocessing.connection import Connection, wait
 
@@ -29,7 +29,7 @@ from phd_exp.records.processes import Child, announce, duration, held, usable_co
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec, Shard
 from phd_exp.rendering.blender import require_bpy
-from phd_exp.rendering.masks import ensure_drawn
+from phd_exp.rendering.masks import draw_if_possible
 from phd_exp.rendering.progress import shown_progress
 from phd_exp.rendering.sealing import Known, Wanted, begin, known_samples, missing, seal
 
@@ -51,7 +51,7 @@ def ensure_rendered(
 ) -> bool:
     """Render those of the first `n_train` and `n_test` samples that are not on disk; returns whether all are there.
 
-    Then draw the masks that training reads. If that is impossible, a training that needs them says so.
+    The masks that training reads are drawn too. If that is impossible, a training that needs them says so.
 
     An unsharded call waits for other processes in the folder and leaves all samples there. Rendered images are kept,
     whatever happens: the same call resumes, and the finished folder has the same bytes as one rendered without
@@ -68,8 +68,7 @@ def ensure_rendered(
         RenderError: bpy is missing, a worker died, the folder cannot be written.
     """
     if not any(folder.missing(spec, n_train, n_test).values()):
-        with suppress(UserError):
-            ensure_drawn(folder, spec, n_train)
+        draw_if_possible(folder, spec, n_train)
         return True
     require_bpy()
     wanted: Wanted = {"train": n_train, "test": n_test}
@@ -92,11 +91,11 @@ def ensure_rendered(
                     folder.manifest_path.unlink(missing_ok=True)
                 raise
             if shard is None:
-                seal(folder, known)
-                return ensure_rendered(folder, spec, n_train, n_test)  # nothing is missing, but masks
+                seal(folder, spec, known)
+                return True
         if not samples:
             announce(f"{folder.root}: nothing left to render in shard {shard}")
-        return _seal_if_last(folder, wanted, shard) and ensure_rendered(folder, spec, n_train, n_test)
+        return _seal_if_last(folder, spec, wanted, shard)
 
 
 @contextmanager
@@ -114,12 +113,12 @@ def _locked(folder: DatasetFolder, shard: Shard | None) -> Iterator[None]:
         yield
 
 
-def _seal_if_last(folder: DatasetFolder, wanted: Wanted, shard: Shard) -> bool:
+def _seal_if_last(folder: DatasetFolder, spec: DatasetSpec, wanted: Wanted, shard: Shard) -> bool:
     with held(folder.render_lock) as alone:
         known = known_samples(folder)
         left = len(missing(known, wanted))
         if alone and not left:
-            seal(folder, known)
+            seal(folder, spec, known)
             outcome = f"shard {shard} was the last; the data set is sealed"
         elif left:
             outcome = f"shard {shard} is done; {left} samples of other shards are missing"

@@ -1,8 +1,7 @@
 """From images and journals to a finished folder: the samples known so far, and the order in which it is sealed.
 
-Each writer has its own journal; an unsharded render has the plain one. The samples of all journals count as
-finished, whoever resumes. A folder is sealed only under an exclusive lock, so that no journal is removed while
-another process writes it.
+Each shard has a journal, and so has a render without shards. A render that resumes takes the samples of all journals
+as finished. Sealing removes the journals; it holds an exclusive lock, so that no other process is writing one.
 """
 
 from contextlib import suppress
@@ -13,7 +12,7 @@ from phd_exp.records.files import read_jsonl, remove_temporaries, write_atomic
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import renderer_version
-from phd_exp.rendering.masks import DRAW
+from phd_exp.rendering.masks import DRAW, draw_if_possible
 from phd_exp.rendering.sampling import generator_version
 
 Wanted = dict[Split, int]
@@ -72,14 +71,15 @@ def missing(known: Known, wanted: Wanted) -> list[tuple[Split, int]]:
     return [(split, index) for split in SPLITS for index in range(wanted[split]) if index not in known[split]]
 
 
-def seal(folder: DatasetFolder, known: Known) -> None:
-    """Write `metadata.jsonl`, remove the journals, and count the samples in the manifest, in this order.
+def seal(folder: DatasetFolder, spec: DatasetSpec, known: Known) -> None:
+    """Write `metadata.jsonl`, remove the journals, count the samples in the manifest, and draw masks, in this order.
 
     The caller holds `render.lock` exclusively.
     """
     seals = {split: done for split in SPLITS if (done := _seal_split(folder, split, known[split])).n}
     remove_temporaries(folder.root)
     folder.write_manifest(folder.manifest.model_copy(update={"splits": seals}))
+    draw_if_possible(folder, spec, folder.manifest.count("train"))
 
 
 def _seal_split(folder: DatasetFolder, split: Split, known: dict[int, SampleRecord]) -> Seal:
