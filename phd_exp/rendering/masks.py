@@ -39,9 +39,9 @@ def ensure_drawn(folder: DatasetFolder, spec: DatasetSpec, n: int) -> None:
 
     Raises RenderError if the folder cannot be written or a mesh cannot be read, DatasetError if a record is broken.
     """
-    names = [] if spec.empty or n == 0 else ["masks.npy", "clearings.npy"] if spec.mesh else ["masks.npy"]
+    names = ["masks.npy", "clearings.npy"] if spec.mesh else ["masks.npy"]
     with suppress(DatasetError):
-        if all(len(folder.drawn(name, n)) for name in names):
+        if n == 0 or spec.empty or all(len(folder.drawn(name, n)) for name in names):
             return
     meshes, records, console = meshes_of(spec), folder.records("train"), Console(stderr=True)
     for name in names:
