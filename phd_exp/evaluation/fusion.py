@@ -10,10 +10,9 @@ from scipy import stats
 from torch import Tensor
 
 from phd_exp.evaluation.predictions import Evaluation, evaluation_of, scalar_bands
-from phd_exp.evaluation.reference import Band
 from phd_exp.evaluation.several_views import SeveralViews
 from phd_exp.fusion import Fused, Plane, Status, average, fuse, fuse_shared, gaussian_fusion
-from phd_exp.metrics.bootstrap import means
+from phd_exp.metrics.bootstrap import Interval, means
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, squared_mahalanobis
 from phd_exp.records.errors import RunError
 
@@ -50,13 +49,13 @@ class FusionScores:
     n: int
     views: int
     left_out: int
-    bands: dict[str, Band]
+    bands: dict[str, Interval[float]]
     surprise: list[int]
-    correlation: Band
-    with_size: Band
+    correlation: Interval[float]
+    with_size: Interval[float]
     exact: dict[str, float]
 
-    def band(self, quantity: str, method: Method, cameras: int, on_plane: bool = False) -> Band:
+    def band(self, quantity: str, method: Method, cameras: int, on_plane: bool = False) -> Interval[float]:
         """The score of the first `cameras` fused by a method, on the ground or in free space."""
         return self.bands[place(quantity, method, cameras, on_plane)]
 

@@ -14,8 +14,8 @@ from phd_exp.distributions.columns import NEES, PARAMETERS, distribution_columns
 from phd_exp.distributions.temperature import Temperature
 from phd_exp.evaluation.parquet import Columns, require_columns, stacked
 from phd_exp.evaluation.point_errors import RESAMPLES, SEED
-from phd_exp.evaluation.reference import Band, calibrated_reference, groups_of
-from phd_exp.metrics.bootstrap import Statistic, bands, interval, means, resampled
+from phd_exp.evaluation.reference import calibrated_reference, groups_of
+from phd_exp.metrics.bootstrap import Interval, Statistic, bands, interval, means, resampled
 from phd_exp.metrics.calibration_scores import COLUMNS, abscissae, calibration_scores, curves, ordered
 from phd_exp.metrics.errors import MILLIMETRES
 from phd_exp.metrics.groups import worst_group
@@ -58,7 +58,7 @@ class Stratum:
     quantity: str
     label: str
     n: int
-    scores: dict[str, Band]
+    scores: dict[str, Interval[float]]
 
 
 @dataclass(frozen=True)
@@ -76,11 +76,11 @@ class Evaluation:
     """
 
     n: int
-    scores: dict[str, Band]
+    scores: dict[str, Interval[float]]
     left_out: int
     curves: dict[str, Curve] = field(default_factory=dict)
     strata: list[Stratum] = field(default_factory=list)
-    reference: dict[str, Band] = field(default_factory=dict)
+    reference: dict[str, Interval[float]] = field(default_factory=dict)
     resampled: dict[str, list[float]] = field(default_factory=dict)
 
 
@@ -102,8 +102,8 @@ def evaluate(table: Columns, resamples: int = RESAMPLES) -> Evaluation:
         reference = calibrated_reference(distribution)
     if is_distribution:
         x = abscissae(columns)
-        intervals = bands(curves, columns, resamples, SEED)
-        found = {name: Curve(x[name].tolist(), *(y.tolist() for y in band)) for name, band in intervals.items()}
+        y = {name: band.each(Tensor.tolist) for name, band in bands(curves, columns, resamples, SEED).items()}
+        found = {name: Curve(x[name].tolist(), band.value, band.low, band.high) for name, band in y.items()}
     scored = evaluation_of(whole, columns, int((~finite).sum()), resamples)
     return replace(scored, curves=found, strata=_strata(statistic, columns, resamples), reference=reference)
 
@@ -113,7 +113,7 @@ def evaluation_of(statistic: Statistic, columns: Mapping[str, Tensor], left_out:
     values, drawn = resampled(statistic, columns, resamples, SEED)
     return Evaluation(
         n=len(next(iter(columns.values()))),
-        scores={name: Band(*map(float, interval(value, drawn[name]))) for name, value in values.items()},
+        scores={name: interval(value, drawn[name]).each(float) for name, value in values.items()},
         left_out=left_out,
         resampled={name: value.tolist() for name, value in drawn.items()},
     )
@@ -184,7 +184,7 @@ def at_temperature(
 def _distribution_scores(
     columns: Mapping[str, Tensor], weight: Tensor, groups: Tensor | None = None
 ) -> dict[str, Tensor]:
-    recorded = {"nll": columns["nll"], "inside_90": 100.0 * (columns["level"] <= 0.9)}
+    recorded = {"nll": columns["nll"], "inside_90": inside(columns["level"], 0.9)}
     recorded["energy_score_mm"] = MILLIMETRES * columns["energy_score"]
     scores = _point_scores(columns, weight) | means(recorded, weight) | calibration_scores(ordered(columns, weight))
     scores |= means({name: columns[name] for name in NEES if name in columns}, weight)
@@ -193,13 +193,20 @@ def _distribution_scores(
     return scores
 
 
+def inside(level: Float[Tensor, " samples"], probability: float) -> Float[Tensor, " samples"]:
+    """Per cent: 100 for a truth inside the credible region of this probability, given the truth's level; else 0."""
+    return 100.0 * (level <= probability).double()
+
+
 def _point_scores(columns: Mapping[str, Tensor], weight: Tensor) -> dict[str, Tensor]:
     return means({name: columns[name] for name in (*ERRORS, *OF_DISTANCE) if name in columns}, weight)
 
 
-def scalar_bands(statistic: Statistic, columns: Mapping[str, Tensor], resamples: int = RESAMPLES) -> dict[str, Band]:
+def scalar_bands(
+    statistic: Statistic, columns: Mapping[str, Tensor], resamples: int = RESAMPLES
+) -> dict[str, Interval[float]]:
     """The 95 % bootstrap intervals of scalars, as plain numbers."""
-    return {name: Band(*map(float, found)) for name, found in bands(statistic, columns, resamples, SEED).items()}
+    return {name: found.each(float) for name, found in bands(statistic, columns, resamples, SEED).items()}
 
 
 def _strata(statistic: Statistic, columns: Mapping[str, Tensor], resamples: int) -> list[Stratum]:

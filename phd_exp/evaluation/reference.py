@@ -1,6 +1,5 @@
 """The scores that a calibrated model would have: for finitely many samples, no distance from calibration is zero."""
 
-from dataclasses import dataclass
 from functools import cache
 
 import torch
@@ -10,6 +9,7 @@ from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import NEES, Columns, draws, nees_columns, parameter_columns, squared_error_columns
+from phd_exp.metrics.bootstrap import Interval
 from phd_exp.metrics.calibration import ence_of, miscalibration_area, uniform_distance
 from phd_exp.metrics.calibration_scores import ence_bins
 from phd_exp.metrics.errors import MILLIMETRES
@@ -27,16 +27,7 @@ REFERENCED = (
 )
 
 
-@dataclass(frozen=True)
-class Band:
-    """A number and its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
-
-
-def calibrated_reference(distribution: ProjectedHuber, simulations: int = 4000) -> dict[str, Band]:
+def calibrated_reference(distribution: ProjectedHuber, simulations: int = 4000) -> dict[str, Interval[float]]:
     """Median and 95 % interval of the scores `REFERENCED` if the truths were drawn from the predictions themselves.
 
     ENCE, CRPS and NEES depend on the predicted densities, so positions are drawn from them: each simulated test set
@@ -59,7 +50,7 @@ def calibrated_reference(distribution: ProjectedHuber, simulations: int = 4000) 
             found.setdefault(name, []).append(values)
     bands = {name: torch.cat(values).double().quantile(_SHARES) for name, values in found.items()}
     bands["inside_90"] = 100 * torch.from_numpy(stats.binom.ppf(_SHARES, n, 0.9)) / n
-    return {name: Band(*bands[name].tolist()) for name in REFERENCED}
+    return {name: Interval(*bands[name].tolist()) for name in REFERENCED}
 
 
 def groups_of(distribution: ProjectedHuber) -> Tensor:

@@ -12,9 +12,8 @@ import pyarrow.parquet as pq
 from phd_exp.evaluation.conformal import threshold
 from phd_exp.evaluation.familiar import ALARM, Familiarity
 from phd_exp.evaluation.parquet import Columns, read_table
-from phd_exp.evaluation.predictions import ERRORS, finite_columns, scalar_bands
-from phd_exp.evaluation.reference import Band
-from phd_exp.metrics.bootstrap import means
+from phd_exp.evaluation.predictions import ERRORS, finite_columns, inside, scalar_bands
+from phd_exp.metrics.bootstrap import Interval, means
 from phd_exp.metrics.calibration_scores import COLUMNS, calibration_scores, ordered
 from phd_exp.records.errors import RunError, one_line
 from phd_exp.records.runs import GUARANTEE, HOME
@@ -36,7 +35,7 @@ class ShiftScores:
     change: str
     n: int
     left_out: int
-    scores: dict[str, Band]
+    scores: dict[str, Interval[float]]
 
 
 def shift_scores(folder: Path, home: Columns, held_out: Columns | None) -> dict[str, ShiftScores]:
@@ -71,7 +70,7 @@ def _rated(familiarity: Familiarity, usual: np.ndarray, table: Columns) -> Colum
 
 def _scores(table: Columns, levels: Mapping[str, float], rated: Columns, change: str = "") -> ShiftScores:
     columns, finite = finite_columns({**table, **rated}, (*MEASURED, *rated))
-    columns |= {f"inside_{name}": 100.0 * (columns["level"] <= level) for name, level in levels.items()}
+    columns |= {f"inside_{name}": inside(columns["level"], level) for name, level in levels.items()}
     scores = scalar_bands(
         lambda part, counts: means(part, counts) | calibration_scores(ordered(part, counts)), columns
     )

@@ -5,28 +5,42 @@ and evaluates many resamples at a time.
 """
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+Number = TypeVar("Number")
+Other = TypeVar("Other")
 
 Statistic = Callable[[Mapping[str, Tensor], Tensor], Mapping[str, Tensor]]
 """Columns of shape (samples,) and counts (resamples, samples) -> name -> (resamples, *points)."""
 _AT_ONCE = 10**6  # counts held in memory at a time
 
 
-class Interval(NamedTuple):
-    """A statistic of the samples, and the bounds that contain it in 95 % of the resamples."""
+@dataclass(frozen=True)
+class Interval(Generic[Number]):
+    """A number and its 95 % interval: a float, a tensor of the points of a curve, or the text of either."""
 
-    value: Float[Tensor, "*points"]
-    low: Float[Tensor, "*points"]
-    high: Float[Tensor, "*points"]
+    value: Number
+    low: Number
+    high: Number
+
+    def each(self, change: Callable[[Number], Other]) -> "Interval[Other]":
+        """The number and its bounds in another form.
+
+        Examples:
+            >>> Interval(0.5, 0.25, 0.75).each("{:.0%}".format)
+            Interval(value='50%', low='25%', high='75%')
+        """
+        return Interval(change(self.value), change(self.low), change(self.high))
 
 
 def bands(
     statistic: Statistic, columns: Mapping[str, Float[Tensor, " samples"]], resamples: int, seed: int
-) -> dict[str, Interval]:
+) -> dict[str, Interval[Tensor]]:
     """95 % percentile intervals of scalars, and of curves at each of their points; equal for equal seeds.
 
     They do not test calibration: a distance from calibration cannot be negative and resampling adds noise to it, so
@@ -68,7 +82,7 @@ def resampled(
     return {name: value[0] for name, value in values.items()}, {k: torch.cat(v) for k, v in drawn.items()}
 
 
-def interval(value: Tensor, drawn: Tensor) -> Interval:
+def interval(value: Tensor, drawn: Tensor) -> Interval[Tensor]:
     """The 95 % percentile interval of resampled values, extended to contain the value itself."""
     tails = torch.tensor([0.025, 0.975], dtype=torch.float64)
     # a resample may lack every sample that a point needs

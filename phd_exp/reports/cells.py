@@ -1,6 +1,6 @@
 """One number of a table: the errors of a model's runs, averaged over seeds, with an interval."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -8,25 +8,10 @@ import numpy as np
 from scipy import stats
 
 from phd_exp.evaluation.point_errors import ErrorKey, SampleMean, difference
+from phd_exp.metrics.bootstrap import Interval
 from phd_exp.records.errors import one_line
 from phd_exp.reports.paper import bound_mm, published_mm
 from phd_exp.reports.runs import Report, Run
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A mean and its 95 % interval, mean ± half_width; None if there is no interval."""
-
-    mean: float
-    half_width: float | None
-    kind: Literal["seeds_and_samples", "samples", "none"]
-
-    @property
-    def ends(self) -> tuple[float, float] | tuple[None, None]:
-        """Lower and upper end."""
-        if self.half_width is None:
-            return None, None
-        return self.mean - self.half_width, self.mean + self.half_width
 
 
 @dataclass(frozen=True)
@@ -36,7 +21,7 @@ class Cell:
     Attributes:
         means: seed -> mean error, of the finished runs.
         images: digests of the test images; a single one if all runs were tested on the same images.
-        interval: the mean over seeds and its interval; None if no run has finished.
+        interval: of the mean over seeds; None without a finished run, or with one seed and one test sample.
         published: the paper's figure.
         bound: the bound on the mean that applies to these runs.
         gaps: seed -> why it is missing, of the seeds that other cells of the table have or that were started.
@@ -48,7 +33,7 @@ class Cell:
     key: ErrorKey
     means: dict[int, SampleMean]
     images: frozenset[str]
-    interval: Interval | None
+    interval: Interval[float] | None
     published: float | None
     bound: float | None
     gaps: dict[int, str]
@@ -56,7 +41,14 @@ class Cell:
     @property
     def mean(self) -> float | None:
         """Our mean, mm; None if no run has finished."""
-        return self.interval.mean if self.interval else None
+        return float(np.mean([mean.value for mean in self.means.values()])) if self.means else None
+
+    @property
+    def scatter(self) -> Literal["seeds_and_samples", "samples", "none"]:
+        """The scatter that the interval includes."""
+        if self.interval is None:
+            return "none"
+        return "seeds_and_samples" if len(self.means) > 1 else "samples"
 
     @property
     def state(self) -> str:
@@ -81,12 +73,11 @@ class Cell:
 
     def numbers(self, table: str, bold: bool) -> dict[str, Any]:
         """A line of CSV."""
-        low, high = self.interval.ends if self.interval else (None, None)
         return {
             "preset": self.preset, "table": table, "data": self.data, "model": self.model,
             "estimate": self.key.estimate, "reading": self.key.reading,
             "quantity": f"{self.key.quantity}_error_mm", "n_seeds": len(self.means),
-            "mean": self.mean, "low": low, "high": high, "interval": self.interval.kind if self.interval else "none",
+            "mean": self.mean, **bounds(self.interval), "interval": self.scatter,
             "published": self.published, "ratio": self.ratio, "bound": self.bound, "best": bold,
             # the smallest, if runs were tested on different numbers of samples
             "n_test": min((mean.n for mean in self.means.values()), default=0), "state": self.state,
@@ -106,34 +97,44 @@ def make_cell(report: Report, preset: str, data: str, model: str, key: ErrorKey,
         key=key,
         means=means,
         images=frozenset(run.measured.images for run in measured.values()),
-        interval=interval(list(means.values())) if means else None,
+        interval=interval(list(means.values())),
         published=published_mm(model, data, key.estimate, key.quantity),
         bound=bound_mm(model, data, key.quantity, sees_f),
         gaps={seed: _reason(runs.get(seed), key) for seed in seeds if seed not in measured},
     )
 
 
-def interval(means: Sequence[SampleMean]) -> Interval:
-    """The mean over seeds with its 95 % interval.
+def interval(means: Sequence[SampleMean]) -> Interval[float] | None:
+    """The mean over seeds with its 95 % interval; None without a mean, or with one whose standard error is unknown.
 
     Half widths of two sources are added in quadrature. The scatter of test sets: 1.96 standard errors over the test
     samples, averaged over seeds, since these share them. The scatter of trainings, with k >= 2 seeds of standard
     deviation s: t s / sqrt(k), t the 97.5 % quantile of Student's law with k - 1 degrees of freedom. With one seed
-    only the former is known; with one sample besides, there is no interval.
+    only the former is known.
 
     Examples:
-        >>> interval([SampleMean(100, 40.0, 1.0), SampleMean(100, 42.0, 1.0)]).mean
-        41.0
+        >>> interval([SampleMean(100, 40.0, 1.0)]).each("{:.2f}".format)
+        Interval(value='40.00', low='38.04', high='41.96')
     """
+    k, errors = len(means), [mean.standard_error for mean in means]
+    if k == 0 or errors == [None]:
+        return None
     values = np.array([mean.value for mean in means])
-    k, errors = len(values), [mean.standard_error for mean in means]
-    of_samples = stats.norm.ppf(0.975) * np.mean([error or 0.0 for error in errors])
+    half_width = stats.norm.ppf(0.975) * np.mean([error or 0.0 for error in errors])
     if k > 1:
-        of_seeds = stats.t.ppf(0.975, k - 1) * values.std(ddof=1) / np.sqrt(k)
-        return Interval(float(values.mean()), float(np.hypot(of_seeds, of_samples)), "seeds_and_samples")
-    if errors[0] is None:
-        return Interval(means[0].value, None, "none")
-    return Interval(means[0].value, float(of_samples), "samples")
+        half_width = np.hypot(stats.t.ppf(0.975, k - 1) * values.std(ddof=1) / np.sqrt(k), half_width)
+    mean, half_width = float(values.mean()), float(half_width)
+    return Interval(mean, mean - half_width, mean + half_width)
+
+
+def bounds(interval: Interval[float] | None) -> dict[str, float | None]:
+    """The columns `low` and `high` of CSV."""
+    return {"low": interval.low, "high": interval.high} if interval else {"low": None, "high": None}
+
+
+def plus_minus(interval: Interval[float] | None, text: Callable[[float], str]) -> str:
+    """Half the width of a symmetric interval, such as `±3`; empty without one."""
+    return f"±{text((interval.high - interval.low) / 2)}" if interval else ""
 
 
 def _reason(run: Run | None, key: ErrorKey) -> str:

@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from phd_exp.evaluation.parquet import Columns, read_table
-from phd_exp.evaluation.predictions import ensemble_table, scalar_bands
-from phd_exp.evaluation.reference import Band
-from phd_exp.metrics.bootstrap import means
+from phd_exp.evaluation.predictions import ensemble_table, inside, scalar_bands
+from phd_exp.metrics.bootstrap import Interval, means
 from phd_exp.records.choices import in_words
 from phd_exp.reports.runs import Report, Run
 from phd_exp.reports.table import Table, TableCell, TableRow, file_stem
@@ -67,7 +66,7 @@ def _configuration(run: Run) -> tuple[str, str, str, str]:
     return run.preset, run.data, run.model, run.digest
 
 
-def _scores(runs: Sequence[Run]) -> dict[str, Mapping[str, Band]]:
+def _scores(runs: Sequence[Run]) -> dict[str, Mapping[str, Interval[float]]]:
     """Kind of prediction -> its scores; empty without an ensemble."""
     runs = [run for run in runs if run.nll is not None]
     seeds = [read_table(run.folder.predictions) for run in runs]
@@ -84,9 +83,9 @@ def _scores(runs: Sequence[Run]) -> dict[str, Mapping[str, Band]]:
 
 def _columns(table: Columns) -> dict[str, Tensor]:
     nll, level = torch.from_numpy(table["nll"]), torch.from_numpy(table["level"])
-    return {"nll": nll, "inside_90": 100.0 * (level <= 0.9).double(), "level": level}
+    return {"nll": nll, "inside_90": inside(level, 0.9), "level": level}
 
 
-def _cell(name: str, band: Band) -> TableCell:
-    value, low, high = map(SCORES[name][1].format, vars(band).values())
-    return TableCell(value, f"({low} to {high})")
+def _cell(name: str, band: Interval[float]) -> TableCell:
+    text = band.each(SCORES[name][1].format)
+    return TableCell(text.value, f"({text.low} to {text.high})")

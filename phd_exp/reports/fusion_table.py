@@ -2,9 +2,10 @@
 
 import math
 from collections.abc import Mapping
+from functools import partial
 
 from phd_exp.evaluation.fusion import CALIBRATION, ERRORS, LEVELS, PROBABILISTIC, FusionScores, Method, place
-from phd_exp.evaluation.reference import Band
+from phd_exp.metrics.bootstrap import Interval
 from phd_exp.records.choices import in_words
 from phd_exp.reports.runs import Report, Run
 from phd_exp.reports.table import Table, TableCell, TableRow, file_stem
@@ -90,9 +91,9 @@ def names_of(quantity: str) -> Mapping[Method, str]:
     return {method: NAMES[method].removesuffix(", mean") for method in PROBABILISTIC}
 
 
-def _cell(quantity: str, band: Band, exact: float | None) -> TableCell:
-    value, low, high = (_number(quantity, number) for number in (band.value, band.low, band.high))
-    return TableCell(value, f"({low}–{high})", below="" if exact is None else f"{exact:.1f}")
+def _cell(quantity: str, band: Interval[float], exact: float | None) -> TableCell:
+    text = band.each(partial(_number, quantity))
+    return TableCell(text.value, f"({text.low}–{text.high})", below="" if exact is None else f"{exact:.1f}")
 
 
 def _number(quantity: str, value: float) -> str:

@@ -1,13 +1,14 @@
 """Densities of different shapes on the same images, compared with the Projected Huber density by paired tests."""
 
 from collections.abc import Sequence
+from statistics import fmean
 
 import numpy as np
 
 from phd_exp.distributions.constraints import findings
 from phd_exp.evaluation.point_errors import SampleMean, difference
 from phd_exp.records.choices import in_words
-from phd_exp.reports.cells import interval
+from phd_exp.reports.cells import interval, plus_minus
 from phd_exp.reports.quantities import SCORES
 from phd_exp.reports.runs import PROBABILISTIC, Report, Run
 from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem
@@ -72,11 +73,10 @@ def _cell(name: str, runs: Sequence[Run], reference: Sequence[Run]) -> TableCell
     means, others, text = _means(runs, name), _means(reference, name), SCORES[name].text
     if not means:
         return TableCell(NOTHING)
-    found = interval(means)
-    spread = "" if found.half_width is None else f"±{text(found.half_width)}"
+    mean, spread = text(fmean(mean.value for mean in means)), plus_minus(interval(means), text)
     same = {(run.measured.images, mean.n) for run, mean in zip((*runs, *reference), (*means, *others), strict=False)}
     if runs is reference or len(same) > 1 or not others:
-        return TableCell(text(found.mean), spread)
+        return TableCell(mean, spread)
     gap, width = difference(means, others)
     below = f"{'+' if gap > 0 else ''}{text(gap)} ±{text(width)}"
-    return TableCell(text(found.mean), spread, below, gap < -width and name != "inside_90")
+    return TableCell(mean, spread, below, gap < -width and name != "inside_90")

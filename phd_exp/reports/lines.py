@@ -6,7 +6,7 @@ from typing import Any
 
 from phd_exp.records.choices import PLAIN_RECIPE, preset_and_recipe
 from phd_exp.records.errors import one_line
-from phd_exp.reports.cells import interval
+from phd_exp.reports.cells import bounds, interval
 from phd_exp.reports.runs import Report, Run
 
 
@@ -25,13 +25,12 @@ def run_lines(report: Report) -> list[dict[str, Any]]:
 
 def _numbers(run: Run) -> Iterator[dict[str, Any]]:
     for key, mean in run.errors.items():
-        low, high = interval([mean]).ends
         name = {"estimate": key.estimate, "reading": key.reading, "quantity": f"{key.quantity}_error_mm"}
-        yield name | {"mean": mean.value, "low": low, "high": high, "n_test": mean.n}
+        yield name | {"mean": mean.value, **bounds(interval([mean])), "n_test": mean.n}
     if run.nll is not None:
         n = max(mean.n for mean in run.errors.values())
         name = {"estimate": "", "reading": "whole", "quantity": "nll"}
-        yield name | {"mean": run.nll, "low": None, "high": None, "n_test": n}
+        yield name | {"mean": run.nll, **bounds(None), "n_test": n}
 
 
 def command_of(run: Run) -> str:

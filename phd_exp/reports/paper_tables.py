@@ -2,11 +2,12 @@
 
 import shlex
 from collections.abc import Iterable, Mapping, Sequence, Set
+from functools import partial
 
 from phd_exp.evaluation.point_errors import COLUMNS, READINGS, ErrorKey, Quantity, Reading
 from phd_exp.records.choices import PLAIN_RECIPE, in_words, preset_and_recipe
 from phd_exp.records.errors import one_line
-from phd_exp.reports.cells import Cell, make_cell
+from phd_exp.reports.cells import Cell, make_cell, plus_minus
 from phd_exp.reports.paper import ASSUMED, BELOW_BOUND, LAYOUTS, OF_A_BOUND, Column, Layout, Line, TableName
 from phd_exp.reports.runs import PROBABILISTIC, Report, Run
 from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem
@@ -124,30 +125,27 @@ def _row(line: Line, cells: Sequence[Cell], best: set[int]) -> TableRow:
 
 
 def _table_cell(cell: Cell, bold: bool) -> TableCell:
-    paper = "" if cell.published is None else _number(cell.published, cell.key.quantity)
+    paper = "" if cell.published is None else _number(cell.key.quantity, cell.published)
     if cell.mean is None:
         return TableCell(cell.state, below=paper)
     if cell.ratio is not None:
         paper += f" (×{cell.ratio:.2f})"
-    return TableCell(_number(cell.mean, cell.key.quantity), _spread(cell), paper, bold)
+    return TableCell(_number(cell.key.quantity, cell.mean), _spread(cell), paper, bold)
 
 
 def _spread(cell: Cell) -> str:
     marks = BELOW_BOUND if _is_below(cell) else ""
     marks += FEWER_SEEDS if cell.gaps else ""
-    half_width = cell.interval.half_width if cell.interval else None
-    if half_width is None:
-        return marks
-    if len(cell.means) == 1:
+    if cell.scatter == "samples":
         marks = ONE_SEED + marks
-    return f"±{_number(half_width, cell.key.quantity)}{marks}"
+    return plus_minus(cell.interval, partial(_number, cell.key.quantity)) + marks
 
 
 def _is_below(cell: Cell) -> bool:
     return cell.mean is not None and cell.bound is not None and cell.mean < cell.bound
 
 
-def _number(value: float, quantity: Quantity) -> str:
+def _number(quantity: Quantity, value: float) -> str:
     return f"{value:.{DIGITS[quantity]}f}"
 
 
@@ -161,7 +159,7 @@ def _bound_row(label: str, bounds: Mapping[str, float], columns: Sequence[Column
 
 def _notes(layout: Layout, reading: Reading, cells: Sequence[Cell]) -> list[str]:
     """The notes that explain the contents of a table."""
-    kinds = {cell.interval.kind for cell in cells if cell.interval}
+    kinds = {cell.scatter for cell in cells if cell.means}
     notes = [OF_THE_READING[reading], OF_A_CELL]
     notes += [text for kind, text in OF_AN_INTERVAL.items() if kind in kinds]
     if any(cell.means and cell.gaps for cell in cells):

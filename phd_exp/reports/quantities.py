@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from phd_exp.evaluation.reference import Band
+from phd_exp.metrics.bootstrap import Interval
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,11 @@ class Quantity:
         return f"{value:.{self.digits}f}".replace("-", "−")
 
 
-def mark(value: float, calibrated: Band | None) -> str:
+def mark(value: float, calibrated: Interval[float] | None) -> str:
     """An arrow for a value above or below the interval of a calibrated model; empty inside it, or without one.
 
     Examples:
-        >>> [mark(value, Band(0.02, 0.01, 0.04)) for value in (0.005, 0.03, 0.2)]
+        >>> [mark(value, Interval(0.02, 0.01, 0.04)) for value in (0.005, 0.03, 0.2)]
         ['↓', '', '↑']
     """
     if calibrated is None or calibrated.low <= value <= calibrated.high:

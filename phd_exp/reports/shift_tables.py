@@ -79,11 +79,11 @@ def _cell(run: Run, name: str, key: str) -> TableCell:
     band = run.measured.shifts[name].scores.get(key) if name in run.measured.shifts else None
     if band is None:
         return TableCell(NOTHING)
-    value, low, high = map(SCORES[key].text, (band.value, band.low, band.high))
+    text = band.each(SCORES[key].text)
     if key != MAIN:
-        return TableCell(value, below=f"({low}–{high})")
+        return TableCell(text.value, below=f"({text.low}–{text.high})")
     if band.low <= WANTED <= band.high:
-        return TableCell(value)
+        return TableCell(text.value)
     if band.value < LEAST:
-        return TableCell(value, "↓↓", tone="broken")
-    return TableCell(value, "↓" if band.value < WANTED else "↑", tone="off")
+        return TableCell(text.value, "↓↓", tone="broken")
+    return TableCell(text.value, "↓" if band.value < WANTED else "↑", tone="off")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from phd_exp.evaluation.fusion import BINS, ERRORS, LEVELS, FusionScores, Method
 from phd_exp.evaluation.predictions import Curve, Evaluation, Stratum
-from phd_exp.evaluation.reference import Band
+from phd_exp.metrics.bootstrap import Interval
 from phd_exp.reports.figures import decades
 from phd_exp.reports.fusion_table import ON_GROUND, names_of
 from phd_exp.reports.quantities import METRICS, SCORES, Quantity
@@ -205,7 +205,7 @@ def _errors(scores: FusionScores, quantity: str, title: str, unit: str) -> Chart
     return Chart(title, f"{text}: {courses}.", traces, {"xaxis": axis("cameras", dtick=1), "yaxis": y})
 
 
-def _curve(x: Iterable[float], bands: list[Band], unit: float = 1.0) -> Curve:
+def _curve(x: Iterable[float], bands: list[Interval[float]], unit: float = 1.0) -> Curve:
     ends = ([getattr(band, end) / unit for band in bands] for end in ("value", "low", "high"))
     return Curve([float(value) for value in x], *ends)
 
