@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,6 +25,9 @@ from phd_exp.reports.gallery import Gallery, images_folder, make_gallery
 from phd_exp.reports.table import file_stem
 
 Found = TypeVar("Found")
+
+VERSIONS = {"before": 1, "after": 1, "fusion": 1, "pairs": 1, "gallery": 1, "shifts": 1}
+"""Measurement -> its version. Raise it when the measurement gives other numbers: all runs are measured again."""
 
 
 class Notes(list[str]):
@@ -49,7 +51,7 @@ class Notes(list[str]):
 
 @dataclass(frozen=True)
 class Measured:
-    """The measurements of a run: plain data, stored until the run or this code changes.
+    """The measurements of a run: plain data, stored until the run or one of the `VERSIONS` changes.
 
     Attributes:
         before: evaluation of the recorded predictions.
@@ -125,10 +127,10 @@ def kept_or_measured(
 
 
 def _key(folder: RunFolder, config: Mapping[str, str]) -> str:
-    """A digest of all inputs of a measurement: the run's tables, its images, this code."""
+    """A digest of all inputs of a measurement: the run's tables, its images, the versions."""
     files = [folder.predictions, folder.held_out, folder.views, folder.config_file, images_folder(config)]
     files += sorted(folder.shifts.glob("*.parquet"))
-    return hashlib.sha256(json.dumps([_code(), *map(_stamp, files)]).encode()).hexdigest()
+    return hashlib.sha256(json.dumps([VERSIONS, *map(_stamp, files)]).encode()).hexdigest()
 
 
 def _stamp(path: Path | None) -> tuple[str, int, int]:
@@ -137,9 +139,3 @@ def _stamp(path: Path | None) -> tuple[str, int, int]:
     except (OSError, ValueError):
         stat = None
     return (str(path), stat.st_mtime_ns, stat.st_size) if stat else (str(path), 0, 0)
-
-
-@cache
-def _code() -> str:
-    files = sorted(Path(__file__).parents[1].rglob("*.py"))
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()

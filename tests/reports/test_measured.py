@@ -1,0 +1,62 @@
+"""Stored measurements hold until a version is raised, so a version is raised when a number changes."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from phd_exp.reports.measured import VERSIONS, Measured, kept_or_measured
+from phd_exp.reports.runs import read_report
+from tests.support.several import write_views
+from tests.support.synthetic import write_run
+
+STORED = {
+    "before": (1, {"nll": -6.64295, "nees": 12.4995, "depth_ence": 0.866212}),
+    "after": (1, {"nll": -7.58365, "nees": 3.17568}),
+    "fusion": (1, {"depth_error_mm/mode/2/free": 14.1506, "coverage_90/gaussian/4/ground": 71.95}),
+    "pairs": (1, {"fused_error_mm": 23.2213}),
+    "gallery": (1, {"best": 42.5, "worst": 42.19}),
+    "shifts": (1, {"inside_90": 93.75, "unfamiliar": 100.0}),
+}
+"""Measurement -> its version, and numbers of it. If one changes, raise the version and store the number."""
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> Measured:
+    folder = tmp_path_factory.mktemp("measured")
+    run = write_run(folder, n=120, epochs=1, overconfidence=2.0)
+    write_run(folder / "elsewhere", seed=1, n=400, overconfidence=2.0).predictions.rename(run.held_out)
+    write_views(run.views, 50)
+    run.shifts.mkdir()
+    write_run(folder / "shifted", "occl", n=80).predictions.rename(run.shift("occl"))
+    return read_report(folder).runs[0].measured
+
+
+def numbers(found: Measured) -> Iterator[tuple[str, dict[str, float]]]:
+    for name in ("before", "after", "pairs"):
+        yield name, {key: band.value for key, band in getattr(found, name).scores.items()}
+    assert found.fusion is not None
+    assert found.gallery is not None
+    yield "fusion", {key: band.low for key, band in found.fusion.bands.items()}
+    yield "shifts", {key: band.high for key, band in found.shifts["occl"].scores.items()}
+    yield "gallery", {"best": found.gallery.best[0].mode[0], "worst": found.gallery.worst[0].truth[1]}
+
+
+@pytest.mark.parametrize("name", VERSIONS)
+def test_a_number_that_changes_has_a_new_version(found: Measured, name: str) -> None:
+    version, stored = STORED[name]
+    now = dict(numbers(found))[name]
+    assert (VERSIONS[name], {key: now[key] for key in stored}) == (version, pytest.approx(stored, rel=1e-3))
+
+
+def test_a_new_version_measures_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, times = write_run(tmp_path / "runs", "occl", "mae_vz", n=4, epochs=1), []
+
+    def measuring() -> Measured:
+        times.append(len(times))
+        return Measured()
+
+    for version in (1, 1, 2):
+        monkeypatch.setitem(VERSIONS, "gallery", version)
+        kept_or_measured(run, {}, measuring, tmp_path)
+    assert len(times) == 2
