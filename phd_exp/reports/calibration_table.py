@@ -1,10 +1,12 @@
 """Scores of calibration, each with the interval of a calibrated model that predicts the same uncertainties."""
 
-from phd_exp.evaluation.predictions import Evaluation
+from dataclasses import replace
+
+from phd_exp.metrics.bootstrap import Interval
 from phd_exp.records.choices import in_words
 from phd_exp.reports.quantities import SCORES, mark
 from phd_exp.reports.runs import Report, Run
-from phd_exp.reports.table import Table, TableCell, TableRow, file_stem
+from phd_exp.reports.table import Table, TableCell, TableRow, bounds, file_stem
 
 COLUMNS = ("depth_ence", "projected_ence", "miscalibration_area", "depth_pit_area", "group_miscalibration", "nees")
 OF_A_CELL = (
@@ -17,10 +19,8 @@ OF_A_CELL = (
 
 def calibration_tables(report: Report) -> list[Table]:
     """A table for every preset with an evaluated distribution."""
-    found = {
-        preset: [(run, kinds) for run in report.runs if run.preset == preset and (kinds := _evaluations(run))]
-        for preset in report.presets
-    }
+    found = [(run, _rows(run)) for run in report.runs]
+    of_presets = {preset: [rows for run, rows in found if run.preset == preset and rows] for preset in report.presets}
     return [
         Table(
             stem=file_stem("calibration", preset),
@@ -28,34 +28,36 @@ def calibration_tables(report: Report) -> list[Table]:
             title=f"Calibration, {in_words(preset)}: distances on the test samples",
             stub=("run",),
             columns=tuple(SCORES[name].label for name in COLUMNS),
-            groups=tuple(tuple(_row(run, *kind) for kind in kinds.items()) for run, kinds in runs),
+            groups=tuple(
+                tuple(TableRow((label,), tuple(cells[name] for name in COLUMNS)) for label, cells in rows.items())
+                for rows in groups
+            ),
             notes=(OF_A_CELL,),
             below="calibrated",
             preset=preset,
-            numbers=tuple(
-                {"preset": preset, "data": run.data, "model": run.model, "run": run.name, "predictions": kind}
-                | {"quantity": name, "value": evaluation.scores[name].value}
-                | dict(zip(("calibrated", "low", "high"), vars(reference).values(), strict=True))
-                for run, kinds in runs
-                for kind, evaluation in kinds.items()
-                for name, reference in evaluation.reference.items()
-            ),
+            cells=tuple(cell for rows in groups for cells in rows.values() for cell in cells.values()),
         )
-        for preset, runs in found.items()
-        if runs
+        for preset, groups in of_presets.items()
+        if groups
     ]
 
 
-def _evaluations(run: Run) -> dict[str, Evaluation]:
-    found = {"as trained": run.measured.before, "recalibrated": run.measured.after}
-    return {kind: evaluation for kind, evaluation in found.items() if evaluation and evaluation.reference}
+def _rows(run: Run) -> dict[str, dict[str, TableCell]]:
+    """Label -> cell of each score, of the predictions as trained and recalibrated."""
+    label, found = f"{run.title}, {run.name}", {"as trained": run.measured.before, "recalibrated": run.measured.after}
+    return {
+        label if kind == "as trained" else f"{label}, {kind}": {
+            name: _cell(run, kind, name, evaluation.scores[name].value, reference)
+            for name, reference in evaluation.reference.items()
+        }
+        for kind, evaluation in found.items()
+        if evaluation and evaluation.reference
+    }
 
 
-def _row(run: Run, kind: str, evaluation: Evaluation) -> TableRow:
-    label = f"{run.title}, {run.name}{', recalibrated' if kind == 'recalibrated' else ''}"
-    cells = []
-    for name in COLUMNS:
-        text, value, reference = SCORES[name].text, evaluation.scores[name].value, evaluation.reference[name]
-        below, arrow = f"({text(reference.low)}–{text(reference.high)})", mark(value, reference)
-        cells.append(TableCell(text(value), arrow, below, tone="off" if arrow else ""))
-    return TableRow((label,), tuple(cells))
+def _cell(run: Run, kind: str, name: str, value: float, calibrated: Interval[float]) -> TableCell:
+    text, arrow = calibrated.each(SCORES[name].text), mark(value, calibrated)
+    line = run.choice | {"run": run.name, "predictions": kind, "quantity": name, "value": value}
+    line |= {"calibrated": calibrated.value, **bounds(calibrated)}
+    cell = TableCell(SCORES[name].text(value), arrow, f"({text.low}–{text.high})", numbers=(line,))
+    return replace(cell, tone="off") if arrow else cell

@@ -1,6 +1,6 @@
 """One number of a table: the errors of a model's runs, averaged over seeds, with an interval."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -12,6 +12,7 @@ from phd_exp.metrics.bootstrap import Interval
 from phd_exp.records.errors import one_line
 from phd_exp.reports.paper import bound_mm, published_mm
 from phd_exp.reports.runs import Report, Run
+from phd_exp.reports.table import bounds
 
 
 @dataclass(frozen=True)
@@ -125,16 +126,6 @@ def interval(means: Sequence[SampleMean]) -> Interval[float] | None:
         half_width = np.hypot(stats.t.ppf(0.975, k - 1) * values.std(ddof=1) / np.sqrt(k), half_width)
     mean, half_width = float(values.mean()), float(half_width)
     return Interval(mean, mean - half_width, mean + half_width)
-
-
-def bounds(interval: Interval[float] | None) -> dict[str, float | None]:
-    """The columns `low` and `high` of CSV."""
-    return {"low": interval.low, "high": interval.high} if interval else {"low": None, "high": None}
-
-
-def plus_minus(interval: Interval[float] | None, text: Callable[[float], str]) -> str:
-    """Half the width of a symmetric interval, such as `±3`; empty without one."""
-    return f"±{text((interval.high - interval.low) / 2)}" if interval else ""
 
 
 def _reason(run: Run | None, key: ErrorKey) -> str:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from itertools import groupby, starmap
+from itertools import groupby
 
 import torch
 from torch import Tensor
@@ -26,11 +26,11 @@ OF_A_LINE = (
 
 def ensemble_tables(report: Report) -> list[Table]:
     """A table for every preset with two seeds of one configuration, or with a record of eight views."""
-    configurations = groupby(sorted(report.runs, key=_configuration), key=_configuration)
+    configurations = [list(runs) for _, runs in groupby(sorted(report.runs, key=_configuration), key=_configuration)]
     attempt = report.notes.attempt
     scored = [
-        (named, attempt(partial(_scores, list(runs)), f"ensembles of {'/'.join(named)}: "))
-        for named, runs in configurations
+        (runs[0], attempt(partial(_scores, runs), f"ensembles of {'/'.join(_configuration(runs[0]))}: "))
+        for runs in configurations
     ]
     return [
         Table(
@@ -41,24 +41,16 @@ def ensemble_tables(report: Report) -> list[Table]:
             columns=tuple(label for label, _ in SCORES.values()),
             groups=tuple(
                 tuple(
-                    TableRow((f"{model} on {data} {hashed}".rstrip(), kind), tuple(starmap(_cell, scores.items())))
+                    TableRow((f"{run.model} on {run.data} {run.digest}".rstrip(), kind), _cells(run, kind, scores))
                     for kind, scores in kinds.items()
                 )
-                for (_, data, model, hashed), kinds in found
+                for run, kinds in found
             ),
             notes=(OF_A_LINE,),
             preset=preset,
-            numbers=tuple(
-                {"preset": preset, "data": data, "model": model, "overrides": hashed, "prediction": kind}
-                | {"quantity": name}
-                | vars(band)
-                for (_, data, model, hashed), kinds in found
-                for kind, scores in kinds.items()
-                for name, band in scores.items()
-            ),
         )
         for preset in report.presets
-        if (found := [(named, kinds) for named, kinds in scored if kinds and named[0] == preset])
+        if (found := [(run, kinds) for run, kinds in scored if kinds and run.preset == preset])
     ]
 
 
@@ -86,6 +78,9 @@ def _columns(table: Columns) -> dict[str, Tensor]:
     return {"nll": nll, "inside_90": inside(level, 0.9), "level": level}
 
 
-def _cell(name: str, band: Interval[float]) -> TableCell:
-    text = band.each(SCORES[name][1].format)
-    return TableCell(text.value, f"({text.low} to {text.high})")
+def _cells(run: Run, kind: str, scores: Mapping[str, Interval[float]]) -> tuple[TableCell, ...]:
+    cells, key = [], run.choice | {"overrides": run.digest, "prediction": kind}
+    for name, band in scores.items():
+        text, line = band.each(SCORES[name][1].format), key | {"quantity": name} | vars(band)
+        cells.append(TableCell(text.value, f"({text.low} to {text.high})", numbers=(line,)))
+    return tuple(cells)

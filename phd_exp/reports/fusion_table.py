@@ -5,10 +5,9 @@ from collections.abc import Mapping
 from functools import partial
 
 from phd_exp.evaluation.fusion import CALIBRATION, ERRORS, LEVELS, PROBABILISTIC, FusionScores, Method, place
-from phd_exp.metrics.bootstrap import Interval
 from phd_exp.records.choices import in_words
 from phd_exp.reports.runs import Report, Run
-from phd_exp.reports.table import Table, TableCell, TableRow, file_stem
+from phd_exp.reports.table import Table, TableCell, TableRow, bounds, file_stem
 
 NAMES: dict[Method, str] = {
     "mode": "Huber, mode",
@@ -52,8 +51,11 @@ def fusion_table(run: Run, scores: FusionScores) -> Table:
     """The table of a run's scores."""
     apart = "" if (run.data, run.model) == ("scale", "probabilistic") else f"{run.title}, "
     places = (False, True)
-    groups = [_rows(scores, quantity, on_plane) for on_plane in places for quantity in ERRORS]
-    groups += [[row for name in CALIBRATION for row in _rows(scores, name, on_plane)] for on_plane in places]
+    cells = {at: _cell(run, scores, at) for at in scores.bands}
+    groups = [_rows(cells, scores.views, quantity, on_plane) for on_plane in places for quantity in ERRORS]
+    groups += [
+        [row for name in CALIBRATION for row in _rows(cells, scores.views, name, on_plane)] for on_plane in places
+    ]
     return Table(
         stem=file_stem("fusion", run.preset, run.data, run.model, run.name),
         kind="fusion",
@@ -64,24 +66,16 @@ def fusion_table(run: Run, scores: FusionScores) -> Table:
         below="exact densities",
         notes=(OF_A_LINE, OF_METHODS, OF_THE_GROUND, *_notes(scores)),
         preset=run.preset,
-        numbers=tuple(
-            {"preset": run.preset, "data": run.data, "model": run.model, "run": run.name}
-            | dict(zip(("quantity", "method", "cameras", "ground"), at.split("/"), strict=True))
-            | {"mean": band.value, "low": band.low, "high": band.high}
-            | {"exact": scores.exact.get(at), "n_scenes": scores.n}
-            for at, band in scores.bands.items()
-        ),
+        cells=tuple(cells.values()),
     )
 
 
-def _rows(scores: FusionScores, quantity: str, on_plane: bool) -> list[TableRow]:
-    label = QUANTITIES[quantity] + (ON_GROUND if on_plane else "")
-    rows = []
-    for method, name in names_of(quantity).items():
-        places = [place(quantity, method, k, on_plane) for k in range(1, scores.views + 1)]
-        cells = tuple(_cell(quantity, scores.bands[at], scores.exact.get(at)) for at in places)
-        rows.append(TableRow((label, name), cells))
-    return rows
+def _rows(cells: Mapping[str, TableCell], views: int, quantity: str, on_plane: bool) -> list[TableRow]:
+    label, cameras = QUANTITIES[quantity] + (ON_GROUND if on_plane else ""), range(1, views + 1)
+    return [
+        TableRow((label, name), tuple(cells[place(quantity, method, k, on_plane)] for k in cameras))
+        for method, name in names_of(quantity).items()
+    ]
 
 
 def names_of(quantity: str) -> Mapping[Method, str]:
@@ -91,9 +85,13 @@ def names_of(quantity: str) -> Mapping[Method, str]:
     return {method: NAMES[method].removesuffix(", mean") for method in PROBABILISTIC}
 
 
-def _cell(quantity: str, band: Interval[float], exact: float | None) -> TableCell:
-    text = band.each(partial(_number, quantity))
-    return TableCell(text.value, f"({text.low}–{text.high})", below="" if exact is None else f"{exact:.1f}")
+def _cell(run: Run, scores: FusionScores, at: str) -> TableCell:
+    band, exact = scores.bands[at], scores.exact.get(at)
+    place = dict(zip(("quantity", "method", "cameras", "ground"), at.split("/"), strict=True))
+    line = run.choice | {"run": run.name, **place, "mean": band.value, **bounds(band)}
+    line |= {"exact": exact, "n_scenes": scores.n}
+    text, below = band.each(partial(_number, place["quantity"])), "" if exact is None else f"{exact:.1f}"
+    return TableCell(text.value, f"({text.low}–{text.high})", below, numbers=(line,))
 
 
 def _number(quantity: str, value: float) -> str:

@@ -1,6 +1,7 @@
 """Densities of different shapes on the same images, compared with the Projected Huber density by paired tests."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from statistics import fmean
 
 import numpy as np
@@ -8,10 +9,10 @@ import numpy as np
 from phd_exp.distributions.constraints import findings
 from phd_exp.evaluation.point_errors import SampleMean, difference
 from phd_exp.records.choices import in_words
-from phd_exp.reports.cells import interval, plus_minus
+from phd_exp.reports.cells import interval
 from phd_exp.reports.quantities import SCORES
 from phd_exp.reports.runs import PROBABILISTIC, Report, Run
-from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem
+from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem, plus_minus
 
 COLUMNS = ("nll", "depth_crps_mm", "inside_90", "projected_error_mm", "depth_error_mm")
 FUSED = "fused_error_mm"
@@ -59,13 +60,6 @@ def _table(preset: str, data: str, digest: str, models: dict[str, list[Run]]) ->
         notes=(OF_A_CELL,),
         below="difference",
         preset=preset,
-        numbers=tuple(
-            {"preset": preset, "data": data, "model": model, "overrides": digest, "seed": run.seed}
-            | {"quantity": name, "value": mean.value}
-            for model, runs in models.items()
-            for name in columns
-            for run, mean in zip(runs, _means(runs, name), strict=False)
-        ),
     )
 
 
@@ -73,10 +67,14 @@ def _cell(name: str, runs: Sequence[Run], reference: Sequence[Run]) -> TableCell
     means, others, text = _means(runs, name), _means(reference, name), SCORES[name].text
     if not means:
         return TableCell(NOTHING)
-    mean, spread = text(fmean(mean.value for mean in means)), plus_minus(interval(means), text)
+    numbers = tuple(
+        run.choice | {"overrides": run.digest, "seed": run.seed, "quantity": name, "value": mean.value}
+        for run, mean in zip(runs, means, strict=True)
+    )
+    alone = TableCell(text(fmean(mean.value for mean in means)), plus_minus(interval(means), text), numbers=numbers)
     same = {(run.measured.images, mean.n) for run, mean in zip((*runs, *reference), (*means, *others), strict=False)}
     if runs is reference or len(same) > 1 or not others:
-        return TableCell(mean, spread)
+        return alone
     gap, width = difference(means, others)
     below = f"{'+' if gap > 0 else ''}{text(gap)} ±{text(width)}"
-    return TableCell(mean, spread, below, gap < -width and name != "inside_90")
+    return replace(alone, below=below, bold=gap < -width and name != "inside_90")

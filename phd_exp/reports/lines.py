@@ -6,15 +6,16 @@ from typing import Any
 
 from phd_exp.records.choices import PLAIN_RECIPE, preset_and_recipe
 from phd_exp.records.errors import one_line
-from phd_exp.reports.cells import bounds, interval
+from phd_exp.reports.cells import interval
 from phd_exp.reports.runs import Report, Run
+from phd_exp.reports.table import bounds
 
 
 def run_lines(report: Report) -> list[dict[str, Any]]:
     """A line for every error of every finished run, and one for its NLL, whose interval is not computed."""
     return [
-        {"preset": run.preset, "data": run.data, "model": run.model, "seed": run.seed}
-        | {"overrides": run.digest}
+        run.choice
+        | {"seed": run.seed, "overrides": run.digest}
         | number
         | {"command": command_of(run), "git_commit": run.status.git_commit, "machine": run.status.machine}
         for run in report.runs

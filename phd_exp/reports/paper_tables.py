@@ -7,10 +7,10 @@ from functools import partial
 from phd_exp.evaluation.point_errors import COLUMNS, READINGS, ErrorKey, Quantity, Reading
 from phd_exp.records.choices import PLAIN_RECIPE, in_words, preset_and_recipe
 from phd_exp.records.errors import one_line
-from phd_exp.reports.cells import Cell, make_cell, plus_minus
+from phd_exp.reports.cells import Cell, make_cell
 from phd_exp.reports.paper import ASSUMED, BELOW_BOUND, LAYOUTS, OF_A_BOUND, Column, Layout, Line, TableName
 from phd_exp.reports.runs import PROBABILISTIC, Report, Run
-from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem
+from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem, plus_minus
 
 DIGITS: dict[Quantity, int] = {"projected": 1, "depth": 0}  # decimals of a millimetre, as in the paper
 ONE_SEED = "†"
@@ -81,7 +81,7 @@ def _table(
     can_be_made = left_out or any(not reason.startswith("no sample") for reason, *_ in gaps)
     by_line = layout.columns[0].quantity is None
     bounds = [row for bound in layout.bounds.items() if (row := _bound_row(*bound, columns, by_line))]
-    rows = [tuple(_row(line, row, best) for line, row in group) for group in measured]
+    rows = [tuple(_row(line, row, layout.name, best) for line, row in group) for group in measured]
     return Table(
         stem=file_stem(layout.name, preset, reading),
         kind="tables",
@@ -93,7 +93,6 @@ def _table(
         below="paper (ratio)",
         gaps=tuple(gap_lines(gaps)),
         command=making_command(report, preset, layout.name, seeds) if can_be_made else "",
-        numbers=tuple(one.numbers(layout.name, id(one) in best) for one in cells),
         preset=preset,
         reading=reading,
     )
@@ -118,19 +117,20 @@ def _best(cells: Sequence[Cell]) -> set[int]:
     return best
 
 
-def _row(line: Line, cells: Sequence[Cell], best: set[int]) -> TableRow:
+def _row(line: Line, cells: Sequence[Cell], table: TableName, best: set[int]) -> TableRow:
     label = f"{line.model} ({line.estimate})" if line.model == PROBABILISTIC else line.model
     stub = (label, line.quantity) if line.quantity else (label,)
-    return TableRow(stub, tuple(_table_cell(cell, id(cell) in best) for cell in cells))
+    return TableRow(stub, tuple(_table_cell(cell, table, id(cell) in best) for cell in cells))
 
 
-def _table_cell(cell: Cell, bold: bool) -> TableCell:
+def _table_cell(cell: Cell, table: TableName, bold: bool) -> TableCell:
     paper = "" if cell.published is None else _number(cell.key.quantity, cell.published)
     if cell.mean is None:
-        return TableCell(cell.state, below=paper)
+        return TableCell(cell.state, below=paper, numbers=(cell.numbers(table, bold),))
     if cell.ratio is not None:
         paper += f" (×{cell.ratio:.2f})"
-    return TableCell(_number(cell.key.quantity, cell.mean), _spread(cell), paper, bold)
+    number, numbers = _number(cell.key.quantity, cell.mean), (cell.numbers(table, bold),)
+    return TableCell(number, _spread(cell), paper, bold, numbers=numbers)
 
 
 def _spread(cell: Cell) -> str:

@@ -70,6 +70,11 @@ class Run:
         return f"{self.preset}/{self.data}/{self.model}/{self.name}"
 
     @property
+    def choice(self) -> dict[str, Any]:
+        """Preset, data set and model, as columns of CSV."""
+        return {"preset": self.preset, "data": self.data, "model": self.model}
+
+    @property
     def digest(self) -> str:
         """The hash of the overrides in its name, equal for all seeds and models with the same ones; else empty."""
         return self.name.partition("-")[2]

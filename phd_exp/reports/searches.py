@@ -19,7 +19,8 @@ def search_tables(report: Report) -> list[Table]:
 
 
 def _table(search: Search) -> Table:
-    best = sorted(search.finished, key=lambda found: found[0])[:MOST]
+    cells = {id(trial): _cell(search, trial) for trial in search.trials}
+    best = [trial for _, trial in sorted(search.finished, key=lambda found: found[0])[:MOST]]
     counts = ", ".join(
         f"{n} {state}"
         for state in ("finished", "pruned", "failed", "running")
@@ -31,23 +32,21 @@ def _table(search: Search) -> Table:
         title=one_line(f"Search {search.name}: {counts}"),
         stub=("trial", "overrides"),
         columns=(one_line(search.objective),),
-        groups=(tuple(_row(value, trial) for value, trial in best),),
+        groups=(tuple(TableRow((str(one.number + 1), one_line(_words(one))), (cells[id(one)],)) for one in best),),
         notes=(OF_A_SEARCH,),
-        numbers=tuple(
-            {"search": search.name, "trial": trial.number + 1, "state": trial.state, "value": trial.value}
-            | {"overrides": " ".join(_words(trial)), "run": printable(trial.run)}
-            for trial in search.trials
-        ),
+        cells=tuple(cells.values()),
     )
 
 
-def _row(value: float, trial: Trial) -> TableRow:
-    return TableRow((str(trial.number + 1), one_line(" ".join(_words(trial)))), (TableCell(f"{value:.4g}"),))
+def _cell(search: Search, trial: Trial) -> TableCell:
+    line = {"search": search.name, "trial": trial.number + 1, "state": trial.state, "value": trial.value}
+    line |= {"overrides": _words(trial), "run": printable(trial.run)}
+    return TableCell("" if trial.value is None else f"{trial.value:.4g}", numbers=(line,))
 
 
-def _words(trial: Trial) -> list[str]:
+def _words(trial: Trial) -> str:
     """The overrides of a trial, with numbers short enough to read."""
-    return [f"{key}={_short(value)}" for key, value in trial.overrides.items()]
+    return " ".join(f"{key}={_short(value)}" for key, value in trial.overrides.items())
 
 
 def _short(text: str) -> str:

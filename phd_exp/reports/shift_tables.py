@@ -1,6 +1,7 @@
 """Tests under distribution shift: for each score a matrix of runs by shifts, first the share inside 90 % regions."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import groupby
 
 from phd_exp.records.choices import in_words
@@ -38,10 +39,9 @@ def _matrix(runs: Sequence[Run], key: str, axis: str) -> Table:
     found = sorted((name, shift.change) for run in runs for name, shift in run.measured.shifts.items())
     changes = {name: change for name, change in found if change and _axis(change) == axis}
     preset, names = runs[0].preset, (HOME, *changes)
-    cameras = [run.config.get("camera.focal_length", "") for run in runs]
     rows = [
-        TableRow((f"{run.data}, {camera}", run.name), tuple(_cell(run, name, key) for name in names))
-        for run, camera in zip(runs, cameras, strict=True)
+        TableRow((f"{run.data}, {_camera(run)}", run.name), tuple(_cell(run, axis, name, key) for name in names))
+        for run in runs
     ]
     return Table(
         stem=file_stem("shifts", key, preset, axis),
@@ -57,16 +57,11 @@ def _matrix(runs: Sequence[Run], key: str, axis: str) -> Table:
         below="95 %",
         preset=preset,
         reading="" if key == MAIN else "details",
-        numbers=tuple(
-            {"preset": preset, "data": run.data, "model": run.model, "run": run.name, "camera": camera}
-            | {"axis": axis, "shift": name, "n": shifts[name].n, "left_out": shifts[name].left_out}
-            | {"quantity": key}
-            | vars(shifts[name].scores[key])
-            for run, camera in zip(runs, cameras, strict=True)
-            for name in names
-            if name in (shifts := run.measured.shifts) and key in shifts[name].scores
-        ),
     )
+
+
+def _camera(run: Run) -> str:
+    return run.config.get("camera.focal_length", "")
 
 
 def _axis(change: str) -> str:
@@ -75,15 +70,19 @@ def _axis(change: str) -> str:
     return "images"
 
 
-def _cell(run: Run, name: str, key: str) -> TableCell:
-    band = run.measured.shifts[name].scores.get(key) if name in run.measured.shifts else None
-    if band is None:
+def _cell(run: Run, axis: str, name: str, key: str) -> TableCell:
+    shift = run.measured.shifts.get(name)
+    band = shift.scores.get(key) if shift else None
+    if shift is None or band is None:
         return TableCell(NOTHING)
+    line = run.choice | {"run": run.name, "camera": _camera(run), "axis": axis, "shift": name}
+    line |= {"n": shift.n, "left_out": shift.left_out, "quantity": key, **vars(band)}
     text = band.each(SCORES[key].text)
+    cell = TableCell(text.value, numbers=(line,))
     if key != MAIN:
-        return TableCell(text.value, below=f"({text.low}–{text.high})")
+        return replace(cell, below=f"({text.low}–{text.high})")
     if band.low <= WANTED <= band.high:
-        return TableCell(text.value)
+        return cell
     if band.value < LEAST:
-        return TableCell(text.value, "↓↓", tone="broken")
-    return TableCell(text.value, "↓" if band.value < WANTED else "↑", tone="off")
+        return replace(cell, spread="↓↓", tone="broken")
+    return replace(cell, spread="↓" if band.value < WANTED else "↑", tone="off")

@@ -1,13 +1,14 @@
-"""A table as data, for the terminal, files and pages alike."""
+"""A table as typed cells, from which the terminal, all files and the pages are made."""
 
 import hashlib
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from phd_exp.metrics.bootstrap import Interval
 from phd_exp.records.errors import one_line
 from phd_exp.records.files import write_atomic
 
@@ -17,14 +18,15 @@ LONGEST_STEM = 120
 
 @dataclass(frozen=True)
 class TableCell:
-    """One cell of a table.
+    """One number of a table.
 
     Attributes:
-        ours: a number, or the reason why it is missing.
+        ours: the number as text, or the reason why it is missing.
         spread: its interval, with its marks.
         below: a second line, such as the paper's figure.
         bold: whether `ours` is significantly the best.
         tone: how bad the number is: "off" for a warning, "broken" for a failure.
+        numbers: its lines of CSV at full precision: one, one for each run that it averages, or none.
     """
 
     ours: str
@@ -32,6 +34,7 @@ class TableCell:
     below: str = ""
     bold: bool = False
     tone: Literal["", "off", "broken"] = ""
+    numbers: tuple[Mapping[str, Any], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,7 @@ class TableRow:
 
 @dataclass(frozen=True)
 class Table:
-    """A table with its notes, and its numbers for CSV.
+    """A table with its notes.
 
     Attributes:
         stem: of its file names.
@@ -54,7 +57,7 @@ class Table:
         below: the meaning of the cells' second lines.
         notes: explanations, a sentence or two each.
         gaps: missing runs, a line each; `command` makes them.
-        numbers: a mapping per number, at full precision.
+        cells: all cells in the order of CSV, if some are in no row or the rows have another order.
     """
 
     stem: str
@@ -67,14 +70,30 @@ class Table:
     below: str = ""
     gaps: tuple[str, ...] = ()
     command: str = ""
-    numbers: tuple[Mapping[str, Any], ...] = ()
     preset: str = ""
     reading: str = ""
+    cells: tuple[TableCell, ...] = ()
+
+    @property
+    def numbers(self) -> list[Mapping[str, Any]]:
+        """The lines of CSV of all cells."""
+        cells = self.cells or [cell for row in self.rows for cell in row.cells]
+        return [line for cell in cells for line in cell.numbers]
 
     @property
     def rows(self) -> tuple[TableRow, ...]:
         """The lines of all groups."""
         return tuple(row for group in self.groups for row in group)
+
+
+def bounds(interval: Interval[float] | None) -> dict[str, float | None]:
+    """The columns `low` and `high` of CSV."""
+    return {"low": interval.low, "high": interval.high} if interval else {"low": None, "high": None}
+
+
+def plus_minus(interval: Interval[float] | None, text: Callable[[float], str]) -> str:
+    """Half the width of a symmetric interval, such as `±3`; empty without one."""
+    return f"±{text((interval.high - interval.low) / 2)}" if interval else ""
 
 
 def printable(name: str) -> str:

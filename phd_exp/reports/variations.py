@@ -5,6 +5,7 @@ are independent of the test samples, which all other tables use.
 """
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from statistics import fmean
 
 from phd_exp.evaluation.point_errors import ErrorKey
@@ -58,18 +59,11 @@ def _table(choice: tuple[str, str, str], found: Mapping[str | None, Variation]) 
         stub=("overrides", "seeds"),
         columns=("NLL (nats)", "projected (mm)", "depth (mm)", "difference"),
         groups=(
-            (_row("none", plain, TableCell("")),),
+            (_row("", plain, TableCell("")),),
             tuple(_row(name, others[name], _difference(others[name], plain)) for name in best_first),
         ),
         notes=(OF_A_LINE,),
         preset=preset,
-        numbers=tuple(
-            {"preset": preset, "data": data, "model": model, "overrides": name or "", "seed": seed}
-            | {"quantity": quantity, "value": value}
-            for name in (None, *best_first)
-            for quantity in QUANTITIES
-            for seed, value in values(found[name], quantity).items()
-        ),
     )
 
 
@@ -77,9 +71,18 @@ def _order(variation: Variation) -> float:
     return fmean((values(variation, "nll") or values(variation, "depth")).values())
 
 
-def _row(label: str, variation: Variation, difference: TableCell) -> TableRow:
-    cells = [_cell(values(variation, name).values(), digits) for name, digits in QUANTITIES.items()]
-    return TableRow((one_line(label), ", ".join(map(str, sorted(variation)))), (*cells, difference))
+def _row(overrides: str, variation: Variation, difference: TableCell) -> TableRow:
+    cells = (_mean(overrides, variation, quantity) for quantity in QUANTITIES)
+    return TableRow((one_line(overrides or "none"), ", ".join(map(str, sorted(variation)))), (*cells, difference))
+
+
+def _mean(overrides: str, variation: Variation, quantity: str) -> TableCell:
+    found = values(variation, quantity)
+    numbers = tuple(
+        variation[seed].choice | {"overrides": overrides, "seed": seed, "quantity": quantity, "value": value}
+        for seed, value in found.items()
+    )
+    return replace(_cell(found.values(), QUANTITIES[quantity]), numbers=numbers)
 
 
 def _difference(variation: Variation, plain: Variation) -> TableCell:
