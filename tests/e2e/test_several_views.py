@@ -1,6 +1,7 @@
 """A run on single views is tried on several views of each scene, once, and is not trained again for that."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,14 +14,11 @@ import torch
 from phd_exp.fusion import Pose
 from phd_exp.records import scenes
 from phd_exp.records.runs import RunFolder, find_runs
-from tests.e2e.conftest import QUICK
-
-QUICKER = ("data=scale", "trainer.max_epochs=1", "logger=none", "trainer.precision=bfloat16")
-VIEWS = "evaluation.multiview.views=2"
+from tests.e2e.conftest import QUICKER
 
 
 def asked(n: int) -> tuple[str, ...]:
-    return (*QUICK, *QUICKER, VIEWS, f"evaluation.multiview.scenes={n}")
+    return (*QUICKER, "evaluation.multiview.views=2", f"evaluation.multiview.scenes={n}")
 
 
 def stamps(run: RunFolder) -> dict[str, int]:
@@ -28,12 +26,12 @@ def stamps(run: RunFolder) -> dict[str, int]:
     return {file.name: file.stat().st_mtime_ns for file in files if file.exists()}
 
 
-def test_views_are_recorded_once_and_the_run_stays_as_it_was(phd_exp: Callable, tmp_path: Path) -> None:
-    assert phd_exp(*QUICK, *QUICKER).status == 0
+def test_views_are_recorded_once_and_the_run_stays_as_it_was(train: Callable, run: RunFolder, tmp_path: Path) -> None:
+    shutil.copytree(run.path.parents[3], tmp_path / "runs")
     (run,) = find_runs(tmp_path / "runs")
     trained = stamps(run)
     assert "views.parquet" not in trained
-    outcome = phd_exp(*asked(4))
+    outcome = train(*asked(4))
     assert outcome.status == 0, outcome.err
     assert "views.parquet: 4 scenes seen by 2 cameras each" in outcome.out
     assert len(find_runs(tmp_path / "runs")) == 1
@@ -55,34 +53,34 @@ def test_views_are_recorded_once_and_the_run_stays_as_it_was(phd_exp: Callable, 
     xyz = Pose.from_scene(poses).into_world(torch.tensor(table[["x", "y", "z"]].to_numpy())).reshape(4, 2, 3)
     np.testing.assert_allclose(xyz[:, 0], xyz[:, 1], atol=1e-5)
 
-    again = phd_exp(*asked(4))
+    again = train(*asked(4))
     assert again.status == 0
     assert "views.parquet" not in again.out
     assert stamps(run) == recorded
 
     # another number of scenes, another record; another data set, none
-    assert "2 scenes" in phd_exp(*asked(2)).out
+    assert "2 scenes" in train(*asked(2)).out
     assert pq.read_metadata(run.views).num_rows == 4
     before = run.views.read_bytes()
-    refused = phd_exp(*asked(2), "evaluation.multiview.views=3")
+    refused = train(*asked(2), "evaluation.multiview.views=3")
     assert refused.status == 1
     assert "holds a data set with views=2, but views=3 is asked for" in refused.err
     assert run.views.read_bytes() == before
-    untrained = phd_exp(*asked(2), "evaluation.multiview.views=3", "seed=1")
+    untrained = train(*asked(2), "evaluation.multiview.views=3", "seed=1")
     assert (untrained.status, untrained.err) == (1, refused.err)
     assert len(find_runs(tmp_path / "runs")) == 1, "found before the training"
 
 
 @pytest.mark.slow
-def test_a_run_that_lacks_its_views_counts_as_begun(phd_exp: Callable, tmp_path: Path) -> None:
+def test_a_run_that_lacks_its_views_counts_as_begun(train: Callable, tmp_path: Path) -> None:
     words = ("-m", "experiment=fusion", *asked(1))
-    first = phd_exp(*words)
+    first = train(*words)
     assert first.status == 0, first.err
-    assert "1 of them finished already" in phd_exp(*words).out
+    assert "1 of them finished already" in train(*words).out
     (run,) = find_runs(tmp_path / "runs")
     run.views.write_bytes(b"torn")
-    outcome = phd_exp(*words)
+    outcome = train(*words)
     assert "views.parquet: 1 scene seen by 2" in outcome.out
     run.views.unlink()
-    assert "1 job, 0 of them finished already" in phd_exp(*words).out
+    assert "1 job, 0 of them finished already" in train(*words).out
     assert json.loads(run.status_file.read_text())["state"] == "finished"

@@ -25,7 +25,7 @@ from tests.e2e.runs import only_run
 @pytest.mark.slow
 @pytest.mark.parametrize("data", ["default", "occl", "scale", "occl_scale"])
 def test_every_data_set_trains(train: Callable, tmp_path: Path, data: str) -> None:
-    """By default, all tests here train on the first, and `test_several_views.py` on `scale`."""
+    """By default, all tests here train on the first."""
     outcome = train(f"data={data}", "logger=none", "trainer.max_epochs=1")
     assert outcome.status == 0, outcome.err
     assert only_run(tmp_path / "runs").results()["data"] == data
