@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from phd_exp.cli import conf_folder
 from phd_exp.config import RunConfig, check
@@ -62,19 +63,15 @@ def test_a_folder_is_used_whole_with_every_preset(checked: Callable, preset: str
     assert (own.image_size, own.batch_size) == (rendered.image_size, rendered.batch_size)
 
 
-def test_variants_differ_only_in_the_keys_of_their_files(checked: Callable) -> None:
-    plain = checked("data=default").data.spec
-    changes = {
-        "occl": {"occluders"},
-        "scale": {"scale_range"},
-        "occl_scale": {"occluders", "scale_range"},
-        "multiview": {"scale_range", "views", "view_angle_range"},
-    }
-    for variant, keys in changes.items():
-        other = checked(f"data={variant}").data.spec
-        differing = {key for key in DatasetSpec.model_fields if getattr(plain, key) != getattr(other, key)}
-        assert differing == keys | {"variant"}
-        assert other.variant == variant
+@pytest.mark.parametrize("variant", ["occl", "scale", "occl_scale", "multiview"])
+def test_variants_differ_only_in_the_keys_of_their_files(checked: Callable, variant: str) -> None:
+    file = yaml.safe_load((conf_folder() / "data" / f"{variant}.yaml").read_text())
+    base, keys = checked(f"data={file['defaults'][0]}").data.spec, file.keys() - {"defaults"}
+    assert differing(base, checked(f"data={variant}").data.spec) == keys >= {"variant"}
+
+
+def differing(one: DatasetSpec, other: DatasetSpec) -> set[str]:
+    return {key for key in DatasetSpec.model_fields if getattr(one, key) != getattr(other, key)}
 
 
 def test_several_views_of_scale_are_the_data_set_multiview(checked: Callable) -> None:
@@ -91,17 +88,9 @@ def test_shifts_to_the_variants_are_these_data_sets(checked: Callable, data: str
         other = config.data_of(variant)
         assert other.spec == checked(f"data={variant}", "data.seed=3").data.spec
         assert (other.folder.name, other.n_test) == (variant, 9)
-    for name, key in {
-        "far": "z_range",
-        "long_f": "f_range",
-        "grey": "saturation_range",
-        "hidden": "half_hidden",
-    }.items():
+    for name, shift in yaml.safe_load((conf_folder() / "shift" / "scenes.yaml").read_text()).items():
         own, other = config.data.spec, config.data_of(name).spec
-        assert {key for key in DatasetSpec.model_fields if getattr(own, key) != getattr(other, key)} == {
-            "variant",
-            key,
-        }
+        assert differing(own, other) == {"variant", *shift["data"]}
         assert other.variant == f"{data}-{name}"
     assert config.data_of("dark").spec == config.data.spec
 
