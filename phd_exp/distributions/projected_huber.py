@@ -145,8 +145,8 @@ class ProjectedHuber(Density, Distribution):
         """The same distribution with a larger batch shape; nothing is copied."""
         return self._of(self._natural.expand(torch.Size(batch_shape)), self._validate_args)
 
-    def __getitem__(self, row: int) -> "ProjectedHuber":
-        """One distribution of a batch."""
+    def __getitem__(self, row: int | Tensor) -> "ProjectedHuber":
+        """One distribution of a batch, or those that a mask chooses."""
         chosen = {name: value[row] for name, value in vars(self._natural).items()}
         return self._of(Natural(**chosen), self._validate_args)
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -24,25 +25,123 @@ from phd_exp.records.errors import DatasetError, RunError
 from phd_exp.records.images import content_of, pillow_warnings
 
 LEVELS = (50, 90, 99)  # per cent of the credible intervals of depth
+P = np.array([0.5, *(end for level in LEVELS for end in (0.5 - level / 200, 0.5 + level / 200))])
+"""The probabilities of the median and of the ends of the intervals."""
 DIGITS = 8
 REPEATED = ("file_name", "box", "score", "category_id")  # of the detection
 NONE = "none: this model predicts a position alone"
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
-    """A detection, its image, and its prediction in the frame of the view's virtual camera (float64).
+class Batch:
+    """Detections that are predicted together, with their images.
 
-    `raw` holds the outputs of the network, from which `Predictor.predict` makes the prediction; `familiar` is of runs
-    with held-out samples.
+    `predictions` are in the frames of the views (float64), made by `Predictor.predict` from `raw`, the outputs of the
+    network; `familiar` is of runs with held-out samples.
     """
 
-    detection: Detection
-    image: Image.Image
-    view: View
-    raw: Float[Tensor, "*members n_outputs"]
-    prediction: Prediction
-    familiar: float | None = None
+    seen: Sequence[tuple[Detection, Image.Image, View]]
+    raw: Float[Tensor, "batch *members n_outputs"]
+    predictions: Prediction
+    familiar: Float[np.ndarray, " batch"] | None = None
+
+    @cached_property
+    def cameras(self) -> Camera:
+        """The virtual cameras."""
+        f = [view.camera.f for _, _, view in self.seen]
+        return Camera(torch.tensor(f, dtype=torch.float64), self.seen[0][2].camera.S)
+
+    @cached_property
+    def numbers(self) -> dict[str, Float[np.ndarray, "batch ..."]]:
+        """What the answers say of the predictions, a row for each detection.
+
+        Lengths are in metres, in the frame of the real camera: x right, y down, z (depth) forward along its axis.
+        This is exact for a turned virtual camera too: points and covariance are rotated, and depth quantiles are
+        integrated along the axis of the real camera (`quantiles_along`). They are NaN where the mode lies 90 degrees
+        or more from it.
+        """
+        made, R = self.predictions, np.stack([view.camera.R for _, _, view in self.seen])
+        mode = made.mode.numpy()
+        found = {"mode": _turned_back(mode, R), "out_of_field": ~self.cameras.contains(made.mode).numpy()}
+        if made.has_closed_forms:
+            found["mean"] = _turned_back(made.mean.numpy(), R)
+            found["covariance"] = R.transpose(0, 2, 1) @ made.covariance_matrix.numpy() @ R
+            axis, quantiles = R[:, :, 2], np.full((len(R), len(P)), np.nan)
+            ahead = (axis * mode).sum(-1) > 0
+            quantiles[ahead] = quantiles_along(made[torch.from_numpy(ahead)], axis[ahead], P)
+            found["median_depth"] = quantiles[:, 0]
+            found["depth_interval"] = quantiles[:, 1:].reshape(-1, len(LEVELS), 2)
+        return found
+
+    @cached_property
+    def errors(self) -> dict[str, Float[np.ndarray, " batch"]]:
+        """The errors of the tables, which rotating the camera does not change, and the scores of a distribution.
+
+        They are NaN where the true position is unknown.
+        """
+        made, unknown = self.predictions, (np.nan, np.nan, np.nan)
+        positions = [unknown if one.line.z is None else one.position for one, _, _ in self.seen]
+        seen = [view.camera.to_virtual(np.array(at)) for at, (*_, view) in zip(positions, self.seen, strict=True)]
+        truth = torch.from_numpy(np.stack(seen))
+        errors = {
+            "projected_error_mm": MILLIMETRES * projected_error(truth, made.mode),
+            "depth_error_mm": MILLIMETRES * depth_error(truth, made.mode),
+        }
+        if isinstance(made, Density):
+            errors |= {"credible_level": made.level(truth), "nll": -made.log_prob(truth)}
+        return {name: value.numpy() for name, value in errors.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """One detection of a batch."""
+
+    batch: Batch
+    row: int
+
+    @property
+    def detection(self) -> Detection:
+        """The detection."""
+        return self.batch.seen[self.row][0]
+
+    @property
+    def image(self) -> Image.Image:
+        """Its image."""
+        return self.batch.seen[self.row][1]
+
+    @property
+    def view(self) -> View:
+        """The input of the network."""
+        return self.batch.seen[self.row][2]
+
+    @property
+    def raw(self) -> Float[Tensor, "*members n_outputs"]:
+        """The outputs of the network."""
+        return self.batch.raw[self.row]
+
+    @property
+    def density(self) -> ProjectedHuber | None:
+        """The prediction, unless it is another density or a position alone."""
+        made = self.batch.predictions
+        return made[self.row] if made.has_closed_forms else None
+
+    @property
+    def mode(self) -> Float[np.ndarray, "3"]:
+        """The most likely position, or the one that is predicted alone, in the frame of the view, m."""
+        mode: np.ndarray = self.batch.predictions.mode[self.row].numpy()
+        return mode
+
+    @property
+    def familiar(self) -> float | None:
+        """Its p-value among held-out samples."""
+        return None if self.batch.familiar is None else float(self.batch.familiar[self.row])
+
+
+def _turned_back(
+    points: Float[np.ndarray, "batch 3"], R: Float[np.ndarray, "batch 3 3"]
+) -> Float[np.ndarray, "batch 3"]:
+    """R^T v: points of the virtual cameras in the frames of the real ones."""
+    return (points[:, None] @ R)[:, 0]
 
 
 def sightings(predictor: Predictor, detections: Sequence[Detection]) -> Iterator[Sighting]:
@@ -50,20 +149,17 @@ def sightings(predictor: Predictor, detections: Sequence[Detection]) -> Iterator
 
     Raises DatasetError, naming the file, for an invalid image, and RunError if a network output is not finite.
     """
-    for batch in _batches(predictor, detections):
-        f = torch.tensor([view.camera.f for _, _, view in batch], dtype=torch.float64)
-        raw = predictor.raw(np.stack([view.image for _, _, view in batch]), f)
-        # a batch takes an ensemble less time than its images one by one
-        made = predictor.predict(raw, f) if predictor.is_ensemble else None
-        familiar = predictor.familiar(raw, f)
-        for row, (detection, image, view) in enumerate(batch):
-            if not bool(raw[row].isfinite().all()):
-                raise RunError(
-                    f"{detection.where}: the network returns numbers that are not finite; train the run again"
-                )
-            prediction = made[row] if made and made.has_closed_forms else predictor.predict(raw[row], f[row])
-            yield Sighting(
-                detection, image, view, raw[row], prediction, None if familiar is None else float(familiar[row])
+    for seen in _batches(predictor, detections):
+        f = torch.tensor([view.camera.f for _, _, view in seen], dtype=torch.float64)
+        raw = predictor.raw(np.stack([view.image for _, _, view in seen]), f)
+        finite = raw.flatten(1).isfinite().all(-1)
+        n = int(finite.long().cumprod(0).sum())  # of those before the first that is not
+        if n:
+            batch = Batch(seen[:n], raw[:n], predictor.predict(raw[:n], f[:n]), predictor.familiar(raw[:n], f[:n]))
+            yield from (Sighting(batch, row) for row in range(n))
+        if n < len(seen):
+            raise RunError(
+                f"{seen[n][0].where}: the network returns numbers that are not finite; train the run again"
             )
 
 
@@ -98,47 +194,27 @@ def _batches(
 
 
 def answer(sighting: Sighting, temperature: Temperature | None, guarantee: Any = None) -> dict[str, Any]:
-    """The prediction for a detection, its region by a `Guarantee`, and its errors if the position is known.
-
-    Lengths are in metres, in the frame of the real camera: x right, y down, z (depth) forward along its axis. This is
-    exact for a turned virtual camera too: points and covariance are rotated, and depth quantiles are integrated along
-    the axis of the real camera (`quantiles_along`).
-    """
-    prediction, view, line = sighting.prediction, sighting.view, sighting.detection.line
+    """The numbers of a detection, its region by a `Guarantee`, and its errors if the position is known."""
+    batch, row, line = sighting.batch, sighting.row, sighting.detection.line
     named: dict[str, Any] = line.model_dump(include=set(REPEATED), exclude_none=True, mode="json")
-    if prediction.has_closed_forms:
-        named |= _distribution(prediction, view) | {"uncertainty": uncertainty(temperature)}
+    numbers = {name: rounded(values[row]) for name, values in batch.numbers.items() if name != "out_of_field"}
+    if "depth_interval" in numbers:
+        intervals = (None if None in ends else ends for ends in numbers["depth_interval"])
+        numbers["depth_interval"] = dict(zip(map(str, LEVELS), intervals, strict=True))
+        named |= numbers | {"uncertainty": uncertainty(temperature)}
         if guarantee:
-            region, facts = guarantee.region(prediction, view.camera.f / view.camera.S)
-            interval = rounded(np.array(region.depth_interval(view.camera.R[:, 2])))
+            camera = sighting.view.camera
+            region, facts = guarantee.region(sighting.density, camera.f / camera.S)
+            interval = rounded(np.array(region.depth_interval(camera.R[:, 2])))
             named["region"] = facts | {"depth_interval": interval, "volume": rounded(np.array(region.volume))}
     else:
-        position = view.camera.to_real(prediction.mode.numpy())
-        none = "not reported: no Projected Huber density" if isinstance(prediction, Density) else NONE
-        named |= {"position": rounded(position), "uncertainty": none}
+        none = "not reported: no Projected Huber density" if isinstance(batch.predictions, Density) else NONE
+        named |= {"position": numbers["mode"], "uncertainty": none}
     if sighting.familiar is not None:
         named["familiar"] = rounded(np.array(sighting.familiar))
-    camera = Camera(torch.tensor(view.camera.f, dtype=torch.float64), view.camera.S)
-    named["out_of_field"] = not bool(camera.contains(prediction.mode))
-    return named | (_errors(sighting) if line.z is not None else {})
-
-
-def _distribution(distribution: ProjectedHuber, view: View) -> dict[str, Any]:
-    """Its numbers; those of depth are None if the mode lies 90 degrees or more from the real camera's axis."""
-    R, axis = view.camera.R, view.camera.R[:, 2]
-    median, intervals = None, [None] * len(LEVELS)
-    if axis @ distribution.mode.numpy() > 0:
-        tails = [(1 - level / 100) / 2 for level in LEVELS]
-        p = [0.5, *(end for tail in tails for end in (tail, 1 - tail))]
-        z = quantiles_along(distribution, axis, np.array(p))
-        median, intervals = rounded(z[0]), rounded(z[1:].reshape(-1, 2))
-    return {
-        "mode": rounded(view.camera.to_real(distribution.mode.numpy())),
-        "mean": rounded(view.camera.to_real(distribution.mean.numpy())),
-        "covariance": rounded(R.T @ distribution.covariance_matrix.numpy() @ R),
-        "median_depth": median,
-        "depth_interval": dict(zip(map(str, LEVELS), intervals, strict=True)),
-    }
+    named["out_of_field"] = bool(batch.numbers["out_of_field"][row])
+    errors = {} if line.z is None else batch.errors
+    return named | {name: rounded(values[row]) for name, values in errors.items()}
 
 
 def uncertainty(temperature: Temperature | None) -> str:
@@ -146,19 +222,6 @@ def uncertainty(temperature: Temperature | None) -> str:
     if temperature is None:
         return "as trained"
     return f"recalibrated: A / {temperature.projected:.4g}, a / {temperature.depth:.4g}"
-
-
-def _errors(sighting: Sighting) -> dict[str, Any]:
-    """The errors of the tables, which rotating the camera does not change, and the scores of a distribution."""
-    prediction = sighting.prediction
-    truth = torch.from_numpy(sighting.view.camera.to_virtual(np.array(sighting.detection.position)))
-    errors = {
-        "projected_error_mm": MILLIMETRES * projected_error(truth, prediction.mode),
-        "depth_error_mm": MILLIMETRES * depth_error(truth, prediction.mode),
-    }
-    if isinstance(prediction, Density):
-        errors |= {"credible_level": prediction.level(truth), "nll": -prediction.log_prob(truth)}
-    return {name: rounded(value.numpy()) for name, value in errors.items()}
 
 
 def rounded(values: Float[np.ndarray, "..."]) -> Any:

@@ -40,7 +40,7 @@ def picture(
     Small curves have a close-up. The region of a `Guarantee` has a dashed outline. The last panel has the calibration
     curve of depth, if given. The title has the main numbers of `line`, which is the `answer` for the sighting.
     """
-    curves = level_curves(sighting.prediction) if sighting.prediction.has_closed_forms else None
+    curves = level_curves(sighting.density) if sighting.density else None
     on_image, above = _outlines(sighting, guarantee)
     marks = _marks(sighting, curves, on_image)
     enlarged = _enlarged(marks, sighting.detection.box(*sighting.image.size))
@@ -87,7 +87,7 @@ def _outlines(sighting: Sighting, guarantee: Any) -> tuple[Points | None, Points
     if not guarantee:
         return None, None
     camera = sighting.view.camera
-    on_image, above = guarantee.region(sighting.prediction, camera.f / camera.S)[0].outlines()
+    on_image, above = guarantee.region(sighting.density, camera.f / camera.S)[0].outlines()
     return camera.real_pixels(on_image), above
 
 
@@ -98,7 +98,7 @@ def _marks(sighting: Sighting, curves: LevelCurves | None, outline: Points | Non
     marks: list[Mark] = [(camera.real_pixels(points), "-", {"linewidth": width} | _AMBER) for width, points in rings]
     if outline is not None:
         marks.append((outline, "--", _AMBER))
-    for point, kind, style in ((sighting.prediction.mode.numpy(), "x", _AMBER), (truth, "o", _WHITE)):
+    for point, kind, style in ((sighting.mode, "x", _AMBER), (truth, "o", _WHITE)):
         if point is not None:
             marks.append((camera.real_pixels(point[None, :2] / point[2]), kind, style))
     return marks

@@ -20,12 +20,16 @@ def distribution(a: float, A: float) -> ProjectedHuber:
     return ProjectedHuber(*(torch.tensor(values, dtype=torch.float64) for values in tensors))
 
 
+def along(one: ProjectedHuber, direction: np.ndarray) -> np.ndarray:
+    return quantiles_along(one.expand((1,)), direction[None], P)[0]
+
+
 @pytest.mark.parametrize(("a", "A"), PRECISIONS)
 def test_quantiles_are_those_of_samples(a: float, A: float) -> None:
     p = distribution(a, A)
     n = 50_000
     samples = p.rsample((n,), torch.Generator().manual_seed(0)).numpy() @ SIDEWAYS
-    below = (samples[:, None] <= quantiles_along(p, SIDEWAYS, P)).mean(axis=0)
+    below = (samples[:, None] <= along(p, SIDEWAYS)).mean(axis=0)
     assert (np.abs(below - P) < 4 * np.sqrt(P * (1 - P) / n)).all()
 
 
@@ -33,9 +37,9 @@ def test_quantiles_are_those_of_samples(a: float, A: float) -> None:
 def test_hardly_turned_they_are_those_of_depth(a: float, A: float) -> None:
     p = distribution(a, A)
     expected = p.depth_icdf(torch.from_numpy(P)).numpy()
-    np.testing.assert_array_equal(quantiles_along(p, np.array([0.0, 0.0, 1.0]), P), expected)
+    np.testing.assert_array_equal(along(p, np.array([0.0, 0.0, 1.0])), expected)
     hardly = np.array([1e-7, 0.0, 1.0])
-    np.testing.assert_allclose(quantiles_along(p, hardly, P), expected, rtol=1e-4)
+    np.testing.assert_allclose(along(p, hardly), expected, rtol=1e-4)
 
 
 @pytest.mark.parametrize("s", [0.0, 0.3, 0.999, 1.0, 2.5, 20.0])
@@ -49,9 +53,15 @@ def test_the_marginal_is_an_integral_of_the_density(s: float) -> None:
     assert whitened_marginal(np.array([s]))[0] == pytest.approx(expected, rel=1e-6)
 
 
-def test_what_is_no_single_distribution_or_lies_behind_is_refused() -> None:
-    p = distribution(3.0, 10.0)
-    with pytest.raises(ValueError, match="of one distribution"):
-        quantiles_along(p.expand((2,)), SIDEWAYS, P)
+def test_a_batch_has_the_quantiles_of_its_distributions() -> None:
+    several = [distribution(a, A) for a, A in PRECISIONS]
+    columns = zip(*((one.mu_xy, one.mu_z, one.A, one.a) for one in several), strict=True)
+    directions = np.array([SIDEWAYS, [0.0, 0.0, 1.0], [1e-3, 0.0, 1.0], -SIDEWAYS * [1, 1, -1]])
+    together = quantiles_along(ProjectedHuber(*map(torch.stack, columns)), directions, P)
+    alone = np.stack([along(one, direction) for one, direction in zip(several, directions, strict=True)])
+    np.testing.assert_allclose(together, alone, rtol=1e-9)
+
+
+def test_a_direction_away_from_the_mode_is_refused() -> None:
     with pytest.raises(ValueError, match="90 degrees"):
-        quantiles_along(p, -SIDEWAYS, P)
+        along(distribution(3.0, 10.0), -SIDEWAYS)

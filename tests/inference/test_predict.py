@@ -18,7 +18,7 @@ from phd_exp.data.crops import cut, facing
 from phd_exp.distributions import PointEstimate, ProjectedHuber
 from phd_exp.geometry import Lens, VirtualCamera, intrinsics
 from phd_exp.inference import pictures
-from phd_exp.inference.answers import Sighting, answer
+from phd_exp.inference.answers import Batch, Sighting, answer
 from phd_exp.inference.views import View
 from phd_exp.records.detections import detections_of
 from phd_exp.records.errors import DatasetError, RunError
@@ -247,8 +247,9 @@ def test_small_curves_have_a_close_up_and_the_box_a_frame(
     image = Image.new("RGB", (640, 480))
     camera = facing(detection, image.size, SIDE)
     eye = torch.eye(2, dtype=torch.float64)
-    prediction = ProjectedHuber(0 * eye[0], 4 * eye[0, 0], precision * eye, 50 * eye[0, 0])
-    sighting = Sighting(detection, image, View(cut(image, camera), camera), torch.zeros(7), prediction)
+    prediction = ProjectedHuber(0 * eye[:1], 4 * eye[0, :1], precision * eye[None], 50 * eye[0, :1])
+    view = View(cut(image, camera), camera)
+    sighting = Sighting(Batch([(detection, image, view)], torch.zeros(1, 7), prediction), 0)
     line = answer(sighting, None)
     figure: Any = pictures.picture(sighting, line)
     first, second, *_ = axes = figure.axes
