@@ -39,10 +39,17 @@ def _at(
     table: Float[Tensor, "bottom right bands"], x: Float[Tensor, "*views rows columns"], y: Tensor
 ) -> Float[Tensor, "*views rows columns bands"]:
     """The table at corners between pixels: linear along both axes, as the sums are inside a pixel."""
-    x, y = (value.nan_to_num(-1.0).clamp(0, size - 1) for value, size in ((x, table.shape[1]), (y, table.shape[0])))
+    height, width, bands = table.shape
+    x, y = (value.nan_to_num(-1.0).clamp(0, size - 1) for value, size in ((x, width), (y, height)))
     column, row = x.floor().long(), y.floor().long()
-    next_column, next_row = (column + 1).clamp_max(table.shape[1] - 1), (row + 1).clamp_max(table.shape[0] - 1)
+    next_column = (column + 1).clamp_max(width - 1)
+    upper, lower = row * width, (row + 1).clamp_max(height - 1) * width
+    flat = table.reshape(-1, bands)
+
+    def at(place: Tensor) -> Tensor:  # five times as fast as two indices
+        return flat.index_select(0, place.flatten()).reshape(*place.shape, bands)
+
     x, y = (x - column)[..., None], (y - row)[..., None]
-    upper = table[row, column] * (1 - x) + table[row, next_column] * x
-    lower = table[next_row, column] * (1 - x) + table[next_row, next_column] * x
-    return upper * (1 - y) + lower * y
+    above = at(upper + column) * (1 - x) + at(upper + next_column) * x
+    below = at(lower + column) * (1 - x) + at(lower + next_column) * x
+    return above * (1 - y) + below * y

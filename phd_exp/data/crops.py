@@ -23,6 +23,7 @@ SIXTEEN_BITS = ("I;16", "I;16L", "I;16B", "I;16N")
 TURNED = range(2, 9)  # EXIF orientations; others than 1 to 8 mean nothing
 TWELVE_BITS = 1 << 12
 ONE_PICTURE = ("JPEG", "MPO")  # formats whose further frames are previews and depth maps
+LARGEST_SUMS = 1 << 23  # pixels whose sums of three bands are held at the same time, 200 MB
 MARGIN = 1  # pixels around a view of more pixels than the image has, which are interpolated
 
 
@@ -79,9 +80,10 @@ def cut(image: Image.Image, camera: VirtualCamera) -> UInt8[np.ndarray, "S S 3"]
     corners = camera.corners
     part = _reach(corners, image.size)
     places = torch.from_numpy(corners - part[:2])
-    # band by band, for the sums take eight bytes per pixel
-    bands = (np.array(image.getchannel(band).crop(part))[..., None] for band in "RGB")
-    return torch.cat([area_means(sums(torch.from_numpy(band)), places) for band in bands], dim=-1).numpy()
+    pixels = torch.from_numpy(np.array(image.crop(part)))
+    # of a large image band by band, for the sums take eight bytes per pixel
+    at_once = 3 if pixels[..., 0].numel() <= LARGEST_SUMS else 1
+    return torch.cat([area_means(sums(bands), places) for bands in pixels.split(at_once, dim=-1)], dim=-1).numpy()
 
 
 def _is_whole(image: Image.Image, camera: VirtualCamera) -> bool:

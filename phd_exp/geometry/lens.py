@@ -54,6 +54,9 @@ class Lens:
 
     def distort(self, xyz: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
         """The place ((u - cx)/fx, (v - cy)/fy) of directions; NaN from the `limit` on."""
+        if self.is_pinhole:
+            ahead = xyz[..., 2:] > 0
+            return np.where(ahead, xyz[..., :2] / np.where(ahead, xyz[..., 2:], 1), np.nan)
         across = np.linalg.norm(xyz[..., :2], axis=-1, keepdims=True)
         angle = np.arctan2(across, xyz[..., 2:])
         bare = (angle if self.is_fisheye else np.tan(angle)) * (xyz[..., :2] / np.maximum(across, TINY))
