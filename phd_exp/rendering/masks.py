@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import track
 
 from phd_exp.records.dataset import CELLS, SPLITS, DatasetFolder
-from phd_exp.records.errors import DatasetError, UserError, writing
+from phd_exp.records.errors import DatasetError, writing
 from phd_exp.records.files import write_atomic
 from phd_exp.records.scenes import SampleRecord
 from phd_exp.records.spec import DatasetSpec
@@ -54,12 +54,6 @@ def ensure_drawn(folder: DatasetFolder, spec: DatasetSpec, n: int) -> None:
             write_atomic(folder.root / name, chain([head.getvalue()], rows))
 
 
-def draw_if_possible(folder: DatasetFolder, spec: DatasetSpec, n: int) -> None:
-    """`ensure_drawn` for trainings that may not need masks; those that do report that they are missing."""
-    with suppress(UserError):
-        ensure_drawn(folder, spec, n)
-
-
 def mask(record: SampleRecord, meshes: Meshes) -> NDArray[np.uint8]:
     """The share of each cell of the image that shows the object, from 0 to 255: (CELLS, CELLS)."""
     side = CELLS * RAYS
@@ -78,9 +72,7 @@ DRAW = {"masks.npy": mask, "clearings.npy": clearing}
 
 
 def write_masks(folder: DatasetFolder, masks: Path, meshes: Meshes = NO_MESHES) -> int:
-    """Write `<masks>/<split>/<index>.png`, white where the object is visible, for all samples; returns how many.
-
-    The masks have one bit per pixel and follow from the records, without Blender.
+    """Write `<masks>/<split>/<index>.png`, one bit per pixel, 1 where the object is visible; returns how many.
 
     Raises DatasetError if there is no data set, or a broken one, RenderError if the masks cannot be written.
     """

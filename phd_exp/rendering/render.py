@@ -18,7 +18,7 @@ finds all work done and seals.
 import math
 import time
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from itertools import islice
 from multiprocessing.connection import Connection, wait
 
@@ -29,7 +29,7 @@ from phd_exp.records.processes import Child, announce, duration, held, usable_co
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec, Shard
 from phd_exp.rendering.blender import require_bpy
-from phd_exp.rendering.masks import draw_if_possible
+from phd_exp.rendering.masks import ensure_drawn
 from phd_exp.rendering.progress import shown_progress
 from phd_exp.rendering.sealing import Known, Wanted, begin, known_samples, missing, seal
 
@@ -68,7 +68,8 @@ def ensure_rendered(
         RenderError: bpy is missing, a worker died, the folder cannot be written.
     """
     if not any(folder.missing(spec, n_train, n_test).values()):
-        draw_if_possible(folder, spec, n_train)
+        with suppress(UserError):
+            ensure_drawn(folder, spec, n_train)
         return True
     require_bpy()
     wanted: Wanted = {"train": n_train, "test": n_test}

@@ -7,12 +7,12 @@ as finished. Sealing removes the journals; it holds an exclusive lock, so that n
 from contextlib import suppress
 
 from phd_exp.records.dataset import SPLITS, DatasetFolder, Manifest, Seal, sha256
-from phd_exp.records.errors import CorruptFileError, DatasetError
+from phd_exp.records.errors import CorruptFileError, DatasetError, UserError
 from phd_exp.records.files import read_jsonl, remove_temporaries, write_atomic
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import renderer_version
-from phd_exp.rendering.masks import DRAW, draw_if_possible
+from phd_exp.rendering.masks import DRAW, ensure_drawn
 from phd_exp.rendering.sampling import generator_version
 
 Wanted = dict[Split, int]
@@ -79,7 +79,8 @@ def seal(folder: DatasetFolder, spec: DatasetSpec, known: Known) -> None:
     seals = {split: done for split in SPLITS if (done := _seal_split(folder, split, known[split])).n}
     remove_temporaries(folder.root)
     folder.write_manifest(folder.manifest.model_copy(update={"splits": seals}))
-    draw_if_possible(folder, spec, folder.manifest.count("train"))
+    with suppress(UserError):  # a training that needs masks reports that they are missing
+        ensure_drawn(folder, spec, folder.manifest.count("train"))
 
 
 def _seal_split(folder: DatasetFolder, split: Split, known: dict[int, SampleRecord]) -> Seal:
