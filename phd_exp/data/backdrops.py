@@ -56,7 +56,7 @@ class BackdropExchange:
 
     def __call__(self, batch: Batch, numbers: Float[Tensor, "batch n_numbers"]) -> Batch:
         """The samples, changed by uniform numbers from -1 to 1."""
-        of_then, own = numbers.split([numbers.shape[1] - sum(NUMBERS), sum(NUMBERS)], dim=1)
+        of_then, own = numbers.tensor_split([-sum(NUMBERS)], dim=1)
         changes, pairs, views = ((own + 1) / 2).split(NUMBERS, dim=1)
         pairs = (len(self.backdrops.empty) * pairs).long()
         others = pairs.gather(1, self.texture[pairs].argmax(dim=1, keepdim=True)).flatten()

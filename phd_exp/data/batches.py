@@ -42,17 +42,13 @@ class Batch:
 
     def select(self, rows: Int[Tensor, " rows"] | slice) -> "Batch":
         """The samples of these rows."""
-        return replace(self, **{name: part[rows] for name, part in self._tensors.items()})
+        mask = None if self.mask is None else self.mask[rows]
+        return Batch(self.image[rows], self.xyz[rows], self.f[rows], self.S, self.row[rows], mask)
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> "Batch":
         """The same samples on a device."""
-        return replace(
-            self, **{key: part.to(device, non_blocking=non_blocking) for key, part in self._tensors.items()}
-        )
-
-    @property
-    def _tensors(self) -> dict[str, Any]:
-        return {name: part for name, part in vars(self).items() if isinstance(part, Tensor)}
+        parts: dict[str, Any] = {name: part for name, part in vars(self).items() if isinstance(part, Tensor)}
+        return replace(self, **{name: part.to(device, non_blocking=non_blocking) for name, part in parts.items()})
 
 
 @runtime_checkable

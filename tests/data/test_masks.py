@@ -8,7 +8,6 @@ from phd_exp.data.sources import RenderedSource
 from phd_exp.records.dataset import CELLS, DatasetFolder
 from phd_exp.records.errors import DatasetError
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.masks import ensure_drawn
 from tests.support.handmade import SIDE
 
 
@@ -18,7 +17,6 @@ def source(folder: DatasetFolder, spec: DatasetSpec) -> RenderedSource:
 
 
 def test_training_batches_alone_have_masks(source: RenderedSource) -> None:
-    ensure_drawn(source.folder, source.spec, 5)
     data = PositionData(source, batch_size=3, masks=True)
     data.setup()
     masks = data.samples["train"].mask
@@ -34,6 +32,7 @@ def test_training_batches_alone_have_masks(source: RenderedSource) -> None:
 
 
 def test_masks_that_are_missing_are_missed_by_their_loss_alone(source: RenderedSource) -> None:
+    (source.folder.root / "masks.npy").unlink()
     data = PositionData(source, batch_size=3)
     data.setup()
     assert data.samples["train"].mask is None

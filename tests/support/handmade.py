@@ -9,6 +9,7 @@ from PIL import Image
 from phd_exp.records.dataset import DatasetFolder, Manifest, Seal, image_name, sha256
 from phd_exp.records.scenes import FIRST_VIEW, Backdrop, SampleRecord, SceneObject, Split
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.masks import ensure_drawn
 
 SIDE = 64
 
@@ -66,4 +67,5 @@ def write_handmade(folder: DatasetFolder, spec: DatasetSpec, counts: Mapping[Spl
         folder.metadata_path(split).write_text(lines)
         seals[split] = Seal(n=n, metadata_sha256=sha256(lines.encode()))
     folder.write_manifest(Manifest(generator=1, renderer="none", spec=spec, splits=seals))
+    ensure_drawn(folder, spec, counts.get("train", 0))
     return folder
