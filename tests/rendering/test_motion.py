@@ -19,7 +19,7 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.antialias import edges
 from phd_exp.rendering.rays import trace_pixels
 from phd_exp.rendering.sampling import sample_scene
-from tests.support.renders import HOME, silhouettes
+from tests.support.renders import ROOT, silhouettes
 
 RIM = 3  # px around silhouettes, which bilinear interpolation blurs
 NOISE = 1.0  # grey values: of the tracer, whose random numbers differ, and of interpolation
@@ -49,7 +49,7 @@ def pictures(folder: Path, *scenes: Scene) -> np.ndarray:
     """By Blender in its own process."""
     lines = "".join(f"{scene.model_dump_json()}\n" for scene in scenes)
     command = [sys.executable, "-c", RENDER, str(folder / "pictures.npy")]
-    subprocess.run(command, input=lines, text=True, cwd=HOME, check=True)
+    subprocess.run(command, input=lines, text=True, cwd=ROOT, check=True)
     return np.asarray(np.load(folder / "pictures.npy"))
 
 

@@ -18,7 +18,7 @@ from phd_exp.records.scenes import SampleRecord, Scene, SceneObject, Split
 from phd_exp.records.spec import DatasetSpec, Shard
 from phd_exp.rendering.rays import NOTHING, Hits, Mask
 
-HOME = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[2]
 PATIENCE = 60.0  # s
 N_TRAIN, N_TEST = 12, 4
 """Samples of the fixture `small`."""
@@ -120,7 +120,7 @@ def rendering_elsewhere(
         f"render.ensure_rendered(DatasetFolder({str(folder.root)!r}), spec, *{n}, {workers}, shard={shard!r})\n"
     )
     options: dict[str, Any] = {"stderr": subprocess.PIPE, "text": True, "start_new_session": True}
-    with subprocess.Popen([sys.executable, "-c", script], cwd=HOME, **options) as process:
+    with subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, **options) as process:
         try:
             yield process
         finally:
