@@ -132,9 +132,9 @@ class DatasetFolder:
         return records
 
     def drawn(self, name: str, n: int) -> NDArray[np.uint8]:
-        """The rows of the first `n` training images in `masks.npy` or `clearings.npy`, mapped into memory.
+        """Rows of the first `n` training images in `masks.npy` (n, CELLS, CELLS) or `clearings.npy` (n, S, S / 8).
 
-        Raises DatasetError if they are not there.
+        They are `mapped`. Raises DatasetError if they are not there.
         """
         S = self.manifest.spec.sensor_size
         row = (CELLS, CELLS) if name == "masks.npy" else (S, -(-S // 8))
@@ -173,9 +173,10 @@ class DatasetFolder:
 
 
 def mapped(file: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """The first rows, of this shape together, of an array on disk; mapped into memory, writable as torch requires.
+    """The first rows of an array on disk, which together have this shape, mapped into memory.
 
-    What is written does not reach the file. Raises OSError or ValueError if the file does not hold such rows.
+    The array is writable, as torch requires; the file does not change. Raises OSError or ValueError if the file does
+    not hold such rows.
     """
     require_plain(file)
     array: NDArray[np.uint8] = np.lib.format.open_memmap(file, mode="c")

@@ -16,7 +16,7 @@ from rich.progress import track
 
 from phd_exp.records.dataset import CELLS, SPLITS, DatasetFolder
 from phd_exp.records.errors import DatasetError, writing
-from phd_exp.records.files import write_atomic
+from phd_exp.records.files import remove_temporaries, write_atomic
 from phd_exp.records.scenes import SampleRecord
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer
@@ -44,6 +44,7 @@ def ensure_drawn(folder: DatasetFolder, spec: DatasetSpec, n: int) -> None:
         if n == 0 or spec.empty or all(len(folder.drawn(name, n)) for name in names):
             return
     meshes, records, console = meshes_of(spec), folder.records("train"), Console(stderr=True)
+    remove_temporaries(folder.root)  # of killed processes
     for name in names:
         words, draw, head = f"drawing {name.removesuffix('.npy')} once", DRAW[name], io.BytesIO()
         shape = (len(records), *draw(records[0], meshes).shape)
@@ -55,7 +56,7 @@ def ensure_drawn(folder: DatasetFolder, spec: DatasetSpec, n: int) -> None:
 
 
 def mask(record: SampleRecord, meshes: Meshes) -> NDArray[np.uint8]:
-    """The share of each cell of the image that shows the object, from 0 to 255: (CELLS, CELLS)."""
+    """The share of each cell of the image that shows the object, 0 to 255: a row (CELLS, CELLS) of `masks.npy`."""
     side = CELLS * RAYS
     scene = record.shown.model_copy(update={"S": side, "f": record.f * side / record.S})
     shown = cylinder_mask(trace_pixels(scene, meshes))
@@ -64,7 +65,7 @@ def mask(record: SampleRecord, meshes: Meshes) -> NDArray[np.uint8]:
 
 
 def clearing(record: SampleRecord, meshes: Meshes) -> NDArray[np.uint8]:
-    """The pixels of the image that show no object, as bits: (S, S/8, rounded up)."""
+    """The pixels of the image that show no object, as bits: a row (S, S / 8, rounded up) of `clearings.npy`."""
     return np.packbits(trace_pixels(record.shown, meshes).first == NOTHING, axis=-1)
 
 
