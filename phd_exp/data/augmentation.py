@@ -56,7 +56,7 @@ class Photometry:
         return self != Photometry()
 
     def __call__(
-        self, image: UInt8[Tensor, "batch height width 3"], numbers: Float[Tensor, "batch 13"]
+        self, image: UInt8[Tensor, "batch height width 3"], numbers: Float[Tensor, "batch n_numbers"]
     ) -> UInt8[Tensor, "batch height width 3"]:
         """The images, changed by uniform numbers from -1 to 1."""
         result = [self._changed(one, row) for one, row in zip(image.numpy(), numbers.tolist(), strict=True)]
@@ -153,7 +153,7 @@ class Augmentation:
         """Whether any change can be drawn."""
         return self.symmetries or self.largest_zoom > 1 or self.colours or self.photometry.changes_anything
 
-    def __call__(self, batch: Batch, numbers: Float[Tensor, "batch 23"]) -> Batch:
+    def __call__(self, batch: Batch, numbers: Float[Tensor, "batch n_numbers"]) -> Batch:
         """The samples, changed by uniform numbers from -1 to 1.
 
         A rotation and zoom that would move the object out of the image is skipped; the symmetry is kept.
