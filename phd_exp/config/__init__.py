@@ -129,11 +129,8 @@ class RunConfig(Record):
         multiview = self.evaluation.multiview
         if multiview is None or multiview.scenes == 0:
             return self
-        from phd_exp.distributions import ProjectedHuber  # imports torch, which takes seconds
-        from phd_exp.distributions.shaped import Shaped
-
         expected = "or evaluation.multiview.scenes=0"
-        if not issubclass(_prediction(self.model.head) or object, ProjectedHuber | Shaped):
+        if not getattr(_prediction(self.model.head), "has_covariance", False):
             raise ValueError(
                 f"evaluation.multiview.scenes: model={self.model.name} has no density with a covariance, which "
                 f"fusion needs; expected model=probabilistic, {expected}"

@@ -97,10 +97,14 @@ def _marginal() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return s, -np.log(m / m[0]), cumulative / cumulative[-1]
 
 
+def _depth_energy(distribution: ProjectedHuber, t: np.ndarray) -> np.ndarray:
+    return float(distribution.a) * (np.maximum(t, 1 / t) - 1)
+
+
 def _excess(distribution: ProjectedHuber, t: np.ndarray, level: float) -> float:
     """The c with P(a (max(t, 1/t) - 1) + e(q_1) <= c) = level."""
     _, energy, cumulative = _marginal()
-    of_depth = float(distribution.a) * (np.maximum(t, 1 / t) - 1)
+    of_depth = _depth_energy(distribution, t)
 
     def surplus(c: float) -> float:
         return float(np.interp(c - of_depth, energy, cumulative, left=0).mean()) - level
@@ -117,12 +121,12 @@ def _outline(distribution: ProjectedHuber, excess: float) -> Points:
     Source: own derivation; the law of (x, z) is constant along the curve, checked by quadrature.
     """
     s, energy, _ = _marginal()
-    a, mu_z = float(distribution.a), float(distribution.mu_z)
-    furthest = 1 + excess / a
+    mu_z = float(distribution.mu_z)
+    furthest = 1 + excess / float(distribution.a)
     bend = np.linspace(0, np.pi / 2, (_POINTS + 1) // 2)
     above = 1 + (furthest - 1) * np.sin(bend)  # dense where the curve closes
     t = np.concatenate([1 / above[:0:-1], above])
-    of_depth = a * (np.maximum(t, 1 / t) - 1)
+    of_depth = _depth_energy(distribution, t)
     half_width = mu_z * np.linalg.norm(np.linalg.inv(_float64(distribution.A))[0])
     half_width = half_width * np.interp(np.clip(excess - of_depth, 0, None), energy, s)
     z = mu_z * t

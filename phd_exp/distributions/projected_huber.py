@@ -9,7 +9,7 @@ q and t are independent, and v is linear in (q, t). Every statistic below follow
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, final
 
 import torch
 from jaxtyping import Float
@@ -28,6 +28,7 @@ from phd_exp.geometry.camera import at_depth
 LARGEST_RAW = 1e9  # squares of larger raw numbers, and their products, would overflow in float32
 
 
+@final
 class ProjectedHuber(Density, Distribution):
     """A density over positions v = (x, y, z) in the camera frame, zero for z <= 0.
 

@@ -10,7 +10,6 @@ from phd_exp.config import check
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.runs import RunFolder
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.masks import ensure_drawn
 from phd_exp.training.train import train
 from tests.support.handmade import write_handmade
 from tests.support.recorded import once
@@ -26,11 +25,12 @@ TINY = (
 @pytest.fixture(scope="session")
 def handmade(make_spec: Callable[..., DatasetSpec], tmp_path_factory: pytest.TempPathFactory) -> DatasetFolder:
     spec = make_spec("handmade", sensor_size=64, f_range=(400.0, 600.0))
-
-    def make(root: Path) -> None:
-        ensure_drawn(write_handmade(DatasetFolder(root / "handmade"), spec, {"train": 20, "test": 6}), spec, 20)
-
-    return DatasetFolder(once(tmp_path_factory, "handmade renders", make) / "handmade")
+    place = once(
+        tmp_path_factory,
+        "handmade renders",
+        lambda root: write_handmade(DatasetFolder(root / "handmade"), spec, {"train": 20, "test": 6}),
+    )
+    return DatasetFolder(place / "handmade")
 
 
 @pytest.fixture(scope="session")
