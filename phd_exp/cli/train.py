@@ -182,16 +182,15 @@ def standing(config: dict[str, Any], overrides: list[str]) -> str | None:
     """The state of a configuration's run. The configuration is not checked, because checking it imports torch."""
     try:
         folder = _folder(config, overrides)
-        status = folder.status()
-        if status is None:
-            return None
-        if status.state == "running":
-            return "running" if folder.is_held() else "exited without a result (killed or out of memory)"
+        state, error = folder.state()
+        if state in (None, "running"):
+            return state
         wanted = [folder.views] if config["evaluation"]["multiview"]["scenes"] > 0 else []
         wanted += [folder.eight_views["test"]] if config["evaluation"]["eight_views"] else []
         wanted += map(folder.shift, config["evaluation"]["shifts"])
-        is_whole = status.state == "finished" and all(file.exists() for file in wanted)
-        return "finished" if is_whole else status.error or "interrupted"
+        if state == "finished":
+            return "finished" if all(file.exists() for file in wanted) else "interrupted"
+        return error or "exited without a result (killed or out of memory)"
     except UNREADABLE:  # the run itself will report it
         return None
 

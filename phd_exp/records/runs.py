@@ -140,6 +140,16 @@ class RunFolder:
         status = self.status()
         return status is not None and status.state == "finished"
 
+    def state(self) -> tuple[State | None, str]:
+        """The state now, and the error that ended the run; a process that died leaves it interrupted, without one.
+
+        None without a record. Raises RunError if the status cannot be read, OSError if the lock cannot be tried.
+        """
+        status = self.status()
+        if status is None or status.state != "running":
+            return (status.state, status.error or "") if status else (None, "")
+        return ("running" if self.is_held() else "interrupted"), ""
+
     def is_held(self) -> bool:
         """Whether a process works on the run now. Raises OSError if the lock cannot be tried."""
         with held(self.path / ".lock") as free:
