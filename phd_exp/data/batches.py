@@ -35,7 +35,7 @@ class Batch:
     @property
     def camera(self) -> Camera:
         """The true cameras of the samples, in the pixels of `image`."""
-        return Camera(self.f, self.S)
+        return Camera.unchecked(self.f, self.S)
 
     def __len__(self) -> int:
         return len(self.row)

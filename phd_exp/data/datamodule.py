@@ -8,7 +8,8 @@ from lightning import LightningDataModule
 from phd_exp.data.backdrops import BackdropExchange
 from phd_exp.data.batches import Augment, Batch, BatchLoader
 from phd_exp.data.sources import PARTS, Part, Source
-from phd_exp.records.errors import ConfigError
+from phd_exp.geometry.camera import Camera
+from phd_exp.records.errors import ConfigError, DatasetError
 from phd_exp.records.runs import CHOOSE
 
 
@@ -66,10 +67,17 @@ class PositionData(LightningDataModule):
         self.train_batches: BatchLoader | None = None
 
     def setup(self, stage: str | None = None) -> None:
-        """Open every part that has samples. Decodes their images on first use."""
+        """Open every part that has samples. Decodes their images on first use.
+
+        Raises DatasetError for a focal length that is not positive and finite; batches are not checked again.
+        """
         for part in PARTS:
             if part not in self.samples and self.source.count(part):
-                self.samples[part] = self.source.samples(part)
+                samples = self.samples[part] = self.source.samples(part)
+                try:
+                    Camera(samples.f, samples.S)
+                except ValueError as error:
+                    raise DatasetError(f"{part} samples: {error}") from None
                 if self.masks and part == "train":
                     self.samples[part] = replace(self.samples[part], mask=self.source.training_masks())
         if self.train_batches is None:

@@ -22,7 +22,7 @@ from phd_exp.distributions.special import log_scaled_normaliser
 
 Pair = Float[Tensor, "*#batch 2"]
 Number = Float[Tensor, "*#batch"]
-_NORMAL, _LAPLACE = Normal(0.0, 1.0), Laplace(0.0, 1.0)
+_NORMAL, _LAPLACE = (law(0.0, 1.0, validate_args=False) for law in (Normal, Laplace))  # a check waits for a GPU
 
 
 class Law(ABC):

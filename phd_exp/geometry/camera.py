@@ -42,6 +42,13 @@ class Camera:
                 f"but {int((~valid).sum())} of {valid.numel()} are not, the first of them {self.f[~valid][0].item()}"
             )
 
+    @classmethod
+    def unchecked(cls, f: Float[Tensor, "*batch"], S: float) -> "Camera":
+        """Cameras from values that were checked before, without reading f, for which a GPU would wait."""
+        camera = object.__new__(cls)
+        vars(camera).update(f=f, S=S)
+        return camera
+
     def project(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 2"]:
         """Pixel of a position: (u, v) = f (x, y)/z + S/2; meaningless for z <= 0.
 
@@ -60,11 +67,8 @@ class Camera:
         return inside.all(dim=-1) & (xyz[..., 2] > 0)
 
     def with_constant_f(self, constant_f: float | None) -> "Camera":
-        """The cameras with one focal length (pixels) for all; None keeps their own.
-
-        Raises ValueError if the focal length is not positive or not finite.
-        """
-        return self if constant_f is None else Camera(torch.full_like(self.f, constant_f), self.S)
+        """The cameras with one focal length (pixels) for all; None keeps their own."""
+        return self if constant_f is None else Camera.unchecked(torch.full_like(self.f, constant_f), self.S)
 
 
 def at_depth(xy_over_z: Float[Tensor, "*#batch 2"], z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch 3"]:

@@ -33,7 +33,7 @@ class Motion:
 
     def camera(self, camera: Camera) -> Camera:
         """The new cameras."""
-        return Camera(self.zoom * camera.f, camera.S)
+        return Camera.unchecked(self.zoom * camera.f, camera.S)
 
     def position(self, xyz: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 3"]:
         """Positions (metres) in the frames of the new cameras."""

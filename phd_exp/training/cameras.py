@@ -27,7 +27,8 @@ class CameraPolicy:
 
     def __call__(self, batch: Batch, epoch: int = 0) -> Camera:
         camera = batch.camera.with_constant_f(self.constant_f)
-        return Camera(camera.f * f_factor(batch.row, self.f_error, epoch), camera.S) if self.f_error else camera
+        factor = f_factor(batch.row, self.f_error, epoch) if self.f_error else 1.0
+        return Camera.unchecked(camera.f * factor, camera.S)
 
 
 def f_factor(row: Int[Tensor, " batch"], f_error: float, epoch: int = 0) -> Float[Tensor, " batch"]:

@@ -20,6 +20,8 @@ from phd_exp.training.objective import Objective, natural_loss
 from phd_exp.training.optimisation import Optimisation
 from phd_exp.training.predictions import columns, summary, training_columns
 
+UNREAD = 50  # steps whose losses are read together
+
 
 class PositionModule(LightningModule):
     """Image and camera -> prediction -> loss, with the metrics of both splits logged once per epoch.
@@ -51,6 +53,7 @@ class PositionModule(LightningModule):
         self.camera = camera or CameraPolicy()
         self.optimisation = optimisation or Optimisation()
         self.training_rows, self.evaluation_rows, self.held_out_rows = Rows(), Rows(), Rows()
+        self.unread: list[tuple[str, Tensor, Tensor, Tensor]] = []
 
     def forward(self, batch: Batch) -> Prediction:
         return self.regressor(batch.image, self.camera(batch))
@@ -71,7 +74,7 @@ class PositionModule(LightningModule):
         prediction = self.regressor.prediction(output, self.camera(batch, self.current_epoch))
         losses = self.loss(prediction, batch.xyz)
         total = self.objective.total(losses, output, batch)
-        self._require_finite(total, losses, batch, "train")
+        self._note(total, losses, batch, "train")
         with torch.no_grad():
             nll = losses if isinstance(self.loss, NegativeLogLikelihood) else None
             table = training_columns(prediction, batch.xyz, nll)
@@ -79,17 +82,22 @@ class PositionModule(LightningModule):
         return total
 
     def on_train_epoch_end(self) -> None:
+        self._require_finite()
         table = self.training_rows.columns()
         self.training_rows.reset()
         self.log_dict({f"train/{name}": column.mean().float() for name, column in table.items()})
+
+    def on_validation_epoch_start(self) -> None:
+        self._require_finite()  # before a broken network is evaluated
 
     def validation_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
         part, rows = (("test", self.evaluation_rows), ("held_out", self.held_out_rows))[dataloader_idx]
         table, losses = self._predict(batch)
         rows.update(table)
-        self._require_finite(losses.mean(), losses, batch, part)
+        self._note(losses.mean(), losses, batch, part)
 
     def on_validation_epoch_end(self) -> None:
+        self._require_finite()
         for part, rows in (("held_out", self.held_out_rows), ("test", self.evaluation_rows)):
             if rows.update_called:
                 scores = summary(rows.columns(), part)
@@ -107,16 +115,29 @@ class PositionModule(LightningModule):
         factor = f_factor(batch.row, self.camera.f_error)
         return columns(prediction, batch, factor) | {"loss": losses.expand(len(batch))}, losses
 
-    def _require_finite(self, total: Tensor, losses: Tensor, batch: Batch, split: str) -> None:
-        """Raise RunError naming the samples whose loss is not finite, or all if only the total is not."""
-        if total.isfinite():
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self._require_finite()
+
+    def _note(self, total: Tensor, losses: Tensor, batch: Batch, part: str) -> None:
+        """Keep the losses of a step until they are read: a GPU would wait for a read in each step."""
+        self.unread.append((part, total.detach(), losses.detach().expand(len(batch)), batch.row))
+        if len(self.unread) == UNREAD:
+            self._require_finite()
+
+    def _require_finite(self) -> None:
+        """Raise RunError naming the samples of the first loss that is not finite, or the batch if only its total is
+        not.
+        """
+        unread, self.unread = self.unread, []
+        if not unread or bool(torch.stack([total for _, total, *_ in unread]).isfinite().all()):
             return
-        is_bad = ~losses.detach().expand(len(batch)).isfinite()
-        rows = batch.row[is_bad if is_bad.any() else slice(None)].tolist()
+        part, total, losses, row = next(one for one in unread if not one[1].isfinite())
+        is_bad = ~losses.isfinite()
+        rows = row[is_bad if is_bad.any() else slice(None)].tolist()
         data = getattr(self.trainer, "datamodule", None)
-        names = data.source.known(split).get("file_name") if data else None
+        names = data.source.known(part).get("file_name") if data else None
         raise RunError(
-            f"loss is {total.item()} in epoch {self.current_epoch + 1}/{self.trainer.max_epochs}, at {split} samples "
+            f"loss is {total.item()} in epoch {self.current_epoch + 1}/{self.trainer.max_epochs}, at {part} samples "
             f"{listed([names[row] if names else str(row) for row in rows])}; the last checkpoint is whole: lower "
             "optimizer.lr, or look at these images"
         )

@@ -7,9 +7,11 @@ from typing import Any
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from phd_exp import build, hardware
 from phd_exp.config import RunConfig, check
+from phd_exp.data.batches import Batch
 from phd_exp.data.images import SHRINKING
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.runs import RunFolder
@@ -79,3 +81,42 @@ def test_images_shrunk_by_another_version_are_refused_where_they_differ(
     refused = begun and side == 64 and version != SHRINKING
     with pytest.raises(RunError, match="shrunk from 224 to 64 pixels") if refused else nullcontext():
         build.require_same_shrinking(folder, config)
+
+
+READS = ("aten::_local_scalar_dense", "aten::nonzero", "aten::is_nonzero", "aten::equal")
+"""Operations whose result the host reads, for which it waits for a GPU."""
+
+
+class Reads(TorchDispatchMode):
+    """Counts them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.found += [function.name()] * (function.name() in READS)
+        return function(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [[], ["camera.f_error=0.05"], ["model=mae_constf"], ["model=quantiles"], ["model=student_t"]],
+    ids=" ".join,
+)
+def test_a_training_step_reads_nothing_back(checked: Callable, words: list[str]) -> None:
+    config = checked("recipe=strong", "photometry=robust", "backbone.width=8", "backbone.channels=4", *words)
+    data = build_data(config)
+    module, n = build_module(config, data), 4
+    optimizer = module.optimisation.optimizer(module.regressor.parameters())
+    image, mask = torch.zeros(n, 64, 64, 3, dtype=torch.uint8), torch.zeros(n, 28, 28, dtype=torch.uint8)
+    batch = Batch(
+        image, torch.tensor([[0.0, 0.0, 4.0]]).expand(n, 3), torch.full((n,), 400.0), 64.0, torch.arange(n), mask
+    )
+    with Reads() as reads:
+        changed = data.augment(batch, torch.full((n, data.augment.n_numbers), 0.9, dtype=torch.float64))
+        module.training_step(changed, 0).backward()
+        optimizer.step()
+        assert reads.found == []
+        bool(batch.xyz.isfinite().all())
+        assert reads.found == [READS[0]]
