@@ -13,23 +13,17 @@ from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from PIL import Image
 
-from phd_exp.distributions.level_curves import LevelCurves, level_curves
+from phd_exp.distributions.level_curves import LevelCurves, Points, level_curves
 from phd_exp.geometry.virtual import Box
 from phd_exp.inference.answers import Sighting
 from phd_exp.records.errors import one_line
-from phd_exp.reports.figures import draw_birds_eye, draw_curve, encoded
+from phd_exp.reports.figures import Mark, draw_birds_eye, draw_curve, encoded, marks_on_image
 from phd_exp.reports.gallery import close_up
 
 LARGEST = 1024  # pixels along the longer side of the image in the picture
 LONGEST_NAME = 60  # characters of a file name in the title
 MARGIN = 0.5  # width of the margin around a box, in sizes of the box
 _HALO = [withStroke(linewidth=3, foreground="#0000009c")]  # for any background
-_AMBER: dict[str, Any] = {"color": "#ffb000", "markersize": 6, "path_effects": _HALO}
-_WHITE: dict[str, Any] = {"color": "white", "markeredgecolor": "black", "markersize": 4}
-
-Points = Float[np.ndarray, "_ 2"]
-Mark = tuple[Points, str, dict[str, Any]]
-"""Points of the image, pixels, with the kind of their line and its style."""
 
 
 def picture(
@@ -93,15 +87,8 @@ def _outlines(sighting: Sighting, guarantee: Any) -> tuple[Points | None, Points
 
 def _marks(sighting: Sighting, curves: LevelCurves | None, outline: Points | None) -> list[Mark]:
     """The level curves, the outline of a region, the mode and the truth on the image."""
-    camera, truth = sighting.view.camera, _truth(sighting)
-    rings = zip((1.6, 1.1, 0.7), curves.projected if curves else (), strict=False)
-    marks: list[Mark] = [(camera.real_pixels(points), "-", {"linewidth": width} | _AMBER) for width, points in rings]
-    if outline is not None:
-        marks.append((outline, "--", _AMBER))
-    for point, kind, style in ((sighting.mode, "x", _AMBER), (truth, "o", _WHITE)):
-        if point is not None:
-            marks.append((camera.real_pixels(point[None, :2] / point[2]), kind, style))
-    return marks
+    pixels = sighting.view.camera.real_pixels
+    return marks_on_image(curves, sighting.mode, _truth(sighting), pixels, outline, path_effects=_HALO)
 
 
 def _around(sighting: Sighting) -> Box:
@@ -124,12 +111,8 @@ def _draw_image(
 ) -> None:
     """A part of the image with the marks, and frames by their line style."""
     left, top, right, bottom = part
-    inside = (
-        max(0, math.floor(left)),
-        max(0, math.floor(top)),
-        min(image.width, math.ceil(right)),
-        min(image.height, math.ceil(bottom)),
-    )
+    ends = (math.floor(left), math.floor(top), math.ceil(right), math.ceil(bottom))
+    inside = np.clip(ends, 0, 2 * image.size).tolist()
     if inside[0] < inside[2] and inside[1] < inside[3]:
         shown = image.crop(inside)
         shown.thumbnail((LARGEST, LARGEST))
@@ -140,8 +123,8 @@ def _draw_image(
             axes.add_patch(
                 Rectangle(corner, *size, fill=False, edgecolor="white", linestyle=dashes, path_effects=_HALO)
             )
-    for points, kind, style in marks:
-        axes.plot(*points.T, kind, **style)
+    for points, line, style in marks:
+        axes.plot(*points.T, line, **style)
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="column (px)", ylabel="row (px)")
     axes.locator_params(nbins=5)  # more labels would overlap
 

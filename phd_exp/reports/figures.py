@@ -1,8 +1,9 @@
-"""Figures of calibration curves and level curves, drawn with matplotlib."""
+"""Calibration curves and level curves, drawn with matplotlib for the report and for single predictions."""
 
 import io
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure  # not pyplot: no global state, no window, no leak over a long sweep
 
-from phd_exp.distributions.level_curves import LevelCurves, on_image
+from phd_exp.distributions.level_curves import LevelCurves, Points, on_image
 from phd_exp.records.files import write_atomic
 
+AMBER = "#ffb000"
+WIDTHS = (1.6, 1.1, 0.7)  # of the lines of 50, 90 and 99 %
+Mark = tuple[Points, str, dict[str, Any]]
+"""Points of an image, pixels, with the format and the style of their line."""
 LABELS = {"depth": ("Depth", "m²"), "projected": ("Projected position", "no unit")}
 
 
@@ -62,17 +67,34 @@ def draw_on_image(
     """Draw the image with the curves of (x, y)/z, the mode as a cross and the projected truth as a dot."""
     if image is not None:
         axes.imshow(image, extent=(0, S, S, 0))
-    for width, points in zip((1.6, 1.1, 0.7), curves.projected, strict=False):
-        axes.plot(*on_image(points, f, S).T, color="#ffb000", linewidth=width)
-    axes.plot(*on_image(curves.mode[:2] / curves.mode[2], f, S), "x", color="#ffb000", markersize=6)
-    if truth is not None:
-        axes.plot(*on_image(truth[:2] / truth[2], f, S), "o", color="white", markeredgecolor="black", markersize=4)
+    for points, line, style in marks_on_image(curves, curves.mode, truth, partial(on_image, f=f, S=S)):
+        axes.plot(*points.T, line, **style)
     axes.set(xlim=(0, S), ylim=(S, 0), aspect="equal", xlabel="column (px)", ylabel="row (px)")
+
+
+def marks_on_image(
+    curves: LevelCurves | None,
+    mode: np.ndarray,
+    truth: np.ndarray | None,
+    pixels: Callable[[Points], Points],
+    outline: Points | None = None,
+    **style: Any,
+) -> list[Mark]:
+    """The curves, a dashed outline (pixels), the mode as a cross and the truth as a dot; `pixels` is of (x, y)/z."""
+    amber = {"color": AMBER, "markersize": 6, **style}
+    rings = zip(WIDTHS, curves.projected if curves else (), strict=False)
+    marks: list[Mark] = [(pixels(points), "-", {"linewidth": width, **amber}) for width, points in rings]
+    marks += [] if outline is None else [(outline, "--", amber)]
+    marks.append((pixels(mode[None, :2] / mode[2]), "x", amber))
+    if truth is not None:
+        white = {"color": "white", "markeredgecolor": "black", "markersize": 4}
+        marks.append((pixels(truth[None, :2] / truth[2]), "o", white))
+    return marks
 
 
 def draw_birds_eye(axes: Axes, curves: LevelCurves, truth: np.ndarray | None) -> None:
     """Draw the curves of (x, z), the mode as a cross and the truth as a dot; the axes differ in scale."""
-    for width, level, points in zip((1.6, 1.1, 0.7), curves.levels, curves.birds_eye, strict=False):
+    for width, level, points in zip(WIDTHS, curves.levels, curves.birds_eye, strict=False):
         axes.plot(*points.T, color="#0072b2", linewidth=width, label=f"{100 * level:g} %")
     axes.plot(curves.mode[0], curves.mode[2], "x", color="#0072b2", markersize=6, label="mode")
     if truth is not None:

@@ -56,6 +56,9 @@ _EXCESS = "0 if predicted variance ranks the errors perfectly, 1 if no better th
 _WORST_GROUP = "largest mean gap between coverage and diagonal in groups of samples with similar predictions"
 _NEES = "squared error of the mean over the predicted covariance; 3 if calibrated, more if overconfident"
 _OVERCONFIDENCE = "mean credible level of the truths minus 1/2; negative if underconfident"
+_INSIDE = "share of truths inside the credible region"
+_CONFORMAL = "share of truths inside; held-out samples set its level"
+_SHARPNESS = "root mean square of the predicted deviation of"
 _ROWS: tuple[tuple[str, str, str, int, str], ...] = (
     ("projected_error_mm", "Projected error", "mm", 1, "distance of the estimate from the true viewing ray"),
     ("depth_error_mm", "Depth error", "mm", 1, "error along the true viewing ray"),
@@ -63,16 +66,8 @@ _ROWS: tuple[tuple[str, str, str, int, str], ...] = (
     ("ale_m", "ALE", "m", 3, "average localisation error: error of the distance from the camera"),
     ("relative_error", "Relative error", "%", 2, "error of the distance from the camera over the distance"),
     ("nll", "NLL", "nats", 2, "mean negative log density at the truth, per cubic metre"),
-    ("inside_50", "Inside the 50 % region", "%", 1, "share of truths inside the credible region"),
-    ("inside_90", "Inside the 90 % region", "%", 1, "share of truths inside the credible region"),
-    ("inside_99", "Inside the 99 % region", "%", 1, "share of truths inside the credible region"),
-    (
-        "inside_conformal",
-        "Inside the conformal 90 % region",
-        "%",
-        1,
-        "share of truths inside; held-out samples set its level",
-    ),
+    *((f"inside_{level}", f"Inside the {level} % region", "%", 1, _INSIDE) for level in (50, 90, 99)),
+    ("inside_conformal", "Inside the conformal 90 % region", "%", 1, _CONFORMAL),
     ("unfamiliar", "Unfamiliar", "%", 1, "share of samples whose familiarity is below 0.05; 5 % at home"),
     ("auroc", "AUROC of familiarity", "", 2, "how well it separates the samples from those at home"),
     ("depth_crps_mm", "CRPS of depth", "mm", 1, "continuous ranked probability score of the depth’s law"),
@@ -88,14 +83,8 @@ _ROWS: tuple[tuple[str, str, str, int, str], ...] = (
     ("nees_x", "NEES of x", "", 2, "squared error of the mean of x over its variance, 1 if calibrated"),
     ("nees_y", "NEES of y", "", 2, "squared error of the mean of y over its variance, 1 if calibrated"),
     ("nees_z", "NEES of z", "", 2, "squared error of the mean of z over its variance, 1 if calibrated"),
-    ("depth_sharpness_mm", "Depth sharpness", "mm", 1, "root mean square of the predicted deviation of z"),
-    (
-        "projected_sharpness_mrad",
-        "Projected sharpness",
-        "mrad",
-        2,
-        "root mean square of the predicted deviation of x/z and y/z",
-    ),
+    ("depth_sharpness_mm", "Depth sharpness", "mm", 1, f"{_SHARPNESS} z"),
+    ("projected_sharpness_mrad", "Projected sharpness", "mrad", 2, f"{_SHARPNESS} x/z and y/z"),
     ("depth_risk_coverage_area", "Depth risk–coverage area", "mm", 1, _RISK),
     ("projected_risk_coverage_area", "Projected risk–coverage area", "mrad", 2, _RISK),
     ("depth_risk_coverage_excess", "Depth risk–coverage excess", "", 3, _EXCESS),
