@@ -29,12 +29,7 @@ class Interval(Generic[Number]):
     high: Number
 
     def each(self, change: Callable[[Number], Other]) -> "Interval[Other]":
-        """The number and its bounds in another form.
-
-        Examples:
-            >>> Interval(0.5, 0.25, 0.75).each("{:.0%}".format)
-            Interval(value='50%', low='25%', high='75%')
-        """
+        """The number and its bounds in another form, such as text."""
         return Interval(change(self.value), change(self.low), change(self.high))
 
 

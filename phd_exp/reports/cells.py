@@ -106,12 +106,14 @@ def make_cell(report: Report, preset: str, data: str, model: str, key: ErrorKey,
 
 
 def interval(means: Sequence[SampleMean]) -> Interval[float] | None:
-    """The mean over seeds with its 95 % interval; None without a mean, or with one whose standard error is unknown.
+    """The mean over seeds and its 95 % interval, mean ± sqrt(w_samples^2 + w_seeds^2).
 
-    Half widths of two sources are added in quadrature. The scatter of test sets: 1.96 standard errors over the test
-    samples, averaged over seeds, since these share them. The scatter of trainings, with k >= 2 seeds of standard
-    deviation s: t s / sqrt(k), t the 97.5 % quantile of Student's law with k - 1 degrees of freedom. With one seed
-    only the former is known.
+    - w_samples, of another test set: 1.96 standard errors over the test samples. Seeds share these samples, so it is
+      averaged over seeds; an unknown standard error counts as 0.
+    - w_seeds, of another training: t s / sqrt(k), where s is the standard deviation over k seeds and t the 97.5 %
+      quantile of Student's law with k - 1 degrees of freedom. It is left out for one seed, which cannot tell it.
+
+    None without a seed, or for one seed whose standard error is unknown.
 
     Examples:
         >>> interval([SampleMean(100, 40.0, 1.0)]).each("{:.2f}".format)

@@ -52,10 +52,8 @@ def fusion_table(run: Run, scores: FusionScores) -> Table:
     apart = "" if (run.data, run.model) == ("scale", "probabilistic") else f"{run.title}, "
     places = (False, True)
     cells = {at: _cell(run, scores, at) for at in scores.bands}
-    groups = [_rows(cells, scores.views, quantity, on_plane) for on_plane in places for quantity in ERRORS]
-    groups += [
-        [row for name in CALIBRATION for row in _rows(cells, scores.views, name, on_plane)] for on_plane in places
-    ]
+    groups = [_rows(cells, scores.views, quantity, on) for on in places for quantity in ERRORS]
+    groups += [[row for name in CALIBRATION for row in _rows(cells, scores.views, name, on)] for on in places]
     return Table(
         stem=file_stem("fusion", run.preset, run.data, run.model, run.name),
         kind="fusion",

@@ -9,23 +9,19 @@ from phd_exp.evaluation.point_errors import Estimate, Quantity
 TableName = Literal["table1", "table2"]
 
 
+DATA = ("default", "occl", "scale", "occl_scale")
+_ERRORS: Mapping[str, tuple[tuple[float, float], ...]] = {
+    "mae_vz": ((3.6, 69), (22.8, 218), (3.7, 359), (37.2, 386)),
+    "mae_logz": ((5.0, 36), (18.0, 178), (5.1, 355), (27.6, 355)),
+    "probabilistic": ((2.4, 48), (13.0, 168), (1.6, 347), (17.0, 350)),
+    "mae_xyz": ((13.0, 327),),  # Table 2, on `default` alone
+    "mae_constf": ((10.8, 325),),
+}
+"""Model -> mean projected and depth error, mm, on each data set, as printed."""
 PUBLISHED: Mapping[tuple[str, str], Mapping[Quantity, float]] = {
-    # Table 1
-    ("mae_vz", "default"): {"projected": 3.6, "depth": 69},
-    ("mae_vz", "occl"): {"projected": 22.8, "depth": 218},
-    ("mae_vz", "scale"): {"projected": 3.7, "depth": 359},
-    ("mae_vz", "occl_scale"): {"projected": 37.2, "depth": 386},
-    ("mae_logz", "default"): {"projected": 5.0, "depth": 36},
-    ("mae_logz", "occl"): {"projected": 18.0, "depth": 178},
-    ("mae_logz", "scale"): {"projected": 5.1, "depth": 355},
-    ("mae_logz", "occl_scale"): {"projected": 27.6, "depth": 355},
-    ("probabilistic", "default"): {"projected": 2.4, "depth": 48},
-    ("probabilistic", "occl"): {"projected": 13.0, "depth": 168},
-    ("probabilistic", "scale"): {"projected": 1.6, "depth": 347},
-    ("probabilistic", "occl_scale"): {"projected": 17.0, "depth": 350},
-    # Table 2, without the rows of Table 1
-    ("mae_xyz", "default"): {"projected": 13.0, "depth": 327},
-    ("mae_constf", "default"): {"projected": 10.8, "depth": 325},
+    (model, data): {"projected": projected, "depth": depth}
+    for model, errors in _ERRORS.items()
+    for data, (projected, depth) in zip(DATA, errors, strict=False)
 }
 """(model, data set) -> mean errors over 2000 test samples, mm."""
 
@@ -80,6 +76,12 @@ class Line:
     estimate: Estimate
     quantity: Quantity | None = None
 
+    def error(self, column: Column) -> Quantity:
+        """The error in a column."""
+        quantity = self.quantity or column.quantity
+        assert quantity is not None, "a layout gives the error to its lines or to its columns"
+        return quantity
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -94,6 +96,11 @@ class Layout:
     groups: tuple[tuple[Line, ...], ...]
     bounds: Mapping[str, Mapping[str, float]]
     note: str
+
+    @property
+    def by_line(self) -> bool:
+        """Whether the lines have the errors, not the columns."""
+        return self.columns[0].quantity is None
 
     @property
     def choices(self) -> set[tuple[str, str]]:
@@ -119,17 +126,16 @@ OF_A_BOUND = (
     f"{BELOW_BOUND}: below the bound of its column that applies to it, within the interval given, unless the network "
     "uses more than apparent size."
 )
-_DATA = ("default", "occl", "scale", "occl_scale")
 
 TABLE_1 = Layout(
     name="table1",
     title="Table 1",
-    columns=tuple(Column(data) for data in _DATA),
+    columns=tuple(Column(data) for data in DATA),
     groups=_groups(("mae_vz", "mae_logz", "probabilistic"), ("projected", "depth")),
     bounds={
         "bound, with f": {"scale": UNKNOWN_SIZE},
         "apparent size, f not an input": {"scale": UNKNOWN_SIZE_F_AFTERWARDS},
-        "guess without the image": dict.fromkeys(_DATA, GUESS),
+        "guess without the image": dict.fromkeys(DATA, GUESS),
     },
     note="On scale the size factor ~ U(0.8, 1.2) is unknown and the image gives size / z: 291 mm is nearly exact for "
     "a network with f as an input (camera=shown). A network without it, whose z/f is multiplied by f, has 336 mm "

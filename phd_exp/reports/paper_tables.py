@@ -1,7 +1,8 @@
 """The paper's two tables in both readings, for every preset with any of their runs."""
 
 import shlex
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 from phd_exp.evaluation.point_errors import COLUMNS, READINGS, ErrorKey, Quantity, Reading
@@ -45,50 +46,45 @@ def paper_tables(report: Report) -> list[Table]:
     for preset in report.presets:
         for layout in LAYOUTS:
             begun = {choice: runs for choice in layout.choices if (runs := report.at_defaults(preset, *choice))}
-            tables += [_table(report, preset, layout, reading, begun) for reading in READINGS if begun]
+            seeds = sorted({seed for runs in begun.values() for seed in runs})
+            shown = _begun(layout, begun)
+            tables += [_table(report, preset, layout, shown, reading, seeds) for reading in READINGS if begun]
     return tables
 
 
-def _table(
-    report: Report, preset: str, layout: Layout, reading: Reading, begun: Mapping[tuple[str, str], Mapping[int, Run]]
-) -> Table:
-    """The table of the seeds, data sets and models of `begun`: (data set, model) -> seed -> run.
-
-    It has all estimates, but eight views only if a run has recorded them.
-    """
-    seeds = sorted({seed for runs in begun.values() for seed in runs})
+def _begun(layout: Layout, begun: Mapping[tuple[str, str], Mapping[int, Run]]) -> Layout:
+    """The columns and lines with a run; all estimates, but eight views only if a run has recorded them."""
     data, models = ({choice[place] for choice in begun} for place in (0, 1))
-    columns = [column for column in layout.columns if column.data in data]
-    recorded = {key.estimate for runs in begun.values() for run in runs.values() for key in run.errors}
-    estimates = {*COLUMNS, *recorded}
-    groups = [
-        lines
+    estimates = {*COLUMNS, *(key.estimate for runs in begun.values() for run in runs.values() for key in run.errors)}
+    groups = (
+        tuple(line for line in group if line.model in models and line.estimate in estimates)
         for group in layout.groups
-        if (lines := [line for line in group if line.model in models and line.estimate in estimates])
-    ]
+    )
+    columns = tuple(column for column in layout.columns if column.data in data)
+    return replace(layout, columns=columns, groups=tuple(filter(None, groups)))
+
+
+def _table(report: Report, preset: str, layout: Layout, shown: Layout, reading: Reading, seeds: list[int]) -> Table:
+    """The table of the columns and lines that are shown of a layout."""
 
     def cell(line: Line, column: Column) -> Cell:
-        quantity = line.quantity or column.quantity
-        assert quantity is not None, "a layout gives the error to its lines or to its columns"
-        key = ErrorKey(line.estimate, reading, quantity)
+        key = ErrorKey(line.estimate, reading, line.error(column))
         return make_cell(report, preset, column.data, line.model, key, seeds)
 
-    measured = [[(line, [cell(line, column) for column in columns]) for line in group] for group in groups]
+    measured = [[(line, [cell(line, one) for one in shown.columns]) for line in group] for group in shown.groups]
     cells = [one for group in measured for _, row in group for one in row]
     best = _best([one for _, row in measured[0] for one in row])
     gaps = dict.fromkeys((reason, one.model, one.data, n) for one in cells for n, reason in one.gaps.items())
-    left_out = _left_out(layout, data, models)
+    left_out = _left_out(layout, shown)
     can_be_made = left_out or any(not reason.startswith("no sample") for reason, *_ in gaps)
-    by_line = layout.columns[0].quantity is None
-    bounds = [row for bound in layout.bounds.items() if (row := _bound_row(*bound, columns, by_line))]
     rows = [tuple(_row(line, row, layout.name, best) for line, row in group) for group in measured]
     return Table(
         stem=file_stem(layout.name, preset, reading),
         kind="tables",
         title=f"The paper's {layout.title}, {one_line(in_words(preset))}: {IN_WORDS[reading]}{_samples(cells)}",
-        stub=("model", "error (mm)") if by_line else ("model",),
-        columns=tuple(f"{c.quantity} error (mm)" if c.quantity else c.data for c in columns),
-        groups=(*rows, tuple(bounds)),
+        stub=("model", "error (mm)") if layout.by_line else ("model",),
+        columns=tuple(f"{c.quantity} error (mm)" if c.quantity else c.data for c in shown.columns),
+        groups=(*rows, tuple(_bound_rows(shown))),
         notes=(*_notes(layout, reading, cells), *left_out),
         below="paper (ratio)",
         gaps=tuple(gap_lines(gaps)),
@@ -98,9 +94,10 @@ def _table(
     )
 
 
-def _left_out(layout: Layout, data: Set[str], models: Set[str]) -> list[str]:
+def _left_out(layout: Layout, shown: Layout) -> list[str]:
     """One line that names the columns and rows without a run."""
-    columns = [column.data for column in layout.columns if column.data not in data]
+    columns = [column.data for column in layout.columns if column not in shown.columns]
+    models = {line.model for group in shown.groups for line in group}
     lines = [line.model for group in layout.groups for line in group if line.model not in models]
     names = ", ".join(dict.fromkeys([*columns, *lines]))
     return [f"Left out of {layout.title}, without a run: {names}."] if names else []
@@ -149,12 +146,13 @@ def _number(quantity: Quantity, value: float) -> str:
     return f"{value:.{DIGITS[quantity]}f}"
 
 
-def _bound_row(label: str, bounds: Mapping[str, float], columns: Sequence[Column], by_line: bool) -> TableRow | None:
-    """The row of a bound on depth error; None if no column has it."""
-    known = {data: f"{bound:.0f}" for data, bound in bounds.items()}
-    texts = [NOTHING if c.quantity == "projected" else known.get(c.data, NOTHING) for c in columns]
-    stub = (label, "depth") if by_line else (label,)
-    return TableRow(stub, tuple(map(TableCell, texts))) if set(texts) != {NOTHING} else None
+def _bound_rows(shown: Layout) -> Iterator[TableRow]:
+    """The rows of bounds on depth error that a column has."""
+    for label, bounds in shown.bounds.items():
+        known = [None if column.quantity == "projected" else bounds.get(column.data) for column in shown.columns]
+        if any(known):
+            cells = (TableCell(f"{bound:.0f}" if bound else NOTHING) for bound in known)
+            yield TableRow((label, "depth") if shown.by_line else (label,), tuple(cells))
 
 
 def _notes(layout: Layout, reading: Reading, cells: Sequence[Cell]) -> list[str]:
@@ -182,13 +180,11 @@ def gap_lines(gaps: Iterable[tuple[str, str, str, int]]) -> list[str]:
     seeds: dict[tuple[str, str, str], list[int]] = {}
     for reason, model, data, seed in gaps:
         seeds.setdefault((reason, model, data), []).append(seed)
-    lacking: dict[tuple[str, str, str], list[str]] = {}
+    lines: dict[tuple[str, str, str], list[str]] = {}
     for (reason, model, data_set), found in seeds.items():
         numbers = f"seed{'s' if len(found) > 1 else ''} {', '.join(map(str, found))}"
-        lacking.setdefault((reason, model, numbers), []).append(data_set)
-    return [
-        f"{model} on {', '.join(data)} ({numbers}): {reason}" for (reason, model, numbers), data in lacking.items()
-    ]
+        lines.setdefault((reason, model, numbers), []).append(data_set)
+    return [f"{model} on {', '.join(data)} ({numbers}): {reason}" for (reason, model, numbers), data in lines.items()]
 
 
 def making_command(report: Report, preset: str, name: TableName, seeds: Iterable[int] = (0,)) -> str:

@@ -148,27 +148,17 @@ def _whole_run(run: Run, kept: Path | None, notes: Notes) -> Run:
     values = notes.attempt(lambda: flatten(folder.config())) or {}
     config = {key: "" if value is None else str(value) for key, value in values.items()}
     rows = notes.attempt(folder.metrics) or []
-    notes.attempt(lambda: _require_whole(folder, values, rows, state))
-    predictions = held_out = tested = tested_held_out = None
-    if state == "finished" or folder.predictions.exists():
-        predictions = notes.attempt(lambda: read_table(folder.predictions))
-    if state == "finished":
-        estimates: Sequence[Estimate] = tuple(COLUMNS) if run.model == PROBABILISTIC else ("mode",)
-        tested = notes.attempt(lambda: _errors(predictions, estimates)) if predictions else None
-        if tested is None:
-            state, detail = "unreadable", f"{notes[-1]}; delete the folder to run again"
-    if folder.held_out.exists():
-        held_out = notes.attempt(lambda: read_table(folder.held_out))
-        chosen = {name: column[CHOOSE] for name, column in (held_out or {}).items()}
-        tested_held_out = notes.attempt(lambda: _errors(chosen, ("mode",))) if chosen else None
+    notes.attempt(lambda: _check_whole(folder, values, rows, state))
+    predictions = _table(folder.predictions, notes, needed=state == "finished")
+    errors, nll = _tested(run, predictions, notes) if state == "finished" else ({}, None)
+    if state == "finished" and not errors:
+        state, detail = "unreadable", f"{notes[-1]}; delete the folder to run again"
+    held_out = _table(folder.held_out, notes)
+    chosen = {name: column[CHOOSE] for name, column in (held_out or {}).items()}
+    held_out_errors, held_out_nll = _errors(chosen, ("mode",), notes)
     measuring = partial(measure, folder, config, predictions, held_out)
     stored = partial(kept_or_measured, folder, config, measuring, kept) if kept else measuring
     measured = notes.attempt(stored) or Measured()
-    errors, nll = tested or ({}, None)
-    if (file := folder.eight_views["test"]).exists() and errors:
-        of_eight = notes.attempt(lambda: mean_errors(read_table(file), ("mode",))) or {}
-        errors = {**errors, **{replace(key, estimate="eight views"): mean for key, mean in of_eight.items()}}
-    held_out_errors, held_out_nll = tested_held_out or ({}, None)
     return replace(
         run,
         seed=int(leaf[1]) if leaf else None,
@@ -188,9 +178,7 @@ def _whole_run(run: Run, kept: Path | None, notes: Notes) -> Run:
     )
 
 
-def _require_whole(
-    folder: RunFolder, config: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], state: str
-) -> None:
+def _check_whole(folder: RunFolder, config: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], state: str) -> None:
     """Raise RunError for half a file: a configuration without its last sections, or too few epochs."""
     sections = {key.partition(".")[0] for key in config}
     if config and (lacking := [name for name in SECTIONS if name not in sections]):
@@ -202,9 +190,22 @@ def _require_whole(
         raise RunError(f"{folder.metrics_file}: incomplete, with {last + 1} of {trained} epochs")
 
 
-def _errors(table: Columns, estimates: Sequence[Estimate]) -> tuple[MeanErrors, float | None]:
-    nll = float(table["nll"].mean()) if "nll" in table else math.nan
-    return mean_errors(table, estimates), nll if math.isfinite(nll) else None
+def _table(file: Path, notes: Notes, needed: bool = False) -> Columns | None:
+    return notes.attempt(partial(read_table, file)) if needed or file.exists() else None
+
+
+def _tested(run: Run, predictions: Columns | None, notes: Notes) -> tuple[MeanErrors, float | None]:
+    """The errors of all point estimates, those of eight views included, and the NLL."""
+    errors, nll = _errors(predictions, tuple(COLUMNS) if run.model == PROBABILISTIC else ("mode",), notes)
+    of_eight, _ = _errors(_table(run.folder.eight_views["test"], notes) if errors else None, ("mode",), notes)
+    return {**errors, **{replace(key, estimate="eight views"): mean for key, mean in of_eight.items()}}, nll
+
+
+def _errors(table: Columns | None, estimates: Sequence[Estimate], notes: Notes) -> tuple[MeanErrors, float | None]:
+    """Mean errors and NLL, as far as they are known; no errors if the table cannot be measured."""
+    errors = notes.attempt(lambda: mean_errors(table, estimates)) if table else None
+    nll = float(table["nll"].mean()) if table and errors and "nll" in table else math.nan
+    return errors or {}, nll if math.isfinite(nll) else None
 
 
 def _state(folder: RunFolder, status: RunStatus) -> tuple[RunState, str]:

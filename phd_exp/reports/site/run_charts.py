@@ -219,9 +219,7 @@ def _coverage(scores: FusionScores) -> Chart:
             name = f"{alone}, {k} camera{'s' if k > 1 else ''}"
             role = MAIN if (k, method) == (scores.views, "mean") else ASIDE
             traces.append(curve_line(name, curve, COLOURS[method], DASH[k == 1], role))
-    shares = "; ".join(
-        f"{trace['name']}: {', '.join(f'{100 * y:.0f} %' for y in trace['y'])}" for trace in traces[1:]
-    )
+    shares = "; ".join(f"{one['name']}: {', '.join(f'{100 * y:.0f} %' for y in one['y'])}" for one in traces[1:])
     layout = {"xaxis": axis("share of a Gaussian inside"), "yaxis": axis("share of truths inside")}
     label = f"Share of true positions inside the ellipsoids of {', '.join(map(str, LEVELS))} %: {shares}."
     return Chart("Fused: coverage of ellipsoids", label, traces, square(layout, 0.0, 1.0))
