@@ -54,7 +54,7 @@ class ErrorKey:
 
 @dataclass(frozen=True)
 class SampleMean:
-    """A mean over n test samples, from which intervals over test images and over seeds are made.
+    """A mean over n test samples, with what `difference` and the intervals of tables need.
 
     Attributes:
         standard_error: None for a single sample.

@@ -48,7 +48,7 @@ def picture(
     if enlarged:
         _draw_image(next(axes), sighting.image, enlarged, marks, {"-": sighting.detection.line.box})
     if curves:
-        _draw_birds_eye(next(axes), sighting, curves, above, guarantee)
+        _draw_above(next(axes), sighting, curves, above, guarantee)
     if calibration:
         draw_curve(next(axes), "depth", calibration)
     with warnings.catch_warnings():
@@ -106,9 +106,7 @@ def _enlarged(marks: Sequence[Mark], box: Box) -> Box | None:
     return (square[0], square[1], square[0] + square[2], square[1] + square[2]) if square else None
 
 
-def _draw_image(
-    axes: Axes, image: Image.Image, part: Box, marks: Sequence[Mark], frames: Mapping[str, Box | None]
-) -> None:
+def _draw_image(axes: Axes, image: Image.Image, part: Box, marks: list[Mark], frames: dict[str, Box | None]) -> None:
     """A part of the image with the marks, and frames by their line style."""
     left, top, right, bottom = part
     ends = (math.floor(left), math.floor(top), math.ceil(right), math.ceil(bottom))
@@ -120,18 +118,14 @@ def _draw_image(
     for dashes, frame in frames.items():
         if frame:
             corner, size = frame[:2], (frame[2] - frame[0], frame[3] - frame[1])
-            axes.add_patch(
-                Rectangle(corner, *size, fill=False, edgecolor="white", linestyle=dashes, path_effects=_HALO)
-            )
+            axes.add_patch(Rectangle(corner, *size, fill=False, edgecolor="w", linestyle=dashes, path_effects=_HALO))
     for points, line, style in marks:
         axes.plot(*points.T, line, **style)
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="column (px)", ylabel="row (px)")
     axes.locator_params(nbins=5)  # more labels would overlap
 
 
-def _draw_birds_eye(
-    axes: Axes, sighting: Sighting, curves: LevelCurves, outline: Points | None, guarantee: Any
-) -> None:
+def _draw_above(axes: Axes, sighting: Sighting, curves: LevelCurves, outline: Points | None, guarantee: Any) -> None:
     if outline is not None:
         axes.plot(*outline.T, "k--", label=f"{100 * guarantee.coverage:g} % guaranteed")
     draw_birds_eye(axes, curves, _truth(sighting))

@@ -22,7 +22,7 @@ _AT_ONCE = 10**6  # counts held in memory at a time
 
 @dataclass(frozen=True)
 class Interval(Generic[Number]):
-    """A number and its 95 % interval: a float, a tensor of the points of a curve, or the text of either."""
+    """A number with its 95 % interval, as floats or text; or the points of a curve with theirs, as tensors."""
 
     value: Number
     low: Number

@@ -80,7 +80,10 @@ def marks_on_image(
     outline: Points | None = None,
     **style: Any,
 ) -> list[Mark]:
-    """The curves, a dashed outline (pixels), the mode as a cross and the truth as a dot; `pixels` is of (x, y)/z."""
+    """What is drawn on an image, in this order: curves, a dashed outline, the mode as a cross, the truth as a dot.
+
+    `pixels` places (x, y)/z on the image; the outline is in pixels, mode and truth are in metres.
+    """
     amber = {"color": AMBER, "markersize": 6, **style}
     rings = zip(WIDTHS, curves.projected if curves else (), strict=False)
     marks: list[Mark] = [(pixels(points), "-", {"linewidth": width, **amber}) for width, points in rings]

@@ -35,7 +35,7 @@ def heads_tables(report: Report) -> list[Table]:
 
 
 def _means(runs: Sequence[Run], name: str) -> list[SampleMean]:
-    """One mean a run; none if a run has not recorded the score."""
+    """One mean for each run; empty if any run has not recorded the score."""
     every = [run.measured.pairs if name == FUSED else run.measured.before for run in runs]
     found = [e for e in every if e and name in e.scores]
     if len(found) < len(runs):

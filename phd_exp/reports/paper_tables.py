@@ -65,7 +65,7 @@ def _begun(layout: Layout, begun: Mapping[tuple[str, str], Mapping[int, Run]]) -
 
 
 def _table(report: Report, preset: str, layout: Layout, shown: Layout, reading: Reading, seeds: list[int]) -> Table:
-    """The table of the columns and lines that are shown of a layout."""
+    """The table of a layout, reduced to the columns and lines of `shown`."""
 
     def cell(line: Line, column: Column) -> Cell:
         key = ErrorKey(line.estimate, reading, line.error(column))
@@ -176,7 +176,7 @@ def _samples(cells: Sequence[Cell]) -> str:
 
 
 def gap_lines(gaps: Iterable[tuple[str, str, str, int]]) -> list[str]:
-    """The missing runs of a table, given as (reason, model, data set, seed): a line a reason, model and seeds."""
+    """The missing runs (reason, model, data set, seed) in words: a line for each reason, model and list of seeds."""
     seeds: dict[tuple[str, str, str], list[int]] = {}
     for reason, model, data, seed in gaps:
         seeds.setdefault((reason, model, data), []).append(seed)

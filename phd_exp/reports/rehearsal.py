@@ -1,4 +1,4 @@
-"""Shows every run and every search alone, before all together: what one record breaks is broken for it alone."""
+"""Makes the report of each run and each search alone first, so that a record that breaks it does not break all."""
 
 import io
 import json
@@ -16,7 +16,7 @@ from phd_exp.reports.terminal import print_report
 
 
 def rehearsed(report: Report) -> Report:
-    """The report, in which a run that cannot be shown is unreadable, and such a search is missing and noted."""
+    """The report without what breaks it: such a run counts as unreadable, such a search is left out with a note."""
     runs = tuple(_shown(report, run) for run in report.runs)
     searches = tuple(search for search in report.searches if _is_shown(report, search))
     return replace(report, runs=runs, searches=searches)
@@ -36,7 +36,7 @@ def _is_shown(report: Report, search: Search) -> bool:
 
 
 def _show(report: Report) -> None:
-    """Make everything that shows all runs and searches together, except their pages."""
+    """Make all tables, the list of runs and the charts of searches, everything except pages; discard them."""
     tables = all_tables(report)
     with redirect_stdout(io.StringIO()):
         print_report(report, tables)
