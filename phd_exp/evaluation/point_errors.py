@@ -9,7 +9,7 @@ Columns, one row per sample; positions are metres in the camera frame:
     median_z, mu_x, mu_y     a distribution's median of depth, and its projected centre
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -28,7 +28,6 @@ Reading = Literal["whole", "central"]
 Quantity = Literal["projected", "depth"]
 
 READINGS: tuple[Reading, ...] = ("whole", "central")
-QUANTITIES: tuple[Quantity, ...] = ("projected", "depth")
 COLUMNS: Mapping[Estimate, tuple[str, str, str]] = {
     "mode": ("mode_x", "mode_y", "mode_z"),
     "mean": ("mean_x", "mean_y", "mean_z"),
@@ -37,7 +36,7 @@ COLUMNS: Mapping[Estimate, tuple[str, str, str]] = {
 CENTRAL = 0.5  # largest |v_p| of both coordinates in the central half of the field of view
 RESAMPLES = 200
 SEED = 0  # seed of all bootstraps: runs tested on the same images are resampled alike, so that differences are paired
-_ERRORS = {"projected": projected_error, "depth": depth_error}
+_ERRORS: Mapping[Quantity, Callable[[Tensor, Tensor], Tensor]] = {"projected": projected_error, "depth": depth_error}
 
 
 @dataclass(frozen=True)
@@ -94,8 +93,8 @@ def mean_errors(table: Columns, estimates: Sequence[Estimate]) -> MeanErrors:
         points = stacked(table, COLUMNS[estimate])
         if estimate == "median":  # median_z (mu_x, mu_y, 1), on the ray of the projected centre
             points[:, :2] *= points[:, 2:]
-        for quantity in QUANTITIES:
-            values = MILLIMETRES * _ERRORS[quantity](truth, points)
+        for quantity, error in _ERRORS.items():
+            values = MILLIMETRES * error(truth, points)
             found[ErrorKey(estimate, "whole", quantity)] = _mean(values)
             if bool(central.any()):
                 found[ErrorKey(estimate, "central", quantity)] = _mean(values[central])

@@ -16,7 +16,7 @@ NAMES: dict[Method, str] = {
     "average": "average",
     "gaussian": "Gaussian",
 }
-QUANTITIES = {
+LABELS = {
     "depth_error_mm": "depth (mm)",
     "distance_mm": "distance (mm)",
     **{f"coverage_{level}": f"inside {level} %" for level in LEVELS},
@@ -69,7 +69,7 @@ def fusion_table(run: Run, scores: FusionScores) -> Table:
 
 
 def _rows(cells: Mapping[str, TableCell], views: int, quantity: str, on_plane: bool) -> list[TableRow]:
-    label, cameras = QUANTITIES[quantity] + (ON_GROUND if on_plane else ""), range(1, views + 1)
+    label, cameras = LABELS[quantity] + (ON_GROUND if on_plane else ""), range(1, views + 1)
     return [
         TableRow((label, name), tuple(cells[place(quantity, method, k, on_plane)] for k in cameras))
         for method, name in names_of(quantity).items()

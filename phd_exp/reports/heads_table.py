@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from statistics import fmean
 
 import numpy as np
 
@@ -71,7 +70,8 @@ def _cell(name: str, runs: Sequence[Run], reference: Sequence[Run]) -> TableCell
         run.choice | {"overrides": run.digest, "seed": run.seed, "quantity": name, "value": mean.value}
         for run, mean in zip(runs, means, strict=True)
     )
-    alone = TableCell(text(fmean(mean.value for mean in means)), plus_minus(interval(means), text), numbers=numbers)
+    mean = float(np.mean([mean.value for mean in means]))
+    alone = TableCell(text(mean), plus_minus(interval(means), text), numbers=numbers)
     same = {(run.measured.images, mean.n) for run, mean in zip((*runs, *reference), (*means, *others), strict=False)}
     if runs is reference or len(same) > 1 or not others:
         return alone

@@ -14,7 +14,7 @@ from phd_exp.records.errors import one_line
 from phd_exp.reports.runs import Report, Run
 from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem
 
-QUANTITIES: Mapping[str, int] = {"nll": 2, "projected": 1, "depth": 0}  # columns and their decimals
+DIGITS: Mapping[str, int] = {"nll": 2, "projected": 1, "depth": 0}  # columns and their decimals
 OF_A_LINE = (
     "Held-out images: of the training split, never trained on, over the whole field of view. A number is the mean "
     "over seeds, in brackets the smallest and the largest. Errors: of the mode. Difference: of the NLL, or of a "
@@ -72,7 +72,7 @@ def _order(variation: Variation) -> float:
 
 
 def _row(overrides: str, variation: Variation, difference: TableCell) -> TableRow:
-    cells = (_mean(overrides, variation, quantity) for quantity in QUANTITIES)
+    cells = (_mean(overrides, variation, quantity) for quantity in DIGITS)
     return TableRow((one_line(overrides or "none"), ", ".join(map(str, sorted(variation)))), (*cells, difference))
 
 
@@ -82,7 +82,7 @@ def _mean(overrides: str, variation: Variation, quantity: str) -> TableCell:
         variation[seed].choice | {"overrides": overrides, "seed": seed, "quantity": quantity, "value": value}
         for seed, value in found.items()
     )
-    return replace(_cell(found.values(), QUANTITIES[quantity]), numbers=numbers)
+    return replace(_cell(found.values(), DIGITS[quantity]), numbers=numbers)
 
 
 def _difference(variation: Variation, plain: Variation) -> TableCell:
