@@ -19,7 +19,7 @@ from scipy import stats
 from torch import Tensor
 
 from phd_exp.evaluation.parquet import Columns, require_columns, stacked
-from phd_exp.metrics.bootstrap import means, resampled
+from phd_exp.metrics.bootstrap import Interval, means, resampled
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
 from phd_exp.records.errors import RunError
 
@@ -119,22 +119,22 @@ def _mean(values: Tensor) -> SampleMean:
     return SampleMean(n, float(values.mean()), float(values.std() / n**0.5) if n > 1 else None, drawn["mean"].numpy())
 
 
-def difference(one: Sequence[SampleMean], other: Sequence[SampleMean]) -> tuple[float, float]:
-    """The mean over seeds of `one` minus that of `other`, and the half width of its 95 % interval.
+def difference(one: Sequence[SampleMean], other: Sequence[SampleMean]) -> Interval[float]:
+    """The mean over seeds of `one` minus that of `other`, with its 95 % interval.
 
     A bootstrap over the seeds of each model and over the shared test images gives the standard error. Deviations of k
     seeds are scaled by sqrt(k / (k - 1)), and the interval uses Student's law with the seeds' degrees of freedom.
-    With one seed the half width is infinite: nothing is known about other trainings.
+    With one seed the interval is infinite: nothing is known about other trainings.
 
     Source: Davison and Hinkley, "Bootstrap methods and their application" (1997), section 2.3 (small samples).
     """
     gap = float(np.mean([mean.value for mean in one]) - np.mean([mean.value for mean in other]))
     if min(len(one), len(other)) < 2:
-        return gap, float("inf")
+        return Interval(gap, -np.inf, np.inf)
     random = np.random.default_rng(SEED)
     drawn = _over_seeds(one, random) - _over_seeds(other, random)
-    freedom = len(one) + len(other) - 2
-    return gap, float(stats.t.ppf(0.975, freedom) * drawn.std(ddof=1))
+    half_width = float(stats.t.ppf(0.975, len(one) + len(other) - 2) * drawn.std(ddof=1))
+    return Interval(gap, gap - half_width, gap + half_width)
 
 
 def _over_seeds(means: Sequence[SampleMean], random: np.random.Generator) -> np.ndarray:

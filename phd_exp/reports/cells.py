@@ -67,10 +67,8 @@ class Cell:
 
     def beats(self, other: "Cell") -> bool:
         """Whether this mean is significantly smaller: a paired bootstrap over seeds and the shared test images."""
-        if len(self.images | other.images) != 1:
-            return False
-        gap, half_width = difference(list(self.means.values()), list(other.means.values()))
-        return gap < -half_width
+        same = len(self.images | other.images) == 1
+        return same and difference(list(self.means.values()), list(other.means.values())).high < 0
 
     def numbers(self, table: str, bold: bool) -> dict[str, Any]:
         """A line of CSV."""

@@ -75,6 +75,6 @@ def _cell(name: str, runs: Sequence[Run], reference: Sequence[Run]) -> TableCell
     same = {(run.measured.images, mean.n) for run, mean in zip((*runs, *reference), (*means, *others), strict=False)}
     if runs is reference or len(same) > 1 or not others:
         return alone
-    gap, width = difference(means, others)
-    below = f"{'+' if gap > 0 else ''}{text(gap)} ±{text(width)}"
-    return replace(alone, below=below, bold=gap < -width and name != "inside_90")
+    gap = difference(means, others)
+    below = f"{'+' if gap.value > 0 else ''}{text(gap.value)} {plus_minus(gap, text)}"
+    return replace(alone, below=below, bold=gap.high < 0 and name != "inside_90")

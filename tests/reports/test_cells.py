@@ -97,12 +97,12 @@ def test_equal_models_are_rarely_separated_and_different_ones_often(seeds: int) 
     for _ in range(100):
         images = random.normal(0, 40, 80)  # hard and easy ones: alike for both models
         for shift in separated:
-            gap, half_width = difference(means(shift, images), means(0.0, images))
-            separated[shift] += abs(gap) > half_width
+            gap = difference(means(shift, images), means(0.0, images))
+            separated[shift] += not gap.low <= 0 <= gap.high
     assert separated[0.0] / 100 <= 0.05 + 4 * np.sqrt(0.05 * 0.95 / 100)
     assert separated[-30.0] / 100 > 0.85
 
 
 def test_one_seed_is_never_separated() -> None:
     one = [SampleMean(10, 1.0, 0.1, np.full(200, 1.0))]
-    assert difference(one, [SampleMean(10, 9.0, 0.1, np.full(200, 9.0))] * 3) == (-8.0, np.inf)
+    assert difference(one, [SampleMean(10, 9.0, 0.1, np.full(200, 9.0))] * 3) == Interval(-8.0, -np.inf, np.inf)
