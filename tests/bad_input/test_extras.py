@@ -14,12 +14,7 @@ from tests.bad_input.table import LEARN, ONE
 PACKAGES = {
     "render": ("bpy",),
     "report": ("matplotlib", "plotly", "jinja2"),
-    "launchers": (
-        "joblib",
-        "submitit",
-        "hydra_plugins.hydra_joblib_launcher",
-        "hydra_plugins.hydra_submitit_launcher",
-    ),
+    "launchers": ("joblib", "submitit", *(f"hydra_plugins.hydra_{name}_launcher" for name in ("joblib", "submitit"))),
     "export": ("onnx", "onnxscript", "onnxruntime"),
     "search": ("optuna",),
     "loggers": ("tensorboard", "tensorboardX", "mlflow"),
@@ -28,13 +23,8 @@ PACKAGES = {
 }
 OTHERS = (*LEARN, "runs=others")
 SMALLEST = (
-    *HANDMADE,
-    "data.variant=new",
-    "data.n_train=1",
-    "data.n_held_out=0",
-    "data.n_test=1",
-    "data.batch_size=1",
-)
+    *HANDMADE, "data.variant=new", "data.n_train=1", "data.n_held_out=0", "data.n_test=1", "data.batch_size=1",
+)  # fmt: skip
 WORKS: dict[str, tuple[str, ...]] = {"report": ("report",), "train": OTHERS, "predict": ONE}
 """The first two lack pictures, which they say."""
 LACKS: dict[str, tuple[tuple[str, ...], ...]] = {
@@ -73,14 +63,12 @@ for words in commands:
 
 
 def test_the_table_has_every_extra() -> None:
-    extras = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"][
-        "optional-dependencies"
-    ]
-    assert {*PACKAGES, "dev"} == set(extras)
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    assert {*PACKAGES, "dev"} == set(project["optional-dependencies"])
     assert PACKAGES.keys() == LACKS.keys()
 
 
-@pytest.mark.timeout(240)
+@pytest.mark.slow
 def test_without_the_packages_of_all_extras(place: Place) -> None:
     """Runs in a new process, because this process has already imported some of these packages."""
     run = str(place.run.path.relative_to(place.root))

@@ -20,11 +20,7 @@ def test_pins_and_floors_are_sound() -> None:
 @pytest.mark.parametrize(
     ("good", "bad", "said"),
     [
-        (
-            "lightning==2.6.6",
-            "lightning==2.6.3",
-            "lightning==2.6.3 is known to be bad: 2.6.2 and 2.6.3 were malicious",
-        ),
+        ("lightning==2.6.6", "lightning==2.6.3", "lightning==2.6.3 is known to be bad: "),
         ("filelock==4.2.11", "filelock==3.16.0", "filelock==3.16.0 is known to be bad"),
         ("hydra-core==1.3.8", "hydra-core==1.4.0", "hydra-core==1.4.0 is not <1.4,>=1.3.4, as pyproject.toml asks"),
     ],

@@ -34,18 +34,15 @@ def test_the_floors_are_those_that_are_checked() -> None:
 
 def test_files_that_contributors_are_sent_to_are_there() -> None:
     paths = re.findall(r"`([\w.-]+/[\w./-]*[\w/])`", CONTRIBUTING)
-    assert len(paths) > 10
+    assert paths
     for path in paths:
         if path.isupper() or "NAME" in path or "VERB" in path:
             continue
         assert any((place / path).exists() for place in (ROOT, ROOT / "phd_exp")), path
 
 
-def test_examples_are_short() -> None:
-    files = list((ROOT / "tests" / "extending").glob("test_*.py"))
-    assert len(files) == 3
-    for file in files:
-        assert len(file.read_text().splitlines()) < 30, file
+def test_contributors_are_sent_to_every_example() -> None:
+    for file in (ROOT / "tests" / "extending").glob("test_*.py"):
         assert f"tests/extending/{file.name}" in CONTRIBUTING
 
 
