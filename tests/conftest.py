@@ -13,6 +13,7 @@ import torch
 from jaxtyping import install_import_hook
 
 from phd_exp.cli import conf_folder, jobs
+from phd_exp.records import runs
 from phd_exp.records.spec import DatasetSpec
 
 # before anything is imported: every annotated function of these modules checks its shapes while tests run; numba
@@ -23,6 +24,7 @@ install_import_hook([f"phd_exp.{name}" for name in HOOKED], "beartype.beartype")
 
 
 torch.set_num_threads(1)
+runs.git_commit = cache(runs.git_commit)  # some 400 runs are recorded
 
 
 @pytest.fixture(autouse=True)
@@ -42,6 +44,14 @@ class Outcome:
     status: int
     out: str
     err: str
+
+    @property
+    def error(self) -> str:
+        """Requires that the command was refused on one line; the line without `error: `."""
+        assert self.status in (1, 2), self
+        (line,) = self.err.splitlines()
+        assert line.startswith("error: ")
+        return line.removeprefix("error: ")
 
 
 @pytest.fixture(scope="session")

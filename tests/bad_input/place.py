@@ -1,7 +1,6 @@
 """What bad inputs are made from: a sound run, sound images and a sound data set, made without a renderer."""
 
 import json
-import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,11 +19,12 @@ from phd_exp.records.dataset import SPLITS, DatasetFolder, Seal, sha256
 from phd_exp.records.runs import RunFolder, find_runs
 from phd_exp.records.spec import DatasetSpec
 from tests.support.handmade import write_handmade
+from tests.support.untrained import NARROW
 
 TRAIN = (
     "preset=smoke", "logger=none", "data=folder", "data.batch_size=4", "data.image_size=32", "data.n_held_out=0",
     "trainer.threads=1", "trainer.precision=float32", "trainer.progress_bar=false", "trainer.max_epochs=1",
-    "trainer.accelerator=cpu",
+    "trainer.accelerator=cpu", *NARROW,
 )  # fmt: skip
 HANDMADE = ("preset=smoke", "data.variant=handmade", "data.sensor_size=64", "data.f_range=[400,600]")
 
@@ -49,7 +49,7 @@ class Place:
         return self.root / "photos/test/metadata.jsonl"
 
     def put(self, file: Path | str, content: bytes | str) -> None:
-        """Write a file anew: the sound one may be shared with other tests."""
+        """Write a file anew, whatever is there."""
         path = self.root / file
         path.parent.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
@@ -71,11 +71,6 @@ class Place:
         seals = folder.manifest.splits | {"test": Seal(n=2, metadata_sha256=sha256(text.encode()))}
         folder.write_manifest(folder.manifest.model_copy(update={"splits": seals}))
 
-    def put_line(self, **changes: Any) -> None:
-        """Change the first line of the metadata of the test images."""
-        first, *rest = self.metadata.read_text().splitlines()
-        self.put(self.metadata, "\n".join([json.dumps(json.loads(first) | changes), *rest]) + "\n")
-
     def put_config(self, **changes: Any) -> None:
         """Change what the run's configuration says; dots lead inside."""
         config = self.run.config()
@@ -95,10 +90,8 @@ class Place:
 
 
 def spoil_checkpoint(file: Path, **changes: Any) -> None:
-    """Change what a checkpoint says; the sound one may be shared with other tests."""
-    content = torch.load(file, weights_only=True) | changes
-    file.unlink()
-    torch.save(content, file)
+    """Change what a checkpoint says."""
+    torch.save(torch.load(file, weights_only=True) | changes, file)
 
 
 def write_photos(folder: Path) -> None:
@@ -133,10 +126,5 @@ def make(root: Path) -> None:
 
 
 def copied(sound: Path, root: Path) -> Place:
-    """A copy to be spoiled; the checkpoint, the one large file, is shared until it is written anew."""
-
-    def copy(source: str, target: str) -> None:
-        (os.link if source.endswith(".ckpt") else shutil.copy2)(source, target)
-
-    shutil.copytree(sound, root, dirs_exist_ok=True, copy_function=copy)
-    return Place(root)
+    """A copy to be spoiled."""
+    return Place(Path(shutil.copytree(sound, root, dirs_exist_ok=True)))

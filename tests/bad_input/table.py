@@ -52,8 +52,8 @@ def nothing(place: Place) -> None:
     """The command line alone is wrong."""
 
 
-def configured(name: str, word: str, said: str) -> Bad:
-    return Bad(f"configuration: {name}", nothing, ("preset=smoke", "logger=none", word), said, 2)
+def configured(name: str, word: str, said: str, again: bool = False) -> Bad:
+    return Bad(f"configuration: {name}", nothing, ("preset=smoke", "logger=none", word), said, 2, again)
 
 
 def photo(name: str, content: bytes | Callable[[], bytes], said: str) -> Bad:
@@ -91,6 +91,16 @@ def foreign(form: str, name: str, word: str, said: str, without: str | None = No
 
 def camera(name: str, words: tuple[str, ...], said: str, status: int = 1) -> Bad:
     return Bad(f"intrinsics: {name}", nothing, (*ONE[:3], *words), said, status)
+
+
+def argument(words: tuple[str, ...], said: str, status: int = 2, **view: Any) -> Bad:
+    """A verb with wrong arguments, or with a line of a view that has more keys."""
+
+    def spoil(place: Place) -> None:
+        if view:
+            place.put(place.metadata, json.dumps({"file_name": "0.png", "f": 300} | view) + "\n")
+
+    return Bad(f"argument: {' '.join(words)}, {view}", spoil, words, said, status)
 
 
 def checkpoint(name: str, spoil: Callable[[Place], Any], said: str) -> list[Bad]:
@@ -138,6 +148,7 @@ def status(**changes: Any) -> Callable[[Place], None]:
 
 
 GOOD = '"file_name": "0.png", "f": 300'
+POSE = {"rotation": [1, 0, 0, 0], "translation": [0, 0, 0]}
 DEEP = "[" * 100_000
 BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
     f"{name}: &{name} [{','.join([f'*{before}'] * 9)}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
@@ -174,14 +185,14 @@ CONFIGURATIONS = [
     configured("a folder without a name", "runs=''", r"runs: got ''; expected the name of a folder"),
     configured("brackets without end", "+a=" + "[" * 2000, r"[^\n]{1,420}"),
     configured("an empty word", "", r": no KEY=VALUE; .*"),
-    *(configured(f"the end of a key, {word}", word, rf"{word.split('=')[0]}: unknown key, did you mean '{key}'\?; expected one of backbone, .*") for word, key in ENDS.items()),
+    *(configured(f"the end of a key, {word}", word, rf"{word.split('=')[0]}: unknown key, did you mean '{key}'\?; expected one of backbone, .*", word not in [*ENDS][:2]) for word, key in ENDS.items()),
     configured("an argument that the files do not name", "trainer.gradient_clip_val=1", r"trainer\.gradient_clip_val: unknown key; .* \+trainer\.gradient_clip_val=VALUE"),
     configured("a key of another section", "trainer.batch_size=8", r"trainer\.batch_size: unknown key, did you mean 'data\.batch_size'\?; .*"),
     configured("a key of a part that is not chosen", "callbacks.early_stopping.patience=3", r"callbacks\.early_stopping\.patience: .* of callbacks=early_stopping; name that choice too"),
     configured("one of several choices", "callbacks=[early_stopping,nosuch]", r"callbacks=nosuch: no such choice; expected one of best_checkpoint, .*lr_monitor"),
     configured("a choice without its group", "strong", r"strong: no KEY=VALUE, did you mean 'recipe=strong'\?; .*"),
     configured("no end of a list", "data.n_train=[", r"data\.n_train=\[: .*; expected KEY=VALUE without spaces, or with the value in quotes, .*"),
-    *(Bad(f"configuration: spaces, {text}", nothing, (*text.split(" "), "preset=smoke"), rf"{re.escape(text.removeprefix('-m '))}: has spaces; expected {re.escape(mended)}", 2) for text, mended in SPACES.items()),
+    *(Bad(f"configuration: spaces, {text}", nothing, (*text.split(" "), "preset=smoke"), rf"{re.escape(text.removeprefix('-m '))}: has spaces; expected {re.escape(mended)}", 2, text in ("model= mae_vz", "model =mae_vz")) for text, mended in SPACES.items()),
     Bad("configuration: a zero byte", nothing, ("preset=smoke", "runs=a\0b"), r"runs=a\?b: holds control characters; .*", 2),
     *(Bad(f"configuration: {word}", nothing, ("-m", "preset=smoke", word), r"seed=range\(0,.*\): more than 10000 jobs; .*", 2, again="1e9" not in word) for word in ("seed=range(0,1e9)", "seed=range(0,nan)", "seed=range(0,inf)")),
     Bad("configuration: two long ranges", nothing, ("-m", "preset=smoke", "seed=range(0,9999)", "data.seed=range(0,9999)"), r"preset=smoke seed=.*: more than 10000 jobs; .*", 2),
@@ -212,10 +223,12 @@ PICTURES = [
     Bad("image: a pipe to train on", lambda place: images.pipe(place.root / "photos/train/0.png"), (*LEARN, "runs=others"), r".*line 1: .*0\.png: cannot be read as an image \(a pipe or a device; .*"),
     Bad("image: a device", nothing, ("predict", RUN, "image=/dev/zero", "f=300"), r"/dev/zero: cannot be read \(a pipe or a device; expected a plain file\)"),
     Bad("image: a folder", nothing, ("predict", RUN, "image=photos", "f=300"), r"photos: cannot be read \(Is a directory\)"),
+    Bad("image: a detection in a folder", lambda place: place.put("dot/metadata.jsonl", '{"file_name": ".", "f": 400}'), ("predict", RUN, "folder=dot"), r"dot: cannot be read \(Is a directory\)"),
     Bad("image: gone", lambda place: place.photo.unlink(), PREDICT, r"photos/test/0\.png: cannot be read \(No such file or directory\)"),
 ]  # fmt: skip
 
 LINES = [
+    line("no camera", '{"file_name": "0.png"}\n', r"expected either f, or fx and fy.*"),
     line("not JSON", "{", r"not JSON \(.*\); expected one object a line"),
     line("nesting without end", f'{{{GOOD}, "box": {DEEP}}}\n', r"not JSON \(nested too deeply\); .*"),
     line("a number of 5000 digits", f'{{"file_name": "0.png", "f": {"9" * 5000}}}\n', r"not JSON \(a whole number of 5000 digits\); .*"),
@@ -258,6 +271,63 @@ CAMERAS = [
 ]  # fmt: skip
 
 
+HERE = ("predict", RUN, "image=photos/test/0.png")
+NOWHERE = ("fuse", "run=nowhere", "folder=photos/test")
+ARGUMENTS = [
+    argument((*ONE, "folder=."), r"predict: expected either image=FILE.*"),
+    argument((*PREDICT, "f=400"), r"photos/test: has annotations, .*metadata\.jsonl; expected images alone, or no f=.*", 1),
+    argument((*PREDICT, "f=400", "object=1"), r"object: selects detections.*"),
+    argument(("predict", RUN, "folder=nowhere", "camera=c.yaml"), r"nowhere: no images; expected a folder with files \*\.png.*", 1),
+    argument(("predict", RUN, "folder=nowhere"), r"nowhere: no such folder.*", 1),
+    argument((*HERE, "camera=no.yaml"), r"no\.yaml: No such file or directory.*", 1),
+    argument((*ONE, "run=nowhere"), r"run: given twice.*"),
+    argument(("predict", RUN, "imag=good.png"), r"imag: unknown key, did you mean 'image'\?.*"),
+    argument(("predict", RUN, "good.png"), r"good\.png: expected key=value.*"),
+    argument((*ONE, "out=photos/test/0.png/x"), r"photos/test/0\.png/x: cannot be written.*"),
+    argument((*ONE, "calibration=true"), r"calibration: is drawn into the pictures; expected out=.*"),
+    argument(("predict", "run=x", "image=y", "views=3"), r"views: got '3'; expected to be '1' or '8'.*"),
+    argument(("predict", "nonsense=1"), r"run: missing; predict takes run=.*"),
+    argument((*ONE, "coverage=1"), r"coverage: got '1'; expected to be less than 1"),
+    argument((*ONE, "coverage=0"), r"coverage: got '0'; expected to be greater than 0"),
+    argument((*ONE, "coverage=nan"), r"coverage: got 'nan'; expected to be.*"),
+    argument((*ONE, "coverage=most"), r"coverage: got 'most'; expected.*"),
+    argument((*ONE, "groups=spread"), r"groups: guarantees a coverage; expected coverage=0\.9.*"),
+    argument((*ONE, "groups=size", "coverage=0.9"), r"groups: got 'size'; expected to be 'spread', 'truncation' or.*"),
+    argument((*ONE, "coverage=0.9"), r"runs/.*/held_out\.parquet: missing; held-out samples are needed: train with.*", 1),
+    argument((*EXPORT, "coverage=0.9"), r"runs/.*/held_out\.parquet: missing.*", 1),
+    argument(("export",), r"run: missing; export takes run=, recalibrate=, coverage=, trust=, views=, out=.*"),
+    argument(("export", "run=nowhere"), r"nowhere: no run; expected a folder with config\.yaml.*", 1),
+    argument(("export", "run=.", "out=."), r"out=\.: is a folder.*"),
+    argument(("fuse", "run=nowhere"), r"folder: missing; fuse takes run=.*"),
+    argument(NOWHERE, r"nowhere: no run; expected a folder with config\.yaml.*", 1, scene=1, pose=POSE),
+    argument((*NOWHERE, "plane=1,2,3"), r"plane: got '1,2,3'; expected plane=NX,NY,NZ,OFFSET.*", scene=1, pose=POSE),
+    argument((*NOWHERE, "plane=0,0,0,1"), r"plane: .*a normal that is not zero.*", scene=1, pose=POSE),
+    argument((*NOWHERE, "plane=0,nan,0,1"), r"plane: .*expected finite numbers.*", scene=1, pose=POSE),
+    argument((*NOWHERE, "out=."), r"out=\.: is a folder.*", scene=1, pose=POSE),
+    argument((*NOWHERE, "out=photos/test/metadata.jsonl"), r"out=.*: is one of the files that are read.*", scene=1, pose=POSE),
+    argument((*NOWHERE, "out=photos/test/0.png"), r"out=.*: is one of the files that are read.*", scene=1, pose=POSE),
+    argument(("fuse", RUN, "folder=photos/test", "coverage=0.9", "plane=0,0,1,3"), r"coverage: holds for views that are fused.*", scene=1, pose=POSE),
+    argument(("fuse", RUN, "folder=photos/test", "coverage=0.9"), r"runs/.*/views\.parquet: no scenes with 1 cameras, as coverage= needs; .*", 1, scene=1, pose=POSE),
+    argument(NOWHERE, r".*line 1: scene is missing.*", 1),
+    argument(NOWHERE, r".*line 1: pose is missing; expected the rotation \[w, x, y, z\].*", 1, scene=1),
+    argument(NOWHERE, r".*line 1: scene: got True; expected a whole number or a name.*", 1, scene=True, pose=POSE),
+    argument(NOWHERE, r".*pose\.rotation: got \[1, 1, 0, 0\]; a rotation is.*", 1, scene=1, pose=POSE | {"rotation": [1, 1, 0, 0]}),
+    argument(NOWHERE, r".*line 1: pose\.translation: missing.*", 1, scene=1, pose={"rotation": [1, 0, 0, 0]}),
+    argument(NOWHERE, r".*pose\.R: unknown key; expected one of rotation, translation.*", 1, scene=1, pose=POSE | {"R": 1}),
+    argument(("report", "rnus=x"), r"rnus: unknown key, did you mean 'runs'\?; report takes runs=, out= \(see .*"),
+    argument(("report", "out="), r"out=: expected key=value; report takes runs=, out= \(see .*"),
+    argument(("report", "runs"), r"runs: expected key=value; report takes runs=, out= \(see .*"),
+    argument(("report", "runs=x"), r"x: no such folder; train first, or name another by runs=DIR", 1),
+    argument(("report", "out=photos/test/0.png"), r"photos/test/0\.png/measured: cannot be written \(.*", 1),
+    argument(("search", "space.yaml", "trials=0"), r"trials: got '0'; .*"),
+    argument(("render", "preset=smoke", "nonsense=1"), r"nonsense: unknown key.*"),
+    argument(("render", "preset=smoke", "masks=renders/default/masks"), r"masks=renders/default/masks: lies in the data set itself.*", 1),
+    argument(("render", "preset=smoke", "bop=renders/default/bop"), r"bop=renders/default/bop: lies in the data set itself.*", 1),
+    argument(("render", "preset=smoke", "bop=bop", "data.image_format=webp"), r"data\.image_format: got webp; BOP has no such images.*"),
+    argument(("render", "preset=smoke", "verify=true"), r".*no data set here.*", 1),
+]  # fmt: skip
+
+
 def trap(place: Place) -> None:
     place.put_checkpoint(state_dict=Trap("owned"))
 
@@ -276,6 +346,12 @@ def repeat(place: Place) -> None:
     """A small file that names large weights."""
     weights = torch.load(place.run.last_checkpoint, weights_only=True)["state_dict"]
     place.put_checkpoint(state_dict=weights | {"regressor.last.bias": torch.zeros(1).expand(7)})
+
+
+def diverge(place: Place) -> None:
+    weights = torch.load(place.run.last_checkpoint, weights_only=True)["state_dict"]
+    weights["regressor.last.bias"][0] = torch.nan
+    place.put_checkpoint(state_dict=weights)
 
 
 def shrunk(place: Place) -> None:
@@ -302,10 +378,13 @@ CHECKPOINTS = [
     *checkpoint("weights of another network", lambda place: place.put_checkpoint(state_dict={"regressor.last.bias": torch.zeros(7)}), r"not a (whole )?checkpoint of this (network|run) \(.*"),
     *checkpoint("weights that are none", lambda place: place.put_checkpoint(state_dict=[1, 2]), r"not a (whole )?checkpoint of this (network|run) \(.*"),
     *checkpoint("weights that repeat one number", repeat, r"not a whole checkpoint of this network \(last\.bias: repeats numbers.*\)")[:2],
+    Bad("checkpoint: gone", lambda place: place.run.last_checkpoint.unlink(), ONE, r"runs/.*/last\.ckpt: missing; the run has not trained a whole epoch yet.*"),
+    Bad("checkpoint: diverged", diverge, ONE, r"photos/test/0\.png: the network returns numbers that are not finite; train the run again.*"),
     checkpoint("an epoch that never was", lambda place: place.put_checkpoint(epoch=10**12), r"not a checkpoint of this run \(epoch 1000000000000 of 1\); .*")[2],
     checkpoint("an epoch of text", lambda place: place.put_checkpoint(epoch="one"), r"not a checkpoint of this run \(epoch 'one' of 1\); .*")[2],
     checkpoint("loops of another trainer", lambda place: place.put_checkpoint(loops={"fit_loop": 3}), r"not a checkpoint of this run \(.*\); .*")[2],
 ]  # fmt: skip
+
 
 REFUSED = r"is not built from a stored configuration.*"
 STORED = [
@@ -358,5 +437,5 @@ FOLDERS = [
 
 
 TABLE = [
-    *CONFIGURATIONS, *PICTURES, *LINES, *LABELS, *FORMATS, *CAMERAS, *CHECKPOINTS, *STORED, *RECORDS, *FOLDERS,
+    *CONFIGURATIONS, *PICTURES, *LINES, *LABELS, *FORMATS, *CAMERAS, *ARGUMENTS, *CHECKPOINTS, *STORED, *RECORDS, *FOLDERS,
 ]  # fmt: skip

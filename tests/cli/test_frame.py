@@ -2,7 +2,6 @@
 
 import os
 import time
-from collections.abc import Callable
 
 import pytest
 import torch
@@ -25,19 +24,3 @@ def test_memory_that_runs_out_is_one_line() -> None:
         assert (ending.state, ending.exit_status) == ("failed", 1)
         (line,) = ending.lines
         assert line.startswith("memory ran out; free some, and the same command resumes, or lower data.batch_size")
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        *((verb, "nonsense=1") for verb in ("predict", "fuse", "report", "export")),
-        ("search", "space.yaml", "trials=0"),
-        ("predict", "run=x", "image=y", "views=3"),
-        ("preset=smoke", "nonsense=1"),
-        ("render", "nonsense=1"),
-    ],
-    ids=" ".join,
-)
-def test_wrong_arguments_have_status_2_in_every_verb(phd_exp: Callable, words: tuple[str, ...]) -> None:
-    outcome = phd_exp(*words)
-    assert (outcome.status, outcome.out, outcome.err.count("\n")) == (2, "", 1)

@@ -13,19 +13,9 @@ from phd_exp.config.sections import FolderConfig, RenderedConfig
 from phd_exp.records.spec import DatasetSpec
 
 NAMES = [
-    *("box(1).obj", "boîte.obj", "José/部品.glb", "a=b.obj", "a,b.obj", "#1.obj", "[new].obj", "[new]", "{x}.obj"),
-    *(
-        "~old.obj",
-        "it's.obj",
-        "'a'b.obj",
-        'say "x".obj',
-        "end\\",
-        "a:b/c d.obj",
-        "50%.obj",
-        "choice(a).obj",
-        "&;!.obj",
-    ),
-]
+    "box(1).obj", "boîte.obj", "José/部品.glb", "a=b.obj", "a,b.obj", "#1.obj", "[new].obj", "[new]", "{x}.obj",
+    "~old.obj", "it's.obj", "'a'b.obj", 'say "x".obj', "end\\", "a:b/c d.obj", "50%.obj", "choice(a).obj", "&;!.obj",
+]  # fmt: skip
 
 
 def values(word: str) -> object:

@@ -6,15 +6,9 @@ from pathlib import Path
 import pytest
 
 TINY = (
-    "data.sensor_size=56",
-    "data.f_range=[300,500]",
-    "preset=smoke",
-    "data.image_size=32",
-    "data.n_train=3",
-    "data.n_held_out=1",
-    "data.n_test=2",
-    "data.samples_per_pixel=1",
-)
+    "data.sensor_size=56", "data.f_range=[300,500]", "preset=smoke", "data.image_size=32", "data.n_train=3",
+    "data.n_held_out=1", "data.n_test=2", "data.samples_per_pixel=1",
+)  # fmt: skip
 
 
 @pytest.fixture
@@ -54,27 +48,3 @@ def test_a_data_set_is_rendered_in_shards_and_verified_and_repaired(
     assert {path.name for path in (tmp_path / "masks" / "test").iterdir()} == {"000000.png", "000001.png"}
     assert "bop: 6 images as BOP" in repaired.out
     assert (tmp_path / "bop" / "train" / "000000" / "rgb" / "000002.png").read_bytes() == whole
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["masks=renders/default/masks"], "masks=renders/default/masks: lies in the data set itself"),
-        (["bop=renders/default/bop"], "bop=renders/default/bop: lies in the data set itself"),
-        (["bop=bop", "data.image_format=webp"], "data.image_format: got webp; BOP has no such images"),
-    ],
-)
-def test_what_cannot_be_written_is_refused_before_anything_is_rendered(
-    render: Callable, tmp_path: Path, words: list[str], said: str
-) -> None:
-    refused = render("data=default", *words)
-    assert refused.status in (1, 2)
-    assert refused.err.startswith(f"error: {said}")
-    assert not (tmp_path / "renders" / "default").exists()
-
-
-def test_verifying_a_missing_data_set_is_one_line(render: Callable) -> None:
-    outcome = render("verify=true")
-    assert outcome.status == 1
-    assert outcome.err.startswith("error: ")
-    assert "no data set here" in outcome.err

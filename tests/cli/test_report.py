@@ -62,21 +62,3 @@ def test_nothing_is_written_where_nothing_is_recorded(phd_exp: Callable, tmp_pat
     assert outcome.status == 0
     assert outcome.out.startswith("no runs recorded yet; begin by: python -m phd_exp -m experiment=table1")
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
-
-
-@pytest.mark.parametrize(
-    ("argument", "said"),
-    [
-        ("rnus=x", "rnus: unknown key, did you mean 'runs'?; report takes runs=, out= (see "),
-        ("out=", "out=: expected key=value; report takes runs=, out= (see "),
-        ("runs", "runs: expected key=value; report takes runs=, out= (see "),
-        ("runs=x", "x: no such folder; train first, or name another by runs=DIR"),
-        ("out=file", "file/measured: cannot be written ("),
-    ],
-)
-def test_a_mistake_is_one_line(phd_exp: Callable, runs: Path, argument: str, said: str) -> None:
-    Path("file").write_text("in the way")
-    outcome = phd_exp("report", argument)
-    assert (outcome.status in (1, 2), outcome.out) == (True, "")
-    (line,) = outcome.err.splitlines()
-    assert line.startswith(f"error: {said}")

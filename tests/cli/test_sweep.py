@@ -14,13 +14,13 @@ from omegaconf import OmegaConf
 
 from phd_exp.cli import conf_folder, sweep
 from phd_exp.cli import jobs as launched
-from phd_exp.cli.frame import Ending
 from phd_exp.cli.jobs import Job
 from phd_exp.cli.sweep import Combination, cores_a_job, plan
 from phd_exp.cli.train import numbers, run_name, standing
 from phd_exp.config import check
 from phd_exp.records.processes import usable_cores
 from phd_exp.records.runs import RunFolder
+from tests.support.recorded import status_of
 
 EXPERIMENTS = [
     pytest.param(file.stem, marks=pytest.mark.slow if file.stem in ("heads", "shift") else ())
@@ -101,9 +101,7 @@ def test_how_a_run_stands_is_read_before_the_configuration_is_checked(
     runs[2].shifts.mkdir()
     runs[2].shift("f_wrong").touch()
     assert standing(shifted.config, shifted.overrides) == "finished"
-    status = runs[1].status()
-    assert status is not None
-    runs[1].write_status(status.model_copy(update={"state": "running"}))
+    status_of(runs[1], state="running")
     assert standing(planned[1].config, planned[1].overrides) == "exited without a result (killed or out of memory)"
 
 
@@ -141,46 +139,18 @@ def test_cores_are_those_that_this_process_was_given(monkeypatch: pytest.MonkeyP
         assert usable_cores() == usable
 
 
-def test_the_time_of_a_sweep_is_printed_beforehand(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sweep, "usable_cores", lambda: 4)
-    job = Job(lambda *_: None, cost=lambda configs, cores: 7200.0 * len(configs))
-    for cores, line in ((2, "about 3.0 h on 4 cores"), (None, "about 6.0 h on 4 cores")):
-        sweep._print_duration(job, [{}] * 3, cores)
-        assert capsys.readouterr().out == f"{line}, by the first steps of one job\n"
-    sweep._print_duration(Job(job.task), [{}], 2)
-    sweep._print_duration(job, [], 2)
-    assert capsys.readouterr().out == ""
-
-
-def test_a_sweep_ends_with_the_errors_of_each_finished_job(
-    jobs: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_the_numbers_of_a_finished_run_are_its_errors_and_its_nll(
+    jobs: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    planned = jobs("preset=smoke", "model=probabilistic,mae_vz", "seed=0,1")
     errors = {"test/projected_error_mm": 6.25, "test/depth_error_mm": 142.0}
-    for job in planned[:3]:
+    for job, nll in zip(jobs("preset=smoke", "model=probabilistic,mae_vz"), ({"test/nll": -8.5}, {}), strict=True):
         run = RunFolder(folder(job))
         run.path.mkdir(parents=True)
-        run.write_results(errors | ({"test/nll": -8.5} if "model=probabilistic" in job.overrides else {}))
-    planned[3].config["seed"] = None  # as a job that is refused
-    endings = [
-        Ending("finished"),
-        Ending("finished already"),
-        Ending("finished"),
-        Ending("failed", ("seed: bad",), 2),
-    ]
-    sweep._print_outcome(Job(lambda *_: None, numbers=numbers), planned, endings)
-    found = capsys.readouterr()
-    said = "projected error 6.25 mm, depth error 142 mm"
-    assert found.out.splitlines()[:4] == [
-        f"model=probabilistic seed=0: finished, {said}, NLL -8.5",
-        f"model=probabilistic seed=1: finished already, {said}, NLL -8.5",
-        f"model=mae_vz seed=0: finished, {said}",
-        "model=mae_vz seed=1: failed",
-    ]
-    assert numbers(planned[3].config, []) == ""
+        run.write_results(errors | nll)
+        expected = f"projected error 6.25 mm, depth error 142 mm{', NLL -8.5' if nll else ''}"
+        assert numbers(job.config, job.overrides) == expected
+        assert numbers(job.config | {"seed": None}, job.overrides) == "", "as a job that is refused"
 
 
 @pytest.mark.parametrize(("launcher", "worker", "share", "seen"), [

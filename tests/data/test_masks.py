@@ -20,7 +20,6 @@ def test_training_batches_alone_have_masks(source: RenderedSource) -> None:
     data = PositionData(source, batch_size=3, masks=True)
     data.setup()
     masks = data.samples["train"].mask
-    assert masks is not None
     assert masks.shape == (3, CELLS, CELLS)
     assert masks.amax() == 255
     assert data.samples["held_out"].mask is None

@@ -1,6 +1,7 @@
 """The pages of the documentation, taken apart."""
 
 import re
+import runpy
 import shlex
 from pathlib import Path
 from typing import NamedTuple
@@ -10,6 +11,8 @@ from phd_exp.cli import PACKAGE
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
+REFERENCE = runpy.run_path(str(DOCS / ".build" / "reference.py"))["pages"]()
+"""The pages that are made from docstrings, by their addresses."""
 _BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _INDENTED = re.compile(r"(?:^ {4}.*\n)+", re.MULTILINE)
 

@@ -3,7 +3,6 @@
 import html
 import os
 import re
-import runpy
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,12 +12,10 @@ from typing import Any
 
 import pytest
 
-from tests.docs.pages import DOCS, PAGES, ROOT
+from tests.docs.pages import PAGES, REFERENCE, ROOT
 from tests.support.browser import Visit
 
 pytestmark = pytest.mark.slow
-
-REFERENCE = runpy.run_path(str(DOCS / ".build" / "reference.py"))["pages"]()
 
 LOADED = {"script": "src", "img": "src", "iframe": "src", "source": "src", "link": "href"}
 """Tags that make a browser fetch something, and the attribute with its address."""

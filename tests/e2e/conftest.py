@@ -1,6 +1,5 @@
 """Real renders, small enough for seconds: a quarter of the sensor, the same field of view."""
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,7 +7,10 @@ import pytest
 
 from phd_exp.__main__ import main
 from phd_exp.records.runs import RunFolder, find_runs
-from tests.support.recorded import once
+from phd_exp.reports import figures
+from tests.support import own_parts
+from tests.support.recorded import once, shared
+from tests.support.untrained import NARROW, SIDE
 
 QUICK = (
     "preset=smoke",
@@ -24,8 +26,7 @@ QUICK = (
 )
 
 
-SIDE = 48
-QUICKER = ("trainer.max_epochs=1", "logger=none", f"data.image_size={SIDE}")
+QUICKER = ("trainer.max_epochs=1", "logger=none", f"data.image_size={SIDE}", *NARROW)
 
 
 def trained(runs: Path, *arguments: str) -> None:
@@ -46,9 +47,16 @@ def run(renders: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 @pytest.fixture(scope="session")
 def renders(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One folder of data sets for all tests, in whatever process: whoever needs a data set first renders it."""
-    base = tmp_path_factory.getbasetemp()
-    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    return shared / "renders"
+    return shared(tmp_path_factory) / "renders"
+
+
+@pytest.fixture
+def own(phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable:
+    """A run of a second in a folder with own parts, without the picture of its calibration."""
+    own_parts.write_own_parts(tmp_path)
+    monkeypatch.setattr(figures, "draw_calibration", lambda curves, file: None)
+    monkeypatch.syspath_prepend(tmp_path)
+    return lambda *words: phd_exp(*own_parts.QUICK, *words)
 
 
 @pytest.fixture

@@ -13,7 +13,6 @@ from phd_exp.records.runs import RunFolder, find_runs
 from phd_exp.reports import ensembles
 from phd_exp.reports.files import write_tables
 from phd_exp.reports.runs import Report, Run
-from tests.support.own_parts import QUICK, write_own_parts
 from tests.support.synthetic import write_run
 from tests.support.untrained import read_lines, write_photos
 
@@ -26,15 +25,12 @@ def report_of(runs: list[RunFolder]) -> Report:
 
 
 @pytest.mark.slow
-def test_two_seeds_and_their_eight_views(phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_own_parts(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)
+def test_two_seeds_and_their_eight_views(own: Callable, phd_exp: Callable, tmp_path: Path) -> None:
     write_photos(tmp_path / "photos", 2)
-    quick = (*QUICK, "data.n_held_out=40")
-    assert phd_exp("-m", *quick, "seed=0,1").status == 0
+    assert own("-m", "data.n_held_out=40", "seed=0,1").status == 0
     first, second = find_runs(Path("runs"))
     before = first.results()
-    outcome = phd_exp(*quick, "seed=0", EIGHT)  # in the same folder: the run is finished already
+    outcome = own("data.n_held_out=40", "seed=0", EIGHT)  # in the same folder: the run is finished already
     assert outcome.status == 0, outcome.err
     assert "finished already" in outcome.out
     results = first.results()

@@ -12,7 +12,8 @@ import pytest
 from phd_exp.data.folder import FolderSource
 from phd_exp.records.own_images import DetectionFolder
 from tests.e2e.runs import only_run
-from tests.support.untrained import read_lines, virtual_cameras, write_photos
+from tests.support.recorded import status_of
+from tests.support.untrained import NARROW, read_lines, virtual_cameras, write_photos
 
 N_TRAIN, N_TEST = 8, 2
 
@@ -31,9 +32,8 @@ def train(phd_exp: Callable, photos: Path, monkeypatch: pytest.MonkeyPatch) -> C
     """A run on the photographs, on a machine without Blender."""
     real = importlib.util.find_spec
     monkeypatch.setattr("importlib.util.find_spec", lambda name, *more: None if name == "bpy" else real(name, *more))
-    quick = ("preset=smoke", "data=folder", "data.batch_size=4", "trainer.progress_bar=false")
-    quick += ("trainer.threads=1", "logger=none", "data.name=mycams")
-    return lambda *arguments: phd_exp(*quick, f"data.folder={photos}", *arguments)
+    quick = ("preset=smoke", "data=folder", "data.batch_size=4", "trainer.progress_bar=false", "trainer.threads=1")
+    return lambda *words: phd_exp(*quick, *NARROW, "logger=none", "data.name=mycams", f"data.folder={photos}", *words)
 
 
 @pytest.fixture(scope="module")
@@ -52,9 +52,7 @@ def test_a_run_on_own_images_leaves_a_whole_record_and_predicts_the_same(
     results = run.results()
     assert (results["data"], results["n_train"], results["n_test"]) == ("mycams", N_TRAIN, N_TEST)
     assert np.isfinite(results["test/depth_error_mm"])
-    status = run.status()
-    assert status is not None
-    assert status.data_manifest == DetectionFolder(photos).fingerprint()
+    assert status_of(run).data_manifest == DetectionFolder(photos).fingerprint()
     table = pd.read_parquet(run.predictions)
     assert {"file_name", "f", "S", "x", "y", "z"} <= set(table.columns)
     assert not {"scale", "visibility"} & set(table.columns)
@@ -80,14 +78,10 @@ def test_a_run_on_other_data_is_never_reused(train: Callable, photos: Path, runs
     metadata.write_text(before + "\n")
     outcome = train()
     metadata.write_text(before)
-    assert outcome.status == 1
-    (line,) = outcome.err.splitlines()
-    assert "as it was before its annotations changed" in line
+    assert "as it was before its annotations changed" in outcome.error
     run = only_run(tmp_path / "runs")
     config = run.config()
     assert config["data"]["folder"] == str(photos)
     config["data"]["folder"] = "elsewhere"
     run.write_config(config)
-    outcome = train()
-    assert outcome.status == 1
-    assert f"data.folder=elsewhere, but data.folder={photos} is asked for" in outcome.err
+    assert f"data.folder=elsewhere, but data.folder={photos} is asked for" in train().error

@@ -1,6 +1,7 @@
 """The user's own parts from the command line and from Python; what is stored is built only on request."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -19,20 +20,11 @@ import phd_exp as package
 from phd_exp.evaluation.parquet import read_table
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import CHOOSE, RunFolder
-from phd_exp.reports import figures
 from phd_exp.training.predictions import TRAINING
-from tests.support.own_parts import QUICK, write_own_parts
+from tests.support.own_parts import QUICK
+from tests.support.recorded import status_of
 
 RUNS = Path("runs")
-
-
-@pytest.fixture
-def own(phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable:
-    """A run of a second in a folder with own parts, without the picture of its calibration."""
-    write_own_parts(tmp_path)
-    monkeypatch.setattr(figures, "draw_calibration", lambda curves, file: None)
-    monkeypatch.syspath_prepend(tmp_path)
-    return lambda *words: phd_exp(*QUICK, *words)
 
 
 def run_of(runs: Path) -> RunFolder:
@@ -55,8 +47,7 @@ def test_own_parts_train_and_are_recorded(own: Callable, words: list[str]) -> No
     outcome = own(*words, "trainer.max_epochs=1")
     assert outcome.status == 0, outcome.err
     run = run_of(RUNS)
-    status = run.status()
-    assert status is not None
+    status = status_of(run)
     assert status.state == "finished"
     assert Path(status.custom["ownparts.Squares"]).name == "ownparts.py"
     assert len(read_table(run.predictions)["z"]) == 16
@@ -92,20 +83,11 @@ def test_pretrained_weights_are_loaded_once(own: Callable, tmp_path: Path) -> No
         (["+logger.mine._target_=ownnet.Mine"], "logger.mine: makes a Mine; expected a Logger of Lightning ("),
         (["callbacks=early_stopping", "callbacks.early_stopping.monitor=test/loss"], "test samples choose nothing"),
         (["callbacks=early_stopping", "data.n_held_out=0"], "data.n_held_out > 0"),
-        (
-            ["callbacks=best_checkpoint", "+callbacks.best_checkpoint.dirpath=."],
-            "got '.'; expected null, since checkpoi",
-        ),
-        (
-            ["callbacks=early_stopping", "callbacks.early_stopping.monitor=held_out/los"],
-            "did you mean 'held_out/loss'?",
-        ),
+        (["callbacks=best_checkpoint", "+callbacks.best_checkpoint.dirpath=."], "got '.'; expected null"),
+        (["callbacks=early_stopping", "callbacks.early_stopping.monitor=held_out/los"], "mean 'held_out/loss'?"),
         (["callbacks=best_checkpoint", "callbacks.best_checkpoint.monitor=loss"], "'loss', which is not logged"),
         (["callbacks=lr_monitor"], "Cannot use `LearningRateMonitor` callback with `Trainer` that has no logger"),
-        (
-            ["+trainer.fast_dev_run=true"],
-            "trainer.fast_dev_run: the run record depends on it; instead set trainer.max_e",
-        ),
+        (["+trainer.fast_dev_run=true"], "trainer.fast_dev_run: the run record depends on it; instead set trainer"),
         (["+trainer.limit_train_batches=0"], "trained no whole epoch, so there is no run"),
         (["backbone=pooled", "+backbone.pretrained=no.pth"], "backbone: pretrained: got 'no.pth'; expected a file"),
         (["+trainer.callbacks=[]"], "trainer.callbacks: the run record depends on it; instead set callbacks=NAME"),
@@ -114,26 +96,19 @@ def test_pretrained_weights_are_loaded_once(own: Callable, tmp_path: Path) -> No
     ids=str,
 )
 def test_bad_parts_are_one_line(own: Callable, words: list[str], message: str) -> None:
-    outcome = own(*words)
-    assert outcome.status != 0
-    (line,) = outcome.err.splitlines()
+    line = own(*words).error
     assert message in line
-    place = {"ownnet": "ownnet.py", "ownloss": "ownloss.py", "broken": "broken.py"}
     if message.endswith("("):
-        assert any(file in line for file in place.values())
+        assert any(file in line for file in ("ownnet.py", "ownloss.py", "broken.py"))
 
 
 def test_an_error_in_the_middle_is_recorded_and_the_run_resumes(own: Callable) -> None:
     words = ("+callbacks.mine._target_=ownparts.Raising", "trainer.max_epochs=3")
-    outcome = own(*words)
-    assert outcome.status == 1
-    (line,) = outcome.err.splitlines()
+    line = own(*words).error
     assert "ZeroDivisionError: my callback (" in line
     assert "ownparts.py, line" in line
     run = run_of(RUNS)
-    status = run.status()
-    assert status is not None
-    assert (status.state, status.error) == ("failed", "ZeroDivisionError: my callback")
+    assert (status_of(run).state, status_of(run).error) == ("failed", "ZeroDivisionError: my callback")
     assert run.last_checkpoint.exists()
     del import_module("ownparts").Raising.on_train_epoch_end  # mended
     outcome = own(*words)
@@ -146,12 +121,7 @@ def test_a_stored_run_builds_foreign_parts_only_on_request(own: Callable, phd_ex
     run = run_of(RUNS)
     words = ("predict", f"run={run.path}", "image=x.png", "f=60")
     Image.new("RGB", (32, 32)).save(tmp_path / "x.png")
-    refused = phd_exp(*words)
-    assert refused.status == 2
-    assert (
-        "'ownnet.Mine' is not built from a stored configuration; if you trust this run, add trust=ownnet"
-        in refused.err
-    )
+    assert re.search("'ownnet.Mine' is not built from .*; .* add trust=ownnet", phd_exp(*words).error)
     trusted = phd_exp(*words, "trust=ownnet")
     assert trusted.status == 0, trusted.err
     assert "mode" in json.loads(trusted.out)

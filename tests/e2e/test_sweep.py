@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import random
+import re
 import signal
 import time
 from collections.abc import Callable
@@ -122,7 +123,9 @@ def jobs_of_submitit(runs: Path) -> list[int]:
 def test_runs_of_a_sweep_are_those_of_single_commands_and_never_reused_for_a_changed_configuration(
     train: Callable, tmp_path: Path
 ) -> None:
-    assert train(*TWO, *SHORT).status == 0
+    outcome = train(*TWO, *SHORT)
+    for seed in (0, 1):
+        assert re.search(rf"^seed={seed}: finished, projected error \S+ mm, depth error \S+ mm$", outcome.out, re.M)
     (one, two) = sorted(find_runs(tmp_path / "runs"), key=lambda run: run.path.name)
     assert train(*ONE, *SHORT, "seed=1", "runs=alone").status == 0
     ((place, alone),) = numbers(tmp_path / "alone").items()

@@ -10,8 +10,6 @@ from hydra.experimental.callback import Callback
 
 from phd_exp.evaluation.parquet import read_table
 from phd_exp.records.runs import CHOOSE, RunFolder
-from phd_exp.reports import figures
-from tests.support.own_parts import QUICK, write_own_parts
 
 
 class Received(Callback):
@@ -23,15 +21,10 @@ class Received(Callback):
         self.scores[config.model.name, str(config.data.n_held_out)] = job_return.return_value
 
 
-def test_the_score_is_that_of_the_held_out_samples_that_may_choose(
-    phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_own_parts(tmp_path)
-    monkeypatch.setattr(figures, "draw_calibration", lambda curves, file: None)
-    monkeypatch.syspath_prepend(tmp_path)
+def test_the_score_is_that_of_the_held_out_samples_that_may_choose(own: Callable) -> None:
     axes = ("model=probabilistic,mae_vz", "data.n_held_out=7,0")
     callback = f"+hydra.callbacks.received._target_={__name__}.Received"
-    outcome = phd_exp(*QUICK, "-m", "hydra/sweeper=basic", callback, *axes, "trainer.max_epochs=1")
+    outcome = own("-m", "hydra/sweeper=basic", callback, *axes, "trainer.max_epochs=1")
     assert outcome.status == 0, outcome.err
     for path in Path("runs").glob("*/*/*/seed*"):
         run = RunFolder(path)

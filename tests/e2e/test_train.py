@@ -20,6 +20,7 @@ from phd_exp.reports.lines import command_of
 from phd_exp.reports.runs import read_report
 from phd_exp.training.module import PositionModule
 from tests.e2e.runs import only_run
+from tests.support.recorded import status_of
 
 
 @pytest.mark.slow
@@ -100,9 +101,7 @@ def test_a_signal_ends_the_command_with_its_status(
     assert "stopped by SIGTERM" in outcome.err
     run = only_run(tmp_path / "runs")
     assert run.path.relative_to(tmp_path / "runs").as_posix().startswith("smoke+strong/default/")
-    status = run.status()
-    assert status is not None
-    assert (status.state, status.error) == ("interrupted", "Stopped: SIGTERM")
+    assert (status_of(run).state, status_of(run).error) == ("interrupted", "Stopped: SIGTERM")
 
 
 @pytest.mark.slow

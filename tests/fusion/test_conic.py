@@ -38,7 +38,6 @@ def conic_optimum(
             best = theirs
         if np.abs(best - ours).max() <= AGREE:
             break
-    assert best is not None
     return best
 
 

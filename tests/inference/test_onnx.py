@@ -44,15 +44,20 @@ def predictor(composed: Callable[..., Any], head: Head, **changes: Any) -> Predi
     )
 
 
-def worst(made: Predictor, images: np.ndarray, f: np.ndarray) -> dict[str, np.ndarray]:
-    """For each output, the deviation of the graph from torch in each row, relative to its largest element."""
-    from phd_exp.inference import onnx
-    from phd_exp.inference.deployed import OfImages, answers
+def exported(made: Predictor, kind: str = "OfImages") -> Any:
+    """A session of the graph of images or of photographs."""
+    from phd_exp.inference import deployed, onnx
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("jaxtyping.config.jaxtyping_disable", True)  # a shape that is checked is a fixed one in a graph
-        content = onnx.graph(OfImages(made)).SerializeToString()
-    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+        content = onnx.graph(getattr(deployed, kind)(made)).SerializeToString()
+    return onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+
+
+def worst(made: Predictor, session: Any, images: np.ndarray, f: np.ndarray) -> dict[str, np.ndarray]:
+    """For each output, the deviation of the graph from torch in each row, relative to its largest element."""
+    from phd_exp.inference.deployed import answers
+
     assert [given.name for given in session.get_inputs()] == ["image", "f"]
     raw, *here = session.run(None, {"image": images, "f": f})
     expected = made.raw(images, torch.from_numpy(f)).double()
@@ -75,7 +80,7 @@ def test_the_distribution_is_that_of_torch(composed: Callable[..., Any]) -> None
     images = np.full((len(scales), SIDE, SIDE, 3), 128, dtype=np.uint8)
     images[:, 0] = (128 + scales * draw.standard_normal(images[:, 0].shape)).round().clip(0, 255)
     f = np.linspace(600, 1000, len(images), dtype=np.float32)
-    deviations = worst(made, images, f)
+    deviations = worst(made, exported(made), images, f)
     assert deviations.keys() == {"mode", "mean", "covariance", "median_depth", "depth_interval"}
     prediction = made.predict(made.raw(images, torch.from_numpy(f)).double(), torch.from_numpy(f).double())
     # A is inverted, and its inputs have the digits of float32
@@ -93,32 +98,31 @@ def test_an_ensemble_is_that_of_torch(composed: Callable[..., Any], networks: in
     others = tuple(Pixels(head, row) for row in range(1, networks))
     made = predictor(composed, head, others=others, views=views)
     images = np.random.default_rng(0).integers(88, 168, (100, SIDE, SIDE, 3), dtype=np.uint8)
-    for name, deviation in worst(made, images, np.linspace(600, 1000, 100, dtype=np.float32)).items():
+    f = np.linspace(600, 1000, 100, dtype=np.float32)
+    for name, deviation in worst(made, exported(made), images, f).items():
         assert np.quantile(deviation, 0.9) < 1e-5, name
         assert deviation.max() < 1e-3, name
-
-
-@pytest.mark.parametrize(("chart", "constant_f"), [(Projected, None), (LogDepth, 777.0), (Cartesian, None)])
-def test_baselines_are_points(
-    composed: Callable[..., Any], chart: Callable[[DepthScale], Chart], constant_f: float | None
-) -> None:
-    made = predictor(composed, ChartHead(DEPTH, chart), constant_f=constant_f)
-    images = np.random.default_rng(0).integers(124, 136, (50, SIDE, SIDE, 3), dtype=np.uint8)
-    (deviation,) = worst(made, images, np.linspace(600, 1000, 50, dtype=np.float32)).values()
-    assert deviation.max() < 1e-6
 
 
 @pytest.fixture(scope="module")
 def sessions(composed: Callable[..., Any]) -> dict[str, Any]:
     """The graphs of a baseline, of photographs and of images."""
-    from phd_exp.inference import onnx
-    from phd_exp.inference.deployed import OfImages, OfPhotographs
-
     made = predictor(composed, ChartHead(DEPTH, Projected))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jaxtyping.config.jaxtyping_disable", True)
-        graphs = {kind: onnx.graph(kind(made)).SerializeToString() for kind in (OfPhotographs, OfImages)}
-    return {kind.__name__: onnxruntime.InferenceSession(content) for kind, content in graphs.items()}
+    return {kind: exported(made, kind) for kind in ("OfPhotographs", "OfImages")}
+
+
+OTHERS = [pytest.param(*case, marks=pytest.mark.slow) for case in ((LogDepth, 777.0), (Cartesian, None))]
+
+
+@pytest.mark.parametrize(("chart", "constant_f"), [(Projected, None), *OTHERS])
+def test_baselines_are_points(
+    composed: Callable[..., Any], sessions: dict[str, Any], chart: Callable[..., Chart], constant_f: float | None
+) -> None:
+    made = predictor(composed, ChartHead(DEPTH, chart), constant_f=constant_f)
+    session = sessions["OfImages"] if chart is Projected else exported(made)
+    images = np.random.default_rng(0).integers(124, 136, (50, SIDE, SIDE, 3), dtype=np.uint8)
+    (deviation,) = worst(made, session, images, np.linspace(600, 1000, 50, dtype=np.float32)).values()
+    assert deviation.max() < 1e-6
 
 
 PHOTOGRAPH = np.random.default_rng(0).integers(0, 256, (90, 120, 3), dtype=np.uint8)

@@ -41,8 +41,6 @@ def locating(depth: int = 10, segments: bool = False) -> Locating:
 def test_it_sees_the_middle_before_it_has_learned(depth: int) -> None:
     seen = locating(depth)(torch.randn(2, 3, 64, 96))
     assert seen.features.shape == (2, 6 + 64 * (4 if depth == 50 else 1))
-    assert seen.log_heat is not None
-    assert seen.place is not None
     # a quarter of the image's resolution: the second of the stages, of which the first has half
     assert seen.log_heat.shape == (2, 16, 24)
     assert_close(seen.log_heat.exp().sum((1, 2)), torch.ones(2))
@@ -53,7 +51,6 @@ def test_a_larger_stride_sees_a_larger_image_as_often() -> None:
     small, large = (Locating(10, width=8, stride=stride, channels=6) for stride in (2, 4))
     for network, side in ((small, 64), (large, 128)):
         heat = network(torch.randn(1, 3, side, side)).log_heat
-        assert heat is not None
         assert heat.shape == (1, 16, 16)
 
 
@@ -71,8 +68,6 @@ def test_the_place_is_the_mean_of_the_map_and_its_offsets() -> None:
         network.map.weight[1:] = 0
         network.map.bias[1:] = offset
     seen = network(torch.randn(3, 3, 64, 64))
-    assert seen.log_heat is not None
-    assert seen.place is not None
     assert seen.place.std() > 1e-4
     assert_close(
         seen.place, torch.einsum("bij,cij->bc", seen.log_heat.exp(), middles(16, 16).movedim(-1, 0)) + offset
@@ -100,7 +95,6 @@ def test_a_segment_adds_its_means_and_its_shape_to_the_features() -> None:
         seen = network(torch.randn(2, 3, 64, 96))
     assert seen.features.shape == (2, network.n_features)
     assert network.n_features == 6 + 64 + 6 + 6
-    assert seen.log_odds is not None
     assert seen.log_odds.shape == (2, 16, 24)
     assert seen.features.isfinite().all()
 
@@ -153,6 +147,5 @@ def test_the_network_predicts_where_it_sees_the_object(name: str, images: torch.
     network = Regressor(locating(), PLACED[name])
     torch.nn.init.normal_(network.backbone.map.weight)
     seen = network.see(images)
-    assert seen.place is not None
     assert seen.place.std() > 1e-4
     assert_close(projected(network(images, CAMERA).mode, CAMERA), seen.place, atol=1e-5, rtol=0)

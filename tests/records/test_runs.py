@@ -32,12 +32,10 @@ def test_a_run_is_named_by_its_choices(tmp_path: Path) -> None:
 def test_a_run_that_ends_well_is_finished(folder: RunFolder) -> None:
     with folder.recording(data_manifest="abc"):
         status = folder.status()
-        assert status is not None
         assert status.state == "running"
         assert not folder.is_finished()
     assert folder.is_finished()
     status = folder.status()
-    assert status is not None
     assert status.data_manifest == "abc"
     assert {"python", "torch", "lightning"} <= status.versions.keys()
 
@@ -50,11 +48,9 @@ def test_a_run_that_is_stopped_says_so(folder: RunFolder, stop: BaseException, s
     with pytest.raises(type(stop)), folder.recording(data_manifest=None):
         raise stop
     status = folder.status()
-    assert status is not None
     assert status.state == state
     assert not folder.is_finished()
     if state == "failed":
-        assert status.traceback is not None
         assert "test_runs.py" in status.traceback
 
 

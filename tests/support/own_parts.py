@@ -102,14 +102,9 @@ FILES = {
     "n_test: 16\nimage_size: 32\nbatch_size: 16\n",
 }
 QUICK = (
-    "--config-dir=my_conf",
-    "data=squares",
-    "backbone=mine",
-    "preset=smoke",
-    "logger=none",
-    "trainer.progress_bar=false",
-    "trainer.threads=1",
-)
+    "--config-dir=my_conf", "data=squares", "backbone=mine", "preset=smoke", "logger=none",
+    "trainer.progress_bar=false", "trainer.threads=1",
+)  # fmt: skip
 """A run of a second, of the parts above."""
 
 

@@ -6,6 +6,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,7 +15,7 @@ from filelock import FileLock
 
 from phd_exp.cli import report
 from phd_exp.records.choices import RunName
-from phd_exp.records.runs import RunFolder
+from phd_exp.records.runs import RunFolder, RunStatus
 from phd_exp.reports.files import all_tables
 from phd_exp.reports.runs import read_report
 from phd_exp.reports.site import build
@@ -88,6 +89,15 @@ HOSTILE = "\\end{table} $x_1$ & 5 % #1 ^~ {a} |b| `c` **d** <script> [red]e[/red
 """An error's message with markup of every format, and a control sequence of the terminal."""
 
 
+def status_of(run: RunFolder, **changes: Any) -> RunStatus:
+    """The status of a run that has one, written anew if anything changes."""
+    status = run.status()
+    status = status.model_copy(update=changes)
+    if changes:
+        run.write_status(status)
+    return status
+
+
 def fail(runs: Path, data: str, model: str, seed: int = 0) -> None:
     """A run that failed."""
     folder = RunFolder(RunName("small", data, model, seed).folder(runs))
@@ -124,10 +134,15 @@ def sited(runs: Path, out: Path) -> Path:
     return build.write_site(found, all_tables(found), [], out / "site").parent
 
 
+def shared(factory: pytest.TempPathFactory) -> Path:
+    """The folder of all test processes."""
+    base = factory.getbasetemp()
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
 def once(factory: pytest.TempPathFactory, name: str, build: Callable[[Path], None]) -> Path:
     """A folder built by the first test process for all others."""
-    base = factory.getbasetemp()
-    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    folder = shared(factory) / name
     with FileLock(folder.with_suffix(".lock")):
         if not folder.exists():
             folder.mkdir()

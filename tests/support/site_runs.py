@@ -43,7 +43,6 @@ def write_runs(folder: Path) -> Path:
     broken_off = _folder(runs, "scale", "probabilistic")
     with broken_off.recording(data_manifest=None):
         status = broken_off.status()
-    assert status is not None
     broken_off.write_status(status.model_copy(update={"state": "running"}))
     _folder(runs, "scale", "mae_vz").status_file.write_text("{")
     _rewrite(write_run(runs, NAME, "mae_vz", preset="a<b>'\"&", n=40, epochs=2, root=folder / "renders"))

@@ -17,7 +17,10 @@ from phd_exp.geometry import DepthScale, VirtualCamera, intrinsics
 from phd_exp.records.runs import RunFolder
 
 SIDE = 48
-SMALL = ("preset=smoke", f"data.image_size={SIDE}", "trainer.threads=1")
+LOCATING = "backbone._target_=phd_exp.models.locating.Locating"
+NARROW = (LOCATING, "+backbone.width=8", "+backbone.stride=4", "+backbone.channels=4")
+"""A network of less than a megabyte. That of `preset=smoke` has 20, and 60 where a training is resumed."""
+SMALL = ("preset=smoke", *NARROW, f"data.image_size={SIDE}", "trainer.threads=1")
 DEPTH = DepthScale.from_ranges(f_range=(200.0, 300.0), z_range=(2.0, 5.0))
 
 

@@ -59,15 +59,8 @@ def test_a_broken_checkpoint_is_one_line(tmp_path: Path) -> None:
 
 
 PATHS = [
-    "/home/diary",
-    "~/diary",
-    "file:///home/diary",
-    "../diary",
-    "a/../../diary",
-    "diary",
-    "photos/diary",
-    "photos/",
-]
+    "/home/diary", "~/diary", "file:///home/diary", "../diary", "a/../../diary", "diary", "photos/diary", "photos/",
+]  # fmt: skip
 NO_PATHS = ["", ".", "held_out/loss", "photos", "min", "nothing_here", "a" * 5000, "a\0b"]
 
 

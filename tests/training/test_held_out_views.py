@@ -15,7 +15,7 @@ from phd_exp.config import check
 from phd_exp.evaluation.parquet import read_table
 from phd_exp.inference import tables
 from phd_exp.records.runs import RunFolder
-from tests.support.recorded import once
+from tests.support.recorded import once, status_of
 
 PREDICT = ("predict", "run=run", "views=8", "coverage=0.5", "image=photo.png", "f=500")
 
@@ -48,9 +48,7 @@ def test_they_are_recorded_on_request_once_and_like_those_of_a_training(phd_exp:
 
 
 def test_an_unfinished_run_is_not_recorded(phd_exp: Callable, run: RunFolder) -> None:
-    status = run.status()
-    assert status is not None
-    run.write_status(status.model_copy(update={"state": "interrupted"}))
+    status_of(run, state="interrupted")
     outcome = phd_exp(*PREDICT)
     assert outcome.status == 1
     assert "evaluation.eight_views=true" in outcome.err.splitlines()[-1]
@@ -68,10 +66,7 @@ def test_another_data_set_or_none_is_one_line(phd_exp: Callable, run: RunFolder,
         (root / "handmade/train/metadata.jsonl").write_text("\n".join(changed) + "\n")
     config["data"]["root"] = str(root)
     run.write_config(config)
-    outcome = phd_exp(*PREDICT)
-    assert outcome.status == 1
-    (line,) = outcome.err.splitlines()
-    assert said in line
+    assert said in phd_exp(*PREDICT).error
     assert not run.eight_views["held_out"].exists()
     with pytest.raises(Exception, match=r"repeat the command of the training with evaluation\.eight_views=true"):
         package.load(run.path, views=8, recalibrate=True)

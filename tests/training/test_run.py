@@ -24,7 +24,7 @@ from phd_exp.training.progress import Progress
 from phd_exp.training.recorder import Recorder
 from phd_exp.training.train import require_same_config, train
 from tests.e2e.runs import weights
-from tests.support.recorded import once
+from tests.support.recorded import once, status_of
 
 MODELS = ("probabilistic", "mae_vz", "mae_logz", "mae_xyz", "mae_constf")
 ERRORS = {"loss", "projected_error_mm", "depth_error_mm"}
@@ -177,9 +177,7 @@ def test_a_run_comes_to_the_same_numbers_whatever_interrupts_it(
     with monkeypatch.context() as patch:
         patch.setattr(PositionModule, "validation_step", fail_in_the_second_epoch)
         require_interrupted()
-    status = run.status()
-    assert status is not None
-    assert (status.state, status.error) == ("failed", "RuntimeError: power cut")
+    assert (status_of(run).state, status_of(run).error) == ("failed", "RuntimeError: power cut")
     assert steps == [(epoch, step) for epoch in range(2) for step in range(4)], "each once"
     require_stopped(signal.SIGTERM, batch=3)
     assert steps[8:] == [(1, 2), (1, 3)], "those after the last checkpoint"

@@ -23,10 +23,7 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"_target_": "phd_exp.models.nothing.There"}, r"cannot be imported"),
     ({"_target_": "phd_exp.models.heads.Nothing"}, r"cannot be imported \(module .* has no attribute 'Nothing'\)"),
     ({"_target_": "phd_exp.models.heads.__name__"}, r"is a str; expected a class or function"),
-    (
-        {"_target_": HEAD, "depht": 1.0},
-        r"^depht: unknown key, did you mean 'depth'\?; phd_exp.models.heads.ChartHead takes",
-    ),
+    ({"_target_": HEAD, "depht": 1.0}, r"^depht: unknown key, did you mean 'depth'\?; .*ChartHead takes"),
     ({"_target_": "phd_exp.models.backbones.resnet", "depth": "deep"}, r"^depth: got 'deep'; expected to be 10, 18"),
     ({"_target_": "phd_exp.models.backbones.resnet", "depth": 7}, r"^depth: got 7; expected to be 10, 18, 34 or 50"),
     ({"_target_": HEAD, "chart": CHART | {"unit": 1}}, r"^chart\.unit: unknown key"),
