@@ -52,6 +52,14 @@ def nothing(place: Place) -> None:
     """The command line alone is wrong."""
 
 
+def in_the_way(place: Place) -> None:
+    place.put("file", "no folder")
+
+
+def space(place: Place) -> None:
+    place.put("space.yaml", "space: {optimizer.lr: 'interval(0.001,0.01)'}\n")
+
+
 def configured(name: str, word: str, said: str, again: bool = False) -> Bad:
     return Bad(f"configuration: {name}", nothing, ("preset=smoke", "logger=none", word), said, 2, again)
 
@@ -193,6 +201,28 @@ CONFIGURATIONS = [
     configured("a choice without its group", "strong", r"strong: no KEY=VALUE, did you mean 'recipe=strong'\?; .*"),
     configured("no end of a list", "data.n_train=[", r"data\.n_train=\[: .*; expected KEY=VALUE without spaces, or with the value in quotes, .*"),
     *(Bad(f"configuration: spaces, {text}", nothing, (*text.split(" "), "preset=smoke"), rf"{re.escape(text.removeprefix('-m '))}: has spaces; expected {re.escape(mended)}", 2, text in ("model= mae_vz", "model =mae_vz")) for text, mended in SPACES.items()),
+    configured("a key that is nearly one", "data.ntrain=3", r"data\.ntrain: unknown key, did you mean 'data\.n_train'\?; expected one of n_train, .*"),
+    configured("a group that is nearly one", "modle=mae_vz", r"modle: .*did you mean 'model'.*"),
+    configured("a choice that is nearly one", "model=mae_log", r"model=mae_log: .*did you mean 'mae_logz'.*probabilistic.*"),
+    configured("a key of another choice", "data.folder=photos", r"data\.folder: .*not a key of this choice.*data=folder.*"),
+    configured("several runs at once", "experiment=table1", r"experiment=table1: names several runs; write -m before it: -m .*experiment=table1"),
+    Bad("configuration: a key that is nearly one of render", nothing, ("render", "preset=smoke", "shrad=0/2"), r"shrad: unknown key, did you mean 'shard'\?; expected one of backbone,.*", 2),
+    Bad("configuration: an experiment that is nearly one", nothing, ("-m", "preset=smoke", "experiment=fusion,tabel2"), r"experiment=tabel2: no such choice, did you mean 'table2'\?.*", 2),
+    Bad("configuration: no experiment", nothing, ("-m", "preset=smoke", "experiment=glob(nothing*)"), r".*experiment=glob\(nothing\*\): .*not one combination.*", 2),
+    Bad("configuration: an unknown verb", nothing, ("trian",), r"trian: no KEY=VALUE, did you mean 'train'\?; .*train, render, report.*", 2),
+    Bad("configuration: a folder without images", nothing, (*LEARN, "data.folder=nowhere"), r"nowhere/train: no such folder.*"),
+    Bad("configuration: data in a file", in_the_way, ("preset=smoke", "logger=none", "data.root=file/renders"), r".*file/renders.*"),
+    Bad("configuration: runs in a file", in_the_way, ("preset=smoke", "logger=none", "runs=file/runs"), r".*file.*runs=DIR.*"),
+    Bad("configuration: a sweep in a file", in_the_way, ("-m", "preset=smoke", "runs=file/runs"), r"file/runs/\.sweep: Not a directory; mend that, and the same command resumes"),
+    Bad("configuration: a search without held-out samples", space, ("search", "space.yaml", "trials=1", *LEARN), r"data\.n_held_out: got 0.*", 2),
+    Bad("configuration: a search with a wrong key", space, ("search", "space.yaml", "trials=1", *LEARN, "optimizer.lrr=1"), r"optimizer\.lrr: unknown key.*", 2),
+    Bad("configuration: a shift of what is not rendered", nothing, (*LEARN, "shift=scenes"), r"evaluation\.shifts\.short_f\.data: data=folder is not rendered; leave out this shift.*", 2),
+    configured("a shift by a negative factor", "+evaluation.shifts.a.f_factor=-1", r"evaluation\.shifts\.a\.f_factor: got -1; expected .*"),
+    configured("a shift of images without a name", "+evaluation.shifts.a.images.hue=1", r"evaluation\.shifts\.a\.images\.hue.*"),
+    configured("a shift of nothing known", "+evaluation.shifts.a.colour=1", r"evaluation\.shifts\.a\.colour: unknown key.*"),
+    configured("a shift that is no file name", "+evaluation.shifts={a/b:{f_factor:2}}", r"evaluation\.shifts\.a/b\.\[key\]: got 'a/b'.*"),
+    configured("a shift to an empty range", "+evaluation.shifts.a.data.z_range=[5,4]", r"evaluation\.shifts\.a\.data: z_range: got \[5, 4\].*"),
+    configured("a shift of no data set", "+evaluation.shifts.a.data.depth=5", r"evaluation\.shifts\.a\.data: depth: got 5.*"),
     Bad("configuration: a zero byte", nothing, ("preset=smoke", "runs=a\0b"), r"runs=a\?b: holds control characters; .*", 2),
     *(Bad(f"configuration: {word}", nothing, ("-m", "preset=smoke", word), r"seed=range\(0,.*\): more than 10000 jobs; .*", 2, again="1e9" not in word) for word in ("seed=range(0,1e9)", "seed=range(0,nan)", "seed=range(0,inf)")),
     Bad("configuration: two long ranges", nothing, ("-m", "preset=smoke", "seed=range(0,9999)", "data.seed=range(0,9999)"), r"preset=smoke seed=.*: more than 10000 jobs; .*", 2),
@@ -319,7 +349,8 @@ ARGUMENTS = [
     argument(("report", "runs"), r"runs: expected key=value; report takes runs=, out= \(see .*"),
     argument(("report", "runs=x"), r"x: no such folder; train first, or name another by runs=DIR", 1),
     argument(("report", "out=photos/test/0.png"), r"photos/test/0\.png/measured: cannot be written \(.*", 1),
-    argument(("search", "space.yaml", "trials=0"), r"trials: got '0'; .*"),
+    argument(("search", "space.yaml", "trials=0"), r"trials: got '0'; expected to be greater than or equal to 1"),
+    argument(("search", "space.yaml", "trials=x"), r"trials: got 'x'; expected a valid integer.*"),
     argument(("render", "preset=smoke", "nonsense=1"), r"nonsense: unknown key.*"),
     argument(("render", "preset=smoke", "masks=renders/default/masks"), r"masks=renders/default/masks: lies in the data set itself.*", 1),
     argument(("render", "preset=smoke", "bop=renders/default/bop"), r"bop=renders/default/bop: lies in the data set itself.*", 1),

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.bad_input.place import HANDMADE, Place
-from tests.bad_input.table import LEARN, ONE
+from tests.bad_input.table import LEARN, ONE, space
 
 PACKAGES = {
     "render": ("bpy",),
@@ -72,7 +72,7 @@ def test_the_table_has_every_extra() -> None:
 def test_without_the_packages_of_all_extras(place: Place) -> None:
     """Runs in a new process, because this process has already imported some of these packages."""
     run = str(place.run.path.relative_to(place.root))
-    place.put("space.yaml", "space: {optimizer.lr: 'interval(0.001,0.01)'}\n")
+    space(place)
     commands = [[word.replace("RUN", run) for word in words] for words in COMMANDS]
     absent = [name for names in PACKAGES.values() for name in names]
     code = [sys.executable, "-c", WITHOUT, json.dumps([commands, absent])]

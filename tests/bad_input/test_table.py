@@ -21,11 +21,13 @@ def test_one_line(place: Place, phd_exp: Callable, bad: Bad) -> None:
     if bad.words[0] in NEEDS:
         pytest.importorskip(NEEDS[bad.words[0]])
     bad.spoil(place)
+    before = sorted(place.root.iterdir())
     run = str(place.run.path.relative_to(place.root))
     outcome = phd_exp(*(word.replace("RUN", run) for word in bad.words))
     assert "Traceback" not in outcome.out + outcome.err
     assert outcome.status == bad.status, outcome.err
     assert not [path for path in ("owned", "renders/default") if (place.root / path).exists()]
+    assert bad.status == 1 or sorted(place.root.iterdir()) == before
     assert bad.words[0] not in ("predict", "fuse") or outcome.out == ""
     (line,) = [line for line in outcome.err.splitlines() if not line.startswith(PROGRESS)]
     assert re.fullmatch(f"error: (?:{bad.said})", line), line

@@ -113,22 +113,6 @@ def test_trials_without_prospects_are_pruned(search: Callable, tmp_path: Path) -
     assert "pruned after epoch 1 of 2" in str(status.error)
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["trials=0"], "trials: got '0'; expected to be greater than or equal to 1"),
-        (["trials=x"], "trials: got 'x'; expected a valid integer"),
-        (["data.n_held_out=0"], "data.n_held_out: got 0"),
-        (["optimizer.lrr=1"], "optimizer.lrr: unknown key"),
-    ],
-    ids=str,
-)
-def test_mistakes_are_one_line(search: Callable, words: list[str], message: str) -> None:
-    outcome = search(*words)
-    assert message in outcome.error
-    assert outcome.status == 2
-
-
 def test_another_space_has_another_name(search: Callable, tmp_path: Path) -> None:
     assert search("trials=1").status == 0
     (tmp_path / "space.yaml").write_text(SPACE.replace("0.1)", "0.2)"))

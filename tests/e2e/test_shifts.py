@@ -13,7 +13,6 @@ from phd_exp.build import build_source
 from phd_exp.config import check
 from phd_exp.records.runs import RunFolder, find_runs
 
-RENDERED = ("data=default", "backbone=resnet10")
 IMAGES = ("noise", "blur", "dark", "bright", "gamma_half", "gamma_two", "jpeg")
 
 
@@ -56,24 +55,6 @@ def test_shifts_are_recorded_once_without_training_again(own: Callable, tmp_path
     assert own(*words, "evaluation.shifts.dark.images.brightness=0.25").out.count(": recorded") == 2
     changed = {name for name, stamp in stamps(run).items() if recorded[name] != stamp}
     assert changed == {"blur.parquet", "dark.parquet"}
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["shift=scenes"], "evaluation.shifts.short_f.data: data=squares is not rendered; leave out this shift"),
-        (["+evaluation.shifts.a.f_factor=-1"], "evaluation.shifts.a.f_factor: got -1; expected "),
-        (["+evaluation.shifts.a.images.hue=1"], "evaluation.shifts.a.images.hue"),
-        (["+evaluation.shifts.a.colour=1"], "evaluation.shifts.a.colour: unknown key"),
-        (["+evaluation.shifts={a/b:{f_factor:2}}"], "evaluation.shifts.a/b.[key]: got 'a/b'"),
-        ([*RENDERED, "+evaluation.shifts.a.data.z_range=[5,4]"], "a.data: z_range: got [5, 4]"),
-        ([*RENDERED, "+evaluation.shifts.a.data.depth=5"], "evaluation.shifts.a.data: depth: got 5"),
-    ],
-    ids=str,
-)
-def test_bad_shifts_are_one_line_before_the_training(own: Callable, words: list[str], message: str) -> None:
-    assert message in own(*words).error
-    assert not list(Path("runs").glob("*/*/*/seed*"))
 
 
 @pytest.mark.slow
