@@ -112,7 +112,7 @@ def kept_or_measured(
     folder: RunFolder, config: Mapping[str, str], measuring: Callable[[], Measured], kept: Path
 ) -> Measured:
     """The measurements stored in the folder `kept` if the run has not changed; else measures, and stores them."""
-    file = kept / f"{file_stem(*folder.path.parts[-4:])}.json"
+    file = kept / f"{file_stem(*folder.names)}.json"
     key = _key(folder, config)
     try:
         content = json.loads(file.read_text())

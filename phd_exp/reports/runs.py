@@ -82,7 +82,7 @@ class Run:
     @property
     def slug(self) -> str:
         """The path as a file name."""
-        return file_stem(*self.folder.path.parts[-4:])
+        return file_stem(*self.folder.names)
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def read_report(runs: Path, kept: Path | None = None, progress: Callable[[str], 
         kept.mkdir(parents=True, exist_ok=True)
         remove_temporaries(kept)  # of a killed process
     for folder in folders:
-        progress("/".join(map(printable, folder.path.parts[-4:])))
+        progress("/".join(map(printable, folder.names)))
         found.append(_read_run(folder, kept))
     return Report(runs, tuple(found), tuple(read_searches(runs)))
 
@@ -135,14 +135,14 @@ def _read_run(folder: RunFolder, kept: Path | None) -> Run:
 
 def unreadable(folder: RunFolder, notes: Sequence[str]) -> Run:
     """A run of which only the place is shown, and the reasons."""
-    preset, data, model, name = map(printable, folder.path.parts[-4:])
+    preset, data, model, name = map(printable, folder.names)
     return Run(folder, preset, data, model, name, detail="; ".join(notes[-1:]), notes=notes)
 
 
 def _whole_run(run: Run, kept: Path | None, notes: Notes) -> Run:
     folder, leaf = run.folder, LEAF.fullmatch(run.name)
     status = notes.attempt(folder.status)
-    state, detail = _state(folder, status) if status else ("unreadable", notes[-1])
+    state, detail = _state(folder) if status else ("unreadable", notes[-1])
     if leaf is None:
         state, detail = "unreadable", f"{run.name}: expected a folder named seed<k> or seed<k>-<hash>"
     values = notes.attempt(lambda: flatten(folder.config())) or {}
@@ -208,14 +208,12 @@ def _errors(table: Columns | None, estimates: Sequence[Estimate], notes: Notes) 
     return errors or {}, nll if math.isfinite(nll) else None
 
 
-def _state(folder: RunFolder, status: RunStatus) -> tuple[RunState, str]:
-    if status.state != "running":
-        return status.state, status.error or ""
+def _state(folder: RunFolder) -> tuple[RunState, str]:
     try:
-        alive = folder.is_held()
+        state, error = folder.state()
     except OSError as error:  # a read-only folder
         return "running", f"or interrupted: its lock cannot be tried ({error.strerror})"
-    return ("running", "") if alive else ("interrupted", "the same command resumes it")
+    return state or "unreadable", error or ("the same command resumes it" if state == "interrupted" else "")
 
 
 def _series(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[float | None]]:

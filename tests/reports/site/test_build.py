@@ -153,11 +153,12 @@ def test_tables_of_the_best_preset_are_open_and_those_of_smoke_closed() -> None:
     counts = {"smoke": 3, "demo": 1, "small": 2}
     names = [(preset, f"seed{k}") for preset, n in counts.items() for k in range(n)]
     runs = [
-        Run(RunFolder(Path(preset, name)), preset, "default", "mae_vz", name, state="finished")
+        Run(RunFolder(Path(preset, "default", "mae_vz", name)), preset, "default", "mae_vz", name, state="finished")
         for preset, name in names
     ]
     runs += [
-        Run(RunFolder(Path("full", name)), "full", "default", "mae_vz", name, state="failed") for _, name in names
+        Run(RunFolder(Path("full", "default", "mae_vz", name)), "full", "default", "mae_vz", name, state="failed")
+        for _, name in names
     ]
     presets = presets_of(runs)
     assert presets == ["small", "demo", "full", "smoke"]
