@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure  # not pyplot: no global state, no window, no leak over a long sweep
+from matplotlib.ticker import NullFormatter
 
 from phd_exp.distributions.level_curves import LevelCurves, Points, on_image
 from phd_exp.records.files import write_atomic
@@ -59,6 +60,8 @@ def draw_identity(axes: Axes, name: str, values: Iterable[float], label: str | N
     axes.plot(bounds, bounds, "--", color="tab:red", linewidth=1, label=label)
     axes.set(xscale="log", yscale="log", xlim=bounds, ylim=bounds, aspect="equal", title=title)
     axes.set(xlabel=f"predicted variance ({unit})", ylabel=f"mean squared error ({unit})")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_minor_formatter(NullFormatter())  # labels inside a single decade would overlap
 
 
 def draw_on_image(
