@@ -104,6 +104,11 @@ class PositionModule(LightningModule):
                 self.log_dict({name: torch.tensor(value) for name, value in scores.items()})
                 rows.reset()
 
+    on_test_epoch_end = on_validation_epoch_end
+
+    def test_step(self, batch: Batch, batch_idx: int) -> None:
+        self.evaluation_rows.update(self._predict(batch)[0])
+
     def predict_step(self, batch: Batch, batch_idx: int) -> Columns:
         return self._predict(batch)[0]
 
