@@ -16,8 +16,9 @@ from phd_exp.config import check
 from phd_exp.data.cache import cached
 from phd_exp.records.runs import RunFolder
 from tests.bad_input import images
+from tests.bad_input.bad import LEARN, ONE, PREDICT, REPORT
 from tests.bad_input.place import Place, spoil_checkpoint
-from tests.bad_input.table import LEARN, ONE, PREDICT, REPORT, Trap, trap
+from tests.bad_input.table import Trap, trap
 
 READY = sorted(file.stem for file in (conf_folder() / "callbacks").glob("*.yaml"))
 """The callbacks that are ready to use."""

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.bad_input.bad import LEARN, ONE
+from tests.bad_input.commands import space
 from tests.bad_input.place import HANDMADE, Place
-from tests.bad_input.table import LEARN, ONE, space
 
 PACKAGES = {
     "render": ("bpy",),

@@ -5,8 +5,9 @@ from collections.abc import Callable
 
 import pytest
 
+from tests.bad_input.bad import Bad
 from tests.bad_input.place import Place
-from tests.bad_input.table import TABLE, Bad
+from tests.bad_input.table import TABLE
 
 PROGRESS = ("verifying ", "decoding ")
 NEEDS = {"export": "onnxruntime", "search": "optuna"}
