@@ -45,11 +45,7 @@ def _at(
     next_column = (column + 1).clamp_max(width - 1)
     upper, lower = row * width, (row + 1).clamp_max(height - 1) * width
     flat = table.reshape(-1, bands)
-
-    def at(place: Tensor) -> Tensor:  # five times as fast as two indices
-        return flat.index_select(0, place.flatten()).reshape(*place.shape, bands)
-
+    places = (upper + column, upper + next_column, lower + column, lower + next_column)
+    a, b, c, d = (flat.index_select(0, place.flatten()).reshape(*place.shape, bands) for place in places)
     x, y = (x - column)[..., None], (y - row)[..., None]
-    above = at(upper + column) * (1 - x) + at(upper + next_column) * x
-    below = at(lower + column) * (1 - x) + at(lower + next_column) * x
-    return above * (1 - y) + below * y
+    return (a * (1 - x) + b * x) * (1 - y) + (c * (1 - x) + d * x) * y

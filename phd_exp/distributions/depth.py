@@ -82,17 +82,17 @@ def depth_icdf(p: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]) -> 
 
 def _solve_lower(drop: Tensor, log_a: Tensor, log_e_2: Tensor) -> Tensor:
     """The l >= 0 with a (e^l - 1) + l - log(E_2(a e^l) / E_2(a)) = drop, E_2 scaled; gradients by the last step."""
-
-    def newton_step(distance: Tensor, drop: Tensor, log_a: Tensor, log_e_2: Tensor) -> Tensor:
-        e_2 = scaled_expint(2, torch.exp(log_a + distance))
-        excess = _energy_of_distance(distance, log_a) + distance - e_2.log() + log_e_2 - drop
-        return distance - excess * e_2
-
     with torch.no_grad():
         distance = torch.minimum(drop, signed_log1p(drop, log_a))
         for _ in range(_NEWTON_STEPS):
-            distance = newton_step(distance, drop, log_a, log_e_2).clamp_min(0)
-    return newton_step(distance, drop, log_a, log_e_2)
+            distance = _newton_step(distance, drop, log_a, log_e_2).clamp_min(0)
+    return _newton_step(distance, drop, log_a, log_e_2)
+
+
+def _newton_step(distance: Tensor, drop: Tensor, log_a: Tensor, log_e_2: Tensor) -> Tensor:
+    e_2 = scaled_expint(2, torch.exp(log_a + distance))
+    excess = _energy_of_distance(distance, log_a) + distance - e_2.log() + log_e_2 - drop
+    return distance - excess * e_2
 
 
 def depth_mean_and_variance(
