@@ -96,9 +96,9 @@ def _is_whole(image: Image.Image, camera: VirtualCamera) -> bool:
 
 def _reach(corners: Float[np.ndarray, "rows columns 2"], size: tuple[int, int]) -> tuple[int, int, int, int]:
     """Left, top, right and bottom of the part of the image that the pixels with these corners read; never empty."""
-    reached = corners[np.isfinite(corners).all(axis=-1)].reshape(-1, 2)
-    left, top = np.floor(reached.min(axis=0) - MARGIN).clip(0, np.array(size) - 1).astype(int).tolist()
-    right, bottom = np.ceil(reached.max(axis=0) + MARGIN).clip(1, size).astype(int).tolist()
+    flat = corners.reshape(-1, 2)  # NaN where the real camera sees nothing
+    left, top = np.floor(np.fmin.reduce(flat) - MARGIN).clip(0, np.array(size) - 1).astype(int).tolist()
+    right, bottom = np.ceil(np.fmax.reduce(flat) + MARGIN).clip(1, size).astype(int).tolist()
     return left, top, right, bottom
 
 
