@@ -5,7 +5,8 @@ from typing import Any
 from phd_exp.cli.jobs import Job, launch
 from phd_exp.config import check_render
 from phd_exp.records.dataset import DatasetFolder
-from phd_exp.records.errors import ConfigError
+from phd_exp.records.errors import ConfigError, RenderError
+from phd_exp.records.processes import announce
 from phd_exp.rendering.bop import write_bop
 from phd_exp.rendering.finished import require_elsewhere, verify
 from phd_exp.rendering.masks import ensure_drawn, meshes_of, write_masks
@@ -31,7 +32,10 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> None:
     n_train, n_test = data.n_training_split, data.n_test
     if not ensure_rendered(folder, data.spec, n_train, n_test, data.workers, cores, checked.shard):
         return  # other shards are missing
-    ensure_drawn(folder, data.spec, n_train)  # `ensure_rendered` does not report why it cannot draw
+    try:
+        ensure_drawn(folder, data.spec, n_train)
+    except RenderError as error:  # a data set that cannot be written is whole without masks
+        announce(f"note: {error}; recipe=strong needs masks")
     print(f"{folder.root}: {n_train} training and {n_test} test samples are there")
     if checked.masks or checked.bop:
         meshes = meshes_of(data.spec)

@@ -144,11 +144,11 @@ def _combinations(words: list[str], master: DictConfig, loader: ConfigLoader) ->
     for item in [*(item for item in params if item.key_or_group not in keys), *given]:
         key = item.get_key_element()
         values[key] = [f"{key}={value}" for value in _values(item)]
-    if math.prod(map(len, values.values())) > MOST_JOBS:
-        raise ConfigError(f"{_given(words)}: more than {MOST_JOBS} jobs; expected fewer values")
     each = [parse(list(overrides)) for overrides in master.hydra.sweeper.get("each") or [[]]]
+    if math.prod(map(len, values.values())) * len(each) > MOST_JOBS:
+        raise ConfigError(f"{_given(words)}: more than {MOST_JOBS} jobs; expected fewer values")
     further = [[str(item.input_line) for item in items if item.key_or_group not in keys] for items in each]
-    return [[*combination, *words] for words in further for combination in itertools.product(*values.values())]
+    return [[*combination, *together] for together in further for combination in itertools.product(*values.values())]
 
 
 def _given(words: list[str]) -> str:

@@ -61,7 +61,8 @@ def quantiles_along(
     """The values s with P(direction . v <= s) = p, for p in (0, 1), of n distributions; metres for unit vectors.
 
     P = E[M((s - kappa z) / |g|)] with kappa = direction . m > 0 and the distribution function M of q_1, an integral
-    over the law of depth, computed piecewise in float64 to about 1e-8. Along (0, 0, 1) it is `depth_icdf`.
+    over the law of depth, computed piecewise in float64 to about 1e-8, for a up to 1e10. Along (0, 0, 1) it is
+    `depth_icdf`.
 
     Raises ValueError for a direction in which the mode does not lie (kappa <= 0).
     Source: own derivation (q and t are independent); checked against samples in tests/distributions/test_along.py.
@@ -121,4 +122,4 @@ class _DepthLaw:
         energy = a * (np.maximum(z / mu_z, mu_z / z) - 1)
         weight = (half * _WEIGHTS).reshape(len(s), -1) * self.height[row, None] * np.exp(-energy)
         at = ((s[:, None] - kappa[:, None] * z) / reach[:, None]).clip(-FURTHEST, FURTHEST)
-        return (weight * _whitened_cdf()(at)).sum(-1)
+        return (weight * _whitened_cdf()(at)).sum(-1) / weight.sum(-1)

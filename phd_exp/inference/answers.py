@@ -77,19 +77,19 @@ class Batch:
     def errors(self) -> dict[str, Float[np.ndarray, " batch"]]:
         """The errors of the tables, which rotating the camera does not change, and the scores of a distribution.
 
-        They are NaN where the true position is unknown.
+        NaN where the true position is unknown.
         """
-        made, unknown = self.predictions, (np.nan, np.nan, np.nan)
-        positions = [unknown if one.line.z is None else one.position for one, _, _ in self.seen]
+        made, known = self.predictions, torch.tensor([one.line.z is not None for one, *_ in self.seen])
+        positions = [one.position if one.line.z is not None else (0.0, 0.0, 1.0) for one, *_ in self.seen]
         seen = [view.camera.to_virtual(np.array(at)) for at, (*_, view) in zip(positions, self.seen, strict=True)]
-        truth = torch.from_numpy(np.stack(seen))
+        truth = torch.where(known[:, None], torch.from_numpy(np.stack(seen)), made.mode)  # a position that it accepts
         errors = {
             "projected_error_mm": MILLIMETRES * projected_error(truth, made.mode),
             "depth_error_mm": MILLIMETRES * depth_error(truth, made.mode),
         }
         if isinstance(made, Density):
             errors |= {"credible_level": made.level(truth), "nll": -made.log_prob(truth)}
-        return {name: value.numpy() for name, value in errors.items()}
+        return {name: value.masked_fill(~known, torch.nan).numpy() for name, value in errors.items()}
 
 
 @dataclass(frozen=True, eq=False)

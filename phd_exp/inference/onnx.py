@@ -1,5 +1,6 @@
 """A run as an ONNX file: images in, positions with their uncertainty out. `DESCRIPTIONS` describes all names."""
 
+import copy
 import json
 import logging
 import warnings
@@ -10,8 +11,9 @@ from typing import Any
 import numpy as np
 import onnxruntime
 import torch
+from jaxtyping import Float
 from onnx import numpy_helper
-from torch import Tensor
+from torch import Tensor, nn
 
 from phd_exp.distributions.level import PRECISIONS, level_energies
 from phd_exp.inference.deployed import Deployed, OfImages, OfPhotographs
@@ -71,9 +73,34 @@ def export(predictor: Predictor, file: Path, coverage: float | None = None, phot
     return deviation
 
 
+class AxisByAxis(nn.Module):
+    """A `GroupNorm` of one group whose means are taken over one axis after the other.
+
+    A runtime may add all numbers of a map in float32 one by one, which costs a digit.
+    """
+
+    def __init__(self, norm: nn.GroupNorm) -> None:
+        super().__init__()
+        self.norm = norm
+
+    def forward(self, x: Float[Tensor, "batch channels *map"]) -> Float[Tensor, "batch channels *map"]:
+        centred = x - _mean(x)
+        scale = self.norm.weight[:, None, None] * (_mean(centred.square()) + self.norm.eps).rsqrt()
+        return centred * scale + self.norm.bias[:, None, None]
+
+
+def _mean(x: Tensor) -> Tensor:
+    return x.mean(3, keepdim=True).mean(2, keepdim=True).mean(1, keepdim=True)
+
+
 def graph(deployed: Deployed) -> Any:
     """The network and its answers as a graph, for any number of images or boxes."""
     *_, (examples, _, _) = deployed.cases()
+    deployed = copy.deepcopy(deployed)
+    for module in list(deployed.modules()):
+        for name, part in module.named_children():
+            if isinstance(part, nn.GroupNorm) and part.num_groups == 1:
+                setattr(module, name, AxisByAxis(part))
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of torch and onnxscript about their own old names

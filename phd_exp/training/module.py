@@ -3,13 +3,13 @@
 from typing import Any
 
 import torch
+import torch.distributed as dist
 from lightning import LightningModule
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_, clip_grad_value_
 
 from phd_exp.data.batches import Batch
-from phd_exp.distributions.columns import Columns
 from phd_exp.losses import NegativeLogLikelihood
 from phd_exp.metrics.rows import Rows
 from phd_exp.models.heads import Prediction
@@ -36,7 +36,7 @@ class PositionModule(LightningModule):
         optimisation: the optimizer and its schedule.
 
     Attributes:
-        evaluation_rows: rows of test samples during an evaluation, see `training.predictions.columns`.
+        evaluation_rows: rows of the test samples of an evaluation, see `training.predictions.columns`.
     """
 
     def __init__(
@@ -70,10 +70,14 @@ class PositionModule(LightningModule):
             clip(self.parameters(), gradient_clip_val)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        output = self.regressor.see(batch.image)
-        prediction = self.regressor.prediction(output, self.camera(batch, self.current_epoch))
-        losses = self.loss(prediction, batch.xyz)
-        total = self.objective.total(losses, output, batch)
+        try:
+            output = self.regressor.see(batch.image)
+            prediction = self.regressor.prediction(output, self.camera(batch, self.current_epoch))
+            losses = self.loss(prediction, batch.xyz)
+            total = self.objective.total(losses, output, batch)
+        except Exception:  # a part may refuse the numbers of a network that an earlier loss has broken
+            self.require_finite()
+            raise
         self._note(total, losses, batch, "train")
         with torch.no_grad():
             nll = losses if isinstance(self.loss, NegativeLogLikelihood) else None
@@ -82,22 +86,22 @@ class PositionModule(LightningModule):
         return total
 
     def on_train_epoch_end(self) -> None:
-        self._require_finite()
+        self.require_finite()
         table = self.training_rows.columns()
         self.training_rows.reset()
         self.log_dict({f"train/{name}": column.mean().float() for name, column in table.items()})
 
     def on_validation_epoch_start(self) -> None:
-        self._require_finite()  # before a broken network is evaluated
+        self.require_finite()  # before a broken network is evaluated
+        self.evaluation_rows.reset()
 
     def validation_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
         part, rows = (("test", self.evaluation_rows), ("held_out", self.held_out_rows))[dataloader_idx]
-        table, losses = self._predict(batch)
-        rows.update(table)
+        _, losses = self._predict(batch, rows)
         self._note(losses.mean(), losses, batch, part)
 
     def on_validation_epoch_end(self) -> None:
-        self._require_finite()
+        self.require_finite()
         for part, rows in (("held_out", self.held_out_rows), ("test", self.evaluation_rows)):
             if rows.update_called:
                 scores = summary(rows.columns(), part)
@@ -107,29 +111,34 @@ class PositionModule(LightningModule):
     on_test_epoch_end = on_validation_epoch_end
 
     def test_step(self, batch: Batch, batch_idx: int) -> None:
-        self.evaluation_rows.update(self._predict(batch)[0])
+        self._predict(batch, self.evaluation_rows)
 
-    def predict_step(self, batch: Batch, batch_idx: int) -> Columns:
-        return self._predict(batch)[0]
+    def on_predict_epoch_start(self) -> None:
+        self.evaluation_rows.reset()
 
-    def _predict(self, batch: Batch) -> tuple[Columns, Tensor]:
-        """The rows of a batch, predicted without autocast, and its losses."""
+    def predict_step(self, batch: Batch, batch_idx: int) -> Prediction:
+        return self._predict(batch, self.evaluation_rows)[0]
+
+    def _predict(self, batch: Batch, rows: Rows) -> tuple[Prediction, Tensor]:
+        """Predict a batch without autocast and add its rows; returns the predictions and their losses."""
         with torch.autocast(self.device.type, enabled=False):
             prediction = self(batch)
             losses = self.loss(prediction, batch.xyz)
         factor = f_factor(batch.row, self.camera.f_error)
-        return columns(prediction, batch, factor) | {"loss": losses.expand(len(batch))}, losses
+        rows.update(columns(prediction, batch, factor) | {"loss": losses.expand(len(batch))})
+        return prediction, losses
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        self._require_finite()
+        self.require_finite()
 
     def _note(self, total: Tensor, losses: Tensor, batch: Batch, part: str) -> None:
         """Keep the losses of a step until they are read: a GPU would wait for a read in each step."""
         self.unread.append((part, total.detach(), losses.detach().expand(len(batch)), batch.row))
-        if len(self.unread) == UNREAD:
-            self._require_finite()
+        # several processes share gradients, so that a broken loss would be found by the wrong one
+        if len(self.unread) == UNREAD or dist.is_initialized():
+            self.require_finite()
 
-    def _require_finite(self) -> None:
+    def require_finite(self) -> None:
         """Raise RunError naming the samples of the first loss that is not finite, or the batch if only its total is
         not.
         """

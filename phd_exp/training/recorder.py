@@ -57,6 +57,7 @@ class Recorder(Checkpoint):
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         # before the module's hook, which resets the rows
+        pl_module.require_finite()  # type: ignore[operator]  # a PositionModule's
         if has_curves(trainer.current_epoch + 1, self.evaluation):
             table = pl_module.evaluation_rows.columns()  # type: ignore[operator, union-attr]  # a PositionModule's
             self.record_curves(epoch_name(trainer.current_epoch), table, trainer.global_step)

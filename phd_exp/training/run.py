@@ -15,7 +15,6 @@ from phd_exp.data.datamodule import PositionData
 from phd_exp.data.images import SHRINKING
 from phd_exp.data.sources import PARTS
 from phd_exp.distributions.columns import Columns
-from phd_exp.metrics.rows import Rows
 from phd_exp.models.weights import ADVICE, load_checkpoint
 from phd_exp.records.errors import RunError, gist, shown
 from phd_exp.records.runs import RunFolder
@@ -120,10 +119,10 @@ def _ends_an_epoch(checkpoint: Mapping[str, Any]) -> bool:
 
 def evaluate(trainer: Trainer, module: PositionModule, loader: BatchLoader) -> Columns:
     """The rows of all samples of a loader with the current weights, gathered from all processes."""
-    device, rows = trainer.strategy.root_device, Rows()
-    for table in trainer.predict(module, dataloaders=loader) or []:
-        rows.update({name: column.to(device) for name, column in table.items()})  # type: ignore[union-attr]
-    return rows.columns()
+    trainer.predict(module, dataloaders=loader, return_predictions=False)
+    table = module.evaluation_rows.columns()
+    module.evaluation_rows.reset()
+    return table
 
 
 def _circumstances(config: RunConfig, data: PositionData, trainer: Trainer) -> dict[str, Any]:
