@@ -20,12 +20,11 @@ from omegaconf.errors import OmegaConfBaseException
 from phd_exp.cli import conf_folder
 from phd_exp.cli.frame import Ending, Stopped, ending_with, failure, print_errors, stopping_on_signals
 from phd_exp.cli.paths import quoted
-from phd_exp.cli.words import REFUSED, explain, require_overrides
+from phd_exp.cli.words import REFUSED, SHARED, explain, require_overrides
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.processes import usable_cores
 
 OMP = "OMP_NUM_THREADS"
-SHARED = ("network", "object")  # sections to which others refer; a run has the values themselves
 NO_SCORE = "the sweeper receives no score: only trainings with held-out samples have one; set data.n_held_out above 0"
 HOME = uuid.uuid4().hex  # names this process: another process that imports this module has another value
 

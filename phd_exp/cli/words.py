@@ -18,6 +18,8 @@ from phd_exp.records.errors import ConfigError, end_of, install, nearest, one_li
 
 REFUSED = (HydraException, OmegaConfBaseException, ValueError, TypeError, ArithmeticError, RecursionError)
 """The errors that a bad override raises; ValueError for a group set to null, TypeError for one set to numbers."""
+SHARED = ("network", "object")
+"""Sections in which presets and recipes describe networks and data=object; a run has the values themselves."""
 LONGEST = 400  # characters of Hydra's messages that are repeated
 GRAMMAR = "expected KEY=VALUE without spaces, or with the value in quotes, \"KEY='VALUE'\""
 
@@ -33,6 +35,11 @@ def require_overrides(words: Sequence[str]) -> None:
             remedy = nearest(word, [*VERBS, *choices])
             verbs = ", ".join(VERBS)
             raise ConfigError(f"{word}: no KEY=VALUE{remedy}; a verb ({verbs}) is the first word; {GRAMMAR}")
+        if word.lstrip("+~").startswith(tuple(f"{section}." for section in SHARED)):
+            key = word.partition("=")[0]
+            raise ConfigError(
+                f"{key}: set by presets and recipes; expected the key of the run, such as backbone.width"
+            )
         try:
             OverridesParser.create().parse_override(word)
         except REFUSED as error:
@@ -77,7 +84,8 @@ def _unknown_key(key: str, config_name: str) -> str:
     if key in groups:
         return f"{key}: a group; expected {key}=CHOICE, or {key}.KEY=VALUE"
     with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
-        config = hydra.compose(config_name)
+        composed = hydra.compose(config_name)
+        config = OmegaConf.masked_copy(composed, [str(name) for name in composed if name not in SHARED])
     top = sorted({*map(str, config), *groups})
     everything = [*top, *flatten(OmegaConf.to_container(config)), *keys]  # type: ignore[arg-type]
     section = key.rpartition(".")[0]

@@ -43,7 +43,8 @@ def read_table(file: Path) -> Columns:
             _require_small(file, metadata)
             # a text that repeats in every row is kept once in memory
             texts = [name for name in TEXTS if name in metadata.schema.to_arrow_schema().names]
-            table = pq.ParquetFile(stream, metadata=metadata, read_dictionary=texts).read()
+            # on this thread: another one may still hold a part of the stream while the program exits, which aborts it
+            table = pq.ParquetFile(stream, metadata=metadata, read_dictionary=texts).read(use_threads=False)
             return {name: _values(name, table[name].to_numpy()) for name in table.column_names}
     except FileNotFoundError:
         raise RunError(f"{file.name}: missing, though the run has finished") from None
