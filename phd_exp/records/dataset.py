@@ -141,7 +141,7 @@ class DatasetFolder:
         try:
             return mapped(self.root / name, (n, *row))
         except (OSError, ValueError) as error:
-            remedy = "write it by `python -m phd_exp render data=...` with the same keys of data, where the folder may be written"
+            remedy = "write it by `python -m phd_exp render data=...` where the folder may be written"
             raise DatasetError(f"{self.root / name}: {gist(error)}; {remedy}") from None
 
     def missing(self, spec: DatasetSpec, n_train: int, n_test: int) -> dict[Split, list[int]]:
