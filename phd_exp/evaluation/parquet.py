@@ -38,13 +38,14 @@ def read_table(file: Path) -> Columns:
     """
     try:
         require_plain(file, LARGEST)
-        with open(file, "rb") as stream:  # pyarrow opens no name that is not UTF-8
+        # pyarrow opens no name that is not UTF-8, and its threads may hold buffers of a Python file while the program
+        # exits, which would abort it
+        with open(file, "rb") as named, pa.OSFile(f"/dev/fd/{named.fileno()}") as stream:
             metadata = pq.read_metadata(stream)
             _require_small(file, metadata)
             # a text that repeats in every row is kept once in memory
             texts = [name for name in TEXTS if name in metadata.schema.to_arrow_schema().names]
-            # on this thread: another one may still hold a part of the stream while the program exits, which aborts it
-            table = pq.ParquetFile(stream, metadata=metadata, read_dictionary=texts).read(use_threads=False)
+            table = pq.ParquetFile(stream, metadata=metadata, read_dictionary=texts).read()
             return {name: _values(name, table[name].to_numpy()) for name in table.column_names}
     except FileNotFoundError:
         raise RunError(f"{file.name}: missing, though the run has finished") from None
