@@ -170,7 +170,7 @@ def test_at_most_eight_lines_have_a_label(chromium: Any, tmp_path: Path) -> None
     visit.open("index.html")
     visit.draw()
     labels = visit.page.locator("#learning .legend li[data-run]:visible")
-    strokes = """[...document.querySelectorAll('[data-chart=learning_depth_error_mm] .scatterlayer .js-line')]
+    strokes = """[...document.querySelectorAll('[data-chart$=learning_depth_error_mm] .scatterlayer .js-line')]
         .map(line => line.style.stroke + line.style.strokeDasharray)"""
     every = visit.page.evaluate(strokes)
     assert (labels.count(), len(every), len(set(every))) == (8, 10, 9)
