@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from phd_exp.records.runs import RunFolder
+from phd_exp.records.runs import SECTIONS, RunFolder
 from phd_exp.reports.table import file_stem
 from tests.bad_input.images import pipe
 from tests.support.recorded import reported, sited
@@ -92,7 +92,7 @@ LONG: dict[str, Spoil] = {
     "one variance of zero": rows(
         lambda frame: frame.assign(depth_variance=frame["depth_variance"].where(frame.index > 0, 0.0))
     ),
-    "a config with a lone surrogate": files(config='a: "\\ud800"\ndata: {root: "\\ud800", spec: {variant: x}}\n'),
+    "a config with a lone surrogate": files(config="".join(f'{name}: {{x: "\\ud800"}}\n' for name in SECTIONS)),
     "long texts": column(file_name="x" * 100_000),
     **{name: renamed(name) for name in RENAMED if name not in HARMLESS},
 }
