@@ -5,7 +5,7 @@ and q_1, any one coordinate of q, are independent.
 """
 
 import math
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 import torch
@@ -98,9 +98,17 @@ class _DepthLaw:
     def __init__(self, distribution: ProjectedHuber) -> None:
         mu_z, a = (one.detach().cpu().double() for one in (distribution.mu_z, distribution.a))
         self.distribution, self.mu_z, self.a = distribution, mu_z.numpy(), a.numpy()
-        self.height = self.a / (self.mu_z * (1 + tail_moment(0, a).numpy()))  # the density at the mode
+
+    @cached_property
+    def height(self) -> Float[np.ndarray, " n"]:
+        """The density at the mode, 1/m."""
+        return self.a / (self.mu_z * (1 + tail_moment(0, torch.from_numpy(self.a)).numpy()))
+
+    @cached_property
+    def breaks(self) -> Float[np.ndarray, "n breaks"]:
+        """The depths between which the law is smooth, m."""
         tails = np.array(_TAILS)
-        self.breaks = np.concatenate([self.icdf(tails), self.mu_z[:, None], self.icdf(1 - tails[::-1])], axis=1)
+        return np.concatenate([self.icdf(tails), self.mu_z[:, None], self.icdf(1 - tails[::-1])], axis=1)
 
     def icdf(self, p: Float[np.ndarray, " quantiles"]) -> Float[np.ndarray, "n quantiles"]:
         """The depths with these probabilities below them, m."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from PIL import Image
 from torch import Tensor
 
@@ -46,10 +46,11 @@ class Batch:
     familiar: Float[np.ndarray, " batch"] | None = None
 
     @cached_property
-    def cameras(self) -> Camera:
-        """The virtual cameras."""
+    def out_of_field(self) -> Bool[np.ndarray, " batch"]:
+        """Whether the mode lies outside the field of the view."""
         f = [view.camera.f for _, _, view in self.seen]
-        return Camera(torch.tensor(f, dtype=torch.float64), self.seen[0][2].camera.S)
+        cameras = Camera(torch.tensor(f, dtype=torch.float64), self.seen[0][2].camera.S)
+        return ~cameras.contains(self.predictions.mode).numpy()
 
     @cached_property
     def numbers(self) -> dict[str, Float[np.ndarray, "batch ..."]]:
@@ -62,7 +63,7 @@ class Batch:
         """
         made, R = self.predictions, np.stack([view.camera.R for _, _, view in self.seen])
         mode = made.mode.numpy()
-        found = {"mode": _turned_back(mode, R), "out_of_field": ~self.cameras.contains(made.mode).numpy()}
+        found = {"mode": _turned_back(mode, R)}
         if made.has_closed_forms:
             found["mean"] = _turned_back(made.mean.numpy(), R)
             found["covariance"] = R.transpose(0, 2, 1) @ made.covariance_matrix.numpy() @ R
@@ -80,9 +81,10 @@ class Batch:
         NaN where the true position is unknown.
         """
         made, known = self.predictions, torch.tensor([one.line.z is not None for one, *_ in self.seen])
-        positions = [one.position if one.line.z is not None else (0.0, 0.0, 1.0) for one, *_ in self.seen]
-        seen = [view.camera.to_virtual(np.array(at)) for at, (*_, view) in zip(positions, self.seen, strict=True)]
-        truth = torch.where(known[:, None], torch.from_numpy(np.stack(seen)), made.mode)  # a position that it accepts
+        truth = made.mode.clone()  # where it is unknown, a position that every density accepts
+        for row in known.nonzero().flatten().tolist():
+            detection, _, view = self.seen[row]
+            truth[row] = torch.from_numpy(view.camera.to_virtual(np.array(detection.position)))
         errors = {
             "projected_error_mm": MILLIMETRES * projected_error(truth, made.mode),
             "depth_error_mm": MILLIMETRES * depth_error(truth, made.mode),
@@ -197,7 +199,7 @@ def answer(sighting: Sighting, temperature: Temperature | None, guarantee: Any =
     """The numbers of a detection, its region by a `Guarantee`, and its errors if the position is known."""
     batch, row, line = sighting.batch, sighting.row, sighting.detection.line
     named: dict[str, Any] = line.model_dump(include=set(REPEATED), exclude_none=True, mode="json")
-    numbers = {name: rounded(values[row]) for name, values in batch.numbers.items() if name != "out_of_field"}
+    numbers = {name: rounded(values[row]) for name, values in batch.numbers.items()}
     if "depth_interval" in numbers:
         intervals = (None if None in ends else ends for ends in numbers["depth_interval"])
         numbers["depth_interval"] = dict(zip(map(str, LEVELS), intervals, strict=True))
@@ -212,7 +214,7 @@ def answer(sighting: Sighting, temperature: Temperature | None, guarantee: Any =
         named |= {"position": numbers["mode"], "uncertainty": none}
     if sighting.familiar is not None:
         named["familiar"] = rounded(np.array(sighting.familiar))
-    named["out_of_field"] = bool(batch.numbers["out_of_field"][row])
+    named["out_of_field"] = bool(batch.out_of_field[row])
     errors = {} if line.z is None else batch.errors
     return named | {name: rounded(values[row]) for name, values in errors.items()}
 
