@@ -10,8 +10,8 @@ from PIL import ExifTags, Image
 
 from phd_exp.data.areas import GREY, area_means, sums
 from phd_exp.data.images import shrunk
-from phd_exp.geometry.lens import PINHOLE, Lens
-from phd_exp.geometry.virtual import VirtualCamera, intrinsics, require_no_fold
+from phd_exp.optics.lens import PINHOLE, Lens
+from phd_exp.optics.virtual import VirtualCamera, intrinsics, require_no_fold
 from phd_exp.records.detections import Detection
 from phd_exp.records.errors import DatasetError
 from phd_exp.records.files import require_plain

@@ -14,7 +14,7 @@ from phd_exp.data.cache import cached
 from phd_exp.data.crops import cut, facing, image_size, read_image
 from phd_exp.data.sources import Known, Part, Source
 from phd_exp.geometry.charts import DepthScale
-from phd_exp.geometry.virtual import VirtualCamera
+from phd_exp.optics.virtual import VirtualCamera
 from phd_exp.records.dataset import sha256
 from phd_exp.records.detections import LARGEST_BOX, Detection
 from phd_exp.records.errors import ConfigError, DatasetError

@@ -8,7 +8,7 @@ from the top left corner of the image; the centre of the pixel in column c and r
 | v = (x, y, z) | `xyz` | position in the camera frame | metres | `geometry.camera.Camera` |
 | f | `f` | focal length | pixels | `geometry.camera.Camera` |
 | S | `S` | side of the square image; the principal point is (S/2, S/2) | pixels | `geometry.camera.Camera` |
-| K, R | `K`, `R` | intrinsics of a real camera, and the rotation from its frame to that of a virtual one | - | `geometry.virtual.VirtualCamera` |
+| K, R | `K`, `R` | intrinsics of a real camera, and the rotation from its frame to that of a virtual one | - | `optics.virtual.VirtualCamera` |
 | v_p | `v_p` | projected position 2 f (x, y) / (S z), in [-1, 1] inside the image | - | `geometry.charts.projected` |
 | z_p | `z_p` | depth z / (mu_z0 f) after compensation for the focal length, in [1/D, D] | - | `geometry.charts.compensated_depth` |
 | mu_z0 | `mu_z0` | the data set's typical depth per focal length, sqrt(max(z/f) min(z/f)) | metres per pixel | `geometry.charts.DepthScale` |
@@ -34,8 +34,8 @@ from the top left corner of the image; the centre of the pixel in column c and r
 
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import Cartesian, Chart, DepthScale, LogDepth, Projected, compensated_depth, projected
-from phd_exp.geometry.lens import Lens
-from phd_exp.geometry.virtual import VirtualCamera, intrinsics
+from phd_exp.optics.lens import Lens
+from phd_exp.optics.virtual import VirtualCamera, intrinsics
 
 __all__ = [
     "Camera",

@@ -13,10 +13,11 @@ from torch import Tensor, nn
 from torch.export import Dim
 
 from phd_exp.data.areas import area_means, sums
-from phd_exp.geometry.virtual import facing, intrinsics, pixel_corners
+from phd_exp.geometry.facing import facing, pixel_corners
 from phd_exp.inference.answers import LEVELS
 from phd_exp.inference.predictor import PIXELS, Predictor
 from phd_exp.models.heads import Prediction
+from phd_exp.optics.virtual import intrinsics
 
 FOCAL_LENGTHS = (5.0, 9.0)  # range for the comparison with torch, in sides of the image
 NUMBER = Dim("n", min=0)

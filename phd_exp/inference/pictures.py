@@ -14,8 +14,8 @@ from matplotlib.patheffects import withStroke
 from PIL import Image
 
 from phd_exp.distributions.level_curves import LevelCurves, Points, level_curves
-from phd_exp.geometry.virtual import Box
 from phd_exp.inference.answers import Sighting
+from phd_exp.optics.virtual import Box
 from phd_exp.records.errors import one_line
 from phd_exp.reports.figures import Mark, draw_birds_eye, draw_curve, encoded, marks_on_image
 from phd_exp.reports.gallery import close_up

@@ -20,10 +20,10 @@ from phd_exp.distributions.columns import parameter_columns
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.geometry.motion import EIGHT, turned
-from phd_exp.geometry.virtual import Box, VirtualCamera, intrinsics
 from phd_exp.inference.views import View, focal_lengths, image_batch
 from phd_exp.models.heads import DistributionHead, Prediction
 from phd_exp.models.regressor import Regressor
+from phd_exp.optics.virtual import Box, VirtualCamera, intrinsics
 from phd_exp.records.errors import ConfigError, DatasetError, RunError
 from phd_exp.records.runs import RunFolder
 

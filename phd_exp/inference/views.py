@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import UInt8
 from torch import Tensor
 
-from phd_exp.geometry.virtual import VirtualCamera
+from phd_exp.optics.virtual import VirtualCamera
 from phd_exp.records.errors import DatasetError, shown
 
 

@@ -16,7 +16,7 @@ from phd_exp.data.areas import GREY
 from phd_exp.data.crops import cut, image_size, pillow_warnings, read_image
 from phd_exp.data.images import shrunk
 from phd_exp.geometry import Camera
-from phd_exp.geometry.virtual import Box, VirtualCamera, intrinsics, rays
+from phd_exp.optics.virtual import Box, VirtualCamera, intrinsics, rays
 from phd_exp.records.errors import DatasetError
 
 K = intrinsics(400.0, 520.0, 120.3, 140.8)  # pixels not square, the principal point off the middle

@@ -6,8 +6,8 @@ from PIL import Image
 
 from phd_exp.data.areas import GREY
 from phd_exp.data.crops import cut
-from phd_exp.geometry.lens import Lens
-from phd_exp.geometry.virtual import VirtualCamera, intrinsics, rays
+from phd_exp.optics.lens import Lens
+from phd_exp.optics.virtual import VirtualCamera, intrinsics, rays
 from tests.support.opencv import projected
 
 WIDTH, HEIGHT, FINE = 1280, 960, 8

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from phd_exp.geometry.virtual import VirtualCamera, facing, intrinsics, pixel_corners
+from phd_exp.geometry.facing import facing, pixel_corners
+from phd_exp.optics.virtual import VirtualCamera, intrinsics
 
 K = intrinsics(700.0, 1100.0, 250.5, 301.25)
 BOXES = np.array([[10, 250, 130, 470], [0, 0, 640, 480], [-40, 100, 90, 101], [600, 440, 620, 470]], dtype=float)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from phd_exp.geometry.lens import Lens
+from phd_exp.optics.lens import Lens
 
 HALF = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 UNTIL = (3, 500, 1e-13)  # steps and change at which its iterations end

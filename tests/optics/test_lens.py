@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from phd_exp.geometry.lens import PINHOLE, Lens
-from phd_exp.geometry.virtual import VirtualCamera, intrinsics, rays, require_no_fold
+from phd_exp.optics.lens import PINHOLE, Lens
+from phd_exp.optics.virtual import VirtualCamera, intrinsics, rays, require_no_fold
 from tests.support.opencv import projected, undistorted
 
 K = intrinsics(500.0, 510.0, 320.5, 240.5)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from phd_exp.geometry.motion import smallest_rotation
-from phd_exp.geometry.virtual import Box, VirtualCamera, intrinsics, rays
+from phd_exp.optics.virtual import Box, VirtualCamera, intrinsics, rays
 
 S = 96.0
 

@@ -8,12 +8,9 @@ pinhole whatever the lens of the real camera.
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float
-from torch import Tensor
 
-from phd_exp.geometry.lens import PINHOLE, Lens
-from phd_exp.geometry.motion import smallest_rotation
+from phd_exp.optics.lens import PINHOLE, Lens
 
 BORDER = 33  # places along a side of a box whose rays a lens bends
 
@@ -67,7 +64,7 @@ class VirtualCamera:
         border = border[np.isfinite(border).all(axis=-1)]
         if not (np.isfinite(middle).all() and len(border)):
             raise ValueError(f"box={list(box)}: its middle or its whole border lies beyond the field of the lens")
-        R = smallest_rotation(torch.from_numpy(middle / np.linalg.norm(middle))).numpy()
+        R = towards(middle)
         border = border @ R.T
         if not (border[:, 2] > 0).all():
             raise ValueError(f"box={list(box)}: its corners are 90 degrees or more from its middle")
@@ -109,41 +106,18 @@ def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, 
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
+def towards(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation without roll that maps a direction to (0, 0, 1), as `geometry.motion.smallest_rotation`."""
+    a, b, c = direction / np.linalg.norm(direction)
+    ab = a * b / (1 + c)
+    return np.array([[1 - a * a / (1 + c), -ab, -a], [-ab, 1 - b * b / (1 + c), -b], [a, b, c]])
+
+
 def rays(
     K: Float[np.ndarray, "3 3"], pixel: Float[np.ndarray, "*batch 2"], lens: Lens = PINHOLE
 ) -> Float[np.ndarray, "*batch 3"]:
     """Position that projects to a pixel: `Lens.undistort` of ((u - cx)/fx, (v - cy)/fy)."""
     return lens.undistort((pixel - K[:2, 2]) / np.diagonal(K)[:2])
-
-
-def facing(
-    K: Float[Tensor, "3 3"], boxes: Float[Tensor, "boxes 4"], S: int, largest_f: float
-) -> tuple[Float[Tensor, "boxes 3 3"], Float[Tensor, " boxes"]]:
-    """R and f of the virtual cameras of boxes in the image of a pinhole: `VirtualCamera.of_box` as a graph.
-
-    f is NaN where that raises ValueError, and for K and boxes that are not finite.
-    """
-    left, top, right, bottom = boxes.unbind(-1)
-    pixels = [((left + right) / 2, (top + bottom) / 2), (left, top), (right, top), (left, bottom), (right, bottom)]
-    places = (torch.stack([torch.stack(pixel, -1) for pixel in pixels], 1) - K[:2, 2]) / K.diagonal()[:2]
-    directions = torch.cat([places, torch.ones_like(places[..., :1])], dim=-1)
-    R = smallest_rotation(directions[:, 0] / directions[:, 0].norm(dim=-1, keepdim=True))
-    corners = directions[:, 1:] @ R.mT
-    half_width = (corners[..., :2] / corners[..., 2:]).abs().amax((1, 2)).clamp_min(S / (2 * largest_f))
-    nearest = R[:, 2, 2] - half_width * R[:, :2, 2].abs().sum(-1)  # z of a corner of the view in the real frame
-    is_view = (corners[..., 2] > 0).all(-1) & (nearest > 0) & half_width.isfinite()
-    return R, torch.where(is_view, S / (2 * half_width), torch.nan)
-
-
-def pixel_corners(
-    K: Float[Tensor, "3 3"], R: Float[Tensor, "boxes 3 3"], f: Float[Tensor, " boxes"], S: int
-) -> Float[Tensor, "boxes places places 2"]:
-    """Pixels of the real image at the corners of the pixels of each virtual image, `VirtualCamera.corners`."""
-    along = torch.arange(S + 1, dtype=K.dtype) - S / 2
-    y, x = torch.meshgrid(along, along, indexing="ij")
-    x, y = x / f[:, None, None], y / f[:, None, None]
-    real = torch.stack([x, y, torch.ones_like(x)], dim=-1) @ R[:, None]
-    return K[:2, 2] + K.diagonal()[:2] * (real[..., :2] / real[..., 2:])
 
 
 def require_no_fold(K: Float[np.ndarray, "3 3"], lens: Lens, width: int, height: int) -> None:

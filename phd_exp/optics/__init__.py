@@ -1,0 +1,1 @@
+"""Real cameras and their virtual ones, with numpy alone: lenses, and square views that face a box."""
