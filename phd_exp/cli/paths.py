@@ -8,7 +8,17 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, Quote, QuotedString
 from hydra.errors import HydraException
 
-PATHS = ("runs", "masks", "bop", "data.root", "data.folder", "data.mesh", "data.backdrops", "data.distractor_meshes")
+PATHS = (
+    "runs",
+    "masks",
+    "bop",
+    "data.root",
+    "data.folder",
+    "data.mesh",
+    "data.backdrops",
+    "data.distractor_meshes",
+    "data.camera",
+)
 """The keys whose values are paths."""
 _PARTS = re.compile(r"""\s*'(?:\\.|[^'\\])*'\s*(?=,|$)|\s*"(?:\\.|[^"\\])*"\s*(?=,|$)|[^,]+""")
 

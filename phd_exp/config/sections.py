@@ -14,6 +14,7 @@ Whole = Annotated[int, Field(strict=True)]
 Natural = Annotated[Whole, Field(ge=0)]
 Count = Annotated[Whole, Field(ge=1)]
 Name = Annotated[str, Field(strict=True, pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
+OF_CAMERA = ("f", "width", "height")
 Factor = Annotated[float, Field(ge=1, le=10)]
 
 
@@ -37,6 +38,17 @@ class SizesConfig(Record):
     batch_size: Count
 
 
+def _with_camera(values: dict[str, Any]) -> dict[str, Any]:
+    """The keys f, width and height as a camera. Raises ValueError if one is missing, or there is a file too."""
+    numbers = {key: values[key] for key in OF_CAMERA if values.get(key) is not None}
+    others = {key: value for key, value in values.items() if key not in OF_CAMERA}
+    if not numbers:
+        return others
+    if len(numbers) < len(OF_CAMERA) or others.get("camera") is not None:
+        raise ValueError(f"{min(numbers)}: expected all of data.f, data.width and data.height, or data.camera alone")
+    return others | {"camera": numbers}
+
+
 class RenderedConfig(SizesConfig):
     """A rendered data set: the keys of `DatasetSpec`, and how much of it a run uses."""
 
@@ -52,6 +64,7 @@ class RenderedConfig(SizesConfig):
         """Move the keys of the specification, which the user writes next to the others, into `spec`."""
         if not isinstance(values, dict) or "spec" in values:
             return values
+        values = _with_camera(values)
         spec = {key: value for key, value in values.items() if key in DatasetSpec.model_fields}
         return {key: value for key, value in values.items() if key not in spec} | {"spec": spec}
 

@@ -10,7 +10,7 @@ from PIL import ExifTags, Image
 
 from phd_exp.data.areas import GREY, area_means, sums
 from phd_exp.data.images import shrunk
-from phd_exp.optics.lens import PINHOLE, Lens
+from phd_exp.optics.lens import PINHOLE
 from phd_exp.optics.virtual import VirtualCamera, intrinsics, require_no_fold
 from phd_exp.records.detections import Detection
 from phd_exp.records.errors import DatasetError
@@ -62,7 +62,7 @@ def facing(detection: Detection, size: tuple[int, int], side: int, largest_f: fl
     Raises DatasetError if the box is too wide, the camera file is for another size, or its lens folds over inside.
     """
     box, K, file = detection.box(*size), intrinsics(*detection.focal_lengths_and_centre(*size)), detection.calibration
-    lens = Lens(file.D[:8], file.model == "equidistant") if file else PINHOLE
+    lens = file.lens if file else PINHOLE
     try:
         require_no_fold(K, lens, *size)
         return VirtualCamera.of_box(K, box, float(side), lens, largest_f if detection.line.box else np.inf)

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -65,8 +66,8 @@ class RenderedSource(Source):
 
     Held-out samples follow the training samples in the training split.
 
-    The constants follow from the specification, before anything is rendered. When an image shrinks, f and S shrink
-    with it and mu_z0 grows.
+    The constants follow from the specification, before anything is rendered; for views of boxes, from the training
+    samples. When an image shrinks, f and S shrink with it and mu_z0 grows.
     """
 
     def __init__(self, folder: DatasetFolder, spec: DatasetSpec, n: Mapping[Part, int], side: int) -> None:
@@ -76,8 +77,25 @@ class RenderedSource(Source):
         self.n = n
         self.side = side
         self.zoom = side / spec.sensor_size
-        self.depth = DepthScale.from_ranges(f_range=spec.f_range, z_range=spec.z_range).scaled(self.zoom)
-        self.constant_f = self.zoom * float(np.sqrt(spec.f_range[0] * spec.f_range[1]))
+
+    @cached_property
+    def depth(self) -> DepthScale:  # type: ignore[override]
+        spec = self.spec
+        if not spec.is_box:
+            return DepthScale.from_ranges(f_range=spec.f_range, z_range=spec.z_range).scaled(self.zoom)
+        return DepthScale.from_samples(*self._depths).scaled(self.zoom)
+
+    @cached_property
+    def constant_f(self) -> float:  # type: ignore[override]
+        extremes = self._depths[1].aminmax() if self.spec.is_box else self.spec.f_range
+        return self.zoom * float(np.sqrt(float(extremes[0]) * float(extremes[1])))
+
+    @cached_property
+    def _depths(self) -> tuple[Tensor, Tensor]:
+        """z and f of the training samples."""
+        records = self.folder.records("train", self.n["train"])
+        z, f = torch.tensor([(record.z, record.f) for record in records], dtype=torch.float64).T
+        return z, f
 
     def samples(self, part: Part) -> Batch:
         split, of_split, rows = self._records(part)

@@ -86,10 +86,10 @@ class Predictor:
     def f_range(self) -> tuple[float, float]:
         """The focal lengths of the training images, px of the network's image.
 
-        From 0 to infinity for a network trained on the user's own images, whose boxes decided.
+        From 0 to infinity for a network trained on boxes, whose sizes decided.
         """
         data = self.config.data
-        if not isinstance(data, RenderedConfig):
+        if not isinstance(data, RenderedConfig) or data.spec.is_box:
             return 0.0, math.inf
         low, high = data.spec.f_range
         zoom = self.side / data.spec.sensor_size

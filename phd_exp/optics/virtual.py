@@ -8,7 +8,7 @@ pinhole whatever the lens of the real camera.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from phd_exp.optics.lens import PINHOLE, Lens
 
@@ -94,6 +94,16 @@ class VirtualCamera:
         """Pixels of the real image at the corners of the pixels of the virtual image."""
         along = (np.arange(int(self.S) + 1) - self.S / 2) / self.f
         return self.real_pixels(np.stack(np.meshgrid(along, along), axis=-1))
+
+    def outside(self, width: float, height: float) -> Bool[np.ndarray, "S S"]:
+        """The pixels of the virtual image whose middles lie outside the real image of that size, px."""
+        half, size = self.S / self.f / 2, np.array([width, height])
+        around = self.real_pixels(_border((-half, -half, half, half), BORDER))
+        if ((around >= 0) & (around <= size)).all():
+            return np.zeros((int(self.S), int(self.S)), bool)
+        along = (np.arange(int(self.S)) + 0.5 - self.S / 2) / self.f
+        place = self.real_pixels(np.stack(np.meshgrid(along, along), axis=-1))
+        return ~((place >= 0) & (place <= size)).all(axis=-1)
 
     @property
     def homography(self) -> Float[np.ndarray, "3 3"]:

@@ -12,8 +12,11 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from phd_exp.optics.lens import Lens
 from phd_exp.records.camera_files import content_of, entries
 from phd_exp.records.errors import DatasetError, gist, listed, shown
 from phd_exp.records.files import LARGEST_RECORD, MB, read_plain
@@ -76,6 +79,18 @@ class Calibration(Record):
     D: tuple[float, ...]
     model: Model
 
+    @property
+    def intrinsics(self) -> NDArray[np.float64]:
+        """Camera matrix (3, 3) of pixels that count from the corner of the first one."""
+        K = np.array(self.K).reshape(3, 3)
+        K[:2, 2] += CORNER
+        return K
+
+    @property
+    def lens(self) -> Lens:
+        """The lens."""
+        return Lens(self.D[:8], self.model == "equidistant")
+
     @model_validator(mode="after")
     def has_no_skew(self) -> "Calibration":
         """Refuse skew, and a focal length that is not in pixels."""
@@ -95,6 +110,26 @@ def read_camera(path: Path) -> Calibration:
         return Calibration(width=width, height=height, K=tuple(_matrix(found)), D=tuple(D), model=model)
     except (OSError, ValueError, RecursionError) as error:
         raise DatasetError(f"{path}: {gist(error)}; see `Lenses` in docs/guides/own_images.md") from None
+
+
+def calibration(given: Any) -> Calibration | None:
+    """The camera of images of a known size: a file, the numbers f, width and height, or the content of a record.
+
+    Raises ValueError if it is none, or its size is not known.
+    """
+    if given is None or isinstance(given, Calibration):
+        return given
+    try:
+        if isinstance(given, dict) and "f" in given:
+            f, width, height = (given[name] for name in ("f", "width", "height"))
+            K = (f, 0, width / 2 - CORNER, 0, f, height / 2 - CORNER, 0, 0, 1)
+            given = {"width": width, "height": height, "K": K, "D": (), "model": "plumb_bob"}
+        camera = read_camera(Path(given)) if isinstance(given, (str, Path)) else Calibration(**given)
+    except (DatasetError, TypeError, ValueError) as error:
+        raise ValueError(f"camera: {gist(error)}") from None
+    if not (camera.width and camera.height):
+        raise ValueError(f"camera: {given} does not say the size of the images; add width and height to the file")
+    return camera
 
 
 def _found(content: Any) -> Found:

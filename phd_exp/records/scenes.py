@@ -10,6 +10,7 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import AfterValidator, Field
 
+from phd_exp.records.cameras import Calibration
 from phd_exp.records.parsing import Record
 
 Split = Literal["train", "test"]
@@ -128,8 +129,10 @@ def _one_of_each(objects: tuple[SceneObject, ...]) -> tuple[SceneObject, ...]:
     return objects
 
 
-# not written for cylinders, whose records stay as they were
+# not written where there is none: records of cylinders stay as they were
 OfMesh = Annotated[Surroundings | None, Field(exclude_if=lambda value: value is None)]
+OfBox = Annotated[Calibration | None, Field(exclude_if=lambda value: value is None)]
+Box = Annotated[tuple[Finite, Finite, Finite, Finite] | None, Field(exclude_if=lambda value: value is None)]
 Objects = Annotated[tuple[SceneObject, ...], Field(min_length=1), AfterValidator(_one_of_each)]
 
 
@@ -143,6 +146,8 @@ class Scene(Record):
         objects: the cylinder or mesh first.
         noise_seed: seed of the path tracer.
         surroundings: of a mesh.
+        camera, box: of a view of a box: the user's camera, whose frame is the scene's, and the box in its image, px:
+            left, top, right, bottom.
     """
 
     f: Positive
@@ -153,6 +158,8 @@ class Scene(Record):
     backdrop: Backdrop
     noise_seed: Seed
     surroundings: OfMesh = None
+    camera: OfBox = None
+    box: Box = None
 
 
 class SampleRecord(Record):
@@ -190,6 +197,8 @@ class SampleRecord(Record):
     backdrop: Backdrop
     noise_seed: Seed
     surroundings: OfMesh = None
+    camera: OfBox = None
+    box: Box = None
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
     @property

@@ -9,7 +9,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, StrictBool, model_serializer, model_validator
 
+from phd_exp.optics.virtual import VirtualCamera
 from phd_exp.records.assets import BLENDERS_SKIES, Asset, backdrops_asset, mesh_asset
+from phd_exp.records.cameras import Calibration, calibration
 from phd_exp.records.parsing import Record
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -23,13 +25,13 @@ def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:
 
 Positive = Annotated[Number, Field(gt=0)]
 FocalLength = Annotated[Number, Field(ge=10, le=1e6)]
-# half a metre keeps the camera outside the largest object: a cube of 0.2 m, scaled by 2, reaches 0.35 m
-Distance = Annotated[Number, Field(ge=0.5, le=100)]
+Distance = Annotated[Number, Field(ge=0.001, le=1e5)]
 Factor = Annotated[Number, Field(ge=0.1, le=2)]
 Share = Annotated[Number, Field(ge=0, le=1)]
 # beyond a right angle, half the cameras would face the lamps
 Angle = Annotated[Number, Field(ge=0, le=90)]
 Pitch = Annotated[Number, Field(ge=-90, le=90)]
+Turn = Annotated[Number, Field(ge=0, le=180)]
 Range = AfterValidator(_ascending)
 
 
@@ -42,13 +44,18 @@ def _point(given: Any) -> Any:
 Reference = Annotated[Literal["origin", "centroid"] | tuple[Number, Number, Number], BeforeValidator(_point)]
 Mesh = BeforeValidator(mesh_asset)
 ImageFormat = Literal["png", "webp", "jpeg"]
+NEAREST = 1.05  # least depth of an object's centre over its reach, so that the camera stays outside
+SOLID = 0.2 * 0.75**0.5  # m: reach of the cube, the largest solid at scale 1
+F_RANGE = (1200.0, 2000.0)  # of conf/data/default.yaml, which a camera replaces
+XY_RANGES = {"field": 0.5, "box": 1.0}  # of meshes, by view
 SHARD = "expected INDEX/COUNT with 0 <= INDEX < COUNT"
 
 
 class DatasetSpec(Record):
     """Everything that a sample depends on, except its split and index. It does not hold the number of samples.
 
-    Positions have the distribution z ~ U(z_range) and x, y ~ (S z / f) xy_range U(-1/2, 1/2).
+    Positions have the distribution z ~ U(z_range) and x, y ~ (S z / f) xy_range U(-1/2, 1/2). With view=box, their
+    pixels in the image of `camera` have it instead, and S and f are those of the view of the object's box.
 
     Attributes:
         variant: name of the data set, and of its folder.
@@ -80,6 +87,12 @@ class DatasetSpec(Record):
         motion_blur: the longest path of the image during the exposure, px.
         ignore: parts of the meshes' files: the materials, in whose place are random ones.
         empty: whether the images show the scenes without their objects.
+        camera: the user's camera. f_range is then the focal length of its whole image, shrunk to S.
+        view: field, the whole image; box, the view of a detector's box, which `predict boxes=` makes too. None, to
+            which the other values are reduced where possible: box if there is a camera, field if not.
+        box_size, box_shift: bounds of the side of that box, and its largest shift, over the side of the exact one.
+        grey: whether the images are grey.
+        front: a direction in the file's axes; its angle to the way to the camera is in `front_range`, degrees.
 
     Raises:
         pydantic.ValidationError: a missing or unknown key, a wrong type, a value out of range.
@@ -115,12 +128,54 @@ class DatasetSpec(Record):
     motion_blur: Annotated[Number, Field(ge=0, le=64)] = 0.0
     ignore: tuple[Literal["materials"], ...] = ()
     empty: StrictBool = False
+    camera: Calibration | None = None
+    view: Literal["field", "box"] | None = None
+    box_size: Annotated[tuple[Positive, Positive], Range] = (0.9, 1.5)
+    box_shift: Annotated[Number, Field(ge=0, le=0.5)] = 0.15
+    grey: StrictBool = False
+    front: tuple[Number, Number, Number] | None = None
+    front_range: Annotated[tuple[Turn, Turn], Range] = (0.0, 180.0)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _follow_camera(cls, values: Any) -> Any:
+        """Read the camera, and fill in what follows from it: f_range, and xy_range if it is null."""
+        if not isinstance(values, dict) or values.get("mesh") is None:
+            return values
+        camera = calibration(values.get("camera"))
+        usual = "box" if camera else "field"
+        view = values.get("view") or usual
+        followed = values | {"camera": camera, "view": None if view == usual else view}
+        if values.get("xy_range") is None:
+            followed["xy_range"] = XY_RANGES.get(view)
+        if camera and "sensor_size" in values:
+            followed["f_range"] = _whole(camera, view, values["sensor_size"], values.get("f_range"))
+        return followed
+
+    @property
+    def is_box(self) -> bool:
+        """Whether the images are views of boxes."""
+        return self.camera is not None and self.view is None
+
+    @model_validator(mode="after")
+    def _view_fits(self) -> "DatasetSpec":
+        if self.view == "box" or (self.is_box and self.views > 1):
+            raise ValueError("view: got box; expected data.camera=FILE or data.f, width and height, and views=1")
+        if not self.is_box and (self.box_size, self.box_shift) != ((0.9, 1.5), 0.15):
+            raise ValueError("box_size, box_shift: got view=field; expected view=box")
+        if (self.front_range != (0.0, 180.0)) > bool(self.front and any(self.front)) or (self.front and self.upright):
+            raise ValueError("front: expected a direction [x, y, z] with front_range, and upright=false")
+        return self
 
     @model_validator(mode="after")
     def _parts_fit(self) -> "DatasetSpec":
         keys, n_others = list(type(self).model_fields), 3 + len(self.distractor_meshes)
         if self.mesh is None and (given := set(keys[keys.index("unit") :]) & self.model_dump().keys()):
             raise ValueError(f"{min(given)}: for meshes alone; expected data=object data.mesh=FILE")
+        if self.mesh is None and (near := NEAREST * SOLID * self.scale_range[1]) > self.z_range[0]:
+            raise ValueError(
+                f"z_range: got {list(self.z_range)}; expected at least {near:.3g} m, outside the objects"
+            )
         if self.mesh is not None and self.occluders:
             raise ValueError("occluders: for the cylinder alone; expected data.distractors=2")
         if self.distractors > n_others or (self.distractors and self.views > 1):
@@ -152,6 +207,17 @@ class DatasetSpec(Record):
         """Sixteen hexadecimal digits that identify the values, the same on every machine."""
         canonical = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+
+
+def _whole(camera: Calibration, view: str, S: int, given: Any) -> tuple[float, float]:
+    """f_range of the whole image of a camera. Raises ValueError if another one is given."""
+    size = (float(camera.width or 0), float(camera.height or 0))
+    f = camera.K[0] * S / max(size)
+    if view == "field":
+        f = VirtualCamera.of_box(camera.intrinsics, (0.0, 0.0, *size), float(S), camera.lens).f
+    if given is not None and tuple(given) not in (F_RANGE, (f, f)):
+        raise ValueError(f"f_range: got {list(given)}, but it follows from data.camera; leave it out")
+    return f, f
 
 
 @dataclass(frozen=True)

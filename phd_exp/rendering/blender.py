@@ -18,7 +18,8 @@ from phd_exp.records.scenes import Scene
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.importing import import_meshes
 from phd_exp.rendering.pixels import Light, read_light
-from phd_exp.rendering.stage import ROUGHER, build_stage, show_scene
+from phd_exp.rendering.sampling import remoteness
+from phd_exp.rendering.stage import CLIPPING, ROUGHER, build_stage, show_scene
 from phd_exp.rendering.surroundings import World
 from phd_exp.rendering.triangles import Meshes
 
@@ -104,6 +105,9 @@ class Renderer:
             self._world = World(self._bpy, spec) if spec and spec.mesh else None
             if self.meshes:
                 _configure_for_meshes(self._bpy)
+            if spec:  # what is nearer or farther than usual is shown too
+                lens, (near, far) = self._scene.camera.data, CLIPPING
+                lens.clip_start, lens.clip_end = near * min(1, 2 * spec.z_range[0]), far * remoteness(spec)
 
     def render(self, scene: Scene, box: Box | None = None) -> Light:
         """Linear light of a box of pixels (height, width, 3), by default of all (S, S, 3); rows from the top.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from phd_exp.records.errors import RenderError, listed, one_line
 from phd_exp.records.mesh_files import MATERIALS, MeshFile, read_mesh
-from phd_exp.records.spec import DatasetSpec
+from phd_exp.records.spec import NEAREST, DatasetSpec
 from phd_exp.rendering.triangles import Meshes, Triangles
 
 MOST_FACES = 1_000_000
@@ -36,7 +36,9 @@ def import_meshes(bpy: Any, spec: DatasetSpec) -> Meshes:
         try:
             handle = _one_object(bpy, read_mesh(asset.path(file)), is_plain="materials" in spec.ignore)
             reference = "centroid" if number else spec.reference
-            meshes[name] = _in_metres(handle, spec.unit, reference, is_y_up=file.lower().endswith(Y_UP))
+            if isinstance(reference, tuple):
+                reference = in_blenders_axes(reference, file)
+            meshes[name] = _in_metres(handle, spec.unit, reference)
             _require_drawn(bpy, handle, meshes[name])
             _require_size(meshes[name], spec)
         except (OSError, ValueError, RuntimeError) as error:  # Blender raises RuntimeError
@@ -96,7 +98,13 @@ def _import(bpy: Any, file: MeshFile) -> set[Any]:
     return set(bpy.data.objects) - before
 
 
-def _in_metres(handle: Any, unit: float, reference: Any, *, is_y_up: bool) -> Triangles:
+def in_blenders_axes(vector: tuple[float, float, float], file: str) -> tuple[float, float, float]:
+    """A vector in the axes of a mesh's file in the local frame, whose z axis points up."""
+    x, y, z = vector
+    return (x, -z, y) if file.lower().endswith(Y_UP) else vector
+
+
+def _in_metres(handle: Any, unit: float, reference: Any) -> Triangles:
     """Scale a mesh to metres, move its reference point to the origin, and return its triangles."""
     mesh = handle.data
     local, corners = _geometry(mesh)
@@ -116,8 +124,7 @@ def _in_metres(handle: Any, unit: float, reference: Any, *, is_y_up: bool) -> Tr
     if reference == "centroid":
         vertices -= Triangles(vertices, corners).centroid
     elif reference != "origin":
-        x, y, z = reference
-        vertices -= unit * np.array([x, -z, y] if is_y_up else [x, y, z])
+        vertices -= unit * np.array(reference)
     handle.parent = None
     handle.matrix_world = np.eye(4).tolist()
     mesh.vertices.foreach_set("co", vertices.astype(np.float32).ravel())
@@ -157,21 +164,21 @@ def _require_drawn(bpy: Any, handle: Any, mesh: Triangles) -> None:
 
 
 def _require_size(mesh: Triangles, spec: DatasetSpec) -> None:
-    """Raise ValueError if a mesh is implausibly small or large, or may reach half of the way to the camera."""
-    longest, reach, half = max(mesh.dimensions), spec.scale_range[1] * mesh.radius, spec.z_range[0] / 2
-    if (fits := SIZES[0] <= longest <= SIZES[1]) and reach <= half:
+    """Raise ValueError if a mesh is implausibly small or large, or may reach the camera."""
+    longest, reach, room = max(mesh.dimensions), spec.scale_range[1] * mesh.radius, spec.z_range[0] / NEAREST
+    if (fits := SIZES[0] <= longest <= SIZES[1]) and reach <= room:
         return
     central = spec.scale_range[1] * Triangles(mesh.vertices - mesh.centroid, mesh.corners).radius
     factor = 1 if fits else 1000 if longest < SIZES[0] else 0.001
     remedies = [] if fits else [f"data.unit={factor * spec.unit:g}"]
-    if factor * reach > half:
+    if factor * reach > room:
         remedies.append(
-            "data.reference=centroid" if factor * central <= half else f"data.z_range above {2 * reach:.3g} m"
+            "data.reference=centroid" if factor * central <= room else f"data.z_range above {NEAREST * reach:.3g} m"
         )
     raise ValueError(
         f"its longest side is {longest:.3g} m, its farthest point {reach:.3g} m from the reference, with data.unit="
-        f"{spec.unit:g}; expected {SIZES[0]:g} to {SIZES[1]:g} m, and at most half of the least depth, {half:g} m; "
-        f"set {' and '.join(remedies)}"
+        f"{spec.unit:g}; expected {SIZES[0]:g} to {SIZES[1]:g} m, and less than the least depth, "
+        f"{spec.z_range[0]:g} m; set {' and '.join(remedies)}"
     )
 
 

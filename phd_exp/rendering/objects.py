@@ -1,24 +1,50 @@
 """Scenes of the user's mesh: those of the cylinder, with the mesh in its place and the world around it."""
 
 import math
+from typing import Any
 
 import numpy as np
 
 from phd_exp.records.assets import PHOTOS
 from phd_exp.records.scenes import SHAPES, Quaternion, Scene, SceneObject, Split, Surroundings, Vector
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.boxes import beside, view_of_box
+from phd_exp.rendering.importing import in_blenders_axes
 from phd_exp.rendering.rays import rotation_matrix
-from phd_exp.rendering.sampling import SIZE, Purpose, draw_object, sample_scene, stream_of
+from phd_exp.rendering.sampling import (
+    MOST_TRIES,
+    SIZE,
+    Purpose,
+    draw_object,
+    sample_scene,
+    stream_of,
+    uniform_rotation,
+)
 from phd_exp.rendering.triangles import Meshes
 
 REACH = SIZE * 0.5**0.5  # m, from the cylinder's centre to its rim
 BRIGHTNESS = (0.5, 2.0)  # factors of a sky's light
 LARGEST_SPAN = 8.0  # of a sky: 8 degrees, all that a long lens sees, are 23 pixels of Blender's panoramas
+AGAIN = 10**9  # the number of a sample that is drawn again grows by this, beyond those of all samples
 LEAST_SIDE = 0.4  # of a photograph's square, in units of its shorter side
 
 
 def sample_object_scene(spec: DatasetSpec, split: Split, index: int, meshes: Meshes) -> Scene:
     """Draw the scene of one sample of a mesh, a pure function of the arguments; `meshes` are the specification's.
+
+    A view of a box is drawn again until it shows enough of the object. Raises ValueError if none does.
+    """
+    if not spec.is_box:
+        return _whole_scene(spec, split, index, meshes)
+    for number in range(index, index + MOST_TRIES * AGAIN, AGAIN):
+        scene = _whole_scene(spec, split, number, meshes)
+        if view := view_of_box(scene, spec, stream_of(spec, split, number, Purpose.BOX), meshes):
+            return view
+    raise ValueError("no image of data.camera shows the object; check data.z_range, data.mesh and data.unit")
+
+
+def _whole_scene(spec: DatasetSpec, split: Split, index: int, meshes: Meshes) -> Scene:
+    """The scene in the frame of the camera.
 
     It is paired with that of `sample_scene`: the pose, the lamps and the panel are the cylinder's.
     """
@@ -27,13 +53,15 @@ def sample_object_scene(spec: DatasetSpec, split: Split, index: int, meshes: Mes
     mesh = meshes["mesh"]
     around, turn = _surroundings(spec, split, number)
     rotation = upright_rotation(around.pitch, turn) if spec.upright else cylinder.rotation
+    if spec.front:
+        rotation = _facing_rotation(spec, cylinder.position, stream_of(spec, split, number, Purpose.FRONT))
     item = cylinder.model_copy(update={"shape": "mesh", "dimensions": mesh.dimensions, "rotation": rotation})
     if spec.ground:  # which the object touches
         up = item.scale * rotation_matrix(rotation)[:, 2]
         point = np.array(item.position) + mesh.vertices[:, 2].min() * up
         around = around.model_copy(update={"ground": tuple(point.tolist())})
     others = [_resized(other, cylinder.position, mesh.radius / REACH) for other in panel]
-    others += _distractors(spec, split, number, scene.f, meshes, without={other.shape for other in panel})
+    others += _distractors(spec, split, number, scene, meshes)
     lamps = () if around.is_sky else scene.lamps
     return scene.model_copy(update={"objects": (item, *others), "surroundings": around, "lamps": lamps})
 
@@ -60,6 +88,20 @@ def _surroundings(spec: DatasetSpec, split: Split, number: int) -> tuple[Surroun
     return around, object_turn
 
 
+def _facing_rotation(spec: DatasetSpec, position: Vector, rng: np.random.Generator) -> Quaternion:
+    """A uniform rotation of an object, among those whose front has an angle of `front_range` to the camera."""
+    assert spec.mesh is not None
+    assert spec.front is not None
+    front = np.array(in_blenders_axes(spec.front, next(iter(spec.mesh.files)))) / np.linalg.norm(spec.front)
+    to_camera = -np.array(position) / np.linalg.norm(position)
+    low, high = np.cos(np.radians(spec.front_range))[::-1]
+    for _ in range(MOST_TRIES):
+        rotation = uniform_rotation(rng)
+        if low <= to_camera @ rotation_matrix(rotation) @ front <= high:
+            return rotation
+    raise ValueError(f"front_range: got {list(spec.front_range)}; expected a wider range")
+
+
 def upright_rotation(pitch: float, turn: float) -> Quaternion:
     """Unit quaternion of a turn about the local z axis, which points up for a camera that looks down by `pitch`."""
     tilt = math.pi / 2 + pitch
@@ -67,24 +109,29 @@ def upright_rotation(pitch: float, turn: float) -> Quaternion:
     return c * cos, s * cos, -s * sin, c * sin
 
 
-def _distractors(
-    spec: DatasetSpec, split: Split, number: int, f: float, meshes: Meshes, without: set[str]
-) -> list[SceneObject]:
-    """Random ones of the three solids and of the further meshes, each at most once, anywhere in the image.
+def _distractors(spec: DatasetSpec, split: Split, number: int, scene: Scene, meshes: Meshes) -> list[SceneObject]:
+    """Random ones of the three solids and of the further meshes, each at most once: anywhere in the image, or near
+    the object of a box.
 
-    The bounding boxes of the solids have the surface of the object's.
+    The bounding boxes of the solids have the surface of the object's. A panel replaces the cube.
     """
     names = [*SHAPES, *(name for name in meshes if name != "mesh")]
     anywhere = spec.model_copy(update={"xy_range": 1.0})
     a, b, c = meshes["mesh"].dimensions
     side = math.sqrt((a * b + b * c + c * a) / 3)
+    first, *panel = scene.objects
     items, order = [], stream_of(spec, split, number, Purpose.DISTRACTORS).permutation(len(names))
     for place in order[: spec.distractors].tolist():
         rng = stream_of(spec, split, number, Purpose.DISTRACTORS, place)
-        item = draw_object(anywhere, names[place], f, rng, rng, rng)
-        own = meshes[item.shape].dimensions if item.shape in meshes else (side, side, side)
-        items.append(item.model_copy(update={"dimensions": own}))
-    return [item for item in items if item.shape not in without]
+        item = draw_object(anywhere, names[place], scene.f, rng, rng, rng)
+        changes: dict[str, Any] = {
+            "dimensions": meshes[item.shape].dimensions if item.shape in meshes else (side,) * 3
+        }
+        if spec.is_box:
+            changes["position"] = beside(first, first.scale * meshes["mesh"].radius, spec, rng)
+        items.append(item.model_copy(update=changes))
+    hidden = {item.shape for item in panel}
+    return [item for item in items if item.shape not in hidden and item.position[2] > 0]
 
 
 def _resized(panel: SceneObject, hidden: Vector, ratio: float) -> SceneObject:

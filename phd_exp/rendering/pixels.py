@@ -38,7 +38,9 @@ _STEPS: Light = np.array([linear((value + 0.5) / 255) for value in range(255)])
 def encode(pixels: Pixels, spec: DatasetSpec) -> bytes:
     """Image (S, S, 3) as the bytes of a file of the specification's format and quality."""
     quality = {} if spec.image_format == "png" else {"quality": spec.image_quality}
-    return file_of(Image.fromarray(pixels), spec.image_format, **OPTIONS[spec.image_format], **quality)
+    image = Image.fromarray(pixels)
+    image = image.convert("L").convert("RGB") if spec.grey else image
+    return file_of(image, spec.image_format, **OPTIONS[spec.image_format], **quality)
 
 
 def file_of(image: Image.Image, image_format: ImageFormat, **options: Any) -> bytes:

@@ -7,10 +7,14 @@ parameter at which the line enters.
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from phd_exp.optics.lens import Lens
+from phd_exp.optics.virtual import VirtualCamera
+from phd_exp.records.cameras import Calibration
 from phd_exp.records.scenes import Pose, Scene, SceneObject
 from phd_exp.rendering.triangles import NO_MESHES, Meshes
 
@@ -54,7 +58,25 @@ def trace_pixels(scene: Scene, meshes: Meshes = NO_MESHES) -> Hits:
             x, y = pixel_middles(rows, columns)
             place = (number, slice(rows.start, rows.stop), slice(columns.start, columns.stop))
             hits.depths[place], hits.surfaces[place] = _cast(scene, number, x, y)
+    if scene.camera:
+        outside = beyond_edges(scene)
+        hits.depths[:, outside], hits.surfaces[:, outside] = np.inf, NOTHING
     return hits
+
+
+def beyond_edges(scene: Scene) -> Mask:
+    """The pixels (S, S) of a view of a box that lie beyond the edges of the user's image."""
+    if scene.camera is None:
+        return np.zeros((scene.S, scene.S), bool)
+    K, lens = optics(scene.camera)
+    view = VirtualCamera(K, rotation_matrix(scene.pose.rotation), scene.f, scene.S, lens)
+    return view.outside(scene.camera.width or 0, scene.camera.height or 0)
+
+
+@lru_cache(maxsize=4)
+def optics(camera: Calibration) -> tuple[Image, Lens]:
+    """Camera matrix and lens of the user's camera; the lens keeps a table."""
+    return camera.intrinsics, camera.lens
 
 
 def trace_points(scene: Scene, x: Image, y: Image) -> Hits:

@@ -15,11 +15,21 @@ from phd_exp.rendering.antialias import smoothed
 from phd_exp.rendering.blender import Box, Renderer, Settings
 from phd_exp.rendering.objects import sample_object_scene
 from phd_exp.rendering.pixels import Light, Pixels, encode, encoded
-from phd_exp.rendering.rays import NOTHING, Hits, Mask, in_camera_frame, trace_pixels, truncation, visibility
+from phd_exp.rendering.rays import (
+    NOTHING,
+    Hits,
+    Mask,
+    beyond_edges,
+    in_camera_frame,
+    trace_pixels,
+    truncation,
+    visibility,
+)
 from phd_exp.rendering.sampling import sample_scene
 from phd_exp.rendering.surroundings import photo_light, shaken
 from phd_exp.rendering.triangles import Meshes
 
+GREY = 128  # of all colours beyond the edges of the user's image, as in the views of photographs
 MARGIN = 4  # px around the objects: the denoiser is less accurate along the border of its image
 
 
@@ -84,7 +94,9 @@ def photograph(renderer: Renderer, scene: Scene, spec: DatasetSpec) -> Pixels:
     if around.file and not around.is_sky and isinstance(spec.backdrops, Asset):
         behind = photo_light(spec.backdrops.path(around.file), around, scene.S)
     light, opacity = np.split(renderer.render(scene), [3], axis=-1)
-    return encoded(shaken(light + (1 - opacity) * behind, around.shake))
+    picture = encoded(shaken(light + (1 - opacity) * behind, around.shake))
+    picture[beyond_edges(scene)] = GREY
+    return picture
 
 
 def backdrop_light(backdrop: Backdrop, side: int) -> Light:

@@ -8,6 +8,7 @@ from typing import get_args
 
 import numpy as np
 
+from phd_exp.optics.virtual import rays
 from phd_exp.records.scenes import (
     FIRST_VIEW,
     SHAPES,
@@ -22,7 +23,7 @@ from phd_exp.records.scenes import (
     Vector,
 )  # fmt: skip
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.rays import rotation_matrix
+from phd_exp.rendering.rays import optics, rotation_matrix
 
 # Increment one when the same specification starts to give other scenes or other pixels. Folders of another version
 # are refused, not continued with samples that do not match.
@@ -30,7 +31,7 @@ GENERATOR_VERSION = 2
 OBJECT_VERSION = 5  # of data sets with a mesh
 
 SIZE = 0.2  # m: height and diameter of the cylinder, side of the cube, diameter of the sphere
-CLEARANCE = 0.5  # m: least depth of an object in a further view
+CLEARANCE = 0.5  # m: least depth of an object in a further view, unless those of the first are smaller
 MOST_TRIES = 10_000
 PANEL = (0.2, 0.4, 0.02)  # m: wider than half of the largest silhouette at its depth
 Stream = np.random.Generator
@@ -51,6 +52,8 @@ class Purpose(IntEnum):
     PANEL = 50
     SURROUNDINGS = 60
     DISTRACTORS = 70  # followed by the number of each
+    BOX = 80
+    FRONT = 81
 
 
 POSE, LOOK, SCALE = range(3)
@@ -144,7 +147,7 @@ def _pose(objects: tuple[SceneObject, ...], spec: DatasetSpec, f: float, rng: St
         rotation = about_axis((math.cos(direction), math.sin(direction), 0.0), angle)
         matrix = rotation_matrix(rotation)
         shift = np.array(_position(spec, f, rng)) - matrix @ places[0]
-        if (places @ matrix.T + shift)[:, 2].min() >= CLEARANCE:
+        if (places @ matrix.T + shift)[:, 2].min() >= min(CLEARANCE, spec.z_range[0]):
             x, y, z = shift.tolist()
             return Pose(rotation=rotation, translation=(x, y, z))
     raise ValueError(f"no camera sees all {len(objects)} objects: lower view_angle_range")
@@ -180,9 +183,23 @@ def _panel(spec: DatasetSpec, hidden: Vector, f: float, rng: Stream) -> SceneObj
 def _position(spec: DatasetSpec, f: float, rng: Stream) -> tuple[float, float, float]:
     """A position in the camera frame; z is drawn first, because x and y span the field of view at that depth."""
     z = _uniform(rng, spec.z_range)
+    if spec.is_box:
+        return _in_image(spec, z, rng)
     half_width = 0.5 * spec.xy_range * spec.sensor_size * z / f
     x, y = (_uniform(rng, (-half_width, half_width)) for _ in range(2))
     return x, y, z
+
+
+def _in_image(spec: DatasetSpec, z: float, rng: Stream) -> tuple[float, float, float]:
+    """A position at depth z whose pixel is uniform in the central share xy_range of the user's image."""
+    assert spec.camera is not None
+    K, lens = optics(spec.camera)
+    size = np.array([spec.camera.width, spec.camera.height], dtype=float)
+    for _ in range(MOST_TRIES):
+        x, y, ahead = rays(K, size / 2 + spec.xy_range * size * (rng.random(2) - 0.5), lens).tolist()
+        if ahead > 0:  # not where a fisheye shows nothing, or what is behind
+            return x / ahead * z, y / ahead * z, z
+    raise ValueError("data.camera shows nothing in front of it; check its coefficients")
 
 
 def _colour(spec: DatasetSpec, rng: Stream) -> tuple[float, float, float]:
@@ -194,15 +211,20 @@ def _colour(spec: DatasetSpec, rng: Stream) -> tuple[float, float, float]:
 
 def _lamps(spec: DatasetSpec, rng: Stream) -> tuple[Lamp, ...]:
     """The three lamps around the middle of the scene, with jitter in place and power."""
-    middle = (0.0, 0.0, sum(spec.z_range) / 2)
+    middle, far = (0.0, 0.0, sum(spec.z_range) / 2), remoteness(spec)
     jitter = (-spec.lamp_jitter, spec.lamp_jitter)
     lamps = []
     for name, direction, side, power in LAMPS:
         shift = np.array([_uniform(rng, jitter) for _ in range(3)])
-        x, y, z = (np.array(middle) + LAMP_DISTANCE * (np.array(direction) + shift)).tolist()
-        power = power * (1 + _uniform(rng, jitter))
-        lamps.append(Lamp(name=name, position=(x, y, z), towards=middle, side=side, power=power))
+        x, y, z = (np.array(middle) + far * LAMP_DISTANCE * (np.array(direction) + shift)).tolist()
+        power = far**2 * power * (1 + _uniform(rng, jitter))
+        lamps.append(Lamp(name=name, position=(x, y, z), towards=middle, side=far * side, power=power))
     return tuple(lamps)
+
+
+def remoteness(spec: DatasetSpec) -> float:
+    """Factor of the distances of lamps and the sizes of surroundings: more than 1 for objects beyond 100 m."""
+    return max(1.0, spec.z_range[1] / 100)
 
 
 def _backdrop(rng: Stream) -> Backdrop:

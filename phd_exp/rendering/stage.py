@@ -16,6 +16,7 @@ from phd_exp.rendering.pixels import linear
 from phd_exp.rendering.rays import rotation_matrix
 
 TO_BLENDER = np.diag([1.0, -1.0, -1.0])
+CLIPPING = (0.01, 1000.0)  # m: the depths that the camera shows
 SENSOR_WIDTH = 36.0  # mm; arbitrary, because the focal length has the same unit
 # Inputs of Principled BSDF. Rubber is matt with a faint sheen; metal reflects the lamps as soft boxes and its
 # neighbours as blurs.
@@ -79,7 +80,7 @@ def build_stage(bpy: Any) -> None:
     camera = bpy.data.cameras.new("camera")
     camera.sensor_fit = "HORIZONTAL"
     camera.sensor_width = SENSOR_WIDTH
-    camera.clip_start, camera.clip_end = 0.01, 1000.0
+    camera.clip_start, camera.clip_end = CLIPPING
     bpy.context.scene.camera = _add(bpy, "camera", camera)
     world = bpy.context.scene.world = bpy.data.worlds.new("world")
     world.cycles.sampling_method = "NONE"  # an importance map is not worth it for such smooth light

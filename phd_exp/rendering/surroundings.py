@@ -18,7 +18,7 @@ from phd_exp.records.scenes import Pose, Surroundings
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.pixels import Light, linear
 from phd_exp.rendering.rays import rotation_matrix
-from phd_exp.rendering.sampling import about_axis
+from phd_exp.rendering.sampling import about_axis, remoteness
 from phd_exp.rendering.stage import TO_BLENDER, matrix_of, new_nodes
 
 GROUND = 1000.0  # m: side of the plane
@@ -35,7 +35,7 @@ class World:
         self._sky, self._studio = bpy.data.worlds.new("sky"), bpy.context.scene.world
         self._sky.cycles.sampling_method, self._sky.cycles.sample_map_resolution = "MANUAL", IMPORTANCE_MAP
         _paint_sky(self._sky.node_tree)
-        bpy.ops.mesh.primitive_plane_add(size=GROUND)
+        bpy.ops.mesh.primitive_plane_add(size=remoteness(spec) * GROUND)
         self._ground = bpy.context.object
         self._ground.is_shadow_catcher = True
 

@@ -10,11 +10,13 @@ import pytest
 from pydantic import ValidationError
 
 from phd_exp.records.assets import Asset
+from phd_exp.records.cameras import calibration
 from phd_exp.records.spec import DatasetSpec, Shard
 from tests.support.renders import VARIANTS
 
 MakeSpec = Callable[..., DatasetSpec]
 YOUNGER = {key for key, field in DatasetSpec.model_fields.items() if not field.is_required()}
+CAMERA = calibration({"f": 900.0, "width": 640, "height": 480})
 MESH = Asset(files={"part.glb": "0" * 64})
 
 
@@ -84,12 +86,20 @@ def test_a_fingerprint_depends_on_every_value_and_on_nothing_else(make_spec: Mak
         "motion_blur": 2.0,
         "ignore": ("materials",),
         "empty": True,
+        "camera": CAMERA,
+        "view": "field",
+        "box_size": (1.0, 1.2),
+        "box_shift": 0.1,
+        "grey": True,
+        "front": (0.0, 0.0, 1.0),
+        "front_range": (0.0, 60.0),
     }
+    needed = {"ground": {"upright": True, "pitch_range": (20.0, 30.0)}, "front_range": {"front": (0.0, 0.0, 1.0)}}
+    needed |= {key: {"camera": CAMERA} for key in ("view", "box_size", "box_shift")}
     assert changes.keys() | of_meshes.keys() == DatasetSpec.model_fields.keys()
     prints = {make_spec(**{key: value}).fingerprint() for key, value in changes.items()}
-    standing = {"upright": True, "pitch_range": (20.0, 30.0)}
     for key, value in of_meshes.items():
-        prints.add(make_spec(mesh=MESH, **{key: value}, **(standing if key == "ground" else {})).fingerprint())
+        prints.add(make_spec(mesh=MESH, **{key: value}, **needed.get(key, {})).fingerprint())
     prints |= {make_spec().fingerprint(), make_spec(f_range=[1200, 2000]).fingerprint()}
     assert len(prints) == len(changes) + len(of_meshes) + 1
     assert make_spec().fingerprint() == "1933c9582b94b54b", "the same on every machine, for ever"
