@@ -66,7 +66,7 @@ def test_the_view_is_that_of_predict_and_the_label_belongs_to_it(
     of_box: MakeSpec, meshes: dict[str, Triangles]
 ) -> None:
     spec, depths = of_box(), []
-    for scene in drawn(spec, 40, meshes):
+    for scene in drawn(spec, 20, meshes):
         camera = VirtualCamera.of_box(scene.camera.intrinsics, scene.box, float(scene.S), scene.camera.lens)
         assert scene.f == pytest.approx(camera.f)
         np.testing.assert_allclose(rotation_matrix(scene.pose.rotation), camera.R, atol=1e-12)
@@ -78,12 +78,12 @@ def test_the_view_is_that_of_predict_and_the_label_belongs_to_it(
 
 def test_the_apparent_size_is_nearly_constant(of_box: MakeSpec, meshes: dict[str, Triangles]) -> None:
     """What the network learns is what the box does not say."""
-    scenes = drawn(of_box(xy_range=0.3, **EXACT), 60, meshes)
+    scenes = drawn(of_box(xy_range=0.3, **EXACT), 30, meshes)
     size = np.array([in_camera_frame(np.array(s.objects[0].position), s.pose)[2] / s.f for s in scenes])
     depth = np.array([s.objects[0].position[2] for s in scenes])
     assert depth.max() / depth.min() > 2.5
     assert size.max() / size.min() < 1.6, "a cylinder's box has one to 1.4 times its side, and perspective"
-    jittered = drawn(of_box(xy_range=0.3, box_size=(0.9, 1.5)), 60, meshes)
+    jittered = drawn(of_box(xy_range=0.3, box_size=(0.9, 1.5)), 30, meshes)
     sides = [np.diff(np.array(s.box).reshape(2, 2), axis=0).max() for s in jittered]
     exact = [np.ptp(outline(s, meshes["mesh"]), axis=0).max() for s in jittered]
     ratio = np.array(sides) / exact
