@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from phd_exp.records.detections import Detection
 from phd_exp.records.errors import ConfigError, DatasetError, RunError, complaint, unknown, writing
@@ -82,10 +82,21 @@ class RunArguments(Arguments):
     """apply the temperatures that fit the run's held-out samples"""
     coverage: Annotated[float, Field(gt=0, lt=1)] | None = None
     """probability of regions that contain the true position, guaranteed by held-out samples"""
+    calibration: str | None = None
+    """a record of `calibrate`: recalibrate with its labelled images, which coverage= uses too"""
     trust: str | None = None
     """packages of the user's own parts that the run names, separated by commas; their code is executed"""
     views: Literal["1", "8"] = "1"
     """8: an ensemble of the eight symmetric views of each image"""
+
+    @model_validator(mode="after")
+    def one_calibration(self) -> Self:
+        """Refuse two sources of temperatures, and a record of another predictor."""
+        if self.calibration and (self.recalibrate or (len(self.run), self.views) != (1, "1")):
+            raise ValueError(
+                "calibration: recalibrates a single run; expected one run=, no recalibrate= and no views=8"
+            )
+        return self
 
 
 def loaded(arguments: RunArguments, device: str = "auto") -> "Predictor":
@@ -96,6 +107,8 @@ def loaded(arguments: RunArguments, device: str = "auto") -> "Predictor":
     predictor = load(arguments.run, device, trust=trust, views=int(arguments.views))
     if predictor.state != "finished":
         print(f"note: {arguments.run[0]}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
+    if arguments.calibration:
+        return predictor.calibrated(arguments.calibration, guarantees=arguments.coverage is not None)
     if predictor.views > 1 and (arguments.recalibrate or arguments.coverage):
         _record_held_out_views(predictor, trust)
     return predictor.recalibrated() if arguments.recalibrate else predictor

@@ -9,6 +9,7 @@ VERBS = {
     "render": "render a data set, or its missing samples",
     "report": "the paper's tables, the dashboard and the figures of all recorded runs",
     "predict": "the object's position in an image and its uncertainty: JSON lines, and pictures with out=",
+    "calibrate": "fit the uncertainty of a run to labelled images of yours, for predict calibration=NAME",
     "fuse": "one position from the predictions of several cameras, and/or on a ground plane: a JSON line a scene",
     "search": "search for good values of keys with Optuna, judged on held-out samples",
     "export": "write a run's network as ONNX, compared with torch; it needs onnxruntime and NumPy alone",
@@ -50,6 +51,10 @@ EXAMPLES = {
         "python -m phd_exp predict run=runs/small/default/probabilistic folder=photos/test",
         "python -m phd_exp predict run=DIR,DIR,DIR views=8 folder=photos/test",
     ],
+    "calibrate": [
+        "python -m phd_exp calibrate run=DIR folder=photos/labelled",
+        "python -m phd_exp predict run=DIR calibration=photographs folder=photos/new",
+    ],
     "fuse": [
         "python -m phd_exp fuse run=runs/small/scale/probabilistic/seed0 folder=renders/multiview/test",
         "python -m phd_exp fuse run=DIR folder=photos/test plane=0,1,0,1.5 recalibrate=true out=fused.jsonl",
@@ -69,7 +74,7 @@ def text_of(verb: str | None) -> str:
     """The help of one verb, or of the programme."""
     if verb is None:
         return _PROGRAMME.format(
-            verbs="\n".join(f"  {name:<8} {purpose}" for name, purpose in VERBS.items()),
+            verbs="\n".join(f"  {name:<9} {purpose}" for name, purpose in VERBS.items()),
             groups=_choices(OF_VERB["train"]),
             conf=conf_folder(),
             examples="\n".join(f"  {lines[0]}" for lines in EXAMPLES.values()),

@@ -53,7 +53,7 @@ class PredictArguments(RunArguments):
     """a folder for predictions.jsonl and a picture for each line; by default lines are printed"""
     groups: Literal["spread", "truncation", "focal_length"] | None = None
     """with coverage=: guarantee it in each of four groups of predictions by this quantity"""
-    calibration: bool = False
+    curve: bool = False
     """draw the run's calibration curve of depth into the pictures"""
 
     @property
@@ -75,10 +75,10 @@ class PredictArguments(RunArguments):
             raise ValueError("object: selects detections of folder=DIR or boxes=FILE; leave it out for one box")
         if self.groups and not self.coverage:
             raise ValueError("groups: guarantees a coverage; expected coverage=0.9, or another in (0, 1), too")
-        if self.calibration and self.out is None:
-            raise ValueError("calibration: is drawn into the pictures; expected out=DIR too")
-        if self.calibration and (len(self.run), self.views) != (1, "1"):
-            raise ValueError("calibration: is recorded for single runs; expected one run= and no views=8")
+        if self.curve and self.out is None:
+            raise ValueError("curve: is drawn into the pictures; expected out=DIR too")
+        if self.curve and (len(self.run), self.views) != (1, "1"):
+            raise ValueError("curve: is recorded for single runs; expected one run= and no views=8")
         return self
 
 
@@ -94,7 +94,7 @@ def main(words: list[str]) -> int:
         output_folder(out)
     predictor = loaded(arguments)
     guarantee = predictor.guarantee(arguments.coverage, arguments.groups) if arguments.coverage else None
-    curve = _depth_curve(arguments.run[0], predictor) if arguments.calibration else None
+    curve = _depth_curve(arguments.run[0], predictor) if arguments.curve else None
     if out is not None:
         _write(predictor, detections, out, curve, guarantee)
         return 0

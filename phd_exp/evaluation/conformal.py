@@ -114,5 +114,11 @@ def threshold(scores: Float[np.ndarray, " samples"], coverage: float, samples: s
     n, c = len(scores), Fraction(str(coverage))  # exact: 10 * 0.9 is 9
     k = math.ceil((n + 1) * c)
     if k > n:
-        raise RunError(f"coverage: got {coverage}; needs at least {math.ceil(c / (1 - c))} {samples}; found {n}")
+        raise RunError(f"coverage: got {coverage}; needs at least {samples_needed(coverage)} {samples}; found {n}")
     return float(np.partition(scores, k - 1)[k - 1])
+
+
+def samples_needed(coverage: float) -> int:
+    """The least number of samples that can guarantee a coverage."""
+    c = Fraction(str(coverage))
+    return math.ceil(c / (1 - c))

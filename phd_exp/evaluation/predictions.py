@@ -119,12 +119,12 @@ def evaluation_of(statistic: Statistic, columns: Mapping[str, Tensor], left_out:
     )
 
 
-def fit_temperature(held_out: Columns) -> Temperature:
+def fit_temperature(held_out: Columns, rows: slice = CHOOSE) -> Temperature:
     """The temperatures fitted on predictions of held-out samples, those that may choose.
 
     Raises RunError if a column is missing, or if no temperature fits.
     """
-    distribution, xyz, _ = at_temperature(held_out, None, CHOOSE)
+    distribution, xyz, _ = at_temperature(held_out, None, rows)
     try:
         return Temperature.fit(distribution, xyz)
     except ValueError as error:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,8 +25,8 @@ from phd_exp.inference.views import View, focal_lengths, image_batch
 from phd_exp.models.heads import DistributionHead, Prediction
 from phd_exp.models.regressor import Regressor
 from phd_exp.optics.virtual import Box, VirtualCamera, intrinsics
-from phd_exp.records.errors import ConfigError, DatasetError, RunError
-from phd_exp.records.runs import RunFolder
+from phd_exp.records.errors import ConfigError, DatasetError, RunError, listed
+from phd_exp.records.runs import CHOOSE, RunFolder
 
 if TYPE_CHECKING:  # imports of pyarrow
     from phd_exp.evaluation.conformal import Groups, Guarantee
@@ -51,6 +52,7 @@ class Predictor:
         temperature: temperatures of recalibrated predictions; None: as trained.
         state: the state of the run, "finished" if it completed.
         folders: the runs, whose held-out samples guarantee regions.
+        labelled: a record of `calibrate`, whose images replace those samples; see `calibrated`.
         others: the further networks of an ensemble.
         views: number of symmetric views of each image, 1 or 8.
     """
@@ -64,6 +66,7 @@ class Predictor:
     temperature: Temperature | None
     state: str
     folders: tuple[RunFolder, ...] = ()
+    labelled: Path | None = None
     others: tuple[Regressor, ...] = ()
     views: int = 1
 
@@ -153,14 +156,33 @@ class Predictor:
 
         return replace(self, temperature=fit_temperature(self.held_out()))
 
+    def calibrated(self, name: str, *, guarantees: bool = False) -> "Predictor":
+        """The same with the temperatures that fit a record of `calibrate`, which guarantees regions too.
+
+        If it is to do so, only every second image chooses the temperatures. Raises RunError if there is no record.
+        """
+        file = self.folders[0].labelled(name)
+        if not file.exists():
+            known = sorted(path.stem for path in file.parent.glob("*.parquet"))
+            raise RunError(
+                f"calibration: got {name}; expected {listed(known) or 'a name'} of `calibrate`; {file} is missing"
+            )
+        from phd_exp.evaluation.parquet import read_table  # imports pyarrow
+        from phd_exp.evaluation.predictions import fit_temperature
+
+        rows = CHOOSE if guarantees else slice(None)
+        return replace(self, temperature=fit_temperature(read_table(file), rows), labelled=file)
+
     def guarantee(self, coverage: float, groups: "Groups | None" = None) -> "Guarantee":
         """Regions that contain the true position with a probability in (0, 1); see `evaluation.conformal`.
 
         Raises RunError if the run has too few held-out samples, ConfigError if it predicts no uncertainty.
         """
         from phd_exp.evaluation.conformal import guarantee
+        from phd_exp.evaluation.parquet import read_table  # imports pyarrow
 
-        return guarantee(self.held_out(), coverage, groups, self.temperature)
+        table = read_table(self.labelled) if self.labelled else self.held_out()
+        return guarantee(table, coverage, groups, self.temperature)
 
     def view(
         self, image: UInt8[np.ndarray, "height width 3"], K: Float[np.ndarray, "3 3"], box: Box | None = None

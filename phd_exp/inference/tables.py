@@ -17,16 +17,19 @@ from phd_exp.config import RenderedConfig, RunConfig
 from phd_exp.config.sections import ShiftConfig
 from phd_exp.config.targets import Trust
 from phd_exp.data.augmentation import Photometry
+from phd_exp.data.batches import Batch
 from phd_exp.data.sources import PARTS, Known, Part, RenderedSource, Source
 from phd_exp.distributions.columns import Columns
 from phd_exp.evaluation.parquet import read_table, stacked
 from phd_exp.evaluation.predictions import XYZ
 from phd_exp.evaluation.several_views import ROTATION, TRANSLATION
+from phd_exp.inference.answers import sightings
 from phd_exp.inference.loading import load
 from phd_exp.inference.predictor import BATCH, Predictor
 from phd_exp.metrics.rows import Rows
 from phd_exp.records.choices import flatten
-from phd_exp.records.errors import RunError
+from phd_exp.records.detections import Detection
+from phd_exp.records.errors import DatasetError, RunError
 from phd_exp.records.processes import announce
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.cameras import f_factor
@@ -83,6 +86,45 @@ def record_held_out_views(predictor: Predictor, source: Source, trust: Trust) ->
         )
     announce(f"{folder.eight_views[part]}: recording the eight views of {len(now)} held-out samples, once")
     record_eight_views(folder, predictor.config, source, [part], trust)
+
+
+def record_labelled(predictor: Predictor, detections: Sequence[Detection], name: str) -> Columns:
+    """Predict the user's labelled images and write the table NAME of `calibrate`; returns its columns.
+
+    Raises DatasetError if a label is missing or in millimetres, RunError for a baseline.
+    """
+    (folder,), table, n = predictor.folders, Rows(), 0
+    if not predictor.is_probabilistic:
+        raise RunError(f"{folder.path}: predicts no Projected Huber density; expected a run of model=probabilistic")
+    for batch in dict.fromkeys(sighting.batch for sighting in sightings(predictor, detections)):
+        views = [view for _, _, view in batch.seen]
+        xyz = [view.camera.to_virtual(np.array(one.position)) for one, _, view in batch.seen]
+        samples = Batch(
+            torch.from_numpy(np.stack([view.image for view in views])),
+            torch.tensor(np.stack(xyz)),
+            torch.tensor([view.camera.f for view in views]),
+            float(predictor.side),
+            torch.arange(n, n + len(views)),
+        )
+        table.update(columns(batch.predictions, samples))
+        n += len(views)
+    found = table.columns()
+    _require_metres(found, detections[0])
+    file = folder.labelled(name)
+    with folder.held():
+        file.parent.mkdir(exist_ok=True)
+        write_parquet(file, found, {"file_name": [one.line.file_name for one in detections]})
+    return found
+
+
+def _require_metres(table: Columns, first: Detection) -> None:
+    """Raise DatasetError if true depths are about a thousand times the predicted ones."""
+    ratio = float((table["z"] / table["mode_z"]).median())
+    if 200 < ratio < 5000:
+        raise DatasetError(
+            f"{first.where}: x, y, z are {ratio:.0f} times the predicted positions (median); expected metres: divide "
+            "millimetres by 1000"
+        )
 
 
 def _poses(source: RenderedSource) -> Known:

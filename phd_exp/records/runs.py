@@ -10,6 +10,7 @@
         held_out.parquet     the same for held-out training samples; see `CHOOSE`
         eight_views_*.parquet  the same two from the eight symmetric views of each image, and the views' disagreement
         views.parquet        the same for scenes with several cameras, and their poses, if asked for
+        labelled/            the same for labelled images by `calibrate`, a table NAME.parquet for each
         shifts/              the same for shifted test samples, a table NAME.parquet for each, if asked for
         calibration/         the calibration curves, as data (JSON) and as pictures (PNG)
         checkpoints/         last.ckpt; best.ckpt with callbacks=best_checkpoint
@@ -119,6 +120,10 @@ class RunFolder:
     def shift(self, name: str) -> Path:
         """Predictions of shifted test samples."""
         return self.shifts / f"{name}.parquet"
+
+    def labelled(self, name: str) -> Path:
+        """Predictions of the user's labelled images, by `calibrate`."""
+        return self.path / "labelled" / f"{name}.parquet"
 
     @property
     def best_checkpoint(self) -> Path:

@@ -17,11 +17,13 @@ from PIL import Image
 
 import phd_exp as package
 from phd_exp.__main__ import main
+from phd_exp.evaluation.predictions import fit_temperature
 from phd_exp.inference import pictures
 from phd_exp.records.runs import RunFolder
 from tests.support.disks import small_disk
 from tests.support.untrained import SIDE, read_lines
 
+ALL = slice(None)
 GUIDE = Path(__file__).parents[2] / "docs" / "guides" / "predict.md"
 
 
@@ -58,13 +60,40 @@ def test_the_test_images_of_a_rendered_set_are_predicted_as_recorded(
     np.testing.assert_allclose(prediction.mode.numpy(), recorded["mode"], rtol=1e-5, atol=1e-5)
 
 
+def test_labelled_images_calibrate_a_run(
+    phd_exp: Callable, run: RunFolder, renders: Path, image: tuple[str, str], tmp_path: Path
+) -> None:
+    """Their temperatures are those that fit the recorded predictions of the same images."""
+    shutil.copytree(run.path, mine := tmp_path / "mine")
+    labelled = renders / "default" / "test"
+    outcome = phd_exp("calibrate", f"run={mine}", f"folder={labelled}", "name=garden")
+    assert outcome.status == 0
+    assert re.search(r"as trained: depth error .* inside 50 %, .* inside 90 %\n  temperatures: A / ", outcome.out)
+    table = pd.read_parquet(run.predictions)
+    fitted = fit_temperature({name: table[name].to_numpy() for name in table if table[name].dtype == float}, ALL)
+    predictor = package.load(mine).calibrated("garden")
+    assert predictor.temperature.projected == pytest.approx(fitted.projected, rel=1e-3)
+    assert predictor.temperature.depth == pytest.approx(fitted.depth, rel=1e-3)
+    (line,) = read_lines(phd_exp("predict", f"run={mine}", *image, "calibration=garden").out)
+    assert line["uncertainty"] == f"recalibrated: A / {fitted.projected:.4g}, a / {fitted.depth:.4g}"
+    lines = [json.loads(text) for text in (labelled / "metadata.jsonl").read_text().splitlines()]
+    (wrong := tmp_path / "mm").mkdir()
+    for one in lines:
+        shutil.copy(labelled / one["file_name"], wrong)
+    scaled = [one | {axis: 1000 * one[axis] for axis in "xyz"} for one in lines]
+    (wrong / "metadata.jsonl").write_text("".join(json.dumps(one) + "\n" for one in scaled))
+    outcome = phd_exp("calibrate", f"run={mine}", f"folder={wrong}")
+    assert outcome.status == 1
+    assert re.search(r"x, y, z are \d+ times the predicted positions .*divide millimetres by 1000", outcome.err)
+
+
 def test_recalibration_changes_the_uncertainty_alone_and_the_curve_in_the_picture(
     phd_exp: Callable, run: RunFolder, image: tuple[str, str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     drawn: list[dict] = []
     monkeypatch.setattr(pictures, "draw_curve", lambda axes, name, curve: drawn.append(curve))
     for words in (("out=trained",), ("out=fitted", "recalibrate=true")):
-        assert phd_exp("predict", f"run={run.path}", *image, "calibration=true", *words).status == 0
+        assert phd_exp("predict", f"run={run.path}", *image, "curve=true", *words).status == 0
     before, after = (json.loads((tmp_path / out / "predictions.jsonl").read_text()) for out in ("trained", "fitted"))
     assert after["mode"] == before["mode"]
     assert after["covariance"] != before["covariance"]

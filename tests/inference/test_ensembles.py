@@ -157,7 +157,7 @@ def test_fused_positions_are_those_of_the_closest_distributions(make: Callable) 
         ({}, "run=runs/a views=7", "views: got '7'; expected to be '1' or '8'"),
         ({}, "run=runs/a,runs/b views=8 recalibrate=true", "recorded for single runs alone"),
         ({}, "run=runs/a views=8 recalibrate=true", "cannot be recorded without the data set: photos/train"),
-        ({}, "run=runs/a views=8 calibration=true out=out", "calibration: is recorded for single runs"),
+        ({}, "run=runs/a views=8 curve=true out=out", "curve: is recorded for single runs"),
         ({"backbone__depth": 11}, "run=runs/a,runs/b", "backbone"),
     ],
 )

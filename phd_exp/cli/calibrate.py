@@ -1,0 +1,53 @@
+"""`python -m phd_exp calibrate`: fit the uncertainty of a run to labelled images of the user."""
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from phd_exp.cli.arguments import Arguments
+from phd_exp.records.detections import NumberOrName
+from phd_exp.records.own_images import detections_in
+
+COVERAGES = (0.5, 0.8, 0.9, 0.95, 0.99)
+
+
+class CalibrateArguments(Arguments):
+    """The run and the labelled images."""
+
+    run: Path
+    """the folder of a run"""
+    folder: Path
+    """images with their true positions: with a metadata.jsonl, or as BOP, KITTI or COCO"""
+    object: NumberOrName | None = None
+    """BOP's obj_id, KITTI's type or COCO's category; by default all objects"""
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")] = "photographs"
+    """the name of the record, which predict calibration=NAME uses"""
+    trust: str | None = None
+    """packages of the user's own parts that the run names, separated by commas; their code is executed"""
+
+
+def main(words: list[str]) -> int:
+    """Predict labelled images, record the predictions, and print what follows from them; returns the exit status."""
+    arguments = CalibrateArguments.parsed("calibrate", words)
+    detections = detections_in(arguments.folder, object_name=arguments.object)
+    from phd_exp.evaluation.conformal import samples_needed
+    from phd_exp.inference.loading import load
+    from phd_exp.inference.tables import record_labelled
+
+    trust = tuple(arguments.trust.split(",")) if arguments.trust else ()
+    predictor = load(arguments.run, trust=trust)
+    table, name = record_labelled(predictor, detections, arguments.name), arguments.name
+    temperature, n = predictor.calibrated(name).temperature, len(detections)
+    assert temperature is not None
+    inside = ", ".join(f"{int((table['level'] <= level).sum())} inside {100 * level:.0f} %" for level in (0.5, 0.9))
+    error = 100 * (table["depth_error_mm"] / 1000 / table["z"]).mean()
+    print(f"{predictor.folders[0].labelled(name)}: {n} labelled detections")
+    print(f"  as trained: depth error {error:.2f} %, {inside}")
+    print(f"  temperatures: A / {temperature.projected:.3g}, a / {temperature.depth:.3g}")
+    enough = [f"{level:g}" for level in COVERAGES if samples_needed(level) <= n // 2]
+    print(
+        f"  coverage= can guarantee {', '.join(enough) or 'nothing'}; 0.9 needs {2 * samples_needed(0.9)} detections"
+    )
+    print(f"  use them: python -m phd_exp predict run={arguments.run} calibration={name} ...")
+    return 0
