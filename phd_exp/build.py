@@ -1,5 +1,6 @@
 """From a checked configuration to its parts: the network and the source of samples, without Lightning."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -94,3 +95,18 @@ def require_same_shrinking(folder: RunFolder, config: RunConfig) -> None:
             f"{folder.path}: trained with images shrunk from {before} to {after} pixels by an earlier version, which "
             "shifted them; move the folder away and train again"
         )
+
+
+def recorded_constants(folder: RunFolder) -> tuple[DepthScale, float]:
+    """Depth scale and constant f of the run's data, as recorded."""
+    file = folder.constants_file
+    if not file.exists():
+        raise RunError(f"{file}: missing, so that the depth scale of its data is unknown; train the run again")
+    values = folder.constants()
+    try:
+        constant_f = float(values["constant_f"])
+        if not 0 < constant_f < math.inf:
+            raise ValueError(f"constant_f must be positive and finite, but is {constant_f}")
+        return DepthScale(*(float(values[name]) for name in ("mu_z0", "D", "z_centre"))), constant_f
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise RunError(f"{file}: not the constants of a run ({error})") from None

@@ -10,6 +10,7 @@ from hydra.errors import HydraException
 
 PATHS = (
     "runs",
+    "init",
     "masks",
     "bop",
     "data.root",

@@ -51,6 +51,7 @@ class RunConfig(Record):
     logger: TrainingTargets
     callbacks: TrainingTargets = Field(default_factory=dict)
     evaluation: sections.EvaluationConfig
+    init: sections.Folder | None = None  # default for older run records
 
     @model_validator(mode="after")
     def parts_fit(self, info: ValidationInfo) -> "RunConfig":

@@ -81,14 +81,16 @@ class RenderedSource(Source):
     @cached_property
     def depth(self) -> DepthScale:  # type: ignore[override]
         spec = self.spec
-        if not spec.is_box:
+        if not spec.is_box or not self.folder.manifest_path.exists():  # before rendering, parts are only tried out
             return DepthScale.from_ranges(f_range=spec.f_range, z_range=spec.z_range).scaled(self.zoom)
         return DepthScale.from_samples(*self._depths).scaled(self.zoom)
 
     @cached_property
     def constant_f(self) -> float:  # type: ignore[override]
-        extremes = self._depths[1].aminmax() if self.spec.is_box else self.spec.f_range
-        return self.zoom * float(np.sqrt(float(extremes[0]) * float(extremes[1])))
+        low, high = self.spec.f_range
+        if self.spec.is_box and self.folder.manifest_path.exists():
+            low, high = map(float, self._depths[1].aminmax())
+        return self.zoom * float(np.sqrt(low * high))
 
     @cached_property
     def _depths(self) -> tuple[Tensor, Tensor]:

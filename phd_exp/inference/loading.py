@@ -1,26 +1,23 @@
 """From the folders of trained runs to a `Predictor`: of one network, or of an ensemble whose members fit together."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
-from phd_exp.build import build_regressor, require_same_shrinking
+from phd_exp.build import build_regressor, recorded_constants, require_same_shrinking
 from phd_exp.config import RunConfig, check
 from phd_exp.config.targets import Trust, custom_parts
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.inference.predictor import Predictor
 from phd_exp.models.heads import DistributionHead
 from phd_exp.models.regressor import Regressor
-from phd_exp.models.weights import load_checkpoint
+from phd_exp.models.weights import fill, regressor_weights
 from phd_exp.records.choices import first_difference, has_influence
 from phd_exp.records.errors import ConfigError, RunError, UserError, gist
 from phd_exp.records.runs import RunFolder
 
-WEIGHTS = "regressor."  # prefix of the network's weights in a checkpoint
 OF_THE_INPUT = ("data.", "camera.", "model.head.")  # keys in which the members of an ensemble agree
 SIZES = ("data.n_train", "data.n_held_out", "data.n_test", "data.batch_size")  # of the data, in which they may differ
 
@@ -91,7 +88,7 @@ def _load(folder: RunFolder, device: str, trust: Trust) -> Predictor:
         raise RunError(f"{folder.path}: no run; expected a folder with config.yaml and checkpoints/last.ckpt")
     config = check(folder.config(), trust)
     require_same_shrinking(folder, config)
-    depth, constant_f = _constants(folder)
+    depth, constant_f = recorded_constants(folder)
     place = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)
     regressor = _regressor(folder, config, depth)
     status = folder.status()
@@ -108,32 +105,17 @@ def _load(folder: RunFolder, device: str, trust: Trust) -> Predictor:
     )
 
 
-def _constants(folder: RunFolder) -> tuple[DepthScale, float]:
-    """Depth scale and constant f of the run's data, as recorded."""
-    file = folder.constants_file
-    if not file.exists():
-        raise RunError(f"{file}: missing, so that the depth scale of its data is unknown; train the run again")
-    values = folder.constants()
-    try:
-        constant_f = float(values["constant_f"])
-        if not 0 < constant_f < math.inf:
-            raise ValueError(f"constant_f must be positive and finite, but is {constant_f}")
-        return DepthScale(*(float(values[name]) for name in ("mu_z0", "D", "z_centre"))), constant_f
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise RunError(f"{file}: not the constants of a run ({error})") from None
-
-
 def _regressor(folder: RunFolder, config: RunConfig, depth: DepthScale) -> Regressor:
     """The network with the weights of a checkpoint, of which only tensors are read.
 
     It is first built without memory, and must fit: a stored configuration may describe a network of any size.
     """
-    weights = _weights(folder.best_checkpoint)
+    weights = regressor_weights(folder.best_checkpoint)
     if not custom_parts(config.model_dump(mode="json")):  # the user's own networks may need their numbers
         with torch.device("meta"):
-            _fill(_built(folder, config, depth), weights, folder.best_checkpoint, assign=True)
+            fill(_built(folder, config, depth), weights, folder.best_checkpoint, assign=True)
     regressor = _built(folder, config, depth)
-    _fill(regressor, weights, folder.best_checkpoint)
+    fill(regressor, weights, folder.best_checkpoint)
     return regressor
 
 
@@ -145,23 +127,3 @@ def _built(folder: RunFolder, config: RunConfig, depth: DepthScale) -> Regressor
     except Exception as error:  # parts that a stranger has named may raise any
         reason = f"{type(error).__name__}: {gist(error)}"
         raise ConfigError(f"{folder.config_file}: describes no network ({reason})") from error
-
-
-def _weights(checkpoint: Path) -> dict[str, Any]:
-    if not checkpoint.exists():
-        raise RunError(f"{checkpoint}: missing; the run has not trained a whole epoch yet")
-    state = load_checkpoint(checkpoint).get("state_dict")
-    if not isinstance(state, dict):
-        raise RunError(f"{checkpoint}: not a checkpoint of this network (no state_dict)")
-    return {name.removeprefix(WEIGHTS): value for name, value in state.items() if str(name).startswith(WEIGHTS)}
-
-
-def _fill(regressor: Regressor, weights: dict[str, Any], checkpoint: Path, assign: bool = False) -> None:
-    try:
-        for name, value in weights.items():
-            if value.nbytes > value.untyped_storage().nbytes():
-                raise ValueError(f"{name}: repeats numbers, which no trained weight does")
-        regressor.load_state_dict(weights, assign=assign)
-    except Exception as error:  # torch raises many kinds for other weights, or none
-        reason = " ".join(str(error).split())[:120]
-        raise RunError(f"{checkpoint}: not a whole checkpoint of this network ({reason})") from None

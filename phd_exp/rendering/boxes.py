@@ -26,7 +26,7 @@ from phd_exp.rendering.triangles import Meshes
 
 FEWEST = 24  # visible pixels of the object, where it fills the image: fewer are no detection
 LEAST_VISIBLE = 0.1  # share of its silhouette
-NEIGHBOURHOOD = 1.5  # of distractors, in units of the object's radius
+NEIGHBOURHOOD = 2.5  # of distractors, in radii of the object: two of them hide parts of a quarter of the objects
 
 
 def view_of_box(scene: Scene, spec: DatasetSpec, rng: np.random.Generator, meshes: Meshes) -> Scene | None:

@@ -10,7 +10,7 @@ import torch
 from hydra.utils import instantiate
 from torch import Tensor
 
-from phd_exp.build import build_regressor, build_source, naming
+from phd_exp.build import build_regressor, build_source, naming, recorded_constants
 from phd_exp.config import RunConfig
 from phd_exp.config.sections import RecipeConfig
 from phd_exp.config.targets import custom_parts, locate
@@ -19,7 +19,9 @@ from phd_exp.data.datamodule import PositionData
 from phd_exp.data.sources import Source
 from phd_exp.geometry.camera import Camera
 from phd_exp.models.backbones import Backbone
-from phd_exp.records.errors import ConfigError
+from phd_exp.models.weights import fill, regressor_weights
+from phd_exp.records.errors import ConfigError, RunError
+from phd_exp.records.runs import RunFolder
 from phd_exp.training.cameras import CameraPolicy
 from phd_exp.training.module import PositionModule
 from phd_exp.training.objective import Objective
@@ -27,9 +29,15 @@ from phd_exp.training.optimisation import Optimisation, factor
 
 
 def build_data(config: RunConfig, rank: int = 0) -> PositionData:
-    """The data set of a run, or of one of its processes. `setup` opens the images."""
+    """The data set of a run, or of one of its processes. `setup` opens the images.
+
+    Raises RunError if the run to start from has no constants.
+    """
+    source = build_source(config.data)
+    if config.init:
+        source.depth, source.constant_f = recorded_constants(RunFolder(config.init))
     return PositionData(
-        build_source(config.data),
+        source,
         batch_size=config.data.batch_size,
         seed=config.seed,
         rank=rank,
@@ -52,9 +60,16 @@ def build_augmentation(recipe: RecipeConfig) -> Augmentation | None:
 def build_module(config: RunConfig, data: PositionData) -> PositionModule:
     """The network, its loss and its optimizer, initialised from torch's current random state.
 
-    Raises ConfigError, naming the key, for values that a part refuses.
+    Raises ConfigError, naming the key, for values that a part refuses, and if the run to start from has
+    another network.
     """
     recipe, regressor = config.recipe, build_regressor(config, data.source.depth)
+    if config.init:
+        start = RunFolder(config.init).best_checkpoint
+        try:
+            fill(regressor, regressor_weights(start), start)
+        except RunError as error:
+            raise ConfigError(f"init: {error}; expected a run with this backbone and head") from None
     with naming("optimizer", config.optimizer):
         optimizer = instantiate(config.optimizer, _partial_=True)
         optimizer(regressor.parameters())  # refuses bad values before hours of rendering
