@@ -18,6 +18,8 @@ Shape = Literal["cylinder", "cube", "sphere"]
 SHAPES: tuple[Shape, ...] = get_args(Shape)
 MeshName = Annotated[str, Field(pattern=r"^mesh[0-9]*$")]  # `mesh` is the user's object, the others are distractors
 Material = Literal["rubber", "metal"]
+Pattern = Literal["plain", "noise", "checker", "scratches"]
+PATTERNS: tuple[Pattern, ...] = get_args(Pattern)
 LampName = Literal["key", "fill", "back"]
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -38,6 +40,26 @@ def _unit(quaternion: tuple[float, float, float, float]) -> tuple[float, float, 
 Quaternion = Annotated[tuple[Finite, Finite, Finite, Finite], AfterValidator(_unit)]
 
 
+class Look(Record):
+    """A random surface, of looks=varied.
+
+    Attributes:
+        pattern, cells, second: of an object without materials: a pattern of its colour and a second one, sRGB, with
+            about so many cells along its longest side.
+        roughness, metallic: of the same, as in Blender's Principled BSDF.
+        hue, saturation, value: of an object's own materials: turns added to the hue, and factors.
+    """
+
+    pattern: Pattern
+    cells: Positive
+    second: tuple[Share, Share, Share]
+    roughness: Share
+    metallic: Share
+    hue: Finite
+    saturation: Positive
+    value: Positive
+
+
 class SceneObject(Record):
     """One rigid object.
 
@@ -47,6 +69,7 @@ class SceneObject(Record):
         dimensions: extent along the local axes at scale 1, m.
         scale: factor on all three dimensions.
         colour: sRGB; as the material, of a mesh without its own.
+        look: replaces the material, of looks=varied.
     """
 
     shape: Shape | MeshName
@@ -56,6 +79,7 @@ class SceneObject(Record):
     scale: Positive
     colour: tuple[Share, Share, Share]
     material: Material
+    look: Annotated[Look | None, Field(exclude_if=lambda value: value is None)] = None
 
 
 class Lamp(Record):

@@ -92,6 +92,7 @@ class DatasetSpec(Record):
             which the other values are reduced where possible: box if there is a camera, field if not.
         box_size, box_shift: bounds of the side of that box, and its largest shift, over the side of the exact one.
         grey: whether the images are grey.
+        looks: varied: random patterns, materials and tones, other shapes of distractors, and hard light.
         front: a direction in the file's axes; its angle to the way to the camera is in `front_range`, degrees.
 
     Raises:
@@ -133,6 +134,7 @@ class DatasetSpec(Record):
     box_size: Annotated[tuple[Positive, Positive], Range] = (0.9, 1.5)
     box_shift: Annotated[Number, Field(ge=0, le=0.5)] = 0.15
     grey: StrictBool = False
+    looks: Literal["plain", "varied"] = "plain"
     front: tuple[Number, Number, Number] | None = None
     front_range: Annotated[tuple[Turn, Turn], Range] = (0.0, 180.0)
 

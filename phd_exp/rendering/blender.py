@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from phd_exp.records.errors import RenderError
-from phd_exp.records.scenes import Scene
+from phd_exp.records.scenes import SHAPES, Scene
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.importing import import_meshes
+from phd_exp.rendering.looks import prepare_looks
 from phd_exp.rendering.pixels import Light, read_light
 from phd_exp.rendering.sampling import remoteness
 from phd_exp.rendering.stage import CLIPPING, ROUGHER, build_stage, show_scene
@@ -105,6 +106,8 @@ class Renderer:
             self._world = World(self._bpy, spec) if spec and spec.mesh else None
             if self.meshes:
                 _configure_for_meshes(self._bpy)
+            if spec and spec.looks == "varied":
+                prepare_looks(self._bpy, [*SHAPES, *self.meshes])
             if spec:  # what is nearer or farther than usual is shown too
                 lens, (near, far) = self._scene.camera.data, CLIPPING
                 lens.clip_start, lens.clip_end = near * min(1, 2 * spec.z_range[0]), far * remoteness(spec)

@@ -10,6 +10,7 @@ from phd_exp.records.scenes import SHAPES, Quaternion, Scene, SceneObject, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.boxes import beside, view_of_box
 from phd_exp.rendering.importing import in_blenders_axes
+from phd_exp.rendering.looks import varied
 from phd_exp.rendering.rays import rotation_matrix
 from phd_exp.rendering.sampling import (
     MOST_TRIES,
@@ -25,6 +26,7 @@ from phd_exp.rendering.triangles import Meshes
 REACH = SIZE * 0.5**0.5  # m, from the cylinder's centre to its rim
 BRIGHTNESS = (0.5, 2.0)  # factors of a sky's light
 LARGEST_SPAN = 8.0  # of a sky: 8 degrees, all that a long lens sees, are 23 pixels of Blender's panoramas
+STRETCH = (math.log(0.25), math.log(1.5))  # of the sides of solids with varied looks
 AGAIN = 10**9  # the number of a sample that is drawn again grows by this, beyond those of all samples
 LEAST_SIDE = 0.4  # of a photograph's square, in units of its shorter side
 
@@ -63,7 +65,8 @@ def _whole_scene(spec: DatasetSpec, split: Split, index: int, meshes: Meshes) ->
     others = [_resized(other, cylinder.position, mesh.radius / REACH) for other in panel]
     others += _distractors(spec, split, number, scene, meshes)
     lamps = () if around.is_sky else scene.lamps
-    return scene.model_copy(update={"objects": (item, *others), "surroundings": around, "lamps": lamps})
+    whole = scene.model_copy(update={"objects": (item, *others), "surroundings": around, "lamps": lamps})
+    return whole if spec.looks == "plain" else varied(whole, spec, stream_of(spec, split, number, Purpose.LOOKS))
 
 
 def _surroundings(spec: DatasetSpec, split: Split, number: int) -> tuple[Surroundings, float]:
@@ -127,6 +130,8 @@ def _distractors(spec: DatasetSpec, split: Split, number: int, scene: Scene, mes
         changes: dict[str, Any] = {
             "dimensions": meshes[item.shape].dimensions if item.shape in meshes else (side,) * 3
         }
+        if spec.looks == "varied" and item.shape in SHAPES:  # rods, slabs and discs
+            changes["dimensions"] = tuple((side * np.exp(rng.uniform(*STRETCH, 3))).tolist())
         if spec.is_box:
             changes["position"] = beside(first, first.scale * meshes["mesh"].radius, spec, rng)
         items.append(item.model_copy(update=changes))

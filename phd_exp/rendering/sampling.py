@@ -54,6 +54,7 @@ class Purpose(IntEnum):
     DISTRACTORS = 70  # followed by the number of each
     BOX = 80
     FRONT = 81
+    LOOKS = 82
 
 
 POSE, LOOK, SCALE = range(3)

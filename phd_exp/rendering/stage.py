@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phd_exp.records.scenes import SHAPES, Backdrop, Lamp, LampName, Material, Scene, SceneObject, Shape
+from phd_exp.rendering.looks import show_look
 from phd_exp.rendering.meshes import build_mesh
 from phd_exp.rendering.pixels import linear
 from phd_exp.rendering.rays import rotation_matrix
@@ -43,7 +44,7 @@ def show_scene(bpy: Any, scene: Scene, meshes: Iterable[str] = ()) -> None:
     for item in scene.objects:
         _place_object(bpy, item)
     for name in get_args(LampName):
-        objects[name].hide_render = not scene.lamps
+        objects[name].hide_render = name not in {lamp.name for lamp in scene.lamps}
     for lamp in scene.lamps:
         _place_lamp(objects[lamp.name], lamp)
     show_backdrop(bpy.data.worlds["world"].node_tree.nodes, scene.backdrop)
@@ -55,6 +56,9 @@ def _place_object(bpy: Any, item: SceneObject) -> None:
     size = 0.5 * np.array(item.dimensions) if item.shape in SHAPES else np.ones(3)
     stretch = item.scale * size
     handle.matrix_world = matrix_of(rotation_matrix(item.rotation) * stretch, np.array(item.position))
+    if item.look:
+        show_look(bpy, item, item.look)
+        return
     if handle.data.materials[0] is not None:  # its own
         return
     handle.color = (*(linear(channel) for channel in item.colour), 1.0)

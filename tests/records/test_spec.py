@@ -91,6 +91,7 @@ def test_a_fingerprint_depends_on_every_value_and_on_nothing_else(make_spec: Mak
         "box_size": (1.0, 1.2),
         "box_shift": 0.1,
         "grey": True,
+        "looks": "varied",
         "front": (0.0, 0.0, 1.0),
         "front_range": (0.0, 60.0),
     }
