@@ -3,9 +3,11 @@
     python notebooks/execute.py                            all of them
     python notebooks/execute.py notebooks/02_renders.ipynb
 
-Data sets and runs that are missing are made; `PHD_EXP_PRESET` (small, if unset) says of which size.
+Data sets and runs that are missing are made; `PHD_EXP_PRESET` (small, if unset) says of which size. A notebook that
+needs photographs is left out unless `PHD_EXP_PHOTOGRAPHS` or the folder `photographs` has them.
 """
 
+import os
 import sys
 import tempfile
 import time
@@ -15,6 +17,7 @@ import nbformat
 from nbclient import NotebookClient
 
 HERE = Path(__file__).parent
+PHOTOGRAPHS = "PHD_EXP_PHOTOGRAPHS"
 KERNEL = {"display_name": "Python 3", "language": "python", "name": "python3"}
 
 
@@ -42,8 +45,17 @@ def execute(notebook: nbformat.NotebookNode, folder: Path) -> None:
             cell.outputs = [output for output in cell.outputs if output.get("name") != "stderr"]
 
 
+def is_possible(file: Path) -> bool:
+    """Whether the photographs that a notebook may need are there."""
+    photographs = os.environ.get(PHOTOGRAPHS, HERE.parent / "photographs")
+    return PHOTOGRAPHS not in file.read_text() or Path(photographs).exists()
+
+
 def main(words: list[str]) -> None:
     for file in map(Path, words) if words else sorted(HERE.glob("*.ipynb")):
+        if not is_possible(file):
+            print(f"{file.name}: left out, without photographs")
+            continue
         began = time.monotonic()
         notebook = nbformat.read(file, as_version=4)
         execute(notebook, HERE.parent)

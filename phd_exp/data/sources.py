@@ -80,6 +80,7 @@ class RenderedSource(Source):
 
     @cached_property
     def depth(self) -> DepthScale:  # type: ignore[override]
+        """The constants that normalise depth."""
         spec = self.spec
         if not spec.is_box or not self.folder.manifest_path.exists():  # before rendering, parts are only tried out
             return DepthScale.from_ranges(f_range=spec.f_range, z_range=spec.z_range).scaled(self.zoom)
@@ -87,6 +88,7 @@ class RenderedSource(Source):
 
     @cached_property
     def constant_f(self) -> float:  # type: ignore[override]
+        """The focal length of models that do not know it, px."""
         low, high = self.spec.f_range
         if self.spec.is_box and self.folder.manifest_path.exists():
             low, high = map(float, self._depths[1].aminmax())

@@ -68,7 +68,7 @@ def test_the_keys_are_those_of_the_configuration() -> None:
         return {
             prefix + name
             for name, field in fields
-            if any(kind in str(field.annotation) for kind in ("Path", "Asset"))
+            if any(kind in str(field.annotation) for kind in ("Path", "Asset", "Calibration"))
         }
 
     found = paths(RunConfig) | paths(RenderConfig)

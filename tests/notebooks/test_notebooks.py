@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 FILES = sorted((ROOT / "notebooks").glob("*.ipynb"))
 NAMES = [file.name for file in FILES]
-LARGEST = 1_500_000
+LARGEST = 1_800_000
 """Bytes of all notebooks together, outputs included."""
 ABSOLUTE = re.compile(r"(?<![\w.~:/<>*-])/(?:home|root|tmp|usr|opt|work|mnt|var|Users)/|[A-Z]:\\\\")
 DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
@@ -81,9 +81,9 @@ def test_they_run_on_nothing_at_smoke_size(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setenv("PHD_EXP_PRESET", "smoke")
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    execute = runpy.run_path(str(ROOT / "notebooks" / "execute.py"))["execute"]
-    for file in FILES:
+    script = runpy.run_path(str(ROOT / "notebooks" / "execute.py"))
+    for file in filter(script["is_possible"], FILES):
         notebook = read(file)
-        execute(notebook, tmp_path)
+        script["execute"](notebook, tmp_path)
         assert "image/png" in json.dumps(notebook), file.name
     assert not [path for path in (ROOT / "notebooks").iterdir() if path.name in {"renders", "runs"}]
