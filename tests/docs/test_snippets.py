@@ -113,7 +113,7 @@ def _write_files(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.syspath_prepend(folder)
     for mesh in ("part.glb", "cup.stl"):
         write_mesh(folder / mesh, solid("cube"))
-    (folder / "camera.yaml").write_text("{image_width: 640, image_height: 480, fx: 900, fy: 900, cx: 320, cy: 240}")
+    (folder / "camera.yaml").write_text("image_width: 640\nimage_height: 480\nfx: 900\nfy: 900\ncx: 320\ncy: 240\n")
     (folder / "rooms").mkdir()
     for number in range(4):
         (folder / f"rooms/{number}.jpg").touch()
