@@ -16,7 +16,8 @@ from phd_exp.records.gltf import joined_gltf, keep_default_scene_at_rest, positi
 
 MATERIALS = "materials.mtl"  # which the copy of an OBJ names
 _BOM = b"\xef\xbb\xbf"
-_OBJ_LINE = re.compile(rb"^[ \t]*(mtllib|usemtl)\b[ \t]*(.*?)[ \t\r]*$", re.M)
+_OBJ_LINE = re.compile(rb"\n[ \t]*(mtllib|usemtl)\b[ \t]*(.*?)[ \t\r]*(?=\n)")  # faster than ^ and $
+_OBJ_COLOUR = re.compile(rb"\n[ \t]*v(?:[ \t]+[^\s#]+){6}")  # after x, y, z
 _NEW_MATERIAL = re.compile(rb"^[ \t]*newmtl[ \t]+(.*?)[ \t\r]*$", re.M)
 _OPTION = rb"-type[ \t]+\w+[ \t]+|-\w+(?:[ \t]+(?:on|off|[rgbmlz]|[-+]?[\d.]+(?:e[-+]?\d+)?)(?=[ \t]))*[ \t]+"
 _MAP = re.compile(
@@ -40,6 +41,7 @@ class MeshFile:
         texture: of a PLY.
         files: the files that it names.
         lost: why parts of its look cannot be drawn.
+        has_colours: whether a vertex of an OBJ has a colour.
         coordinates: returns those of its vertices as arrays (n, 3), unless they are compressed.
     """
 
@@ -49,6 +51,7 @@ class MeshFile:
     texture: Path | None = None
     files: list[Path] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
+    has_colours: Callable[[], bool] = bool
     coordinates: Callable[[], list[NDArray[Any]]] = list
 
     def find(self, name: str, folder: Path) -> Path | None:
@@ -113,7 +116,9 @@ def _read_gltf(mesh: MeshFile) -> None:
 
 
 def _read_obj(mesh: MeshFile) -> None:
-    text = mesh.copy.removeprefix(_BOM).replace(b"\\\n", b"").replace(b"\\\r\n", b"")
+    text = b"\n%b\n" % mesh.copy.removeprefix(_BOM).replace(b"\\\n", b"").replace(b"\\\r\n", b"")
+    if b"\0" in text:
+        raise ValueError("has bytes that are no text; expected UTF-8")
     lines = _OBJ_LINE.findall(text)
     used = {name for word, name in lines if word == b"usemtl"}
     named = [os.fsdecode(name) for word, name in lines if word == b"mtllib"]
@@ -128,7 +133,8 @@ def _read_obj(mesh: MeshFile) -> None:
     if not used and len(known) > 1:
         mesh.lost.append(f"no usemtl says which of {len(known)} materials it has")
     only = b"usemtl %b\n" % known.pop() if not used and len(known) == 1 else b""
-    mesh.copy = b"mtllib %b\n" % MATERIALS.encode() + only + re.sub(rb"(?m)^[ \t]*mtllib\b.*$", b"", text)
+    mesh.copy = b"mtllib %b\n" % MATERIALS.encode() + only + re.sub(rb"\n[ \t]*mtllib\b[^\n]*", b"", text)
+    mesh.has_colours = lambda: bool(_OBJ_COLOUR.search(text))
     mesh.coordinates = lambda: [_numbers(rb"v", text)]
 
 
@@ -154,7 +160,7 @@ def _read_ply(mesh: MeshFile) -> None:
             mesh.lost.append(f"vertices have no texture coordinates (s, t) for {name}")
     if b" red" in sections.get(b"face", b"") and not {b"red", b"t"} & kinds.keys():
         mesh.lost.append("colours of faces are not read; expected colours of vertices")
-    if kinds.get(b"red") in (b"char", b"int8", b"short", b"int16", b"int", b"int32", b"uint", b"uint32"):
+    if kinds.get(b"red", b"uchar") not in (b"uchar", b"uint8", b"float", b"float32", b"double", b"float64"):
         mesh.lost.append(f"colours of vertices are of type {kinds[b'red'].decode()}; expected uchar")
     if list(sections)[:1] == [b"vertex"] and b" list " not in vertex:
         mesh.coordinates = lambda: [_rows(head, kinds, int(vertex.split()[2]), body[body.find(b"\n") + 1 :])]

@@ -41,10 +41,9 @@ def import_meshes(bpy: Any, spec: DatasetSpec) -> Meshes:
             meshes[name] = _in_metres(handle, spec.unit, reference)
             _require_drawn(bpy, handle, meshes[name])
             _require_size(meshes[name], spec)
-        except (OSError, ValueError, RuntimeError) as error:  # Blender raises RuntimeError
-            lines = [line for line in str(error).splitlines() if line.strip() and not line.startswith("Location:")]
-            key, reason = "distractor_meshes" if number else "mesh", one_line(lines[-1].removeprefix("Error: "))
-            raise RenderError(f"data.{key}: {file}: {reason}") from None
+        except (OSError, ValueError, RuntimeError) as error:
+            key = "distractor_meshes" if number else "mesh"
+            raise RenderError(f"data.{key}: {file}: {one_line(str(error))}") from None
         handle.name = name
     return meshes
 
@@ -72,12 +71,19 @@ def _one_object(bpy: Any, file: MeshFile, *, is_plain: bool) -> Any:
     whole.modifiers.clear()
     for item in others:
         bpy.data.objects.remove(item)
-    if is_plain or not any(whole.data.materials):
-        whole.data.materials.clear()
-        whole.data.materials.append(None if is_plain else _paint(bpy, whole.data, file.texture))
+    _paint_all(bpy, whole.data, file, is_plain=is_plain)
+    return whole
+
+
+def _paint_all(bpy: Any, mesh: Any, file: MeshFile, *, is_plain: bool) -> None:
+    """Remove a mesh's materials, or require that all that its file names is drawn. Raises ValueError."""
+    if not is_plain and not mesh.color_attributes and file.has_colours():
+        raise ValueError(f"colours of its vertices cannot be read; expected three numbers of each; {PLAIN}")
+    if is_plain or not any(mesh.materials):
+        mesh.materials.clear()
+        mesh.materials.append(None if is_plain else _paint(bpy, mesh, file.texture))
     if not is_plain and (broken := [i.name for i in bpy.data.images if i.source == "FILE" and not i.size[0]]):
         raise ValueError(f"its texture {listed(broken)} cannot be read; replace it, or {PLAIN}")
-    return whole
 
 
 def _import(bpy: Any, file: MeshFile) -> set[Any]:
@@ -94,7 +100,11 @@ def _import(bpy: Any, file: MeshFile) -> set[Any]:
             else:
                 getattr(bpy.ops.wm, f"{suffix[1:]}_import")(filepath=str(path))
         except RuntimeError as error:
-            raise ValueError(str(error).replace(folder, "")) from None
+            lines = str(error).replace(f"{folder}/", "").splitlines()
+            told = [line for line in lines if line.strip() and not line.startswith("Location:")]
+            raise ValueError(
+                f"Blender cannot read it ({told[-1].removeprefix('Error: ')}); export it again"
+            ) from None
     return set(bpy.data.objects) - before
 
 
@@ -110,7 +120,7 @@ def _in_metres(handle: Any, unit: float, reference: Any) -> Triangles:
     local, corners = _geometry(mesh)
     if not corners.size:
         raise ValueError(f"is transparent everywhere; expected opaque faces; {PLAIN}")
-    used, places = np.unique(corners, return_inverse=True)
+    used = np.unique(corners)
     far, size = np.abs(local[used]).max(), np.ptp(local[used], axis=0).max()
     if Triangles(local.astype(float), corners).areas.sum() <= (TOLERANCE * size) ** 2:
         raise ValueError("its faces have no area; expected a surface")
@@ -129,6 +139,8 @@ def _in_metres(handle: Any, unit: float, reference: Any) -> Triangles:
     handle.matrix_world = np.eye(4).tolist()
     mesh.vertices.foreach_set("co", vertices.astype(np.float32).ravel())
     mesh.update()
+    # again, because rounding decides how Blender divides a polygon that is not flat
+    used, places = np.unique(_geometry(mesh)[1], return_inverse=True)
     return Triangles(vertices[used], places.reshape(-1, 3).astype(np.int32))
 
 
@@ -155,12 +167,10 @@ def _require_drawn(bpy: Any, handle: Any, mesh: Triangles) -> None:
     """Raise ValueError unless Blender draws the triangles where they are."""
     drawn = handle.evaluated_get(bpy.context.evaluated_depsgraph_get())
     world, (vertices, corners) = np.array(drawn.matrix_world), _geometry(drawn.data)
-    points = vertices[corners.ravel()] @ world[:3, :3].T + world[:3, 3]
-    gaps = np.abs([np.ptp([side(points, 0), side(mesh.vertices, 0)], 0) for side in (np.min, np.max)])
-    if gaps.max() > TOLERANCE * max(mesh.dimensions):
-        raise ValueError(
-            f"Blender draws it {gaps.max():.3g} m away from its labels; export it without modifiers or poses"
-        )
+    points, labels = vertices[corners] @ world[:3, :3].T + world[:3, 3], mesh.vertices[mesh.corners]
+    near = TOLERANCE * max(mesh.dimensions)
+    if points.shape != labels.shape or not np.allclose(points, labels, rtol=0, atol=near):
+        raise ValueError("Blender draws other triangles than its labels have; export it without modifiers or poses")
 
 
 def _require_size(mesh: Triangles, spec: DatasetSpec) -> None:

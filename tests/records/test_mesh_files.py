@@ -201,3 +201,9 @@ def test_rows_of_a_binary_ply_may_have_other_columns(tmp_path: Path, order: str)
     (tmp_path / "a.ply").write_bytes(head.encode() + b"".join(rows))
     with pytest.raises(ValueError, match=r"vertex 2 is at \[nan, 2\.0, 3\.0\]"):
         read_mesh(tmp_path / "a.ply").require_finite()
+
+
+def test_an_obj_is_text_in_utf_8(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text(OBJ, "utf-16")
+    with pytest.raises(ValueError, match=r"cannot be read as \.obj .*expected UTF-8"):
+        mesh_asset(tmp_path / "a.obj")

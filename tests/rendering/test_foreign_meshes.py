@@ -33,10 +33,10 @@ SHORT = [f"uchar {name}" for name in "rgba"]
 def drawn(make_spec: MakeSpec) -> Callable[..., tuple[Renderer, np.ndarray]]:
     """A renderer of a mesh, and the mean colour of its opaque pixels, which are those of its labels."""
 
-    def drawn(file: Path, **changes: Any) -> tuple[Renderer, np.ndarray]:
+    def drawn(file: Path, index: int = 0, **changes: Any) -> tuple[Renderer, np.ndarray]:
         spec = make_spec("object", mesh=str(file), **SMALL, **changes)
         renderer = Renderer(Settings(samples=1, denoised=False, at_middles=True), spec)
-        scene = sample_object_scene(spec, "train", 0, renderer.meshes)
+        scene = sample_object_scene(spec, "train", index, renderer.meshes)
         light = renderer.render(scene)
         opaque = light[..., 3] > 0.5
         assert opaque.sum() > 100
@@ -106,6 +106,14 @@ def test_points_outside_all_faces_do_not_count(tmp_path: Path, drawn: Callable) 
     assert renderer.meshes["mesh"].dimensions == SIZE
 
 
+def test_a_polygon_that_is_not_flat_is_labelled_as_it_is_drawn(tmp_path: Path, drawn: Callable) -> None:
+    """There are several ways to divide this one into triangles, which show different silhouettes."""
+    corners = [(-1, 0, 1), (1, 0, 1), (1, 0, -1), (-1, 0, -1), (0, 1, -1)]
+    file = tmp_path / "tent.obj"
+    file.write_text("".join(f"v {x} {y} {z}\n" for x, y, z in corners) + "f 1 2 3 4 5\n")
+    drawn(file, index=1, unit=0.1)
+
+
 def red(path: Path) -> None:
     Image.new("RGB", (8, 8), (200, 0, 0)).save(path)
 
@@ -160,12 +168,21 @@ def test_materials_are_refused_or_ignored(
     drawn(file, ignore=["materials"])
 
 
-def test_colours_beyond_one_are_refused(tmp_path: Path, drawn: Callable) -> None:
+@pytest.mark.parametrize(
+    ("colours", "message"),
+    [
+        ([" 255 128 0"] * 8, "its colours reach"),
+        ([" 1 0 0", *[""] * 7], "colours of its vertices cannot be read"),
+        ([*[" 1 0 0"] * 7, " nan nan nan"], "colours of its vertices cannot be read"),
+    ],
+)
+def test_strange_colours_are_refused(tmp_path: Path, drawn: Callable, colours: list[str], message: str) -> None:
     file = write_mesh(tmp_path / "a.obj", CUBE)
-    lines = [f"{line} 255 128 0" if line[0] == "v" else line for line in file.read_text().splitlines()]
-    file.write_text("\n".join(lines) + "\n")
-    with pytest.raises(RenderError, match="its colours reach"):
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join([*map("".join, zip(lines, colours, strict=False)), *lines[8:], ""]))
+    with pytest.raises(RenderError, match=message):
         drawn(file)
+    drawn(file, ignore=["materials"])
 
 
 def test_a_mesh_that_blender_draws_elsewhere_is_refused(
@@ -180,7 +197,7 @@ def test_a_mesh_that_blender_draws_elsewhere_is_refused(
         return handle
 
     monkeypatch.setattr(importing, "_one_object", with_shape_keys)
-    with pytest.raises(RenderError, match=r"Blender draws it .* away from its labels"):
+    with pytest.raises(RenderError, match="Blender draws other triangles than its labels have"):
         drawn(write_mesh(tmp_path / "a.stl", CUBE, per_metre=1000), unit=0.001)
 
 
