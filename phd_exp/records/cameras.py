@@ -4,7 +4,7 @@ The whole file is searched for the names in `NAMES`. Two values of one quantity 
 several cameras.
 
 Source: documentation of OpenCV (FileStorage, calib3d), ROS (camera_info), Kalibr, COLMAP (cameras.txt), nerfstudio
-(transforms.json), librealsense, BOP (camera.json), Open3D, ORB_SLAM, stella_vslam and VINS (camodocal).
+(transforms.json), librealsense, BOP (camera.json), Open3D, ORB_SLAM, stella_vslam, VINS (camodocal), maplab and SVO.
 """
 
 import math
@@ -34,11 +34,11 @@ COEFFICIENTS = {
 NAMES = {
     "width": "width imagewidth imgwidth w cameracols",
     "height": "height imageheight imgheight h camerarows",
-    "size": "resolution imagesize",
+    "size": "resolution imagesize cameraresolution",
     "K": "k m cameramatrix camk intrinsics intrinsicmatrix cameraintrinsics mtx",
     **{"fx": "fx flx fu mu", "fy": "fy fly fv mv", "cx": "cx ppx cu u0", "cy": "cy ppy cv v0"},
-    "D": "d dist distortion distortioncoef distcoef coef",
-    "model": "distortionmodel cameramodel model modeltype cameratype",
+    "D": "d dist distortion distortioncoef distcoef coef distortionparameters",
+    "model": "distortionmodel cameramodel model modeltype cameratype distortiontype",
     "fisheye": "fisheyemodel fisheye isfisheye",
     **{name: name for name in COEFFICIENTS["rational_polynomial"]},
 }
@@ -48,14 +48,15 @@ MODELS = {
     "rational_polynomial": "rationalpolynomial rational fullopencv full radtan8",
     "equidistant": "equidistant equi fisheye opencvfisheye kannalabrandt kannalabrandt4 kannalabrandt8 kb4 "
     "radialfisheye simpleradialfisheye",
-    "none": "none nodistortion inversebrownconrady modifiedbrownconrady",  # those of librealsense are read if zero
-    "": "pinhole perspective simplepinhole rectified",  # of the projection alone
+    # those of librealsense, by number too, are read if zero
+    "none": "none nodistortion inversebrownconrady modifiedbrownconrady 0 1 2",
+    "": "pinhole perspective simplepinhole rectified 4",  # the coefficients tell which
 }
 """Model -> its names in files, in small letters and digits, without `pinhole` and `distortion` before them."""
 _QUANTITIES = {alias: name for name, aliases in NAMES.items() for alias in aliases.split()}
 _MODELS = {"": "none"} | {alias: model for model, aliases in MODELS.items() for alias in aliases.split()}
 _NOT_OF_A_NAME = re.compile(r"^(left|right)|(left|right|\d+)$|(?<=coef)f?(icient)?s?\d*$")
-_COEFFICIENT, _LENS = re.compile(r"[kps]\d|xi|skew"), re.compile(r"distor|radial|tangential|coef")
+_COEFFICIENT, _LENS = re.compile(r"[kps]\d|xi|skew"), re.compile(r"distor|radial|tangential|coef(?!.*stddev)")
 """Names that belong to a lens even where they are none of `NAMES`."""
 
 Size = Annotated[int, Field(gt=0)]
@@ -134,25 +135,23 @@ def calibration(given: Any) -> Calibration | None:
 
 def _found(content: Any) -> Found:
     """The quantities of a file. Raises ValueError if one has two values, or there is no focal length."""
+    values = list(entries(content))
+    names = [_quantity(key, value) for key, value in values]
+    if not {"K", "fx"} & set(names):
+        keys, expected = listed(list(dict(values))), "camera_matrix, K or intrinsics, or fx, fy, cx, cy"
+        raise ValueError(f"no camera matrix: found {keys or 'no keys'}; expected {expected}")
     found: Found = {}
-    keys: dict[str, None] = {}
-    for key, value in entries(content):
-        keys[key] = None
-        name = _quantity(key, value)
-        if name == "model":
-            value = _model(key, value)
+    for name, (key, given) in zip(names, values, strict=True):
+        value = _model(key, given) if name == "model" else given
         if name and value != "" and found.setdefault(name, (key, value))[1] != value:
             raise ValueError(f"{found[name][0]} and {key} differ; expected the calibration of one camera alone")
-    if not found.keys() & {"K", "fx"}:
-        expected = "camera_matrix, K or intrinsics, or fx, fy, cx, cy"
-        raise ValueError(f"no camera matrix: found {listed(list(keys)) or 'no keys'}; expected {expected}")
     return found
 
 
 def _quantity(key: str, value: Any) -> str | None:
     """The quantity with a key, if it is one. Raises ValueError for a part of a lens that is none."""
     *outer, name = (re.sub(r"[^a-z\d]", "", part) for part in key.lower().split("."))
-    if name in ("type", "cols", "rows"):  # of anything
+    if name in ("type", "cols", "rows", "parameters"):  # of anything
         name = "".join(outer[-1:]).rstrip("0123456789") + name
     is_list = isinstance(value, list | dict)
     quantity = _QUANTITIES.get(_NOT_OF_A_NAME.sub("", name) if is_list else name)
@@ -234,7 +233,8 @@ def _lens(found: Found) -> tuple[Any, list[float]]:
     model = model or _only_model(D, named, is_pinhole=flag is False or bool(named.keys() & {"p1", "p2"}))
     names = COEFFICIENTS.get(model, ())
     given = dict(zip([*names, *map(str, range(len(D)))], D, strict=False)) if D else named
-    if (len(D) == 3 and D[2]) or any(value for name, value in given.items() if name not in names):
+    is_short = any(D[2:3] if model == "plumb_bob" else D) and len(D) < 4  # k3 or p1; or another model's
+    if is_short or any(value for name, value in given.items() if name not in names):
         expected = f"{', '.join(names) or 'none'} for {model}, zero beyond"
         raise ValueError(f"coefficients: got {D or named}; expected {expected}")
     return model, [given.get(name, 0.0) for name in names]

@@ -95,6 +95,13 @@ def kalibr(D: list[float], model: str) -> dict[str, Any]:
     return {"cam0": camera | {"intrinsics": [400.5, 401.2, 319.5, 239.5], "resolution": [640, 480], "rostopic": "/a"}}
 
 
+def maplab(model: str, D: list[float]) -> dict[str, Any]:
+    """A rig of one camera."""
+    camera = {"image_width": 640, "image_height": 480, "type": "pinhole", "intrinsics": matrix([*F.values()], 4, 1)}
+    lens = {"type": model, "parameters": matrix(D, len(D), 1)}
+    return {"label": "rig", "cameras": [{"camera": camera | {"distortion": lens}, "T_B_C": matrix([1.0] * 16, 4, 4)}]}
+
+
 def named(names: str, values: list[float]) -> dict[str, float]:
     return dict(zip(names.split(), values, strict=True))
 
@@ -154,6 +161,11 @@ SAME: dict[str, tuple[Any, str, list[float]]] = {
     "OpenCV, K": (opencv("distortion_model: radtan\n", names="K D", D=FOUR), BROWN, FOUR),
     "OpenCV, fisheye by name": (opencv("distortion_model: fisheye\n", names="K D", D=FISHEYE), KB, FISHEYE),
     "OpenCV, XML": (xml(FIVE), BROWN, FIVE),
+    "OpenCV, interactive-calibration": (
+        opencv("cameraResolution: [640, 480]\ndist_coeffs_std_dev: [0.1, 0.2]\n", "cameraMatrix dist_coeffs"),
+        BROWN,
+        FIVE,
+    ),
     "Kalibr": (kalibr(FOUR, "radtan"), BROWN, FOUR),
     "Kalibr, fisheye": (kalibr(FISHEYE, "equidistant"), KB, FISHEYE),
     "Kalibr, none": (kalibr([], "none"), BROWN, NONE),
@@ -176,6 +188,13 @@ SAME: dict[str, tuple[Any, str, list[float]]] = {
         BROWN,
         FIVE,
     ),
+    "RealSense, by number": (named("fx fy ppx ppy", [*F.values()]) | {"model": 2, "coeffs": [0.0] * 5}, BROWN, NONE),
+    "Orbbec": (
+        {"intrinsic": F, "distortion": named("k1 k2 k3 k4 k5 k6 p1 p2", [-0.28, 0.07, 0.01, 0, 0, 0, 5e-4, -3e-4])}
+        | {"model": 4},
+        RATIONAL,
+        FIVE,
+    ),
     "RealSense, fisheye": (
         named("fx fy ppx ppy", [*F.values()]) | {"model": "kannala_brandt4", "coeffs": [*FISHEYE, 0.0]},
         KB,
@@ -193,6 +212,9 @@ SAME: dict[str, tuple[Any, str, list[float]]] = {
     "nerfstudio, frames": ({"frames": [CORNER | named(FIRST, FOUR)] * 2}, BROWN, FOUR),
     "nerfstudio, fisheye": (CORNER | named("k1 k2 k3 k4", FISHEYE) | {"camera_model": "OPENCV_FISHEYE"}, KB, FISHEYE),
     "instant-ngp": (CORNER | named(FIRST + " k3 k4", [*FOUR, 0, 0]) | {"is_fisheye": False}, BROWN, FOUR),
+    "maplab": (maplab("radial-tangential", FOUR), BROWN, FOUR),
+    "SVO, fisheye": (maplab("equidistant", FISHEYE), KB, FISHEYE),
+    "SVO, none": (maplab("none", []), BROWN, NONE),
     "ORB_SLAM2": (settings(prefixed("Camera", F | named(FIRST + " k3", FIVE)) | SIZE), BROWN, FIVE),
     "ORB_SLAM3": (
         settings({"Camera.type": "PinHole"} | prefixed("Camera1", F | named(FIRST, FOUR)) | SIZE),
@@ -330,6 +352,9 @@ BAD: list[tuple[Any, str]] = [
     ({"M1": ROWS, "M2": [*ROWS[:2], [0, 0, 2]]}, "M1 and M2 differ"),
     ({"K_left": ROWS, "K_right": [*ROWS[:2], [0, 0, 2]]}, "K_left and K_right differ"),
     ({"model_type": "MEI", "projection_parameters": F}, "model_type: got 'MEI'; expected plumb_bob"),
+    (maplab("fisheye", [0.93]), "coefficients: got [0.93]; expected k1, k2, k3, k4 for equidistant"),
+    ({"imu0": {"model": "kalibr"}}, "no camera matrix: found imu0.model"),
+    (F | {"coeffs": FIVE, "model": 2}, "expected none for none"),
     ("1 FOV 640 480 400 400 320 240 0.9", "FOV with 5 parameters; expected one of SIMPLE_PINHOLE"),
     ("<calibration><f>900</f></calibration>", "XML of <calibration>; expected <opencv_storage>"),
     ("<a", "XML: "),
