@@ -107,7 +107,7 @@ def _as_rgb(file: Path, image: Image.Image) -> Image.Image:
         if 0 < (largest := int(np.asarray(image).max())) < TWELVE_BITS:
             raise DatasetError(
                 f"{file}: the largest of its 16-bit values is {largest}; expected the whole range up to 65535: "
-                "multiply 12-bit values by 16"
+                "multiply 12-bit values by 16, 14-bit values by 4"
             )
         return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8)).convert("RGB")
     if image.mode in WITH_ALPHA:

@@ -33,8 +33,7 @@ Entry = tuple[str, str, dict[str, Any]]
 METRE = 1000.0  # mm
 VISIBILITY = {0.0: 1.0, 1.0: 2 / 3, 2.0: 1 / 3}  # of KITTI's levels of occlusion, not measured; level 3 is unknown
 LARGEST = 1000 * MB  # bytes of a file; the instances of COCO's training images have 450 MB
-
-
+RULE = "see `Standard formats` in docs/guides/own_images.md"
 COCO_FILES = {
     "../annotations/instances_{}.json": "",
     "../../annotations/instances_{}.json": "",  # CVAT
@@ -63,12 +62,19 @@ def expected_in(folder: Path) -> str:
     """What was looked for in a folder without annotations, and what is there."""
     if not folder.is_dir():
         return "no such folder"
-    names = sorted(f"{file.name}/" if file.is_dir() else file.name for file in folder.glob("*"))
+    around = [folder.parent, *sorted(folder.glob("*/")), *sorted(folder.glob("*/*/"))]
+    if near := [str(place) for place in around if (place / "metadata.jsonl").exists() or format_of(place)]:
+        return f"no annotations; expected one of the folders with annotations near it: {listed(near)}"
     coco = ", ".join(COCO_FILES).format(*[folder.absolute().name] * 2)
     return (
-        f"no annotations; found {listed(names) or 'nothing'}; expected metadata.jsonl, */scene_gt.json (BOP), "
-        f"label_2/*.txt (KITTI), or one of {coco} (COCO); see `Standard formats` in docs/guides/own_images.md"
+        f"no annotations; found {_names_in(folder)}; expected metadata.jsonl, */scene_gt.json (BOP), "
+        f"label_2/*.txt (KITTI), or one of {coco} (COCO); {RULE}"
     )
+
+
+def _names_in(folder: Path) -> str:
+    names = sorted(f"{file.name}/" if file.is_dir() else file.name for file in folder.glob("*"))
+    return listed(names) or "nothing"
 
 
 def _bop(folder: Path) -> Iterator[Entry]:
@@ -112,6 +118,9 @@ def _kitti(folder: Path) -> Iterator[Entry]:
     A label is the centre of the bottom in the frame of the reference camera, which P2 = K [I | t] maps to the image.
     """
     images = _images(folder / "image_2")
+    if not (folder / "image_2").exists():
+        boxes = "image_2/, of the left colour camera, which the boxes refer to"
+        raise DatasetError(f"{folder}: found {_names_in(folder)}; expected {boxes}; {RULE}")
     for file in sorted(folder.glob("label_2/*.txt")):
         calibration = folder / "calib" / file.name
         with _reading(f"{calibration}, P2"):
@@ -139,6 +148,8 @@ def _coco(file: Path, subfolder: str, folder: Path) -> Iterator[Entry]:
     """All annotations except crowds."""
     content = _read(file)
     with _reading(file):
+        if not isinstance(content, dict):
+            raise ValueError("expected an object with images, annotations and categories; export it as COCO")
         images, categories = _by_id(content["images"]), _by_id(content["categories"])
         items = list(enumerate(content["annotations"]))
     for number, item in items:
@@ -150,7 +161,9 @@ def _coco(file: Path, subfolder: str, folder: Path) -> Iterator[Entry]:
             values |= dict(zip("xyz", item["position"], strict=True)) if "position" in item else {}
             name = Path(subfolder, image["file_name"].replace("\\", "/"))
             values |= {"file_name": str(name), "box": edges(item["bbox"])}
-            camera = image.get("camera") or content["camera"]
+            camera = image.get("camera") or content.get("camera")
+            if camera is None:
+                raise ValueError('no camera; add "camera": {"f": 900} in pixels, once or to each image')
             yield where, str(categories[str(item["category_id"])]["name"]), camera | values
 
 
@@ -208,8 +221,7 @@ def _reading(where: Path | str) -> Iterator[None]:
         yield
     except (OSError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         reason = f"{gist(error)} is missing" if isinstance(error, KeyError) else gist(error)
-        rule = "see `Standard formats` in docs/guides/own_images.md"
-        raise DatasetError(f"{where}: cannot be read ({reason}); {rule}") from None
+        raise DatasetError(f"{where}: cannot be read ({reason}); {RULE}") from None
 
 
 def _read(file: Path, parse: Callable[[str], Any] = parse_json) -> Any:

@@ -168,6 +168,23 @@ def test_a_folder_without_annotations_says_what_is_there_and_what_is_read(tmp_pa
     assert all(layout in str(caught.value) for layout in layouts)
 
 
+@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("given", [".", "deep", "deep/test/000002"])
+def test_a_folder_near_annotations_names_theirs(tmp_path: Path, name: str, given: str) -> None:
+    """The root of a data set in any format, or a single scene of BOP."""
+    WRITERS[name](tmp_path / "deep" / "test")
+    (tmp_path / given).mkdir(exist_ok=True)
+    with pytest.raises(DatasetError, match=r"no annotations; expected one of the folders .*: \S*/deep/test$"):
+        detections_in(tmp_path / given)
+
+
+def test_boxes_of_kitti_are_not_those_of_a_grey_camera(tmp_path: Path) -> None:
+    WRITERS["kitti"](tmp_path / "test")
+    (tmp_path / "test/image_2").rename(tmp_path / "test/image_0")
+    with pytest.raises(DatasetError, match=r"test: found calib/, image_0/, label_2/; expected image_2/, of the left"):
+        detections_in(tmp_path / "test")
+
+
 def test_results_are_the_boxes_of_one_image(tmp_path: Path) -> None:
     def boxes(*items: dict[str, Any], category: int | None = None) -> list[dict[str, Any]]:
         (file := tmp_path / "boxes.json").write_text(json.dumps(items))
@@ -285,9 +302,9 @@ BAD = [
     (("kitti", lambda folder: (folder / "calib/000000.txt").unlink()), "No such file"),
     (("kitti", lambda folder: (folder / "image_2/000000.png").unlink()), "'image_2/000000' is missing"),
     (("kitti", lambda folder: (folder / "label_2/000000.txt").write_bytes(b"\xff")), "cannot be read"),
-    (("coco", lambda folder: (folder.parent / "annotations/instances_test.json").write_text("[]")), "cannot be"),
+    (("coco", lambda folder: (folder.parent / "annotations/instances_test.json").write_text("[]")), "expected an obj"),
     (coco(lambda content: content.pop("images")), "'images' is missing"),
-    (coco(lambda content: content.pop("camera")), "annotation 1: cannot be read .'camera' is missing"),
+    (coco(lambda content: content.pop("camera")), r"annotation 1: .*no camera; add \"camera\""),
     (coco(lambda content: content["camera"].update(k1=0.1)), "annotation 1: k1: a line describes no lens"),
     (coco(lambda content: content["annotations"][0].update(bbox=[1, 2, 3])), "annotation 0: cannot be read"),
     (coco(lambda content: content["annotations"][0].update(bbox=[1, 2, 0, 3])), "annotation 0: box=.* positive size"),
