@@ -302,7 +302,7 @@ BAD = [
     (("kitti", lambda folder: (folder / "calib/000000.txt").unlink()), "No such file"),
     (("kitti", lambda folder: (folder / "image_2/000000.png").unlink()), "'image_2/000000' is missing"),
     (("kitti", lambda folder: (folder / "label_2/000000.txt").write_bytes(b"\xff")), "cannot be read"),
-    (("coco", lambda folder: (folder.parent / "annotations/instances_test.json").write_text("[]")), "expected an obj"),
+    (("coco", lambda folder: (folder.parent / "annotations/instances_test.json").write_text("[]")), "an object"),
     (coco(lambda content: content.pop("images")), "'images' is missing"),
     (coco(lambda content: content.pop("camera")), r"annotation 1: .*no camera; add \"camera\""),
     (coco(lambda content: content["camera"].update(k1=0.1)), "annotation 1: k1: a line describes no lens"),
