@@ -175,6 +175,16 @@ SAME: dict[str, tuple[Any, str, list[float]]] = {
         BROWN,
         FIVE,
     ),
+    "PhotonVision": (
+        {
+            "resolution": {"width": 640.0, "height": 480.0},
+            "cameraIntrinsics": matrix(MATRIX),
+            "distCoeffs": matrix(FIVE, 1, 5),
+        }
+        | {"observations": [{"pose": {"rotation": {"quaternion": {"W": 0.6, "X": 0.8}}}}]},
+        BROWN,
+        FIVE,
+    ),
     "BOP": (F | {"depth_scale": 0.1, "width": 640, "height": 480}, BROWN, NONE),
     "BOP, scene": ({"0": {"cam_K": MATRIX, "depth_scale": 1.0}, "7": {"cam_K": MATRIX}}, BROWN, NONE),
     "Open3D": ({"width": 640, "height": 480, "intrinsic_matrix": COLUMNS}, BROWN, NONE),
