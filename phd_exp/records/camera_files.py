@@ -24,7 +24,7 @@ _SECTION = re.compile(r"\[([A-Za-z][^\]\"'{}:,]*)\]")
 _ROW = re.compile(r"\d+\s+[A-Z_]+\s+\d+\s+\d+(\s+[-+.\deE]+)+")
 _OF_OPENCV = re.compile(r"^%YAML.*$|!!opencv-(nd-)?matrix", re.MULTILINE)
 _NO_SPACE = re.compile(r"^(\s*[\w.]+):(?=[\w\[-])", re.MULTILINE)  # which OpenCV does not need
-_ELSEWHERE = ("roi", "rotation", "quaternion", "orientation")
+_ELSEWHERE = ("roi", "calobjectSize", "rotation", "quaternion", "orientation")
 """Sections whose width, height and w are not those of the image."""
 
 

@@ -181,7 +181,10 @@ SAME: dict[str, tuple[Any, str, list[float]]] = {
             "cameraIntrinsics": matrix(MATRIX),
             "distCoeffs": matrix(FIVE, 1, 5),
         }
-        | {"observations": [{"pose": {"rotation": {"quaternion": {"W": 0.6, "X": 0.8}}}}]},
+        | {
+            "calobjectSize": {"width": 7, "height": 7},
+            "observations": [{"pose": {"rotation": {"quaternion": {"W": 0.6, "X": 0.8}}}}],
+        },
         BROWN,
         FIVE,
     ),
