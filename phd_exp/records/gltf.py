@@ -69,11 +69,8 @@ def positions(document: Any, rest: bytes) -> list[NDArray[np.float32]]:
         if accessor["componentType"] == FLOATS and "bufferView" in accessor:
             view = document["bufferViews"][accessor["bufferView"]]
             buffer = _bytes_of(document["buffers"][view["buffer"]].get("uri"), rest)
-            start, strides = (
-                view.get("byteOffset", 0) + accessor.get("byteOffset", 0),
-                (view.get("byteStride", 12), 4),
-            )
-            result.append(np.ndarray((accessor["count"], 3), "<f4", buffer, start, strides))
+            start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+            result.append(np.ndarray((accessor["count"], 3), "<f4", buffer, start, (view.get("byteStride", 12), 4)))
     return result
 
 
