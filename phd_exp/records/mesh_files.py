@@ -19,7 +19,8 @@ _BOM = b"\xef\xbb\xbf"
 _OBJ_LINE = re.compile(rb"\n[ \t]*(mtllib|usemtl)\b[ \t]*(.*?)[ \t\r]*(?=\n)")  # faster than ^ and $
 _OBJ_COLOUR = re.compile(rb"\n[ \t]*v(?:[ \t]+[^\s#]+){6}")  # after x, y, z
 _NEW_MATERIAL = re.compile(rb"^[ \t]*newmtl[ \t]+(.*?)[ \t\r]*$", re.M)
-_OPTION = rb"-type[ \t]+\w+[ \t]+|-\w+(?:[ \t]+(?:on|off|[rgbmlz]|[-+]?[\d.]+(?:e[-+]?\d+)?)(?=[ \t]))*[ \t]+"
+_OPTION = rb"-(?:type|colorspace)[ \t]+\w+[ \t]+|"
+_OPTION += rb"-\w+(?:[ \t]+(?:on|off|[rgbmlz]|[-+]?[\d.]+(?:e[-+]?\d+)?)(?=[ \t]))*[ \t]+"
 _MAP = re.compile(
     rb"^([ \t]*(?:map_(?!aat)\w+|bump|disp|decal|refl|norm)[ \t]+(?:%b)*)(.+?)[ \t\r]*$" % _OPTION, re.M | re.I
 )

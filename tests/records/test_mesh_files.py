@@ -50,7 +50,7 @@ TEXTURED = {
     "OBJ with Windows' names": ("a.obj", "mtllib .\\b\\a.mtl\r\n", {"b/a.mtl": "map_Kd t\\p.png\r\n"}, "b/t/p.png"),
     "OBJ of another machine": ("a.obj", "mtllib a.mtl\n", {"a.mtl": f"map_Kd {OTHER}"}, "wood floor.png"),
     "OBJ with two libraries": ("a.obj", "mtllib b.mtl c d.mtl\n", {"b.mtl": "", "c d.mtl": "bump -bm 5 1"}, "1"),
-    "OBJ with options": ("a.obj", "mtllib a.mtl\n", {"a.mtl": "map_Ks -s 1 1 1 -clamp on a b.png"}, "a b.png"),
+    "OBJ with options": ("a.obj", "mtllib a.mtl\n", {"a.mtl": "map_Ks -s 1 1 1 -colorspace sRGB a b.png"}, "a b.png"),
     "OBJ with the library of its name": ("a.obj", "usemtl x\n", {"a.mtl": "newmtl x\nmap_Kd paint.png"}, NEAR),
     "PLY": ("a.ply", ply_with("my paint.png"), {}, "my paint.png"),
 }  # fmt: skip
