@@ -14,6 +14,7 @@ Source: bop_toolkit, docs/bop_datasets_format.md (scripts/calc_gt_info.py for th
 CameraUtility.py (the principal point); readme of KITTI's object development kit; cocodataset.org/#format-data.
 """
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -62,8 +63,9 @@ def expected_in(folder: Path) -> str:
     """What was looked for in a folder without annotations, and what is there."""
     if not folder.is_dir():
         return "no such folder"
-    around = [folder.parent, *sorted(folder.glob("*/")), *sorted(folder.glob("*/*/"))]
-    if near := [str(place) for place in around if (place / "metadata.jsonl").exists() or format_of(place)]:
+    places = [folder.parent, *sorted(folder.glob("*/")), *sorted(folder.glob("*/*/"))]
+    open_to_us = [place for place in places if os.access(place, os.X_OK)]  # others raise PermissionError
+    if near := [str(place) for place in open_to_us if (place / "metadata.jsonl").exists() or format_of(place)]:
         return f"no annotations; expected one of the folders with annotations near it: {listed(near)}"
     coco = ", ".join(COCO_FILES).format(*[folder.absolute().name] * 2)
     return (
