@@ -36,7 +36,7 @@ FILES = {
     "render": {"render": "", **RENDERED},
 }
 """Verb -> the files of conf/ that explain its keys, with their headings."""
-NAMES = {int: "int", float: "float", bool: "bool", NoneType: "null", tuple: "list"}
+NAMES = {int: "int", float: "float", bool: "bool", NoneType: "null", tuple: "list", dict: "section"}
 Key = tuple[str, str, str, str]
 """Name, type, default and description."""
 
@@ -72,7 +72,8 @@ def _in(file: str, model: type[BaseModel]) -> Iterator[Key]:
         name = prefix + ".".join(sections)
         if not (found[3] and found[4]):
             continue
-        default = found[3] if found[3] != MISSING else "set by preset" if name in by_preset else "required"
+        unset = "set by preset" if name in by_preset else "required"
+        default = {MISSING: unset, "{}": "empty"}.get(found[3], found[3])
         # the arguments of a class have no model
         of_class = type(parse_yaml(found[3])) if group == "optimizer" else None
         if annotation := of_class or _annotation(model, name.split(".")):

@@ -100,7 +100,7 @@ def _unknown_key(key: str, config_name: str) -> str:
 
 
 def _keys_of_choices() -> dict[str, list[str]]:
-    """Dotted key -> the choices of its group whose files set it."""
+    """Dotted key -> the choices whose files set it; backbone=resnet has the keys of a recipe's `network.resnet`."""
     owners: dict[str, list[str]] = defaultdict(list)
     for group in OF_VERB["train"]:
         for name in choices_of(group):
@@ -109,4 +109,6 @@ def _keys_of_choices() -> dict[str, list[str]]:
             for key in flatten(OmegaConf.to_container(OmegaConf.load(file)), prefix):  # type: ignore[arg-type]
                 if key.startswith(f"{group}."):
                     owners[key].append(f"{group}={name}")
+                elif key.startswith("network.resnet."):
+                    owners[key.replace("network.resnet", "backbone")].append(f"{group}={name} backbone=resnet")
     return owners

@@ -72,6 +72,7 @@ CONFIGURATIONS = [
     configured("a key of another section", "trainer.batch_size=8", r"trainer\.batch_size: unknown key, did you mean 'data\.batch_size'\?; .*"),
     configured("a key of a part that is not chosen", "callbacks.early_stopping.patience=3", r"callbacks\.early_stopping\.patience: .* of callbacks=early_stopping; name that choice too"),
     configured("one of several choices", "callbacks=[early_stopping,nosuch]", r"callbacks=nosuch: no such choice; expected one of best_checkpoint, .*lr_monitor"),
+    configured("a key of the backbone of another recipe", "backbone.width=8", r"backbone\.width: not a key of this choice, but of recipe=strong backbone=resnet; .*"),
     configured("a size of the presets", "network.width=8", r"network\.width: set by presets and recipes; expected the key of the run, such as backbone\.width"),
     configured("the ablation of earlier versions", "without=muon", r"without: unknown key.*; expected one of backbone, .*"),
     configured("a choice without its group", "strong", r"strong: no KEY=VALUE, did you mean 'recipe=strong'\?; .*"),
