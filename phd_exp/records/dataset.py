@@ -7,6 +7,7 @@
         <split>/metadata.partial.jsonl    only while rendering: one line per finished image
         <split>/metadata.partial-0-of-4.jsonl    the same for one of several shards
         masks.npy, clearings.npy      where training images show the object, and no object (`rendering/masks.py`)
+        masks.json, clearings.json    the version of the drawing of each
         .cache/                       data that programs derive from the images
 
 `SampleRecord` describes a line. The arrays follow from the lines; the manifest does not count them.
@@ -23,13 +24,14 @@ from pydantic import Field, ValidationError
 from phd_exp.records.choices import first_difference
 from phd_exp.records.errors import DatasetError, gist
 from phd_exp.records.files import read_jsonl, read_plain, require_plain, write_atomic
-from phd_exp.records.parsing import Record
+from phd_exp.records.parsing import Record, parse_json
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec, ImageFormat, Shard
 
 SPLITS: tuple[Split, ...] = get_args(Split)
 SUFFIXES: dict[ImageFormat, str] = {"png": ".png", "webp": ".webp", "jpeg": ".jpg"}
 CELLS = 28  # cells along each side of a mask: 8 x 8 pixels of a render of 224
+DRAWING = {"drawing": 1}  # version of masks and clearings, recorded with each; raise it if they are drawn otherwise
 
 
 class Seal(Record):
@@ -134,15 +136,19 @@ class DatasetFolder:
     def drawn(self, name: str, n: int) -> NDArray[np.uint8]:
         """Rows of the first `n` training images in `masks.npy` (n, CELLS, CELLS) or `clearings.npy` (n, S, S / 8).
 
-        They are `mapped`. Raises DatasetError if they are not there.
+        They are `mapped`. Raises DatasetError if they are not there, or were drawn by another version.
         """
         S = self.manifest.spec.sensor_size
         row = (CELLS, CELLS) if name == "masks.npy" else (S, -(-S // 8))
+        file = self.root / name
         try:
-            return mapped(self.root / name, (n, *row))
+            rows = mapped(file, (n, *row))
+            if (version := parse_json(read_plain(file.with_suffix(".json")).decode())) != DRAWING:
+                raise ValueError(f"has version {version}; expected {DRAWING}")
+            return rows
         except (OSError, ValueError) as error:
             remedy = "write it by `python -m phd_exp render data=...` where the folder may be written"
-            raise DatasetError(f"{self.root / name}: {gist(error)}; {remedy}") from None
+            raise DatasetError(f"{file}: {gist(error)}; {remedy}") from None
 
     def missing(self, spec: DatasetSpec, n_train: int, n_test: int) -> dict[Split, list[int]]:
         """Indices of the wanted samples that are not finished, or whose image or line has gone, by split.

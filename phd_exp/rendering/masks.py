@@ -4,7 +4,7 @@ The masks follow from the records by ray casting; Blender only reads the meshes.
 """
 
 import io
-from contextlib import suppress
+import json
 from itertools import chain
 from pathlib import Path
 
@@ -14,9 +14,10 @@ from PIL import Image
 from rich.console import Console
 from rich.progress import track
 
-from phd_exp.records.dataset import CELLS, SPLITS, DatasetFolder
+from phd_exp.records.dataset import CELLS, DRAWING, SPLITS, DatasetFolder
 from phd_exp.records.errors import DatasetError, writing
 from phd_exp.records.files import remove_temporaries, write_atomic
+from phd_exp.records.processes import held
 from phd_exp.records.scenes import SampleRecord
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer
@@ -37,22 +38,44 @@ def meshes_of(spec: DatasetSpec) -> Meshes:
 def ensure_drawn(folder: DatasetFolder, spec: DatasetSpec, n: int) -> None:
     """Draw masks, and of a mesh clearings, of all training images, unless those of the first `n` are on disk.
 
+    Processes that draw in the same folder wait for each other.
+
     Raises RenderError if the folder cannot be written or a mesh cannot be read, DatasetError if a record is broken.
     """
     names = ["masks.npy", "clearings.npy"] if spec.mesh else ["masks.npy"]
-    with suppress(DatasetError):
-        if n == 0 or spec.empty or all(len(folder.drawn(name, n)) for name in names):
-            return
-    meshes, records, console = meshes_of(spec), folder.records("train"), Console(stderr=True)
-    remove_temporaries(folder.root)  # of killed processes
+    if n == 0 or spec.empty or not _missing(folder, names, n):
+        return
+    with writing(folder.root):
+        folder.cache.mkdir(exist_ok=True)
+        with held(folder.cache / "drawing.lock", waiting=f"{folder.root}: waiting for the masks of another process"):
+            remove_temporaries(folder.root)  # of killed processes
+            if missing := _missing(folder, names, n):
+                _draw(folder, missing, meshes_of(spec))
+
+
+def _missing(folder: DatasetFolder, names: list[str], n: int) -> list[str]:
+    """Those arrays that do not hold the first `n` images, drawn by the present version."""
+    missing = []
+    for name in names:
+        try:
+            folder.drawn(name, n)
+        except DatasetError:
+            missing.append(name)
+    return missing
+
+
+def _draw(folder: DatasetFolder, names: list[str], meshes: Meshes) -> None:
+    """Write arrays of all training images, and then their version."""
+    records, console = folder.records("train"), Console(stderr=True)
     for name in names:
         words, draw, head = f"drawing {name.removesuffix('.npy')} once", DRAW[name], io.BytesIO()
         shape = (len(records), *draw(records[0], meshes).shape)
         np.lib.format.write_array_header_1_0(head, {"descr": "|u1", "fortran_order": False, "shape": shape})
         shown = track(records, words, console=console, transient=True, disable=not console.is_terminal)
         rows = (draw(record, meshes).tobytes() for record in shown)
-        with writing(folder.root):
-            write_atomic(folder.root / name, chain([head.getvalue()], rows))
+        file = folder.root / name
+        write_atomic(file, chain([head.getvalue()], rows))
+        write_atomic(file.with_suffix(".json"), json.dumps(DRAWING) + "\n")
 
 
 def mask(record: SampleRecord, meshes: Meshes) -> NDArray[np.uint8]:

@@ -29,7 +29,8 @@ def begin(folder: DatasetFolder, spec: DatasetSpec) -> None:
         folder.split_folder(split).mkdir(exist_ok=True)
     if not folder.manifest_path.exists():
         for name in DRAW:  # of another data set that was here
-            (folder.root / name).unlink(missing_ok=True)
+            for file in (folder.root / name, (folder.root / name).with_suffix(".json")):
+                file.unlink(missing_ok=True)
         manifest = Manifest(generator=generator_version(spec), renderer=renderer_version(), spec=spec, splits={})
         folder.write_manifest(manifest)
     for key, theirs, ours in other_make(folder.manifest):

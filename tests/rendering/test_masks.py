@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from phd_exp.records import dataset
 from phd_exp.records.dataset import CELLS, DatasetFolder
 from phd_exp.records.errors import DatasetError, RenderError
+from phd_exp.records.files import write_atomic
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering import masks
 from phd_exp.rendering.finished import verify
@@ -125,14 +127,33 @@ def test_a_broken_array_is_drawn_anew(
     np.testing.assert_array_equal(old.drawn("masks.npy", N_TRAIN), small.drawn("masks.npy", N_TRAIN))
 
 
-def test_two_that_draw_at_once_do_not_meet(old: DatasetFolder, small_spec: DatasetSpec) -> None:
+def test_one_of_another_version_is_refused_and_drawn_anew(
+    old: DatasetFolder, small_spec: DatasetSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as earlier:
+        for module in (dataset, masks):
+            earlier.setattr(module, "DRAWING", {"drawing": 0})
+        earlier.setitem(masks.DRAW, "masks.npy", lambda *_: np.zeros((CELLS, CELLS), np.uint8))
+        ensure_drawn(old, small_spec, N_TRAIN)
+        assert not old.drawn("masks.npy", N_TRAIN).any()
+    with pytest.raises(DatasetError, match=r"masks\.npy: has version .*; expected .*; write it by .* render data="):
+        old.drawn("masks.npy", N_TRAIN)
+    ensure_rendered(old, small_spec, N_TRAIN, N_TEST)
+    assert old.drawn("masks.npy", N_TRAIN).any()
+
+
+def test_one_of_several_processes_draws(
+    old: DatasetFolder, small_spec: DatasetSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = []
+    monkeypatch.setattr(masks, "write_atomic", lambda file, data: (written.append(file.name), write_atomic(file, data)))
     racing = [threading.Thread(target=ensure_drawn, args=(old, small_spec, N_TRAIN)) for _ in range(4)]
     for thread in racing:
         thread.start()
     for thread in racing:
         thread.join()
     assert len(old.drawn("masks.npy", N_TRAIN)) == N_TRAIN
-    assert not list(old.root.glob(".*.tmp"))
+    assert written == ["masks.npy", "masks.json"]
 
 
 def test_those_of_another_data_set_are_removed(
