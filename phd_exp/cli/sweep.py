@@ -25,6 +25,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from phd_exp.cli.frame import RESUMES, Ending, print_errors
 from phd_exp.cli.jobs import Job, plain
+from phd_exp.cli.words import explain
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.processes import duration, usable_cores
 
@@ -112,7 +113,10 @@ def plan(words: list[str], config_name: str) -> tuple[DictConfig, list[Combinati
     for chosen in _one_experiment_each(words, loader):
         master = loader.load_configuration(config_name, chosen, RunMode.MULTIRUN)
         for overrides in _combinations(chosen, master, loader):
-            composed = loader.load_sweep_config(master, overrides)
+            try:
+                composed = loader.load_sweep_config(master, overrides)
+            except (HydraException, OmegaConfBaseException) as error:
+                raise _misfit(error, chosen, overrides, config_name) from error
             with open_dict(composed):
                 del composed["hydra"]
             config = plain(composed)
@@ -120,6 +124,14 @@ def plan(words: list[str], config_name: str) -> tuple[DictConfig, list[Combinati
     if not jobs:
         raise ConfigError(f"{_given(words)}: not one combination; does a glob(...) match nothing?")
     return master, list(jobs.values())
+
+
+def _misfit(error: Exception, words: list[str], overrides: list[str], config_name: str) -> Exception:
+    """The error of a job that cannot be composed: that of an experiment names the job."""
+    if not any(word.startswith("experiment=") for word in words):
+        return error
+    own = " ".join(word for word in overrides if word not in words)
+    return ConfigError(f"{_given(words)}: its job {own} cannot be composed: {explain(error, config_name)}")
 
 
 def _one_experiment_each(words: list[str], loader: ConfigLoader) -> Iterator[list[str]]:

@@ -85,6 +85,7 @@ CONFIGURATIONS = [
     configured("several runs at once", "experiment=table1", r"experiment=table1: names several runs; write -m before it: -m .*experiment=table1"),
     Bad("configuration: a key that is nearly one of render", nothing, ("render", "preset=smoke", "shrad=0/2"), r"shrad: unknown key, did you mean 'shard'\?; expected one of backbone,.*", 2),
     Bad("configuration: an experiment that is nearly one", nothing, ("-m", "preset=smoke", "experiment=fusion,tabel2"), r"experiment=tabel2: no such choice, did you mean 'table2'\?.*", 2),
+    *(Bad(f"configuration: an experiment with {word}", nothing, ("-m", "preset=smoke", "experiment=ablation", word), rf"preset=smoke experiment=ablation {word}: its job .*optimizer\.weight_decay=0 cannot be composed: optimizer\.weight_decay: .*optimizer=muon; .*", 2, again=word == "recipe=paper") for word in ("optimizer=adam", "recipe=paper")),
     Bad("configuration: no experiment", nothing, ("-m", "preset=smoke", "experiment=glob(nothing*)"), r".*experiment=glob\(nothing\*\): .*not one combination.*", 2),
     Bad("configuration: an unknown verb", nothing, ("trian",), r"trian: no KEY=VALUE, did you mean 'train'\?; .*train, render, report.*", 2),
     Bad("configuration: a folder without images", nothing, (*LEARN, "data.folder=nowhere"), r"nowhere/train: no such folder.*"),
