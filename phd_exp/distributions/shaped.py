@@ -125,7 +125,8 @@ class Shaped(Density):
     @property
     def projected_covariance(self) -> Float[Tensor, "*batch 2 2"]:
         inverse, along = self.whitening.spread
-        return torch.as_tensor(self.law.variance)[..., None, None] * (spd.square(inverse) + _outer(along, along))
+        variance = torch.as_tensor(self.law.variance).to(inverse)
+        return variance[..., None, None] * (spd.square(inverse) + _outer(along, along))
 
     @property
     def depth_mean(self) -> Float[Tensor, "*batch"]:
