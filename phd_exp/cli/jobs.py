@@ -26,7 +26,7 @@ from phd_exp.records.processes import usable_cores
 
 OMP = "OMP_NUM_THREADS"
 NO_SCORE = "the sweeper receives no score: only trainings with held-out samples have one; set data.n_held_out above 0"
-HOME = uuid.uuid4().hex  # names this process: another process that imports this module has another value
+THIS_PROCESS = uuid.uuid4().hex  # names this process: another process that imports this module has another value
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Job:
     n_jobs: int = 1
     cores: int | None = None
     parent: int | None = None
-    home: str = HOME
+    home: str = THIS_PROCESS
     omp: str | None = field(default_factory=lambda: os.environ.get(OMP))
 
     def __call__(self, config: DictConfig) -> float | None:
@@ -74,7 +74,7 @@ class Job:
 
     def end(self, config: DictConfig) -> Ending:
         """Run the job; returns how it ended. In the launcher's own process, a signal stops the whole sweep."""
-        at_home = self.home == HOME
+        at_home = self.home == THIS_PROCESS
         try:
             # a launcher may have changed the signal handlers
             with stopping_on_signals(), ending_with(None if at_home else self.parent):

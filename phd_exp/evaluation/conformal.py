@@ -30,7 +30,7 @@ from phd_exp.records.errors import RunError
 from phd_exp.records.runs import CHOOSE, GUARANTEE
 
 Groups = Literal["spread", "truncation", "focal_length"]
-QUANTITIES: Mapping[Groups | None, Callable[[ProjectedHuber, Tensor], Tensor]] = {
+GROUPED_BY: Mapping[Groups | None, Callable[[ProjectedHuber, Tensor], Tensor]] = {
     None: lambda p, f: torch.zeros_like(p.a),
     "spread": lambda p, f: p.variance.sum(-1).sqrt(),
     "truncation": lambda p, f: 1 - (2 * f[..., None] * p.mu_xy).abs().amax(-1),
@@ -54,7 +54,7 @@ class Guarantee:
 
     def region(self, prediction: ProjectedHuber, f: float) -> tuple[Region, dict[str, Any]]:
         """The region of one prediction, and its guarantee for JSON; f is the focal length in sides of the image."""
-        quantity = QUANTITIES[self.groups](prediction, torch.tensor(f, dtype=torch.float64))
+        quantity = GROUPED_BY[self.groups](prediction, torch.tensor(f, dtype=torch.float64))
         place = int(np.searchsorted(self.edges, float(quantity), side="right"))
         facts = {"coverage": self.coverage, "level": self.levels[place], "held_out_samples": self.n[place]}
         ends = [None, *self.edges.tolist(), None][place : place + 2]
@@ -74,7 +74,7 @@ def guarantee(
         p, xyz, columns = at_temperature(held_out, temperature, rows)
         require_columns(("f", "S") if groups else (), columns)
         f = torch.from_numpy(columns["f"] / columns["S"]) if groups else p.a
-        return p.level(xyz).numpy(), QUANTITIES[groups](p, f).numpy()
+        return p.level(xyz).numpy(), GROUPED_BY[groups](p, f).numpy()
 
     (_, chosen), (scores, values) = scored(CHOOSE), scored(GUARANTEE)
     edges = np.unique(np.quantile(chosen, np.arange(1, PARTS) / PARTS))

@@ -21,9 +21,9 @@ Method = Literal["mode", "mean", "shared", "average", "gaussian"]
 inverse-covariance fusion."""
 METHODS: tuple[Method, ...] = ("mode", "mean", "shared", "average", "gaussian")
 PROBABILISTIC: tuple[Method, ...] = ("mean", "shared", "gaussian")  # the methods with a covariance
-LEVELS = (50, 90, 99)  # per cent of the ellipsoids whose coverage is counted
+PER_CENT = (50, 90, 99)  # per cent of the ellipsoids whose coverage is counted
 ERRORS = ("depth_error_mm", "distance_mm")
-CALIBRATION = (*(f"coverage_{level}" for level in LEVELS), "normalised_squared_error")
+CALIBRATION = (*(f"coverage_{level}" for level in PER_CENT), "normalised_squared_error")
 BINS = 20
 MOST_SHARED = 0.99
 
@@ -87,8 +87,8 @@ def fusion_scores(views: SeveralViews, resamples: int = 200) -> FusionScores:
         for method in METHODS:
             for quantity, column in _columns(kept, *estimates[method], on_plane).items():
                 columns[place(quantity, method, k, on_plane)] = column
-        shares = ways["mean"].coverage([level / 100 for level in LEVELS])[sound].mean(0)
-        for level, share in zip(LEVELS, shares.tolist(), strict=True):
+        shares = ways["mean"].coverage([level / 100 for level in PER_CENT])[sound].mean(0)
+        for level, share in zip(PER_CENT, shares.tolist(), strict=True):
             exact[place(f"coverage_{level}", "mean", k, on_plane)] = 100 * share
     causes = scalar_bands(_correlations, _depth_errors(kept), resamples)
     surprise = fused[views.views, False]["mean"].surprise[sound].flatten()
@@ -174,7 +174,7 @@ def _columns(
     if covariance is not None:
         dimensions = 2 if on_plane else 3
         distance = squared_mahalanobis(-error, covariance, views.ground.directions if on_plane else None)
-        for level in LEVELS:
+        for level in PER_CENT:
             columns[f"coverage_{level}"] = 100.0 * (distance <= stats.chi2.ppf(level / 100, dimensions))
         columns["normalised_squared_error"] = distance / dimensions
     return columns

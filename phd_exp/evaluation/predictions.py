@@ -28,7 +28,7 @@ XYZ = ("x", "y", "z")
 ERRORS = ("projected_error_mm", "depth_error_mm")
 OF_DISTANCE = ("ale_m", "relative_error")  # younger than the first records
 OF_A_DISTRIBUTION = (*XYZ, *COLUMNS, *ERRORS, "nll", "energy_score")
-QUANTITIES: Mapping[str, tuple[str, str, tuple[float, ...] | int]] = {
+STRATIFIED_BY: Mapping[str, tuple[str, str, tuple[float, ...] | int]] = {
     "visibility": ("visibility", "", (0.0, 0.25, 0.5, 0.75, 0.95, 1.0)),
     "truncation": ("truncation", "", (0.0, 0.05, 0.25, 0.5, 1.0)),
     "depth": ("z", "m", 4),
@@ -92,7 +92,7 @@ def evaluate(table: Columns, resamples: int = RESAMPLES) -> Evaluation:
     is_distribution, is_huber = "level" in table, "a" in table
     needed = (*(PARAMETERS if is_huber else ()), *OF_A_DISTRIBUTION) if is_distribution else ERRORS
     needed += tuple(name for name in OF_DISTANCE if name in table)
-    columns, finite = finite_columns(table, needed, [name for name, _, _ in QUANTITIES.values() if name in table])
+    columns, finite = finite_columns(table, needed, [name for name, _, _ in STRATIFIED_BY.values() if name in table])
     statistic: Statistic = _distribution_scores if is_distribution else _point_scores
     whole, found, reference = statistic, {}, {}
     if is_huber:
@@ -211,7 +211,7 @@ def scalar_bands(
 
 def _strata(statistic: Statistic, columns: Mapping[str, Tensor], resamples: int) -> list[Stratum]:
     found = []
-    for quantity, (column, unit, edges) in QUANTITIES.items():
+    for quantity, (column, unit, edges) in STRATIFIED_BY.items():
         for label, mask in strata(quantity, columns[column], edges, unit).items() if column in columns else ():
             part = {name: values[mask] for name, values in columns.items()}
             found.append(Stratum(quantity, label, int(mask.sum()), scalar_bands(statistic, part, resamples)))

@@ -16,7 +16,7 @@ from phd_exp.evaluation.predictions import ERRORS, finite_columns, inside, scala
 from phd_exp.metrics.bootstrap import Interval, means
 from phd_exp.metrics.calibration_scores import COLUMNS, calibration_scores, ordered
 from phd_exp.records.errors import RunError, one_line
-from phd_exp.records.runs import GUARANTEE, HOME
+from phd_exp.records.runs import GUARANTEE, UNSHIFTED
 
 MEASURED = (*COLUMNS, *ERRORS, "nll")
 
@@ -53,7 +53,7 @@ def shift_scores(folder: Path, home: Columns, held_out: Columns | None) -> dict[
         table, said = read_table(file), pq.read_schema(file).metadata or {}
         change = one_line(said.get(b"shift", b"").decode(errors="replace"))
         found[file.stem] = _scores(table, levels, rated(table), change)
-    return found | {HOME: _scores(home, levels, rated(home))} if found else {}
+    return found | {UNSHIFTED: _scores(home, levels, rated(home))} if found else {}
 
 
 def _unrated(table: Columns) -> Columns:

@@ -24,8 +24,8 @@ from phd_exp.records.detections import Detection
 from phd_exp.records.errors import DatasetError, RunError
 from phd_exp.records.images import content_of, pillow_warnings
 
-LEVELS = (50, 90, 99)  # per cent of the credible intervals of depth
-P = np.array([0.5, *(end for level in LEVELS for end in (0.5 - level / 200, 0.5 + level / 200))])
+PER_CENT = (50, 90, 99)  # per cent of the credible intervals of depth
+P = np.array([0.5, *(end for level in PER_CENT for end in (0.5 - level / 200, 0.5 + level / 200))])
 """The probabilities of the median and of the ends of the intervals."""
 DIGITS = 8
 REPEATED = ("file_name", "box", "score", "category_id")  # of the detection
@@ -33,7 +33,7 @@ NONE = "none: this model predicts a position alone"
 
 
 @dataclass(frozen=True, eq=False)
-class Batch:
+class PredictedBatch:
     """Detections that are predicted together, with their images.
 
     `predictions` are in the frames of the views (float64), made by `Predictor.predict` from `raw`, the outputs of the
@@ -71,7 +71,7 @@ class Batch:
             ahead = (axis * mode).sum(-1) > 0
             quantiles[ahead] = quantiles_along(made[torch.from_numpy(ahead)], axis[ahead], P)
             found["median_depth"] = quantiles[:, 0]
-            found["depth_interval"] = quantiles[:, 1:].reshape(-1, len(LEVELS), 2)
+            found["depth_interval"] = quantiles[:, 1:].reshape(-1, len(PER_CENT), 2)
         return found
 
     @cached_property
@@ -98,7 +98,7 @@ class Batch:
 class Sighting:
     """One detection of a batch."""
 
-    batch: Batch
+    batch: PredictedBatch
     row: int
 
     @property
@@ -157,7 +157,9 @@ def sightings(predictor: Predictor, detections: Sequence[Detection]) -> Iterator
         finite = raw.flatten(1).isfinite().all(-1)
         n = int(finite.long().cumprod(0).sum())  # of those before the first that is not
         if n:
-            batch = Batch(seen[:n], raw[:n], predictor.predict(raw[:n], f[:n]), predictor.familiar(raw[:n], f[:n]))
+            batch = PredictedBatch(
+                seen[:n], raw[:n], predictor.predict(raw[:n], f[:n]), predictor.familiar(raw[:n], f[:n])
+            )
             yield from (Sighting(batch, row) for row in range(n))
         if n < len(seen):
             raise RunError(
@@ -202,7 +204,7 @@ def answer(sighting: Sighting, temperature: Temperature | None, guarantee: Any =
     numbers = {name: rounded(values[row]) for name, values in batch.numbers.items()}
     if "depth_interval" in numbers:
         intervals = (None if None in ends else ends for ends in numbers["depth_interval"])
-        numbers["depth_interval"] = dict(zip(map(str, LEVELS), intervals, strict=True))
+        numbers["depth_interval"] = dict(zip(map(str, PER_CENT), intervals, strict=True))
         named |= numbers | {"uncertainty": uncertainty(temperature)}
         if guarantee:
             camera = sighting.view.camera

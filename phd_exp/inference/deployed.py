@@ -14,7 +14,7 @@ from torch.export import Dim
 
 from phd_exp.data.areas import area_means, sums
 from phd_exp.geometry.facing import facing, pixel_corners
-from phd_exp.inference.answers import LEVELS
+from phd_exp.inference.answers import PER_CENT
 from phd_exp.inference.predictor import PIXELS, Predictor
 from phd_exp.models.heads import Prediction
 from phd_exp.optics.virtual import intrinsics
@@ -135,7 +135,7 @@ def answers(prediction: Prediction) -> dict[str, Tensor]:
     """The answers for a batch of predictions, in the frame of their cameras."""
     if not prediction.has_closed_forms:
         return {"position": prediction.mode}
-    tails = torch.tensor([(1 - level / 100) / 2 for level in LEVELS], dtype=torch.float64)
+    tails = torch.tensor([(1 - level / 100) / 2 for level in PER_CENT], dtype=torch.float64)
     p = torch.cat([tails.new_tensor([0.5]), tails, 1 - tails])
     z = prediction.depth_icdf(p[:, None])  # all at once, for a small graph
     return {
@@ -143,7 +143,7 @@ def answers(prediction: Prediction) -> dict[str, Tensor]:
         "mean": prediction.mean,
         "covariance": prediction.covariance_matrix,
         "median_depth": z[0],
-        "depth_interval": torch.stack([z[1 : 1 + len(LEVELS)], z[1 + len(LEVELS) :]]).permute(2, 1, 0),
+        "depth_interval": torch.stack([z[1 : 1 + len(PER_CENT)], z[1 + len(PER_CENT) :]]).permute(2, 1, 0),
     }
 
 

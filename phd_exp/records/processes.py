@@ -16,7 +16,7 @@ from typing import Any
 
 from phd_exp.records.errors import one_line
 
-HOME = Path(__file__).resolve().parents[2]
+PROJECT = Path(__file__).resolve().parents[2]
 PATIENCE = 10.0  # seconds that a child gets to finish its work before it is killed
 
 
@@ -72,7 +72,7 @@ class Child:
 
     def __init__(self, module: str, environment: Mapping[str, str] | None = None, log: Path | None = None) -> None:
         self.connection, theirs = Pipe()
-        importable = os.pathsep.join(filter(None, [str(HOME), os.environ.get("PYTHONPATH")]))
+        importable = os.pathsep.join(filter(None, [str(PROJECT), os.environ.get("PYTHONPATH")]))
         with theirs, nullcontext() if log is None else open(log, "ab") as stream:
             self.process = subprocess.Popen(
                 [sys.executable, "-P", "-m", module, str(theirs.fileno())],

@@ -41,7 +41,7 @@ from phd_exp.records.parsing import Record, parse_json, parse_yaml
 from phd_exp.records.processes import held, machine
 
 LAST_EPOCH = 10**9
-HOME = "home"  # the unchanged test samples, among shifts
+UNSHIFTED = "home"  # the unchanged test samples, among shifts
 SECTIONS = ("data", "model", "camera", "recipe", "backbone", "loss", "optimizer", "trainer", "evaluation")
 """Sections that every configuration has."""
 LARGEST = MB  # bytes of a configuration or of a run's numbers

@@ -72,31 +72,41 @@ def ensure_rendered(
             ensure_drawn(folder, spec, n_train)
         return True
     require_bpy()
-    wanted: Wanted = {"train": n_train, "test": n_test}
     with writing(folder.root):
         folder.cache.mkdir(parents=True, exist_ok=True)
-        with _locked(folder, shard):
-            with held(folder.cache / "begin.lock", waiting=f"{folder.root}: waiting for the manifest"):
-                # another process may have begun another data set, or finished this one, in the meantime
-                if not any(folder.missing(spec, n_train, n_test).values()):
-                    return True
-                begin(folder, spec)
-            known = known_samples(folder)
-            samples = [sample for sample in missing(known, wanted) if shard is None or shard.holds(sample[1])]
-            try:
-                if samples:
-                    workers = workers or worker_count(len(samples), cores)
-                    _render(folder, spec, samples, known, workers, shard)
-            except UserError:
-                if not any(known.values()):  # the next command may have another specification
-                    folder.manifest_path.unlink(missing_ok=True)
-                raise
-            if shard is None:
-                seal(folder, spec, known)
+        return _render_share(folder, spec, {"train": n_train, "test": n_test}, workers, cores, shard)
+
+
+def _render_share(
+    folder: DatasetFolder,
+    spec: DatasetSpec,
+    wanted: Wanted,
+    workers: int | None,
+    cores: int | None,
+    shard: Shard | None,
+) -> bool:
+    """Render the missing samples of a shard, None for all, and seal the folder if it is whole, which is returned."""
+    with _locked(folder, shard):
+        with held(folder.cache / "begin.lock", waiting=f"{folder.root}: waiting for the manifest"):
+            # another process may have begun another data set, or finished this one, in the meantime
+            if not any(folder.missing(spec, wanted["train"], wanted["test"]).values()):
                 return True
-        if not samples:
-            announce(f"{folder.root}: nothing left to render in shard {shard}")
-        return _seal_if_last(folder, spec, wanted, shard)
+            begin(folder, spec)
+        known = known_samples(folder)
+        samples = [sample for sample in missing(known, wanted) if shard is None or shard.holds(sample[1])]
+        try:
+            if samples:
+                _render(folder, spec, samples, known, workers or worker_count(len(samples), cores), shard)
+        except UserError:
+            if not any(known.values()):  # the next command may have another specification
+                folder.manifest_path.unlink(missing_ok=True)
+            raise
+        if shard is None:
+            seal(folder, spec, known)
+            return True
+    if not samples:
+        announce(f"{folder.root}: nothing left to render in shard {shard}")
+    return _seal_if_last(folder, spec, wanted, shard)
 
 
 @contextmanager

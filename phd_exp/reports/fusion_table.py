@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from functools import partial
 
-from phd_exp.evaluation.fusion import CALIBRATION, ERRORS, LEVELS, PROBABILISTIC, FusionScores, Method, place
+from phd_exp.evaluation.fusion import CALIBRATION, ERRORS, PER_CENT, PROBABILISTIC, FusionScores, Method, place
 from phd_exp.records.choices import in_words
 from phd_exp.reports.runs import Report, Run
 from phd_exp.reports.table import Table, TableCell, TableRow, bounds, file_stem
@@ -19,7 +19,7 @@ NAMES: dict[Method, str] = {
 LABELS = {
     "depth_error_mm": "depth (mm)",
     "distance_mm": "distance (mm)",
-    **{f"coverage_{level}": f"inside {level} %" for level in LEVELS},
+    **{f"coverage_{level}": f"inside {level} %" for level in PER_CENT},
     "normalised_squared_error": "squared error",
 }
 ON_GROUND = ", ground"
@@ -99,7 +99,7 @@ def _number(quantity: str, value: float) -> str:
 
 
 def _notes(scores: FusionScores) -> list[str]:
-    levels = ", ".join(map(str, LEVELS))
+    levels = ", ".join(map(str, PER_CENT))
     notes = [
         f"Inside {levels} %: per cent of true positions in the ellipsoids of mean and covariance that contain as "
         "much of a Gaussian; below it the share that exact densities have there, whose tails are longer. Squared "

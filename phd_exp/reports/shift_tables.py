@@ -5,7 +5,7 @@ from dataclasses import replace
 from itertools import groupby
 
 from phd_exp.records.choices import in_words
-from phd_exp.records.runs import HOME
+from phd_exp.records.runs import UNSHIFTED
 from phd_exp.reports.quantities import SCORES
 from phd_exp.reports.runs import Report, Run
 from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem, printable
@@ -38,7 +38,7 @@ def _matrix(runs: Sequence[Run], key: str, axis: str) -> Table:
     """A row for each run of a preset, a column for each shift of an axis."""
     found = sorted((name, shift.change) for run in runs for name, shift in run.measured.shifts.items())
     changes = {name: change for name, change in found if change and _axis(change) == axis}
-    preset, names = runs[0].preset, (HOME, *changes)
+    preset, names = runs[0].preset, (UNSHIFTED, *changes)
     rows = [
         TableRow((f"{run.data}, {_camera(run)}", run.name), tuple(_cell(run, axis, name, key) for name in names))
         for run in runs

@@ -27,7 +27,7 @@ from phd_exp.rendering.sampling import GENERATOR_VERSION
 
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(7200)]
 
-HOME = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[2]
 SEED = int(os.environ.get("BENCH_SEED", "2026"))  # not the seed that settings were chosen on
 IMAGES = int(os.environ.get("BENCH_IMAGES", "8"))  # of each variant
 ROUNDS = 3
@@ -45,7 +45,7 @@ def painted(kind: str, spec: DatasetSpec, folder: Path, samples: int, indices: S
     """Seconds an image; the images lie in the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, str(Path(__file__).with_name("painter.py")), kind, spec.model_dump_json()]
-    environment = os.environ | {"PYTHONPATH": str(HOME)}
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
     result = subprocess.run(
         [*command, str(folder), str(samples), *map(str, indices)],
         env=environment, capture_output=True, text=True,
@@ -58,7 +58,7 @@ def references(spec: DatasetSpec) -> Path:
     """The folder of converged pictures of the first samples; those of an earlier call are kept."""
     looks = spec.model_dump_json(exclude={"samples_per_pixel", "image_format", "image_quality"})
     key = hashlib.sha256(f"{GENERATOR_VERSION} {looks}".encode()).hexdigest()[:12]
-    folder = HOME / ".bench" / f"{spec.variant}-{key}"
+    folder = ROOT / ".bench" / f"{spec.variant}-{key}"
     missing = [index for index in range(IMAGES) if not (folder / f"{index}.png").exists()]
     cores = os.cpu_count() or 1
     with ThreadPoolExecutor(cores) as pool:

@@ -55,7 +55,8 @@ def test_help_lists_every_key_once_for_each_choice(verb: str) -> None:
     assert {"data.variant", "data.root", "data.f_range"} <= rendered.keys()
     assert rendered["data.n_train"] == "set by preset"
     if verb == "train":
-        assert everywhere["seed"] == "0" and everywhere["evaluation.shifts"] == "empty"
+        assert everywhere["seed"] == "0"
+        assert everywhere["evaluation.shifts"] == "empty"
         assert found["trainer"]["trainer.max_epochs"] == "set by preset"
         assert {"data.name", "data.object", "data.n_train"} <= found["data=folder"].keys()
         assert found["data=folder"]["data.folder"] == "required"

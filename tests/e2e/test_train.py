@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from phd_exp.evaluation.point_errors import ErrorKey
-from phd_exp.records.processes import HOME
+from phd_exp.records.processes import PROJECT
 from phd_exp.records.runs import RunFolder
 from phd_exp.reports.lines import command_of
 from phd_exp.reports.runs import read_report
@@ -110,7 +110,7 @@ def test_the_strong_recipe_is_exported(train: Callable, tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime", reason="export needs `pip install 'phd_exp[export]'`")
     assert train("recipe=strong", "data.image_size=64", "logger=none", "trainer.max_epochs=1").status == 0
     command = ["phd_exp", "export", f"run={only_run(tmp_path / 'runs').path}", "out=network.onnx"]
-    subprocess.run([sys.executable, "-m", *command], env={**os.environ, "PYTHONPATH": str(HOME)}, check=True)
+    subprocess.run([sys.executable, "-m", *command], env={**os.environ, "PYTHONPATH": str(PROJECT)}, check=True)
     assert (tmp_path / "network.onnx").exists()
 
 

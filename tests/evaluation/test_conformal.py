@@ -13,7 +13,7 @@ from scipy import stats
 
 from phd_exp.distributions import ProjectedHuber, Temperature
 from phd_exp.distributions.columns import coordinates, parameter_columns
-from phd_exp.evaluation.conformal import QUANTITIES, fused_guarantee, guarantee, threshold
+from phd_exp.evaluation.conformal import GROUPED_BY, fused_guarantee, guarantee, threshold
 from phd_exp.evaluation.predictions import fit_temperature
 from phd_exp.evaluation.several_views import read_views
 from phd_exp.fusion import fuse
@@ -98,14 +98,14 @@ def test_a_coverage_is_between_0_and_1(coverage: float) -> None:
         threshold(np.ones(100), coverage, "samples")
 
 
-@pytest.mark.parametrize("groups", QUANTITIES)
+@pytest.mark.parametrize("groups", GROUPED_BY)
 @pytest.mark.parametrize("overconfidence", [0.5, 2.0])
 def test_every_group_is_covered(groups: str | None, overconfidence: float) -> None:
     """Counts of fresh samples in their regions, within the law of the threshold and of counting."""
     found = guarantee(table_of(3000, 2, overconfidence, of_wide=1.5), 0.9, groups, None)  # type: ignore[arg-type]
     fresh = table_of(3000, 3, overconfidence, of_wide=1.5)
     p, f = predictions(fresh), torch.from_numpy(fresh["f"] / fresh["S"])
-    place = np.searchsorted(found.edges, QUANTITIES[groups](p, f).numpy(), side="right")  # type: ignore[index]
+    place = np.searchsorted(found.edges, GROUPED_BY[groups](p, f).numpy(), side="right")  # type: ignore[index]
     assert len(found.levels) == (1 if groups is None else 4)
     scores = scores_of(fresh)
     for group, (level, n) in enumerate(zip(found.levels, found.n, strict=True)):

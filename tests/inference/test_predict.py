@@ -18,7 +18,7 @@ from phd_exp.data.crops import cut, facing
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.geometry import Lens, VirtualCamera, intrinsics
 from phd_exp.inference import pictures
-from phd_exp.inference.answers import Batch, Sighting, answer
+from phd_exp.inference.answers import PredictedBatch, Sighting, answer
 from phd_exp.inference.views import View
 from phd_exp.records.detections import detections_of
 from phd_exp.records.errors import DatasetError, RunError
@@ -244,7 +244,7 @@ def test_small_curves_have_a_close_up_and_the_box_a_frame(
     eye = torch.eye(2, dtype=torch.float64)
     prediction = ProjectedHuber(0 * eye[:1], 4 * eye[0, :1], precision * eye[None], 50 * eye[0, :1])
     view = View(cut(image, camera), camera)
-    sighting = Sighting(Batch([(detection, image, view)], torch.zeros(1, 7), prediction), 0)
+    sighting = Sighting(PredictedBatch([(detection, image, view)], torch.zeros(1, 7), prediction), 0)
     line = answer(sighting, None)
     figure: Any = pictures.picture(sighting, line)
     first, second, *_ = axes = figure.axes

@@ -146,7 +146,9 @@ def test_one_of_several_processes_draws(
     old: DatasetFolder, small_spec: DatasetSpec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written = []
-    monkeypatch.setattr(masks, "write_atomic", lambda file, data: (written.append(file.name), write_atomic(file, data)))
+    monkeypatch.setattr(
+        masks, "write_atomic", lambda file, data: (written.append(file.name), write_atomic(file, data))
+    )
     racing = [threading.Thread(target=ensure_drawn, args=(old, small_spec, N_TRAIN)) for _ in range(4)]
     for thread in racing:
         thread.start()

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from phd_exp.evaluation.fusion import BINS, ERRORS, LEVELS, FusionScores, Method
+from phd_exp.evaluation.fusion import BINS, ERRORS, PER_CENT, FusionScores, Method
 from phd_exp.evaluation.predictions import Curve, Evaluation, Stratum
 from phd_exp.metrics.bootstrap import Interval
 from phd_exp.reports.figures import decades
@@ -214,14 +214,14 @@ def _coverage(scores: FusionScores) -> Chart:
     traces = [identity(0.0, 1.0, "Gaussian")]
     for k in (1, scores.views):
         for method, alone in names_of("coverage").items():
-            bands = [scores.band(f"coverage_{level}", method, k) for level in LEVELS]
-            curve = _curve([level / 100 for level in LEVELS], bands, unit=100)
+            bands = [scores.band(f"coverage_{level}", method, k) for level in PER_CENT]
+            curve = _curve([level / 100 for level in PER_CENT], bands, unit=100)
             name = f"{alone}, {k} camera{'s' if k > 1 else ''}"
             role = MAIN if (k, method) == (scores.views, "mean") else ASIDE
             traces.append(curve_line(name, curve, COLOURS[method], DASH[k == 1], role))
     shares = "; ".join(f"{one['name']}: {', '.join(f'{100 * y:.0f} %' for y in one['y'])}" for one in traces[1:])
     layout = {"xaxis": axis("share of a Gaussian inside"), "yaxis": axis("share of truths inside")}
-    label = f"Share of true positions inside the ellipsoids of {', '.join(map(str, LEVELS))} %: {shares}."
+    label = f"Share of true positions inside the ellipsoids of {', '.join(map(str, PER_CENT))} %: {shares}."
     return Chart("Fused: coverage of ellipsoids", label, traces, square(layout, 0.0, 1.0))
 
 
