@@ -143,8 +143,9 @@ class DatasetFolder:
         file = self.root / name
         try:
             rows = mapped(file, (n, *row))
-            if (version := parse_json(read_plain(file.with_suffix(".json")).decode())) != DRAWING:
-                raise ValueError(f"has version {version}; expected {DRAWING}")
+            version = file.with_suffix(".json")
+            if not version.exists() or parse_json(read_plain(version).decode()) != DRAWING:
+                raise ValueError("drawn by another version of the program")
             return rows
         except (OSError, ValueError) as error:
             remedy = "write it by `python -m phd_exp render data=...` where the folder may be written"

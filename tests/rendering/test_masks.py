@@ -136,10 +136,13 @@ def test_one_of_another_version_is_refused_and_drawn_anew(
         earlier.setitem(masks.DRAW, "masks.npy", lambda *_: np.zeros((CELLS, CELLS), np.uint8))
         ensure_drawn(old, small_spec, N_TRAIN)
         assert not old.drawn("masks.npy", N_TRAIN).any()
-    with pytest.raises(DatasetError, match=r"masks\.npy: has version .*; expected .*; write it by .* render data="):
+    with pytest.raises(DatasetError, match=r"masks\.npy: drawn by another version.*; write it by .* render data="):
         old.drawn("masks.npy", N_TRAIN)
     ensure_rendered(old, small_spec, N_TRAIN, N_TEST)
     assert old.drawn("masks.npy", N_TRAIN).any()
+    (old.root / "masks.json").unlink()
+    with pytest.raises(DatasetError, match=r"masks\.npy: drawn by another version"):
+        old.drawn("masks.npy", N_TRAIN)
 
 
 def test_one_of_several_processes_draws(
