@@ -38,13 +38,6 @@ def test_they_are_numbered() -> None:
     assert [name[:3] for name in NAMES] == [f"{place:02d}_" for place in range(1, len(NAMES) + 1)] != []
 
 
-def test_definitions_and_absolute_paths_are_recognised() -> None:
-    assert all(map(defines, ("def f(): pass", "class A: pass", "f = lambda: 1", "if 1:\n  def f(): pass")))
-    assert not defines("figure = draw(sorted([1], key=lambda x: -x))")
-    assert all(ABSOLUTE.search(text) for text in ("'/home/me/runs'", "at /tmp/x.png", "C:\\\\runs"))
-    assert not ABSOLUTE.search("runs/small, m/px and </td>")
-
-
 @pytest.mark.parametrize("file", FILES, ids=NAMES)
 def test_a_notebook_is_valid_explained_executed_and_defines_nothing(file: Path) -> None:
     notebook = read(file)

@@ -15,7 +15,6 @@ from rich.console import Console
 
 from phd_exp.distributions.constraints import Finding
 from phd_exp.reports.files import all_tables, constraints_table, latex, markdown, tidy, write_tables
-from phd_exp.reports.fusion_table import headline
 from phd_exp.reports.lines import run_lines
 from phd_exp.reports.runs import Report, Run, read_report
 from phd_exp.reports.table import Table, TableCell
@@ -259,6 +258,3 @@ def test_the_fusion_table_explains_common_errors(found: list[Table], several: Ru
     assert scores is not None
     views = scores.correlation
     assert f"have the correlation {views.value:.2f} ({views.low:.2f}–{views.high:.2f})" in notes
-    assert "the size of an object, common to its views, shifts all of them" in notes
-    assert "the fused squared error of" in notes
-    assert re.fullmatch(r"depth error .* mm with 4", headline(scores))
