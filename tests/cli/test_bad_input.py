@@ -37,12 +37,9 @@ WRONG_VALUES = [
     (["data.n_train=true"], ["data.n_train", "True", "integer"]),
     (["backbone.depth=19"], ["backbone.depth", "19", "18, 34 or 50"]),
     (["data.n_train=0"], ["data.n_train", "got 0", "greater than or equal to 1"]),
-    (["data.f_range=[0,2000]"], ["data.f_range", "got 0", "greater than or equal to 10"]),
     (["data.f_range=[2000,1200]"], ["data.f_range", "lower bound"]),
-    (["data.z_range=[0,5]"], ["data.z_range"]),
     (["data.image_size=448"], ["data", "image_size=448", "sensor_size=224"]),
     (["data.batch_size=64"], ["data", "batch_size=64", "n_train=32"]),
-    (["data.xy_range=2"], ["data.xy_range"]),
     (["data.variant=../elsewhere"], ["data.variant"]),
     (["trainer.threads=0"], ["trainer.threads", "got 0"]),
     (["evaluation.multiview.views=1"], ["evaluation.multiview.views", "got 1"]),
@@ -68,7 +65,6 @@ WRONG_VALUES = [
     (["render", "+shards=0/2"], ["shards: unknown key"]),
     (["render", "data.workers=0"], ["data.workers: got 0"]),
     (["render", "masks=true"], ["masks: got True; expected the name of a folder"]),
-    (["render", "data.view_angle_range=[60,20]"], ["data.view_angle_range: "]),
 ]
 
 
