@@ -65,7 +65,7 @@ def _draw(report: "Report", tables: "list[Table]", out: Path) -> None:
     from phd_exp.reports.paper_figures import write_figures
     from phd_exp.reports.site.build import write_site
 
-    print(f"drawing figures, and the pages of {len(report.runs)} runs", flush=True)
+    print("drawing figures and pages", flush=True)
     figures = write_figures(report, out / "figures")
     print(f"figures: {out / 'figures'}")
     print(f"site: {write_site(report, tables, figures, out / 'site')}, to be opened in a browser")

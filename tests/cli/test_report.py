@@ -21,7 +21,7 @@ def test_tables_are_printed_and_written(phd_exp: Callable, runs: Path, tmp_path:
     assert "The paper's Table 1, preset small: the whole field of view" in outcome.out
     assert "Table 1, preset small: the central half of the field of view" in outcome.out
     assert "Made by: python -m phd_exp -m experiment=table1 preset=small\n" in outcome.out
-    assert "tables: report/tables\n" in outcome.out
+    assert "tables: report/tables\ndrawing figures and pages\nfigures: " in outcome.out
     assert "Fusion" not in outcome.out
     assert {path.name for path in (tmp_path / "report" / "tables").iterdir()} == {
         "table1-small-whole.md",
