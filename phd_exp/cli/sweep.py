@@ -130,6 +130,7 @@ def _misfit(error: Exception, words: list[str], overrides: list[str], config_nam
     """The error of a job that cannot be composed: that of an experiment names the job."""
     if not any(word.startswith("experiment=") for word in words):
         return error
+    GlobalHydra.instance().clear()  # the sweep ends here, and an explanation composes
     own = " ".join(word for word in overrides if word not in words)
     return ConfigError(f"{_given(words)}: its job {own} cannot be composed: {explain(error, config_name)}")
 
