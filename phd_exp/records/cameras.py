@@ -24,6 +24,7 @@ from phd_exp.records.parsing import Record
 
 CORNER = 0.5  # px from the corner of the first pixel to its centre
 LARGEST = 1e6  # of any number in a camera file
+WIDEST = 150  # degrees that an image may show, unless through a fisheye
 SHORTEST = 0.01  # focal length, px; a shorter one is probably in metres
 Model = Literal["plumb_bob", "rational_polynomial", "equidistant"]
 COEFFICIENTS = {
@@ -130,7 +131,20 @@ def calibration(given: Any) -> Calibration | None:
         raise ValueError(f"camera: {gist(error)}") from None
     if not (camera.width and camera.height):
         raise ValueError(f"camera: {given} does not say the size of the images; add width and height to the file")
+    if camera.model != "equidistant":
+        require_narrow(camera.K[0], camera.K[4], camera.width, camera.height)
     return camera
+
+
+def require_narrow(fx: float, fy: float, width: int, height: int) -> None:
+    """Raise ValueError if images show more than `WIDEST`, which only those of a fisheye may."""
+    angle = math.degrees(2 * math.atan(max(width / fx, height / fy) / 2))
+    if angle > WIDEST:
+        raise ValueError(
+            f"with a focal length of {fx:g} x {fy:g} pixels, an image of {width} x {height} pixels shows {angle:.0f} "
+            f"degrees; expected at most {WIDEST}; f in millimetres must be divided by the size of a pixel in "
+            "millimetres"
+        )
 
 
 def _found(content: Any) -> Found:

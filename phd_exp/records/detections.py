@@ -1,6 +1,5 @@
 """One detection in the user's own images: its image, camera and true position, a line of `metadata.jsonl`."""
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,14 +10,13 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field, PlainValidator, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
-from phd_exp.records.cameras import CORNER, SHORTEST, Calibration, Size, read_camera
+from phd_exp.records.cameras import CORNER, SHORTEST, Calibration, Size, read_camera, require_narrow
 from phd_exp.records.errors import DatasetError, complaint, unknown
 from phd_exp.records.parsing import Record
 from phd_exp.records.scenes import Pose, SampleRecord
 from phd_exp.records.spec import Number, Positive
 
 DISTORTION = re.compile(r"[kp][1-8]|.*distort.*|dist(_?coeff.*)?|.*fisheye.*", re.IGNORECASE)
-WIDEST = 150  # degrees that an image may show, unless through a fisheye
 NORMALISED = 1.5  # px; the largest right or bottom of a box in units of the image, even of one by its middle
 LARGEST_BOX = 3
 """Sides of a box over the longer side of its image; the part outside the image is grey and holds no information."""
@@ -142,13 +140,11 @@ class Detection:
             fx, fy = (value for value in (line.f or line.fx, line.f or line.fy) if value)  # a line has f or both
             cx = width / 2 if line.cx is None else line.cx
             cy = height / 2 if line.cy is None else line.cy
-        angle = math.degrees(2 * math.atan(max(width / fx, height / fy) / 2))
-        if angle > WIDEST and not (file and file.model == "equidistant"):
-            raise DatasetError(
-                f"{self.where}: with a focal length of {fx:g} x {fy:g} pixels, an image of {width} x {height} pixels "
-                f"shows {angle:.0f} degrees; expected at most {WIDEST}; f in millimetres must be divided by the size "
-                "of a pixel in millimetres"
-            )
+        try:
+            if not (file and file.model == "equidistant"):
+                require_narrow(fx, fy, width, height)
+        except ValueError as error:
+            raise DatasetError(f"{self.where}: {error}") from None
         return fx, fy, cx, cy
 
     def box(self, width: int, height: int) -> tuple[float, float, float, float]:

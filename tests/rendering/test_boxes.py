@@ -141,6 +141,7 @@ def test_grey_images_are_grey(of_box: MakeSpec) -> None:
         ({"camera": None, "view": "box"}, "view: got box; expected data.camera=FILE"),
         ({"f_range": (300.0, 400.0)}, "f_range: .* follows from data.camera; leave it out"),
         ({"camera": CAMERA | {"width": None}}, "camera: .* does not say the size"),
+        ({"camera": {"f": 18.0, "width": 4000, "height": 3000}}, "shows 179 degrees; .* f in millimetres"),
         ({"camera": "nowhere.yaml"}, "camera: nowhere.yaml: No such file"),
         ({"view": "field", "box_shift": 0.1}, "box_shift: got view=field; expected view=box"),
         ({"front_range": (0.0, 60.0)}, "front: expected a direction"),
