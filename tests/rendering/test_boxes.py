@@ -6,16 +6,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from phd_exp.data.crops import cut
 from phd_exp.optics.virtual import VirtualCamera
 from phd_exp.records.cameras import calibration
 from phd_exp.records.errors import gist
 from phd_exp.records.scenes import Scene
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer, Settings
+from phd_exp.rendering.boxes import view_of_box
 from phd_exp.rendering.objects import sample_object_scene
 from phd_exp.rendering.rays import NOTHING, beyond_edges, in_camera_frame, rotation_matrix, trace_pixels
-from phd_exp.rendering.samples import GREY, make_sample
+from phd_exp.rendering.samples import GREY, make_sample, photograph
 from phd_exp.rendering.triangles import Triangles
 from tests.support.meshes import solid, write_mesh
 from tests.support.renders import decoded
@@ -74,6 +77,24 @@ def test_the_view_is_that_of_predict_and_the_label_belongs_to_it(
         np.testing.assert_allclose(in_camera_frame(real, scene.pose), camera.to_virtual(real), atol=1e-12)
         depths.append(real[2])
     assert 0.5 < min(depths) < max(depths) < 1.5
+
+
+def test_a_view_shows_what_the_crop_of_a_whole_photograph_shows(of_box: MakeSpec) -> None:
+    """Light and noise aside: a scene rendered in the view of a box, and the view of that box in a large render."""
+    camera = {"f": 500.0, "width": 448, "height": 448}
+    changes: dict[str, Any] = {"camera": camera, "xy_range": 0.5, "backdrops": None, "samples_per_pixel": 8}
+    whole, box = of_box(view="field", sensor_size=448, **changes), of_box(sensor_size=96, **changes)
+    renderer = Renderer(Settings(samples=16, denoised=True, at_middles=False), whole)
+    scene = sample_object_scene(whole, "train", 3, renderer.meshes)
+    view = view_of_box(scene.model_copy(update={"S": 96}), box, np.random.default_rng(0), renderer.meshes)
+    assert view is not None
+    K = calibration(camera).intrinsics
+    blank = {"level": 0.6, "falloff": 0.0}  # the backdrop belongs to the image, not to the scene
+    plain = [one.model_copy(update={"backdrop": one.backdrop.model_copy(update=blank)}) for one in (scene, view)]
+    seen = cut(Image.fromarray(photograph(renderer, plain[0], whole)), VirtualCamera.of_box(K, view.box, 96.0))
+    drawn_directly = photograph(renderer, plain[1], box)
+    assert np.abs(seen.astype(float) - drawn_directly).mean() < 3
+    assert drawn_directly.std() > 20
 
 
 def test_the_apparent_size_is_nearly_constant(of_box: MakeSpec, meshes: dict[str, Triangles]) -> None:
