@@ -1,13 +1,15 @@
 """Exchange the backdrops of training images, so that a network cannot learn which object has which backdrop."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
+import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from phd_exp.data.batches import Augment, Batch
+from phd_exp.data.photometry import change, levels, on
 
 NUMBERS = (1, 2, 4)  # per sample: whether it changes; two samples; zoom, two shifts and transposition of the backdrop
 FINEST = 4.0  # largest factor by which a backdrop is shown smaller, with finer texture
@@ -24,6 +26,15 @@ class Backdrops:
 
     empty: UInt8[Tensor, "samples side side 3"]
     clear: UInt8[Tensor, "samples side side"]
+
+    @property
+    def n_bytes(self) -> int:
+        """Memory that they take."""
+        return self.empty.nbytes + self.clear.nbytes
+
+    def to(self, device: torch.device) -> "Backdrops":
+        """The same on a device."""
+        return Backdrops(self.empty.to(device), self.clear.to(device))
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +55,10 @@ class BackdropExchange:
     then: Augment | None
 
     @cached_property
-    def texture(self) -> Float[Tensor, " samples"]:
+    def texture(self) -> Float[np.ndarray, " samples"]:
         """The mean difference between neighbouring pixels of each backdrop."""
         rows = ((one[1:].float() - one[:-1].float()).abs().mean() for one in self.backdrops.empty)
-        return torch.stack(list(rows))
+        return torch.stack(list(rows)).cpu().numpy()
 
     @property
     def n_numbers(self) -> int:
@@ -57,32 +68,44 @@ class BackdropExchange:
     def __call__(self, batch: Batch, numbers: Float[Tensor, "batch n_numbers"]) -> Batch:
         """The samples, changed by uniform numbers from -1 to 1."""
         of_then, own = numbers.tensor_split([-sum(NUMBERS)], dim=1)
-        changes, pairs, views = ((own + 1) / 2).split(NUMBERS, dim=1)
-        pairs = (len(self.backdrops.empty) * pairs).long()
-        others = pairs.gather(1, self.texture[pairs].argmax(dim=1, keepdim=True)).flatten()
+        changes, pairs, views = (part.numpy() for part in ((own + 1) / 2).split(NUMBERS, dim=1))
+        pairs = (len(self.backdrops.empty) * pairs).astype(np.int64)
+        others = np.take_along_axis(pairs, self.texture[pairs].argmax(axis=1)[:, None], axis=1)[:, 0]
         image = batch.image.clone()
-        for place in (changes[:, 0] < self.share).nonzero().flatten().tolist():
-            fine, down, right, turn = views[place].tolist()
-            new, row = tiled(self.backdrops.empty[others[place]], FINEST**fine, down, right), batch.row[place]
-            change = (new.transpose(0, 1) if turn < 0.5 else new).float() - self.backdrops.empty[row].float()
-            share = self.backdrops.clear[row, ..., None] / 255
-            image[place] = change.mul_(share).add_(image[place]).round_().clamp_(0, 255)
+        change(image, changes[:, 0] < self.share, partial(self._before, batch.row), np.arange(len(batch)), others, views)
         batch = replace(batch, image=image)
         return self.then(batch, of_then) if self.then else batch
 
+    def _before(
+        self,
+        row: Int[Tensor, " batch"],
+        image: UInt8[Tensor, "chosen side side 3"],
+        place: Int[np.ndarray, " chosen"],
+        others: Int[np.ndarray, " chosen"],
+        views: Float[np.ndarray, "chosen 4"],
+    ) -> UInt8[Tensor, "chosen side side 3"]:
+        """The images of these places in the batch before views of other backdrops."""
+        empty, clear = self.backdrops.empty, self.backdrops.clear
+        rows = row.index_select(0, on(row, place)).to(empty.device)
+        old, share = (part.index_select(0, rows).to(image.device) for part in (empty, clear))
+        new = tiled(empty, others, views).to(image.device)
+        return levels((new.float() - old.float()).mul_(share[..., None] / 255).add_(image))
+
 
 def tiled(
-    image: UInt8[Tensor, "side side 3"], fine: float, down: float, right: float
-) -> UInt8[Tensor, "side side 3"]:
-    """A view, as large as the image, of the plane that the image and its mirror images tile.
+    images: UInt8[Tensor, "samples side side 3"], which: Int[np.ndarray, " n"], views: Float[np.ndarray, "n 4"]
+) -> UInt8[Tensor, "n side side 3"]:
+    """Views, as large as the images, of the planes that these images and their mirror images tile.
 
-    It begins at the place (`down`, `right`), in units of the tiling's period, which is two images. Pixels are picked
-    without interpolation.
-
-    Args:
-        fine: how many times smaller the view shows the image; more is finer texture.
+    The numbers of a view are from 0 to 1. The first is for how many times smaller the image appears, 1 to `FINEST`.
+    The view begins at the next two, down and right, in units of the tiling's period, which is two images. It is
+    transposed if the last one is below 1/2. Pixels are picked without interpolation.
     """
-    side = len(image)
-    rows, columns = ((torch.arange(side) * fine + 2 * side * start).long() % (2 * side) for start in (down, right))
-    rows, columns = (torch.minimum(place, 2 * side - 1 - place) for place in (rows, columns))
-    return image.index_select(0, rows).index_select(1, columns)
+    side, (fine, down, right, turn) = images.shape[1], views.T
+    steps = np.arange(side) * np.float32(FINEST**fine)[:, None]
+    places = ((steps + np.float32(2 * side * start)[:, None]).astype(np.int64) % (2 * side) for start in (down, right))
+    row, column = (np.minimum(place, 2 * side - 1 - place) for place in places)
+    row, transposed = side * (side * which[:, None] + row), (turn < 0.5)[:, None]
+    outer, inner = on(images, np.where(transposed, column, row)), on(images, np.where(transposed, row, column))
+    pixels = (outer[:, :, None] + inner[:, None, :]).flatten()
+    return images.view(-1, 3).index_select(0, pixels).view(-1, side, side, 3)

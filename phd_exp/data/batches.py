@@ -1,6 +1,7 @@
 """Batches of a data set in memory, in an order that depends on (seed, epoch) alone."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
@@ -42,13 +43,27 @@ class Batch:
 
     def select(self, rows: Int[Tensor, " rows"] | slice) -> "Batch":
         """The samples of these rows."""
-        mask = None if self.mask is None else self.mask[rows]
-        return Batch(self.image[rows], self.xyz[rows], self.f[rows], self.S, self.row[rows], mask)
+        if isinstance(rows, slice):
+            return self._map(lambda part: part[rows])
+        place = rows.to(self.image.device, non_blocking=True)
+        return self._map(lambda part: part.index_select(0, place))  # on a CPU, twenty times as fast as part[place]
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> "Batch":
         """The same samples on a device."""
+        return self._map(lambda part: part.to(device, non_blocking=non_blocking))
+
+    def pinned(self) -> "Batch":
+        """The same samples in page-locked memory, from which a GPU copies while it computes."""
+        return self._map(Tensor.pin_memory)
+
+    @property
+    def n_bytes(self) -> int:
+        """Memory that the samples take."""
+        return sum(part.nbytes for part in vars(self).values() if isinstance(part, Tensor))
+
+    def _map(self, function: Callable[[Tensor], Tensor]) -> "Batch":
         parts: dict[str, Any] = {name: part for name, part in vars(self).items() if isinstance(part, Tensor)}
-        return replace(self, **{name: part.to(device, non_blocking=non_blocking) for name, part in parts.items()})
+        return replace(self, **{name: function(part) for name, part in parts.items()})
 
 
 @runtime_checkable
@@ -80,6 +95,9 @@ class BatchLoader:
     for the whole batch, so they do not depend on `world`. The signs of the first three numbers of a row are
     stratified: within eight epochs each row gets all eight combinations.
 
+    Batches are on `device`, where `augment` works. If the samples are elsewhere, the next batch is selected and copied
+    in a thread while the last one is in use.
+
     Examples:
         >>> n = 4
         >>> samples = Batch(torch.zeros(n, 8, 8, 3, dtype=torch.uint8), torch.ones(n, 3), torch.ones(n), 8.0,
@@ -96,6 +114,7 @@ class BatchLoader:
     rank: int = 0
     world: int = 1
     augment: Augment | None = None
+    device: torch.device = torch.device("cpu")
     epoch: int = field(default=-1, init=False)
     next_batch: int = field(default=0, init=False)
     resumes: bool = field(default=False, init=False)
@@ -111,16 +130,33 @@ class BatchLoader:
         self.resumes = False
         order = self.order(self.epoch)
         signs = self.signs(self.epoch) if self.augment else np.empty(0)
-        while self.next_batch < len(self):
-            number, start = self.next_batch, self.next_batch * self.batch_size
+        starts = range(self.next_batch * self.batch_size, len(self) * self.batch_size, self.batch_size)
+        rows = [order[start : start + self.batch_size] for start in starts]
+        for of_batch, batch in zip(rows, self._selected(rows), strict=True):
+            number = self.next_batch
             self.next_batch += 1
-            rows = order[start : start + self.batch_size]
-            batch = self.samples.select(rows[self.rank :: self.world])
-            if self.augment:
-                numbers = self._random(self.epoch, number).uniform(-1, 1, (len(rows), self.augment.n_numbers))
-                numbers[:, :SIGNS] = signs[rows] * np.abs(numbers[:, :SIGNS])
-                batch = self.augment(batch, torch.from_numpy(numbers[self.rank :: self.world]))
-            yield batch
+            yield self._augmented(batch, number, of_batch, signs) if self.augment else batch
+
+    def _selected(self, rows: Iterable[Int[Tensor, " _"]]) -> Iterator[Batch]:
+        """The samples of this process in batches of these rows, on the device."""
+        mine = [of_batch[self.rank :: self.world] for of_batch in rows]
+        if self.samples.image.device == self.device:
+            yield from map(self.samples.select, mine)
+        else:
+            yield from one_ahead(self._copied, mine)
+
+    def _copied(self, rows: Int[Tensor, " rows"]) -> Batch:
+        batch = self.samples.select(rows)
+        return (batch.pinned() if self.device.type == "cuda" else batch).to(self.device, non_blocking=True)
+
+    def _augmented(
+        self, batch: Batch, number: int, rows: Int[Tensor, " batch"], signs: Int[np.ndarray, "samples 3"]
+    ) -> Batch:
+        """The share of this process of a batch of these rows, changed by numbers drawn for all of it."""
+        assert self.augment is not None
+        numbers = self._random(self.epoch, number).uniform(-1, 1, (len(rows), self.augment.n_numbers))
+        numbers[:, :SIGNS] = signs[rows] * np.abs(numbers[:, :SIGNS])
+        return self.augment(batch, torch.from_numpy(numbers[self.rank :: self.world]))
 
     def order(self, epoch: int) -> Int[Tensor, " samples"]:
         """The rows in the order of an epoch."""
@@ -146,3 +182,16 @@ class BatchLoader:
         """Continue the next iteration at this position."""
         self.epoch, self.next_batch = state_dict["epoch"], state_dict["next_batch"]
         self.resumes = 0 < self.next_batch < len(self)
+
+
+def one_ahead(make: Callable[[Any], Batch], arguments: Iterable[Any]) -> Iterator[Batch]:
+    """make(argument) for each in order; the next is made in a thread while the last is in use."""
+    with ThreadPoolExecutor(1) as thread:
+        waiting = None
+        for argument in arguments:
+            following = thread.submit(make, argument)
+            if waiting:
+                yield waiting.result()
+            waiting = following
+        if waiting:
+            yield waiting.result()

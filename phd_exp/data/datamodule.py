@@ -2,15 +2,20 @@
 
 from dataclasses import replace
 from functools import partial
+from typing import TypeVar
 
+import torch
 from lightning import LightningDataModule
 
-from phd_exp.data.backdrops import BackdropExchange
+from phd_exp.data.backdrops import BackdropExchange, Backdrops
 from phd_exp.data.batches import Augment, Batch, BatchLoader
 from phd_exp.data.sources import PARTS, Part, Source
 from phd_exp.geometry.camera import Camera
 from phd_exp.records.errors import ConfigError, DatasetError
+from phd_exp.records.processes import announce
 from phd_exp.records.runs import CHOOSE
+
+Held = TypeVar("Held", Batch, Backdrops)
 
 
 class PositionData(LightningDataModule):
@@ -86,6 +91,19 @@ class PositionData(LightningDataModule):
                 augment = BackdropExchange(self.source.training_backdrops(), self.backdrops, augment)
             self.train_batches = self.batches(self.samples["train"], shuffle=True, augment=augment)
 
+    def move_to(self, device: torch.device) -> None:
+        """Hold the samples on the device that trains, as far as half of its free memory suffices for each part.
+
+        Those without room stay in host memory, memory-mapped, and are copied batch by batch; a line says so.
+        """
+        for part, samples in self.samples.items():
+            self.samples[part] = held_on(device, samples, f"the {part} samples")
+        self.batches = partial(self.batches, device=device)
+        loader = self.train_dataloader()
+        loader.samples, loader.device = self.samples["train"], device
+        if isinstance(exchange := loader.augment, BackdropExchange):
+            loader.augment = replace(exchange, backdrops=held_on(device, exchange.backdrops, "the backdrops"))
+
     def train_dataloader(self) -> BatchLoader:
         assert self.train_batches is not None, "setup comes first"
         return self.train_batches
@@ -108,3 +126,15 @@ class PositionData(LightningDataModule):
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
         self.train_dataloader().load_state_dict(state_dict)
+
+
+def held_on(device: torch.device, held: Held, words: str) -> Held:
+    """What is held in host memory on a device, if it is a GPU with twice the memory free; otherwise as it is."""
+    if device.type == "cpu":
+        return held
+    free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else 0
+    if held.n_bytes > free / 2:
+        size, room = held.n_bytes / 1e9, free / 2e9
+        announce(f"{device}: {words} take {size:.1f} GB, more than the {room:.1f} GB there; they stay in host memory")
+        return held
+    return held.to(device)

@@ -16,8 +16,8 @@ import torch
 from phd_exp.config import RenderedConfig, RunConfig
 from phd_exp.config.sections import ShiftConfig
 from phd_exp.config.targets import Trust
-from phd_exp.data.augmentation import Photometry
 from phd_exp.data.batches import Batch
+from phd_exp.data.photometry import Photometry
 from phd_exp.data.sources import PARTS, Known, Part, RenderedSource, Source
 from phd_exp.distributions.columns import Columns
 from phd_exp.evaluation.parquet import read_table, stacked

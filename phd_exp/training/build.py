@@ -14,8 +14,9 @@ from phd_exp.build import build_regressor, build_source, naming, recorded_consta
 from phd_exp.config import RunConfig
 from phd_exp.config.sections import RecipeConfig
 from phd_exp.config.targets import custom_parts, locate
-from phd_exp.data.augmentation import Augmentation, Photometry
+from phd_exp.data.augmentation import Augmentation
 from phd_exp.data.datamodule import PositionData
+from phd_exp.data.photometry import Photometry
 from phd_exp.data.sources import Source
 from phd_exp.geometry.camera import Camera
 from phd_exp.models.backbones import Backbone

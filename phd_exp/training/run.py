@@ -52,6 +52,7 @@ def run(
     with tracked(config, folder, rank) as loggers:
         recorder = Recorder(folder, config.evaluation, draw, loggers)
         trainer = build_trainer(config, recorder, callbacks)
+        data.move_to(trainer.strategy.root_device)
         _fit(trainer, module, data, recorder)
         if not folder.last_checkpoint.exists():
             raise RunError(

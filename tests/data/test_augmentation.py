@@ -6,8 +6,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from phd_exp.data.augmentation import Augmentation, Photometry, moved
+from phd_exp.data.augmentation import Augmentation, moved
 from phd_exp.data.batches import Batch
+from phd_exp.data.photometry import Photometry
 from phd_exp.geometry import Camera
 from phd_exp.geometry.motion import Motion, symmetries
 

@@ -1,9 +1,11 @@
 """Training samples before other backdrops: the objects stay, what is behind them changes."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -76,17 +78,24 @@ def test_the_backdrop_with_more_texture_is_preferred(batch: Batch) -> None:
     assert (new.image != 0).any((1, 2, 3)).float().mean() == pytest.approx(0.75, abs=0.15)
 
 
+def tile(image: torch.Tensor, fine: float, down: float, right: float, turn: float = 0.9) -> torch.Tensor:
+    """One view, given how many times smaller it shows the image."""
+    images = torch.stack([torch.zeros_like(image), image])
+    return tiled(images, np.array([1]), np.array([[math.log(fine) / math.log(FINEST), down, right, turn]]))[0]
+
+
 def test_an_image_and_its_mirror_images_tile_the_plane() -> None:
     image = torch.randint(0, 256, (SIDE, SIDE, 3), dtype=torch.uint8)
-    assert torch.equal(tiled(image, 1.0, 0.0, 0.0), image)
-    assert torch.equal(tiled(image, 1.0, 0.5, 0.0), image.flip(0))
-    assert torch.equal(tiled(image, 1.0, 0.0, 0.5), image.flip(1))
+    assert torch.equal(tile(image, 1.0, 0.0, 0.0), image)
+    assert torch.equal(tile(image, 1.0, 0.5, 0.0), image.flip(0))
+    assert torch.equal(tile(image, 1.0, 0.0, 0.5), image.flip(1))
     half = image[::2, ::2]
-    small = tiled(image, 2.0, 0.0, 0.0)
+    small = tile(image, 2.0, 0.0, 0.0)
     assert torch.equal(small[: SIDE // 2, : SIDE // 2], half)
     assert torch.equal(small[SIDE // 2 :, : SIDE // 2], image[1::2, ::2].flip(0))
-    seen = tiled(image, FINEST, 0.37, 0.81).reshape(-1, 3)
-    assert {tuple(pixel) for pixel in seen.tolist()} <= {tuple(pixel) for pixel in image.reshape(-1, 3).tolist()}
+    fine = tile(image, FINEST, 0.37, 0.81)
+    assert {tuple(pixel) for pixel in fine.view(-1, 3).tolist()} <= {tuple(p) for p in image.view(-1, 3).tolist()}
+    assert torch.equal(tile(image, FINEST, 0.37, 0.81, turn=0.1), fine.transpose(0, 1))
 
 
 def test_the_share_is_changed_and_then_augmented(batch: Batch) -> None:

@@ -9,7 +9,8 @@ import torch
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from phd_exp.data.augmentation import Photometry
+from phd_exp.data.jpeg import compressed
+from phd_exp.data.photometry import NUMBERS, Photometry
 
 N, SIDE = 400, 32
 
@@ -43,10 +44,11 @@ def test_each_change_is_drawn_for_its_share_of_images(limits: dict, share: float
     assert Photometry(**limits).changes_anything
 
 
-def drawn(number: float, place: int) -> torch.Tensor:
+def drawn(number: float, name: str, place: int = 0) -> torch.Tensor:
     """Numbers of one image that draw one change, at this strength, and no other."""
     row = torch.full((1, Photometry.n_numbers), -0.2)  # at which a factor of up to 1.5 is 1
-    row[0, place] = number
+    parts = dict(zip(NUMBERS, row.split(list(NUMBERS.values()), dim=1), strict=True))
+    parts[name][0, place] = number
     return row
 
 
@@ -65,20 +67,20 @@ def test_tones_follow_their_formulas(number: float) -> None:
         4: (Photometry(white_balance=1.5), before * np.array([1, factor, 1])),
     }
     for place, (photometry, after) in expected.items():
-        found = value(photometry(images(1), drawn(number, place)))
+        found = value(photometry(images(1), drawn(number, "tone", place)))
         np.testing.assert_allclose(found, after.clip(0, 1), atol=0.51 / 255)
 
 
 def test_blur_noise_and_compression() -> None:
     edge = images(1)
     edge[:, :, SIDE // 2 :] = 255
-    blurred = value(Photometry(blur=2.0)(edge, drawn(1.0, 6)))
+    blurred = value(Photometry(blur=2.0)(edge, drawn(1.0, "blur")))
     reference = gaussian_filter(value(edge), (2, 2, 0), mode="nearest")
     np.testing.assert_allclose(blurred, reference, atol=0.03)
-    noisy = value(Photometry(noise=10.0)(images(1), drawn(1.0, 7))) - value(images(1))
+    noisy = value(Photometry(noise=10.0)(images(1), drawn(1.0, "noise"))) - value(images(1))
     assert noisy.std() * 255 == pytest.approx(10, rel=0.05)
     assert abs(noisy.mean()) * 255 < 1
-    lossy = [value(Photometry(jpeg=20)(edge, drawn(strength, 10))) - value(edge) for strength in (0.8, 1.0)]
+    lossy = [value(Photometry(jpeg=20)(edge, drawn(strength, "jpeg"))) - value(edge) for strength in (0.8, 1.0)]
     assert 0 < lossy[0].std() < lossy[1].std() < 0.2
 
 
@@ -97,10 +99,25 @@ def test_an_occluder_hides_a_convex_part_by_one_colour_and_the_original_stays() 
         assert hidden[middle]  # the centroid of a convex shape lies inside
 
 
-def compressed(image: np.ndarray, quality: int) -> np.ndarray:
+def by_pillow(image: np.ndarray, quality: int) -> np.ndarray:
     stream = io.BytesIO()
-    Image.fromarray((255 * image).round().astype(np.uint8)).save(stream, format="jpeg", quality=quality)
-    return np.asarray(Image.open(stream)) / 255
+    Image.fromarray(image).save(stream, format="jpeg", quality=quality)
+    return np.asarray(Image.open(stream))
+
+
+@pytest.mark.parametrize("quality", [10, 25, 49, 50, 75, 95, 100])
+@pytest.mark.parametrize("size", [(64, 64), (224, 224), (50, 71)], ids=str)
+def test_compression_is_that_of_pillow(quality: int, size: tuple[int, int]) -> None:
+    random = torch.Generator().manual_seed(0)
+    smooth = torch.nn.functional.interpolate(torch.rand(3, 3, 9, 9, generator=random), size, mode="bicubic")
+    smooth[1, :, :, size[1] // 2 :] = 1 - smooth[1, :, :, size[1] // 2 :]  # an edge
+    noisy = smooth + torch.randn(3, 3, *size, generator=random) * torch.tensor([0, 0.02, 0.1]).view(3, 1, 1, 1)
+    before = (255 * noisy.clamp(0, 1)).round().to(torch.uint8).permute(0, 2, 3, 1).contiguous()
+    after = compressed(before, np.full(3, float(quality))).int().numpy()
+    for one, found in zip(before.numpy(), after, strict=True):
+        expected = by_pillow(one, quality).astype(int)
+        assert np.abs(found - expected).mean() < 1
+        assert np.abs(found - expected).mean() < 0.4 * np.abs(one.astype(int) - expected).mean() + 0.4
 
 
 @pytest.mark.parametrize(
@@ -113,7 +130,7 @@ def compressed(image: np.ndarray, quality: int) -> np.ndarray:
         ({"gamma": 0.5}, np.sqrt, 0.51 / 255),
         ({"gamma": 2.0}, np.square, 0.51 / 255),
         ({"blur": 2.0}, lambda image: gaussian_filter(image, (2, 2, 0), mode="nearest"), 0.03),
-        ({"jpeg": 30}, lambda image: compressed(image, 30), 0),
+        ({"jpeg": 30}, lambda image: by_pillow((255 * image).round().astype(np.uint8), 30) / 255, 0.03),
     ],
     ids=lambda value: str(value) if isinstance(value, dict) else "",
 )
