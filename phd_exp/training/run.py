@@ -13,6 +13,7 @@ from phd_exp.config import RunConfig
 from phd_exp.data.batches import BatchLoader
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.images import SHRINKING
+from phd_exp.data.photometry import VERSION
 from phd_exp.data.sources import PARTS
 from phd_exp.distributions.columns import Columns
 from phd_exp.models.weights import ADVICE, load_checkpoint
@@ -47,7 +48,7 @@ def run(
     data.setup()
     if rank == 0:
         constants = asdict(data.source.depth) | {"constant_f": data.source.constant_f}
-        folder.write_constants(constants | {"shrinking": SHRINKING})
+        folder.write_constants(constants | {"shrinking": SHRINKING, "photometry": VERSION})
     module = build_module(config, data)
     with tracked(config, folder, rank) as loggers:
         recorder = Recorder(folder, config.evaluation, draw, loggers)

@@ -10,6 +10,7 @@ from lightning import Callback
 from phd_exp.build import require_same_shrinking
 from phd_exp.config import FolderConfig, RenderedConfig, RunConfig
 from phd_exp.config.targets import custom_parts
+from phd_exp.data.photometry import VERSION
 from phd_exp.hardware import default_threads
 from phd_exp.records.choices import first_difference, flatten
 from phd_exp.records.dataset import DatasetFolder
@@ -17,7 +18,7 @@ from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import checksum, remove_temporaries
 from phd_exp.records.own_images import DetectionFolder
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.build import build_data, build_module
+from phd_exp.training.build import build_augmentation, build_data, build_module
 from phd_exp.training.ranks import train_together
 from phd_exp.training.recorder import Draw
 from phd_exp.training.run import run
@@ -93,6 +94,7 @@ def require_same_config(folder: RunFolder, config: RunConfig) -> None:
     if not folder.config_file.exists():
         return
     require_same_shrinking(folder, config)
+    require_same_photometry(folder, config)
     if difference := _difference(folder, config):
         raise RunError(
             f"{folder.path}: holds a run with {difference} is asked for; "
@@ -104,6 +106,21 @@ def require_same_config(folder: RunFolder, config: RunConfig) -> None:
         raise RunError(
             f"{folder.path}: holds a run on {config.data.folder} as it was before its annotations changed; "
             "move that run's folder away, or choose another place by runs=DIR"
+        )
+
+
+def require_same_photometry(folder: RunFolder, config: RunConfig) -> None:
+    """Raise RunError for an interrupted run that trained on images changed by another version of `Photometry`."""
+    augmentation = build_augmentation(config.recipe)
+    if augmentation is None or not augmentation.photometry.changes_anything:
+        return
+    if folder.is_finished() or not folder.last_checkpoint.exists():
+        return
+    before = folder.constants().get("photometry") if folder.constants_file.exists() else None
+    if before != VERSION:
+        raise RunError(
+            f"{folder.path}: interrupted while it trained with blur, noise, JPEG or light of an earlier version, which "
+            "changed other images; move the folder away and train again"
         )
 
 

@@ -7,6 +7,7 @@ import torch
 from torch.testing import assert_close
 
 from phd_exp.data.augmentation import Augmentation, moved
+from phd_exp.data.backdrops import BackdropExchange, Backdrops
 from phd_exp.data.batches import Batch
 from phd_exp.data.photometry import Photometry
 from phd_exp.geometry import Camera
@@ -134,3 +135,18 @@ def test_each_part_is_there_by_itself(noise: Batch, part: dict) -> None:
     assert not torch.equal(new.image, noise.image)
     assert torch.equal(new.f, noise.f) == ("largest_zoom" not in part)
     assert torch.equal(new.xyz, noise.xyz) == (part.keys() <= {"colours", "photometry"})
+
+
+@pytest.mark.parametrize("largest_zoom", [1.0, 1.2])
+def test_all_of_it_happens_where_the_images_are(noise: Batch, largest_zoom: float) -> None:
+    """On a device without values: whatever reads one, or mixes in a tensor of the host, raises an error."""
+    everything = Photometry(0.5, 2.0, 2.0, 2.0, 1.5, 2.5, 15.0, 25)
+    augment = Augmentation(symmetries=True, largest_zoom=largest_zoom, colours=True, photometry=everything)
+    backdrops = Backdrops(noise.image, noise.image[..., 0])
+    exchange, batch = BackdropExchange(backdrops, 0.5, augment), replace(noise, mask=noise.image[..., 0])
+    assert len(exchange.texture) == N  # read once, before the first step
+    vars(exchange)["backdrops"] = backdrops.to(torch.device("meta"))
+    new = exchange(batch.to("meta"), 2 * torch.rand(N, exchange.n_numbers, dtype=torch.float64) - 1)
+    for name in ("image", "xyz", "f", "mask"):
+        found, expected = getattr(new, name), getattr(batch, name)
+        assert (found.device.type, found.shape, found.dtype) == ("meta", expected.shape, expected.dtype)

@@ -1,11 +1,13 @@
 """A rendered data set as batches: the camera shrinks with the image, the depth scale grows."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
 
-from phd_exp.data.datamodule import PositionData
+from phd_exp.data.batches import Batch
+from phd_exp.data.datamodule import PositionData, held_on
 from phd_exp.data.sources import Part, RenderedSource
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import DatasetError
@@ -80,3 +82,25 @@ def test_too_few_samples_are_one_line(folder: DatasetFolder, spec: DatasetSpec) 
         data(folder, spec, n_train=6)
     with pytest.raises(DatasetError, match="6 samples asked for, 5 "):
         data(folder, spec, n_train=4, n_held_out=2)
+
+
+@pytest.mark.parametrize("share", [0.9, 2.1])
+def test_samples_without_room_on_a_gpu_stay_on_the_host(
+    folder: DatasetFolder, spec: DatasetSpec, share: float, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    samples = data(folder, spec).samples["train"]
+    there = samples.select(slice(1))
+    monkeypatch.setattr(Batch, "to", lambda *_: there)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (int(share * samples.n_bytes), 0))
+    found = held_on(torch.device("cuda:0"), samples, "the train samples")
+    assert found is (there if share > 2 else samples)
+    line = "cuda:0: the train samples take 0.0 GB, more than the 0.0 GB there; they stay in host memory\n"
+    assert capsys.readouterr().err.replace("\n", " ").strip() == ("" if share > 2 else line.strip())
+
+
+def test_samples_on_the_host_serve_another_device(folder: DatasetFolder, spec: DatasetSpec) -> None:
+    module = data(folder, spec)
+    module.move_to(torch.device("meta"))  # has no memory
+    assert module.samples["train"].image.device.type == "cpu"
+    for loader in (module.train_dataloader(), *module.val_dataloader()):
+        assert {batch.image.device.type for batch in loader} == {"meta"}

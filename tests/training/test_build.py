@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,15 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from phd_exp import build, hardware
 from phd_exp.config import RunConfig, check
-from phd_exp.data.batches import Batch
+from phd_exp.data.backdrops import BackdropExchange, Backdrops
+from phd_exp.data.batches import Batch, BatchLoader
 from phd_exp.data.images import SHRINKING
+from phd_exp.data.photometry import VERSION
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import build_data, build_module
 from phd_exp.training.optimisation import factor
+from phd_exp.training.train import require_same_photometry
 
 
 def arithmetic(config: RunConfig) -> str:
@@ -83,6 +87,24 @@ def test_images_shrunk_by_another_version_are_refused_where_they_differ(
         build.require_same_shrinking(folder, config)
 
 
+@pytest.mark.parametrize("words", [["photometry=robust"], ["recipe=strong"]], ids=" ".join)
+@pytest.mark.parametrize("version", [None, VERSION])
+@pytest.mark.parametrize("state", ["new", "interrupted", "finished"])
+def test_a_run_with_photometry_of_another_version_is_not_resumed(
+    checked: Callable, tmp_path: Path, words: list[str], version: int | None, state: str
+) -> None:
+    folder = RunFolder(tmp_path)
+    folder.checkpoints.mkdir()
+    with folder.recording(None) if state == "finished" else nullcontext():
+        pass
+    if state != "new":
+        folder.last_checkpoint.touch()
+    folder.write_constants({"photometry": version} if version else {})
+    refused = state == "interrupted" and words == ["photometry=robust"] and version is None
+    with pytest.raises(RunError, match="move the folder away and train again") if refused else nullcontext():
+        require_same_photometry(folder, checked(*words))
+
+
 READS = ("aten::_local_scalar_dense", "aten::nonzero", "aten::is_nonzero", "aten::equal")
 """Operations whose result the host reads, for which it waits for a GPU."""
 
@@ -101,10 +123,13 @@ class Reads(TorchDispatchMode):
 
 @pytest.mark.parametrize(
     "words",
-    [[], ["camera.f_error=0.05"], ["model=mae_constf"], ["model=quantiles"], ["model=student_t"]],
+    [
+        *([], ["camera.f_error=0.05"], ["model=mae_constf"], ["model=quantiles"], ["model=student_t"]),
+        ["recipe.augmentation.largest_zoom=1.2"],
+    ],
     ids=" ".join,
 )
-def test_a_training_step_reads_nothing_back(checked: Callable, words: list[str]) -> None:
+def test_a_training_step_and_its_data_read_nothing_back(checked: Callable, words: list[str]) -> None:
     config = checked("recipe=strong", "photometry=robust", "backbone.width=8", "backbone.channels=4", *words)
     data = build_data(config)
     module, n = build_module(config, data), 4
@@ -113,8 +138,14 @@ def test_a_training_step_reads_nothing_back(checked: Callable, words: list[str])
     batch = Batch(
         image, torch.tensor([[0.0, 0.0, 4.0]]).expand(n, 3), torch.full((n,), 400.0), 64.0, torch.arange(n), mask
     )
+    limits = {"contrast": 2.0, "white_balance": 1.5, "occluders": 1.0}
+    augment = replace(data.augment, photometry=replace(data.augment.photometry, **limits))
+    augment = BackdropExchange(Backdrops(image, mask.new_zeros(n, 64, 64)), 1.0, augment)
+    loader = BatchLoader(batch, n, shuffle=True, seed=0, augment=augment)
+    assert len(augment.texture) == n  # computed once, before the first step
     with Reads() as reads:
-        changed = data.augment(batch, torch.full((n, data.augment.n_numbers), 0.9, dtype=torch.float64))
+        (first,) = loader
+        changed = augment(first, torch.full((n, augment.n_numbers), 0.9, dtype=torch.float64))  # all of it
         module.training_step(changed, 0).backward()
         optimizer.step()
         assert reads.found == []
