@@ -63,7 +63,9 @@ class Augmentation:
 
 
 def rearranged(
-    image: UInt8[Tensor, "batch side side channels"], signs: Float[np.ndarray, "batch 3"], channels: Int[np.ndarray, "batch n"]
+    image: UInt8[Tensor, "batch side side channels"],
+    signs: Float[np.ndarray, "batch 3"],
+    channels: Int[np.ndarray, "batch n"],
 ) -> UInt8[Tensor, "batch side side channels"]:
     """The images `moved` by `symmetries` of these signs, without interpolation; with their channels in that order."""
     result = torch.empty_like(image)

@@ -72,7 +72,8 @@ class BackdropExchange:
         pairs = (len(self.backdrops.empty) * pairs).astype(np.int64)
         others = np.take_along_axis(pairs, self.texture[pairs].argmax(axis=1)[:, None], axis=1)[:, 0]
         image = batch.image.clone()
-        change(image, changes[:, 0] < self.share, partial(self._before, batch.row), np.arange(len(batch)), others, views)
+        formula = partial(self._before, batch.row)
+        change(image, changes[:, 0] < self.share, formula, np.arange(len(batch)), others, views)
         batch = replace(batch, image=image)
         return self.then(batch, of_then) if self.then else batch
 
@@ -102,9 +103,10 @@ def tiled(
     transposed if the last one is below 1/2. Pixels are picked without interpolation.
     """
     side, (fine, down, right, turn) = images.shape[1], views.T
-    steps = np.arange(side) * np.float32(FINEST**fine)[:, None]
-    places = ((steps + np.float32(2 * side * start)[:, None]).astype(np.int64) % (2 * side) for start in (down, right))
-    row, column = (np.minimum(place, 2 * side - 1 - place) for place in places)
+    steps = np.arange(side) * (FINEST**fine)[:, None].astype(np.float32)
+    starts = ((2 * side * start)[:, None].astype(np.float32) for start in (down, right))
+    row, column = ((steps + start).astype(np.int64) % (2 * side) for start in starts)
+    row, column = (np.minimum(place, 2 * side - 1 - place) for place in (row, column))
     row, transposed = side * (side * which[:, None] + row), (turn < 0.5)[:, None]
     outer, inner = on(images, np.where(transposed, column, row)), on(images, np.where(transposed, row, column))
     pixels = (outer[:, :, None] + inner[:, None, :]).flatten()

@@ -15,6 +15,7 @@ from phd_exp.geometry.camera import Camera
 
 SIGNS = 3  # the first random numbers of a row, whose signs are stratified
 OCTANTS = 2**SIGNS
+HOST = torch.device("cpu")
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,9 @@ class Batch:
         return sum(part.nbytes for part in vars(self).values() if isinstance(part, Tensor))
 
     def _map(self, function: Callable[[Tensor], Tensor]) -> "Batch":
-        parts: dict[str, Any] = {name: part for name, part in vars(self).items() if isinstance(part, Tensor)}
-        return replace(self, **{name: function(part) for name, part in parts.items()})
+        parts = {name: part for name, part in vars(self).items() if isinstance(part, Tensor)}
+        changed: dict[str, Any] = {name: function(part) for name, part in parts.items()}
+        return replace(self, **changed)
 
 
 @runtime_checkable
@@ -95,8 +97,8 @@ class BatchLoader:
     for the whole batch, so they do not depend on `world`. The signs of the first three numbers of a row are
     stratified: within eight epochs each row gets all eight combinations.
 
-    Batches are on `device`, where `augment` works. If the samples are elsewhere, the next batch is selected and copied
-    in a thread while the last one is in use.
+    Batches are on `device`, where `augment` works. If the samples are elsewhere, the next batch is selected and
+    copied in a thread while the last one is in use.
 
     Examples:
         >>> n = 4
@@ -114,7 +116,7 @@ class BatchLoader:
     rank: int = 0
     world: int = 1
     augment: Augment | None = None
-    device: torch.device = torch.device("cpu")
+    device: torch.device = HOST
     epoch: int = field(default=-1, init=False)
     next_batch: int = field(default=0, init=False)
     resumes: bool = field(default=False, init=False)

@@ -139,7 +139,7 @@ def toned(image: Images, tables: UInt8[np.ndarray, "batch bands 256"]) -> Images
 
 
 def blurred(image: Images, deviation: NDArray[np.float64]) -> Images:
-    """The convolution with a Gaussian of that standard deviation up to three of them, the border repeated beyond it."""
+    """The convolution with a Gaussian of that standard deviation, up to three of them; the border is repeated."""
     reach = np.ceil(3 * deviation)[:, None]
     place = np.arange(int(reach.max()) + 1)
     weight = np.exp(-(place**2) / (2 * deviation[:, None] ** 2)) * (place <= reach)

@@ -2,7 +2,7 @@
 
     runs/<preset>[+<recipe>]/<data>/<model>/seed<k>[-<hash of other overrides>]/
         config.yaml          the configuration, resolved
-        constants.json       constants of the data set (depth scale, focal length), versions of shrinking and photometry
+        constants.json       constants of the data set (depth scale, focal length); versions of its images
         status.json          state, error, versions, git commit, hash of the data set
         metrics.jsonl        one line per epoch
         results.json         the final numbers

@@ -119,8 +119,8 @@ def require_same_photometry(folder: RunFolder, config: RunConfig) -> None:
     before = folder.constants().get("photometry") if folder.constants_file.exists() else None
     if before != VERSION:
         raise RunError(
-            f"{folder.path}: interrupted while it trained with blur, noise, JPEG or light of an earlier version, which "
-            "changed other images; move the folder away and train again"
+            f"{folder.path}: interrupted while it trained with light, blur, noise or JPEG of an earlier version, "
+            "whose images differ; move the folder away and train again"
         )
 
 
