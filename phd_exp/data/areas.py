@@ -3,10 +3,12 @@
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import grid_sample, pad
 
 GREY = 128  # all colours of transparent pixels and of those beyond the edges of an image
 TIES = 1e6  # means are rounded to 1/TIES first, so that halves are exact whatever the order of the sums
+
+BEYOND = 3.0  # a place outside every image, in units of half its size from the middle
 
 
 def sums(image: UInt8[Tensor, "height width bands"]) -> Float[Tensor, "height+1 width+1 bands"]:
@@ -24,14 +26,42 @@ def area_means(
     the pixel along both axes (the root of the sum of squares of its two edges), and at least that of a pixel of the
     image, so that views of more pixels are interpolated linearly. Beyond the image, and at NaN, all is grey.
     """
-    a, b = corners[..., :-1, :-1, :], corners[..., :-1, 1:, :]
-    c, d = corners[..., 1:, :-1, :], corners[..., 1:, 1:, :]
-    across, down = (b + d - a - c) / 2, (c + d - a - b) / 2
-    side = (across.square() + down.square()).sqrt().clamp_min(1)
-    middle = (a + b + c + d) / 4
+    middle, side = _rectangles(corners)
+    side = side.clamp_min(1)
     (left, top), (right, bottom) = ((middle + sign * side / 2).unbind(-1) for sign in (-1, 1))
     total = _at(table, right, bottom) - _at(table, left, bottom) - _at(table, right, top) + _at(table, left, top)
     mean = (GREY + total / side.prod(-1, keepdim=True)).nan_to_num(float(GREY))  # where a corner is NaN
+    return _rounded(mean)
+
+
+def view(
+    image: UInt8[Tensor, "height width bands"], corners: Float[Tensor, "lower further 2"]
+) -> UInt8[Tensor, "rows columns bands"]:
+    """The view of an image whose pixels have their corners at these places: `area_means`.
+
+    If no pixel is larger than those of the image, the means are bilinear interpolations, which need a quarter of the
+    look-ups and no sums. Both are computed in float64 and differ in its rounding alone.
+    """
+    middle, side = _rectangles(corners)
+    if side.nan_to_num(0.0).max() > 1:
+        return area_means(sums(image), corners)
+    size = middle.new_tensor([image.shape[1], image.shape[0]])
+    place = (2 * middle / size - 1).nan_to_num(BEYOND).clamp(-BEYOND, BEYOND)
+    values = image.permute(2, 0, 1)[None].to(middle.dtype).sub_(GREY)  # zero beyond the edges
+    return _rounded(GREY + grid_sample(values, place[None], align_corners=False)[0].permute(1, 2, 0))
+
+
+def _rectangles(
+    corners: Float[Tensor, "*views lower further 2"],
+) -> tuple[Float[Tensor, "*views rows columns 2"], Float[Tensor, "*views rows columns 2"]]:
+    """The middles and the sides (across, down) of the rectangles about pixels with these corners."""
+    a, b = corners[..., :-1, :-1, :], corners[..., :-1, 1:, :]
+    c, d = corners[..., 1:, :-1, :], corners[..., 1:, 1:, :]
+    across, down = (b + d - a - c) / 2, (c + d - a - b) / 2
+    return (a + b + c + d) / 4, (across.square() + down.square()).sqrt()
+
+
+def _rounded(mean: Float[Tensor, "*views rows columns bands"]) -> UInt8[Tensor, "*views rows columns bands"]:
     return ((mean * TIES).round() / TIES).round().clamp(0, 255).to(torch.uint8)
 
 

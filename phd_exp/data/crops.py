@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, UInt8
 from PIL import ExifTags, Image
 
-from phd_exp.data.areas import GREY, area_means, sums
+from phd_exp.data.areas import GREY, view
 from phd_exp.data.images import shrunk
 from phd_exp.optics.lens import PINHOLE
 from phd_exp.optics.virtual import VirtualCamera, intrinsics, require_no_fold
@@ -73,7 +73,7 @@ def facing(detection: Detection, size: tuple[int, int], side: int, largest_f: fl
 def cut(image: Image.Image, camera: VirtualCamera) -> UInt8[np.ndarray, "S S 3"]:
     """The virtual camera's view of an RGB image of its real camera; grey beyond the edges of the image.
 
-    The pixels are `area_means`. A square image viewed as a whole is `shrunk`, to the same pixels in less time.
+    The pixels are means over areas, see `view`. A square image viewed as a whole is `shrunk`, to the same pixels in less time.
     """
     if _is_whole(image, camera) and image.width >= camera.S:
         return shrunk(np.asarray(image), int(camera.S))
@@ -83,7 +83,7 @@ def cut(image: Image.Image, camera: VirtualCamera) -> UInt8[np.ndarray, "S S 3"]
     pixels = torch.from_numpy(np.array(image.crop(part)))
     # of a large image band by band, for the sums take eight bytes per pixel
     at_once = 3 if pixels[..., 0].numel() <= LARGEST_SUMS else 1
-    return torch.cat([area_means(sums(bands), places) for bands in pixels.split(at_once, dim=-1)], dim=-1).numpy()
+    return torch.cat([view(bands, places) for bands in pixels.split(at_once, dim=-1)], dim=-1).numpy()
 
 
 def _is_whole(image: Image.Image, camera: VirtualCamera) -> bool:
