@@ -68,7 +68,7 @@ def rearranged(
     channels: Int[np.ndarray, "batch n"],
 ) -> UInt8[Tensor, "batch side side channels"]:
     """The images `moved` by `symmetries` of these signs, without interpolation; with their channels in that order."""
-    result = torch.empty_like(image)
+    result = torch.empty_like(image, memory_format=torch.contiguous_format)
     kinds, kind = np.unique(np.column_stack([signs < 0, channels]), axis=0, return_inverse=True)
     for number, (across, down, is_exchanged, *order) in enumerate(kinds.tolist()):
         rows = on(image, np.flatnonzero(kind == number))

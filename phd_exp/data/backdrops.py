@@ -71,7 +71,7 @@ class BackdropExchange:
         changes, pairs, views = (part.numpy() for part in ((own + 1) / 2).split(NUMBERS, dim=1))
         pairs = (len(self.backdrops.empty) * pairs).astype(np.int64)
         others = np.take_along_axis(pairs, self.texture[pairs].argmax(axis=1)[:, None], axis=1)[:, 0]
-        image = batch.image.clone()
+        image = batch.image.clone(memory_format=torch.contiguous_format)
         formula = partial(self._before, batch.row)
         change(image, changes[:, 0] < self.share, formula, np.arange(len(batch)), others, views)
         batch = replace(batch, image=image)

@@ -73,7 +73,8 @@ def facing(detection: Detection, size: tuple[int, int], side: int, largest_f: fl
 def cut(image: Image.Image, camera: VirtualCamera) -> UInt8[np.ndarray, "S S 3"]:
     """The virtual camera's view of an RGB image of its real camera; grey beyond the edges of the image.
 
-    The pixels are means over areas, see `view`. A square image viewed as a whole is `shrunk`, to the same pixels in less time.
+    The pixels are means over areas, see `view`. A square image viewed as a whole is `shrunk`, to the same pixels in
+    less time.
     """
     if _is_whole(image, camera) and image.width >= camera.S:
         return shrunk(np.asarray(image), int(camera.S))
@@ -96,9 +97,9 @@ def _is_whole(image: Image.Image, camera: VirtualCamera) -> bool:
 
 def _reach(corners: Float[np.ndarray, "rows columns 2"], size: tuple[int, int]) -> tuple[int, int, int, int]:
     """Left, top, right and bottom of the part of the image that the pixels with these corners read; never empty."""
-    flat = corners.reshape(-1, 2)  # NaN where the real camera sees nothing
-    left, top = np.floor(np.fmin.reduce(flat) - MARGIN).clip(0, np.array(size) - 1).astype(int).tolist()
-    right, bottom = np.ceil(np.fmax.reduce(flat) + MARGIN).clip(1, size).astype(int).tolist()
+    flat = np.ascontiguousarray(corners.reshape(-1, 2).T)  # NaN where the real camera sees nothing
+    left, top = np.floor(np.fmin.reduce(flat, 1) - MARGIN).clip(0, np.array(size) - 1).astype(int).tolist()
+    right, bottom = np.ceil(np.fmax.reduce(flat, 1) + MARGIN).clip(1, size).astype(int).tolist()
     return left, top, right, bottom
 
 

@@ -63,7 +63,7 @@ class Photometry:
         drawn = {name: part.numpy() for name, part in zip(NUMBERS, parts, strict=True)}
         blur, noise, loss = (_strength(drawn[name][:, 0]) for name in ("blur", "noise", "jpeg"))
         quality = (100 - (100 - self.jpeg) * loss).round().clip(1)
-        image = image.clone()
+        image = image.clone(memory_format=torch.contiguous_format)
         change(image, drawn["occluder"][:, 0] < 2 * self.occluders - 1, occluded, drawn["shape"])
         if (self.brightness, self.contrast, self.gamma, self.white_balance) != (1, 1, 1, 1):
             change(image, np.ones(len(image)), toned, self._tones(drawn["tone"]))
@@ -117,7 +117,7 @@ def write(
 ) -> None:
     """image[rows] = part, in place; by words of four bytes if they fit, since a CPU copies element by element."""
     word = torch.uint8 if image[0].numel() % 4 else torch.int32
-    image.flatten(1).view(word).index_copy_(0, rows, part.flatten(1).view(word))
+    image.view(len(image), -1).view(word).index_copy_(0, rows, part.flatten(1).view(word))
 
 
 def on(image: Tensor, numbers: np.ndarray) -> Tensor:

@@ -101,6 +101,7 @@ def measured(overrides: list[str], steps: int) -> dict[str, Any]:
         masks=config.recipe.segmentation > 0,
     )
     data.setup()
+    data.move_to(torch.device("cuda", 0) if torch.cuda.is_available() else torch.device("cpu"))
     batch = next(iter(data.train_dataloader()))
     whole = seconds(config, data, data.train_dataloader(), steps)
     alone = seconds(config, data, itertools.repeat(batch), steps)
