@@ -20,8 +20,8 @@ def test_a_view_is_the_mean_over_areas(size: tuple[int, int], zoom: float) -> No
     corners = (
         torch.stack([math.cos(turn) * x - math.sin(turn) * y, math.sin(turn) * x + math.cos(turn) * y], dim=-1) - 3
     )
-    corners[:3, :5] = math.nan
+    corners[-3:, -5:] = math.nan
     found = view(image, corners)
     assert torch.equal(found, area_means(sums(image), corners))
-    assert (found[:2, :4] == GREY).all()
+    assert (found[-2:, -4:] == GREY).all()
     assert (found != GREY).any()
