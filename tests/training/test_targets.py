@@ -33,7 +33,7 @@ FOREIGN: list[tuple[dict[str, Any], str]] = [
     ({"_target_": ADAM}, r"^_target_: 'torch.optim.Adam' is not built"),
     ({"_target_": "phd_exp.records.files.write_atomic"}, r"is not built from a stored configuration$"),
     ({"_target_": "phd_exp.models_of_mine.Net"}, r"is not built from a stored configuration$"),
-    ({"_target_": "phd_exp.optics.virtual.dataclass"}, r"is only imported there"),
+    ({"_target_": "phd_exp.geometry.camera.dataclass"}, r"is only imported there"),
     ({"_target_": HEAD, "chart": [{"_target_": "os.system"}]}, r"^chart\.0\._target_: 'os.system' is not"),
     ({"_target_": HEAD, "chart": {"deep": {"_target_": "os.system"}}}, r"^chart\.deep\._target_: 'os.system' is not"),
     ({"_target_": HEAD, "chart": CHART | {"_target_": "os.system"}}, r"^chart\._target_: 'os.system' is not"),
