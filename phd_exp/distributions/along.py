@@ -1,7 +1,7 @@
 """The law of the position's coordinate along any direction, such as the depth for another camera.
 
-For a vector c, c . v = (c . m) z + |g| q_1 in law, with m = (mu_x, mu_y, 1) and g = A_xy^(-1) (c_x, c_y): the depth z
-and q_1, any one coordinate of q, are independent.
+For a vector c, c . v = c . apex + (c . m) z + |g| q_1 in law, with m = (m_xy, 1) and g = A_xy^(-1) (c_x, c_y): the
+depth z and q_1, any one coordinate of q, are independent.
 """
 
 import math
@@ -22,6 +22,7 @@ FURTHEST = 45.0  # the |q_1| beyond which no probability is left in float64
 STEP = 0.005  # of the table of the law of q_1, which errs by less than 1e-9
 _TAILS = (1e-14, 1e-9, 1e-5, 1e-3, 0.02, 0.1, 0.3)  # the law of depth is smooth between these quantiles
 _BREAKS = np.array([-FURTHEST, -16.0, -8.0, -4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0, 8.0, 16.0, FURTHEST])
+_LEAST_KAPPA = 1e-12  # moves a quantile by 1e-12 of the depth where the axis runs across the direction
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 
 
@@ -60,18 +61,21 @@ def quantiles_along(
 ) -> Float[np.ndarray, "n quantiles"]:
     """The values s with P(direction . v <= s) = p, for p in (0, 1), of n distributions; metres for unit vectors.
 
-    P = E[M((s - kappa z) / |g|)] with kappa = direction . m > 0 and the distribution function M of q_1, an integral
-    over the law of depth, computed piecewise in float64 to about 1e-8, for a up to 1e10. Along (0, 0, 1) it is
-    `depth_icdf`.
+    From the apex P = E[M((s - kappa z) / |g|)] with kappa = direction . m and the distribution function M of q_1, an
+    integral over the law of depth, computed piecewise in float64 to about 1e-8, for a up to 1e10. Along (0, 0, 1) it
+    is `depth_icdf`. A free axis may lead away from the direction (kappa < 0), which turns both round.
 
-    Raises ValueError for a direction in which the mode does not lie (kappa <= 0).
+    Raises ValueError for a direction in which the mode does not lie.
     Source: own derivation (q and t are independent); checked against samples in tests/distributions/test_along.py.
     """
-    parameters = (distribution.mu_xy, distribution.mu_z, distribution.A)
-    mu_xy, mu_z, A = (tensor.detach().cpu().double().numpy() for tensor in parameters)
-    kappa = (direction[:, :2] * mu_xy).sum(-1) + direction[:, 2]
-    if not (kappa > 0).all():
+    parameters = (distribution.mode, distribution.m_xy, distribution.apex, distribution.mu_z, distribution.A)
+    mode, m_xy, apex, mu_z, A = (tensor.detach().cpu().double().numpy() for tensor in parameters)
+    if not ((direction * mode).sum(-1) > 0).all():
         raise ValueError("the mode lies 90 degrees or more from this direction")
+    kappa = (direction[:, :2] * m_xy).sum(-1) + direction[:, 2]
+    sign = np.where(kappa < 0, -1.0, 1.0)
+    kappa = np.maximum(np.abs(kappa), _LEAST_KAPPA)
+    p = np.where(sign[:, None] < 0, 1 - p, p)
     reach = np.linalg.norm(np.linalg.solve(A, direction[:, :2, None])[..., 0], axis=-1) * mu_z
     law = _DepthLaw(distribution)
     found = kappa[:, None] * law.icdf(p)
@@ -81,15 +85,17 @@ def quantiles_along(
         far = np.stack([p / 2, 1 - (1 - p) / 2])
         radius = radial_icdf(torch.from_numpy(np.maximum(far, 1 - far))).numpy()
         low, high = (
-            (kappa[:, None] * law.icdf(one) + sign * reach[:, None] * q)[turned].ravel()
-            for one, q, sign in zip(far, radius, (-1, 1), strict=True)
+            (kappa[:, None] * law.icdf(one) + side * reach[:, None] * q)[turned].ravel()
+            for one, q, side in zip(far, radius, (-1, 1), strict=True)
         )
-        rows, p_of = np.repeat(turned, len(p)), np.tile(p, len(turned))
+        rows = np.repeat(turned, p.shape[1])
         root = find_root(
-            lambda s, row, p: law.cdf_of_sum(s, row, kappa[row], reach[row]) - p, (low, high), args=(rows, p_of)
+            lambda s, row, p: law.cdf_of_sum(s, row, kappa[row], reach[row]) - p,
+            (low, high),
+            args=(rows, p[turned].ravel()),
         )
-        found[turned] = root.x.reshape(-1, len(p))
-    return found
+        found[turned] = root.x.reshape(-1, p.shape[1])
+    return sign[:, None] * found + (direction * apex).sum(-1)[:, None]
 
 
 class _DepthLaw:
@@ -107,12 +113,12 @@ class _DepthLaw:
     @cached_property
     def breaks(self) -> Float[np.ndarray, "n breaks"]:
         """The depths between which the law is smooth, m."""
-        tails = np.array(_TAILS)
-        return np.concatenate([self.icdf(tails), self.mu_z[:, None], self.icdf(1 - tails[::-1])], axis=1)
+        tails = np.array(_TAILS)[None]
+        return np.concatenate([self.icdf(tails), self.mu_z[:, None], self.icdf(1 - tails[:, ::-1])], axis=1)
 
-    def icdf(self, p: Float[np.ndarray, " quantiles"]) -> Float[np.ndarray, "n quantiles"]:
+    def icdf(self, p: Float[np.ndarray, "#n quantiles"]) -> Float[np.ndarray, "n quantiles"]:
         """The depths with these probabilities below them, m."""
-        return self.distribution.depth_icdf(torch.from_numpy(p)[:, None]).detach().cpu().double().numpy().T
+        return self.distribution.depth_icdf(torch.from_numpy(p.T)).detach().cpu().double().numpy().T
 
     def cdf_of_sum(
         self,

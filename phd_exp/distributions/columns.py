@@ -1,6 +1,6 @@
 """A batch of distributions as columns of numbers, one row a sample, and back."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import torch
 from jaxtyping import Float
@@ -14,22 +14,30 @@ Columns = dict[str, Tensor]
 """Name -> one number a sample."""
 
 PARAMETERS = ("mu_x", "mu_y", "mu_z", "A_xx", "A_xy", "A_yy", "a")
+FREE_AXIS = ("k_x", "k_y")
+"""Further parameters of a distribution with a free axis."""
 COVARIANCE = ("C_xx", "C_xy", "C_xz", "C_yy", "C_yz", "C_zz")
 NEES = ("nees", "nees_x", "nees_y", "nees_z")
+
+
+def parameter_names(table: Collection[str]) -> tuple[str, ...]:
+    """The columns of parameters that a table has, or lacks: `PARAMETERS`, and `FREE_AXIS` if it has one of those."""
+    return PARAMETERS if not set(FREE_AXIS) & set(table) else PARAMETERS + FREE_AXIS
 
 
 def parameter_columns(distribution: ProjectedHuber) -> Columns:
     """The parameters of the camera frame: a distribution's columns from which `from_columns` rebuilds it."""
     mu_xy, A = distribution.mu_xy, distribution.A
     values = (*mu_xy.unbind(-1), distribution.mu_z, A[:, 0, 0], A[:, 0, 1], A[:, 1, 1], distribution.a)
-    return dict(zip(PARAMETERS, values, strict=True))
+    table = dict(zip(PARAMETERS, values, strict=True))
+    return table if distribution.k is None else table | dict(zip(FREE_AXIS, distribution.k.unbind(-1), strict=True))
 
 
 def from_columns(columns: Mapping[str, Tensor]) -> ProjectedHuber:
     """The distributions with the parameters of a table. Raises ValueError where one violates its constraint."""
-    mu_x, mu_y, mu_z, A_xx, A_xy, A_yy, a = (columns[name] for name in PARAMETERS)
+    mu_x, mu_y, mu_z, A_xx, A_xy, A_yy, a, *k = (columns[name] for name in parameter_names(columns))
     A = torch.stack([A_xx, A_xy, A_xy, A_yy], dim=-1).unflatten(-1, (2, 2))
-    return ProjectedHuber(torch.stack([mu_x, mu_y], dim=-1), mu_z, A, a)
+    return ProjectedHuber(torch.stack([mu_x, mu_y], dim=-1), mu_z, A, a, torch.stack(k, dim=-1) if k else None)
 
 
 def distribution_columns(distribution: Density, xyz: Float[Tensor, "samples 3"]) -> Columns:
@@ -68,7 +76,7 @@ def draws(distribution: Density, n: int, seed: int) -> Float[Tensor, "n samples 
 def squared_error_columns(distribution: Density, xyz: Float[Tensor, "*draws samples 3"]) -> Columns:
     """Variances and squared errors: m^2 (of depth, about its mean), and without unit (projected: x/z plus y/z)."""
     z = xyz[..., 2]
-    off_centre = xyz[..., :2] / z[..., None] - distribution.mu_xy
+    off_centre = xyz[..., :2] / z[..., None] - distribution.projected_mean
     return {
         "depth_variance": distribution.depth_variance,
         "depth_squared_error": (z - distribution.depth_mean).square(),

@@ -50,7 +50,12 @@ class Density(ABC):
     @property
     @abstractmethod
     def mu_xy(self) -> Float[Tensor, "*batch 2"]:
-        """Mean of (x, y)/z."""
+        """Centre of (x, y)/z."""
+
+    @property
+    def projected_mean(self) -> Float[Tensor, "*batch 2"]:
+        """Mean of (x, y)/z, which is mu_xy unless the axis is free."""
+        return self.mu_xy
 
     @property
     @abstractmethod

@@ -111,6 +111,21 @@ def depth_mean_and_variance(
     return 1 + first / a, (second - first.square()) / a.square()
 
 
+def inverse_depth_shortfall(a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """1 - E[1/t] = int_0^inf s^2 e^(-s) (1 + s/a)^(-2) ds / (a^2 (1 + g(a))), in (0, 1), about 1/a^2 where a is large.
+
+    With y the shortfall, Var[1/t] = y (2 - y), because E[1/t^2] = 1. For a <= 1 the integral over a^2 is
+    1 + g - 2 a e^a E_1(a), which would cancel where a is large.
+
+    Source: own derivation (moments around the mode); checked against mpmath in tests/distributions/test_depth.py.
+    """
+    small = a <= 1
+    below, above = a.masked_fill(~small, 1), a.masked_fill(small, 1)
+    near = 1 + tail_moment(0, below) - 2 * below * scaled_expint(1, below)
+    far = weighted_integral(lambda s: (s / (above + s)).square(), above)
+    return torch.where(small, near, far) / (1 + tail_moment(0, a))
+
+
 def depth_entropy(log_a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """Entropy of t in nats, log(e^a N(a)) + E[w]."""
     return log_scaled_normaliser(log_a) + depth_mean_energy(log_a)

@@ -1,20 +1,24 @@
 """Level curves of one predicted density: on the image, and from above (the paper's first figure).
 
 A curve of level p bounds the smallest region that holds the probability p, of (x, y)/z on the image and of (x, z) in
-the bird's-eye view. Both laws are marginals of the density of (x, y, z), and both have closed curves because q and t
-are independent (see `ProjectedHuber`).
+the bird's-eye view. Both laws are marginals of the density of (x, y, z). Their curves are closed, and convex on the
+image: p is log-concave, and for such a density the integral of p(z u, z) z^2 over z, to the power -1/3, is convex in u.
+
+Source: Ball, "Logarithmically concave functions and sections of convex sets in R^n" (1988).
 """
 
+import math
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy import integrate, optimize
+from scipy import integrate, optimize, special
+from scipy.optimize.elementwise import find_root
 
 from phd_exp.distributions.along import FURTHEST, whitened_marginal
-from phd_exp.distributions.huber import radial_cdf
+from phd_exp.distributions.huber import huber_energy, radial_cdf
 from phd_exp.distributions.projected_huber import ProjectedHuber
 
 Points = Float[np.ndarray, "_ 2"]
@@ -22,6 +26,8 @@ Points = Float[np.ndarray, "_ 2"]
 LEVELS = (0.5, 0.9, 0.99)
 _POINTS = 73  # of a curve, and of half an outline
 _STRATA = 500  # equally probable values of t that represent its law
+_FURTHEST_ENERGY = 40.0  # of depth; beyond, no probability is left
+_REACH, _RADII = 10.0, 128  # of asinh(50 radius): radii up to 220 deviations
 
 
 @dataclass(frozen=True)
@@ -51,9 +57,13 @@ def level_curves(distribution: ProjectedHuber, levels: tuple[float, ...] = LEVEL
         raise ValueError(f"levels lie between 0 and 1, exclusive; these are {levels}")
     middles = (torch.arange(_STRATA, dtype=torch.float64) + 0.5) / _STRATA  # of equally probable strata
     t = _float64(distribution.depth_icdf(middles) / distribution.mu_z)
+    if distribution.k is None:
+        projected = tuple(_ellipse(distribution, _radius(t, level)) for level in levels)
+    else:
+        projected = _free_curves(distribution, _float64(distribution.k), levels)
     return LevelCurves(
         levels=levels,
-        projected=tuple(_ellipse(distribution, _radius(t, level)) for level in levels),
+        projected=projected,
         birds_eye=tuple(_outline(distribution, _excess(distribution, t, level)) for level in levels),
         mode=_float64(distribution.mode),
     )
@@ -84,8 +94,62 @@ def _radius(t: Float[np.ndarray, " strata"], level: float) -> float:
 def _ellipse(distribution: ProjectedHuber, radius: float) -> Points:
     """u = mu_xy + A^(-1) rho (cos, sin), once around."""
     angle = np.linspace(0, 2 * np.pi, _POINTS)
-    circle = radius * np.stack([np.cos(angle), np.sin(angle)])
-    return _float64(distribution.mu_xy) + np.linalg.solve(_float64(distribution.A), circle).T
+    return _on_rays(distribution, radius * np.stack([np.cos(angle), np.sin(angle)], -1))
+
+
+def _on_rays(distribution: ProjectedHuber, w: Points) -> Points:
+    """The u = (x, y)/z with A (u - mu_xy) = w."""
+    return _float64(distribution.mu_xy) + np.linalg.solve(_float64(distribution.A), w.T).T
+
+
+def _free_curves(
+    distribution: ProjectedHuber, k: Float[np.ndarray, " 2"], levels: tuple[float, ...]
+) -> tuple[Points, ...]:
+    """The curves on the image with a free axis.
+
+    w = A (u - mu_xy) has the density E[t^2 exp(-h(|t w + k a (t - 1)|))] up to a constant. On a polar grid around a
+    point of the axis, the density of a curve is a quantile of the grid's densities; each point is a root along its ray.
+    """
+    s, t, log_weight = _depth_nodes(float(distribution.a), 64 + 16 * math.ceil(min(np.linalg.norm(k), 40)))
+
+    def log_density(w: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*points"]:
+        q = torch.from_numpy(t * w[..., None, :] + k * s)
+        return np.asarray(special.logsumexp(log_weight - huber_energy(q).numpy(), axis=-1))
+
+    on_axis = -k * s / t
+    centre = on_axis[log_density(on_axis).argmax()]
+    A = _float64(distribution.A)
+    root = np.linalg.cholesky(A @ _float64(distribution.projected_covariance) @ A)
+    angle = np.linspace(0, 2 * np.pi, _POINTS)
+    rays = np.stack([np.cos(angle), np.sin(angle)], -1) @ root.T
+    x = (np.arange(_RADII) + 0.5) * (_REACH / _RADII)
+    height = log_density(centre + np.sinh(x)[:, None, None] / 50 * rays[1:])
+    mass = np.exp(height - height.max()) * (np.sinh(x) * np.cosh(x))[:, None]
+    order = np.argsort(-height, axis=None)
+    below = mass.ravel()[order].cumsum() - mass.ravel()[order] / 2
+    on_curve = np.interp(levels, below / mass.sum(), height.ravel()[order])
+
+    def point(at: np.ndarray, ray: np.ndarray) -> np.ndarray:
+        return centre + np.sinh(at)[..., None] / 50 * rays[ray]
+
+    ray = np.arange(_POINTS)
+    ends = np.zeros(_POINTS), np.full(_POINTS, _REACH)
+    found = (find_root(lambda at, i, c=c: log_density(point(at, i)) - c, ends, args=(ray,)).x for c in on_curve)
+    return tuple(_on_rays(distribution, point(at, ray)) for at in found)
+
+
+def _depth_nodes(a: float, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """a (t - 1), t and log(weight t^2), each (2 n, .), of a Gauss rule on each side of the mode in the excess energy.
+
+    The weights sum to a multiple of 1. Energies W = 40 y^2 are denser near the mode.
+    """
+    y, weight = np.polynomial.legendre.leggauss(n)
+    y, W = (y + 1) / 2, _FURTHEST_ENERGY * ((y + 1) / 2) ** 2
+    log_weight = np.log(weight * y) - W
+    near = 1 / (1 + W / a)  # dt = -t^2 dW/a
+    s, t = np.concatenate([W, -W * near]), np.concatenate([1 + W / a, near])
+    log_weight = np.concatenate([log_weight, log_weight + 2 * np.log(near)]) + 2 * np.log(t)
+    return s[:, None], t[:, None], log_weight
 
 
 @cache
@@ -115,8 +179,8 @@ def _excess(distribution: ProjectedHuber, t: np.ndarray, level: float) -> float:
 def _outline(distribution: ProjectedHuber, excess: float) -> Points:
     """The (x, z) with a (max(t, 1/t) - 1) + e(q_1) = c, once around.
 
-    Given z, x = z mu_x + |g| q_1 in law, where g is the first row of mu_z A^(-1); so (x, z) has the density of t
-    times that of q_1, both at their own scale.
+    Given z, x is on the axis plus |g| q_1 in law, where g is the first row of mu_z A^(-1); so (x, z) has the density
+    of t times that of q_1, both at their own scale.
 
     Source: own derivation; the law of (x, z) is constant along the curve, checked by quadrature.
     """
@@ -130,6 +194,6 @@ def _outline(distribution: ProjectedHuber, excess: float) -> Points:
     half_width = mu_z * np.linalg.norm(np.linalg.inv(_float64(distribution.A))[0])
     half_width = half_width * np.interp(np.clip(excess - of_depth, 0, None), energy, s)
     z = mu_z * t
-    middle = z * float(distribution.mu_xy[0])
+    middle = float(distribution.apex[0]) + z * float(distribution.m_xy[0])
     right, left = (np.stack([x, z], axis=-1) for x in (middle + half_width, middle - half_width))
     return np.concatenate([right, left[::-1], right[:1]])

@@ -104,13 +104,13 @@ class Mixture:
     def closest(self) -> ProjectedHuber:
         """The Projected Huber distribution p with the least KL(mixture || p): that of maximum E[log p].
 
-        -E[log p] is a function of (A_xy, nu_xy), convex, plus one of (mu_z, a); each has its minimum by itself.
-        Parameters are wanted in float64. Source: own derivation; checked against a general optimiser in
-        tests/distributions/test_mixture.py.
+        -E[log p] is a function of (A_xy, nu_xy, nu_0), convex, plus one of (mu_z, a); each has its minimum by itself.
+        Its axis is free if the members' are. Parameters are wanted in float64. Source: own derivation; checked
+        against a general optimiser in tests/distributions/test_mixture.py.
         """
         mu_z, a = _closest_depth(self.members)
-        mu_xy, A_xy = _closest_projection(self.members)
-        return ProjectedHuber(mu_xy, mu_z, A_xy * mu_z[..., None, None], a, validate_args=False)
+        m_xy, apex, A_xy = _closest_projection(self.members)
+        return ProjectedHuber.about_axis(m_xy, apex, mu_z, A_xy * mu_z[..., None, None], a)
 
 
 def _closest_depth(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
@@ -147,23 +147,23 @@ def _closest_depth(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch"], Fl
     return middle.exp(), conditions(middle)[1]
 
 
-def _closest_projection(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch 2 2"]]:
-    """The mu_xy and A_xy that minimise the mean of h(|q|) - log|A_xy|, q = A_xy ((x, y) - mu_xy z), over the mixture.
+def _closest_projection(
+    members: ProjectedHuber,
+) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch 2"] | None, Float[Tensor, "*batch 2 2"]]:
+    """The m_xy, apex and A_xy that minimise the mean of h(|q|) - log|A_xy| over the mixture.
 
-    h(|q|) is at most |q|^2 / (2 max(1, |q_0|)) + constant, with equality at q_0: where that replaces it, mu_xy is a
-    weighted regression and A_xy^(-2) a weighted covariance C, and each such step lowers the mean. The integral is a
-    sum over `_whitened_nodes` at the root mean square of each member's depth.
+    q = A_xy ((x, y) - m_xy z - apex), without an apex (None) unless the members' axes are free. h(|q|) is at most
+    |q|^2 / (2 max(1, |q_0|)) + constant, with equality at q_0: where that replaces it, the axis is a weighted
+    regression and A_xy^(-2) a weighted covariance C, and each such step lowers the mean. The integral is a sum over
+    `_nodes`.
     """
-    nodes, weight = (torch.from_numpy(values).to(members.a) for values in _whitened_nodes())
-    z = (members.depth_variance + members.depth_mean.square()).sqrt()[..., None, None]
-    spread = spd.inverse(members.A, members.log_det_A) * members.mu_z[..., None, None]
-    xy = spd.matvec(spread[..., None, :, :], nodes) + z * members.mu_xy[..., None, :]
-    z, weight = z.expand_as(xy[..., :1]).flatten(-3, -2), weight / members.batch_shape[-1]
-    xy, weight = xy.flatten(-3, -2), weight.repeat(members.batch_shape[-1])[:, None]
-    pull = weight.expand_as(z)
+    z, xy, weight = _nodes(members)
+    has_apex, pull = members.k is not None, weight
     for _ in range(_STEPS):
-        mu_xy = (pull * z * xy).sum(-2) / (pull * z.square()).sum(-2)
-        off = xy - mu_xy[..., None, :] * z
+        mean_z, mean_xy = ((pull * v).sum(-2, keepdim=True) / pull.sum(-2, keepdim=True) for v in (z, xy))
+        z_0, xy_0 = (mean_z, mean_xy) if has_apex else (torch.zeros_like(mean_z), torch.zeros_like(mean_xy))
+        m_xy = (pull * (z - z_0) * (xy - xy_0)).sum(-2) / (pull * (z - z_0).square()).sum(-2)
+        off = xy - xy_0 - m_xy[..., None, :] * (z - z_0)
         C = ((pull * off)[..., :, None] * off[..., None, :]).sum(-3)
         log_det = spd.log_det(C)
         inverse = spd.inverse(C, log_det)
@@ -171,7 +171,28 @@ def _closest_projection(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch 
         pull = weight / q.clamp_min(1)
     root_det = torch.exp(-log_det / 2)[..., None, None]  # C^(-1/2) by the theorem of Cayley and Hamilton
     trace = inverse.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-    return mu_xy, (inverse + root_det * torch.eye(2).to(C)) / (trace + 2 * root_det).sqrt()
+    A_xy = (inverse + root_det * torch.eye(2).to(C)) / (trace + 2 * root_det).sqrt()
+    return m_xy, (xy_0.squeeze(-2) - m_xy * z_0.squeeze(-2)) if has_apex else None, A_xy
+
+
+def _nodes(
+    members: ProjectedHuber,
+) -> tuple[Float[Tensor, "*batch nodes 1"], Float[Tensor, "*batch nodes 2"], Float[Tensor, "nodes 1"]]:
+    """Depths, (x, y) and weights of the `_whitened_nodes` of all members.
+
+    They are at the root mean square of each member's depth, with a free axis at its mean less and plus its deviation.
+    """
+    nodes, weight = (torch.from_numpy(values).to(members.a) for values in _whitened_nodes())
+    mean, variance = members.depth_mean, members.depth_variance
+    around = mean - variance.sqrt(), mean + variance.sqrt()
+    depths = ((variance + mean.square()).sqrt(),) if members.k is None else around
+    spread = spd.inverse(members.A, members.log_det_A) * members.mu_z[..., None, None]
+    axis = [z[..., None] * members.m_xy + members.apex[..., :2] for z in depths]
+    across = spd.matvec(spread[..., None, :, :], nodes)
+    xy = torch.cat([across + at[..., None, :] for at in axis], dim=-2)
+    z = torch.cat([at[..., None, None].expand_as(across[..., :1]) for at in depths], dim=-2)
+    count = len(depths) * members.batch_shape[-1]
+    return z.flatten(-3, -2), xy.flatten(-3, -2), (weight / count).repeat(count)[:, None]
 
 
 def _whitened_nodes() -> tuple[np.ndarray, np.ndarray]:

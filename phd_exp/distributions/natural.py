@@ -5,7 +5,8 @@ The density needs no inverse of a matrix.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -17,19 +18,23 @@ from phd_exp.distributions.special import signed_log1p
 
 LARGEST_RATIO = 100.0
 """Of the eigenvalues of B, and so of A. Larger ones, on unusual images, were useless."""
-_EVENT_DIMS = {"A_xy": 2, "nu_xy": 1}
+_EVENT_DIMS = {"A_xy": 2, "nu_xy": 1, "nu_0": 1}
 
 
 @dataclass(frozen=True)
 class Natural:
-    """The parameters of a batch: q = A_xy (x, y) - nu_xy z and log t = log z - log mu_z.
+    """The parameters of a batch: q = A_xy (x, y) - nu_xy z - nu_0 and log t = log z - log mu_z.
+
+    The paper's axis, the line q = 0, passes through the camera: nu_0 = 0. With a free axis q has the further term
+    k a (t - 1), so that nu_xy = A_xy mu_xy - k a/mu_z and nu_0 = k a.
 
     Args:
         A_xy: A / mu_z, precision of (x, y) at any depth, 1/metres.
-        nu_xy: A_xy mu_xy, 1/metres.
+        nu_xy: A_xy mu_xy, with a free axis less k a/mu_z, 1/metres.
         log_det_A_xy: log|A_xy|; finite where |A_xy| underflows.
         log_mu_z: log of the depth's centre, mu_z in metres.
         log_a: log of the depth's precision.
+        nu_0: k a, with a free axis alone.
     """
 
     A_xy: Float[Tensor, "*#batch 2 2"]
@@ -37,6 +42,7 @@ class Natural:
     log_det_A_xy: Float[Tensor, "*#batch"]
     log_mu_z: Float[Tensor, "*#batch"]
     log_a: Float[Tensor, "*#batch"]
+    nu_0: Float[Tensor, "*#batch 2"] | None = None
 
     @classmethod
     def from_camera_frame(
@@ -45,24 +51,33 @@ class Natural:
         mu_z: Float[Tensor, "*#batch"],
         A: Float[Tensor, "*#batch 2 2"],
         a: Float[Tensor, "*#batch"],
+        k: Float[Tensor, "*#batch 2"] | None = None,
     ) -> "Natural":
-        """From the centre and precision of (x, y)/z and of z (metres).
+        """From the centre and precision of (x, y)/z and of z (metres), and the k of a free axis.
 
         Source: paper, section "Projected Huber distribution".
         """
         A_xy = A / mu_z[..., None, None]
         log_mu_z = mu_z.log()
-        return cls(A_xy, spd.matvec(A_xy, mu_xy), spd.log_det(A) - 2 * log_mu_z, log_mu_z, a.log())
+        log_det_A_xy = spd.log_det(A) - 2 * log_mu_z
+        return cls(A_xy, spd.matvec(A_xy, mu_xy), log_det_A_xy, log_mu_z, a.log()).with_axis(k)
+
+    def with_axis(self, k: Float[Tensor, "*#batch 2"] | None) -> "Natural":
+        """The paper's parameters with the axis turned about the mode: q plus k a (t - 1)."""
+        if k is None:
+            return self
+        nu_xy = self.nu_xy - k * torch.exp(self.log_a - self.log_mu_z)[..., None]
+        return replace(self, nu_xy=nu_xy, nu_0=k * self.log_a.exp()[..., None])
 
     @classmethod
     def from_raw(
-        cls, raw: Float[Tensor, "*#batch 7"], f: Float[Tensor, "*#batch"], S: float, mu_z0: float
+        cls, raw: Float[Tensor, "*#batch n"], f: Float[Tensor, "*#batch"], S: float, mu_z0: float
     ) -> "Natural":
-        """From seven raw numbers (n_1, n_2, b_1, b_2, b_3, w_1, w_2) of a network and its camera.
+        """From seven raw numbers (n_1, n_2, b_1, b_2, b_3, w_1, w_2) of a network and its camera, or nine with k.
 
         In the frame of the network nu_p = (n_1, n_2), B = `precision`(b_1, b_2, b_3), a = `positive`(w_1) and
         log nu_z = sign(w_2) log(1 + |w_2|/a). Then mu_z = nu_z mu_z0 f, A_xy = 2 B / (S mu_z0) and
-        nu_xy = nu_p / (mu_z0 f): in both frames, nu_z does not affect the projection.
+        nu_xy = nu_p / (mu_z0 f): in both frames, nu_z does not affect the projection. k is the same in both.
 
         Source: paper, sections "Parameter remapping" and "Enforcing constraints on distribution parameters".
         """
@@ -70,30 +85,34 @@ class Natural:
         log_a = spd.log_positive(raw[..., 5])
         f_in_metres = mu_z0 * f  # the depth at which z_p = 1
         scale = 2 / (S * mu_z0)
-        return cls(
+        paper = cls(
             A_xy=scale * B,
             nu_xy=raw[..., :2] / f_in_metres[..., None],
             log_det_A_xy=log_det_B + 2 * math.log(scale),
             log_mu_z=signed_log1p(raw[..., 6], log_a) + f_in_metres.log(),
             log_a=log_a,
         )
+        return paper.with_axis(raw[..., 7:] if raw.shape[-1] > 7 else None)
 
     @property
     def batch_shape(self) -> torch.Size:
         """The common batch shape of the parameters."""
-        first, *others = (_batch_shape(name, value) for name, value in vars(self).items())
+        parameters = ((name, value) for name, value in vars(self).items() if value is not None)
+        first, *others = (_batch_shape(name, value) for name, value in parameters)
         if all(shape == first for shape in others):  # broadcasting takes 50 us
             return first
         return torch.broadcast_shapes(first, *others)
 
     def expand(self, batch_shape: torch.Size) -> "Natural":
         """The same parameters with a larger batch shape; nothing is copied."""
-        return type(self)(
-            **{
-                name: value.expand(batch_shape + value.shape[len(_batch_shape(name, value)) :])
-                for name, value in vars(self).items()
-            }
+        return self.map(
+            lambda name, value: value.expand(batch_shape + value.shape[len(_batch_shape(name, value)) :])
         )
+
+    def map(self, change: Callable[[str, Tensor], Tensor]) -> "Natural":
+        """A function of the name and value of each parameter."""
+        parameters = ((name, value) for name, value in vars(self).items() if value is not None)
+        return type(self)(**{name: change(name, value) for name, value in parameters})
 
 
 def precision(b: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 2 2"], Float[Tensor, "*batch"]]:

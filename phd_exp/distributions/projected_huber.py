@@ -1,10 +1,11 @@
 """The Projected Huber distribution of a position in front of a camera.
 
-With q = A_xy (x, y) - nu_xy z and t = z / mu_z,
+With q = A_xy (x, y) - nu_xy z - nu_0 and t = z / mu_z,
 
     -log p(v) = h(|q|) - log|A_xy| + log(2 pi (1 + e^(-1/2))) + a max(t, 1/t) + log(mu_z N(a))   for z > 0.
 
-q and t are independent, and v is linear in (q, t). Every statistic below follows from that.
+q and t are independent, and v is affine in (q, t). Every statistic below follows from that. In the paper's density
+nu_0 = 0: its axis, the line q = 0, passes through the camera. A free axis passes through `apex` in the plane z = 0.
 """
 
 import math
@@ -37,6 +38,8 @@ class ProjectedHuber(Density, Distribution):
         mu_z: centre of z, metres; the mode is mu_z (mu_xy, 1).
         A: precision of (x, y)/z, symmetric positive definite; (x, y)/z has covariance 3.0765 A^(-2).
         a: precision of z; Var[z] is about 2 mu_z^2/a^2 where a is large.
+        k: adds k a (t - 1) to q, so that the axis, the line of centres of (x, y) given z, leaves the viewing ray of
+            the mode; None for the paper's density. With k = 0 all values are those of the paper's density.
         validate_args: check parameters here and positions later (default: True). A check synchronises with the GPU
             and does not run under `torch.func.vmap`; pass False there.
 
@@ -50,7 +53,9 @@ class ProjectedHuber(Density, Distribution):
         >>> p.log_prob(torch.tensor([0.1, 0.0, 4.2])) < p.log_prob(p.mode)  # nats per cubic metre
         tensor(True)
 
-    Source: paper, section "Projected Huber distribution".
+    Source: paper, section "Projected Huber distribution"; the free axis is an own generalisation. It keeps the
+    normaliser, the law of depth, the levels and convexity, because (q, t) stays affine in v with the same slope in
+    (x, y).
     """
 
     has_closed_forms: ClassVar[Literal[True]] = True
@@ -59,6 +64,7 @@ class ProjectedHuber(Density, Distribution):
         "mu_z": constraints.positive,
         "A": constraints.positive_definite,
         "a": constraints.positive,
+        "k": constraints.real_vector,
     }
     support = constraints.independent(
         constraints.cat([constraints.real, constraints.positive], dim=-1, lengths=[2, 1]), 1
@@ -71,18 +77,38 @@ class ProjectedHuber(Density, Distribution):
         mu_z: Float[Tensor, "*#batch"],
         A: Float[Tensor, "*#batch 2 2"],
         a: Float[Tensor, "*#batch"],
+        k: Float[Tensor, "*#batch 2"] | None = None,
         validate_args: bool | None = None,
     ) -> None:
         if _wants_validation(validate_args):
-            for name, value in (("mu_xy", mu_xy), ("mu_z", mu_z), ("A", A), ("a", a)):
-                require(name, value, self.arg_constraints[name])
-        self._adopt(Natural.from_camera_frame(mu_xy, mu_z, A, a), validate_args)
+            for name, value in (("mu_xy", mu_xy), ("mu_z", mu_z), ("A", A), ("a", a), ("k", k)):
+                if value is not None:
+                    require(name, value, self.arg_constraints[name])
+        self._adopt(Natural.from_camera_frame(mu_xy, mu_z, A, a, k), validate_args)
         self._require_representable()
+
+    @classmethod
+    def about_axis(
+        cls,
+        m_xy: Float[Tensor, "*#batch 2"],
+        apex: Float[Tensor, "*#batch 2"] | None,
+        mu_z: Float[Tensor, "*#batch"],
+        A: Float[Tensor, "*#batch 2 2"],
+        a: Float[Tensor, "*#batch"],
+    ) -> "ProjectedHuber":
+        """The distribution whose axis has the slope m_xy and the (x, y) of `apex` at z = 0 (metres), not validated.
+
+        Without an apex it is the paper's density, whose axis passes through the camera.
+        """
+        if apex is None:
+            return cls(m_xy, mu_z, A, a, validate_args=False)
+        place = apex / mu_z[..., None]
+        return cls(m_xy + place, mu_z, A, a, spd.matvec(A, place) / a[..., None], validate_args=False)
 
     @classmethod
     def from_raw(
         cls,
-        raw: Float[Tensor, "*#batch 7"],
+        raw: Float[Tensor, "*#batch n"],
         *,
         f: Float[Tensor, "*#batch"] | float,
         S: float,
@@ -90,6 +116,8 @@ class ProjectedHuber(Density, Distribution):
         validate_args: bool | None = None,
     ) -> "ProjectedHuber":
         """The distribution of the raw numbers (n_1, n_2, b_1, b_2, b_3, w_1, w_2) of a network, as `predict` uses it.
+
+        Nine numbers (..., w_1, w_2, k_1, k_2) give a free axis.
 
         The lesser eigenvalue of A is raised to at least 1/100 of the greater, a constant for the gradient. The
         constructor takes any A.
@@ -103,11 +131,13 @@ class ProjectedHuber(Density, Distribution):
                 numbers up to 1e9.
 
         Raises:
-            ValueError: a raw number is beyond +-1e9; f, S or mu_z0 is not positive and finite; or mode or covariance
+            ValueError: there are not seven or nine raw numbers; one is beyond +-1e9; f, S or mu_z0 is not positive and finite; or mode or covariance
                 overflow.
 
         Source: paper, section "Enforcing constraints on distribution parameters"; formulas in `Natural.from_raw`.
         """
+        if raw.shape[-1:] not in ((7,), (9,)):
+            raise ValueError(f"raw: got shape {tuple(raw.shape)}; expected 7 as the last dimension, or 9 with k")
         f = torch.as_tensor(f, dtype=raw.dtype, device=raw.device)
         if _wants_validation(validate_args):
             require("raw", raw, constraints.independent(constraints.interval(-LARGEST_RAW, LARGEST_RAW), 1))
@@ -134,7 +164,8 @@ class ProjectedHuber(Density, Distribution):
         """Raise ValueError if mode or covariances overflow in the data type, unless validation is off."""
         if not self._validate_args:
             return
-        parts = [self.mode, self.covariance_matrix.flatten(-2), self.projected_covariance.flatten(-2)]
+        covariances = (self.covariance_matrix, self.projected_covariance)
+        parts = [self.mode, self.mean, *(covariance.flatten(-2) for covariance in covariances)]
         overflow = ~torch.cat(parts, dim=-1).isfinite().all(-1)
         if bool(overflow.any()):
             raise ValueError(
@@ -148,23 +179,53 @@ class ProjectedHuber(Density, Distribution):
 
     def __getitem__(self, row: int | Tensor) -> "ProjectedHuber":
         """One distribution of a batch, or those that a mask chooses."""
-        chosen = {name: value[row] for name, value in vars(self._natural).items()}
-        return self._of(Natural(**chosen), self._validate_args)
+        return self._of(self._natural.map(lambda _, value: value[row]), self._validate_args)
 
     def tempered(self, projected: float, depth: float) -> "ProjectedHuber":
-        """The distribution with A / projected and a / depth in place of A and a, around the same mode."""
+        """The distribution with A / projected and a / depth in place of A and a, around the same mode and axis."""
         n = self._natural
         log_det_A_xy, log_a = n.log_det_A_xy - 2 * math.log(projected), n.log_a - math.log(depth)
-        tempered = Natural(n.A_xy / projected, n.nu_xy / projected, log_det_A_xy, n.log_mu_z, log_a)
+        nu_0 = None if n.nu_0 is None else n.nu_0 / projected
+        tempered = Natural(n.A_xy / projected, n.nu_xy / projected, log_det_A_xy, n.log_mu_z, log_a, nu_0)
         return self._of(tempered, self._validate_args)
 
     def __repr__(self) -> str:
         return f"ProjectedHuber(batch_shape={tuple(self.batch_shape)})"
 
     @property
+    def parameters(self) -> dict[str, Tensor]:
+        """The arguments of the constructor; with a free axis also k."""
+        found = {"mu_xy": self.mu_xy, "mu_z": self.mu_z, "A": self.A, "a": self.a}
+        return found if self.k is None else found | {"k": self.k}
+
+    @property
     def mu_xy(self) -> Float[Tensor, "*batch 2"]:
-        """Centre of (x, y)/z, also its mean."""
+        """Centre of (x, y)/z, that of the mode."""
+        n = self._natural
+        if n.nu_0 is None:
+            return self.m_xy
+        return spd.matvec(self._A_xy_inverse, n.nu_xy + n.nu_0 * torch.exp(-n.log_mu_z)[..., None])
+
+    @property
+    def m_xy(self) -> Float[Tensor, "*batch 2"]:
+        """Slope of the axis, the change of the centre of (x, y) with z; mu_xy without a free axis."""
         return spd.matvec(self._A_xy_inverse, self._natural.nu_xy)
+
+    @property
+    def apex(self) -> Float[Tensor, "*batch 3"]:
+        """Where the axis meets the plane z = 0, metres; the camera without a free axis.
+
+        The density of v is that of the paper at v - apex.
+        """
+        if self._natural.nu_0 is None:
+            return self.mode.new_zeros(()).expand((*self.batch_shape, 3))
+        return pad(spd.matvec(self._A_xy_inverse, self._natural.nu_0), (0, 1))
+
+    @property
+    def k(self) -> Float[Tensor, "*batch 2"] | None:
+        """The further term of q over a (t - 1); None without a free axis."""
+        nu_0 = self._natural.nu_0
+        return None if nu_0 is None else nu_0 * torch.exp(-self._natural.log_a)[..., None]
 
     @property
     def mu_z(self) -> Float[Tensor, "*batch"]:
@@ -191,8 +252,10 @@ class ProjectedHuber(Density, Distribution):
         return spd.inverse(self._natural.A_xy, self._natural.log_det_A_xy)
 
     def whiten(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 2"]:
-        """The projection of a position in units of its precision, q = A ((x, y)/z - mu_xy) z/mu_z."""
-        return spd.matvec(self._natural.A_xy, xyz[..., :2]) - self._natural.nu_xy * xyz[..., 2:]
+        """The projection in units of its precision, q = A ((x, y)/z - mu_xy) t, with a free axis plus k a (t - 1)."""
+        n = self._natural
+        q = spd.matvec(n.A_xy, xyz[..., :2]) - n.nu_xy * xyz[..., 2:]
+        return q if n.nu_0 is None else q - n.nu_0
 
     def depth_energy(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
         """The excess energy of a depth z > 0 (metres), a (max(t, 1/t) - 1) with t = z/mu_z."""
@@ -239,12 +302,17 @@ class ProjectedHuber(Density, Distribution):
         return at_depth(self.mu_xy, self.mu_z)
 
     @property
+    def mean(self) -> Float[Tensor, "*batch 3"]:
+        """Expected position, apex + E[z] (m_xy, 1), metres."""
+        return self.apex + at_depth(self.m_xy, self.depth_mean)
+
+    @property
     def covariance_matrix(self) -> Float[Tensor, "*batch 3 3"]:
-        """Covariance of the position, Var[z] m m^T + c A_xy^(-2) with m = (mu_xy, 1), square metres.
+        """Covariance of the position, Var[z] m m^T + c A_xy^(-2) with m = (m_xy, 1), square metres.
 
         Source: own derivation (q and t are independent); checked against samples.
         """
-        m = pad(self.mu_xy, (0, 1), value=1)
+        m = pad(self.m_xy, (0, 1), value=1)
         along = self.depth_variance[..., None, None] * m[..., :, None] * m[..., None, :]
         across = huber.HUBER_COVARIANCE * spd.square(self._A_xy_inverse)
         return along + pad(across, (0, 1, 0, 1))
@@ -255,12 +323,27 @@ class ProjectedHuber(Density, Distribution):
         return self.covariance_matrix.diagonal(dim1=-2, dim2=-1)
 
     @property
+    def projected_mean(self) -> Float[Tensor, "*batch 2"]:
+        """Mean of (x, y)/z, m_xy + E[1/z] (x, y) of the apex: mu_xy without a free axis.
+
+        Source: own derivation; checked against quadrature in tests/distributions/test_free_axis.py.
+        """
+        if self._natural.nu_0 is None:
+            return self.mu_xy
+        return self.mu_xy + (self.m_xy - self.mu_xy) * depth.inverse_depth_shortfall(self.a)[..., None]
+
+    @property
     def projected_covariance(self) -> Float[Tensor, "*batch 2 2"]:
-        """Covariance of (x, y)/z, c A^(-2).
+        """Covariance of (x, y)/z, c A^(-2) + Var[1/t] d d^T with d = m_xy - mu_xy, which is 0 without a free axis.
 
         Source: paper, section "Variance of projected coordinates", with the constant corrected.
         """
-        return huber.HUBER_COVARIANCE * spd.square(spd.inverse(self.A, self.log_det_A))
+        across = huber.HUBER_COVARIANCE * spd.square(spd.inverse(self.A, self.log_det_A))
+        if self._natural.nu_0 is None:
+            return across
+        shortfall = depth.inverse_depth_shortfall(self.a)
+        d = (self.m_xy - self.mu_xy) * (shortfall * (2 - shortfall)).sqrt()[..., None]  # E[1/t^2] = 1
+        return across + d[..., :, None] * d[..., None, :]
 
     @property
     def depth_mean(self) -> Float[Tensor, "*batch"]:
@@ -293,7 +376,7 @@ class ProjectedHuber(Density, Distribution):
     def rsample(
         self, sample_shape: torch.Size | Sequence[int] = (), generator: torch.Generator | None = None
     ) -> Float[Tensor, "*shape 3"]:
-        """Exact samples, differentiable in the parameters: (x, y) = z mu_xy + A_xy^(-1) q.
+        """Exact samples, differentiable in the parameters: (x, y) = A_xy^(-1) (q + nu_xy z + nu_0).
 
         Source: own derivation (q and t are independent); gradients by the implicit function theorem.
         """
@@ -302,7 +385,9 @@ class ProjectedHuber(Density, Distribution):
         q = huber.sample_whitened(shape, dtype=dtype, device=device, generator=generator)
         p = torch.rand(shape, dtype=dtype, device=device, generator=generator)
         z = self.depth_icdf(p.clamp_min(torch.finfo(dtype).eps / 2))  # rand may return 0, where z would be 0
-        xy = spd.matvec(self._A_xy_inverse, q + self._natural.nu_xy * z[..., None])
+        q_from_apex = q + self._natural.nu_xy * z[..., None]
+        nu_0 = self._natural.nu_0
+        xy = spd.matvec(self._A_xy_inverse, q_from_apex if nu_0 is None else q_from_apex + nu_0)
         return torch.cat([xy, z[..., None]], dim=-1)
 
     def entropy(self) -> Float[Tensor, "*batch"]:

@@ -30,12 +30,13 @@ class Region:
     def depth_interval(self, axis: Float[np.ndarray, "3"] = OPTICAL_AXIS) -> tuple[float, float]:
         """The extent along a unit vector c, metres; [mu_z/T, mu_z T] along the optical axis.
 
-        At the depth t it is mu_z (t c . m +- |A^(-1) (c_x, c_y)| r). Source: own derivation; checked against samples.
+        At the depth t it is c . apex + mu_z (t c . m +- |A^(-1) (c_x, c_y)| r), m = (m_xy, 1). Source: own derivation; checked against samples.
         """
         p, (log_t, r) = self.distribution, self._discs
         reach = np.linalg.norm(np.linalg.solve(p.A.double().numpy(), axis[:2])) * r
-        middle = np.exp(log_t) * (axis[:2] @ p.mu_xy.double().numpy() + axis[2])
-        return float(p.mu_z) * float((middle - reach).min()), float(p.mu_z) * float((middle + reach).max())
+        middle = np.exp(log_t) * (axis[:2] @ p.m_xy.double().numpy() + axis[2])
+        start, unit = float(axis @ p.apex.double().numpy()), float(p.mu_z)
+        return start + unit * float((middle - reach).min()), start + unit * float((middle + reach).max())
 
     @property
     def volume(self) -> float:
@@ -49,8 +50,8 @@ class Region:
         p, (log_t, r), angle = self.distribution, self._discs, np.linspace(0, 2 * np.pi, 73)
         q = r[::4, None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
         t = np.broadcast_to(np.exp(log_t[::4, None, None]), (*q.shape[:2], 1))
-        xy = t * p.mu_xy.double().numpy() + q @ np.linalg.inv(p.A.double().numpy())
-        border = float(p.mu_z) * np.concatenate([xy, t], -1).reshape(-1, 3)
+        xy = t * p.m_xy.double().numpy() + q @ np.linalg.inv(p.A.double().numpy())
+        border = p.apex.double().numpy() + float(p.mu_z) * np.concatenate([xy, t], -1).reshape(-1, 3)
         views = border[:, :2] / border[:, 2:], border[:, ::2]
         hulls = [ConvexHull(view, qhull_options="QbB").vertices for view in views]
         return [view[[*hull, hull[0]]] for view, hull in zip(views, hulls, strict=True)]

@@ -10,7 +10,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from phd_exp.distributions import Mixture, ProjectedHuber
-from phd_exp.distributions.columns import NEES, PARAMETERS, distribution_columns, draws, from_columns, nees_columns
+from phd_exp.distributions.columns import (
+    NEES,
+    distribution_columns,
+    draws,
+    from_columns,
+    nees_columns,
+    parameter_names,
+)
 from phd_exp.distributions.temperature import Temperature
 from phd_exp.evaluation.parquet import Columns, require_columns, stacked
 from phd_exp.evaluation.point_errors import RESAMPLES, SEED
@@ -90,7 +97,7 @@ def evaluate(table: Columns, resamples: int = RESAMPLES) -> Evaluation:
     Raises RunError if a column is missing, or if no sample has finite values.
     """
     is_distribution, is_huber = "level" in table, "a" in table
-    needed = (*(PARAMETERS if is_huber else ()), *OF_A_DISTRIBUTION) if is_distribution else ERRORS
+    needed = (*(parameter_names(table) if is_huber else ()), *OF_A_DISTRIBUTION) if is_distribution else ERRORS
     needed += tuple(name for name in OF_DISTANCE if name in table)
     columns, finite = finite_columns(table, needed, [name for name, _, _ in STRATIFIED_BY.values() if name in table])
     statistic: Statistic = _distribution_scores if is_distribution else _point_scores
@@ -155,12 +162,13 @@ def ensemble_table(tables: Sequence[Columns]) -> Columns:
 
     Raises RunError if a column is missing, or the tables are of different samples.
     """
+    parameters = parameter_names(tables[0])
     for table in tables:
-        require_columns((*PARAMETERS, *XYZ), table)
+        require_columns((*parameters, *XYZ), table)
         names = [name for name in (*XYZ, "file_name") if name in table]
         if not all(name in tables[0] and np.array_equal(table[name], tables[0][name]) for name in names):
             raise RunError("predictions: those of an ensemble are of different samples; train on one data set")
-    columns = {name: torch.tensor(np.stack([table[name] for table in tables], axis=-1)) for name in PARAMETERS}
+    columns = {name: torch.tensor(np.stack([table[name] for table in tables], axis=-1)) for name in parameters}
     mixture = Mixture(from_columns(columns))
     scores = distribution_columns(mixture.closest, stacked(tables[0], XYZ)) | {"disagreement": mixture.disagreement}
     kept = {name: tables[0][name] for name in (*XYZ, "f", "S") if name in tables[0]}
@@ -175,7 +183,7 @@ def at_temperature(
     Raises RunError if a column is missing, or if no row is finite.
     """
     recorded = {name: array[rows] for name, array in table.items()}
-    columns, finite = finite_columns(recorded, (*PARAMETERS, *XYZ))
+    columns, finite = finite_columns(recorded, (*parameter_names(recorded), *XYZ))
     distribution = _distribution(columns)
     kept = {name: array[finite.numpy()] for name, array in recorded.items()}
     return temperature.apply(distribution) if temperature else distribution, stacked(columns, XYZ), kept

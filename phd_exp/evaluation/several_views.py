@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.columns import COVARIANCE, PARAMETERS, from_columns
+from phd_exp.distributions.columns import COVARIANCE, PARAMETERS, from_columns, parameter_names
 from phd_exp.evaluation.parquet import read_table, require_columns, stacked
 from phd_exp.evaluation.predictions import XYZ
 from phd_exp.fusion import Plane, Pose
@@ -23,7 +23,7 @@ TRANSLATION = ("pose_t_x", "pose_t_y", "pose_t_z")
 """Columns of a camera's pose: the unit quaternion of R, and t (m), of v_camera = R v_scene + t."""
 NEEDED = ("scene", "view", "scale", *XYZ, *ROTATION, *TRANSLATION)
 MOMENTS = ("mean_x", "mean_y", "mean_z", *COVARIANCE)
-"""Further columns of a density that is no Projected Huber density, which has `PARAMETERS`."""
+"""Further columns of a density that is no Projected Huber density, which has `parameter_names`."""
 TILT = math.radians(30)  # angle by which the first camera looks down at the ground; see `SeveralViews.ground`
 AGAIN = "delete it and repeat the command that made it"
 
@@ -33,7 +33,7 @@ class SeveralViews:
     """Predictions of every view of every scene, and the truth.
 
     Args:
-        columns: `NEEDED`, and `PARAMETERS` or `MOMENTS`; a row per scene and a column per view, float64.
+        columns: `NEEDED`, and `parameter_names` or `MOMENTS`; a row per scene and a column per view, float64.
         left_out: number of scenes that were removed because a value is not finite.
     """
 
@@ -58,7 +58,7 @@ class SeveralViews:
     @cached_property
     def predictions(self) -> ProjectedHuber:
         """The predictions, in the frame of each camera. Raises RunError if they are other densities."""
-        require_columns(PARAMETERS, self.columns, "several views")
+        require_columns(parameter_names(self.columns), self.columns, "several views")
         return from_columns(self.columns)
 
     @property
@@ -119,7 +119,7 @@ class SeveralViews:
 def read_views(file: Path) -> SeveralViews:
     """The recorded views of a run. Raises RunError if they cannot be read, or are not views of several cameras."""
     table = read_table(file)
-    needed = (*NEEDED, *(MOMENTS if COVARIANCE[0] in table else PARAMETERS))
+    needed = (*NEEDED, *(MOMENTS if COVARIANCE[0] in table else parameter_names(table)))
     require_columns(needed, table, file.name)
     flat = {name: torch.from_numpy(table[name]) for name in needed}
     rows = torch.arange(len(flat["view"]), dtype=torch.float64)

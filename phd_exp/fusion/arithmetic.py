@@ -1,6 +1,6 @@
 """The arithmetic of one problem: what a camera measures of a position, the energy, and systems of three unknowns.
 
-Every camera measures (q_x, q_y, t) of a position, q = A ((x, y)/z - mu_xy) z/mu_z and t = z/mu_z, which is affine in
+Every camera measures (q_x, q_y, t) of a position (`ProjectedHuber.whiten`, t = z/mu_z), which is affine in
 the unknowns u: `at_origin` (3) plus `slope` (3 x 3) times u. On a plane there are two unknowns; the third column of
 each slope is zero, and so is H_22 below. A camera that takes no part has slope 0, q = 0, t = 1 and a = 0.
 

@@ -95,7 +95,8 @@ class Problems:
             normal = _flat("plane.normal", plane.normal, shape[:-1], event=1, cameras=0)
             plane = Plane(normal, _flat("plane.offset", plane.offset, shape[:-1], cameras=0))
             origin, directions = plane.nearest(origin), pad(plane.directions, (0, 1))
-        at_origin = (measure @ pose.into_camera(origin[:, None])[..., None]).squeeze(-1)
+        apex = _flat("predictions", predictions.apex, shape, event=1)
+        at_origin = (measure @ (pose.into_camera(origin[:, None]) - apex)[..., None]).squeeze(-1)
         free_slope = measure @ pose.R
         # 0, or NaN where one of the numbers that these are products of is not finite
         finite = 0 * (free_slope.sum((-2, -1)) + at_origin.sum(-1) + a) == 0
@@ -138,9 +139,9 @@ def _status(mask: Tensor, valid: Tensor, rigid: Tensor, plane: Plane | None) -> 
 
 
 def _measure(predictions: ProjectedHuber) -> Float[Tensor, "*batch 3 3"]:
-    """The matrix from a position in the camera frame to (q_x, q_y, t)."""
+    """The matrix from a position in the camera frame, relative to the apex, to (q_x, q_y, t)."""
     axes = torch.eye(3, dtype=predictions.a.dtype, device=predictions.a.device)
-    q = torch.stack([predictions.whiten(axis) for axis in axes], dim=-1)
+    q = torch.stack([predictions.whiten(predictions.apex + axis) for axis in axes], dim=-1)
     t = axes[2] / predictions.mu_z[..., None]
     return torch.cat([q, t[..., None, :]], dim=-2)
 

@@ -22,18 +22,21 @@ def own_part(
 ) -> tuple[ProjectedHuber, Float[Tensor, "*batch"]]:
     """The density of each view given that s = 0, and the deviation of s that restores its mean and covariance.
 
-    For z = e^s z', 1 + Var[z]/E[z]^2 is the product of those of e^s, which is e^(deviation^2), and of z'; the ratio
+    e^s scales positions relative to the apex, so that it moves them along the axis. For z = e^s z', 1 + Var[z]/E[z]^2 is the product of those of e^s, which is e^(deviation^2), and of z'; the ratio
     of z' is 1 - share of that of z.
     """
-    mu_xy, mu_z, A, a = (getattr(predictions, name).double().cpu() for name in ("mu_xy", "mu_z", "A", "a"))
+    views = ProjectedHuber(
+        **{name: value.double().cpu() for name, value in predictions.parameters.items()}, validate_args=False
+    )
+    mu_z, A, a = views.mu_z, views.A, views.a
     mean, ratio = _mean_and_ratio(a.log())
     own_ratio = (1 - share) * ratio
     ratios = _mean_and_ratio(torch.from_numpy(_LOG_A))[1].log().numpy()
     log_a = torch.from_numpy(np.interp(-own_ratio.log().numpy(), -ratios, _LOG_A))
     growth = (1 + ratio) / (1 + own_ratio)
     change = mean / _mean_and_ratio(log_a)[0] / growth.sqrt()  # of mu_z
-    A = A * (change * growth)[..., None, None]
-    return ProjectedHuber(mu_xy, mu_z * change, A, log_a.exp(), validate_args=False), growth.log().sqrt()
+    own = _along_axis(views, mu_z * change, A * (change * growth)[..., None, None], log_a.exp())
+    return own, growth.log().sqrt()
 
 
 def _mean_and_ratio(log_a: Tensor) -> tuple[Tensor, Tensor]:
@@ -106,4 +109,10 @@ def fuse_shared(
 
 
 def _grown(own: ProjectedHuber, deviations: Tensor, at: Tensor) -> ProjectedHuber:
-    return ProjectedHuber(own.mu_xy, own.mu_z * (deviations * at[..., None]).exp(), own.A, own.a, validate_args=False)
+    return _along_axis(own, own.mu_z * (deviations * at[..., None]).exp(), own.A, own.a)
+
+
+def _along_axis(views: ProjectedHuber, mu_z: Tensor, A: Tensor, a: Tensor) -> ProjectedHuber:
+    """The distributions about the same axes with these parameters."""
+    apex = None if views.k is None else views.apex[..., :2]
+    return ProjectedHuber.about_axis(views.m_xy, apex, mu_z, A, a)

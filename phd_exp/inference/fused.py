@@ -23,7 +23,7 @@ AGREE = 0.01
 
 def outputs(
     scenes: Sequence[Observed], sightings: Iterable[Sighting]
-) -> tuple[Float[Tensor, "views *members 7"], Float[Tensor, " views"], Pose, list[float | None]]:
+) -> tuple[Float[Tensor, "views *members n"], Float[Tensor, " views"], Pose, list[float | None]]:
     """Network outputs, focal lengths, poses of the virtual cameras in the world, and `familiar`, for each view.
 
     No image is kept. A virtual camera is the real one turned, v_virtual = R_v v_camera, so that its pose is

@@ -236,7 +236,7 @@ class Predictor:
         assert isinstance(head, DistributionHead)  # checked by `load`
         return head.turned_back(raw, torch.tensor(signs).to(raw)).flatten(1, 2)
 
-    def members(self, raw: Float[Tensor, "*batch members 7"], f: Float[Tensor, "*batch"]) -> Mixture:
+    def members(self, raw: Float[Tensor, "*batch members n"], f: Float[Tensor, "*batch"]) -> Mixture:
         """The mixture of an ensemble's predictions, in float64, from its raw numbers."""
         prediction = self.regressor.head(raw.double(), self.camera(f.double()[..., None]))
         assert prediction.has_closed_forms  # checked by `load`
@@ -254,7 +254,7 @@ class Predictor:
         return None
 
     def familiar(
-        self, raw: Float[Tensor, "batch *members 7"], f: Float[Tensor, " batch"]
+        self, raw: Float[Tensor, "batch *members n"], f: Float[Tensor, " batch"]
     ) -> Float[np.ndarray, " batch"] | None:
         """How usual the predictions are among held-out ones, as p-values, see `evaluation.familiar`; None if unknown.
 

@@ -40,6 +40,10 @@ class Head(Protocol):
 class DistributionHead:
     """Seven raw numbers -> the Projected Huber distribution, `ProjectedHuber.from_raw`.
 
+    Args:
+        depth: constants of the data set.
+        free_axis: the distribution has a free axis, by two further raw numbers.
+
     Examples:
         >>> import torch
         >>> from phd_exp.geometry import Camera, DepthScale
@@ -49,13 +53,13 @@ class DistributionHead:
         tensor([0.0000, 0.0000, 3.7500])
     """
 
-    n_outputs = 7
     prediction = ProjectedHuber
 
-    def __init__(self, depth: DepthScale) -> None:
+    def __init__(self, depth: DepthScale, free_axis: bool = False) -> None:
         self.mu_z0 = depth.mu_z0
+        self.n_outputs = 9 if free_axis else 7
 
-    def __call__(self, raw: Float[Tensor, "*batch 7"], camera: Camera) -> ProjectedHuber:
+    def __call__(self, raw: Float[Tensor, "*batch n"], camera: Camera) -> ProjectedHuber:
         # not validated for speed: the training step refuses a loss that is not finite
         return ProjectedHuber.from_raw(raw, f=camera.f, S=camera.S, mu_z0=self.mu_z0, validate_args=False)
 
@@ -65,18 +69,19 @@ class DistributionHead:
         return torch.cat([raw[..., :2] + (B @ place[..., None]).squeeze(-1), raw[..., 2:]], dim=-1)
 
     def turned_back(
-        self, raw: Float[Tensor, "*views 7"], signs: Float[Tensor, "*#views 3"]
-    ) -> Float[Tensor, "*views 7"]:
+        self, raw: Float[Tensor, "*views n"], signs: Float[Tensor, "*#views 3"]
+    ) -> Float[Tensor, "*views n"]:
         """Raw numbers in the frame of an image, given those of its views after `symmetries` of these signs.
 
-        A symmetry R changes nu_p to R nu_p and B to R B R^T: both signs and an exchange of raw numbers, exactly.
+        A symmetry R changes nu_p to R nu_p, k to R k and B to R B R^T: signs and an exchange of raw numbers, exactly.
         Source: own derivation (`spectral_map` commutes with R); checked in tests/models/test_symmetric_views.py.
         """
-        n, b, w = raw.split((2, 3, 2), dim=-1)
+        n, b, w, k = raw.split((2, 3, 2, self.n_outputs - 7), dim=-1)
         x, y, exchange = signs.split(1, dim=-1)
         n, b = n * signs[..., :2], b * torch.cat([x * x, x * y, y * y], dim=-1)
-        n, b = (torch.where(exchange < 0, part.flip(-1), part) for part in (n, b))
-        return torch.cat([n, b, w], dim=-1)
+        k = k * signs[..., : k.shape[-1]]
+        n, b, k = (torch.where(exchange < 0, part.flip(-1), part) for part in (n, b, k))
+        return torch.cat([n, b, w, k], dim=-1)
 
 
 class ShapedHead:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from phd_exp.distributions.columns import PARAMETERS, from_columns
+from phd_exp.distributions.columns import from_columns, parameter_names
 from phd_exp.distributions.level_curves import LEVELS, LevelCurves, level_curves, on_image
 from phd_exp.evaluation.parquet import Columns, require_columns
 from phd_exp.records.errors import UserError
@@ -139,9 +139,10 @@ def _picture(row: Mapping[str, Any], source: Path | None) -> Picture:
 
 def curves_of(row: Mapping[str, Any]) -> LevelCurves | None:
     """The level curves of a row; None for a baseline, or if the parameters are not of a distribution."""
-    if any(name not in row for name in PARAMETERS):
+    names = parameter_names(row)
+    if any(name not in row for name in names):
         return None
-    numbers = {name: torch.tensor(float(row[name]), dtype=torch.float64) for name in PARAMETERS}
+    numbers = {name: torch.tensor(float(row[name]), dtype=torch.float64) for name in names}
     try:
         return level_curves(from_columns(numbers))
     except ValueError:

@@ -15,8 +15,8 @@ SIDEWAYS = np.array([0.3, -0.4, math.sqrt(0.75)])
 PRECISIONS = [(0.05, 3.0), (3.0, 10.0), (300.0, 5.0), (5.0, 1e4)]
 
 
-def distribution(a: float, A: float) -> ProjectedHuber:
-    tensors = ([0.1, -0.2], 4.0, [[A, 0.1 * A], [0.1 * A, 2 * A]], a)
+def distribution(a: float, A: float, k: tuple[float, float] = (0.0, 0.0)) -> ProjectedHuber:
+    tensors = ([0.1, -0.2], 4.0, [[A, 0.1 * A], [0.1 * A, 2 * A]], a, k)
     return ProjectedHuber(*(torch.tensor(values, dtype=torch.float64) for values in tensors))
 
 
@@ -24,9 +24,10 @@ def along(one: ProjectedHuber, direction: np.ndarray) -> np.ndarray:
     return quantiles_along(one.expand((1,)), direction[None], P)[0]
 
 
+@pytest.mark.parametrize("k", [(0.0, 0.0), (0.9, -0.4), (5.0, -9.0)])  # the last leads away from the direction
 @pytest.mark.parametrize(("a", "A"), PRECISIONS)
-def test_quantiles_are_those_of_samples(a: float, A: float) -> None:
-    p = distribution(a, A)
+def test_quantiles_are_those_of_samples(a: float, A: float, k: tuple[float, float]) -> None:
+    p = distribution(a, A, k)
     n = 50_000
     samples = p.rsample((n,), torch.Generator().manual_seed(0)).numpy() @ SIDEWAYS
     below = (samples[:, None] <= along(p, SIDEWAYS)).mean(axis=0)
@@ -54,8 +55,8 @@ def test_the_marginal_is_an_integral_of_the_density(s: float) -> None:
 
 
 def test_a_batch_has_the_quantiles_of_its_distributions() -> None:
-    several = [distribution(a, A) for a, A in PRECISIONS]
-    columns = zip(*((one.mu_xy, one.mu_z, one.A, one.a) for one in several), strict=True)
+    several = [distribution(a, A, k) for (a, A), k in zip(PRECISIONS, [(0, 0), (5, -9), (0, 0), (1, 1)], strict=True)]
+    columns = zip(*(one.parameters.values() for one in several), strict=True)
     directions = np.array([SIDEWAYS, [0.0, 0.0, 1.0], [1e-3, 0.0, 1.0], -SIDEWAYS * [1, 1, -1]])
     together = quantiles_along(ProjectedHuber(*map(torch.stack, columns)), directions, P)
     alone = np.stack([along(one, direction) for one, direction in zip(several, directions, strict=True)])

@@ -16,16 +16,20 @@ from phd_exp.geometry.charts import DepthScale, Projected
 SAMPLES = 50_000
 
 
-def _distribution(a: float, precision: float = 200.0) -> ProjectedHuber:
+def _distribution(a: float, precision: float = 200.0, k: tuple[float, float] | None = None) -> ProjectedHuber:
     A = precision * torch.tensor([[1.5, 0.6], [0.6, 0.9]], dtype=torch.float64)
     mu_xy = torch.tensor([0.05, -0.03], dtype=torch.float64)
-    return ProjectedHuber(mu_xy, torch.tensor(4.0, dtype=torch.float64), A, torch.tensor(a, dtype=torch.float64))
+    mu_z, a_ = torch.tensor([4.0, a], dtype=torch.float64)
+    return ProjectedHuber(mu_xy, mu_z, A, a_, k and torch.tensor(k, dtype=torch.float64))
 
 
 CASES = [
     pytest.param(_distribution(0.5), id="depth hardly known"),
     pytest.param(_distribution(60.0), id="depth known"),
     pytest.param(_distribution(2e3, precision=2.0), id="depth exact, projection vague"),
+    pytest.param(_distribution(3.0, k=(0.0, 0.0)), id="free axis along the ray"),
+    pytest.param(_distribution(2.0, k=(-1.0, 0.6)), id="free axis, depth hardly known"),
+    pytest.param(_distribution(60.0, k=(1.5, 4.0)), id="free axis, depth known"),
 ]
 
 
@@ -60,10 +64,11 @@ def test_the_law_of_the_birds_eye_view_is_constant_along_a_curve(distribution: P
     for curve in level_curves(distribution).birds_eye:
         xz = curve[::11]
         reach = 60 * 4 * A_inverse[1, 1]
-        y = torch.from_numpy(np.linspace(-reach, reach, 8001) - 0.03 * 4)
         places = torch.from_numpy(xz)
-        x, z = (places[:, None, i].expand(-1, len(y)) for i in (0, 1))
-        xyz = torch.stack([x, y.expand(len(places), -1), z], dim=-1)
+        axis = distribution.apex[1] + distribution.m_xy[1] * places[:, 1]
+        y = torch.from_numpy(np.linspace(-reach, reach, 8001)) + axis[:, None]
+        x, z = (places[:, None, i].expand_as(y) for i in (0, 1))
+        xyz = torch.stack([x, y, z], dim=-1)
         density = integrate.simpson(distribution.log_prob(xyz).exp().numpy(), x=y.numpy())
         np.testing.assert_allclose(density, density[0], rtol=5e-3)
 

@@ -37,21 +37,24 @@ def printed_parameters(raw: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, t
 
 
 def printed_loss(raw: torch.Tensor, xyz: torch.Tensor) -> torch.Tensor:
-    """L = h(|B v_p - nu_p| z_p) - log|B| + a max(z_p/nu_z, nu_z/z_p) + log N(a) + log nu_z."""
-    nu_p, B, a, nu_z = printed_parameters(raw)
+    """L = h(|B v_p - nu_p| z_p) - log|B| + a max(z_p/nu_z, nu_z/z_p) + log N(a) + log nu_z; of nine numbers with k."""
+    nu_p, B, a, nu_z = printed_parameters(raw[:7])
     camera = Camera(torch.tensor(F, dtype=torch.float64), S)
     v_p, z_p = projected(xyz, camera), compensated_depth(xyz, camera, MU_Z0)
-    projection = huber_energy((v_p @ B - nu_p) * z_p[:, None]) - torch.logdet(B)
+    q = (v_p @ B - nu_p) * z_p[:, None]
+    q = q + raw[7:] * (a * (z_p / nu_z - 1))[:, None] if len(raw) > 7 else q
+    projection = huber_energy(q) - torch.logdet(B)
     return projection + a * torch.maximum(z_p / nu_z, nu_z / z_p) + log_normaliser(a) + nu_z.log()
 
 
-def raw_numbers(n: int, scale: float, seed: int) -> torch.Tensor:
-    return scale * torch.randn(n, 7, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+def raw_numbers(n: int, scale: float, seed: int, numbers: int = 7) -> torch.Tensor:
+    return scale * torch.randn(n, numbers, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
+@pytest.mark.parametrize("numbers", [7, 9])
 @pytest.mark.parametrize("scale", [0.3, 1.0, 5.0])
-def test_loss_is_the_printed_formula(scale: float) -> None:
-    for raw in raw_numbers(30, scale, seed=0):
+def test_loss_is_the_printed_formula(scale: float, numbers: int) -> None:
+    for raw in raw_numbers(30, scale, 0, numbers):
         torch.testing.assert_close(loss(raw, XYZ), printed_loss(raw, XYZ))
 
 
@@ -77,6 +80,9 @@ SEAMS = {
     "w_2 = 0": [n_1, n_2, b_1, b_2, b_3, w_1, 0.0],
     "w_1 = w_2 = 0": [n_1, n_2, b_1, b_2, b_3, 0.0, 0.0],
     "w_2 = 0, a < 1": [n_1, n_2, b_1, b_2, b_3, -1.0, 0.0],
+    "nine": [*GENERIC, 0.7, -0.4],
+    "nine zeros": [0.0] * 9,
+    "w_1 = w_2 = 0 of nine": [n_1, n_2, b_1, b_2, b_3, 0.0, 0.0, 0.7, -0.4],
 }
 
 
@@ -87,8 +93,9 @@ def test_gradients_are_true_on_every_seam(raw: list[float]) -> None:
     assert gradcheck(lambda raw: loss(raw, XYZ[:2]), tensor, atol=2e-6)
 
 
-def test_every_output_of_an_untrained_network_learns() -> None:
-    raw = torch.zeros(2, 7, dtype=torch.float64, requires_grad=True)
+@pytest.mark.parametrize("numbers", [7, 9])
+def test_every_output_of_an_untrained_network_learns(numbers: int) -> None:
+    raw = torch.zeros(2, numbers, dtype=torch.float64, requires_grad=True)
     loss(raw, XYZ[:2]).sum().backward()
     assert raw.grad is not None
     assert (raw.grad.abs() > 1e-3).all()
@@ -97,9 +104,10 @@ def test_every_output_of_an_untrained_network_learns() -> None:
 EXTREMES = torch.tensor(list(itertools.product((-1e4, 0.0, 1e4), repeat=7)))
 
 
+@pytest.mark.parametrize("numbers", [7, 9])
 @pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
-def test_float32_is_near_float64(scale: float) -> None:
-    raw = raw_numbers(300, scale, seed=2).requires_grad_()
+def test_float32_is_near_float64(scale: float, numbers: int) -> None:
+    raw = raw_numbers(300, scale, 2, numbers).requires_grad_()
     low = raw.detach().float().requires_grad_()
     for xyz in XYZ:
         exact, near = loss(raw, xyz), loss(low, xyz.float())
@@ -109,11 +117,11 @@ def test_float32_is_near_float64(scale: float) -> None:
         torch.testing.assert_close(near_slope.double(), slope, rtol=1e-3, atol=1e-4)
 
 
-def of_any_size(n: int, equal_eigenvalues: bool) -> torch.Tensor:
+def of_any_size(n: int, equal_eigenvalues: bool, numbers: int = 7) -> torch.Tensor:
     """Raw numbers of any sign from 1e-4 to 1e4, in float32, as the network's last layer gives them."""
     random = torch.Generator().manual_seed(12)
-    size = 10 ** (8 * torch.rand(n, 7, generator=random) - 4)
-    raw = size * torch.randn(n, 7, generator=random).sign()
+    size = 10 ** (8 * torch.rand(n, numbers, generator=random) - 4)
+    raw = size * torch.randn(n, numbers, generator=random).sign()
     if equal_eigenvalues:
         raw[:, 3], raw[:, 4] = 0, raw[:, 2]
     return raw
@@ -121,8 +129,15 @@ def of_any_size(n: int, equal_eigenvalues: bool) -> torch.Tensor:
 
 @pytest.mark.parametrize(
     "raw",
-    [EXTREMES, 1e5 * EXTREMES, of_any_size(2000, equal_eigenvalues=False), of_any_size(2000, equal_eigenvalues=True)],
-    ids=["extremes", "further extremes", "any size", "equal eigenvalues"],
+    [
+        EXTREMES,
+        1e5 * EXTREMES,
+        of_any_size(2000, equal_eigenvalues=False),
+        of_any_size(2000, equal_eigenvalues=True),
+        of_any_size(2000, equal_eigenvalues=True, numbers=9),
+        torch.cat([1e5 * EXTREMES, -1e9 + 2e9 * torch.rand(len(EXTREMES), 2)], dim=-1),
+    ],
+    ids=["extremes", "further extremes", "any size", "equal eigenvalues", "nine of any size", "extremes of nine"],
 )
 def test_bfloat16_autocast_rounds_nothing_of_the_loss_and_its_gradient(raw: torch.Tensor) -> None:
     """At positions on the edge of the field; as in training, where the backbone alone may be rounded."""

@@ -31,7 +31,8 @@ def moments(a: float) -> tuple[float, float]:
 
 
 def test_it_is_the_squared_mahalanobis_distance() -> None:
-    predictions = ProjectedHuber(*(column.flatten(0, 1) for column in columns_of(random_problems(50, 4)[0])))
+    problems = random_problems(50, 4, free_axis=True)[0]
+    predictions = ProjectedHuber(*(column.flatten(0, 1) for column in columns_of(problems)))
     xyz = predictions.rsample((3,), torch.Generator().manual_seed(0))
     found = nees_columns(predictions, xyz)
     covariance = predictions.covariance_matrix.expand(3, -1, 3, 3)

@@ -67,7 +67,7 @@ def test_the_volume_is_that_of_the_positions_up_to_the_level(distribution: Proje
     )
     q = random.uniform(-1.05 * widest, 1.05 * widest, (n, 2))
     A_xy = distribution.A.numpy() / float(distribution.mu_z)
-    xy = z[:, None] * distribution.mu_xy.numpy() + np.linalg.solve(A_xy, q.T).T
+    xy = distribution.apex[:2].numpy() + z[:, None] * distribution.m_xy.numpy() + np.linalg.solve(A_xy, q.T).T
     inside = (distribution.level(torch.from_numpy(np.column_stack([xy, z]))) <= level).numpy()
     share, box = inside.mean(), (high - low) * (2.1 * widest) ** 2 / np.linalg.det(A_xy)
     assert region.volume == pytest.approx(share * box, rel=5 * math.sqrt((1 - share) / (share * n)))

@@ -64,10 +64,13 @@ def test_leaves_mode_and_batch(distribution: ProjectedHuber) -> None:
     assert hotter.batch_shape == (2, 3)
     torch.testing.assert_close(hotter.mode[0, 0], distribution.mode)
     torch.testing.assert_close(hotter.mu_xy[0, 0], distribution.mu_xy)
+    torch.testing.assert_close(hotter.m_xy[0, 0], distribution.m_xy)
+    torch.testing.assert_close(hotter.apex[0, 0], distribution.apex)
+    torch.testing.assert_close(hotter.whiten(distribution.mean)[0, 0], distribution.whiten(distribution.mean) / 2)
     torch.testing.assert_close(hotter.A[0, 0], distribution.A / 2)
     torch.testing.assert_close(hotter.a[0, 0], distribution.a / 3)
     torch.testing.assert_close(hotter.log_det_A[0, 0], distribution.log_det_A - 2 * math.log(2))
-    rebuilt = ProjectedHuber(hotter.mu_xy, hotter.mu_z, hotter.A, hotter.a)
+    rebuilt = ProjectedHuber(**hotter.parameters)
     torch.testing.assert_close(hotter.log_prob(distribution.mean), rebuilt.log_prob(distribution.mean))
 
 

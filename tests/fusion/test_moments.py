@@ -68,9 +68,10 @@ def ratios(covariance: Tensor, reference: Tensor) -> Tensor:
     return (ours / theirs)[theirs > 1e-12]
 
 
-def test_one_camera_has_exactly_the_moments_of_its_prediction() -> None:
+@pytest.mark.parametrize("free_axis", [False, True])
+def test_one_camera_has_exactly_the_moments_of_its_prediction(free_axis: bool) -> None:
     """With the other cameras masked out too."""
-    predictions, pose, _ = random_problems(50, 3, seed=20, outliers=0.0)
+    predictions, pose, _ = random_problems(50, 3, seed=20, outliers=0.0, free_axis=free_axis)
     mask = torch.zeros(50, 3, dtype=torch.bool)
     mask[:, 1] = True
     fused, R = fuse(predictions, pose, mask=mask), pose.R[:, 1]
@@ -78,9 +79,9 @@ def test_one_camera_has_exactly_the_moments_of_its_prediction() -> None:
     torch.testing.assert_close(fused.covariance, R.mT @ predictions.covariance_matrix[:, 1] @ R)
 
 
-@pytest.mark.parametrize("cameras", [2, 4])
-def test_several_cameras_have_the_moments_of_a_dense_grid(cameras: int) -> None:
-    predictions, pose, _ = random_problems(4, cameras, seed=21, outliers=0.0)
+@pytest.mark.parametrize(("cameras", "free_axis"), [(2, False), (4, False), (2, True)])
+def test_several_cameras_have_the_moments_of_a_dense_grid(cameras: int, free_axis: bool) -> None:
+    predictions, pose, _ = random_problems(4, cameras, seed=21, outliers=0.0, free_axis=free_axis)
     fused = fuse(predictions, pose, contradiction=0.0)
     mean, covariance, coverage = grid_moments(predictions, pose, fused)
     error = (ratios(fused.covariance, covariance) - 1).abs()

@@ -20,26 +20,29 @@ DEVIATION, OWN = 0.12, 40.0
 SHARE = DEVIATION**2 / (DEVIATION**2 + 2 / OWN**2)  # 2/a^2 is nearly the variance of log depth
 
 
+@pytest.mark.parametrize("free_axis", [False, True])
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.99])
-def test_the_shared_factor_restores_mean_and_covariance_of_each_view(share: float) -> None:
-    """E[e^s] = G^(1/2) and E[e^(2s)] = G^2 for G = e^(deviation^2)."""
-    views = random_problems(100, 2, seed=3)[0]
+def test_the_shared_factor_restores_mean_and_covariance_of_each_view(share: float, free_axis: bool) -> None:
+    """E[e^s] = G^(1/2) and E[e^(2s)] = G^2 for G = e^(deviation^2), of positions relative to the apex."""
+    views = random_problems(100, 2, seed=3, free_axis=free_axis)[0]
     own, found = own_part(views, torch.tensor(share, dtype=torch.float64))
     certain = views.a > 50  # where variances of logs are those of ratios
     variances = views.depth_variance / views.depth_mean.square()
     torch.testing.assert_close(found.square()[certain], (share * variances)[certain], rtol=2e-3, atol=1e-9)
     G = found.square().exp()[..., None]
-    mean = own.mean * G.sqrt()
-    second = own.covariance_matrix + own.mean[..., :, None] * own.mean[..., None, :]
+    from_apex = own.mean - own.apex
+    mean = from_apex * G.sqrt()
+    second = own.covariance_matrix + from_apex[..., :, None] * from_apex[..., None, :]
     covariance = second * G[..., None] ** 2 - mean[..., :, None] * mean[..., None, :]
-    torch.testing.assert_close(mean, views.mean)
+    torch.testing.assert_close(own.apex, views.apex)
+    torch.testing.assert_close(mean + views.apex, views.mean)
     error = (covariance - views.covariance_matrix).abs().amax((-2, -1)) / views.covariance_matrix.amax((-2, -1))
     assert error.max() < 1e-5
 
 
 @pytest.mark.parametrize("on_plane", [False, True])
 def test_without_a_shared_part_and_with_one_camera_it_is_the_independent_fusion(on_plane: bool) -> None:
-    views, pose, truth = random_problems(20, 3, seed=4, outliers=0.0)
+    views, pose, truth = random_problems(20, 3, seed=4, outliers=0.0, free_axis=not on_plane)
     normal = torch.randn(20, 3, generator=torch.Generator().manual_seed(0)).double()
     plane = Plane(normal, (normal * truth).sum(-1)) if on_plane else None
     one = torch.zeros(20, 3, dtype=torch.bool)

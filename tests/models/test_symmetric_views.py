@@ -7,7 +7,9 @@ from phd_exp.geometry import Camera, DepthScale
 from phd_exp.geometry.motion import EIGHT, symmetries, turned
 from phd_exp.models.heads import DistributionHead
 
-HEAD = DistributionHead(DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0)))
+DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
+HEADS = [DistributionHead(DEPTH), DistributionHead(DEPTH, free_axis=True)]
+every_head = pytest.mark.parametrize("head", HEADS, ids=["seven numbers", "nine"])
 SIGNS = torch.tensor(EIGHT, dtype=torch.float64)
 CAMERA = Camera(torch.full((8,), 1500.0, dtype=torch.float64), 224.0)
 
@@ -18,21 +20,25 @@ def test_the_first_symmetry_is_the_identity_and_all_eight_differ() -> None:
     assert len({tuple(matrix.flatten().tolist()) for matrix in R}) == 8
 
 
+@every_head
 @pytest.mark.parametrize("seed", range(3))
-def test_the_density_at_a_position_is_that_of_the_view_at_the_turned_position(seed: int) -> None:
+def test_the_density_at_a_position_is_that_of_the_view_at_the_turned_position(
+    seed: int, head: DistributionHead
+) -> None:
     draw = torch.Generator().manual_seed(seed)
-    raw = 3 * torch.randn(7, generator=draw, dtype=torch.float64).expand(8, 7)
+    raw = 3 * torch.randn(head.n_outputs, generator=draw, dtype=torch.float64).expand(8, -1)
     xyz = torch.tensor([0.1, -0.2, 4.0]) + 0.1 * torch.randn(8, 3, generator=draw, dtype=torch.float64)
-    of_view = HEAD(raw, CAMERA)  # eight networks that give the same numbers for eight views
-    back = HEAD(HEAD.turned_back(raw, SIGNS), CAMERA)
+    of_view = head(raw, CAMERA)  # eight networks that give the same numbers for eight views
+    back = head(head.turned_back(raw, SIGNS), CAMERA)
     torch.testing.assert_close(back.log_prob(xyz), of_view.log_prob(symmetries(SIGNS).position(xyz)))
 
 
-def test_bringing_back_moves_numbers_and_changes_signs_alone() -> None:
-    raw = torch.tensor([1.0, 2, 4, 8, 16, 32, -64])
-    for back in HEAD.turned_back(raw.expand(8, 7), SIGNS.float()):
+@every_head
+def test_bringing_back_moves_numbers_and_changes_signs_alone(head: DistributionHead) -> None:
+    raw = torch.tensor([1.0, 2, 4, 8, 16, 32, -64, 128, 256])[: head.n_outputs]
+    for back in head.turned_back(raw.expand(8, -1), SIGNS.float()):
         assert sorted(back.abs().tolist()) == sorted(raw.abs().tolist())
-        assert back[5:].tolist() == [32, -64]
+        assert back[5:7].tolist() == [32, -64]
 
 
 def test_a_pixel_of_a_turned_image_lies_at_the_turned_position() -> None:

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import clarabel
 import numpy as np
+import torch
 from scipy import sparse
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion import Pose
-from tests.support.random_problems import columns_of
 
 
 @dataclass(frozen=True)
@@ -19,12 +19,14 @@ class Camera:
     mu_z: float
     A: np.ndarray
     a: float
+    k: np.ndarray
     R: np.ndarray
     t: np.ndarray
 
 
 def cameras_of(predictions: ProjectedHuber, pose: Pose) -> list[list[Camera]]:
-    columns = (*columns_of(predictions), pose.R, pose.t)
+    k = torch.zeros_like(predictions.mu_xy) if predictions.k is None else predictions.k
+    columns = (predictions.mu_xy, predictions.mu_z, predictions.A, predictions.a, k, pose.R, pose.t)
     arrays = [column.numpy() for column in columns]
     problems, cameras = predictions.batch_shape
     return [[Camera(*(array[i, j] for array in arrays)) for j in range(cameras)] for i in range(problems)]
@@ -60,6 +62,7 @@ class Program:
         q = camera.A @ (xyz[:2] - np.outer(camera.mu_xy, xyz[2])) / camera.mu_z
         q_0 = camera.A @ (at_origin[:2] - camera.mu_xy * at_origin[2]) / camera.mu_z
         t, t_0 = xyz[2] / camera.mu_z, at_origin[2] / camera.mu_z
+        q, q_0 = q + camera.a * np.outer(camera.k, t), q_0 + camera.a * camera.k * (t_0 - 1)
         self.require(clarabel.NonnegativeConeT(2), np.stack([n, w - t]), np.array([0, -t_0]))
         self.require(clarabel.SecondOrderConeT(3), np.vstack([m + n, q]), np.array([0, *q_0]))
         self.require(
