@@ -59,6 +59,7 @@ def families() -> dict[str, Family]:
     """
     return {
         "probabilistic": Family(_projected_huber, _seven_numbers),
+        "free_axis": Family(_projected_huber, _nine_numbers),
         "gaussian": _shaped(shaped.Gaussian),
         "gaussian_logz": _shaped(shaped.LogDepthGaussian),
         "laplace_inverse": _shaped(shaped.InverseDepthLaplace),
@@ -81,12 +82,16 @@ def _ten_numbers(n: int, generator: torch.Generator) -> Tensor:
     return torch.cat([_seven_numbers(n, generator), further], dim=-1)
 
 
+def _nine_numbers(n: int, generator: torch.Generator) -> Tensor:
+    return _ten_numbers(n, generator)[:, :9]
+
+
 def _medians_and_gaps(n: int, generator: torch.Generator) -> Tensor:
     """Medians as of `_seven_numbers`, and gaps over four decades, alike for each coordinate."""
     uniform = torch.rand(n, 6, generator=generator, dtype=torch.float64)
     gaps = (9 * uniform[:, 3:] - 7).repeat_interleave(len(LEVELS) - 1, dim=-1)
     gaps = gaps + torch.randn(gaps.shape, generator=generator, dtype=torch.float64) / 2
-    return torch.cat([2 * uniform[:, :2] - 1, torch.zeros(n, 4), uniform[:, 2:3] - 0.5, gaps], dim=-1)
+    return torch.cat([2 * uniform[:, :2] - 1, torch.zeros(n, 5), uniform[:, 2:3] - 0.5, gaps], dim=-1)
 
 
 def _shaped(

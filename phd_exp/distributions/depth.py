@@ -112,7 +112,7 @@ def depth_mean_and_variance(
 
 
 def inverse_depth_shortfall(a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """1 - E[1/t] = int_0^inf s^2 e^(-s) (1 + s/a)^(-2) ds / (a^2 (1 + g(a))), in (0, 1), about 1/a^2 where a is large.
+    """1 - E[1/t] = int_0^inf s^2 e^(-s) (1 + s/a)^(-2) ds / (a^2 (1 + g(a))), about 1/a^2 where a is large.
 
     With y the shortfall, Var[1/t] = y (2 - y), because E[1/t^2] = 1. For a <= 1 the integral over a^2 is
     1 + g - 2 a e^a E_1(a), which would cancel where a is large.

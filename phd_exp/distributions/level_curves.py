@@ -2,32 +2,35 @@
 
 A curve of level p bounds the smallest region that holds the probability p, of (x, y)/z on the image and of (x, z) in
 the bird's-eye view. Both laws are marginals of the density of (x, y, z). Their curves are closed, and convex on the
-image: p is log-concave, and for such a density the integral of p(z u, z) z^2 over z, to the power -1/3, is convex in u.
+image: p is log-concave, and then the integral of p(z u, z) z^2 over z, to the power -1/3, is convex in u.
 
 Source: Ball, "Logarithmically concave functions and sections of convex sets in R^n" (1988).
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy import integrate, optimize, special
+from scipy import integrate, optimize
+from scipy.interpolate import CubicSpline
 from scipy.optimize.elementwise import find_root
 
 from phd_exp.distributions.along import FURTHEST, whitened_marginal
-from phd_exp.distributions.huber import huber_energy, radial_cdf
+from phd_exp.distributions.huber import radial_cdf
 from phd_exp.distributions.projected_huber import ProjectedHuber
 
 Points = Float[np.ndarray, "_ 2"]
+_LogDensity = Callable[[np.ndarray], np.ndarray]
 
 LEVELS = (0.5, 0.9, 0.99)
 _POINTS = 73  # of a curve, and of half an outline
 _STRATA = 500  # equally probable values of t that represent its law
-_FURTHEST_ENERGY = 40.0  # of depth; beyond, no probability is left
-_REACH, _RADII = 10.0, 128  # of asinh(50 radius): radii up to 220 deviations
+_FURTHEST_ENERGY = 25.0  # of depth; beyond, no probability is left
+_REACH, _RADII, _CELLS = 10.0, 97, 3000  # of asinh(50 radius): radii up to 220 deviations, interpolated
 
 
 @dataclass(frozen=True)
@@ -107,49 +110,64 @@ def _free_curves(
 ) -> tuple[Points, ...]:
     """The curves on the image with a free axis.
 
-    w = A (u - mu_xy) has the density E[t^2 exp(-h(|t w + k a (t - 1)|))] up to a constant. On a polar grid around a
-    point of the axis, the density of a curve is a quantile of the grid's densities; each point is a root along its ray.
+    w = A (u - mu_xy) has the density E[t^2 exp(-h(|t w + k a (t - 1)|))] up to a constant, symmetric about the line
+    of k. The density of a curve is a quantile of those on a polar grid around a point of that line; each point of the
+    curve is then a root on its ray.
     """
-    s, t, log_weight = _depth_nodes(float(distribution.a), 64 + 16 * math.ceil(min(np.linalg.norm(k), 40)))
+    size = float(np.linalg.norm(k))
+    along = k / size if size else np.array([1.0, 0.0])
+    frame = np.stack([along, [-along[1], along[0]]])
+    s, t, weight = _depth_nodes(float(distribution.a), 64 + 40 * math.ceil(min(size, 20)))
 
     def log_density(w: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*points"]:
-        q = torch.from_numpy(t * w[..., None, :] + k * s)
-        return np.asarray(special.logsumexp(log_weight - huber_energy(q).numpy(), axis=-1))
+        r = np.hypot(t * w[..., :1] + size * s, t * w[..., 1:])
+        return np.log(np.exp(-np.where(r <= 1, r * r / 2, r - 0.5)) @ weight + np.finfo(float).tiny)
 
-    on_axis = -k * s / t
-    centre = on_axis[log_density(on_axis).argmax()]
     A = _float64(distribution.A)
-    root = np.linalg.cholesky(A @ _float64(distribution.projected_covariance) @ A)
-    angle = np.linspace(0, 2 * np.pi, _POINTS)
-    rays = np.stack([np.cos(angle), np.sin(angle)], -1) @ root.T
-    x = (np.arange(_RADII) + 0.5) * (_REACH / _RADII)
-    height = log_density(centre + np.sinh(x)[:, None, None] / 50 * rays[1:])
+    spread = frame @ A @ _float64(distribution.projected_covariance) @ A @ frame.T
+    angle = np.linspace(0, np.pi, _POINTS // 2 + 1)
+    rays = np.stack([np.cos(angle), np.sin(angle)], -1) * np.sqrt(spread.diagonal()) / 50
+    on_axis = -size * (s / t)[:, None] * [1, 0]
+    centre = on_axis[log_density(on_axis).argmax()]
+    halves = (_half(log_density, centre, rays, c) for c in _thresholds(log_density, centre, rays, levels))
+    curves = (np.concatenate([half, half[-2::-1] * [1, -1]]) for half in halves)
+    return tuple(_on_rays(distribution, curve @ frame) for curve in curves)
+
+
+def _thresholds(log_density: _LogDensity, centre: np.ndarray, rays: Points, levels: tuple[float, ...]) -> np.ndarray:
+    """The log densities of the curves with these probabilities inside, by a polar grid over half the plane."""
+    x = np.linspace(0, _REACH, _RADII)
+    coarse = CubicSpline(x, log_density(centre + np.sinh(x)[:, None, None] * rays))
+    x = (np.arange(_CELLS) + 0.5) * (_REACH / _CELLS)
+    height = coarse(x)
     mass = np.exp(height - height.max()) * (np.sinh(x) * np.cosh(x))[:, None]
+    mass[:, [0, -1]] /= 2
     order = np.argsort(-height, axis=None)
-    below = mass.ravel()[order].cumsum() - mass.ravel()[order] / 2
-    on_curve = np.interp(levels, below / mass.sum(), height.ravel()[order])
+    within = mass.ravel()[order].cumsum() - mass.ravel()[order] / 2
+    return np.interp(levels, within / mass.sum(), height.ravel()[order])
 
-    def point(at: np.ndarray, ray: np.ndarray) -> np.ndarray:
-        return centre + np.sinh(at)[..., None] / 50 * rays[ray]
 
-    ray = np.arange(_POINTS)
-    ends = np.zeros(_POINTS), np.full(_POINTS, _REACH)
-    found = (find_root(lambda at, i, c=c: log_density(point(at, i)) - c, ends, args=(ray,)).x for c in on_curve)
-    return tuple(_on_rays(distribution, point(at, ray)) for at in found)
+def _half(log_density: _LogDensity, centre: np.ndarray, rays: Points, threshold: np.floating) -> Points:
+    """The points with this log density on each ray from the centre."""
+
+    def outside(x: np.ndarray, ray: np.ndarray) -> np.ndarray:
+        return threshold - log_density(centre + np.sinh(x)[:, None] * rays[ray])
+
+    ends = np.zeros(len(rays)), np.full(len(rays), _REACH)
+    return centre + np.sinh(find_root(outside, ends, args=(np.arange(len(rays)),)).x)[:, None] * rays
 
 
 def _depth_nodes(a: float, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """a (t - 1), t and log(weight t^2), each (2 n, .), of a Gauss rule on each side of the mode in the excess energy.
+    """a (t - 1), t and weights times t^2, each (2 n), of a Gauss rule on each side of the mode in the excess energy.
 
-    The weights sum to a multiple of 1. Energies W = 40 y^2 are denser near the mode.
+    The weights sum to a multiple of 1. Energies W, a multiple of y^2, are denser near the mode.
     """
     y, weight = np.polynomial.legendre.leggauss(n)
     y, W = (y + 1) / 2, _FURTHEST_ENERGY * ((y + 1) / 2) ** 2
-    log_weight = np.log(weight * y) - W
+    weight = weight * y * np.exp(-W)
     near = 1 / (1 + W / a)  # dt = -t^2 dW/a
     s, t = np.concatenate([W, -W * near]), np.concatenate([1 + W / a, near])
-    log_weight = np.concatenate([log_weight, log_weight + 2 * np.log(near)]) + 2 * np.log(t)
-    return s[:, None], t[:, None], log_weight
+    return s, t, np.concatenate([weight, weight * near**2]) * t**2
 
 
 @cache

@@ -105,9 +105,7 @@ class Natural:
 
     def expand(self, batch_shape: torch.Size) -> "Natural":
         """The same parameters with a larger batch shape; nothing is copied."""
-        return self.map(
-            lambda name, value: value.expand(batch_shape + value.shape[len(_batch_shape(name, value)) :])
-        )
+        return self.map(lambda name, value: value.expand(batch_shape + value.shape[len(_batch_shape(name, value)) :]))
 
     def map(self, change: Callable[[str, Tensor], Tensor]) -> "Natural":
         """A function of the name and value of each parameter."""

@@ -131,8 +131,8 @@ class ProjectedHuber(Density, Distribution):
                 numbers up to 1e9.
 
         Raises:
-            ValueError: there are not seven or nine raw numbers; one is beyond +-1e9; f, S or mu_z0 is not positive and finite; or mode or covariance
-                overflow.
+            ValueError: there are not seven or nine raw numbers; one is beyond +-1e9; f, S or mu_z0 is not positive
+                and finite; or mode or covariance overflow.
 
         Source: paper, section "Enforcing constraints on distribution parameters"; formulas in `Natural.from_raw`.
         """

@@ -14,10 +14,11 @@ from phd_exp.distributions.density import Density, nodes
 from phd_exp.distributions.laws import NormalLaw
 from phd_exp.distributions.projected_huber import ProjectedHuber
 from phd_exp.distributions.shaped import Whitening
+from phd_exp.distributions.special import signed_log1p
 
 LEVELS = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 """Probabilities of the predicted quantiles."""
-_LAW = NormalLaw()
+_LAW, _MIDDLE = NormalLaw(), len(LEVELS) // 2
 
 
 @final
@@ -29,8 +30,8 @@ class Quantiles(Density):
     only interpolates them. Regions are balls of the three normal variables.
 
     Args:
-        medians: the map to v_p and log z, from their medians.
-        knots: the quantiles of v_p and log z, from their medians.
+        medians: the map to v_p, from its median, and to log z_p.
+        knots: the quantiles of these.
 
     Source: own derivation; quantile regression is Koenker and Bassett's (1978).
     """
@@ -40,14 +41,20 @@ class Quantiles(Density):
     knots: Float[Tensor, "*batch 3 quantiles"]
 
     @classmethod
-    def from_raw(cls, medians: ProjectedHuber, gaps: Float[Tensor, "*batch gaps"]) -> "Quantiles":
-        """From a density that has the medians, B = I and a = 1, and raw numbers of the gaps between quantiles."""
+    def from_raw(cls, medians: ProjectedHuber, raw: Float[Tensor, "*batch n"]) -> "Quantiles":
+        """From a density with the median of v_p, B = I, a = 1 and nu_z = 1, and raw numbers of depth and all gaps.
+
+        The first gives the median of log z_p, the log nu_z of w_2 for a = 1. It is one of the knots, so that v_p,
+        from its median, does not depend on it.
+        """
+        depth, gaps = raw[..., :1], raw[..., 1:]
         size = spd.positive(gaps).unflatten(-1, (3, -1)) * _normal_knots(gaps).diff()
         knots = pad(size.cumsum(-1), (1, 0))
-        return cls(Whitening(medians, 0), knots - knots[..., [len(LEVELS) // 2]])
+        log_z_p = pad(signed_log1p(depth, torch.zeros_like(depth)), (2, 0))[..., None]
+        return cls(Whitening(medians, 0), knots - knots[..., [_MIDDLE]] + log_z_p)
 
-    def about_medians(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
-        """v_p and log z of a position (metres), from their medians."""
+    def variables(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
+        """v_p of a position (metres), from its median, and log z_p."""
         q, s, _, _ = self.medians.variables(xyz)
         return torch.cat([q, s[..., None]], dim=-1)
 
@@ -79,7 +86,7 @@ class Quantiles(Density):
 
     @property
     def mode(self) -> Float[Tensor, "*batch 3"]:
-        return self.medians.around.mode
+        return self.medians.position(torch.zeros_like(self.medians.around.mu_xy), self.knots[..., 2, _MIDDLE])
 
     @property
     def _ray(self) -> tuple[Tensor, Tensor]:

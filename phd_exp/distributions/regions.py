@@ -30,7 +30,8 @@ class Region:
     def depth_interval(self, axis: Float[np.ndarray, "3"] = OPTICAL_AXIS) -> tuple[float, float]:
         """The extent along a unit vector c, metres; [mu_z/T, mu_z T] along the optical axis.
 
-        At the depth t it is c . apex + mu_z (t c . m +- |A^(-1) (c_x, c_y)| r), m = (m_xy, 1). Source: own derivation; checked against samples.
+        At the depth t it is c . apex + mu_z (t c . m +- |A^(-1) (c_x, c_y)| r) with m = (m_xy, 1). Source: own
+        derivation; checked against samples.
         """
         p, (log_t, r) = self.distribution, self._discs
         reach = np.linalg.norm(np.linalg.solve(p.A.double().numpy(), axis[:2])) * r

@@ -22,8 +22,8 @@ def own_part(
 ) -> tuple[ProjectedHuber, Float[Tensor, "*batch"]]:
     """The density of each view given that s = 0, and the deviation of s that restores its mean and covariance.
 
-    e^s scales positions relative to the apex, so that it moves them along the axis. For z = e^s z', 1 + Var[z]/E[z]^2 is the product of those of e^s, which is e^(deviation^2), and of z'; the ratio
-    of z' is 1 - share of that of z.
+    e^s scales positions relative to the apex, so that it moves them along the axis. For z = e^s z', 1 + Var[z]/E[z]^2
+    is the product of those of e^s, which is e^(deviation^2), and of z'; the ratio of z' is 1 - share of that of z.
     """
     views = ProjectedHuber(
         **{name: value.double().cpu() for name, value in predictions.parameters.items()}, validate_args=False

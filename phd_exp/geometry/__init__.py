@@ -17,11 +17,14 @@ from the top left corner of the image; the centre of the pixel in column c and r
 | mu_z | `mu_z` | centre of z: its mode, and the mode of the whole density is mu_z (mu_xy, 1) | metres | `distributions.projected_huber.ProjectedHuber` |
 | A | `A` | precision of (x, y)/z, symmetric positive definite 2 x 2 | - | `distributions.projected_huber.ProjectedHuber` |
 | a | `a` | precision of z: E[(z - mu_z)^2] is about 2 mu_z^2 / a^2 where a is large | - | `distributions.projected_huber.ProjectedHuber` |
+| k | `k` | free axis: q has the further term k a (t - 1); none in the paper's density | - | `distributions.projected_huber.ProjectedHuber` |
+| m_xy | `m_xy` | slope of the axis, the change of the centre of (x, y) with z: mu_xy without a free axis | - | `distributions.projected_huber.ProjectedHuber.m_xy` |
 | nu_p, B | `nu_p`, `B` | centre and precision of v_p in the frame of the network: B v_p - nu_p | - | `distributions.natural.Natural.from_raw` |
 | nu_z | `nu_z` | mu_z / (mu_z0 f), the centre of z_p | - | `distributions.natural.Natural.from_raw` |
 | A_xy | `A_xy` | A / mu_z, precision of (x, y) at any depth | 1 / metres | `distributions.natural.Natural` |
-| nu_xy | `nu_xy` | A_xy mu_xy | 1 / metres | `distributions.natural.Natural` |
-| q | `q` | the whitened projection A_xy (x, y) - nu_xy z, independent of t | - | `distributions.projected_huber.ProjectedHuber.whiten` |
+| nu_xy | `nu_xy` | A_xy m_xy | 1 / metres | `distributions.natural.Natural` |
+| nu_0 | `nu_0` | k a, with a free axis alone | - | `distributions.natural.Natural` |
+| q | `q` | the whitened projection A_xy (x, y) - nu_xy z - nu_0, independent of t | - | `distributions.projected_huber.ProjectedHuber.whiten` |
 | t | `t` | the relative depth z / mu_z | - | `distributions.depth` |
 | h | `huber_energy` | Huber's function: r^2/2 up to 1, r - 1/2 beyond | - | `distributions.huber.huber_energy` |
 | E_n | `scaled_expint` | generalised exponential integral E_n(a) = int_1^inf e^(-a u) u^(-n) du | - | `distributions.special.scaled_expint` |
@@ -29,7 +32,7 @@ from the top left corner of the image; the centre of the pixel in column c and r
 | g | `tail_moment(0, a)` | a e^a E_2(a), in (0, 1): the odds of t < 1 | - | `distributions.special.tail_moment` |
 | u | `u` | unknowns of a fusion: the position itself, or its place on a plane | metres | `fusion.problems` |
 | lam | `lam` | subgradient of max(t, 1/t) at its kink t = 1, in [-1, 1] | - | `fusion.certificate.certify` |
-| 7 outputs | `raw` | (n_1, n_2, b_1, b_2, b_3, w_1, w_2): what a network returns | - | `models.heads.DistributionHead` |
+| 7 outputs | `raw` | (n_1, n_2, b_1, b_2, b_3, w_1, w_2): what a network returns; with a free axis also k_1, k_2 | - | `models.heads.DistributionHead` |
 """
 
 from phd_exp.geometry.camera import Camera

@@ -14,5 +14,5 @@ class Pinball(nn.Module):
     prediction = Quantiles
 
     def forward(self, prediction: Quantiles, xyz: Float[Tensor, "batch 3"]) -> Float[Tensor, " batch"]:
-        excess = prediction.about_medians(xyz)[..., None] - prediction.knots
+        excess = prediction.variables(xyz)[..., None] - prediction.knots
         return pinball(excess, torch.tensor(LEVELS).to(excess)).mean(-1).sum(-1)

@@ -116,8 +116,8 @@ class QuantileHead:
         self.seven = DistributionHead(depth)
 
     def __call__(self, raw: Float[Tensor, "*batch n_outputs"], camera: Camera) -> Quantiles:
-        medians = torch.cat([raw[..., :2], torch.zeros_like(raw[..., :4]), raw[..., 2:3]], dim=-1)
-        return Quantiles.from_raw(self.seven(medians, camera), raw[..., 3:])
+        medians = torch.cat([raw[..., :2], torch.zeros_like(raw[..., :5])], dim=-1)
+        return Quantiles.from_raw(self.seven(medians, camera), raw[..., 2:])
 
     def placed(self, raw: Float[Tensor, "*batch n"], place: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch n"]:
         """Raw numbers with the medians of v_p shifted by `place`."""

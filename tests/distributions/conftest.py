@@ -32,7 +32,7 @@ def from_raw(*raw: float) -> ProjectedHuber:
 
 FREE = {
     "free axis": from_camera_frame((0.05, -0.03), 4.2, (120.0, 250.0), 0.6, 25.0, (1.4, -0.6)),
-    "free axis, wide in depth": from_camera_frame((0.02, 0.03), 3.2, (30.0, 50.0), 0.6, 0.9, (-0.5, 2.0)),
+    "free axis, wide in depth": from_camera_frame((0.02, 0.03), 3.2, (30.0, 50.0), 0.6, 1.0, (-0.5, 2.0)),
     "free axis, sharp": from_camera_frame((0.03, 0.07), 4.9, (2000.0, 700.0), 2.0, 1e4, (0.5, 3.0)),
 }
 INSTANCES = {

@@ -18,6 +18,8 @@ from phd_exp.models.regressor import FocalLengthInput, Regressor
 KEPT = {
     # every one of them, by construction; the first up to the largest ratio of A's eigenvalues
     "probabilistic": {1, 2, 3, 4, 5, 6, 7},
+    # k = 0 is the paper's density; (q, t) stays affine in v, with q alone in (x, y)
+    "free_axis": {1, 2, 3, 4, 5, 6, 7},
     # Proposition 1 of the paper: -log p is not convex in v
     "decomposed": {1, 2, 3, 4, 6, 7},
     "gaussian_logz": {1, 2, 3, 4, 6, 7},

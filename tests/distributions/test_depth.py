@@ -55,6 +55,17 @@ def test_cdf(a: float) -> None:
         assert depth.depth_cdf(log(t), log(a)).item() == pytest.approx(exact_cdf(t, a), rel=1e-9, abs=1e-14)
 
 
+def test_mean_of_the_inverse_depth(a: float) -> None:
+    with mp.workdps(60):
+        x = mp.mpf(a)
+        exact = float(1 - 2 * scaled(1, x) / (scaled(2, x) + scaled(0, x)))
+    assert depth.inverse_depth_shortfall(torch.tensor(a, dtype=torch.float64)).item() == pytest.approx(
+        exact, rel=1e-9
+    )
+    single = depth.inverse_depth_shortfall(torch.tensor(a, dtype=torch.float32))
+    assert single.item() == pytest.approx(exact, rel=1e-5)
+
+
 def test_mean_and_variance(a: float) -> None:
     mean, variance = depth.depth_mean_and_variance(log(a))
     assert (mean.item(), variance.item()) == pytest.approx(exact_moments(a), rel=1e-12)

@@ -37,7 +37,7 @@ def printed_parameters(raw: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, t
 
 
 def printed_loss(raw: torch.Tensor, xyz: torch.Tensor) -> torch.Tensor:
-    """L = h(|B v_p - nu_p| z_p) - log|B| + a max(z_p/nu_z, nu_z/z_p) + log N(a) + log nu_z; of nine numbers with k."""
+    """L = h(|B v_p - nu_p| z_p) - log|B| + a max(z_p/nu_z, nu_z/z_p) + log N(a) + log nu_z; of nine with k."""
     nu_p, B, a, nu_z = printed_parameters(raw[:7])
     camera = Camera(torch.tensor(F, dtype=torch.float64), S)
     v_p, z_p = projected(xyz, camera), compensated_depth(xyz, camera, MU_Z0)

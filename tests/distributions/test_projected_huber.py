@@ -26,7 +26,7 @@ def samples(distribution: ProjectedHuber) -> torch.Tensor:
 
 
 def test_log_prob_is_the_papers_density(distribution: ProjectedHuber, samples: torch.Tensor) -> None:
-    """-log p = h(|q|) + a max(t, 1/t) + log K_proj + log K_depth in the camera frame, as printed; q plus k a (t - 1)."""
+    """-log p = h(|q|) + a max(t, 1/t) + log K_proj + log K_depth in the camera frame, as printed; q with k."""
     xyz = samples[:500]
     mu_xy, mu_z, A, a = distribution.mu_xy, distribution.mu_z, distribution.A, distribution.a
     z = xyz[:, 2]
