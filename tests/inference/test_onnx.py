@@ -73,8 +73,9 @@ def worst(made: Predictor, session: Any, images: np.ndarray, f: np.ndarray) -> d
 
 
 @pytest.mark.slow
-def test_the_distribution_is_that_of_torch(composed: Callable[..., Any]) -> None:
-    made = predictor(composed, DistributionHead(DEPTH), temperature=Temperature(1.3, 0.7))
+@pytest.mark.parametrize("free_axis", [False, True])
+def test_the_distribution_is_that_of_torch(composed: Callable[..., Any], free_axis: bool) -> None:
+    made = predictor(composed, DistributionHead(DEPTH, free_axis), temperature=Temperature(1.3, 0.7))
     draw = np.random.default_rng(0)
     scales = np.repeat([0, 8, 24, 60], [1, 299, 300, 300])[:, None, None]
     images = np.full((len(scales), SIDE, SIDE, 3), 128, dtype=np.uint8)
@@ -92,9 +93,11 @@ def test_the_distribution_is_that_of_torch(composed: Callable[..., Any]) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("networks", "views"), [(3, 1), (1, 8)])
-def test_an_ensemble_is_that_of_torch(composed: Callable[..., Any], networks: int, views: int) -> None:
-    head = DistributionHead(DEPTH)
+@pytest.mark.parametrize(("networks", "views", "free_axis"), [(3, 1, False), (1, 8, False), (1, 8, True)])
+def test_an_ensemble_is_that_of_torch(
+    composed: Callable[..., Any], networks: int, views: int, free_axis: bool
+) -> None:
+    head = DistributionHead(DEPTH, free_axis)
     others = tuple(Pixels(head, row) for row in range(1, networks))
     made = predictor(composed, head, others=others, views=views)
     images = np.random.default_rng(0).integers(88, 168, (100, SIDE, SIDE, 3), dtype=np.uint8)

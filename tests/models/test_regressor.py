@@ -16,12 +16,15 @@ from tests.support.heads import SHAPED
 DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
 HEADS: dict[str, Head] = {
     "probabilistic": DistributionHead(DEPTH),
+    "free_axis": DistributionHead(DEPTH, free_axis=True),
     "mae_vz": ChartHead(DEPTH, Projected),
     "mae_logz": ChartHead(DEPTH, LogDepth),
     "mae_xyz": ChartHead(DEPTH, Cartesian),
     **SHAPED,
 }
-LOSSES = {name: NegativeLogLikelihood() for name in ("probabilistic", *SHAPED)} | {"quantiles": Pinball()}
+LOSSES = {name: NegativeLogLikelihood() for name in ("probabilistic", "free_axis", *SHAPED)} | {
+    "quantiles": Pinball()
+}
 
 
 @pytest.fixture
