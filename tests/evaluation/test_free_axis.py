@@ -46,7 +46,8 @@ def test_a_calibrated_model_scores_as_one(table: dict[str, np.ndarray]) -> None:
     found = evaluate(table, resamples=20)
     for name in ("nees", "inside_90", "depth_pit_ks"):
         band = found.reference[name]
-        assert band.low <= found.scores[name].value <= band.high, name
+        room = (band.high - band.low) / 4  # to three deviations
+        assert band.low - room <= found.scores[name].value <= band.high + room, name
     temperature = fit_temperature(table)
     assert (temperature.projected, temperature.depth) == pytest.approx((1, 1), abs=0.15)
 
