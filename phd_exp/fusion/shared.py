@@ -25,17 +25,14 @@ def own_part(
     e^s scales positions relative to the apex, so that it moves them along the axis. For z = e^s z', 1 + Var[z]/E[z]^2
     is the product of those of e^s, which is e^(deviation^2), and of z'; the ratio of z' is 1 - share of that of z.
     """
-    views = ProjectedHuber(
-        **{name: value.double().cpu() for name, value in predictions.parameters.items()}, validate_args=False
-    )
-    mu_z, A, a = views.mu_z, views.A, views.a
+    mu_z, A, a = (getattr(predictions, name).double().cpu() for name in ("mu_z", "A", "a"))
     mean, ratio = _mean_and_ratio(a.log())
     own_ratio = (1 - share) * ratio
     ratios = _mean_and_ratio(torch.from_numpy(_LOG_A))[1].log().numpy()
     log_a = torch.from_numpy(np.interp(-own_ratio.log().numpy(), -ratios, _LOG_A))
     growth = (1 + ratio) / (1 + own_ratio)
     change = mean / _mean_and_ratio(log_a)[0] / growth.sqrt()  # of mu_z
-    own = _along_axis(views, mu_z * change, A * (change * growth)[..., None, None], log_a.exp())
+    own = _along_axis(predictions, mu_z * change, A * (change * growth)[..., None, None], log_a.exp())
     return own, growth.log().sqrt()
 
 
@@ -113,6 +110,6 @@ def _grown(own: ProjectedHuber, deviations: Tensor, at: Tensor) -> ProjectedHube
 
 
 def _along_axis(views: ProjectedHuber, mu_z: Tensor, A: Tensor, a: Tensor) -> ProjectedHuber:
-    """The distributions about the same axes with these parameters."""
-    apex = None if views.k is None else views.apex[..., :2]
-    return ProjectedHuber.about_axis(views.m_xy, apex, mu_z, A, a)
+    """The distributions about the same axes with these parameters, in float64 on the CPU."""
+    apex = None if views.k is None else views.apex[..., :2].double().cpu()
+    return ProjectedHuber.about_axis(views.m_xy.double().cpu(), apex, mu_z, A, a)
