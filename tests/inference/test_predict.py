@@ -118,7 +118,7 @@ def test_a_baseline_has_positions_without_uncertainty(
         image = np.asarray(Image.open(photos / row["file_name"]))
         prediction = predictor.see(predictor.view(image, camera.K, row["box"]))
         np.testing.assert_allclose(row["position"], camera.to_real(prediction.mode.numpy()), rtol=1e-5, atol=1e-5)
-    for word, said in (("recalibrate", "no Projected Huber densities"), ("calibration", "no calibration curve")):
+    for word, said in (("recalibrate", "no Projected Huber densities"), ("curve", "no calibration curve")):
         refused = phd_exp("predict", f"run={baseline.path}", f"folder={photos}", f"{word}=true", "out=more")
         assert said in refused.error
 
