@@ -1,0 +1,25 @@
+"""Paths: the predictions of one or several cameras over time, smoothed with a motion model.
+
+`frames.py` checks the input, `chain.py` writes it as a chain of frames, `newton.py` finds the most likely path,
+`certificate.py` bounds its error, and `gaussian.py` adds mean and covariance. `track.py` is the interface for whole
+sequences, `tracker.py` for live ones.
+"""
+
+from phd_exp.fusion.tracks.frames import Gaussian
+from phd_exp.fusion.tracks.lost import Lost
+from phd_exp.fusion.tracks.motion import ConstantAcceleration, ConstantVelocity
+from phd_exp.fusion.tracks.slow import Slow, autocorrelation, standardised_errors
+from phd_exp.fusion.tracks.track import Path, estimated, track
+
+__all__ = [
+    "ConstantAcceleration",
+    "ConstantVelocity",
+    "Gaussian",
+    "Lost",
+    "Path",
+    "Slow",
+    "autocorrelation",
+    "estimated",
+    "standardised_errors",
+    "track",
+]

@@ -1,0 +1,111 @@
+"""The error of a path, bounded by subgradients alone, independently of the method that found it."""
+# mypy: no-check-untyped-defs, allow-untyped-defs
+
+import math
+
+import numpy as np
+
+from phd_exp.fusion.arithmetic import TINY, compiled, huber_weight
+from phd_exp.fusion.certificate import RADII
+from phd_exp.fusion.newton import KINK
+from phd_exp.fusion.tracks.energy import GAUSSIAN, add_camera, motion_energy
+from phd_exp.fusion.tracks.newton import measure_all
+from phd_exp.fusion.tracks.tridiagonal import factorise, forward, selected_inverse
+
+
+@compiled
+def certify(chain, work, x, lam, distance):
+    """The bound on the gap to the lowest energy, nats; fills `distance` with that on each position's error, metres.
+
+    Both hold for any x and any lam in [-1, 1], and are infinite where the energy is too flat. The bound of
+    `phd_exp.fusion.certificate`, for all frames together: with a subgradient G, a curvature H that holds while no
+    frame's measured unknowns move by more than rho, and e for kinks that are not exactly at t = 1, a lower energy
+    at x + d needs
+
+        G.d + d.H d/2 - e <= 0    so    d.H d <= (|G| + sqrt(|G|^2 + 2 e))^2 with |G|^2 = G.H^(-1) G
+
+    while d_k moves less than rho, and the gap is at most |G|^2/2 + e. Frame k moves by at most the root of d.H d
+    times the trace of its block of H^(-1). If that is less than rho in every frame, all holds, by convexity.
+
+    Source: own derivation; checked against a conic solver in tests/fusion/test_tracks.py.
+    """
+    n = chain.slope.shape[3]
+    covariance = np.empty_like(work.L)
+    measure_all(chain, x, work.at)
+    motion_energy(chain, chain.mean, x, work.pull)
+    error = _subgradient(chain, work, lam, work.pull)
+    for radius in RADII:
+        work.L[:] = work.motion
+        _add_least_curvature(chain, work, lam, radius)
+        factorise(work.L, work.coupling, work.below)
+        work.g[:] = work.pull
+        forward(work.L, work.below, work.g)
+        squared = (work.g * work.g).sum()
+        reach = math.sqrt(squared) + math.sqrt(squared + 2 * error)
+        selected_inverse(work.L, work.below, covariance)
+        farthest = 0.0
+        for k in range(len(x)):
+            trace = 0.0
+            for i in range(n):
+                trace += covariance[k, i, i]
+                if i == 2:
+                    distance[k] = math.sqrt(trace) * reach
+            farthest = max(farthest, math.sqrt(trace) * reach) if trace >= 0 else np.inf
+        if farthest <= radius:
+            return squared / 2 + error
+    distance[:] = np.inf
+    return np.inf
+
+
+@compiled
+def _subgradient(chain, work, lam, G):
+    """Adds the subgradients of the cameras to G; returns how much the energy at kinks may be lower than assumed."""
+    error = 0.0
+    nothing = np.zeros((chain.slope.shape[3], chain.slope.shape[3]))
+    for k in range(len(lam)):
+        for c in range(lam.shape[1]):
+            q_x, q_y, t = work.at[k, c]
+            a = chain.a[k, c]
+            slope = chain.slope[k, c]
+            if a == GAUSSIAN:
+                add_camera(slope, q_x, q_y, t, 0.0, 0.0, 0.0, 0.0, G[k], nothing)
+                continue
+            kink = abs(t - 1) <= KINK and abs(lam[k, c]) < 1
+            weight, _, _ = huber_weight(q_x, q_y)
+            by_t = lam[k, c] if kink else 1.0 if t >= 1 else -1 / (t * t)
+            add_camera(slope, weight * q_x, weight * q_y, a * by_t, 0.0, 0.0, 0.0, 0.0, G[k], nothing)
+            error += 3 * a * abs(t - 1) if kink else 0.0
+    return error
+
+
+@compiled
+def _add_least_curvature(chain, work, lam, radius):
+    """Adds a lower bound of the cameras' curvature while no frame's measured unknowns move by more than radius."""
+    nothing = np.zeros(chain.slope.shape[3])
+    for k in range(len(lam)):
+        for c in range(lam.shape[1]):
+            slope, a = chain.slope[k, c], chain.a[k, c]
+            if a == GAUSSIAN:
+                add_camera(slope, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 1.0, nothing, work.L[k])
+                continue
+            bounds = _least_curvature(slope, work.at[k, c], a, lam[k, c], radius)
+            add_camera(slope, 0.0, 0.0, 0.0, *bounds, nothing, work.L[k])
+
+
+@compiled
+def _least_curvature(slope, at, a, lam, radius):
+    """The bound of one camera; see `phd_exp.fusion.certificate`."""
+    q_x, q_y, t = at
+    delta = radius * math.sqrt((slope[0] * slope[0]).sum() + (slope[1] * slope[1]).sum())
+    length = math.sqrt(q_x * q_x + q_y * q_y)
+    xx, xy, yy = 1.0, 0.0, 1.0
+    if length + delta >= 1:
+        x, y, turn = q_x / max(length, 0.5), q_y / max(length, 0.5), delta / max(length, 0.5)
+        scale = 1 / (length + delta) if turn < 1 else 0.0
+        xx, xy, yy = scale * (1 - turn - x * x), -scale * x * y, scale * (1 - turn - y * y)
+    reach = radius * math.sqrt((slope[2] * slope[2]).sum())
+    far = t + reach
+    depth = 2 / (far * far * far) if far < 1 else 0.0
+    if abs(t - 1) <= KINK and abs(lam) < 1:
+        depth = 2 * (1 - abs(lam)) / max(reach, TINY)
+    return xx, xy, yy, a * depth

@@ -1,0 +1,164 @@
+"""The frames of a path: checked, and written as affine functions of the object's position."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions.density import Density
+from phd_exp.fusion.gaussian import average
+from phd_exp.fusion.pose import Pose
+from phd_exp.fusion.problems import Problems, Status
+from phd_exp.fusion.problems import _flat as flat
+from phd_exp.fusion.problems import _status as frames_status
+from phd_exp.fusion.tracks.energy import GAUSSIAN
+
+@dataclass(frozen=True)
+class Gaussian:
+    """Predictions given by their moments in the camera frame, as those of densities without closed forms.
+
+    Args:
+        mean: expected position, metres.
+        covariance: square metres, positive definite.
+    """
+
+    mean: Float[Tensor, "*batch 3"]
+    covariance: Float[Tensor, "*batch 3 3"]
+
+    @classmethod
+    def of(cls, density: Density) -> "Gaussian":
+        """With the moments of any density that has a covariance."""
+        return cls(density.mean, density.covariance_matrix)
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Shape of the batch."""
+        return self.mean.shape[:-1]
+
+
+@dataclass(frozen=True)
+class Frames:
+    """What every camera measures in every frame; in float64, relative to a common origin.
+
+    Args:
+        times: seconds.
+        origin: of the coordinates below, in the world, metres.
+        slope: d(q_x, q_y, t)/dv, 1/metres; 0 where a camera takes no part.
+        at_origin: (q_x, q_y, t) at the origin.
+        a: precision of the depth, or GAUSSIAN.
+        mask: which cameras take part.
+        near: the average of each frame's predicted positions; those of the nearest frames where there is none.
+        centres: the positions of the cameras.
+    """
+
+    times: Float[np.ndarray, " frames"]
+    origin: Float[np.ndarray, "3"]
+    slope: Float[np.ndarray, "frames cameras 3 3"]
+    at_origin: Float[np.ndarray, "frames cameras 3"]
+    a: Float[np.ndarray, "frames cameras"]
+    mask: Bool[np.ndarray, "frames cameras"]
+    near: Float[np.ndarray, "frames 3"]
+    centres: Float[np.ndarray, "frames cameras 3"]
+
+    @classmethod
+    def checked(
+        cls,
+        times: Float[Tensor, " frames"],
+        predictions: ProjectedHuber | Gaussian,
+        pose: Pose,
+        mask: Bool[Tensor, "frames cameras"] | None,
+        origin: Float[np.ndarray, "3"] | None = None,
+    ) -> "Frames":
+        """The frames of the arguments of `track`; by default the origin is amid the predicted positions.
+
+        Raises:
+            ValueError: an argument is not valid; one line.
+        """
+        if not isinstance(predictions, ProjectedHuber | Gaussian):
+            raise ValueError(
+                f"predictions: got {type(predictions).__name__}; expected ProjectedHuber or Gaussian; use Gaussian.of "
+                "for other densities; a point estimate has no uncertainty"
+            )
+        shape = predictions.batch_shape
+        if len(shape) != 2 or 0 in shape:
+            raise ValueError(f"predictions: got batch shape {tuple(shape)}; expected (frames, cameras), none of them 0")
+        seconds = checked_times(times, shape[0])
+        views = _views(predictions, pose, mask)
+        for k, status in enumerate(views.status.tolist()):
+            if status not in (Status.FUSED, Status.NO_CAMERA):
+                raise ValueError(f"frame {k}: {Status(status).reason}")
+        seen = views.mask.any(-1).numpy()
+        if not seen.any():
+            raise ValueError("mask: got no prediction in any frame; expected at least one")
+        position = average(views.positions, views.mask).numpy()
+        origin = position[seen].mean(0) if origin is None else origin
+        near = np.stack([np.interp(seconds, seconds[seen], axis) for axis in (position[seen] - origin).T], -1)
+        at_origin = views.at_zero.numpy() + (views.slope.numpy() @ origin)
+        shown = views.mask.numpy()
+        at_origin = np.where(shown[..., None], at_origin, (0.0, 0.0, 1.0))
+        centres = np.where(shown[..., None], views.centres.numpy() - origin, 0.0)
+        return cls(seconds, origin, views.slope.numpy(), at_origin, views.a.numpy(), shown, near, centres)
+
+    def __getitem__(self, part: slice) -> "Frames":
+        """Some of the frames."""
+        values = {name: value if name == "origin" else value[part] for name, value in vars(self).items()}
+        return Frames(**values)
+
+
+def checked_times(times: Float[Tensor, " frames"], frames: int) -> Float[np.ndarray, " frames"]:
+    """The times in float64. Raises ValueError where they are not one increasing number for each frame."""
+    if tuple(times.shape) != (frames,):
+        raise ValueError(f"times: got shape {tuple(times.shape)}; expected ({frames},), one time for each frame")
+    seconds = times.double().cpu().numpy()
+    if not np.isfinite(seconds).all():
+        k = int(np.argmin(np.isfinite(seconds)))
+        raise ValueError(f"times: got {seconds[k]} in frame {k}; expected finite times in seconds")
+    for k in (np.diff(seconds) <= 0).nonzero()[0]:
+        raise ValueError(
+            f"times: got {seconds[k + 1]} in frame {k + 1} after {seconds[k]}; expected increasing times; remove "
+            "repeated frames and sort the others"
+        )
+    return seconds
+
+
+@dataclass(frozen=True)
+class _Views:
+    """The views of all frames in the world: as in `Frames`, but `at_zero` is at the world's origin."""
+
+    slope: Float[Tensor, "frames cameras 3 3"]
+    at_zero: Float[Tensor, "frames cameras 3"]
+    a: Float[Tensor, "frames cameras"]
+    mask: Bool[Tensor, "frames cameras"]
+    positions: Float[Tensor, "frames cameras 3"]
+    centres: Float[Tensor, "frames cameras 3"]
+    status: Int[Tensor, " frames"]
+
+
+def _views(predictions: ProjectedHuber | Gaussian, pose: Pose, mask: Tensor | None) -> _Views:
+    if isinstance(predictions, Gaussian):
+        return _gaussian_views(predictions, pose, mask)
+    problems = Problems.posed(predictions, pose, None, mask)
+    origin = problems.origin.nan_to_num()[:, None, :, None]
+    at_zero = problems.at_origin - (problems.slope @ origin).squeeze(-1)
+    positions = problems.pose.into_world(predictions.mode.double().cpu())
+    centres = problems.pose.into_world(torch.zeros(3, dtype=torch.float64))
+    return _Views(problems.slope, at_zero, problems.a, problems.mask, positions, centres, problems.status)
+
+
+def _gaussian_views(predictions: Gaussian, pose: Pose, mask: Tensor | None) -> _Views:
+    """q_x, q_y and t are the deviations from the mean, divided by the Cholesky factor of the covariance."""
+    shape = predictions.batch_shape
+    pose = Pose(flat("pose.R", pose.R, shape, event=2), flat("pose.t", pose.t, shape, event=1))
+    mask = flat("mask", torch.ones(shape) if mask is None else mask, shape) > 0
+    mean = flat("predictions", predictions.mean, shape, event=1)
+    L, failed = torch.linalg.cholesky_ex(flat("predictions", predictions.covariance, shape, event=2).nan_to_num())
+    whiten = torch.linalg.inv_ex(L)[0]
+    slope = torch.where(mask[..., None, None], whiten @ pose.R, 0)
+    at_zero = torch.where(mask[..., None], (whiten @ (pose.t - mean)[..., None]).squeeze(-1), 0)
+    valid = (failed == 0) & predictions.covariance.isfinite().all(-1).all(-1).cpu() & mean.isfinite().all(-1)
+    status = frames_status(mask, valid, pose.is_rigid, None)
+    centres = pose.into_world(torch.zeros(3, dtype=torch.float64))
+    return _Views(slope, at_zero, torch.full(shape, GAUSSIAN).double(), mask, pose.into_world(mean), centres, status)

@@ -1,0 +1,48 @@
+"""The compiled functions that Python calls, for one path each."""
+# mypy: no-check-untyped-defs, allow-untyped-defs
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+from numba import njit
+
+from phd_exp.fusion.tracks.certificate import certify
+from phd_exp.fusion.tracks.energy import frames_energy, motion_energy
+from phd_exp.fusion.tracks.gaussian import gaussian
+from phd_exp.fusion.tracks.newton import measure_all, optimum, polish, workspace
+from phd_exp.fusion.tracks.tridiagonal import log_determinant
+
+
+def _functions(sources):
+    """Both functions, compiled from these sources; see `phd_exp.fusion.kernels`."""
+
+    @njit(cache=True, error_model="numpy")
+    def most_likely(chain, x, at, distance):
+        """Moves x to the optimum; returns whether a position is in front of all cameras, the energy and its bound.
+
+        Fills `at` with (q_x, q_y, t), and `distance` with the bounds of `certify`.
+        """
+        assert len(sources) > 0
+        work, lam = workspace(chain), np.zeros(chain.a.shape)
+        if not optimum(chain, work, x, lam):
+            return False, np.nan, np.inf
+        polish(chain, work, x, lam)
+        gap = certify(chain, work, x, lam, distance)
+        measure_all(chain, x, at)
+        energy = motion_energy(chain, chain.mean, x, work.g)
+        return True, energy + frames_energy(at, at, 0.0, chain.a, 0.0, 1e-6), gap
+
+    @njit(cache=True, error_model="numpy")
+    def moments(chain, mean, covariance):
+        """Moves `mean` from the optimum to the mean, fills `covariance`; log-determinant of the whole precision."""
+        assert len(sources) > 0
+        work = workspace(chain)
+        gaussian(chain, work, mean, covariance)
+        return log_determinant(work.L)
+
+    return most_likely, moments
+
+
+_SOURCES = b"".join(source.read_bytes() for source in sorted(Path(__file__).parents[1].rglob("*.py")))
+most_likely, moments = _functions(hashlib.sha256(_SOURCES).hexdigest())

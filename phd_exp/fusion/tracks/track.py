@@ -1,0 +1,267 @@
+"""The most likely path of an object through the predictions of one or several cameras over time."""
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy import optimize
+from torch import Tensor
+
+from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions.level import credible_level
+from phd_exp.fusion.pose import Pose
+from phd_exp.fusion.problems import Status
+from phd_exp.fusion.tracks.chain import Array, measured, moving, start
+from phd_exp.fusion.tracks.energy import GAUSSIAN, Chain
+from phd_exp.fusion.tracks.frames import Frames, Gaussian
+from phd_exp.fusion.tracks.lost import Lost
+from phd_exp.fusion.tracks.motion import ConstantAcceleration, ConstantVelocity, Motion
+from phd_exp.fusion.tracks.slow import Slow
+from phd_exp.hardware import one_thread
+
+# `kernels` is imported in the functions that use it: importing numba takes a second
+
+M = TypeVar("M", ConstantVelocity, ConstantAcceleration)
+NONE = Slow()
+WIDEST = math.log(1000)
+PASSES = 2  # about the path without slow errors, then about the path with them
+
+
+@dataclass(frozen=True)
+class Solved:
+    """The frames of a track, and the optimum of their chain.
+
+    Args:
+        frames: of the track.
+        chain: the energy.
+        x: the most likely unknowns, see `phd_exp.fusion.tracks.chain`.
+        at: (q_x, q_y, t) there.
+        energy: -log density up to constants, nats.
+        gap: its bound.
+        distance: bounds of each position, metres.
+    """
+
+    frames: Frames
+    chain: Chain
+    x: Float[Array, "frames d"]
+    at: Float[Array, "frames cameras 3"]
+    energy: float
+    gap: float
+    distance: Float[Array, " frames"]
+
+    @cached_property
+    def moments(self) -> tuple[Float[Array, "frames d"], Float[Array, "frames d d"], float]:
+        """Mean and covariance of the unknowns of each frame, and the log-determinant of the precision of all."""
+        from phd_exp.fusion.tracks.kernels import moments
+
+        mean, covariance = self.x.copy(), np.empty((*self.x.shape, self.x.shape[1]))
+        log_determinant = moments(self.chain, mean, covariance)
+        return mean, covariance, log_determinant
+
+    @property
+    def surprise(self) -> Float[Array, "frames cameras"]:
+        """Credible level of the path in each view; NaN where masked out."""
+        q_x, q_y, t = (torch.from_numpy(values) for values in np.moveaxis(self.at, -1, 0))
+        a = torch.from_numpy(self.chain.a)
+        squared = q_x.square() + q_y.square()
+        if bool((a == GAUSSIAN).any()):
+            level = torch.special.gammainc(torch.full_like(a, 1.5), (squared + t.square()) / 2)
+        else:
+            h = torch.where(squared > 1, squared.sqrt() - 0.5, squared / 2)
+            level = credible_level(h + a * (torch.maximum(t, 1 / t) - 1), a)
+        return np.where(self.frames.mask, level.numpy(), np.nan)
+
+
+@dataclass(frozen=True)
+class Path:
+    """A path in the world and its uncertainty; in float64, on the CPU.
+
+    Numbers of frames before the first prediction and after the end of the track are NaN.
+
+    Args:
+        times: of all frames, seconds.
+        first: the index of the first frame of the track.
+        lost: why and when the track ended before the last frame; None if it did not.
+        solved: the frames of the track; everything else is computed from it.
+    """
+
+    times: Float[Tensor, " frames"]
+    first: int
+    lost: str | None
+    solved: Solved
+
+    @property
+    def point(self) -> Float[Tensor, "frames 3"]:
+        """The most likely positions, metres."""
+        return self._entered(self.solved.x[:, :3] + self.solved.frames.origin)
+
+    @property
+    def velocity(self) -> Float[Tensor, "frames 3"]:
+        """The velocities of the most likely path, metres per second."""
+        return self._entered(self.solved.x[:, self._velocity])
+
+    @property
+    def slow(self) -> Float[Tensor, "frames slow"]:
+        """The most likely slow errors in their standard deviations: of log depth, then of each camera's q."""
+        return self._entered(self.solved.x[:, 3 : self.solved.chain.slope.shape[3]])
+
+    @property
+    def gap(self) -> float:
+        """Upper bound on the energy of the path above the lowest energy, nats; inf where that is too flat."""
+        return self.solved.gap
+
+    @property
+    def certificate(self) -> Float[Tensor, " frames"]:
+        """Upper bound on the distance of each position from the true optimum, metres; inf as `gap`."""
+        return self._entered(self.solved.distance)
+
+    @property
+    def surprise(self) -> Float[Tensor, "frames cameras"]:
+        """Credible level of the path in each view, near 1 where they contradict; NaN where masked out."""
+        return self._entered(self.solved.surprise)
+
+    @property
+    def mean(self) -> Float[Tensor, "frames 3"]:
+        """The expected positions, metres."""
+        return self._entered(self.solved.moments[0][:, :3] + self.solved.frames.origin)
+
+    @property
+    def covariance(self) -> Float[Tensor, "frames 3 3"]:
+        """Covariance of each position about its mean, square metres; see `phd_exp.fusion.tracks.gaussian`."""
+        return self._entered(self.solved.moments[1][:, :3, :3])
+
+    @property
+    def velocity_covariance(self) -> Float[Tensor, "frames 3 3"]:
+        """Covariance of each velocity, square metres per square second."""
+        return self._entered(self.solved.moments[1][:, self._velocity, self._velocity])
+
+    @property
+    def log_evidence(self) -> float:
+        """Log density of the predictions given the motion, up to constants, nats, by Laplace's method."""
+        precisions = np.linalg.slogdet(self.solved.chain.W)[1].sum()
+        return (precisions - self.solved.moments[2]) / 2 - self.solved.energy
+
+    @property
+    def _velocity(self) -> slice:
+        n = self.solved.chain.slope.shape[3]
+        return slice(n, n + 3)
+
+    def _entered(self, values: Float[Array, "frames ..."]) -> Tensor:
+        """With NaN for the frames outside the track."""
+        whole = torch.full((len(self.times), *values.shape[1:]), torch.nan, dtype=torch.float64)
+        whole[self.first : self.first + len(values)] = torch.from_numpy(values)
+        return whole
+
+
+@torch.no_grad()
+def track(
+    times: Float[Tensor, " frames"],
+    predictions: ProjectedHuber | Gaussian,
+    pose: Pose,
+    motion: Motion,
+    mask: Bool[Tensor, "frames cameras"] | None = None,
+    slow: Slow = NONE,
+    lost: Lost = Lost(),
+) -> Path:
+    """The path of highest density: the product of the densities of all predictions and that of the motion.
+
+    It minimises sum -log p_(k,i)(R v_k + t) plus half the squared noise of the motion over its variance. The problem
+    is convex, and solved to rounding in O(frames). With slow errors it is convex about a given path, found first
+    without them; then the factor of depth is linear, see `phd_exp.fusion.tracks.chain`, and errs by about s^2/2 for
+    a factor e^s.
+
+    Args:
+        times: of the frames, increasing, seconds.
+        predictions: of batch shape (frames, cameras).
+        pose: of each camera in each frame; its batch shape broadcasts to that.
+        motion: `ConstantVelocity` or `ConstantAcceleration`; `estimated` finds its noise.
+        mask: which cameras take part in each frame (default: all); the others' predictions and poses are ignored.
+        slow: the errors that consecutive frames share (default: none); for ProjectedHuber only.
+        lost: when the track ends.
+
+    Raises:
+        ValueError: an argument is not valid, or no path is in front of all cameras.
+
+    Source: Aravkin, Burke and Pillonetto, "Optimization viewpoint on Kalman smoothing" (2013), for convex smoothing
+    of paths; the densities are the paper's.
+    """
+    with one_thread():
+        independent = Frames.checked(times, predictions, pose, mask)
+        frames, deviation = independent, np.zeros(independent.a.shape)
+        if slow != NONE:
+            if isinstance(predictions, Gaussian):
+                raise ValueError("slow: got Gaussian predictions; expected ProjectedHuber")
+            own, spread = slow.own_part(predictions)
+            frames, deviation = Frames.checked(times, own, pose, mask, independent.origin), spread.numpy()
+        seen = frames.mask.any(-1)
+        first = int(np.argmax(seen))
+        length, why = lost.gap(frames.times[first:], seen[first:])
+        while True:
+            part = slice(first, first + length)
+            solved = _smoothed(independent[part], frames[part], deviation[part], motion, slow)
+            length, contradicted = lost.contradicted(solved.frames.times, solved.surprise)
+            if contradicted is None:
+                return Path(torch.from_numpy(frames.times), first, why, solved)
+            why = contradicted
+
+
+def _smoothed(
+    independent: Frames, frames: Frames, deviation: Float[Array, "frames cameras"], motion: Motion, slow: Slow
+) -> Solved:
+    """The optimum; with slow errors about that of the independent frames, and once more about itself."""
+    level = np.zeros(len(frames.times))
+    if slow == NONE:
+        return solve(frames, motion, slow, deviation, frames.near, level)
+    solved = solve(independent, motion, NONE, deviation, independent.near, level)
+    for _ in range(PASSES):
+        solved = solve(frames, motion, slow, deviation, solved.x[:, :3], level)
+        level = solved.x[:, 3] if slow.depth_share else level
+    return solved
+
+
+def solve(
+    frames: Frames,
+    motion: Motion,
+    slow: Slow,
+    deviation: Float[Array, "frames cameras"],
+    about: Float[Array, "frames 3"],
+    level: Float[Array, " frames"],
+) -> Solved:
+    """The optimum of the frames, with the slow factor linear about a path. Raises ValueError if there is none."""
+    from phd_exp.fusion.tracks.kernels import most_likely
+
+    cameras = frames.a.shape[1]
+    slope, at_origin = measured(frames, slow, deviation, about, level)
+    begin, steps = start(motion, slow, cameras), moving(motion, slow, cameras, np.diff(frames.times))
+    chain = Chain(slope, at_origin, frames.a, *begin, *steps)
+    x = np.zeros((len(frames.times), len(begin[0])))
+    x[:, :3] = about
+    at, distance = np.empty_like(at_origin), np.empty(len(x))
+    in_front, energy, gap = most_likely(chain, x, at, distance)
+    if not in_front:
+        status = Status.NO_COMMON_VIEW if np.isfinite(x).all() else Status.NOT_CONVERGED
+        raise ValueError(f"predictions: {status.reason}")
+    return Solved(frames, chain, x, at, energy, gap, distance)
+
+
+def estimated(
+    times: Float[Tensor, " frames"],
+    predictions: ProjectedHuber | Gaussian,
+    pose: Pose,
+    motion: M,
+    mask: Bool[Tensor, "frames cameras"] | None = None,
+    slow: Slow = NONE,
+) -> M:
+    """The motion with the noise of highest `log_evidence`, from 1/1000 to 1000 times the given one."""
+
+    def loss(log_noise: float) -> float:
+        moved = replace(motion, noise=math.exp(log_noise))
+        return -track(times, predictions, pose, moved, mask, slow, Lost(math.inf, len(times) + 1)).log_evidence
+
+    middle = math.log(motion.noise)
+    found = optimize.minimize_scalar(loss, bounds=(middle - WIDEST, middle + WIDEST), method="bounded")
+    return replace(motion, noise=math.exp(found.x))
