@@ -32,7 +32,7 @@ def certify(chain, work, x, lam, distance):
     n = chain.slope.shape[3]
     covariance = np.empty_like(work.L)
     measure_all(chain, x, work.at)
-    motion_energy(chain, chain.mean, x, work.pull)
+    motion_energy(chain, 1.0, x, work.pull)
     error = _subgradient(chain, work, lam, work.pull)
     for radius in RADII:
         work.L[:] = work.motion

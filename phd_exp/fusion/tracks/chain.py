@@ -34,14 +34,13 @@ def measured(
     order, and affine in (v, s): the energy is convex in all unknowns. The slow offset adds to q.
     """
     cameras = frames.a.shape[1]
-    parts, at_origin = [frames.slope], frames.at_origin
+    shrunk = np.exp(-deviation * level[:, None])[..., None]
+    at_origin = frames.at_origin + (1 - shrunk) * (frames.slope @ frames.centres[..., None])[..., 0]
+    parts = [shrunk[..., None] * frames.slope]
     if slow.depth_share:
-        shrunk = np.exp(-deviation * level[:, None])[..., None]
-        reference = (frames.slope @ (about[:, None] - frames.centres)[..., None])[..., 0]
-        centre = (frames.slope @ frames.centres[..., None])[..., 0]
-        along = -deviation[..., None] * shrunk * reference
-        at_origin = at_origin + (1 - shrunk) * centre - along * level[:, None, None]
-        parts = [shrunk[..., None] * frames.slope, along[..., None]]
+        along = -deviation[..., None] * (parts[0] @ (about[:, None] - frames.centres)[..., None])[..., 0]
+        at_origin = at_origin - along * level[:, None, None]
+        parts.append(along[..., None])
     if slow.projection_share:
         offsets = np.zeros((*frames.a.shape, 3, 2 * cameras))
         for c in range(cameras):

@@ -33,6 +33,7 @@ class Chain(NamedTuple):
         precision: inverse of their covariance, d x d; 0 in a direction that is not known before.
         F: the motion from one frame to the next, N-1 x d x d.
         W: inverse covariance of its noise, N-1 x d x d.
+        linear: a further term of the energy, the sum of linear x, N x d.
     """
 
     slope: np.ndarray
@@ -42,6 +43,7 @@ class Chain(NamedTuple):
     precision: np.ndarray
     F: np.ndarray
     W: np.ndarray
+    linear: np.ndarray
 
 
 @compiled
@@ -58,40 +60,35 @@ def measure(slope, x, at):
 
 
 @compiled
-def motion_energy(chain, mean, x, gradient):
-    """The energy of the motion, for this mean of the first frame; fills in its gradient."""
-    precision, F, W = chain.precision, chain.F, chain.W
+def motion_energy(chain, whole, x, gradient):
+    """The energy of the motion; its quadratic part alone if `whole` is 0 instead of 1. Fills in the gradient."""
+    F, W = chain.F, chain.W
     frames, d = x.shape
     value = 0.0
-    gradient[:] = 0.0
+    for k in range(frames):
+        for i in range(d):
+            gradient[k, i] = whole * chain.linear[k, i]
+            value += gradient[k, i] * x[k, i]
     for i in range(d):
+        pull = 0.0
         for j in range(d):
-            gradient[0, i] += precision[i, j] * (x[0, j] - mean[j])
-        value += gradient[0, i] * (x[0, i] - mean[i]) / 2
+            pull += chain.precision[i, j] * (x[0, j] - whole * chain.mean[j])
+        value += pull * (x[0, i] - whole * chain.mean[i]) / 2
+        gradient[0, i] += pull
+    residual = np.empty(d)
     for k in range(frames - 1):
-        for i in range(d):  # the residual stands where its gradient will
-            residual = x[k + 1, i]
+        for i in range(d):
+            residual[i] = x[k + 1, i]
             for j in range(d):
-                residual -= F[k, i, j] * x[k, j]
-            gradient[k + 1, i] = residual
-        value += _pull(F[k], W[k], gradient[k], gradient[k + 1]) / 2
-    return value
-
-
-@compiled
-def _pull(F, W, before, residual):
-    """r.W r; replaces the residual r by W r and subtracts F^T W r from the gradient of the frame before."""
-    d = len(residual)
-    value, pulled = 0.0, residual.copy()
-    for i in range(d):
-        pulled[i] = 0.0
-        for j in range(d):
-            pulled[i] += W[i, j] * residual[j]
-        value += pulled[i] * residual[i]
-    for i in range(d):
-        residual[i] = pulled[i]
-        for j in range(d):
-            before[j] -= F[i, j] * pulled[i]
+                residual[i] -= F[k, i, j] * x[k, j]
+        for i in range(d):
+            pull = 0.0
+            for j in range(d):
+                pull += W[k, i, j] * residual[j]
+            value += pull * residual[i] / 2
+            gradient[k + 1, i] += pull
+            for j in range(d):
+                gradient[k, j] -= F[k, i, j] * pull
     return value
 
 

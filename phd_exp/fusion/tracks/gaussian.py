@@ -30,7 +30,7 @@ def gaussian(chain, work, mean, covariance):
     covariance[:] = 0.0
     for step in range(STEPS):
         measure_all(chain, mean, work.at)
-        motion_energy(chain, chain.mean, mean, work.g)
+        motion_energy(chain, 1.0, mean, work.g)
         work.L[:] = work.motion
         for k in range(len(mean)):
             for c in range(chain.a.shape[1]):
@@ -41,6 +41,27 @@ def gaussian(chain, work, mean, covariance):
         if step > 0:
             mean += work.dx
         selected_inverse(work.L, work.below, covariance)
+
+
+@compiled
+def freedom(chain, at, covariance, dof):
+    """Fills `dof` (N x C) with how many of a frame's position unknowns each camera determines, at most 3.
+
+    That is the trace of the averaged curvature times the covariance of (q_x, q_y, t) with the part of it that the
+    position causes.
+    """
+    n = chain.slope.shape[3]
+    for k in range(len(dof)):
+        for c in range(dof.shape[1]):
+            slope = chain.slope[k, c]
+            _, _, _, xx, xy, yy, tt = averaged(at[k, c], spread(slope, covariance[k]), chain.a[k, c], False)
+            dof[k, c] = 0.0
+            for i in range(3):
+                for j in range(n):
+                    C = covariance[k, i, j]
+                    x, y, t = slope[0, i] * C, slope[1, i] * C, slope[2, i] * C
+                    dof[k, c] += xx * x * slope[0, j] + xy * (x * slope[1, j] + y * slope[0, j])
+                    dof[k, c] += yy * y * slope[1, j] + tt * t * slope[2, j]
 
 
 @compiled

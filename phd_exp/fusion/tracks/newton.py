@@ -144,7 +144,7 @@ def minimise(chain, work, x, lam, least):
 @compiled
 def _linearise_smoothed(chain, work, x, y, lam, width, least):
     """The energy of the motion; fills gradients and curvature of the smoothed energy."""
-    motion = motion_energy(chain, chain.mean, x, work.pull)
+    motion = motion_energy(chain, 1.0, x, work.pull)
     work.g[:] = work.pull
     work.L[:] = work.motion
     for k in range(len(x)):
@@ -160,7 +160,7 @@ def _line_search(chain, work, motion, width, least):
     work.moved[:] = 0.0
     measure(chain.slope, work.dx, work.moved)
     descent, by_motion = (work.g * work.dx).sum(), (work.pull * work.dx).sum()
-    bend = motion_energy(chain, np.zeros_like(chain.mean), work.dx, work.pull)
+    bend = motion_energy(chain, 0.0, work.dx, work.pull)
     before = motion + frames_energy(work.at, work.moved, 0.0, chain.a, width, least)
     enough = before + 1e-12 * abs(before)  # rounding may add this much where nothing is left to gain
     share = 1.0
@@ -196,7 +196,7 @@ def polish(chain, work, x, lam):
     kink = np.zeros(lam.shape, dtype=np.bool_)
     for _ in range(ROUNDS):
         measure_all(chain, x, work.at)
-        motion_energy(chain, chain.mean, x, work.g)
+        motion_energy(chain, 1.0, x, work.g)
         work.L[:] = work.motion
         for k in range(len(x)):
             for c in range(lam.shape[1]):

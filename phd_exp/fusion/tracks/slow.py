@@ -10,13 +10,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import optimize
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.huber import HUBER_COVARIANCE
+from phd_exp.fusion.pose import Pose
 from phd_exp.fusion.shared import own_part
+from phd_exp.fusion.tracks.frames import Frames, Gaussian
 
 
 @dataclass(frozen=True)
@@ -52,14 +54,29 @@ class Slow:
         offsets = [self.projection_time] * (2 * cameras if self.projection_share else 0)
         return [self.depth_time] * bool(self.depth_share) + offsets
 
-    def own_part(
-        self, predictions: ProjectedHuber
-    ) -> tuple[ProjectedHuber, Float[Tensor, "frames cameras"]]:
-        """The densities without the slow errors, and the standard deviation of each frame's slow log depth."""
-        own, deviation = predictions, torch.zeros(predictions.batch_shape, dtype=torch.float64)
+    def frames(
+        self,
+        times: Float[Tensor, " frames"],
+        predictions: ProjectedHuber | Gaussian,
+        pose: Pose,
+        mask: Bool[Tensor, "frames cameras"] | None,
+    ) -> tuple[Frames, Float[np.ndarray, "frames cameras"]]:
+        """The frames without the slow errors, and the standard deviation of each frame's slow log depth.
+
+        Raises:
+            ValueError: an argument of `track` is not valid.
+        """
+        frames = Frames.checked(times, predictions, pose, mask)
+        deviation = torch.zeros(predictions.batch_shape, dtype=torch.float64)
+        if self.depth_share == self.projection_share == 0:
+            return frames, deviation.numpy()
+        if isinstance(predictions, Gaussian):
+            raise ValueError("slow: got Gaussian predictions; expected ProjectedHuber")
+        own = predictions
         if self.depth_share:
             own, deviation = own_part(predictions, torch.tensor(self.depth_share, dtype=torch.float64))
-        return own.tempered(math.sqrt(1 - self.projection_share), 1.0), deviation
+        own = own.tempered(math.sqrt(1 - self.projection_share), 1.0)
+        return Frames.checked(times, own, pose, mask), np.where(frames.mask, deviation.numpy(), 0.0)
 
     @property
     def offset(self) -> float:

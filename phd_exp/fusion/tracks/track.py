@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -31,6 +31,19 @@ WIDEST = math.log(1000)
 PASSES = 2  # about the path without slow errors, then about the path with them
 
 
+class Moments(NamedTuple):
+    """The Gaussian of a path: `mean` and `covariance` of each frame's unknowns.
+
+    `freedom` is the number of a position's unknowns that each camera determines, and `log_determinant` that of the
+    precision of all frames together.
+    """
+
+    mean: Float[Array, "frames d"]
+    covariance: Float[Array, "frames d d"]
+    freedom: Float[Array, "frames cameras"]
+    log_determinant: float
+
+
 @dataclass(frozen=True)
 class Solved:
     """The frames of a track, and the optimum of their chain.
@@ -54,13 +67,14 @@ class Solved:
     distance: Float[Array, " frames"]
 
     @cached_property
-    def moments(self) -> tuple[Float[Array, "frames d"], Float[Array, "frames d d"], float]:
-        """Mean and covariance of the unknowns of each frame, and the log-determinant of the precision of all."""
+    def moments(self) -> "Moments":
+        """Mean and covariance, on demand."""
         from phd_exp.fusion.tracks.kernels import moments
 
         mean, covariance = self.x.copy(), np.empty((*self.x.shape, self.x.shape[1]))
-        log_determinant = moments(self.chain, mean, covariance)
-        return mean, covariance, log_determinant
+        freedom = np.empty(self.chain.a.shape)
+        log_determinant = moments(self.chain, mean, covariance, freedom)
+        return Moments(mean, covariance, freedom, log_determinant)
 
     @property
     def surprise(self) -> Float[Array, "frames cameras"]:
@@ -127,23 +141,23 @@ class Path:
     @property
     def mean(self) -> Float[Tensor, "frames 3"]:
         """The expected positions, metres."""
-        return self._entered(self.solved.moments[0][:, :3] + self.solved.frames.origin)
+        return self._entered(self.solved.moments.mean[:, :3] + self.solved.frames.origin)
 
     @property
     def covariance(self) -> Float[Tensor, "frames 3 3"]:
         """Covariance of each position about its mean, square metres; see `phd_exp.fusion.tracks.gaussian`."""
-        return self._entered(self.solved.moments[1][:, :3, :3])
+        return self._entered(self.solved.moments.covariance[:, :3, :3])
 
     @property
     def velocity_covariance(self) -> Float[Tensor, "frames 3 3"]:
         """Covariance of each velocity, square metres per square second."""
-        return self._entered(self.solved.moments[1][:, self._velocity, self._velocity])
+        return self._entered(self.solved.moments.covariance[:, self._velocity, self._velocity])
 
     @property
     def log_evidence(self) -> float:
         """Log density of the predictions given the motion, up to constants, nats, by Laplace's method."""
         precisions = np.linalg.slogdet(self.solved.chain.W)[1].sum()
-        return (precisions - self.solved.moments[2]) / 2 - self.solved.energy
+        return (precisions - self.solved.moments.log_determinant) / 2 - self.solved.energy
 
     @property
     def _velocity(self) -> slice:
@@ -190,36 +204,32 @@ def track(
     of paths; the densities are the paper's.
     """
     with one_thread():
-        independent = Frames.checked(times, predictions, pose, mask)
-        frames, deviation = independent, np.zeros(independent.a.shape)
-        if slow != NONE:
-            if isinstance(predictions, Gaussian):
-                raise ValueError("slow: got Gaussian predictions; expected ProjectedHuber")
-            own, spread = slow.own_part(predictions)
-            frames, deviation = Frames.checked(times, own, pose, mask, independent.origin), spread.numpy()
+        frames, deviation = slow.frames(times, predictions, pose, mask)
         seen = frames.mask.any(-1)
         first = int(np.argmax(seen))
         length, why = lost.gap(frames.times[first:], seen[first:])
         while True:
             part = slice(first, first + length)
-            solved = _smoothed(independent[part], frames[part], deviation[part], motion, slow)
+            solved = _smoothed(frames[part], deviation[part], motion, slow)
             length, contradicted = lost.contradicted(solved.frames.times, solved.surprise)
             if contradicted is None:
                 return Path(torch.from_numpy(frames.times), first, why, solved)
             why = contradicted
 
 
-def _smoothed(
-    independent: Frames, frames: Frames, deviation: Float[Array, "frames cameras"], motion: Motion, slow: Slow
-) -> Solved:
-    """The optimum; with slow errors about that of the independent frames, and once more about itself."""
+def _smoothed(frames: Frames, deviation: Float[Array, "frames cameras"], motion: Motion, slow: Slow) -> Solved:
+    """The optimum; with a slow factor of depth, twice about the path given that factor, first 1.
+
+    A path of another size has another volume of paths around it: integrated over paths, the density at a factor e^s
+    has a further factor e^(d s) for each unknown that a camera determines. Without it, the factor would be too small.
+    """
     level = np.zeros(len(frames.times))
-    if slow == NONE:
-        return solve(frames, motion, slow, deviation, frames.near, level)
-    solved = solve(independent, motion, NONE, deviation, independent.near, level)
-    for _ in range(PASSES):
-        solved = solve(frames, motion, slow, deviation, solved.x[:, :3], level)
-        level = solved.x[:, 3] if slow.depth_share else level
+    given = replace(slow, depth_share=0.0)
+    solved = solve(frames, motion, given, deviation, frames.near, level, 0 * level)
+    for _ in range(PASSES if slow.depth_share else 0):
+        pull = -(deviation * solved.moments.freedom).sum(-1)
+        solved = solve(frames, motion, slow, deviation, solved.x[:, :3], level, pull)
+        level = solved.x[:, 3]
     return solved
 
 
@@ -230,16 +240,23 @@ def solve(
     deviation: Float[Array, "frames cameras"],
     about: Float[Array, "frames 3"],
     level: Float[Array, " frames"],
+    pull: Float[Array, " frames"],
 ) -> Solved:
-    """The optimum of the frames, with the slow factor linear about a path. Raises ValueError if there is none."""
+    """The optimum of the frames, with the slow factor linear about a path and level, and a linear energy `pull` of it.
+
+    Raises:
+        ValueError: there is none.
+    """
     from phd_exp.fusion.tracks.kernels import most_likely
 
     cameras = frames.a.shape[1]
     slope, at_origin = measured(frames, slow, deviation, about, level)
     begin, steps = start(motion, slow, cameras), moving(motion, slow, cameras, np.diff(frames.times))
-    chain = Chain(slope, at_origin, frames.a, *begin, *steps)
-    x = np.zeros((len(frames.times), len(begin[0])))
+    x, linear = np.zeros((2, len(frames.times), len(begin[0])))
     x[:, :3] = about
+    if slow.depth_share:
+        x[:, 3], linear[:, 3] = level, pull
+    chain = Chain(slope, at_origin, frames.a, *begin, *steps, linear)
     at, distance = np.empty_like(at_origin), np.empty(len(x))
     in_front, energy, gap = most_likely(chain, x, at, distance)
     if not in_front:
