@@ -9,7 +9,7 @@ from torch import Tensor
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.huber import sample_whitened
 from phd_exp.fusion import Pose
-from phd_exp.fusion.tracks.chain import moving
+from phd_exp.fusion.tracks.chain import Model
 from phd_exp.fusion.tracks.motion import Motion
 from phd_exp.fusion.tracks.slow import Slow
 from tests.support.shared import with_shared_part
@@ -29,7 +29,7 @@ def around(cameras: int, angle: float = 0.5) -> Pose:
 
 def moved(motion: Motion, slow: Slow, cameras: int, steps: np.ndarray, random: np.random.Generator, n: int) -> np.ndarray:
     """Unknowns of n paths by their law: (paths, frames, d);."""
-    F, W = moving(motion, slow, cameras, steps)
+    F, W = Model(motion, slow, cameras).moving(steps)
     roots = np.linalg.cholesky(np.linalg.inv(W))
     d = F.shape[-1]
     slow_unknowns = d - 3 * motion.order

@@ -10,6 +10,7 @@ from phd_exp.fusion.tracks.lost import Lost
 from phd_exp.fusion.tracks.motion import ConstantAcceleration, ConstantVelocity
 from phd_exp.fusion.tracks.slow import Slow, autocorrelation, standardised_errors
 from phd_exp.fusion.tracks.track import Path, estimated, track
+from phd_exp.fusion.tracks.tracker import State, Tracker
 
 __all__ = [
     "ConstantAcceleration",
@@ -18,6 +19,8 @@ __all__ = [
     "Lost",
     "Path",
     "Slow",
+    "State",
+    "Tracker",
     "autocorrelation",
     "estimated",
     "standardised_errors",

@@ -1,6 +1,6 @@
 """The frames of a path: checked, and written as affine functions of the object's position."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -52,6 +52,7 @@ class Frames:
         mask: which cameras take part.
         near: the average of each frame's predicted positions; those of the nearest frames where there is none.
         centres: the positions of the cameras.
+        deviation: standard deviation of the slow log depth; 0 without slow errors.
     """
 
     times: Float[np.ndarray, " frames"]
@@ -62,6 +63,7 @@ class Frames:
     mask: Bool[np.ndarray, "frames cameras"]
     near: Float[np.ndarray, "frames 3"]
     centres: Float[np.ndarray, "frames cameras 3"]
+    deviation: Float[np.ndarray, "frames cameras"]
 
     @classmethod
     def checked(
@@ -70,9 +72,8 @@ class Frames:
         predictions: ProjectedHuber | Gaussian,
         pose: Pose,
         mask: Bool[Tensor, "frames cameras"] | None,
-        origin: Float[np.ndarray, "3"] | None = None,
     ) -> "Frames":
-        """The frames of the arguments of `track`; by default the origin is amid the predicted positions.
+        """The frames of the arguments of `track`.
 
         Raises:
             ValueError: an argument is not valid; one line.
@@ -94,18 +95,34 @@ class Frames:
         if not seen.any():
             raise ValueError("mask: got no prediction in any frame; expected at least one")
         position = average(views.positions, views.mask).numpy()
-        origin = position[seen].mean(0) if origin is None else origin
+        origin = position[seen].mean(0)
         near = np.stack([np.interp(seconds, seconds[seen], axis) for axis in (position[seen] - origin).T], -1)
         at_origin = views.at_zero.numpy() + (views.slope.numpy() @ origin)
         shown = views.mask.numpy()
         at_origin = np.where(shown[..., None], at_origin, (0.0, 0.0, 1.0))
         centres = np.where(shown[..., None], views.centres.numpy() - origin, 0.0)
-        return cls(seconds, origin, views.slope.numpy(), at_origin, views.a.numpy(), shown, near, centres)
+        of_cameras = views.slope.numpy(), at_origin, views.a.numpy(), shown
+        return cls(seconds, origin, *of_cameras, near, centres, np.zeros(shape))
 
     def __getitem__(self, part: slice) -> "Frames":
         """Some of the frames."""
         values = {name: value if name == "origin" else value[part] for name, value in vars(self).items()}
         return Frames(**values)
+
+    def unseen(self, time: float) -> "Frames":
+        """One later frame, in which no camera takes part."""
+        values = {name: np.zeros_like(value[-1:]) for name, value in vars(self).items()}
+        values |= {"times": np.array([time]), "origin": self.origin, "near": self.near[-1:]}
+        values["at_origin"][..., 2] = 1.0
+        return Frames(**values)
+
+    def followed_by(self, later: "Frames") -> "Frames":
+        """Both, relative to the origin of the first."""
+        shift = self.origin - later.origin
+        at_origin = later.at_origin + later.slope @ shift
+        later = replace(later, at_origin=at_origin, near=later.near - shift, centres=later.centres - shift)
+        values = {name: np.concatenate([value, getattr(later, name)]) for name, value in vars(self).items()}
+        return Frames(**(values | {"origin": self.origin}))
 
 
 def checked_times(times: Float[Tensor, " frames"], frames: int) -> Float[np.ndarray, " frames"]:

@@ -1,11 +1,11 @@
-"""Mean and covariance of a path: the Gaussian whose own averages of gradient and curvature agree with it.
+"""Mean and covariance of a path by expectation propagation.
 
-A second derivative at the optimum misses the kinks of depth and the linear tails. Averaged over the Gaussian itself,
-gradients vanish at its mean, and curvatures are its inverse covariance: that Gaussian is nearest to the density of
-paths by the Kullback-Leibler divergence, and for Gaussian predictions it is the density.
+A second derivative at the optimum misses the kinks of depth and the linear tails. Here every camera's density of q,
+and that of t, is replaced by a Gaussian factor such that the path, with the true density instead of its factor, has
+the same mean and covariance of q or t. For Gaussian predictions, and for one frame of one camera, this is exact.
 
-Source: Opper and Archambeau, "The variational Gaussian approximation revisited" (2009); the averages of a camera are
-an own derivation, checked against quadrature and simulated paths in tests/fusion/test_tracks_moments.py.
+Source: Minka, "Expectation propagation for approximate Bayesian inference" (2001); checked against closed forms and
+simulated paths in tests/fusion/test_tracks_moments.py.
 """
 # mypy: no-check-untyped-defs, allow-untyped-defs
 
@@ -13,64 +13,98 @@ import math
 
 import numpy as np
 
-from phd_exp.fusion.arithmetic import TINY, compiled, huber_weight
+from phd_exp.fusion.arithmetic import TINY, compiled, huber
 from phd_exp.fusion.tracks.energy import GAUSSIAN, add_camera, motion_energy
 from phd_exp.fusion.tracks.newton import measure_all, newton_step
-from phd_exp.fusion.tracks.tridiagonal import selected_inverse
+from phd_exp.fusion.tracks.tridiagonal import log_determinant, selected_inverse
 
-STEPS = 8
-LEAST_SHARE = 0.25  # of the depth: a Gaussian has a part behind the camera, where there is no density
-_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(5)
-_WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
-
-
-@compiled
-def gaussian(chain, work, mean, covariance):
-    """Moves `mean` from the optimum to the mean, and fills `covariance` (N x d x d); `work.L` gets the factor."""
-    covariance[:] = 0.0
-    for step in range(STEPS):
-        measure_all(chain, mean, work.at)
-        motion_energy(chain, 1.0, mean, work.g)
-        work.L[:] = work.motion
-        for k in range(len(mean)):
-            for c in range(chain.a.shape[1]):
-                slope, a = chain.slope[k, c], chain.a[k, c]
-                terms = averaged(work.at[k, c], spread(slope, covariance[k]), a, step == 0)
-                add_camera(slope, *terms, work.g[k], work.L[k])
-        newton_step(chain, work, mean)
-        if step > 0:
-            mean += work.dx
-        selected_inverse(work.L, work.below, covariance)
+STEPS, SETTLED = 40, 1e-5  # the latter as a share of the precision of q and t
+WIDEST = 8.0  # standard deviations of t that count
+LEAST_DEPTH = 1e-3  # share of the predicted depth below which the density counts as zero
+_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(11)
+_LOG_WEIGHTS = np.log(_WEIGHTS / _WEIGHTS.sum())
+_PLACES, _SHARES = np.polynomial.legendre.leggauss(16)
+_PLACES, _LOG_SHARES = (_PLACES + 1) / 2, np.log(_SHARES / 2)
 
 
 @compiled
-def freedom(chain, at, covariance, dof):
-    """Fills `dof` (N x C) with how many of a frame's position unknowns each camera determines, at most 3.
+def gaussian(chain, work, mean, covariance, factors, dof):
+    """Moves `mean` from the optimum to the mean, and fills `covariance` (N x d x d), `factors` and `dof` (N x C).
 
-    That is the trace of the averaged curvature times the covariance of (q_x, q_y, t) with the part of it that the
-    position causes.
+    `factors` (N x C x 7) are the Gaussian ones: precision of q (xx, xy, yy) and t, then precision times mean. `dof`
+    is how many unknowns of a frame's position each camera determines, at most 3. Returns the log of the integral of
+    e^(-energy) over all paths, up to a constant.
     """
-    n = chain.slope.shape[3]
-    for k in range(len(dof)):
-        for c in range(dof.shape[1]):
-            slope = chain.slope[k, c]
-            _, _, _, xx, xy, yy, tt = averaged(at[k, c], spread(slope, covariance[k]), chain.a[k, c], False)
-            dof[k, c] = 0.0
-            for i in range(3):
-                for j in range(n):
-                    C = covariance[k, i, j]
-                    x, y, t = slope[0, i] * C, slope[1, i] * C, slope[2, i] * C
-                    dof[k, c] += xx * x * slope[0, j] + xy * (x * slope[1, j] + y * slope[0, j])
-                    dof[k, c] += yy * y * slope[1, j] + tt * t * slope[2, j]
+    frames, cameras = chain.a.shape
+    factors[:] = 0.0
+    measure_all(chain, mean, work.at)
+    for k in range(frames):
+        for c in range(cameras):
+            first_factor(work.at[k, c], chain.a[k, c], factors[k, c])
+    for _ in range(STEPS):
+        _gaussian_path(chain, work, mean, factors)
+        selected_inverse(work.L, work.below, covariance)
+        change, log_ratio = 0.0, 0.0
+        for k in range(frames):
+            for c in range(cameras):
+                marginal = work.at[k, c], spread(chain.slope[k, c], covariance[k])
+                moved, gained = update(*marginal, chain.a[k, c], factors[k, c])
+                change, log_ratio = max(change, moved), log_ratio + gained
+        if not change > SETTLED:
+            break
+    freedom(chain, factors, covariance, dof)
+    return log_ratio - log_determinant(work.L) / 2 - _factored_energy(chain, work, mean, factors)
+
+
+@compiled
+def first_factor(at, a, factor):
+    """Fills in a factor whose curvature and gradient at the optimum resemble those of the density's energy."""
+    if a == GAUSSIAN:
+        factor[:4] = 1.0, 0.0, 1.0, 1.0
+        return
+    q_x, q_y, t = at
+    squared = q_x * q_x + q_y * q_y
+    weight = 1 / math.sqrt(3 + squared)
+    rest = weight - 1 / math.sqrt(max(squared, 1.0))
+    bend = a / (2 / max(a, TINY) + abs(t - 1))
+    factor[:] = weight, 0.0, weight, bend, rest * q_x, rest * q_y, bend * (t - (t - 1) / 2)
+
+
+@compiled
+def _gaussian_path(chain, work, mean, factors):
+    """Moves `mean` to that of the motion and these factors; `work.L` gets the factor of the precision."""
+    motion_energy(chain, 1.0, mean, work.g)
+    work.L[:] = work.motion
+    for k in range(len(mean)):
+        for c in range(factors.shape[1]):
+            xx, xy, yy, tt, l_x, l_y, l_t = factors[k, c]
+            q_x, q_y, t = work.at[k, c]
+            by_x, by_y = xx * q_x + xy * q_y - l_x, xy * q_x + yy * q_y - l_y
+            add_camera(chain.slope[k, c], by_x, by_y, tt * t - l_t, xx, xy, yy, tt, work.g[k], work.L[k])
+    newton_step(work)
+    mean += work.dx
+    measure_all(chain, mean, work.at)
+
+
+@compiled
+def _factored_energy(chain, work, mean, factors):
+    """The energy of the motion and these factors at the mean."""
+    value = motion_energy(chain, 1.0, mean, work.g)
+    for k in range(len(mean)):
+        for c in range(factors.shape[1]):
+            xx, xy, yy, tt, l_x, l_y, l_t = factors[k, c]
+            q_x, q_y, t = work.at[k, c]
+            value += (xx * q_x * q_x + 2 * xy * q_x * q_y + yy * q_y * q_y + tt * t * t) / 2
+            value -= l_x * q_x + l_y * q_y + l_t * t
+    return value
 
 
 @compiled
 def spread(slope, covariance):
     """Covariance of (q_x, q_y), and variance of t: xx, xy, yy, tt."""
-    n = slope.shape[1]
     xx = xy = yy = tt = 0.0
-    for i in range(n):
-        for j in range(n):
+    for i in range(slope.shape[1]):
+        for j in range(slope.shape[1]):
             C = covariance[i, j]
             xx, xy = xx + slope[0, i] * C * slope[0, j], xy + slope[0, i] * C * slope[1, j]
             yy, tt = yy + slope[1, i] * C * slope[1, j], tt + slope[2, i] * C * slope[2, j]
@@ -78,48 +112,98 @@ def spread(slope, covariance):
 
 
 @compiled
-def averaged(at, spread, a, first):
-    """Gradient and curvature of one camera, averaged over a Gaussian: by x, y, t; then xx, xy, yy, tt.
+def update(at, spread, a, factor):
+    """Replaces the factors of one camera; returns the largest change, and the log of what they change the integral by.
 
-    Those of h by quadrature at 5 x 5 points. Those of max(t, 1/t) have, for t < 1, its derivatives at the mean of
-    such t; the kink's curvature is twice the density at t = 1. Without a spread, in the `first` step, a kink counts
-    as if it had a spread of about 1/a.
+    With mean m and covariance S = R R^T of q, and those of the path with the true density, m + R z and R Z R^T, the
+    precision of the factor changes by R^(-T) (Z^(-1) - I) R^(-1), so that both agree.
     """
-    q_x, q_y, t = at
-    if a == GAUSSIAN:
-        return q_x, q_y, t, 1.0, 0.0, 1.0, 1.0
-    if first:
-        weight = 1 / math.sqrt(1 + q_x * q_x + q_y * q_y)
-        return 0.0, 0.0, 0.0, weight, 0.0, weight, a * a / 2
-    by_x, by_y, xx, xy, yy = _averaged_projection(q_x, q_y, spread)
-    by_t, tt = _averaged_depth(t, math.sqrt(max(spread[3], TINY)))
-    return by_x, by_y, a * by_t, xx, xy, yy, a * tt
+    if a == GAUSSIAN or a == 0:
+        return 0.0, 0.0
+    r_xx = math.sqrt(max(spread[0], TINY))
+    r_yx = spread[1] / r_xx
+    r_yy = math.sqrt(max(spread[2] - r_yx * r_yx, TINY))
+    log_q, z_x, z_y, Z_xx, Z_xy, Z_yy = _tilted_projection(at[0], at[1], r_xx, r_yx, r_yy, factor)
+    determinant = Z_xx * Z_yy - Z_xy * Z_xy
+    P_xx, P_xy, P_yy = Z_yy / determinant - 1, -Z_xy / determinant, Z_xx / determinant - 1
+    p_x, p_y = P_xx * z_x + P_xy * z_y + z_x, P_xy * z_x + P_yy * z_y + z_y
+    # R^(-1) = [[u, 0], [w, v]]
+    u, v, w = 1 / r_xx, 1 / r_yy, -r_yx / (r_xx * r_yy)
+    xx, xy, yy = u * u * P_xx + 2 * u * w * P_xy + w * w * P_yy, v * (u * P_xy + w * P_yy), v * v * P_yy
+    factor[0], factor[1], factor[2] = factor[0] + xx, factor[1] + xy, factor[2] + yy
+    factor[4] += xx * at[0] + xy * at[1] + u * p_x + w * p_y
+    factor[5] += xy * at[0] + yy * at[1] + v * p_y
+    deviation = math.sqrt(max(spread[3], TINY))
+    log_t, mean, variance = _tilted_depth(at[2], deviation, a, factor[3], factor[6])
+    tt = 1 / variance - 1 / spread[3]
+    factor[3] += tt
+    factor[6] += mean / variance - at[2] / spread[3]
+    change = max(abs(P_xx), abs(P_yy), abs(P_xy), abs(z_x), abs(z_y), abs(tt) * spread[3])
+    return max(change, abs(mean - at[2]) / deviation), log_q + log_t
 
 
 @compiled
-def _averaged_projection(q_x, q_y, spread):
-    """Gradient and curvature of h(|q|), averaged."""
-    root_xx = math.sqrt(max(spread[0], TINY))
-    root_yx = spread[1] / root_xx
-    root_yy = math.sqrt(max(spread[2] - root_yx * root_yx, 0.0))
-    by_x = by_y = xx = xy = yy = 0.0
-    for i in range(len(_NODES)):
-        for j in range(len(_NODES)):
-            p_x, p_y = q_x + root_xx * _NODES[i], q_y + root_yx * _NODES[i] + root_yy * _NODES[j]
-            weight, unit_x, unit_y = huber_weight(p_x, p_y)
-            share = weight * _WEIGHTS[i] * _WEIGHTS[j]
-            by_x, by_y = by_x + share * p_x, by_y + share * p_y
-            xx, xy = xx + share * (1 - unit_x * unit_x), xy - share * unit_x * unit_y
-            yy += share * (1 - unit_y * unit_y)
-    return by_x, by_y, xx, xy, yy
+def _tilted_projection(q_x, q_y, r_xx, r_yx, r_yy, factor):
+    """log E[ratio], and mean and covariance of the standardised q weighted by the ratio of density and factor."""
+    xx, xy, yy, _, l_x, l_y, _ = factor
+    points = len(_NODES)
+    log_weight = np.empty((points, points))
+    for i in range(points):
+        for j in range(points):
+            x, y = q_x + r_xx * _NODES[i], q_y + r_yx * _NODES[i] + r_yy * _NODES[j]
+            log_factor = l_x * x + l_y * y - (xx * x * x + 2 * xy * x * y + yy * y * y) / 2
+            log_weight[i, j] = _LOG_WEIGHTS[i] + _LOG_WEIGHTS[j] - huber(x * x + y * y) - log_factor
+    highest = log_weight.max()
+    total = x = y = xx = xy = yy = 0.0
+    for i in range(points):
+        for j in range(points):
+            weight = math.exp(log_weight[i, j] - highest)
+            w_x, w_y = weight * _NODES[i], weight * _NODES[j]
+            total, x, y = total + weight, x + w_x, y + w_y
+            xx, xy, yy = xx + w_x * _NODES[i], xy + w_x * _NODES[j], yy + w_y * _NODES[j]
+    x, y = x / total, y / total
+    return highest + math.log(total), x, y, xx / total - x * x, xy / total - x * y, yy / total - y * y
 
 
 @compiled
-def _averaged_depth(t, deviation):
-    """First and second derivative of max(t, 1/t), averaged."""
-    standard = (1 - t) / deviation
-    density = math.exp(-standard * standard / 2) / (deviation * math.sqrt(2 * math.pi))
-    below = math.erfc(-standard / math.sqrt(2)) / 2
-    typical = t - deviation * deviation * density / below if below > 1e-9 else t  # the mean of T < 1
-    typical = min(max(typical, LEAST_SHARE * t), 1.0)
-    return 1 - below - below / (typical * typical), 2 * density + 2 * below / (typical * typical * typical)
+def _tilted_depth(t, deviation, a, precision, linear):
+    """log E[ratio], and mean and variance of t weighted by the ratio of density and factor.
+
+    By Gauss's rule on each side of the kink.
+    """
+    points = len(_PLACES)
+    place, log_weight = np.empty(2 * points), np.full(2 * points, -np.inf)
+    least = max(t - WIDEST * deviation, LEAST_DEPTH)
+    most = max(t + WIDEST * deviation, 2 * LEAST_DEPTH)
+    kink = min(max(1.0, least), most)
+    for i in range(2 * points):
+        low, high = (least, kink) if i < points else (kink, most)
+        place[i] = x = low + (high - low) * _PLACES[i % points]
+        if high > low:
+            standard = (x - t) / deviation
+            log_factor = linear * x - precision * x * x / 2
+            log_weight[i] = _LOG_SHARES[i % points] + math.log((high - low) / deviation) - standard * standard / 2
+            log_weight[i] -= a * max(x, 1 / x) + log_factor
+    highest = log_weight.max()
+    total = first = second = 0.0
+    for i in range(2 * points):
+        weight, x = math.exp(log_weight[i] - highest), (place[i] - t) / deviation
+        total, first, second = total + weight, first + weight * x, second + weight * x * x
+    mean = first / total
+    variance = (second / total - mean * mean) * deviation * deviation
+    return highest + math.log(total / math.sqrt(2 * math.pi)), t + deviation * mean, variance
+
+
+@compiled
+def freedom(chain, factors, covariance, dof):
+    """Fills in the trace of the factors' precision times the covariance of (q_x, q_y, t) with its part by position."""
+    for k in range(len(dof)):
+        for c in range(dof.shape[1]):
+            slope, (xx, xy, yy, tt, _, _, _) = chain.slope[k, c], factors[k, c]
+            dof[k, c] = 0.0
+            for i in range(3):
+                for j in range(slope.shape[1]):
+                    C = covariance[k, i, j]
+                    x, y, t = slope[0, i] * C, slope[1, i] * C, slope[2, i] * C
+                    dof[k, c] += xx * x * slope[0, j] + xy * (x * slope[1, j] + y * slope[0, j])
+                    dof[k, c] += yy * y * slope[1, j] + tt * t * slope[2, j]

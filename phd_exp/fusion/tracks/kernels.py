@@ -9,9 +9,8 @@ from numba import njit
 
 from phd_exp.fusion.tracks.certificate import certify
 from phd_exp.fusion.tracks.energy import frames_energy, motion_energy
-from phd_exp.fusion.tracks.gaussian import freedom, gaussian
+from phd_exp.fusion.tracks.gaussian import gaussian
 from phd_exp.fusion.tracks.newton import measure_all, optimum, polish, workspace
-from phd_exp.fusion.tracks.tridiagonal import log_determinant
 
 
 def _functions(sources):
@@ -34,14 +33,10 @@ def _functions(sources):
         return True, energy + frames_energy(at, at, 0.0, chain.a, 0.0, 1e-6), gap
 
     @njit(cache=True, error_model="numpy")
-    def moments(chain, mean, covariance, dof):
-        """Moves `mean` from the optimum to the mean, fills the others; log-determinant of the whole precision."""
+    def moments(chain, mean, covariance, factors, dof):
+        """Calls `gaussian`."""
         assert len(sources) > 0
-        work = workspace(chain)
-        gaussian(chain, work, mean, covariance)
-        measure_all(chain, mean, work.at)
-        freedom(chain, work.at, covariance, dof)
-        return log_determinant(work.L)
+        return gaussian(chain, workspace(chain), mean, covariance, factors, dof)
 
     return most_likely, moments
 

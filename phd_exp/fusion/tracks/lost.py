@@ -49,20 +49,25 @@ class Lost:
         if not late.any():
             return len(times), None
         k = int(np.argmax(late))
-        return k, f"lost after {last[k - 1]:g} s: no prediction for more than {self.after:g} s"
+        return k, self.late(last[k - 1])
+
+    def late(self, last: float) -> str:
+        """The reason of an end by a gap after the last prediction."""
+        return f"lost after {last:g} s: no prediction for more than {self.after:g} s"
 
     def contradicted(
-        self, times: Float[np.ndarray, " frames"], surprise: Float[np.ndarray, "frames cameras"]
+        self, times: Float[np.ndarray, " frames"], surprise: Float[np.ndarray, "frames cameras"], begun: bool = False
     ) -> tuple[int, str | None]:
         """The number of frames before the first run of contradictions that is too long, and the reason.
 
-        A run from the first frame on does not end the track: then it is the later frames that agree.
+        Unless the track has `begun` before, a run from the first frame on does not end it: then it is the later
+        frames that agree.
         """
         against, seen = self.contradicts(surprise), (~np.isnan(surprise)).any(-1)
         run, begin = 0, 0
         for k in seen.nonzero()[0]:
-            begin = begin if run and against[k] else k
+            begin = begin if run and against[k] else int(k)
             run = run + 1 if against[k] else 0
-            if run == self.contradictions and begin > 0:
-                return int(begin), f"lost after {times[begin - 1]:g} s: {run} frames in a row contradict the path"
+            if run == self.contradictions and (begun or begin > 0):
+                return begin, f"lost at {times[begin]:g} s: from then on {run} frames in a row contradict the path"
         return len(times), None

@@ -89,7 +89,7 @@ def measure_all(chain, x, at):
 
 
 @compiled
-def newton_step(chain, work, x):
+def newton_step(work):
     """Fills `dx` with the step of the gradient g and the curvature L, which becomes its factor."""
     factorise(work.L, work.coupling, work.below)
     work.dx[:] = -work.g
@@ -131,7 +131,7 @@ def minimise(chain, work, x, lam, least):
     measure_all(chain, x, work.at)
     for _ in range(MOST_STEPS):
         before = _linearise_smoothed(chain, work, x, y, lam, width, least)
-        newton_step(chain, work, x)
+        newton_step(work)
         share = _line_search(chain, work, before, width, least)
         settled = _move(chain, work, y, lam, share)
         x += share * work.dx
@@ -201,7 +201,7 @@ def polish(chain, work, x, lam):
         for k in range(len(x)):
             for c in range(lam.shape[1]):
                 _add_exact(chain, work, k, c, lam, kink)
-        newton_step(chain, work, x)
+        newton_step(work)
         x += work.dx
         measure_all(chain, x, work.at)
         for k in range(len(x)):

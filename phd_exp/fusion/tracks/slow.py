@@ -6,7 +6,7 @@ variance of each prediction belongs to them, the rest to the frame alone.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -60,23 +60,23 @@ class Slow:
         predictions: ProjectedHuber | Gaussian,
         pose: Pose,
         mask: Bool[Tensor, "frames cameras"] | None,
-    ) -> tuple[Frames, Float[np.ndarray, "frames cameras"]]:
-        """The frames without the slow errors, and the standard deviation of each frame's slow log depth.
+    ) -> Frames:
+        """The frames without the slow errors.
 
         Raises:
             ValueError: an argument of `track` is not valid.
         """
         frames = Frames.checked(times, predictions, pose, mask)
-        deviation = torch.zeros(predictions.batch_shape, dtype=torch.float64)
         if self.depth_share == self.projection_share == 0:
-            return frames, deviation.numpy()
+            return frames
         if isinstance(predictions, Gaussian):
             raise ValueError("slow: got Gaussian predictions; expected ProjectedHuber")
-        own = predictions
+        own, deviation = predictions, torch.zeros(predictions.batch_shape)
         if self.depth_share:
             own, deviation = own_part(predictions, torch.tensor(self.depth_share, dtype=torch.float64))
         own = own.tempered(math.sqrt(1 - self.projection_share), 1.0)
-        return Frames.checked(times, own, pose, mask), np.where(frames.mask, deviation.numpy(), 0.0)
+        known = np.where(frames.mask, deviation.double().numpy(), 0.0)
+        return replace(Frames.checked(times, own, pose, mask), deviation=known)
 
     @property
     def offset(self) -> float:

@@ -15,7 +15,7 @@ from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.level import credible_level
 from phd_exp.fusion.pose import Pose
 from phd_exp.fusion.problems import Status
-from phd_exp.fusion.tracks.chain import Array, measured, moving, start
+from phd_exp.fusion.tracks.chain import Array, Model
 from phd_exp.fusion.tracks.energy import GAUSSIAN, Chain
 from phd_exp.fusion.tracks.frames import Frames, Gaussian
 from phd_exp.fusion.tracks.lost import Lost
@@ -34,14 +34,16 @@ PASSES = 2  # about the path without slow errors, then about the path with them
 class Moments(NamedTuple):
     """The Gaussian of a path: `mean` and `covariance` of each frame's unknowns.
 
-    `freedom` is the number of a position's unknowns that each camera determines, and `log_determinant` that of the
-    precision of all frames together.
+    `factors` are the Gaussian ones in place of each camera's density, `freedom` is how many unknowns of a position
+    each camera determines, and `log_integral` is that of the density over all paths, up to a constant; see
+    `phd_exp.fusion.tracks.gaussian`.
     """
 
     mean: Float[Array, "frames d"]
     covariance: Float[Array, "frames d d"]
+    factors: Float[Array, "frames cameras 7"]
     freedom: Float[Array, "frames cameras"]
-    log_determinant: float
+    log_integral: float
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,7 @@ class Solved:
 
     Args:
         frames: of the track.
+        model: the law of the unknowns.
         chain: the energy.
         x: the most likely unknowns, see `phd_exp.fusion.tracks.chain`.
         at: (q_x, q_y, t) there.
@@ -59,6 +62,7 @@ class Solved:
     """
 
     frames: Frames
+    model: Model
     chain: Chain
     x: Float[Array, "frames d"]
     at: Float[Array, "frames cameras 3"]
@@ -72,9 +76,9 @@ class Solved:
         from phd_exp.fusion.tracks.kernels import moments
 
         mean, covariance = self.x.copy(), np.empty((*self.x.shape, self.x.shape[1]))
-        freedom = np.empty(self.chain.a.shape)
-        log_determinant = moments(self.chain, mean, covariance, freedom)
-        return Moments(mean, covariance, freedom, log_determinant)
+        freedom, factors = np.empty(self.chain.a.shape), np.empty((*self.chain.a.shape, 7))
+        log_integral = moments(self.chain, mean, covariance, factors, freedom)
+        return Moments(mean, covariance, factors, freedom, log_integral)
 
     @property
     def surprise(self) -> Float[Array, "frames cameras"]:
@@ -116,12 +120,12 @@ class Path:
     @property
     def velocity(self) -> Float[Tensor, "frames 3"]:
         """The velocities of the most likely path, metres per second."""
-        return self._entered(self.solved.x[:, self._velocity])
+        return self._entered(self.solved.x[:, self.solved.model.velocity])
 
     @property
     def slow(self) -> Float[Tensor, "frames slow"]:
         """The most likely slow errors in their standard deviations: of log depth, then of each camera's q."""
-        return self._entered(self.solved.x[:, 3 : self.solved.chain.slope.shape[3]])
+        return self._entered(self.solved.x[:, 3 : self.solved.model.measured_unknowns])
 
     @property
     def gap(self) -> float:
@@ -151,18 +155,13 @@ class Path:
     @property
     def velocity_covariance(self) -> Float[Tensor, "frames 3 3"]:
         """Covariance of each velocity, square metres per square second."""
-        return self._entered(self.solved.moments.covariance[:, self._velocity, self._velocity])
+        v = self.solved.model.velocity
+        return self._entered(self.solved.moments.covariance[:, v, v])
 
     @property
     def log_evidence(self) -> float:
-        """Log density of the predictions given the motion, up to constants, nats, by Laplace's method."""
-        precisions = np.linalg.slogdet(self.solved.chain.W)[1].sum()
-        return (precisions - self.solved.moments.log_determinant) / 2 - self.solved.energy
-
-    @property
-    def _velocity(self) -> slice:
-        n = self.solved.chain.slope.shape[3]
-        return slice(n, n + 3)
+        """Log density of the predictions given the motion, up to constants, nats."""
+        return self.solved.moments.log_integral + float(np.linalg.slogdet(self.solved.chain.W)[1].sum()) / 2
 
     def _entered(self, values: Float[Array, "frames ..."]) -> Tensor:
         """With NaN for the frames outside the track."""
@@ -204,65 +203,63 @@ def track(
     of paths; the densities are the paper's.
     """
     with one_thread():
-        frames, deviation = slow.frames(times, predictions, pose, mask)
+        frames = slow.frames(times, predictions, pose, mask)
         seen = frames.mask.any(-1)
         first = int(np.argmax(seen))
         length, why = lost.gap(frames.times[first:], seen[first:])
         while True:
-            part = slice(first, first + length)
-            solved = _smoothed(frames[part], deviation[part], motion, slow)
+            solved = _smoothed(frames[first : first + length], motion, slow)
             length, contradicted = lost.contradicted(solved.frames.times, solved.surprise)
             if contradicted is None:
                 return Path(torch.from_numpy(frames.times), first, why, solved)
             why = contradicted
 
 
-def _smoothed(frames: Frames, deviation: Float[Array, "frames cameras"], motion: Motion, slow: Slow) -> Solved:
-    """The optimum; with a slow factor of depth, twice about the path given that factor, first 1.
-
-    A path of another size has another volume of paths around it: integrated over paths, the density at a factor e^s
-    has a further factor e^(d s) for each unknown that a camera determines. Without it, the factor would be too small.
-    """
-    level = np.zeros(len(frames.times))
-    given = replace(slow, depth_share=0.0)
-    solved = solve(frames, motion, given, deviation, frames.near, level, 0 * level)
-    for _ in range(PASSES if slow.depth_share else 0):
-        pull = -(deviation * solved.moments.freedom).sum(-1)
-        solved = solve(frames, motion, slow, deviation, solved.x[:, :3], level, pull)
-        level = solved.x[:, 3]
+def _smoothed(frames: Frames, motion: Motion, slow: Slow) -> Solved:
+    """The optimum; with a slow factor of depth, twice about the path given that factor, first 1."""
+    cameras = frames.a.shape[1]
+    model = Model(motion, replace(slow, depth_share=0.0), cameras)
+    x = np.zeros((len(frames.times), len(model.start()[0])))
+    x[:, :3] = frames.near
+    solved = solve(model, frames, x, model.start(), None)
+    if slow.depth_share:
+        model = Model(motion, slow, cameras)
+        x = np.insert(solved.x, 3, 0.0, axis=1)
+        for _ in range(PASSES):
+            solved = solve(model, frames, x, model.start(), solved.moments.freedom)
+            x = solved.x
     return solved
 
 
 def solve(
+    model: Model,
     frames: Frames,
-    motion: Motion,
-    slow: Slow,
-    deviation: Float[Array, "frames cameras"],
-    about: Float[Array, "frames 3"],
-    level: Float[Array, " frames"],
-    pull: Float[Array, " frames"],
+    about: Float[Array, "frames d"],
+    start: tuple[Float[Array, " d"], Float[Array, "d d"]],
+    freedom: Float[Array, "frames cameras"] | None,
 ) -> Solved:
-    """The optimum of the frames, with the slow factor linear about a path and level, and a linear energy `pull` of it.
+    """The optimum of the frames, by a search from `about`, where the slow factor of depth is linear.
+
+    A path of another size has another volume of paths around it: integrated over these, the density at a factor
+    e^(d s) has a further factor e^(d s) for each unknown that a camera determines, their `freedom`. Without it, the
+    factor would be too small.
 
     Raises:
         ValueError: there is none.
     """
     from phd_exp.fusion.tracks.kernels import most_likely
 
-    cameras = frames.a.shape[1]
-    slope, at_origin = measured(frames, slow, deviation, about, level)
-    begin, steps = start(motion, slow, cameras), moving(motion, slow, cameras, np.diff(frames.times))
-    x, linear = np.zeros((2, len(frames.times), len(begin[0])))
-    x[:, :3] = about
-    if slow.depth_share:
-        x[:, 3], linear[:, 3] = level, pull
-    chain = Chain(slope, at_origin, frames.a, *begin, *steps, linear)
-    at, distance = np.empty_like(at_origin), np.empty(len(x))
+    slope, at_origin = model.measured(frames, about)
+    linear = np.zeros_like(about)
+    if freedom is not None:
+        linear[:, 3] = -(frames.deviation * freedom).sum(-1)
+    chain = Chain(slope, at_origin, frames.a, *start, *model.moving(np.diff(frames.times)), linear)
+    x, at, distance = about.copy(), np.empty_like(at_origin), np.empty(len(about))
     in_front, energy, gap = most_likely(chain, x, at, distance)
     if not in_front:
         status = Status.NO_COMMON_VIEW if np.isfinite(x).all() else Status.NOT_CONVERGED
         raise ValueError(f"predictions: {status.reason}")
-    return Solved(frames, chain, x, at, energy, gap, distance)
+    return Solved(frames, model, chain, x, at, energy, gap, distance)
 
 
 def estimated(

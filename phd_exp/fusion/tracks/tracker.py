@@ -1,0 +1,194 @@
+"""A path while it is seen: each frame's state a fixed number of frames later, in constant time a frame."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from phd_exp.distributions import ProjectedHuber
+from phd_exp.fusion.pose import Pose
+from phd_exp.fusion.tracks.chain import Array, Model
+from phd_exp.fusion.tracks.frames import Frames, Gaussian
+from phd_exp.fusion.tracks.lost import Lost
+from phd_exp.fusion.tracks.motion import Motion
+from phd_exp.fusion.tracks.slow import Slow
+from phd_exp.fusion.tracks.track import NONE, Solved, solve
+from phd_exp.hardware import one_thread
+
+
+@dataclass(frozen=True)
+class State:
+    """One frame of a path, given all frames up to `lag` later; as in `Path`.
+
+    Args:
+        time: of the frame, seconds.
+        point: the most likely position, metres.
+        velocity: of the most likely path, metres per second.
+        mean: the expected position, metres.
+        covariance: of the position, square metres.
+        velocity_covariance: square metres per square second.
+        surprise: credible level of the position in each view; NaN where masked out.
+    """
+
+    time: float
+    point: Float[Tensor, "3"]
+    velocity: Float[Tensor, "3"]
+    mean: Float[Tensor, "3"]
+    covariance: Float[Tensor, "3 3"]
+    velocity_covariance: Float[Tensor, "3 3"]
+    surprise: Float[Tensor, " cameras"]
+
+
+class Tracker:
+    """Smooths a path frame by frame.
+
+    The last `lag` + 1 frames are solved anew with each frame. Older ones are replaced by their Gaussian factors, see
+    `phd_exp.fusion.tracks.gaussian`, which is exact for Gaussian predictions.
+
+    Args:
+        motion: `ConstantVelocity` or `ConstantAcceleration`.
+        lag: how many later frames the state of a frame takes into account; 0 gives a filter.
+        slow: the errors that consecutive frames share (default: none).
+        lost: when the track ends.
+
+    Attributes:
+        lost_because: when and why the track ended, else None. Then `update` returns None; begin a new Tracker.
+
+    Raises:
+        ValueError: lag is negative, or less than the contradictions that end a track need.
+
+    Examples:
+        >>> import torch
+        >>> from phd_exp.distributions import ProjectedHuber
+        >>> from phd_exp.fusion import Pose
+        >>> from phd_exp.fusion.tracks import ConstantVelocity, Lost, Tracker
+        >>> tracker = Tracker(ConstantVelocity(noise=1.0), lag=1, lost=Lost(contradictions=2))
+        >>> A, a, here = 300 * torch.eye(2)[None], torch.tensor([20.0]), Pose(torch.eye(3), torch.zeros(3))
+        >>> for frame in range(3):
+        ...     prediction = ProjectedHuber(torch.zeros(1, 2), torch.tensor([4.0 + frame]), A, a)
+        ...     state = tracker.update(float(frame), prediction, here)
+        >>> state.time, state.velocity.round(decimals=1)
+        (1.0, tensor([0., 0., 1.], dtype=torch.float64))
+    """
+
+    def __init__(self, motion: Motion, lag: int = 10, slow: Slow = NONE, lost: Lost = Lost()) -> None:
+        if lag < 0:
+            raise ValueError(f"lag: got {lag}; expected a number of frames, at least 0")
+        if lost.contradictions > lag + 1:
+            raise ValueError(
+                f"lost.contradictions: got {lost.contradictions}; expected at most lag + 1 = {lag + 1} frames"
+            )
+        self.motion, self.lag, self.slow, self.lost = motion, lag, slow, lost
+        self.lost_because: str | None = None
+        self._window: Solved | None = None
+        self._seen = -np.inf  # the last time with a prediction
+
+    @torch.no_grad()
+    def update(
+        self,
+        time: float,
+        predictions: ProjectedHuber | Gaussian,
+        pose: Pose,
+        mask: Bool[Tensor, " cameras"] | None = None,
+    ) -> State | None:
+        """The state `lag` frames before this one; None until there is one, and after the track is lost.
+
+        Args:
+            time: of this frame, later than that of the frame before, seconds.
+            predictions: of batch shape (cameras,).
+            pose: of each camera; its batch shape broadcasts to that.
+            mask: which cameras take part (default: all). A frame without any is bridged.
+
+        Raises:
+            ValueError: an argument is not valid.
+        """
+        seen = mask is None or bool(mask.any())
+        if self.lost_because is not None or (self._window is None and not seen):
+            return None
+        if self._window is not None and not time > self._window.frames.times[-1]:
+            raise ValueError(f"time: got {time} after {self._window.frames.times[-1]}; expected a later time")
+        if time - self._seen > self.lost.after and self._window is not None:
+            self.lost_because = self.lost.late(self._seen)
+            return None
+        with one_thread():
+            frame = self._frame(time, predictions, pose, mask) if seen else self._window.frames.unseen(time)
+            self._window = self._first(frame) if self._window is None else self._next(self._window, frame)
+            self._seen = time if seen else self._seen
+            full = len(self._window.frames.times) == self.lag + 1
+            _, self.lost_because = self.lost.contradicted(self._window.frames.times, self._window.surprise, full)
+            return self._state(0) if full and self.lost_because is None else None
+
+    def finish(self) -> list[State]:
+        """The states of the last frames, for which `update` has not returned one."""
+        if self._window is None or self.lost_because is not None:
+            return []
+        frames = len(self._window.frames.times)
+        return [self._state(k) for k in range(int(frames == self.lag + 1), frames)]
+
+    def _frame(self, time: float, predictions: ProjectedHuber | Gaussian, pose: Pose, mask: Tensor | None) -> Frames:
+        """One frame, checked."""
+        if isinstance(predictions, ProjectedHuber):
+            predictions = predictions.expand((1, *predictions.batch_shape))
+        elif isinstance(predictions, Gaussian):
+            predictions = Gaussian(predictions.mean[None], predictions.covariance[None])
+        times = torch.tensor([time], dtype=torch.float64)
+        return self.slow.frames(times, predictions, pose, None if mask is None else mask[None])
+
+    def _first(self, frame: Frames) -> Solved:
+        """The window of the first frame."""
+        model = Model(self.motion, self.slow, frame.a.shape[1])
+        self._start = model.start()
+        x = np.zeros((1, len(self._start[0])))
+        x[0, :3] = frame.near[0]
+        return solve(model, frame, x, self._start, self._freedom(3.0 * frame.mask / frame.mask.sum()))
+
+    def _next(self, window: Solved, frame: Frames) -> Solved:
+        """The window with one more frame, without its first one if it is full."""
+        model, frames = window.model, window.frames.followed_by(frame)
+        (F,), _ = model.moving(np.diff(frames.times[-2:]))
+        x = np.concatenate([window.x, (F @ window.x[-1])[None]])
+        freedom = np.concatenate([window.moments.freedom, window.moments.freedom[-1:]])
+        if len(frames.times) > self.lag + 1:
+            self._start = after_first(window, self._start, *model.moving(np.diff(frames.times[:2])))
+            frames, x, freedom = frames[1:], x[1:], freedom[1:]
+        return solve(model, frames, x, self._start, self._freedom(freedom))
+
+    def _freedom(self, freedom: Float[Array, "frames cameras"]) -> Float[Array, "frames cameras"] | None:
+        return freedom if self.slow.depth_share else None
+
+    def _state(self, k: int) -> State:
+        """That of a frame of the window."""
+        assert self._window is not None
+        window, v = self._window, self._window.model.velocity
+        mean, covariance, origin = window.moments.mean[k], window.moments.covariance[k], window.frames.origin
+        numbers = (
+            window.x[k, :3] + origin, window.x[k, v], mean[:3] + origin,
+            covariance[:3, :3], covariance[v, v], window.surprise[k],
+        )  # fmt: skip
+        return State(float(window.frames.times[k]), *(torch.from_numpy(value.copy()) for value in numbers))
+
+
+def after_first(
+    window: Solved,
+    start: tuple[Float[Array, " d"], Float[Array, "d d"]],
+    F: Float[Array, "1 d d"],
+    W: Float[Array, "1 d d"],
+) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
+    """Mean and precision of the second frame's unknowns given the first frame, by its Gaussian factors.
+
+    F and W are those between the two, and `start` holds before the first.
+    """
+    mean, precision = start
+    information, precision = precision @ mean - window.chain.linear[0], precision.copy()
+    n = window.model.measured_unknowns
+    views = window.chain.slope[0], window.chain.at_origin[0], window.moments.factors[0]
+    for slope, at, factor in zip(*views, strict=True):
+        xx, xy, yy, tt = factor[:4]
+        K = np.array([[xx, xy, 0], [xy, yy, 0], [0, 0, tt]])
+        precision[:n, :n] += slope.T @ K @ slope
+        information[:n] += slope.T @ (factor[4:] - K @ at)
+    covariance = np.linalg.inv(precision)
+    moved = F[0] @ covariance @ F[0].T + np.linalg.inv(W[0])
+    return F[0] @ covariance @ information, np.linalg.inv((moved + moved.T) / 2)
