@@ -19,7 +19,8 @@ from phd_exp.records.spec import DatasetSpec
 # before anything is imported: every annotated function of these modules checks its shapes while tests run; numba
 # compiles the other modules of fusion
 FUSION = ("fusion.fuse", "fusion.gaussian", "fusion.pose", "fusion.problems")
-HOOKED = ("geometry", "distributions", "losses", "metrics", "models", "data", "evaluation", *FUSION)
+TRACKS = ("fusion.tracks.chain", "fusion.tracks.lost", "fusion.tracks.motion")
+HOOKED = ("geometry", "distributions", "losses", "metrics", "models", "data", "evaluation", *FUSION, *TRACKS)
 install_import_hook([f"phd_exp.{name}" for name in HOOKED], "beartype.beartype")
 
 

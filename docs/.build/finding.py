@@ -17,6 +17,7 @@ WORDS = {
     "guides/search.md": ["hyperparameter", "tune"],
     "guides/several_cameras.md": ["stereo", "triangulation"],
     "guides/shift.md": ["robustness", "out of distribution"],
+    "guides/tracking.md": ["video", "sequence", "Kalman filter", "smoother", "trajectory"],
     "ideas/calibration.md": ["confidence", "reliability"],
     "ideas/density.md": ["loss", "likelihood"],
     "index.md": ["licence", "license", "citation", "install"],

@@ -48,7 +48,7 @@ class Frames:
         origin: of the coordinates below, in the world, metres.
         slope: d(q_x, q_y, t)/dv, 1/metres; 0 where a camera takes no part.
         at_origin: (q_x, q_y, t) at the origin.
-        a: precision of the depth, or GAUSSIAN.
+        a: precision of the depth, or GAUSSIAN; 0 where a camera takes no part.
         mask: which cameras take part.
         near: the average of each frame's predicted positions; those of the nearest frames where there is none.
         centres: the positions of the cameras.
@@ -178,4 +178,5 @@ def _gaussian_views(predictions: Gaussian, pose: Pose, mask: Tensor | None) -> _
     valid = (failed == 0) & predictions.covariance.isfinite().all(-1).all(-1).cpu() & mean.isfinite().all(-1)
     status = frames_status(mask, valid, pose.is_rigid, None)
     centres = pose.into_world(torch.zeros(3, dtype=torch.float64))
-    return _Views(slope, at_zero, torch.full(shape, GAUSSIAN).double(), mask, pose.into_world(mean), centres, status)
+    a = torch.where(mask, GAUSSIAN, 0.0).double()
+    return _Views(slope, at_zero, a, mask, pose.into_world(mean), centres, status)

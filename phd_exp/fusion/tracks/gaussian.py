@@ -28,7 +28,7 @@ _PLACES, _LOG_SHARES = (_PLACES + 1) / 2, np.log(_SHARES / 2)
 
 
 @compiled
-def gaussian(chain, work, mean, covariance, factors, dof):
+def propagate(chain, work, mean, covariance, factors, dof):
     """Moves `mean` from the optimum to the mean, and fills `covariance` (N x d x d), `factors` and `dof` (N x C).
 
     `factors` (N x C x 7) are the Gaussian ones: precision of q (xx, xy, yy) and t, then precision times mean. `dof`

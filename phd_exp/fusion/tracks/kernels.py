@@ -7,9 +7,12 @@ from pathlib import Path
 import numpy as np
 from numba import njit
 
+from phd_exp.fusion import arithmetic
+from phd_exp.fusion import newton as fusion_newton
+from phd_exp.fusion.tracks import certificate, energy, gaussian, newton, tridiagonal
 from phd_exp.fusion.tracks.certificate import certify
 from phd_exp.fusion.tracks.energy import frames_energy, motion_energy
-from phd_exp.fusion.tracks.gaussian import gaussian
+from phd_exp.fusion.tracks.gaussian import propagate
 from phd_exp.fusion.tracks.newton import measure_all, optimum, polish, workspace
 
 
@@ -29,17 +32,18 @@ def _functions(sources):
         polish(chain, work, x, lam)
         gap = certify(chain, work, x, lam, distance)
         measure_all(chain, x, at)
-        energy = motion_energy(chain, 1.0, x, work.g)
-        return True, energy + frames_energy(at, at, 0.0, chain.a, 0.0, 1e-6), gap
+        motion = motion_energy(chain, 1.0, x, work.g)
+        return True, motion + frames_energy(at, at, 0.0, chain.a, 0.0, 1e-6), gap
 
     @njit(cache=True, error_model="numpy")
     def moments(chain, mean, covariance, factors, dof):
-        """Calls `gaussian`."""
+        """Calls `propagate`."""
         assert len(sources) > 0
-        return gaussian(chain, workspace(chain), mean, covariance, factors, dof)
+        return propagate(chain, workspace(chain), mean, covariance, factors, dof)
 
     return most_likely, moments
 
 
-_SOURCES = b"".join(source.read_bytes() for source in sorted(Path(__file__).parents[1].rglob("*.py")))
+_COMPILED = (arithmetic, fusion_newton, certificate, energy, gaussian, newton, tridiagonal)
+_SOURCES = b"".join(Path(str(module.__file__)).read_bytes() for module in _COMPILED)
 most_likely, moments = _functions(hashlib.sha256(_SOURCES).hexdigest())

@@ -33,6 +33,11 @@ class Lost:
         if not 0 <= self.probability < 1:
             raise ValueError(f"probability: got {self.probability}; expected a probability from 0 to less than 1")
 
+    @property
+    def least_excess(self) -> float:
+        """An excess energy, nats, that a view must have to contradict the path: its level is at most 1 - e^(-W)/2."""
+        return -math.log(2 * self.probability) if self.probability else math.inf
+
     def contradicts(self, surprise: Float[np.ndarray, "frames cameras"]) -> Bool[np.ndarray, " frames"]:
         """Which frames contradict the path; `surprise` is NaN where a camera takes no part."""
         against = (surprise > 1 - self.probability).sum(-1)

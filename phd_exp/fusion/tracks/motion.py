@@ -1,26 +1,29 @@
 """How an object moves between frames: white noise of its acceleration or of its jerk."""
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar, final
 
 import numpy as np
 from jaxtyping import Float
 
 
-class Motion(Protocol):
+class Motion(ABC):
     """A motion with `order` derivatives, the position among them, of which the last one is driven by white noise."""
 
     order: ClassVar[int]
     noise: float
 
     @property
+    @abstractmethod
     def deviations(self) -> tuple[float, ...]:
         """Standard deviations of the derivatives in the first frame, in each axis, before any prediction."""
 
 
+@final
 @dataclass(frozen=True)
-class ConstantVelocity:
+class ConstantVelocity(Motion):
     """A velocity that changes by white noise of the acceleration.
 
     Args:
@@ -45,8 +48,9 @@ class ConstantVelocity:
         return (self.speed,)
 
 
+@final
 @dataclass(frozen=True)
-class ConstantAcceleration:
+class ConstantAcceleration(Motion):
     """An acceleration that changes by white noise of the jerk.
 
     Args:

@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy import optimize
+from scipy import optimize, special
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
@@ -80,18 +80,26 @@ class Solved:
         log_integral = moments(self.chain, mean, covariance, factors, freedom)
         return Moments(mean, covariance, factors, freedom, log_integral)
 
+    @cached_property
+    def excess(self) -> Float[Array, "frames cameras"]:
+        """Energy of the path in each view above the view's lowest energy, nats."""
+        q_x, q_y, t = np.moveaxis(self.at, -1, 0)
+        inverse = 1 / np.where(t == 0, np.inf, t)  # t of a Gaussian prediction may be 0
+        squared, a = q_x**2 + q_y**2, self.chain.a
+        huber = np.where(squared > 1, np.sqrt(squared) - 0.5, squared / 2) + a * (np.maximum(t, inverse) - 1)
+        return np.where(a == GAUSSIAN, (squared + t**2) / 2, huber)
+
     @property
     def surprise(self) -> Float[Array, "frames cameras"]:
         """Credible level of the path in each view; NaN where masked out."""
-        q_x, q_y, t = (torch.from_numpy(values) for values in np.moveaxis(self.at, -1, 0))
-        a = torch.from_numpy(self.chain.a)
-        squared = q_x.square() + q_y.square()
-        if bool((a == GAUSSIAN).any()):
-            level = torch.special.gammainc(torch.full_like(a, 1.5), (squared + t.square()) / 2)
-        else:
-            h = torch.where(squared > 1, squared.sqrt() - 0.5, squared / 2)
-            level = credible_level(h + a * (torch.maximum(t, 1 / t) - 1), a)
-        return np.where(self.frames.mask, level.numpy(), np.nan)
+        return np.where(self.frames.mask, levels(self.excess, self.chain.a), np.nan)
+
+
+def levels(excess: Float[Array, "*views"], a: Float[Array, "*views"]) -> Float[Array, "*views"]:
+    """Credible levels of excess energies, under Gaussian predictions where a is GAUSSIAN."""
+    if (a == GAUSSIAN).any():
+        return special.gammainc(1.5, excess)
+    return credible_level(torch.from_numpy(excess), torch.from_numpy(a)).numpy()
 
 
 @dataclass(frozen=True)

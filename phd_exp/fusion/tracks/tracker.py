@@ -14,7 +14,7 @@ from phd_exp.fusion.tracks.frames import Frames, Gaussian
 from phd_exp.fusion.tracks.lost import Lost
 from phd_exp.fusion.tracks.motion import Motion
 from phd_exp.fusion.tracks.slow import Slow
-from phd_exp.fusion.tracks.track import NONE, Solved, solve
+from phd_exp.fusion.tracks.track import NONE, Solved, levels, solve
 from phd_exp.hardware import one_thread
 
 
@@ -29,7 +29,8 @@ class State:
         mean: the expected position, metres.
         covariance: of the position, square metres.
         velocity_covariance: square metres per square second.
-        surprise: credible level of the position in each view; NaN where masked out.
+        excess: energy of the position in each view above the view's lowest energy, nats.
+        a: precision of each view's depth.
     """
 
     time: float
@@ -38,7 +39,14 @@ class State:
     mean: Float[Tensor, "3"]
     covariance: Float[Tensor, "3 3"]
     velocity_covariance: Float[Tensor, "3 3"]
-    surprise: Float[Tensor, " cameras"]
+    excess: Float[Tensor, " cameras"]
+    a: Float[Tensor, " cameras"]
+
+    @property
+    def surprise(self) -> Float[Tensor, " cameras"]:
+        """Credible level of the position in each view, near 1 where they contradict; NaN where masked out."""
+        level = torch.from_numpy(levels(self.excess.numpy(), self.a.numpy()))
+        return level.masked_fill(self.a == 0, torch.nan)
 
 
 class Tracker:
@@ -117,7 +125,9 @@ class Tracker:
             self._window = self._first(frame) if self._window is None else self._next(self._window, frame)
             self._seen = time if seen else self._seen
             full = len(self._window.frames.times) == self.lag + 1
-            _, self.lost_because = self.lost.contradicted(self._window.frames.times, self._window.surprise, full)
+            if (self._window.excess > self.lost.least_excess).any():
+                times = self._window.frames.times
+                _, self.lost_because = self.lost.contradicted(times, self._window.surprise, full)
             return self._state(0) if full and self.lost_because is None else None
 
     def finish(self) -> list[State]:
@@ -165,7 +175,7 @@ class Tracker:
         mean, covariance, origin = window.moments.mean[k], window.moments.covariance[k], window.frames.origin
         numbers = (
             window.x[k, :3] + origin, window.x[k, v], mean[:3] + origin,
-            covariance[:3, :3], covariance[v, v], window.surprise[k],
+            covariance[:3, :3], covariance[v, v], window.excess[k], window.chain.a[k],
         )  # fmt: skip
         return State(float(window.frames.times[k]), *(torch.from_numpy(value.copy()) for value in numbers))
 

@@ -1,0 +1,75 @@
+"""Mean and covariance of paths: closed forms, and simulated paths with and without slow errors."""
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from phd_exp.distributions import ProjectedHuber
+from phd_exp.fusion.tracks import ConstantVelocity, Lost, Slow, autocorrelation, estimated, standardised_errors, track
+from phd_exp.metrics.errors import squared_mahalanobis
+from tests.support.paths import around, chosen, drawn_paths, share_of
+
+LAW, TIMES = ConstantVelocity(noise=0.3, speed=0.3), np.arange(60) / 30
+NEVER = Lost(contradictions=10**6)
+DEVIATION = 0.05
+SLOW_DEPTH = Slow(depth_share=share_of(DEVIATION, 20.0), depth_time=1.0)
+SLOW = Slow(SLOW_DEPTH.depth_share, 1.0, projection_share=0.4, projection_time=0.5)
+
+
+@pytest.mark.parametrize("a", [3.0, 20.0, 100.0])
+def test_one_frame_has_the_moments_of_its_density(a: float) -> None:
+    one = torch.ones(1, 1).double()
+    A = 100 * torch.tensor([[2.0, 0.5], [0.5, 1.0]]).double().expand(1, 1, 2, 2)
+    density = ProjectedHuber(torch.tensor([[[0.05, -0.02]]]).double(), 4 * one, A, a * one)
+    path = track(torch.zeros(1), density, around(1), LAW)
+    off = squared_mahalanobis(path.mean - density.mean[:, 0], density.covariance_matrix[:, 0])
+    ratios = torch.linalg.eigvals(torch.linalg.solve(density.covariance_matrix[0, 0], path.covariance[0])).real
+    assert off.sqrt().max() < 0.01
+    assert (ratios - 1).abs().max() < 0.02
+
+
+def nees(n: int, used: Slow, *, cameras: int = 1, slow: Slow | None = None, seed: int = 0) -> tuple[float, float]:
+    """Squared Mahalanobis distances over 3, averaged over each of n paths: their mean, and half its 95 % interval."""
+    pose, deviation = around(cameras), DEVIATION if slow else 0.0
+    drawn, truth = drawn_paths(n, TIMES, LAW, pose, deviation=deviation, slow=slow, seed=seed)
+    found = []
+    for i in range(n):
+        path = track(torch.from_numpy(TIMES), chosen(drawn, i), pose, LAW, slow=used, lost=NEVER)
+        found.append(float(squared_mahalanobis(truth[i] - path.mean, path.covariance).mean()) / 3)
+    return float(np.mean(found)), float(stats.sem(found) * stats.t.ppf(0.975, n - 1))
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_independent_errors_are_within_their_covariance(cameras: int) -> None:
+    mean, half = nees(100, Slow(), cameras=cameras)
+    assert abs(mean - 1) < half < 0.1
+
+
+@pytest.mark.parametrize("slow", [SLOW_DEPTH, pytest.param(SLOW, marks=pytest.mark.slow)])
+def test_slow_errors_are_within_the_covariance_if_they_are_carried_and_far_outside_if_not(slow: Slow) -> None:
+    mean, half = nees(100, slow, slow=slow)
+    assert abs(mean - 1) < half < 0.15
+    ignored, half = nees(30, Slow(), slow=slow)
+    assert ignored - half > 2
+
+
+def test_share_and_time_of_slow_errors_are_found() -> None:
+    drawn, truth = drawn_paths(200, TIMES, LAW, around(1), deviation=DEVIATION, slow=SLOW, seed=5)
+    depth, projection = standardised_errors(drawn, around(1).into_camera(truth[:, :, None]))
+    times = [TIMES] * 200
+    share, time = autocorrelation(times, list(depth[..., 0].numpy()))
+    assert share == pytest.approx(SLOW.depth_share, abs=0.08)
+    assert time == pytest.approx(1.0, rel=0.4)
+    share, time = autocorrelation(times * 2, [*projection[..., 0, 0].numpy(), *projection[..., 0, 1].numpy()])
+    assert share == pytest.approx(0.4, abs=0.08)
+    assert time == pytest.approx(0.5, rel=0.4)
+    with pytest.raises(ValueError, match="^times: got 1 sequences of one frame at most; expected"):
+        autocorrelation([TIMES[:1]], [TIMES[:1]])
+
+
+def test_the_noise_of_the_motion_is_found() -> None:
+    drawn, _ = drawn_paths(4, np.arange(100) / 30, ConstantVelocity(0.5, speed=0.3), around(2), seed=7)
+    times = torch.arange(100).double() / 30
+    found = [estimated(times, chosen(drawn, i), around(2), ConstantVelocity(3.0, speed=0.3)).noise for i in range(4)]
+    assert 0.3 < np.exp(np.mean(np.log(found))) < 0.8

@@ -1,0 +1,100 @@
+"""Paths for a generic conic solver (Clarabel), written down from the formulas, with their energy."""
+
+import clarabel
+import numpy as np
+from scipy import sparse
+from torch import Tensor
+
+from phd_exp.distributions import ProjectedHuber
+from phd_exp.fusion import Pose
+from tests.support.conic import Camera, cameras_of
+
+
+def noise(step: float, density: float) -> np.ndarray:
+    """Covariance of (position, velocity) after this time of white acceleration noise."""
+    one_axis = density**2 * np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
+    return np.kron(one_axis, np.eye(3))
+
+
+def motion(step: float) -> np.ndarray:
+    """(position, velocity) after this time at constant velocity."""
+    return np.kron(np.array([[1, step], [0, 1]]), np.eye(3))
+
+
+class PathProgram:
+    """The problem of a path: unknowns (v_k - origin, velocity_k), noise e, and m, n, w of each camera in each frame."""
+
+    def __init__(
+        self, times: np.ndarray, predictions: ProjectedHuber, pose: Pose, mask: Tensor, density: float, speed: float
+    ) -> None:
+        frames = cameras_of(predictions, Pose(pose.R.expand(*mask.shape, 3, 3), pose.t.expand(*mask.shape, 3)))
+        self.views = [(k, camera) for k, row in enumerate(frames) for c, camera in enumerate(row) if mask[k, c]]
+        self.times, self.density, self.speed = times, density, speed
+        self.origin = np.array([0.0, 0.0, 4.0])
+        N = len(times)
+        self.n = 6 * N + 6 * (N - 1) + 3 * len(self.views)
+        self.diagonal, self.c = np.zeros(self.n), np.zeros(self.n)
+        self.rows: list[sparse.csc_matrix] = []
+        self.constants: list[np.ndarray] = []
+        self.cones: list[object] = []
+        self.diagonal[3:6] = 1 / speed**2
+        for k, step in enumerate(np.diff(times)):
+            self.add_motion(k, step)
+        for i, (k, camera) in enumerate(self.views):
+            self.add_camera(k, camera, 12 * N - 6 + 3 * i)
+
+    def require(self, cone: object, slope: np.ndarray, constant: np.ndarray) -> None:
+        """slope x + constant lies in the cone."""
+        self.rows.append(sparse.csc_matrix(-slope))
+        self.constants.append(constant)
+        self.cones.append(cone)
+
+    def add_motion(self, k: int, step: float) -> None:
+        """x_(k+1) = F x_k + root e_k, with |e_k|^2/2 in the energy."""
+        first = 6 * len(self.times) + 6 * k
+        self.diagonal[first : first + 6] = 1
+        slope = np.zeros((6, self.n))
+        whiten = np.linalg.inv(np.linalg.cholesky(noise(step, self.density)))
+        slope[:, 6 * k : 6 * k + 6], slope[:, 6 * k + 6 : 6 * k + 12] = whiten @ motion(step), -whiten
+        slope[:, first : first + 6] = np.eye(6)
+        self.require(clarabel.ZeroConeT(6), slope, np.zeros(6))
+
+    def add_camera(self, k: int, camera: Camera, first: int) -> None:
+        """h(|q|) = min m^2/2 + n over |q| <= m + n, n >= 0; max(t, 1/t) = min w over w >= t, w t >= 1."""
+        m, n, w = (np.eye(1, self.n, first + i)[0] for i in range(3))
+        self.diagonal[first] = 1
+        self.c[first + 1], self.c[first + 2] = 1, camera.a
+        xyz = np.zeros((3, self.n))
+        xyz[:, 6 * k : 6 * k + 3] = camera.R
+        at = camera.R @ self.origin + camera.t
+        q = camera.A @ (xyz[:2] - np.outer(camera.mu_xy, xyz[2])) / camera.mu_z
+        q_0 = camera.A @ (at[:2] - camera.mu_xy * at[2]) / camera.mu_z
+        t, t_0 = xyz[2] / camera.mu_z, at[2] / camera.mu_z
+        self.require(clarabel.NonnegativeConeT(2), np.stack([n, w - t]), np.array([0, -t_0]))
+        self.require(clarabel.SecondOrderConeT(3), np.vstack([m + n, q]), np.array([0, *q_0]))
+        self.require(
+            clarabel.SecondOrderConeT(3), np.stack([w + t, w - t, np.zeros(self.n)]), np.array([t_0, -t_0, 2])
+        )
+
+    def solve(self, tolerance: float) -> np.ndarray:
+        """The unknowns (frames, 6)."""
+        settings = clarabel.DefaultSettings()
+        settings.verbose = False
+        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
+        P, rows = sparse.diags(self.diagonal).tocsc(), sparse.vstack(self.rows).tocsc()
+        solution = clarabel.DefaultSolver(P, self.c, rows, np.concatenate(self.constants), self.cones, settings).solve()
+        return np.array(solution.x[: 6 * len(self.times)]).reshape(-1, 6) + np.append(self.origin, np.zeros(3))
+
+    def energy(self, x: np.ndarray) -> np.longdouble:
+        """-log density of position and velocity (frames, 6) up to constants."""
+        x = x.astype(np.longdouble)
+        value = (x[0, 3:] ** 2).sum() / self.speed**2 / 2
+        for k, step in enumerate(np.diff(self.times)):
+            residual = x[k + 1] - motion(step) @ x[k]
+            value += residual @ np.linalg.inv(noise(step, self.density)) @ residual / 2
+        for k, camera in self.views:
+            v = camera.R @ x[k, :3] + camera.t
+            q = camera.A @ (v[:2] - camera.mu_xy * v[2]) / camera.mu_z
+            r, t = np.sqrt((q**2).sum()), v[2] / camera.mu_z
+            value += (r**2 / 2 if r <= 1 else r - np.longdouble(0.5)) + camera.a * max(t, 1 / t)
+        return value
