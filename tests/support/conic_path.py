@@ -22,7 +22,7 @@ def motion(step: float) -> np.ndarray:
 
 
 class PathProgram:
-    """The problem of a path: unknowns (v_k - origin, velocity_k), noise e, and m, n, w of each camera in each frame."""
+    """The problem of a path: unknowns (v_k - origin, velocity_k), noise e, and m, n, w of each view."""
 
     def __init__(
         self, times: np.ndarray, predictions: ProjectedHuber, pose: Pose, mask: Tensor, density: float, speed: float
@@ -82,7 +82,9 @@ class PathProgram:
         settings.verbose = False
         settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
         P, rows = sparse.diags(self.diagonal).tocsc(), sparse.vstack(self.rows).tocsc()
-        solution = clarabel.DefaultSolver(P, self.c, rows, np.concatenate(self.constants), self.cones, settings).solve()
+        solution = clarabel.DefaultSolver(
+            P, self.c, rows, np.concatenate(self.constants), self.cones, settings
+        ).solve()
         return np.array(solution.x[: 6 * len(self.times)]).reshape(-1, 6) + np.append(self.origin, np.zeros(3))
 
     def energy(self, x: np.ndarray) -> np.longdouble:

@@ -27,7 +27,9 @@ def around(cameras: int, angle: float = 0.5) -> Pose:
     return Pose(R, middle - R @ middle)
 
 
-def moved(motion: Motion, slow: Slow, cameras: int, steps: np.ndarray, random: np.random.Generator, n: int) -> np.ndarray:
+def moved(
+    motion: Motion, slow: Slow, cameras: int, steps: np.ndarray, random: np.random.Generator, n: int
+) -> np.ndarray:
     """Unknowns of n paths by their law: (paths, frames, d);."""
     F, W = Model(motion, slow, cameras).moving(steps)
     roots = np.linalg.cholesky(np.linalg.inv(W))

@@ -1,8 +1,8 @@
 """Paths: the predictions of one or several cameras over time, smoothed with a motion model.
 
-`frames.py` checks the input, `chain.py` writes it as a chain of frames, `newton.py` finds the most likely path,
-`certificate.py` bounds its error, and `gaussian.py` adds mean and covariance. `track.py` is the interface for whole
-sequences, `tracker.py` for live ones.
+`frames.py` checks the input, and `chain.py` writes it as a chain of frames. `newton.py` finds the most likely path,
+`certificate.py` bounds its error, and `gaussian.py` adds mean and covariance; these are compiled. `track.py` is the
+interface for whole sequences, `tracker.py` for live ones.
 """
 
 from phd_exp.fusion.tracks.frames import Gaussian

@@ -62,33 +62,48 @@ def measure(slope, x, at):
 @compiled
 def motion_energy(chain, whole, x, gradient):
     """The energy of the motion; its quadratic part alone if `whole` is 0 instead of 1. Fills in the gradient."""
-    F, W = chain.F, chain.W
-    frames, d = x.shape
+    gradient[:] = 0.0
+    residual = x[0] - whole * chain.mean
+    value = _quadratic(chain.precision, residual, gradient[0])
+    for k in range(len(x) - 1):
+        value += _step_energy(chain.F[k], chain.W[k], x[k], x[k + 1], residual, gradient[k], gradient[k + 1])
+    for k in range(len(x)):
+        for i in range(x.shape[1]):
+            value += whole * chain.linear[k, i] * x[k, i]
+            gradient[k, i] += whole * chain.linear[k, i]
+    return value
+
+
+@compiled
+def _quadratic(precision, residual, gradient):
+    """r.W r/2; adds W r to the gradient."""
     value = 0.0
-    for k in range(frames):
-        for i in range(d):
-            gradient[k, i] = whole * chain.linear[k, i]
-            value += gradient[k, i] * x[k, i]
+    for i in range(len(residual)):
+        pull = 0.0
+        for j in range(len(residual)):
+            pull += precision[i, j] * residual[j]
+        value += pull * residual[i] / 2
+        gradient[i] += pull
+    return value
+
+
+@compiled
+def _step_energy(F, W, before, after, residual, by_before, by_after):
+    """The energy of one step between frames; fills `residual`, and adds to the gradients of both frames."""
+    d = len(residual)
+    for i in range(d):
+        residual[i] = after[i]
+        for j in range(d):
+            residual[i] -= F[i, j] * before[j]
+    value = 0.0
     for i in range(d):
         pull = 0.0
         for j in range(d):
-            pull += chain.precision[i, j] * (x[0, j] - whole * chain.mean[j])
-        value += pull * (x[0, i] - whole * chain.mean[i]) / 2
-        gradient[0, i] += pull
-    residual = np.empty(d)
-    for k in range(frames - 1):
-        for i in range(d):
-            residual[i] = x[k + 1, i]
-            for j in range(d):
-                residual[i] -= F[k, i, j] * x[k, j]
-        for i in range(d):
-            pull = 0.0
-            for j in range(d):
-                pull += W[k, i, j] * residual[j]
-            value += pull * residual[i] / 2
-            gradient[k + 1, i] += pull
-            for j in range(d):
-                gradient[k, j] -= F[k, i, j] * pull
+            pull += W[i, j] * residual[j]
+        value += pull * residual[i] / 2
+        by_after[i] += pull
+        for j in range(d):
+            by_before[j] -= F[i, j] * pull
     return value
 
 

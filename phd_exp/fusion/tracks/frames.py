@@ -16,6 +16,7 @@ from phd_exp.fusion.problems import _flat as flat
 from phd_exp.fusion.problems import _status as frames_status
 from phd_exp.fusion.tracks.energy import GAUSSIAN
 
+
 @dataclass(frozen=True)
 class Gaussian:
     """Predictions given by their moments in the camera frame, as those of densities without closed forms.
@@ -80,12 +81,14 @@ class Frames:
         """
         if not isinstance(predictions, ProjectedHuber | Gaussian):
             raise ValueError(
-                f"predictions: got {type(predictions).__name__}; expected ProjectedHuber or Gaussian; use Gaussian.of "
-                "for other densities; a point estimate has no uncertainty"
+                f"predictions: got {type(predictions).__name__}; expected ProjectedHuber or Gaussian; use "
+                "Gaussian.of for other densities; a point estimate has no uncertainty"
             )
         shape = predictions.batch_shape
         if len(shape) != 2 or 0 in shape:
-            raise ValueError(f"predictions: got batch shape {tuple(shape)}; expected (frames, cameras), none of them 0")
+            raise ValueError(
+                f"predictions: got batch shape {tuple(shape)}; expected (frames, cameras), none of them 0"
+            )
         seconds = checked_times(times, shape[0])
         views = _views(predictions, pose, mask)
         for k, status in enumerate(views.status.tolist()):

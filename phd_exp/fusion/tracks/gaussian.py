@@ -113,7 +113,7 @@ def spread(slope, covariance):
 
 @compiled
 def update(at, spread, a, factor):
-    """Replaces the factors of one camera; returns the largest change, and the log of what they change the integral by.
+    """Replaces the factors of one camera; returns the largest change, and the log of that of the integral.
 
     With mean m and covariance S = R R^T of q, and those of the path with the true density, m + R z and R Z R^T, the
     precision of the factor changes by R^(-T) (Z^(-1) - I) R^(-1), so that both agree.
@@ -196,7 +196,7 @@ def _tilted_depth(t, deviation, a, precision, linear):
 
 @compiled
 def freedom(chain, factors, covariance, dof):
-    """Fills in the trace of the factors' precision times the covariance of (q_x, q_y, t) with its part by position."""
+    """Fills in the trace of the precision times the covariance of (q_x, q_y, t) with its part by position."""
     for k in range(len(dof)):
         for c in range(dof.shape[1]):
             slope, (xx, xy, yy, tt, _, _, _) = chain.slope[k, c], factors[k, c]

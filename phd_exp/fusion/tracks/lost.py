@@ -26,7 +26,7 @@ class Lost:
     probability: float = 1e-4
 
     def __post_init__(self) -> None:
-        if not 0 < self.after:
+        if not self.after > 0:
             raise ValueError(f"after: got {self.after}; expected a positive number of seconds")
         if self.contradictions < 1:
             raise ValueError(f"contradictions: got {self.contradictions}; expected a number of frames, at least 1")
@@ -76,3 +76,6 @@ class Lost:
             if run == self.contradictions and (begun or begin > 0):
                 return begin, f"lost at {times[begin]:g} s: from then on {run} frames in a row contradict the path"
         return len(times), None
+
+
+USUAL = Lost()

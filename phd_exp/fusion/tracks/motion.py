@@ -3,6 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cache
 from typing import ClassVar, final
 
 import numpy as np
@@ -88,12 +89,19 @@ def transitions(
     Source: Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001).
     """
     m = motion.order
-    i, j = np.indices((m, m))
-    factorial = np.vectorize(math.factorial, otypes=[float])
-    F = np.where(j >= i, steps[:, None, None] ** np.maximum(j - i, 0) / factorial(np.maximum(j - i, 0)), 0.0)
-    unit = 1 / ((2 * m - 1 - i - j) * factorial(m - 1 - i) * factorial(m - 1 - j))
+    powers, taylor, inverse = _of_a_second(m)
     scale = steps[:, None] ** -(m - 0.5 - np.arange(m)) / motion.noise
-    return F, scale[:, :, None] * np.linalg.inv(unit) * scale[:, None, :]
+    return taylor * steps[:, None, None] ** powers, scale[:, :, None] * inverse * scale[:, None, :]
+
+
+@cache
+def _of_a_second(m: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Powers of s in F and their factors, and the inverse covariance for s = 1 and noise 1."""
+    i, j = np.indices((m, m))
+    powers = np.maximum(j - i, 0)
+    factorial = np.vectorize(math.factorial, otypes=[float])
+    noise = 1 / ((2 * m - 1 - i - j) * factorial(m - 1 - i) * factorial(m - 1 - j))
+    return powers, np.where(j >= i, 1 / factorial(powers), 0.0), np.linalg.inv(noise)
 
 
 def _require_positive(**values: float) -> None:

@@ -195,25 +195,30 @@ def polish(chain, work, x, lam):
     start, first = x.copy(), lam.copy()
     kink = np.zeros(lam.shape, dtype=np.bool_)
     for _ in range(ROUNDS):
-        measure_all(chain, x, work.at)
-        motion_energy(chain, 1.0, x, work.g)
-        work.L[:] = work.motion
-        for k in range(len(x)):
-            for c in range(lam.shape[1]):
-                _add_exact(chain, work, k, c, lam, kink)
+        _linearise_exact(chain, work, x, lam, kink)
         newton_step(work)
         x += work.dx
         measure_all(chain, x, work.at)
         for k in range(len(x)):
             for c in range(lam.shape[1]):
-                if kink[k, c]:
-                    lam[k, c] += PENALTY * (work.at[k, c, 2] - 1)
+                lam[k, c] += PENALTY * (work.at[k, c, 2] - 1) if kink[k, c] else 0.0
         if np.abs(work.dx).max() <= STILL:
             break
     if not np.all(np.abs(x - start) <= FARTHEST):  # NaN too
         x[:] = start
         lam[:] = first
     lam[:] = np.minimum(np.maximum(lam, -1.0), 1.0)
+
+
+@compiled
+def _linearise_exact(chain, work, x, lam, kink):
+    """Fills gradient and curvature of the exact energy."""
+    measure_all(chain, x, work.at)
+    motion_energy(chain, 1.0, x, work.g)
+    work.L[:] = work.motion
+    for k in range(len(x)):
+        for c in range(lam.shape[1]):
+            _add_exact(chain, work, k, c, lam, kink)
 
 
 @compiled

@@ -110,7 +110,9 @@ def autocorrelation(
     """
     pairs = [np.triu_indices(len(sequence), 1) for sequence in times]
     if not any(len(i) for i, _ in pairs):
-        raise ValueError(f"times: got {len(times)} sequences of one frame at most; expected two frames in one of them")
+        raise ValueError(
+            f"times: got {len(times)} sequences of one frame at most; expected two frames in one of them"
+        )
     lag = np.concatenate([abs(s[j] - s[i]) for s, (i, j) in zip(times, pairs, strict=True)])
     product = np.concatenate([e[i] * e[j] for e, (i, j) in zip(errors, pairs, strict=True)])
     product = product / np.mean(np.concatenate(list(errors)) ** 2)
@@ -125,3 +127,6 @@ def autocorrelation(
     bounds = (math.log(float(lag.min()) * 0.3), math.log(step * 1e3))
     found = optimize.minimize_scalar(lambda log_time: share(log_time)[1], bounds=bounds, method="bounded")
     return share(found.x)[0], math.exp(found.x)
+
+
+NONE = Slow()

@@ -11,10 +11,10 @@ from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion.pose import Pose
 from phd_exp.fusion.tracks.chain import Array, Model
 from phd_exp.fusion.tracks.frames import Frames, Gaussian
-from phd_exp.fusion.tracks.lost import Lost
+from phd_exp.fusion.tracks.lost import USUAL, Lost
 from phd_exp.fusion.tracks.motion import Motion
-from phd_exp.fusion.tracks.slow import Slow
-from phd_exp.fusion.tracks.track import NONE, Solved, levels, solve
+from phd_exp.fusion.tracks.slow import NONE, Slow
+from phd_exp.fusion.tracks.solved import Solved, levels, solve
 from phd_exp.hardware import one_thread
 
 
@@ -81,7 +81,7 @@ class Tracker:
         (1.0, tensor([0., 0., 1.], dtype=torch.float64))
     """
 
-    def __init__(self, motion: Motion, lag: int = 10, slow: Slow = NONE, lost: Lost = Lost()) -> None:
+    def __init__(self, motion: Motion, lag: int = 10, slow: Slow = NONE, lost: Lost = USUAL) -> None:
         if lag < 0:
             raise ValueError(f"lag: got {lag}; expected a number of frames, at least 0")
         if lost.contradictions > lag + 1:
@@ -121,8 +121,9 @@ class Tracker:
             self.lost_because = self.lost.late(self._seen)
             return None
         with one_thread():
-            frame = self._frame(time, predictions, pose, mask) if seen else self._window.frames.unseen(time)
-            self._window = self._first(frame) if self._window is None else self._next(self._window, frame)
+            window = self._window
+            frame = window.frames.unseen(time) if window and not seen else self._frame(time, predictions, pose, mask)
+            self._window = self._next(window, frame) if window else self._first(frame)
             self._seen = time if seen else self._seen
             full = len(self._window.frames.times) == self.lag + 1
             if (self._window.excess > self.lost.least_excess).any():

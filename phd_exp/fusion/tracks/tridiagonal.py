@@ -19,27 +19,38 @@ def factorise(diagonal, coupling, below):
     The matrix is L L^T, where L has `diagonal` on the diagonal and `below` under it. NaN where the matrix is not
     positive definite.
     """
-    frames, d = diagonal.shape[0], diagonal.shape[1]
-    for k in range(frames):
-        if k > 0:
-            for i in range(d):  # X L^T = coupling, row by row
-                for j in range(d):
-                    rest = coupling[k - 1, i, j]
-                    for m in range(j):
-                        rest -= below[k - 1, i, m] * diagonal[k - 1, j, m]
-                    below[k - 1, i, j] = rest / diagonal[k - 1, j, j]
-            for i in range(d):
-                for j in range(i + 1):
-                    product = 0.0
-                    for m in range(d):
-                        product += below[k - 1, i, m] * below[k - 1, j, m]
-                    diagonal[k, i, j] -= product
-        for i in range(d):
-            for j in range(i + 1):
-                rest = diagonal[k, i, j]
-                for m in range(j):
-                    rest -= diagonal[k, i, m] * diagonal[k, j, m]
-                diagonal[k, i, j] = math.sqrt(rest) if i == j else rest / diagonal[k, j, j]
+    _cholesky(diagonal[0])
+    for k in range(1, len(diagonal)):
+        _eliminate(diagonal[k - 1], coupling[k - 1], below[k - 1], diagonal[k])
+        _cholesky(diagonal[k])
+
+
+@compiled
+def _cholesky(block):
+    """Replaces the lower triangle of a block by that of its Cholesky factor."""
+    for i in range(len(block)):
+        for j in range(i + 1):
+            rest = block[i, j]
+            for m in range(j):
+                rest -= block[i, m] * block[j, m]
+            block[i, j] = math.sqrt(rest) if i == j else rest / block[j, j]
+
+
+@compiled
+def _eliminate(L, coupling, below, block):
+    """Fills in the X with X L^T = coupling, and subtracts X X^T from the lower triangle of the next block."""
+    d = len(L)
+    for i in range(d):
+        for j in range(d):
+            rest = coupling[i, j]
+            for m in range(j):
+                rest -= below[i, m] * L[j, m]
+            below[i, j] = rest / L[j, j]
+        for j in range(i + 1):
+            product = 0.0
+            for m in range(d):
+                product += below[i, m] * below[j, m]
+            block[i, j] -= product
 
 
 @compiled
