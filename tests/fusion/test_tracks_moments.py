@@ -40,7 +40,7 @@ def nees(n: int, used: Slow, *, cameras: int = 1, slow: Slow | None = None, seed
     return float(np.mean(found)), float(stats.sem(found) * stats.t.ppf(0.975, n - 1))
 
 
-@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("cameras", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_independent_errors_are_within_their_covariance(cameras: int) -> None:
     mean, half = nees(100, Slow(), cameras=cameras)
     assert abs(mean - 1) < half < 0.1
