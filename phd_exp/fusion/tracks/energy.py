@@ -25,7 +25,7 @@ GAUSSIAN = -1.0
 class Chain(NamedTuple):
     """The energy of a path of N frames, C cameras and d unknowns a frame.
 
-    Args:
+    Attributes:
         slope: d(q_x, q_y, t)/dx, N x C x 3 x n.
         at_origin: (q_x, q_y, t) at x = 0, N x C x 3.
         a: precision of the depth, or GAUSSIAN, N x C.

@@ -44,7 +44,7 @@ from phd_exp.fusion.tracks.tridiagonal import factorise, solve
 class Work(NamedTuple):
     """Arrays that every step fills anew.
 
-    Args:
+    Attributes:
         at: (q_x, q_y, t) of each camera, N x C x 3.
         moved: their change with the step.
         terms: what `move_duals` needs of each camera, N x C x 6.
