@@ -70,6 +70,7 @@ class PathProgram:
         q = camera.A @ (xyz[:2] - np.outer(camera.mu_xy, xyz[2])) / camera.mu_z
         q_0 = camera.A @ (at[:2] - camera.mu_xy * at[2]) / camera.mu_z
         t, t_0 = xyz[2] / camera.mu_z, at[2] / camera.mu_z
+        q, q_0 = q + camera.a * np.outer(camera.k, t), q_0 + camera.a * camera.k * (t_0 - 1)
         self.require(clarabel.NonnegativeConeT(2), np.stack([n, w - t]), np.array([0, -t_0]))
         self.require(clarabel.SecondOrderConeT(3), np.vstack([m + n, q]), np.array([0, *q_0]))
         self.require(
@@ -97,6 +98,8 @@ class PathProgram:
         for k, camera in self.views:
             v = camera.R @ x[k, :3] + camera.t
             q = camera.A @ (v[:2] - camera.mu_xy * v[2]) / camera.mu_z
-            r, t = np.sqrt((q**2).sum()), v[2] / camera.mu_z
+            t = v[2] / camera.mu_z
+            q = q + camera.a * camera.k * (t - 1)
+            r = np.sqrt((q**2).sum())
             value += (r**2 / 2 if r <= 1 else r - np.longdouble(0.5)) + camera.a * max(t, 1 / t)
         return value

@@ -52,7 +52,7 @@ class Frames:
         a: precision of the depth, or GAUSSIAN; 0 where a camera takes no part.
         mask: which cameras take part.
         near: the average of each frame's predicted positions; those of the nearest frames where there is none.
-        centres: the positions of the cameras.
+        centres: the apices of the densities, without a free axis the positions of the cameras.
         deviation: standard deviation of the slow log depth; 0 without slow errors.
     """
 
@@ -164,7 +164,7 @@ def _views(predictions: ProjectedHuber | Gaussian, pose: Pose, mask: Tensor | No
     origin = problems.origin.nan_to_num()[:, None, :, None]
     at_zero = problems.at_origin - (problems.slope @ origin).squeeze(-1)
     positions = problems.pose.into_world(predictions.mode.double().cpu())
-    centres = problems.pose.into_world(torch.zeros(3, dtype=torch.float64))
+    centres = problems.pose.into_world(flat("predictions", predictions.apex, predictions.batch_shape, event=1))
     return _Views(problems.slope, at_zero, problems.a, problems.mask, positions, centres, problems.status)
 
 
