@@ -134,7 +134,7 @@ def test_no_object_comes_near_a_camera(make_spec: MakeSpec, monkeypatch: pytest.
 
 
 def test_a_view_that_cannot_be_is_said(make_spec: MakeSpec, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("phd_exp.rendering.sampling.CLEARANCE", 50.0)
+    monkeypatch.setattr("phd_exp.rendering.sampling.MOST_TRIES", 0)
     with pytest.raises(ValueError, match=r"no camera sees all 3 objects: lower view_angle_range"):
         sample_scene(make_spec("multiview", occluders=True), "train", 1)
 
