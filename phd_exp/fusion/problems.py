@@ -84,18 +84,18 @@ class Problems:
         shape = predictions.batch_shape
         if len(shape) == 0 or shape[-1] == 0:
             raise ValueError(f"predictions: got batch shape {tuple(shape)}; expected (*problems, cameras)")
-        pose = Pose(_flat("pose.R", pose.R, shape, event=2), _flat("pose.t", pose.t, shape, event=1))
-        mask = _flat("mask", torch.ones(shape) if mask is None else mask, shape) > 0
-        measure = _flat("predictions", _measure(predictions), shape, event=2)
-        mode = _flat("predictions", predictions.mode, shape, event=1)
-        a = _flat("predictions", predictions.a, shape)
+        pose = Pose(flat("pose.R", pose.R, shape, event=2), flat("pose.t", pose.t, shape, event=1))
+        mask = flat("mask", torch.ones(shape) if mask is None else mask, shape) > 0
+        measure = flat("predictions", _measure(predictions), shape, event=2)
+        mode = flat("predictions", predictions.mode, shape, event=1)
+        a = flat("predictions", predictions.a, shape)
         origin = average(pose.into_world(mode), mask)
         directions = torch.eye(3, dtype=torch.float64).expand(len(origin), 3, 3)
         if plane is not None:
-            normal = _flat("plane.normal", plane.normal, shape[:-1], event=1, cameras=0)
-            plane = Plane(normal, _flat("plane.offset", plane.offset, shape[:-1], cameras=0))
+            normal = flat("plane.normal", plane.normal, shape[:-1], event=1, cameras=0)
+            plane = Plane(normal, flat("plane.offset", plane.offset, shape[:-1], cameras=0))
             origin, directions = plane.nearest(origin), pad(plane.directions, (0, 1))
-        apex = _flat("predictions", predictions.apex, shape, event=1)
+        apex = flat("predictions", predictions.apex, shape, event=1)
         at_origin = (measure @ (pose.into_camera(origin[:, None]) - apex)[..., None]).squeeze(-1)
         free_slope = measure @ pose.R
         # 0, or NaN where one of the numbers that these are products of is not finite
@@ -104,7 +104,7 @@ class Problems:
         free_slope = torch.where(mask[..., None, None], free_slope, 0)
         slope, dimensions = (free_slope, 3) if plane is None else (free_slope @ directions[:, None], 2)
         at_origin = torch.where(mask[..., None], at_origin, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
-        a, status = torch.where(mask, a, 0), _status(mask, valid, pose.is_rigid, plane)
+        a, status = torch.where(mask, a, 0), status_of(mask, valid, pose.is_rigid, plane)
         return cls(predictions, pose, mask, origin, directions, dimensions, slope, free_slope, at_origin, a, status)
 
     @property
@@ -121,13 +121,13 @@ class Problems:
         alone = (self.mask.sum(-1) == 1) & (self.dimensions == 3)
         camera = alone[:, None] & self.mask
         shape = self.predictions.batch_shape
-        mean = _flat("mean", self.predictions.mean, shape, event=1)[camera]
-        covariance = _flat("covariance", self.predictions.covariance_matrix, shape, event=2)[camera]
+        mean = flat("mean", self.predictions.mean, shape, event=1)[camera]
+        covariance = flat("covariance", self.predictions.covariance_matrix, shape, event=2)[camera]
         pose = Pose(self.pose.R[camera], self.pose.t[camera])
         return alone, pose.into_world(mean), pose.R.mT @ covariance @ pose.R
 
 
-def _status(mask: Tensor, valid: Tensor, rigid: Tensor, plane: Plane | None) -> Int[Tensor, " problems"]:
+def status_of(mask: Tensor, valid: Tensor, rigid: Tensor, plane: Plane | None) -> Int[Tensor, " problems"]:
     """The status of each problem, from three masks over its cameras."""
     status = torch.full(mask.shape[:1], int(Status.FUSED))
     status[(~rigid & mask).any(-1)] = Status.NOT_A_ROTATION
@@ -146,7 +146,7 @@ def _measure(predictions: ProjectedHuber) -> Float[Tensor, "*batch 3 3"]:
     return torch.cat([q, t[..., None, :]], dim=-2)
 
 
-def _flat(name: str, value: Tensor, shape: torch.Size, event: int = 0, cameras: int = 1) -> Tensor:
+def flat(name: str, value: Tensor, shape: torch.Size, event: int = 0, cameras: int = 1) -> Tensor:
     """The values in one dimension of problems, before those of cameras and event; float64, on the CPU."""
     batch, own = value.shape[: value.ndim - event], value.shape[value.ndim - event :]
     try:

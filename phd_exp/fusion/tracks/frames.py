@@ -11,9 +11,7 @@ from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.density import Density
 from phd_exp.fusion.gaussian import average
 from phd_exp.fusion.pose import Pose
-from phd_exp.fusion.problems import Problems, Status
-from phd_exp.fusion.problems import _flat as flat
-from phd_exp.fusion.problems import _status as frames_status
+from phd_exp.fusion.problems import Problems, Status, flat, status_of
 from phd_exp.fusion.tracks.energy import GAUSSIAN
 
 
@@ -179,7 +177,7 @@ def _gaussian_views(predictions: Gaussian, pose: Pose, mask: Tensor | None) -> _
     slope = torch.where(mask[..., None, None], whiten @ pose.R, 0)
     at_zero = torch.where(mask[..., None], (whiten @ (pose.t - mean)[..., None]).squeeze(-1), 0)
     valid = (failed == 0) & predictions.covariance.isfinite().all(-1).all(-1).cpu() & mean.isfinite().all(-1)
-    status = frames_status(mask, valid, pose.is_rigid, None)
+    status = status_of(mask, valid, pose.is_rigid, None)
     centres = pose.into_world(torch.zeros(3, dtype=torch.float64))
     a = torch.where(mask, GAUSSIAN, 0.0).double()
     return _Views(slope, at_zero, a, mask, pose.into_world(mean), centres, status)
