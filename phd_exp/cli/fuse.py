@@ -90,6 +90,8 @@ def _answers(arguments: FuseArguments, scenes: Sequence[Observed]) -> list[dict[
         )
     if predictor.is_ensemble and arguments.coverage:
         raise ConfigError(single)
+    if arguments.calibration and arguments.coverage:
+        raise ConfigError("coverage: recorded scenes of renders guarantee it; expected no calibration=")
     numbers = torch.tensor(arguments.plane or (), dtype=torch.float64)
     plane = Plane(numbers[:3], numbers[3]) if arguments.plane else None
     detections = [detection for scene in scenes for detection in scene.detections]

@@ -82,7 +82,7 @@ class RenderedSource(Source):
     def depth(self) -> DepthScale:  # type: ignore[override]
         """The constants that normalise depth."""
         spec = self.spec
-        if not spec.is_box or not self.folder.manifest_path.exists():  # before rendering, parts are only tried out
+        if not (spec.is_box and self._is_rendered):
             return DepthScale.from_ranges(f_range=spec.f_range, z_range=spec.z_range).scaled(self.zoom)
         return DepthScale.from_samples(*self._depths).scaled(self.zoom)
 
@@ -90,9 +90,15 @@ class RenderedSource(Source):
     def constant_f(self) -> float:  # type: ignore[override]
         """The focal length of models that do not know it, px."""
         low, high = self.spec.f_range
-        if self.spec.is_box and self.folder.manifest_path.exists():
+        if self.spec.is_box and self._is_rendered:
             low, high = map(float, self._depths[1].aminmax())
         return self.zoom * float(np.sqrt(low * high))
+
+    @property
+    def _is_rendered(self) -> bool:
+        """Whether all training samples are there; before, the parts of a run are only tried out."""
+        folder, n = self.folder, self.n["train"]
+        return folder.manifest_path.exists() and folder.manifest.count("train") >= n
 
     @cached_property
     def _depths(self) -> tuple[Tensor, Tensor]:

@@ -162,6 +162,8 @@ class Predictor:
         If it is to do so, only every second image chooses the temperatures. Raises RunError if there is no record.
         """
         file = self.folders[0].labelled(name)
+        if self.is_ensemble:
+            raise RunError(f"calibration: got an ensemble with {file.parent.parent}; expected a single run")
         if not file.exists():
             known = sorted(path.stem for path in file.parent.glob("*.parquet"))
             raise RunError(

@@ -93,7 +93,9 @@ def record_labelled(predictor: Predictor, detections: Sequence[Detection], name:
 
     Raises DatasetError if a label is missing or in millimetres, RunError for a baseline.
     """
-    (folder,), table, n = predictor.folders, Rows(), 0
+    folder, table, n = predictor.folders[0], Rows(), 0
+    if predictor.is_ensemble or predictor.state != "finished":
+        raise RunError(f"{folder.path}: expected a single run, which is finished")
     if not predictor.is_probabilistic:
         raise RunError(f"{folder.path}: predicts no Projected Huber density; expected a run of model=probabilistic")
     for batch in dict.fromkeys(sighting.batch for sighting in sightings(predictor, detections)):

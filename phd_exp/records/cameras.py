@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from phd_exp.optics.lens import Lens
+from phd_exp.optics.virtual import require_no_fold
 from phd_exp.records.camera_files import content_of, entries
 from phd_exp.records.errors import DatasetError, gist, listed, shown
 from phd_exp.records.files import LARGEST_RECORD, MB, read_plain
@@ -133,6 +134,7 @@ def calibration(given: Any) -> Calibration | None:
         raise ValueError(f"camera: {given} does not say the size of the images; add width and height to the file")
     if camera.model != "equidistant":
         require_narrow(camera.K[0], camera.K[4], camera.width, camera.height)
+    require_no_fold(camera.intrinsics, camera.lens, camera.width, camera.height)
     return camera
 
 

@@ -170,8 +170,8 @@ class Scene(Record):
         objects: the cylinder or mesh first.
         noise_seed: seed of the path tracer.
         surroundings: of a mesh.
-        camera, box: of a view of a box: the user's camera, whose frame is the scene's, and the box in its image, px:
-            left, top, right, bottom.
+        real_camera, real_box: of a view of a box: the user's camera, whose frame is the scene's, and the box in its
+            image, px: left, top, right, bottom.
     """
 
     f: Positive
@@ -182,8 +182,8 @@ class Scene(Record):
     backdrop: Backdrop
     noise_seed: Seed
     surroundings: OfMesh = None
-    camera: OfBox = None
-    box: Box = None
+    real_camera: OfBox = None
+    real_box: Box = None
 
 
 class SampleRecord(Record):
@@ -221,8 +221,8 @@ class SampleRecord(Record):
     backdrop: Backdrop
     noise_seed: Seed
     surroundings: OfMesh = None
-    camera: OfBox = None
-    box: Box = None
+    real_camera: OfBox = None
+    real_box: Box = None
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
     @property

@@ -31,6 +31,7 @@ Share = Annotated[Number, Field(ge=0, le=1)]
 # beyond a right angle, half the cameras would face the lamps
 Angle = Annotated[Number, Field(ge=0, le=90)]
 Pitch = Annotated[Number, Field(ge=-90, le=90)]
+Side = Annotated[Number, Field(ge=0.2, le=10)]
 Turn = Annotated[Number, Field(ge=0, le=180)]
 Range = AfterValidator(_ascending)
 
@@ -131,12 +132,12 @@ class DatasetSpec(Record):
     empty: StrictBool = False
     camera: Calibration | None = None
     view: Literal["field", "box"] | None = None
-    box_size: Annotated[tuple[Positive, Positive], Range] = (0.9, 1.5)
+    box_size: Annotated[tuple[Side, Side], Range] = (0.9, 1.5)
     box_shift: Annotated[Number, Field(ge=0, le=0.5)] = 0.15
     grey: StrictBool = False
     looks: Literal["plain", "varied"] = "plain"
     front: tuple[Number, Number, Number] | None = None
-    front_range: Annotated[tuple[Turn, Turn], Range] = (0.0, 180.0)
+    front_range: Annotated[tuple[Turn, Turn], Range] = (0.0, 90.0)
 
     @model_validator(mode="before")
     @classmethod
@@ -161,11 +162,13 @@ class DatasetSpec(Record):
 
     @model_validator(mode="after")
     def _view_fits(self) -> "DatasetSpec":
-        if self.view == "box" or (self.is_box and self.views > 1):
-            raise ValueError("view: got box; expected data.camera=FILE or data.f, width and height, and views=1")
+        if self.view == "box":
+            raise ValueError("view: got box; expected data.camera=FILE, or data.f, data.width and data.height")
+        if self.is_box and self.views > 1:
+            raise ValueError(f"views: got {self.views} with view=box; expected 1")
         if not self.is_box and (self.box_size, self.box_shift) != ((0.9, 1.5), 0.15):
             raise ValueError("box_size, box_shift: got view=field; expected view=box")
-        if (self.front_range != (0.0, 180.0)) > bool(self.front and any(self.front)) or (self.front and self.upright):
+        if (self.front_range != (0.0, 90.0)) > bool(self.front and any(self.front)) or (self.front and self.upright):
             raise ValueError("front: expected a direction [x, y, z] with front_range, and upright=false")
         return self
 

@@ -50,7 +50,7 @@ def view_of_box(scene: Scene, spec: DatasetSpec, rng: np.random.Generator, meshe
         camera = VirtualCamera.of_box(K, box, float(spec.sensor_size), lens)
     except ValueError:
         return None
-    changes = {"f": camera.f, "pose": _pose(camera.R), "camera": spec.camera, "box": box}
+    changes = {"f": camera.f, "pose": _pose(camera.R), "real_camera": spec.camera, "real_box": box}
     view = scene.model_copy(update=changes)
     return view if all(_is_ahead(item, view.pose, meshes) for item in scene.objects if item.shape in meshes) else None
 

@@ -23,7 +23,7 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer
 from phd_exp.rendering.pixels import file_of
 from phd_exp.rendering.progress import shown_progress
-from phd_exp.rendering.rays import NOTHING, cylinder_mask, trace_pixels
+from phd_exp.rendering.rays import NOTHING, beyond_edges, cylinder_mask, trace_pixels
 from phd_exp.rendering.samples import fast_settings
 from phd_exp.rendering.triangles import NO_MESHES, Meshes
 
@@ -88,8 +88,9 @@ def mask(record: SampleRecord, meshes: Meshes) -> NDArray[np.uint8]:
 
 
 def clearing(record: SampleRecord, meshes: Meshes) -> NDArray[np.uint8]:
-    """The pixels of the image that show no object, as bits: a row (S, S / 8, rounded up) of `clearings.npy`."""
-    return np.packbits(trace_pixels(record.shown, meshes).first == NOTHING, axis=-1)
+    """The pixels that show no object and lie in the user's image, as bits: a row (S, S / 8) of `clearings.npy`."""
+    clear = trace_pixels(record.shown, meshes).first == NOTHING
+    return np.packbits(clear & ~beyond_edges(record.shown), axis=-1)
 
 
 DRAW = {"masks.npy": mask, "clearings.npy": clearing}

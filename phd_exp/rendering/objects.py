@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from phd_exp.records.assets import PHOTOS
 from phd_exp.records.scenes import SHAPES, Quaternion, Scene, SceneObject, Split, Surroundings, Vector
@@ -12,15 +13,7 @@ from phd_exp.rendering.boxes import beside, view_of_box
 from phd_exp.rendering.importing import in_blenders_axes
 from phd_exp.rendering.looks import varied
 from phd_exp.rendering.rays import rotation_matrix
-from phd_exp.rendering.sampling import (
-    MOST_TRIES,
-    SIZE,
-    Purpose,
-    draw_object,
-    sample_scene,
-    stream_of,
-    uniform_rotation,
-)
+from phd_exp.rendering.sampling import MOST_TRIES, SIZE, Purpose, draw_object, sample_scene, stream_of
 from phd_exp.rendering.triangles import Meshes
 
 REACH = SIZE * 0.5**0.5  # m, from the cylinder's centre to its rim
@@ -95,14 +88,14 @@ def _facing_rotation(spec: DatasetSpec, position: Vector, rng: np.random.Generat
     """A uniform rotation of an object, among those whose front has an angle of `front_range` to the camera."""
     assert spec.mesh is not None
     assert spec.front is not None
-    front = np.array(in_blenders_axes(spec.front, next(iter(spec.mesh.files)))) / np.linalg.norm(spec.front)
-    to_camera = -np.array(position) / np.linalg.norm(position)
-    low, high = np.cos(np.radians(spec.front_range))[::-1]
-    for _ in range(MOST_TRIES):
-        rotation = uniform_rotation(rng)
-        if low <= to_camera @ rotation_matrix(rotation) @ front <= high:
-            return rotation
-    raise ValueError(f"front_range: got {list(spec.front_range)}; expected a wider range")
+    front, z = in_blenders_axes(spec.front, next(iter(spec.mesh.files))), (0, 0, 1)
+    farthest, nearest = np.cos(np.radians(spec.front_range))[::-1]
+    around, spin = rng.uniform(0, math.tau, 2)
+    tilt = Rotation.from_euler("ZYZ", [around, math.acos(rng.uniform(farthest, nearest)), spin])
+    to_camera = Rotation.align_vectors([-np.array(position)], [z])[0]
+    turned = to_camera * tilt * Rotation.align_vectors([z], [front])[0]
+    *vector, scalar = turned.as_quat().tolist()
+    return scalar, vector[0], vector[1], vector[2]
 
 
 def upright_rotation(pitch: float, turn: float) -> Quaternion:

@@ -58,7 +58,7 @@ def trace_pixels(scene: Scene, meshes: Meshes = NO_MESHES) -> Hits:
             x, y = pixel_middles(rows, columns)
             place = (number, slice(rows.start, rows.stop), slice(columns.start, columns.stop))
             hits.depths[place], hits.surfaces[place] = _cast(scene, number, x, y)
-    if scene.camera:
+    if scene.real_camera:
         outside = beyond_edges(scene)
         hits.depths[:, outside], hits.surfaces[:, outside] = np.inf, NOTHING
     return hits
@@ -66,11 +66,11 @@ def trace_pixels(scene: Scene, meshes: Meshes = NO_MESHES) -> Hits:
 
 def beyond_edges(scene: Scene) -> Mask:
     """The pixels (S, S) of a view of a box that lie beyond the edges of the user's image."""
-    if scene.camera is None:
+    if scene.real_camera is None:
         return np.zeros((scene.S, scene.S), bool)
-    K, lens = optics(scene.camera)
+    K, lens = optics(scene.real_camera)
     view = VirtualCamera(K, rotation_matrix(scene.pose.rotation), scene.f, scene.S, lens)
-    return view.outside(scene.camera.width or 0, scene.camera.height or 0)
+    return view.outside(scene.real_camera.width or 0, scene.real_camera.height or 0)
 
 
 @lru_cache(maxsize=4)

@@ -36,6 +36,8 @@ def build_data(config: RunConfig, rank: int = 0) -> PositionData:
     """
     source = build_source(config.data)
     if config.init:
+        if not RunFolder(config.init).is_finished():
+            raise ConfigError(f"init: got {config.init}; expected the folder of a finished run")
         source.depth, source.constant_f = recorded_constants(RunFolder(config.init))
     return PositionData(
         source,

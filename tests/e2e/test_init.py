@@ -29,7 +29,7 @@ def test_it_begins_where_that_run_ended_with_its_constants_of_depth(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("init=nowhere",), r"nowhere/constants\.json: missing"),
+        (("init=nowhere",), r"init: got nowhere; expected the folder of a finished run"),
         (("init={run}", "backbone.width=16"), r"init: .* \(.*size mismatch.*this backbone and head"),
         (("init={run}", "model=mae_vz"), r"init: .*; expected a run with this backbone"),
     ],
