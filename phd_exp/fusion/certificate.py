@@ -70,18 +70,25 @@ def _least_curvature(slope, at, a, lam, kink, radius):
     """
     sums = ZERO
     for c in range(len(a)):
-        q_x, q_y, t = at[c]
-        delta = radius * math.sqrt(squared_norm(slope[c, 0]) + squared_norm(slope[c, 1]))
-        length = math.sqrt(q_x * q_x + q_y * q_y)
-        xx, xy, yy = 1.0, 0.0, 1.0
-        if length + delta >= 1:
-            x, y, turn = q_x / max(length, 0.5), q_y / max(length, 0.5), delta / max(length, 0.5)
-            scale = 1 / (length + delta) if turn < 1 else 0.0
-            xx, xy, yy = scale * (1 - turn - x * x), -scale * x * y, scale * (1 - turn - y * y)
-        reach = radius * math.sqrt(squared_norm(slope[c, 2]))
-        far = t + reach
-        depth = 2 / (far * far * far) if far < 1 else 0.0
-        if kink[c]:
-            depth = 2 * (1 - abs(lam[c])) / max(reach, TINY)
-        sums = add(sums, slope[c], 0.0, 0.0, 0.0, xx, xy, yy, a[c] * depth)
+        xx, xy, yy, depth = least_curvature_of_camera(slope[c], at[c], a[c], lam[c], kink[c], radius)
+        sums = add(sums, slope[c], 0.0, 0.0, 0.0, xx, xy, yy, depth)
     return sums
+
+
+@compiled
+def least_curvature_of_camera(slope, at, a, lam, is_at_kink, radius):
+    """The bound of one camera, in (q_x, q_y) and in t."""
+    q_x, q_y, t = at
+    delta = radius * math.sqrt(squared_norm(slope[0]) + squared_norm(slope[1]))
+    length = math.sqrt(q_x * q_x + q_y * q_y)
+    xx, xy, yy = 1.0, 0.0, 1.0
+    if length + delta >= 1:
+        x, y, turn = q_x / max(length, 0.5), q_y / max(length, 0.5), delta / max(length, 0.5)
+        scale = 1 / (length + delta) if turn < 1 else 0.0
+        xx, xy, yy = scale * (1 - turn - x * x), -scale * x * y, scale * (1 - turn - y * y)
+    reach = radius * math.sqrt(squared_norm(slope[2]))
+    far = t + reach
+    depth = 2 / (far * far * far) if far < 1 else 0.0
+    if is_at_kink:
+        depth = 2 * (1 - abs(lam)) / max(reach, TINY)
+    return xx, xy, yy, a * depth

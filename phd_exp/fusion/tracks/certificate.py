@@ -5,8 +5,8 @@ import math
 
 import numpy as np
 
-from phd_exp.fusion.arithmetic import TINY, compiled, huber_weight
-from phd_exp.fusion.certificate import RADII
+from phd_exp.fusion.arithmetic import compiled, huber_weight
+from phd_exp.fusion.certificate import RADII, least_curvature_of_camera
 from phd_exp.fusion.newton import KINK
 from phd_exp.fusion.tracks.energy import GAUSSIAN, add_camera, motion_energy
 from phd_exp.fusion.tracks.newton import measure_all
@@ -88,24 +88,6 @@ def _add_least_curvature(chain, work, lam, radius):
             if a == GAUSSIAN:
                 add_camera(slope, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 1.0, nothing, work.L[k])
                 continue
-            bounds = _least_curvature(slope, work.at[k, c], a, lam[k, c], radius)
+            is_at_kink = abs(work.at[k, c, 2] - 1) <= KINK and abs(lam[k, c]) < 1
+            bounds = least_curvature_of_camera(slope, work.at[k, c], a, lam[k, c], is_at_kink, radius)
             add_camera(slope, 0.0, 0.0, 0.0, *bounds, nothing, work.L[k])
-
-
-@compiled
-def _least_curvature(slope, at, a, lam, radius):
-    """The bound of one camera; see `phd_exp.fusion.certificate`."""
-    q_x, q_y, t = at
-    delta = radius * math.sqrt((slope[0] * slope[0]).sum() + (slope[1] * slope[1]).sum())
-    length = math.sqrt(q_x * q_x + q_y * q_y)
-    xx, xy, yy = 1.0, 0.0, 1.0
-    if length + delta >= 1:
-        x, y, turn = q_x / max(length, 0.5), q_y / max(length, 0.5), delta / max(length, 0.5)
-        scale = 1 / (length + delta) if turn < 1 else 0.0
-        xx, xy, yy = scale * (1 - turn - x * x), -scale * x * y, scale * (1 - turn - y * y)
-    reach = radius * math.sqrt((slope[2] * slope[2]).sum())
-    far = t + reach
-    depth = 2 / (far * far * far) if far < 1 else 0.0
-    if abs(t - 1) <= KINK and abs(lam) < 1:
-        depth = 2 * (1 - abs(lam)) / max(reach, TINY)
-    return xx, xy, yy, a * depth
