@@ -99,11 +99,16 @@ class RunArguments(Arguments):
         return self
 
 
+def trusted(packages: str | None) -> tuple[str, ...]:
+    """The packages that trust= names."""
+    return tuple(packages.split(",")) if packages else ()
+
+
 def loaded(arguments: RunArguments, device: str = "auto") -> "Predictor":
     """The predictor of a run, with a note on standard error if the run is not finished."""
     from phd_exp.inference.loading import load
 
-    trust = tuple(arguments.trust.split(",")) if arguments.trust else ()
+    trust = trusted(arguments.trust)
     predictor = load(arguments.run, device, trust=trust, views=int(arguments.views))
     if predictor.state != "finished":
         print(f"note: {arguments.run[0]}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from phd_exp.cli.arguments import Arguments
+from phd_exp.cli.arguments import Arguments, trusted
 from phd_exp.records.detections import NumberOrName
 from phd_exp.records.own_images import detections_in
 
@@ -35,8 +35,7 @@ def main(words: list[str]) -> int:
     from phd_exp.inference.loading import load
     from phd_exp.inference.tables import record_labelled
 
-    trust = tuple(arguments.trust.split(",")) if arguments.trust else ()
-    predictor = load(arguments.run, trust=trust)
+    predictor = load(arguments.run, trust=trusted(arguments.trust))
     table, name = record_labelled(predictor, detections, arguments.name), arguments.name
     temperature, n = predictor.calibrated(name).temperature, len(detections)
     assert temperature is not None

@@ -166,9 +166,10 @@ class DatasetSpec(Record):
             raise ValueError("view: got box; expected data.camera=FILE, or data.f, data.width and data.height")
         if self.is_box and self.views > 1:
             raise ValueError(f"views: got {self.views} with view=box; expected 1")
-        if not self.is_box and (self.box_size, self.box_shift) != ((0.9, 1.5), 0.15):
+        if not (self.is_box or (self._is_usual("box_size") and self._is_usual("box_shift"))):
             raise ValueError("box_size, box_shift: got view=field; expected view=box")
-        if (self.front_range != (0.0, 90.0)) > bool(self.front and any(self.front)) or (self.front and self.upright):
+        has_front = self.front is not None and any(self.front)
+        if (self.front and self.upright) or not (has_front or self._is_usual("front_range")):
             raise ValueError("front: expected a direction [x, y, z] with front_range, and upright=false")
         return self
 
@@ -205,8 +206,11 @@ class DatasetSpec(Record):
     @model_serializer(mode="wrap")
     def _without_defaults(self, serialize: Any) -> dict[str, Any]:
         # younger keys at their defaults are not written: fingerprints and manifests stay as they were
-        fields = type(self).model_fields
-        return {key: value for key, value in serialize(self).items() if getattr(self, key) != fields[key].default}
+        return {key: value for key, value in serialize(self).items() if not self._is_usual(key)}
+
+    def _is_usual(self, key: str) -> bool:
+        """Whether a key has its default."""
+        return bool(getattr(self, key) == type(self).model_fields[key].default)
 
     def fingerprint(self) -> str:
         """Sixteen hexadecimal digits that identify the values, the same on every machine."""

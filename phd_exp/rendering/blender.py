@@ -17,10 +17,10 @@ from phd_exp.records.errors import RenderError
 from phd_exp.records.scenes import SHAPES, Scene
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.importing import import_meshes
-from phd_exp.rendering.looks import prepare_looks
+from phd_exp.rendering.looks import ROUGHER, prepare_looks
 from phd_exp.rendering.pixels import Light, read_light
 from phd_exp.rendering.sampling import remoteness
-from phd_exp.rendering.stage import CLIPPING, ROUGHER, build_stage, show_scene
+from phd_exp.rendering.stage import CLIPPING, build_stage, show_scene
 from phd_exp.rendering.surroundings import World
 from phd_exp.rendering.triangles import Meshes
 

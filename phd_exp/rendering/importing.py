@@ -101,9 +101,9 @@ def _import(bpy: Any, file: MeshFile) -> set[Any]:
                 getattr(bpy.ops.wm, f"{suffix[1:]}_import")(filepath=str(path))
         except RuntimeError as error:
             lines = str(error).replace(f"{folder}/", "").splitlines()
-            told = [line for line in lines if line.strip() and not line.startswith("Location:")]
+            reasons = [line for line in lines if line.strip() and not line.startswith("Location:")]
             raise ValueError(
-                f"Blender cannot read it ({told[-1].removeprefix('Error: ')}); export it again"
+                f"Blender cannot read it ({reasons[-1].removeprefix('Error: ')}); export it again"
             ) from None
     return set(bpy.data.objects) - before
 

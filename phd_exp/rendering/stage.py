@@ -25,9 +25,6 @@ SURFACES: dict[Material, dict[str, float]] = {
     "rubber": {"Metallic": 0.0, "Roughness": 0.75, "Specular IOR Level": 0.25},
     "metal": {"Metallic": 1.0, "Roughness": 0.24},
 }
-# Of metal in scenes with meshes, whose denoiser uses albedo and normals: where the squared roughness is below 0.075,
-# Cycles takes both from what the surface reflects, and they are as noisy as the image.
-ROUGHER = 0.28
 # Surroundings that metal reflects and the camera does not show: dim below, brighter above.
 SURROUNDINGS = (0.10, 0.75)
 

@@ -1,5 +1,6 @@
 """The same problem for a generic conic solver (Clarabel), written down from the paper's formulas."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import clarabel
@@ -32,6 +33,22 @@ def cameras_of(predictions: ProjectedHuber, pose: Pose) -> list[list[Camera]]:
     return [[Camera(*(array[i, j] for array in arrays)) for j in range(cameras)] for i in range(problems)]
 
 
+def cones_of(
+    camera: Camera, xyz: np.ndarray, at: np.ndarray, m: np.ndarray, n: np.ndarray, w: np.ndarray
+) -> Iterator[tuple[object, np.ndarray, np.ndarray]]:
+    """Cones that contain slope x + constant, of a camera whose position of the object is xyz x + at.
+
+    h(|q|) = min m^2/2 + n over |q| <= m + n, n >= 0; max(t, 1/t) = min w over w >= t, w t >= 1.
+    """
+    q = camera.A @ (xyz[:2] - np.outer(camera.mu_xy, xyz[2])) / camera.mu_z
+    q_0 = camera.A @ (at[:2] - camera.mu_xy * at[2]) / camera.mu_z
+    t, t_0 = xyz[2] / camera.mu_z, at[2] / camera.mu_z
+    q, q_0 = q + camera.a * np.outer(camera.k, t), q_0 + camera.a * camera.k * (t_0 - 1)
+    yield clarabel.NonnegativeConeT(2), np.stack([n, w - t]), np.array([0, -t_0])
+    yield clarabel.SecondOrderConeT(3), np.vstack([m + n, q]), np.array([0, *q_0])
+    yield clarabel.SecondOrderConeT(3), np.stack([w + t, w - t, np.zeros_like(t)]), np.array([t_0, -t_0, 2])
+
+
 class Program:
     """minimise x.P x/2 + c.x with affine expressions of x in cones; x = (v - origin)/unit, then the rest."""
 
@@ -52,22 +69,14 @@ class Program:
         self.cones.append(cone)
 
     def add_camera(self, camera: Camera, first: int) -> None:
-        """h(|q|) = min m^2/2 + n over |q| <= m + n, n >= 0; max(t, 1/t) = min w over w >= t, w t >= 1."""
+        """The energy of a camera, with m, n and w from the unknown `first` on."""
         m, n, w = np.eye(self.n)[first : first + 3]
         self.P[first, first] = 1
         self.c[first + 1], self.c[first + 2] = 1, camera.a
         xyz = np.zeros((3, self.n))
         xyz[:, :3] = camera.R * self.unit
-        at_origin = camera.R @ self.origin + camera.t
-        q = camera.A @ (xyz[:2] - np.outer(camera.mu_xy, xyz[2])) / camera.mu_z
-        q_0 = camera.A @ (at_origin[:2] - camera.mu_xy * at_origin[2]) / camera.mu_z
-        t, t_0 = xyz[2] / camera.mu_z, at_origin[2] / camera.mu_z
-        q, q_0 = q + camera.a * np.outer(camera.k, t), q_0 + camera.a * camera.k * (t_0 - 1)
-        self.require(clarabel.NonnegativeConeT(2), np.stack([n, w - t]), np.array([0, -t_0]))
-        self.require(clarabel.SecondOrderConeT(3), np.vstack([m + n, q]), np.array([0, *q_0]))
-        self.require(
-            clarabel.SecondOrderConeT(3), np.stack([w + t, w - t, np.zeros(self.n)]), np.array([t_0, -t_0, 2])
-        )
+        for cone, slope, constant in cones_of(camera, xyz, camera.R @ self.origin + camera.t, m, n, w):
+            self.require(cone, slope, constant)
 
     def on_plane(self, normal: np.ndarray, offset: float) -> "Program":
         """With the constraint normal . v = offset."""

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion import Pose
-from tests.support.conic import Camera, cameras_of
+from tests.support.conic import Camera, cameras_of, cones_of
 
 
 def noise(step: float, density: float) -> np.ndarray:
@@ -60,22 +60,14 @@ class PathProgram:
         self.require(clarabel.ZeroConeT(6), slope, np.zeros(6))
 
     def add_camera(self, k: int, camera: Camera, first: int) -> None:
-        """h(|q|) = min m^2/2 + n over |q| <= m + n, n >= 0; max(t, 1/t) = min w over w >= t, w t >= 1."""
+        """The energy of a camera in frame k, with m, n and w from the unknown `first` on."""
         m, n, w = (np.eye(1, self.n, first + i)[0] for i in range(3))
         self.diagonal[first] = 1
         self.c[first + 1], self.c[first + 2] = 1, camera.a
         xyz = np.zeros((3, self.n))
         xyz[:, 6 * k : 6 * k + 3] = camera.R
-        at = camera.R @ self.origin + camera.t
-        q = camera.A @ (xyz[:2] - np.outer(camera.mu_xy, xyz[2])) / camera.mu_z
-        q_0 = camera.A @ (at[:2] - camera.mu_xy * at[2]) / camera.mu_z
-        t, t_0 = xyz[2] / camera.mu_z, at[2] / camera.mu_z
-        q, q_0 = q + camera.a * np.outer(camera.k, t), q_0 + camera.a * camera.k * (t_0 - 1)
-        self.require(clarabel.NonnegativeConeT(2), np.stack([n, w - t]), np.array([0, -t_0]))
-        self.require(clarabel.SecondOrderConeT(3), np.vstack([m + n, q]), np.array([0, *q_0]))
-        self.require(
-            clarabel.SecondOrderConeT(3), np.stack([w + t, w - t, np.zeros(self.n)]), np.array([t_0, -t_0, 2])
-        )
+        for cone, slope, constant in cones_of(camera, xyz, camera.R @ self.origin + camera.t, m, n, w):
+            self.require(cone, slope, constant)
 
     def solve(self, tolerance: float) -> np.ndarray:
         """The unknowns (frames, 6)."""
