@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from phd_exp.distributions import shaped
+from phd_exp.distributions.gaussian_mixture import GaussianMixture
 from phd_exp.distributions.natural import LARGEST_RATIO
 from phd_exp.distributions.point_estimate import PointDensity, PointEstimate
 from phd_exp.distributions.projected_huber import ProjectedHuber
@@ -28,7 +29,7 @@ MIDDLE_F = (F_RANGE[0] * F_RANGE[1]) ** 0.5
 DEPTH = DepthScale.from_ranges(F_RANGE, Z_RANGE)
 SCALE = 0.1
 """Scale of the baselines' residuals, in units of their charts."""
-Density = ProjectedHuber | shaped.Shaped | Quantiles | PointDensity
+Density = ProjectedHuber | shaped.Shaped | Quantiles | GaussianMixture | PointDensity
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,8 @@ def families() -> dict[str, Family]:
         "probabilistic": Family(_projected_huber, _seven_numbers),
         "free_axis": Family(_projected_huber, _nine_numbers),
         "gaussian": _shaped(shaped.Gaussian),
+        "gaussian_ray": _shaped(shaped.RayGaussian),
+        "gaussian_mixture": Family(_mixture, _thirty_numbers),
         "gaussian_logz": _shaped(shaped.LogDepthGaussian),
         "laplace_inverse": _shaped(shaped.InverseDepthLaplace),
         "decomposed": _shaped(shaped.Decomposed),
@@ -84,6 +87,18 @@ def _ten_numbers(n: int, generator: torch.Generator) -> Tensor:
 
 def _nine_numbers(n: int, generator: torch.Generator) -> Tensor:
     return _ten_numbers(n, generator)[:, :9]
+
+
+def _thirty_numbers(n: int, generator: torch.Generator) -> Tensor:
+    """Three times nine numbers that differ by about a half, and log weights."""
+    apart = torch.randn(3, n, 10, generator=generator, dtype=torch.float64) / 2
+    nine = _nine_numbers(n, generator) + apart[..., :9]
+    return torch.cat([*nine, *apart[..., 9:]], dim=-1)
+
+
+def _mixture(raw: Tensor, camera: Camera) -> GaussianMixture:
+    parts = raw[..., :27].unflatten(-1, (3, 9))
+    return GaussianMixture.about(_projected_huber(parts, Camera(camera.f[..., None], S)), raw[..., 27:])
 
 
 def _medians_and_gaps(n: int, generator: torch.Generator) -> Tensor:

@@ -181,6 +181,10 @@ class ProjectedHuber(Density, Distribution):
         """One distribution of a batch, or those that a mask chooses."""
         return self._of(self._natural.map(lambda _, value: value[row]), self._validate_args)
 
+    def with_axis(self, k: Float[Tensor, "*#batch 2"]) -> "ProjectedHuber":
+        """The paper's density with its axis turned about the mode; see the argument k."""
+        return self._of(self._natural.with_axis(k), self._validate_args)
+
     def tempered(self, projected: float, depth: float) -> "ProjectedHuber":
         """The distribution with A / projected and a / depth in place of A and a, around the same mode and axis."""
         n = self._natural

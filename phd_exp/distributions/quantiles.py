@@ -98,11 +98,11 @@ class Quantiles(Density):
 
     @property
     def mu_xy(self) -> Float[Tensor, "*batch 2"]:
-        return self.medians.around.mu_xy + spd.matvec(self.medians.spread[0], self._ray[0])
+        return self.medians.around.mu_xy + spd.matvec(self.medians.A_inverse, self._ray[0])
 
     @property
     def projected_covariance(self) -> Float[Tensor, "*batch 2 2"]:
-        return spd.square(self.medians.spread[0]) * self._ray[1][..., None]
+        return spd.square(self.medians.A_inverse) * self._ray[1][..., None]
 
     def depth_cdf(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
         s, visible = self.medians.s(z)

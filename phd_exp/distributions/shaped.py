@@ -27,18 +27,16 @@ from phd_exp.geometry.camera import at_depth
 class Whitening:
     """The map from positions to (q, s): with q and t = z/mu_z of a Projected Huber density, s = a (t^e - 1)/e.
 
-    s is a log t for e = 0. For e = 1 positions fill all space and the first variable is q + k s. For e < 1 they have
+    s is a log t for e = 0. For e = 1 positions fill all space. For e < 1 they have
     z > 0 and it is the ray q/t.
 
     Args:
-        around: provides the parameters.
+        around: provides the parameters; it may have a free axis for e = 1 alone.
         exponent: e, one of -1, 0 and 1.
-        tilt: k, for e = 1 alone.
     """
 
     around: ProjectedHuber
     exponent: int
-    tilt: Float[Tensor, "*batch 2"] | None = None
 
     def variables(self, xyz: Float[Tensor, "*#batch 3"]) -> tuple[Pair, Number, Number, Bool[Tensor, "*#batch"]]:
         """q and s of a position (metres), the log of their volume per cubic metre, and whether it has them."""
@@ -46,8 +44,8 @@ class Whitening:
         volume = around.log_det_A + around.a.log() - 3 * around.mu_z.log()
         xyz = torch.where(visible[..., None], xyz, around.mode)  # so that no NaN is multiplied by a zero gradient
         q, s = around.whiten(xyz), self._s(xyz[..., 2])
-        if self.tilt is not None:
-            return q + self.tilt * s[..., None], s, volume, visible
+        if self.exponent == 1:
+            return q, s, volume, visible
         t = xyz[..., 2] / around.mu_z
         return q / t[..., None], s, volume + (self.exponent - 3) * t.log(), visible
 
@@ -70,16 +68,13 @@ class Whitening:
 
     def position(self, q: Pair, s: Number) -> Float[Tensor, "*#batch 3"]:
         """The position of q and s, metres."""
-        z, (inverse, along) = self.z(s), self.spread
-        shift = spd.matvec(inverse, q) - along * s[..., None]
-        at = self.around.mu_z if self.exponent == 1 else z
-        return at_depth(self.around.mu_xy, z) + pad(at[..., None] * shift, (0, 1))
+        z, around = self.z(s), self.around
+        across = (around.mu_z if self.exponent == 1 else z)[..., None] * spd.matvec(self.A_inverse, q)
+        return around.apex + at_depth(around.m_xy, z) + pad(across, (0, 1))
 
     @property
-    def spread(self) -> tuple[Float[Tensor, "*batch 2 2"], Float[Tensor, "*batch 2"]]:
-        """A^(-1), and A^(-1) k."""
-        inverse = spd.inverse(self.around.A, self.around.log_det_A)
-        return inverse, inverse[..., 0] * 0 if self.tilt is None else spd.matvec(inverse, self.tilt)
+    def A_inverse(self) -> Float[Tensor, "*batch 2 2"]:
+        return spd.inverse(self.around.A, self.around.log_det_A)
 
 
 @final
@@ -124,9 +119,10 @@ class Shaped(Density):
 
     @property
     def projected_covariance(self) -> Float[Tensor, "*batch 2 2"]:
-        inverse, along = self.whitening.spread
-        variance = torch.as_tensor(self.law.variance).to(inverse)
-        return variance[..., None, None] * (spd.square(inverse) + _outer(along, along))
+        around = self.whitening.around
+        along = (around.m_xy - around.mu_xy) / around.a[..., None]
+        variance = torch.as_tensor(self.law.variance).to(along)[..., None, None]
+        return variance * (spd.square(self.whitening.A_inverse) + along[..., :, None] * along[..., None, :])
 
     @property
     def depth_mean(self) -> Float[Tensor, "*batch"]:
@@ -145,9 +141,10 @@ class Shaped(Density):
         if self.whitening.exponent != 1:
             return super().covariance_matrix
         around = self.whitening.around
-        m, along = pad(self.mu_xy, (0, 1), value=1), pad(self.whitening.spread[1], (0, 1)) * around.a[..., None]
-        across = pad(around.mu_z.square()[..., None, None] * self.projected_covariance, (0, 1, 0, 1))
-        return self.depth_variance[..., None, None] * (_outer(m, m) - _outer(m, along) - _outer(along, m)) + across
+        m = pad(around.m_xy, (0, 1), value=1)
+        across = torch.as_tensor(self.law.variance).to(m)[..., None, None] * spd.square(self.whitening.A_inverse)
+        across = pad(around.mu_z.square()[..., None, None] * across, (0, 1, 0, 1))
+        return self.depth_variance[..., None, None] * (m[..., :, None] * m[..., None, :]) + across
 
     def depth_cdf(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
         s, visible = self.whitening.s(z)
@@ -157,21 +154,23 @@ class Shaped(Density):
         return self.whitening.z(self.law.icdf(torch.as_tensor(p).to(self.whitening.around.a)))
 
 
-def _outer(x: Tensor, y: Tensor) -> Tensor:
-    return x[..., :, None] * y[..., None, :]
-
-
 # what conf/model names: from the density of the seven raw numbers, and further raw numbers
 
 
 def Gaussian(around: ProjectedHuber, further: Float[Tensor, "*batch n"]) -> Shaped:
     """A Gaussian in space with any covariance; positions behind the camera have their share of it."""
-    return Shaped(Whitening(around, 1, further[..., :2]), NormalLaw())
+    return Shaped(Whitening(around.with_axis(further[..., :2]), 1), NormalLaw())
+
+
+def RayGaussian(around: ProjectedHuber, _: Tensor) -> Shaped:
+    """A Gaussian in space whose longest axis, as that of the paper's density, is the viewing ray of its mode."""
+    return Shaped(Whitening(around, 1), NormalLaw())
 
 
 def StudentT(around: ProjectedHuber, further: Float[Tensor, "*batch n"]) -> Shaped:
     """Student's t in space with any scale matrix and 2 + phi(third further number) degrees of freedom."""
-    return Shaped(Whitening(around, 1, further[..., :2]), StudentLaw(2 + spd.positive(further[..., 2])))
+    law = StudentLaw(2 + spd.positive(further[..., 2]))
+    return Shaped(Whitening(around.with_axis(further[..., :2]), 1), law)
 
 
 def LogDepthGaussian(around: ProjectedHuber, _: Tensor) -> Shaped:

@@ -24,6 +24,7 @@ from phd_exp.distributions.regions import Region
 from phd_exp.evaluation.parquet import Columns, require_columns
 from phd_exp.evaluation.predictions import at_temperature
 from phd_exp.evaluation.several_views import read_views
+from phd_exp.evaluation.volumes import LOG_VOLUMES
 from phd_exp.fusion import fuse
 from phd_exp.metrics.errors import squared_mahalanobis
 from phd_exp.records.errors import RunError
@@ -105,6 +106,24 @@ def fused_guarantee(file: Path, k: int, coverage: float, temperature: Temperatur
     scores = distance[distance.isfinite()].numpy()
     found = threshold(scores, coverage, "scenes, every second of evaluation.multiview.scenes")
     return {"coverage": coverage, "squared_mahalanobis": found, "held_out_samples": len(scores)}
+
+
+def conformal_log_volumes(table: Columns, held_out: Columns, coverage: float = 0.9) -> Columns:
+    """Column `log_volume`: the log volume (m^3) of each sample's region with a guaranteed coverage.
+
+    Held-out samples set the level of the regions, so that densities are compared at equal coverage. Between the
+    recorded levels, the log volume is interpolated linearly in log(level / (1 - level)).
+
+    Raises RunError for too few held-out samples, or missing columns.
+    """
+    require_columns(LOG_VOLUMES.values(), table)
+    require_columns(("level",), held_out)
+    level = threshold(held_out["level"][GUARANTEE], coverage, "held-out samples")
+    ends, values = np.array(list(LOG_VOLUMES)), np.stack([table[name] for name in LOG_VOLUMES.values()])
+    at, ends = (np.log(number / (1 - number)) for number in (np.clip(level, ends[0], ends[-1]), ends))
+    place = min(int(np.searchsorted(ends, at, "right")), len(ends) - 1)
+    share = (at - ends[place - 1]) / (ends[place] - ends[place - 1])
+    return {"log_volume": (1 - share) * values[place - 1] + share * values[place]}
 
 
 def threshold(scores: Float[np.ndarray, " samples"], coverage: float, samples: str) -> float:

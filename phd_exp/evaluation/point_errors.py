@@ -11,7 +11,7 @@ Columns, one row per sample; positions are metres in the camera frame:
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -26,6 +26,7 @@ from phd_exp.records.errors import RunError
 Estimate = Literal["mode", "mean", "median", "eight views"]
 Reading = Literal["whole", "central"]
 Quantity = Literal["projected", "depth"]
+Key = TypeVar("Key")
 
 READINGS: tuple[Reading, ...] = ("whole", "central")
 COLUMNS: Mapping[Estimate, tuple[str, str, str]] = {
@@ -135,6 +136,31 @@ def difference(one: Sequence[SampleMean], other: Sequence[SampleMean]) -> Interv
     drawn = _over_seeds(one, random) - _over_seeds(other, random)
     half_width = float(stats.t.ppf(0.975, len(one) + len(other) - 2) * drawn.std(ddof=1))
     return Interval(gap, gap - half_width, gap + half_width)
+
+
+def p_value(gap: Interval[float], seeds: int) -> float:
+    """The two-sided p-value of a `difference` of 0, for the seeds of both models together."""
+    if not np.isfinite(gap.high):
+        return 1.0
+    law = stats.t(seeds - 2)
+    return float(2 * law.sf(law.ppf(0.975) * abs(gap.value) / max(gap.high - gap.value, np.finfo(float).tiny)))
+
+
+def significant(p_values: Mapping[Key, float], error_rate: float = 0.05) -> set[Key]:
+    """The keys whose hypotheses are rejected, with a probability of `error_rate` at most that one of them is true.
+
+    Source: Holm, "A simple sequentially rejective multiple test procedure" (1979).
+
+    Examples:
+        >>> sorted(significant({"a": 0.01, "b": 0.03, "c": 0.04}))
+        ['a']
+    """
+    found: set[Key] = set()
+    for place, key in enumerate(sorted(p_values, key=p_values.__getitem__)):
+        if p_values[key] * (len(p_values) - place) > error_rate:
+            break
+        found.add(key)
+    return found
 
 
 def _over_seeds(means: Sequence[SampleMean], random: np.random.Generator) -> np.ndarray:

@@ -10,30 +10,24 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from phd_exp.distributions import Mixture, ProjectedHuber
-from phd_exp.distributions.columns import (
-    NEES,
-    distribution_columns,
-    draws,
-    from_columns,
-    nees_columns,
-    parameter_names,
-)
+from phd_exp.distributions.columns import NEES, distribution_columns, from_columns, nees_columns, parameter_names
 from phd_exp.distributions.temperature import Temperature
 from phd_exp.evaluation.parquet import Columns, require_columns, stacked
 from phd_exp.evaluation.point_errors import RESAMPLES, SEED
 from phd_exp.evaluation.reference import calibrated_reference, groups_of
+from phd_exp.evaluation.volumes import drawn_columns
 from phd_exp.metrics.bootstrap import Interval, Statistic, bands, interval, means, resampled
 from phd_exp.metrics.calibration_scores import COLUMNS, abscissae, calibration_scores, curves, ordered
 from phd_exp.metrics.errors import MILLIMETRES
 from phd_exp.metrics.groups import worst_group
-from phd_exp.metrics.scores import DRAWS, energy_score
 from phd_exp.metrics.strata import strata
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import CHOOSE
 
 XYZ = ("x", "y", "z")
 ERRORS = ("projected_error_mm", "depth_error_mm")
-OF_DISTANCE = ("ale_m", "relative_error")  # younger than the first records
+OF_DISTANCE = ("ale_m", "relative_error")
+OPTIONAL = (*OF_DISTANCE, "log_volume")  # younger than the first records, or measured with held-out samples
 OF_A_DISTRIBUTION = (*XYZ, *COLUMNS, *ERRORS, "nll", "energy_score")
 STRATIFIED_BY: Mapping[str, tuple[str, str, tuple[float, ...] | int]] = {
     "visibility": ("visibility", "", (0.0, 0.25, 0.5, 0.75, 0.95, 1.0)),
@@ -73,7 +67,7 @@ class Evaluation:
     """The evaluation of n samples; `left_out` further samples had values that are not finite.
 
     Attributes:
-        scores: means of `ERRORS` and, if recorded, of `OF_DISTANCE`; of a distribution also of `nll` (nats) and
+        scores: means of `ERRORS` and, if present, of `OPTIONAL`; of a distribution also of `nll` (nats) and
             `energy_score_mm`, the per cent `inside_90` of truths in regions of 90 %, and the `calibration_scores`; of
             Projected Huber densities the means of `nees_columns`, and `group_miscalibration`.
         reference: of each score of `REFERENCED`, the median and 95 % interval for calibrated predictions with equal
@@ -98,7 +92,7 @@ def evaluate(table: Columns, resamples: int = RESAMPLES) -> Evaluation:
     """
     is_distribution, is_huber = "level" in table, "a" in table
     needed = (*(parameter_names(table) if is_huber else ()), *OF_A_DISTRIBUTION) if is_distribution else ERRORS
-    needed += tuple(name for name in OF_DISTANCE if name in table)
+    needed += tuple(name for name in OPTIONAL if name in table)
     columns, finite = finite_columns(table, needed, [name for name, _, _ in STRATIFIED_BY.values() if name in table])
     statistic: Statistic = _distribution_scores if is_distribution else _point_scores
     whole, found, reference = statistic, {}, {}
@@ -153,7 +147,7 @@ def recalibrated(table: Columns, temperature: Temperature) -> dict[str, np.ndarr
     """
     distribution, xyz, kept = at_temperature(table, temperature)
     changed = distribution_columns(distribution, xyz)
-    changed["energy_score"] = energy_score(draws(distribution, DRAWS, SEED), xyz)
+    changed |= drawn_columns(distribution, xyz, SEED)
     return kept | {name: column.numpy() for name, column in changed.items()}
 
 
@@ -207,7 +201,7 @@ def inside(level: Float[Tensor, " samples"], probability: float) -> Float[Tensor
 
 
 def _point_scores(columns: Mapping[str, Tensor], weight: Tensor) -> dict[str, Tensor]:
-    return means({name: columns[name] for name in (*ERRORS, *OF_DISTANCE) if name in columns}, weight)
+    return means({name: columns[name] for name in (*ERRORS, *OPTIONAL) if name in columns}, weight)
 
 
 def scalar_bands(

@@ -12,13 +12,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from phd_exp.distributions import Density, PointEstimate, ProjectedHuber
+from phd_exp.distributions.gaussian_mixture import GaussianMixture
 from phd_exp.distributions.natural import precision
 from phd_exp.distributions.quantiles import LEVELS, Quantiles
 from phd_exp.distributions.shaped import Shaped
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import Chart, DepthScale
 
-Prediction = ProjectedHuber | Shaped | Quantiles | PointEstimate
+Prediction = ProjectedHuber | Shaped | Quantiles | GaussianMixture | PointEstimate
 
 
 @runtime_checkable
@@ -104,6 +105,39 @@ class ShapedHead:
 
     def __call__(self, raw: Float[Tensor, "*batch n_outputs"], camera: Camera) -> Shaped:
         return self.density(self.seven(raw[..., :7], camera), raw[..., 7:])
+
+
+class MixtureHead:
+    """Raw numbers of Gaussians with any covariance, nine each, and of their weights -> `GaussianMixture`.
+
+    Args:
+        depth: constants of the data set.
+        n_parts: number of Gaussians.
+    """
+
+    prediction = GaussianMixture
+
+    def __init__(self, depth: DepthScale, n_parts: int) -> None:
+        self.nine, self.n_parts = DistributionHead(depth, free_axis=True), n_parts
+        self.n_outputs = 10 * n_parts
+        # equal Gaussians would have equal gradients for ever: w_2 sets the Gaussians of zeros at different depths
+        self.start = torch.zeros(n_parts, 9)
+        self.start[:, 6] = torch.linspace(-0.3, 0.3, n_parts)
+
+    def __call__(self, raw: Float[Tensor, "*batch n"], camera: Camera) -> GaussianMixture:
+        numbers, log_weight = self._split(raw)
+        around = self.nine(numbers + self.start.to(raw), Camera.unchecked(camera.f[..., None], camera.S))
+        return GaussianMixture.about(around, log_weight)
+
+    def placed(self, raw: Float[Tensor, "*batch n"], place: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch n"]:
+        """Raw numbers with all Gaussians shifted by `place`."""
+        numbers, log_weight = self._split(raw)
+        moved = self.nine.placed(numbers, place[..., None, :].expand(*numbers.shape[:-1], 2))
+        return torch.cat([moved.flatten(-2), log_weight], dim=-1)
+
+    def _split(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+        numbers, log_weight = raw.split((9 * self.n_parts, self.n_parts), dim=-1)
+        return numbers.unflatten(-1, (self.n_parts, 9)), log_weight
 
 
 class QuantileHead:

@@ -13,12 +13,13 @@ from typing import Any, TypeVar
 from pydantic import TypeAdapter
 
 from phd_exp.distributions.temperature import Temperature
+from phd_exp.evaluation.conformal import conformal_log_volumes
 from phd_exp.evaluation.fusion import FusionScores, fusion_scores, two_cameras
 from phd_exp.evaluation.parquet import Columns
 from phd_exp.evaluation.predictions import Evaluation, evaluate, fit_temperature, recalibrated
 from phd_exp.evaluation.several_views import read_views
 from phd_exp.evaluation.shifts import ShiftScores, shift_scores
-from phd_exp.records.errors import UserError, one_line
+from phd_exp.records.errors import RunError, UserError, one_line
 from phd_exp.records.files import write_atomic
 from phd_exp.records.runs import RunFolder
 from phd_exp.reports.gallery import Gallery, images_folder, make_gallery
@@ -26,7 +27,7 @@ from phd_exp.reports.table import file_stem
 
 Found = TypeVar("Found")
 
-VERSIONS = {"before": 1, "after": 1, "fusion": 1, "pairs": 1, "gallery": 1, "shifts": 1}
+VERSIONS = {"before": 2, "after": 1, "fusion": 1, "pairs": 1, "gallery": 1, "shifts": 1}
 """Measurement -> its version. Raise it when the measurement gives other numbers: all runs are measured again."""
 
 
@@ -80,7 +81,7 @@ def measure(
     found: dict[str, Any] = {}
     if predictions:
         found["images"] = _images(folder, predictions)
-        found["before"] = notes.attempt(lambda: evaluate(predictions))
+        found["before"] = notes.attempt(lambda: evaluate(_with_volumes(predictions, held_out)))
         if "a" in predictions and held_out:
             found |= notes.attempt(lambda: _recalibrated(predictions, held_out)) or {}
         found["gallery"] = notes.attempt(lambda: make_gallery(predictions, config))
@@ -91,6 +92,13 @@ def measure(
         found["pairs"] = notes.attempt(lambda: two_cameras(views))
         found["fusion"] = notes.attempt(lambda: fusion_scores(views)) if views.is_huber else None
     return Measured(**found, notes=notes)
+
+
+def _with_volumes(predictions: Columns, held_out: Columns | None) -> Columns:
+    """The predictions with the volumes of their conformal regions, where the record permits it."""
+    with suppress(RunError):  # too few held-out samples, or a record from before the volumes
+        return {**predictions, **conformal_log_volumes(predictions, held_out or {})}
+    return predictions
 
 
 def _recalibrated(predictions: Columns, held_out: Columns) -> dict[str, Any]:

@@ -70,6 +70,7 @@ _ROWS: tuple[tuple[str, str, str, int, str], ...] = (
     ("inside_conformal", "Inside the conformal 90 % region", "%", 1, _CONFORMAL),
     ("unfamiliar", "Unfamiliar", "%", 1, "share of samples whose familiarity is below 0.05; 5 % at home"),
     ("auroc", "AUROC of familiarity", "", 2, "how well it separates the samples from those at home"),
+    ("log_volume", "Log volume of the conformal 90 % region", "log m³", 2, "0.1 more is a volume 11 % larger"),
     ("depth_crps_mm", "CRPS of depth", "mm", 1, "continuous ranked probability score of the depth’s law"),
     ("energy_score_mm", "Energy score", "mm", 1, "continuous ranked probability score of the position in space"),
     ("depth_ence", "Depth ENCE", "", 3, "expected normalised calibration error of the depth’s variance"),

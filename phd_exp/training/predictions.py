@@ -13,11 +13,11 @@ from torch import Tensor
 from phd_exp.data.batches import Batch
 from phd_exp.data.sources import Known
 from phd_exp.distributions import Density
-from phd_exp.distributions.columns import Columns, coordinates, distribution_columns, draws
+from phd_exp.distributions.columns import Columns, coordinates, distribution_columns
+from phd_exp.evaluation.volumes import drawn_columns
 from phd_exp.metrics.calibration import CalibrationCurve, calibration_curve
 from phd_exp.metrics.calibration_scores import exact_scores
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, distance_error, projected_error
-from phd_exp.metrics.scores import DRAWS, energy_score
 from phd_exp.models.heads import Prediction
 from phd_exp.records.files import write_atomic
 
@@ -75,9 +75,8 @@ def columns(prediction: Prediction, batch: Batch, f_factor: Float[Tensor, " batc
     table["relative_error"] = 100 * table["ale_m"] / batch.xyz.norm(dim=-1)
     if isinstance(prediction, Density):
         table |= distribution_columns(prediction, batch.xyz)
-        # seeded by the sample, so that the score does not depend on the epoch
-        drawn = draws(prediction, DRAWS, seed=int(batch.row[0]))
-        table["energy_score"] = energy_score(drawn, batch.xyz)
+        # seeded by the sample, so that the scores do not depend on the epoch
+        table |= drawn_columns(prediction, batch.xyz, seed=int(batch.row[0]))
     return {name: column.double() for name, column in table.items()}
 
 

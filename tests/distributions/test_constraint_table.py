@@ -28,6 +28,9 @@ KEPT = {
     "quantiles": {1, 2, 3, 4, 6},
     # blind to the camera's plane and to what is behind it
     "gaussian": {1, 2, 4, 5, 7},
+    "gaussian_ray": {1, 2, 4, 5, 7},
+    # and a mixture is not convex
+    "gaussian_mixture": {1, 2, 4, 7},
     # and log(1 + r^2/n) is not convex
     "student_t": {1, 2, 4, 7},
     # one spread for all; z_p may be negative; a ray's density is spread over z^2, so it is infinite at the camera;

@@ -1,11 +1,13 @@
 """The laws of every density other than the paper's, each over vague, generic and sharp raw numbers, in float64."""
 
+from itertools import chain
+
 import numpy as np
 import pytest
 import torch
 from scipy import stats
 
-from phd_exp.distributions import Density
+from phd_exp.distributions import Density, ProjectedHuber
 from phd_exp.distributions.laws import StudentLaw
 from phd_exp.distributions.shaped import Gaussian, InverseDepthLaplace, LogDepthGaussian, Shaped, StudentT
 from phd_exp.geometry import Camera
@@ -20,7 +22,7 @@ SEVEN = {
     "trained": [20.0, -45.0, 90.0, 15.0, 120.0, 200.0, 4.0],
 }
 GAPS = {"untrained": 0.0, "generic": -2.0, "trained": -5.0}  # raw numbers of the gaps of quantiles
-IN_SPACE = ("gaussian", "student_t")
+IN_SPACE = ("gaussian", "gaussian_ray", "gaussian_mixture", "student_t")
 N = 50_000
 
 
@@ -30,6 +32,11 @@ def density(model: str, seven: str, dtype: torch.dtype = torch.float64) -> Densi
     if model == "quantiles":  # medians of v_p and log z, and gaps
         medians, gaps = [0.4, -0.8, 0.2], [GAPS[seven] + number for number in FURTHER * 2]
         raw = [0.0] * 21 if seven == "untrained" else medians + gaps
+    if model == "gaussian_mixture":
+        one, other = [0.3, 0.2, -0.2, 0.1, 0.3, -0.4, 0.2, 0.1, 0.0], [-0.5, 0.3, 0.4, 0.0, 0.2, 0.6, -0.3, 0.0, 0.3]
+        nine = SEVEN[seven] + (FURTHER[:2] if seven != "untrained" else [0.0] * 2)
+        parts = ([a + b for a, b in zip(nine, apart, strict=True)] for apart in ([0.0] * 9, one, other))
+        raw = [*chain.from_iterable(parts), 0.2, -0.3, 0.0]
     return head(torch.tensor(raw, dtype=dtype), Camera(CAMERA.f.to(dtype), CAMERA.S))
 
 
@@ -67,7 +74,12 @@ def test_has_the_mass_of_its_samples(case: tuple) -> None:
 
 
 def test_levels_and_depths_of_own_samples_are_uniform(case: tuple) -> None:
-    _, _, law, samples = case
+    model, _, law, samples = case
+    if model == "gaussian_mixture":  # its levels are sampled
+        samples = samples[:2000]
+        assert stats.kstest(law.level(samples), "uniform").pvalue > 1e-3
+        assert stats.kstest(law.depth_cdf(samples[:, 2]), "uniform").pvalue > 1e-3
+        return
     for values in (law.level(samples), law.depth_cdf(samples[:, 2])):
         assert stats.kstest(values, "uniform").pvalue > 1e-3
     p = torch.tensor([1e-4, 0.1, 0.5, 0.8, 0.9999], dtype=torch.float64)
@@ -133,6 +145,9 @@ def test_scores_and_densities_are_those_of_scipy(seven: str) -> None:
         "gaussian": stats.multivariate_normal(gaussian.mode, gaussian.covariance_matrix).logpdf(xyz),
         "student_t": stats.multivariate_t(t.mode, covariance * (n - 2) / n, n).logpdf(xyz),
     }
+    mixture = laws["gaussian_mixture"]
+    parts = zip(mixture.parts.mode, mixture.parts.covariance_matrix, mixture.log_weight.softmax(-1), strict=True)
+    theirs["gaussian_mixture"] = np.log(sum(w * stats.multivariate_normal(m, C).pdf(xyz) for m, C, w in parts))
     rays = (xyz[:, :2] / z[:, None]).numpy()
     for name, depth in (
         ("gaussian_logz", stats.lognorm(1 / a, scale=mu_z)),
@@ -159,11 +174,12 @@ def test_many_degrees_of_freedom_are_a_gaussian_and_precise_logs_too() -> None:
     """Limits that the heads share: one Gaussian, in whatever coordinates."""
     gaussian = density("gaussian", "trained")
     law, k = gaussian.whitening.around, torch.zeros(2, dtype=torch.float64)
-    many = StudentT(law, torch.cat([gaussian.whitening.tilt, torch.tensor([1e7])]))
+    seven = ProjectedHuber(law.mu_xy, law.mu_z, law.A, law.a)
+    many = StudentT(seven, torch.cat([law.k, torch.tensor([1e7])]))
     xyz = gaussian.rsample((100,), torch.Generator().manual_seed(0))
     torch.testing.assert_close(many.log_prob(xyz), gaussian.log_prob(xyz), rtol=0, atol=1e-4)
     torch.testing.assert_close(many.level(xyz), gaussian.level(xyz), rtol=0, atol=1e-5)
-    sure = law.tempered(1e-4, 1e-4)
+    sure = seven.tempered(1e-4, 1e-4)
     xyz = Gaussian(sure, k).rsample((100,), torch.Generator().manual_seed(0))
     torch.testing.assert_close(
         LogDepthGaussian(sure, k).log_prob(xyz), Gaussian(sure, k).log_prob(xyz), rtol=0, atol=1e-3

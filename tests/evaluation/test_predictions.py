@@ -21,10 +21,10 @@ from phd_exp.evaluation.predictions import (
     fit_temperature,
     recalibrated,
 )  # fmt: skip
+from phd_exp.evaluation.volumes import drawn_columns
 from phd_exp.metrics.calibration import calibration_curve
 from phd_exp.metrics.calibration_scores import exact_scores
 from phd_exp.metrics.errors import depth_error, projected_error
-from phd_exp.metrics.scores import energy_score
 from phd_exp.records.errors import RunError
 from phd_exp.reports.quantities import SCORES
 
@@ -40,7 +40,7 @@ def predictions(n: int) -> tuple[ProjectedHuber, np.ndarray]:
     return ProjectedHuber.from_raw(raw, f=f, S=224.0, mu_z0=2.5e-3), f.numpy()
 
 
-OTHER = ("fused_error_mm", "inside_50", "inside_99", "inside_conformal", "unfamiliar", "auroc")
+OTHER = ("fused_error_mm", "log_volume", "inside_50", "inside_99", "inside_conformal", "unfamiliar", "auroc")
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def table() -> Callable[..., dict[str, np.ndarray]]:
         values["depth_error_mm"] = 1000 * depth_error(xyz, claim.mode)
         values["ale_m"] = (claim.mode.norm(dim=-1) - xyz.norm(dim=-1)).abs()
         values["relative_error"] = 100 * values["ale_m"] / xyz.norm(dim=-1)
-        values["energy_score"] = energy_score(draws(claim, 64, seed=3), xyz)
+        values |= drawn_columns(claim, xyz, seed=3)
         visibility = np.linspace(0, 1, N)
         visibility[:10] = math.nan
         known = {"file_name": np.array([f"{i}.png" for i in range(N)]), "f": f, "visibility": visibility}

@@ -18,5 +18,8 @@ def head(model: str) -> Head:
 
 SHAPED = {
     name: head(name)
-    for name in ("gaussian", "gaussian_logz", "laplace_inverse", "decomposed", "student_t", "quantiles")
+    for name in (
+        *("gaussian", "gaussian_ray", "gaussian_logz", "gaussian_mixture"),
+        *("laplace_inverse", "decomposed", "student_t", "quantiles"),
+    )
 }
