@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from phd_exp.cli import conf_folder
+from phd_exp.cli import choices_of, conf_folder
 
 VERBS = {
     "train": "render missing data, train, measure and record a run (the default)",
@@ -98,16 +98,6 @@ def text_of(verb: str | None) -> str:
 def _choices(groups: Iterable[str]) -> str:
     """The choices of each group, a line a group."""
     return "\n".join(f"  {group:<10} {', '.join(choices_of(group))}" for group in groups)
-
-
-def choices_of(group: str) -> list[str]:
-    """The choices of a configuration group, sorted."""
-    return sorted(file.stem for file in (conf_folder() / group).glob("*.yaml"))
-
-
-def prefix_of(group: str, content: str) -> str:
-    """What precedes the keys in a file of a group: nothing if the file sets keys of the whole configuration."""
-    return f"{group}." if group and "# @package _global_" not in content else ""
 
 
 _PROGRAMME = """\

@@ -10,8 +10,7 @@ from omegaconf import MISSING
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from phd_exp.cli import conf_folder
-from phd_exp.cli.help import prefix_of
+from phd_exp.cli import conf_folder, prefix_of
 from phd_exp.config import RenderConfig, RunConfig
 from phd_exp.records.choices import flatten
 from phd_exp.records.parsing import parse_yaml

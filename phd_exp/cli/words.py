@@ -11,8 +11,8 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from phd_exp.cli import conf_folder
-from phd_exp.cli.help import OF_VERB, VERBS, choices_of, prefix_of
+from phd_exp.cli import choices_of, conf_folder, prefix_of
+from phd_exp.cli.help import OF_VERB, VERBS
 from phd_exp.records.choices import flatten
 from phd_exp.records.errors import ConfigError, end_of, install, nearest, one_line, shortened, unknown
 

@@ -11,7 +11,7 @@ from phd_exp.reports.files import all_tables, tidy
 from phd_exp.reports.lines import run_lines
 from phd_exp.reports.measured import Notes
 from phd_exp.reports.runs import Report, Run, unreadable
-from phd_exp.reports.searches import search_charts
+from phd_exp.reports.site.overview import search_charts
 from phd_exp.reports.terminal import print_report
 
 

@@ -1,9 +1,8 @@
-"""Searches: a table of the best trials of each, the history of its trials, and the importance of its keys."""
+"""Searches: a table of the best trials of each."""
 
 from phd_exp.records.errors import one_line
 from phd_exp.records.searches import Search, Trial
 from phd_exp.reports.runs import Report
-from phd_exp.reports.site.charts import Chart, axis, bars, line
 from phd_exp.reports.table import Table, TableCell, TableRow, file_stem, printable
 
 MOST = 10  # trials of a table
@@ -54,27 +53,3 @@ def _short(text: str) -> str:
         return f"{float(text):.4g}"
     except ValueError:
         return text
-
-
-def search_charts(search: Search) -> dict[str, Chart]:
-    """The values of all trials with the best so far, and the importances of the keys."""
-    if not search.finished:
-        return {}
-    values = [value for value, _ in search.finished]
-    numbers = [trial.number + 1 for _, trial in search.finished]
-    so_far = [min(values[: place + 1]) for place in range(len(values))]
-    points = line("finished trials", numbers, values, 1) | {"mode": "markers"}
-    label = f"{search.objective} of {len(values)} finished trials; the best is {min(values):.4g}."
-    layout = {"xaxis": axis("trial"), "yaxis": axis(search.objective)}
-    history = Chart(f"{search.name}: history", label, [points, line("best so far", numbers, so_far, 2)], layout)
-    charts = {f"history_{search.name}": history}
-    if ranked := sorted(search.importances.items(), key=lambda item: -item[1]):
-        keys, shares = zip(*ranked, strict=True)
-        label = ", ".join(f"{key} {share:.0%}" for key, share in ranked)
-        layout = {
-            "xaxis": axis("share of the variance of the score", rangemode="tozero"),
-            "yaxis": axis("") | {"type": "category", "autorange": "reversed"},
-        }
-        trace = bars("importance", shares, keys, 1, shares, shares)
-        charts[f"importance_{search.name}"] = Chart(f"{search.name}: importance of keys", label, [trace], layout)
-    return charts

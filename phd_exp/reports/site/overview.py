@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from phd_exp.records.searches import Search
 from phd_exp.reports.quantities import METRICS
 from phd_exp.reports.runs import Run
-from phd_exp.reports.searches import search_charts
-from phd_exp.reports.site.charts import Chart, Trace, identity, square
+from phd_exp.reports.site.charts import Chart, Trace, axis, bars, identity, line, square
 
 CALIBRATION = ("depth_calibration", "projected_calibration", "coverage", "depth_pit")
 LEARNING = tuple(
@@ -90,3 +89,27 @@ def _of_run(trace: Trace, one: Drawn) -> Trace:
         "text": one.run.path,
         "meta": {"role": trace["meta"]["role"], "preset": one.run.preset, "data": one.run.data},
     }
+
+
+def search_charts(search: Search) -> dict[str, Chart]:
+    """The values of all trials with the best so far, and the importances of the keys."""
+    if not search.finished:
+        return {}
+    values = [value for value, _ in search.finished]
+    numbers = [trial.number + 1 for _, trial in search.finished]
+    so_far = [min(values[: place + 1]) for place in range(len(values))]
+    points = line("finished trials", numbers, values, 1) | {"mode": "markers"}
+    label = f"{search.objective} of {len(values)} finished trials; the best is {min(values):.4g}."
+    layout = {"xaxis": axis("trial"), "yaxis": axis(search.objective)}
+    history = Chart(f"{search.name}: history", label, [points, line("best so far", numbers, so_far, 2)], layout)
+    charts = {f"history_{search.name}": history}
+    if ranked := sorted(search.importances.items(), key=lambda item: -item[1]):
+        keys, shares = zip(*ranked, strict=True)
+        label = ", ".join(f"{key} {share:.0%}" for key, share in ranked)
+        layout = {
+            "xaxis": axis("share of the variance of the score", rangemode="tozero"),
+            "yaxis": axis("") | {"type": "category", "autorange": "reversed"},
+        }
+        trace = bars("importance", shares, keys, 1, shares, shares)
+        charts[f"importance_{search.name}"] = Chart(f"{search.name}: importance of keys", label, [trace], layout)
+    return charts
