@@ -4,8 +4,8 @@
     python docs/results/write.py --check          # exit status 1 if a page differs from them
     python docs/results/write.py --take report    # first take the numbers of a report
 
-`runs.csv`, `tables.csv` and `calibration.csv` hold lines of the same files in `<report>/tables/`; what is taken
-again replaces its lines. A table stands between `<!-- results: NAME -->` and `<!-- end -->`.
+`runs.csv`, `tables.csv`, `calibration.csv` and `heads.csv` hold lines of the same files in `<report>/tables/`;
+what is taken again replaces its lines. A table stands between `<!-- results: NAME -->` and `<!-- end -->`.
 """
 
 import argparse
@@ -24,12 +24,13 @@ from phd_exp.reports.table import NOTHING
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
-PAGES = ("README.md", "docs/guides/tables.md")
+PAGES = ("README.md", "docs/guides/tables.md", "docs/ideas/heads.md")
 BLOCK = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 KEYS = {
     "runs": ["preset", "data", "model", "seed", "overrides"],
     "tables": ["preset", "table", "data", "model", "estimate", "reading", "quantity"],
     "calibration": ["preset", "data", "model", "run"],
+    "heads": ["preset", "data", "model", "seed", "overrides"],
 }
 DATA = ("default", "occl", "scale", "occl_scale")
 PRESET = "full+strong"
@@ -214,6 +215,39 @@ def score(lines: pd.DataFrame, quantity: str, digits: int) -> str:
     return f"{means['value']:.{digits}f} ({means['low']:.{digits}f} to {means['high']:.{digits}f})"
 
 
+def heads(lines: pd.DataFrame) -> str:
+    """Densities of other shapes: the mean over seeds, and the difference to `probabilistic` with its interval."""
+    columns = {
+        "nll": ("NLL (nats)", 2),
+        "depth_crps_mm": ("CRPS of depth (mm)", 1),
+        "inside_90": ("inside 90 % region (%)", 0),
+        "log_volume": ("log volume of the conformal 90 % region", 2),
+        "projected_error_mm": ("projected error (mm)", 1),
+        "depth_error_mm": ("depth error (mm)", 1),
+        "fused_error_mm": ("fused error, two cameras (mm)", 1),
+    }
+    table = heading(*(label for label, _ in columns.values()))
+    for data in DATA:
+        of_data = chosen(lines, data=data)
+        table += line(f"*`{data}`*", *[""] * len(columns)) if len(of_data) else ""
+        for model in dict.fromkeys(["probabilistic", "free_axis", *of_data["model"]]):
+            cells = [compared(chosen(of_data, model=model, quantity=name), n) for name, (_, n) in columns.items()]
+            table += row(f"`{model}`", cells)
+    return table
+
+
+def compared(lines: pd.DataFrame, digits: int) -> str:
+    """A mean; below it the difference to the reference; bold if better by a test."""
+    if lines.empty:
+        return NOTHING
+    first, mean = lines.iloc[0], lines["value"].astype(float).mean()
+    text = f"**{mean:.{digits}f}**" if first["better"] == "True" else f"{mean:.{digits}f}"
+    if not first["difference"]:
+        return text
+    gap = float(first["difference"])
+    return f"{text}<br>{gap:+.{digits}f} ± {float(first['high']) - gap:.{digits}f}"
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true")
@@ -227,6 +261,7 @@ def main() -> int:
     of_scores = [calibration, coverage]
     scores = read(HERE / "calibration.csv")
     tables |= {table.__name__: table(scores) for table in of_scores}
+    tables["heads"] = heads(read(HERE / "heads.csv"))
     differs = False
     for name in PAGES:
         before = (ROOT / name).read_text()

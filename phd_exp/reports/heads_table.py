@@ -12,7 +12,7 @@ from phd_exp.records.choices import in_words
 from phd_exp.reports.cells import interval
 from phd_exp.reports.quantities import SCORES
 from phd_exp.reports.runs import PROBABILISTIC, Report, Run
-from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem, plus_minus
+from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, bounds, file_stem, plus_minus
 
 FUSED = "fused_error_mm"
 COLUMNS = ("nll", "depth_crps_mm", "inside_90", "log_volume", "projected_error_mm", "depth_error_mm", FUSED)
@@ -86,8 +86,10 @@ def _cell(name: str, runs: Sequence[Run], gap: Interval[float] | None, is_sure: 
     means, text = _means(runs, name), SCORES[name].text
     if not means:
         return TableCell(NOTHING)
+    is_better = is_sure and gap is not None and gap.value < 0
+    against = {"difference": gap.value if gap else None, **bounds(gap), "better": is_better}
     numbers = tuple(
-        run.choice | {"overrides": run.digest, "seed": run.seed, "quantity": name, "value": mean.value}
+        run.choice | {"overrides": run.digest, "seed": run.seed, "quantity": name, "value": mean.value} | against
         for run, mean in zip(runs, means, strict=True)
     )
     mean = float(np.mean([mean.value for mean in means]))
@@ -95,4 +97,4 @@ def _cell(name: str, runs: Sequence[Run], gap: Interval[float] | None, is_sure: 
     if gap is None:
         return alone
     below = f"{'+' if gap.value > 0 else ''}{text(gap.value)} {plus_minus(gap, text)}"
-    return replace(alone, below=below, bold=is_sure and gap.value < 0)
+    return replace(alone, below=below, bold=is_better)
