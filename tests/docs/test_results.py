@@ -14,7 +14,7 @@ import pytest
 from phd_exp.reports.table import NOTHING
 from tests.docs.pages import ROOT
 
-PAGES = ("README.md", "docs/guides/tables.md")
+PAGES = ("README.md", "docs/guides/tables.md", "docs/ideas/heads.md")
 KEY = {"preset": "full+strong", "data": "default", "model": "probabilistic", "table": "table1"}
 
 
@@ -54,7 +54,7 @@ def test_numbers_taken_again_replace_the_old_ones(copied: Path) -> None:
     after = pd.read_csv(results / "tables.csv", dtype=str, keep_default_na=False)
     assert len(after) == len(lines)
     assert (after["mean"] == "123456.0").sum() == len(again) > 0
-    assert all("1234" not in (ROOT / page).read_text() != (copied / page).read_text() for page in PAGES)
+    assert all("1234" not in (ROOT / page).read_text() != (copied / page).read_text() for page in PAGES[:2])
 
 
 def test_a_run_with_the_positions_of_the_authors_has_a_row(copied: Path) -> None:
