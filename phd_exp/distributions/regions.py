@@ -22,32 +22,36 @@ _BENDS = np.sin(np.linspace(-np.pi / 2, np.pi / 2, 401))  # depths, denser where
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """The positions of credible level at most `level` < 1 in one distribution."""
+    """The positions of credible level at most `level` < 1 in a distribution, or in each of a batch."""
 
     distribution: ProjectedHuber
-    level: float
+    level: float | Float[np.ndarray, "*batch"]
 
-    def depth_interval(self, axis: Float[np.ndarray, "3"] = OPTICAL_AXIS) -> tuple[float, float]:
+    def depth_interval(
+        self, axis: Float[np.ndarray, "*batch 3"] = OPTICAL_AXIS
+    ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
         """The extent along a unit vector c, metres; [mu_z/T, mu_z T] along the optical axis.
 
         At the depth t it is c . apex + mu_z (t c . m +- |A^(-1) (c_x, c_y)| r) with m = (m_xy, 1). Source: own
         derivation; checked against samples.
         """
         p, (log_t, r) = self.distribution, self._discs
-        reach = np.linalg.norm(np.linalg.solve(p.A.double().numpy(), axis[:2])) * r
-        middle = np.exp(log_t) * (axis[:2] @ p.m_xy.double().numpy() + axis[2])
-        start, unit = float(axis @ p.apex.double().numpy()), float(p.mu_z)
-        return start + unit * float((middle - reach).min()), start + unit * float((middle + reach).max())
+        A, m_xy, apex, mu_z = (one.double().numpy() for one in (p.A, p.m_xy, p.apex, p.mu_z))
+        across = np.linalg.norm(np.linalg.solve(A, axis[..., :2, None])[..., 0], axis=-1)
+        middle = np.exp(log_t) * ((axis[..., :2] * m_xy).sum(-1) + axis[..., 2])[..., None]
+        start, reach = (axis * apex).sum(-1), across[..., None] * r
+        low, high = (middle - reach).min(-1), (middle + reach).max(-1)
+        return np.asarray(start + mu_z * low), np.asarray(start + mu_z * high)
 
     @property
-    def volume(self) -> float:
+    def volume(self) -> Float[np.ndarray, "*batch"]:
         """The volume, pi mu_z^3/|A| int_(1/T)^T r^2 dt, cubic metres. Source: own derivation; checked by samples."""
         log_t, r = self._discs
-        discs = math.pi * float(integrate.simpson(r**2 * np.exp(log_t), x=log_t))
-        return discs * float((3 * self.distribution.mu_z.log() - self.distribution.log_det_A).exp())
+        discs = math.pi * integrate.simpson(r**2 * np.exp(log_t), x=log_t)
+        return np.asarray(discs * (3 * self.distribution.mu_z.log() - self.distribution.log_det_A).exp().numpy())
 
     def outlines(self) -> list[Float[np.ndarray, "_ 2"]]:
-        """The closed outlines of the region on the image, of (x, y)/z, and from above, of (x, z) in metres."""
+        """The closed outlines of one region on the image, of (x, y)/z, and from above, of (x, z) in metres."""
         p, (log_t, r), angle = self.distribution, self._discs, np.linspace(0, 2 * np.pi, 73)
         q = r[::4, None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
         t = np.broadcast_to(np.exp(log_t[::4, None, None]), (*q.shape[:2], 1))
@@ -58,10 +62,13 @@ class Region:
         return [view[[*hull, hull[0]]] for view, hull in zip(views, hulls, strict=True)]
 
     @cached_property
-    def _discs(self) -> tuple[Float[np.ndarray, " depths"], Float[np.ndarray, " depths"]]:
+    def _discs(self) -> tuple[Float[np.ndarray, "*batch depths"], Float[np.ndarray, "*batch depths"]]:
         """log t and the radius of the disc of q at several depths."""
-        a = float(self.distribution.a)
-        W = np.interp(math.log(a), PRECISIONS.log(), level_energies(self.level))
-        log_t = math.log1p(W / a) * _BENDS
+        a = self.distribution.a.double().numpy()[..., None]
+        log_a, known = np.log(a), PRECISIONS.log().numpy()
+        level, W = np.asarray(self.level)[..., None], np.empty_like(a)
+        for one in np.unique(level):
+            W = np.where(level == one, np.interp(log_a, known, level_energies(float(one))), W)
+        log_t = np.log1p(W / a) * _BENDS
         left = np.maximum(W - a * np.expm1(np.abs(log_t)), 0)
         return log_t, np.where(left < 0.5, np.sqrt(2 * left), left + 0.5)

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber, Temperature
@@ -55,11 +55,25 @@ class Guarantee:
 
     def region(self, prediction: ProjectedHuber, f: float) -> tuple[Region, dict[str, Any]]:
         """The region of one prediction, and its guarantee for JSON; f is the focal length in sides of the image."""
-        quantity = GROUPED_BY[self.groups](prediction, torch.tensor(f, dtype=torch.float64))
-        place = int(np.searchsorted(self.edges, float(quantity), side="right"))
+        (place,) = self._places(prediction, np.array(f)).ravel().tolist()
+        return Region(prediction, self.levels[place]), self._facts(place)
+
+    def regions(
+        self, predictions: ProjectedHuber, f: Float[np.ndarray, " batch"]
+    ) -> tuple[Region, list[dict[str, Any]]]:
+        """The regions of a batch, and the guarantee of each, as `region`."""
+        places = self._places(predictions, f)
+        return Region(predictions, np.array(self.levels)[places]), [self._facts(place) for place in places.tolist()]
+
+    def _places(self, predictions: ProjectedHuber, f: Float[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
+        """The group of each prediction."""
+        quantity = GROUPED_BY[self.groups](predictions, torch.from_numpy(f))
+        return np.asarray(np.searchsorted(self.edges, quantity.numpy(), side="right"))
+
+    def _facts(self, place: int) -> dict[str, Any]:
         facts = {"coverage": self.coverage, "level": self.levels[place], "held_out_samples": self.n[place]}
         ends = [None, *self.edges.tolist(), None][place : place + 2]
-        return Region(prediction, self.levels[place]), facts | ({self.groups: ends} if self.groups else {})
+        return facts | ({self.groups: ends} if self.groups else {})
 
 
 def guarantee(

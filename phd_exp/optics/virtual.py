@@ -6,6 +6,7 @@ pinhole whatever the lens of the real camera.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -59,8 +60,10 @@ class VirtualCamera:
                 degrees or more from its optical axis, or, except for a fisheye, from that of the real camera.
         """
         left, top, right, bottom = box
-        middle = rays(K, np.array([(left + right) / 2, (top + bottom) / 2]), lens)
-        border = rays(K, _border(box, 2 if lens.is_pinhole else BORDER), lens)
+        centre = np.array([[(left + right) / 2, (top + bottom) / 2]])
+        places = np.concatenate([centre, _border(box, 2 if lens.is_pinhole else BORDER)])
+        directions = rays(K, places, lens)
+        middle, border = directions[0], directions[1:]
         border = border[np.isfinite(border).all(axis=-1)]
         if not (np.isfinite(middle).all() and len(border)):
             raise ValueError(f"box={list(box)}: its middle or its whole border lies beyond the field of the lens")
@@ -137,17 +140,26 @@ def require_no_fold(K: Float[np.ndarray, "3 3"], lens: Lens, width: int, height:
 
     A circular fisheye, whose 180 degrees end inside the image, does not.
     """
+    if lens.limit < np.pi and (fold := _fold(tuple(map(tuple, K.tolist())), lens, width, height)):
+        raise ValueError(fold)
+
+
+@lru_cache(maxsize=64)  # a folder of images has one camera, or a few
+def _fold(rows: tuple[tuple[float, ...], ...], lens: Lens, width: int, height: int) -> str | None:
+    """Where a lens folds over inside an image; None if it does not."""
+    K = np.array(rows)
     corners = _border((0.0, 0.0, float(width), float(height)), 2)
-    if lens.limit < np.pi and np.isnan(rays(K, corners, lens)).any():
-        way = (K[:2, 2] + np.linspace(0, 1, 1001)[:, None, None] * (corners - K[:2, 2])).reshape(-1, 2)
-        x, y, z = rays(K, way, lens).T
-        angle = np.arctan2(np.hypot(x, y), z)
-        pixel = way[np.nanargmax(angle)].round(1).tolist()
-        fold = np.nanmax(angle) if lens.limit == np.pi / 2 else lens.limit  # the former of tangential terms alone
-        raise ValueError(
-            f"the lens folds over inside the image of {width} x {height} pixels, {np.degrees(fold):.1f} degrees from "
-            f"its axis, at pixel {pixel}; check its coefficients"
-        )
+    if not np.isnan(rays(K, corners, lens)).any():
+        return None
+    way = (K[:2, 2] + np.linspace(0, 1, 1001)[:, None, None] * (corners - K[:2, 2])).reshape(-1, 2)
+    x, y, z = rays(K, way, lens).T
+    angle = np.arctan2(np.hypot(x, y), z)
+    pixel = way[np.nanargmax(angle)].round(1).tolist()
+    fold = np.nanmax(angle) if lens.limit == np.pi / 2 else lens.limit  # the former of tangential terms alone
+    return (
+        f"the lens folds over inside the image of {width} x {height} pixels, {np.degrees(fold):.1f} degrees from "
+        f"its axis, at pixel {pixel}; check its coefficients"
+    )
 
 
 def _border(box: Box, n: int) -> Float[np.ndarray, "places 2"]:
