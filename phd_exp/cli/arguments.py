@@ -13,6 +13,7 @@ from phd_exp.records.errors import ConfigError, DatasetError, RunError, complain
 from phd_exp.records.files import remove_temporaries
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
+    from phd_exp.evaluation.conformal import Guarantee
     from phd_exp.inference.answers import Sighting
     from phd_exp.inference.predictor import Predictor
 
@@ -141,11 +142,13 @@ def _record_held_out_views(predictor: "Predictor", trust: tuple[str, ...]) -> No
             raise RunError(f"{file}: missing, and cannot be recorded without the data set: {error}") from None
 
 
-def predicted(predictor: "Predictor", detections: Sequence[Detection]) -> Iterable["Sighting"]:
+def predicted(
+    predictor: "Predictor", detections: Sequence[Detection], guarantee: "Guarantee | None" = None
+) -> Iterable["Sighting"]:
     """The predictions, with a progress bar for several detections on a terminal."""
     from phd_exp.inference.answers import sightings
 
-    seen = _noting_focal_lengths(predictor, sightings(predictor, detections))
+    seen = _noting_focal_lengths(predictor, sightings(predictor, detections, guarantee))
     if len(detections) == 1 or not sys.stderr.isatty():
         return seen
     from rich.console import Console
@@ -157,16 +160,16 @@ def predicted(predictor: "Predictor", detections: Sequence[Detection]) -> Iterab
 def _noting_focal_lengths(predictor: "Predictor", seen: Iterable["Sighting"]) -> Iterator["Sighting"]:
     """The predictions; afterwards a note on standard error if the network views some at untrained focal lengths."""
     low, high = predictor.f_range
-    outside: list[str] = []
+    first, n = "", 0
     for sighting in seen:
         f = sighting.view.camera.f
         if not 0.999 * low <= f <= 1.001 * high:
-            outside.append(f"{sighting.detection.where}: {f:.4g} px")
+            first, n = first or f"{sighting.detection.where}: {f:.4g} px", n + 1
         yield sighting
-    if outside:
+    if n:
         print(
-            f"note: f: {len(outside)} view(s) have a focal length that the network was not trained with, first "
-            f"{outside[0]}; expected {low:.4g} to {high:.4g} px in its images of {predictor.side} px; give a box= "
+            f"note: f: {n} view(s) have a focal length that the network was not trained with, first "
+            f"{first}; expected {low:.4g} to {high:.4g} px in its images of {predictor.side} px; give a box= "
             "around the object, or train with another data.f_range",
             file=sys.stderr,
         )

@@ -100,8 +100,8 @@ def main(words: list[str]) -> int:
         return 0
     from phd_exp.inference.answers import answer
 
-    for sighting in predicted(predictor, detections):
-        print(json.dumps(answer(sighting, predictor.temperature, guarantee), allow_nan=False), flush=True)
+    for sighting in predicted(predictor, detections, guarantee):
+        print(json.dumps(answer(sighting, predictor.temperature), allow_nan=False), flush=True)
     return 0
 
 
@@ -122,10 +122,10 @@ def _write(predictor: "Predictor", detections: list[Detection], out: Path, curve
     file, temperature = out / "predictions.jsonl", predictor.temperature
     file.unlink(missing_ok=True)
     with open(file, "x", buffering=1) as lines:
-        for number, sighting in enumerate(predicted(predictor, detections), start=1):
+        for number, sighting in enumerate(predicted(predictor, detections, guarantee), start=1):
             stem = Path(sighting.detection.line.file_name).stem[:LONGEST_STEM]
             name = f"{number:0{len(str(len(detections)))}}-{stem}.png"
-            line = answer(sighting, temperature, guarantee) | {"picture": name}
+            line = answer(sighting, temperature) | {"picture": name}
             lines.write(json.dumps(line, allow_nan=False) + "\n")
             write_atomic(out / name, picture(sighting, line, curve, guarantee))
     print(f"{file}, and a picture for each line", file=sys.stderr)

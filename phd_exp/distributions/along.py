@@ -5,25 +5,31 @@ depth z and q_1, any one coordinate of q, are independent.
 """
 
 import math
-from functools import cache, cached_property
+from collections.abc import Callable
+from functools import cache, cached_property, partial
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy import special
 from scipy.interpolate import CubicHermiteSpline
-from scipy.optimize.elementwise import find_root
 
 from phd_exp.distributions.huber import RADIAL_NORMALISER, radial_icdf
 from phd_exp.distributions.projected_huber import ProjectedHuber
 from phd_exp.distributions.special import tail_moment
+
+Values = Float[np.ndarray, " m"]
 
 FURTHEST = 45.0  # the |q_1| beyond which no probability is left in float64
 STEP = 0.005  # of the table of the law of q_1, which errs by less than 1e-9
 _TAILS = (1e-14, 1e-9, 1e-5, 1e-3, 0.02, 0.1, 0.3)  # the law of depth is smooth between these quantiles
 _BREAKS = np.array([-FURTHEST, -16.0, -8.0, -4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0, 8.0, 16.0, FURTHEST])
 _LEAST_KAPPA = 1e-12  # moves a quantile by 1e-12 of the depth where the axis runs across the direction
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
+_STEPS = 60  # of Newton's method at most, with bisection, and about four usually
+_LAST_STEP = 1e-5  # of the width of the interval; the next one would be about its square
+_LEAST = np.finfo(float).tiny
+_COARSE, _FINE = 6, 16  # nodes of Gauss's rule between two breaks
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(_FINE)
 
 
 def whitened_marginal(s: Float[np.ndarray, " values"]) -> Float[np.ndarray, " values"]:
@@ -54,6 +60,12 @@ def _whitened_cdf() -> CubicHermiteSpline:
     above, density = np.append(0, parts.cumsum()), whitened_marginal(s)
     cdf = 0.5 + np.concatenate([-above[:0:-1], above]) / (2 * above[-1])
     return CubicHermiteSpline(np.concatenate([-s[:0:-1], s]), cdf, np.concatenate([density[:0:-1], density]))
+
+
+def _whitened_icdf(p: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+    """The quantiles of q_1, interpolated linearly."""
+    cdf = _whitened_cdf()
+    return np.interp(p, cdf(cdf.x), cdf.x)
 
 
 def quantiles_along(
@@ -89,13 +101,36 @@ def quantiles_along(
             for one, q, side in zip(far, radius, (-1, 1), strict=True)
         )
         rows = np.repeat(turned, p.shape[1])
-        root = find_root(
-            lambda s, row, p: law.cdf_of_sum(s, row, kappa[row], reach[row]) - p,
-            (low, high),
-            args=(rows, p[turned].ravel()),
-        )
-        found[turned] = root.x.reshape(-1, p.shape[1])
+        # for normal laws exact: the distances from the median are added as squares
+        median = (kappa[:, None] * law.icdf(np.full((1, 1), 0.5)))[turned]
+        apart = np.hypot(found[turned] - median, reach[turned, None] * _whitened_icdf(p[turned]))
+        start = (median + np.where(p[turned] < 0.5, -apart, apart)).ravel()
+        rows = np.repeat(turned, p.shape[1])
+        root = start
+        for nodes in (_COARSE, _FINE):  # the first leaves one step to the second
+            of_sum = partial(law.of_sum, row=rows, kappa=kappa[rows], reach=reach[rows], nodes=nodes)
+            root = _root(of_sum, p[turned].ravel(), low, root, high)
+        found[turned] = root.reshape(-1, p.shape[1])
     return sign[:, None] * found + (direction * apex).sum(-1)[:, None]
+
+
+def _root(
+    law: Callable[[Values], tuple[Values, Values]], p: Values, low: Values, start: Values, high: Values
+) -> Values:
+    """The values between `low` and `high` with these probabilities, given a law: values -> cdf and density.
+
+    By Newton's method; a step out of the interval, which shrinks, is replaced by its middle.
+    """
+    s, width = start.clip(low, high), high - low
+    for _ in range(_STEPS):
+        cdf, density = law(s)
+        low, high = np.where(cdf < p, s, low), np.where(cdf < p, high, s)
+        newton = s - (cdf - p) / np.maximum(density, _LEAST)
+        is_last = (np.abs(newton - s) <= _LAST_STEP * width).all()
+        s = np.where((low <= newton) & (newton <= high), newton, (low + high) / 2)
+        if is_last:
+            break
+    return s
 
 
 class _DepthLaw:
@@ -120,20 +155,23 @@ class _DepthLaw:
         """The depths with these probabilities below them, m."""
         return self.distribution.depth_icdf(torch.from_numpy(p.T)).detach().cpu().double().numpy().T
 
-    def cdf_of_sum(
+    def of_sum(
         self,
         s: Float[np.ndarray, " m"],
         row: Int[np.ndarray, " m"],
         kappa: Float[np.ndarray, " m"],
         reach: Float[np.ndarray, " m"],
-    ) -> Float[np.ndarray, " m"]:
-        """P(kappa z + reach q_1 <= s), of the depth z of each row."""
+        nodes: int,
+    ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+        """P(kappa z + reach q_1 <= s), of the depth z of each row, and its derivative by s."""
         breaks, mu_z, a = self.breaks[row], self.mu_z[row, None], self.a[row, None]
         of_q = (s[:, None] - reach[:, None] * _BREAKS) / kappa[:, None]
         edges = np.sort(np.concatenate([breaks, of_q.clip(breaks[:, :1], breaks[:, -1:])], axis=1), axis=1)
-        half = np.diff(edges)[..., None] / 2
-        z = (edges[:, :-1, None] + half * (_NODES + 1)).reshape(len(s), -1)
+        (x, w), half = np.polynomial.legendre.leggauss(nodes), np.diff(edges)[..., None] / 2
+        z = (edges[:, :-1, None] + half * (x + 1)).reshape(len(s), -1)
         energy = a * (np.maximum(z / mu_z, mu_z / z) - 1)
-        weight = (half * _WEIGHTS).reshape(len(s), -1) * self.height[row, None] * np.exp(-energy)
+        weight = (half * w).reshape(len(s), -1) * self.height[row, None] * np.exp(-energy)
         at = ((s[:, None] - kappa[:, None] * z) / reach[:, None]).clip(-FURTHEST, FURTHEST)
-        return (weight * _whitened_cdf()(at)).sum(-1) / weight.sum(-1)
+        total, cdf = weight.sum(-1), _whitened_cdf()
+        density = (weight * cdf(at, nu=1)).sum(-1) / (total * reach)
+        return (weight * cdf(at)).sum(-1) / total, density

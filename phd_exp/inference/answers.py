@@ -1,9 +1,12 @@
 """Detections in image files, each predicted by a network, and the predictions as JSON objects."""
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from itertools import groupby
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -11,7 +14,7 @@ from jaxtyping import Bool, Float
 from PIL import Image
 from torch import Tensor
 
-from phd_exp.data.cache import LARGEST_AT_ONCE
+from phd_exp.data.cache import DECODERS, LARGEST_AT_ONCE
 from phd_exp.data.crops import cut, facing, read_image
 from phd_exp.distributions import Density, ProjectedHuber, Temperature
 from phd_exp.distributions.along import quantiles_along
@@ -23,6 +26,9 @@ from phd_exp.models.heads import Prediction
 from phd_exp.records.detections import Detection
 from phd_exp.records.errors import DatasetError, RunError
 from phd_exp.records.images import content_of, pillow_warnings
+
+if TYPE_CHECKING:  # imports of pyarrow
+    from phd_exp.evaluation.conformal import Guarantee
 
 PER_CENT = (50, 90, 99)  # per cent of the credible intervals of depth
 P = np.array([0.5, *(end for level in PER_CENT for end in (0.5 - level / 200, 0.5 + level / 200))])
@@ -37,20 +43,30 @@ class PredictedBatch:
     """Detections that are predicted together, with their images.
 
     `predictions` are in the frames of the views (float64), made by `Predictor.predict` from `raw`, the outputs of the
-    network; `familiar` is of runs with held-out samples.
+    network; `familiar` is of runs with held-out samples; a `guarantee` gives each prediction a region.
     """
 
     seen: Sequence[tuple[Detection, Image.Image, View]]
     raw: Float[Tensor, "batch *members n_outputs"]
     predictions: Prediction
     familiar: Float[np.ndarray, " batch"] | None = None
+    guarantee: "Guarantee | None" = None
+
+    @property
+    def cameras(self) -> Camera:
+        """The cameras of the views."""
+        f = [view.camera.f for _, _, view in self.seen]
+        return Camera(torch.tensor(f, dtype=torch.float64), self.seen[0][2].camera.S)
+
+    @property
+    def R(self) -> Float[np.ndarray, "batch 3 3"]:
+        """The rotations from the frames of the real cameras to those of the views."""
+        return np.stack([view.camera.R for _, _, view in self.seen])
 
     @cached_property
     def out_of_field(self) -> Bool[np.ndarray, " batch"]:
         """Whether the mode lies outside the field of the view."""
-        f = [view.camera.f for _, _, view in self.seen]
-        cameras = Camera(torch.tensor(f, dtype=torch.float64), self.seen[0][2].camera.S)
-        return ~cameras.contains(self.predictions.mode).numpy()
+        return ~self.cameras.contains(self.predictions.mode).numpy()
 
     @cached_property
     def numbers(self) -> dict[str, Float[np.ndarray, "batch ..."]]:
@@ -61,7 +77,7 @@ class PredictedBatch:
         integrated along the axis of the real camera (`quantiles_along`). They are NaN where the mode lies 90 degrees
         or more from it.
         """
-        made, R = self.predictions, np.stack([view.camera.R for _, _, view in self.seen])
+        made, R = self.predictions, self.R
         mode = made.mode.numpy()
         found = {"mode": _turned_back(mode, R)}
         if made.has_closed_forms:
@@ -92,6 +108,40 @@ class PredictedBatch:
         if isinstance(made, Density):
             errors |= {"credible_level": made.level(truth), "nll": -made.log_prob(truth)}
         return {name: value.masked_fill(~known, torch.nan).numpy() for name, value in errors.items()}
+
+    @cached_property
+    def positions(self) -> list[dict[str, Any]]:
+        """The `numbers` of each detection, for JSON; a baseline has its position alone."""
+        columns = {name: rounded(values) for name, values in self.numbers.items()}
+        if "depth_interval" in columns:
+            columns["depth_interval"] = [
+                {str(level): None if None in ends else ends for level, ends in zip(PER_CENT, intervals, strict=True)}
+                for intervals in columns["depth_interval"]
+            ]
+        else:
+            columns = {"position": columns["mode"]}
+        return _rows(columns)
+
+    @cached_property
+    def scores(self) -> list[dict[str, Any]]:
+        """The region of each detection, its familiarity, and its errors if the position is known, for JSON."""
+        columns: dict[str, Any] = {}
+        if self.guarantee and self.predictions.has_closed_forms:
+            columns["region"] = self._regions(self.guarantee, self.predictions)
+        if self.familiar is not None:
+            columns["familiar"] = rounded(self.familiar)
+        found = _rows(columns | {"out_of_field": self.out_of_field.tolist()})
+        is_known = [one.line.z is not None for one, *_ in self.seen]
+        if not any(is_known):
+            return found
+        errors = _rows({name: rounded(values) for name, values in self.errors.items()})
+        return [row | more if known else row for row, more, known in zip(found, errors, is_known, strict=True)]
+
+    def _regions(self, guarantee: "Guarantee", predictions: ProjectedHuber) -> list[dict[str, Any]]:
+        regions, facts = guarantee.regions(predictions, (self.cameras.f / self.cameras.S).numpy())
+        extent = np.stack(regions.depth_interval(self.R[:, :, 2]), axis=-1)
+        numbers = _rows({"depth_interval": rounded(extent), "volume": rounded(regions.volume)})
+        return [{**one, **more} for one, more in zip(facts, numbers, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,8 +196,15 @@ def _turned_back(
     return (points[:, None] @ R)[:, 0]
 
 
-def sightings(predictor: Predictor, detections: Sequence[Detection]) -> Iterator[Sighting]:
-    """The prediction for each detection, in their order.
+def _rows(columns: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
+    """The rows of columns of equal length."""
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
+def sightings(
+    predictor: Predictor, detections: Sequence[Detection], guarantee: "Guarantee | None" = None
+) -> Iterator[Sighting]:
+    """The prediction for each detection, in their order, with the regions of a guarantee.
 
     Raises DatasetError, naming the file, for an invalid image, and RunError if a network output is not finite.
     """
@@ -157,9 +214,8 @@ def sightings(predictor: Predictor, detections: Sequence[Detection]) -> Iterator
         finite = raw.flatten(1).isfinite().all(-1)
         n = int(finite.long().cumprod(0).sum())  # of those before the first that is not
         if n:
-            batch = PredictedBatch(
-                seen[:n], raw[:n], predictor.predict(raw[:n], f[:n]), predictor.familiar(raw[:n], f[:n])
-            )
+            made, familiar = predictor.predict(raw[:n], f[:n]), predictor.familiar(raw[:n], f[:n])
+            batch = PredictedBatch(seen[:n], raw[:n], made, familiar, guarantee)
             yield from (Sighting(batch, row) for row in range(n))
         if n < len(seen):
             raise RunError(
@@ -167,58 +223,60 @@ def sightings(predictor: Predictor, detections: Sequence[Detection]) -> Iterator
             )
 
 
-def _batches(
-    predictor: Predictor, detections: Sequence[Detection]
-) -> Iterator[list[tuple[Detection, Image.Image, View]]]:
+Seen = tuple[Detection, Image.Image, View]
+
+
+def _batches(predictor: Predictor, detections: Sequence[Detection]) -> Iterator[list[Seen]]:
     """Detections with image and view; consecutive detections in one file share its image.
 
-    A batch ends at `BATCH` detections, or when its images exceed `LARGEST_AT_ONCE` pixels.
+    A batch has `BATCH` detections, fewer when its images exceed `LARGEST_AT_ONCE` pixels. As many files as torch has
+    threads are decoded at the same time.
     """
-    batch: list[tuple[Detection, Image.Image, View]] = []
-    pixels = 0
-    for detection in detections:
-        try:
-            if batch and batch[-1][0].file == detection.file:
-                image = batch[-1][1]
-            else:
+    threads = min(DECODERS, torch.get_num_threads())
+    with ThreadPoolExecutor(threads) as pool:
+        for first in range(0, len(detections), BATCH):
+            files = [list(same) for _, same in groupby(detections[first : first + BATCH], lambda one: one.file)]
+            batch: list[Seen] = []
+            for some in range(0, len(files), threads):
                 with pillow_warnings():
-                    image = read_image(detection.file, content_of(detection.file))
-                pixels += image.width * image.height
-            camera = facing(detection, image.size, predictor.side, predictor.largest_f)
-        except DatasetError:
+                    futures = [pool.submit(_seen, predictor, file) for file in files[some : some + threads]]
+                    wait(futures)
+                for future in futures:
+                    found, error = future.result()
+                    batch += found
+                    if error:
+                        if batch:
+                            yield batch  # the predictions before the invalid image are not lost
+                        raise error
+                if sum({id(image): image.width * image.height for _, image, _ in batch}.values()) > LARGEST_AT_ONCE:
+                    yield batch
+                    batch = []
             if batch:
-                yield batch  # the predictions before the invalid image are not lost
-            raise
-        batch.append((detection, image, View(cut(image, camera), camera)))
-        if len(batch) == BATCH or pixels > LARGEST_AT_ONCE:
-            yield batch
-            batch, pixels = [], 0
-    if batch:
-        yield batch
+                yield batch
 
 
-def answer(sighting: Sighting, temperature: Temperature | None, guarantee: Any = None) -> dict[str, Any]:
-    """The numbers of a detection, its region by a `Guarantee`, and its errors if the position is known."""
-    batch, row, line = sighting.batch, sighting.row, sighting.detection.line
-    named: dict[str, Any] = line.model_dump(include=set(REPEATED), exclude_none=True, mode="json")
-    numbers = {name: rounded(values[row]) for name, values in batch.numbers.items()}
-    if "depth_interval" in numbers:
-        intervals = (None if None in ends else ends for ends in numbers["depth_interval"])
-        numbers["depth_interval"] = dict(zip(map(str, PER_CENT), intervals, strict=True))
-        named |= numbers | {"uncertainty": uncertainty(temperature)}
-        if guarantee:
-            camera = sighting.view.camera
-            region, facts = guarantee.region(sighting.density, camera.f / camera.S)
-            interval = rounded(np.array(region.depth_interval(camera.R[:, 2])))
-            named["region"] = facts | {"depth_interval": interval, "volume": rounded(np.array(region.volume))}
+def _seen(predictor: Predictor, detections: Sequence[Detection]) -> tuple[list[Seen], DatasetError | None]:
+    """The detections in one file, those before the first that is invalid, and its error."""
+    found: list[Seen] = []
+    try:
+        image = read_image(detections[0].file, content_of(detections[0].file))
+        for detection in detections:
+            camera = facing(detection, image.size, predictor.side, predictor.largest_f)
+            found.append((detection, image, View(cut(image, camera), camera)))
+    except DatasetError as error:
+        return found, error
+    return found, None
+
+
+def answer(sighting: Sighting, temperature: Temperature | None) -> dict[str, Any]:
+    """The numbers of a detection for JSON, its region, and its errors if the position is known."""
+    batch, row, made = sighting.batch, sighting.row, sighting.batch.predictions
+    named: dict[str, Any] = sighting.detection.line.model_dump(include=set(REPEATED), exclude_none=True, mode="json")
+    if made.has_closed_forms:
+        origin = uncertainty(temperature)
     else:
-        none = "not reported: no Projected Huber density" if isinstance(batch.predictions, Density) else NONE
-        named |= {"position": numbers["mode"], "uncertainty": none}
-    if sighting.familiar is not None:
-        named["familiar"] = rounded(np.array(sighting.familiar))
-    named["out_of_field"] = bool(batch.out_of_field[row])
-    errors = {} if line.z is None else batch.errors
-    return named | {name: rounded(values[row]) for name, values in errors.items()}
+        origin = "not reported: no Projected Huber density" if isinstance(made, Density) else NONE
+    return named | batch.positions[row] | {"uncertainty": origin} | batch.scores[row]
 
 
 def uncertainty(temperature: Temperature | None) -> str:
@@ -230,6 +288,10 @@ def uncertainty(temperature: Temperature | None) -> str:
 
 def rounded(values: Float[np.ndarray, "..."]) -> Any:
     """Lists of numbers for JSON; None for a number that is not finite."""
-    if np.ndim(values):
-        return [rounded(value) for value in values]
-    return float(f"{values:.{DIGITS}g}") if np.isfinite(values) else None
+    return _rounded(np.asarray(values).tolist())
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_rounded(one) for one in value]
+    return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
