@@ -49,13 +49,22 @@ def _with_camera(values: dict[str, Any]) -> dict[str, Any]:
     return others | {"camera": numbers}
 
 
+class PhotographsConfig(Record):
+    """Labelled photographs that replace a share of the samples of each training batch; without a folder, none."""
+
+    folder: Folder | None = None
+    object: NumberOrName | None = None
+    share: Annotated[float, Field(gt=0, lt=1)] = 0.25
+
+
 class RenderedConfig(SizesConfig):
-    """A rendered data set: the keys of `DatasetSpec`, and how much of it a run uses."""
+    """A rendered data set: the keys of `DatasetSpec`, how much of it a run uses, and photographs to train on too."""
 
     root: Folder
     n_train: Count
     n_test: Count
     workers: Count | None
+    photographs: PhotographsConfig = PhotographsConfig()  # default for older run records
     spec: DatasetSpec
 
     @model_validator(mode="before")

@@ -33,6 +33,8 @@ class Batch:
     """Index of each sample in its split."""
     mask: UInt8[Tensor, "batch rows columns"] | None = None
     """Share of each cell of the image that shows the object, from 0 to 255, if it is known."""
+    mask_weight: Float[Tensor, " batch"] | None = None
+    """Weight of each mask in a loss, 0 for an unknown mask; None: 1 for all."""
 
     @property
     def camera(self) -> Camera:
@@ -157,7 +159,8 @@ class BatchLoader:
         """The share of this process of a batch of these rows, changed by numbers drawn for all of it."""
         assert self.augment is not None
         numbers = self._random(self.epoch, number).uniform(-1, 1, (len(rows), self.augment.n_numbers))
-        numbers[:, :SIGNS] = signs[rows] * np.abs(numbers[:, :SIGNS])
+        first = numbers[:, :SIGNS]
+        first[:] = signs[rows, : first.shape[1]] * np.abs(first)
         return self.augment(batch, torch.from_numpy(numbers[self.rank :: self.world]))
 
     def order(self, epoch: int) -> Int[Tensor, " samples"]:

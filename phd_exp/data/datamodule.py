@@ -9,6 +9,7 @@ from lightning import LightningDataModule
 
 from phd_exp.data.backdrops import BackdropExchange, Backdrops
 from phd_exp.data.batches import Augment, Batch, BatchLoader
+from phd_exp.data.photographs import PhotographExchange, Photographs
 from phd_exp.data.sources import PARTS, Part, Source
 from phd_exp.geometry.camera import Camera
 from phd_exp.records.errors import ConfigError, DatasetError
@@ -22,8 +23,9 @@ class PositionData(LightningDataModule):
     """The samples of a source in batches, or the share of one of several processes (`rank` of `world`).
 
     `augment` changes training batches only; the share `backdrops` of their samples is shown before other backdrops
-    first. With `masks`, these batches have the masks of the source, if it has any. The validation evaluates the test
-    samples, which choose nothing, and with `held_out` also the held-out samples that may choose.
+    first, and `photographs` replace their share of them. With `masks`, these batches have the masks of the source, if
+    it has any. The validation evaluates the test samples, which choose nothing, and with `held_out` also the held-out
+    samples that may choose; all of these are the source's.
 
     Raises ConfigError if there are too few samples for one batch, or if the processes cannot share them; on `setup`,
     DatasetError if the source lacks samples or an image is damaged.
@@ -41,6 +43,7 @@ class PositionData(LightningDataModule):
         held_out: bool = False,
         masks: bool = False,
         backdrops: float = 0.0,
+        photographs: Photographs | None = None,
     ) -> None:
         super().__init__()
         if backdrops and not source.has_backdrops:
@@ -66,6 +69,7 @@ class PositionData(LightningDataModule):
         self.augment = augment
         self.masks = masks
         self.backdrops = backdrops
+        self.photographs = photographs
         self.validated: tuple[Part, ...] = ("test", "held_out") if held_out else ("test",)
         self.batches = partial(BatchLoader, batch_size=batch_size, seed=seed, rank=rank, world=world)
         self.samples: dict[Part, Batch] = {}
@@ -86,10 +90,12 @@ class PositionData(LightningDataModule):
                 if self.masks and part == "train":
                     self.samples[part] = replace(self.samples[part], mask=self.source.training_masks())
         if self.train_batches is None:
-            augment = self.augment
-            if self.backdrops:
+            samples, augment = self.samples["train"], self.augment
+            if self.photographs:
+                augment = PhotographExchange(self.photographs.samples(samples), self.photographs.share, augment)
+            if self.backdrops:  # first, since what is behind photographs is not known
                 augment = BackdropExchange(self.source.training_backdrops(), self.backdrops, augment)
-            self.train_batches = self.batches(self.samples["train"], shuffle=True, augment=augment)
+            self.train_batches = self.batches(samples, shuffle=True, augment=augment)
 
     def move_to(self, device: torch.device) -> None:
         """Hold the samples on the device that trains, as far as half of its free memory suffices for each part.
@@ -101,8 +107,7 @@ class PositionData(LightningDataModule):
         self.batches = partial(self.batches, device=device)
         loader = self.train_dataloader()
         loader.samples, loader.device = self.samples["train"], device
-        if isinstance(exchange := loader.augment, BackdropExchange):
-            loader.augment = replace(exchange, backdrops=held_on(device, exchange.backdrops, "the backdrops"))
+        loader.augment = _moved(loader.augment, device)
 
     def train_dataloader(self) -> BatchLoader:
         assert self.train_batches is not None, "setup comes first"
@@ -126,6 +131,16 @@ class PositionData(LightningDataModule):
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
         self.train_dataloader().load_state_dict(state_dict)
+
+
+def _moved(augment: Augment | None, device: torch.device) -> Augment | None:
+    """An augmentation whose images are held on a device."""
+    if isinstance(augment, BackdropExchange):
+        backdrops = held_on(device, augment.backdrops, "the backdrops")
+        return replace(augment, backdrops=backdrops, then=_moved(augment.then, device))
+    if isinstance(augment, PhotographExchange):
+        return replace(augment, photographs=held_on(device, augment.photographs, "the photographs"))
+    return augment
 
 
 def held_on(device: torch.device, held: Held, words: str) -> Held:

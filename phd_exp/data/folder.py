@@ -1,6 +1,7 @@
 """Samples from a folder of the user's own images, with one virtual camera per detection."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,6 @@ from phd_exp.records.detections import LARGEST_BOX, Detection
 from phd_exp.records.errors import ConfigError, DatasetError
 from phd_exp.records.images import content_of, pillow_warnings
 from phd_exp.records.own_images import DetectionFolder
-from phd_exp.records.scenes import Split
 
 KNOWN = ("scale", "visibility", "truncation")  # values that are recorded with the predictions
 CROP_LAYOUT = 3  # version of `cut`, recorded with each cache
@@ -31,6 +31,8 @@ class Crop:
     """A detection and its virtual camera; `xyz` (metres) is in the frame of that camera."""
 
     detection: Detection
+    size: tuple[int, int]
+    """Width and height of the detection's image."""
     camera: VirtualCamera
     xyz: Float[np.ndarray, "3"]
 
@@ -49,12 +51,7 @@ class FolderSource(Source):
     ) -> None:
         self.folder = folder
         self.side = side
-        self.sizes: dict[Path, tuple[int, int]] = {}
-
-        def crops(split: Split, n: int | None) -> list[Crop]:
-            return [_crop(detection, side, self.sizes) for detection in folder.detections(split, n)]
-
-        training = crops("train", None if n_train is None else n_train + n_held_out)
+        training = crops_of(folder.detections("train", None if n_train is None else n_train + n_held_out), side)
         n_train = len(training) - n_held_out
         if n_train < 1:
             raise ConfigError(
@@ -64,7 +61,7 @@ class FolderSource(Source):
         self.crops: dict[Part, list[Crop]] = {
             "train": training[:n_train],
             "held_out": training[n_train:],
-            "test": crops("test", n_test),
+            "test": crops_of(folder.detections("test", n_test), side),
         }
         z = torch.tensor([crop.xyz[2] for crop in self.crops["train"]], dtype=torch.float64)
         f = torch.tensor([crop.camera.f for crop in self.crops["train"]], dtype=torch.float64)
@@ -72,11 +69,7 @@ class FolderSource(Source):
         self.constant_f = float((f.min() * f.max()).sqrt())
 
     def samples(self, part: Part) -> Batch:
-        crops = self.crops[part]
-        xyz = torch.from_numpy(np.stack([crop.xyz for crop in crops]).astype(np.float32))
-        f = torch.tensor([crop.camera.f for crop in crops], dtype=torch.float32)
-        image = torch.from_numpy(self._images(crops, part))
-        return Batch(image, xyz, f, float(self.side), torch.arange(len(crops)))
+        return samples_of(self.crops[part], self.side, self.folder.cache, part)
 
     def known(self, part: Part) -> Known:
         crops = self.crops[part]
@@ -92,28 +85,46 @@ class FolderSource(Source):
     def count(self, part: Part) -> int:
         return len(self.crops[part])
 
-    @pillow_warnings()
-    def _images(self, crops: list[Crop], part: Part) -> np.ndarray:
-        """The crops, cached."""
-        rows: dict[Path, list[int]] = {}  # a file may have many detections
-        for row, crop in enumerate(crops):
-            rows.setdefault(crop.detection.file, []).append(row)
-        checksums = {file: sha256(content_of(file)) for file in rows}
 
-        def fill(array: np.ndarray, file: Path) -> None:
-            content = content_of(file)
-            if sha256(content) != checksums[file]:
-                raise DatasetError(f"{file}: changed while it was read; start again")
-            image = read_image(file, content)
-            for row in rows[file]:
-                array[row] = cut(image, crops[row].camera)
+def crops_of(detections: Sequence[Detection], side: int) -> list[Crop]:
+    """The virtual camera, of `side` x `side` pixels, and the position of each detection.
 
-        content = [checksums[crop.detection.file].encode() + _key(crop.camera) for crop in crops]
-        key = {"layout": CROP_LAYOUT, "crops": sha256(b"".join(content))}
-        kept = self.folder.cache / f"crops-{part}-{len(crops)}x{self.side}.npy"
-        largest = max((math.prod(self.sizes[file]) for file in rows), default=1)
-        shape, words = (len(crops), self.side, self.side, 3), f"decoding {part.replace('_', '-')} images once"
-        return cached(kept, key, shape, list(rows), fill, words, largest)
+    Raises DatasetError, naming file and line, for an image, a box or a position that cannot be right.
+    """
+    sizes: dict[Path, tuple[int, int]] = {}  # a file may have many detections
+    return [_crop(detection, side, sizes) for detection in detections]
+
+
+def samples_of(crops: list[Crop], side: int, cache: Path, name: str) -> Batch:
+    """The samples of crops; their images are decoded once into the folder `cache`."""
+    xyz = torch.from_numpy(np.stack([crop.xyz for crop in crops]).astype(np.float32))
+    f = torch.tensor([crop.camera.f for crop in crops], dtype=torch.float32)
+    image = torch.from_numpy(_images(crops, side, cache, name))
+    return Batch(image, xyz, f, float(side), torch.arange(len(crops)))
+
+
+@pillow_warnings()
+def _images(crops: list[Crop], side: int, cache: Path, name: str) -> np.ndarray:
+    """The crops, cached."""
+    rows: dict[Path, list[int]] = {}
+    for row, crop in enumerate(crops):
+        rows.setdefault(crop.detection.file, []).append(row)
+    checksums = {file: sha256(content_of(file)) for file in rows}
+
+    def fill(array: np.ndarray, file: Path) -> None:
+        content = content_of(file)
+        if sha256(content) != checksums[file]:
+            raise DatasetError(f"{file}: changed while it was read; start again")
+        image = read_image(file, content)
+        for row in rows[file]:
+            array[row] = cut(image, crops[row].camera)
+
+    content = [checksums[crop.detection.file].encode() + _key(crop.camera) for crop in crops]
+    key = {"layout": CROP_LAYOUT, "crops": sha256(b"".join(content))}
+    kept = cache / f"crops-{name}-{len(crops)}x{side}.npy"
+    largest = max((math.prod(crop.size) for crop in crops), default=1)
+    shape, words = (len(crops), side, side, 3), f"decoding {name.replace('_', '-')} images once"
+    return cached(kept, key, shape, list(rows), fill, words, largest)
 
 
 def _key(camera: VirtualCamera) -> bytes:
@@ -137,4 +148,4 @@ def _crop(detection: Detection, side: int, sizes: dict[Path, tuple[int, int]]) -
             f"{detection.where}: the position {list(detection.position)} is far outside the image of {size[0]} x "
             f"{size[1]} pixels, or 90 degrees or more from the middle of its box; check x, y, z (m) and the camera"
         )
-    return Crop(detection, camera, xyz)
+    return Crop(detection, size, camera, xyz)

@@ -7,14 +7,18 @@ from torch.nn.functional import binary_cross_entropy_with_logits, interpolate
 
 
 def segmentation_loss(
-    log_odds: Float[Tensor, "batch rows columns"], mask: UInt8[Tensor, "batch mask_rows mask_columns"]
+    log_odds: Float[Tensor, "batch rows columns"],
+    mask: UInt8[Tensor, "batch mask_rows mask_columns"],
+    weight: Float[Tensor, " batch"] | None = None,
 ) -> Float[Tensor, ""]:
     """The mean cross entropy between log odds and the true shares of the cells of a mask (0 to 255), in nats.
 
-    Where the mask's cells are larger or smaller, the log odds are averaged or repeated.
+    Where the mask's cells are larger or smaller, the log odds are averaged or repeated. `weight` is a factor of the
+    cross entropy of each sample; the mean is over all samples.
     """
     odds = interpolate(log_odds[:, None], size=mask.shape[1:], mode="area")[:, 0]
-    return binary_cross_entropy_with_logits(odds, mask.to(odds) / 255)
+    weights = None if weight is None else weight.to(odds)[:, None, None]
+    return binary_cross_entropy_with_logits(odds, mask.to(odds) / 255, weights)
 
 
 def localisation_loss(

@@ -46,19 +46,25 @@ class DetectionFolder:
         return detections_in(self.root / split, n, f" (data.n_{split})", self.object_name)
 
     def fingerprint(self) -> str:
-        """Checksum of the annotations and camera files of both splits, without the images.
+        """The `fingerprint` of both splits."""
+        return fingerprint(*(self.root / split for split in SPLITS))
 
-        Raises OSError if a file cannot be read, DatasetError if a line is not JSON.
-        """
-        files = [file for split in SPLITS for file in (*annotations(self.root / split)[0], *self._cameras(split))]
-        return sha256("".join(map(checksum, files)).encode())
 
-    def _cameras(self, split: Split) -> list[Path]:
-        """The camera files that the lines of a split name."""
-        path = self.metadata_path(split)
-        lines = [values for _, _, values in _entries(path.parent)] if path.exists() else []
-        names = {line["camera"] for line in lines if isinstance(line, dict) and isinstance(line.get("camera"), str)}
-        return [_inside(path.parent, name, str(path), "camera") for name in sorted(names)]
+def fingerprint(*folders: Path) -> str:
+    """Checksum of the annotations and camera files of folders, without the images.
+
+    Raises OSError if a file cannot be read, DatasetError if a line is not JSON.
+    """
+    files = [file for folder in folders for file in (*annotations(folder)[0], *_cameras(folder))]
+    return sha256("".join(map(checksum, files)).encode())
+
+
+def _cameras(folder: Path) -> list[Path]:
+    """The camera files that the lines of a folder's `metadata.jsonl` name."""
+    path = folder / "metadata.jsonl"
+    lines = [values for _, _, values in _entries(folder)] if path.exists() else []
+    names = {line["camera"] for line in lines if isinstance(line, dict) and isinstance(line.get("camera"), str)}
+    return [_inside(folder, name, str(path), "camera") for name in sorted(names)]
 
 
 def detections_in(

@@ -11,11 +11,12 @@ from hydra.utils import instantiate
 from torch import Tensor
 
 from phd_exp.build import build_regressor, build_source, naming, recorded_constants
-from phd_exp.config import RunConfig
+from phd_exp.config import FolderConfig, RenderedConfig, RunConfig, SourceConfig
 from phd_exp.config.sections import RecipeConfig
 from phd_exp.config.targets import custom_parts, locate
 from phd_exp.data.augmentation import Augmentation
 from phd_exp.data.datamodule import PositionData
+from phd_exp.data.photographs import Photographs
 from phd_exp.data.photometry import Photometry
 from phd_exp.data.sources import Source
 from phd_exp.geometry.camera import Camera
@@ -49,7 +50,16 @@ def build_data(config: RunConfig, rank: int = 0) -> PositionData:
         held_out=config.evaluation.held_out and config.data.n_held_out > 0,
         masks=config.recipe.segmentation > 0,
         backdrops=config.recipe.augmentation.backdrops,
+        photographs=_photographs(config.data),
     )
+
+
+def _photographs(data: RenderedConfig | FolderConfig | SourceConfig) -> Photographs | None:
+    """The photographs to train on in addition to renders, if any."""
+    asked = data.photographs if isinstance(data, RenderedConfig) else None
+    if asked is None or asked.folder is None:
+        return None
+    return Photographs(asked.folder, asked.object, data.image_size, asked.share)
 
 
 def build_augmentation(recipe: RecipeConfig) -> Augmentation | None:

@@ -39,7 +39,7 @@ class Objective:
             place = projected(batch.xyz, batch.camera)
             total = total + self.localisation * localisation_loss(output.log_heat, place)
         if self.segmentation and output.log_odds is not None and batch.mask is not None:
-            total = total + self.segmentation * segmentation_loss(output.log_odds, batch.mask)
+            total = total + self.segmentation * segmentation_loss(output.log_odds, batch.mask, batch.mask_weight)
         return total
 
 

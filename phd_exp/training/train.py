@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import torch
 from lightning import Callback
 
 from phd_exp.build import require_same_shrinking
-from phd_exp.config import FolderConfig, RenderedConfig, RunConfig
+from phd_exp.config import FolderConfig, RenderedConfig, RunConfig, SourceConfig
 from phd_exp.config.targets import custom_parts
 from phd_exp.data.photometry import VERSION
 from phd_exp.hardware import default_threads
@@ -16,7 +17,7 @@ from phd_exp.records.choices import first_difference, flatten
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import checksum, remove_temporaries
-from phd_exp.records.own_images import DetectionFolder
+from phd_exp.records.own_images import DetectionFolder, fingerprint
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import build_augmentation, build_data, build_module
 from phd_exp.training.ranks import train_together
@@ -101,10 +102,10 @@ def require_same_config(folder: RunFolder, config: RunConfig) -> None:
             "move that folder away, or choose another place by runs=DIR"
         )
     # the user's own data may change under the same name; a rendered set only grows
-    status, manifest = folder.status(), _manifest_hash(config)
-    if isinstance(config.data, FolderConfig) and status and manifest not in (None, status.data_manifest):
+    status, own = folder.status(), _fingerprint(config.data)
+    if own and status and not (status.data_manifest or "").endswith(own):
         raise RunError(
-            f"{folder.path}: holds a run on {config.data.folder} as it was before its annotations changed; "
+            f"{folder.path}: holds a run on {_own_images(config.data)} as it was before its annotations changed; "
             "move that run's folder away, or choose another place by runs=DIR"
         )
 
@@ -142,9 +143,28 @@ def equal_run(config: RunConfig, folder: RunFolder) -> RunFolder | None:
 
 
 def _manifest_hash(config: RunConfig) -> str | None:
+    """Checksum of the data set's manifest, and of the annotations of the user's own images, if there are any."""
+    data, own = config.data, _fingerprint(config.data)
+    if not isinstance(data, RenderedConfig):
+        return own
     with suppress(OSError):  # the data of a finished run may be gone
-        if isinstance(config.data, FolderConfig):
-            return DetectionFolder(config.data.folder).fingerprint()
-        if isinstance(config.data, RenderedConfig):
-            return checksum(DatasetFolder(config.data.folder).manifest_path)
+        manifest = checksum(DatasetFolder(data.folder).manifest_path)
+        return f"{manifest}+{own}" if own else manifest
+    return None
+
+
+def _own_images(data: FolderConfig | RenderedConfig | SourceConfig) -> Path | None:
+    """The folder of the user's own images that a run trains on."""
+    if isinstance(data, FolderConfig):
+        return data.folder
+    return data.photographs.folder if isinstance(data, RenderedConfig) else None
+
+
+def _fingerprint(data: FolderConfig | RenderedConfig | SourceConfig) -> str | None:
+    """Checksum of the annotations of the user's own images."""
+    own = _own_images(data)
+    with suppress(OSError):
+        if isinstance(data, FolderConfig):
+            return DetectionFolder(data.folder).fingerprint()
+        return fingerprint(own) if own else None
     return None

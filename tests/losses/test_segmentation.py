@@ -28,3 +28,10 @@ def test_a_finer_map_is_averaged_and_a_coarser_one_repeated() -> None:
     finer = odds.repeat_interleave(2, 1).repeat_interleave(2, 2) + noise
     assert_close(segmentation_loss(finer, MASK), here)
     assert_close(segmentation_loss(odds, MASK.repeat_interleave(2, 1).repeat_interleave(2, 2)), here)
+
+
+def test_a_sample_of_weight_zero_adds_nothing_to_the_mean() -> None:
+    odds, masks = torch.randn(2, 2, 4), MASK.expand(2, -1, -1)
+    both = segmentation_loss(odds, masks, torch.tensor([1.0, 0.0]))
+    assert_close(both, segmentation_loss(odds[:1], MASK) / 2)
+    assert_close(segmentation_loss(odds, masks, torch.ones(2)), segmentation_loss(odds, masks))

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Callable
@@ -15,6 +16,7 @@ import torch
 from lightning.pytorch.callbacks import ProgressBar
 
 from phd_exp.config import check
+from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training import trainer as build
@@ -263,3 +265,20 @@ def test_threads_are_those_of_the_configuration_or_of_omp_num_threads_or_the_cor
     monkeypatch.setattr("phd_exp.training.train.run", lambda config, folder, draw, threads, **_: {"threads": threads})
     config = check(composed("preset=smoke", f"data.root={tmp_path}", *words))
     assert train(config, RunFolder(tmp_path / "run"), None, cores=8) == {"threads": expected}
+
+
+def test_a_run_on_renders_and_photographs_is_tested_on_renders_and_notices_other_labels(
+    run_in: Callable, composed: Callable, handmade: DatasetFolder, tmp_path: Path
+) -> None:
+    photos = shutil.copytree(handmade.root / "test", tmp_path / "photos")
+    words = ("trainer.max_epochs=1", f"data.photographs.folder={photos}", "data.photographs.share=0.5")
+    mixed, plain = run_in(tmp_path / "mixed", *words), run_in(tmp_path / "plain", *words[:1])
+    one, other = (pd.read_parquet(run.predictions) for run in (mixed, plain))
+    assert one["file_name"].tolist() == other["file_name"].tolist()
+    assert (one["mode_z"] != other["mode_z"]).all()
+    config = check(mixed.config())
+    require_same_config(mixed, config)
+    metadata = photos / "metadata.jsonl"
+    metadata.write_text(metadata.read_text() + "\n")
+    with pytest.raises(RunError, match=f"a run on {photos} as it was before its annotations changed"):
+        require_same_config(mixed, config)
