@@ -73,7 +73,7 @@ class SceneObject(Record):
     """
 
     shape: Shape | MeshName
-    position: tuple[Finite, Finite, Positive]
+    position: Vector
     rotation: Quaternion
     dimensions: tuple[Positive, Positive, Positive]
     scale: Positive
@@ -157,6 +157,8 @@ def _one_of_each(objects: tuple[SceneObject, ...]) -> tuple[SceneObject, ...]:
 OfMesh = Annotated[Surroundings | None, Field(exclude_if=lambda value: value is None)]
 OfBox = Annotated[Calibration | None, Field(exclude_if=lambda value: value is None)]
 Box = Annotated[tuple[Finite, Finite, Finite, Finite] | None, Field(exclude_if=lambda value: value is None)]
+OfSequence = Annotated[Finite | None, Field(exclude_if=lambda value: value is None)]
+Track = Annotated[str | None, Field(exclude_if=lambda value: value is None)]
 Objects = Annotated[tuple[SceneObject, ...], Field(min_length=1), AfterValidator(_one_of_each)]
 
 
@@ -197,7 +199,8 @@ class SampleRecord(Record):
         visibility: visible pixels of the cylinder over those visible without other objects; 0 if there are none.
         truncation: share of the cylinder's silhouette, without other objects, that lies outside the image.
         index, split, seed: determine everything else, given the specification.
-        scene, view: number of the scene in the split, and of the view of that scene.
+        scene, view: number of the scene in the split, and of the view of that scene. Each frame of a sequence is a scene.
+        track, time: of a frame: the name of its sequence, and seconds since its first frame.
         sha256: checksum of the image file.
     """
 
@@ -223,6 +226,8 @@ class SampleRecord(Record):
     surroundings: OfMesh = None
     real_camera: OfBox = None
     real_box: Box = None
+    track: Track = None
+    time: OfSequence = None
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
     @property

@@ -33,6 +33,7 @@ Angle = Annotated[Number, Field(ge=0, le=90)]
 Pitch = Annotated[Number, Field(ge=-90, le=90)]
 Side = Annotated[Number, Field(ge=0.2, le=10)]
 Turn = Annotated[Number, Field(ge=0, le=180)]
+Spin = Annotated[Number, Field(ge=0, le=3600)]
 Range = AfterValidator(_ascending)
 
 
@@ -76,6 +77,13 @@ class DatasetSpec(Record):
         image_quality: of webp and jpeg, per cent.
         saturation_range: bounds of the saturation of every colour; near 0 it is grey.
         half_hidden: whether a panel in front of the cylinder hides half of it. It replaces the cube of `occluders`.
+        frames: images of each scene, one after the other; sample i is frame i mod frames of scene i div frames. The
+            motion is described in `rendering/sequences.py`.
+        frame_rate: frames per second.
+        speed: root mean square speed of each object along each axis, m/s.
+        spin_range: bounds of the rate at which each object turns, degrees per second.
+        camera_speed, camera_turn: root mean square rates of the camera along and about each axis, m/s and degrees per
+            second.
         mesh: the object instead of the cylinder. The following keys are for meshes alone.
         unit: metres per unit of the meshes' files.
         reference: the point whose position is predicted: the file's origin, the centroid of the surface, or a point
@@ -118,6 +126,12 @@ class DatasetSpec(Record):
     image_quality: Annotated[int, Field(strict=True, ge=1, le=100)]
     saturation_range: Annotated[tuple[Share, Share], Range] = (0.45, 0.95)
     half_hidden: StrictBool = False
+    frames: Annotated[int, Field(strict=True, ge=1, le=10_000)] = 1
+    frame_rate: Annotated[Number, Field(ge=0.1, le=10_000)] = 30.0
+    speed: Annotated[Number, Field(ge=0, le=100)] = 0.5
+    spin_range: Annotated[tuple[Spin, Spin], Range] = (0.0, 90.0)
+    camera_speed: Annotated[Number, Field(ge=0, le=100)] = 0.0
+    camera_turn: Angle = 0.0
     mesh: Annotated[Asset | None, Mesh] = None
     unit: Annotated[Number, Field(gt=0, le=1000)] = 1.0
     reference: Reference = "origin"
@@ -171,6 +185,15 @@ class DatasetSpec(Record):
         has_front = self.front is not None and any(self.front)
         if (self.front and self.upright) or not (has_front or self._is_usual("front_range")):
             raise ValueError("front: expected a direction [x, y, z] with front_range, and upright=false")
+        return self
+
+    @model_validator(mode="after")
+    def _frames_fit(self) -> "DatasetSpec":
+        if self.frames > 1 and (self.mesh is not None or self.views > 1):
+            raise ValueError(f"frames: got {self.frames}; sequences are of the cylinder, from one camera; expected 1")
+        motion = ("frame_rate", "speed", "spin_range", "camera_speed", "camera_turn")
+        if self.frames == 1 and (given := [key for key in motion if not self._is_usual(key)]):
+            raise ValueError(f"{given[0]}: nothing moves in single images; expected data=sequence")
         return self
 
     @model_validator(mode="after")

@@ -70,6 +70,8 @@ def describe(
         seed=spec.seed,
         scene=number,
         view=view,
+        track=str(number // spec.frames) if spec.frames > 1 else None,
+        time=number % spec.frames / spec.frame_rate if spec.frames > 1 else None,
         sha256=checksum,
     )
 

@@ -2,6 +2,7 @@
 
 import colorsys
 import math
+from collections.abc import Callable
 from enum import IntEnum
 from functools import partial
 from typing import get_args
@@ -24,6 +25,7 @@ from phd_exp.records.scenes import (
 )  # fmt: skip
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.rays import optics, rotation_matrix
+from phd_exp.rendering.sequences import camera_pose, in_scene, moved
 
 # Increment one when the same specification starts to give other scenes or other pixels. Folders of another version
 # are refused, not continued with samples that do not match.
@@ -55,6 +57,9 @@ class Purpose(IntEnum):
     BOX = 80
     FRONT = 81
     LOOKS = 82
+    MOTION = 90  # followed by the place of the shape
+    CAMERA_MOTION = 91
+    FRAME_NOISE = 92  # followed by the number of the frame
 
 
 POSE, LOOK, SCALE = range(3)
@@ -80,25 +85,39 @@ def sample_scene(spec: DatasetSpec, split: Split, index: int) -> Scene:
     Source: paper, section "Dataset"; lamps after CLEVR (key, fill and back area lamps with jitter).
     """
     number, view = divmod(index, spec.views)
+    number, frame = divmod(number, spec.frames)
     stream = partial(stream_of, spec, split, number)
     f = _uniform(stream(Purpose.CAMERA), spec.f_range)
-    objects = []
-    for place, shape in enumerate(SHAPES if spec.occluders else SHAPES[:1]):
-        pose, look, size = (stream(Purpose.OBJECT + 10 * place + part) for part in (POSE, LOOK, SCALE))
-        objects.append(draw_object(spec, shape, f, pose, look, size))
-    if spec.half_hidden:
-        panel = _panel(spec, objects[0].position, f, stream(Purpose.PANEL))
-        objects = [*(item for item in objects if item.shape != panel.shape), panel]
+    pose = camera_pose(spec, frame / spec.frame_rate, stream(Purpose.CAMERA_MOTION)) if frame else FIRST_VIEW
     scene = Scene(
         f=f,
         S=spec.sensor_size,
-        pose=FIRST_VIEW,
-        objects=tuple(objects),
+        pose=pose,
+        objects=_objects(spec, f, pose, frame, stream),
         lamps=_lamps(spec, stream(Purpose.LAMPS)),
         backdrop=_backdrop(stream(Purpose.BACKDROP)),
-        noise_seed=_seed(stream(Purpose.NOISE)),
+        noise_seed=_seed(stream(Purpose.FRAME_NOISE, frame) if frame else stream(Purpose.NOISE)),
     )
     return _seen_again(scene, spec, stream(Purpose.VIEW, view)) if view else scene
+
+
+def _objects(
+    spec: DatasetSpec, f: float, pose: Pose, frame: int, stream: Callable[..., Stream]
+) -> tuple[SceneObject, ...]:
+    """The objects in front of the first view, in a frame of its sequence."""
+    objects = []
+    for place, shape in enumerate(SHAPES if spec.occluders else SHAPES[:1]):
+        where, look, size = (stream(Purpose.OBJECT + 10 * place + part) for part in (POSE, LOOK, SCALE))
+        item = draw_object(spec, shape, f, where, look, size)
+        if frame:
+            item = moved(item, spec, f, frame / spec.frame_rate, stream(Purpose.MOTION, place))
+        objects.append(item)
+    panels = [_panel(spec, objects[0].position, f, stream(Purpose.PANEL))] if spec.half_hidden else []
+    objects = [item for item in objects if not panels or item.shape != panels[0].shape]
+    if frame:  # panels are parallel to the image, whatever the camera's pose
+        objects = [in_scene(item, pose, turned=False) for item in objects]
+        panels = [in_scene(item, pose, turned=True) for item in panels]
+    return (*objects, *panels)
 
 
 def about_axis(axis: Vector, angle: float) -> Quaternion:

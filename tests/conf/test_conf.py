@@ -70,6 +70,10 @@ def test_variants_differ_only_in_the_keys_of_their_files(checked: Callable, vari
     assert differing(base, checked(f"data={variant}").data.spec) == keys >= {"variant"}
 
 
+def test_the_file_of_sequences_states_the_defaults_of_their_motion(checked: Callable) -> None:
+    assert differing(checked("data=scale").data.spec, checked("data=sequence").data.spec) == {"variant", "frames"}
+
+
 def differing(one: DatasetSpec, other: DatasetSpec) -> set[str]:
     return {key for key in DatasetSpec.model_fields if getattr(one, key) != getattr(other, key)}
 

@@ -37,6 +37,12 @@ BAD: dict[str, list[Any]] = {
     "image_quality": [0, 101],
     "saturation_range": [(0.5, 0.4), (0.0, 1.1)],
     "half_hidden": [1],
+    "frames": [0, 2.0],
+    "frame_rate": [0.0],
+    "speed": [-1.0],
+    "spin_range": [(90.0, 0.0)],
+    "camera_speed": [math.inf],
+    "camera_turn": [91.0],
     "sensor": [224],
 }  # fmt: skip
 
@@ -46,6 +52,19 @@ def test_an_invalid_value_is_refused_and_its_key_named(make_spec: MakeSpec, key:
     with pytest.raises(ValidationError) as error:
         make_spec(**{key: value})
     assert [complaint["loc"][0] for complaint in error.value.errors()] == [key] * error.value.error_count()
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"frames": 2, "views": 2}, "frames: got 2; sequences are of the cylinder, from one camera; expected 1"),
+        ({"frames": 2, "mesh": MESH}, "frames: got 2; sequences are of the cylinder"),
+        ({"speed": 1.0}, "speed: nothing moves in single images; expected data=sequence"),
+    ],
+)
+def test_a_motion_without_a_sequence_is_refused(make_spec: MakeSpec, values: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        make_spec(**values)
 
 
 def test_every_value_has_to_be_given(make_spec: MakeSpec) -> None:
@@ -72,7 +91,15 @@ def test_a_fingerprint_depends_on_every_value_and_on_nothing_else(make_spec: Mak
         "image_quality": 90,
         "saturation_range": (0.0, 0.1),
         "half_hidden": True,
+        "frames": 2,
         "mesh": Asset(files={"part.glb": "1" * 64}),
+    }
+    of_sequences = {
+        "frame_rate": 25.0,
+        "speed": 1.0,
+        "spin_range": (0.0, 0.0),
+        "camera_speed": 0.1,
+        "camera_turn": 1.0,
     }
     of_meshes = {
         "unit": 0.001,
@@ -97,12 +124,13 @@ def test_a_fingerprint_depends_on_every_value_and_on_nothing_else(make_spec: Mak
     }
     needed = {"ground": {"upright": True, "pitch_range": (20.0, 30.0)}, "front_range": {"front": (0.0, 0.0, 1.0)}}
     needed |= {key: {"camera": CAMERA} for key in ("view", "box_size", "box_shift")}
-    assert changes.keys() | of_meshes.keys() == DatasetSpec.model_fields.keys()
+    assert changes.keys() | of_sequences.keys() | of_meshes.keys() == DatasetSpec.model_fields.keys()
     prints = {make_spec(**{key: value}).fingerprint() for key, value in changes.items()}
+    prints |= {make_spec(frames=2, **{key: value}).fingerprint() for key, value in of_sequences.items()}
     for key, value in of_meshes.items():
         prints.add(make_spec(mesh=MESH, **{key: value}, **needed.get(key, {})).fingerprint())
     prints |= {make_spec().fingerprint(), make_spec(f_range=[1200, 2000]).fingerprint()}
-    assert len(prints) == len(changes) + len(of_meshes) + 1
+    assert len(prints) == len(changes) + len(of_sequences) + len(of_meshes) + 1
     assert make_spec().fingerprint() == "1933c9582b94b54b", "the same on every machine, for ever"
 
 
