@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -167,6 +168,10 @@ def _record_further(run: RunFolder, checked: RunConfig, cores: int) -> None:
         n = several.n_test // views
         scenes = f"{'1 scene' if n == 1 else f'{n} scenes'} seen by {views} cameras each"
         record(run.views, several, tables.origin_of(run, checked, data=several.spec.fingerprint(), scenes=n), scenes)
+    for (frames, held_out), data in checked.sequences.items():
+        file, n = run.sequence(frames, held_out=held_out), data.n_test // frames
+        origin = tables.origin_of(run, checked, data=data.spec.fingerprint(), sequences=n)
+        record(file, data, origin, f"{n} sequence{'s' if n > 1 else ''} of {frames} frames")
     for name, shift in checked.evaluation.shifts.items():
         origin = tables.origin_of_shift(run, checked, name)
         record(run.shift(name), checked.data_of(name), origin, "recorded", shift)
@@ -187,6 +192,8 @@ def standing(config: dict[str, Any], overrides: list[str]) -> str | None:
             return state
         wanted = [folder.views] if config["evaluation"]["multiview"]["scenes"] > 0 else []
         wanted += [folder.eight_views["test"]] if config["evaluation"]["eight_views"] else []
+        for frames, held_out in product((size[1] for size in config["evaluation"]["sequences"]), (False, True)):
+            wanted.append(folder.sequence(frames, held_out=held_out))
         wanted += map(folder.shift, config["evaluation"]["shifts"])
         if state == "finished":
             return "finished" if all(file.exists() for file in wanted) else "interrupted"

@@ -16,6 +16,7 @@ from phd_exp.config.targets import Target, TrainingTarget, TrainingTargets, Trus
 from phd_exp.records.choices import flatten
 from phd_exp.records.errors import ConfigError, gist, shown
 from phd_exp.records.parsing import Record
+from phd_exp.records.runs import HELD_OUT
 from phd_exp.records.spec import Shard
 
 __all__ = ["FolderConfig", "RenderConfig", "RenderedConfig", "RunConfig", "SourceConfig", "check", "check_render"]
@@ -123,6 +124,46 @@ class RunConfig(Record):
         name = "multiview" if data.name == "scale" else f"{data.name}-multiview"
         changes = {"variant": name, "views": asked.views, "view_angle_range": asked.angle_range}
         return data.changed(changes, asked.scenes * asked.views)
+
+    @property
+    def sequences(self) -> dict[tuple[int, bool], RenderedConfig]:
+        """The sequences that follow the training, as test samples: by their frames, and whether they are held out.
+
+        Half as many are held out; they have another seed.
+        """
+        if not isinstance(data := self.data, RenderedConfig):
+            return {}
+        found = {}
+        for n, frames in self.evaluation.sequences:
+            changes: dict[str, Any] = {"variant": f"{data.name}-sequences-{frames}", "frames": frames}
+            held_out = {"variant": f"{changes['variant']}{HELD_OUT}", "seed": (data.spec.seed + 1) % 2**63}
+            found[frames, False] = data.changed(changes, n * frames)
+            found[frames, True] = data.changed(changes | held_out, -(-n // 2) * frames)
+        return found
+
+    @model_validator(mode="after")
+    def sequences_fit(self) -> "RunConfig":
+        """Refuse sequences for predictions that cannot be smoothed, and for data that cannot move."""
+        asked, expected = self.evaluation.sequences, "or evaluation.sequences=[]"
+        if not asked:
+            return self
+        if not getattr(_prediction(self.model.head), "has_closed_forms", False):
+            raise ValueError(
+                f"evaluation.sequences: model={self.model.name} predicts no Projected Huber density, which the "
+                f"smoother needs; expected model=probabilistic, {expected}"
+            )
+        if not isinstance(self.data, RenderedConfig) or self.data.spec.frames > 1:
+            raise ValueError(
+                f"evaluation.sequences: data={self.data.name} is not rendered in single images; expected data=scale, "
+                f"{expected}"
+            )
+        if len({frames for _, frames in asked}) < len(asked):
+            raise ValueError("evaluation.sequences: expected pairs [sequences, frames] of different frames")
+        try:
+            _ = self.sequences
+        except ValueError as error:
+            raise ValueError(f"evaluation.sequences: {gist(error)}") from None
+        return self
 
     @model_validator(mode="after")
     def several_views_fit(self) -> "RunConfig":

@@ -214,6 +214,8 @@ class MultiviewConfig(Record):
     angle_range: Annotated[tuple[Angle, Angle], Range]
 
 
+SizesOfSequences = tuple[Count, Annotated[Whole, Field(ge=2, le=10_000)]]
+"""A number of sequences, and of frames in each."""
 Times = Annotated[float, Field(ge=0.1, le=100)]
 Change = Literal["brightness", "contrast", "gamma", "blur", "noise", "jpeg"]
 
@@ -241,5 +243,6 @@ class EvaluationConfig(Record):
     held_out: StrictBool = False  # whether the held-out samples are evaluated too, for callbacks that monitor them
     eight_views: StrictBool = False  # default for older run records
     multiview: MultiviewConfig | None = None  # default for older run records
+    sequences: tuple[SizesOfSequences, ...] = ()  # default for older run records
     shifts: dict[Name, ShiftConfig] = Field(default_factory=dict)  # default for older run records
     n_shifted: Count | None = None  # default for older run records

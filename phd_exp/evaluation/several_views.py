@@ -22,6 +22,8 @@ ROTATION = ("pose_w", "pose_x", "pose_y", "pose_z")
 TRANSLATION = ("pose_t_x", "pose_t_y", "pose_t_z")
 """Columns of a camera's pose: the unit quaternion of R, and t (m), of v_camera = R v_scene + t."""
 NEEDED = ("scene", "view", "scale", *XYZ, *ROTATION, *TRANSLATION)
+OF_FRAMES = ("track", "time", "visibility")
+"""Further columns of a sequence."""
 MOMENTS = ("mean_x", "mean_y", "mean_z", *COVARIANCE)
 """Further columns of a density that is no Projected Huber density, which has `parameter_names`."""
 TILT = math.radians(30)  # angle by which the first camera looks down at the ground; see `SeveralViews.ground`
@@ -126,6 +128,30 @@ def read_views(file: Path) -> SeveralViews:
     views = int(flat["view"].max()) + 1
     if views < 2 or len(rows) % views or not bool((flat["scene"] * views + flat["view"] == rows).all()):
         raise RunError(f"{file.name}: not every view of every scene, two or more, in order; {AGAIN}")
+    return _finite(flat, views, file)
+
+
+def read_sequences(file: Path) -> SeveralViews:
+    """The recorded sequences of a run: its views are the frames of one camera, with `time` (s) and `visibility`.
+
+    Raises RunError if they cannot be read, or are not sequences of equal length.
+    """
+    table = read_table(file)
+    needed = (*NEEDED, *OF_FRAMES, *parameter_names(table))
+    require_columns(needed, table, file.name)
+    flat = {name: torch.from_numpy(table[name]) for name in needed}
+    frames = int((flat["track"] == 0).sum())
+    n, rest = divmod(len(flat["track"]), max(frames, 1))
+    expected = torch.arange(n, dtype=torch.float64).repeat_interleave(frames)
+    if frames < 2 or rest or not torch.equal(flat["track"], expected):
+        raise RunError(f"{file.name}: not sequences of equal length, two frames or more, in order; {AGAIN}")
+    if not bool((flat["time"].reshape(n, frames).diff() > 0).all()):
+        raise RunError(f"{file.name}: the times of a sequence do not increase; {AGAIN}")
+    return _finite(flat, frames, file)
+
+
+def _finite(flat: Mapping[str, Tensor], views: int, file: Path) -> SeveralViews:
+    """The scenes, of so many rows each, whose values are finite and whose predictions are densities."""
     columns = {name: column.reshape(-1, views) for name, column in flat.items()}
     finite = torch.stack(list(columns.values())).isfinite().all(0).all(-1)
     if not bool(finite.any()):

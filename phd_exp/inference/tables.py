@@ -43,14 +43,14 @@ def record(
 ) -> None:
     """Predict the test samples of a source, with the changes of a shift, and write them.
 
-    Of several views, the table also has the pose of each. Raises RunError if another process holds the run or it has
+    Of several views and of sequences, the table also has the pose of each, and the time. Raises RunError if another process holds the run or it has
     no checkpoint, DatasetError if a sample is missing.
     """
     predictor = load(folder.path, trust=None)  # the user has trained it
     with folder.held():
         table, known = _predicted(predictor, source, "test", shift), dict(source.known("test"))
-        if file == folder.views and isinstance(source, RenderedSource):
-            known |= _poses(source)
+        if isinstance(source, RenderedSource) and max(source.spec.views, source.spec.frames) > 1:
+            known |= _poses_and_times(source)
         file.parent.mkdir(exist_ok=True)
         write_parquet(file, table, known, origin)
 
@@ -129,11 +129,17 @@ def _require_metres(table: Columns, first: Detection) -> None:
         )
 
 
-def _poses(source: RenderedSource) -> Known:
-    """The pose of the camera of each test sample."""
-    poses = [sample.pose for sample in source.folder.records("test", source.count("test"))]
-    numbers = zip(*((*pose.rotation, *pose.translation) for pose in poses), strict=True)
-    return dict(zip((*ROTATION, *TRANSLATION), map(list, numbers), strict=True))
+def _poses_and_times(source: RenderedSource) -> Known:
+    """The pose of the camera of each test sample; of a sequence also its number and the time, seconds."""
+    samples = source.folder.records("test", source.count("test"))
+    numbers = zip(*((*sample.pose.rotation, *sample.pose.translation) for sample in samples), strict=True)
+    known: dict[str, Any] = dict(zip((*ROTATION, *TRANSLATION), map(list, numbers), strict=True))
+    if source.spec.frames > 1:
+        known |= {
+            "track": [int(sample.track or 0) for sample in samples],
+            "time": [sample.time for sample in samples],
+        }
+    return known
 
 
 def _predicted(predictor: Predictor, source: Source, part: Part, shift: ShiftConfig = UNCHANGED) -> Columns:

@@ -11,6 +11,7 @@
         eight_views_*.parquet  the same two from the eight symmetric views of each image, and the views' disagreement
         views.parquet        the same for scenes with several cameras, and their poses, if asked for
         labelled/            the same for labelled images by `calibrate`, a table NAME.parquet for each
+        sequences/           the same for sequences, by their frames: 20.parquet, 20-held-out.parquet; see `HELD_OUT`
         shifts/              the same for shifted test samples, a table NAME.parquet for each, if asked for
         calibration/         the calibration curves, as data (JSON) and as pictures (PNG)
         checkpoints/         last.ckpt; best.ckpt with callbacks=best_checkpoint
@@ -41,6 +42,7 @@ from phd_exp.records.parsing import Record, parse_json, parse_yaml
 from phd_exp.records.processes import held, machine
 
 LAST_EPOCH = 10**9
+HELD_OUT = "-held-out"  # of sequences of another seed, which choose the motion and the slow errors
 UNSHIFTED = "home"  # the unchanged test samples, among shifts
 SECTIONS = ("data", "model", "camera", "recipe", "backbone", "loss", "optimizer", "trainer", "evaluation")
 """Sections that every configuration has."""
@@ -100,6 +102,7 @@ class RunFolder:
         self.held_out = path / "held_out.parquet"
         self.views = path / "views.parquet"
         self.shifts = path / "shifts"
+        self.sequences = path / "sequences"
         self.eight_views = {part: path / f"eight_views_{part}.parquet" for part in ("held_out", "test")}
         self.results_file = path / "results.json"
         self.metrics_file = path / "metrics.jsonl"
@@ -120,6 +123,10 @@ class RunFolder:
     def shift(self, name: str) -> Path:
         """Predictions of shifted test samples."""
         return self.shifts / f"{name}.parquet"
+
+    def sequence(self, frames: int, *, held_out: bool) -> Path:
+        """Predictions of sequences of so many frames: those tested, or other ones that choose."""
+        return self.sequences / f"{frames}{HELD_OUT if held_out else ''}.parquet"
 
     def labelled(self, name: str) -> Path:
         """Predictions of the user's labelled images, by `calibrate`."""

@@ -90,10 +90,9 @@ def _waves(rng: Stream) -> tuple[Float[np.ndarray, " waves"], ...]:
 
 
 def _rotation(quaternion: Quaternion) -> Rotation:
-    w, x, y, z = quaternion
-    return Rotation.from_quat([x, y, z, w])
+    return Rotation.from_quat(quaternion, scalar_first=True)
 
 
 def _quaternion(rotation: Rotation) -> Quaternion:
-    x, y, z, w = rotation.as_quat().tolist()
+    w, x, y, z = rotation.as_quat(scalar_first=True).tolist()
     return w, x, y, z

@@ -20,6 +20,7 @@ from phd_exp.reports.runs import Report
 from phd_exp.reports.searches import search_tables
 from phd_exp.reports.shift_tables import shift_tables
 from phd_exp.reports.table import Table, TableCell, TableRow, write_text
+from phd_exp.reports.tracks_table import tracks_tables
 from phd_exp.reports.variations import variation_tables
 
 SPECIAL = re.compile(r"([\\`*_\[\]<>#|~&@$])")
@@ -66,6 +67,7 @@ def all_tables(report: Report) -> list[Table]:
         shift_tables,
         variation_tables,
         fusion_tables,
+        tracks_tables,
         search_tables,
     )
     found = (report.notes.attempt(partial(make, report), f"{make.__name__}: ") or [] for make in makers)

@@ -17,17 +17,18 @@ from phd_exp.evaluation.conformal import conformal_log_volumes
 from phd_exp.evaluation.fusion import FusionScores, fusion_scores, two_cameras
 from phd_exp.evaluation.parquet import Columns
 from phd_exp.evaluation.predictions import Evaluation, evaluate, fit_temperature, recalibrated
-from phd_exp.evaluation.several_views import read_views
+from phd_exp.evaluation.several_views import read_sequences, read_views
 from phd_exp.evaluation.shifts import ShiftScores, shift_scores
+from phd_exp.evaluation.tracks import TrackScores, choose, track_scores
 from phd_exp.records.errors import RunError, UserError, one_line
 from phd_exp.records.files import write_atomic
-from phd_exp.records.runs import RunFolder
+from phd_exp.records.runs import HELD_OUT, RunFolder
 from phd_exp.reports.gallery import Gallery, images_folder, make_gallery
 from phd_exp.reports.table import file_stem
 
 Found = TypeVar("Found")
 
-VERSIONS = {"before": 2, "after": 1, "fusion": 1, "pairs": 1, "gallery": 1, "shifts": 1}
+VERSIONS = {"before": 2, "after": 1, "fusion": 1, "pairs": 1, "tracks": 1, "gallery": 1, "shifts": 1}
 """Measurement -> its version. Raise it when the measurement gives other numbers: all runs are measured again."""
 
 
@@ -58,6 +59,7 @@ class Measured:
         before: evaluation of the recorded predictions.
         after: evaluation of the recalibrated predictions; None without held-out samples.
         pairs: scores of the positions fused from two cameras; None without a record of several views.
+        tracks: scores of sequences, by their frames; empty without sequences.
         shifts: scores at home and under each shift; empty without a shift.
         images: a digest of data set and true positions, equal for runs tested on the same images.
     """
@@ -68,6 +70,7 @@ class Measured:
     fusion: FusionScores | None = None
     pairs: Evaluation | None = None
     gallery: Gallery | None = None
+    tracks: dict[str, TrackScores] = field(default_factory=dict)
     shifts: dict[str, ShiftScores] = field(default_factory=dict)
     images: str = ""
     notes: list[str] = field(default_factory=list)
@@ -91,6 +94,7 @@ def measure(
     if folder.views.exists() and (views := notes.attempt(lambda: read_views(folder.views))):
         found["pairs"] = notes.attempt(lambda: two_cameras(views))
         found["fusion"] = notes.attempt(lambda: fusion_scores(views)) if views.is_huber else None
+    found["tracks"] = notes.attempt(lambda: _tracks(folder)) or {}
     return Measured(**found, notes=notes)
 
 
@@ -99,6 +103,18 @@ def _with_volumes(predictions: Columns, held_out: Columns | None) -> Columns:
     with suppress(RunError):  # too few held-out samples, or a record from before the volumes
         return {**predictions, **conformal_log_volumes(predictions, held_out or {})}
     return predictions
+
+
+def _tracks(folder: RunFolder) -> dict[str, TrackScores]:
+    files = sorted(folder.sequences.glob("*.parquet"))
+    choosing = [read_sequences(file) for file in files if file.stem.endswith(HELD_OUT)]
+    tested = {file.stem: read_sequences(file) for file in files if not file.stem.endswith(HELD_OUT)}
+    if not tested:
+        return {}
+    if not choosing:
+        raise RunError(f"{folder.sequences.name}: no held-out sequences; repeat the command of the training")
+    choice = choose(choosing)
+    return {frames: track_scores(sequences, choice) for frames, sequences in tested.items()}
 
 
 def _recalibrated(predictions: Columns, held_out: Columns) -> dict[str, Any]:
@@ -137,7 +153,7 @@ def kept_or_measured(
 def _key(folder: RunFolder, config: Mapping[str, str]) -> str:
     """A digest of all inputs of a measurement: the run's tables, its images, the versions."""
     files = [folder.predictions, folder.held_out, folder.views, folder.config_file, images_folder(config)]
-    files += sorted(folder.shifts.glob("*.parquet"))
+    files += [*sorted(folder.shifts.glob("*.parquet")), *sorted(folder.sequences.glob("*.parquet"))]
     return hashlib.sha256(json.dumps([VERSIONS, *map(_stamp, files)]).encode()).hexdigest()
 
 

@@ -84,7 +84,7 @@ def require_possible(config: RunConfig, folder: RunFolder) -> None:
         raise ConfigError("trainer.accelerator: got 'gpu', but torch sees none here; expected 'cpu' or 'auto'")
     if trainer.accelerator != "cpu" and 0 < found < trainer.devices:
         raise ConfigError(f"trainer.devices: got {trainer.devices}, but torch sees {found} GPUs here")
-    for other in (config.several_views, *map(config.data_of, config.evaluation.shifts)):
+    for other in (config.several_views, *config.sequences.values(), *map(config.data_of, config.evaluation.shifts)):
         if isinstance(other, RenderedConfig):
             DatasetFolder(other.folder).missing(other.spec, 0, 0)  # refuses another data set in its folder
     build_module(config, build_data(config))

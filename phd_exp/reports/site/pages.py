@@ -15,6 +15,8 @@ from phd_exp.reports.quantities import SCORES, mark
 from phd_exp.reports.runs import Run
 from phd_exp.reports.site.overview import Drawn, Groups, presets_of
 from phd_exp.reports.table import Table
+from phd_exp.reports.tracks_table import headline as headline_of_tracks
+from phd_exp.reports.tracks_table import tracks_table
 
 _ENVIRONMENT = Environment(
     loader=FileSystemLoader(Path(__file__).parent / "templates"),
@@ -24,7 +26,12 @@ _ENVIRONMENT = Environment(
     lstrip_blocks=True,
 )
 _ENVIRONMENT.filters |= {"moment": lambda at: f"{at:%Y-%m-%d %H:%M} {at.tzname()}", "duration": duration}
-_ENVIRONMENT.globals |= {"score": SCORES.__getitem__, "headline": headline, "mark": mark}
+_ENVIRONMENT.globals |= {
+    "score": SCORES.__getitem__,
+    "headline": headline,
+    "headline_of_tracks": headline_of_tracks,
+    "mark": mark,
+}
 HEADLINES = ("projected_error_mm", "depth_error_mm", "inside_90", "nll")
 
 
@@ -59,6 +66,7 @@ def run_page(drawn: Drawn, several: bool) -> str:
         environment=_environment(run),
         charts=drawn.charts,
         fusion=fusion_table(run, run.measured.fusion) if run.measured.fusion else None,
+        tracks=tracks_table(run, run.measured.tracks) if run.measured.tracks else None,
     )
 
 

@@ -1,4 +1,4 @@
-"""The charts of one run: calibration, training, errors by stratum, and several cameras."""
+"""The charts of one run: calibration, training, errors by stratum, several cameras, and paths."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -12,6 +12,7 @@ from phd_exp.reports.fusion_table import ON_GROUND, names_of
 from phd_exp.reports.quantities import METRICS, SCORES, Quantity
 from phd_exp.reports.runs import Run
 from phd_exp.reports.site.charts import DASHES, Chart, Trace, axis, bars, curve_line, identity, line, square
+from phd_exp.reports.site.track_charts import track_charts
 
 
 def run_charts(run: Run) -> dict[str, dict[str, Chart]]:
@@ -22,6 +23,7 @@ def run_charts(run: Run) -> dict[str, dict[str, Chart]]:
         "learning": learning_charts(run),
         "strata": strata_charts(before) if before else {},
         "fusion": fusion_charts(fusion) if fusion else {},
+        "tracks": track_charts(run.measured.tracks),
     }
     return {name: charts for name, charts in sections.items() if charts}
 

@@ -1,0 +1,182 @@
+"""Compares ways to smooth the predictions of sequences: errors and calibration of the paths."""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from scipy import optimize, stats
+from torch import Tensor
+
+from phd_exp.distributions.columns import from_columns
+from phd_exp.evaluation.predictions import SEED, Curve, scalar_bands
+from phd_exp.evaluation.several_views import SeveralViews
+from phd_exp.fusion import Pose
+from phd_exp.fusion.tracks import ConstantVelocity, Gaussian, Lost, Path, Slow, autocorrelation, standardised_errors
+from phd_exp.fusion.tracks import track as smoothed
+from phd_exp.metrics.bootstrap import Interval, bands
+from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error, squared_mahalanobis
+from phd_exp.records.errors import RunError
+
+Method = Literal["single", "kalman", "independent", "slow"]
+"""Each frame alone (its mode); a Rauch-Tung-Striebel smoother of the frames' means and covariances; the mean path of
+`fusion.tracks.track` without and with slow errors."""
+METHODS: tuple[Method, ...] = ("single", "kalman", "independent", "slow")
+SMOOTHERS = METHODS[1:]
+ERRORS = ("depth_error_mm", "projected_error_mm")
+NEES = "nees"
+HIDDEN = 0.3  # visibility below which the object counts as hidden
+WHOLE = Lost(after=math.inf, contradictions=10**9)  # no track ends early: all methods have the same frames
+NOISES = (0.01, 100.0)  # m/s^2 per sqrt(Hz), among which the noise of the motion is chosen
+PRECISION = 0.05  # of its logarithm
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What held-out sequences choose: the noise of each smoother's motion, m/s^2 per sqrt(Hz), and the slow errors."""
+
+    noise: dict[Method, float]
+    slow: Slow
+
+
+@dataclass(frozen=True)
+class TrackScores:
+    """Scores of n sequences of one camera.
+
+    Attributes:
+        n, frames, hidden: number of sequences, of frames in each, and of all frames that hide the object.
+        left_out: further sequences, with a value that is not finite or without a path in front of the camera.
+        choice: of the held-out sequences.
+        bands: by `place`, means over frames with 95 % bootstrap intervals over sequences. `nees` is the squared
+            Mahalanobis distance over 3, 1 on average if calibrated; `hidden/` is of the hidden frames alone, absent
+            without one; `ratio/` is the mean error over that of single frames; `gain/` is the mean depth error of
+            the Kalman smoother minus that of a method, mm.
+        curves: by `place`, means over sequences at each time (s).
+        calibrated: 95 % interval of the mean NEES of n frames, one of each sequence, if calibrated.
+    """
+
+    n: int
+    frames: int
+    hidden: int
+    left_out: int
+    choice: Choice
+    bands: dict[str, Interval[float]]
+    curves: dict[str, Curve]
+    calibrated: tuple[float, float]
+
+
+def place(quantity: str, method: Method) -> str:
+    """The key of a number or curve."""
+    return f"{quantity}/{method}"
+
+
+def choose(held_out: Sequence[SeveralViews]) -> Choice:
+    """The slow errors by the autocorrelation of standardised errors, then each noise by the likelihood of all paths.
+
+    Raises RunError if no sequence has a path.
+    """
+    slow = _slow(held_out)
+    return Choice({method: _noise(held_out, method, slow) for method in SMOOTHERS}, slow)
+
+
+def _slow(held_out: Sequence[SeveralViews]) -> Slow:
+    times = [row for one in held_out for row in one.columns["time"].numpy()]
+    both = [standardised_errors(one.predictions, one.xyz) for one in held_out]
+    depth = [row for errors, _ in both for row in errors.numpy()]
+    across = [row for _, errors in both for axis in errors.unbind(-1) for row in axis.numpy()]
+    of_axes = [row for one in held_out for _ in range(2) for row in one.columns["time"].numpy()]
+    return Slow(*autocorrelation(times, depth), *autocorrelation(of_axes, across))
+
+
+def _noise(held_out: Sequence[SeveralViews], method: Method, slow: Slow) -> float:
+    """The noise of highest total `log_evidence`."""
+
+    def loss(log_noise: float) -> float:
+        choice = Choice({method: math.exp(log_noise)}, slow)
+        found = [path.log_evidence for one in held_out for path in _paths(one, method, choice) if path]
+        if not found:
+            raise RunError("sequences: not one held-out sequence has a path; train longer")
+        return -sum(found)
+
+    bounds = math.log(NOISES[0]), math.log(NOISES[1])
+    return math.exp(optimize.minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": PRECISION}).x)
+
+
+def _paths(sequences: SeveralViews, method: Method, choice: Choice) -> Iterator[Path | None]:
+    """The path of each sequence; None where there is none in front of the camera."""
+    predictions = from_columns({name: column[..., None] for name, column in sequences.columns.items()})
+    motion, slow = ConstantVelocity(choice.noise[method]), choice.slow if method == "slow" else Slow()
+    for row, times in enumerate(sequences.columns["time"]):
+        pose = Pose(sequences.pose.R[row, :, None], sequences.pose.t[row, :, None])
+        given = Gaussian.of(predictions[row]) if method == "kalman" else predictions[row]
+        try:
+            yield smoothed(times, given, pose, motion, slow=slow, lost=WHOLE)
+        except ValueError:
+            yield None
+
+
+def track_scores(sequences: SeveralViews, choice: Choice, resamples: int = 1000) -> TrackScores:
+    """Smooth with every method and score. Raises RunError if no sequence has a path by all of them."""
+    paths = {method: list(_paths(sequences, method, choice)) for method in SMOOTHERS}
+    sound = torch.tensor([all(each) for each in zip(*paths.values(), strict=True)])
+    if not bool(sound.any()):
+        raise RunError("sequences: not one has a path by every method; train longer")
+    kept = sequences.subset(sound)
+    found = _scored(kept, "single", kept.pose.into_world(kept.predictions.mode), *kept.world_moments)
+    for method, of_all in paths.items():
+        whole = [path for path, good in zip(of_all, sound, strict=True) if path and good]
+        mean = torch.stack([path.mean for path in whole])
+        found |= _scored(kept, method, mean, mean, torch.stack([path.covariance for path in whole]))
+    hidden = (kept.columns["visibility"] < HIDDEN).double()
+    times, n = kept.columns["time"][0].tolist(), kept.n
+    low, high = stats.chi2.ppf((0.025, 0.975), 3 * n) / (3 * n)
+    return TrackScores(
+        n=n,
+        frames=kept.views,
+        hidden=int(hidden.sum()),
+        left_out=kept.left_out,
+        choice=choice,
+        bands=scalar_bands(_means, found | {"hidden": hidden}, resamples),
+        curves={
+            at: Curve(times, *(getattr(band, end).tolist() for end in ("value", "low", "high")))
+            for at, band in bands(_over_time, found, resamples, SEED).items()
+        },
+        calibrated=(float(low), float(high)),
+    )
+
+
+def _scored(
+    sequences: SeveralViews,
+    method: Method,
+    point: Float[Tensor, "sequences frames 3"],
+    mean: Float[Tensor, "sequences frames 3"],
+    covariance: Float[Tensor, "sequences frames 3 3"],
+) -> dict[str, Float[Tensor, "sequences frames"]]:
+    """The errors of positions in the world, and the NEES of means and covariances, in each frame."""
+    xyz, estimate = sequences.xyz, sequences.pose.into_camera(point)
+    errors: tuple[Callable[..., Tensor], ...] = depth_error, projected_error
+    found = {place(name, method): MILLIMETRES * of(xyz, estimate) for name, of in zip(ERRORS, errors, strict=True)}
+    truth = sequences.pose.into_world(xyz)
+    return found | {place(NEES, method): squared_mahalanobis(truth - mean, covariance) / 3}
+
+
+def _means(columns: Mapping[str, Tensor], counts: Tensor) -> dict[str, Tensor]:
+    """The statistic of all `bands`, given the columns of `_scored` and which frames are hidden."""
+    hidden = columns["hidden"]
+    weight, frames = counts @ hidden.sum(-1), counts.sum(-1)
+    found = {name: counts @ column.mean(-1) / frames for name, column in columns.items() if name != "hidden"}
+    if bool(hidden.any()):
+        of_hidden = {name: counts @ (column * hidden).sum(-1) / weight for name, column in columns.items()}
+        found |= {f"hidden/{name}": value for name, value in of_hidden.items() if name != "hidden"}
+    single = {name: value for name, value in found.items() if name.endswith("/single") and NEES not in name}
+    for name, value in single.items():
+        quantity = name.removesuffix("/single")
+        found |= {f"ratio/{place(quantity, method)}": found[place(quantity, method)] / value for method in SMOOTHERS}
+    kalman = found[place(ERRORS[0], "kalman")]
+    return found | {place("gain", method): kalman - found[place(ERRORS[0], method)] for method in SMOOTHERS[1:]}
+
+
+def _over_time(columns: Mapping[str, Tensor], counts: Tensor) -> dict[str, Tensor]:
+    return {name: counts @ column / counts.sum(-1, keepdim=True) for name, column in columns.items()}

@@ -1,0 +1,105 @@
+"""Paths over time as a table: a column per length of the sequences, a line per method."""
+
+from collections.abc import Mapping
+
+from phd_exp.evaluation.tracks import ERRORS, HIDDEN, METHODS, NEES, SMOOTHERS, Method, TrackScores, place
+from phd_exp.records.choices import in_words
+from phd_exp.reports.runs import Report, Run
+from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, bounds, file_stem
+
+NAMES: dict[Method, str] = {
+    "single": "single frames",
+    "kalman": "Kalman (RTS)",
+    "independent": "ours, independent frames",
+    "slow": "ours, slow errors",
+}
+LABELS = {
+    "depth_error_mm": "depth (mm)",
+    "projected_error_mm": "projected (mm)",
+    "hidden/depth_error_mm": "depth, hidden (mm)",
+    "hidden/projected_error_mm": "projected, hidden (mm)",
+    "ratio/depth_error_mm": "depth / single",
+    "ratio/hidden/depth_error_mm": "depth / single, hidden",
+    "gain": "depth, less than Kalman (mm)",
+    NEES: "squared error",
+}
+"""Quantity -> its label; the errors, then comparisons, then calibration."""
+OF_QUANTITIES = (
+    "Means over the frames of all sequences, of one camera; in brackets: 95 % bootstrap intervals over sequences. Depth: along the "
+    "camera's true viewing ray; projected: across it, as in the paper's tables. Hidden: frames in which less than "
+    f"{100 * HIDDEN:.0f} % of the object is visible. Ratios are those of mean errors. Squared error: the squared Mahalanobis "
+    "distance per dimension, averaged over the path, 1 where calibrated, above 1 where overconfident."
+)
+OF_METHODS = (
+    "Single frames: the mode of each. Kalman (RTS): a Rauch-Tung-Striebel smoother of the frames' means and covariances. Ours: the mean "
+    "path under the frames' densities; slow errors: errors that the frames share are estimated with it. All assume a velocity that changes by "
+    "white noise."
+)
+
+
+def tracks_tables(report: Report) -> list[Table]:
+    """The tables of all runs that recorded sequences."""
+    return [tracks_table(run, run.measured.tracks) for run in report.runs if run.measured.tracks]
+
+
+def tracks_table(run: Run, scores: Mapping[str, TrackScores]) -> Table:
+    """The table of a run's scores, by the frames of a sequence."""
+    every = sorted(scores.values(), key=lambda one: one.frames)
+    found = {
+        quantity: tuple(
+            TableRow((label, NAMES[method]), tuple(_cell(run, one, quantity, method) for one in every))
+            for method in METHODS
+            if any(place(quantity, method) in one.bands for one in every)
+        )
+        for quantity, label in LABELS.items()
+    }
+    return Table(
+        stem=file_stem("tracks", run.preset, run.data, run.model, run.name),
+        kind="tracks",
+        title=f"Paths, {in_words(run.preset)}, {run.title}, {run.name}",
+        stub=("quantity", "method"),
+        columns=tuple(f"{one.n} × {one.frames} frames" for one in every),
+        groups=tuple(rows for rows in found.values() if rows),
+        notes=(OF_QUANTITIES, OF_METHODS, *map(_chosen, every[:1]), *filter(None, map(_calibrated, every))),
+        preset=run.preset,
+    )
+
+
+def _cell(run: Run, scores: TrackScores, quantity: str, method: Method) -> TableCell:
+    band = scores.bands.get(place(quantity, method))
+    if band is None:
+        return TableCell(NOTHING)
+    line = run.choice | {"run": run.name, "frames": scores.frames, "quantity": quantity, "method": method}
+    line |= {"mean": band.value, **bounds(band), "n_sequences": scores.n, "n_hidden": scores.hidden}
+    text = band.each(lambda value: number(quantity, value))
+    return TableCell(text.value, f"({text.low}–{text.high})".replace("–-", " to -"), numbers=(line,))
+
+
+def number(quantity: str, value: float) -> str:
+    """A score as text."""
+    if quantity in (NEES, *(label for label in LABELS if label.startswith("ratio"))):
+        return f"{value:.2f}"
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"
+
+
+def _chosen(scores: TrackScores) -> str:
+    noise, slow = scores.choice.noise, scores.choice.slow
+    noises = ", ".join(f"{noise[method]:.2g} ({NAMES[method]})" for method in SMOOTHERS)
+    return (
+        f"Held-out sequences chose the noise of the motion, in m/s² per √Hz: {noises}; and the slow errors: "
+        f"{100 * slow.depth_share:.0f} % of the variance of depth, with the time constant {slow.depth_time:.2g} s, and "
+        f"{100 * slow.projection_share:.0f} % of that of the projection, with {slow.projection_time:.2g} s, the autocorrelation of "
+        "standardised errors."
+    )
+
+
+def _calibrated(scores: TrackScores) -> str:
+    left = f" {scores.left_out} further sequences are left out." if scores.left_out else ""
+    return f"{scores.hidden} of {scores.n * scores.frames} frames of the sequences of {scores.frames} hide the object.{left}"
+
+
+def headline(scores: Mapping[str, TrackScores]) -> str:
+    """The depth error of single frames and of the path, in words."""
+    one = min(scores.values(), key=lambda each: each.frames)
+    single, path = (number(ERRORS[0], one.bands[place(ERRORS[0], method)].value) for method in ("single", "slow"))
+    return f"depth error {single} mm in single frames, {path} mm on paths of {one.frames}"

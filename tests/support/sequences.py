@@ -1,0 +1,36 @@
+"""Records of sequences whose motion and slow errors are known."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from phd_exp.data.batches import Batch
+from phd_exp.evaluation.several_views import ROTATION, TRANSLATION
+from phd_exp.fusion.tracks import ConstantVelocity, Slow
+from phd_exp.training.predictions import columns, write_parquet
+from tests.support.paths import HERTZ, around, chosen, drawn_paths
+
+MOTION = ConstantVelocity(noise=0.3, speed=0.3)
+DEVIATION = 0.05  # of slow log depth
+CAMERA = 1  # of two
+SLOW = Slow(0.38, 1.0, 0.4, 0.5)
+
+
+def write_sequences(file: Path, n: int, frames: int, *, slow: Slow | None = None, seed: int = 0) -> None:
+    """`n` sequences at 30 Hz from one camera, which is not the world's; every third frame counts as hidden."""
+    pose, times = around(2), np.arange(frames) / HERTZ
+    drawn, truth = drawn_paths(n, times, MOTION, pose, deviation=DEVIATION if slow else 0.0, slow=slow, seed=seed)
+    xyz, rows = pose.into_camera(truth[:, :, None])[:, :, CAMERA].flatten(0, 1), torch.arange(n * frames)
+    image = torch.zeros(len(rows), 1, 1, 3, dtype=torch.uint8)
+    batch = Batch(image, xyz, torch.full((len(rows),), 1500.0), S=224.0, row=rows)
+    table = columns(chosen(drawn, (rows // frames, rows % frames, CAMERA)), batch)
+    x, y, z, w = Rotation.from_matrix(pose.R[CAMERA].numpy()).as_quat()
+    numbers = (w, x, y, z, *pose.t[CAMERA].tolist())
+    known = {name: [value] * len(rows) for name, value in zip((*ROTATION, *TRANSLATION), numbers, strict=True)}
+    known |= {"scene": rows.tolist(), "view": [0] * len(rows), "scale": [1.0] * len(rows)}
+    known |= {"track": (rows // frames).tolist(), "time": np.tile(times, n).tolist()}
+    known |= {"visibility": torch.where(rows % 3 == 0, 0.1, 1.0).tolist()}
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_parquet(file, table, known)
