@@ -177,8 +177,8 @@ class ProjectedHuber(Density, Distribution):
         """The same distribution with a larger batch shape; nothing is copied."""
         return self._of(self._natural.expand(torch.Size(batch_shape)), self._validate_args)
 
-    def __getitem__(self, row: int | Tensor) -> "ProjectedHuber":
-        """One distribution of a batch, or those that a mask chooses."""
+    def __getitem__(self, row: int | Tensor | None) -> "ProjectedHuber":
+        """One distribution of a batch, or those that a mask chooses; None adds a dimension."""
         return self._of(self._natural.map(lambda _, value: value[row]), self._validate_args)
 
     def with_axis(self, k: Float[Tensor, "*#batch 2"]) -> "ProjectedHuber":
@@ -222,7 +222,7 @@ class ProjectedHuber(Density, Distribution):
         The density of v is that of the paper at v - apex.
         """
         if self._natural.nu_0 is None:
-            return self.mode.new_zeros(()).expand((*self.batch_shape, 3))
+            return self._natural.log_mu_z.new_zeros(()).expand((*self.batch_shape, 3))
         return pad(spd.matvec(self._A_xy_inverse, self._natural.nu_0), (0, 1))
 
     @property
@@ -254,6 +254,13 @@ class ProjectedHuber(Density, Distribution):
     @property
     def _A_xy_inverse(self) -> Tensor:
         return spd.inverse(self._natural.A_xy, self._natural.log_det_A_xy)
+
+    @property
+    def measure(self) -> Float[Tensor, "*batch 3 3"]:
+        """The matrix from a position relative to the apex (metres) to (q, t), with t = z/mu_z."""
+        n = self._natural
+        q = torch.cat([n.A_xy, -n.nu_xy[..., None]], -1)
+        return torch.cat([q, pad(torch.exp(-n.log_mu_z)[..., None, None], (2, 0))], -2)
 
     def whiten(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 2"]:
         """The projection in units of its precision, q = A ((x, y)/z - mu_xy) t, with a free axis plus k a (t - 1)."""

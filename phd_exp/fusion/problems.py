@@ -86,7 +86,7 @@ class Problems:
             raise ValueError(f"predictions: got batch shape {tuple(shape)}; expected (*problems, cameras)")
         pose = Pose(flat("pose.R", pose.R, shape, event=2), flat("pose.t", pose.t, shape, event=1))
         mask = flat("mask", torch.ones(shape) if mask is None else mask, shape) > 0
-        measure = flat("predictions", _measure(predictions), shape, event=2)
+        measure = flat("predictions", predictions.measure, shape, event=2)
         mode = flat("predictions", predictions.mode, shape, event=1)
         a = flat("predictions", predictions.a, shape)
         origin = average(pose.into_world(mode), mask)
@@ -136,14 +136,6 @@ def status_of(mask: Tensor, valid: Tensor, rigid: Tensor, plane: Plane | None) -
         status[(plane.normal == 0).all(-1)] = Status.NOT_A_PLANE
     status[~mask.any(-1)] = Status.NO_CAMERA
     return status
-
-
-def _measure(predictions: ProjectedHuber) -> Float[Tensor, "*batch 3 3"]:
-    """The matrix from a position in the camera frame, relative to the apex, to (q_x, q_y, t)."""
-    axes = torch.eye(3, dtype=predictions.a.dtype, device=predictions.a.device)
-    q = torch.stack([predictions.whiten(predictions.apex + axis) for axis in axes], dim=-1)
-    t = axes[2] / predictions.mu_z[..., None]
-    return torch.cat([q, t[..., None, :]], dim=-2)
 
 
 def flat(name: str, value: Tensor, shape: torch.Size, event: int = 0, cameras: int = 1) -> Tensor:

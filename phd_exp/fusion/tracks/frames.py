@@ -95,7 +95,7 @@ class Frames:
         seen = views.mask.any(-1).numpy()
         if not seen.any():
             raise ValueError("mask: got no prediction in any frame; expected at least one")
-        position = average(views.positions, views.mask).numpy()
+        position = views.position.numpy()
         origin = position[seen].mean(0)
         near = np.stack([np.interp(seconds, seconds[seen], axis) for axis in (position[seen] - origin).T], -1)
         at_origin = views.at_zero.numpy() + (views.slope.numpy() @ origin)
@@ -144,13 +144,16 @@ def checked_times(times: Float[Tensor, " frames"], frames: int) -> Float[np.ndar
 
 @dataclass(frozen=True)
 class _Views:
-    """The views of all frames in the world: as in `Frames`, but `at_zero` is at the world's origin."""
+    """The views of all frames in the world: as in `Frames`, but `at_zero` is at the world's origin.
+
+    `position` is the average of each frame's predicted positions; NaN where no camera takes part.
+    """
 
     slope: Float[Tensor, "frames cameras 3 3"]
     at_zero: Float[Tensor, "frames cameras 3"]
     a: Float[Tensor, "frames cameras"]
     mask: Bool[Tensor, "frames cameras"]
-    positions: Float[Tensor, "frames cameras 3"]
+    position: Float[Tensor, "frames 3"]
     centres: Float[Tensor, "frames cameras 3"]
     status: Int[Tensor, " frames"]
 
@@ -161,9 +164,8 @@ def _views(predictions: ProjectedHuber | Gaussian, pose: Pose, mask: Tensor | No
     problems = Problems.posed(predictions, pose, None, mask)
     origin = problems.origin.nan_to_num()[:, None, :, None]
     at_zero = problems.at_origin - (problems.slope @ origin).squeeze(-1)
-    positions = problems.pose.into_world(predictions.mode.double().cpu())
-    centres = problems.pose.into_world(flat("predictions", predictions.apex, predictions.batch_shape, event=1))
-    return _Views(problems.slope, at_zero, problems.a, problems.mask, positions, centres, problems.status)
+    centres = problems.pose.into_world(predictions.apex.double().cpu())
+    return _Views(problems.slope, at_zero, problems.a, problems.mask, problems.origin, centres, problems.status)
 
 
 def _gaussian_views(predictions: Gaussian, pose: Pose, mask: Tensor | None) -> _Views:
@@ -180,4 +182,4 @@ def _gaussian_views(predictions: Gaussian, pose: Pose, mask: Tensor | None) -> _
     status = status_of(mask, valid, pose.is_rigid, None)
     centres = pose.into_world(torch.zeros(3, dtype=torch.float64))
     a = torch.where(mask, GAUSSIAN, 0.0).double()
-    return _Views(slope, at_zero, a, mask, pose.into_world(mean), centres, status)
+    return _Views(slope, at_zero, a, mask, average(pose.into_world(mean), mask), centres, status)

@@ -66,17 +66,17 @@ class Slow:
         Raises:
             ValueError: an argument of `track` is not valid.
         """
-        frames = Frames.checked(times, predictions, pose, mask)
-        if self.depth_share == self.projection_share == 0:
-            return frames
-        if isinstance(predictions, Gaussian):
+        none = self.depth_share == self.projection_share == 0
+        if not none and isinstance(predictions, Gaussian):
             raise ValueError("slow: got Gaussian predictions; expected ProjectedHuber")
+        if none or not isinstance(predictions, ProjectedHuber):
+            return Frames.checked(times, predictions, pose, mask)
         own, deviation = predictions, torch.zeros(predictions.batch_shape)
         if self.depth_share:
             own, deviation = own_part(predictions, torch.tensor(self.depth_share, dtype=torch.float64))
         own = own.tempered(math.sqrt(1 - self.projection_share), 1.0)
-        known = np.where(frames.mask, deviation.double().numpy(), 0.0)
-        return replace(Frames.checked(times, own, pose, mask), deviation=known)
+        frames = Frames.checked(times, own, pose, mask)
+        return replace(frames, deviation=np.where(frames.mask, deviation.double().numpy(), 0.0))
 
     @property
     def offset(self) -> float:

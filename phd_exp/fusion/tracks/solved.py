@@ -97,10 +97,12 @@ def solve(
     model: Model,
     frames: Frames,
     about: Float[Array, "frames d"],
-    start: tuple[Float[Array, " d"], Float[Array, "d d"]],
+    motion: tuple[Array, ...],
     freedom: Float[Array, "frames cameras"] | None,
 ) -> Solved:
     """The optimum of the frames, by a search from `about`, where the slow factor of depth is linear.
+
+    `motion` is what `Model.start` and `Model.moving` return, in a row.
 
     A path of another size has another volume of paths around it: integrated over these, the density at a factor
     e^(d s) has a further factor e^(d s) for each unknown that a camera determines, their `freedom`. Without it, the
@@ -115,7 +117,7 @@ def solve(
     linear = np.zeros_like(about)
     if freedom is not None:
         linear[:, 3] = -(frames.deviation * freedom).sum(-1)
-    chain = Chain(slope, at_origin, frames.a, *start, *model.moving(np.diff(frames.times)), linear)
+    chain = Chain(slope, at_origin, frames.a, *motion, linear)
     x, at, distance = about.copy(), np.empty_like(at_origin), np.empty(len(about))
     in_front, energy, gap = most_likely(chain, x, at, distance)
     if not in_front:
@@ -130,11 +132,13 @@ def smoothed(frames: Frames, motion: Motion, slow: Slow) -> Solved:
     model = Model(motion, replace(slow, depth_share=0.0), cameras)
     x = np.zeros((len(frames.times), len(model.start()[0])))
     x[:, :3] = frames.near
-    solved = solve(model, frames, x, model.start(), None)
+    steps = np.diff(frames.times)
+    solved = solve(model, frames, x, (*model.start(), *model.moving(steps)), None)
     if slow.depth_share:
         model = Model(motion, slow, cameras)
         x = np.insert(solved.x, 3, 0.0, axis=1)
         for _ in range(PASSES):
-            solved = solve(model, frames, x, model.start(), solved.moments.freedom)
+            moving = (*model.start(), *model.moving(steps))
+            solved = solve(model, frames, x, moving, solved.moments.freedom)
             x = solved.x
     return solved

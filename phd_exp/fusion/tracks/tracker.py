@@ -62,7 +62,8 @@ class Tracker:
         lost: when the track ends.
 
     Attributes:
-        lost_because: when and why the track ended, else None. Then `update` returns None; begin a new Tracker.
+        lost_because: when and why the track ended, else None. Then `update` returns None, and `finish` the states up
+            to there; begin a new Tracker.
 
     Raises:
         ValueError: lag is negative, or less than the contradictions that end a track need.
@@ -92,6 +93,8 @@ class Tracker:
         self.lost_because: str | None = None
         self._window: Solved | None = None
         self._seen = -np.inf  # the last time with a prediction
+        self._given = False  # whether `update` has returned the state of the window's first frame
+        self._end: int | None = None  # the frames of the window that belong to the track, all by default
 
     @torch.no_grad()
     def update(
@@ -128,20 +131,35 @@ class Tracker:
             full = len(self._window.frames.times) == self.lag + 1
             if (self._window.excess > self.lost.least_excess).any():
                 times = self._window.frames.times
-                _, self.lost_because = self.lost.contradicted(times, self._window.surprise, full)
-            return self._state(0) if full and self.lost_because is None else None
+                self._end, self.lost_because = self.lost.contradicted(times, self._window.surprise, full)
+            self._given = full and self.lost_because is None
+            return self._state(0) if self._given else None
 
     def finish(self) -> list[State]:
-        """The states of the last frames, for which `update` has not returned one."""
-        if self._window is None or self.lost_because is not None:
+        """The states of the last frames of the track, for which `update` has not returned one."""
+        if self._window is None:
             return []
-        frames = len(self._window.frames.times)
-        return [self._state(k) for k in range(int(frames == self.lag + 1), frames)]
+        frames = len(self._window.frames.times[: self._end])
+        return [self._state(k) for k in range(int(self._given), frames)]
+
+    def position(self, time: float) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+        """Expected position (metres) and its covariance (square metres) at a time, given all frames so far.
+
+        The time is that of one of the last `lag` + 1 frames, or later. Raises ValueError before the first frame.
+        """
+        if (window := self._window) is None:
+            raise ValueError("position: expected a frame with a prediction before")
+        k = int(np.searchsorted(window.frames.times, time))
+        mean, covariance = (values[min(k, len(window.x) - 1)] for values in window.moments[:2])
+        if k == len(window.x):
+            (F,), (W,) = window.model.moving(time - window.frames.times[-1:])
+            mean, covariance = F @ mean, F @ covariance @ F.T + np.linalg.inv(W)
+        return mean[:3] + window.frames.origin, covariance[:3, :3]
 
     def _frame(self, time: float, predictions: ProjectedHuber | Gaussian, pose: Pose, mask: Tensor | None) -> Frames:
         """One frame, checked."""
         if isinstance(predictions, ProjectedHuber):
-            predictions = predictions.expand((1, *predictions.batch_shape))
+            predictions = predictions[None]
         elif isinstance(predictions, Gaussian):
             predictions = Gaussian(predictions.mean[None], predictions.covariance[None])
         times = torch.tensor([time], dtype=torch.float64)
@@ -153,18 +171,19 @@ class Tracker:
         self._start = model.start()
         x = np.zeros((1, len(self._start[0])))
         x[0, :3] = frame.near[0]
-        return solve(model, frame, x, self._start, self._freedom(3.0 * frame.mask / frame.mask.sum()))
+        motion = (*self._start, *model.moving(np.empty(0)))
+        return solve(model, frame, x, motion, self._freedom(3.0 * frame.mask / frame.mask.sum()))
 
     def _next(self, window: Solved, frame: Frames) -> Solved:
         """The window with one more frame, without its first one if it is full."""
         model, frames = window.model, window.frames.followed_by(frame)
-        (F,), _ = model.moving(np.diff(frames.times[-2:]))
-        x = np.concatenate([window.x, (F @ window.x[-1])[None]])
+        F, W = model.moving(np.diff(frames.times))
+        x = np.concatenate([window.x, (F[-1] @ window.x[-1])[None]])
         freedom = np.concatenate([window.moments.freedom, window.moments.freedom[-1:]])
         if len(frames.times) > self.lag + 1:
-            self._start = after_first(window, self._start, *model.moving(np.diff(frames.times[:2])))
-            frames, x, freedom = frames[1:], x[1:], freedom[1:]
-        return solve(model, frames, x, self._start, self._freedom(freedom))
+            self._start = after_first(window, self._start, F[0], W[0])
+            frames, x, freedom, F, W = frames[1:], x[1:], freedom[1:], F[1:], W[1:]
+        return solve(model, frames, x, (*self._start, F, W), self._freedom(freedom))
 
     def _freedom(self, freedom: Float[Array, "frames cameras"]) -> Float[Array, "frames cameras"] | None:
         return freedom if self.slow.depth_share else None
@@ -184,8 +203,8 @@ class Tracker:
 def after_first(
     window: Solved,
     start: tuple[Float[Array, " d"], Float[Array, "d d"]],
-    F: Float[Array, "1 d d"],
-    W: Float[Array, "1 d d"],
+    F: Float[Array, "d d"],
+    W: Float[Array, "d d"],
 ) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
     """Mean and precision of the second frame's unknowns given the first frame, by its Gaussian factors.
 
@@ -201,5 +220,5 @@ def after_first(
         precision[:n, :n] += slope.T @ K @ slope
         information[:n] += slope.T @ (factor[4:] - K @ at)
     covariance = np.linalg.inv(precision)
-    moved = F[0] @ covariance @ F[0].T + np.linalg.inv(W[0])
-    return F[0] @ covariance @ information, np.linalg.inv((moved + moved.T) / 2)
+    moved = F @ covariance @ F.T + np.linalg.inv(W)
+    return F @ covariance @ information, np.linalg.inv((moved + moved.T) / 2)
