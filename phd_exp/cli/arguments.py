@@ -17,6 +17,8 @@ if TYPE_CHECKING:  # imports of seconds, which follow the checks of the argument
     from phd_exp.inference.answers import Sighting
     from phd_exp.inference.predictor import Predictor
 
+BEYOND = 1.1  # factor beyond the least and the largest focal length of held-out samples; training reaches further
+
 
 class Arguments(BaseModel):
     """Arguments of a verb; a key without a default is required. Each has a description, for --help."""
@@ -159,7 +161,7 @@ def predicted(
 
 def _noting_focal_lengths(predictor: "Predictor", seen: Iterable["Sighting"]) -> Iterator["Sighting"]:
     """The predictions; afterwards a note on standard error if the network views some at untrained focal lengths."""
-    low, high = predictor.f_range
+    low, high, remedy = _trained_focal_lengths(predictor)
     first, n = "", 0
     for sighting in seen:
         f = sighting.view.camera.f
@@ -169,7 +171,24 @@ def _noting_focal_lengths(predictor: "Predictor", seen: Iterable["Sighting"]) ->
     if n:
         print(
             f"note: f: {n} view(s) have a focal length that the network was not trained with, first "
-            f"{first}; expected {low:.4g} to {high:.4g} px in its images of {predictor.side} px; give a box= "
-            "around the object, or train with another data.f_range",
+            f"{first}; expected {low:.4g} to {high:.4g} px in its images of {predictor.side} px; {remedy}",
             file=sys.stderr,
         )
+
+
+def _trained_focal_lengths(predictor: "Predictor") -> tuple[float, float, str]:
+    """The least and the largest focal length of the training, px of the network's image, and what to do beyond them.
+
+    Of views of boxes, where distance and size of the box decide them, those of the recorded held-out samples.
+    """
+    from phd_exp.config import RenderedConfig
+    from phd_exp.evaluation.parquet import read_table, require_columns
+
+    data, file = predictor.config.data, predictor.folders[0].held_out
+    if not (isinstance(data, RenderedConfig) and data.spec.is_box and file.exists()):
+        return *predictor.f_range, "give a box= around the object, or train with another data.f_range"
+    table = read_table(file)
+    require_columns(("f", "S"), table)
+    f = table["f"] / table["S"] * predictor.side
+    remedy = "expected distances in data.z_range, and boxes as data.box_size describes them"
+    return float(f.min()) / BEYOND, float(f.max()) * BEYOND, remedy

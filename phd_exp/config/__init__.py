@@ -103,13 +103,15 @@ class RunConfig(Record):
         return self
 
     def data_of(self, shift: str) -> RenderedConfig | FolderConfig | SourceConfig:
-        """The data whose test samples a shift changes. Raises ConfigError for values that no rendered set has."""
+        """The data whose test samples a shift changes. Raises ConfigError for values that no such set has."""
         changes, data, n = self.evaluation.shifts[shift].data, self.data, self.evaluation.n_shifted
         try:
             if not isinstance(data, RenderedConfig):
                 if changes:
                     raise ValueError(f"data={data.name} is not rendered; leave out this shift")
                 return data
+            if data.spec.camera and "f_range" in changes:
+                raise ValueError("f_range follows from data.camera; expected shifts without it, such as shift=images")
             named = {"variant": f"{data.name}-{shift}"} if changes else {}
             return data.changed(named | changes, n or data.n_test)
         except ValueError as error:

@@ -77,11 +77,15 @@ class Guarantee:
 
 
 def guarantee(
-    held_out: Columns, coverage: float, groups: Groups | None, temperature: Temperature | None
+    held_out: Columns,
+    coverage: float,
+    groups: Groups | None,
+    temperature: Temperature | None,
+    origin: str = "held-out samples, every second of data.n_held_out",
 ) -> Guarantee:
     """The guarantee by recorded predictions of held-out samples, recalibrated if a temperature is given.
 
-    Raises RunError if there are too few samples, or too many positions of level 1.
+    Raises RunError, which names the origin of the samples, if there are too few, or too many positions of level 1.
     """
 
     def scored(rows: slice) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]:
@@ -96,10 +100,10 @@ def guarantee(
     edges = edges[edges > chosen.min()]  # equal values are one group
     place = np.searchsorted(edges, values, side="right")
     parts = [scores[place == group] for group in range(len(edges) + 1)]
-    samples = f"held-out samples{' of each group' if groups else ''}, every second of data.n_held_out"
+    samples = origin.replace(",", " of each group,") if groups else origin
     levels = [threshold(part, coverage, samples) for part in parts]
     if max(levels) == 1:
-        raise RunError(f"coverage: got {coverage}; too many held-out positions have level 1; try recalibrate=true")
+        raise RunError(f"coverage: got {coverage}; too many true positions have level 1; try recalibrate=true")
     return Guarantee(coverage, groups, edges, levels, [len(part) for part in parts])
 
 

@@ -178,13 +178,16 @@ class Predictor:
     def guarantee(self, coverage: float, groups: "Groups | None" = None) -> "Guarantee":
         """Regions that contain the true position with a probability in (0, 1); see `evaluation.conformal`.
 
-        Raises RunError if the run has too few held-out samples, ConfigError if it predicts no uncertainty.
+        Raises RunError if there are too few held-out samples or labelled images, ConfigError if the run predicts no
+        uncertainty.
         """
         from phd_exp.evaluation.conformal import guarantee
         from phd_exp.evaluation.parquet import read_table  # imports pyarrow
 
-        table = read_table(self.labelled) if self.labelled else self.held_out()
-        return guarantee(table, coverage, groups, self.temperature)
+        if self.labelled is None:
+            return guarantee(self.held_out(), coverage, groups, self.temperature)
+        origin = "labelled images, every second of those of `calibrate`"
+        return guarantee(read_table(self.labelled), coverage, groups, self.temperature, origin)
 
     def view(
         self, image: UInt8[np.ndarray, "height width 3"], K: Float[np.ndarray, "3 3"], box: Box | None = None

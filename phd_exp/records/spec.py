@@ -48,7 +48,7 @@ Mesh = BeforeValidator(mesh_asset)
 ImageFormat = Literal["png", "webp", "jpeg"]
 NEAREST = 1.05  # least depth of an object's centre over its reach, so that the camera stays outside
 SOLID = 0.2 * 0.75**0.5  # m: reach of the cube, the largest solid at scale 1
-F_RANGE = (1200.0, 2000.0)  # of conf/data/default.yaml, which a camera replaces
+F_RANGE = (1200.0, 2000.0)  # of meshes without a camera
 XY_RANGES = {"field": 0.5, "box": 1.0}  # of meshes, by view
 SHARD = "expected INDEX/COUNT with 0 <= INDEX < COUNT"
 
@@ -156,7 +156,7 @@ class DatasetSpec(Record):
     @model_validator(mode="before")
     @classmethod
     def _follow_camera(cls, values: Any) -> Any:
-        """Read the camera, and fill in what follows from it: f_range, and xy_range if it is null."""
+        """Read the camera, and fill in what follows from it: f_range and xy_range, if they are null."""
         if not isinstance(values, dict) or values.get("mesh") is None:
             return values
         camera = calibration(values.get("camera"))
@@ -167,6 +167,8 @@ class DatasetSpec(Record):
             followed["xy_range"] = XY_RANGES.get(view)
         if camera and "sensor_size" in values:
             followed["f_range"] = _whole(camera, view, values["sensor_size"], values.get("f_range"))
+        elif values.get("f_range", F_RANGE) is None:
+            followed["f_range"] = F_RANGE
         return followed
 
     @property
@@ -247,7 +249,7 @@ def _whole(camera: Calibration, view: str, S: int, given: Any) -> tuple[float, f
     f = camera.K[0] * S / max(size)
     if view == "field":
         f = VirtualCamera.of_box(camera.intrinsics, (0.0, 0.0, *size), float(S), camera.lens).f
-    if given is not None and tuple(given) not in (F_RANGE, (f, f)):
+    if given is not None and tuple(given) != (f, f):
         raise ValueError(f"f_range: got {list(given)}, but it follows from data.camera; leave it out")
     return f, f
 

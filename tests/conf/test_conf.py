@@ -10,6 +10,7 @@ import yaml
 
 from phd_exp.cli import conf_folder
 from phd_exp.config import RunConfig, check
+from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import SECTIONS
 from phd_exp.records.spec import DatasetSpec
 
@@ -97,6 +98,15 @@ def test_shifts_to_the_variants_are_these_data_sets(checked: Callable, data: str
         assert differing(own, other) == {"variant", *shift["data"]}
         assert other.variant == f"{data}-{name}"
     assert config.data_of("dark").spec == config.data.spec
+
+
+def test_focal_lengths_that_follow_from_a_camera_are_not_shifted(checked: Callable, tmp_path: Path) -> None:
+    (tmp_path / "part.obj").touch()
+    camera = ("data.f=900", "data.width=640", "data.height=480", "data.z_range=[2,3]")
+    config = checked("data=object", f"data.mesh={tmp_path}/part.obj", *camera, "shift=scenes")
+    with pytest.raises(ConfigError, match=r"shifts\.short_f\.data: f_range follows from data\.camera; expected .*"):
+        config.data_of("short_f")
+    assert config.data_of("far").spec.z_range == (5.0, 7.0)
 
 
 def test_older_records_without_several_views_are_valid(composed: Callable[..., dict[str, Any]]) -> None:

@@ -88,8 +88,11 @@ def test_too_few_samples_are_an_error_with_the_number_needed(coverage: float, ne
         threshold(scores[1:], coverage, "samples")
     held_out = table_of(2 * needed, 1)
     assert guarantee(held_out, coverage, None, None).n == [needed]
+    fewer = {name: column[:-1] for name, column in held_out.items()}
     with pytest.raises(RunError, match=rf"needs at least {needed} held-out samples, every second of data.n_held_out"):
-        guarantee({name: column[:-1] for name, column in held_out.items()}, coverage, None, None)
+        guarantee(fewer, coverage, None, None)
+    with pytest.raises(RunError, match=rf"needs at least {needed} photographs; found {needed - 1}"):
+        guarantee(fewer, coverage, None, None, "photographs")
 
 
 @pytest.mark.parametrize("coverage", [0.0, 1.0, -1.0, 90.0, math.nan])
@@ -165,7 +168,7 @@ def test_recalibrated_regions_have_their_own_threshold() -> None:
 
 def test_samples_that_no_bounded_region_holds_are_an_error() -> None:
     table = table_of(200, 1, overconfidence=1e4)
-    with pytest.raises(RunError, match="too many held-out positions have level 1; try recalibrate=true"):
+    with pytest.raises(RunError, match="too many true positions have level 1; try recalibrate=true"):
         guarantee(table, 0.9, None, None)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from PIL import Image
@@ -102,6 +103,23 @@ def test_a_focal_length_outside_the_training_range_is_noted(
     outcome = phd_exp("predict", f"run={rendered.path}", "image=photo.png", f"f={f}")
     assert (outcome.status, outcome.err.startswith("note: f: 1 view")) == (0, is_noted)
     assert ("photo.png" in outcome.err, f"{f * SIDE / 200:.4g} px" in outcome.err) == (is_noted, is_noted)
+
+
+@pytest.mark.parametrize(("side", "is_noted"), [(50, False), (10, True), (190, True)])
+def test_a_distance_outside_the_training_on_boxes_is_noted(
+    phd_exp: Callable, make: Callable[..., RunFolder], tmp_path: Path, side: int, is_noted: bool
+) -> None:
+    """The held-out samples have views of boxes of 40 to 60 px in images with f = 200 px."""
+    (tmp_path / "part.obj").touch()
+    camera = ("data.f=200", "data.width=200", "data.height=200")
+    trained = make("data=object", f"data.mesh={tmp_path / 'part.obj'}", *camera)
+    f = 200 * 224 / np.linspace(40, 60, 9)
+    pd.DataFrame({"f": f, "S": np.full(9, 224.0)}).to_parquet(trained.held_out)
+    Image.fromarray(np.zeros((200, 200, 3), np.uint8)).save(tmp_path / "photo.png")
+    box = f"box={100 - side / 2},{100 - side / 2},{100 + side / 2},{100 + side / 2}"
+    outcome = phd_exp("predict", f"run={trained.path}", "image=photo.png", "f=200", box)
+    assert (outcome.status, outcome.err.startswith("note: f: 1 view")) == (0, is_noted)
+    assert ("data.z_range" in outcome.err) == is_noted
 
 
 def test_a_baseline_has_positions_without_uncertainty(

@@ -168,6 +168,7 @@ def test_grey_images_are_grey(of_box: MakeSpec) -> None:
     [
         ({"camera": None, "view": "box"}, "view: got box; expected data.camera=FILE"),
         ({"f_range": (300.0, 400.0)}, "f_range: .* follows from data.camera; leave it out"),
+        ({"f_range": (1200.0, 2000.0)}, "f_range: .* follows from data.camera; leave it out"),
         ({"camera": CAMERA | {"width": None}}, "camera: .* does not say the size"),
         ({"camera": {"f": 18.0, "width": 4000, "height": 3000}}, "shows 179 degrees; .* f in millimetres"),
         ({"camera": "nowhere.yaml"}, "camera: nowhere.yaml: No such file"),
@@ -187,6 +188,7 @@ def test_the_whole_image_of_a_camera_decides_the_focal_length(of_box: MakeSpec) 
     plain = {"f": 900.0, "width": 640, "height": 480}
     spec = of_box(camera=plain, view="field")
     assert spec.f_range == pytest.approx((900 * 224 / 640,) * 2)
+    assert of_box(camera=None).f_range == (1200.0, 2000.0)
     assert (spec.xy_range, of_box(camera=plain).xy_range) == (0.5, 1.0)
     assert calibration(plain) == spec.camera
     assert DatasetSpec.model_validate_json(spec.model_dump_json()) == spec
