@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -31,14 +31,22 @@ HIDDEN = 0.3  # visibility below which the object counts as hidden
 WHOLE = Lost(after=math.inf, contradictions=10**9)  # no track ends early: all methods have the same frames
 NOISES = (0.01, 100.0)  # m/s^2 per sqrt(Hz), among which the noise of the motion is chosen
 PRECISION = 0.05  # of its logarithm
+PARTS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the shares by autocorrelation, among which those of slow errors are chosen
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What held-out sequences choose: the noise of each smoother's motion, m/s^2 per sqrt(Hz), and the slow errors."""
+    """What held-out sequences choose.
+
+    Attributes:
+        noise: of each smoother's motion, m/s^2 per sqrt(Hz).
+        slow: the slow errors of the smoother.
+        correlated: shares and time constants of the autocorrelation of standardised errors.
+    """
 
     noise: dict[Method, float]
     slow: Slow
+    correlated: Slow
 
 
 @dataclass(frozen=True)
@@ -73,15 +81,38 @@ def place(quantity: str, method: Method) -> str:
 
 
 def choose(held_out: Sequence[SeveralViews]) -> Choice:
-    """The slow errors by the autocorrelation of standardised errors, then each noise by the likelihood of all paths.
+    """Each noise by the likelihood of the predictions, the slow errors by that of the true positions.
+
+    The time constants are those of the autocorrelation of standardised errors. Its shares are upper bounds: a
+    factor of depth in proportion to each frame's predicted deviation exaggerates their differences, so that one of
+    `PARTS` of both shares is chosen, with which the true positions are most likely under the paths' covariances.
 
     Raises RunError if no sequence has a path.
     """
-    slow = _slow(held_out)
-    return Choice({method: _noise(held_out, method, slow) for method in SMOOTHERS}, slow)
+    whole = correlated(held_out)
+    noise = {method: _noise(held_out, method) for method in SMOOTHERS[:2]}
+    noise["slow"] = noise["independent"]
+    parts = [
+        replace(whole, depth_share=part * whole.depth_share, projection_share=part * whole.projection_share)
+        for part in PARTS
+    ]
+    return Choice(noise, min(parts, key=lambda slow: _surprisal(held_out, Choice(noise, slow))), whole)
 
 
-def _slow(held_out: Sequence[SeveralViews]) -> Slow:
+def _surprisal(held_out: Sequence[SeveralViews], choice: Choice) -> float:
+    """-log density of the true positions under the Gaussians of paths with slow errors, up to a constant."""
+    found = 0.0
+    for one in held_out:
+        truth = one.pose.into_world(one.xyz)
+        for row, path in enumerate(_paths(one, "slow", choice)):
+            if path:
+                distance = squared_mahalanobis(truth[row] - path.mean, path.covariance)
+                found += float((distance + torch.linalg.slogdet(path.covariance)[1]).sum()) / 2
+    return found
+
+
+def correlated(held_out: Sequence[SeveralViews]) -> Slow:
+    """Shares and time constants of the autocorrelation of standardised errors."""
     times = [row for one in held_out for row in one.columns["time"].numpy()]
     both = [standardised_errors(one.predictions, one.xyz) for one in held_out]
     depth = [row for errors, _ in both for row in errors.numpy()]
@@ -90,11 +121,11 @@ def _slow(held_out: Sequence[SeveralViews]) -> Slow:
     return Slow(*autocorrelation(times, depth), *autocorrelation(of_axes, across))
 
 
-def _noise(held_out: Sequence[SeveralViews], method: Method, slow: Slow) -> float:
+def _noise(held_out: Sequence[SeveralViews], method: Method) -> float:
     """The noise of highest total `log_evidence`."""
 
     def loss(log_noise: float) -> float:
-        choice = Choice({method: math.exp(log_noise)}, slow)
+        choice = Choice({method: math.exp(log_noise)}, Slow(), Slow())
         found = [path.log_evidence for one in held_out for path in _paths(one, method, choice) if path]
         if not found:
             raise RunError("sequences: not one held-out sequence has a path; train longer")

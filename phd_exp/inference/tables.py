@@ -43,8 +43,8 @@ def record(
 ) -> None:
     """Predict the test samples of a source, with the changes of a shift, and write them.
 
-    Of several views and of sequences, the table also has the pose of each, and the time. Raises RunError if another process holds the run or it has
-    no checkpoint, DatasetError if a sample is missing.
+    Of several views and of sequences, the table also has the pose of each, and the time. Raises RunError if another
+    process holds the run or it has no checkpoint, DatasetError if a sample is missing.
     """
     predictor = load(folder.path, trust=None)  # the user has trained it
     with folder.held():

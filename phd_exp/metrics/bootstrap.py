@@ -16,7 +16,7 @@ Number = TypeVar("Number")
 Other = TypeVar("Other")
 
 Statistic = Callable[[Mapping[str, Tensor], Tensor], Mapping[str, Tensor]]
-"""Columns of shape (samples,) and counts (resamples, samples) -> name -> (resamples, *points)."""
+"""Columns of shape (samples, ...) and counts (resamples, samples) -> name -> (resamples, *points)."""
 _AT_ONCE = 10**6  # counts held in memory at a time
 
 
@@ -34,7 +34,7 @@ class Interval(Generic[Number]):
 
 
 def bands(
-    statistic: Statistic, columns: Mapping[str, Float[Tensor, " samples"]], resamples: int, seed: int
+    statistic: Statistic, columns: Mapping[str, Float[Tensor, "samples ..."]], resamples: int, seed: int
 ) -> dict[str, Interval[Tensor]]:
     """95 % percentile intervals of scalars, and of curves at each of their points; equal for equal seeds.
 
@@ -54,7 +54,7 @@ def bands(
 
 
 def resampled(
-    statistic: Statistic, columns: Mapping[str, Float[Tensor, " samples"]], resamples: int, seed: int
+    statistic: Statistic, columns: Mapping[str, Float[Tensor, "samples ..."]], resamples: int, seed: int
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """The statistic of the samples, and of each resample (along the first dimension).
 

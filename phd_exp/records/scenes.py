@@ -199,7 +199,8 @@ class SampleRecord(Record):
         visibility: visible pixels of the cylinder over those visible without other objects; 0 if there are none.
         truncation: share of the cylinder's silhouette, without other objects, that lies outside the image.
         index, split, seed: determine everything else, given the specification.
-        scene, view: number of the scene in the split, and of the view of that scene. Each frame of a sequence is a scene.
+        scene, view: number of the scene in the split, and of the view of that scene. Each frame of a sequence is a
+            scene.
         track, time: of a frame: the name of its sequence, and seconds since its first frame.
         sha256: checksum of the image file.
     """

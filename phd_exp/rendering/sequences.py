@@ -1,8 +1,8 @@
 """Sequences: the objects of a scene move, and so may the camera.
 
-Each coordinate of an object is a function of a smooth stationary Gaussian process, such that in every frame it has the
-distribution of single images: depth is uniform in `z_range`, x and y are uniform over the field of view at that depth.
-Objects therefore never leave the field. The first frame is a single image.
+Each coordinate of an object is a function of a smooth stationary Gaussian process, such that in every frame it has
+the distribution of single images: depth is uniform in `z_range`, x and y are uniform over the field of view at that
+depth. Objects therefore never leave the field. The first frame is a single image.
 """
 
 import math
@@ -21,7 +21,7 @@ WAVES = 3  # sinusoids of a Gaussian process
 FREQUENCIES = (0.5, 1.5)  # bounds of their frequencies, before these are scaled
 EDGE = 1e-9  # least distance of a coordinate from the ends of its range, as a share; there the process is infinite
 RMS_SLOPE = math.sqrt(2 / (math.pi * math.sqrt(3)))
-"""Root mean square of ds/dy for s = 2 Phi(y) - 1 with y ~ N(0, 1): of 2 phi(y), since E[phi(y)^2] = 1/(2 pi sqrt 3)."""
+"""Root mean square of ds/dy = 2 phi(y) for s = 2 Phi(y) - 1 with y ~ N(0, 1); E[phi(y)^2] = 1/(2 pi sqrt 3)."""
 
 
 def moved(item: SceneObject, spec: DatasetSpec, f: float, time: float, rng: Stream) -> SceneObject:
@@ -55,7 +55,7 @@ def camera_pose(spec: DatasetSpec, time: float, rng: Stream) -> Pose:
 
 
 def in_scene(item: SceneObject, pose: Pose, *, turned: bool) -> SceneObject:
-    """An object given in the camera's frame as it is in the scene's; without `turned`, its rotation is there already."""
+    """An object given in the camera's frame, in the scene's; its rotation too if it is to be `turned`."""
     back = _rotation(pose.rotation).inv()
     x, y, z = back.apply(np.array(item.position) - pose.translation).tolist()
     rotation = _quaternion(back * _rotation(item.rotation)) if turned else item.rotation

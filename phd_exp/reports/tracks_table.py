@@ -25,15 +25,16 @@ LABELS = {
 }
 """Quantity -> its label; the errors, then comparisons, then calibration."""
 OF_QUANTITIES = (
-    "Means over the frames of all sequences, of one camera; in brackets: 95 % bootstrap intervals over sequences. Depth: along the "
-    "camera's true viewing ray; projected: across it, as in the paper's tables. Hidden: frames in which less than "
-    f"{100 * HIDDEN:.0f} % of the object is visible. Ratios are those of mean errors. Squared error: the squared Mahalanobis "
-    "distance per dimension, averaged over the path, 1 where calibrated, above 1 where overconfident."
+    "Means over the frames of all sequences, of one camera; in brackets: 95 % bootstrap intervals over sequences. "
+    "Depth: along the camera's true viewing ray; projected: across it, as in the paper's tables. Hidden: frames in "
+    f"which less than {100 * HIDDEN:.0f} % of the object is visible. Ratios are those of mean errors. Squared error: "
+    "the squared Mahalanobis distance per dimension, averaged over the path, 1 where calibrated, above 1 where "
+    "overconfident."
 )
 OF_METHODS = (
-    "Single frames: the mode of each. Kalman (RTS): a Rauch-Tung-Striebel smoother of the frames' means and covariances. Ours: the mean "
-    "path under the frames' densities; slow errors: errors that the frames share are estimated with it. All assume a velocity that changes by "
-    "white noise."
+    "Single frames: the mode of each. Kalman (RTS): a Rauch-Tung-Striebel smoother of the frames' means and "
+    "covariances. Ours: the mean path under the frames' densities; slow errors: errors that the frames share are "
+    "estimated with it. All assume a velocity that changes by white noise."
 )
 
 
@@ -60,7 +61,7 @@ def tracks_table(run: Run, scores: Mapping[str, TrackScores]) -> Table:
         stub=("quantity", "method"),
         columns=tuple(f"{one.n} × {one.frames} frames" for one in every),
         groups=tuple(rows for rows in found.values() if rows),
-        notes=(OF_QUANTITIES, OF_METHODS, *map(_chosen, every[:1]), *filter(None, map(_calibrated, every))),
+        notes=(OF_QUANTITIES, OF_METHODS, *map(_chosen, every[:1]), *map(_frames, every)),
         preset=run.preset,
     )
 
@@ -83,19 +84,21 @@ def number(quantity: str, value: float) -> str:
 
 
 def _chosen(scores: TrackScores) -> str:
-    noise, slow = scores.choice.noise, scores.choice.slow
+    noise, slow, whole = scores.choice.noise, scores.choice.slow, scores.choice.correlated
     noises = ", ".join(f"{noise[method]:.2g} ({NAMES[method]})" for method in SMOOTHERS)
     return (
-        f"Held-out sequences chose the noise of the motion, in m/s² per √Hz: {noises}; and the slow errors: "
-        f"{100 * slow.depth_share:.0f} % of the variance of depth, with the time constant {slow.depth_time:.2g} s, and "
-        f"{100 * slow.projection_share:.0f} % of that of the projection, with {slow.projection_time:.2g} s, the autocorrelation of "
-        "standardised errors."
+        f"Held-out sequences chose the noise of the motion, in m/s² per √Hz: {noises}. The autocorrelation of their "
+        f"standardised errors is {whole.depth_share:.2f} e^(-s/{whole.depth_time:.2g} s) for depth and "
+        f"{whole.projection_share:.2f} e^(-s/{whole.projection_time:.2g} s) for the projection; the smoother takes "
+        f"{100 * slow.depth_share:.0f} % and {100 * slow.projection_share:.0f} % of the variances as slow, with which "
+        "the true held-out positions were most likely."
     )
 
 
-def _calibrated(scores: TrackScores) -> str:
+def _frames(scores: TrackScores) -> str:
     left = f" {scores.left_out} further sequences are left out." if scores.left_out else ""
-    return f"{scores.hidden} of {scores.n * scores.frames} frames of the sequences of {scores.frames} hide the object.{left}"
+    n = scores.n * scores.frames
+    return f"{scores.hidden} of {n} frames of the sequences of {scores.frames} frames hide the object.{left}"
 
 
 def headline(scores: Mapping[str, TrackScores]) -> str:

@@ -6,11 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from scipy import stats
 
 from phd_exp.evaluation.several_views import SeveralViews, read_sequences
 from phd_exp.evaluation.tracks import HIDDEN, METHODS, SMOOTHERS, Choice, TrackScores, choose, place, track_scores
-from phd_exp.fusion.tracks import Slow
 from phd_exp.records.errors import RunError
 from tests.support.sequences import MOTION, SLOW, write_sequences
 
@@ -30,7 +28,7 @@ def independent(folder: Path) -> SeveralViews:
 
 @pytest.fixture(scope="module")
 def known() -> Choice:
-    return Choice(dict.fromkeys(SMOOTHERS, MOTION.noise), SLOW)
+    return Choice(dict.fromkeys(SMOOTHERS, MOTION.noise), SLOW, SLOW)
 
 
 @pytest.fixture(scope="module")
@@ -93,9 +91,17 @@ def test_the_interval_of_calibrated_frames_is_that_of_draws(scores: TrackScores)
 def test_held_out_sequences_choose_noise_and_slow_errors(folder: Path) -> None:
     write_sequences(folder / "held.parquet", 60, 30, slow=SLOW, seed=2)
     choice = choose([read_sequences(folder / "held.parquet")])
-    assert choice.slow.depth_share == pytest.approx(SLOW.depth_share, abs=0.15)
-    assert choice.slow.projection_share == pytest.approx(SLOW.projection_share, abs=0.15)
-    assert 0.15 < choice.noise["slow"] < 0.6, "0.3 made them"
+    assert choice.correlated.depth_share == pytest.approx(SLOW.depth_share, abs=0.15)
+    assert choice.correlated.projection_share == pytest.approx(SLOW.projection_share, abs=0.15)
+    assert choice.slow == choice.correlated, "they are of the smoother's own law"
+    assert 0.15 < choice.noise["kalman"] < 1.5, "0.3 made them"
+
+
+def test_independent_errors_choose_no_slow_ones(folder: Path) -> None:
+    write_sequences(folder / "none.parquet", 40, FRAMES, seed=3)
+    choice = choose([read_sequences(folder / "none.parquet")])
+    assert choice.slow.depth_share < 0.1
+    assert choice.slow.projection_share < 0.1
 
 
 def test_a_sequence_with_a_value_that_is_not_finite_is_left_out(independent: SeveralViews, folder: Path) -> None:
@@ -118,7 +124,7 @@ def test_a_sequence_with_a_value_that_is_not_finite_is_left_out(independent: Sev
         (lambda t: t.assign(mu_z=np.inf), "of no scene all predictions are finite"),
     ],
 )
-def test_a_bad_record_is_one_line(independent: SeveralViews, folder: Path, change, message: str) -> None:  # noqa: ANN001
+def test_a_bad_record_is_one_line(independent: SeveralViews, folder: Path, change, message: str) -> None:
     change(pd.read_parquet(folder / "independent.parquet")).to_parquet(folder / "bad.parquet")
     with pytest.raises(RunError, match=message) as error:
         read_sequences(folder / "bad.parquet")

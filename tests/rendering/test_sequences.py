@@ -105,7 +105,7 @@ def test_a_moving_camera_sees_the_same_path_from_known_poses(make_spec: MakeSpec
         np.testing.assert_allclose(turned[2], [0, 0, 1], atol=1e-9)
 
 
-def described(spec: DatasetSpec, index: int):  # noqa: ANN201
+def described(spec: DatasetSpec, index: int):
     scene = sample_scene(spec, "test", index)
     return describe(spec, "test", index, scene, trace_pixels(scene), "0" * 64, NO_MESHES)
 
@@ -135,7 +135,7 @@ def test_the_camera_moves_as_specified(make_spec: MakeSpec) -> None:
 
 
 @pytest.mark.slow
-def test_bytes_do_not_depend_on_workers_or_interruptions(make_spec: MakeSpec, tmp_path) -> None:  # noqa: ANN001
+def test_bytes_do_not_depend_on_workers_or_interruptions(make_spec: MakeSpec, tmp_path) -> None:
     small = {"sensor_size": 56, "f_range": (300.0, 500.0), "samples_per_pixel": 1}
     spec = make_spec("sequence", frames=3, occluders=True, **small)
     whole, resumed = DatasetFolder(tmp_path / "whole"), DatasetFolder(tmp_path / "resumed")
