@@ -90,8 +90,8 @@ def _chosen(scores: TrackScores) -> str:
         f"Held-out sequences chose the noise of the motion, in m/s² per √Hz: {noises}. The autocorrelation of their "
         f"standardised errors is {whole.depth_share:.2f} e^(-s/{whole.depth_time:.2g} s) for depth and "
         f"{whole.projection_share:.2f} e^(-s/{whole.projection_time:.2g} s) for the projection; the smoother takes "
-        f"{100 * slow.depth_share:.0f} % and {100 * slow.projection_share:.0f} % of the variances as slow, with which "
-        "the true held-out positions were most likely."
+        f"{100 * slow.depth_share:.0f} % and {100 * slow.projection_share:.0f} % of the variances as slow, with "
+        "which the true held-out positions were most likely."
     )
 
 

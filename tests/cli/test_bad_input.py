@@ -26,6 +26,7 @@ NOTHING_TO_RENDER = "data=folder: there is nothing to render, these are your own
 FOLDER = ["data=folder", "data.folder=photos"]
 TOGETHER = ["trainer=ddp", "trainer.accelerator=cpu"]
 MULTIVIEW = "evaluation.multiview.scenes"
+SEQUENCES = "evaluation.sequences=[[4,20]]"
 OPEN = ("backbone", "loss", "optimizer", "logger", "callbacks", "model.head")
 WRONG_VALUES = [
     # (arguments, parts of the line): found once Hydra has composed the configuration
@@ -47,6 +48,12 @@ WRONG_VALUES = [
     ([f"{MULTIVIEW}=9", "data=multiview"], ["data=multiview is not rendered with one view", "expected data=scale"]),
     ([f"{MULTIVIEW}=9", *FOLDER], ["is not rendered", "expected data=scale"]),
     ([f"{MULTIVIEW}=9", "data=scale", "model=mae_vz"], ["model=mae_vz has no density", "expected model=prob"]),
+    ([SEQUENCES, "data=sequence"], ["data=sequence is not rendered in single images", "expected data=scale"]),
+    ([SEQUENCES, *FOLDER], ["data=photos is not rendered in single images"]),
+    ([SEQUENCES, "model=mae_vz"], ["model=mae_vz predicts no Projected Huber density", "expected model=prob"]),
+    (["evaluation.sequences=[[4,20],[2,20]]"], ["expected pairs [sequences, frames] of different frames"]),
+    (["evaluation.sequences=[[4,1]]"], ["evaluation.sequences", "got 1"]),
+    ([SEQUENCES, "data=multiview"], ["evaluation.sequences", "frames: got 20; sequences are of the cylinder"]),
     (["evaluation.eight_views=true", "model=mae_vz"], ["evaluation.eight_views", "model=mae_vz predicts points"]),
     (["loss=mae"], ["loss", "PointEstimate", "model=probabilistic", "ProjectedHuber"]),
     (["model=mae_vz", "loss=nll"], ["loss", "Density", "model=mae_vz"]),

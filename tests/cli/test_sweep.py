@@ -45,6 +45,7 @@ def folder(job: Combination) -> Path:
     ("words", "n"),
     [
         (["experiment=fusion", "seed=0,1", "evaluation.multiview.scenes=7"], 2),
+        (["experiment=track", "seed=0,1", "evaluation.sequences=[[4,20]]"], 6),
         (["experiment=glob(table*)", "data=occl"], 5),
         (["data=occl", "experiment=table1", "model=mae_vz,probabilistic"], 2),
         (["seed=0,0,1,0"], 2),

@@ -9,7 +9,8 @@ import pytest
 import yaml
 
 from phd_exp.cli import conf_folder
-from phd_exp.config import RunConfig, check
+from phd_exp.config import RenderedConfig, RunConfig, check
+from phd_exp.records.choices import has_influence
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import SECTIONS
 from phd_exp.records.spec import DatasetSpec
@@ -71,6 +72,23 @@ def test_variants_differ_only_in_the_keys_of_their_files(checked: Callable, vari
     assert differing(base, checked(f"data={variant}").data.spec) == keys >= {"variant"}
 
 
+def test_sequences_are_of_the_runs_own_scenes_and_others_are_held_out(checked: Callable) -> None:
+    config = checked("data=occl", "evaluation.sequences=[[5,20],[2,200]]", "data.seed=3", "data.z_range=[4,5]")
+    single = config.data.spec
+    for (n, frames, held_out), found in zip([(5, 20, 3), (2, 200, 1)], pairs(config), strict=True):
+        tested, choosing = (one.spec for one in found)
+        assert (tested.variant, choosing.variant) == (f"occl-sequences-{frames}", f"occl-sequences-{frames}-held-out")
+        assert differing(single, tested) == {"variant", "frames"}
+        assert differing(tested, choosing) == {"variant", "seed"}
+        assert [one.n_test for one in found] == [n * frames, held_out * frames]
+    assert checked("data=occl").sequences == {}
+    assert not has_influence("evaluation.sequences")
+
+
+def pairs(config: RunConfig) -> list[tuple[RenderedConfig, RenderedConfig]]:
+    return [(config.sequences[frames, False], config.sequences[frames, True]) for frames in (20, 200)]
+
+
 def test_the_file_of_sequences_states_the_defaults_of_their_motion(checked: Callable) -> None:
     assert differing(checked("data=scale").data.spec, checked("data=sequence").data.spec) == {"variant", "frames"}
 
@@ -111,7 +129,7 @@ def test_focal_lengths_that_follow_from_a_camera_are_not_shifted(checked: Callab
 
 def test_older_records_without_several_views_are_valid(composed: Callable[..., dict[str, Any]]) -> None:
     config = composed()
-    for key in ("multiview", "shifts", "n_shifted"):
+    for key in ("multiview", "sequences", "shifts", "n_shifted"):
         del config["evaluation"][key]
     for key in ("saturation_range", "half_hidden"):
         del config["data"][key]
