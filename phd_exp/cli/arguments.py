@@ -102,6 +102,34 @@ class RunArguments(Arguments):
         return self
 
 
+BOX = four_numbers("box=LEFT,TOP,RIGHT,BOTTOM in pixels")
+OF_A_CAMERA = ("f", "fx", "fy", "cx", "cy", "camera", "box")
+
+
+class CameraArguments(RunArguments):
+    """A run, and the camera of the images that it predicts from."""
+
+    f: float | None = None
+    """focal length, px"""
+    fx: float | None = None
+    """horizontal focal length, px"""
+    fy: float | None = None
+    """vertical focal length, px"""
+    cx: float | None = None
+    """column of the principal point, px; by default the middle"""
+    cy: float | None = None
+    """row of the principal point, px; by default the middle"""
+    camera: str | None = None
+    """instead of f=, a camera file of ROS, OpenCV, Kalibr, COLMAP or another tool, with the lens"""
+    box: Annotated[tuple[float, float, float, float], BOX] | None = None
+    """LEFT,TOP,RIGHT,BOTTOM of the object, px; by default the whole image"""
+
+    @property
+    def of_camera(self) -> dict[str, Any]:
+        """The keys of a camera that were given."""
+        return {key: getattr(self, key) for key in OF_A_CAMERA if getattr(self, key) is not None}
+
+
 def trusted(packages: str | None) -> tuple[str, ...]:
     """The packages that trust= names."""
     return tuple(packages.split(",")) if packages else ()

@@ -11,6 +11,7 @@ VERBS = {
     "predict": "the object's position in an image and its uncertainty: JSON lines, and pictures with out=",
     "calibrate": "fit the uncertainty of a run to labelled images of yours, for predict calibration=NAME",
     "fuse": "one position from the predictions of several cameras, and/or on a ground plane: a JSON line a scene",
+    "track": "the path of an object through a video or a folder: a JSON line a frame; a video and a page with out=",
     "search": "search for good values of keys with Optuna, judged on held-out samples",
     "export": "write a run's network as ONNX, compared with torch; it needs onnxruntime and NumPy alone",
 }
@@ -58,6 +59,11 @@ EXAMPLES = {
     "fuse": [
         "python -m phd_exp fuse run=runs/small/scale/probabilistic/seed0 folder=renders/multiview/test",
         "python -m phd_exp fuse run=DIR folder=photos/test plane=0,1,0,1.5 recalibrate=true out=fused.jsonl",
+    ],
+    "track": [
+        "python -m phd_exp track run=DIR video=clip.mp4 camera=camera.yaml box=400,30,620,140 out=tracked",
+        "python -m phd_exp track run=DIR video=clip.mp4 f=900 boxes=detections.json",
+        "python -m phd_exp track run=DIR folder=frames > track.jsonl",
     ],
     "search": [
         "python -m phd_exp search space.yaml trials=40",

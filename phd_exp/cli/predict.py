@@ -4,11 +4,11 @@ import json
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import model_validator
 
-from phd_exp.cli.arguments import Paths, RunArguments, four_numbers, loaded, output_folder, predicted
+from phd_exp.cli.arguments import CameraArguments, Paths, loaded, output_folder, predicted
 from phd_exp.records.detections import Detection, NumberOrName, detections_of
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import write_atomic
@@ -19,12 +19,10 @@ from phd_exp.records.runs import RunFolder
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
     from phd_exp.inference.predictor import Predictor
 
-BOX = four_numbers("box=LEFT,TOP,RIGHT,BOTTOM in pixels")
-OF_A_CAMERA = ("f", "fx", "fy", "cx", "cy", "camera", "box")
 LONGEST_STEM = 50  # characters of an image's name in the name of its picture
 
 
-class PredictArguments(RunArguments):
+class PredictArguments(CameraArguments):
     """The run, the images and their cameras; lengths in pixels of the image file."""
 
     image: Paths | None = None
@@ -33,20 +31,6 @@ class PredictArguments(RunArguments):
     """instead of image=, a folder of images: alone with their camera, or with a metadata.jsonl, BOP, KITTI or COCO"""
     object: NumberOrName | None = None
     """with annotations or boxes=: BOP's obj_id, KITTI's type or COCO's category; by default all objects"""
-    f: float | None = None
-    """focal length, px"""
-    fx: float | None = None
-    """horizontal focal length, px"""
-    fy: float | None = None
-    """vertical focal length, px"""
-    cx: float | None = None
-    """column of the principal point, px; by default the middle"""
-    cy: float | None = None
-    """row of the principal point, px; by default the middle"""
-    camera: str | None = None
-    """instead of f=, a camera file of ROS, OpenCV, Kalibr, COLMAP or another tool, with the lens"""
-    box: Annotated[tuple[float, float, float, float], BOX] | None = None
-    """LEFT,TOP,RIGHT,BOTTOM of the object, px; by default the whole image"""
     boxes: Path | None = None
     """instead of box=, a file of COCO results, or of COCO, with the boxes of many objects"""
     out: Path | None = None
@@ -55,11 +39,6 @@ class PredictArguments(RunArguments):
     """with coverage=: guarantee it in each of four groups of predictions by this quantity"""
     curve: bool = False
     """draw the run's calibration curve of depth into the pictures"""
-
-    @property
-    def of_camera(self) -> dict[str, Any]:
-        """The keys of a camera that were given."""
-        return {key: getattr(self, key) for key in OF_A_CAMERA if getattr(self, key) is not None}
 
     @model_validator(mode="after")
     def one_source(self) -> "PredictArguments":

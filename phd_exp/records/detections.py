@@ -55,7 +55,8 @@ class DetectionLine(Record):
         x, y, z: true position in the camera frame (x right, y down, z forward), m.
         scale, visibility, truncation: as in a rendered data set; recorded with the predictions.
         scene: lines with the same scene show the same object at the same time.
-        pose: of the camera, in the world that the cameras of a scene share.
+        pose: of the camera, in the world that the cameras of a scene, or the frames of a track, share.
+        time: of the image, s; lines with the same track show the same object at different times.
     """
 
     file_name: FileName
@@ -78,6 +79,8 @@ class DetectionLine(Record):
     truncation: Annotated[Number, Field(ge=0, le=1)] | None = None
     scene: NumberOrName | None = None
     pose: Pose | None = None
+    time: Number | None = None
+    track: NumberOrName | None = None
 
     @model_validator(mode="before")
     @classmethod

@@ -21,7 +21,7 @@ _LIBRARIES = (str(_PACKAGE), str(_PACKAGE.parent / "hydra_plugins"), sysconfig.g
 EXTRAS = {
     "bpy": "render", "matplotlib": "report", "plotly": "report", "jinja2": "report", "onnx": "export",
     "onnxscript": "export", "onnxruntime": "export", "optuna": "search", "tensorboard": "loggers",
-    "mlflow": "loggers", "timm": "timm", "joblib": "launchers", "submitit": "launchers", "ray": "ray",
+    "mlflow": "loggers", "timm": "timm", "av": "video", "joblib": "launchers", "submitit": "launchers", "ray": "ray",
 }  # fmt: skip
 """Optional package -> the extra of phd_exp that installs it."""
 NAMED = 5  # names that a message lists

@@ -188,20 +188,30 @@ def boxes_in(file: Path, category: int | str | None = None) -> list[dict[str, An
 
     Raises DatasetError if the file cannot be read, has boxes of several images, or none of the category.
     """
+    images = boxes_of_images(file, category)
+    if len(images) > 1:
+        raise DatasetError(f"{file}: has boxes of several images; expected those of one; {RULE}")
+    return next(iter(images.values()))
+
+
+def boxes_of_images(file: Path, category: int | str | None = None) -> dict[str, list[dict[str, Any]]]:
+    """The same for each `image_id`, as text; of images without a box of the category there is nothing.
+
+    Raises DatasetError if the file cannot be read, or has no box of the category.
+    """
     items = _read(file)
-    found, others = [], set()
+    found: dict[str, list[dict[str, Any]]] = {}
+    others = set()
     with _reading(file):
         items = items["annotations"] if isinstance(items, dict) else items
         if not all(isinstance(item, dict) for item in items):
             raise ValueError("expected a list of {bbox: [x, y, width, height], category_id: ...}")
         items = [item for item in items if not _is_crowd(item)]
-        if len({str(item.get("image_id")) for item in items}) > 1:
-            raise ValueError("has boxes of several images; expected those of one")
     for number, item in enumerate(items):
         with _reading(f"{file}, box {number}"):
             if category is None or str(item["category_id"]) == str(category):
                 given = {key: item[key] for key in ("score", "category_id") if key in item}
-                found.append({"box": edges(item["bbox"]), **given})
+                found.setdefault(str(item.get("image_id")), []).append({"box": edges(item["bbox"]), **given})
             else:
                 others.add(str(item["category_id"]))
     if not found:

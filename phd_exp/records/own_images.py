@@ -165,6 +165,14 @@ def observed(detections: Sequence[Detection]) -> list[Observed]:
     return [Observed(scene, *map(tuple, zip(*pairs, strict=True))) for scene, pairs in views.items()]
 
 
+def tracks_of(detections: Sequence[Detection]) -> dict[int | str | None, list[Detection]]:
+    """Name -> detections of each track, in the order of the lines; None for lines without a track."""
+    tracks: dict[int | str | None, list[Detection]] = {}
+    for detection in detections:
+        tracks.setdefault(detection.line.track, []).append(detection)
+    return tracks
+
+
 def _inside(folder: Path, name: str, where: str, key: str = "file_name") -> Path:
     """The file; a stranger's data set must not read files outside its folder."""
     try:

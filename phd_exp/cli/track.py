@@ -1,0 +1,171 @@
+"""`python -m phd_exp track`: the path of an object through a video or a folder of images, as JSON lines."""
+
+import json
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+from pydantic import Field, model_validator
+
+from phd_exp.cli.arguments import CameraArguments, loaded, output_folder
+from phd_exp.records.detections import NumberOrName, detections_of
+from phd_exp.records.errors import ConfigError
+from phd_exp.records.foreign import boxes_of_images
+from phd_exp.records.own_images import detections_in, tracks_of
+from phd_exp.records.videos import length_of, require_av
+
+if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
+    from phd_exp.inference.following import Followed, Frame
+    from phd_exp.inference.predictor import Predictor
+
+LEAST_LAG = 4  # five frames in a row that contradict a path end it
+
+
+class TrackArguments(CameraArguments):
+    """The run, the video with its camera and box, or the folder; lengths in pixels of the images."""
+
+    video: Path | None = None
+    """a video file, with its camera as f=, fx= and fy=, or camera="""
+    folder: Path | None = None
+    """instead of video=, images with a metadata.jsonl whose lines have a time (s), and a track for several paths"""
+    boxes: Path | None = None
+    """instead of box=, COCO results of a detector, whose image_id is the number of a frame, from 0"""
+    object: NumberOrName | None = None
+    """with boxes=: the category_id; by default all boxes"""
+    stride: Annotated[int, Field(ge=1)] = 1
+    """use every stride-th frame of the video"""
+    noise: Annotated[float, Field(gt=0)] = 1.0
+    """how fast the velocity changes: by noise m/s in a second, growing with the root of time"""
+    lag: Annotated[int, Field(ge=LEAST_LAG)] = 10
+    """how many later frames the state of a frame takes into account"""
+    depth_share: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """part of the variance of log depth whose error changes slowly from frame to frame"""
+    depth_time: Annotated[float, Field(gt=0)] = 1.0
+    """with depth_share=: the time constant of that error, s"""
+    out: Path | None = None
+    """a folder for track.jsonl, a video with level curves, and a page with the path; by default lines are printed"""
+
+    @model_validator(mode="after")
+    def one_source(self) -> "TrackArguments":
+        """Require a video with its camera, or a folder with both."""
+        if (self.video is None) == (self.folder is None):
+            raise ValueError("track: expected either video=FILE with f=PIXELS or camera=FILE, or folder=DIR")
+        if self.folder and (self.of_camera or self.boxes or self.stride > 1):
+            raise ValueError(
+                "folder: its metadata.jsonl has cameras and boxes; expected no f=, camera=, box=, stride="
+            )
+        if self.video and not self.of_camera.keys() - {"box"}:
+            raise ValueError("video: has no camera; expected f=PIXELS, fx= and fy=, or camera=FILE too")
+        if self.box and self.boxes:
+            raise ValueError("box: expected either box= of the first frame, or boxes= of a detector")
+        if self.object is not None and not self.boxes:
+            raise ValueError("object: selects detections of boxes=FILE; leave it out for one box")
+        if self.coverage:
+            raise ValueError("coverage: is guaranteed for single predictions, not for paths; leave it out")
+        if self.depth_time != 1.0 and not self.depth_share:
+            raise ValueError(
+                "depth_time: is that of the slow error; expected depth_share=0.4, or another below 1, too"
+            )
+        return self
+
+
+class _Sequence(NamedTuple):
+    """The frames of one path, their number if it is known, and a name that files may have."""
+
+    frames: Iterable["Frame"]
+    length: int | None
+    name: str
+
+
+def main(words: list[str]) -> int:
+    """Follow each object; returns the exit status."""
+    arguments = TrackArguments.parsed("track", words)
+    if arguments.video or arguments.out:
+        require_av("video" if arguments.video else "out")
+    sequences, out = list(_sequences(arguments)), arguments.out
+    if out is not None:
+        if find_spec("plotly") is None:
+            raise ConfigError("out: pages need `pip install 'phd_exp[report]'`; without out= there is JSON alone")
+        source = arguments.folder or Path(str(arguments.video)).parent
+        if out.resolve() == source.resolve():
+            raise ConfigError(f"out={out}: holds the images themselves; choose another folder")
+        output_folder(out)
+    predictor = loaded(arguments)
+    if out is not None:
+        _write(arguments, predictor, sequences, out)
+        return 0
+    for sequence in sequences:
+        for followed in _followed(arguments, predictor, sequence):
+            print(_line(arguments, predictor, sequence, followed), flush=True)
+    return 0
+
+
+def _sequences(arguments: TrackArguments) -> Iterator[_Sequence]:
+    from phd_exp.inference.frames import folder_frames, video_frames
+
+    if arguments.folder:
+        for name, detections in tracks_of(detections_in(arguments.folder)).items():
+            yield _Sequence(
+                folder_frames(detections), len(detections), str(arguments.folder.name if name is None else name)
+            )
+        return
+    video, camera = arguments.video, arguments.of_camera
+    assert video is not None  # by `one_source`
+    (detection,) = detections_of([video], camera)
+    boxes: dict[int, list[tuple[float, float, float, float]]] | None = None
+    if arguments.boxes:
+        found = boxes_of_images(arguments.boxes, arguments.object)
+        if wrong := next((name for name in found if not name.isdecimal()), None):
+            raise ConfigError(f"boxes: got image_id {wrong}; expected the number of a frame, from 0")
+        ordered = {int(n): sorted(given, key=lambda one: -one.get("score", 0.0)) for n, given in found.items()}
+        boxes = {n: [tuple(one["box"]) for one in given] for n, given in ordered.items()}
+    elif arguments.box:
+        boxes = {0: [arguments.box]}
+    length = length_of(video)
+    frames = video_frames(detection, boxes, arguments.stride)
+    yield _Sequence(frames, length and -(-length // arguments.stride), video.stem)
+
+
+def _followed(arguments: TrackArguments, predictor: "Predictor", sequence: _Sequence) -> Iterator["Followed"]:
+    """The frames with their states, with a progress bar on a terminal."""
+    from phd_exp.fusion.tracks import ConstantVelocity, Slow
+    from phd_exp.inference.following import follow
+
+    slow = Slow(arguments.depth_share, arguments.depth_time)
+    followed = follow(predictor, sequence.frames, ConstantVelocity(arguments.noise), arguments.lag, slow)
+    if sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import track
+
+        name, console = f"tracking {sequence.name}", Console(stderr=True)
+        followed = iter(track(followed, name, sequence.length, console=console, transient=True))
+    for one in followed:
+        if one.reason:
+            print(f"note: {one.frame.where}: {one.reason}", file=sys.stderr)
+        yield one
+
+
+def _line(arguments: TrackArguments, predictor: "Predictor", sequence: _Sequence, followed: "Followed") -> str:
+    numbers = followed.answer(predictor) | {"frame": arguments.stride * followed.number}
+    return json.dumps({"name": sequence.name} | numbers, allow_nan=False)
+
+
+def _write(arguments: TrackArguments, predictor: "Predictor", sequences: list[_Sequence], out: Path) -> None:
+    """Write each line before its frame of the video, whose name begins with the number of its sequence."""
+    from phd_exp.inference.path_page import write_page
+    from phd_exp.inference.path_video import PathVideo
+
+    file, page = out / "track.jsonl", out / "track.html"
+    file.unlink(missing_ok=True)
+    with ExitStack() as ends, open(file, "x", buffering=1) as lines:
+        ends.callback(write_page, file, page)  # also of the frames before an error
+        for number, sequence in enumerate(sequences, start=1):
+            name = "track" if len(sequences) == 1 else f"{number:0{len(str(len(sequences)))}}"
+            with PathVideo(out / f"{name}.mp4") as video:
+                for followed in _followed(arguments, predictor, sequence):
+                    lines.write(_line(arguments, predictor, sequence, followed) + "\n")
+                    video.add(followed)
+    print(f"{file}, a video for each path, and {page}", file=sys.stderr)
