@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from phd_exp.records.scenes import Scene
-from phd_exp.rendering.pixels import Light
-from phd_exp.rendering.rays import Labels, Mask, trace_points
+from phd_exp.rendering.pixels import Box, Light
+from phd_exp.rendering.rays import Labels, Mask, silhouette, trace_points
+from phd_exp.rendering.triangles import Meshes
 
 FILTER_WIDTH = 3.0  # px
+FINER = 3  # points along a side of a pixel at which the silhouettes of meshes are computed
 REACH = 2  # px from a pixel to the farthest one that its filter touches
 POINTS = 13  # rays a pixel; with GENERATOR a Fibonacci lattice, whose points differ in both coordinates
 GENERATOR = 5
@@ -46,12 +48,45 @@ def filter_points() -> tuple[Light, Light]:
     """Offsets to the right and down (POINTS,), px, distributed as the filter, so that their weights are equal."""
     number = np.arange(POINTS) - POINTS // 2  # about the middle: the lattice is its own quarter turn
     places = np.linspace(0, 1, 4097)
-    angle = 2 * np.pi * places
-    window = 0.35875 - 0.48829 * np.cos(angle) + 0.14128 * np.cos(2 * angle) - 0.01168 * np.cos(3 * angle)
-    share = (np.cumsum(window) - window / 2) / window.sum()
+    weights = pixel_filter(places)
+    share = (np.cumsum(weights) - weights / 2) / weights.sum()
     even = (number / POINTS + 0.5, (number * GENERATOR / POINTS + 0.5) % 1)
     right, down = (FILTER_WIDTH * (np.interp(u, share, places) - 0.5) for u in even)
     return right, down
+
+
+def pixel_filter(places: Light) -> Light:
+    """Blender's pixel filter at places from 0, one end, to 1."""
+    angle = 2 * np.pi * places
+    return 0.35875 - 0.48829 * np.cos(angle) + 0.14128 * np.cos(2 * angle) - 0.01168 * np.cos(3 * angle)
+
+
+def filtered(fine: Light, finer: int) -> Light:
+    """Values (rows, columns, channels) of pixels from those at `finer` points along each of their sides.
+
+    The points are those of (rows + 2, columns + 2) pixels, because the filter reaches one pixel beyond each.
+    """
+    from phd_exp.rendering.rasterizing import filtered_rows
+
+    weights = pixel_filter((np.arange(3 * finer) + 0.5) / (3 * finer)).astype(np.float32)
+    weights /= weights.sum()
+    rows = filtered_rows(np.ascontiguousarray(fine), weights, finer)
+    return filtered_rows(np.ascontiguousarray(rows.swapaxes(0, 1)), weights, finer).swapaxes(0, 1)
+
+
+def coverage(scene: Scene, box: Box, meshes: Meshes) -> Light:
+    """The share of each pixel of a box (height, width, 1), under the filter, that opaque objects cover."""
+    finer = scene.model_copy(update={"S": FINER * scene.S, "f": FINER * scene.f})
+    left, top, right, bottom = (FINER * (edge + side) for edge, side in zip(box, (-1, -1, 1, 1), strict=True))
+    covered = np.zeros((bottom - top, right - left, 1), np.float32)
+    for number in range(len(scene.objects)):
+        shown, rows, columns = silhouette(finer, number, meshes)
+        first_row, last_row = max(rows.start, top), min(rows.stop, bottom)
+        first, last = max(columns.start, left), min(columns.stop, right)
+        if first_row < last_row and first < last:
+            part = shown[first_row - rows.start : last_row - rows.start, first - columns.start : last - columns.start]
+            covered[first_row - top : last_row - top, first - left : last - left, 0][part] = 1.0
+    return filtered(covered, FINER)
 
 
 def _donors(surfaces: Labels, seen: Labels, x: Light, y: Light) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -11,19 +11,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal
 
 from phd_exp.records.errors import RenderError
 from phd_exp.records.scenes import SHAPES, Scene
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.importing import import_meshes
 from phd_exp.rendering.looks import ROUGHER, prepare_looks
-from phd_exp.rendering.pixels import Light, read_light
+from phd_exp.rendering.pixels import Box, Light, read_light
 from phd_exp.rendering.sampling import remoteness
 from phd_exp.rendering.stage import CLIPPING, build_stage, show_scene
 from phd_exp.rendering.surroundings import World
 from phd_exp.rendering.triangles import Meshes
 
+Layer = Literal["objects", "ground"]
 X_LIBRARIES = "libx11-6 libxext6 libxfixes3 libxi6 libxrender1 libxkbcommon0 libsm6 libice6 libgl1"
 
 
@@ -57,15 +58,6 @@ def load_bpy() -> Any:
         raise RenderError(
             f"bpy is installed but cannot be loaded ({error}): apt-get install {X_LIBRARIES}"
         ) from error
-
-
-class Box(NamedTuple):
-    """Pixels left <= column < right and top <= row < bottom."""
-
-    left: int
-    top: int
-    right: int
-    bottom: int
 
 
 @dataclass(frozen=True)
@@ -106,23 +98,30 @@ class Renderer:
             self._world = World(self._bpy, spec) if spec and spec.mesh else None
             if self.meshes:
                 _configure_for_meshes(self._bpy)
+            self.is_opaque = all(mesh.is_opaque for mesh in self.meshes.values())
+            if spec and not self.is_opaque:  # their opacity is traced too
+                self._scene.cycles.samples = max(settings.samples, spec.samples_per_pixel)
             if spec and spec.looks == "varied":
                 prepare_looks(self._bpy, [*SHAPES, *self.meshes])
             if spec:  # what is nearer or farther than usual is shown too
                 lens, (near, far) = self._scene.camera.data, CLIPPING
                 lens.clip_start, lens.clip_end = near * min(1, 2 * spec.z_range[0]), far * remoteness(spec)
 
-    def render(self, scene: Scene, box: Box | None = None) -> Light:
+    def render(self, scene: Scene, box: Box | None = None, layer: Layer = "objects") -> Light:
         """Linear light of a box of pixels (height, width, 3), by default of all (S, S, 3); rows from the top.
 
-        An image is white from 1 upwards. A pure function of the scene, the box and the settings. With meshes, a
-        fourth channel is the opacity, by which the light is multiplied.
+        An image is white from 1 upwards. A pure function of the scene, the box and the settings. With meshes, the
+        background is transparent: a fourth channel is the opacity, by which the light is multiplied. The ground has
+        a layer of its own, whose opacity is its shadow, also where objects hide it.
         """
         box = box or Box(0, 0, scene.S, scene.S)
         self._frame(box, scene.S)
-        show_scene(self._bpy, scene, self.meshes)
-        if self._world and scene.surroundings:
-            self._world.show(scene.surroundings, scene.pose)
+        brightness = self._world.show(scene.surroundings) if self._world and scene.surroundings else 1.0
+        show_scene(self._bpy, scene, self.meshes, brightness)
+        if self._world:
+            self._world.show_layer(scene, layer)
+            # chooses among lamps, and takes a fifth of the time
+            self._scene.cycles.use_light_tree = bool(scene.lamps)
         self._scene.cycles.seed = scene.noise_seed
         self._scene.render.filepath = str(self._output)
         try:
@@ -131,7 +130,14 @@ class Renderer:
             content = self._output.read_bytes()
         finally:
             self._output.unlink(missing_ok=True)
-        return read_light(content, box.bottom - box.top, box.right - box.left, 4 if self.meshes else 3)
+        light = read_light(content, box.bottom - box.top, box.right - box.left, 4 if self.meshes else 3)
+        light[..., :3] *= brightness
+        return light
+
+    def sky(self, scene: Scene) -> Light:
+        """Linear light (S, S, 3) of the sky behind the objects of a scene with a mesh."""
+        assert self._world is not None
+        return self._world.behind(scene)
 
     def _frame(self, box: Box, side: int) -> None:
         """Set the box as fractions of the image from the bottom left corner, which Blender truncates to whole pixels.
@@ -185,8 +191,8 @@ def _configure_for_meshes(bpy: Any) -> None:
     scene, metal = bpy.context.scene, bpy.data.materials["metal"]
     metal.node_tree.nodes["Principled BSDF"].inputs["Roughness"].default_value = ROUGHER
     scene.render.image_settings.color_mode = "RGBA"
+    scene.render.film_transparent = True
     scene.cycles.transparent_max_bounces = 8
-    scene.cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"  # a decibel better on textures
 
 
 @contextmanager

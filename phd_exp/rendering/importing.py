@@ -141,7 +141,8 @@ def _in_metres(handle: Any, unit: float, reference: Any) -> Triangles:
     mesh.update()
     # again, because rounding decides how Blender divides a polygon that is not flat
     used, places = np.unique(_geometry(mesh)[1], return_inverse=True)
-    return Triangles(vertices[used], places.reshape(-1, 3).astype(np.int32))
+    is_opaque = all(_alphas(material) in ({0.0}, {1.0}) for material in filter(None, mesh.materials))
+    return Triangles(vertices[used], places.reshape(-1, 3).astype(np.int32), is_opaque)
 
 
 def _geometry(mesh: Any) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
@@ -158,9 +159,14 @@ def _geometry(mesh: Any) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
 
 def _is_opaque(material: Any) -> bool:
     """Whether a material is seen at all: its alpha is not the constant 0."""
-    shaders = [node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED"] if material else []
+    return material is None or _alphas(material) != {0.0}
+
+
+def _alphas(material: Any) -> set[float | None]:
+    """The opacities of a material's shaders; None for one that varies."""
+    shaders = [node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED"]
     alphas = [shader.inputs["Alpha"] for shader in shaders]
-    return not alphas or any(alpha.is_linked or alpha.default_value > 0 for alpha in alphas)
+    return {None if alpha.is_linked else float(alpha.default_value) for alpha in alphas} or {1.0}
 
 
 def _require_drawn(bpy: Any, handle: Any, mesh: Triangles) -> None:

@@ -46,7 +46,7 @@ def _whole_scene(spec: DatasetSpec, split: Split, index: int, meshes: Meshes) ->
     scene, number = sample_scene(spec, split, index), index // spec.views
     cylinder, *panel = scene.objects
     mesh = meshes["mesh"]
-    around, turn = _surroundings(spec, split, number)
+    around, turn = surroundings_of(spec, split, number)
     rotation = upright_rotation(around.pitch, turn) if spec.upright else cylinder.rotation
     if spec.front:
         rotation = _facing_rotation(spec, cylinder.position, stream_of(spec, split, number, Purpose.FRONT))
@@ -62,7 +62,7 @@ def _whole_scene(spec: DatasetSpec, split: Split, index: int, meshes: Meshes) ->
     return whole if spec.looks == "plain" else varied(whole, spec, stream_of(spec, split, number, Purpose.LOOKS))
 
 
-def _surroundings(spec: DatasetSpec, split: Split, number: int) -> tuple[Surroundings, float]:
+def surroundings_of(spec: DatasetSpec, split: Split, number: int) -> tuple[Surroundings, float]:
     """The world around an object, without its ground, and a turn about the vertical, radians."""
     rng = stream_of(spec, split, number, Purpose.SURROUNDINGS)
     pitch, object_turn = math.radians(rng.uniform(*spec.pitch_range)), rng.uniform(0, math.tau)

@@ -1,7 +1,7 @@
 """Pixels: linear light, 8-bit sRGB (IEC 61966-2-1), and the files of both."""
 
 import io
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,16 @@ from phd_exp.records.spec import DatasetSpec, ImageFormat
 
 Light = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
+
+
+class Box(NamedTuple):
+    """Pixels left <= column < right and top <= row < bottom."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
 
 # Level 9 of zlib saves 2 % of the bytes for twice the time. A JPEG has colour at full resolution, since a silhouette
 # is often a step in colour alone.

@@ -30,13 +30,16 @@ from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec, Shard
 from phd_exp.rendering.blender import require_bpy
 from phd_exp.rendering.masks import ensure_drawn
+from phd_exp.rendering.objects import surroundings_of
 from phd_exp.rendering.progress import shown_progress
 from phd_exp.rendering.sealing import Known, Wanted, begin, known_samples, missing, seal
 
 Samples = Sequence[tuple[Split, int]]
 """Split and index of each sample."""
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # of each worker
+TOGETHER = 128  # samples
 FEWEST_PER_WORKER = 8  # starting one more process costs about as much as rendering this many images
+FEWER = "fewer images: preset=demo, or data.n_train=... data.n_test=..."
 WAITING = "waiting for it to finish"
 
 
@@ -151,8 +154,9 @@ def _render(
     title = spec.variant if shard is None else f"{spec.variant} {shard}"
     with ExitStack() as stack:
         journals = {split: stack.enter_context(open_journal(folder.journal_path(split, shard))) for split in SPLITS}
-        advance = stack.enter_context(shown_progress(len(samples), f"rendering {title}"))
-        for record in stack.enter_context(closing(render_all(folder, spec, samples, workers))):
+        shown = shown_progress(len(samples), f"rendering {title}", min(workers, len(samples)), FEWER)
+        advance = stack.enter_context(shown)
+        for record in stack.enter_context(closing(render_all(folder, spec, by_sky(spec, samples), workers))):
             journals[record.split].write(record.model_dump_json() + "\n")
             known[record.split][record.index] = record
             advance()
@@ -196,6 +200,22 @@ def render_all(
                     busy[connection].send(following)
 
 
+def by_sky(spec: DatasetSpec, samples: Samples) -> Samples:
+    """The samples in another order: of each TOGETHER in succession, those with the same sky follow each other.
+
+    A worker needs longer to load another sky than for the rest of the scene.
+    """
+    if spec.mesh is None or spec.backdrops is None:
+        return samples
+
+    def sky(sample: tuple[Split, int]) -> str:
+        split, index = sample
+        return surroundings_of(spec, split, index // spec.views)[0].file or ""
+
+    parts = (samples[first : first + TOGETHER] for first in range(0, len(samples), TOGETHER))
+    return [sample for part in parts for sample in sorted(part, key=sky)]
+
+
 def worker_count(samples: int, cores: int | None = None) -> int:
     """Default number of processes: one per core that may be used, fewer for little work."""
     return max(1, min(cores or usable_cores(), math.ceil(samples / FEWEST_PER_WORKER)))
@@ -205,6 +225,6 @@ def _first_words(folder: DatasetFolder, spec: DatasetSpec, n: int, workers: int,
     left = f"the remaining {n}" if resumed else f"{n}"
     return (
         f"rendering {left} images of '{spec.variant}' into {folder.root}, once, with {workers} "
-        f"process{'es' if workers > 1 else ''}; the time left follows the first images; fewer with "
-        "data.n_train=... data.n_test=...; stop at any time, the same command resumes"
+        f"process{'es' if workers > 1 else ''}; the time left follows the first images; "
+        "stop at any time, the same command resumes"
     )

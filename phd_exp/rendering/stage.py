@@ -29,13 +29,16 @@ SURFACES: dict[Material, dict[str, float]] = {
 SURROUNDINGS = (0.10, 0.75)
 
 
-def show_scene(bpy: Any, scene: Scene, meshes: Iterable[str] = ()) -> None:
-    """Arrange everything on the stage as in a scene; `meshes` are the names of imported objects."""
+def show_scene(bpy: Any, scene: Scene, meshes: Iterable[str] = (), brightness: float = 1.0) -> None:
+    """Arrange everything on the stage as in a scene whose image will become brighter by a factor.
+
+    `meshes` are the names of imported objects.
+    """
     objects = bpy.data.objects
     objects["camera"].data.lens = scene.f * SENSOR_WIDTH / scene.S
     # p_scene = R^T (p_camera - translation), with Blender's axes in both frames
     back = rotation_matrix(scene.pose.rotation).T
-    objects["camera"].matrix_world = matrix_of(back @ TO_BLENDER, -back @ np.array(scene.pose.translation))
+    objects["camera"].matrix_basis = matrix_of(back @ TO_BLENDER, -back @ np.array(scene.pose.translation))
     for shape in (*SHAPES, *meshes):
         objects[shape].hide_render = True
     for item in scene.objects:
@@ -43,7 +46,7 @@ def show_scene(bpy: Any, scene: Scene, meshes: Iterable[str] = ()) -> None:
     for name in get_args(LampName):
         objects[name].hide_render = name not in {lamp.name for lamp in scene.lamps}
     for lamp in scene.lamps:
-        _place_lamp(objects[lamp.name], lamp)
+        _place_lamp(objects[lamp.name], lamp, brightness)
     show_backdrop(bpy.data.worlds["world"].node_tree.nodes, scene.backdrop)
 
 
@@ -52,7 +55,7 @@ def _place_object(bpy: Any, item: SceneObject) -> None:
     handle.hide_render = False
     size = 0.5 * np.array(item.dimensions) if item.shape in SHAPES else np.ones(3)
     stretch = item.scale * size
-    handle.matrix_world = matrix_of(rotation_matrix(item.rotation) * stretch, np.array(item.position))
+    handle.matrix_basis = matrix_of(rotation_matrix(item.rotation) * stretch, np.array(item.position))
     if item.look:
         show_look(bpy, item, item.look)
         return
@@ -103,12 +106,12 @@ def _new_mesh(bpy: Any, shape: Shape) -> Any:
     return mesh
 
 
-def _place_lamp(handle: Any, lamp: Lamp) -> None:
+def _place_lamp(handle: Any, lamp: Lamp, brightness: float) -> None:
     """An area lamp shines along its local -z."""
     position = np.array(lamp.position)
     forward = np.array(lamp.towards) - position
-    handle.matrix_world = matrix_of(TO_BLENDER @ _aimed_along(TO_BLENDER @ forward), position)
-    handle.data.energy = lamp.power
+    handle.matrix_basis = matrix_of(TO_BLENDER @ _aimed_along(TO_BLENDER @ forward), position)
+    handle.data.energy = lamp.power / brightness
     handle.data.size = lamp.side
 
 

@@ -12,10 +12,14 @@ Depths = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Triangles:
-    """A mesh in its local frame: vertices (n, 3), m, and the three vertices of each triangle (m, 3)."""
+    """A mesh in its local frame: vertices (n, 3), m, and the three vertices of each triangle (m, 3).
+
+    `is_opaque`: whether light passes through none of its triangles.
+    """
 
     vertices: NDArray[np.float64]
     corners: NDArray[np.int32]
+    is_opaque: bool = True
 
     @property
     def dimensions(self) -> tuple[float, float, float]:

@@ -93,8 +93,12 @@ def test_a_view_shows_what_the_crop_of_a_whole_photograph_shows(of_box: MakeSpec
     K = calibration(camera).intrinsics
     blank = {"level": 0.6, "falloff": 0.0}  # the backdrop belongs to the image, not to the scene
     plain = [one.model_copy(update={"backdrop": one.backdrop.model_copy(update=blank)}) for one in (scene, view)]
-    seen = cut(Image.fromarray(photograph(renderer, plain[0], whole)), VirtualCamera.of_box(K, view.real_box, 96.0))
-    drawn_directly = photograph(renderer, plain[1], box)
+    pictures = [
+        photograph(renderer, one, trace_pixels(one, renderer.meshes), spec)
+        for one, spec in zip(plain, (whole, box), strict=True)
+    ]
+    seen = cut(Image.fromarray(pictures[0]), VirtualCamera.of_box(K, view.real_box, 96.0))
+    drawn_directly = pictures[1]
     assert np.abs(seen.astype(float) - drawn_directly).mean() < 3
     assert drawn_directly.std() > 20
 

@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,13 @@ from scipy import stats
 from phd_exp.records.errors import RenderError
 from phd_exp.records.scenes import Pose, Scene, Surroundings
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.antialias import coverage
 from phd_exp.rendering.blender import Renderer, Settings, load_bpy
 from phd_exp.rendering.objects import REACH, sample_object_scene, upright_rotation
+from phd_exp.rendering.pixels import Box
 from phd_exp.rendering.rays import NOTHING, cylinder_mask, rotation_matrix, trace_pixels, truncation, visibility
-from phd_exp.rendering.samples import fast_settings, make_sample
+from phd_exp.rendering.render import by_sky
+from phd_exp.rendering.samples import fast_settings, make_sample, shadow
 from phd_exp.rendering.sampling import about_axis, sample_scene
 from phd_exp.rendering.surroundings import photo_light, shaken
 from phd_exp.rendering.triangles import Triangles
@@ -341,47 +345,111 @@ def test_vertices_keep_their_colours(make_spec: MakeSpec, tmp_path: Path) -> Non
     assert (opacity, green > 5 * red) == (1.0, True)
 
 
-def test_skies_light_the_scene_and_turn_with_the_camera(of_mesh: MakeSpec) -> None:
+@pytest.fixture(scope="module")
+def under_a_sky(of_mesh: MakeSpec) -> tuple[Renderer, Scene]:
+    """A renderer without denoiser, and a scene whose object is in the middle."""
+    spec = of_mesh(sensor_size=32, f_range=(60.0, 60.0), xy_range=0.0)
+    renderer = Renderer(Settings(samples=64, denoised=False, at_middles=False), spec)
+    return renderer, sample_object_scene(spec, "train", 0, renderer.meshes)
+
+
+def changed(scene: Scene, f: float = 60.0, pose: Pose | None = None, **changes: Any) -> Scene:
+    """A scene under the sky `city`, in its true size, with changes of the surroundings."""
+    seen = scene.surroundings.model_copy(update={"file": "city", "span": 1.0} | changes)
+    return scene.model_copy(update={"surroundings": seen, "f": f, "pose": pose or scene.pose})
+
+
+AWAY = Pose(rotation=about_axis((0.6, 0.8, 0.0), 1.0), translation=(0.0, 0.0, 0.0))  # as a further view turns
+
+
+@pytest.mark.parametrize("pose", [None, AWAY])
+def test_a_sky_is_looked_up_as_it_is_traced(under_a_sky: tuple[Renderer, Scene], pose: Pose | None) -> None:
+    renderer, scene = under_a_sky
+    empty = changed(scene, pose=pose, pitch=0.4).model_copy(update={"objects": (), "lamps": ()})
+    film, tracer = load_bpy().context.scene.render, load_bpy().context.scene.cycles
+    film.film_transparent, tracer.samples = False, 1024
+    try:
+        traced = renderer.render(empty)
+    finally:
+        film.film_transparent, tracer.samples = True, 64
+    light = renderer.sky(empty)
+    assert (traced[..., 3] == 1).all()
+    np.testing.assert_allclose(light, traced[..., :3], rtol=0.07, atol=0.01)
+    assert light.std() > 0.1 * light.mean()
+
+
+def test_skies_light_the_scene_and_turn_with_the_camera(under_a_sky: tuple[Renderer, Scene]) -> None:
     """A camera that looks down sees what a panorama has below; a brighter sky lights more."""
-    spec = of_mesh(sensor_size=32, f_range=(40.0, 40.0), xy_range=0.0)
-    renderer = Renderer(Settings(samples=16, denoised=False, at_middles=False), spec)
-    scene = sample_object_scene(spec, "train", 0, renderer.meshes)
-
-    def corner(**changes: Any) -> np.ndarray:
-        seen = scene.surroundings.model_copy(update={"file": "sunrise", **changes})
-        return renderer.render(scene.model_copy(update={"surroundings": seen}))
-
-    plain, bright = corner(brightness=1.0), corner(brightness=2.0)
-    assert bright.mean() == pytest.approx(2 * plain.mean() - plain[..., 3].mean() / 4, rel=0.05)
-    assert (plain[..., 3] == 1).all()
+    renderer, scene = under_a_sky
+    plain, bright = (changed(scene, file="sunrise", brightness=factor) for factor in (1.0, 2.0))
+    for paint in (renderer.render, renderer.sky):
+        np.testing.assert_allclose(paint(bright)[..., :3], 2 * paint(plain)[..., :3], rtol=1e-3, atol=1e-3)
+    assert renderer.render(plain)[16, 16, :3].min() > 0.01
     panorama = load_bpy().data.images["sunrise.exr"]
     rows = np.array(panorama.pixels[:]).reshape(512, 1024, 4)[..., :3].mean(axis=(1, 2))
     for pitch, half in ((np.pi / 2, rows[:128]), (-np.pi / 2, rows[-128:])):
-        shown = corner(pitch=pitch, brightness=1.0)[:4, :, :3].mean()
+        shown = renderer.sky(changed(scene, f=40.0, file="sunrise", pitch=pitch, brightness=1.0)).mean()
         assert half.min() <= shown <= half.max()
 
 
-def test_a_sky_spans_a_wider_field_but_lights_from_where_it_is(of_mesh: MakeSpec) -> None:
+def test_a_sky_spans_a_wider_field_but_lights_from_where_it_is(
+    under_a_sky: tuple[Renderer, Scene], of_mesh: MakeSpec
+) -> None:
     """Behind the object is what a lens of that much shorter focal length shows; the object's light is the same."""
-    spec = of_mesh(sensor_size=32, f_range=(60.0, 60.0), xy_range=0.0)
+    renderer, scene = under_a_sky
+    for pose in (None, AWAY):
+        wide, short = changed(scene, span=4.0, pose=pose), changed(scene, f=15.0, pose=pose)
+        np.testing.assert_array_equal(renderer.sky(wide), renderer.sky(short))
+    narrow = changed(scene)
+    np.testing.assert_array_equal(renderer.render(changed(scene, span=4.0)), renderer.render(narrow))
+    assert np.abs(renderer.sky(changed(scene, span=4.0)) - renderer.sky(narrow)).mean() > 0.05
+    spans = np.log([one.surroundings.span for one in drawn(of_mesh(), 300, renderer.meshes)]) / np.log(8)
+    assert stats.kstest(spans, "uniform").pvalue > UNLIKELY
+
+
+def test_computed_edges_are_those_of_the_tracer(under_a_sky: tuple[Renderer, Scene]) -> None:
+    renderer, scene = under_a_sky
+    near = changed(scene, f=300.0)
+    box = Box(2, 3, 30, 31)
+    computed, traced = coverage(near, box, renderer.meshes), renderer.render(near, box)[..., 3:]
+    assert ((traced > 0.1) & (traced < 0.9)).sum() > 20, "there are edges"
+    assert np.abs(computed - traced).max() < 0.2, "of 64 random points"
+    assert np.abs(computed - traced)[(traced > 0) & (traced < 1)].mean() < 0.04
+
+
+def test_the_ground_has_a_shadow_below_the_object(of_mesh: MakeSpec) -> None:
+    """On a layer of its own, on which objects are not visible; without an object, there is none."""
+    spec = of_mesh(sensor_size=48, f_range=(300.0, 300.0), upright=True, ground=True, pitch_range=(30.0, 31.0))
+    renderer = Renderer(Settings(samples=16, denoised=False, at_middles=False), spec)
+    scene = sample_object_scene(spec, "train", 3, renderer.meshes)
+    dark = shadow(renderer, scene)[..., 0]
+    shown = cylinder_mask(trace_pixels(scene, renderer.meshes))
+    assert dark[shown].max() > 0.4
+    assert dark[:6].mean() < 0.1
+    assert np.abs(shadow(renderer, scene.model_copy(update={"objects": ()}))).max() < 0.01
+    opacity = renderer.render(scene)[..., 3]
+    assert ((opacity > 0.5) != shown).sum() <= 10, "the ground is not on the layer of the objects"
+
+
+def test_samples_under_the_same_sky_follow_each_other(of_mesh: MakeSpec, meshes: dict[str, Triangles]) -> None:
+    spec, samples = of_mesh(), [("train", index) for index in range(200)]
+    ordered = by_sky(spec, samples)
+    assert sorted(ordered[:128]) == samples[:128]
+    assert sorted(ordered) == samples
+    files = [sample_object_scene(spec, split, index, meshes).surroundings.file for split, index in ordered]
+    assert sum(one != other for one, other in pairwise(files)) <= 2 * 6
+    assert by_sky(of_mesh(backdrops=None), samples) == samples
+
+
+def test_a_glowing_material_does_not_depend_on_the_sky(make_spec: MakeSpec, tmp_path: Path) -> None:
+    file = write_mesh(tmp_path / "part.obj", solid("cube"))
+    file.write_text("mtllib part.mtl\n" + file.read_text().replace("f ", "usemtl lamp\nf ", 1))
+    (tmp_path / "part.mtl").write_text("newmtl lamp\nKd 0 0 0\nKs 0 0 0\nKe 0 3 0\n")
+    spec = make_spec("object", mesh=str(file), sensor_size=32, f_range=(300.0, 300.0), xy_range=0.0)
     renderer = Renderer(AT_MIDDLES, spec)
     scene = sample_object_scene(spec, "train", 0, renderer.meshes)
-
-    def shown(f: float, span: float, **changes: Any) -> np.ndarray:
-        seen = scene.surroundings.model_copy(update={"file": "city", "span": span})
-        return renderer.render(scene.model_copy(update={"surroundings": seen, "f": f} | changes))[..., :3]
-
-    narrow, wide = shown(60.0, 1.0), shown(60.0, 4.0)
-    border, middle = slice(None, 4), (16, 16)
-    np.testing.assert_allclose(wide[border], shown(15.0, 1.0)[border], rtol=0.02, atol=0.01)
-    assert np.abs(wide - narrow)[border].mean() > 0.05 * narrow[border].mean(), "and it is another part of the sky"
-    np.testing.assert_allclose(wide[middle], narrow[middle], rtol=0.02)
-    away = Pose(rotation=about_axis((0.6, 0.8, 0.0), 1.0), translation=(0.0, 0.0, 0.0))  # as a further view turns
-    np.testing.assert_allclose(
-        shown(60.0, 4.0, pose=away)[border], shown(15.0, 1.0, pose=away)[border], rtol=0.02, atol=0.01
-    )
-    spans = np.log([one.surroundings.span for one in drawn(spec, 300, renderer.meshes)]) / np.log(8)
-    assert stats.kstest(spans, "uniform").pvalue > UNLIKELY
+    dim, bright = (renderer.render(changed(scene, 300.0, brightness=value))[16, 16] for value in (0.5, 2.0))
+    assert (dim[1], bright[1]) == (pytest.approx(3, rel=0.1), pytest.approx(3, rel=0.3))
 
 
 def write_ball(folder: Path, side: int = 160) -> Path:
