@@ -1,5 +1,6 @@
 """Reads tables of predictions: columns of numbers, or a RunError of one line. The files are not trusted."""
 
+import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -46,7 +47,7 @@ def read_table(file: Path) -> Columns:
             # a text that repeats in every row is kept once in memory
             texts = [name for name in TEXTS if name in metadata.schema.to_arrow_schema().names]
             table = pq.ParquetFile(stream, metadata=metadata, read_dictionary=texts).read()
-            return {name: _values(name, table[name].to_numpy()) for name in table.column_names}
+            return {name: _values(name, table[name]) for name in table.column_names}
     except FileNotFoundError:
         raise RunError(f"{file.name}: missing, though the run has finished") from None
     except (pa.ArrowException, OSError, KeyError, TypeError, ValueError) as error:
@@ -64,10 +65,22 @@ def stacked(columns: Mapping[str, Any], names: Sequence[str]) -> Tensor:
     return torch.from_numpy(np.stack([columns[name] for name in names], axis=-1))
 
 
-def _values(name: str, column: np.ndarray) -> np.ndarray:
-    """The texts or numbers of a column. Raises ValueError or TypeError for other values."""
-    if name in TEXTS:
-        return column
+def _values(name: str, stored: pa.ChunkedArray) -> np.ndarray:
+    """The texts or numbers of a column, without pandas, which `to_numpy` imports.
+
+    Raises ValueError or TypeError for other values.
+    """
+    if name in TEXTS and pa.types.is_dictionary(stored.type):
+        column = stored.combine_chunks()
+        rows = column.indices.fill_null(len(column.dictionary)) if column.null_count else column.indices
+        texts = np.array([*column.dictionary.to_pylist(), None], dtype=object)
+        return np.asarray(texts[np.from_dlpack(rows)])
+    kinds = (pa.types.is_floating, pa.types.is_integer, pa.types.is_boolean, pa.types.is_null)
+    if any(is_kind(stored.type) for is_kind in kinds):
+        numbers = stored.cast(pa.float64(), safe=False)
+        numbers = numbers.fill_null(math.nan) if numbers.null_count else numbers
+        return np.array(np.from_dlpack(numbers.combine_chunks()))
+    column = stored.to_numpy()
     if column.dtype == object and any(not isinstance(value, int | float | None) for value in column):
         raise TypeError(f"column {name!r} holds {type(column[0]).__name__}; expected numbers")
     return np.array(column, dtype=np.float64)

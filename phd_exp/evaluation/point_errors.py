@@ -15,7 +15,6 @@ from typing import Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from scipy import stats
 from torch import Tensor
 
 from phd_exp.evaluation.parquet import Columns, require_columns, stacked
@@ -134,6 +133,8 @@ def difference(one: Sequence[SampleMean], other: Sequence[SampleMean]) -> Interv
         return Interval(gap, -np.inf, np.inf)
     random = np.random.default_rng(SEED)
     drawn = _over_seeds(one, random) - _over_seeds(other, random)
+    from scipy import stats  # takes half a second
+
     half_width = float(stats.t.ppf(0.975, len(one) + len(other) - 2) * drawn.std(ddof=1))
     return Interval(gap, gap - half_width, gap + half_width)
 

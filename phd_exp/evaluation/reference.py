@@ -4,7 +4,6 @@ from functools import cache
 
 import torch
 from jaxtyping import Float
-from scipy import stats
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
@@ -49,6 +48,8 @@ def calibrated_reference(distribution: ProjectedHuber, simulations: int = 4000) 
         for name, values in (of_groups | _simulated(scored, variances, size, generator)).items():
             found.setdefault(name, []).append(values)
     bands = {name: torch.cat(values).double().quantile(_SHARES) for name, values in found.items()}
+    from scipy import stats  # takes half a second
+
     bands["inside_90"] = 100 * torch.from_numpy(stats.binom.ppf(_SHARES, n, 0.9)) / n
     return {name: Interval(*bands[name].tolist()) for name in REFERENCED}
 

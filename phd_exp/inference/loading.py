@@ -3,8 +3,10 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
+from torch.overrides import TorchFunctionMode
 
 from phd_exp.build import build_regressor, recorded_constants, require_same_shrinking
 from phd_exp.config import RunConfig, check
@@ -112,11 +114,18 @@ def _regressor(folder: RunFolder, config: RunConfig, depth: DepthScale) -> Regre
     """
     weights = regressor_weights(folder.best_checkpoint)
     if not custom_parts(config.model_dump(mode="json")):  # the user's own networks may need their numbers
-        with torch.device("meta"):
+        with torch.device("meta"), _Uninitialised():
             fill(_built(folder, config, depth), weights, folder.best_checkpoint, assign=True)
     regressor = _built(folder, config, depth)
     fill(regressor, weights, folder.best_checkpoint)
     return regressor
+
+
+class _Uninitialised(TorchFunctionMode):
+    """Leaves out normal random numbers, for which torch imports its compiler where tensors have no memory."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return args[0] if func is torch.Tensor.normal_ else func(*args, **(kwargs or {}))
 
 
 def _built(folder: RunFolder, config: RunConfig, depth: DepthScale) -> Regressor:

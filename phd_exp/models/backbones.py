@@ -6,8 +6,8 @@ from typing import Literal, NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torchvision.models.resnet import BasicBlock, Bottleneck, ResNet
 
+from phd_exp.models.torchvisions import BasicBlock, Bottleneck, ResNet
 from phd_exp.records.errors import gist
 
 BLOCKS: dict[int, tuple[type[BasicBlock | Bottleneck], list[int]]] = {

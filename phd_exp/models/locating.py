@@ -8,10 +8,10 @@ from annotated_types import Ge, Gt, MultipleOf
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, relu
-from torchvision.models.resnet import BasicBlock, Bottleneck
 
 from phd_exp.geometry.camera import middles
 from phd_exp.models.backbones import BLOCKS, NORM, Backbone, BackboneOutput, Depth
+from phd_exp.models.torchvisions import BasicBlock, Bottleneck
 
 
 class Locating(Backbone):

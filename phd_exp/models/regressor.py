@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
@@ -88,8 +89,9 @@ class Regressor(nn.Module):
         nn.init.zeros_(self.last.bias)
         self.shown = shown
         self.exposure = exposure
-        self.register_buffer("mean", 255 * torch.tensor(IMAGENET_MEAN), persistent=False)
-        self.register_buffer("std", 255 * torch.tensor(IMAGENET_STD), persistent=False)
+        for name, values in (("mean", IMAGENET_MEAN), ("std", IMAGENET_STD)):
+            # multiplied by numpy: without memory, torch would import its compiler to multiply
+            self.register_buffer(name, torch.tensor(255 * np.array(values, np.float32)), persistent=False)
 
     def forward(self, image: UInt8[Tensor, "batch height width 3"], camera: Camera) -> Prediction:
         return self.prediction(self.see(image), camera)

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from PIL import Image
@@ -25,6 +27,7 @@ from phd_exp.records.detections import detections_of
 from phd_exp.records.errors import DatasetError, RunError
 from phd_exp.records.own_images import detections_in
 from phd_exp.records.runs import RunFolder
+from tests.evaluation.test_conformal import table_of
 from tests.support.foreign import WRITERS
 from tests.support.recorded import status_of
 from tests.support.untrained import SIDE, SMALL, read_lines, untrained, virtual_cameras, write_photos
@@ -359,6 +362,16 @@ def test_an_unfinished_run_is_used_with_a_notice(phd_exp: Callable, spoiled: Run
 
 
 LOADS = "phd_exp.load(sys.argv[1])\nassert not {'lightning', 'matplotlib', 'pyarrow', 'bpy'} & set(sys.modules)"
+SLOW_TO_IMPORT = {
+    "lightning",
+    "wandb",
+    "pandas",
+    "scipy.stats",
+    "sympy",
+    "torch._dynamo",
+    "torch._inductor",
+    "matplotlib",
+}
 
 
 @pytest.mark.parametrize("then", ["", pytest.param(LOADS, marks=pytest.mark.slow)], ids=["import", "load"])
@@ -367,3 +380,20 @@ def test_the_import_does_not_wait_for_torch_nor_a_prediction_for_lightning(run: 
     code = f"import sys, phd_exp\nassert 'torch' not in sys.modules\n{then}"
     done = subprocess.run([sys.executable, "-c", code, str(run.path)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_prediction_imports_neither_the_compiler_of_torch_nor_pandas(
+    make: Callable[..., RunFolder], photos: Path
+) -> None:
+    """With recorded held-out samples, which a prediction reads to say how familiar it is."""
+    run = make("data=folder", "data.folder=nowhere")
+    pq.write_table(pa.table(dict(table_of(100, 1))), run.held_out)
+    code = (
+        "import sys; from phd_exp.__main__ import main\n"
+        "assert main(sys.argv[1:]) == 0\n"
+        f"found = {SLOW_TO_IMPORT} & set(sys.modules); assert not found, found"
+    )
+    words = ["predict", f"run={run.path}", f"image={photos / '0.png'}", "f=400"]
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "familiar" in json.loads(done.stdout)
