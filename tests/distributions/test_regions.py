@@ -48,6 +48,16 @@ def test_the_extent_along_any_axis_is_reached_and_never_exceeded(distribution: P
         assert high - 0.06 * width < along.max() < high + 1e-3 * width
 
 
+def test_regions_of_a_batch_are_those_of_its_members(distribution: ProjectedHuber) -> None:
+    """Each with its own level and direction."""
+    batch, axes = distribution.expand([len(LEVELS)]), np.array(AXES[-len(LEVELS) :])
+    regions = Region(batch, np.array(LEVELS))
+    for row, (level, axis) in enumerate(zip(LEVELS, axes, strict=True)):
+        alone = Region(distribution, level)
+        np.testing.assert_allclose([end[row] for end in regions.depth_interval(axes)], alone.depth_interval(axis))
+        np.testing.assert_allclose(regions.volume[row], alone.volume)
+
+
 def test_depth_reaches_from_mu_z_over_t_to_mu_z_times_t(distribution: ProjectedHuber) -> None:
     low, high = Region(distribution, 0.9).depth_interval()
     assert low * high == pytest.approx(float(distribution.mu_z) ** 2)
