@@ -96,7 +96,7 @@ def choose(held_out: Sequence[SeveralViews]) -> Choice:
         replace(whole, depth_share=part * whole.depth_share, projection_share=part * whole.projection_share)
         for part in PARTS
     ]
-    return Choice(noise, min(parts, key=lambda slow: _surprisal(held_out, Choice(noise, slow))), whole)
+    return Choice(noise, min(parts, key=lambda slow: _surprisal(held_out, Choice(noise, slow, whole))), whole)
 
 
 def _surprisal(held_out: Sequence[SeveralViews], choice: Choice) -> float:
