@@ -11,7 +11,8 @@ from scipy import optimize, stats
 from torch import Tensor
 
 from phd_exp.distributions.columns import from_columns
-from phd_exp.evaluation.predictions import SEED, Curve, scalar_bands
+from phd_exp.evaluation.point_errors import SEED
+from phd_exp.evaluation.predictions import Curve, scalar_bands
 from phd_exp.evaluation.several_views import SeveralViews
 from phd_exp.fusion import Pose
 from phd_exp.fusion.tracks import ConstantVelocity, Gaussian, Lost, Path, Slow, autocorrelation, standardised_errors

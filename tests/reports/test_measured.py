@@ -7,6 +7,7 @@ import pytest
 
 from phd_exp.reports.measured import VERSIONS, Measured, kept_or_measured
 from phd_exp.reports.runs import read_report
+from tests.support.sequences import write_sequences
 from tests.support.several import write_views
 from tests.support.synthetic import write_run
 
@@ -15,6 +16,7 @@ STORED = {
     "after": (1, {"all": 25, "nll": -7.58365, "nees": 3.17568}),
     "fusion": (1, {"all": 176, "depth_error_mm/mode/2/free": 14.1506, "coverage_90/gaussian/4/ground": 71.95}),
     "pairs": (1, {"all": 1, "fused_error_mm": 23.2213}),
+    "tracks": (1, {"all": 0, "depth_error_mm/single": 0.0, "nees/slow": 0.0}),
     "gallery": (1, {"all": 2, "best": 42.5, "worst": 42.19}),
     "shifts": (1, {"all": 29, "inside_90": 93.75, "unfamiliar": 100.0}),
 }
@@ -27,6 +29,8 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Measured:
     run = write_run(folder, n=120, epochs=1, overconfidence=2.0)
     write_run(folder / "elsewhere", seed=1, n=400, overconfidence=2.0).predictions.rename(run.held_out)
     write_views(run.views, 50)
+    for held_out in (False, True):
+        write_sequences(run.sequence(10, held_out=held_out), 6, 10, seed=int(held_out))
     run.shifts.mkdir()
     write_run(folder / "shifted", "occl", n=80).predictions.rename(run.shift("occl"))
     return read_report(folder).runs[0].measured
@@ -38,6 +42,7 @@ def numbers(found: Measured) -> Iterator[tuple[str, dict[str, float]]]:
     assert found.fusion is not None
     assert found.gallery is not None
     yield "fusion", {key: band.low for key, band in found.fusion.bands.items()}
+    yield "tracks", {key: band.value for key, band in found.tracks["10"].bands.items()}
     yield "shifts", {key: band.high for key, band in found.shifts["occl"].scores.items()}
     yield "gallery", {"best": found.gallery.best[0].mode[0], "worst": found.gallery.worst[0].truth[1]}
 
