@@ -16,7 +16,7 @@ STORED = {
     "after": (1, {"all": 25, "nll": -7.58365, "nees": 3.17568}),
     "fusion": (1, {"all": 176, "depth_error_mm/mode/2/free": 14.1506, "coverage_90/gaussian/4/ground": 71.95}),
     "pairs": (1, {"all": 1, "fused_error_mm": 23.2213}),
-    "tracks": (1, {"all": 0, "depth_error_mm/single": 0.0, "nees/slow": 0.0}),
+    "tracks": (1, {"all": 38, "depth_error_mm/single": 199.206, "nees/slow": 0.772033}),
     "gallery": (1, {"all": 2, "best": 42.5, "worst": 42.19}),
     "shifts": (1, {"all": 29, "inside_90": 93.75, "unfamiliar": 100.0}),
 }
