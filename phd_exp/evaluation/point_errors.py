@@ -15,6 +15,7 @@ from typing import Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float64
+from scipy import special
 from torch import Tensor
 
 from phd_exp.evaluation.parquet import Columns, require_columns, stacked
@@ -133,9 +134,7 @@ def difference(one: Sequence[SampleMean], other: Sequence[SampleMean]) -> Interv
         return Interval(gap, -np.inf, np.inf)
     random = np.random.default_rng(SEED)
     drawn = _over_seeds(one, random) - _over_seeds(other, random)
-    from scipy import stats  # takes half a second
-
-    half_width = float(stats.t.ppf(0.975, len(one) + len(other) - 2) * drawn.std(ddof=1))
+    half_width = float(special.stdtrit(len(one) + len(other) - 2, 0.975) * drawn.std(ddof=1))
     return Interval(gap, gap - half_width, gap + half_width)
 
 
@@ -143,8 +142,8 @@ def p_value(gap: Interval[float], seeds: int) -> float:
     """The two-sided p-value of a `difference` of 0, for the seeds of both models together."""
     if not np.isfinite(gap.high):
         return 1.0
-    law = stats.t(seeds - 2)
-    return float(2 * law.sf(law.ppf(0.975) * abs(gap.value) / max(gap.high - gap.value, np.finfo(float).tiny)))
+    half_width, freedom = max(gap.high - gap.value, np.finfo(float).tiny), seeds - 2
+    return float(2 * special.stdtr(freedom, -special.stdtrit(freedom, 0.975) * abs(gap.value) / half_width))
 
 
 def significant(p_values: Mapping[Key, float], error_rate: float = 0.05) -> set[Key]:

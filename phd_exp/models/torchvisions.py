@@ -20,7 +20,7 @@ def _without_compiler() -> Iterator[None]:
     def is_compile_supported(device: Any) -> bool:
         from torch._dynamo.utils import is_compile_supported as theirs
 
-        return theirs(device)  # type: ignore[no-any-return]
+        return theirs(device)
 
     if COMPILER in sys.modules:
         yield

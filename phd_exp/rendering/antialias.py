@@ -78,7 +78,7 @@ def coverage(scene: Scene, box: Box, meshes: Meshes) -> Light:
     """The share of each pixel of a box (height, width, 1), under the filter, that opaque objects cover."""
     finer = scene.model_copy(update={"S": FINER * scene.S, "f": FINER * scene.f})
     left, top, right, bottom = (FINER * (edge + side) for edge, side in zip(box, (-1, -1, 1, 1), strict=True))
-    covered = np.zeros((bottom - top, right - left, 1), np.float32)
+    covered: Light = np.zeros((bottom - top, right - left, 1))
     for number in range(len(scene.objects)):
         shown, rows, columns = silhouette(finer, number, meshes)
         first_row, last_row = max(rows.start, top), min(rows.stop, bottom)

@@ -97,7 +97,7 @@ def solve(
     model: Model,
     frames: Frames,
     about: Float[Array, "frames d"],
-    motion: tuple[Array, ...],
+    motion: tuple[Array, Array, Array, Array],
     freedom: Float[Array, "frames cameras"] | None,
 ) -> Solved:
     """The optimum of the frames, by a search from `about`, where the slow factor of depth is linear.
