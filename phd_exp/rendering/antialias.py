@@ -8,6 +8,7 @@ error left after denoising. Here the shares come from rays that carry no light a
 
 from functools import cache
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +62,7 @@ def pixel_filter(places: Light) -> Light:
     return 0.35875 - 0.48829 * np.cos(angle) + 0.14128 * np.cos(2 * angle) - 0.01168 * np.cos(3 * angle)
 
 
-def filtered(fine: Light, finer: int) -> Light:
+def filtered(fine: NDArray[np.floating[Any]], finer: int) -> Light:
     """Values (rows, columns, channels) of pixels from those at `finer` points along each of their sides.
 
     The points are those of (rows + 2, columns + 2) pixels, because the filter reaches one pixel beyond each.

@@ -1,8 +1,8 @@
 """One sample: its image and its record.
 
-An image takes its light from the path tracer, its smooth edges from geometry (`antialias`), and its backdrop from a
-formula. The tracer renders only the box around the objects, and of that only the pixels that show an object are
-used. The box therefore leaves no seam that could reveal where the objects are.
+An image takes its light from the path tracer, its smooth edges from geometry (`antialias`), and what is behind from a
+formula, a photograph or a look-up in a sky. The tracer renders only the box around the objects, and of that only the
+pixels that show an object are used. The box therefore leaves no seam that could reveal where the objects are.
 """
 
 import math

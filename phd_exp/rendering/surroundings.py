@@ -27,7 +27,7 @@ from phd_exp.rendering.stage import TO_BLENDER, matrix_of, new_nodes
 
 GROUND = 1000.0  # m: side of the plane
 IMPORTANCE_MAP = 512  # px: that of a sky's own resolution, 1024, would take a second for each image
-FINER = (2, 8)  # least and largest number of points, along each side of a pixel, at which the sky is looked up
+FINEST = 8  # largest number of points, along each side of a pixel, at which the sky is looked up
 _LINEAR = np.array([linear(value / 255) for value in range(256)])
 """Linear light of 8-bit values."""
 
@@ -142,7 +142,7 @@ def sky_light(panorama: NDArray[np.float32], turn: Light, f: float, S: int) -> L
     from phd_exp.rendering.rasterizing import look_up
 
     texels = panorama.shape[1] / (2 * math.pi * f)  # that a pixel spans
-    finer = min(max(FINER[0], math.ceil(texels)), FINER[1])
+    finer = min(max(1, math.ceil(2 * texels)), FINEST)
     side = (np.arange(finer * (S + 2)) + 0.5) / finer - 1 - S / 2  # one pixel more at each border, for the filter
     return filtered(look_up(panorama, turn.astype(np.float32), (side / f).astype(np.float32)), finer)
 
