@@ -81,12 +81,9 @@ def coverage(scene: Scene, box: Box, meshes: Meshes) -> Light:
     left, top, right, bottom = (FINER * (edge + side) for edge, side in zip(box, (-1, -1, 1, 1), strict=True))
     covered: Light = np.zeros((bottom - top, right - left, 1))
     for number in range(len(scene.objects)):
-        shown, rows, columns = silhouette(finer, number, meshes)
-        first_row, last_row = max(rows.start, top), min(rows.stop, bottom)
-        first, last = max(columns.start, left), min(columns.stop, right)
-        if first_row < last_row and first < last:
-            part = shown[first_row - rows.start : last_row - rows.start, first - columns.start : last - columns.start]
-            covered[first_row - top : last_row - top, first - left : last - left, 0][part] = 1.0
+        shown, rows, columns = silhouette(finer, number, meshes, (range(top, bottom), range(left, right)))
+        place = slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left)
+        covered[place][shown] = 1.0
     return filtered(covered, FINER)
 
 

@@ -114,16 +114,35 @@ def truncation(scene: Scene, hits: Hits, meshes: Meshes = NO_MESHES) -> float:
     return float(1 - (hits.surfaces[0] != NOTHING).sum() / whole) if whole else 1.0
 
 
-def silhouette(scene: Scene, number: int = 0, meshes: Meshes = NO_MESHES) -> tuple[Mask, range, range]:
-    """Pixels of an object in an image without borders or other objects, and the rows and columns of these pixels."""
+Window = tuple[range, range]
+"""Rows and columns."""
+
+
+def silhouette(
+    scene: Scene, number: int = 0, meshes: Meshes = NO_MESHES, within: Window | None = None
+) -> tuple[Mask, range, range]:
+    """Pixels of an object in an image without borders or other objects, and the rows and columns of these pixels.
+
+    Pixels are those within a window, by default all.
+    """
     item = scene.objects[number]
     if item.shape in meshes:
         place = (*_placed(scene, item), scene.f, scene.S)
-        rows, columns = meshes[item.shape].window(*place)
+        rows, columns = _clipped(meshes[item.shape].window(*place), within)
         return np.isfinite(meshes[item.shape].depths(*place, window=(rows, columns))), rows, columns
-    rows, columns = window(scene, item)
+    rows, columns = _clipped(window(scene, item), within)
     alone = scene.model_copy(update={"objects": scene.objects[number : number + 1]})
     return trace_points(alone, *pixel_middles(rows, columns)).surfaces[0] != NOTHING, rows, columns
+
+
+def _clipped(whole: Window, within: Window | None) -> Window:
+    if within is None:
+        return whole
+    first, second = (
+        range(max(one.start, other.start), max(one.start, other.start, min(one.stop, other.stop)))
+        for one, other in zip(whole, within, strict=True)
+    )
+    return first, second
 
 
 def _placed(scene: Scene, item: SceneObject) -> tuple[Image, Image]:

@@ -33,7 +33,7 @@ from phd_exp.rendering.surroundings import photo_light, shaken
 from phd_exp.rendering.triangles import Meshes
 
 GREY = 128  # of all colours beyond the edges of the user's image, as in the views of photographs
-FEWER = 0.5  # samples a pixel of opaque meshes before a backdrop, over samples_per_pixel
+FEWER = 0.625  # samples a pixel of opaque meshes before a backdrop, over samples_per_pixel
 MARGIN = 4  # px around the objects: the denoiser is less accurate along the border of its image
 
 
