@@ -16,6 +16,7 @@ from phd_exp.models.heads import ChartHead, DistributionHead, Head
 
 onnxruntime = pytest.importorskip("onnxruntime", reason="needs `pip install 'phd_exp[export]'`")
 
+pytestmark = pytest.mark.timeout(1800)  # s; an export takes half a minute of a core, which others may use too
 SIDE = 32
 DEPTH = DepthScale.from_ranges(f_range=(600.0, 1000.0), z_range=(3.0, 5.0))
 
