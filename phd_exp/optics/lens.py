@@ -129,8 +129,8 @@ class Lens:
 
 def _polynomial(x: _Numbers, *coefficients: float) -> _Numbers:
     """The polynomial with these coefficients, the lowest first, by Horner's rule."""
-    *lower, highest = coefficients
-    value = highest + 0 * x
+    *lower, last_but_one, last = coefficients
+    value = last_but_one + last * x
     for coefficient in reversed(lower):
         value = value * x + coefficient
     return value
