@@ -73,7 +73,7 @@ def _cell(run: Run, scores: TrackScores, quantity: str, method: Method) -> Table
     line = run.choice | {"run": run.name, "frames": scores.frames, "quantity": quantity, "method": method}
     line |= {"mean": band.value, **bounds(band), "n_sequences": scores.n, "n_hidden": scores.hidden}
     text = band.each(lambda value: number(quantity, value))
-    return TableCell(text.value, f"({text.low}–{text.high})".replace("–-", " to -"), numbers=(line,))
+    return TableCell(text.value, f"({text.low}{' to ' if band.low < 0 else '–'}{text.high})", numbers=(line,))
 
 
 def number(quantity: str, value: float) -> str:

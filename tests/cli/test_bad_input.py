@@ -49,7 +49,7 @@ WRONG_VALUES = [
     ([f"{MULTIVIEW}=9", *FOLDER], ["is not rendered", "expected data=scale"]),
     ([f"{MULTIVIEW}=9", "data=scale", "model=mae_vz"], ["model=mae_vz has no density", "expected model=prob"]),
     ([SEQUENCES, "data=sequence"], ["data=sequence is not rendered in single images", "expected data=scale"]),
-    ([SEQUENCES, *FOLDER], ["data=photos is not rendered in single images"]),
+    ([SEQUENCES, *FOLDER], ["is not rendered in single images", "expected data=scale"]),
     ([SEQUENCES, "model=mae_vz"], ["model=mae_vz predicts no Projected Huber density", "expected model=prob"]),
     (["evaluation.sequences=[[4,20],[2,20]]"], ["expected pairs [sequences, frames] of different frames"]),
     (["evaluation.sequences=[[4,1]]"], ["evaluation.sequences", "got 1"]),
