@@ -89,7 +89,7 @@ def test_the_interval_of_calibrated_frames_is_that_of_draws(scores: TrackScores)
 
 
 def test_held_out_sequences_choose_noise_and_slow_errors(folder: Path) -> None:
-    write_sequences(folder / "held.parquet", 60, 30, slow=SLOW, seed=2)
+    write_sequences(folder / "held.parquet", 40, FRAMES, slow=SLOW, seed=2)
     choice = choose([read_sequences(folder / "held.parquet")])
     assert choice.correlated.depth_share == pytest.approx(SLOW.depth_share, abs=0.15)
     assert choice.correlated.projection_share == pytest.approx(SLOW.projection_share, abs=0.15)
@@ -100,7 +100,7 @@ def test_held_out_sequences_choose_noise_and_slow_errors(folder: Path) -> None:
 
 
 def test_independent_errors_choose_no_slow_ones(folder: Path) -> None:
-    write_sequences(folder / "none.parquet", 40, FRAMES, seed=3)
+    write_sequences(folder / "none.parquet", 20, FRAMES, seed=3)
     choice = choose([read_sequences(folder / "none.parquet")])
     assert choice.slow.depth_share < 0.1
     assert choice.slow.projection_share < 0.1
