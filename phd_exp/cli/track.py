@@ -45,6 +45,8 @@ class TrackArguments(CameraArguments):
     """part of the variance of log depth whose error changes slowly from frame to frame"""
     depth_time: Annotated[float, Field(gt=0)] = 1.0
     """with depth_share=: the time constant of that error, s"""
+    least_familiar: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """leave out predictions that are more unusual than this, see familiar in the lines: the object may be hidden"""
     out: Path | None = None
     """a folder for track.jsonl, a video with level curves, and a page with the path; by default lines are printed"""
 
@@ -135,7 +137,8 @@ def _followed(arguments: TrackArguments, predictor: "Predictor", sequence: _Sequ
     from phd_exp.inference.following import follow
 
     slow = Slow(arguments.depth_share, arguments.depth_time)
-    followed = follow(predictor, sequence.frames, ConstantVelocity(arguments.noise), arguments.lag, slow)
+    motion, least = ConstantVelocity(arguments.noise), arguments.least_familiar
+    followed = follow(predictor, sequence.frames, motion, arguments.lag, slow, least_familiar=least)
     if sys.stderr.isatty():
         from rich.console import Console
         from rich.progress import track

@@ -24,6 +24,7 @@ from phd_exp.records.errors import ConfigError, DatasetError, RunError, UserErro
 
 USUAL = ConstantVelocity(noise=1.0)
 SPREADS = 2.0  # standard deviations of the predicted position by which each side of its box is moved outwards
+WIDEST = 0.25  # the most by which it is moved, over the size of the box: networks have met boxes about as tight
 HERE = Pose(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
 
 
@@ -114,13 +115,15 @@ def follow(
     lag: int = 10,
     slow: Slow | None = None,
     lost: Lost | None = None,
+    least_familiar: float = 0.0,
 ) -> Iterator[Followed]:
     """Each frame with its state, `lag` frames later; frames may come from a live camera.
 
     A box of a detector is needed in the first frame only. It is taken as an outline that faces the camera at the
     predicted position; the box of a later frame is this outline, wider by the spread, at the position that the path
     predicts. Where boxes are given, the one that overlaps most with the predicted one replaces it. After a track is
-    lost, the next box begins another, and so does the next whole image.
+    lost, the next box begins another, and so does the next whole image. A prediction whose `familiar` is less than
+    `least_familiar` takes no part after the first one: the object may be hidden.
 
     Raises:
         ConfigError: the predictor has no uncertainty.
@@ -134,7 +137,7 @@ def follow(
         )
 
     def begun(track: int) -> _Track:
-        return _Track(predictor, Tracker(motion, lag, slow or Slow(), lost or Lost()), track)
+        return _Track(predictor, Tracker(motion, lag, slow or Slow(), lost or Lost()), track, least_familiar)
 
     current = begun(0)
     try:
@@ -151,8 +154,8 @@ def follow(
 class _Track:
     """One track: its tracker, the frames that wait for their state, and the outline of the last given box."""
 
-    def __init__(self, predictor: Predictor, tracker: Tracker, number: int) -> None:
-        self.predictor, self.tracker, self.number = predictor, tracker, number
+    def __init__(self, predictor: Predictor, tracker: Tracker, number: int, least_familiar: float) -> None:
+        self.predictor, self.tracker, self.number, self.least_familiar = predictor, tracker, number, least_familiar
         self.waiting: deque[Followed] = deque()
         self.last: tuple[ProjectedHuber, Pose] | None = None  # prediction and pose of the virtual camera
         self.outline: _Outline | None = None
@@ -165,8 +168,10 @@ class _Track:
         followed = Followed(number, frame, self.number)
         is_seen = frame.boxes is None or box is not None
         if is_seen:
+            before = self.last
             self.last, familiar = self._predict(frame, box)
             followed = replace(followed, box=box, familiar=familiar)
+            is_seen = before is None or familiar is None or familiar >= self.least_familiar
         if self.last is None:
             yield followed
             return
@@ -264,7 +269,8 @@ class _Outline:
         turn = towards(position)
         spread = np.sqrt((turn @ covariance @ turn.T).diagonal()[:2])
         corners = self.corners.copy()
-        corners[:, :2] += SPREADS * spread * np.sign(corners[:, :2] - corners[:, :2].mean(0))
+        outwards = corners[:, :2] - corners[:, :2].mean(0)
+        corners[:, :2] += np.sign(outwards) * np.minimum(SPREADS * spread, 2 * WIDEST * np.abs(outwards))
         place = frame.lens.distort(position + corners @ turn)
         pixels = frame.K[:2, 2] + np.diagonal(frame.K)[:2] * place
         (left, top), (right, bottom) = pixels.min(0), pixels.max(0)

@@ -78,8 +78,8 @@ class PathVideo:
         mean, covariance = followed.in_camera
         curves = _ellipses(mean[[0, 2]], covariance[np.ix_([0, 2], [0, 2])])
         self._trail.append(mean[[0, 2]])
-        shown = np.concatenate([curves[-1], np.zeros((1, 2))])  # with the camera
-        self._low, self._high = np.minimum(self._low, shown.min(0)), np.maximum(self._high, shown.max(0))
+        self._low = np.minimum(self._low, curves[-1].min(0))
+        self._high = np.maximum(self._high, curves[-1].max(0))
         scale = (1 - 2 * MARGIN) * min(np.array(size) / np.maximum(self._high - self._low, 1e-6))
         middle = (self._low + self._high) / 2
 
@@ -89,8 +89,6 @@ class PathVideo:
             return [(float(x), float(y)) for x, y in offsets]
 
         _draw_grid(draw, size, 10 ** math.floor(math.log10(min(size) / scale / 2)), placed)
-        (x, y), *_ = placed(np.zeros((1, 2)))
-        draw.polygon([(x, y), (x - 7, y - 12), (x + 7, y - 12)], outline="black")
         draw.line(placed(np.stack(list(self._trail))), fill="#648fff", width=2)
         for curve, width in zip(curves, WIDTHS, strict=True):
             draw.line(placed(curve), fill=COLOURS[followed.status], width=width)

@@ -20,6 +20,7 @@ PACKAGES = {
     "search": ("optuna",),
     "loggers": ("tensorboard", "tensorboardX", "mlflow"),
     "timm": ("timm",),
+    "video": ("av",),
     "ray": ("ray", "hydra_plugins.hydra_ray_launcher"),
 }
 OTHERS = (*LEARN, "runs=others")
@@ -38,6 +39,7 @@ LACKS: dict[str, tuple[tuple[str, ...], ...]] = {
     "export": (("export", "run=RUN"),),
     "search": (("search", "space.yaml", "trials=1", *OTHERS),),
     "loggers": ((*LEARN, "runs=a", "logger=tensorboard"), (*LEARN, "runs=b", "logger=mlflow")),
+    "video": (("track", "run=RUN", "video=clip.mp4", "f=300"),),
     "timm": ((*LEARN, "runs=c", "backbone._target_=timm.create_model"),),
     "ray": (("-m", *OTHERS, "seed=1,2", "hydra/launcher=ray"),),
 }
