@@ -106,10 +106,11 @@ def main(words: list[str]) -> int:
 
 
 def _sequences(arguments: TrackArguments) -> Iterator[_Sequence]:
-    from phd_exp.inference.frames import folder_frames, video_frames
-
     if arguments.folder:
-        for name, detections in tracks_of(detections_in(arguments.folder)).items():
+        tracks = tracks_of(detections_in(arguments.folder))
+        from phd_exp.inference.frames import folder_frames
+
+        for name, detections in tracks.items():
             yield _Sequence(
                 folder_frames(detections), len(detections), str(arguments.folder.name if name is None else name)
             )
@@ -127,6 +128,8 @@ def _sequences(arguments: TrackArguments) -> Iterator[_Sequence]:
     elif arguments.box:
         boxes = {0: [arguments.box]}
     length = length_of(video)
+    from phd_exp.inference.frames import video_frames
+
     frames = video_frames(detection, boxes, arguments.stride)
     yield _Sequence(frames, length and -(-length // arguments.stride), video.stem)
 

@@ -2,6 +2,7 @@
 
 import math
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -15,6 +16,7 @@ from phd_exp.inference.following import Followed
 from phd_exp.optics.virtual import VirtualCamera, towards
 from phd_exp.records.videos import VideoWriter
 
+Pixel = tuple[float, float]
 COLOURS = {"tracked": "#ffb000", "bridged": "#fe6100", "lost": "#dc267f"}
 WIDTHS = (3, 2, 1)  # of the lines of 50, 90 and 99 %
 RADII = [math.sqrt(-2 * math.log(1 - level)) for level in LEVELS]  # of a Gaussian in two dimensions, in deviations
@@ -83,7 +85,7 @@ class PathVideo:
         scale = (1 - 2 * MARGIN) * min(np.array(size) / np.maximum(self._high - self._low, 1e-6))
         middle = (self._low + self._high) / 2
 
-        def placed(points: Points) -> list[tuple[float, float]]:
+        def placed(points: Points) -> list[Pixel]:
             """Pixels: x to the right, z upwards."""
             offsets = scale * (points - middle) * (1, -1) + np.array(size) / 2
             return [(float(x), float(y)) for x, y in offsets]
@@ -119,9 +121,10 @@ def _draw_text(draw: ImageDraw.ImageDraw, size: tuple[int, int], followed: Follo
     draw.text((4, 4), text, "white", ImageFont.load_default(height), stroke_width=2, stroke_fill="black")
 
 
-def _draw_grid(draw: ImageDraw.ImageDraw, size: tuple[int, int], step: float, placed: object) -> None:
+def _draw_grid(
+    draw: ImageDraw.ImageDraw, size: tuple[int, int], step: float, placed: Callable[[Points], list[Pixel]]
+) -> None:
     """Lines every `step` metres, with their distance."""
-    assert callable(placed)
     (x0, y0), (x1, y1) = placed(np.array([[0.0, 0.0], [step, step]]))
     font = ImageFont.load_default(max(10, size[1] // 36))
     for k in range(math.ceil(-x0 / (x1 - x0)), math.floor((size[0] - x0) / (x1 - x0)) + 1):
