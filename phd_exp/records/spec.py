@@ -70,8 +70,7 @@ class DatasetSpec(Record):
         scale_range: bounds of each object's size factor; (1, 1) makes sizes known.
         occluders: whether to add a cube and a sphere.
         lamp_jitter: largest relative change of a lamp's place and power.
-        samples_per_pixel: light paths traced per pixel, before denoising. Opaque meshes without `ground` get five
-            eighths of them, because their edges are computed.
+        samples_per_pixel: light paths traced per pixel, before denoising.
         views: cameras per scene; sample i is view i mod views of scene i div views.
         view_angle_range: bounds of the angle between the lines of sight of a further view and the first, degrees.
         image_format: png keeps every pixel, webp and jpeg are small.

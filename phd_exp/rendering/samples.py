@@ -33,19 +33,12 @@ from phd_exp.rendering.surroundings import photo_light, shaken
 from phd_exp.rendering.triangles import Meshes
 
 GREY = 128  # of all colours beyond the edges of the user's image, as in the views of photographs
-FEWER = 0.625  # samples a pixel of opaque meshes before a backdrop, over samples_per_pixel
 MARGIN = 4  # px around the objects: the denoiser is less accurate along the border of its image
 
 
 def fast_settings(spec: DatasetSpec) -> Settings:
-    """Settings of the tracer for the images of a data set.
-
-    Before a backdrop, opaque meshes need fewer samples for the same error, because their edges are computed.
-    """
-    samples = spec.samples_per_pixel
-    if spec.mesh is not None and not spec.ground:
-        samples = math.ceil(FEWER * samples)
-    return Settings(samples=samples, denoised=True, at_middles=spec.mesh is None)
+    """Settings of the tracer for the images of a data set."""
+    return Settings(samples=spec.samples_per_pixel, denoised=True, at_middles=spec.mesh is None)
 
 
 def make_sample(renderer: Renderer, spec: DatasetSpec, split: Split, index: int) -> tuple[bytes, SampleRecord]:
