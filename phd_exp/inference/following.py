@@ -261,6 +261,7 @@ class _Outline:
         here = self.frame.pose.into_camera(torch.from_numpy(position)).numpy()
         self.corners = (np.linalg.norm(here) * self._rays - here) @ towards(here).T
 
+    @np.errstate(invalid="ignore")  # straight behind the camera
     def box(self, frame: Frame, position: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"]) -> Box | None:
         """The box at a position in the frame of the camera (metres), moved outwards by its spread.
 
