@@ -59,9 +59,11 @@ def _configuration(run: Run) -> tuple[str, str, str, str]:
 
 
 def _scores(runs: Sequence[Run]) -> dict[str, Mapping[str, Interval[float]]]:
-    """Kind of prediction -> its scores; empty without an ensemble."""
+    """Kind of prediction -> its scores; empty without an ensemble, and for densities of other shapes."""
     runs = [run for run in runs if run.nll is not None]
     seeds = [read_table(run.folder.predictions) for run in runs]
+    if not all("a" in table for table in seeds):
+        return {}
     tables = {f"{k} seeds": ensemble_table(seeds[:k]) for k in SIZES if k <= len(seeds)}
     eight = {run.name.partition("-")[0]: run.folder.eight_views["test"] for run in runs}
     tables |= {f"eight views, {seed}": read_table(file) for seed, file in eight.items() if file.exists()}
