@@ -74,6 +74,7 @@ class Whitening:
 
     @property
     def A_inverse(self) -> Float[Tensor, "*batch 2 2"]:
+        """A^(-1), which scales q to (x, y)/z."""
         return spd.inverse(self.around.A, self.around.log_det_A)
 
 

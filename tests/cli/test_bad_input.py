@@ -125,7 +125,7 @@ def test_every_key_refuses_a_wrong_value(tmp_path: Path, verb: str, model: type[
         OmegaConf.update(config, key, wrong)
     with pytest.raises(ConfigError) as refused:
         require_sound(verb, config, tmp_path)
-    named = [re.split(r"(?:\.\d)?: ", line)[0] for line in str(refused.value).splitlines()]
+    named = [re.split(r"(?:\.\d)*: ", line)[0] for line in str(refused.value).splitlines()]
     assert [key for key in keys if key not in named] == []
 
 
