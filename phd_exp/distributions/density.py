@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import torch
@@ -12,6 +12,7 @@ from torch.nn.functional import pad
 
 from phd_exp.geometry.camera import at_depth
 
+_BISECTIONS = 60
 _NODES = 400  # of quadrature over quantiles; relative errors are below 1e-3
 
 
@@ -113,6 +114,21 @@ def nodes(like: Float[Tensor, "*batch"]) -> tuple[Float[Tensor, "nodes ..."], Fl
     angle = (torch.arange(_NODES, dtype=like.dtype, device=like.device) + 0.5) * (math.pi / _NODES)
     angle = angle.reshape(-1, *[1] * like.ndim)
     return (angle / 2).sin().square(), angle.sin() * (math.pi / 2 / _NODES)
+
+
+def quantile_between(
+    cdf: Callable[[Tensor], Tensor], p: Float[Tensor, "*#batch"], ends: Float[Tensor, "*#batch n"]
+) -> Float[Tensor, "*batch"]:
+    """The value of which smaller ones have the probability p, between the least and the largest of `ends`.
+
+    By bisection, to the last bits.
+    """
+    low, high = ends.amin(-1), ends.amax(-1)
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2
+        is_low = cdf(middle) < p
+        low, high = torch.where(is_low, middle, low), torch.where(is_low, high, middle)
+    return high
 
 
 def pinball(excess: Float[Tensor, "..."], p: Float[Tensor, "..."]) -> Float[Tensor, "..."]:

@@ -12,14 +12,13 @@ from torch.distributions import Normal
 from torch.nn.functional import pad
 from torch.quasirandom import SobolEngine
 
-from phd_exp.distributions.density import Density
+from phd_exp.distributions.density import Density, quantile_between
 from phd_exp.distributions.laws import NormalLaw
 from phd_exp.distributions.projected_huber import ProjectedHuber
 from phd_exp.distributions.shaped import Shaped, Whitening
 
 _NORMAL = Normal(0.0, 1.0, validate_args=False)
 _DRAWS, _AT_ONCE = 512, 128  # draws of each Gaussian for a level, and those in memory at a time
-_BISECTIONS = 60
 _STEPS = 30  # of the fixed point to the mode
 
 
@@ -138,12 +137,7 @@ class GaussianMixture(Density):
         """By bisection."""
         p = torch.as_tensor(p).to(self.log_weight)
         ends = self.parts.depth_icdf(p[..., None])
-        low, high = ends.amin(-1), ends.amax(-1)
-        for _ in range(_BISECTIONS):
-            middle = (low + high) / 2
-            is_low = self.depth_cdf(middle) < p
-            low, high = torch.where(is_low, middle, low), torch.where(is_low, high, middle)
-        return high
+        return quantile_between(self.depth_cdf, p, ends)
 
     def depth_crps(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
         """E|Z - z| - E|Z - Z'|/2 with closed forms for each pair of Gaussians.

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from phd_exp.distributions import spd
+from phd_exp.distributions.density import quantile_between
 from phd_exp.distributions.depth import depth_mean_energy
 from phd_exp.distributions.huber import RADIAL_NORMALISER
 from phd_exp.distributions.projected_huber import ProjectedHuber
@@ -18,7 +19,6 @@ from phd_exp.distributions.special import scaled_expints, tail_moment
 
 DRAWS = 10_240  # for a level, whose standard error is at most 0.5 / sqrt(DRAWS) = 0.0049
 _AT_ONCE = 512  # draws in memory at a time
-_BISECTIONS = 60
 _STEPS = 15  # of weighted least squares; each removes about two thirds of the error
 _PARTS, _ROUNDS = 16, 8  # an interval is divided into parts, and one of them again
 
@@ -71,12 +71,7 @@ class Mixture:
         """The depth z, metres, with P(depth <= z) = p, for p in (0, 1), by bisection."""
         p = torch.as_tensor(p, dtype=self.members.a.dtype, device=self.members.a.device)
         ends = self.members.depth_icdf(p[..., None])
-        low, high = ends.amin(-1), ends.amax(-1)
-        for _ in range(_BISECTIONS):
-            middle = (low + high) / 2
-            is_low = self.depth_cdf(middle) < p
-            low, high = torch.where(is_low, middle, low), torch.where(is_low, high, middle)
-        return high
+        return quantile_between(self.depth_cdf, p, ends)
 
     def rsample(
         self, sample_shape: Sequence[int] = (), generator: torch.Generator | None = None
