@@ -18,6 +18,9 @@ from phd_exp.training.recorder import epoch_metrics
 
 LINES = 10  # of a training, about
 PATIENCE = 5.0  # s from the first batch to the first line, and at least between lines within an epoch
+FEWEST = 3  # batches after the first one before the first line
+LONG = 600.0  # s left, of which more are announced with a smaller choice
+SMALLER = {"paper": "preset=small", "full": "preset=small", "small": "preset=demo"}
 BETWEEN_LOOKS = 0.5  # s between two readings of the loss, which a GPU would have to wait for
 SHOWN = ("test/loss", "test/projected_error_mm", "test/depth_error_mm")
 
@@ -27,10 +30,12 @@ class Progress(Callback):
 
     Args:
         is_terminal: whether to draw a bar on standard error; otherwise lines go to standard output.
+        preset: if the first estimate of the time left is long, a line names a smaller one.
     """
 
-    def __init__(self, is_terminal: bool) -> None:
+    def __init__(self, is_terminal: bool, preset: str = "") -> None:
         self.bar = _Bar() if is_terminal else None
+        self.smaller = SMALLER.get(preset, "")
         self.say = rank_zero_only(partial(print, flush=True))
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -47,6 +52,8 @@ class Progress(Callback):
     ) -> None:
         n = int(trainer.num_training_batches)
         is_due, self.loss = self._count(trainer.current_epoch * n + batch_idx + 1), outputs["loss"]
+        if is_due and self.smaller:
+            self._name_smaller()
         if self.bar and is_due:
             self.bar.show(_epoch(trainer), self.done, self._words())
         elif is_due and batch_idx + 1 < n:
@@ -99,6 +106,8 @@ class Progress(Callback):
         if self.first is None:  # the first batch includes allocation and compilation
             self.first, self.last = (now, done), now
             return False
+        if done - self.first[1] < FEWEST:
+            return False
         if self.bar:
             is_due = now >= self.last + BETWEEN_LOOKS
         else:
@@ -117,11 +126,19 @@ class Progress(Callback):
     def _loss(self) -> str:
         return f"loss {float(self.loss):.4g}"  # of the last batch
 
+    def _name_smaller(self) -> None:
+        """Once, with the first estimate."""
+        smaller, self.smaller = self.smaller, ""
+        if self._seconds_left() > LONG:
+            self.say(f"{self._left()}; {smaller} takes a fraction of it")
+
     def _left(self) -> str:
-        """The time left at the mean speed so far, evaluations included."""
+        return f"about {duration(self._seconds_left())} left"
+
+    def _seconds_left(self) -> float:
+        """At the mean speed so far, evaluations included."""
         since, before = self.first or (time.monotonic(), self.done)
-        speed = (time.monotonic() - since) / max(self.done - before, 1)
-        return f"about {duration(speed * (self.total - self.done))} left"
+        return (time.monotonic() - since) / max(self.done - before, 1) * (self.total - self.done)
 
 
 class _Bar:

@@ -53,7 +53,7 @@ def build_trainer(config: RunConfig, recorder: Recorder, callbacks: Sequence[Cal
     if config.trainer.devices == 1:  # several processes would stop at different batches
         ours.append(StopBetweenBatches(folder.last_checkpoint))
     if config.trainer.progress_bar:
-        ours.append(Progress(is_terminal=sys.stderr.isatty()))
+        ours.append(Progress(sys.stderr.isatty(), config.preset))
     every = [*ours, *build_callbacks(config, folder), *callbacks]
     arguments: dict[str, Any] = {
         "accelerator": config.trainer.accelerator,

@@ -16,7 +16,7 @@ import pytest
 
 from phd_exp.records.processes import duration
 from phd_exp.training import progress
-from phd_exp.training.progress import LINES, PATIENCE, Progress, line_epochs
+from phd_exp.training.progress import FEWEST, LINES, LONG, PATIENCE, Progress, line_epochs
 
 BATCHES = 100
 
@@ -27,10 +27,10 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[tuple[float, 
     now = SimpleNamespace(seconds=1000.0)
     monkeypatch.setattr(progress.time, "monotonic", lambda: now.seconds)
 
-    def train(seconds: float, epochs: int, every: int) -> list[tuple[float, str]]:
+    def train(seconds: float, epochs: int, every: int, preset: str = "") -> list[tuple[float, str]]:
         lines: list[tuple[float, str]] = []
         now.seconds = 1000.0
-        callback = Progress(is_terminal=False)
+        callback = Progress(False, preset)
         callback.say = lambda line: lines.append((now.seconds - 1000.0, line))  # type: ignore[assignment]
         trainer: Any = SimpleNamespace(
             max_epochs=epochs, num_training_batches=BATCHES, check_val_every_n_epoch=every, current_epoch=0,
@@ -53,7 +53,7 @@ def test_lines_come_soon_and_about_every_tenth(trained: Callable, seconds: float
     lines, whole = trained(seconds, epochs, every), epochs * BATCHES * seconds
     times = [0.0, *(time for time, _ in lines)]
     assert min(LINES, epochs) <= len(lines) <= 2 * LINES
-    assert times[1] <= max(2 * seconds + PATIENCE, whole / LINES if whole < 2 * PATIENCE else 0) + seconds
+    assert times[1] <= max((FEWEST + 1) * seconds + PATIENCE, whole / LINES if whole < 2 * PATIENCE else 0) + seconds
     assert max(after - before for before, after in pairwise(times)) <= max(
         0.2 * whole, whole / epochs if whole < 60 else 0
     )
@@ -66,6 +66,17 @@ def test_lines_come_soon_and_about_every_tenth(trained: Callable, seconds: float
         ).groups()  # type: ignore[union-attr]
         expected = "test/loss 3" if int(number) % every == 0 else "loss 5"
         assert tested == (None if batch else expected)
+
+
+@pytest.mark.parametrize(("preset", "smaller"), [("full", "preset=small"), ("small", "preset=demo"), ("demo", "")])
+@pytest.mark.parametrize("seconds", [0.05, 1.0])
+def test_a_long_training_names_a_smaller_one_once(
+    trained: Callable, seconds: float, preset: str, smaller: str
+) -> None:
+    is_long = 20 * BATCHES * seconds > LONG
+    named = [line for _, line in trained(seconds, 20, 20, preset) if "preset=" in line]
+    assert len(named) == int(is_long and bool(smaller))
+    assert all(re.fullmatch(rf"about .* left; {smaller} takes a fraction of it", line) for line in named)
 
 
 @pytest.mark.parametrize(("epochs", "every"), [(1, 1), (7, 2), (10, 10), (42, 10), (90, 1), (1000, 7)])
