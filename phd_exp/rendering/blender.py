@@ -99,8 +99,6 @@ class Renderer:
             if self.meshes:
                 _configure_for_meshes(self._bpy)
             self.is_opaque = all(mesh.is_opaque for mesh in self.meshes.values())
-            if spec and not self.is_opaque:  # their opacity is traced too
-                self._scene.cycles.samples = max(settings.samples, spec.samples_per_pixel)
             if spec and spec.looks == "varied":
                 prepare_looks(self._bpy, [*SHAPES, *self.meshes])
             if spec:  # what is nearer or farther than usual is shown too
