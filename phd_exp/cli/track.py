@@ -1,6 +1,7 @@
 """`python -m phd_exp track`: the path of an object through a video or a folder of images, as JSON lines."""
 
 import json
+import math
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
@@ -21,6 +22,7 @@ if TYPE_CHECKING:  # imports of seconds, which follow the checks of the argument
     from phd_exp.inference.following import Followed, Frame
     from phd_exp.inference.predictor import Predictor
 
+Box = tuple[float, float, float, float]
 LEAST_LAG = 4  # five frames in a row that contradict a path end it
 
 
@@ -37,13 +39,13 @@ class TrackArguments(CameraArguments):
     """with boxes=: the category_id; by default all boxes"""
     stride: Annotated[int, Field(ge=1)] = 1
     """use every stride-th frame of the video"""
-    noise: Annotated[float, Field(gt=0)] = 1.0
+    noise: Annotated[float, Field(ge=1e-3, le=1e3)] = 1.0
     """how fast the velocity changes: by noise m/s in a second, growing with the root of time"""
-    lag: Annotated[int, Field(ge=LEAST_LAG)] = 10
-    """how many later frames the state of a frame takes into account"""
+    lag: Annotated[int, Field(ge=LEAST_LAG, le=1000)] = 10
+    """how many later frames the state of a frame takes into account; as many images are in memory"""
     depth_share: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """part of the variance of log depth whose error changes slowly from frame to frame"""
-    depth_time: Annotated[float, Field(gt=0)] = 1.0
+    depth_time: Annotated[float, Field(gt=0, le=1e6)] = 1.0
     """with depth_share=: the time constant of that error, s"""
     least_familiar: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """leave out predictions that are more unusual than this, see familiar in the lines: the object may be hidden"""
@@ -118,20 +120,35 @@ def _sequences(arguments: TrackArguments) -> Iterator[_Sequence]:
     video, camera = arguments.video, arguments.of_camera
     assert video is not None  # by `one_source`
     (detection,) = detections_of([video], camera)
-    boxes: dict[int, list[tuple[float, float, float, float]]] | None = None
+    boxes: dict[int, list[Box]] | None = None
     if arguments.boxes:
-        found = boxes_of_images(arguments.boxes, arguments.object)
-        if wrong := next((name for name in found if not name.isdecimal()), None):
-            raise ConfigError(f"boxes: got image_id {wrong}; expected the number of a frame, from 0")
-        ordered = {int(n): sorted(given, key=lambda one: -one.get("score", 0.0)) for n, given in found.items()}
-        boxes = {n: [tuple(one["box"]) for one in given] for n, given in ordered.items()}
+        boxes = _boxes_of_frames(arguments.boxes, arguments.object)
     elif arguments.box:
         boxes = {0: [arguments.box]}
     length = length_of(video)
+    if boxes and not any(n % arguments.stride == 0 and n < (length or math.inf) for n in boxes):
+        used = "every frame" if arguments.stride == 1 else f"frames 0, {arguments.stride}, ..."
+        raise ConfigError(
+            f"boxes: got image_id {min(boxes)} to {max(boxes)}, none of a frame; expected numbers from 0, of {used}"
+        )
     from phd_exp.inference.frames import video_frames
 
     frames = video_frames(detection, boxes, arguments.stride)
     yield _Sequence(frames, length and -(-length // arguments.stride), video.stem)
+
+
+def _boxes_of_frames(file: Path, category: int | str | None) -> dict[int, list[Box]]:
+    """The boxes of each frame, the most certain first. Raises ConfigError for other names of frames, or scores."""
+    found: dict[int, list[Box]] = {}
+    for name, given in boxes_of_images(file, category).items():
+        if not name.isdecimal():
+            raise ConfigError(f"boxes: got image_id {name}; expected the number of a frame, from 0")
+        scores = [one.get("score", 0.0) for one in given]
+        if wrong := [score for score in scores if not isinstance(score, int | float)]:
+            raise ConfigError(f"boxes: got the score {wrong[0]} in frame {name}; expected a number, or no score")
+        order = sorted(range(len(given)), key=lambda k: -scores[k])
+        found[int(name)] = [tuple(given[k]["box"]) for k in order]
+    return found
 
 
 def _followed(arguments: TrackArguments, predictor: "Predictor", sequence: _Sequence) -> Iterator["Followed"]:
@@ -165,7 +182,8 @@ def _write(arguments: TrackArguments, predictor: "Predictor", sequences: list[_S
     from phd_exp.inference.path_video import PathVideo
 
     file, page = out / "track.jsonl", out / "track.html"
-    file.unlink(missing_ok=True)
+    for earlier in (file, page):  # a page is written only if a frame has a position
+        earlier.unlink(missing_ok=True)
     with ExitStack() as ends, open(file, "x", buffering=1) as lines:
         ends.callback(write_page, file, page)  # also of the frames before an error
         for number, sequence in enumerate(sequences, start=1):
@@ -174,4 +192,4 @@ def _write(arguments: TrackArguments, predictor: "Predictor", sequences: list[_S
                 for followed in _followed(arguments, predictor, sequence):
                     lines.write(_line(arguments, predictor, sequence, followed) + "\n")
                     video.add(followed)
-    print(f"{file}, a video for each path, and {page}", file=sys.stderr)
+    print(f"{file}, a video for each path{f', and {page}' * page.exists()}", file=sys.stderr)

@@ -102,7 +102,8 @@ def test_a_bad_frame_is_refused_on_one_line_and_those_before_are_kept(
         (("folder=.", "coverage=0.9"), "coverage: is guaranteed for single predictions"),
         (("folder=.", "depth_time=2"), "depth_time: is that of the slow error"),
         (("folder=.", "lag=2"), "lag: got '2'; expected to be greater than or equal to 4"),
-        (("folder=.", "noise=0"), "noise: got '0'; expected to be greater than 0"),
+        (("folder=.", "noise=0"), "noise: got '0'; expected to be greater than or equal to 0.001"),
+        (("folder=.", "noise=inf"), "noise: got 'inf'; expected to be less than or equal to 1000"),
     ],
 )
 def test_wrong_arguments_are_refused(phd_exp: Callable, words: tuple[str, ...], said: str) -> None:
@@ -180,6 +181,20 @@ def test_a_video_is_followed_from_one_box(phd_exp: Callable, run: str, video: Pa
     outcome = phd_exp(*words, f"boxes={tmp_path / 'boxes.json'}", "object=3")
     assert outcome.status == 0, outcome.err
     assert len(read_lines(outcome.out)) == len(lines)
+
+
+@pytest.mark.parametrize(
+    ("frame", "score", "said"), [(1, 0.5, "none of a frame"), (99, 0.5, "none of a frame"), (0, None, "score None")]
+)
+def test_boxes_that_no_frame_can_use_are_refused(
+    phd_exp: Callable, video: Path, tmp_path: Path, frame: int, score: float | None, said: str
+) -> None:
+    boxes = tmp_path / "boxes.json"
+    boxes.write_text(json.dumps([{"image_id": frame, "category_id": 1, "bbox": [9, 9, 9, 9], "score": score}]))
+    outcome = phd_exp("track", "run=nowhere", f"video={video}", "f=900", f"boxes={boxes}", "stride=2")
+    assert outcome.status == 2
+    (line,) = outcome.err.splitlines()
+    assert said in line
 
 
 @pytest.mark.parametrize(
