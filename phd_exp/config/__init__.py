@@ -154,7 +154,7 @@ class RunConfig(Record):
                 f"evaluation.sequences: model={self.model.name} predicts no Projected Huber density, which the "
                 f"smoother needs; expected model=probabilistic, {expected}"
             )
-        if not isinstance(self.data, RenderedConfig) or self.data.spec.frames > 1:
+        if not isinstance(self.data, RenderedConfig) or self.data.spec.frames > 1 or self.data.spec.views > 1:
             raise ValueError(
                 f"evaluation.sequences: data={self.data.name} is not rendered in single images; expected data=scale, "
                 f"{expected}"

@@ -56,6 +56,13 @@ class PhotographsConfig(Record):
     object: NumberOrName | None = None
     share: Annotated[float, Field(gt=0, lt=1)] = 0.25
 
+    @model_validator(mode="after")
+    def of_a_folder(self) -> "PhotographsConfig":
+        """Refuse the other keys without a folder."""
+        if self.folder is None and self != PhotographsConfig.model_construct():
+            raise ValueError("photographs: share and object need photographs, expected data.photographs.folder too")
+        return self
+
 
 class RenderedConfig(SizesConfig):
     """A rendered data set: the keys of `DatasetSpec`, how much of it a run uses, and photographs to train on too."""

@@ -20,7 +20,7 @@ from phd_exp.inference.answers import PER_CENT, rounded, uncertainty
 from phd_exp.inference.predictor import Predictor
 from phd_exp.optics.lens import PINHOLE, Lens
 from phd_exp.optics.virtual import Box, VirtualCamera, rays, towards
-from phd_exp.records.errors import ConfigError, DatasetError, RunError, UserError
+from phd_exp.records.errors import ConfigError, DatasetError, RunError, UserError, gist
 
 USUAL = ConstantVelocity(noise=1.0)
 SPREADS = 2.0  # standard deviations of the predicted position by which each side of its box is moved outwards
@@ -127,8 +127,8 @@ def follow(
 
     Raises:
         ConfigError: the predictor has no uncertainty.
-        DatasetError: a given box is not valid; the states of earlier frames are yielded first.
-        ValueError: a time is not later than the one before.
+        DatasetError: a given box is not valid, a time is not later than the one before, or no path is found; the
+            states of earlier frames are yielded first.
     """
     if not predictor.is_probabilistic:
         raise ConfigError(
@@ -176,7 +176,11 @@ class _Track:
             yield followed
             return
         self.waiting.append(followed)
-        state = self.tracker.update(frame.time, *self.last, torch.tensor([is_seen]))
+        try:
+            state = self.tracker.update(frame.time, *self.last, torch.tensor([is_seen]))
+        except ValueError as error:
+            self.waiting.pop()
+            raise DatasetError(f"{frame.where}: no path through this frame ({gist(error)})") from None
         if self.outline:
             self.outline.age += 1
         if given and box:
