@@ -18,7 +18,7 @@ from phd_exp.training.recorder import epoch_metrics
 
 LINES = 10  # of a training, about
 PATIENCE = 5.0  # s from the first batch to the first line, and at least between lines within an epoch
-FEWEST = 3  # batches after the first one before the first line
+FEWEST, LONGEST = 10, 30.0  # batches after the first one, or seconds, before the first line
 LONG = 600.0  # s left, of which more are announced with a smaller choice
 SMALLER = {"paper": "preset=small", "full": "preset=small", "small": "preset=demo"}
 BETWEEN_LOOKS = 0.5  # s between two readings of the loss, which a GPU would have to wait for
@@ -95,7 +95,7 @@ class Progress(Callback):
     def _start(self, trainer: Trainer, place: str, total: int, is_long: bool, stays: bool = True) -> None:
         """`is_long`: whether an epoch takes so long that there are lines within it."""
         self.total, self.is_long, self.done = total, is_long, 0
-        self.first: tuple[float, int] | None = None
+        self.times: list[float] = []
         self.last, self.tenth = math.inf, -1
         if self.bar and trainer.is_global_zero:
             self.bar.start(place, total, stays)
@@ -103,10 +103,10 @@ class Progress(Callback):
     def _count(self, done: int) -> bool:
         """Count a batch; returns whether to show it."""
         self.done, now = done, time.monotonic()
-        if self.first is None:  # the first batch includes allocation and compilation
-            self.first, self.last = (now, done), now
-            return False
-        if done - self.first[1] < FEWEST:
+        self.times.append(now)
+        if len(self.times) == 1:
+            self.last = now
+        if len(self.times) <= FEWEST and now < self.times[0] + LONGEST:
             return False
         if self.bar:
             is_due = now >= self.last + BETWEEN_LOOKS
@@ -136,9 +136,9 @@ class Progress(Callback):
         return f"about {duration(self._seconds_left())} left"
 
     def _seconds_left(self) -> float:
-        """At the mean speed so far, evaluations included."""
-        since, before = self.first or (time.monotonic(), self.done)
-        return (time.monotonic() - since) / max(self.done - before, 1) * (self.total - self.done)
+        """At the mean speed of the later half of the batches so far, since the first are slow, with evaluations."""
+        later = self.times[len(self.times) // 2 :]
+        return (time.monotonic() - later[0]) / max(len(later) - 1, 1) * (self.total - self.done)
 
 
 class _Bar:

@@ -16,7 +16,7 @@ import pytest
 
 from phd_exp.records.processes import duration
 from phd_exp.training import progress
-from phd_exp.training.progress import FEWEST, LINES, LONG, PATIENCE, Progress, line_epochs
+from phd_exp.training.progress import FEWEST, LINES, LONG, LONGEST, PATIENCE, Progress, line_epochs
 
 BATCHES = 100
 
@@ -27,7 +27,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[tuple[float, 
     now = SimpleNamespace(seconds=1000.0)
     monkeypatch.setattr(progress.time, "monotonic", lambda: now.seconds)
 
-    def train(seconds: float, epochs: int, every: int, preset: str = "") -> list[tuple[float, str]]:
+    def train(seconds: Any, epochs: int, every: int, preset: str = "") -> list[tuple[float, str]]:
         lines: list[tuple[float, str]] = []
         now.seconds = 1000.0
         callback = Progress(False, preset)
@@ -39,7 +39,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[tuple[float, 
         callback.on_train_start(trainer, None)  # type: ignore[arg-type]
         for trainer.current_epoch in range(epochs):
             for batch in range(BATCHES):
-                now.seconds += seconds
+                now.seconds += seconds(trainer.current_epoch * BATCHES + batch) if callable(seconds) else seconds
                 callback.on_train_batch_end(trainer, None, {"loss": 5.0}, None, batch)  # type: ignore[arg-type]
             callback.on_train_epoch_end(trainer, None)  # type: ignore[arg-type]
         return lines
@@ -53,7 +53,11 @@ def test_lines_come_soon_and_about_every_tenth(trained: Callable, seconds: float
     lines, whole = trained(seconds, epochs, every), epochs * BATCHES * seconds
     times = [0.0, *(time for time, _ in lines)]
     assert min(LINES, epochs) <= len(lines) <= 2 * LINES
-    assert times[1] <= max((FEWEST + 1) * seconds + PATIENCE, whole / LINES if whole < 2 * PATIENCE else 0) + seconds
+    assert (
+        times[1]
+        <= max(min(FEWEST * seconds, LONGEST) + 2 * seconds + PATIENCE, whole / LINES if whole < 2 * PATIENCE else 0)
+        + seconds
+    )
     assert max(after - before for before, after in pairwise(times)) <= max(
         0.2 * whole, whole / epochs if whole < 60 else 0
     )
@@ -66,6 +70,15 @@ def test_lines_come_soon_and_about_every_tenth(trained: Callable, seconds: float
         ).groups()  # type: ignore[union-attr]
         expected = "test/loss 3" if int(number) % every == 0 else "loss 5"
         assert tested == (None if batch else expected)
+
+
+def test_slow_first_batches_do_not_count_for_long(trained: Callable) -> None:
+    """Ten times as slow until the sixth: within a factor of two from the first line."""
+    lines = trained(lambda number: 5.0 if number < 6 else 0.5, 20, 20)
+    whole = 6 * 5.0 + (20 * BATCHES - 6) * 0.5
+    for time, line in lines[1:]:
+        minutes = float(re.search(r"about (\d+) min", line)[1]) if "min" in line else None  # type: ignore[index]
+        assert minutes is None or 0.5 < 60 * minutes / (whole - time) < 2
 
 
 @pytest.mark.parametrize(("preset", "smaller"), [("full", "preset=small"), ("small", "preset=demo"), ("demo", "")])
