@@ -53,7 +53,7 @@ WRONG_VALUES = [
     ([SEQUENCES, "model=mae_vz"], ["model=mae_vz predicts no Projected Huber density", "expected model=prob"]),
     (["evaluation.sequences=[[4,20],[2,20]]"], ["expected pairs [sequences, frames] of different frames"]),
     (["evaluation.sequences=[[4,1]]"], ["evaluation.sequences", "got 1"]),
-    ([SEQUENCES, "data=multiview"], ["evaluation.sequences", "frames: got 20; sequences are of the cylinder"]),
+    ([SEQUENCES, "data=multiview"], ["evaluation.sequences", "data=multiview is not rendered in single images"]),
     (["evaluation.eight_views=true", "model=mae_vz"], ["evaluation.eight_views", "model=mae_vz predicts points"]),
     (["loss=mae"], ["loss", "PointEstimate", "model=probabilistic", "ProjectedHuber"]),
     (["model=mae_vz", "loss=nll"], ["loss", "Density", "model=mae_vz"]),
