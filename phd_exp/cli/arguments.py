@@ -4,7 +4,7 @@ import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
@@ -18,6 +18,9 @@ if TYPE_CHECKING:  # imports of seconds, which follow the checks of the argument
     from phd_exp.inference.predictor import Predictor
 
 BEYOND = 1.1  # factor beyond the least and the largest focal length of held-out samples; training reaches further
+
+
+Item = TypeVar("Item")
 
 
 class Arguments(BaseModel):
@@ -179,12 +182,17 @@ def predicted(
     from phd_exp.inference.answers import sightings
 
     seen = _noting_focal_lengths(predictor, sightings(predictor, detections, guarantee))
-    if len(detections) == 1 or not sys.stderr.isatty():
-        return seen
+    return seen if len(detections) == 1 else with_bar(seen, "predicting", len(detections))
+
+
+def with_bar(items: Iterable[Item], words: str, total: int | None) -> Iterable[Item]:
+    """The items, with a progress bar on a terminal; `total` is their number, if it is known."""
+    if not sys.stderr.isatty():
+        return items
     from rich.console import Console
     from rich.progress import track
 
-    return track(seen, "predicting", len(detections), console=Console(stderr=True), transient=True)
+    return track(items, words, total, console=Console(stderr=True), transient=True)
 
 
 def _noting_focal_lengths(predictor: "Predictor", seen: Iterable["Sighting"]) -> Iterator["Sighting"]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from pydantic import Field, model_validator
 
-from phd_exp.cli.arguments import CameraArguments, loaded, output_folder
+from phd_exp.cli.arguments import CameraArguments, loaded, output_folder, with_bar
 from phd_exp.records.detections import NumberOrName, detections_of
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.foreign import boxes_of_images
@@ -159,13 +159,7 @@ def _followed(arguments: TrackArguments, predictor: "Predictor", sequence: _Sequ
     slow = Slow(arguments.depth_share, arguments.depth_time)
     motion, least = ConstantVelocity(arguments.noise), arguments.least_familiar
     followed = follow(predictor, sequence.frames, motion, arguments.lag, slow, least_familiar=least)
-    if sys.stderr.isatty():
-        from rich.console import Console
-        from rich.progress import track
-
-        name, console = f"tracking {sequence.name}", Console(stderr=True)
-        followed = iter(track(followed, name, sequence.length, console=console, transient=True))
-    for one in followed:
+    for one in with_bar(followed, f"tracking {sequence.name}", sequence.length):
         if one.reason:
             print(f"note: {one.frame.where}: {one.reason}", file=sys.stderr)
         yield one

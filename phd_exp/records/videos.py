@@ -29,7 +29,7 @@ class Shot(NamedTuple):
 
 
 def require_av(key: str) -> None:
-    """Raise ConfigError unless PyAV is installed; `key` is that which needs it."""
+    """Raise ConfigError, which names the key that needs PyAV, unless PyAV is installed."""
     if find_spec("av") is None:
         raise ConfigError(f"{key}: videos need `pip install 'phd_exp[video]'`")
 

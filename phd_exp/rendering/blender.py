@@ -109,8 +109,8 @@ class Renderer:
         """Linear light of a box of pixels (height, width, 3), by default of all (S, S, 3); rows from the top.
 
         An image is white from 1 upwards. A pure function of the scene, the box and the settings. With meshes, the
-        background is transparent: a fourth channel is the opacity, by which the light is multiplied. The ground has
-        a layer of its own, whose opacity is its shadow, also where objects hide it.
+        background is transparent: a fourth channel is the opacity, by which the light is multiplied. The layer
+        "ground" shows the ground without the objects; its opacity is their shadow.
         """
         box = box or Box(0, 0, scene.S, scene.S)
         self._frame(box, scene.S)

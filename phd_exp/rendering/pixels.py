@@ -21,6 +21,11 @@ class Box(NamedTuple):
     right: int
     bottom: int
 
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Its rows and columns of an image."""
+        return slice(self.top, self.bottom), slice(self.left, self.right)
+
 
 # Level 9 of zlib saves 2 % of the bytes for twice the time. A JPEG has colour at full resolution, since a silhouette
 # is often a step in colour alone.

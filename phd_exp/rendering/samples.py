@@ -84,7 +84,7 @@ def take_picture(renderer: Renderer, scene: Scene, hits: Hits) -> Pixels:
     if not shown.any():
         return encoded(light)
     box = box_around(shown, MARGIN)
-    inside = (slice(box.top, box.bottom), slice(box.left, box.right))
+    inside = box.slices
     light[inside] = np.where(shown[inside][..., None], renderer.render(scene, box), light[inside])
     return encoded(smoothed(light, first, scene))
 
@@ -98,7 +98,7 @@ def photograph(renderer: Renderer, scene: Scene, hits: Hits, spec: DatasetSpec) 
         light *= 1 - shadow(renderer, scene)
     if shown.any() and not spec.empty:
         box = box_around(shown, MARGIN)
-        inside = (slice(box.top, box.bottom), slice(box.left, box.right))
+        inside = box.slices
         front, opacity = np.split(renderer.render(scene, box), [3], axis=-1)
         if renderer.is_opaque:
             opacity = coverage(scene, box, renderer.meshes)

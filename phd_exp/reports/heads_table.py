@@ -46,15 +46,15 @@ def _means(runs: Sequence[Run], name: str) -> list[SampleMean]:
 
 def _table(preset: str, data: str, digest: str, models: dict[str, list[Run]]) -> Table:
     constraints, rows = findings(), []
-    columns = [name for name in COLUMNS if any(_means(runs, name) for runs in models.values())]
-    reference = models[PROBABILISTIC]
-    gaps = {(model, name): _gap(name, runs, reference) for model, runs in models.items() for name in columns}
+    means = {(model, name): _means(runs, name) for model, runs in models.items() for name in COLUMNS}
+    columns = [name for name in COLUMNS if any(means[model, name] for model in models)]
+    gaps = {(model, name): _gap(models, means, model, name) for model in models for name in columns}
     known = {place: gap for place, gap in gaps.items() if gap and place[1] != COVERAGE}
     sure = significant({(m, name): p_value(gap, _seeds(models, m)) for (m, name), gap in known.items()})
     for model, runs in models.items():
         broken = ", ".join(name[0] for name, row in constraints.items() if model in row and not row[model].holds)
         stub = (model, broken or NOTHING, ", ".join(str(run.seed) for run in runs))
-        cells = [_cell(name, runs, gaps[model, name], (model, name) in sure) for name in columns]
+        cells = [_cell(name, runs, means[model, name], gaps[model, name], (model, name) in sure) for name in columns]
         rows.append(TableRow(stub, tuple(cells)))
     return Table(
         stem=file_stem("heads", preset, data, *([digest] if digest else [])),
@@ -73,17 +73,22 @@ def _seeds(models: dict[str, list[Run]], model: str) -> int:
     return len(models[model]) + len(models[PROBABILISTIC])
 
 
-def _gap(name: str, runs: Sequence[Run], reference: Sequence[Run]) -> Interval[float] | None:
-    """The difference to the reference; None for the reference itself, or tests on other images."""
-    means, others = _means(runs, name), _means(reference, name)
-    same = {(run.measured.images, mean.n) for run, mean in zip((*runs, *reference), (*means, *others), strict=False)}
-    if runs is reference or not means or not others or len(same) > 1:
+def _gap(
+    models: dict[str, list[Run]], means: dict[tuple[str, str], list[SampleMean]], model: str, name: str
+) -> Interval[float] | None:
+    """The difference to the probabilistic model; None for that model itself, or tests on other images."""
+    ours, others = means[model, name], means[PROBABILISTIC, name]
+    runs = (*models[model], *models[PROBABILISTIC])
+    same = {(run.measured.images, mean.n) for run, mean in zip(runs, (*ours, *others), strict=False)}
+    if model == PROBABILISTIC or not ours or not others or len(same) > 1:
         return None
-    return difference(means, others)
+    return difference(ours, others)
 
 
-def _cell(name: str, runs: Sequence[Run], gap: Interval[float] | None, is_sure: bool) -> TableCell:
-    means, text = _means(runs, name), SCORES[name].text
+def _cell(
+    name: str, runs: Sequence[Run], means: Sequence[SampleMean], gap: Interval[float] | None, is_sure: bool
+) -> TableCell:
+    text = SCORES[name].text
     if not means:
         return TableCell(NOTHING)
     is_better = is_sure and gap is not None and gap.value < 0

@@ -418,7 +418,7 @@ def test_computed_edges_are_those_of_the_tracer(under_a_sky: tuple[Renderer, Sce
 
 
 def test_the_ground_has_a_shadow_below_the_object(of_mesh: MakeSpec) -> None:
-    """On a layer of its own, on which objects are not visible; without an object, there is none."""
+    """Its layer shows it without the objects; a scene without an object has no shadow."""
     spec = of_mesh(sensor_size=48, f_range=(300.0, 300.0), upright=True, ground=True, pitch_range=(30.0, 31.0))
     renderer = Renderer(Settings(samples=16, denoised=False, at_middles=False), spec)
     scene = sample_object_scene(spec, "train", 3, renderer.meshes)
