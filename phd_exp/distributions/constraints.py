@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from phd_exp.distributions import shaped
+from phd_exp.distributions.closest import closest_to_student
 from phd_exp.distributions.gaussian_mixture import GaussianMixture
 from phd_exp.distributions.natural import LARGEST_RATIO
 from phd_exp.distributions.point_estimate import PointDensity, PointEstimate
@@ -61,6 +62,7 @@ def families() -> dict[str, Family]:
     return {
         "probabilistic": Family(_projected_huber, _seven_numbers),
         "free_axis": Family(_projected_huber, _nine_numbers),
+        "free_axis_t": _shaped(closest_to_student),
         "gaussian": _shaped(shaped.Gaussian),
         "gaussian_ray": _shaped(shaped.RayGaussian),
         "gaussian_mixture": Family(_mixture, _thirty_numbers),

@@ -8,7 +8,6 @@ q and t are independent, and v is affine in (q, t). Every statistic below follow
 nu_0 = 0: its axis, the line q = 0, passes through the camera. A free axis passes through `apex` in the plane z = 0.
 """
 
-import math
 from collections.abc import Sequence
 from typing import ClassVar, Literal, final
 
@@ -185,12 +184,18 @@ class ProjectedHuber(Density, Distribution):
         """The paper's density with its axis turned about the mode; see the argument k."""
         return self._of(self._natural.with_axis(k), self._validate_args)
 
-    def tempered(self, projected: float, depth: float) -> "ProjectedHuber":
+    def tempered(
+        self, projected: Float[Tensor, "*#batch"] | float, depth: Float[Tensor, "*#batch"] | float
+    ) -> "ProjectedHuber":
         """The distribution with A / projected and a / depth in place of A and a, around the same mode and axis."""
         n = self._natural
-        log_det_A_xy, log_a = n.log_det_A_xy - 2 * math.log(projected), n.log_a - math.log(depth)
-        nu_0 = None if n.nu_0 is None else n.nu_0 / projected
-        tempered = Natural(n.A_xy / projected, n.nu_xy / projected, log_det_A_xy, n.log_mu_z, log_a, nu_0)
+        projected, depth = (
+            torch.as_tensor(one, dtype=n.log_a.dtype, device=n.log_a.device) for one in (projected, depth)
+        )
+        log_det_A_xy, log_a = n.log_det_A_xy - 2 * projected.log(), n.log_a - depth.log()
+        across = projected[..., None]
+        nu_0 = None if n.nu_0 is None else n.nu_0 / across
+        tempered = Natural(n.A_xy / across[..., None], n.nu_xy / across, log_det_A_xy, n.log_mu_z, log_a, nu_0)
         return self._of(tempered, self._validate_args)
 
     def __repr__(self) -> str:

@@ -170,8 +170,13 @@ def RayGaussian(around: ProjectedHuber, _: Tensor) -> Shaped:
 
 def StudentT(around: ProjectedHuber, further: Float[Tensor, "*batch n"]) -> Shaped:
     """Student's t in space with any scale matrix and 2 + phi(third further number) degrees of freedom."""
-    law = StudentLaw(2 + spd.positive(further[..., 2]))
+    law = StudentLaw(student_freedom(further[..., 2]))
     return Shaped(Whitening(around.with_axis(further[..., :2]), 1), law)
+
+
+def student_freedom(raw: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """The degrees of freedom of a raw number, more than 2, so that variances exist."""
+    return 2 + spd.positive(raw)
 
 
 def LogDepthGaussian(around: ProjectedHuber, _: Tensor) -> Shaped:

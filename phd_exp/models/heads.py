@@ -12,10 +12,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from phd_exp.distributions import Density, PointEstimate, ProjectedHuber
+from phd_exp.distributions.closest import closest_to_student
 from phd_exp.distributions.gaussian_mixture import GaussianMixture
 from phd_exp.distributions.natural import precision
 from phd_exp.distributions.quantiles import LEVELS, Quantiles
-from phd_exp.distributions.shaped import Shaped
+from phd_exp.distributions.shaped import Shaped, StudentT
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import Chart, DepthScale
 
@@ -77,12 +78,34 @@ class DistributionHead:
         A symmetry R changes nu_p to R nu_p, k to R k and B to R B R^T: signs and an exchange of raw numbers, exactly.
         Source: own derivation (`spectral_map` commutes with R); checked in tests/models/test_symmetric_views.py.
         """
-        n, b, w, k = raw.split((2, 3, 2, self.n_outputs - 7), dim=-1)
+        n, b, w, k, other = raw.tensor_split((2, 5, 7, 9), dim=-1)
         x, y, exchange = signs.split(1, dim=-1)
         n, b = n * signs[..., :2], b * torch.cat([x * x, x * y, y * y], dim=-1)
         k = k * signs[..., : k.shape[-1]]
         n, b, k = (torch.where(exchange < 0, part.flip(-1), part) for part in (n, b, k))
-        return torch.cat([n, b, w, k], dim=-1)
+        return torch.cat([n, b, w, k, other], dim=-1)
+
+
+class SurrogateHead(DistributionHead):
+    """Ten raw numbers -> the Projected Huber density with a free axis that is closest to a Student's t.
+
+    Training maximises the likelihood of the Student's t, whose tails let the network fit most images well although
+    it cannot fit a few. The tenth number gives the degrees of freedom.
+
+    Args:
+        depth: constants of the data set.
+    """
+
+    def __init__(self, depth: DepthScale) -> None:
+        super().__init__(depth, free_axis=True)
+        self.n_outputs = 10
+
+    def surrogate(self, raw: Float[Tensor, "*batch 10"], camera: Camera) -> Shaped:
+        """The Student's t that training fits."""
+        return StudentT(super().__call__(raw[..., :7], camera), raw[..., 7:])
+
+    def __call__(self, raw: Float[Tensor, "*batch 10"], camera: Camera) -> ProjectedHuber:
+        return closest_to_student(super().__call__(raw[..., :7], camera), raw[..., 7:])
 
 
 class ShapedHead:

@@ -100,6 +100,13 @@ class Regressor(nn.Module):
         """The prediction, given the output of the backbone."""
         return self.head(self.numbers(output, camera.f), camera)
 
+    def trained(self, output: BackboneOutput, camera: Camera) -> tuple[Prediction, Prediction]:
+        """The prediction, and the one whose loss training minimises: the same, unless the head has a surrogate."""
+        numbers = self.numbers(output, camera.f)
+        prediction = self.head(numbers, camera)
+        surrogate = getattr(self.head, "surrogate", None)
+        return prediction, prediction if surrogate is None else surrogate(numbers, camera)
+
     def raw(
         self, image: UInt8[Tensor, "batch height width 3"], f: Float[Tensor, " batch"] | None = None
     ) -> Float[Tensor, "batch n_outputs"]:

@@ -72,15 +72,15 @@ class PositionModule(LightningModule):
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         try:
             output = self.regressor.see(batch.image)
-            prediction = self.regressor.prediction(output, self.camera(batch, self.current_epoch))
-            losses = self.loss(prediction, batch.xyz)
+            prediction, trained = self.regressor.trained(output, self.camera(batch, self.current_epoch))
+            losses = self.loss(trained, batch.xyz)
             total = self.objective.total(losses, output, batch)
         except Exception:  # a part may refuse the numbers of a network that an earlier loss has broken
             self.require_finite()
             raise
         self._note(total, losses, batch, "train")
         with torch.no_grad():
-            nll = losses if isinstance(self.loss, NegativeLogLikelihood) else None
+            nll = losses if isinstance(self.loss, NegativeLogLikelihood) and trained is prediction else None
             table = training_columns(prediction, batch.xyz, nll)
             self.training_rows.update({"loss": losses.expand(len(batch))} | table)
         return total

@@ -9,7 +9,7 @@ from torchvision.models import resnet18, resnet34, resnet50
 from phd_exp.geometry import Camera, Cartesian, DepthScale, LogDepth, Projected
 from phd_exp.losses import MeanAbsoluteError, NegativeLogLikelihood, Pinball
 from phd_exp.models.backbones import resnet
-from phd_exp.models.heads import ChartHead, DistributionHead, Head
+from phd_exp.models.heads import ChartHead, DistributionHead, Head, SurrogateHead
 from phd_exp.models.regressor import Regressor
 from tests.support.heads import SHAPED
 
@@ -17,12 +17,13 @@ DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
 HEADS: dict[str, Head] = {
     "probabilistic": DistributionHead(DEPTH),
     "free_axis": DistributionHead(DEPTH, free_axis=True),
+    "free_axis_t": SurrogateHead(DEPTH),
     "mae_vz": ChartHead(DEPTH, Projected),
     "mae_logz": ChartHead(DEPTH, LogDepth),
     "mae_xyz": ChartHead(DEPTH, Cartesian),
     **SHAPED,
 }
-LOSSES = {name: NegativeLogLikelihood() for name in ("probabilistic", "free_axis", *SHAPED)} | {
+LOSSES = {name: NegativeLogLikelihood() for name in ("probabilistic", "free_axis", "free_axis_t", *SHAPED)} | {
     "quantiles": Pinball()
 }
 
@@ -127,3 +128,17 @@ def test_corrected_images_do_not_depend_on_brightness_and_white_balance(
 def test_a_black_image_is_no_division_by_zero() -> None:
     network = Regressor(resnet(18), HEADS["probabilistic"], exposure=True)
     assert network.see(torch.zeros(1, 64, 64, 3, dtype=torch.uint8)).features.isfinite().all()
+
+
+def test_training_fits_the_surrogate_of_a_head_that_has_one(
+    image: torch.Tensor, camera: Camera, xyz: torch.Tensor
+) -> None:
+    """So that its gradients are those of the Student's t."""
+    gradients = []
+    for name in ("free_axis_t", "student_t"):
+        network = regressor(HEADS[name]).train()
+        prediction, trained = network.trained(network.see(image), camera)
+        NegativeLogLikelihood()(trained, xyz).mean().backward()
+        gradients.append(network.last.weight.grad)
+        assert (prediction is trained) == (name == "student_t")
+    assert torch.equal(*gradients)

@@ -5,11 +5,11 @@ import torch
 
 from phd_exp.geometry import Camera, DepthScale
 from phd_exp.geometry.motion import EIGHT, symmetries, turned
-from phd_exp.models.heads import DistributionHead
+from phd_exp.models.heads import DistributionHead, SurrogateHead
 
 DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
-HEADS = [DistributionHead(DEPTH), DistributionHead(DEPTH, free_axis=True)]
-every_head = pytest.mark.parametrize("head", HEADS, ids=["seven numbers", "nine"])
+HEADS = [DistributionHead(DEPTH), DistributionHead(DEPTH, free_axis=True), SurrogateHead(DEPTH)]
+every_head = pytest.mark.parametrize("head", HEADS, ids=["seven numbers", "nine", "ten"])
 SIGNS = torch.tensor(EIGHT, dtype=torch.float64)
 CAMERA = Camera(torch.full((8,), 1500.0, dtype=torch.float64), 224.0)
 
@@ -35,10 +35,11 @@ def test_the_density_at_a_position_is_that_of_the_view_at_the_turned_position(
 
 @every_head
 def test_bringing_back_moves_numbers_and_changes_signs_alone(head: DistributionHead) -> None:
-    raw = torch.tensor([1.0, 2, 4, 8, 16, 32, -64, 128, 256])[: head.n_outputs]
+    raw = torch.tensor([1.0, 2, 4, 8, 16, 32, -64, 128, 256, -512])[: head.n_outputs]
     for back in head.turned_back(raw.expand(8, -1), SIGNS.float()):
         assert sorted(back.abs().tolist()) == sorted(raw.abs().tolist())
         assert back[5:7].tolist() == [32, -64]
+        assert back[9:].tolist() == raw[9:].tolist()
 
 
 def test_a_pixel_of_a_turned_image_lies_at_the_turned_position() -> None:
