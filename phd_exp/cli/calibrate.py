@@ -43,7 +43,7 @@ def main(words: list[str]) -> int:
     error = 100 * (table["depth_error_mm"] / 1000 / table["z"]).mean()
     print(f"{predictor.folders[0].labelled(name)}: {n} labelled detections")
     print(f"  as trained: depth error {error:.2f} %, {inside}")
-    print(f"  temperatures: A / {temperature.projected:.3g}, a / {temperature.depth:.3g}")
+    print(f"  temperatures of a typical prediction: {temperature}")
     enough = [f"{level:g}" for level in COVERAGES if samples_needed(level) <= n // 2]
     print(
         f"  coverage= can guarantee {', '.join(enough) or 'nothing'}; 0.9 needs {2 * samples_needed(0.9)} detections"

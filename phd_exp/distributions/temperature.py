@@ -1,23 +1,53 @@
-"""Recalibration: two temperatures that change the uncertainty of every prediction but not its mode."""
+"""Recalibration: temperatures that change the uncertainty of every prediction but not its mode.
+
+A network's small spreads may be too large and its large ones too small, or the other way round. So the log of a
+temperature is linear in the log of the predicted precision.
+"""
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
+import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.optimize import brentq
+from scipy.optimize import brentq, minimize
 from torch import Tensor
 
 from phd_exp.distributions.depth import depth_mean_energy
 from phd_exp.distributions.projected_huber import ProjectedHuber
+from phd_exp.distributions.special import log_scaled_normaliser
 
 _WIDEST = 80.0  # of log(1/temperature); a fit beyond has no minimum
+_ENDS = (0.05, 0.95)  # quantiles of the fitted predictions between which temperatures vary
+_PRIOR = 0.5  # standard deviation of a normal prior of slopes about 0, for few or equal predictions
+
+Values = Float[np.ndarray, " samples"]
+
+
+@dataclass(frozen=True)
+class Slope:
+    """The change of log T with the log precision u: `slope` (u - middle), constant below `low` and above `high`."""
+
+    slope: float
+    low: float
+    high: float
+
+    def change(self, log_precision: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """log T less its value in the middle of `low` and `high`."""
+        return self.slope * (log_precision.clamp(self.low, self.high) - (self.low + self.high) / 2)
 
 
 @dataclass(frozen=True)
 class Temperature:
     """A' = A / projected and a' = a / depth: above 1 for overconfident predictions, below 1 for underconfident ones.
+
+    Args:
+        projected: the temperature of the projection, with a slope that of a typical prediction.
+        depth: that of depth.
+        projected_slope: its change with log|A|/2; None: it is the same for all predictions.
+        depth_slope: the change of the other with log a.
 
     Examples:
         >>> p = ProjectedHuber(torch.zeros(2), torch.tensor(4.0), 100 * torch.eye(2), torch.tensor(20.0))
@@ -28,49 +58,90 @@ class Temperature:
 
     projected: float
     depth: float
+    projected_slope: Slope | None = None
+    depth_slope: Slope | None = None
+
+    def __str__(self) -> str:
+        return f"A / {self.projected:.4g}, a / {self.depth:.4g}"
 
     @classmethod
     def fit(cls, distribution: ProjectedHuber, xyz: Float[Tensor, "samples 3"]) -> "Temperature":
         """The temperatures that minimise the mean NLL of true positions (metres) under a batch of predictions.
 
-        The mean NLL is a sum of one function of each temperature, convex in its reciprocal r:
-        h(r |q|) - 2 log r and a r max(t, 1/t) + log N(a r). Each minimum is the one root of a derivative.
+        With log T = -v it is the sum of the means of h(e^v |q|) - 2 v and of a e^v max(t, 1/t) + log N(a e^v). If all
+        have one v, it is the root of a derivative; the slope is found from there, with a normal prior about 0.
 
         Raises ValueError if there are no samples, if one is not finite or not in front of the camera, or if all lie
         at their modes, so that no temperature is low enough.
-        Source: temperature scaling (Guo et al., 2017); convexity: h is convex and grows, and log N(a) is the log of
-        an integral of exponentials of a. Checked in tests/distributions/test_temperature.py.
+        Source: temperature scaling (Guo et al., 2017); the slopes are an own extension. Checked in
+        tests/distributions/test_temperature.py.
         """
         xyz = xyz.detach().double()
         radius = distribution.whiten(xyz).norm(dim=-1).detach().double()
         energy = distribution.depth_energy(xyz[..., 2]).detach().double()
-        log_a = distribution.a.detach().double().log().expand_as(energy)
-        for values in (xyz, radius, energy, log_a):
+        log_A, log_a = (u.detach().double().expand_as(energy) for u in _log_precisions(distribution))
+        for values in (xyz, radius, energy, log_A, log_a):
             if values.numel() == 0 or not bool(values.isfinite().all()):
                 raise ValueError(
                     "temperatures are fitted to finite predictions and positions with z > 0, at least one, but "
                     f"{int((~values.isfinite()).sum())} of {values.numel()} numbers are not finite"
                 )
-        # the slopes are r d/dr of the mean of h(r |q|) - 2 log r
-        projected = _temperature(lambda r: torch.minimum(r * radius, (r * radius).square()).mean() - 2)
-        # and of r a max(t, 1/t) + log N(r a): actual minus predicted energies
-        depth = _temperature(lambda r: (r * energy - depth_mean_energy(log_a + r.log())).mean())
-        return cls(projected, depth)
+        projected, projected_slope = _fit(partial(_projected_nll, radius), log_A)
+        depth, depth_slope = _fit(partial(_depth_nll, energy, log_a), log_a)
+        return cls(projected, depth, projected_slope, depth_slope)
 
     def apply(self, distribution: ProjectedHuber) -> ProjectedHuber:
         """The same predictions at these temperatures; mu_xy and mu_z stay."""
-        return distribution.tempered(self.projected, self.depth)
+        if self.projected_slope is None or self.depth_slope is None:
+            return distribution.tempered(self.projected, self.depth)
+        log_A, log_a = _log_precisions(distribution)
+        projected = self.projected * self.projected_slope.change(log_A).exp()
+        return distribution.tempered(projected, self.depth * self.depth_slope.change(log_a).exp())
 
 
-def _temperature(slope: Callable[[Tensor], Tensor]) -> float:
-    """The 1/r at which the slope, negative for small r and positive for large r, is zero."""
+def _log_precisions(distribution: ProjectedHuber) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    return distribution.log_det_A / 2, distribution.a.log()
 
-    def at(log_r: float) -> float:
-        return float(slope(torch.tensor(log_r, dtype=torch.float64).exp()))
 
+def _projected_nll(radius: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    """h(r) - 2 v with r = e^v |q|, and its derivative by v; both are convex in v."""
+    r = v.exp() * radius
+    derivative = torch.minimum(r, r.square())
+    return torch.where(r > 1, r - 0.5, derivative / 2) - 2 * v, derivative - 2
+
+
+def _depth_nll(energy: Tensor, log_a: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    """e^v w + log(e^(a') N(a')) with the excess energy w and a' = e^v a, and its derivative by v: actual minus
+    predicted energies.
+    """
+    scaled = v.exp() * energy
+    return scaled + log_scaled_normaliser(log_a + v), scaled - depth_mean_energy(log_a + v)
+
+
+def _fit(nll: Callable[[Tensor], tuple[Tensor, Tensor]], log_precision: Tensor) -> tuple[float, Slope]:
+    """The typical temperature and the slope with the least mean of nll(v), which returns values and derivatives."""
+    low, high = log_precision.quantile(torch.tensor(_ENDS).double()).tolist()
+    change = Slope(1.0, low, high).change(log_precision)
+    n = len(log_precision)
+
+    def loss(parameters: Values) -> tuple[float, Values]:
+        start, slope = parameters.tolist()
+        value, derivative = nll(start - slope * change)
+        penalty = slope / (_PRIOR**2 * n)
+        gradient = derivative.mean(), -(derivative * change).mean() + penalty
+        return float(value.mean()) + slope * penalty / 2, np.array([float(one) for one in gradient])
+
+    found = minimize(
+        loss, (_root(lambda v: loss(np.array([v, 0.0]))[1][0]), 0.0), jac=True, method="BFGS", tol=1e-9
+    ).x
+    return math.exp(-found[0]), Slope(float(found[1]), low, high)
+
+
+def _root(derivative: Callable[[float], float]) -> float:
+    """The v at which a derivative, negative for small v and positive for large v, is zero."""
     width = 1.0
-    while not at(-width) < 0 < at(width):
+    while not derivative(-width) < 0 < derivative(width):
         width *= 2
         if width > _WIDEST:
             raise ValueError("no temperature fits: the errors are zero, or out of proportion to the predictions")
-    return math.exp(-brentq(at, -width, width, xtol=1e-12))
+    return float(brentq(derivative, -width, width, xtol=1e-12))

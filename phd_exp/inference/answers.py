@@ -283,7 +283,7 @@ def uncertainty(temperature: Temperature | None) -> str:
     """The origin of the uncertainty: as trained, or recalibrated."""
     if temperature is None:
         return "as trained"
-    return f"recalibrated: A / {temperature.projected:.4g}, a / {temperature.depth:.4g}"
+    return f"recalibrated: {temperature}"
 
 
 def rounded(values: Float[np.ndarray, "..."]) -> Any:

@@ -1,13 +1,14 @@
 """Temperatures: known ones are found again, and the fit is the minimum that it claims to be."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import distribution_columns, draws, from_columns, parameter_columns
-from phd_exp.distributions.temperature import Temperature
+from phd_exp.distributions.temperature import Slope, Temperature
 
 
 @pytest.fixture(scope="module")
@@ -37,17 +38,36 @@ def test_finds_by_how_much_predictions_are_overconfident(
     torch.testing.assert_close(mended.projected_covariance, truth.projected_covariance, rtol=0.05, atol=1e-9)
 
 
+def test_finds_a_slope(truth: ProjectedHuber, xyz: torch.Tensor) -> None:
+    """Of predictions whose spreads vary too little in projection, and too much in depth."""
+    wrong = Temperature(0.5, 0.3, Slope(0.4, -20.0, 20.0), Slope(-0.2, -20.0, 20.0)).apply(truth)
+    mended = Temperature.fit(wrong, xyz).apply(wrong)
+    for found, right in ((mended.a.log(), truth.a.log()), (mended.log_det_A, truth.log_det_A)):
+        middle = (right - right.median()).abs() < right.std()  # far beyond, temperatures are constant
+        torch.testing.assert_close(found[middle], right[middle], rtol=0, atol=0.1)
+
+
+def test_few_predictions_have_little_slope(truth: ProjectedHuber, xyz: torch.Tensor) -> None:
+    few = Temperature.fit(truth[torch.arange(10_000) < 8], xyz[:8])
+    assert few.projected_slope is not None
+    assert abs(few.projected_slope.slope) < 0.5
+
+
 def test_is_the_minimum_of_the_mean_nll(truth: ProjectedHuber, xyz: torch.Tensor) -> None:
     predicted = truth.tempered(0.5, 0.3)
     found = Temperature.fit(predicted, xyz)
 
-    def nll(projected: float, depth: float) -> float:
-        return -float(predicted.tempered(projected, depth).log_prob(xyz).mean())
+    def nll(temperature: Temperature) -> float:
+        return -float(temperature.apply(predicted).log_prob(xyz).mean())
 
-    least = nll(found.projected, found.depth)
+    least = nll(found)
     for factor in (0.99, 0.999, 1.001, 1.01):
-        assert nll(found.projected * factor, found.depth) > least
-        assert nll(found.projected, found.depth * factor) > least
+        assert nll(replace(found, projected=found.projected * factor)) > least
+        assert nll(replace(found, depth=found.depth * factor)) > least
+    for name in ("projected_slope", "depth_slope"):
+        slope = getattr(found, name)
+        for step in (-0.02, 0.02):
+            assert nll(replace(found, **{name: replace(slope, slope=slope.slope + step)})) > least
 
 
 def test_mean_nll_is_convex_in_both_reciprocals(truth: ProjectedHuber, xyz: torch.Tensor) -> None:

@@ -68,7 +68,7 @@ def test_labelled_images_calibrate_a_run(
     labelled = renders / "default" / "test"
     outcome = phd_exp("calibrate", f"run={mine}", f"folder={labelled}", "name=garden")
     assert outcome.status == 0
-    assert re.search(r"as trained: depth error .* inside 50 %, .* inside 90 %\n  temperatures: A / ", outcome.out)
+    assert re.search(r"as trained: depth error .* inside 50 %, .* inside 90 %\n  temperatures .*: A / ", outcome.out)
     table = pd.read_parquet(run.predictions)
     fitted = fit_temperature({name: table[name].to_numpy() for name in table if table[name].dtype == float}, ALL)
     predictor = package.load(mine).calibrated("garden")
