@@ -3,14 +3,16 @@
 import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
-from phd_exp.records.detections import Detection
 from phd_exp.records.errors import ConfigError, DatasetError, RunError, complaint, unknown, writing
 from phd_exp.records.files import remove_temporaries
+from phd_exp.records.messages import MessageFile, require_rosbags
+from phd_exp.records.recordings import MCAP, Detections, Recording, is_recording
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
     from phd_exp.evaluation.conformal import Guarantee
@@ -76,6 +78,38 @@ def require_file(out: Path, name: str) -> None:
         raise ConfigError(f"out={out}: is a folder; expected a file, such as {out / name}")
 
 
+def require_output(out: Path, name: str, inputs: Iterable[Path]) -> None:
+    """Make the folder of an output file; the message about a folder suggests `name` inside it.
+
+    Raises ConfigError if the file is a folder or an input, cannot be written, or needs rosbags, which is missing.
+    """
+    require_file(out, name)
+    if out.resolve() in {file.resolve() for file in inputs}:
+        raise ConfigError(f"out={out}: is one of the files that are read; choose another")
+    if out.suffix == MCAP:
+        require_rosbags("out")
+    output_folder(out.parent)
+
+
+@contextmanager
+def message_file(out: Path | None) -> Iterator[MessageFile | None]:
+    """The file of an out= that is a recording to write; None for another one."""
+    if out is None or out.suffix != MCAP:
+        yield None
+        return
+    with MessageFile(out) as messages:
+        yield messages
+
+
+def require_covariance(arguments: "RunArguments", predictor: "Predictor") -> None:
+    """Raise ConfigError if a run predicts no covariance, which messages need."""
+    if not predictor.is_probabilistic:
+        raise ConfigError(
+            f"{arguments.run[0]}: predicts no covariance, which out=*{MCAP} needs; expected a run of "
+            "model=probabilistic"
+        )
+
+
 Paths = Annotated[tuple[Path, ...], BeforeValidator(lambda text: [text] if os.path.exists(text) else text.split(","))]
 
 
@@ -126,6 +160,16 @@ class CameraArguments(RunArguments):
     """instead of f=, a camera file of ROS, OpenCV, Kalibr, COLMAP or another tool, with the lens"""
     box: Annotated[tuple[float, float, float, float], BOX] | None = None
     """LEFT,TOP,RIGHT,BOTTOM of the object, px; by default the whole image"""
+    topic: str | None = None
+    """of a recording of several cameras: the topic of the images, or IMAGES,CAMERA_INFO"""
+
+    def recording(self, folder: Path | None) -> Recording | None:
+        """The images of a folder= that is a recording of ROS 2; None if it is not."""
+        if folder is None or not is_recording(folder):
+            if self.topic:
+                raise ConfigError("topic: selects images of a recording; expected folder=FILE.mcap")
+            return None
+        return Recording.of(folder, self.topic, self.of_camera)
 
     @property
     def of_camera(self) -> dict[str, Any]:
@@ -176,7 +220,7 @@ def _record_held_out_views(predictor: "Predictor", trust: tuple[str, ...]) -> No
 
 
 def predicted(
-    predictor: "Predictor", detections: Sequence[Detection], guarantee: "Guarantee | None" = None
+    predictor: "Predictor", detections: Detections, guarantee: "Guarantee | None" = None
 ) -> Iterable["Sighting"]:
     """The predictions, with a progress bar for several detections on a terminal."""
     from phd_exp.inference.answers import sightings

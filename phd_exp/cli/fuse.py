@@ -3,18 +3,23 @@
 import json
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import field_validator
 
-from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, output_folder, predicted, require_file
+from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, message_file, predicted, require_output
 from phd_exp.records.detections import NumberOrName
 from phd_exp.records.errors import ConfigError, RunError, listed
 from phd_exp.records.files import write_atomic
+from phd_exp.records.messages import MessageFile
 from phd_exp.records.own_images import Observed, annotations, detections_in, observed
+from phd_exp.records.recordings import is_recording
 from phd_exp.records.runs import RunFolder
+
+if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
+    from phd_exp.inference.answers import Sighting
 
 PLANE = four_numbers("plane=NX,NY,NZ,OFFSET: the points v with normal . v = offset, metres")
 
@@ -31,7 +36,7 @@ class FuseArguments(RunArguments):
     shared_scale: bool = False
     """estimate one factor that the depths of all views share, as they do in the run's recorded scenes"""
     out: Path | None = None
-    """a file for the lines; by default they are printed"""
+    """a file for the lines; by default they are printed, also with FILE.mcap, which receives messages of ROS 2"""
 
     @field_validator("plane")
     @classmethod
@@ -46,20 +51,23 @@ def main(words: list[str]) -> int:
     """Fuse the predictions of each scene; returns the exit status, which is 1 if a scene has no result."""
     arguments = FuseArguments.parsed("fuse", words)
     out = arguments.out
+    if is_recording(arguments.folder):
+        raise ConfigError(
+            f"folder={arguments.folder}: a recording has no poses of cameras; expected a folder with metadata.jsonl"
+        )
     detections = detections_in(arguments.folder, object_name=arguments.object)
     scenes = observed(detections)
     if out is not None:
-        require_file(out, "fused.jsonl")
         inputs = [*annotations(arguments.folder)[0], *(detection.file for detection in detections)]
-        if out.resolve() in {file.resolve() for file in inputs}:
-            raise ConfigError(f"out={out}: is one of the files that are read; choose another")
-        output_folder(out.parent)
-    answers = _answers(arguments, scenes)
+        require_output(out, "fused.jsonl", inputs)
+    with message_file(out) as messages:
+        answers = _answers(arguments, scenes, messages)
     text = "".join(json.dumps(answer, allow_nan=False) + "\n" for answer in answers)
-    if out is None:
+    if out is None or messages is not None:
         print(text, end="", flush=True)
     else:
         write_atomic(out, text)
+    if out is not None:
         print(f"{out}: {len(answers)} scenes", file=sys.stderr)
     failed = [str(answer["scene"]) for answer in answers if answer["status"] != "fused"]
     if failed:
@@ -68,13 +76,16 @@ def main(words: list[str]) -> int:
     return 1 if failed else 0
 
 
-def _answers(arguments: FuseArguments, scenes: Sequence[Observed]) -> list[dict[str, Any]]:
+def _answers(
+    arguments: FuseArguments, scenes: Sequence[Observed], messages: MessageFile | None
+) -> list[dict[str, Any]]:
+    """The answers for JSON, which are written to `messages` too."""
     # imports of seconds, which follow the checks of the arguments
     import torch
 
     from phd_exp.evaluation.conformal import fused_guarantee
     from phd_exp.fusion import Plane
-    from phd_exp.inference.fused import fused_answers, fused_region
+    from phd_exp.inference.fused import for_json, fused_region
     from phd_exp.inference.tables import require_received
 
     if arguments.coverage and (arguments.plane or arguments.shared_scale):
@@ -102,8 +113,22 @@ def _answers(arguments: FuseArguments, scenes: Sequence[Observed]) -> list[dict[
         views, cameras = predictor.folders[0].views, {len(scene.detections) for scene in scenes}
         guarantees = {k: fused_guarantee(views, k, arguments.coverage, predictor.temperature) for k in cameras}
     shared = _shared_share(predictor.folders[0]) if arguments.shared_scale else None
-    answers = fused_answers(scenes, predicted(predictor, detections), predictor, plane, shared)
-    return [answer | fused_region(answer, guarantees) for answer in answers] if guarantees else answers
+    answers = _fused(messages, scenes, predicted(predictor, detections), predictor, plane, shared)
+    return [for_json(answer) | (fused_region(answer, guarantees) if guarantees else {}) for answer in answers]
+
+
+def _fused(
+    messages: MessageFile | None, scenes: Sequence[Observed], sightings: Iterable["Sighting"], *how: Any
+) -> list[dict[str, Any]]:
+    """The answers of `fused_answers`, which are written to `messages` with the images."""
+    from phd_exp.inference.fused import fused_answers
+    from phd_exp.inference.ros import write_fused, write_views
+
+    if messages is None:
+        return fused_answers(scenes, sightings, *how)
+    answers = fused_answers(scenes, write_views(messages, scenes, sightings), *how)
+    write_fused(messages, scenes, answers)
+    return answers
 
 
 def _shared_share(run: RunFolder) -> float:

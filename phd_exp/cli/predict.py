@@ -8,12 +8,22 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import model_validator
 
-from phd_exp.cli.arguments import CameraArguments, Paths, loaded, output_folder, predicted
-from phd_exp.records.detections import Detection, NumberOrName, detections_of
+from phd_exp.cli.arguments import (
+    CameraArguments,
+    Paths,
+    loaded,
+    message_file,
+    output_folder,
+    predicted,
+    require_covariance,
+    require_output,
+)  # fmt: skip
+from phd_exp.records.detections import NumberOrName, detections_of
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import write_atomic
 from phd_exp.records.foreign import boxes_in
 from phd_exp.records.own_images import detections_in, images_in
+from phd_exp.records.recordings import MCAP, Detections, Recording
 from phd_exp.records.runs import RunFolder
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
@@ -28,13 +38,15 @@ class PredictArguments(CameraArguments):
     image: Paths | None = None
     """one image or several, separated by commas, with their camera as f=, fx= and fy=, or camera="""
     folder: Path | None = None
-    """instead of image=, a folder of images: alone with their camera, or with a metadata.jsonl, BOP, KITTI or COCO"""
+    """instead of image=, a folder of images: alone with their camera, or with a metadata.jsonl, BOP, KITTI or COCO;
+    or FILE.mcap or rosbag2, a recording of ROS 2 with camera_info"""
     object: NumberOrName | None = None
     """with annotations or boxes=: BOP's obj_id, KITTI's type or COCO's category; by default all objects"""
     boxes: Path | None = None
     """instead of box=, a file of COCO results, or of COCO, with the boxes of many objects"""
     out: Path | None = None
-    """a folder for predictions.jsonl and a picture for each line; by default lines are printed"""
+    """a folder for predictions.jsonl and a picture for each line; by default lines are printed, also with FILE.mcap,
+    which receives messages of ROS 2"""
     groups: Literal["spread", "truncation", "focal_length"] | None = None
     """with coverage=: guarantee it in each of four groups of predictions by this quantity"""
     curve: bool = False
@@ -54,7 +66,7 @@ class PredictArguments(CameraArguments):
             raise ValueError("object: selects detections of folder=DIR or boxes=FILE; leave it out for one box")
         if self.groups and not self.coverage:
             raise ValueError("groups: guarantees a coverage; expected coverage=0.9, or another in (0, 1), too")
-        if self.curve and self.out is None:
+        if self.curve and (self.out is None or self.out.suffix == MCAP):
             raise ValueError("curve: is drawn into the pictures; expected out=DIR too")
         if self.curve and (len(self.run), self.views) != (1, "1"):
             raise ValueError("curve: is recorded for single runs; expected one run= and no views=8")
@@ -65,27 +77,38 @@ def main(words: list[str]) -> int:
     """Predict each detection; returns the exit status."""
     arguments = PredictArguments.parsed("predict", words)
     out, detections = arguments.out, _detections(arguments)
-    if out is not None:
+    inputs = [detections.path] if isinstance(detections, Recording) else [one.file for one in detections]
+    if out is not None and out.suffix == MCAP:
+        require_output(out, f"predictions{MCAP}", inputs)
+    elif out is not None:
         if find_spec("matplotlib") is None:
             raise ConfigError("out: pictures need `pip install 'phd_exp[report]'`; without out= there is JSON alone")
-        if out.resolve() in {detection.file.resolve().parent for detection in detections}:
+        if out.resolve() in {file.resolve().parent for file in inputs}:
             raise ConfigError(f"out={out}: holds the images themselves; choose another folder")
         output_folder(out)
     predictor = loaded(arguments)
     guarantee = predictor.guarantee(arguments.coverage, arguments.groups) if arguments.coverage else None
     curve = _depth_curve(arguments.run[0], predictor) if arguments.curve else None
-    if out is not None:
+    if out is not None and out.suffix != MCAP:
         _write(predictor, detections, out, curve, guarantee)
         return 0
     from phd_exp.inference.answers import answer
+    from phd_exp.inference.ros import write_predictions
 
-    for sighting in predicted(predictor, detections, guarantee):
-        print(json.dumps(answer(sighting, predictor.temperature), allow_nan=False), flush=True)
+    sightings = predicted(predictor, detections, guarantee)
+    with message_file(out) as messages:
+        if messages is not None:
+            require_covariance(arguments, predictor)
+            sightings = write_predictions(messages, sightings)
+        for sighting in sightings:
+            print(json.dumps(answer(sighting, predictor.temperature), allow_nan=False), flush=True)
     return 0
 
 
-def _detections(arguments: PredictArguments) -> list[Detection]:
+def _detections(arguments: PredictArguments) -> Detections:
     camera, folder = arguments.of_camera, arguments.folder
+    if recording := arguments.recording(folder):
+        return recording
     if folder and not camera:
         return detections_in(folder, object_name=arguments.object)
     files = images_in(folder) if folder else arguments.image or ()
@@ -93,7 +116,7 @@ def _detections(arguments: PredictArguments) -> list[Detection]:
     return detections_of(files, camera, boxes)
 
 
-def _write(predictor: "Predictor", detections: list[Detection], out: Path, curve: Any, guarantee: Any) -> None:
+def _write(predictor: "Predictor", detections: Detections, out: Path, curve: Any, guarantee: Any) -> None:
     """Write each line of `predictions.jsonl` before its picture, whose name begins with the line's number."""
     from phd_exp.inference.answers import answer
     from phd_exp.inference.pictures import picture

@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from pydantic import Field, model_validator
 
-from phd_exp.cli.arguments import CameraArguments, loaded, output_folder, with_bar
+from phd_exp.cli.arguments import CameraArguments, loaded, message_file, output_folder, require_output, with_bar
 from phd_exp.records.detections import NumberOrName, detections_of
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.foreign import boxes_of_images
+from phd_exp.records.messages import optical_frame
 from phd_exp.records.own_images import detections_in, tracks_of
-from phd_exp.records.videos import length_of, require_av
+from phd_exp.records.recordings import MCAP, is_recording
+from phd_exp.records.videos import length_of, require_av, shots_in
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
     from phd_exp.inference.following import Followed, Frame
@@ -32,13 +34,14 @@ class TrackArguments(CameraArguments):
     video: Path | None = None
     """a video file, with its camera as f=, fx= and fy=, or camera="""
     folder: Path | None = None
-    """instead of video=, images with a metadata.jsonl whose lines have a time (s), and a track for several paths"""
+    """instead of video=, images with a metadata.jsonl whose lines have a time (s), and a track for several paths; or
+    FILE.mcap or rosbag2, a recording of ROS 2 with camera_info"""
     boxes: Path | None = None
     """instead of box=, COCO results of a detector, whose image_id is the number of a frame, from 0"""
     object: NumberOrName | None = None
     """with boxes=: the category_id; by default all boxes"""
     stride: Annotated[int, Field(ge=1)] = 1
-    """use every stride-th frame of the video"""
+    """use every stride-th frame of the video or recording"""
     noise: Annotated[float, Field(ge=1e-3, le=1e3)] = 1.0
     """how fast the velocity changes: by noise m/s in a second, growing with the root of time"""
     lag: Annotated[int, Field(ge=LEAST_LAG, le=1000)] = 10
@@ -50,14 +53,16 @@ class TrackArguments(CameraArguments):
     least_familiar: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """leave out predictions that are more unusual than this, see familiar in the lines: the object may be hidden"""
     out: Path | None = None
-    """a folder for track.jsonl, a video with level curves, and a page with the path; by default lines are printed"""
+    """a folder for track.jsonl, a video with level curves, and a page with the path; by default lines are printed,
+    also with FILE.mcap, which receives messages of ROS 2"""
 
     @model_validator(mode="after")
     def one_source(self) -> "TrackArguments":
         """Require a video with its camera, or a folder with both."""
         if (self.video is None) == (self.folder is None):
             raise ValueError("track: expected either video=FILE with f=PIXELS or camera=FILE, or folder=DIR")
-        if self.folder and (self.of_camera or self.boxes or self.stride > 1):
+        described = self.folder and not is_recording(self.folder)
+        if described and (self.of_camera or self.boxes or self.stride > 1):
             raise ValueError(
                 "folder: its metadata.jsonl has cameras and boxes; expected no f=, camera=, box=, stride="
             )
@@ -77,38 +82,58 @@ class TrackArguments(CameraArguments):
 
 
 class _Sequence(NamedTuple):
-    """The frames of one path, their number if it is known, and a name that files may have."""
+    """The frames of one path, their number if it is known, and a name that files may have.
+
+    For messages of ROS 2, the time 0 of the frames in ns, and the name of the camera's frame.
+    """
 
     frames: Iterable["Frame"]
     length: int | None
     name: str
+    origin: int = 0
+    camera: str = optical_frame("camera")
 
 
 def main(words: list[str]) -> int:
     """Follow each object; returns the exit status."""
     arguments = TrackArguments.parsed("track", words)
-    if arguments.video or arguments.out:
+    out = arguments.out
+    if arguments.video or (out and out.suffix != MCAP):
         require_av("video" if arguments.video else "out")
-    sequences, out = list(_sequences(arguments)), arguments.out
+    sequences = list(_sequences(arguments))
     if out is not None:
-        if find_spec("plotly") is None:
-            raise ConfigError("out: pages need `pip install 'phd_exp[report]'`; without out= there is JSON alone")
-        source = arguments.folder or Path(str(arguments.video)).parent
-        if out.resolve() == source.resolve():
-            raise ConfigError(f"out={out}: holds the images themselves; choose another folder")
-        output_folder(out)
+        _prepare(out, arguments.folder or Path(str(arguments.video)))
     predictor = loaded(arguments)
-    if out is not None:
+    if out is not None and out.suffix != MCAP:
         _write(arguments, predictor, sequences, out)
         return 0
-    for sequence in sequences:
-        for followed in _followed(arguments, predictor, sequence):
-            print(_line(arguments, predictor, sequence, followed), flush=True)
+    from phd_exp.inference.ros import write_path
+
+    with message_file(out) as messages:
+        for sequence in sequences:
+            path = _followed(arguments, predictor, sequence)
+            if messages is not None:
+                path = write_path(messages, sequence.name, sequence.origin, sequence.camera, path)
+            for followed in path:
+                print(_line(arguments, predictor, sequence, followed), flush=True)
     return 0
 
 
+def _prepare(out: Path, source: Path) -> None:
+    """Make the place to write to. Raises ConfigError if that is impossible, or would change the source."""
+    if out.suffix == MCAP:
+        require_output(out, f"track{MCAP}", [source])
+        return
+    if find_spec("plotly") is None:
+        raise ConfigError("out: pages need `pip install 'phd_exp[report]'`; without out= there is JSON alone")
+    if out.resolve() == (source if source.is_dir() else source.parent).resolve():
+        raise ConfigError(f"out={out}: holds the images themselves; choose another folder")
+    output_folder(out)
+
+
 def _sequences(arguments: TrackArguments) -> Iterator[_Sequence]:
-    if arguments.folder:
+    recording = arguments.recording(arguments.folder)
+    if arguments.folder and not recording:
         tracks = tracks_of(detections_in(arguments.folder))
         from phd_exp.inference.frames import folder_frames
 
@@ -117,24 +142,27 @@ def _sequences(arguments: TrackArguments) -> Iterator[_Sequence]:
                 folder_frames(detections), len(detections), str(arguments.folder.name if name is None else name)
             )
         return
-    video, camera = arguments.video, arguments.of_camera
-    assert video is not None  # by `one_source`
-    (detection,) = detections_of([video], camera)
     boxes: dict[int, list[Box]] | None = None
     if arguments.boxes:
         boxes = _boxes_of_frames(arguments.boxes, arguments.object)
     elif arguments.box:
         boxes = {0: [arguments.box]}
-    length = length_of(video)
-    if boxes and not any(n % arguments.stride == 0 and n < (length or math.inf) for n in boxes):
-        used = "every frame" if arguments.stride == 1 else f"frames 0, {arguments.stride}, ..."
+    video, stride = arguments.video, arguments.stride
+    length = len(recording) if recording else length_of(Path(str(video)))
+    if boxes and not any(n % stride == 0 and n < (length or math.inf) for n in boxes):
+        used = "every frame" if stride == 1 else f"frames 0, {stride}, ..."
         raise ConfigError(
             f"boxes: got image_id {min(boxes)} to {max(boxes)}, none of a frame; expected numbers from 0, of {used}"
         )
-    from phd_exp.inference.frames import video_frames
+    from phd_exp.inference.frames import recorded_shots, video_frames
 
-    frames = video_frames(detection, boxes, arguments.stride)
-    yield _Sequence(frames, length and -(-length // arguments.stride), video.stem)
+    n = length and -(-length // stride)
+    if recording:
+        frames = video_frames(recording.template, boxes, recorded_shots(recording, stride))
+        yield _Sequence(frames, n, recording.path.stem, recording.start, recording.frame)
+    elif video:
+        (detection,) = detections_of([video], arguments.of_camera)
+        yield _Sequence(video_frames(detection, boxes, shots_in(video, stride)), n, video.stem)
 
 
 def _boxes_of_frames(file: Path, category: int | str | None) -> dict[int, list[Box]]:

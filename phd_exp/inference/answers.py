@@ -1,12 +1,12 @@
 """Detections in image files, each predicted by a network, and the predictions as JSON objects."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import groupby
-from typing import TYPE_CHECKING, Any
+from itertools import islice
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
@@ -24,11 +24,13 @@ from phd_exp.inference.views import View
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
 from phd_exp.models.heads import Prediction
 from phd_exp.records.detections import Detection
-from phd_exp.records.errors import DatasetError, RunError
+from phd_exp.records.errors import DatasetError, RunError, UserError
 from phd_exp.records.images import content_of, pillow_warnings
 
 if TYPE_CHECKING:  # imports of pyarrow
     from phd_exp.evaluation.conformal import Guarantee
+
+Item = TypeVar("Item")
 
 PER_CENT = (50, 90, 99)  # per cent of the credible intervals of depth
 P = np.array([0.5, *(end for level in PER_CENT for end in (0.5 - level / 200, 0.5 + level / 200))])
@@ -202,7 +204,7 @@ def _rows(columns: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
 
 
 def sightings(
-    predictor: Predictor, detections: Sequence[Detection], guarantee: "Guarantee | None" = None
+    predictor: Predictor, detections: Iterable[Detection], guarantee: "Guarantee | None" = None
 ) -> Iterator[Sighting]:
     """The prediction for each detection, in their order, with the regions of a guarantee.
 
@@ -226,40 +228,68 @@ def sightings(
 Seen = tuple[Detection, Image.Image, View]
 
 
-def _batches(predictor: Predictor, detections: Sequence[Detection]) -> Iterator[list[Seen]]:
+def _batches(predictor: Predictor, detections: Iterable[Detection]) -> Iterator[list[Seen]]:
     """Detections with image and view; consecutive detections in one file share its image.
 
-    A batch has `BATCH` detections, fewer when its images exceed `LARGEST_AT_ONCE` pixels. As many files as torch has
-    threads are decoded at the same time.
+    A batch ends with the file that completes `BATCH` detections or exceeds `LARGEST_AT_ONCE` pixels. As many files as
+    torch has threads are decoded at the same time.
     """
     threads = min(DECODERS, torch.get_num_threads())
+    files = _with_error(together(detections, lambda one: one.file, BATCH))
+    batch: list[Seen] = []
     with ThreadPoolExecutor(threads) as pool:
-        for first in range(0, len(detections), BATCH):
-            files = [list(same) for _, same in groupby(detections[first : first + BATCH], lambda one: one.file)]
-            batch: list[Seen] = []
-            for some in range(0, len(files), threads):
-                with pillow_warnings():
-                    futures = [pool.submit(_seen, predictor, file) for file in files[some : some + threads]]
-                    wait(futures)
-                for future in futures:
-                    found, error = future.result()
-                    batch += found
-                    if error:
-                        if batch:
-                            yield batch  # the predictions before the invalid image are not lost
-                        raise error
-                if sum({id(image): image.width * image.height for _, image, _ in batch}.values()) > LARGEST_AT_ONCE:
-                    yield batch
-                    batch = []
-            if batch:
+        while some := list(islice(files, threads)):
+            with pillow_warnings():
+                futures = [pool.submit(_seen, predictor, file) for file in some]
+                wait(futures)
+            for future in futures:
+                found, error = future.result()
+                batch += found
+                if error:
+                    if batch:
+                        yield batch  # the predictions before the invalid image are not lost
+                    raise error
+            pixels = sum({id(image): image.width * image.height for _, image, _ in batch}.values())
+            if len(batch) >= BATCH or pixels > LARGEST_AT_ONCE:
                 yield batch
+                batch = []
+        if batch:
+            yield batch
 
 
-def _seen(predictor: Predictor, detections: Sequence[Detection]) -> tuple[list[Seen], DatasetError | None]:
-    """The detections in one file, those before the first that is invalid, and its error."""
-    found: list[Seen] = []
+def together(items: Iterable[Item], key: Callable[[Item], object], most: float = math.inf) -> Iterator[list[Item]]:
+    """Consecutive items with the same key, at most so many; also the last ones before a UserError."""
+    same: list[Item] = []
     try:
-        image = read_image(detections[0].file, content_of(detections[0].file))
+        for item in items:
+            if same and (key(item) != key(same[0]) or len(same) == most):
+                yield same
+                same = []
+            same.append(item)
+    except UserError:
+        if same:
+            yield same
+        raise
+    if same:
+        yield same
+
+
+def _with_error(items: Iterable[Item]) -> Iterator[Item | UserError]:
+    """The items, and the UserError with which they end, if they do."""
+    try:
+        yield from items
+    except UserError as error:
+        yield error
+
+
+def _seen(predictor: Predictor, detections: list[Detection] | UserError) -> tuple[list[Seen], UserError | None]:
+    """The detections in one file, those before the first that is invalid, and its error."""
+    if isinstance(detections, UserError):
+        return [], detections
+    found: list[Seen] = []
+    file, recorded = detections[0].file, detections[0].recorded
+    try:
+        image = read_image(file, recorded.content if recorded else content_of(file))
         for detection in detections:
             camera = facing(detection, image.size, predictor.side, predictor.largest_f)
             found.append((detection, image, View(cut(image, camera), camera)))

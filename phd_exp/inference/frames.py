@@ -1,6 +1,6 @@
-"""The frames of a video file, and of the user's own images with times."""
+"""The frames of a video file or a recording, and of the user's own images with times."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,20 +13,48 @@ from phd_exp.optics.virtual import Box, intrinsics, require_no_fold
 from phd_exp.records.detections import Detection
 from phd_exp.records.errors import DatasetError
 from phd_exp.records.images import content_of, pillow_warnings
-from phd_exp.records.videos import shots_in
+from phd_exp.records.messages import SECOND
+from phd_exp.records.recordings import Recording
+from phd_exp.records.videos import Shot
 
 
-def video_frames(detection: Detection, boxes: Mapping[int, Sequence[Box]] | None, stride: int = 1) -> Iterator[Frame]:
-    """Every `stride`-th frame of a video; None for `boxes` means whole images.
+def video_frames(
+    detection: Detection, boxes: Mapping[int, Sequence[Box]] | None, shots: Iterable[Shot]
+) -> Iterator[Frame]:
+    """The frames of a video or a recording; None for `boxes` means whole images.
 
-    Raises DatasetError if the video, the camera or a box is not valid.
+    Raises DatasetError if the camera or a box is not valid, and all errors of the shots.
     """
     first: Frame | None = None
-    for shot in shots_in(detection.file, stride):
+    for shot in shots:
         where = f"{detection.file}, frame {shot.number}"
         given = None if boxes is None else _boxes(detection, boxes.get(shot.number, ()), shot.image, where)
         first = first or frame_of(detection, shot.image, shot.time, None)
         yield replace(first, time=shot.time, image=shot.image, boxes=given, where=where)
+
+
+def recorded_shots(recording: Recording, stride: int = 1) -> Iterator[Shot]:
+    """Every `stride`-th image of a recording, with its time after the first one.
+
+    Raises DatasetError, after the images before, if one cannot be read, has another size, or a time that is not later
+    than that of the one before.
+    """
+    size, before = None, recording.start - 1
+    for number, detection in enumerate(recording):
+        image = detection.recorded
+        assert image is not None
+        if image.time <= before:
+            apart = (before - image.time) / SECOND
+            raise DatasetError(
+                f"{detection.where}: time: {apart:g} s before the image before; expected increasing times in the "
+                "headers; cut the recording there"
+            )
+        before = image.time
+        if number % stride == 0:
+            with pillow_warnings():
+                pixels = np.asarray(read_image(detection.file, image.content))
+            size = _alike(detection.where, pixels, size)
+            yield Shot(number, (image.time - recording.start) / SECOND, pixels)
 
 
 def folder_frames(detections: Sequence[Detection]) -> Iterator[Frame]:
@@ -44,13 +72,18 @@ def folder_frames(detections: Sequence[Detection]) -> Iterator[Frame]:
             raise DatasetError(f"{where}: pose is missing; expected one on all lines of the track, or on none")
         with pillow_warnings():
             image = np.asarray(read_image(detection.file, content_of(detection.file)))
-        size = size or image.shape
-        if image.shape != size:
-            got, expected = (f"{shape[1]} x {shape[0]}" for shape in (image.shape, size))
-            raise DatasetError(f"{where}: got {got} pixels; expected {expected} as in the first frame of the track")
+        size = _alike(where, image, size)
         before = line.time
         boxes = _boxes(detection, [line.box] if line.box else [], image, where) if has_boxes else None
         yield frame_of(detection, image, line.time, boxes)
+
+
+def _alike(where: str, image: np.ndarray, size: tuple[int, ...] | None) -> tuple[int, ...]:
+    """The shape of an image. Raises DatasetError if it is not that of the first one."""
+    if size and image.shape != size:
+        got, expected = (f"{shape[1]} x {shape[0]}" for shape in (image.shape, size))
+        raise DatasetError(f"{where}: got {got} pixels; expected {expected} as in the first frame of the track")
+    return image.shape
 
 
 def frame_of(detection: Detection, image: np.ndarray, time: float, boxes: tuple[Box, ...] | None) -> Frame:

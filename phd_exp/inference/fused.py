@@ -44,9 +44,9 @@ def fused_answers(
     plane: Plane | None,
     shared_scale: float | None = None,
 ) -> list[dict[str, Any]]:
-    """The fused position of each scene, with its errors if the true position is known.
+    """The fused position of each scene, with its errors if the true position is known; `for_json` rounds the numbers.
 
-    Lengths are in metres, in the world of the poses. A scene that fails has null for numbers and its `reason`.
+    Lengths are in metres, in the world of the poses. A scene that fails has NaN for numbers and its `reason`.
 
     Args:
         scenes: the scenes to fuse.
@@ -77,19 +77,24 @@ def fused_answers(
     answers = []
     for place, scene in enumerate(scenes):
         known = bool(truth[place].isfinite().all())
-        scores = {name: rounded(value[place].numpy()) for name, value in errors.items() if known}
+        scores = {name: value[place].numpy() for name, value in errors.items() if known}
         p_values = [familiar[row] for row in rows[place][mask[place]].tolist()]
         unusual = {} if None in p_values else {"familiar": rounded(np.array(p_values))}
         answers.append(_answer(scene, fused, place) | origin | unusual | scores)
     return answers
 
 
+def for_json(answer: Mapping[str, Any]) -> dict[str, Any]:
+    """An answer with lists of rounded numbers; None for NaN."""
+    return {name: rounded(value) if isinstance(value, np.ndarray) else value for name, value in answer.items()}
+
+
 def fused_region(answer: Mapping[str, Any], guarantees: Mapping[int, dict[str, Any]]) -> dict[str, Any]:
     """The ellipsoid of a fused answer: its guarantee, the ends of x, y and z (m), and its volume (m^3)."""
     if answer["status"] != Status.FUSED.name.lower():
         return {}
-    facts, mean = guarantees[len(answer["file_names"])], np.array(answer["mean"])
-    scaled = facts["squared_mahalanobis"] * np.array(answer["covariance"])
+    facts, mean = guarantees[len(answer["file_names"])], answer["mean"]
+    scaled = facts["squared_mahalanobis"] * answer["covariance"]
     reach, volume = np.sqrt(scaled.diagonal()), 4 / 3 * np.pi * np.sqrt(np.linalg.det(scaled))
     extent = rounded(np.stack([mean - reach, mean + reach], -1))
     return {"region": facts | {"extent": extent, "volume": rounded(volume)}}
@@ -129,4 +134,4 @@ def _answer(scene: Observed, fused: Fused, place: int) -> dict[str, Any]:
     numbers["surprise"] = fused.surprise[place, : len(scene.detections)]
     if fused.shared is not None:
         numbers["shared_scale"] = fused.shared[0][place]
-    return named | {name: rounded(value.numpy()) for name, value in numbers.items()}
+    return named | {name: value.numpy() for name, value in numbers.items()}

@@ -108,11 +108,16 @@ def read_camera(path: Path) -> Calibration:
     try:
         # YAML takes seconds a megabyte
         text = read_plain(path, LARGEST_RECORD if path.suffix == ".json" else MB).decode("utf-8-sig")
-        found = _found(content_of(text))
-        (width, height), (model, D) = _size(found), _lens(found)
-        return Calibration(width=width, height=height, K=tuple(_matrix(found)), D=tuple(D), model=model)
+        return calibration_in(content_of(text))
     except (OSError, ValueError, RecursionError) as error:
         raise DatasetError(f"{path}: {gist(error)}; see `Lenses` in docs/guides/own_images.md") from None
+
+
+def calibration_in(content: Any) -> Calibration:
+    """The calibration in the content of a camera file. Raises ValueError if there is none."""
+    found = _found(content)
+    (width, height), (model, D) = _size(found), _lens(found)
+    return Calibration(width=width, height=height, K=tuple(_matrix(found)), D=tuple(D), model=model)
 
 
 def calibration(given: Any) -> Calibration | None:

@@ -109,13 +109,26 @@ class DetectionLine(Record):
 
 
 @dataclass(frozen=True)
+class RecordedImage:
+    """An image of a recording: the bytes of an image file, its time (ns), and the name of its camera's frame."""
+
+    content: bytes
+    time: int
+    frame: str
+
+
+@dataclass(frozen=True)
 class Detection:
-    """One line, the image that it names, the place of the line, for messages, and the content of its camera file."""
+    """One line, the image that it names, the place of the line, for messages, and the content of its camera file.
+
+    The `file` of a `recorded` image is its place in the recording, and no file on disk.
+    """
 
     line: DetectionLine
     file: Path
     where: str
     calibration: Calibration | None = None
+    recorded: RecordedImage | None = None
 
     @property
     def position(self) -> tuple[float, float, float]:

@@ -22,6 +22,7 @@ EXTRAS = {
     "bpy": "render", "matplotlib": "report", "plotly": "report", "jinja2": "report", "onnx": "export",
     "onnxscript": "export", "onnxruntime": "export", "optuna": "search", "tensorboard": "loggers",
     "mlflow": "loggers", "timm": "timm", "av": "video", "joblib": "launchers", "submitit": "launchers", "ray": "ray",
+    "rosbags": "ros",
 }  # fmt: skip
 """Optional package -> the extra of phd_exp that installs it."""
 NAMED = 5  # names that a message lists

@@ -1,0 +1,212 @@
+"""Writing recordings of ROS 2 messages, as MCAP files, with `rosbags`, which the extra `ros` installs.
+
+Positions are in metres, in the frame that a message names. That of a camera is ROS's optical frame (x right, y down,
+z forward), which is also the camera frame of this package. The messages are those of ROS 2 Jazzy, and of vision_msgs
+4, which Humble and later distributions have.
+
+Source: REP 103 and 105; the definitions of vision_msgs, geometry_msgs, sensor_msgs and tf2_msgs.
+"""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from jaxtyping import Float
+
+from phd_exp.optics.lens import Lens
+from phd_exp.records.cameras import COEFFICIENTS, CORNER
+from phd_exp.records.errors import ConfigError
+
+SECOND = 10**9  # nanoseconds
+UNKNOWN = 1e6
+"""Variance of each angle (rad²): the rotation is not estimated."""
+WORLD = "world"
+DETECTIONS, POSITION = "vision_msgs/msg/Detection3DArray", "geometry_msgs/msg/PoseWithCovarianceStamped"
+RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+INFO = "sensor_msgs/msg/CameraInfo"
+VISION = {
+    "ObjectHypothesis": "string class_id\nfloat64 score",
+    "ObjectHypothesisWithPose": "ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose",
+    "BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
+    "Detection3D": "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\nstring id",
+    "Detection3DArray": "std_msgs/Header header\nDetection3D[] detections",
+}
+"""The fields of vision_msgs, which rosbags does not have."""
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """The position of an object.
+
+    Args:
+        mean: m.
+        covariance: m².
+        class_id: of the detector.
+        score: of the detector; 1 without one.
+        id: the same in messages about the same object.
+    """
+
+    mean: Float[np.ndarray, "3"]
+    covariance: Float[np.ndarray, "3 3"]
+    class_id: str = ""
+    score: float = 1.0
+    id: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """An image file and its camera.
+
+    Args:
+        format: `png` or `jpeg`.
+        content: the bytes of the file.
+        size: width and height, px.
+        K: camera matrix, px, as `intrinsics` returns it.
+        lens: of the camera.
+    """
+
+    format: str
+    content: bytes
+    size: tuple[int, int]
+    K: Float[np.ndarray, "3 3"]
+    lens: Lens
+
+
+def require_rosbags(key: str) -> None:
+    """Raise ConfigError, which names the key that needs rosbags, unless rosbags is installed."""
+    if find_spec("rosbags") is None:
+        raise ConfigError(f"{key}: recordings of ROS 2 need `pip install 'phd_exp[ros]'`")
+
+
+@cache
+def typestore() -> Any:
+    """The definitions of the messages."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, fields in VISION.items():
+        store.register(get_types_from_msg(fields, f"vision_msgs/msg/{name}"))
+    return store
+
+
+def optical_frame(camera: str) -> str:
+    """The name of a camera's optical frame, by ROS's convention."""
+    return f"{camera}_optical_frame"
+
+
+class MessageFile:
+    """An MCAP file, written message by message. It replaces an earlier file at the end, also after an error.
+
+    Times are in nanoseconds.
+    """
+
+    def __init__(self, file: Path) -> None:
+        from rosbags.rosbag2 import StoragePlugin, Writer
+
+        self.file = file
+        # a recording is a folder to rosbags; its MCAP file is complete without the rest
+        self._folder = TemporaryDirectory(prefix=f".{file.name}.", suffix=".tmp", dir=file.parent)
+        self._writer = Writer(Path(self._folder.name) / "all", version=8, storage_plugin=StoragePlugin.MCAP)
+        self._writer.open()
+        self._connections: dict[str, Any] = {}
+
+    def positions(self, time: int, frame: str, objects: Sequence[Located]) -> None:
+        """Write `/detections`, and `/position` for each object."""
+        header = _header(time, frame)
+        detections = []
+        for one in objects:
+            pose = _pose(one)
+            hypothesis = _made("vision_msgs/msg/ObjectHypothesis", class_id=one.class_id, score=one.score)
+            result = _made("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis, pose=pose)
+            box = _made("vision_msgs/msg/BoundingBox3D", center=pose.pose, size=_vector(np.zeros(3)))
+            named = {"header": header, "results": [result], "bbox": box, "id": one.id}
+            detections.append(_made("vision_msgs/msg/Detection3D", **named))
+            self._write(
+                "/position", time, _made("geometry_msgs/msg/PoseWithCovarianceStamped", header=header, pose=pose)
+            )
+        self._write(
+            "/detections", time, _made("vision_msgs/msg/Detection3DArray", header=header, detections=detections)
+        )
+
+    def photograph(self, time: int, frame: str, camera: str, photograph: Photograph) -> None:
+        """Write `/CAMERA/image_raw/compressed` and `/CAMERA/camera_info`."""
+        header, data = _header(time, frame), np.frombuffer(photograph.content, np.uint8)
+        image = _made(COMPRESSED, header=header, format=photograph.format, data=data)
+        self._write(f"/{camera}/image_raw/compressed", time, image)
+        self._write(f"/{camera}/camera_info", time, _camera_info(header, photograph))
+
+    def pose(self, time: int, frame: str, place: Float[np.ndarray, "3"], turn: Float[np.ndarray, "4"]) -> None:
+        """Write `/tf`: the place (m) of a frame in the world, and the quaternion (x, y, z, w) of its axes."""
+        transform = _made("geometry_msgs/msg/Transform", translation=_vector(place), rotation=_quaternion(turn))
+        named = {"header": _header(time, WORLD), "child_frame_id": frame, "transform": transform}
+        stamped = _made("geometry_msgs/msg/TransformStamped", **named)
+        self._write("/tf", time, _made("tf2_msgs/msg/TFMessage", transforms=[stamped]))
+
+    def _write(self, topic: str, time: int, message: Any) -> None:
+        store, kind = typestore(), message.__msgtype__
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(topic, kind, typestore=store)
+        self._writer.write(self._connections[topic], time, store.serialize_cdr(message, kind))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, place: TracebackType | None
+    ) -> None:
+        with self._folder:
+            self._writer.close()
+            if error is None or self._connections:
+                os.replace(Path(self._folder.name) / "all" / "all.mcap", self.file)
+
+
+def _made(kind: str, **fields: Any) -> Any:
+    return typestore().types[kind](**fields)
+
+
+def _header(time: int, frame: str) -> Any:
+    seconds, nanoseconds = divmod(time, SECOND)
+    stamp = _made("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+    return _made("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+
+def _vector(xyz: Float[np.ndarray, "3"], kind: str = "Vector3") -> Any:
+    return _made(f"geometry_msgs/msg/{kind}", **dict(zip("xyz", map(float, xyz), strict=True)))
+
+
+def _quaternion(xyzw: Float[np.ndarray, "4"]) -> Any:
+    return _made("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", map(float, xyzw), strict=True)))
+
+
+def _pose(located: Located) -> Any:
+    """The axes are those of the frame, with variances that say how little this means."""
+    covariance = np.diag([0.0, 0.0, 0.0, UNKNOWN, UNKNOWN, UNKNOWN])
+    covariance[:3, :3] = located.covariance
+    no_turn = _quaternion(np.array([0.0, 0.0, 0.0, 1.0]))
+    pose = _made("geometry_msgs/msg/Pose", position=_vector(located.mean, "Point"), orientation=no_turn)
+    return _made("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance.ravel())
+
+
+def _camera_info(header: Any, photograph: Photograph) -> Any:
+    """The intrinsics; ROS counts pixels from the centre of the first one."""
+    (width, height), lens = photograph.size, photograph.lens
+    K = photograph.K - CORNER * np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
+    model = (
+        "equidistant" if lens.is_fisheye else "plumb_bob" if len(lens.coefficients) <= 5 else "rational_polynomial"
+    )
+    D = np.zeros(len(COEFFICIENTS[model]))
+    D[: len(lens.coefficients)] = lens.coefficients
+    region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0) | {"do_rectify": False}
+    return _made(
+        INFO,
+        header=header, height=height, width=width, distortion_model=model, d=D, k=K.ravel(), r=np.eye(3).ravel(),
+        p=np.c_[K, np.zeros(3)].ravel(), binning_x=0, binning_y=0,
+        roi=_made("sensor_msgs/msg/RegionOfInterest", **region),
+    )  # fmt: skip

@@ -1,0 +1,211 @@
+"""Images and `camera_info` of a ROS 2 recording: an MCAP file, or a rosbag2 folder with MCAP or SQLite files.
+
+`rosbags`, which the extra `ros` installs, reads them, one chunk at a time. Messages are decoded by the definitions of
+ROS 2, not by those in a stranger's file.
+
+Source: the definitions of sensor_msgs; image_pipeline's names of topics.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from phd_exp.records.cameras import Calibration, calibration_in, read_camera
+from phd_exp.records.detections import Detection, RecordedImage, line_of
+from phd_exp.records.errors import DatasetError, UserError, gist, listed, shown
+from phd_exp.records.files import require_plain
+from phd_exp.records.messages import COMPRESSED, INFO, RAW, SECOND, require_rosbags, typestore
+
+MCAP = ".mcap"
+ENCODINGS = {"mono8": 1, "rgb8": 3, "bgr8": 3}
+"""Encoding of an image that is not compressed -> bytes a pixel."""
+RECTIFIED = "image_rect"
+"""Beginning of the names of topics whose images have no distortion, and the camera P instead of K."""
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a path is a recording: an MCAP file, or a folder with rosbag2's `metadata.yaml`."""
+    return (path.suffix == MCAP and not path.is_dir()) or (path / "metadata.yaml").is_file()
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """The images of one topic with their camera, as detections in the order in which they were recorded.
+
+    Attributes:
+        path: of the recording.
+        topic: of the images.
+        template: a detection without an image.
+        infos: the topic of the camera; None for a camera from elsewhere.
+        n: number of images.
+        start: time of the first one (ns).
+        frame: name of the camera's frame.
+    """
+
+    path: Path
+    topic: str
+    template: Detection
+    infos: str | None
+    n: int
+    start: int
+    frame: str
+
+    @classmethod
+    def of(cls, path: Path, topic: str | None, camera: Mapping[str, Any]) -> "Recording":
+        """The images of a topic (IMAGE, or IMAGE,CAMERA_INFO), which only a recording of several cameras needs.
+
+        `camera` has the keys of a camera, of a `DetectionLine`, that replace `camera_info`, and a box.
+
+        Raises ConfigError without rosbags; DatasetError if the recording cannot be read, the topics are unclear, or
+        there is no camera or no image.
+        """
+        require_rosbags("folder")
+        with _opened(path) as reader:
+            counts = {(one.topic, one.msgtype): one.msgcount for one in reader.connections if one.msgcount}
+        topics = {name: kind for name, kind in counts}
+        name, _, given = (topic or "").partition(",")
+        images = _chosen(path, name, [one for one, kind in topics.items() if kind in (RAW, COMPRESSED)])
+        infos, calibration = None, None
+        if camera.keys() <= {"box"}:
+            infos = _info_of(path, images, given, [one for one, kind in topics.items() if kind == INFO])
+            _, _, message = next(_messages(path, [infos]))
+            calibration = _calibration(path, images, infos, message)
+            camera = {"camera": infos, **camera}
+        elif "camera" in camera:
+            calibration = read_camera(Path(camera["camera"]))
+        line = line_of({"file_name": images, **camera}, str(path))
+        n = counts[images, topics[images]]
+        template = Detection(line, path, str(path), calibration)
+        time, _, message = next(_messages(path, [images]))
+        return cls(path, images, template, infos, n, _time(message, time), str(message.header.frame_id))
+
+    def __len__(self) -> int:
+        """The number of images."""
+        return self.n
+
+    def __iter__(self) -> Iterator[Detection]:
+        """The images one by one. Raises DatasetError, after those before, where one cannot be read."""
+        for time, topic, message in _messages(self.path, [self.topic, *([self.infos] if self.infos else [])]):
+            time = _time(message, time)
+            stamp = f"{time // SECOND}.{time % SECOND:09}"
+            where = f"{self.path}, {topic} at {stamp}"
+            if topic == self.infos:
+                if _calibration(self.path, self.topic, topic, message) != self.template.calibration:
+                    raise DatasetError(f"{where}: the camera changes; expected one camera; cut the recording there")
+                continue
+            image = RecordedImage(_image_file(where, message), time, str(message.header.frame_id))
+            line = self.template.line.model_copy(update={"file_name": stamp})
+            yield replace(self.template, line=line, file=self.path / stamp, where=where, recorded=image)
+
+
+def _chosen(path: Path, name: str, topics: list[str]) -> str:
+    """The topic of the images."""
+    if name in topics or (not name and len(topics) == 1):
+        return name or topics[0]
+    if not topics:
+        raise DatasetError(f"{path}: has no images; expected a topic of {RAW} or {COMPRESSED}")
+    got = f"got {shown(name)}" if name else f"{len(topics)} topics of images"
+    raise DatasetError(f"{path}: topic: {got}; expected topic=NAME, one of {listed(sorted(topics))}")
+
+
+def _info_of(path: Path, images: str, name: str, topics: list[str]) -> str:
+    """The topic of a camera: the given one, or that next to the images."""
+    base = images.removesuffix("/compressed").rpartition("/")[0]
+    name = name or f"{base}/camera_info"
+    if name in topics:
+        return name
+    found = f"found {listed(sorted(topics))}" if topics else "found none"
+    raise DatasetError(
+        f"{path}: no camera_info of {images}: {found}; expected {name}, topic={images},CAMERA_INFO, or camera=FILE "
+        "or f=PIXELS"
+    )
+
+
+def _calibration(path: Path, images: str, infos: str, message: Any) -> Calibration:
+    """The camera of a `camera_info`; ROS counts pixels from the centre of the first one, as camera files do."""
+    size = {"width": message.width, "height": message.height}
+    camera = {"K": message.k.tolist(), "D": message.d.tolist(), "distortion_model": message.distortion_model}
+    if images.removesuffix("/compressed").rpartition("/")[2].startswith(RECTIFIED):
+        camera = {"K": message.p.reshape(3, 4)[:, :3].ravel().tolist(), "D": []}
+    try:
+        return calibration_in(size | camera)
+    except (ValueError, ValidationError) as error:
+        raise DatasetError(f"{path}, {infos}: {gist(error)}; expected a calibrated camera, or camera=FILE") from None
+
+
+def _time(message: Any, recorded: int) -> int:
+    """The time at which a message was taken (ns); if it does not say, that of its recording."""
+    stamp = message.header.stamp
+    return stamp.sec * SECOND + stamp.nanosec or recorded
+
+
+def _image_file(where: str, message: Any) -> bytes:
+    """The bytes of an image file: those of a compressed image, or a PPM with the pixels of another one."""
+    if message.__msgtype__ == COMPRESSED:
+        return bytes(message.data)
+    encoding, bands = message.encoding, ENCODINGS.get(message.encoding)
+    if bands is None:
+        raise DatasetError(
+            f"{where}: got the encoding {shown(encoding)}; expected {', '.join(ENCODINGS)}, or a compressed image; "
+            "convert it with image_proc or cv_bridge"
+        )
+    height, width, step = message.height, message.width, message.step
+    if not 0 < width * bands <= step or height * step != len(message.data):
+        raise DatasetError(
+            f"{where}: got {len(message.data)} bytes for {width} x {height} pixels of {encoding} in rows of {step}; "
+            "expected height x step"
+        )
+    pixels = message.data.reshape(height, step)[:, : width * bands].reshape(height, width, bands)
+    pixels = pixels[..., ::-1] if encoding == "bgr8" else pixels
+    return b"P%d %d %d 255\n" % (5 if bands == 1 else 6, width, height) + np.ascontiguousarray(pixels).tobytes()
+
+
+def _messages(path: Path, topics: list[str]) -> Iterator[tuple[int, str, Any]]:
+    """The messages of some topics: time of recording (ns), topic, and content."""
+    with _opened(path) as reader:
+        found = iter(reader.messages([one for one in reader.connections if one.topic in topics]))
+        while True:
+            with _reading(path):
+                if (one := next(found, None)) is None:
+                    return
+                connection, time, data = one
+                message = typestore().deserialize_cdr(data, connection.msgtype)
+            yield time, connection.topic, message
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """The recording as rosbags reads it."""
+    from rosbags.rosbag2 import Reader
+
+    with _reading(path):
+        if not path.is_dir():
+            require_plain(path)
+        reader = Reader(path)
+        reader.open()
+    try:
+        yield reader
+    finally:
+        reader.close()
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Turn any error into a DatasetError: rosbags has errors of many kinds for damaged files."""
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        raise DatasetError(
+            f"{path}: cannot be read as a recording of ROS 2 ({gist(error) or type(error).__name__}); copy the file "
+            "again; if its writer was interrupted, `mcap recover` or `ros2 bag reindex` repairs it"
+        ) from None
+
+
+Detections = Sequence[Detection] | Recording
