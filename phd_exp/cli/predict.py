@@ -23,7 +23,7 @@ from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import write_atomic
 from phd_exp.records.foreign import boxes_in
 from phd_exp.records.own_images import detections_in, images_in
-from phd_exp.records.recordings import MCAP, Detections, Recording
+from phd_exp.records.recordings import MCAP, Detections, Recording, is_recording
 from phd_exp.records.runs import RunFolder
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
@@ -62,7 +62,8 @@ class PredictArguments(CameraArguments):
             )
         if self.boxes and (self.box or self.folder or len(self.image or ()) > 1):
             raise ValueError("boxes: the boxes of one image=FILE; expected no box=, no folder= and no further image")
-        if self.object is not None and (self.image or self.of_camera) and not self.boxes:
+        has_none = self.image or self.of_camera or (self.folder and is_recording(self.folder))
+        if self.object is not None and has_none and not self.boxes:
             raise ValueError("object: selects detections of folder=DIR or boxes=FILE; leave it out for one box")
         if self.groups and not self.coverage:
             raise ValueError("groups: guarantees a coverage; expected coverage=0.9, or another in (0, 1), too")

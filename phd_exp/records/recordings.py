@@ -90,6 +90,7 @@ class Recording:
 
     def __iter__(self) -> Iterator[Detection]:
         """The images one by one. Raises DatasetError, after those before, where one cannot be read."""
+        n = 0
         for time, topic, message in _messages(self.path, [self.topic, *([self.infos] if self.infos else [])]):
             time = _time(message, time)
             stamp = f"{time // SECOND}.{time % SECOND:09}"
@@ -101,6 +102,9 @@ class Recording:
             image = RecordedImage(_image_file(where, message), time, str(message.header.frame_id))
             line = self.template.line.model_copy(update={"file_name": stamp})
             yield replace(self.template, line=line, file=self.path / stamp, where=where, recorded=image)
+            n += 1
+        if n != self.n:
+            raise DatasetError(f"{self.path}: got {n} images of {self.topic}; expected {self.n}; copy the file again")
 
 
 def _chosen(path: Path, name: str, topics: list[str]) -> str:
