@@ -14,6 +14,7 @@ WORDS = {
     "guides/own_object.md": ["CAD", "mesh", "synthetic images"],
     "guides/own_images.md": ["annotation", "bounding box", "fine-tune"],
     "guides/predict.md": ["inference", "confidence", "video", "deploy"],
+    "guides/ros.md": ["ROS2", "rosbag", "MCAP", "Foxglove", "rclpy", "robot"],
     "guides/search.md": ["hyperparameter", "tune"],
     "guides/several_cameras.md": ["stereo", "triangulation"],
     "guides/shift.md": ["robustness", "out of distribution"],

@@ -21,6 +21,7 @@ PACKAGES = {
     "loggers": ("tensorboard", "tensorboardX", "mlflow"),
     "timm": ("timm",),
     "video": ("av",),
+    "ros": ("rosbags",),
     "ray": ("ray", "hydra_plugins.hydra_ray_launcher"),
 }
 OTHERS = (*LEARN, "runs=others")
@@ -40,6 +41,7 @@ LACKS: dict[str, tuple[tuple[str, ...], ...]] = {
     "search": (("search", "space.yaml", "trials=1", *OTHERS),),
     "loggers": ((*LEARN, "runs=a", "logger=tensorboard"), (*LEARN, "runs=b", "logger=mlflow")),
     "video": (("track", "run=RUN", "video=clip.mp4", "f=300"),),
+    "ros": ((*ONE, "out=a.mcap"), ("track", "run=RUN", "folder=a.mcap")),
     "timm": ((*LEARN, "runs=c", "backbone._target_=timm.create_model"),),
     "ray": (("-m", *OTHERS, "seed=1,2", "hydra/launcher=ray"),),
 }
