@@ -122,10 +122,11 @@ def _fused(
 ) -> list[dict[str, Any]]:
     """The answers of `fused_answers`, which are written to `messages` with the images."""
     from phd_exp.inference.fused import fused_answers
-    from phd_exp.inference.ros import write_fused, write_views
 
     if messages is None:
         return fused_answers(scenes, sightings, *how)
+    from phd_exp.inference.ros import write_fused, write_views
+
     answers = fused_answers(scenes, write_views(messages, scenes, sightings), *how)
     write_fused(messages, scenes, answers)
     return answers

@@ -94,11 +94,12 @@ def main(words: list[str]) -> int:
         _write(predictor, detections, out, curve, guarantee)
         return 0
     from phd_exp.inference.answers import answer
-    from phd_exp.inference.ros import write_predictions
 
     sightings = predicted(predictor, detections, guarantee)
     with message_file(out) as messages:
         if messages is not None:
+            from phd_exp.inference.ros import write_predictions
+
             require_covariance(arguments, predictor)
             sightings = write_predictions(messages, sightings)
         for sighting in sightings:

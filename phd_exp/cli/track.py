@@ -107,12 +107,12 @@ def main(words: list[str]) -> int:
     if out is not None and out.suffix != MCAP:
         _write(arguments, predictor, sequences, out)
         return 0
-    from phd_exp.inference.ros import write_path
-
     with message_file(out) as messages:
         for sequence in sequences:
             path = _followed(arguments, predictor, sequence)
             if messages is not None:
+                from phd_exp.inference.ros import write_path
+
                 path = write_path(messages, sequence.name, sequence.origin, sequence.camera, path)
             for followed in path:
                 print(_line(arguments, predictor, sequence, followed), flush=True)
