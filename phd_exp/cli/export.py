@@ -1,10 +1,17 @@
 """`python -m phd_exp export`: a run's network as an ONNX file, compared with torch."""
 
+import sys
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 from phd_exp.cli.arguments import RunArguments, loaded, output_folder, require_file
 from phd_exp.records.errors import ConfigError
+
+if TYPE_CHECKING:  # imports of torch, which follow the checks of the arguments
+    from phd_exp.data.batches import Batch
+    from phd_exp.inference.deployed import Precision
+    from phd_exp.inference.predictor import Predictor
 
 
 class ExportArguments(RunArguments):
@@ -14,6 +21,10 @@ class ExportArguments(RunArguments):
     """the file; by default network.onnx in the (first) run's folder"""
     photographs: bool = False
     """the inputs are a photograph, its camera matrix and boxes, and the graph crops as predict does"""
+    precision: Literal["float32", "float64"] | None = None
+    """of the numbers after the network: float32, which all runtimes take, unless only float64 is accurate enough"""
+    quantize: Literal["int8"] | None = None
+    """convolutions in int8, calibrated and measured on the run's held-out images; refused if the errors grow"""
 
 
 def main(words: list[str]) -> int:
@@ -28,13 +39,45 @@ def main(words: list[str]) -> int:
     from phd_exp.inference.deployed import PHOTOGRAPHS, batches
     from phd_exp.inference.onnx import TOLERANCE, export
 
+    precision = _precision(arguments, predictor)
+    held_out = _held_out(predictor) if arguments.quantize else None
     sizes = [n for _, _, n in PHOTOGRAPHS] if arguments.photographs else batches(predictor.side)
     numbers = ", ".join(map(str, sizes))
     what = f"photographs with {numbers} boxes" if arguments.photographs else f"images in batches of {numbers}"
     if arguments.coverage:
         predictor.guarantee(arguments.coverage)  # is refused, if at all, before the work that is printed
     print(f"{file}: converting the network to ONNX, then comparing it with torch on {what}", flush=True)
-    deviation = export(predictor, file, arguments.coverage, arguments.photographs)
-    print(f"{file}: {file.stat().st_size / 1e6:.1f} MB")
+    deviation, change = export(
+        predictor, file, arguments.coverage, arguments.photographs, precision=precision, held_out=held_out
+    )
+    print(f"{file}: {file.stat().st_size / 1e6:.1f} MB, {precision} after the network")
     print(f"  largest relative deviation from torch: {deviation:.1e} (at most {TOLERANCE:g})")
+    if change:
+        print(f"  int8: {change}")
     return 0
+
+
+def _precision(arguments: ExportArguments, predictor: "Predictor") -> "Precision":
+    """The precision that was asked for, or the default. Raises ConfigError if it is not accurate enough."""
+    from phd_exp.inference.deployed import needs_float64
+
+    reason = needs_float64(predictor, arguments.photographs)
+    if reason and arguments.precision == "float32":
+        raise ConfigError(f"precision: got float32; expected float64: {reason}")
+    if reason and arguments.precision is None:
+        print(f"note: precision=float64, because {reason}; not every runtime takes it", file=sys.stderr)
+    return "float64" if reason else arguments.precision or "float32"
+
+
+def _held_out(predictor: "Predictor") -> "Batch":
+    """The run's held-out samples. Raises ConfigError if there are too few."""
+    from phd_exp.build import build_source
+    from phd_exp.inference.onnx_int8 import IMAGES_AT_LEAST
+
+    data = predictor.config.data
+    if data.n_held_out < IMAGES_AT_LEAST:
+        raise ConfigError(
+            f"quantize: got a run with {data.n_held_out} held-out images; expected {IMAGES_AT_LEAST} at least, which "
+            "int8 is calibrated and measured on; train with data.n_held_out=100"
+        )
+    return build_source(data).samples("held_out")

@@ -98,17 +98,32 @@ def _newton_step(distance: Tensor, drop: Tensor, log_a: Tensor, log_e_2: Tensor)
 def depth_mean_and_variance(
     log_a: Float[Tensor, "*batch"],
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-    """Mean and variance of t.
+    """Mean and variance of t, from `depth_excess_moments`."""
+    a = log_a.exp()
+    mean, variance = depth_excess_moments(log_a)
+    return 1 + mean / a, variance / a.square()
 
-    E[t] = 1 + (1 - J_1) / (a (1 + J_0)) and Var[t] = ((2 + J_2) / (1 + J_0) - ((1 - J_1) / (1 + J_0))^2) / a^2.
-    Where a is large, M_2/M_0 - (M_1/M_0)^2 of the paper's raw moments would lose every digit.
+
+def depth_excess_moments(log_a: Float[Tensor, "*batch"]) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """Mean and variance of a (t - 1), the depth beyond the mode in units of the law's width.
+
+    The mean is (1 - J_1) / (1 + J_0), the variance (2 + J_2) / (1 + J_0) less its square. Where a is large,
+    M_2/M_0 - (M_1/M_0)^2 of the paper's raw moments would lose every digit, and 1 - J_1, about 6/a, is the integral
+    of s e^(-s) (1 - u^3) with u = a/(a + s).
 
     Source: own derivation (moments around the mode); checked against mpmath in tests/distributions/test_depth.py.
     """
     a = log_a.exp()
     j_0, j_1, j_2 = (tail_moment(k, a) for k in range(3))
-    first, second = (1 - j_1) / (1 + j_0), (2 + j_2) / (1 + j_0)
-    return 1 + first / a, (second - first.square()) / a.square()
+    small = a <= 1
+    above = a.masked_fill(small, 1)
+    far = weighted_integral(lambda s: s.square() / (above + s) * _three_powers(above / (above + s)), above)
+    mean = torch.where(small, 1 - j_1, far) / (1 + j_0)
+    return mean, (2 + j_2) / (1 + j_0) - mean.square()
+
+
+def _three_powers(u: Tensor) -> Tensor:
+    return 1 + u + u.square()
 
 
 def inverse_depth_shortfall(a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:

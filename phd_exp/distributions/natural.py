@@ -6,7 +6,7 @@ The density needs no inverse of a matrix.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -18,23 +18,23 @@ from phd_exp.distributions.special import signed_log1p
 
 LARGEST_RATIO = 100.0
 """Of the eigenvalues of B, and so of A. Larger ones, on unusual images, were useless."""
-_EVENT_DIMS = {"A_xy": 2, "nu_xy": 1, "nu_0": 1}
+_EVENT_DIMS = {"A_xy": 2, "nu_xy": 1, "k": 1}
 
 
 @dataclass(frozen=True)
 class Natural:
-    """The parameters of a batch: q = A_xy (x, y) - nu_xy z - nu_0 and log t = log z - log mu_z.
+    """The parameters of a batch: q = A_xy (x, y) - nu_xy z + k a (t - 1) and log t = log z - log mu_z.
 
-    The paper's axis, the line q = 0, passes through the camera: nu_0 = 0. With a free axis q has the further term
-    k a (t - 1), so that nu_xy = A_xy mu_xy - k a/mu_z and nu_0 = k a.
+    The paper's axis, the line q = 0, passes through the camera: k = 0. The last term of a free axis stays apart from
+    the others, because the two would cancel at the mode.
 
     Args:
         A_xy: A / mu_z, precision of (x, y) at any depth, 1/metres.
-        nu_xy: A_xy mu_xy, with a free axis less k a/mu_z, 1/metres.
+        nu_xy: A_xy mu_xy, 1/metres.
         log_det_A_xy: log|A_xy|; finite where |A_xy| underflows.
         log_mu_z: log of the depth's centre, mu_z in metres.
         log_a: log of the depth's precision.
-        nu_0: k a, with a free axis alone.
+        k: turns the axis about the mode; None for the paper's.
     """
 
     A_xy: Float[Tensor, "*#batch 2 2"]
@@ -42,7 +42,7 @@ class Natural:
     log_det_A_xy: Float[Tensor, "*#batch"]
     log_mu_z: Float[Tensor, "*#batch"]
     log_a: Float[Tensor, "*#batch"]
-    nu_0: Float[Tensor, "*#batch 2"] | None = None
+    k: Float[Tensor, "*#batch 2"] | None = None
 
     @classmethod
     def from_camera_frame(
@@ -60,14 +60,7 @@ class Natural:
         A_xy = A / mu_z[..., None, None]
         log_mu_z = mu_z.log()
         log_det_A_xy = spd.log_det(A) - 2 * log_mu_z
-        return cls(A_xy, spd.matvec(A_xy, mu_xy), log_det_A_xy, log_mu_z, a.log()).with_axis(k)
-
-    def with_axis(self, k: Float[Tensor, "*#batch 2"] | None) -> "Natural":
-        """The paper's parameters with the axis turned about the mode: q plus k a (t - 1)."""
-        if k is None:
-            return self
-        nu_xy = self.nu_xy - k * torch.exp(self.log_a - self.log_mu_z)[..., None]
-        return replace(self, nu_xy=nu_xy, nu_0=k * self.log_a.exp()[..., None])
+        return cls(A_xy, spd.matvec(A_xy, mu_xy), log_det_A_xy, log_mu_z, a.log(), k)
 
     @classmethod
     def from_raw(
@@ -85,14 +78,14 @@ class Natural:
         log_a = spd.log_positive(raw[..., 5])
         f_in_metres = mu_z0 * f  # the depth at which z_p = 1
         scale = 2 / (S * mu_z0)
-        paper = cls(
+        return cls(
             A_xy=scale * B,
             nu_xy=raw[..., :2] / f_in_metres[..., None],
             log_det_A_xy=log_det_B + 2 * math.log(scale),
             log_mu_z=signed_log1p(raw[..., 6], log_a) + f_in_metres.log(),
             log_a=log_a,
+            k=raw[..., 7:] if raw.shape[-1] > 7 else None,
         )
-        return paper.with_axis(raw[..., 7:] if raw.shape[-1] > 7 else None)
 
     @property
     def batch_shape(self) -> torch.Size:

@@ -1,14 +1,15 @@
 """The Projected Huber distribution of a position in front of a camera.
 
-With q = A_xy (x, y) - nu_xy z - nu_0 and t = z / mu_z,
+With q = A_xy (x, y) - nu_xy z + k a (t - 1) and t = z / mu_z,
 
     -log p(v) = h(|q|) - log|A_xy| + log(2 pi (1 + e^(-1/2))) + a max(t, 1/t) + log(mu_z N(a))   for z > 0.
 
 q and t are independent, and v is affine in (q, t). Every statistic below follows from that. In the paper's density
-nu_0 = 0: its axis, the line q = 0, passes through the camera. A free axis passes through `apex` in the plane z = 0.
+k = 0: its axis, the line q = 0, passes through the camera. A free axis passes through `apex` in the plane z = 0.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import ClassVar, Literal, final
 
 import torch
@@ -182,7 +183,7 @@ class ProjectedHuber(Density, Distribution):
 
     def with_axis(self, k: Float[Tensor, "*#batch 2"]) -> "ProjectedHuber":
         """The paper's density with its axis turned about the mode; see the argument k."""
-        return self._of(self._natural.with_axis(k), self._validate_args)
+        return self._of(replace(self._natural, k=k), self._validate_args)
 
     def tempered(
         self, projected: Float[Tensor, "*#batch"] | float, depth: Float[Tensor, "*#batch"] | float
@@ -194,8 +195,8 @@ class ProjectedHuber(Density, Distribution):
         )
         log_det_A_xy, log_a = n.log_det_A_xy - 2 * projected.log(), n.log_a - depth.log()
         across = projected[..., None]
-        nu_0 = None if n.nu_0 is None else n.nu_0 / across
-        tempered = Natural(n.A_xy / across[..., None], n.nu_xy / across, log_det_A_xy, n.log_mu_z, log_a, nu_0)
+        k = None if n.k is None else n.k * (depth[..., None] / across)
+        tempered = Natural(n.A_xy / across[..., None], n.nu_xy / across, log_det_A_xy, n.log_mu_z, log_a, k)
         return self._of(tempered, self._validate_args)
 
     def __repr__(self) -> str:
@@ -210,15 +211,18 @@ class ProjectedHuber(Density, Distribution):
     @property
     def mu_xy(self) -> Float[Tensor, "*batch 2"]:
         """Centre of (x, y)/z, that of the mode."""
-        n = self._natural
-        if n.nu_0 is None:
-            return self.m_xy
-        return spd.matvec(self._A_xy_inverse, n.nu_xy + n.nu_0 * torch.exp(-n.log_mu_z)[..., None])
+        return spd.matvec(self._A_xy_inverse, self._natural.nu_xy)
 
     @property
     def m_xy(self) -> Float[Tensor, "*batch 2"]:
         """Slope of the axis, the change of the centre of (x, y) with z; mu_xy without a free axis."""
-        return spd.matvec(self._A_xy_inverse, self._natural.nu_xy)
+        return spd.matvec(self._A_xy_inverse, self._slope)
+
+    @property
+    def _slope(self) -> Float[Tensor, "*batch 2"]:
+        """A_xy m_xy, 1/metres."""
+        n = self._natural
+        return n.nu_xy if n.k is None else n.nu_xy - n.k * torch.exp(n.log_a - n.log_mu_z)[..., None]
 
     @property
     def apex(self) -> Float[Tensor, "*batch 3"]:
@@ -226,15 +230,14 @@ class ProjectedHuber(Density, Distribution):
 
         The density of v is that of the paper at v - apex.
         """
-        if self._natural.nu_0 is None:
+        if self.k is None:
             return self._natural.log_mu_z.new_zeros(()).expand((*self.batch_shape, 3))
-        return pad(spd.matvec(self._A_xy_inverse, self._natural.nu_0), (0, 1))
+        return pad(spd.matvec(self._A_xy_inverse, self.k * self.a[..., None]), (0, 1))
 
     @property
     def k(self) -> Float[Tensor, "*batch 2"] | None:
         """The further term of q over a (t - 1); None without a free axis."""
-        nu_0 = self._natural.nu_0
-        return None if nu_0 is None else nu_0 * torch.exp(-self._natural.log_a)[..., None]
+        return self._natural.k
 
     @property
     def mu_z(self) -> Float[Tensor, "*batch"]:
@@ -264,14 +267,21 @@ class ProjectedHuber(Density, Distribution):
     def measure(self) -> Float[Tensor, "*batch 3 3"]:
         """The matrix from a position relative to the apex (metres) to (q, t), with t = z/mu_z."""
         n = self._natural
-        q = torch.cat([n.A_xy, -n.nu_xy[..., None]], -1)
+        q = torch.cat([n.A_xy, -self._slope[..., None]], -1)
         return torch.cat([q, pad(torch.exp(-n.log_mu_z)[..., None, None], (2, 0))], -2)
 
     def whiten(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 2"]:
         """The projection in units of its precision, q = A ((x, y)/z - mu_xy) t, with a free axis plus k a (t - 1)."""
         n = self._natural
         q = spd.matvec(n.A_xy, xyz[..., :2]) - n.nu_xy * xyz[..., 2:]
-        return q if n.nu_0 is None else q - n.nu_0
+        return q if n.k is None else q + self._turn(xyz[..., 2])
+
+    def _turn(self, z: Tensor) -> Tensor:
+        """k a (t - 1), the further term of q with a free axis."""
+        n = self._natural
+        assert n.k is not None
+        # a t, because t itself may overflow where a underflows
+        return n.k * (torch.exp(n.log_a - n.log_mu_z) * z - n.log_a.exp())[..., None]
 
     def depth_energy(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
         """The excess energy of a depth z > 0 (metres), a (max(t, 1/t) - 1) with t = z/mu_z."""
@@ -319,8 +329,12 @@ class ProjectedHuber(Density, Distribution):
 
     @property
     def mean(self) -> Float[Tensor, "*batch 3"]:
-        """Expected position, apex + E[z] (m_xy, 1), metres."""
-        return self.apex + at_depth(self.m_xy, self.depth_mean)
+        """Expected position, E[z] (mu_xy, 1) - A_xy^(-1) k a E[t - 1], metres; on the axis."""
+        mean = at_depth(self.mu_xy, self.depth_mean)
+        if self.k is None:
+            return mean
+        excess = depth.depth_excess_moments(self._natural.log_a)[0]
+        return mean - pad(spd.matvec(self._A_xy_inverse, self.k * excess[..., None]), (0, 1))
 
     @property
     def covariance_matrix(self) -> Float[Tensor, "*batch 3 3"]:
@@ -344,9 +358,14 @@ class ProjectedHuber(Density, Distribution):
 
         Source: own derivation; checked against quadrature in tests/distributions/test_free_axis.py.
         """
-        if self._natural.nu_0 is None:
+        if self.k is None:
             return self.mu_xy
-        return self.mu_xy + (self.m_xy - self.mu_xy) * depth.inverse_depth_shortfall(self.a)[..., None]
+        return self.mu_xy + self._drift * depth.inverse_depth_shortfall(self.a)[..., None]
+
+    @property
+    def _drift(self) -> Float[Tensor, "*batch 2"]:
+        """m_xy - mu_xy of a free axis, without their difference."""
+        return -self.apex[..., :2] / self.mu_z[..., None]
 
     @property
     def projected_covariance(self) -> Float[Tensor, "*batch 2 2"]:
@@ -355,10 +374,10 @@ class ProjectedHuber(Density, Distribution):
         Source: paper, section "Variance of projected coordinates", with the constant corrected.
         """
         across = huber.HUBER_COVARIANCE * spd.square(spd.inverse(self.A, self.log_det_A))
-        if self._natural.nu_0 is None:
+        if self.k is None:
             return across
         shortfall = depth.inverse_depth_shortfall(self.a)
-        d = (self.m_xy - self.mu_xy) * (shortfall * (2 - shortfall)).sqrt()[..., None]  # E[1/t^2] = 1
+        d = self._drift * (shortfall * (2 - shortfall)).sqrt()[..., None]  # E[1/t^2] = 1
         return across + d[..., :, None] * d[..., None, :]
 
     @property
@@ -392,7 +411,7 @@ class ProjectedHuber(Density, Distribution):
     def rsample(
         self, sample_shape: torch.Size | Sequence[int] = (), generator: torch.Generator | None = None
     ) -> Float[Tensor, "*shape 3"]:
-        """Exact samples, differentiable in the parameters: (x, y) = A_xy^(-1) (q + nu_xy z + nu_0).
+        """Exact samples, differentiable in the parameters: (x, y) = A_xy^(-1) (q + nu_xy z - k a (t - 1)).
 
         Source: own derivation (q and t are independent); gradients by the implicit function theorem.
         """
@@ -401,9 +420,8 @@ class ProjectedHuber(Density, Distribution):
         q = huber.sample_whitened(shape, dtype=dtype, device=device, generator=generator)
         p = torch.rand(shape, dtype=dtype, device=device, generator=generator)
         z = self.depth_icdf(p.clamp_min(torch.finfo(dtype).eps / 2))  # rand may return 0, where z would be 0
-        q_from_apex = q + self._natural.nu_xy * z[..., None]
-        nu_0 = self._natural.nu_0
-        xy = spd.matvec(self._A_xy_inverse, q_from_apex if nu_0 is None else q_from_apex + nu_0)
+        across = q + self._natural.nu_xy * z[..., None]
+        xy = spd.matvec(self._A_xy_inverse, across if self.k is None else across - self._turn(z))
         return torch.cat([xy, z[..., None]], dim=-1)
 
     def entropy(self) -> Float[Tensor, "*batch"]:

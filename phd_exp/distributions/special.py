@@ -239,13 +239,21 @@ def _tail_moment_and_derivative(k: int, a: Tensor) -> tuple[Tensor, Tensor]:
 def _series(n: int, a: Tensor) -> list[Tensor]:
     """e^a E_1(a), ..., e^a E_n(a) for 0 <= a <= 1; at a = 0 the first is finite where it should be infinite."""
     log_a = a.clamp_min(torch.finfo(a.dtype).tiny).log()
-    *lower, regular = _constants(a)[2]  # Horner's rule for sum_k psi(k + 1) a^k / k!
-    for coefficient in reversed(lower):
-        regular = torch.addcmul(coefficient, regular, a)
-    e = [regular - log_a * a.exp()]
+    e = [_regular(a) - log_a * a.exp()]
     for j in range(1, n):
         e.append((1 - a * e[-1]) / j)
     return e
+
+
+def _regular(a: Tensor) -> Tensor:
+    """sum_k psi(k + 1) a^k / k!."""
+    coefficients = _constants(a)[2]
+    if torch.compiler.is_exporting():  # three operations of a graph instead of 36
+        return (torch.stack(coefficients) * a[..., None] ** torch.arange(len(coefficients)).to(a)).sum(-1)
+    *lower, total = coefficients  # Horner's rule
+    for coefficient in reversed(lower):
+        total = torch.addcmul(coefficient, total, a)
+    return total
 
 
 def _difference(k: int, values: list[Tensor]) -> Tensor:

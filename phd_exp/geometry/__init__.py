@@ -22,9 +22,8 @@ from the top left corner of the image; the centre of the pixel in column c and r
 | nu_p, B | `nu_p`, `B` | centre and precision of v_p in the frame of the network: B v_p - nu_p | - | `distributions.natural.Natural.from_raw` |
 | nu_z | `nu_z` | mu_z / (mu_z0 f), the centre of z_p | - | `distributions.natural.Natural.from_raw` |
 | A_xy | `A_xy` | A / mu_z, precision of (x, y) at any depth | 1 / metres | `distributions.natural.Natural` |
-| nu_xy | `nu_xy` | A_xy m_xy | 1 / metres | `distributions.natural.Natural` |
-| nu_0 | `nu_0` | k a, with a free axis alone | - | `distributions.natural.Natural` |
-| q | `q` | the whitened projection A_xy (x, y) - nu_xy z - nu_0, independent of t | - | `distributions.projected_huber.ProjectedHuber.whiten` |
+| nu_xy | `nu_xy` | A_xy mu_xy | 1 / metres | `distributions.natural.Natural` |
+| q | `q` | the whitened projection A_xy (x, y) - nu_xy z + k a (t - 1), independent of t | - | `distributions.projected_huber.ProjectedHuber.whiten` |
 | t | `t` | the relative depth z / mu_z | - | `distributions.depth` |
 | h | `huber_energy` | Huber's function: r^2/2 up to 1, r - 1/2 beyond | - | `distributions.huber.huber_energy` |
 | E_n | `scaled_expint` | generalised exponential integral E_n(a) = int_1^inf e^(-a u) u^(-n) du | - | `distributions.special.scaled_expint` |

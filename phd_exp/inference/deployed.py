@@ -1,10 +1,11 @@
 """The predictor as a network of its own, from images, or from a photograph with boxes, to positions with uncertainty.
 
-An exported graph is traced from it. The network computes in float32, everything before and after it in float64.
+An exported graph is traced from it. The network computes in float32, everything after it in float32 or float64.
 """
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
+from typing import Literal
 
 import numpy as np
 import torch
@@ -15,33 +16,44 @@ from torch.export import Dim
 from phd_exp.data.areas import area_means, sums
 from phd_exp.geometry.facing import facing, pixel_corners
 from phd_exp.inference.answers import PER_CENT
-from phd_exp.inference.predictor import PIXELS, Predictor
+from phd_exp.inference.predictor import BATCH, PIXELS, Predictor
 from phd_exp.models.heads import Prediction
 from phd_exp.optics.virtual import intrinsics
 
+Precision = Literal["float32", "float64"]
+"""The type of all numbers after the network."""
 FOCAL_LENGTHS = (5.0, 9.0)  # range for the comparison with torch, in sides of the image
 NUMBER = Dim("n", min=0)
 PHOTOGRAPHS = ((150, 150, 1), (180, 240, 7), (301, 199, 24))  # width, height and number of boxes
 
 
 class Deployed(nn.Module, ABC):
-    """Abstract base class: the inputs of a graph -> the raw numbers of the network, and the answers, in float32."""
+    """Abstract base class: the inputs of a graph -> the raw numbers of the network, and the answers, in float32.
+
+    Args:
+        predictor: the network or ensemble.
+        precision: the type of all numbers after the network.
+    """
 
     inputs: tuple[str, ...]
     dynamic_shapes: tuple[dict[int, Dim] | None, ...]
     """Of each input: the dimensions whose size is free."""
 
-    def __init__(self, predictor: Predictor) -> None:
+    def __init__(self, predictor: Predictor, precision: Precision = "float64") -> None:
         super().__init__()
-        self.predictor = predictor
+        self.predictor, self.dtype = predictor, torch.float32 if precision == "float32" else torch.float64
         self.networks = nn.ModuleList(predictor.networks)
+
+    @abstractmethod
+    def samples(self, images: UInt8[Tensor, "n S S 3"], f: Float[Tensor, " n"]) -> Iterator[tuple[Tensor, ...]]:
+        """The inputs that show whole images of the network's size, with the principal point in the middle."""
 
     @abstractmethod
     def cases(self) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Prediction]]:
         """Inputs on which the graph is compared with `predict`: inputs, raw numbers, predictions in float64."""
 
     def answers(self, prediction: Prediction, *inputs: Tensor) -> dict[str, Tensor]:
-        """The outputs after the raw numbers, in float64."""
+        """The outputs after the raw numbers."""
         return answers(prediction)
 
     def outputs(self, is_valid: Bool[Tensor, " batch"], raw: Tensor, answers: Iterable[Tensor]) -> tuple[Tensor, ...]:
@@ -58,8 +70,11 @@ class OfImages(Deployed):
 
     def forward(self, image: UInt8[Tensor, "batch S S 3"], f: Float[Tensor, " batch"]) -> tuple[Tensor, ...]:
         raw = self.predictor.outputs(image, self.predictor.camera(f).f)
-        answers = self.answers(self.predictor.predict(raw, f), image, f)
+        answers = self.answers(self.predictor.predict(raw, f, self.dtype), image, f)
         return self.outputs((f > 0) & f.isfinite(), raw, answers.values())
+
+    def samples(self, images: UInt8[Tensor, "n S S 3"], f: Float[Tensor, " n"]) -> Iterator[tuple[Tensor, ...]]:
+        return zip(images.split(BATCH), f.split(BATCH), strict=True)
 
     def cases(self) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Prediction]]:
         side = self.predictor.side
@@ -106,6 +121,12 @@ class OfPhotographs(Deployed):
             here["interval_along_ray"] = here.pop("depth_interval")
         return here | {"ray": R[:, 2]}
 
+    def samples(self, images: UInt8[Tensor, "n S S 3"], f: Float[Tensor, " n"]) -> Iterator[tuple[Tensor, ...]]:
+        side = float(self.predictor.side)
+        box = torch.tensor([[0, 0, side, side]], dtype=torch.float64)
+        for image, value in zip(images, f.tolist(), strict=True):
+            yield image, torch.from_numpy(intrinsics(value, value, side / 2, side / 2)), box
+
     def cases(self) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Prediction]]:
         draw, predictor = np.random.default_rng(1), self.predictor
         for width, height, n in PHOTOGRAPHS:
@@ -119,6 +140,13 @@ class OfPhotographs(Deployed):
             raw = predictor.raw(np.stack([view.image for view in views]), known)
             inputs = torch.from_numpy(photograph), torch.from_numpy(K), torch.from_numpy(boxes)
             yield inputs, raw, predictor.predict(raw.double(), known.double())
+
+
+def needs_float64(predictor: Predictor, photographs: bool) -> str | None:
+    """Why the numbers after the network must be float64; None if float32 is accurate enough."""
+    if photographs:
+        return "photographs=true computes the pixels of crops"
+    return "the density closest to an ensemble is searched for" if predictor.is_ensemble else None
 
 
 def batches(side: int) -> list[int]:
@@ -135,7 +163,7 @@ def answers(prediction: Prediction) -> dict[str, Tensor]:
     """The answers for a batch of predictions, in the frame of their cameras."""
     if not prediction.has_closed_forms:
         return {"position": prediction.mode}
-    tails = torch.tensor([(1 - level / 100) / 2 for level in PER_CENT], dtype=torch.float64)
+    tails = torch.tensor([(1 - level / 100) / 2 for level in PER_CENT], dtype=prediction.mode.dtype)
     p = torch.cat([tails.new_tensor([0.5]), tails, 1 - tails])
     z = prediction.depth_icdf(p[:, None])  # all at once, for a small graph
     return {

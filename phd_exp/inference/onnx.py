@@ -13,10 +13,14 @@ import onnxruntime
 import torch
 from jaxtyping import Float
 from onnx import numpy_helper
+from onnx_ir.passes import common as passes
+from onnxscript import optimizer
 from torch import Tensor, nn
 
+from phd_exp.data.batches import Batch
 from phd_exp.distributions.level import PRECISIONS, level_energies
-from phd_exp.inference.deployed import Deployed, OfImages, OfPhotographs
+from phd_exp.inference.deployed import Deployed, OfImages, OfPhotographs, Precision
+from phd_exp.inference.onnx_int8 import Change, measured_change, quantized
 from phd_exp.inference.predictor import Predictor
 from phd_exp.records.errors import UserError
 from phd_exp.records.files import write_atomic
@@ -46,31 +50,45 @@ TOLERANCE = 1e-5
 SMALL = 0.01  # size of an output of the network below which it is compared absolutely
 
 
-def export(predictor: Predictor, file: Path, coverage: float | None = None, photographs: bool = False) -> float:
+def export(
+    predictor: Predictor,
+    file: Path,
+    coverage: float | None = None,
+    photographs: bool = False,
+    precision: Precision = "float64",
+    held_out: Batch | None = None,
+) -> tuple[float, Change | None]:
     """Write the file after comparing it with torch; returns the largest relative deviation.
 
-    With a coverage, the metadata has the level of its regions and their energy W at each depth precision a.
+    With a coverage, the metadata has the level of its regions and their energy W at each depth precision a. With
+    held-out samples the network computes in int8; the deviation is then that of the float32 network from which it is
+    made, and the change of the errors of these samples comes second.
 
-    Raises UserError, and writes no file, if that exceeds 1e-5.
+    Raises UserError, and writes no file, if the deviation exceeds 1e-5 or int8 changes the errors too much.
     """
-    deployed = (OfPhotographs if photographs else OfImages)(predictor).eval()
+    deployed = (OfPhotographs if photographs else OfImages)(predictor, precision).eval()
     metadata = _metadata(deployed)
     if coverage:
         guarantee = predictor.guarantee(coverage)
         facts = {"coverage": coverage, "level": guarantee.levels[0], "held_out_samples": guarantee.n[0]}
         energies = {"a": PRECISIONS.tolist(), "W": level_energies(guarantee.levels[0]).tolist()}
         metadata["region"] = facts | energies
-    model = graph(deployed)  # last, because it takes half a minute
-    model.metadata_props.add(key=METADATA, value=json.dumps(metadata))
-    content = model.SerializeToString()
-    deviation = largest_deviation(deployed, content)
+    model, change = graph(deployed), None  # last, because it takes half a minute
+    deviation = largest_deviation(deployed, model.SerializeToString())
     if not deviation <= TOLERANCE:
         raise UserError(
             f"{file}: not written: it deviates from torch by {deviation:.2g}, more than {TOLERANCE:g}; "
-            "another version of onnxruntime or torch may do better"
+            f"{'precision=float64' if precision == 'float32' else 'another version of onnxruntime or torch'} "
+            "may do better"
         )
-    write_atomic(file, content)
-    return deviation
+    if held_out is not None:
+        model = quantized(model, deployed, held_out)
+        change = measured_change(model, deployed, held_out)
+        change.require_small(file)
+        metadata["int8"] = asdict(change)
+    model.metadata_props.add(key=METADATA, value=json.dumps(metadata))
+    write_atomic(file, model.SerializeToString())
+    return deviation, change
 
 
 class AxisByAxis(nn.Module):
@@ -112,13 +130,35 @@ def graph(deployed: Deployed) -> Any:
             dynamic_shapes=deployed.dynamic_shapes,
             opset_version=OPSET,
             dynamo=True,
+            optimize=False,
             verbose=False,
         )
     assert program is not None
+    _folded(program.model)
     results = program.model.graph.outputs
     for value in (value for node in program.model.graph for value in node.outputs if value not in results):
         value.name = f"inner_{value.name}"  # the exporter names a mean within the network "mean" too
     return _with_axes_from_the_front(program.model_proto)
+
+
+def _folded(model: Any) -> None:
+    """Compute what is constant and drop what is unused, in place.
+
+    The exporter's own optimiser also tries all its rules at all nodes, which takes most of an export and changes
+    nothing here.
+    """
+    passes.InlinePass()(model)
+    optimizer.fold_constants(model)
+    for step in (
+        passes.RemoveUnusedNodesPass(),
+        passes.RemoveUnusedFunctionsPass(),
+        passes.RemoveUnusedOpsetsPass(),
+        passes.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
+        passes.DeduplicateInitializersPass(),
+        passes.CommonSubexpressionEliminationPass(),
+        passes.NameFixPass(),
+    ):
+        step(model)
 
 
 def _with_axes_from_the_front(model: Any) -> Any:
@@ -153,6 +193,7 @@ def _metadata(deployed: Deployed) -> dict[str, Any]:
         "run": run,
         "side": predictor.side,
         "temperature": asdict(temperature) if temperature else None,
+        "precision": str(deployed.dtype).removeprefix("torch."),
         **{name: DESCRIPTIONS[name] for name in (*deployed.inputs, "raw", *_names(deployed))},
     }
 

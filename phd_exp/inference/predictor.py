@@ -241,9 +241,11 @@ class Predictor:
         assert isinstance(head, DistributionHead)  # checked by `load`
         return head.turned_back(raw, torch.tensor(signs).to(raw)).flatten(1, 2)
 
-    def members(self, raw: Float[Tensor, "*batch members n"], f: Float[Tensor, "*batch"]) -> Mixture:
-        """The mixture of an ensemble's predictions, in float64, from its raw numbers."""
-        prediction = self.regressor.head(raw.double(), self.camera(f.double()[..., None]))
+    def members(
+        self, raw: Float[Tensor, "*batch members n"], f: Float[Tensor, "*batch"], dtype: torch.dtype = torch.float64
+    ) -> Mixture:
+        """The mixture of an ensemble's predictions from its raw numbers."""
+        prediction = self.regressor.head(raw.to(dtype), self.camera(f.to(dtype)[..., None]))
         assert prediction.has_closed_forms  # checked by `load`
         return Mixture(prediction)
 
@@ -275,13 +277,17 @@ class Predictor:
         distance = self.familiarity.distance({name: column.numpy() for name, column in columns.items()})
         return self.familiarity.p_value(distance)
 
-    def predict(self, raw: Float[Tensor, "*batch n_outputs"], f: Float[Tensor, "*batch"]) -> Prediction:
-        """Predictions in float64, from the raw numbers of the network and focal lengths in pixels of its images.
+    def predict(
+        self, raw: Float[Tensor, "*batch n_outputs"], f: Float[Tensor, "*batch"], dtype: torch.dtype = torch.float64
+    ) -> Prediction:
+        """Predictions from the raw numbers of the network and focal lengths in pixels of its images.
 
         Those of an ensemble have a dimension for the members before the last.
         """
-        raw, f = raw.double(), f.double()
-        prediction = self.members(raw, f).closest if self.is_ensemble else self.regressor.head(raw, self.camera(f))
+        if self.is_ensemble:
+            prediction = self.members(raw, f, dtype).closest
+        else:
+            prediction = self.regressor.head(raw.to(dtype), self.camera(f.to(dtype)))
         if self.temperature is not None and prediction.has_closed_forms:
             return self.temperature.apply(prediction)
         return prediction
