@@ -99,9 +99,9 @@ class Mixture:
     def closest(self) -> ProjectedHuber:
         """The Projected Huber distribution p with the least KL(mixture || p): that of maximum E[log p].
 
-        -E[log p] is a function of A_xy, A_xy m_xy and A_xy apex, convex, plus one of (mu_z, a); each has its minimum by itself.
-        Its axis is free if the members' are. Parameters are wanted in float64. Source: own derivation; checked
-        against a general optimiser in tests/distributions/test_mixture.py.
+        -E[log p] is a function of A_xy, A_xy m_xy and A_xy apex, convex, plus one of (mu_z, a); each has its minimum
+        by itself. Its axis is free if the members' are. Parameters are wanted in float64. Source: own derivation;
+        checked against a general optimiser in tests/distributions/test_mixture.py.
         """
         mu_z, a = _closest_depth(self.members)
         m_xy, apex, A_xy = _closest_projection(self.members)

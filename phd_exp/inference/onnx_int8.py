@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -68,8 +69,7 @@ def quantized(model: Any, deployed: Deployed, held_out: Batch) -> Any:
     The rest, from the last linear layer on, stays as it is.
     """
     images, f = (values[CHOOSE][:CALIBRATION] for values in (held_out.image, held_out.f))
-    logging.getLogger().setLevel(logging.ERROR)  # onnxruntime advises on the root logger
-    with TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder, _quiet():
         before, after = Path(folder) / "before.onnx", Path(folder) / "after.onnx"
         onnx.save(model, before)
         quantization.quantize_static(
@@ -84,6 +84,16 @@ def quantized(model: Any, deployed: Deployed, held_out: Batch) -> Any:
             extra_options={"ActivationSymmetric": True, "WeightSymmetric": True},
         )
         return onnx.load(after)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """No warnings, since onnxruntime advises through the root logger to prepare the graph, which `graph` has done."""
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(logging.NOTSET)
 
 
 class _Images(quantization.CalibrationDataReader):
@@ -114,9 +124,7 @@ def measured_change(model: Any, deployed: Deployed, held_out: Batch) -> Change:
     return Change(len(f), pairs[0], *(pairs[1:] or (None, None)))
 
 
-def _errors(
-    deployed: Deployed, raw: Tensor, f: Float[Tensor, " n"], xyz: Float[Tensor, "n 3"]
-) -> tuple[float, ...]:
+def _errors(deployed: Deployed, raw: Tensor, f: Float[Tensor, " n"], xyz: Float[Tensor, "n 3"]) -> tuple[float, ...]:
     """Mean depth error in mm; of a density also the mean NLL and the share of positions inside the 90 % region."""
     prediction, xyz = deployed.predictor.predict(raw, f), xyz.double()
     error = float(MILLIMETRES * depth_error(xyz, prediction.mode).mean())

@@ -1,4 +1,4 @@
-"""How many photographs `predict` answers in a second of one core, beyond its start."""
+"""How many images `predict` and exported graphs answer in a second of one core, beyond their start."""
 
 import json
 import time
@@ -9,15 +9,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
+from phd_exp.data.batches import Batch
 from phd_exp.hardware import one_thread
 from phd_exp.inference.answers import answer, sightings
 from phd_exp.inference.loading import load
 from phd_exp.records.own_images import detections_in
 from tests.support.untrained import untrained
 
-pytestmark = pytest.mark.bench
+pytestmark = [pytest.mark.bench, pytest.mark.timeout(1800)]
 N, ROUNDS = 128, 5
 CAMERA = {
     "image_width": 640,
@@ -58,3 +60,35 @@ def test_predictions_of_photographs_on_one_core(
     speed = N / median(seconds)
     record("predict, boxes with a lens", f"{speed:.0f} images/s", "one core", f"{speed:.0f}", "100")
     assert speed >= 100
+
+
+def test_exported_graphs_on_one_core(
+    unchecked: None, composed: Callable[..., Any], record: Callable, tmp_path: Path
+) -> None:
+    onnxruntime = pytest.importorskip("onnxruntime", reason="needs `pip install 'phd_exp[export]'`")
+    from phd_exp.inference.deployed import OfImages, pictures
+    from phd_exp.inference.onnx import graph
+    from phd_exp.inference.onnx_int8 import quantized
+
+    run = untrained(tmp_path / "run", composed("preset=small", "recipe=strong", "data=default"))
+    predictor = load(run.path, "cpu")
+    image, f = torch.from_numpy(pictures(N, predictor.side, predictor.side)), torch.full((N,), 1550.0)
+    batch = Batch(image, torch.zeros(N, 3), f, float(predictor.side), torch.arange(N))
+    deployed = {name: OfImages(predictor, name).eval() for name in ("float32", "float64")}
+    graphs = {name: graph(one) for name, one in deployed.items()}
+    graphs["int8"] = quantized(graphs["float32"], deployed["float32"], batch)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    sessions = {name: onnxruntime.InferenceSession(one.SerializeToString(), options) for name, one in graphs.items()}
+    given = {"image": image[:32].numpy(), "f": f[:32].numpy()}
+    seconds: dict[str, list[float]] = {name: [] for name in sessions}
+    for _ in range(ROUNDS + 1):  # in turn, since other work changes the speed; the first round warms up
+        for name, session in sessions.items():
+            start = time.process_time()
+            session.run(None, given)
+            seconds[name].append(time.process_time() - start)
+    speed = {name: 32 / median(one[1:]) for name, one in seconds.items()}
+    for name, value in speed.items():
+        ratio = value / speed["float64"]
+        record(f"exported graph, {name}", f"{value:.0f} images/s", "float64", f"{ratio:.2f}", "0.9, int8: none")
+    assert speed["float32"] > 0.9 * speed["float64"]

@@ -21,6 +21,7 @@ from phd_exp.evaluation.predictions import fit_temperature
 from phd_exp.inference import pictures
 from phd_exp.records.runs import RunFolder
 from tests.support.disks import small_disk
+from tests.support.portable import openvino_outputs, require_portable
 from tests.support.untrained import SIDE, read_lines
 
 ALL = slice(None)
@@ -152,6 +153,9 @@ def test_the_lines_of_the_guide_deploy_it_without_torch(
 @pytest.mark.slow
 def test_the_exported_file_describes_its_inputs_and_outputs(exported: Path) -> None:
     import onnxruntime
+    from onnx import load
+
+    require_portable(load(exported))
 
     for file in (exported, exported.with_name("photographs.onnx")):
         session = onnxruntime.InferenceSession(file)
@@ -159,6 +163,23 @@ def test_the_exported_file_describes_its_inputs_and_outputs(exported: Path) -> N
         names = [value.name for value in (*session.get_inputs(), *session.get_outputs())]
         assert {*names} <= said.keys()
         assert (said["side"], said["temperature"]) == (SIDE, None)
+        assert said["precision"] == ("float32" if file == exported else "float64")
+
+
+@pytest.mark.slow
+def test_openvino_gives_the_answers_of_onnxruntime(exported: Path) -> None:
+    import onnxruntime
+
+    from phd_exp.inference.deployed import pictures
+
+    given = {"image": pictures(20, SIDE, SIDE), "f": np.linspace(200, 400, 20, dtype=np.float32)}
+    here = openvino_outputs(exported.read_bytes(), given)
+    session = onnxruntime.InferenceSession(exported)
+    for place, (value, expected) in enumerate(zip(here, session.run(None, given), strict=True)):
+        name = session.get_outputs()[place].name
+        rows = expected.reshape(20, -1)
+        deviation = np.abs(value.reshape(20, -1) - rows).max(1) / np.abs(rows).max(1)
+        assert deviation.max() < (1e-3 if name == "covariance" else 2e-5), name
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """The exported graph gives the answers of the torch classes, for any numbers a network may return."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,33 +10,57 @@ from torch import Tensor, nn
 
 from phd_exp.config import check
 from phd_exp.distributions import Temperature
-from phd_exp.geometry import Cartesian, Chart, DepthScale, LogDepth, Projected
+from phd_exp.distributions.constraints import families
+from phd_exp.geometry import Camera, Cartesian, Chart, DepthScale, LogDepth, Projected
+from phd_exp.inference.deployed import answers
 from phd_exp.inference.predictor import Predictor
 from phd_exp.models.heads import ChartHead, DistributionHead, Head
+from tests.support.portable import openvino_outputs, require_portable
+from tests.support.raw_numbers import hostile
 
 onnxruntime = pytest.importorskip("onnxruntime", reason="needs `pip install 'phd_exp[export]'`")
 
 pytestmark = pytest.mark.timeout(1800)  # s; an export takes half a minute of a core, which others may use too
+ORT = ["CPUExecutionProvider"]
+TOLERANCES = {"covariance": 1e-3}
+"""Of float32, relative; of all other answers 1e-5."""
 SIDE = 32
 DEPTH = DepthScale.from_ranges(f_range=(600.0, 1000.0), z_range=(3.0, 5.0))
 
 
-class Pixels(nn.Module):
-    """Stands in for a regressor: its outputs, from -16 to 16, are the first values of a row of the image."""
+class Table(nn.Module):
+    """Stands in for a regressor: the first three bytes of an image number a row of outputs, modulo their number."""
 
-    def __init__(self, head: Head, row: int = 0) -> None:
+    numbers: Tensor
+
+    def __init__(self, head: Head, numbers: Tensor) -> None:
         super().__init__()
-        self.head, self.row = head, row
+        self.head = head
+        self.register_buffer("numbers", numbers[:, : head.n_outputs].float())
 
     def raw(self, image: Tensor, f: Tensor | None = None) -> Tensor:
-        return (image[:, self.row].flatten(1)[:, : self.head.n_outputs].float() - 128) / 8
+        row = (image[:, 0, 0].long() * torch.tensor([1, 256, 65536])).sum(-1)
+        return self.numbers[row % len(self.numbers)]
 
 
-def predictor(composed: Callable[..., Any], head: Head, **changes: Any) -> Predictor:
+def images_of(rows: np.ndarray) -> np.ndarray:
+    """Images that number these rows of a `Table`."""
+    images = np.zeros((len(rows), SIDE, SIDE, 3), dtype=np.uint8)
+    images[:, 0, 0] = rows[:, None] // [1, 256, 65536] % 256
+    return images
+
+
+def draws(n: int, extreme: int) -> Tensor:
+    """Raw numbers throughout the documented range, then at its ends."""
+    generator = torch.Generator().manual_seed(0)
+    return torch.cat([families()["free_axis"].inputs(n, generator), hostile(extreme, generator)])
+
+
+def predictor(composed: Callable[..., Any], head: Head, numbers: Tensor, **changes: Any) -> Predictor:
     kept: dict[str, Any] = {"constant_f": None, "temperature": None} | changes
     return Predictor(
         config=check(composed("preset=smoke")),
-        regressor=Pixels(head),  # type: ignore[arg-type]
+        regressor=Table(head, numbers),  # type: ignore[arg-type]
         side=SIDE,
         depth=DEPTH,
         device=torch.device("cpu"),
@@ -45,87 +69,126 @@ def predictor(composed: Callable[..., Any], head: Head, **changes: Any) -> Predi
     )
 
 
-def exported(made: Predictor, kind: str = "OfImages") -> Any:
-    """A session of the graph of images or of photographs."""
+def exported(made: Predictor, kind: str = "OfImages", precision: str = "float64") -> Any:
+    """The graph of images or of photographs."""
     from phd_exp.inference import deployed, onnx
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("jaxtyping.config.jaxtyping_disable", True)  # a shape that is checked is a fixed one in a graph
-        content = onnx.graph(getattr(deployed, kind)(made)).SerializeToString()
-    return onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+        return onnx.graph(getattr(deployed, kind)(made, precision))
+
+
+def session_of(model: Any) -> Any:
+    """The graph in onnxruntime."""
+    return onnxruntime.InferenceSession(model.SerializeToString(), providers=ORT)
+
+
+def deviations(here: Sequence[np.ndarray], there: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Of each output, the deviation in each row, relative to its largest element."""
+    found = []
+    for value, expected in zip(here, there, strict=True):
+        assert value.shape == expected.shape
+        rows = expected.reshape(len(expected), -1).astype(float)
+        found.append(np.abs(value.reshape(rows.shape) - rows).max(1) / np.abs(rows).max(1))
+    return found
 
 
 def worst(made: Predictor, session: Any, images: np.ndarray, f: np.ndarray) -> dict[str, np.ndarray]:
-    """For each output, the deviation of the graph from torch in each row, relative to its largest element."""
-    from phd_exp.inference.deployed import answers
-
+    """For each output, the deviation of the graph from torch in float64, in each row."""
     assert [given.name for given in session.get_inputs()] == ["image", "f"]
     raw, *here = session.run(None, {"image": images, "f": f})
     expected = made.raw(images, torch.from_numpy(f)).double()
     np.testing.assert_array_equal(raw, expected.numpy())
     there = answers(made.predict(expected, torch.from_numpy(f).double()))
     assert [out.name for out in session.get_outputs()] == ["raw", *there]
-    deviations = {}
-    for value, (name, tensor) in zip(here, there.items(), strict=True):
-        assert value.shape == tensor.shape
-        rows = tensor.numpy().reshape(len(f), -1)
-        deviations[name] = np.abs(value.reshape(rows.shape) - rows).max(1) / np.abs(rows).max(1)
-    return deviations
+    return dict(zip(there, deviations(here, [value.numpy() for value in there.values()]), strict=True))
 
 
-@pytest.mark.slow
+def require_accurate(found: dict[str, np.ndarray]) -> None:
+    """Fails where an answer deviates by more than its tolerance."""
+    for name, deviation in found.items():
+        assert deviation.max() < TOLERANCES.get(name, 1e-5), name
+
+
 @pytest.mark.parametrize("free_axis", [False, True])
-def test_the_distribution_is_that_of_torch(composed: Callable[..., Any], free_axis: bool) -> None:
-    made = predictor(composed, DistributionHead(DEPTH, free_axis), temperature=Temperature(1.3, 0.7))
-    draw = np.random.default_rng(0)
-    scales = np.repeat([0, 8, 24, 60], [1, 299, 300, 300])[:, None, None]
-    images = np.full((len(scales), SIDE, SIDE, 3), 128, dtype=np.uint8)
-    images[:, 0] = (128 + scales * draw.standard_normal(images[:, 0].shape)).round().clip(0, 255)
-    f = np.linspace(600, 1000, len(images), dtype=np.float32)
-    deviations = worst(made, exported(made), images, f)
-    assert deviations.keys() == {"mode", "mean", "covariance", "median_depth", "depth_interval"}
-    prediction = made.predict(made.raw(images, torch.from_numpy(f)).double(), torch.from_numpy(f).double())
-    # A is inverted, and its inputs have the digits of float32
-    sound = torch.linalg.cond(prediction.A).numpy() < 1e6  # type: ignore[union-attr]
-    assert sound.mean() > 0.7
-    for name, deviation in deviations.items():
-        rows = slice(None) if "depth" in name else sound
-        assert deviation[rows].max() < 1e-5, name
+def test_float32_has_the_digits_of_float64(free_axis: bool) -> None:
+    head, raw = DistributionHead(DEPTH, free_axis), draws(10_000, 10_000).float()
+    f = torch.linspace(2, 9, len(raw)) * SIDE
+    here, there = (
+        answers(head(raw[:, : head.n_outputs].to(dtype), Camera(f.to(dtype), float(SIDE))))
+        for dtype in (torch.float32, torch.float64)
+    )
+    assert all(value.dtype == torch.float32 for value in here.values())
+    values = ([value.numpy() for value in one.values()] for one in (here, there))
+    require_accurate(dict(zip(there, deviations(*values), strict=True)))
+
+
+OTHERS = set(families()) - {"probabilistic", "free_axis", "gaussian_mixture"}
+
+
+@pytest.mark.parametrize("name", sorted(OTHERS))
+def test_float32_has_the_digits_of_float64_in_the_modes_of_other_densities(name: str) -> None:
+    family = families()[name]
+    raw = family.inputs(10_000, torch.Generator().manual_seed(0)).float()
+    f = torch.linspace(600, 2000, len(raw))
+    found = (family.predict(raw.to(dtype), Camera(f.to(dtype), 224.0)) for dtype in (torch.float32, torch.float64))
+    here, there = (getattr(one, "estimate", one).mode.numpy() for one in found)
+    assert deviations([here], [there])[0].max() < 1e-5
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("networks", "views", "free_axis"), [(3, 1, False), (1, 8, False), (1, 8, True)])
-def test_an_ensemble_is_that_of_torch(
-    composed: Callable[..., Any], networks: int, views: int, free_axis: bool
-) -> None:
-    head = DistributionHead(DEPTH, free_axis)
-    others = tuple(Pixels(head, row) for row in range(1, networks))
-    made = predictor(composed, head, others=others, views=views)
-    images = np.random.default_rng(0).integers(88, 168, (100, SIDE, SIDE, 3), dtype=np.uint8)
-    f = np.linspace(600, 1000, 100, dtype=np.float32)
-    for name, deviation in worst(made, exported(made), images, f).items():
+def test_the_distribution_is_that_of_torch_in_every_runtime(composed: Callable[..., Any]) -> None:
+    numbers = draws(10_000, 2_000)
+    made = predictor(composed, DistributionHead(DEPTH, free_axis=True), numbers, temperature=Temperature(1.3, 0.7))
+    images, f = images_of(np.arange(len(numbers))), np.linspace(2, 9, len(numbers), dtype=np.float32) * SIDE
+    model = exported(made, precision="float32")
+    require_portable(model)
+    session = session_of(model)
+    found = worst(made, session, images, f)
+    assert found.keys() == {"mode", "mean", "covariance", "median_depth", "depth_interval"}
+    require_accurate(found)
+    given = {"image": images, "f": f}
+    other = openvino_outputs(model.SerializeToString(), given)
+    np.testing.assert_array_equal(other[0], session.run(["raw"], given)[0])
+    there = answers(made.predict(made.raw(images, torch.from_numpy(f)), torch.from_numpy(f))).values()
+    require_accurate(dict(zip(found, deviations(other[1:], [value.numpy() for value in there]), strict=True)))
+
+
+@pytest.mark.slow
+def test_an_ensemble_is_that_of_torch(composed: Callable[..., Any]) -> None:
+    """Two networks with eight views each, in float64."""
+    head = DistributionHead(DEPTH, free_axis=True)
+    numbers = torch.randn(100, 2, 9, generator=torch.Generator().manual_seed(0)) * 3
+    made = predictor(composed, head, numbers[:, 0], others=(Table(head, numbers[:, 1]),), views=8)
+    images, f = images_of(np.arange(100)), np.linspace(600, 1000, 100, dtype=np.float32)
+    for name, deviation in worst(made, session_of(exported(made)), images, f).items():
         assert np.quantile(deviation, 0.9) < 1e-5, name
         assert deviation.max() < 1e-3, name
+
+
+POINTS = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
 
 
 @pytest.fixture(scope="module")
 def sessions(composed: Callable[..., Any]) -> dict[str, Any]:
     """The graphs of a baseline, of photographs and of images."""
-    made = predictor(composed, ChartHead(DEPTH, Projected))
-    return {kind: exported(made, kind) for kind in ("OfPhotographs", "OfImages")}
+    made = predictor(composed, ChartHead(DEPTH, Projected), POINTS)
+    graphs = {"OfPhotographs": exported(made, "OfPhotographs"), "OfImages": exported(made, precision="float32")}
+    require_portable(graphs["OfImages"])
+    return {kind: session_of(graph) for kind, graph in graphs.items()}
 
 
-OTHERS = [pytest.param(*case, marks=pytest.mark.slow) for case in ((LogDepth, 777.0), (Cartesian, None))]
+OTHER_CHARTS = [pytest.param(*case, marks=pytest.mark.slow) for case in ((LogDepth, 777.0), (Cartesian, None))]
 
 
-@pytest.mark.parametrize(("chart", "constant_f"), [(Projected, None), *OTHERS])
+@pytest.mark.parametrize(("chart", "constant_f"), [(Projected, None), *OTHER_CHARTS])
 def test_baselines_are_points(
     composed: Callable[..., Any], sessions: dict[str, Any], chart: Callable[..., Chart], constant_f: float | None
 ) -> None:
-    made = predictor(composed, ChartHead(DEPTH, chart), constant_f=constant_f)
-    session = sessions["OfImages"] if chart is Projected else exported(made)
-    images = np.random.default_rng(0).integers(124, 136, (50, SIDE, SIDE, 3), dtype=np.uint8)
-    (deviation,) = worst(made, session, images, np.linspace(600, 1000, 50, dtype=np.float32)).values()
+    made = predictor(composed, ChartHead(DEPTH, chart), POINTS, constant_f=constant_f)
+    session = sessions["OfImages"] if chart is Projected else session_of(exported(made, precision="float32"))
+    images, f = images_of(np.arange(50)), np.linspace(600, 1000, 50, dtype=np.float32)
+    (deviation,) = worst(made, session, images, f).values()
     assert deviation.max() < 1e-6
 
 

@@ -1,0 +1,80 @@
+"""A network in int8: what is quantised, what it costs, and that too much is refused."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from phd_exp.data.batches import Batch
+from phd_exp.inference.loading import load
+from phd_exp.records.errors import UserError
+from tests.support.portable import openvino_outputs, require_portable
+from tests.support.untrained import SIDE, SMALL, untrained
+
+pytest.importorskip("onnxruntime", reason="needs `pip install 'phd_exp[export]'`")
+numpy_helper = pytest.importorskip("onnx.numpy_helper")
+
+pytestmark = pytest.mark.timeout(1800)  # s; an export takes half a minute of a core, which others may use too
+FILE = Path("network.onnx")
+
+
+def test_too_large_a_change_is_refused_with_its_figures() -> None:
+    from phd_exp.inference.onnx_int8 import Change
+
+    Change(500, (75.0, 77.2), (-10.12, -10.03), (0.9, 0.88)).require_small(FILE)
+    Change(500, (75.0, 50.0), None, None).require_small(FILE)
+    figures = r"depth error 75\.00 -> 77\.30 mm \(\+3\.1 %\)"
+    for change, said in (
+        (Change(500, (75.0, 77.3), (-10.12, -10.12), (0.9, 0.88)), figures),
+        (Change(500, (75.0, 77.3), None, None), figures),
+        (Change(500, (75.0, 75.0), (-10.12, -10.01), (0.9, 0.88)), r"NLL -10\.120 -> -10\.010 nats"),
+        (Change(500, (75.0, float("nan")), (-10.12, -10.12), (0.9, 0.88)), r"nan"),
+    ):
+        expected = rf"network\.onnx: not written: quantize=int8 .*{said}.*3 % and 0\.1 nats"
+        with pytest.raises(UserError, match=expected):
+            change.require_small(FILE)
+
+
+@pytest.mark.slow
+def test_convolutions_are_in_int8_and_errors_are_those_of_the_graph(
+    composed: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from phd_exp.inference.deployed import OfImages, pictures
+    from phd_exp.inference.onnx import graph
+    from phd_exp.inference.onnx_int8 import measured_change, quantized
+
+    monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)  # a checked shape would be fixed in the graph
+    predictor = load(untrained(tmp_path / "run", composed(*SMALL)).path, "cpu")
+    images, f = pictures(80, SIDE, SIDE), torch.linspace(200, 300, 80)
+    p = predictor.predict(predictor.raw(images, f), f)
+    xyz = p.rsample(generator=torch.Generator().manual_seed(0)).float()
+    held_out = Batch(torch.from_numpy(images), xyz, f, float(SIDE), torch.arange(80))
+    deployed = OfImages(predictor, "float32").eval()
+    before = graph(deployed)
+    after = quantized(before, deployed, held_out)
+    require_portable(after)
+    constants = {tensor.name: numpy_helper.to_array(tensor) for tensor in after.graph.initializer}
+    nodes = {output: node for node in after.graph.node for output in node.output}
+    convolutions = [node for node in after.graph.node if node.op_type == "Conv"]
+    exact = [node for node in convolutions if nodes[node.input[0]].op_type != "DequantizeLinear"]
+    assert 1 <= len(exact) < len(convolutions) / 2
+    for node in nodes.values():
+        if node.op_type in ("QuantizeLinear", "DequantizeLinear"):
+            zero = constants[node.input[2]]
+            assert (zero == 0).all()
+    untouched, change = (measured_change(model, deployed, held_out) for model in (before, after))
+    assert untouched.depth_error_mm[0] == pytest.approx(untouched.depth_error_mm[1], rel=1e-4)
+    assert untouched.nll is not None
+    assert untouched.nll[0] == pytest.approx(untouched.nll[1], abs=1e-3)
+    assert untouched.inside_90 is not None
+    assert 0.7 < untouched.inside_90[0] <= 1, "positions are drawn from the predictions"
+    assert change.images == 40
+    assert change.depth_error_mm[0] == untouched.depth_error_mm[0]
+    assert change.nll is not None
+    assert change.nll[1] != change.nll[0], "int8 rounds"
+    given = {"image": images[:5], "f": f[:5].numpy()}
+    for value in openvino_outputs(after.SerializeToString(), given):
+        assert np.isfinite(value).all()
