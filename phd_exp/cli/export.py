@@ -36,9 +36,10 @@ def main(words: list[str]) -> int:
     require_file(file, "network.onnx")
     predictor = loaded(arguments, "cpu")
     output_folder(file.parent)
-    from phd_exp.inference.deployed import PHOTOGRAPHS, batches
+    from phd_exp.inference.deployed import PHOTOGRAPHS, batches, require_exportable
     from phd_exp.inference.onnx import TOLERANCE, export
 
+    require_exportable(predictor)
     precision = _precision(arguments, predictor)
     held_out = _held_out(predictor) if arguments.quantize else None
     sizes = [n for _, _, n in PHOTOGRAPHS] if arguments.photographs else batches(predictor.side)

@@ -14,11 +14,13 @@ from torch import Tensor, nn
 from torch.export import Dim
 
 from phd_exp.data.areas import area_means, sums
+from phd_exp.distributions.gaussian_mixture import GaussianMixture
 from phd_exp.geometry.facing import facing, pixel_corners
 from phd_exp.inference.answers import PER_CENT
 from phd_exp.inference.predictor import BATCH, PIXELS, Predictor
 from phd_exp.models.heads import Prediction
 from phd_exp.optics.virtual import intrinsics
+from phd_exp.records.errors import ConfigError
 
 Precision = Literal["float32", "float64"]
 """The type of all numbers after the network."""
@@ -140,6 +142,15 @@ class OfPhotographs(Deployed):
             raw = predictor.raw(np.stack([view.image for view in views]), known)
             inputs = torch.from_numpy(photograph), torch.from_numpy(K), torch.from_numpy(boxes)
             yield inputs, raw, predictor.predict(raw.double(), known.double())
+
+
+def require_exportable(predictor: Predictor) -> None:
+    """Raise ConfigError for a density whose answers are no graph."""
+    if predictor.regressor.head.prediction is GaussianMixture:
+        raise ConfigError(
+            f"{predictor.config.model.name}: cannot be exported, because the mode of a mixture of Gaussians needs "
+            "inverse matrices, which ONNX lacks; expected a run of another model"
+        )
 
 
 def needs_float64(predictor: Predictor, photographs: bool) -> str | None:

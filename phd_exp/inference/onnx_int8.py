@@ -25,6 +25,7 @@ from phd_exp.records.runs import CHOOSE, GUARANTEE
 
 MOST_DEPTH_ERROR, MOST_NLL = 3.0, 0.1  # per cent and nats that int8 may add
 CALIBRATION = 256  # held-out images at most whose activations give the ranges of int8
+AT_THE_END = 2  # last convolutions that stay exact: they give the object's place, which int8 would round to a cell
 IMAGES_AT_LEAST = 40  # below, a change of the errors is mostly noise
 INSIDE = 0.9  # level of the regions whose share of true positions is compared
 
@@ -66,8 +67,9 @@ def quantized(model: Any, deployed: Deployed, held_out: Batch) -> Any:
     """The graph with convolutions in int8, calibrated on every second held-out image.
 
     Weights have a scale for each channel, activations one for each tensor; all zero points are 0, as TensorRT wants.
-    The rest, from the last linear layer on, stays as it is.
+    The first convolution, the last `AT_THE_END` and all other operations stay as they are.
     """
+    names = [node.name for node in model.graph.node if node.op_type == "Conv"]
     images, f = (values[CHOOSE][:CALIBRATION] for values in (held_out.image, held_out.f))
     with TemporaryDirectory() as folder, _quiet():
         before, after = Path(folder) / "before.onnx", Path(folder) / "after.onnx"
@@ -78,6 +80,7 @@ def quantized(model: Any, deployed: Deployed, held_out: Batch) -> Any:
             _Images(deployed, images, f),
             quant_format=quantization.QuantFormat.QDQ,
             op_types_to_quantize=["Conv"],
+            nodes_to_exclude=[names[0], *names[-AT_THE_END:]],
             per_channel=True,
             activation_type=quantization.QuantType.QInt8,
             weight_type=quantization.QuantType.QInt8,

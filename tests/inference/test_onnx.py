@@ -12,9 +12,10 @@ from phd_exp.config import check
 from phd_exp.distributions import Temperature
 from phd_exp.distributions.constraints import families
 from phd_exp.geometry import Camera, Cartesian, Chart, DepthScale, LogDepth, Projected
-from phd_exp.inference.deployed import answers
+from phd_exp.inference.deployed import answers, require_exportable
 from phd_exp.inference.predictor import Predictor
-from phd_exp.models.heads import ChartHead, DistributionHead, Head
+from phd_exp.models.heads import ChartHead, DistributionHead, Head, MixtureHead
+from phd_exp.records.errors import ConfigError
 from tests.support.portable import openvino_outputs, require_portable
 from tests.support.raw_numbers import hostile
 
@@ -190,6 +191,12 @@ def test_baselines_are_points(
     images, f = images_of(np.arange(50)), np.linspace(600, 1000, 50, dtype=np.float32)
     (deviation,) = worst(made, session, images, f).values()
     assert deviation.max() < 1e-6
+
+
+def test_a_mixture_of_gaussians_is_refused(composed: Callable[..., Any]) -> None:
+    made = predictor(composed, MixtureHead(DEPTH, 2), torch.zeros(1, 20))
+    with pytest.raises(ConfigError, match="mixture of Gaussians needs inverse matrices"):
+        require_exportable(made)
 
 
 PHOTOGRAPH = np.random.default_rng(0).integers(0, 256, (90, 120, 3), dtype=np.uint8)
