@@ -1,25 +1,13 @@
-"""Networks from image to features: torchvision's ResNets, trained from scratch, and any other network."""
+"""Networks from image to features: ResNets, trained from scratch, and any other network."""
 
-from functools import partial
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from phd_exp.models.torchvisions import BasicBlock, Bottleneck, ResNet
+from phd_exp.models.residual import Depth, ResNet
 from phd_exp.records.errors import gist
-
-BLOCKS: dict[int, tuple[type[BasicBlock | Bottleneck], list[int]]] = {
-    10: (BasicBlock, [1, 1, 1, 1]),
-    18: (BasicBlock, [2, 2, 2, 2]),
-    34: (BasicBlock, [3, 4, 6, 3]),
-    50: (Bottleneck, [3, 4, 6, 3]),
-}
-"""Depth -> type of block, and the number of blocks at each of the four resolutions."""
-
-Depth = Literal[10, 18, 34, 50]
-NORM = partial(nn.GroupNorm, 1)  # in place of every BatchNorm
 
 
 class BackboneOutput(NamedTuple):
@@ -112,7 +100,5 @@ def resnet(depth: Depth) -> PooledFeatures:
 
     Source: the authors' training protocol.
     """
-    network = ResNet(*BLOCKS[depth], norm_layer=NORM)
-    n_features = network.fc.in_features
-    network.fc = nn.Identity()
-    return PooledFeatures(network, n_features)
+    network = ResNet(depth)
+    return PooledFeatures(network, network.n_features)

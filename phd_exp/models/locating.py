@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate, relu
 
 from phd_exp.geometry.camera import middles
-from phd_exp.models.backbones import BLOCKS, NORM, Backbone, BackboneOutput, Depth
-from phd_exp.models.torchvisions import BasicBlock, Bottleneck
+from phd_exp.models.backbones import Backbone, BackboneOutput
+from phd_exp.models.residual import BLOCKS, NORM, Depth, convolution, initialise, residual_stage
 
 
 class Locating(Backbone):
@@ -55,16 +55,12 @@ class Locating(Backbone):
         block, counts = BLOCKS[depth]
         widths = [width * 2**stage for stage in range(len(counts))]
         outputs = [n * block.expansion for n in widths]
-        convolution = nn.Conv2d(3, width, 7, stride, padding=3, bias=False)
-        self.stem = nn.Sequential(convolution, NORM(width), nn.ReLU(inplace=True))
+        self.stem = nn.Sequential(convolution(3, width, 7, stride), NORM(width), nn.ReLU(inplace=True))
         self.stages = nn.ModuleList(
-            _stage(block, count, n_in, n, stride=1 if n == width else 2)
+            residual_stage(block, count, n_in, n, stride=1 if n == width else 2)
             for count, n_in, n in zip(counts, [width, *outputs], widths, strict=False)
         )
-        for module in self.modules():
-            if isinstance(module, nn.Conv2d):
-                # as torchvision's
-                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+        initialise(self)
         self.lateral = nn.ModuleList(nn.Conv2d(n, channels, 1) for n in outputs[1:])
         self.smooth = nn.Conv2d(channels, channels, 3, padding=1)
         self.map = nn.Conv2d(channels, 4 if segments else 3, 1)
@@ -105,16 +101,6 @@ class Locating(Backbone):
             log_heat=log_heat.unflatten(-1, score.shape[-2:]),
             log_odds=log_odds[:, 0] if self.segments else None,
         )
-
-
-def _stage(block: type[BasicBlock | Bottleneck], count: int, n_in: int, width: int, stride: int) -> nn.Sequential:
-    """`count` blocks, the first of which changes resolution and channels."""
-    n_out = width * block.expansion
-    shortcut = None
-    if stride > 1 or n_in != n_out:
-        shortcut = nn.Sequential(nn.Conv2d(n_in, n_out, 1, stride, bias=False), NORM(n_out))
-    first = block(n_in, width, stride, shortcut, norm_layer=NORM)
-    return nn.Sequential(first, *(block(n_out, width, norm_layer=NORM) for _ in range(count - 1)))
 
 
 def _of_segment(

@@ -1,16 +1,18 @@
 """The network: its initial predictions, gradients and precision."""
 
-from collections.abc import Callable
+from functools import partial
 
 import pytest
 import torch
-from torchvision.models import resnet18, resnet34, resnet50
+from torchvision.models.resnet import BasicBlock, Bottleneck
+from torchvision.models.resnet import ResNet as TorchvisionResNet
 
 from phd_exp.geometry import Camera, Cartesian, DepthScale, LogDepth, Projected
 from phd_exp.losses import MeanAbsoluteError, NegativeLogLikelihood, Pinball
 from phd_exp.models.backbones import resnet
 from phd_exp.models.heads import ChartHead, DistributionHead, Head, SurrogateHead
 from phd_exp.models.regressor import Regressor
+from phd_exp.models.residual import Depth
 from tests.support.heads import SHAPED
 
 DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
@@ -76,13 +78,21 @@ def test_the_input_images_do_not_change(image: torch.Tensor) -> None:
     assert torch.equal(image, before)
 
 
-@pytest.mark.parametrize(("depth", "torchvisions"), [(18, resnet18), (34, resnet34), (50, resnet50)])
-def test_resnets_are_torchvisions_with_group_norm(depth: int, torchvisions: Callable[..., torch.nn.Module]) -> None:
-    network = resnet(depth).network
-    theirs = {name: weight.shape for name, weight in torchvisions().named_parameters() if "fc" not in name}
-    assert {name: weight.shape for name, weight in network.named_parameters()} == theirs
-    assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in network.modules())
-    assert {m.num_groups for m in network.modules() if isinstance(m, torch.nn.GroupNorm)} == {1}
+@pytest.mark.parametrize(
+    ("depth", "block", "counts"), [(34, BasicBlock, (3, 4, 6, 3)), (50, Bottleneck, (3, 4, 6, 3))]
+)
+def test_resnets_are_torchvisions_with_group_norm(depth: Depth, block: type, counts: tuple[int, ...]) -> None:
+    """The same weights from the same seed, under the same names, and the same features to the bit."""
+    torch.manual_seed(0)
+    theirs = TorchvisionResNet(block, list(counts), norm_layer=partial(torch.nn.GroupNorm, 1))
+    theirs.fc = torch.nn.Identity()
+    torch.manual_seed(0)
+    ours = resnet(depth).network
+    weights = ours.state_dict()
+    assert weights.keys() == theirs.state_dict().keys()
+    assert all(torch.equal(weights[name], value) for name, value in theirs.state_dict().items())
+    pixels = torch.rand(2, 3, 64, 64)
+    assert torch.equal(ours(pixels), theirs(pixels))
 
 
 def test_under_autocast_the_last_layer_stays_in_float32(image: torch.Tensor, camera: Camera) -> None:
