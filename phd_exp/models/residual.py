@@ -24,7 +24,7 @@ def convolution(n_in: int, n_out: int, size: int, stride: int = 1) -> nn.Conv2d:
 
 
 class BasicBlock(nn.Module):
-    """Two convolutions of `width` channels, added to the input, or to a `shortcut` of other channels or resolution."""
+    """Two convolutions of `width` channels, added to the input, or to its `shortcut` where the shape changes."""
 
     expansion = 1
 
@@ -96,16 +96,14 @@ class ResNet(nn.Module):
     def __init__(self, depth: Depth) -> None:
         super().__init__()
         block, counts = BLOCKS[depth]
-        widths, n = (64, 128, 256, 512), block.expansion
         self.conv1 = convolution(3, 64, 7, 2)
         self.bn1 = NORM(64)
         self.maxpool = nn.MaxPool2d(3, 2, padding=1)
-        for index, (count, n_in, width) in enumerate(
-            zip(counts, (64, *(n * w for w in widths)), widths, strict=False)
-        ):
-            self.add_module(
-                f"layer{index + 1}", residual_stage(block, count, n_in, width, stride=1 if index == 0 else 2)
-            )
+        widths, n = (64, 128, 256, 512), block.expansion
+        inputs = (64, *(n * width for width in widths))
+        for index, (count, n_in, width) in enumerate(zip(counts, inputs, widths, strict=False)):
+            layer = residual_stage(block, count, n_in, width, stride=1 if index == 0 else 2)
+            self.add_module(f"layer{index + 1}", layer)
         self.n_features = n * widths[-1]
         nn.Linear(self.n_features, 1000)  # torchvision's last layer: with its draws, a seed makes the same network
         initialise(self)

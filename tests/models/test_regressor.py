@@ -84,7 +84,7 @@ def test_the_input_images_do_not_change(image: torch.Tensor) -> None:
 def test_resnets_are_torchvisions_with_group_norm(depth: Depth, block: type, counts: tuple[int, ...]) -> None:
     """The same weights from the same seed, under the same names, and the same features to the bit."""
     torch.manual_seed(0)
-    theirs = TorchvisionResNet(block, list(counts), norm_layer=partial(torch.nn.GroupNorm, 1))
+    theirs = TorchvisionResNet(block, [3, 4, 6, 3], norm_layer=partial(torch.nn.GroupNorm, 1))
     theirs.fc = torch.nn.Identity()
     torch.manual_seed(0)
     ours = resnet(depth).network
