@@ -5,12 +5,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from hydra.errors import HydraException
-from hydra.utils import instantiate
 from torch import nn
 
 from phd_exp.config import FolderConfig, RenderedConfig, RunConfig, SourceConfig
-from phd_exp.config.targets import custom_parts
+from phd_exp.config.targets import build, custom_parts
 from phd_exp.data.folder import FolderSource
 from phd_exp.data.images import SHRINKING
 from phd_exp.data.sources import Part, RenderedSource, Source
@@ -32,7 +30,7 @@ def build_source(data: RenderedConfig | FolderConfig | SourceConfig) -> Source:
     if isinstance(data, RenderedConfig):
         return RenderedSource(DatasetFolder(data.folder), data.spec, sizes, data.image_size)
     with naming("data.source", data.source):
-        source = instantiate(data.source, _partial_=True)(n=sizes, side=data.image_size)
+        source = build(data.source, is_partial=True)(n=sizes, side=data.image_size)
         if not isinstance(source, Source):
             raise ValueError(f"makes a {type(source).__name__}; expected a phd_exp.data.sources.Source")
         return source
@@ -43,12 +41,11 @@ def build_regressor(config: RunConfig, depth: DepthScale, is_new: bool = True) -
 
     Raises ConfigError, naming the key, for values that a part refuses.
     """
-    # partial, then called: `instantiate` would convert an object among its arguments to a configuration
     with naming("model.head", config.model.head):
-        head = instantiate(config.model.head, _partial_=True)(depth=depth)
+        head = build(config.model.head, is_partial=True)(depth=depth)
     node = config.backbone if is_new else _without_weights(config.backbone)
     with naming("backbone", node):
-        backbone = instantiate(node)
+        backbone = build(node)
         if isinstance(backbone, nn.Module) and not isinstance(backbone, Backbone):
             backbone = pooled(backbone, config.data.image_size)
         if not isinstance(backbone, Backbone):
@@ -74,7 +71,7 @@ def naming(key: str, node: dict[str, Any]) -> Iterator[None]:
         yield
     except Exception as error:
         place = in_user_code(error)
-        if place is None and not isinstance(error, ValueError | TypeError | OSError | RuntimeError | HydraException):
+        if place is None and not isinstance(error, ValueError | TypeError | OSError | RuntimeError):
             raise
         own = dict.fromkeys(custom_parts(node).values())
         files = ", ".join(file for file in own if "site-packages" not in file)

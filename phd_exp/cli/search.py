@@ -9,7 +9,6 @@ from warnings import catch_warnings
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, RangeSweep
 from hydra.errors import HydraException
-from hydra.utils import instantiate
 from pydantic import BaseModel, ConfigDict, Field
 
 from phd_exp.cli.arguments import Arguments
@@ -18,6 +17,7 @@ from phd_exp.cli.jobs import composed
 from phd_exp.cli.paths import quoted
 from phd_exp.cli.train import run_name, task
 from phd_exp.config import check
+from phd_exp.config.targets import build
 from phd_exp.records.errors import ConfigError, RunError, UserError, gist
 from phd_exp.records.files import read_plain, write_atomic
 from phd_exp.records.parsing import parse_yaml
@@ -117,13 +117,13 @@ class _Search:
         self.study = optuna.create_study(
             storage=f"sqlite:///{folder.absolute() / 'study.db'}",
             study_name=folder.name,
-            pruner=instantiate(space.pruner),
+            pruner=build(space.pruner),
             load_if_exists=True,
         )
         sampler = dict(space.sampler)
         if "seed" in sampler:  # a resumed search would draw the values of its first trials again
             sampler["seed"] += len(self.study.trials)
-        self.study.sampler = instantiate(sampler)
+        self.study.sampler = build(sampler)
         asked = {"space": space.space, "overrides": fixed}
         if self.study.user_attrs.get("asked", asked) != asked:
             raise RunError(

@@ -218,7 +218,7 @@ def check_render(config: dict[str, Any]) -> RenderConfig:
 
 def _validated(model: type[Checked], config: dict[str, Any], trust: Trust) -> Checked:
     for key, value in flatten(config).items():
-        # Hydra would evaluate it on `instantiate`, and put values of this machine into a stranger's configuration
+        # Hydra evaluates them when it composes a typed configuration; a stranger's could read this machine's values
         if "${" in str(value):
             raise ConfigError(
                 f"{key}: got {shown(value)}; expected a value, since no interpolation is evaluated here"

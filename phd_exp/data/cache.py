@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 
 from phd_exp.records.dataset import mapped
 from phd_exp.records.files import read_plain, write_atomic
@@ -49,6 +47,9 @@ def cached(
     """
 
     def fill_all(array: np.ndarray) -> None:
+        from rich.console import Console  # imported slowly, and most arrays are there
+        from rich.progress import track
+
         console = Console(stderr=True)
         with ThreadPoolExecutor(max(1, min(DECODERS, LARGEST_AT_ONCE // largest))) as pool:
             done = pool.map(partial(fill, array), jobs)

@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import UInt8
-from scipy.sparse import csr_array
 
 from phd_exp.data.cache import cached
 from phd_exp.records.dataset import DatasetFolder, sha256
@@ -13,6 +13,9 @@ from phd_exp.records.errors import DatasetError
 from phd_exp.records.files import checksum
 from phd_exp.records.images import recorded_image
 from phd_exp.records.scenes import SampleRecord, Split
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 SHRINKING = 2  # version of `shrunk`, recorded with each run and cache. Version 1 was exact for integer factors only.
 _LARGEST_STRIPE = 1 << 22  # values converted to float64 at once
@@ -88,8 +91,10 @@ def shrunk(pixels: UInt8[np.ndarray, "height width bands"], side: int) -> UInt8[
 
 
 @lru_cache(maxsize=16)
-def _overlaps(n: int, side: int) -> csr_array:
+def _overlaps(n: int, side: int) -> "csr_array":
     """Overlap of output pixel i with input pixel x, in units of 1/side input pixels; each row sums to n."""
+    from scipy.sparse import csr_array  # imported slowly, and images of the network's size do not need it
+
     i, x = np.arange(side)[:, None], np.arange(n)
     length = np.minimum((i + 1) * n, (x + 1) * side) - np.maximum(i * n, x * side)
     return csr_array(length.clip(0).astype(float))

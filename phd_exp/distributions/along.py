@@ -7,16 +7,19 @@ depth z and q_1, any one coordinate of q, are independent.
 import math
 from collections.abc import Callable
 from functools import cache, cached_property, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy import special
-from scipy.interpolate import CubicHermiteSpline
 
 from phd_exp.distributions.huber import RADIAL_NORMALISER, radial_icdf
 from phd_exp.distributions.projected_huber import ProjectedHuber
 from phd_exp.distributions.special import tail_moment
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicHermiteSpline
 
 Values = Float[np.ndarray, " m"]
 
@@ -52,13 +55,15 @@ def whitened_marginal(s: Float[np.ndarray, " values"]) -> Float[np.ndarray, " va
 
 
 @cache
-def _whitened_cdf() -> CubicHermiteSpline:
+def _whitened_cdf() -> "CubicHermiteSpline":
     """P(q_1 <= s) for |s| <= `FURTHEST`: the integral of `whitened_marginal`, interpolated."""
     s = np.arange(round(FURTHEST / STEP) + 1) * STEP
     inside = s[:-1, None] + STEP * (_NODES + 1) / 2
     parts = whitened_marginal(inside.ravel()).reshape(inside.shape) @ _WEIGHTS * STEP / 2
     above, density = np.append(0, parts.cumsum()), whitened_marginal(s)
     cdf = 0.5 + np.concatenate([-above[:0:-1], above]) / (2 * above[-1])
+    from scipy.interpolate import CubicHermiteSpline  # imported slowly, and a camera that is not turned needs none
+
     return CubicHermiteSpline(np.concatenate([-s[:0:-1], s]), cdf, np.concatenate([density[:0:-1], density]))
 
 

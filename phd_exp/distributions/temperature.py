@@ -12,7 +12,6 @@ from functools import partial
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.optimize import brentq, minimize
 from torch import Tensor
 
 from phd_exp.distributions.depth import depth_mean_energy
@@ -131,6 +130,8 @@ def _fit(nll: Callable[[Tensor], tuple[Tensor, Tensor]], log_precision: Tensor) 
         gradient = derivative.mean(), -(derivative * change).mean() + penalty
         return float(value.mean()) + slope * penalty / 2, np.array([float(one) for one in gradient])
 
+    from scipy.optimize import minimize  # imported slowly, and only fits need it
+
     found = minimize(
         loss, (_root(lambda v: loss(np.array([v, 0.0]))[1][0]), 0.0), jac=True, method="BFGS", tol=1e-9
     ).x
@@ -139,6 +140,8 @@ def _fit(nll: Callable[[Tensor], tuple[Tensor, Tensor]], log_precision: Tensor) 
 
 def _root(derivative: Callable[[float], float]) -> float:
     """The v at which a derivative, negative for small v and positive for large v, is zero."""
+    from scipy.optimize import brentq
+
     width = 1.0
     while not derivative(-width) < 0 < derivative(width):
         width *= 2

@@ -10,8 +10,8 @@ the p-value is the conformal one (Vovk, Gammerman and Shafer, "Algorithmic Learn
 """
 
 import numpy as np
+import torch
 from jaxtyping import Float
-from scipy.spatial import KDTree
 
 from phd_exp.distributions import Temperature
 from phd_exp.distributions.columns import parameter_columns
@@ -22,6 +22,7 @@ from phd_exp.records.runs import CHOOSE, GUARANTEE
 
 NEIGHBOURS = 5
 FEWEST = 20  # held-out samples that may choose
+ROWS = 1024  # samples at once, whose distances to all others are in memory
 ALARM = 0.05  # the p-value below which a sample counts as unfamiliar
 _LEAST_VARIANCE = 1e-4  # 1 % of a quantity that never varies, such as the f of a single camera
 _FURTHEST = 1e3
@@ -44,13 +45,16 @@ class Familiarity:
         self.middle = chosen.mean(0)
         variance, axes = np.linalg.eigh(np.cov(chosen.T))
         self.whiten = axes / np.sqrt(np.maximum(variance, _LEAST_VARIANCE))
-        self.tree = KDTree((chosen - self.middle) @ self.whiten)
+        self.chosen = torch.from_numpy((chosen - self.middle) @ self.whiten)
         self.usual = np.sort(self.distance(columns)[GUARANTEE])
 
     def distance(self, columns: Columns) -> Float[np.ndarray, " samples"]:
         """The score of predictions with these parameters, f and S (px); larger for less familiar ones."""
-        nearest: np.ndarray = self.tree.query((_features(columns) - self.middle) @ self.whiten, [NEIGHBOURS])[0]
-        return nearest[:, 0]
+        points = torch.from_numpy((_features(columns) - self.middle) @ self.whiten)
+        away = (
+            torch.cdist(some, self.chosen, compute_mode="donot_use_mm_for_euclid_dist") for some in points.split(ROWS)
+        )
+        return torch.cat([distance.kthvalue(NEIGHBOURS).values for distance in away]).numpy()
 
     def p_value(self, distance: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
         """The share of held-out samples at least as far away; below 0.05 for 5 % of familiar samples."""

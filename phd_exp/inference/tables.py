@@ -26,7 +26,6 @@ from phd_exp.evaluation.several_views import ROTATION, TRANSLATION
 from phd_exp.inference.answers import sightings
 from phd_exp.inference.loading import load
 from phd_exp.inference.predictor import BATCH, Predictor
-from phd_exp.metrics.rows import Rows
 from phd_exp.records.choices import flatten
 from phd_exp.records.detections import Detection
 from phd_exp.records.errors import DatasetError, RunError
@@ -93,7 +92,7 @@ def record_labelled(predictor: Predictor, detections: Sequence[Detection], name:
 
     Raises DatasetError if a label is missing or in millimetres, RunError for a baseline.
     """
-    folder, table, n = predictor.folders[0], Rows(), 0
+    folder, parts, n = predictor.folders[0], list[Columns](), 0
     if predictor.is_ensemble or predictor.state != "finished":
         raise RunError(f"{folder.path}: expected a single run, which is finished")
     if not predictor.is_probabilistic:
@@ -108,9 +107,9 @@ def record_labelled(predictor: Predictor, detections: Sequence[Detection], name:
             float(predictor.side),
             torch.arange(n, n + len(views)),
         )
-        table.update(columns(batch.predictions, samples))
+        parts.append(columns(batch.predictions, samples))
         n += len(views)
-    found = table.columns()
+    found = _joined(parts)
     _require_metres(found, detections[0])
     file = folder.labelled(name)
     with folder.held():
@@ -145,7 +144,7 @@ def _poses_and_times(source: RenderedSource) -> Known:
 def _predicted(predictor: Predictor, source: Source, part: Part, shift: ShiftConfig = UNCHANGED) -> Columns:
     """Predictions of a part of the samples; of several symmetric views also their `disagreement`."""
     samples, f_error = source.samples(part), predictor.config.camera.f_error
-    change, table = Photometry(**dict[str, Any](**shift.images)), Rows()
+    change, parts = Photometry(**dict[str, Any](**shift.images)), list[Columns]()
     for rows in torch.arange(len(samples)).split(BATCH):
         batch = samples.select(rows)
         factor = shift.f_factor * f_factor(batch.row, f_error)
@@ -154,8 +153,13 @@ def _predicted(predictor: Predictor, source: Source, part: Part, shift: ShiftCon
         found = columns(predictor.predict(raw, f), batch, factor)
         if predictor.is_ensemble:
             found["disagreement"] = predictor.members(raw, f).disagreement
-        table.update(found)
-    return table.columns()
+        parts.append(found)
+    return _joined(parts)
+
+
+def _joined(parts: Sequence[Columns]) -> Columns:
+    """Tables one below the other."""
+    return {name: torch.cat([part[name] for part in parts]).cpu() for name in parts[0]}
 
 
 def of_camera(config: RunConfig) -> dict[str, str]:

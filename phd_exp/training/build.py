@@ -7,13 +7,12 @@ from inspect import isclass
 from typing import Any
 
 import torch
-from hydra.utils import instantiate
 from torch import Tensor
 
 from phd_exp.build import build_regressor, build_source, naming, recorded_constants
 from phd_exp.config import FolderConfig, RenderedConfig, RunConfig, SourceConfig
 from phd_exp.config.sections import RecipeConfig
-from phd_exp.config.targets import custom_parts, locate
+from phd_exp.config.targets import build, custom_parts, locate
 from phd_exp.data.augmentation import Augmentation
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.photographs import Photographs
@@ -84,11 +83,11 @@ def build_module(config: RunConfig, data: PositionData) -> PositionModule:
         except RunError as error:
             raise ConfigError(f"init: {error}; expected a run with this backbone and head") from None
     with naming("optimizer", config.optimizer):
-        optimizer = instantiate(config.optimizer, _partial_=True)
+        optimizer = build(config.optimizer, is_partial=True)
         optimizer(regressor.parameters())  # refuses bad values before hours of rendering
     with naming("loss", config.loss):
         # a class makes a loss, a function is one
-        loss = instantiate(config.loss, _partial_=not isclass(locate(config.loss["_target_"], None)))
+        loss = build(config.loss, is_partial=not isclass(locate(config.loss["_target_"], None)))
     _require_maps(recipe, regressor.backbone)
     constant_f = data.source.constant_f if config.camera.focal_length == "constant" else None
     module = PositionModule(

@@ -7,12 +7,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
-from hydra.utils import instantiate
 from lightning.pytorch.loggers import Logger, WandbLogger
 
 from phd_exp.build import naming
 from phd_exp.config import RunConfig
-from phd_exp.config.targets import locate
+from phd_exp.config.targets import build, locate
 from phd_exp.records.choices import flatten
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import RunFolder
@@ -25,7 +24,7 @@ def require_possible_loggers(loggers: Mapping[str, Any]) -> None:
     for name, node in loggers.items():
         if node["_target_"] != WANDB:
             with naming(f"logger.{name}", node):
-                instantiate(node, _partial_=True)
+                build(node, is_partial=True)
         elif not node.get("offline"):
             import wandb
 
@@ -57,7 +56,7 @@ def _logger(name: str, node: dict[str, Any], config: RunConfig, folder: RunFolde
     with naming(f"logger.{name}", node):
         takes_folder = "save_dir" in inspect.signature(locate(node["_target_"], None)).parameters
         place = {"save_dir": str(folder.path.absolute() / name)} if takes_folder else {}
-        logger = instantiate(place | node)
+        logger = build(place | node)
         if not isinstance(logger, Logger):
             raise ValueError(f"makes a {type(logger).__name__}; expected a Logger of Lightning")
         logger.log_hyperparams(flatten(config.model_dump(mode="json")))

@@ -5,13 +5,13 @@ from collections.abc import Sequence
 from inspect import signature
 from typing import Any
 
-from hydra.utils import instantiate
 from lightning import Trainer
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar
 
 from phd_exp.build import naming
 from phd_exp.config import RunConfig
+from phd_exp.config.targets import build
 from phd_exp.hardware import precision
 from phd_exp.records.errors import ConfigError, shown, unknown
 from phd_exp.records.runs import RunFolder
@@ -100,7 +100,7 @@ def build_callbacks(config: RunConfig, folder: RunFolder) -> list[Callback]:
     found = []
     for name, node in config.callbacks.items():
         with naming(f"callbacks.{name}", node):
-            callback = instantiate(node)
+            callback = build(node)
             if not isinstance(callback, Callback):
                 raise ValueError(f"makes a {type(callback).__name__}; expected a lightning.Callback")
         if getattr(callback, "dirpath", None) is not None:

@@ -364,8 +364,16 @@ def test_an_unfinished_run_is_used_with_a_notice(phd_exp: Callable, spoiled: Run
 LOADS = "phd_exp.load(sys.argv[1])\nassert not {'lightning', 'matplotlib', 'pyarrow', 'bpy'} & set(sys.modules)"
 SLOW_TO_IMPORT = {
     "lightning",
+    "hydra",
+    "omegaconf",
     "wandb",
     "pandas",
+    "torchvision",
+    "torchmetrics",
+    "numba",
+    "rich",
+    "scipy.optimize",
+    "scipy.spatial",
     "scipy.stats",
     "sympy",
     "torch._dynamo",
@@ -382,7 +390,7 @@ def test_the_import_does_not_wait_for_torch_nor_a_prediction_for_lightning(run: 
     assert done.returncode == 0, done.stderr
 
 
-def test_a_prediction_imports_neither_the_compiler_of_torch_nor_pandas(
+def test_a_prediction_imports_nothing_that_it_does_not_need(
     make: Callable[..., RunFolder], photos: Path
 ) -> None:
     """With recorded held-out samples, which a prediction reads to say how familiar it is."""

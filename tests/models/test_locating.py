@@ -5,9 +5,9 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from hydra.utils import instantiate
 from torch.testing import assert_close
 
+from phd_exp.config.targets import build
 from phd_exp.geometry import Camera, Cartesian, DepthScale, LogDepth, Projected
 from phd_exp.geometry.camera import middles
 from phd_exp.geometry.charts import projected
@@ -80,7 +80,7 @@ def test_the_recipe_costs_no_more_than_the_authors_network(preset: str, composed
 
     def operations(recipe: str) -> int:
         config = composed(f"preset={preset}", f"recipe={recipe}")
-        network, side = instantiate(config["backbone"]), config["data"]["image_size"]
+        network, side = build(config["backbone"]), config["data"]["image_size"]
         with FlopCounterMode(display=False) as counter:
             network(torch.zeros(1, 3, side, side))
         return counter.get_total_flops()
