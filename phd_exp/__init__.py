@@ -22,10 +22,14 @@ def train(overrides: Sequence[str] = (), config_dir: str | Path | None = None) -
         overrides: such as `["model=mae_logz", "data=scale", "preset=small"]`.
         config_dir: a folder with further choices, like --config-dir.
 
-    Raises UserError, or an error of a custom part.
+    Raises UserError, also without the extra `train`, or an error of a custom part.
     """
-    from phd_exp.cli.train import trained
+    from phd_exp.records.errors import ConfigError, install
 
+    try:
+        from phd_exp.cli.train import trained
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"{error}{install(error.name or '')}") from None
     return trained(overrides, config_dir)
 
 

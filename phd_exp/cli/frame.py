@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NamedTuple
 
-from phd_exp.records.errors import UNPRINTABLE, ConfigError, UserError, in_user_code, one_line
+from phd_exp.records.errors import UNPRINTABLE, ConfigError, UserError, in_user_code, install, one_line
 
 RESUMES = "the same command resumes"
 
@@ -48,6 +48,8 @@ def failure(error: BaseException) -> Ending:
         return Ending("interrupted", (f"stopped by {error}; {RESUMES}",), 128 + error.signum)
     if isinstance(error, UserError):
         return Ending("failed", tuple(str(error).splitlines()), 2 if isinstance(error, ConfigError) else 1)
+    if isinstance(error, ModuleNotFoundError) and (remedy := install(error.name or "")):
+        return Ending("failed", (f"{error}{remedy}",), 2)
     # torch raises a RuntimeError on a CPU, and a class of the second name on a GPU
     no_memory = type(error).__name__ in ("MemoryError", "OutOfMemoryError")
     if isinstance(error, OSError) and error.strerror:

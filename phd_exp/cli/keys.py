@@ -6,7 +6,6 @@ from importlib import import_module
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from omegaconf import MISSING
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
@@ -35,6 +34,7 @@ FILES = {
     "render": {"render": "", **RENDERED},
 }
 """Verb -> the files of conf/ that explain its keys, with their headings."""
+MISSING = "???"  # the value of a key that has none
 NAMES = {int: "int", float: "float", bool: "bool", NoneType: "null", tuple: "list", dict: "section"}
 Key = tuple[str, str, str, str]
 """Name, type, default and description."""

@@ -19,8 +19,9 @@ _PACKAGE = Path(__file__).parents[1]
 _LIBRARIES = (str(_PACKAGE), str(_PACKAGE.parent / "hydra_plugins"), sysconfig.get_path("stdlib"), "<")
 """Beginnings of the file names of this package, the standard library, and code without a file."""
 EXTRAS = {
-    "bpy": "render", "matplotlib": "report", "plotly": "report", "jinja2": "report", "onnx": "export",
-    "onnxscript": "export", "onnxruntime": "export", "optuna": "search", "tensorboard": "loggers",
+    "hydra": "train", "omegaconf": "train", "lightning": "train", "wandb": "train", "torchmetrics": "train",
+    "torchvision": "train", "bpy": "render", "matplotlib": "report", "plotly": "report", "jinja2": "report",
+    "onnx": "export", "onnxscript": "export", "onnxruntime": "export", "optuna": "search", "tensorboard": "loggers",
     "mlflow": "loggers", "timm": "timm", "av": "video", "joblib": "launchers", "submitit": "launchers", "ray": "ray",
     "rosbags": "ros",
 }  # fmt: skip
@@ -107,7 +108,8 @@ def complaint(key: str, problem: ErrorDetails) -> str:
 def install(text: str) -> str:
     """`; pip install 'phd_exp[EXTRA]'` if a message about a missing package names an optional one, else empty."""
     words = re.findall(r"[a-z0-9]+", text)
-    extra = next((EXTRAS[word] for word in words if word in EXTRAS), None)
+    extras = [EXTRAS[word] for word in words if word in EXTRAS]
+    extra = next(iter(sorted(extras, key="train".__eq__)), None)  # plugins of hydra and lightning name these too
     return f"; pip install 'phd_exp[{extra}]'" if extra else ""
 
 

@@ -4,7 +4,9 @@ import json
 import subprocess
 import sys
 import tomllib
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,6 +15,7 @@ from tests.bad_input.commands import space
 from tests.bad_input.place import HANDMADE, Place
 
 PACKAGES = {
+    "train": ("hydra", "omegaconf", "lightning", "wandb", "torchmetrics", "torchvision"),
     "render": ("bpy",),
     "report": ("matplotlib", "plotly", "jinja2"),
     "launchers": ("joblib", "submitit", *(f"hydra_plugins.hydra_{name}_launcher" for name in ("joblib", "submitit"))),
@@ -31,6 +34,7 @@ SMALLEST = (
 WORKS: dict[str, tuple[str, ...]] = {"report": ("report",), "train": OTHERS, "predict": ONE}
 """The first two lack pictures, which they say."""
 LACKS: dict[str, tuple[tuple[str, ...], ...]] = {
+    "train": (OTHERS, ("render", *SMALLEST), ("search", "space.yaml", "trials=1"), ("-m", *OTHERS, "seed=1,2")),
     "render": (("render", *SMALLEST), (*SMALLEST, "logger=none")),
     "report": ((*ONE, "out=pictures"),),
     "launchers": (
@@ -45,7 +49,6 @@ LACKS: dict[str, tuple[tuple[str, ...], ...]] = {
     "timm": ((*LEARN, "runs=c", "backbone._target_=timm.create_model"),),
     "ray": (("-m", *OTHERS, "seed=1,2", "hydra/launcher=ray"),),
 }
-COMMANDS = [*WORKS.values(), *(words for several in LACKS.values() for words in several)]
 WITHOUT = """
 import contextlib, importlib.metadata, io, json, sys
 commands, absent = json.loads(sys.argv.pop())
@@ -73,26 +76,56 @@ def test_the_table_has_every_extra() -> None:
     assert PACKAGES.keys() == LACKS.keys()
 
 
-@pytest.mark.slow
-def test_without_the_packages_of_all_extras(place: Place) -> None:
-    """Runs in a new process, because this process has already imported some of these packages."""
+@pytest.fixture
+def outcomes(place: Place) -> Callable[..., list[tuple[int, str, str]]]:
+    """Run commands without packages: the status, output and errors of each.
+
+    In a new process, because this process has already imported some of these packages.
+    """
     run = str(place.run.path.relative_to(place.root))
     space(place)
-    commands = [[word.replace("RUN", run) for word in words] for words in COMMANDS]
+
+    def outcomes(commands: Sequence[Sequence[str]], absent: Sequence[str]) -> list[tuple[int, str, str]]:
+        words = [[word.replace("RUN", run) for word in command] for command in commands]
+        code = [sys.executable, "-c", WITHOUT, json.dumps([words, absent])]
+        answer = subprocess.run(code, capture_output=True, text=True, cwd=place.root)
+        assert answer.returncode == 0, answer.stderr
+        return [json.loads(line) for line in answer.stdout.splitlines()]
+
+    return outcomes
+
+
+def require_lacks(extra: str, outcome: tuple[int, str, str]) -> None:
+    """Fail unless one line names the extra."""
+    status, _, err = outcome
+    assert status in (1, 2), err
+    (line,) = err.splitlines()
+    assert line.startswith("error: "), line
+    assert f"pip install 'phd_exp[{extra}]'" in line
+
+
+def test_a_prediction_needs_no_extra(outcomes: Callable[..., Any]) -> None:
+    commands = [ONE, *LACKS["train"], ("predict", "--help"), ("train", "--help")]
     absent = [name for names in PACKAGES.values() for name in names]
-    code = [sys.executable, "-c", WITHOUT, json.dumps([commands, absent])]
-    answer = subprocess.run(code, capture_output=True, text=True, cwd=place.root)
-    assert answer.returncode == 0, answer.stderr
-    outcomes = {words: json.loads(line) for words, line in zip(COMMANDS, answer.stdout.splitlines(), strict=True)}
+    (status, out, err), *others = outcomes(commands, absent)
+    assert (status, err) == (0, "")
+    assert "covariance" in json.loads(out)
+    for outcome in others[: len(LACKS["train"])]:
+        require_lacks("train", outcome)
+    assert [status for status, *_ in others[len(LACKS["train"]) :]] == [0, 0]
+
+
+@pytest.mark.slow
+def test_without_the_packages_of_all_other_extras(outcomes: Callable[..., Any]) -> None:
+    lacking = {extra: commands for extra, commands in LACKS.items() if extra != "train"}
+    commands = [*WORKS.values(), *(words for several in lacking.values() for words in several)]
+    absent = [name for extra, names in PACKAGES.items() if extra != "train" for name in names]
+    found = dict(zip(commands, outcomes(commands, absent), strict=True))
     for verb, words in WORKS.items():
-        status, out, err = outcomes[words]
+        status, out, err = found[words]
         assert (status, err) == (0, ""), (verb, err)
         assert ("pip install 'phd_exp[report]'" in out) == (verb != "predict"), (verb, out)
-    assert "tables: report/tables" in outcomes[WORKS["report"]][1]
-    for extra, several in LACKS.items():
+    assert "tables: report/tables" in found[WORKS["report"]][1]
+    for extra, several in lacking.items():
         for words in several:
-            status, _, err = outcomes[words]
-            assert status in (1, 2), words
-            (line,) = err.splitlines()
-            assert line.startswith("error: "), words
-            assert f"pip install 'phd_exp[{extra}]'" in line, words
+            require_lacks(extra, found[words])
