@@ -118,7 +118,7 @@ class RunArguments(Arguments):
     """The run whose network a verb uses."""
 
     run: Paths
-    """the folder of a run; several, separated by commas, or a folder of seeds are an ensemble"""
+    """the folder of a run, or a file of `pack`; several, separated by commas, or a folder of seeds are an ensemble"""
     recalibrate: bool = False
     """apply the temperatures that fit the run's held-out samples"""
     coverage: Annotated[float, Field(gt=0, lt=1)] | None = None

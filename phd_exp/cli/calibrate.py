@@ -7,6 +7,7 @@ from pydantic import Field
 
 from phd_exp.cli.arguments import Arguments, trusted
 from phd_exp.records.detections import NumberOrName
+from phd_exp.records.errors import ConfigError
 from phd_exp.records.own_images import detections_in
 
 COVERAGES = (0.5, 0.8, 0.9, 0.95, 0.99)
@@ -30,6 +31,8 @@ class CalibrateArguments(Arguments):
 def main(words: list[str]) -> int:
     """Predict labelled images, record the predictions, and print what follows from them; returns the exit status."""
     arguments = CalibrateArguments.parsed("calibrate", words)
+    if arguments.run.is_file():
+        raise ConfigError(f"run={arguments.run}: a packed run records nothing; expected the folder of a run")
     detections = detections_in(arguments.folder, object_name=arguments.object)
     from phd_exp.evaluation.conformal import samples_needed
     from phd_exp.inference.loading import load

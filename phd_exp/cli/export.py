@@ -18,7 +18,7 @@ class ExportArguments(RunArguments):
     """The run and the file; recalibrate=true applies the temperatures fitted on the run's held-out samples."""
 
     out: Path | None = None
-    """the file; by default network.onnx in the (first) run's folder"""
+    """the file; by default network.onnx in the (first) run's folder, or next to a file of `pack`"""
     photographs: bool = False
     """the inputs are a photograph, its camera matrix and boxes, and the graph crops as predict does"""
     precision: Literal["float32", "float64"] | None = None
@@ -30,7 +30,8 @@ class ExportArguments(RunArguments):
 def main(words: list[str]) -> int:
     """Export the network of a run; returns the exit status."""
     arguments = ExportArguments.parsed("export", words)
-    file = arguments.out or arguments.run[0] / "network.onnx"
+    run = arguments.run[0]
+    file = arguments.out or (run.with_suffix(".onnx") if run.is_file() else run / "network.onnx")
     if missing := [name for name in ("onnx", "onnxscript", "onnxruntime") if find_spec(name) is None]:
         raise ConfigError(f"export needs {', '.join(missing)}: `pip install 'phd_exp[export]'`")
     require_file(file, "network.onnx")

@@ -13,6 +13,7 @@ VERBS = {
     "fuse": "one position from the predictions of several cameras, and/or on a ground plane: a JSON line a scene",
     "track": "the path of an object through a video or a folder: a JSON line a frame; a video and a page with out=",
     "search": "search for good values of keys with Optuna, judged on held-out samples",
+    "pack": "write a run as one file with a card, for predict run=FILE on other machines",
     "export": "write a run's network as ONNX, compared with torch; it needs onnxruntime and NumPy alone",
 }
 OF_VERB = {
@@ -69,6 +70,10 @@ EXAMPLES = {
     "search": [
         "python -m phd_exp search space.yaml trials=40",
         "python -m phd_exp search space.yaml trials=40 preset=small data=occl",
+    ],
+    "pack": [
+        "python -m phd_exp pack run=DIR out=run.zip license=CC-BY-4.0",
+        "python -m phd_exp predict run=run.zip image=photo.jpg f=1550",
     ],
     "export": [
         "python -m phd_exp export run=runs/small/default/probabilistic/seed0",

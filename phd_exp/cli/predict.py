@@ -24,7 +24,6 @@ from phd_exp.records.files import write_atomic
 from phd_exp.records.foreign import boxes_in
 from phd_exp.records.own_images import detections_in, images_in
 from phd_exp.records.recordings import MCAP, Detections, Recording, is_recording
-from phd_exp.records.runs import RunFolder
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
     from phd_exp.inference.predictor import Predictor
@@ -89,7 +88,7 @@ def main(words: list[str]) -> int:
         output_folder(out)
     predictor = loaded(arguments)
     guarantee = predictor.guarantee(arguments.coverage, arguments.groups) if arguments.coverage else None
-    curve = _depth_curve(arguments.run[0], predictor) if arguments.curve else None
+    curve = _depth_curve(predictor) if arguments.curve else None
     if out is not None and out.suffix != MCAP:
         _write(predictor, detections, out, curve, guarantee)
         return 0
@@ -135,7 +134,7 @@ def _write(predictor: "Predictor", detections: Detections, out: Path, curve: Any
     print(f"{file}, and a picture for each line", file=sys.stderr)
 
 
-def _depth_curve(run: Path, predictor: "Predictor") -> dict[str, Any]:
+def _depth_curve(predictor: "Predictor") -> dict[str, Any]:
     """The calibration curve of depth on the run's test samples, recalibrated like the predictions.
 
     Raises RunError if there is none, as for a baseline.
@@ -146,7 +145,7 @@ def _depth_curve(run: Path, predictor: "Predictor") -> dict[str, Any]:
     from phd_exp.evaluation.predictions import recalibrated
     from phd_exp.metrics.calibration import calibration_curve
 
-    file = RunFolder(run).predictions
+    file = predictor.folders[0].predictions
     table = read_table(file) if file.exists() else {}
     if predictor.temperature is not None:
         table = recalibrated(table, predictor.temperature)

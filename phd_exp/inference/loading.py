@@ -1,4 +1,4 @@
-"""From the folders of trained runs to a `Predictor`: of one network, or of an ensemble whose members fit together."""
+"""From trained runs, folders or files, to a `Predictor`: of one network, or of an ensemble whose members fit."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -18,6 +18,7 @@ from phd_exp.models.regressor import Regressor
 from phd_exp.models.weights import fill, regressor_weights
 from phd_exp.records.choices import first_difference, has_influence
 from phd_exp.records.errors import ConfigError, RunError, UserError, gist
+from phd_exp.records.packed import opened
 from phd_exp.records.runs import RunFolder
 
 OF_THE_INPUT = ("data.", "camera.", "model.head.")  # keys in which the members of an ensemble agree
@@ -34,7 +35,7 @@ def load(
     """The network of a run's best checkpoint, or its last; or an ensemble of several runs or views.
 
     Args:
-        run: the run's folder; several, or a folder of seeds, for an ensemble.
+        run: the run's folder, or a file of `pack`; several, or a folder of seeds, for an ensemble.
         device: "auto" chooses a GPU if there is one.
         recalibrate: apply the temperatures that fit the run's predictions of held-out samples.
         trust: packages other than phd_exp whose classes the run may build; None: any.
@@ -57,7 +58,7 @@ def load(
 
 def _members(runs: Sequence[str | Path]) -> tuple[list[RunFolder], Callable[[str], bool]]:
     """The runs to load, and which keys of theirs must be equal. A folder of seeds stands for its finished runs."""
-    folders = [RunFolder(Path(run)) for run in runs]
+    folders = [opened(Path(run)) for run in runs]
     if len(folders) == 1 and not folders[0].config_file.exists():
         seeds = [RunFolder(path) for path in sorted(folders[0].path.glob("seed*"))]
         if finished := [seed for seed in seeds if seed.is_finished()]:
@@ -87,7 +88,10 @@ def _require_alike(predictors: Sequence[Predictor], matters: Callable[[str], boo
 def _load(folder: RunFolder, device: str, trust: Trust) -> Predictor:
     """The network of one run, as trained."""
     if not folder.config_file.exists():
-        raise RunError(f"{folder.path}: no run; expected a folder with config.yaml and checkpoints/last.ckpt")
+        raise RunError(
+            f"{folder.path}: no run; expected a folder with config.yaml and checkpoints/last.ckpt, or a file "
+            "of `pack`"
+        )
     config = check(folder.config(), trust)
     require_same_shrinking(folder, config)
     depth, constant_f = recorded_constants(folder)

@@ -9,6 +9,7 @@ import torch
 from PIL import Image
 
 from tests.bad_input import images
+from tests.bad_input.archives import ARCHIVES
 from tests.bad_input.bad import EXPORT, LEARN, LEARN_HANDMADE, ONE, PREDICT, RUN, VERIFY, Bad
 from tests.bad_input.commands import ARGUMENTS, CONFIGURATIONS, nothing
 from tests.bad_input.place import Place
@@ -282,5 +283,5 @@ FOLDERS = [
 
 
 TABLE = [
-    *CONFIGURATIONS, *PICTURES, *LINES, *LABELS, *FORMATS, *CAMERAS, *ARGUMENTS, *CHECKPOINTS, *STORED, *RECORDS, *FOLDERS,
+    *CONFIGURATIONS, *PICTURES, *LINES, *LABELS, *FORMATS, *CAMERAS, *ARGUMENTS, *CHECKPOINTS, *STORED, *RECORDS, *ARCHIVES, *FOLDERS,
 ]  # fmt: skip

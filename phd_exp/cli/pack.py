@@ -1,0 +1,37 @@
+"""`python -m phd_exp pack`: a run as one file for others, with a card."""
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from phd_exp.cli.arguments import Arguments, output_folder, require_file, trusted
+from phd_exp.records.runs import RunFolder
+
+
+class PackArguments(Arguments):
+    """The run, the file, and what the card cannot know."""
+
+    run: Path
+    """the folder of a finished run"""
+    out: Path | None = None
+    """the file; by default run.zip in the run's folder"""
+    license: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9.+-]{0,99}$")] = "unknown"
+    """identifier of the licence that you give the weights, such as CC-BY-4.0, for the card"""
+    trust: str | None = None
+    """packages of the user's own parts that the run names, separated by commas; their code is executed"""
+
+
+def main(words: list[str]) -> int:
+    """Pack a run; returns the exit status."""
+    arguments = PackArguments.parsed("pack", words)
+    out = arguments.out or arguments.run / "run.zip"
+    require_file(out, "run.zip")
+    from phd_exp.inference.packing import pack
+
+    run = RunFolder(arguments.run)
+    output_folder(out.parent) if run.path.is_dir() else None
+    sizes = pack(run, out, arguments.license, trusted(arguments.trust))
+    print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {len(sizes)} files; README.md in it is the card")
+    print(f"  use it: python -m phd_exp predict run={out} image=photo.jpg f=PIXELS")
+    return 0
