@@ -390,9 +390,7 @@ def test_the_import_does_not_wait_for_torch_nor_a_prediction_for_lightning(run: 
     assert done.returncode == 0, done.stderr
 
 
-def test_a_prediction_imports_nothing_that_it_does_not_need(
-    make: Callable[..., RunFolder], photos: Path
-) -> None:
+def test_a_prediction_imports_nothing_that_it_does_not_need(make: Callable[..., RunFolder], photos: Path) -> None:
     """With recorded held-out samples, which a prediction reads to say how familiar it is."""
     run = make("data=folder", "data.folder=nowhere")
     pq.write_table(pa.table(dict(table_of(100, 1))), run.held_out)
