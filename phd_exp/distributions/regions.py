@@ -52,14 +52,21 @@ class Region:
 
     def outlines(self) -> list[Float[np.ndarray, "_ 2"]]:
         """The closed outlines of one region on the image, of (x, y)/z, and from above, of (x, z) in metres."""
-        p, (log_t, r), angle = self.distribution, self._discs, np.linspace(0, 2 * np.pi, 73)
-        q = r[::4, None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
-        t = np.broadcast_to(np.exp(log_t[::4, None, None]), (*q.shape[:2], 1))
-        xy = t * p.m_xy.double().numpy() + q @ np.linalg.inv(p.A.double().numpy())
-        border = p.apex.double().numpy() + float(p.mu_z) * np.concatenate([xy, t], -1).reshape(-1, 3)
+        border = self.rings(101, 72).reshape(-1, 3)
         views = border[:, :2] / border[:, 2:], border[:, ::2]
         hulls = [ConvexHull(view, qhull_options="QbB").vertices for view in views]
         return [view[[*hull, hull[0]]] for view, hull in zip(views, hulls, strict=True)]
+
+    def rings(self, depths: int, angles: int) -> Float[np.ndarray, "{depths} {angles} 3"]:
+        """Positions around the border of one region, metres, at increasing depths; at the first and the last depth,
+        all are the same. `depths` is a divisor of 400 plus one.
+        """
+        p, every, angle = self.distribution, 400 // (depths - 1), 2 * np.pi / angles * np.arange(angles)
+        log_t, r = (one[::every, None, None] for one in self._discs)
+        q = r * np.stack([np.cos(angle), np.sin(angle)], -1)
+        t = np.broadcast_to(np.exp(log_t), (depths, angles, 1))
+        xy = t * p.m_xy.double().numpy() + q @ np.linalg.inv(p.A.double().numpy())
+        return np.asarray(p.apex.double().numpy() + float(p.mu_z) * np.concatenate([xy, t], -1))
 
     @cached_property
     def _discs(self) -> tuple[Float[np.ndarray, "*batch depths"], Float[np.ndarray, "*batch depths"]]:
