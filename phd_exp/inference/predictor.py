@@ -284,6 +284,7 @@ class Predictor:
 
         Those of an ensemble have a dimension for the members before the last.
         """
+        prediction: Prediction
         if self.is_ensemble:
             prediction = self.members(raw, f, dtype).closest
         else:
