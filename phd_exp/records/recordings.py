@@ -1,4 +1,4 @@
-"""Images and `camera_info` of a ROS 2 recording: an MCAP file, or a rosbag2 folder with MCAP or SQLite files.
+"""Images and `camera_info` of a ROS 2 recording: an MCAP or SQLite file, or a rosbag2 folder with such files.
 
 `rosbags`, which the extra `ros` installs, reads them, one chunk at a time. Messages are decoded by the definitions of
 ROS 2, not by those in a stranger's file.
@@ -22,6 +22,7 @@ from phd_exp.records.files import require_plain
 from phd_exp.records.messages import COMPRESSED, INFO, RAW, SECOND, require_rosbags, typestore
 
 MCAP = ".mcap"
+FILES = (MCAP, ".db3")
 ENCODINGS = {"mono8": 1, "rgb8": 3, "bgr8": 3}
 """Encoding of an image that is not compressed -> bytes a pixel."""
 RECTIFIED = "image_rect"
@@ -29,8 +30,8 @@ RECTIFIED = "image_rect"
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a path is a recording: an MCAP file, or a folder with rosbag2's `metadata.yaml`."""
-    return (path.suffix == MCAP and not path.is_dir()) or (path / "metadata.yaml").is_file()
+    """Whether a path is a recording: an MCAP or SQLite file, or a folder with rosbag2's `metadata.yaml`."""
+    return (path.suffix in FILES and not path.is_dir()) or (path / "metadata.yaml").is_file()
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +67,8 @@ class Recording:
         """
         require_rosbags("folder")
         with _opened(path) as reader:
-            counts = {(one.topic, one.msgtype): one.msgcount for one in reader.connections if one.msgcount}
-        topics = {name: kind for name, kind in counts}
+            counts = {(one.topic, _kind(one)): one.msgcount for one in reader.connections if one.msgcount}
+        topics = dict(counts.keys())
         name, _, given = (topic or "").partition(",")
         images = _chosen(path, name, [one for one, kind in topics.items() if kind in (RAW, COMPRESSED)])
         infos, calibration = None, None
@@ -178,8 +179,14 @@ def _messages(path: Path, topics: list[str]) -> Iterator[tuple[int, str, Any]]:
                 if (one := next(found, None)) is None:
                     return
                 connection, time, data = one
-                message = typestore().deserialize_cdr(data, connection.msgtype)
+                message = typestore().deserialize_cdr(data, _kind(connection))
             yield time, connection.topic, message
+
+
+def _kind(connection: Any) -> str:
+    """The type of the messages; early recordings of ROS 2 have `sensor_msgs/Image`, without `msg`."""
+    package, _, name = connection.msgtype.rpartition("/")
+    return f"{package.removesuffix('/msg')}/msg/{name}"
 
 
 @contextmanager
