@@ -1,8 +1,10 @@
 """Recordings of ROS 2: messages read by another library, images of recordings as those of files, and mistakes."""
 
+import contextlib
 import io
 import json
 import re
+import sqlite3
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -185,9 +187,17 @@ def as_sqlite(folder: Path, messages: list[Message]) -> Path:
     return folder / "bag"
 
 
+def as_early_file(folder: Path, messages: list[Message]) -> Path:
+    """A database whose types have the names of the first releases of ROS 2."""
+    (file,) = as_sqlite(folder, messages).glob("*.db3")
+    with contextlib.closing(sqlite3.connect(file)) as database, database:
+        database.execute("UPDATE topics SET type = replace(type, '/msg/', '/')")
+    return file
+
+
 @pytest.mark.parametrize(
     ("encoding", "store"),
-    [("mono8", as_file), ("rgb8", as_file), ("bgr8", as_file), ("bgr8", as_sqlite), ("png", as_sqlite)],
+    [("mono8", as_file), ("rgb8", as_file), ("bgr8", as_file), ("bgr8", as_sqlite), ("png", as_early_file)],
 )
 def test_images_of_all_encodings_are_those_of_files(
     phd_exp: Callable, run: str, tmp_path: Path, encoding: str, store: Callable
