@@ -17,7 +17,7 @@ from phd_exp.cli.arguments import (
     predicted,
     require_covariance,
     require_output,
-)  # fmt: skip
+)
 from phd_exp.records.detections import NumberOrName, detections_of
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import write_atomic

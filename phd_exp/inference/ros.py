@@ -24,7 +24,7 @@ from phd_exp.records.own_images import Observed
 
 CAMERA = "camera"
 LATEST = 2**31  # seconds, which a message holds in 32 bits
-QUALITY = 95  # of JPEG
+HOW = {"png": {"compress_level": 1}, "jpeg": {"quality": 95}}  # other levels take several times as long
 MARKS = {"png": b"\x89PNG\r\n\x1a\n", "jpeg": b"\xff\xd8\xff"}
 """Format of image files -> their first bytes."""
 
@@ -77,7 +77,7 @@ def write_path(
     """
     for one in path:
         shown, moves = one.frame, one.frame.pose is not HERE
-        time, (height, width) = origin + _nanoseconds(shown.time, shown.where), shown.image.shape[:2]
+        time, (height, width) = _nanoseconds(shown.where, shown.time, origin), shown.image.shape[:2]
         content = _encoded(Image.fromarray(shown.image), "jpeg")
         photograph = Photograph("jpeg", content, (width, height), shown.K, shown.lens)
         messages.photograph(time, frame, CAMERA, photograph)
@@ -94,15 +94,18 @@ def write_path(
 def _time(detection: Detection, number: int) -> int:
     """The time of an image, ns; without one, its number in seconds."""
     if detection.recorded:
-        return detection.recorded.time
+        return _nanoseconds(detection.where, 0.0, detection.recorded.time)
     time = detection.line.time
-    return number * SECOND if time is None else _nanoseconds(time, detection.where)
+    return number * SECOND if time is None else _nanoseconds(detection.where, time)
 
 
-def _nanoseconds(time: float, where: str) -> int:
-    if not 0 <= time < LATEST:
-        raise DatasetError(f"{where}: time: got {time:g}; messages need 0 to {LATEST} seconds")
-    return round(time * SECOND)
+def _nanoseconds(where: str, time: float, origin: int = 0) -> int:
+    """The time (s) after an origin (ns), ns. Raises DatasetError for one that a message cannot hold."""
+    if not 0 <= origin / SECOND + time < LATEST:
+        raise DatasetError(
+            f"{where}: time: got {origin / SECOND + time:g} s; messages have times from 0 to {LATEST} s"
+        )
+    return origin + round(time * SECOND)
 
 
 def _located(sighting: Sighting) -> Located:
@@ -123,7 +126,7 @@ def _photograph(sighting: Sighting) -> Photograph:
 
 def _encoded(image: Image.Image, kind: str) -> bytes:
     stream = io.BytesIO()
-    image.save(stream, kind, quality=QUALITY)  # PNG has no quality
+    image.save(stream, kind, **HOW[kind])
     return stream.getvalue()
 
 

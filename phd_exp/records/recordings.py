@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from phd_exp.records.cameras import Calibration, calibration_in, read_camera
 from phd_exp.records.detections import Detection, RecordedImage, line_of
-from phd_exp.records.errors import DatasetError, UserError, gist, listed, shown
+from phd_exp.records.errors import UNPRINTABLE, DatasetError, UserError, gist, listed, one_line, shown
 from phd_exp.records.files import require_plain
 from phd_exp.records.messages import COMPRESSED, INFO, RAW, SECOND, require_rosbags, typestore
 
@@ -67,22 +67,22 @@ class Recording:
         """
         require_rosbags("folder")
         with _opened(path) as reader:
-            counts = {(one.topic, _kind(one)): one.msgcount for one in reader.connections if one.msgcount}
+            found = [one for one in reader.connections if one.msgcount and not UNPRINTABLE.search(one.topic)]
+            counts = {(one.topic, _kind(one)): one.msgcount for one in found}
         topics = dict(counts.keys())
         name, _, given = (topic or "").partition(",")
         images = _chosen(path, name, [one for one, kind in topics.items() if kind in (RAW, COMPRESSED)])
         infos, calibration = None, None
         if camera.keys() <= {"box"}:
             infos = _info_of(path, images, given, [one for one, kind in topics.items() if kind == INFO])
-            _, _, message = next(_messages(path, [infos]))
-            calibration = _calibration(path, images, infos, message)
+            calibration = _calibration(path, images, infos, _first(path, infos)[1])
             camera = {"camera": infos, **camera}
         elif "camera" in camera:
             calibration = read_camera(Path(camera["camera"]))
         line = line_of({"file_name": images, **camera}, str(path))
         n = counts[images, topics[images]]
         template = Detection(line, path, str(path), calibration)
-        time, _, message = next(_messages(path, [images]))
+        time, message = _first(path, images)
         return cls(path, images, template, infos, n, _time(message, time), str(message.header.frame_id))
 
     def __len__(self) -> int:
@@ -145,8 +145,8 @@ def _calibration(path: Path, images: str, infos: str, message: Any) -> Calibrati
 
 def _time(message: Any, recorded: int) -> int:
     """The time at which a message was taken (ns); if it does not say, that of its recording."""
-    stamp = message.header.stamp
-    return stamp.sec * SECOND + stamp.nanosec or recorded
+    time: int = message.header.stamp.sec * SECOND + message.header.stamp.nanosec
+    return time if time > 0 else recorded
 
 
 def _image_file(where: str, message: Any) -> bytes:
@@ -168,6 +168,13 @@ def _image_file(where: str, message: Any) -> bytes:
     pixels = message.data.reshape(height, step)[:, : width * bands].reshape(height, width, bands)
     pixels = pixels[..., ::-1] if encoding == "bgr8" else pixels
     return b"P%d %d %d 255\n" % (5 if bands == 1 else 6, width, height) + np.ascontiguousarray(pixels).tobytes()
+
+
+def _first(path: Path, topic: str) -> tuple[int, Any]:
+    """Time of recording (ns) and content of the first message."""
+    for time, _, message in _messages(path, [topic]):
+        return time, message
+    raise DatasetError(f"{path}: got no message of {topic}, which its index names; copy the file again")
 
 
 def _messages(path: Path, topics: list[str]) -> Iterator[tuple[int, str, Any]]:
@@ -213,9 +220,10 @@ def _reading(path: Path) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:
+        reason = one_line(gist(error)) or type(error).__name__
         raise DatasetError(
-            f"{path}: cannot be read as a recording of ROS 2 ({gist(error) or type(error).__name__}); copy the file "
-            "again; if its writer was interrupted, `mcap recover` or `ros2 bag reindex` repairs it"
+            f"{path}: cannot be read as a recording of ROS 2 ({reason}); copy the file again; if its writer was "
+            "interrupted, `mcap recover` or `ros2 bag reindex` repairs it"
         ) from None
 
 

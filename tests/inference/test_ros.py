@@ -359,6 +359,9 @@ SPOILED: dict[str, tuple[Callable[[Path], Any], str, int]] = {
     "damaged": (lambda file: damaged(recorded(file)), UNREADABLE, 0),
     "empty": (lambda file: file.write_bytes(b""), UNREADABLE + ".*empty", 0),
     "text": (lambda file: file.write_text("no recording"), UNREADABLE + ".*magic", 0),
+    "an unprintable topic": (
+        lambda file: write(file, [CAMERA, image(pictures(1)[0], "rgb8", START, "/a\nerror: b")]), r"has no images", 0
+    ),
     "missing": (lambda file: None, UNREADABLE + "No such file or directory", 0),
 }  # fmt: skip
 """What makes a recording, the line that refuses it, and the frames before."""
@@ -397,6 +400,15 @@ def test_a_bad_image_leaves_the_predictions_before_it(phd_exp: Callable, run: st
     outcome = phd_exp("predict", run, "folder=a.mcap", "out=b.mcap")
     assert "the camera changes" in outcome.error
     assert len(read_lines(outcome.out)) == len(written(tmp_path / "b.mcap")["/detections"]) == 5
+
+
+def test_a_time_that_messages_cannot_hold_is_refused(phd_exp: Callable, run: str, tmp_path: Path) -> None:
+    late = 2**31 * SECOND - 1000  # the time of recording is later, as that of an image without one is
+    shot = image(pictures(1)[0], "rgb8", late)
+    shot = shot._replace(content=shot.content | {"header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}})
+    write(tmp_path / "a.mcap", [CAMERA, shot])
+    outcome = phd_exp("predict", run, "folder=a.mcap", "out=b.mcap")
+    assert "time: got 2.14748e+09 s; messages have times from 0 to 2147483648 s" in outcome.error
 
 
 def test_a_folder_without_its_database_is_refused(phd_exp: Callable, run: str, tmp_path: Path) -> None:
