@@ -17,6 +17,7 @@ WORDS = {
     "guides/ros.md": ["ROS2", "rosbag", "MCAP", "Foxglove", "rclpy", "robot"],
     "guides/search.md": ["hyperparameter", "tune"],
     "guides/several_cameras.md": ["stereo", "triangulation"],
+    "guides/sharing.md": ["install", "docker", "publish", "model card", "licence", "license"],
     "guides/shift.md": ["robustness", "out of distribution"],
     "guides/tracking.md": ["video", "sequence", "Kalman filter", "smoother", "trajectory"],
     "ideas/calibration.md": ["confidence", "reliability"],
