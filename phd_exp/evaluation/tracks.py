@@ -15,7 +15,7 @@ from phd_exp.evaluation.point_errors import SEED
 from phd_exp.evaluation.predictions import Curve, scalar_bands
 from phd_exp.evaluation.several_views import SeveralViews
 from phd_exp.fusion import Pose
-from phd_exp.fusion.tracks import ConstantVelocity, Gaussian, Lost, Path, Slow, autocorrelation, standardised_errors
+from phd_exp.fusion.tracks import ConstantVelocity, Gaussian, Lost, Path, Slow, correlation_time, standardised_errors
 from phd_exp.fusion.tracks import track as smoothed
 from phd_exp.metrics.bootstrap import Interval, bands
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error, squared_mahalanobis
@@ -32,7 +32,7 @@ HIDDEN = 0.3  # visibility below which the object counts as hidden
 WHOLE = Lost(after=math.inf, contradictions=10**9)  # no track ends early: all methods have the same frames
 NOISES = (0.01, 100.0)  # m/s^2 per sqrt(Hz), among which the noise of the motion is chosen
 PRECISION = 0.05  # of its logarithm
-PARTS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the shares by autocorrelation, among which those of slow errors are chosen
+FACTORS = (1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)  # of the noise and the time constants of paths with slow errors
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,13 @@ class Choice:
 
     Attributes:
         noise: of each smoother's motion, m/s^2 per sqrt(Hz).
+        speed: of the motion in the first frame, m/s.
         slow: the slow errors of the smoother.
-        correlated: shares and time constants of the autocorrelation of standardised errors.
+        correlated: those by the autocorrelation of standardised errors.
     """
 
     noise: dict[Method, float]
+    speed: float
     slow: Slow
     correlated: Slow
 
@@ -82,22 +84,33 @@ def place(quantity: str, method: Method) -> str:
 
 
 def choose(held_out: Sequence[SeveralViews]) -> Choice:
-    """Each noise by the likelihood of the predictions, the slow errors by that of the true positions.
+    """The motion and the slow errors that suit held-out sequences.
 
-    The time constants are those of the autocorrelation of standardised errors. Its shares are upper bounds: a
-    factor of depth in proportion to each frame's predicted deviation exaggerates their differences, so that one of
-    `PARTS` of both shares is chosen, with which the true positions are most likely under the paths' covariances.
+    The speed is that of the true positions. The noise of smoothers of independent frames makes the predictions most
+    likely. With slow errors, where the predictions hardly tell the noise, it makes the true positions most likely
+    under the path's covariances, as do both time constants, among `FACTORS` times those of the autocorrelation.
 
     Raises RunError if no sequence has a path.
     """
-    whole = correlated(held_out)
-    noise = {method: _noise(held_out, method) for method in SMOOTHERS[:2]}
-    noise["slow"] = noise["independent"]
-    parts = [
-        replace(whole, depth_share=part * whole.depth_share, projection_share=part * whole.projection_share)
-        for part in PARTS
-    ]
-    return Choice(noise, min(parts, key=lambda slow: _surprisal(held_out, Choice(noise, slow, whole))), whole)
+    start, speed = correlated(held_out), _speed(held_out)
+    found = Choice({}, speed, start, start)
+    noise = {method: _noise(held_out, found, method) for method in SMOOTHERS[:2]}
+    found = replace(found, noise=noise | {"slow": noise["independent"]})
+    for change in (_with_noise, _with_depth_time, _with_projection_time, _with_noise):
+        found = min((change(found, factor) for factor in FACTORS), key=lambda one: _surprisal(held_out, one))
+    return found
+
+
+def _with_noise(choice: Choice, factor: float) -> Choice:
+    return replace(choice, noise=choice.noise | {"slow": factor * choice.noise["slow"]})
+
+
+def _with_depth_time(choice: Choice, factor: float) -> Choice:
+    return replace(choice, slow=replace(choice.slow, depth_time=factor * choice.slow.depth_time))
+
+
+def _with_projection_time(choice: Choice, factor: float) -> Choice:
+    return replace(choice, slow=replace(choice.slow, projection_time=factor * choice.slow.projection_time))
 
 
 def _surprisal(held_out: Sequence[SeveralViews], choice: Choice) -> float:
@@ -109,24 +122,33 @@ def _surprisal(held_out: Sequence[SeveralViews], choice: Choice) -> float:
             if path:
                 distance = squared_mahalanobis(truth[row] - path.mean, path.covariance)
                 found += float((distance + torch.linalg.slogdet(path.covariance)[1]).sum()) / 2
-    return found
+    return found if math.isfinite(found) else math.inf
+
+
+def _speed(held_out: Sequence[SeveralViews]) -> float:
+    """Root mean square of the velocity of the true positions along an axis, m/s."""
+    squares = []
+    for one in held_out:
+        moved = one.pose.into_world(one.xyz).diff(dim=1) / one.columns["time"].diff(dim=1)[..., None]
+        squares.append(moved.square().flatten())
+    return float(torch.cat(squares).mean().sqrt())
 
 
 def correlated(held_out: Sequence[SeveralViews]) -> Slow:
-    """Shares and time constants of the autocorrelation of standardised errors."""
+    """The time constants by the autocorrelation of standardised errors."""
     times = [row for one in held_out for row in one.columns["time"].numpy()]
     both = [standardised_errors(one.predictions, one.xyz) for one in held_out]
     depth = [row for errors, _ in both for row in errors.numpy()]
     across = [row for _, errors in both for axis in errors.unbind(-1) for row in axis.numpy()]
     of_axes = [row for one in held_out for _ in range(2) for row in one.columns["time"].numpy()]
-    return Slow(*autocorrelation(times, depth), *autocorrelation(of_axes, across))
+    return Slow(correlation_time(times, depth), correlation_time(of_axes, across))
 
 
-def _noise(held_out: Sequence[SeveralViews], method: Method) -> float:
+def _noise(held_out: Sequence[SeveralViews], known: Choice, method: Method) -> float:
     """The noise of highest total `log_evidence`."""
 
     def loss(log_noise: float) -> float:
-        choice = Choice({method: math.exp(log_noise)}, Slow(), Slow())
+        choice = replace(known, noise={method: math.exp(log_noise)})
         found = [path.log_evidence for one in held_out for path in _paths(one, method, choice) if path]
         if not found:
             raise RunError("sequences: not one held-out sequence has a path; train longer")
@@ -139,7 +161,8 @@ def _noise(held_out: Sequence[SeveralViews], method: Method) -> float:
 def _paths(sequences: SeveralViews, method: Method, choice: Choice) -> Iterator[Path | None]:
     """The path of each sequence; None where there is none in front of the camera."""
     predictions = from_columns({name: column[..., None] for name, column in sequences.columns.items()})
-    motion, slow = ConstantVelocity(choice.noise[method]), choice.slow if method == "slow" else Slow()
+    motion = ConstantVelocity(choice.noise[method], choice.speed)
+    slow = choice.slow if method == "slow" else Slow()
     for row, times in enumerate(sequences.columns["time"]):
         pose = Pose(sequences.pose.R[row, :, None], sequences.pose.t[row, :, None])
         given = Gaussian.of(predictions[row]) if method == "kalman" else predictions[row]

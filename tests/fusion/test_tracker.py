@@ -9,15 +9,15 @@ import torch
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion import Pose
 from phd_exp.fusion.tracks import ConstantVelocity, Gaussian, Lost, Slow, State, Tracker, track
-from tests.support.paths import around, chosen, drawn_paths, share_of
+from tests.support.paths import NO_ERRORS, Errors, around, chosen, drawn_paths
 
 LAW, TIMES = ConstantVelocity(noise=0.3, speed=0.3), np.arange(40) / 30
 NEVER = Lost(after=math.inf, contradictions=10**6)
 POSE = around(1)
 
 
-def drawn(slow: Slow | None = None) -> ProjectedHuber:
-    predictions, _ = drawn_paths(1, TIMES, LAW, POSE, deviation=0.05, slow=slow, seed=1)
+def drawn(errors: Errors = NO_ERRORS) -> ProjectedHuber:
+    predictions, _ = drawn_paths(1, TIMES, LAW, POSE, errors=errors, seed=1)
     return chosen(predictions, 0)
 
 
@@ -60,11 +60,14 @@ def test_a_lag_of_all_frames_gives_the_path_and_a_shorter_one_nearly() -> None:
     assert squared.mean() < 0.1
 
 
-def test_the_slow_factor_of_depth_is_carried_on() -> None:
-    slow = Slow(depth_share=share_of(0.05, 20.0), depth_time=1.0)
-    predictions = drawn(slow)
-    path = track(torch.from_numpy(TIMES), predictions, POSE, LAW, slow=slow, lost=NEVER)
-    last = fed(Tracker(LAW, 10, slow), predictions)[-1]
+def test_slow_errors_weigh_the_frames_as_on_a_whole_path() -> None:
+    slow, mask = Slow(0.4, 0.2), torch.ones(40, 1, dtype=torch.bool)
+    mask[12:18] = False
+    predictions = drawn(Errors(deviation=0.05, share=0.4))
+    path = track(torch.from_numpy(TIMES), predictions, POSE, LAW, mask, slow, NEVER)
+    whole = fed(Tracker(LAW, 100, slow), predictions, mask)
+    torch.testing.assert_close(torch.stack([state.point for state in whole]), path.point, rtol=0, atol=1e-7)
+    last = fed(Tracker(LAW, 10, slow), predictions, mask)[-1]
     off = last.mean - path.mean[-1]
     assert off @ torch.linalg.solve(path.covariance[-1], off) < 1
     ratios = torch.linalg.eigvals(torch.linalg.solve(path.covariance[-1], last.covariance)).real
@@ -109,5 +112,7 @@ def test_bad_input_is_refused_on_one_line() -> None:
         tracker.update(1.1, chosen(drawn(), 1), Pose(POSE.R.expand(2, 3, 3), POSE.t.expand(2, 3)))
     with pytest.raises(ValueError, match=r"^lag: got -1; expected"):
         Tracker(LAW, lag=-1)
+    with pytest.raises(ValueError, match=r"^lag: got 0; expected a number of frames, at least 1$"):
+        Tracker(LAW, lag=0, slow=Slow(1.0), lost=Lost(contradictions=1))
     with pytest.raises(ValueError, match=r"^lost.contradictions: got 5; expected at most lag \+ 1 = 3 frames$"):
         Tracker(LAW, lag=2)

@@ -216,7 +216,7 @@ def bad_input() -> dict[str, tuple[dict[str, Any], str]]:
         "a prediction": (bad(predictions=broken), r"frame 2: a prediction, pose or plane is not finite"),
         "nothing": (bad(mask=torch.zeros(4, 1, dtype=torch.bool)), r"mask: got no prediction in any frame"),
         "a baseline": (bad(predictions=POINTS), r"predictions: got PointEstimate; expected Projected"),
-        "slow": (bad(predictions=Gaussian.of(predictions), slow=Slow(0.5)), r"slow: got Gaussian predictions; exp"),
+        "slow": (bad(predictions=Gaussian.of(predictions), slow=Slow(depth_time=0.5)), r"slow: got Gaussian predictions; exp"),
         "singular": (
             bad(predictions=Gaussian(predictions.mean, 0 * predictions.covariance_matrix)),
             r"frame 0: a prediction, pose or plane is not finite",
@@ -250,8 +250,8 @@ def test_bad_input_is_refused_on_one_line(case: str) -> None:
     [
         (lambda: ConstantVelocity(noise=0.0), "noise: got 0.0; expected a positive number"),
         (lambda: replace(ConstantAcceleration(1.0), acceleration=math.inf), "acceleration: got inf; expected"),
-        (lambda: Slow(depth_share=1.0), "depth_share: got 1.0; expected a share from 0 to less than 1"),
-        (lambda: Slow(projection_time=-1.0), "projection_time: got -1.0; expected a positive number of seconds"),
+        (lambda: Slow(depth_time=math.inf), "depth_time: got inf; expected a number of seconds, 0 for"),
+        (lambda: Slow(projection_time=-1.0), "projection_time: got -1.0; expected a number of seconds"),
         (lambda: Lost(after=0.0), "after: got 0.0; expected a positive number of seconds"),
         (lambda: Lost(contradictions=0), "contradictions: got 0; expected a number of frames"),
         (lambda: Lost(probability=1.0), "probability: got 1.0; expected a probability"),

@@ -6,15 +6,15 @@ import torch
 from scipy import stats
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.fusion.tracks import ConstantVelocity, Lost, Slow, autocorrelation, estimated, standardised_errors, track
+from phd_exp.fusion.tracks import ConstantVelocity, Lost, Slow, correlation_time, estimated, standardised_errors, track
+from phd_exp.fusion.tracks.slow import weights
 from phd_exp.metrics.errors import squared_mahalanobis
-from tests.support.paths import around, chosen, drawn_paths, share_of
+from tests.support.paths import NO_ERRORS, Errors, around, chosen, drawn_paths
 
 LAW, TIMES = ConstantVelocity(noise=0.3, speed=0.3), np.arange(60) / 30
 NEVER = Lost(contradictions=10**6)
-DEVIATION = 0.05
-SLOW_DEPTH = Slow(depth_share=share_of(DEVIATION, 20.0), depth_time=1.0)
-SLOW = Slow(SLOW_DEPTH.depth_share, 1.0, projection_share=0.4, projection_time=0.5)
+DEPTH = Errors(deviation=0.05, depth_time=1.0)  # 38 % of the variance
+BOTH = Errors(0.05, 1.0, share=0.4, projection_time=0.5)
 
 
 @pytest.mark.parametrize("a", [3.0, 20.0, 100.0])
@@ -29,10 +29,10 @@ def test_one_frame_has_the_moments_of_its_density(a: float) -> None:
     assert (ratios - 1).abs().max() < 0.02
 
 
-def nees(n: int, used: Slow, *, cameras: int = 1, slow: Slow | None = None, seed: int = 0) -> tuple[float, float]:
+def nees(n: int, used: Slow, *, cameras: int = 1, errors: Errors = NO_ERRORS, seed: int = 0) -> tuple[float, float]:
     """Squared Mahalanobis distances over 3, averaged over each of n paths: their mean, and half its 95 % interval."""
-    pose, deviation = around(cameras), DEVIATION if slow else 0.0
-    drawn, truth = drawn_paths(n, TIMES, LAW, pose, deviation=deviation, slow=slow, seed=seed)
+    pose = around(cameras)
+    drawn, truth = drawn_paths(n, TIMES, LAW, pose, errors=errors, seed=seed)
     found = []
     for i in range(n):
         path = track(torch.from_numpy(TIMES), chosen(drawn, i), pose, LAW, slow=used, lost=NEVER)
@@ -46,26 +46,42 @@ def test_independent_errors_are_within_their_covariance(cameras: int) -> None:
     assert abs(mean - 1) < half < 0.1
 
 
-@pytest.mark.parametrize("slow", [SLOW_DEPTH, pytest.param(SLOW, marks=pytest.mark.slow)])
-def test_slow_errors_are_within_the_covariance_if_they_are_carried_and_far_outside_if_not(slow: Slow) -> None:
-    mean, half = nees(60, slow, slow=slow)
-    assert abs(mean - 1) < half < 0.15
-    ignored, half = nees(30, Slow(), slow=slow)
+@pytest.mark.parametrize(
+    ("errors", "slow"),
+    [(DEPTH, Slow(0.38)), pytest.param(BOTH, Slow(0.38, 0.2), marks=pytest.mark.slow)],
+)
+def test_slow_errors_are_about_within_the_covariance_if_frames_have_weights_and_far_outside_if_not(
+    errors: Errors, slow: Slow
+) -> None:
+    mean, half = nees(60, slow, errors=errors)
+    print(mean, half)
+    assert abs(mean - 1) < 0.3
+    ignored, half = nees(30, Slow(), errors=errors)
     assert ignored - half > 2
 
 
-def test_share_and_time_of_slow_errors_are_found() -> None:
-    drawn, truth = drawn_paths(200, TIMES, LAW, around(1), deviation=DEVIATION, slow=SLOW, seed=5)
+def test_weights_are_those_of_the_best_mean_of_a_process() -> None:
+    """The rows of the inverse correlation matrix; masked frames do not count."""
+    times = np.cumsum(np.random.default_rng(0).uniform(0.01, 0.2, 12))
+    seen = np.arange(12) != 5
+    since = np.concatenate([[np.inf], np.diff(times)])
+    since[6] += since[5]
+    found = weights(0.3, since[:, None], seen[:, None])[:, 0]
+    correlation = np.exp(-abs(times[seen, None] - times[seen]) / 0.3)
+    np.testing.assert_allclose(found[seen], np.linalg.solve(correlation, np.ones(11)), rtol=1e-9)
+    assert found[5] == 0
+    np.testing.assert_array_equal(weights(0.0, since[:, None], seen[:, None])[:, 0], seen)
+
+
+def test_the_time_constant_of_slow_errors_is_found() -> None:
+    drawn, truth = drawn_paths(200, TIMES, LAW, around(1), errors=BOTH, seed=5)
     depth, projection = standardised_errors(drawn, around(1).into_camera(truth[:, :, None]))
     times = [TIMES] * 200
-    share, time = autocorrelation(times, list(depth[..., 0].numpy()))
-    assert share == pytest.approx(SLOW.depth_share, abs=0.08)
-    assert time == pytest.approx(1.0, rel=0.4)
-    share, time = autocorrelation(times * 2, [*projection[..., 0, 0].numpy(), *projection[..., 0, 1].numpy()])
-    assert share == pytest.approx(0.4, abs=0.08)
-    assert time == pytest.approx(0.5, rel=0.4)
+    assert correlation_time(times, list(depth[..., 0].numpy())) == pytest.approx(0.38, rel=0.4)
+    both = [*projection[..., 0, 0].numpy(), *projection[..., 0, 1].numpy()]
+    assert correlation_time(times * 2, both) == pytest.approx(0.2, rel=0.4)
     with pytest.raises(ValueError, match=r"^times: got 1 sequences of one frame at most; expected"):
-        autocorrelation([TIMES[:1]], [TIMES[:1]])
+        correlation_time([TIMES[:1]], [TIMES[:1]])
 
 
 def test_the_noise_of_the_motion_is_found() -> None:

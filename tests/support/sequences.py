@@ -10,18 +10,18 @@ from phd_exp.data.batches import Batch
 from phd_exp.evaluation.several_views import ROTATION, TRANSLATION
 from phd_exp.fusion.tracks import ConstantVelocity, Slow
 from phd_exp.training.predictions import columns, write_parquet
-from tests.support.paths import HERTZ, around, chosen, drawn_paths
+from tests.support.paths import HERTZ, NO_ERRORS, Errors, around, chosen, drawn_paths
 
 MOTION = ConstantVelocity(noise=0.3, speed=0.3)
-DEVIATION = 0.05  # of slow log depth
 CAMERA = 1  # of two
-SLOW = Slow(0.38, 1.0, 0.4, 0.5)
+ERRORS = Errors(deviation=0.05, depth_time=1.0, share=0.4, projection_time=0.5)
+SLOW = Slow(0.38 * 1.0, 0.4 * 0.5)  # the integrals of their autocorrelations
 
 
-def write_sequences(file: Path, n: int, frames: int, *, slow: Slow | None = None, seed: int = 0) -> None:
+def write_sequences(file: Path, n: int, frames: int, *, errors: Errors = NO_ERRORS, seed: int = 0) -> None:
     """`n` sequences at 30 Hz from one camera, which is not the world's; every third frame counts as hidden."""
     pose, times = around(2), np.arange(frames) / HERTZ
-    drawn, truth = drawn_paths(n, times, MOTION, pose, deviation=DEVIATION if slow else 0.0, slow=slow, seed=seed)
+    drawn, truth = drawn_paths(n, times, MOTION, pose, errors=errors, seed=seed)
     xyz, rows = pose.into_camera(truth[:, :, None])[:, :, CAMERA].flatten(0, 1), torch.arange(n * frames)
     image = torch.zeros(len(rows), 1, 1, 3, dtype=torch.uint8)
     batch = Batch(image, xyz, torch.full((len(rows),), 1500.0), S=224.0, row=rows)

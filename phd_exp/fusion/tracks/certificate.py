@@ -19,7 +19,7 @@ def certify(chain, work, x, lam, distance):
 
     Both hold for any x and any lam in [-1, 1], and are infinite where the energy is too flat. The bound of
     `phd_exp.fusion.certificate`, for all frames together: with a subgradient G, a curvature H that holds while no
-    frame's measured unknowns move by more than rho, and e for kinks that are not exactly at t = 1, a lower energy
+    frame's position moves by more than rho, and e for kinks that are not exactly at t = 1, a lower energy
     at x + d needs
 
         G.d + d.H d/2 - e <= 0    so    d.H d <= (|G| + sqrt(|G|^2 + 2 e))^2 with |G|^2 = G.H^(-1) G
@@ -29,7 +29,6 @@ def certify(chain, work, x, lam, distance):
 
     Source: own derivation; checked against a conic solver in tests/fusion/test_tracks.py.
     """
-    n = chain.slope.shape[3]
     covariance = np.empty_like(work.L)
     measure_all(chain, x, work.at)
     motion_energy(chain, 1.0, x, work.pull)
@@ -45,12 +44,9 @@ def certify(chain, work, x, lam, distance):
         selected_inverse(work.L, work.below, covariance)
         farthest = 0.0
         for k in range(len(x)):
-            trace = 0.0
-            for i in range(n):
-                trace += covariance[k, i, i]
-                if i == 2:
-                    distance[k] = math.sqrt(trace) * reach
-            farthest = max(farthest, math.sqrt(trace) * reach) if trace >= 0 else np.inf
+            trace = covariance[k, 0, 0] + covariance[k, 1, 1] + covariance[k, 2, 2]
+            distance[k] = math.sqrt(trace) * reach
+            farthest = max(farthest, distance[k]) if trace >= 0 else np.inf
         if farthest <= radius:
             return squared / 2 + error
     distance[:] = np.inf
@@ -61,7 +57,7 @@ def certify(chain, work, x, lam, distance):
 def _subgradient(chain, work, lam, G):
     """Adds the subgradients of the cameras to G; returns how much the energy at kinks may be lower than assumed."""
     error = 0.0
-    nothing = np.zeros((chain.slope.shape[3], chain.slope.shape[3]))
+    nothing = np.zeros((3, 3))
     for k in range(len(lam)):
         for c in range(lam.shape[1]):
             q_x, q_y, t = work.at[k, c]
@@ -71,7 +67,7 @@ def _subgradient(chain, work, lam, G):
                 add_camera(slope, q_x, q_y, t, 0.0, 0.0, 0.0, 0.0, G[k], nothing)
                 continue
             kink = abs(t - 1) <= KINK and abs(lam[k, c]) < 1
-            weight, _, _ = huber_weight(q_x, q_y)
+            weight = chain.p[k, c] * huber_weight(q_x, q_y)[0]
             by_t = lam[k, c] if kink else 1.0 if t >= 1 else -1 / (t * t)
             add_camera(slope, weight * q_x, weight * q_y, a * by_t, 0.0, 0.0, 0.0, 0.0, G[k], nothing)
             error += 3 * a * abs(t - 1) if kink else 0.0
@@ -80,14 +76,14 @@ def _subgradient(chain, work, lam, G):
 
 @compiled
 def _add_least_curvature(chain, work, lam, radius):
-    """Adds a lower bound of the cameras' curvature while no frame's measured unknowns move by more than radius."""
-    nothing = np.zeros(chain.slope.shape[3])
+    """Adds a lower bound of the cameras' curvature while no frame's position moves by more than radius."""
+    nothing = np.zeros(3)
     for k in range(len(lam)):
         for c in range(lam.shape[1]):
-            slope, a = chain.slope[k, c], chain.a[k, c]
+            slope, a, p = chain.slope[k, c], chain.a[k, c], chain.p[k, c]
             if a == GAUSSIAN:
                 add_camera(slope, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 1.0, nothing, work.L[k])
                 continue
             is_at_kink = abs(work.at[k, c, 2] - 1) <= KINK and abs(lam[k, c]) < 1
-            bounds = least_curvature_of_camera(slope, work.at[k, c], a, lam[k, c], is_at_kink, radius)
-            add_camera(slope, 0.0, 0.0, 0.0, *bounds, nothing, work.L[k])
+            xx, xy, yy, tt = least_curvature_of_camera(slope, work.at[k, c], a, lam[k, c], is_at_kink, radius)
+            add_camera(slope, 0.0, 0.0, 0.0, p * xx, p * xy, p * yy, tt, nothing, work.L[k])

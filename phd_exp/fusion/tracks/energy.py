@@ -1,9 +1,9 @@
 """The energy of a path: that of the frames' predictions, and a quadratic one of the motion from frame to frame.
 
-A frame has d unknowns x_k, of which the first n are measured. Each camera measures (q_x, q_y, t) = at_origin +
-slope x_k, as in `phd_exp.fusion.arithmetic`; slope is 3 x n. Its energy is h(|q|) + a max(t, 1/t), or
+A frame has d unknowns x_k, of which the first three, the position, are measured. Each camera measures (q_x, q_y, t) =
+at_origin + slope x_k, as in `phd_exp.fusion.arithmetic`. Its energy is p h(|q|) + a max(t, 1/t), or
 (q_x^2 + q_y^2 + t^2)/2 of a Gaussian prediction, which has a = GAUSSIAN. A camera that takes no part has slope 0,
-q = 0, t = 1 and a = 0.
+q = 0, t = 1 and a = p = 0.
 
 The motion is `start`, the mean and precision of x_0, and `steps`, the transitions F_k and the precisions W_k of
 x_(k+1) - F_k x_k. Its energy is half the sum of (x_0 - mean).precision (x_0 - mean) and of all r.W_k r.
@@ -26,35 +26,37 @@ class Chain(NamedTuple):
     """The energy of a path of N frames, C cameras and d unknowns a frame.
 
     Attributes:
-        slope: d(q_x, q_y, t)/dx, N x C x 3 x n.
+        slope: d(q_x, q_y, t)/dv, N x C x 3 x 3.
         at_origin: (q_x, q_y, t) at x = 0, N x C x 3.
-        a: precision of the depth, or GAUSSIAN, N x C.
+        a: weighted precision of the depth, or GAUSSIAN, N x C.
+        p: weight of the projection, N x C.
+        sharpness: precision of the depth without its weight, N x C.
         mean: expected unknowns of the first frame, d.
         precision: inverse of their covariance, d x d; 0 in a direction that is not known before.
         F: the motion from one frame to the next, N-1 x d x d.
         W: inverse covariance of its noise, N-1 x d x d.
-        linear: a further term of the energy, the sum of linear x, N x d.
     """
 
     slope: np.ndarray
     at_origin: np.ndarray
     a: np.ndarray
+    p: np.ndarray
+    sharpness: np.ndarray
     mean: np.ndarray
     precision: np.ndarray
     F: np.ndarray
     W: np.ndarray
-    linear: np.ndarray
 
 
 @compiled
 def measure(slope, x, at):
     """Adds slope x to `at`, for all cameras of all frames."""
-    frames, cameras, _, n = slope.shape
+    frames, cameras = slope.shape[:2]
     for k in range(frames):
         for c in range(cameras):
             for i in range(3):
                 value = at[k, c, i]
-                for j in range(n):
+                for j in range(3):
                     value += slope[k, c, i, j] * x[k, j]
                 at[k, c, i] = value
 
@@ -67,10 +69,6 @@ def motion_energy(chain, whole, x, gradient):
     value = _quadratic(chain.precision, residual, gradient[0])
     for k in range(len(x) - 1):
         value += _step_energy(chain.F[k], chain.W[k], x[k], x[k + 1], residual, gradient[k], gradient[k + 1])
-    for k in range(len(x)):
-        for i in range(x.shape[1]):
-            value += whole * chain.linear[k, i] * x[k, i]
-            gradient[k, i] += whole * chain.linear[k, i]
     return value
 
 
@@ -131,7 +129,7 @@ def motion_curvature(chain, diagonal, coupling):
 @compiled
 def add_camera(slope, by_x, by_y, by_t, xx, xy, yy, tt, gradient, curvature):
     """Adds a camera's gradient and lower triangle of the curvature, which are given with respect to (q_x, q_y, t)."""
-    for i in range(slope.shape[1]):
+    for i in range(3):
         x, y, t = slope[0, i], slope[1, i], slope[2, i]
         gradient[i] += x * by_x + y * by_y + t * by_t
         along_x, along_y, along_t = xx * x + xy * y, xy * x + yy * y, tt * t
@@ -140,28 +138,29 @@ def add_camera(slope, by_x, by_y, by_t, xx, xy, yy, tt, gradient, curvature):
 
 
 @compiled
-def camera_energy(q_x, q_y, t, a, width, least):
+def camera_energy(q_x, q_y, t, a, p, width, least):
     """The energy of one camera, smoothed as in `phd_exp.fusion.newton`; exact for the width 0."""
     if a == GAUSSIAN:
         return (q_x * q_x + q_y * q_y + t * t) / 2
     depth, _, _ = smooth_depth_energy(t, extended_inverse(t, least)[0], width)
-    return huber(q_x * q_x + q_y * q_y) + a * depth
+    return p * huber(q_x * q_x + q_y * q_y) + a * depth
 
 
 @compiled
-def frames_energy(at, moved, share, a, width, least):
+def frames_energy(at, moved, share, a, p, width, least):
     """The energy of all cameras at `at` + share `moved`."""
     frames, cameras = a.shape
     value = 0.0
     for k in range(frames):
         for c in range(cameras):
             q_x, q_y = at[k, c, 0] + share * moved[k, c, 0], at[k, c, 1] + share * moved[k, c, 1]
-            value += camera_energy(q_x, q_y, at[k, c, 2] + share * moved[k, c, 2], a[k, c], width, least)
+            t = at[k, c, 2] + share * moved[k, c, 2]
+            value += camera_energy(q_x, q_y, t, a[k, c], p[k, c], width, least)
     return value
 
 
 @compiled
-def add_smoothed(slope, at, a, y, lam, width, least, terms, gradient, curvature):
+def add_smoothed(slope, at, a, p, y, lam, width, least, terms, gradient, curvature):
     """Adds one camera's smoothed gradient and its curvature given the duals; fills `terms`; see `fusion.newton`."""
     q_x, q_y, t = at
     if a == GAUSSIAN:
@@ -172,6 +171,7 @@ def add_smoothed(slope, at, a, y, lam, width, least, terms, gradient, curvature)
     weight, unit_x, unit_y = huber_weight(q_x, q_y)
     g_slope, side = (1 - first) / 2, g / s
     terms[:] = weight, unit_x, unit_y, g, g_slope, s
+    weight *= p
     xx = weight * (1 - y[0] * unit_x) + RIDGE * weight
     xy = -weight * (y[0] * unit_y + y[1] * unit_x) / 2
     yy = weight * (1 - y[1] * unit_y) + RIDGE * weight

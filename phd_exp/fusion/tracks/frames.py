@@ -50,8 +50,7 @@ class Frames:
         a: precision of the depth, or GAUSSIAN; 0 where a camera takes no part.
         mask: which cameras take part.
         near: the average of each frame's predicted positions; those of the nearest frames where there is none.
-        centres: the apices of the densities, without a free axis the positions of the cameras.
-        deviation: standard deviation of the slow log depth; 0 without slow errors.
+        since: seconds since the camera's prediction before; inf without one.
     """
 
     times: Float[np.ndarray, " frames"]
@@ -61,8 +60,7 @@ class Frames:
     a: Float[np.ndarray, "frames cameras"]
     mask: Bool[np.ndarray, "frames cameras"]
     near: Float[np.ndarray, "frames 3"]
-    centres: Float[np.ndarray, "frames cameras 3"]
-    deviation: Float[np.ndarray, "frames cameras"]
+    since: Float[np.ndarray, "frames cameras"]
 
     @classmethod
     def checked(
@@ -101,9 +99,10 @@ class Frames:
         at_origin = views.at_zero.numpy() + (views.slope.numpy() @ origin)
         shown = views.mask.numpy()
         at_origin = np.where(shown[..., None], at_origin, (0.0, 0.0, 1.0))
-        centres = np.where(shown[..., None], views.centres.numpy() - origin, 0.0)
-        of_cameras = views.slope.numpy(), at_origin, views.a.numpy(), shown
-        return cls(seconds, origin, *of_cameras, near, centres, np.zeros(shape))
+        latest = np.maximum.accumulate(np.where(shown, seconds[:, None], -np.inf))
+        since = seconds[:, None] - np.concatenate([np.full_like(latest[:1], -np.inf), latest[:-1]])
+        slope = np.ascontiguousarray(views.slope.numpy())
+        return cls(seconds, origin, slope, at_origin, views.a.numpy(), shown, near, since)
 
     def __getitem__(self, part: slice) -> "Frames":
         """Some of the frames."""
@@ -118,10 +117,12 @@ class Frames:
         return Frames(**values)
 
     def followed_by(self, later: "Frames") -> "Frames":
-        """Both, relative to the origin of the first."""
+        """With one frame more, relative to the same origin."""
         shift = self.origin - later.origin
         at_origin = later.at_origin + later.slope @ shift
-        later = replace(later, at_origin=at_origin, near=later.near - shift, centres=later.centres - shift)
+        latest = self.times[-1] - np.where(self.mask[-1], 0.0, self.since[-1])
+        since = later.times[:, None] - latest
+        later = replace(later, at_origin=at_origin, near=later.near - shift, since=since)
         values = {name: np.concatenate([value, getattr(later, name)]) for name, value in vars(self).items()}
         return Frames(**(values | {"origin": self.origin}))
 
@@ -154,7 +155,6 @@ class _Views:
     a: Float[Tensor, "frames cameras"]
     mask: Bool[Tensor, "frames cameras"]
     position: Float[Tensor, "frames 3"]
-    centres: Float[Tensor, "frames cameras 3"]
     status: Int[Tensor, " frames"]
 
 
@@ -164,8 +164,7 @@ def _views(predictions: ProjectedHuber | Gaussian, pose: Pose, mask: Tensor | No
     problems = Problems.posed(predictions, pose, None, mask)
     origin = problems.origin.nan_to_num()[:, None, :, None]
     at_zero = problems.at_origin - (problems.slope @ origin).squeeze(-1)
-    centres = problems.pose.into_world(predictions.apex.double().cpu())
-    return _Views(problems.slope, at_zero, problems.a, problems.mask, problems.origin, centres, problems.status)
+    return _Views(problems.slope, at_zero, problems.a, problems.mask, problems.origin, problems.status)
 
 
 def _gaussian_views(predictions: Gaussian, pose: Pose, mask: Tensor | None) -> _Views:
@@ -180,6 +179,5 @@ def _gaussian_views(predictions: Gaussian, pose: Pose, mask: Tensor | None) -> _
     at_zero = torch.where(mask[..., None], (whiten @ (pose.t - mean)[..., None]).squeeze(-1), 0)
     valid = (failed == 0) & predictions.covariance.isfinite().all(-1).all(-1).cpu() & mean.isfinite().all(-1)
     status = status_of(mask, valid, pose.is_rigid, None)
-    centres = pose.into_world(torch.zeros(3, dtype=torch.float64))
     a = torch.where(mask, GAUSSIAN, 0.0).double()
-    return _Views(slope, at_zero, a, mask, average(pose.into_world(mean), mask), centres, status)
+    return _Views(slope, at_zero, a, mask, average(pose.into_world(mean), mask), status)

@@ -28,19 +28,18 @@ _PLACES, _LOG_SHARES = (_PLACES + 1) / 2, np.log(_SHARES / 2)
 
 
 @compiled
-def propagate(chain, work, mean, covariance, factors, dof):
-    """Moves `mean` from the optimum to the mean, and fills `covariance` (N x d x d), `factors` and `dof` (N x C).
+def propagate(chain, work, mean, covariance, factors):
+    """Moves `mean` from the optimum to the mean, and fills `covariance` (N x d x d) and `factors` (N x C x 7).
 
-    `factors` (N x C x 7) are the Gaussian ones: precision of q (xx, xy, yy) and t, then precision times mean. `dof`
-    is how many unknowns of a frame's position each camera determines, at most 3. Returns the log of the integral of
-    e^(-energy) over all paths, up to a constant.
+    `factors` are the Gaussian ones: precision of q (xx, xy, yy) and t, then precision times mean. Returns the log of
+    the integral of e^(-energy) over all paths, up to a constant.
     """
     frames, cameras = chain.a.shape
     factors[:] = 0.0
     measure_all(chain, mean, work.at)
     for k in range(frames):
         for c in range(cameras):
-            first_factor(work.at[k, c], chain.a[k, c], factors[k, c])
+            first_factor(work.at[k, c], chain.a[k, c], chain.p[k, c], chain.sharpness[k, c], factors[k, c])
     for _ in range(STEPS):
         _gaussian_path(chain, work, mean, factors)
         selected_inverse(work.L, work.below, covariance)
@@ -48,25 +47,24 @@ def propagate(chain, work, mean, covariance, factors, dof):
         for k in range(frames):
             for c in range(cameras):
                 marginal = work.at[k, c], spread(chain.slope[k, c], covariance[k])
-                moved, gained = update(*marginal, chain.a[k, c], factors[k, c])
+                moved, gained = update(*marginal, chain.a[k, c], chain.p[k, c], factors[k, c])
                 change, log_ratio = max(change, moved), log_ratio + gained
         if not change > SETTLED:
             break
-    freedom(chain, factors, covariance, dof)
     return log_ratio - log_determinant(work.L) / 2 - _factored_energy(chain, work, mean, factors)
 
 
 @compiled
-def first_factor(at, a, factor):
+def first_factor(at, a, p, sharpness, factor):
     """Fills in a factor whose curvature and gradient at the optimum resemble those of the density's energy."""
     if a == GAUSSIAN:
         factor[:4] = 1.0, 0.0, 1.0, 1.0
         return
     q_x, q_y, t = at
     squared = q_x * q_x + q_y * q_y
-    weight = 1 / math.sqrt(3 + squared)
-    rest = weight - 1 / math.sqrt(max(squared, 1.0))
-    bend = a / (2 / max(a, TINY) + abs(t - 1))
+    weight = p / math.sqrt(3 + squared)
+    rest = weight - p / math.sqrt(max(squared, 1.0))
+    bend = a / (2 / max(sharpness, TINY) + abs(t - 1))
     factor[:] = weight, 0.0, weight, bend, rest * q_x, rest * q_y, bend * (t - (t - 1) / 2)
 
 
@@ -103,8 +101,8 @@ def _factored_energy(chain, work, mean, factors):
 def spread(slope, covariance):
     """Covariance of (q_x, q_y), and variance of t: xx, xy, yy, tt."""
     xx = xy = yy = tt = 0.0
-    for i in range(slope.shape[1]):
-        for j in range(slope.shape[1]):
+    for i in range(3):
+        for j in range(3):
             C = covariance[i, j]
             xx, xy = xx + slope[0, i] * C * slope[0, j], xy + slope[0, i] * C * slope[1, j]
             yy, tt = yy + slope[1, i] * C * slope[1, j], tt + slope[2, i] * C * slope[2, j]
@@ -112,7 +110,7 @@ def spread(slope, covariance):
 
 
 @compiled
-def update(at, spread, a, factor):
+def update(at, spread, a, p, factor):
     """Replaces the factors of one camera; returns the largest change, and the log of that of the integral.
 
     With mean m and covariance S = R R^T of q, and those of the path with the true density, m + R z and R Z R^T, the
@@ -123,7 +121,7 @@ def update(at, spread, a, factor):
     r_xx = math.sqrt(max(spread[0], TINY))
     r_yx = spread[1] / r_xx
     r_yy = math.sqrt(max(spread[2] - r_yx * r_yx, TINY))
-    log_q, z_x, z_y, Z_xx, Z_xy, Z_yy = _tilted_projection(at[0], at[1], r_xx, r_yx, r_yy, factor)
+    log_q, z_x, z_y, Z_xx, Z_xy, Z_yy = _tilted_projection(at[0], at[1], r_xx, r_yx, r_yy, p, factor)
     determinant = Z_xx * Z_yy - Z_xy * Z_xy
     P_xx, P_xy, P_yy = Z_yy / determinant - 1, -Z_xy / determinant, Z_xx / determinant - 1
     p_x, p_y = P_xx * z_x + P_xy * z_y + z_x, P_xy * z_x + P_yy * z_y + z_y
@@ -143,7 +141,7 @@ def update(at, spread, a, factor):
 
 
 @compiled
-def _tilted_projection(q_x, q_y, r_xx, r_yx, r_yy, factor):
+def _tilted_projection(q_x, q_y, r_xx, r_yx, r_yy, p, factor):
     """log E[ratio], and mean and covariance of the standardised q weighted by the ratio of density and factor."""
     xx, xy, yy, _, l_x, l_y, _ = factor
     points = len(_NODES)
@@ -152,7 +150,7 @@ def _tilted_projection(q_x, q_y, r_xx, r_yx, r_yy, factor):
         for j in range(points):
             x, y = q_x + r_xx * _NODES[i], q_y + r_yx * _NODES[i] + r_yy * _NODES[j]
             log_factor = l_x * x + l_y * y - (xx * x * x + 2 * xy * x * y + yy * y * y) / 2
-            log_weight[i, j] = _LOG_WEIGHTS[i] + _LOG_WEIGHTS[j] - huber(x * x + y * y) - log_factor
+            log_weight[i, j] = _LOG_WEIGHTS[i] + _LOG_WEIGHTS[j] - p * huber(x * x + y * y) - log_factor
     highest = log_weight.max()
     total = x = y = xx = xy = yy = 0.0
     for i in range(points):
@@ -192,18 +190,3 @@ def _tilted_depth(t, deviation, a, precision, linear):
     mean = first / total
     variance = (second / total - mean * mean) * deviation * deviation
     return highest + math.log(total / math.sqrt(2 * math.pi)), t + deviation * mean, variance
-
-
-@compiled
-def freedom(chain, factors, covariance, dof):
-    """Fills in the trace of the precision times the covariance of (q_x, q_y, t) with its part by position."""
-    for k in range(len(dof)):
-        for c in range(dof.shape[1]):
-            slope, (xx, xy, yy, tt, _, _, _) = chain.slope[k, c], factors[k, c]
-            dof[k, c] = 0.0
-            for i in range(3):
-                for j in range(slope.shape[1]):
-                    C = covariance[k, i, j]
-                    x, y, t = slope[0, i] * C, slope[1, i] * C, slope[2, i] * C
-                    dof[k, c] += xx * x * slope[0, j] + xy * (x * slope[1, j] + y * slope[0, j])
-                    dof[k, c] += yy * y * slope[1, j] + tt * t * slope[2, j]

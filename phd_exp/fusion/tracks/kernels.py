@@ -20,10 +20,10 @@ def _functions(sources):
     """Both functions, compiled from these sources; see `phd_exp.fusion.kernels`."""
 
     @njit(cache=True, error_model="numpy")
-    def most_likely(chain, x, at, distance):
+    def most_likely(chain, x, distance):
         """Moves x to the optimum; returns whether a position is in front of all cameras, the energy and its bound.
 
-        Fills `at` with (q_x, q_y, t), and `distance` with the bounds of `certify`.
+        Fills `distance` with the bounds of `certify`.
         """
         assert len(sources) > 0
         work, lam = workspace(chain), np.zeros(chain.a.shape)
@@ -31,15 +31,15 @@ def _functions(sources):
             return False, np.nan, np.inf
         polish(chain, work, x, lam)
         gap = certify(chain, work, x, lam, distance)
-        measure_all(chain, x, at)
+        measure_all(chain, x, work.at)
         motion = motion_energy(chain, 1.0, x, work.g)
-        return True, motion + frames_energy(at, at, 0.0, chain.a, 0.0, 1e-6), gap
+        return True, motion + frames_energy(work.at, work.at, 0.0, chain.a, chain.p, 0.0, 1e-6), gap
 
     @njit(cache=True, error_model="numpy")
-    def moments(chain, mean, covariance, factors, dof):
+    def moments(chain, mean, covariance, factors):
         """Calls `propagate`."""
         assert len(sources) > 0
-        return propagate(chain, workspace(chain), mean, covariance, factors, dof)
+        return propagate(chain, workspace(chain), mean, covariance, factors)
 
     return most_likely, moments
 

@@ -149,7 +149,7 @@ def _linearise_smoothed(chain, work, x, y, lam, width, least):
     work.L[:] = work.motion
     for k in range(len(x)):
         for c in range(chain.a.shape[1]):
-            views = chain.slope[k, c], work.at[k, c], chain.a[k, c], y[k, c], lam[k, c]
+            views = chain.slope[k, c], work.at[k, c], chain.a[k, c], chain.p[k, c], y[k, c], lam[k, c]
             add_smoothed(*views, width, least, work.terms[k, c], work.g[k], work.L[k])
     return motion
 
@@ -161,12 +161,12 @@ def _line_search(chain, work, motion, width, least):
     measure(chain.slope, work.dx, work.moved)
     descent, by_motion = (work.g * work.dx).sum(), (work.pull * work.dx).sum()
     bend = motion_energy(chain, 0.0, work.dx, work.pull)
-    before = motion + frames_energy(work.at, work.moved, 0.0, chain.a, width, least)
+    before = motion + frames_energy(work.at, work.moved, 0.0, chain.a, chain.p, width, least)
     enough = before + 1e-12 * abs(before)  # rounding may add this much where nothing is left to gain
     share = 1.0
     for _ in range(MOST_HALVINGS):
         value = motion + share * (by_motion + share * bend)
-        value += frames_energy(work.at, work.moved, share, chain.a, width, least)
+        value += frames_energy(work.at, work.moved, share, chain.a, chain.p, width, least)
         if not value > enough + ARMIJO * share * descent:
             break
         share /= 2
@@ -239,6 +239,7 @@ def _add_exact(chain, work, k, c, lam, kink):
     else:
         lam[k, c] = side
     weight, unit_x, unit_y = huber_weight(q_x, q_y)
+    weight *= chain.p[k, c]
     xx, xy = weight * (1 + EXACT_RIDGE - unit_x * unit_x), -weight * unit_x * unit_y
     yy, tt = weight * (1 + EXACT_RIDGE - unit_y * unit_y), a * (bend + EXACT_RIDGE)
     add_camera(slope, weight * q_x, weight * q_y, a * by_t, xx, xy, yy, tt, g, L)

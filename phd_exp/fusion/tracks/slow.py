@@ -1,87 +1,66 @@
-"""Errors that consecutive frames share: a slow factor of depth, and a slow offset of the projection.
+"""Errors that consecutive frames share: each frame counts by how much it tells that the others do not.
 
-Both are Ornstein-Uhlenbeck processes of variance 1, whose correlation over a time s is exp(-s/time). A share of the
-variance of each prediction belongs to them, the rest to the frame alone.
+Let the standardised errors of a camera be an Ornstein-Uhlenbeck process, whose correlation over s seconds is
+exp(-s/time). Of the frames of an object at rest, the best mean has the weights of the rows of the inverse correlation
+matrix. With decay = exp(-s/time) over the steps to the frames before and after, that of a frame is
+
+    1 - decay_before/(1 + decay_before) - decay_after/(1 + decay_after),
+
+and the sum over the frames of a duration T is about 1 + T/(2 time). A path multiplies densities to the power of these
+weights. So nothing is extrapolated, and the energy of the path is as convex as without slow errors.
+
+Source: own derivation. The product of powers of densities is a logarithmic opinion pool (Genest and Zidek, "Combining
+probability distributions", 1986); compared with slow errors as unknowns in docs/guides/tracking.md.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 from scipy import optimize
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.huber import HUBER_COVARIANCE
-from phd_exp.fusion.pose import Pose
-from phd_exp.fusion.shared import own_part
-from phd_exp.fusion.tracks.frames import Frames, Gaussian
 
 
 @dataclass(frozen=True)
 class Slow:
-    """How much of the predictions' errors is slow.
+    """How long the predictions of a camera err alike.
 
     Args:
-        depth_share: part of the variance of log depth that all cameras share and that changes slowly, from 0 to less
-            than 1.
-        depth_time: its time constant, seconds.
-        projection_share: part of the variance of (x, y)/z that changes slowly, on its own in each camera.
-        projection_time: its time constant, seconds.
+        depth_time: time constant of the errors of log depth, seconds; 0 for independent frames.
+        projection_time: that of (x, y)/z.
 
     Raises:
-        ValueError: a number is out of range.
+        ValueError: a number is negative or not finite.
     """
 
-    depth_share: float = 0.0
-    depth_time: float = 1.0
-    projection_share: float = 0.0
-    projection_time: float = 1.0
+    depth_time: float = 0.0
+    projection_time: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("depth_share", "projection_share"):
-            if not 0 <= getattr(self, name) < 1:
-                raise ValueError(f"{name}: got {getattr(self, name)}; expected a share from 0 to less than 1")
-        for name in ("depth_time", "projection_time"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: got {getattr(self, name)}; expected a positive number of seconds")
+        for name, value in vars(self).items():
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name}: got {value}; expected a number of seconds, 0 for independent frames")
 
-    def times(self, cameras: int) -> list[float]:
-        """The time constant of each slow unknown: the factor of depth, then the offsets camera by camera."""
-        offsets = [self.projection_time] * (2 * cameras if self.projection_share else 0)
-        return [self.depth_time] * bool(self.depth_share) + offsets
 
-    def frames(
-        self,
-        times: Float[Tensor, " frames"],
-        predictions: ProjectedHuber | Gaussian,
-        pose: Pose,
-        mask: Bool[Tensor, "frames cameras"] | None,
-    ) -> Frames:
-        """The frames without the slow errors.
+NONE = Slow()
 
-        Raises:
-            ValueError: an argument of `track` is not valid.
-        """
-        none = self.depth_share == self.projection_share == 0
-        if not none and isinstance(predictions, Gaussian):
-            raise ValueError("slow: got Gaussian predictions; expected ProjectedHuber")
-        if none or not isinstance(predictions, ProjectedHuber):
-            return Frames.checked(times, predictions, pose, mask)
-        own, deviation = predictions, torch.zeros(predictions.batch_shape)
-        if self.depth_share:
-            own, deviation = own_part(predictions, torch.tensor(self.depth_share, dtype=torch.float64))
-        own = own.tempered(math.sqrt(1 - self.projection_share), 1.0)
-        frames = Frames.checked(times, own, pose, mask)
-        return replace(frames, deviation=np.where(frames.mask, deviation.double().numpy(), 0.0))
 
-    @property
-    def offset(self) -> float:
-        """Standard deviation of the slow offset in units of a frame's own q."""
-        return math.sqrt(HUBER_COVARIANCE * self.projection_share / (1 - self.projection_share))
+def weights(
+    time: float, since: Float[np.ndarray, "frames cameras"], mask: Bool[np.ndarray, "frames cameras"]
+) -> Float[np.ndarray, "frames cameras"]:
+    """The weight of each frame, given the seconds `since` the camera's prediction before; 0 where masked out."""
+    found = mask.astype(float)
+    for camera in range(mask.shape[1] if time else 0):
+        seen = mask[:, camera]
+        decay = np.exp(-since[seen, camera] / time)
+        told = decay / (1 + decay)
+        found[seen, camera] -= told + np.append(told[1:], 0.0)
+    return found
 
 
 def standardised_errors(
@@ -93,13 +72,13 @@ def standardised_errors(
     return depth, (predictions.A @ offset[..., None]).squeeze(-1) / math.sqrt(HUBER_COVARIANCE)
 
 
-def autocorrelation(
+def correlation_time(
     times: Sequence[Float[np.ndarray, " frames"]], errors: Sequence[Float[np.ndarray, " frames"]]
-) -> tuple[float, float]:
-    """Share and time constant (seconds) of the slow part of errors: what `Slow` takes.
+) -> float:
+    """The time constant of errors, seconds: the integral of their autocorrelation, of which `Slow` takes two.
 
     Products of two errors of a sequence, over the mean square, have the expectation share exp(-s/time) at a distance
-    of s seconds. Both numbers are fitted to all pairs by least squares.
+    of s seconds. Both numbers are fitted to all pairs by least squares; the integral is their product.
 
     Args:
         times: of the frames of each sequence, seconds.
@@ -126,7 +105,4 @@ def autocorrelation(
     step = float(np.median(lag))
     bounds = (math.log(float(lag.min()) * 0.3), math.log(step * 1e3))
     found = optimize.minimize_scalar(lambda log_time: share(log_time)[1], bounds=bounds, method="bounded")
-    return share(found.x)[0], math.exp(found.x)
-
-
-NONE = Slow()
+    return share(found.x)[0] * math.exp(found.x)

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion.pose import Pose
-from phd_exp.fusion.tracks.chain import Array
-from phd_exp.fusion.tracks.frames import Gaussian
+from phd_exp.fusion.tracks.chain import VELOCITY, Array
+from phd_exp.fusion.tracks.frames import Frames, Gaussian
 from phd_exp.fusion.tracks.lost import USUAL, Lost
 from phd_exp.fusion.tracks.motion import ConstantAcceleration, ConstantVelocity, Motion
 from phd_exp.fusion.tracks.slow import NONE, Slow
@@ -50,12 +50,7 @@ class Path:
     @property
     def velocity(self) -> Float[Tensor, "frames 3"]:
         """The velocities of the most likely path, metres per second."""
-        return self._entered(self.solved.x[:, self.solved.model.velocity])
-
-    @property
-    def slow(self) -> Float[Tensor, "frames slow"]:
-        """The most likely slow errors in their standard deviations: of log depth, then of each camera's q."""
-        return self._entered(self.solved.x[:, 3 : self.solved.model.measured_unknowns])
+        return self._entered(self.solved.x[:, VELOCITY])
 
     @property
     def gap(self) -> float:
@@ -85,8 +80,7 @@ class Path:
     @property
     def velocity_covariance(self) -> Float[Tensor, "frames 3 3"]:
         """Covariance of each velocity, square metres per square second."""
-        v = self.solved.model.velocity
-        return self._entered(self.solved.moments.covariance[:, v, v])
+        return self._entered(self.solved.moments.covariance[:, VELOCITY, VELOCITY])
 
     @property
     def log_evidence(self) -> float:
@@ -113,9 +107,8 @@ def track(
     """The path of highest density: the product of the densities of all predictions and that of the motion.
 
     It minimises sum -log p_(k,i)(R v_k + t) plus half the squared noise of the motion over its variance. The problem
-    is convex, and solved to rounding in O(frames). With slow errors it is convex about a given path, found first
-    without them; then the factor of depth is linear, see `phd_exp.fusion.tracks.chain`, and errs by about s^2/2 for
-    a factor e^s.
+    is convex, and solved to rounding in O(frames). With slow errors, each frame has a weight for its depth and one
+    for its projection, see `phd_exp.fusion.tracks.slow`. Those of several cameras count as independent.
 
     Args:
         times: of the frames, increasing, seconds.
@@ -123,7 +116,7 @@ def track(
         pose: of each camera in each frame; its batch shape broadcasts to that.
         motion: `ConstantVelocity` or `ConstantAcceleration`; `estimated` finds its noise.
         mask: which cameras take part in each frame (default: all); the others' predictions and poses are ignored.
-        slow: the errors that consecutive frames share (default: none); for ProjectedHuber only.
+        slow: how long frames err alike (default: not at all); for ProjectedHuber only.
         lost: when the track ends.
 
     Raises:
@@ -133,7 +126,7 @@ def track(
     of paths; the densities are the paper's.
     """
     with one_thread():
-        frames = slow.frames(times, predictions, pose, mask)
+        frames = checked(times, predictions, pose, mask, slow)
         seen = frames.mask.any(-1)
         first = int(np.argmax(seen))
         length, why = lost.gap(frames.times[first:], seen[first:])
@@ -143,6 +136,15 @@ def track(
             if contradicted is None:
                 return Path(torch.from_numpy(frames.times), first, why, solved)
             why = contradicted
+
+
+def checked(
+    times: Tensor, predictions: ProjectedHuber | Gaussian, pose: Pose, mask: Tensor | None, slow: Slow
+) -> Frames:
+    """The frames of the arguments of `track`. Raises ValueError where one is not valid."""
+    if slow != NONE and isinstance(predictions, Gaussian):
+        raise ValueError("slow: got Gaussian predictions; expected ProjectedHuber")
+    return Frames.checked(times, predictions, pose, mask)
 
 
 def estimated(

@@ -9,12 +9,13 @@ from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion.pose import Pose
-from phd_exp.fusion.tracks.chain import Array, Model
+from phd_exp.fusion.tracks.chain import VELOCITY, Array, moving, start
 from phd_exp.fusion.tracks.frames import Frames, Gaussian
 from phd_exp.fusion.tracks.lost import USUAL, Lost
 from phd_exp.fusion.tracks.motion import Motion
 from phd_exp.fusion.tracks.slow import NONE, Slow
 from phd_exp.fusion.tracks.solved import Solved, levels, solve
+from phd_exp.fusion.tracks.track import checked
 from phd_exp.hardware import one_thread
 
 
@@ -58,7 +59,8 @@ class Tracker:
     Args:
         motion: `ConstantVelocity` or `ConstantAcceleration`.
         lag: how many later frames the state of a frame takes into account; 0 gives a filter.
-        slow: the errors that consecutive frames share (default: none).
+        slow: how long frames err alike (default: not at all). This needs a lag of at least 1, because the next frame
+            changes the weight of a frame.
         lost: when the track ends.
 
     Attributes:
@@ -66,7 +68,7 @@ class Tracker:
             to there; begin a new Tracker.
 
     Raises:
-        ValueError: lag is negative, or less than the contradictions that end a track need.
+        ValueError: lag is less than 0, or 1 with slow errors, or less than the contradictions that end a track need.
 
     Examples:
         >>> import torch
@@ -83,8 +85,8 @@ class Tracker:
     """
 
     def __init__(self, motion: Motion, lag: int = 10, slow: Slow = NONE, lost: Lost = USUAL) -> None:
-        if lag < 0:
-            raise ValueError(f"lag: got {lag}; expected a number of frames, at least 0")
+        if lag < (least := int(slow != NONE)):
+            raise ValueError(f"lag: got {lag}; expected a number of frames, at least {least}")
         if lost.contradictions > lag + 1:
             raise ValueError(
                 f"lost.contradictions: got {lost.contradictions}; expected at most lag + 1 = {lag + 1} frames"
@@ -152,7 +154,7 @@ class Tracker:
         k = int(np.searchsorted(window.frames.times, time))
         mean, covariance = (values[min(k, len(window.x) - 1)] for values in window.moments[:2])
         if k == len(window.x):
-            (F,), (W,) = window.model.moving(time - window.frames.times[-1:])
+            (F,), (W,) = moving(self.motion, time - window.frames.times[-1:])
             mean, covariance = F @ mean, F @ covariance @ F.T + np.linalg.inv(W)
         return mean[:3] + window.frames.origin, covariance[:3, :3]
 
@@ -163,39 +165,33 @@ class Tracker:
         elif isinstance(predictions, Gaussian):
             predictions = Gaussian(predictions.mean[None], predictions.covariance[None])
         times = torch.tensor([time], dtype=torch.float64)
-        return self.slow.frames(times, predictions, pose, None if mask is None else mask[None])
+        return checked(times, predictions, pose, None if mask is None else mask[None], self.slow)
 
     def _first(self, frame: Frames) -> Solved:
         """The window of the first frame."""
-        model = Model(self.motion, self.slow, frame.a.shape[1])
-        self._start = model.start()
+        self._start = start(self.motion)
         x = np.zeros((1, len(self._start[0])))
         x[0, :3] = frame.near[0]
-        motion = (*self._start, *model.moving(np.empty(0)))
-        return solve(model, frame, x, motion, self._freedom(3.0 * frame.mask / frame.mask.sum()))
+        return solve(frame, x, (*self._start, *moving(self.motion, np.empty(0))), self.slow)
 
     def _next(self, window: Solved, frame: Frames) -> Solved:
         """The window with one more frame, without its first one if it is full."""
-        model, frames = window.model, window.frames.followed_by(frame)
-        F, W = model.moving(np.diff(frames.times))
+        frames = window.frames.followed_by(frame)
+        F, W = moving(self.motion, np.diff(frames.times))
         x = np.concatenate([window.x, (F[-1] @ window.x[-1])[None]])
-        freedom = np.concatenate([window.moments.freedom, window.moments.freedom[-1:]])
         if len(frames.times) > self.lag + 1:
             self._start = after_first(window, self._start, F[0], W[0])
-            frames, x, freedom, F, W = frames[1:], x[1:], freedom[1:], F[1:], W[1:]
-        return solve(model, frames, x, (*self._start, F, W), self._freedom(freedom))
-
-    def _freedom(self, freedom: Float[Array, "frames cameras"]) -> Float[Array, "frames cameras"] | None:
-        return freedom if self.slow.depth_share else None
+            frames, x, F, W = frames[1:], x[1:], F[1:], W[1:]
+        return solve(frames, x, (*self._start, F, W), self.slow)
 
     def _state(self, k: int) -> State:
         """That of a frame of the window."""
         assert self._window is not None
-        window, v = self._window, self._window.model.velocity
+        window, v = self._window, VELOCITY
         mean, covariance, origin = window.moments.mean[k], window.moments.covariance[k], window.frames.origin
         numbers = (
             window.x[k, :3] + origin, window.x[k, v], mean[:3] + origin,
-            covariance[:3, :3], covariance[v, v], window.excess[k], window.chain.a[k],
+            covariance[:3, :3], covariance[v, v], window.excess[k], window.frames.a[k],
         )  # fmt: skip
         return State(float(window.frames.times[k]), *(torch.from_numpy(value.copy()) for value in numbers))
 
@@ -211,14 +207,13 @@ def after_first(
     F and W are those between the two, and `start` holds before the first.
     """
     mean, precision = start
-    information, precision = precision @ mean - window.chain.linear[0], precision.copy()
-    n = window.model.measured_unknowns
+    information, precision = precision @ mean, precision.copy()
     views = window.chain.slope[0], window.chain.at_origin[0], window.moments.factors[0]
     for slope, at, factor in zip(*views, strict=True):
         xx, xy, yy, tt = factor[:4]
         K = np.array([[xx, xy, 0], [xy, yy, 0], [0, 0, tt]])
-        precision[:n, :n] += slope.T @ K @ slope
-        information[:n] += slope.T @ (factor[4:] - K @ at)
+        precision[:3, :3] += slope.T @ K @ slope
+        information[:3] += slope.T @ (factor[4:] - K @ at)
     covariance = np.linalg.inv(precision)
     moved = F @ covariance @ F.T + np.linalg.inv(W)
     return F @ covariance @ information, np.linalg.inv((moved + moved.T) / 2)
