@@ -6,7 +6,15 @@ import torch
 from scipy import stats
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.fusion.tracks import ConstantVelocity, Lost, Slow, correlation_time, estimated, standardised_errors, track
+from phd_exp.fusion.tracks import (
+    ConstantVelocity,
+    Lost,
+    Slow,
+    correlation_time,
+    estimated,
+    standardised_errors,
+    track,
+)
 from phd_exp.fusion.tracks.slow import weights
 from phd_exp.metrics.errors import squared_mahalanobis
 from tests.support.paths import NO_ERRORS, Errors, around, chosen, drawn_paths
@@ -47,8 +55,7 @@ def test_independent_errors_are_within_their_covariance(cameras: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("errors", "slow"),
-    [(DEPTH, Slow(0.38)), pytest.param(BOTH, Slow(0.38, 0.2), marks=pytest.mark.slow)],
+    ("errors", "slow"), [(DEPTH, Slow(0.38)), pytest.param(BOTH, Slow(0.38, 0.2), marks=pytest.mark.slow)]
 )
 def test_slow_errors_are_about_within_the_covariance_if_frames_have_weights_and_far_outside_if_not(
     errors: Errors, slow: Slow

@@ -51,6 +51,8 @@ class Frames:
         mask: which cameras take part.
         near: the average of each frame's predicted positions; those of the nearest frames where there is none.
         since: seconds since the camera's prediction before; inf without one.
+        centres: positions of the cameras.
+        shear: see `phd_exp.fusion.tracks.shear`.
     """
 
     times: Float[np.ndarray, " frames"]
@@ -61,6 +63,8 @@ class Frames:
     mask: Bool[np.ndarray, "frames cameras"]
     near: Float[np.ndarray, "frames 3"]
     since: Float[np.ndarray, "frames cameras"]
+    centres: Float[np.ndarray, "frames cameras 3"]
+    shear: Float[np.ndarray, "frames 3 4"]
 
     @classmethod
     def checked(
@@ -102,7 +106,9 @@ class Frames:
         latest = np.maximum.accumulate(np.where(shown, seconds[:, None], -np.inf))
         since = seconds[:, None] - np.concatenate([np.full_like(latest[:1], -np.inf), latest[:-1]])
         slope = np.ascontiguousarray(views.slope.numpy())
-        return cls(seconds, origin, slope, at_origin, views.a.numpy(), shown, near, since)
+        centres = views.centres.numpy() - origin
+        of_cameras = slope, at_origin, views.a.numpy(), shown
+        return cls(seconds, origin, *of_cameras, near, since, centres, np.tile(np.eye(3, 4), (len(seconds), 1, 1)))
 
     def __getitem__(self, part: slice) -> "Frames":
         """Some of the frames."""
@@ -111,10 +117,10 @@ class Frames:
 
     def unseen(self, time: float) -> "Frames":
         """One later frame, in which no camera takes part."""
-        values = {name: np.zeros_like(value[-1:]) for name, value in vars(self).items()}
-        values |= {"times": np.array([time]), "origin": self.origin, "near": self.near[-1:]}
-        values["at_origin"][..., 2] = 1.0
-        return Frames(**values)
+        no_view = np.zeros_like(self.slope[-1:]), np.zeros_like(self.at_origin[-1:]) + (0.0, 0.0, 1.0)
+        nothing = np.zeros_like(self.a[-1:]), np.zeros_like(self.mask[-1:])
+        known = self.near[-1:], self.since[-1:], self.centres[-1:], np.eye(3, 4)[None]
+        return Frames(np.array([time]), self.origin, *no_view, *nothing, *known)
 
     def followed_by(self, later: "Frames") -> "Frames":
         """With one frame more, relative to the same origin."""
@@ -122,7 +128,8 @@ class Frames:
         at_origin = later.at_origin + later.slope @ shift
         latest = self.times[-1] - np.where(self.mask[-1], 0.0, self.since[-1])
         since = later.times[:, None] - latest
-        later = replace(later, at_origin=at_origin, near=later.near - shift, since=since)
+        near, centres = later.near - shift, later.centres - shift
+        later = replace(later, at_origin=at_origin, near=near, since=since, centres=centres)
         values = {name: np.concatenate([value, getattr(later, name)]) for name, value in vars(self).items()}
         return Frames(**(values | {"origin": self.origin}))
 
@@ -155,6 +162,7 @@ class _Views:
     a: Float[Tensor, "frames cameras"]
     mask: Bool[Tensor, "frames cameras"]
     position: Float[Tensor, "frames 3"]
+    centres: Float[Tensor, "frames cameras 3"]
     status: Int[Tensor, " frames"]
 
 
@@ -164,7 +172,8 @@ def _views(predictions: ProjectedHuber | Gaussian, pose: Pose, mask: Tensor | No
     problems = Problems.posed(predictions, pose, None, mask)
     origin = problems.origin.nan_to_num()[:, None, :, None]
     at_zero = problems.at_origin - (problems.slope @ origin).squeeze(-1)
-    return _Views(problems.slope, at_zero, problems.a, problems.mask, problems.origin, problems.status)
+    centres = problems.pose.into_world(torch.zeros(3, dtype=torch.float64))
+    return _Views(problems.slope, at_zero, problems.a, problems.mask, problems.origin, centres, problems.status)
 
 
 def _gaussian_views(predictions: Gaussian, pose: Pose, mask: Tensor | None) -> _Views:
@@ -179,5 +188,6 @@ def _gaussian_views(predictions: Gaussian, pose: Pose, mask: Tensor | None) -> _
     at_zero = torch.where(mask[..., None], (whiten @ (pose.t - mean)[..., None]).squeeze(-1), 0)
     valid = (failed == 0) & predictions.covariance.isfinite().all(-1).all(-1).cpu() & mean.isfinite().all(-1)
     status = status_of(mask, valid, pose.is_rigid, None)
+    centres = pose.into_world(torch.zeros(3, dtype=torch.float64))
     a = torch.where(mask, GAUSSIAN, 0.0).double()
-    return _Views(slope, at_zero, a, mask, average(pose.into_world(mean), mask), status)
+    return _Views(slope, at_zero, a, mask, average(pose.into_world(mean), mask), centres, status)

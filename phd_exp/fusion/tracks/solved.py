@@ -1,6 +1,6 @@
 """The optimum of the frames of a track, and its moments."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -15,13 +15,14 @@ from phd_exp.fusion.tracks.chain import Array, moving, start
 from phd_exp.fusion.tracks.energy import GAUSSIAN, Chain
 from phd_exp.fusion.tracks.frames import Frames
 from phd_exp.fusion.tracks.motion import Motion
+from phd_exp.fusion.tracks.shear import along_rays, is_at_rest, unsheared, unsheared_covariance
 from phd_exp.fusion.tracks.slow import Slow, weights
 
 # `kernels` is imported in the functions that use it: importing numba takes a second
 
 
 class Moments(NamedTuple):
-    """The Gaussian of a path: `mean` and `covariance` of each frame's unknowns.
+    """The Gaussian of a path: `mean` and `covariance` of each frame's sheared unknowns.
 
     `factors` are the Gaussian ones in place of each camera's density, and `log_integral` is that of the density over
     all paths, up to a constant; see `phd_exp.fusion.tracks.gaussian`.
@@ -40,7 +41,7 @@ class Solved:
     Args:
         frames: of the track.
         chain: the energy.
-        x: the most likely unknowns, see `phd_exp.fusion.tracks.chain`.
+        x: the most likely unknowns, see `phd_exp.fusion.tracks.chain`, sheared.
         energy: -log density up to constants, nats.
         gap: its bound.
         distance: bounds of each position, metres.
@@ -54,8 +55,23 @@ class Solved:
     distance: Float[Array, " frames"]
 
     @cached_property
+    def unknowns(self) -> Float[Array, "frames d"]:
+        """The most likely unknowns."""
+        return unsheared(self.frames.shear, self.x)
+
+    @cached_property
+    def mean(self) -> Float[Array, "frames d"]:
+        """The expected unknowns."""
+        return unsheared(self.frames.shear, self.moments.mean)
+
+    @cached_property
+    def covariance(self) -> Float[Array, "frames d d"]:
+        """That of the unknowns of each frame."""
+        return unsheared_covariance(self.frames.shear, self.moments.covariance)
+
+    @cached_property
     def moments(self) -> "Moments":
-        """Mean and covariance, on demand."""
+        """Mean and covariance of the sheared unknowns, on demand."""
         from phd_exp.fusion.tracks.kernels import moments
 
         mean, covariance = self.x.copy(), np.empty((*self.x.shape, self.x.shape[1]))
@@ -67,7 +83,7 @@ class Solved:
     def excess(self) -> Float[Array, "frames cameras"]:
         """Energy of the path in each view above the view's lowest energy, nats."""
         frames = self.frames
-        at = frames.at_origin + (frames.slope @ self.x[:, None, :3, None])[..., 0]
+        at = frames.at_origin + (frames.slope @ self.unknowns[:, None, :3, None])[..., 0]
         q_x, q_y, t = np.moveaxis(at, -1, 0)
         inverse = 1 / np.where(t == 0, np.inf, t)  # t of a Gaussian prediction may be 0
         squared, a = q_x**2 + q_y**2, frames.a
@@ -101,18 +117,26 @@ def solve(
 
     of_depth, of_projection = (weights(time, frames.since, frames.mask) for time in vars(slow).values())
     a = frames.a if slow.depth_time == 0 else frames.a * of_depth
-    chain = Chain(frames.slope, frames.at_origin, a, of_projection, frames.a, *motion)
+    shear = frames.shear[:, None]
+    at_origin = frames.at_origin + (frames.slope @ shear[..., 3:])[..., 0]
+    chain = Chain(frames.slope @ shear[..., :3], at_origin, a, of_projection, frames.a, *motion)
     x, distance = x.copy(), np.empty(len(x))
     in_front, energy, gap = most_likely(chain, x, distance)
     if not in_front:
         status = Status.NO_COMMON_VIEW if np.isfinite(x).all() else Status.NOT_CONVERGED
         raise ValueError(f"predictions: {status.reason}")
+    distance *= np.linalg.norm(frames.shear[:, :, :3], 2, (1, 2))
     return Solved(frames, chain, x, energy, gap, distance)
 
 
 def smoothed(frames: Frames, motion: Motion, slow: Slow) -> Solved:
-    """The optimum of a whole track."""
+    """The optimum of a whole track; of a camera at rest twice, sheared about the first."""
     mean, precision = start(motion)
     x = np.zeros((len(frames.times), len(mean)))
     x[:, :3] = frames.near
-    return solve(frames, x, (mean, precision, *moving(motion, np.diff(frames.times))), slow)
+    law = mean, precision, *moving(motion, np.diff(frames.times))
+    solved = solve(frames, x, law, slow)
+    if is_at_rest(frames.centres):
+        shear = along_rays(solved.x[:, :3], frames.centres, frames.near[0])
+        solved = solve(replace(frames, shear=shear), solved.x, law, slow)
+    return solved

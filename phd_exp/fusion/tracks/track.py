@@ -45,12 +45,12 @@ class Path:
     @property
     def point(self) -> Float[Tensor, "frames 3"]:
         """The most likely positions, metres."""
-        return self._entered(self.solved.x[:, :3] + self.solved.frames.origin)
+        return self._entered(self.solved.unknowns[:, :3] + self.solved.frames.origin)
 
     @property
     def velocity(self) -> Float[Tensor, "frames 3"]:
         """The velocities of the most likely path, metres per second."""
-        return self._entered(self.solved.x[:, VELOCITY])
+        return self._entered(self.solved.unknowns[:, VELOCITY])
 
     @property
     def gap(self) -> float:
@@ -70,17 +70,17 @@ class Path:
     @property
     def mean(self) -> Float[Tensor, "frames 3"]:
         """The expected positions, metres."""
-        return self._entered(self.solved.moments.mean[:, :3] + self.solved.frames.origin)
+        return self._entered(self.solved.mean[:, :3] + self.solved.frames.origin)
 
     @property
     def covariance(self) -> Float[Tensor, "frames 3 3"]:
         """Covariance of each position about its mean, square metres; see `phd_exp.fusion.tracks.gaussian`."""
-        return self._entered(self.solved.moments.covariance[:, :3, :3])
+        return self._entered(self.solved.covariance[:, :3, :3])
 
     @property
     def velocity_covariance(self) -> Float[Tensor, "frames 3 3"]:
         """Covariance of each velocity, square metres per square second."""
-        return self._entered(self.solved.moments.covariance[:, VELOCITY, VELOCITY])
+        return self._entered(self.solved.covariance[:, VELOCITY, VELOCITY])
 
     @property
     def log_evidence(self) -> float:
@@ -107,7 +107,8 @@ def track(
     """The path of highest density: the product of the densities of all predictions and that of the motion.
 
     It minimises sum -log p_(k,i)(R v_k + t) plus half the squared noise of the motion over its variance. The problem
-    is convex, and solved to rounding in O(frames). With slow errors, each frame has a weight for its depth and one
+    is convex, and solved to rounding in O(frames). For one camera at rest, the motion is that across the rays at the
+    distance of a first such path, so that it does not tell the distance, see `phd_exp.fusion.tracks.shear`. With slow errors, each frame has a weight for its depth and one
     for its projection, see `phd_exp.fusion.tracks.slow`. Those of several cameras count as independent.
 
     Args:

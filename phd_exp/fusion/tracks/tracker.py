@@ -1,6 +1,6 @@
 """A path while it is seen: each frame's state a fixed number of frames later, in constant time a frame."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from phd_exp.fusion.tracks.chain import VELOCITY, Array, moving, start
 from phd_exp.fusion.tracks.frames import Frames, Gaussian
 from phd_exp.fusion.tracks.lost import USUAL, Lost
 from phd_exp.fusion.tracks.motion import Motion
+from phd_exp.fusion.tracks.shear import along_rays, is_at_rest
 from phd_exp.fusion.tracks.slow import NONE, Slow
 from phd_exp.fusion.tracks.solved import Solved, levels, solve
 from phd_exp.fusion.tracks.track import checked
@@ -152,7 +153,7 @@ class Tracker:
         if (window := self._window) is None:
             raise ValueError("position: expected a frame with a prediction before")
         k = int(np.searchsorted(window.frames.times, time))
-        mean, covariance = (values[min(k, len(window.x) - 1)] for values in window.moments[:2])
+        mean, covariance = (values[min(k, len(window.x) - 1)] for values in (window.mean, window.covariance))
         if k == len(window.x):
             (F,), (W,) = moving(self.motion, time - window.frames.times[-1:])
             mean, covariance = F @ mean, F @ covariance @ F.T + np.linalg.inv(W)
@@ -172,13 +173,19 @@ class Tracker:
         self._start = start(self.motion)
         x = np.zeros((1, len(self._start[0])))
         x[0, :3] = frame.near[0]
+        self._first_seen = frame.near[0], frame.centres
+        if is_at_rest(frame.centres):
+            frame = replace(frame, shear=along_rays(frame.near, frame.centres, frame.near[0]))
         return solve(frame, x, (*self._start, *moving(self.motion, np.empty(0))), self.slow)
 
     def _next(self, window: Solved, frame: Frames) -> Solved:
         """The window with one more frame, without its first one if it is full."""
         frames = window.frames.followed_by(frame)
         F, W = moving(self.motion, np.diff(frames.times))
-        x = np.concatenate([window.x, (F[-1] @ window.x[-1])[None]])
+        x = np.concatenate([window.x, (F[-1] @ window.unknowns[-1])[None]])
+        position, centres = self._first_seen
+        if is_at_rest(np.concatenate([centres, frames.centres[-1:]])):
+            frames.shear[-1] = along_rays(x[-1:, :3], centres, position)[0]
         if len(frames.times) > self.lag + 1:
             self._start = after_first(window, self._start, F[0], W[0])
             frames, x, F, W = frames[1:], x[1:], F[1:], W[1:]
@@ -188,9 +195,9 @@ class Tracker:
         """That of a frame of the window."""
         assert self._window is not None
         window, v = self._window, VELOCITY
-        mean, covariance, origin = window.moments.mean[k], window.moments.covariance[k], window.frames.origin
+        mean, covariance, origin = window.mean[k], window.covariance[k], window.frames.origin
         numbers = (
-            window.x[k, :3] + origin, window.x[k, v], mean[:3] + origin,
+            window.unknowns[k, :3] + origin, window.unknowns[k, v], mean[:3] + origin,
             covariance[:3, :3], covariance[v, v], window.excess[k], window.frames.a[k],
         )  # fmt: skip
         return State(float(window.frames.times[k]), *(torch.from_numpy(value.copy()) for value in numbers))
