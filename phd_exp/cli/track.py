@@ -46,10 +46,10 @@ class TrackArguments(CameraArguments):
     """how fast the velocity changes: by noise m/s in a second, growing with the root of time"""
     lag: Annotated[int, Field(ge=LEAST_LAG, le=1000)] = 10
     """how many later frames the state of a frame takes into account; as many images are in memory"""
-    depth_share: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """part of the variance of log depth whose error changes slowly from frame to frame"""
-    depth_time: Annotated[float, Field(gt=0, le=1e6)] = 1.0
-    """with depth_share=: the time constant of that error, s"""
+    depth_time: Annotated[float, Field(ge=0, le=1e6)] = 1.0
+    """how long depths err alike, s; 0 for independent frames"""
+    projection_time: Annotated[float, Field(ge=0, le=1e6)] = 0.1
+    """how long directions err alike, s"""
     least_familiar: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """leave out predictions that are more unusual than this, see familiar in the lines: the object may be hidden"""
     out: Path | None = None
@@ -74,10 +74,6 @@ class TrackArguments(CameraArguments):
             raise ValueError("object: selects detections of boxes=FILE; leave it out for one box")
         if self.coverage:
             raise ValueError("coverage: is guaranteed for single predictions, not for paths; leave it out")
-        if self.depth_time != 1.0 and not self.depth_share:
-            raise ValueError(
-                "depth_time: is that of the slow error; expected depth_share=0.4, or another below 1, too"
-            )
         return self
 
 
@@ -184,7 +180,7 @@ def _followed(arguments: TrackArguments, predictor: "Predictor", sequence: _Sequ
     from phd_exp.fusion.tracks import ConstantVelocity, Slow
     from phd_exp.inference.following import follow
 
-    slow = Slow(arguments.depth_share, arguments.depth_time)
+    slow = Slow(arguments.depth_time, arguments.projection_time)
     motion, least = ConstantVelocity(arguments.noise), arguments.least_familiar
     followed = follow(predictor, sequence.frames, motion, arguments.lag, slow, least_familiar=least)
     for one in with_bar(followed, f"tracking {sequence.name}", sequence.length):

@@ -33,8 +33,8 @@ OF_QUANTITIES = (
 )
 OF_METHODS = (
     "Single frames: the mode of each. Kalman (RTS): a Rauch-Tung-Striebel smoother of the frames' means and "
-    "covariances. Ours: the mean path under the frames' densities; slow errors: these are weighted by how much each frame tells that "
-    "the others do not. All assume a velocity that changes by white noise."
+    "covariances. Ours: the mean path under the frames' densities; slow errors: these have weights "
+    "by how much each frame tells that the others do not. All assume a velocity that changes by white noise."
 )
 
 
@@ -87,10 +87,11 @@ def _chosen(scores: TrackScores) -> str:
     noise, slow, whole = scores.choice.noise, scores.choice.slow, scores.choice.correlated
     noises = ", ".join(f"{noise[method]:.2g} ({NAMES[method]})" for method in SMOOTHERS)
     return (
-        f"Held-out sequences have a speed of {scores.choice.speed:.2g} m/s, and chose the noise of the motion, in m/s² "
-        f"per √Hz: {noises}. Their errors have the time constants {whole.depth_time:.2g} s of depth and "
-        f"{whole.projection_time:.2g} s of the projection by autocorrelation; the smoother uses {slow.depth_time:.2g} s "
-        f"and {slow.projection_time:.2g} s, with which the true held-out positions were most likely."
+        f"Held-out sequences have a speed of {scores.choice.speed:.2g} m/s, and chose the noise of the motion, in "
+        f"m/s² per √Hz: {noises}. Their errors have the time constants {whole.depth_time:.2g} s of depth and "
+        f"{whole.projection_time:.2g} s of the projection by autocorrelation; the smoother uses "
+        f"{slow.depth_time:.2g} s and {slow.projection_time:.2g} s, with which the true held-out positions were most "
+        "likely."
     )
 
 

@@ -60,13 +60,17 @@ def test_a_lag_of_all_frames_gives_the_path_and_a_shorter_one_nearly() -> None:
     assert squared.mean() < 0.1
 
 
-def test_slow_errors_weigh_the_frames_as_on_a_whole_path() -> None:
+def test_slow_errors_weigh_the_frames_nearly_as_on_a_whole_path() -> None:
     slow, mask = Slow(0.4, 0.2), torch.ones(40, 1, dtype=torch.bool)
     mask[12:18] = False
     predictions = drawn(Errors(deviation=0.05, share=0.4))
     path = track(torch.from_numpy(TIMES), predictions, POSE, LAW, mask, slow, NEVER)
     whole = fed(Tracker(LAW, 100, slow), predictions, mask)
-    torch.testing.assert_close(torch.stack([state.point for state in whole]), path.point, rtol=0, atol=1e-7)
+    off = torch.stack([state.mean for state in whole]) - path.mean  # the paths about which both are taken differ
+    squared = torch.einsum("ki,kij,kj->k", off, torch.linalg.inv(path.covariance), off)
+    print(squared)
+    assert squared.max() < 0.5
+    assert squared.mean() < 0.1
     last = fed(Tracker(LAW, 10, slow), predictions, mask)[-1]
     off = last.mean - path.mean[-1]
     assert off @ torch.linalg.solve(path.covariance[-1], off) < 1

@@ -216,7 +216,7 @@ def bad_input() -> dict[str, tuple[dict[str, Any], str]]:
         "a prediction": (bad(predictions=broken), r"frame 2: a prediction, pose or plane is not finite"),
         "nothing": (bad(mask=torch.zeros(4, 1, dtype=torch.bool)), r"mask: got no prediction in any frame"),
         "a baseline": (bad(predictions=POINTS), r"predictions: got PointEstimate; expected Projected"),
-        "slow": (bad(predictions=Gaussian.of(predictions), slow=Slow(depth_time=0.5)), r"slow: got Gaussian predictions; exp"),
+        "slow": (bad(predictions=Gaussian.of(predictions), slow=Slow(0.5)), r"slow: got Gaussian predictions; exp"),
         "singular": (
             bad(predictions=Gaussian(predictions.mean, 0 * predictions.covariance_matrix)),
             r"frame 0: a prediction, pose or plane is not finite",

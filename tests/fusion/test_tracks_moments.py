@@ -61,7 +61,6 @@ def test_slow_errors_are_about_within_the_covariance_if_frames_have_weights_and_
     errors: Errors, slow: Slow
 ) -> None:
     mean, half = nees(60, slow, errors=errors)
-    print(mean, half)
     assert abs(mean - 1) < 0.3
     ignored, half = nees(30, Slow(), errors=errors)
     assert ignored - half > 2
@@ -84,9 +83,9 @@ def test_the_time_constant_of_slow_errors_is_found() -> None:
     drawn, truth = drawn_paths(200, TIMES, LAW, around(1), errors=BOTH, seed=5)
     depth, projection = standardised_errors(drawn, around(1).into_camera(truth[:, :, None]))
     times = [TIMES] * 200
-    assert correlation_time(times, list(depth[..., 0].numpy())) == pytest.approx(0.38, rel=0.4)
+    assert 0.38 / 2 < correlation_time(times, list(depth[..., 0].numpy())) < 0.38 * 1.5  # of 38 % over 1 s
     both = [*projection[..., 0, 0].numpy(), *projection[..., 0, 1].numpy()]
-    assert correlation_time(times * 2, both) == pytest.approx(0.2, rel=0.4)
+    assert 0.2 / 2 < correlation_time(times * 2, both) < 0.2 * 1.5
     with pytest.raises(ValueError, match=r"^times: got 1 sequences of one frame at most; expected"):
         correlation_time([TIMES[:1]], [TIMES[:1]])
 

@@ -56,7 +56,7 @@ def frames(folder: Path, **changes: dict[int, Any]) -> str:
 
 
 def test_each_frame_of_a_folder_has_a_line(phd_exp: Callable, run: str, tmp_path: Path) -> None:
-    outcome = phd_exp("track", run, frames(tmp_path), "least_familiar=0.01", "depth_share=0.3", "depth_time=2")
+    outcome = phd_exp("track", run, frames(tmp_path), "least_familiar=0.01", "depth_time=2", "projection_time=0")
     assert (outcome.status, outcome.err) == (0, "")
     lines = read_lines(outcome.out)
     assert [line["frame"] for line in lines] == list(range(N))
@@ -100,7 +100,6 @@ def test_a_bad_frame_is_refused_on_one_line_and_those_before_are_kept(
         (("video=a.mp4", "f=90", "box=1,2,3,4", "boxes=b.json"), "box: expected either box= of the first frame"),
         (("video=a.mp4", "f=90", "object=1"), "object: selects detections of boxes=FILE"),
         (("folder=.", "coverage=0.9"), "coverage: is guaranteed for single predictions"),
-        (("folder=.", "depth_time=2"), "depth_time: is that of the slow error"),
         (("folder=.", "lag=2"), "lag: got '2'; expected to be greater than or equal to 4"),
         (("folder=.", "noise=0"), "noise: got '0'; expected to be greater than or equal to 0.001"),
         (("folder=.", "noise=inf"), "noise: got 'inf'; expected to be less than or equal to 1000"),

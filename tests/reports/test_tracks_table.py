@@ -9,7 +9,8 @@ from phd_exp.reports.files import all_tables, markdown
 from phd_exp.reports.runs import Report, read_report
 from phd_exp.reports.site.build import write_site
 from phd_exp.reports.site.run_charts import run_charts
-from tests.support.sequences import SLOW, write_sequences
+from tests.support.sequences import ERRORS as SLOW_ERRORS
+from tests.support.sequences import write_sequences
 from tests.support.synthetic import write_run
 
 
@@ -18,7 +19,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Report:
     folder = tmp_path_factory.mktemp("tracks")
     run = write_run(folder, "occl", n=40, epochs=1)
     for held_out in (False, True):
-        write_sequences(run.sequence(8, held_out=held_out), 8, 8, slow=SLOW, seed=int(held_out))
+        write_sequences(run.sequence(8, held_out=held_out), 8, 8, errors=SLOW_ERRORS, seed=int(held_out))
     write_sequences(run.sequence(12, held_out=False), 3, 12, seed=5)
     return read_report(folder)
 

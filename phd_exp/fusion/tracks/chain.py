@@ -1,4 +1,4 @@
-"""The unknowns of a path: position (relative to an origin, metres), velocity, and the motion's acceleration if any."""
+"""The unknowns of a path: position (relative to an origin, metres), velocity, and acceleration if there is one."""
 
 import numpy as np
 from jaxtyping import Float

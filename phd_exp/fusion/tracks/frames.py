@@ -51,8 +51,9 @@ class Frames:
         mask: which cameras take part.
         near: the average of each frame's predicted positions; those of the nearest frames where there is none.
         since: seconds since the camera's prediction before; inf without one.
-        centres: positions of the cameras.
-        shear: see `phd_exp.fusion.tracks.shear`.
+        centres: the apices of the densities, without a free axis the positions of the cameras.
+        about: a path, see `phd_exp.fusion.tracks.shear`; at first `near`.
+        shear: S and offset there; at first I and 0.
     """
 
     times: Float[np.ndarray, " frames"]
@@ -64,6 +65,7 @@ class Frames:
     near: Float[np.ndarray, "frames 3"]
     since: Float[np.ndarray, "frames cameras"]
     centres: Float[np.ndarray, "frames cameras 3"]
+    about: Float[np.ndarray, "frames 3"]
     shear: Float[np.ndarray, "frames 3 4"]
 
     @classmethod
@@ -106,9 +108,10 @@ class Frames:
         latest = np.maximum.accumulate(np.where(shown, seconds[:, None], -np.inf))
         since = seconds[:, None] - np.concatenate([np.full_like(latest[:1], -np.inf), latest[:-1]])
         slope = np.ascontiguousarray(views.slope.numpy())
-        centres = views.centres.numpy() - origin
+        centres = np.where(shown[..., None], views.centres.numpy() - origin, 0.0)
         of_cameras = slope, at_origin, views.a.numpy(), shown
-        return cls(seconds, origin, *of_cameras, near, since, centres, np.tile(np.eye(3, 4), (len(seconds), 1, 1)))
+        shear = np.tile(np.eye(3, 4), (len(seconds), 1, 1))
+        return cls(seconds, origin, *of_cameras, near, since, centres, near, shear)
 
     def __getitem__(self, part: slice) -> "Frames":
         """Some of the frames."""
@@ -117,19 +120,17 @@ class Frames:
 
     def unseen(self, time: float) -> "Frames":
         """One later frame, in which no camera takes part."""
-        no_view = np.zeros_like(self.slope[-1:]), np.zeros_like(self.at_origin[-1:]) + (0.0, 0.0, 1.0)
-        nothing = np.zeros_like(self.a[-1:]), np.zeros_like(self.mask[-1:])
-        known = self.near[-1:], self.since[-1:], self.centres[-1:], np.eye(3, 4)[None]
-        return Frames(np.array([time]), self.origin, *no_view, *nothing, *known)
+        nothing = {name: np.zeros_like(getattr(self, name)[-1:]) for name in ("slope", "at_origin", "a", "mask")}
+        nothing["at_origin"][..., 2] = 1.0
+        return replace(self[-1:], times=np.array([time]), **nothing)
 
     def followed_by(self, later: "Frames") -> "Frames":
         """With one frame more, relative to the same origin."""
         shift = self.origin - later.origin
         at_origin = later.at_origin + later.slope @ shift
         latest = self.times[-1] - np.where(self.mask[-1], 0.0, self.since[-1])
-        since = later.times[:, None] - latest
-        near, centres = later.near - shift, later.centres - shift
-        later = replace(later, at_origin=at_origin, near=near, since=since, centres=centres)
+        moved = {name: getattr(later, name) - shift for name in ("near", "centres", "about")}
+        later = replace(later, at_origin=at_origin, since=later.times[:, None] - latest, **moved)
         values = {name: np.concatenate([value, getattr(later, name)]) for name, value in vars(self).items()}
         return Frames(**(values | {"origin": self.origin}))
 
@@ -172,7 +173,7 @@ def _views(predictions: ProjectedHuber | Gaussian, pose: Pose, mask: Tensor | No
     problems = Problems.posed(predictions, pose, None, mask)
     origin = problems.origin.nan_to_num()[:, None, :, None]
     at_zero = problems.at_origin - (problems.slope @ origin).squeeze(-1)
-    centres = problems.pose.into_world(torch.zeros(3, dtype=torch.float64))
+    centres = problems.pose.into_world(predictions.apex.double().cpu())
     return _Views(problems.slope, at_zero, problems.a, problems.mask, problems.origin, centres, problems.status)
 
 

@@ -75,10 +75,10 @@ def standardised_errors(
 def correlation_time(
     times: Sequence[Float[np.ndarray, " frames"]], errors: Sequence[Float[np.ndarray, " frames"]]
 ) -> float:
-    """The time constant of errors, seconds: the integral of their autocorrelation, of which `Slow` takes two.
+    """The time constant of errors, seconds, of which `Slow` takes two.
 
-    Products of two errors of a sequence, over the mean square, have the expectation share exp(-s/time) at a distance
-    of s seconds. Both numbers are fitted to all pairs by least squares; the integral is their product.
+    Products of two errors of a sequence, over the mean square, have the expectation exp(-s/time) at a distance of s
+    seconds. The time is fitted to all pairs by least squares.
 
     Args:
         times: of the frames of each sequence, seconds.
@@ -96,13 +96,8 @@ def correlation_time(
     product = np.concatenate([e[i] * e[j] for e, (i, j) in zip(errors, pairs, strict=True)])
     product = product / np.mean(np.concatenate(list(errors)) ** 2)
 
-    def share(log_time: float) -> tuple[float, float]:
-        """The best share in [0, 1) for a time constant, and the sum of squares."""
-        decay = np.exp(-lag / np.exp(log_time))
-        best = min(max(float(product @ decay / max(decay @ decay, 1e-300)), 0.0), 0.999)
-        return best, float(((product - best * decay) ** 2).sum())
+    def loss(log_time: float) -> float:
+        return float(np.square(product - np.exp(-lag / math.exp(log_time))).sum())
 
-    step = float(np.median(lag))
-    bounds = (math.log(float(lag.min()) * 0.3), math.log(step * 1e3))
-    found = optimize.minimize_scalar(lambda log_time: share(log_time)[1], bounds=bounds, method="bounded")
-    return share(found.x)[0] * math.exp(found.x)
+    bounds = math.log(0.1 * float(lag.min())), math.log(1000 * float(np.median(lag)))
+    return math.exp(optimize.minimize_scalar(loss, bounds=bounds, method="bounded").x)

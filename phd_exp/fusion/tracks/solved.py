@@ -1,6 +1,6 @@
 """The optimum of the frames of a track, and its moments."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -15,8 +15,8 @@ from phd_exp.fusion.tracks.chain import Array, moving, start
 from phd_exp.fusion.tracks.energy import GAUSSIAN, Chain
 from phd_exp.fusion.tracks.frames import Frames
 from phd_exp.fusion.tracks.motion import Motion
-from phd_exp.fusion.tracks.shear import along_rays, is_at_rest, unsheared, unsheared_covariance
-from phd_exp.fusion.tracks.slow import Slow, weights
+from phd_exp.fusion.tracks.shear import apart, sheared, unsheared, unsheared_covariance
+from phd_exp.fusion.tracks.slow import NONE, Slow, weights
 
 # `kernels` is imported in the functions that use it: importing numba takes a second
 
@@ -115,11 +115,11 @@ def solve(
     """
     from phd_exp.fusion.tracks.kernels import most_likely
 
-    of_depth, of_projection = (weights(time, frames.since, frames.mask) for time in vars(slow).values())
-    a = frames.a if slow.depth_time == 0 else frames.a * of_depth
-    shear = frames.shear[:, None]
-    at_origin = frames.at_origin + (frames.slope @ shear[..., 3:])[..., 0]
-    chain = Chain(frames.slope @ shear[..., :3], at_origin, a, of_projection, frames.a, *motion)
+    a, p, views = frames.a, frames.mask.astype(float), (frames.slope, frames.at_origin)
+    if slow != NONE:
+        a, p = (weights(time, frames.since, frames.mask) for time in vars(slow).values())
+        a, views = a * frames.a, apart(frames)
+    chain = Chain(*views, a, p, frames.a, *motion)
     x, distance = x.copy(), np.empty(len(x))
     in_front, energy, gap = most_likely(chain, x, distance)
     if not in_front:
@@ -130,13 +130,10 @@ def solve(
 
 
 def smoothed(frames: Frames, motion: Motion, slow: Slow) -> Solved:
-    """The optimum of a whole track; of a camera at rest twice, sheared about the first."""
+    """The optimum of a whole track; with slow errors about that without them."""
     mean, precision = start(motion)
     x = np.zeros((len(frames.times), len(mean)))
     x[:, :3] = frames.near
     law = mean, precision, *moving(motion, np.diff(frames.times))
-    solved = solve(frames, x, law, slow)
-    if is_at_rest(frames.centres):
-        shear = along_rays(solved.x[:, :3], frames.centres, frames.near[0])
-        solved = solve(replace(frames, shear=shear), solved.x, law, slow)
-    return solved
+    solved = solve(frames, x, law, NONE)
+    return solved if slow == NONE else solve(sheared(frames, solved.x[:, :3]), solved.x, law, slow)

@@ -107,9 +107,9 @@ def track(
     """The path of highest density: the product of the densities of all predictions and that of the motion.
 
     It minimises sum -log p_(k,i)(R v_k + t) plus half the squared noise of the motion over its variance. The problem
-    is convex, and solved to rounding in O(frames). For one camera at rest, the motion is that across the rays at the
-    distance of a first such path, so that it does not tell the distance, see `phd_exp.fusion.tracks.shear`. With slow errors, each frame has a weight for its depth and one
-    for its projection, see `phd_exp.fusion.tracks.slow`. Those of several cameras count as independent.
+    is convex, and solved to rounding in O(frames). With slow errors, each frame has a weight for its depth and one
+    for its projection, see `phd_exp.fusion.tracks.slow`, several cameras count as independent, and the problem is
+    that about the path without slow errors, see `phd_exp.fusion.tracks.shear`.
 
     Args:
         times: of the frames, increasing, seconds.

@@ -1,6 +1,6 @@
 """A path while it is seen: each frame's state a fixed number of frames later, in constant time a frame."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from phd_exp.fusion.tracks.chain import VELOCITY, Array, moving, start
 from phd_exp.fusion.tracks.frames import Frames, Gaussian
 from phd_exp.fusion.tracks.lost import USUAL, Lost
 from phd_exp.fusion.tracks.motion import Motion
-from phd_exp.fusion.tracks.shear import along_rays, is_at_rest
+from phd_exp.fusion.tracks.shear import sheared
 from phd_exp.fusion.tracks.slow import NONE, Slow
 from phd_exp.fusion.tracks.solved import Solved, levels, solve
 from phd_exp.fusion.tracks.track import checked
@@ -173,9 +173,8 @@ class Tracker:
         self._start = start(self.motion)
         x = np.zeros((1, len(self._start[0])))
         x[0, :3] = frame.near[0]
-        self._first_seen = frame.near[0], frame.centres
-        if is_at_rest(frame.centres):
-            frame = replace(frame, shear=along_rays(frame.near, frame.centres, frame.near[0]))
+        frame = sheared(frame, frame.near) if self.slow != NONE else frame
+        self._first_seen = frame
         return solve(frame, x, (*self._start, *moving(self.motion, np.empty(0))), self.slow)
 
     def _next(self, window: Solved, frame: Frames) -> Solved:
@@ -183,9 +182,8 @@ class Tracker:
         frames = window.frames.followed_by(frame)
         F, W = moving(self.motion, np.diff(frames.times))
         x = np.concatenate([window.x, (F[-1] @ window.unknowns[-1])[None]])
-        position, centres = self._first_seen
-        if is_at_rest(np.concatenate([centres, frames.centres[-1:]])):
-            frames.shear[-1] = along_rays(x[-1:, :3], centres, position)[0]
+        if self.slow != NONE:
+            frames = sheared(frames, x[-1:, :3], self._first_seen)
         if len(frames.times) > self.lag + 1:
             self._start = after_first(window, self._start, F[0], W[0])
             frames, x, F, W = frames[1:], x[1:], F[1:], W[1:]
