@@ -200,8 +200,10 @@ def _write(arguments: TrackArguments, predictor: "Predictor", sequences: list[_S
     from phd_exp.inference.path_video import PathVideo
 
     file, page = out / "track.jsonl", out / "track.html"
-    for earlier in (file, page):  # a page is written only if a frame has a position
-        earlier.unlink(missing_ok=True)
+    if file.exists():  # of an earlier command, which may have had more paths, or a page
+        for earlier in (*out.glob("*.mp4"), page, file):
+            if earlier in (file, page) or earlier.stem == "track" or earlier.stem.isdecimal():
+                earlier.unlink(missing_ok=True)
     with ExitStack() as ends, open(file, "x", buffering=1) as lines:
         ends.callback(write_page, file, page)  # also of the frames before an error
         for number, sequence in enumerate(sequences, start=1):

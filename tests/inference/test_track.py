@@ -166,8 +166,13 @@ def test_a_video_has_its_times_and_pixels(video: Path) -> None:
 
 def test_a_video_is_followed_from_one_box(phd_exp: Callable, run: str, video: Path, tmp_path: Path) -> None:
     words = ("track", run, f"video={video}", "f=90", "stride=2")
+    (tmp_path / "out").mkdir()
+    for name in ("track.jsonl", "2.mp4", "mine.mp4"):
+        (tmp_path / "out" / name).touch()
     outcome = phd_exp(*words, "box=8,12,32,38", f"out={tmp_path / 'out'}")
     assert outcome.status == 0, outcome.err
+    left = {file.name for file in (tmp_path / "out").iterdir()}
+    assert left == {"track.jsonl", "track.mp4", "track.html", "mine.mp4"}, "the video of an earlier path is removed"
     lines = read_lines((tmp_path / "out/track.jsonl").read_text())
     assert [line["frame"] for line in lines] == list(range(0, N, 2))
     assert lines[0]["box"] == [8, 12, 32, 38]
