@@ -181,6 +181,7 @@ def answers(prediction: Prediction) -> dict[str, Tensor]:
         "mode": prediction.mode,
         "mean": prediction.mean,
         "covariance": prediction.covariance_matrix,
+        "a": prediction.a,
         "median_depth": z[0],
         "depth_interval": torch.stack([z[1 : 1 + len(PER_CENT)], z[1 + len(PER_CENT) :]]).permute(2, 1, 0),
     }

@@ -38,6 +38,7 @@ DESCRIPTIONS = {
     "mode": "(n, 3) float32: position of highest density, m; camera frame: x right, y down, z forward",
     "mean": "(n, 3) float32: expected position, m",
     "covariance": "(n, 3, 3) float32: covariance of the position, m^2",
+    "a": "(n,) float32: the depth precision of the density, which decides about guaranteed regions",
     "median_depth": "(n,) float32: median of z, m",
     "depth_interval": "(n, 3, 2) float32: lower and upper end of the central 50, 90 and 99 % intervals of z, m",
     "ray": "(n, 3) float32: unit vector from the camera through the middle of each box",
