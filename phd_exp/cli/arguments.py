@@ -5,6 +5,7 @@ import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
@@ -109,6 +110,18 @@ def require_covariance(arguments: "RunArguments", predictor: "Predictor") -> Non
             f"{arguments.run[0]}: predicts no covariance, which out=*{MCAP} needs; expected a run of "
             "model=probabilistic"
         )
+
+
+def new_view(view: Path) -> None:
+    """Make the folder of a recording for Rerun. Raises ConfigError unless it can be a new file *.rrd."""
+    if view.suffix != ".rrd":
+        raise ConfigError(f"view: got {view}; expected a file *.rrd, such as {view.with_name('view.rrd')}")
+    if os.path.lexists(view):
+        raise ConfigError(f"view: got {view}, which exists; expected a new file; delete it, or choose another")
+    if find_spec("rerun") is None:
+        raise ConfigError("view: recordings for Rerun need `pip install 'phd_exp[rerun]'`")
+    with writing(view, "view=", ConfigError):
+        view.parent.mkdir(parents=True, exist_ok=True)
 
 
 Paths = Annotated[tuple[Path, ...], BeforeValidator(lambda text: [text] if os.path.exists(text) else text.split(","))]

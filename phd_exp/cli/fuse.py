@@ -3,13 +3,23 @@
 import json
 import math
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import field_validator
 
-from phd_exp.cli.arguments import RunArguments, four_numbers, loaded, message_file, predicted, require_output
+from phd_exp.cli.arguments import (
+    RunArguments,
+    four_numbers,
+    loaded,
+    message_file,
+    new_view,
+    predicted,
+    require_output,
+)
 from phd_exp.records.detections import NumberOrName
 from phd_exp.records.errors import ConfigError, RunError, listed
 from phd_exp.records.files import write_atomic
@@ -37,6 +47,8 @@ class FuseArguments(RunArguments):
     """estimate one factor that the depths of all views share, as they do in the run's recorded scenes"""
     out: Path | None = None
     """a file for the lines; by default they are printed, also with FILE.mcap, which receives messages of ROS 2"""
+    view: Path | None = None
+    """a new file *.rrd for the viewer Rerun: all cameras with their images and regions, and the fused position"""
 
     @field_validator("plane")
     @classmethod
@@ -60,6 +72,8 @@ def main(words: list[str]) -> int:
     if out is not None:
         inputs = [*annotations(arguments.folder)[0], *(detection.file for detection in detections)]
         require_output(out, "fused.jsonl", inputs)
+    if arguments.view is not None:
+        new_view(arguments.view)
     with message_file(out) as messages:
         answers = _answers(arguments, scenes, messages)
     text = "".join(json.dumps(answer, allow_nan=False) + "\n" for answer in answers)
@@ -85,7 +99,7 @@ def _answers(
 
     from phd_exp.evaluation.conformal import fused_guarantee
     from phd_exp.fusion import Plane
-    from phd_exp.inference.fused import for_json, fused_region
+    from phd_exp.inference.fused import for_json, fused_answers, fused_region
     from phd_exp.inference.tables import require_received
 
     if arguments.coverage and (arguments.plane or arguments.shared_scale):
@@ -113,23 +127,31 @@ def _answers(
         views, cameras = predictor.folders[0].views, {len(scene.detections) for scene in scenes}
         guarantees = {k: fused_guarantee(views, k, arguments.coverage, predictor.temperature) for k in cameras}
     shared = _shared_share(predictor.folders[0]) if arguments.shared_scale else None
-    answers = _fused(messages, scenes, predicted(predictor, detections), predictor, plane, shared)
+    with _recorded(arguments.view, messages, scenes, predicted(predictor, detections)) as (sightings, adding):
+        answers = fused_answers(scenes, sightings, predictor, plane, shared)
+        adding(answers)
     return [for_json(answer) | (fused_region(answer, guarantees) if guarantees else {}) for answer in answers]
 
 
-def _fused(
-    messages: MessageFile | None, scenes: Sequence[Observed], sightings: Iterable["Sighting"], *how: Any
-) -> list[dict[str, Any]]:
-    """The answers of `fused_answers`, which are written to `messages` with the images."""
-    from phd_exp.inference.fused import fused_answers
+@contextmanager
+def _recorded(
+    view: Path | None, messages: MessageFile | None, scenes: Sequence[Observed], sightings: Iterable["Sighting"]
+) -> Iterator[tuple[Iterable["Sighting"], Callable[[list[dict[str, Any]]], None]]]:
+    """The sightings, written to the recordings of view= and out= as they pass, and a function that adds answers."""
+    recordings: list[Callable[[list[dict[str, Any]]], None]] = []
+    with ExitStack() as ends:
+        if messages is not None:
+            from phd_exp.inference.ros import write_fused, write_views
 
-    if messages is None:
-        return fused_answers(scenes, sightings, *how)
-    from phd_exp.inference.ros import write_fused, write_views
+            sightings = write_views(messages, scenes, sightings)
+            recordings.append(partial(write_fused, messages, scenes))
+        if view is not None:
+            from phd_exp.inference.rerun_view import add_fused, of_scenes, viewed_scenes
 
-    answers = fused_answers(scenes, write_views(messages, scenes, sightings), *how)
-    write_fused(messages, scenes, answers)
-    return answers
+            recording = ends.enter_context(of_scenes(view, scenes))
+            sightings = viewed_scenes(recording, scenes, sightings)
+            recordings.append(partial(add_fused, recording))
+        yield sightings, lambda answers: [add(answers) for add in recordings]
 
 
 def _shared_share(run: RunFolder) -> float:

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -13,6 +14,7 @@ from phd_exp.cli.arguments import (
     Paths,
     loaded,
     message_file,
+    new_view,
     output_folder,
     predicted,
     require_covariance,
@@ -26,6 +28,7 @@ from phd_exp.records.own_images import detections_in, images_in
 from phd_exp.records.recordings import MCAP, Detections, Recording, is_recording
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
+    from phd_exp.inference.answers import Sighting
     from phd_exp.inference.predictor import Predictor
 
 LONGEST_STEM = 50  # characters of an image's name in the name of its picture
@@ -46,6 +49,8 @@ class PredictArguments(CameraArguments):
     out: Path | None = None
     """a folder for predictions.jsonl and a picture for each line; by default lines are printed, also with FILE.mcap,
     which receives messages of ROS 2"""
+    view: Path | None = None
+    """a new file *.rrd for the viewer Rerun: images with outlines, and the regions of 50 and 90 % in space"""
     groups: Literal["spread", "truncation", "focal_length"] | None = None
     """with coverage=: guarantee it in each of four groups of predictions by this quantity"""
     curve: bool = False
@@ -77,24 +82,16 @@ def main(words: list[str]) -> int:
     """Predict each detection; returns the exit status."""
     arguments = PredictArguments.parsed("predict", words)
     out, detections = arguments.out, _detections(arguments)
-    inputs = [detections.path] if isinstance(detections, Recording) else [one.file for one in detections]
-    if out is not None and out.suffix == MCAP:
-        require_output(out, f"predictions{MCAP}", inputs)
-    elif out is not None:
-        if find_spec("matplotlib") is None:
-            raise ConfigError("out: pictures need `pip install 'phd_exp[report]'`; without out= there is JSON alone")
-        if out.resolve() in {file.resolve().parent for file in inputs}:
-            raise ConfigError(f"out={out}: holds the images themselves; choose another folder")
-        output_folder(out)
+    _prepare(arguments, detections)
     predictor = loaded(arguments)
     guarantee = predictor.guarantee(arguments.coverage, arguments.groups) if arguments.coverage else None
     curve = _depth_curve(predictor) if arguments.curve else None
+    sightings = _viewed(arguments, predictor, predicted(predictor, detections, guarantee))
     if out is not None and out.suffix != MCAP:
-        _write(predictor, detections, out, curve, guarantee)
+        _write(predictor, sightings, len(detections), out, curve, guarantee)
         return 0
     from phd_exp.inference.answers import answer
 
-    sightings = predicted(predictor, detections, guarantee)
     with message_file(out) as messages:
         if messages is not None:
             from phd_exp.inference.ros import write_predictions
@@ -104,6 +101,22 @@ def main(words: list[str]) -> int:
         for sighting in sightings:
             print(json.dumps(answer(sighting, predictor.temperature), allow_nan=False), flush=True)
     return 0
+
+
+def _prepare(arguments: PredictArguments, detections: Detections) -> None:
+    """Make the folders of the outputs. Raises ConfigError if one cannot be written, or is an input."""
+    out = arguments.out
+    inputs = [detections.path] if isinstance(detections, Recording) else [one.file for one in detections]
+    if out is not None and out.suffix == MCAP:
+        require_output(out, f"predictions{MCAP}", inputs)
+    elif out is not None:
+        if find_spec("matplotlib") is None:
+            raise ConfigError("out: pictures need `pip install 'phd_exp[report]'`; without out= there is JSON alone")
+        if out.resolve() in {file.resolve().parent for file in inputs}:
+            raise ConfigError(f"out={out}: holds the images themselves; choose another folder")
+        output_folder(out)
+    if arguments.view is not None:
+        new_view(arguments.view)
 
 
 def _detections(arguments: PredictArguments) -> Detections:
@@ -117,7 +130,25 @@ def _detections(arguments: PredictArguments) -> Detections:
     return detections_of(files, camera, boxes)
 
 
-def _write(predictor: "Predictor", detections: Detections, out: Path, curve: Any, guarantee: Any) -> None:
+def _viewed(
+    arguments: PredictArguments, predictor: "Predictor", sightings: Iterable["Sighting"]
+) -> Iterable["Sighting"]:
+    """The sightings, each of which is written to view= first."""
+    if arguments.view is None:
+        return sightings
+    if not predictor.is_probabilistic:
+        raise ConfigError(
+            f"view: {arguments.run[0]} predicts no Projected Huber densities, whose regions it shows; expected a run "
+            "of model=probabilistic"
+        )
+    from phd_exp.inference.rerun_view import viewed
+
+    return viewed(arguments.view, sightings)
+
+
+def _write(
+    predictor: "Predictor", sightings: Iterable["Sighting"], n: int, out: Path, curve: Any, guarantee: Any
+) -> None:
     """Write each line of `predictions.jsonl` before its picture, whose name begins with the line's number."""
     from phd_exp.inference.answers import answer
     from phd_exp.inference.pictures import picture
@@ -125,9 +156,9 @@ def _write(predictor: "Predictor", detections: Detections, out: Path, curve: Any
     file, temperature = out / "predictions.jsonl", predictor.temperature
     file.unlink(missing_ok=True)
     with open(file, "x", buffering=1) as lines:
-        for number, sighting in enumerate(predicted(predictor, detections, guarantee), start=1):
+        for number, sighting in enumerate(sightings, start=1):
             stem = Path(sighting.detection.line.file_name).stem[:LONGEST_STEM]
-            name = f"{number:0{len(str(len(detections)))}}-{stem}.png"
+            name = f"{number:0{len(str(n))}}-{stem}.png"
             line = answer(sighting, temperature) | {"picture": name}
             lines.write(json.dumps(line, allow_nan=False) + "\n")
             write_atomic(out / name, picture(sighting, line, curve, guarantee))

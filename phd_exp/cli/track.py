@@ -3,7 +3,7 @@
 import json
 import math
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from pydantic import Field, model_validator
 
-from phd_exp.cli.arguments import CameraArguments, loaded, message_file, output_folder, require_output, with_bar
+from phd_exp.cli.arguments import (
+    CameraArguments,
+    loaded,
+    message_file,
+    new_view,
+    output_folder,
+    require_output,
+    with_bar,
+)
 from phd_exp.records.detections import NumberOrName, detections_of
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.foreign import boxes_of_images
@@ -23,6 +31,7 @@ from phd_exp.records.videos import length_of, require_av, shots_in
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
     from phd_exp.inference.following import Followed, Frame
     from phd_exp.inference.predictor import Predictor
+    from phd_exp.inference.rerun_recording import Recording
 
 Box = tuple[float, float, float, float]
 LEAST_LAG = 4  # five frames in a row that contradict a path end it
@@ -55,6 +64,8 @@ class TrackArguments(CameraArguments):
     out: Path | None = None
     """a folder for track.jsonl, a video with level curves, and a page with the path; by default lines are printed,
     also with FILE.mcap, which receives messages of ROS 2"""
+    view: Path | None = None
+    """a new file *.rrd for the viewer Rerun: images with outlines, ellipsoids and the path in space, over time"""
 
     @model_validator(mode="after")
     def one_source(self) -> "TrackArguments":
@@ -97,34 +108,35 @@ def main(words: list[str]) -> int:
     if arguments.video or (out and out.suffix != MCAP):
         require_av("video" if arguments.video else "out")
     sequences = list(_sequences(arguments))
-    if out is not None:
-        _prepare(out, arguments.folder or Path(str(arguments.video)))
+    _prepare(arguments)
     predictor = loaded(arguments)
-    if out is not None and out.suffix != MCAP:
-        _write(arguments, predictor, sequences, out)
-        return 0
-    with message_file(out) as messages:
-        for sequence in sequences:
-            path = _followed(arguments, predictor, sequence)
-            if messages is not None:
-                from phd_exp.inference.ros import write_path
+    with ExitStack() as ends:
+        view = None
+        if arguments.view is not None:
+            from phd_exp.inference.rerun_view import of_paths
 
-                path = write_path(messages, sequence.name, sequence.origin, sequence.camera, path)
-            for followed in path:
-                print(_line(arguments, predictor, sequence, followed), flush=True)
+            view = ends.enter_context(of_paths(arguments.view, [sequence.name for sequence in sequences]))
+        paths = [(sequence, _followed(arguments, predictor, sequence, view)) for sequence in sequences]
+        if out is not None and out.suffix != MCAP:
+            _write(arguments, predictor, paths, out)
+        else:
+            _print(arguments, predictor, paths)
     return 0
 
 
-def _prepare(out: Path, source: Path) -> None:
-    """Make the place to write to. Raises ConfigError if that is impossible, or would change the source."""
-    if out.suffix == MCAP:
+def _prepare(arguments: TrackArguments) -> None:
+    """Make the places to write to. Raises ConfigError if that is impossible, or would change the source."""
+    out, source = arguments.out, arguments.folder or Path(str(arguments.video))
+    if out is not None and out.suffix == MCAP:
         require_output(out, f"track{MCAP}", [source])
-        return
-    if find_spec("plotly") is None:
-        raise ConfigError("out: pages need `pip install 'phd_exp[report]'`; without out= there is JSON alone")
-    if out.resolve() == (source if source.is_dir() else source.parent).resolve():
-        raise ConfigError(f"out={out}: holds the images themselves; choose another folder")
-    output_folder(out)
+    elif out is not None:
+        if find_spec("plotly") is None:
+            raise ConfigError("out: pages need `pip install 'phd_exp[report]'`; without out= there is JSON alone")
+        if out.resolve() == (source if source.is_dir() else source.parent).resolve():
+            raise ConfigError(f"out={out}: holds the images themselves; choose another folder")
+        output_folder(out)
+    if arguments.view is not None:
+        new_view(arguments.view)
 
 
 def _sequences(arguments: TrackArguments) -> Iterator[_Sequence]:
@@ -175,14 +187,20 @@ def _boxes_of_frames(file: Path, category: int | str | None) -> dict[int, list[B
     return found
 
 
-def _followed(arguments: TrackArguments, predictor: "Predictor", sequence: _Sequence) -> Iterator["Followed"]:
-    """The frames with their states, with a progress bar on a terminal."""
+def _followed(
+    arguments: TrackArguments, predictor: "Predictor", sequence: _Sequence, view: "Recording | None"
+) -> Iterator["Followed"]:
+    """The frames with their states, in the recording for view= first, with a progress bar on a terminal."""
     from phd_exp.fusion.tracks import ConstantVelocity, Slow
     from phd_exp.inference.following import follow
 
     slow = Slow(arguments.depth_time, arguments.projection_time)
     motion, least = ConstantVelocity(arguments.noise), arguments.least_familiar
     followed = follow(predictor, sequence.frames, motion, arguments.lag, slow, least_familiar=least)
+    if view is not None:
+        from phd_exp.inference.rerun_view import viewed_path
+
+        followed = viewed_path(view, sequence.name, followed)
     for one in with_bar(followed, f"tracking {sequence.name}", sequence.length):
         if one.reason:
             print(f"note: {one.frame.where}: {one.reason}", file=sys.stderr)
@@ -194,7 +212,25 @@ def _line(arguments: TrackArguments, predictor: "Predictor", sequence: _Sequence
     return json.dumps({"name": sequence.name} | numbers, allow_nan=False)
 
 
-def _write(arguments: TrackArguments, predictor: "Predictor", sequences: list[_Sequence], out: Path) -> None:
+def _print(
+    arguments: TrackArguments, predictor: "Predictor", paths: list[tuple[_Sequence, Iterator["Followed"]]]
+) -> None:
+    with message_file(arguments.out) as messages:
+        for sequence, path in paths:
+            if messages is not None:
+                from phd_exp.inference.ros import write_path
+
+                path = write_path(messages, sequence.name, sequence.origin, sequence.camera, path)
+            for followed in path:
+                print(_line(arguments, predictor, sequence, followed), flush=True)
+
+
+def _write(
+    arguments: TrackArguments,
+    predictor: "Predictor",
+    paths: Sequence[tuple[_Sequence, Iterator["Followed"]]],
+    out: Path,
+) -> None:
     """Write each line before its frame of the video, whose name begins with the number of its sequence."""
     from phd_exp.inference.path_page import write_page
     from phd_exp.inference.path_video import PathVideo
@@ -206,10 +242,10 @@ def _write(arguments: TrackArguments, predictor: "Predictor", sequences: list[_S
                 earlier.unlink(missing_ok=True)
     with ExitStack() as ends, open(file, "x", buffering=1) as lines:
         ends.callback(write_page, file, page)  # also of the frames before an error
-        for number, sequence in enumerate(sequences, start=1):
-            name = "track" if len(sequences) == 1 else f"{number:0{len(str(len(sequences)))}}"
+        for number, (sequence, path) in enumerate(paths, start=1):
+            name = "track" if len(paths) == 1 else f"{number:0{len(str(len(paths)))}}"
             with PathVideo(out / f"{name}.mp4") as video:
-                for followed in _followed(arguments, predictor, sequence):
+                for followed in path:
                     lines.write(_line(arguments, predictor, sequence, followed) + "\n")
                     video.add(followed)
     print(f"{file}, a video for each path{f', and {page}' * page.exists()}", file=sys.stderr)

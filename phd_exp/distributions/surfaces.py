@@ -1,13 +1,15 @@
-"""Closed surfaces of triangles in space: around the region of a credible level, and ellipsoids of a covariance."""
+"""Closed surfaces of triangles: around the region of a credible level, and ellipsoids; their outlines on images."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy import stats
+from scipy.spatial import ConvexHull
 
 from phd_exp.distributions.projected_huber import ProjectedHuber
 from phd_exp.distributions.regions import Region
+from phd_exp.optics.virtual import VirtualCamera
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +45,11 @@ def level_surface(distribution: ProjectedHuber, level: float, depths: int = 21, 
 
 
 def ellipsoid(
-    mean: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"], level: float, depths: int = 21, angles: int = 48
+    mean: Float[np.ndarray, "3"],
+    covariance: Float[np.ndarray, "3 3"],
+    level: float,
+    depths: int = 21,
+    angles: int = 48,
 ) -> Surface:
     """The ellipsoid that has the probability `level` under a Gaussian."""
     across, around = np.linspace(0, np.pi, depths)[:, None], 2 * np.pi / angles * np.arange(angles)
@@ -56,6 +62,19 @@ def ellipsoid(
 def gaussian_radius(level: float) -> float:
     """The Mahalanobis distance in three dimensions within which a Gaussian has the probability `level`."""
     return float(np.sqrt(stats.chi2.ppf(level, 3)))
+
+
+def outline(points: Float[np.ndarray, "n 3"], camera: VirtualCamera) -> Float[np.ndarray, "m 2"]:
+    """The closed outline of the convex hull of points (metres, frame of `camera`), pixels of the real image.
+
+    Empty if not all points are before the virtual camera; without the parts that the lens of the real one hides.
+    """
+    if not (points[:, 2] > 0).all():
+        return np.zeros((0, 2))
+    flat = points[:, :2] / points[:, 2:]
+    hull = ConvexHull(flat, qhull_options="QbB").vertices
+    pixels = camera.real_pixels(flat[[*hull, hull[0]]])
+    return np.asarray(pixels[np.isfinite(pixels).all(-1)])
 
 
 def _closed(rings: Float[np.ndarray, "depths angles 3"]) -> Surface:

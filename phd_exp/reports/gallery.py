@@ -14,6 +14,7 @@ from PIL import Image
 
 from phd_exp.distributions.columns import from_columns, parameter_names
 from phd_exp.distributions.level_curves import LEVELS, LevelCurves, level_curves, on_image
+from phd_exp.distributions.projected_huber import ProjectedHuber
 from phd_exp.evaluation.parquet import Columns, require_columns
 from phd_exp.records.errors import UserError
 from phd_exp.records.files import require_plain
@@ -138,13 +139,19 @@ def _picture(row: Mapping[str, Any], source: Path | None) -> Picture:
 
 
 def curves_of(row: Mapping[str, Any]) -> LevelCurves | None:
-    """The level curves of a row; None for a baseline, or if the parameters are not of a distribution."""
+    """The level curves of a row; None without a distribution."""
+    distribution = distribution_of(row)
+    return level_curves(distribution) if distribution else None
+
+
+def distribution_of(row: Mapping[str, Any]) -> ProjectedHuber | None:
+    """The distribution of a row; None for a baseline, or if the parameters are not of one."""
     names = parameter_names(row)
     if any(name not in row for name in names):
         return None
     numbers = {name: torch.tensor(float(row[name]), dtype=torch.float64) for name in names}
     try:
-        return level_curves(from_columns(numbers))
+        return from_columns(numbers)
     except ValueError:
         return None
 

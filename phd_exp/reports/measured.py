@@ -24,11 +24,12 @@ from phd_exp.records.errors import RunError, UserError, one_line
 from phd_exp.records.files import write_atomic
 from phd_exp.records.runs import HELD_OUT, RunFolder
 from phd_exp.reports.gallery import Gallery, images_folder, make_gallery
+from phd_exp.reports.scene import Scene, first_scene
 from phd_exp.reports.table import file_stem
 
 Found = TypeVar("Found")
 
-VERSIONS = {"before": 2, "after": 1, "fusion": 1, "pairs": 1, "tracks": 1, "gallery": 1, "shifts": 1}
+VERSIONS = {"before": 2, "after": 1, "fusion": 1, "pairs": 1, "tracks": 1, "gallery": 1, "scene": 1, "shifts": 1}
 """Measurement -> its version. Raise it when the measurement gives other numbers: all runs are measured again."""
 
 
@@ -59,6 +60,7 @@ class Measured:
         before: evaluation of the recorded predictions.
         after: evaluation of the recalibrated predictions; None without held-out samples.
         pairs: scores of the positions fused from two cameras; None without a record of several views.
+        scene: the first test sample in space; None without a Projected Huber density.
         tracks: scores of sequences, by their frames; empty without sequences.
         shifts: scores at home and under each shift; empty without a shift.
         images: a digest of data set and true positions, equal for runs tested on the same images.
@@ -70,6 +72,7 @@ class Measured:
     fusion: FusionScores | None = None
     pairs: Evaluation | None = None
     gallery: Gallery | None = None
+    scene: Scene | None = None
     tracks: dict[str, TrackScores] = field(default_factory=dict)
     shifts: dict[str, ShiftScores] = field(default_factory=dict)
     images: str = ""
@@ -88,6 +91,7 @@ def measure(
         if "a" in predictions and held_out:
             found |= notes.attempt(lambda: _recalibrated(predictions, held_out)) or {}
         found["gallery"] = notes.attempt(lambda: make_gallery(predictions, config))
+        found["scene"] = notes.attempt(lambda: first_scene(predictions))
         if found["before"] and (left_out := found["before"].left_out):
             notes.append(f"{left_out} test samples are left out: a prediction was not finite")
         found["shifts"] = notes.attempt(lambda: shift_scores(folder.shifts, predictions, held_out)) or {}

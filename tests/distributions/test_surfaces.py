@@ -5,10 +5,14 @@ from collections import Counter
 import numpy as np
 import pytest
 import torch
+from matplotlib.path import Path as Outline
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.regions import Region
-from phd_exp.distributions.surfaces import Surface, ellipsoid, level_surface
+from phd_exp.distributions.surfaces import Surface, ellipsoid, level_surface, outline
+from phd_exp.geometry import Lens, intrinsics
+from phd_exp.optics.virtual import VirtualCamera, towards
+from tests.support.opencv import projected
 
 
 def volume(surface: Surface) -> float:
@@ -46,3 +50,20 @@ def test_an_ellipsoid_holds_its_share_of_a_gaussian(level: float) -> None:
     inside = np.linalg.norm(random.standard_normal((100_000, 3)), axis=-1) < radii[0]
     assert abs(inside.mean() - level) < 4 * np.sqrt(level * (1 - level) / 100_000)
     assert volume(surface) == pytest.approx(4 / 3 * np.pi * radii[0] ** 3 * np.linalg.det(factor), rel=0.02)
+
+
+@pytest.mark.parametrize("lens", [Lens(), Lens((-0.2, 0.05, 0.001, -0.002)), Lens((0.01, -0.002, 0.0, 0.0), is_fisheye=True)])
+def test_an_outline_is_around_all_points_as_opencv_projects_them(lens: Lens) -> None:
+    K, mean = intrinsics(310.0, 290.0, 150.0, 110.0), np.array([0.6, -0.3, 3.0])
+    surface = ellipsoid(mean, np.diag([0.04, 0.01, 0.25]) ** 2 + 0.0009, 0.9)
+    camera = VirtualCamera(K, towards(mean), 1.0, 1.0, lens)
+    curve, pixels = outline(camera.to_virtual(surface.vertices), camera), projected(surface.vertices, K, lens)
+    assert np.array_equal(curve[0], curve[-1])
+    nearest = np.linalg.norm(curve[:, None] - pixels, axis=-1).min(-1)
+    assert nearest.max() < 1e-6
+    assert Outline(curve).contains_points(pixels, radius=0.02).all()
+
+
+def test_a_body_around_the_camera_has_no_outline() -> None:
+    points = ellipsoid(np.array([0.0, 0.0, 0.5]), np.eye(3), 0.9).vertices
+    assert len(outline(points, VirtualCamera(intrinsics(310.0, 290.0, 150.0, 110.0), np.eye(3), 1.0, 1.0))) == 0

@@ -14,6 +14,7 @@ from phd_exp.reports.paper import PUBLISHED
 from phd_exp.reports.quantities import SCORES, mark
 from phd_exp.reports.runs import Run
 from phd_exp.reports.site.overview import Drawn, Groups, presets_of
+from phd_exp.reports.site.scene_traces import scene_traces
 from phd_exp.reports.table import Table
 from phd_exp.reports.tracks_table import headline as headline_of_tracks
 from phd_exp.reports.tracks_table import tracks_table
@@ -25,7 +26,11 @@ _ENVIRONMENT = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_ENVIRONMENT.filters |= {"moment": lambda at: f"{at:%Y-%m-%d %H:%M} {at.tzname()}", "duration": duration}
+_ENVIRONMENT.filters |= {
+    "moment": lambda at: f"{at:%Y-%m-%d %H:%M} {at.tzname()}",
+    "duration": duration,
+    "metres": lambda xyz: f"({', '.join(f'{one:.4g}' for one in xyz)}) m",
+}
 _ENVIRONMENT.globals |= {
     "score": SCORES.__getitem__,
     "headline": headline,
@@ -112,6 +117,7 @@ def run_script(drawn: Drawn) -> str:
             name: [float(f"{value:.6g}") for value in values]
             for name, values in (before.resampled if before else {}).items()
         },
+        "scene": scene_traces(run.measured.scene) if run.measured.scene else None,
         "charts": {key: asdict(chart) for charts in drawn.charts.values() for key, chart in charts.items()},
     }  # fmt: skip
     return as_script(run.slug, content)

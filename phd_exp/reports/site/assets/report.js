@@ -298,5 +298,5 @@ const phdExp = (() => {
   document.documentElement.addEventListener("themechange", redraw);
   window.addEventListener("beforeprint", drawAll);
 
-  return { receive, runs, watch, drawAll, table };
+  return { receive, runs, watch, drawAll, table, themed, style };
 })();
