@@ -53,6 +53,7 @@ EXAMPLES = {
         "python -m phd_exp predict run=runs/small/default/probabilistic folder=photos/test",
         "python -m phd_exp predict run=DIR,DIR,DIR views=8 folder=photos/test",
         "python -m phd_exp predict run=DIR folder=drive.mcap box=400,30,620,140 out=found.mcap",
+        "python -m phd_exp predict run=DIR folder=photos/test view=photos.rrd",
     ],
     "calibrate": [
         "python -m phd_exp calibrate run=DIR folder=photos/labelled",

@@ -4,7 +4,7 @@ import json
 import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -110,12 +110,7 @@ def main(words: list[str]) -> int:
     sequences = list(_sequences(arguments))
     _prepare(arguments)
     predictor = loaded(arguments)
-    with ExitStack() as ends:
-        view = None
-        if arguments.view is not None:
-            from phd_exp.inference.rerun_view import of_paths
-
-            view = ends.enter_context(of_paths(arguments.view, [sequence.name for sequence in sequences]))
+    with _recording(arguments, sequences) as view:
         paths = [(sequence, _followed(arguments, predictor, sequence, view)) for sequence in sequences]
         if out is not None and out.suffix != MCAP:
             _write(arguments, predictor, paths, out)
@@ -137,6 +132,17 @@ def _prepare(arguments: TrackArguments) -> None:
         output_folder(out)
     if arguments.view is not None:
         new_view(arguments.view)
+
+
+def _recording(
+    arguments: TrackArguments, sequences: Sequence[_Sequence]
+) -> AbstractContextManager["Recording | None"]:
+    """The recording for view=, if it is given."""
+    if arguments.view is None:
+        return nullcontext()
+    from phd_exp.inference.rerun_view import of_paths
+
+    return of_paths(arguments.view, [sequence.name for sequence in sequences])
 
 
 def _sequences(arguments: TrackArguments) -> Iterator[_Sequence]:

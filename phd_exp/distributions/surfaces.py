@@ -44,15 +44,9 @@ def level_surface(distribution: ProjectedHuber, level: float, depths: int = 21, 
     return _closed(Region(distribution, level).rings(depths, angles))
 
 
-def ellipsoid(
-    mean: Float[np.ndarray, "3"],
-    covariance: Float[np.ndarray, "3 3"],
-    level: float,
-    depths: int = 21,
-    angles: int = 48,
-) -> Surface:
+def ellipsoid(mean: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"], level: float) -> Surface:
     """The ellipsoid that has the probability `level` under a Gaussian."""
-    across, around = np.linspace(0, np.pi, depths)[:, None], 2 * np.pi / angles * np.arange(angles)
+    across, around = np.linspace(0, np.pi, 21)[:, None], 2 * np.pi / 48 * np.arange(48)
     sphere = np.stack(
         np.broadcast_arrays(np.sin(across) * np.cos(around), np.sin(across) * np.sin(around), -np.cos(across)), -1
     )

@@ -174,9 +174,9 @@ class Recording:
         """A line through positions in the world."""
         self._stream.log(place, rr.LineStrips3D([positions], colors=[GAUSSIAN]))
 
-    def depth(self, place: Place, values: Float[np.ndarray, " n"]) -> None:
-        """Values over time, metres."""
-        self._stream.log(place, rr.Scalars(values))
+    def depth(self, place: Place, values: Vector) -> None:
+        """The lower end of the 90 % interval, the mean, and the upper end, over time, metres."""
+        self._stream.log(place, rr.Scalars(values), rr.SeriesLines(names=["5 %", "mean", "95 %"]))
 
 
 def named(level: float) -> str:

@@ -45,14 +45,14 @@ def viewed_scenes(
     recording: Recording, scenes: Sequence[Observed], sightings: Iterable[Sighting]
 ) -> Iterator[Sighting]:
     """The sightings of all scenes, in their order; each is recorded before it is yielded."""
-    remaining = iter(sightings)
+    remaining, most = iter(sightings), max(len(scene.detections) for scene in scenes)
     for number, scene in enumerate(scenes):
         poses = Pose.from_scene(scene.poses)
         for k, (R, t) in enumerate(zip(poses.R, poses.t, strict=True)):
             sighting, pose = next(remaining), Pose(R, t)
             if k == 0:
                 recording.at("scene", number)
-                recording.clear(["cameras"], ["views"], ["fused"])
+                recording.clear(["views"], ["fused"], *map(_camera, range(len(scene.detections), most)))
             recording.camera(_camera(k), sighting.image, sighting.view.camera.K, pose, sighting.mode)
             recording.sighting(["views", k], [*_camera(k), "image", "object"], sighting, pose)
             yield sighting
@@ -73,31 +73,38 @@ def of_paths(file: Path, names: Sequence[str]) -> Recording:
 
 
 def viewed_path(recording: Recording, name: str, path: Iterable[Followed]) -> Iterator[Followed]:
-    """The frames of a path; each is recorded before it is yielded, with the latest positions."""
-    trail: deque[Vector] = deque(maxlen=TRAIL)
-    for one in path:
-        frame, on_image = one.frame, [name, "camera", "image"]
-        recording.at_time(frame.time)
-        if frame.pose is HERE:
-            recording.in_camera()
-        position = None if one.state is None else one.in_camera[0]
-        recording.camera([name, "camera"], Image.fromarray(frame.image), frame.K, frame.pose, position)
-        recording.box([*on_image, "box"], one.box)
-        if one.state is None:
-            recording.clear([name, "object"], [name, "path"], [name, "depth"], [*on_image, "object"])
-            trail.clear()
-        else:
-            mean, covariance = one.in_camera
-            camera = VirtualCamera(frame.K, towards(mean), 1.0, 1.0, frame.lens)
-            colour = tuple(bytes.fromhex(COLOURS[one.status][1:]))
-            for level in LEVELS:
-                points = camera.to_virtual(ellipsoid(mean, covariance, level).vertices)
-                recording.outline([*on_image, "object", named(level)], points, camera, colour)
-            trail.append(one.state.mean.numpy())
-            recording.gaussian([name, "object"], trail[-1], one.state.covariance.numpy(), one.status)
-            recording.path([name, "path"], np.stack(list(trail)))
-            recording.depth([name, "depth"], mean[2] + HALF_90 * np.sqrt(covariance[2, 2]) * np.array([-1, 0, 1]))
-        yield one
+    """The frames of a path; each is recorded before it is yielded, with the latest positions of its track."""
+    for _, track in groupby(path, lambda one: one.track):
+        trail: deque[Vector] = deque(maxlen=TRAIL)
+        for one in track:
+            _add_frame(recording, name, one)
+            if one.state is None:
+                image = [name, "camera", "image"]
+                recording.clear([name, "object"], [name, "path"], [name, "depth"], [*image, "object"])
+            else:
+                trail.append(one.state.mean.numpy())
+                recording.gaussian([name, "object"], trail[-1], one.state.covariance.numpy(), one.status)
+                recording.path([name, "path"], np.stack(list(trail)))
+            yield one
+
+
+def _add_frame(recording: Recording, name: str, one: Followed) -> None:
+    """The camera with the image, and what is in its frame: box, outlines, depth with its 90 % interval."""
+    frame, place = one.frame, [name, "camera"]
+    recording.at_time(frame.time)
+    if frame.pose is HERE:
+        recording.in_camera()
+    mean, covariance = (None, None) if one.state is None else one.in_camera
+    recording.camera(place, Image.fromarray(frame.image), frame.K, frame.pose, mean)
+    recording.box([*place, "image", "box"], one.box)
+    if mean is None or covariance is None:
+        return
+    camera = VirtualCamera(frame.K, towards(mean), 1.0, 1.0, frame.lens)
+    colour = tuple(bytes.fromhex(COLOURS[one.status][1:]))
+    for level in LEVELS:
+        points = camera.to_virtual(ellipsoid(mean, covariance, level).vertices)
+        recording.outline([*place, "image", "object", named(level)], points, camera, colour)
+    recording.depth([name, "depth"], mean[2] + HALF_90 * np.sqrt(covariance[2, 2]) * np.array([-1, 0, 1]))
 
 
 def _camera(k: int) -> Place:

@@ -121,6 +121,8 @@ ARGUMENTS = [
     argument(("predict", RUN, "imag=good.png"), r"imag: unknown key, did you mean 'image'\?.*"),
     argument(("predict", RUN, "good.png"), r"good\.png: expected key=value.*"),
     argument((*ONE, "out=photos/test/0.png/x"), r"photos/test/0\.png/x: cannot be written.*"),
+    argument((*ONE, "view=photos"), r"view: got photos; expected a file \*\.rrd, such as view\.rrd"),
+    argument((*ONE, "view=8"), r"view: got 8; expected a file \*\.rrd, such as view\.rrd"),
     argument((*ONE, "curve=true"), r"curve: is drawn into the pictures; expected out=.*"),
     argument(("predict", "run=x", "image=y", "views=3"), r"views: got '3'; expected to be '1' or '8'.*"),
     argument(("predict", "nonsense=1"), r"run: missing; predict takes run=.*"),

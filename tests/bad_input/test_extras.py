@@ -25,6 +25,7 @@ PACKAGES = {
     "timm": ("timm",),
     "video": ("av",),
     "ros": ("rosbags",),
+    "rerun": ("rerun",),
     "ray": ("ray", "hydra_plugins.hydra_ray_launcher"),
 }
 OTHERS = (*LEARN, "runs=others")
@@ -46,6 +47,7 @@ LACKS: dict[str, tuple[tuple[str, ...], ...]] = {
     "loggers": ((*LEARN, "runs=a", "logger=tensorboard"), (*LEARN, "runs=b", "logger=mlflow")),
     "video": (("track", "run=RUN", "video=clip.mp4", "f=300"),),
     "ros": ((*ONE, "out=a.mcap"), ("track", "run=RUN", "folder=a.mcap")),
+    "rerun": ((*ONE, "view=a.rrd"),),
     "timm": ((*LEARN, "runs=c", "backbone._target_=timm.create_model"),),
     "ray": (("-m", *OTHERS, "seed=1,2", "hydra/launcher=ray"),),
 }

@@ -52,7 +52,9 @@ def test_an_ellipsoid_holds_its_share_of_a_gaussian(level: float) -> None:
     assert volume(surface) == pytest.approx(4 / 3 * np.pi * radii[0] ** 3 * np.linalg.det(factor), rel=0.02)
 
 
-@pytest.mark.parametrize("lens", [Lens(), Lens((-0.2, 0.05, 0.001, -0.002)), Lens((0.01, -0.002, 0.0, 0.0), is_fisheye=True)])
+@pytest.mark.parametrize(
+    "lens", [Lens(), Lens((-0.2, 0.05, 0.001, -0.002)), Lens((0.01, -0.002, 0.0, 0.0), is_fisheye=True)]
+)
 def test_an_outline_is_around_all_points_as_opencv_projects_them(lens: Lens) -> None:
     K, mean = intrinsics(310.0, 290.0, 150.0, 110.0), np.array([0.6, -0.3, 3.0])
     surface = ellipsoid(mean, np.diag([0.04, 0.01, 0.25]) ** 2 + 0.0009, 0.9)

@@ -18,6 +18,7 @@ STORED = {
     "pairs": (1, {"all": 1, "fused_error_mm": 23.2213}),
     "tracks": (1, {"all": 38, "depth_error_mm/single": 199.206, "nees/slow": 0.772033}),
     "gallery": (1, {"all": 2, "best": 42.5, "worst": 42.19}),
+    "scene": (1, {"all": 2, "mode_z": 3.7408, "extent_90": 1.7036}),
     "shifts": (1, {"all": 29, "inside_90": 93.75, "unfamiliar": 100.0}),
 }
 """Measurement -> its version, its count of numbers, and some of them. If one changes, raise the version, store it."""
@@ -44,6 +45,9 @@ def numbers(found: Measured) -> Iterator[tuple[str, dict[str, float]]]:
     yield "fusion", {key: band.low for key, band in found.fusion.bands.items()}
     yield "tracks", {key: band.value for key, band in found.tracks["10"].bands.items()}
     yield "shifts", {key: band.high for key, band in found.shifts["occl"].scores.items()}
+    assert found.scene is not None
+    z = [position[2] for position in found.scene.regions[1][0]]
+    yield "scene", {"mode_z": found.scene.mode[2], "extent_90": max(z) - min(z)}
     yield "gallery", {"best": found.gallery.best[0].mode[0], "worst": found.gallery.worst[0].truth[1]}
 
 

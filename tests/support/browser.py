@@ -3,6 +3,9 @@
 from pathlib import Path
 from typing import Any
 
+ADVICE = ("Canvas2D: Multiple readback operations", "GPU stall due to ReadPixels")
+"""Warnings about the speed of plotly's plots in space."""
+
 
 class Visit:
     """A browser page and all its faults: errors, warnings, failed requests, network requests."""
@@ -18,7 +21,7 @@ class Visit:
         self.page.on("request", self._on_request)
 
     def _on_message(self, message: Any) -> None:
-        if message.type in ("error", "warning"):
+        if message.type in ("error", "warning") and not any(advice in message.text for advice in ADVICE):
             self.faults.append(message.text)
 
     def _on_request(self, request: Any) -> None:

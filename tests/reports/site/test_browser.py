@@ -94,6 +94,26 @@ def test_every_page_opens_and_draws_its_charts(visit: Visit, site: Path) -> None
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("visit", [LAPTOP, PHONE_DARK], ids=["laptop, light", "phone, dark"], indirect=True)
+def test_a_test_image_is_drawn_in_space(visit: Visit) -> None:
+    """To scale, and a close-up without the camera; also after a change of the theme."""
+    visit.open(RUN)
+    figure = visit.page.locator("figure.scene")
+    figure.scroll_into_view_if_needed()
+    colours = []
+    for _ in range(2):
+        visit.page.wait_for_selector("figure.scene.drawn")
+        assert figure.locator("canvas").count() >= 2
+        names = figure.locator(".plot").evaluate_all("plots => plots.map(plot => plot.data.map(({ name }) => name))")
+        assert set(names[0]) - set(names[1]) == {"camera and the edges of its image"}
+        colours.append(figure.locator(".plot").first.evaluate("plot => plot.data[1].color"))
+        visit.page.evaluate("document.querySelector('figure.scene').classList.remove('drawn')")
+        visit.page.get_by_role("button", name="Dark theme").click()
+    assert colours[0] != colours[1]
+    assert visit.width_beyond() <= 0
+
+
+@pytest.mark.slow
 def test_links_and_the_comparison_keep_their_runs(visit: Visit) -> None:
     visit.open("index.html")
     visit.page.get_by_role("link", name="probabilistic on default").first.click()
