@@ -127,9 +127,9 @@ def _answers(
         views, cameras = predictor.folders[0].views, {len(scene.detections) for scene in scenes}
         guarantees = {k: fused_guarantee(views, k, arguments.coverage, predictor.temperature) for k in cameras}
     shared = _shared_share(predictor.folders[0]) if arguments.shared_scale else None
-    with _recorded(arguments.view, messages, scenes, predicted(predictor, detections)) as (sightings, adding):
+    with _recorded(arguments.view, messages, scenes, predicted(predictor, detections)) as (sightings, add):
         answers = fused_answers(scenes, sightings, predictor, plane, shared)
-        adding(answers)
+        add(answers)
     return [for_json(answer) | (fused_region(answer, guarantees) if guarantees else {}) for answer in answers]
 
 
@@ -148,10 +148,15 @@ def _recorded(
         if view is not None:
             from phd_exp.inference.rerun_view import add_fused, of_scenes, viewed_scenes
 
-            recording = ends.enter_context(of_scenes(view, scenes))
-            sightings = viewed_scenes(recording, scenes, sightings)
-            recordings.append(partial(add_fused, recording))
-        yield sightings, lambda answers: [add(answers) for add in recordings]
+            shown = ends.enter_context(of_scenes(view, scenes))
+            sightings = viewed_scenes(shown, scenes, sightings)
+            recordings.append(partial(add_fused, shown))
+
+        def add(answers: list[dict[str, Any]]) -> None:
+            for recording in recordings:
+                recording(answers)
+
+        yield sightings, add
 
 
 def _shared_share(run: RunFolder) -> float:
