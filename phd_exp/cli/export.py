@@ -3,7 +3,9 @@
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, Self
+
+from pydantic import model_validator
 
 from phd_exp.cli.arguments import RunArguments, loaded, output_folder, require_file
 from phd_exp.records.errors import ConfigError
@@ -25,6 +27,13 @@ class ExportArguments(RunArguments):
     """of the numbers after the network: float32, which all runtimes take, unless only float64 is accurate enough"""
     quantize: Literal["int8"] | None = None
     """convolutions in int8, calibrated and measured on the run's held-out images; refused if the errors grow"""
+
+    @model_validator(mode="after")
+    def one_network(self) -> Self:
+        """Refuse a guarantee that was made for another network."""
+        if self.quantize and self.coverage:
+            raise ValueError("coverage: is guaranteed for the network in float32; expected no quantize=")
+        return self
 
 
 def main(words: list[str]) -> int:

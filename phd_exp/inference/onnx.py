@@ -69,12 +69,7 @@ def export(
     Raises UserError, and writes no file, if the deviation exceeds 1e-5 or int8 changes the errors too much.
     """
     deployed = (OfPhotographs if photographs else OfImages)(predictor, precision).eval()
-    metadata = _metadata(deployed)
-    if coverage:
-        guarantee = predictor.guarantee(coverage)
-        facts = {"coverage": coverage, "level": guarantee.levels[0], "held_out_samples": guarantee.n[0]}
-        energies = {"a": PRECISIONS.tolist(), "W": level_energies(guarantee.levels[0]).tolist()}
-        metadata["region"] = facts | energies
+    metadata = _metadata(deployed) | (_region(predictor, coverage) if coverage else {})
     model, change = graph(deployed), None  # last, because it takes half a minute
     deviation = largest_deviation(deployed, model.SerializeToString())
     if not deviation <= TOLERANCE:
@@ -198,6 +193,13 @@ def _metadata(deployed: Deployed) -> dict[str, Any]:
         "precision": str(deployed.dtype).removeprefix("torch."),
         **{name: DESCRIPTIONS[name] for name in (*deployed.inputs, "raw", *_names(deployed))},
     }
+
+
+def _region(predictor: Predictor, coverage: float) -> dict[str, Any]:
+    """The metadata of regions with a guaranteed coverage."""
+    guarantee = predictor.guarantee(coverage)
+    facts = {"coverage": coverage, "level": guarantee.levels[0], "held_out_samples": guarantee.n[0]}
+    return {"region": facts | {"a": PRECISIONS.tolist(), "W": level_energies(guarantee.levels[0]).tolist()}}
 
 
 def largest_deviation(deployed: Deployed, content: bytes) -> float:

@@ -20,7 +20,7 @@ from phd_exp.data.batches import Batch
 from phd_exp.distributions.density import Density
 from phd_exp.inference.deployed import Deployed
 from phd_exp.metrics.errors import MILLIMETRES, depth_error
-from phd_exp.records.errors import UserError
+from phd_exp.records.errors import ConfigError, UserError
 from phd_exp.records.runs import CHOOSE, GUARANTEE
 
 MOST_DEPTH_ERROR, MOST_NLL = 3.0, 0.1  # per cent and nats that int8 may add
@@ -68,8 +68,15 @@ def quantized(model: Any, deployed: Deployed, held_out: Batch) -> Any:
 
     Weights have a scale for each channel, activations one for each tensor; all zero points are 0, as TensorRT wants.
     The first convolution, the last `AT_THE_END` and all other operations stay as they are.
+
+    Raises ConfigError if no other convolution is left.
     """
     names = [node.name for node in model.graph.node if node.op_type == "Conv"]
+    if len(names) <= 1 + AT_THE_END:
+        raise ConfigError(
+            f"quantize: got a network with {len(names)} convolutions; expected {2 + AT_THE_END} at least, because "
+            "the first and the last stay in float32"
+        )
     images, f = (values[CHOOSE][:CALIBRATION] for values in (held_out.image, held_out.f))
     with TemporaryDirectory() as folder, _quiet():
         before, after = Path(folder) / "before.onnx", Path(folder) / "after.onnx"

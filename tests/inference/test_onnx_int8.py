@@ -10,7 +10,7 @@ import torch
 
 from phd_exp.data.batches import Batch
 from phd_exp.inference.loading import load
-from phd_exp.records.errors import UserError
+from phd_exp.records.errors import ConfigError, UserError
 from tests.support.portable import openvino_outputs, require_portable
 from tests.support.untrained import SIDE, SMALL, untrained
 
@@ -36,6 +36,15 @@ def test_too_large_a_change_is_refused_with_its_figures() -> None:
         expected = rf"network\.onnx: not written: quantize=int8 .*{said}.*3 % and 0\.1 nats"
         with pytest.raises(UserError, match=expected):
             change.require_small(FILE)
+
+
+def test_a_network_without_convolutions_is_refused() -> None:
+    from onnx import ModelProto
+
+    from phd_exp.inference.onnx_int8 import quantized
+
+    with pytest.raises(ConfigError, match="quantize: got a network with 0 convolutions; expected 4 at least"):
+        quantized(ModelProto(), None, None)  # type: ignore[arg-type]
 
 
 @pytest.mark.slow
