@@ -19,7 +19,7 @@ from phd_exp.records.spec import DatasetSpec
 # before anything is imported: every annotated function of these modules checks its shapes while tests run; numba
 # compiles the other modules of fusion
 FUSION = ("fusion.fuse", "fusion.gaussian", "fusion.pose", "fusion.problems")
-TRACKS = ("fusion.tracks.chain", "fusion.tracks.lost", "fusion.tracks.motion")
+TRACKS = tuple(f"fusion.tracks.{name}" for name in ("chain", "lost", "motion", "shear", "slow"))
 NUMERIC = ("optics", "geometry", "distributions", "losses", "metrics", "models", "data", "evaluation")
 HOOKED = (*NUMERIC, *FUSION, *TRACKS)
 install_import_hook([f"phd_exp.{name}" for name in HOOKED], "beartype.beartype")
