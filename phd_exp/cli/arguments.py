@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
-from phd_exp.records.errors import ConfigError, DatasetError, RunError, complaint, unknown, writing
+from phd_exp.records.errors import ConfigError, DatasetError, RunError, complaint, writing
 from phd_exp.records.files import remove_temporaries
 from phd_exp.records.messages import MessageFile, require_rosbags
 from phd_exp.records.recordings import MCAP, Detections, Recording, is_recording
@@ -50,8 +50,7 @@ class Arguments(BaseModel):
         except ValidationError as error:
             problem = error.errors(include_url=False)[0]
             key = ".".join(map(str, problem["loc"]))
-            ours = {"extra_forbidden": unknown(key, cls.model_fields, takes), "missing": f"{key}: missing; {takes}"}
-            raise ConfigError(ours.get(problem["type"]) or complaint(key, problem)) from None
+            raise ConfigError(complaint(key, problem, cls.model_fields, takes)) from None
 
 
 def four_numbers(expected: str) -> BeforeValidator:
@@ -124,6 +123,7 @@ def new_view(view: Path) -> None:
         view.parent.mkdir(parents=True, exist_ok=True)
 
 
+Coverage = Annotated[float, Field(gt=0, lt=1)] | None
 Paths = Annotated[tuple[Path, ...], BeforeValidator(lambda text: [text] if os.path.exists(text) else text.split(","))]
 
 
@@ -134,10 +134,8 @@ class RunArguments(Arguments):
     """the folder of a run, or a file of `pack`; several, separated by commas, or a folder of seeds are an ensemble"""
     recalibrate: bool = False
     """apply the temperatures that fit the run's held-out samples"""
-    coverage: Annotated[float, Field(gt=0, lt=1)] | None = None
-    """probability of regions that contain the true position, guaranteed by held-out samples"""
     calibration: str | None = None
-    """a record of `calibrate`: recalibrate with its labelled images, which coverage= uses too"""
+    """a record of `calibrate`: recalibrate with its labelled images, which also guarantee a coverage"""
     trust: str | None = None
     """packages of the user's own parts that the run names, separated by commas; their code is executed"""
     views: Literal["1", "8"] = "1"
@@ -196,8 +194,8 @@ def trusted(packages: str | None) -> tuple[str, ...]:
     return tuple(packages.split(",")) if packages else ()
 
 
-def loaded(arguments: RunArguments, device: str = "auto") -> "Predictor":
-    """The predictor of a run, with a note on standard error if the run is not finished."""
+def loaded(arguments: RunArguments, device: str = "auto", coverage: Coverage = None) -> "Predictor":
+    """The predictor of a run, ready to guarantee a coverage; a note on standard error names an unfinished run."""
     gc.disable()  # imports make objects that stay: looking for garbage among them takes a tenth of the start
     try:
         from phd_exp.inference.loading import load
@@ -209,8 +207,8 @@ def loaded(arguments: RunArguments, device: str = "auto") -> "Predictor":
     if predictor.state != "finished":
         print(f"note: {arguments.run[0]}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
     if arguments.calibration:
-        return predictor.calibrated(arguments.calibration, guarantees=arguments.coverage is not None)
-    if predictor.views > 1 and (arguments.recalibrate or arguments.coverage):
+        return predictor.calibrated(arguments.calibration, guarantees=coverage is not None)
+    if predictor.views > 1 and (arguments.recalibrate or coverage):
         _record_held_out_views(predictor, trust)
     return predictor.recalibrated() if arguments.recalibrate else predictor
 

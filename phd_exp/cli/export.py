@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal, Self
 
 from pydantic import model_validator
 
-from phd_exp.cli.arguments import RunArguments, loaded, output_folder, require_file
+from phd_exp.cli.arguments import Coverage, RunArguments, loaded, output_folder, require_file
 from phd_exp.records.errors import ConfigError
 
 if TYPE_CHECKING:  # imports of torch, which follow the checks of the arguments
@@ -21,6 +21,8 @@ class ExportArguments(RunArguments):
 
     out: Path | None = None
     """the file; by default network.onnx in the (first) run's folder, or next to a file of `pack`"""
+    coverage: Coverage = None
+    """probability of regions that contain the true position, guaranteed by held-out samples"""
     photographs: bool = False
     """the inputs are a photograph, its camera matrix and boxes, and the graph crops as predict does"""
     precision: Literal["float32", "float64"] | None = None
@@ -44,7 +46,7 @@ def main(words: list[str]) -> int:
     if missing := [name for name in ("onnx", "onnxscript", "onnxruntime") if find_spec(name) is None]:
         raise ConfigError(f"export needs {', '.join(missing)}: `pip install 'phd_exp[export]'`")
     require_file(file, "network.onnx")
-    predictor = loaded(arguments, "cpu")
+    predictor = loaded(arguments, "cpu", arguments.coverage)
     output_folder(file.parent)
     from phd_exp.inference.deployed import PHOTOGRAPHS, batches, require_exportable
     from phd_exp.inference.onnx import TOLERANCE, export

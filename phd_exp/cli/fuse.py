@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import field_validator
 
 from phd_exp.cli.arguments import (
+    Coverage,
     RunArguments,
     four_numbers,
     loaded,
@@ -45,6 +46,8 @@ class FuseArguments(RunArguments):
     """NX,NY,NZ,OFFSET: the object lies on this plane, metres"""
     shared_scale: bool = False
     """estimate one factor that the depths of all views share, as they do in the run's recorded scenes"""
+    coverage: Coverage = None
+    """probability of regions that contain the true position, guaranteed by held-out samples"""
     out: Path | None = None
     """a file for the lines; by default they are printed, also with FILE.mcap, which receives messages of ROS 2"""
     view: Path | None = None
@@ -107,7 +110,7 @@ def _answers(
     single = "coverage: scenes with several cameras are recorded by single runs; expected one run= and no views=8"
     if arguments.coverage and arguments.views != "1":
         raise ConfigError(single)
-    predictor = loaded(arguments)
+    predictor = loaded(arguments, coverage=arguments.coverage)
     if not predictor.is_probabilistic:
         raise ConfigError(
             f"{arguments.run[0]}: predicts no Projected Huber densities, which fuse needs; expected a run of "

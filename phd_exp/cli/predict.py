@@ -11,6 +11,7 @@ from pydantic import model_validator
 
 from phd_exp.cli.arguments import (
     CameraArguments,
+    Coverage,
     Paths,
     loaded,
     message_file,
@@ -51,6 +52,8 @@ class PredictArguments(CameraArguments):
     which receives messages of ROS 2"""
     view: Path | None = None
     """a new file *.rrd for the viewer Rerun: images with outlines, and the regions of 50 and 90 % in space"""
+    coverage: Coverage = None
+    """probability of regions that contain the true position, guaranteed by held-out samples"""
     groups: Literal["spread", "truncation", "focal_length"] | None = None
     """with coverage=: guarantee it in each of four groups of predictions by this quantity"""
     curve: bool = False
@@ -83,7 +86,7 @@ def main(words: list[str]) -> int:
     arguments = PredictArguments.parsed("predict", words)
     out, detections = arguments.out, _detections(arguments)
     _prepare(arguments, detections)
-    predictor = loaded(arguments)
+    predictor = loaded(arguments, coverage=arguments.coverage)
     guarantee = predictor.guarantee(arguments.coverage, arguments.groups) if arguments.coverage else None
     curve = _depth_curve(predictor) if arguments.curve else None
     sightings = _viewed(arguments, predictor, predicted(predictor, detections, guarantee))

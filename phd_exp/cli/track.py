@@ -83,8 +83,6 @@ class TrackArguments(CameraArguments):
             raise ValueError("box: expected either box= of the first frame, or boxes= of a detector")
         if self.object is not None and not self.boxes:
             raise ValueError("object: selects detections of boxes=FILE; leave it out for one box")
-        if self.coverage:
-            raise ValueError("coverage: is guaranteed for single predictions, not for paths; leave it out")
         return self
 
 
@@ -163,11 +161,8 @@ def _sequences(arguments: TrackArguments) -> Iterator[_Sequence]:
         boxes = {0: [arguments.box]}
     video, stride = arguments.video, arguments.stride
     length = len(recording) if recording else length_of(Path(str(video)))
-    if boxes and not any(n % stride == 0 and n < (length or math.inf) for n in boxes):
-        used = "every frame" if stride == 1 else f"frames 0, {stride}, ..."
-        raise ConfigError(
-            f"boxes: got image_id {min(boxes)} to {max(boxes)}, none of a frame; expected numbers from 0, of {used}"
-        )
+    if boxes:
+        _require_frames(boxes, length, stride)
     from phd_exp.inference.frames import recorded_shots, video_frames
 
     n = length and -(-length // stride)
@@ -177,6 +172,18 @@ def _sequences(arguments: TrackArguments) -> Iterator[_Sequence]:
     elif video:
         (detection,) = detections_of([video], arguments.of_camera)
         yield _Sequence(video_frames(detection, boxes, shots_in(video, stride)), n, video.stem)
+
+
+def _require_frames(boxes: dict[int, list[Box]], length: int | None, stride: int) -> None:
+    """Raise ConfigError if no box is in a frame that is used, or numbers begin with 1; a length may be unknown."""
+    first, last = min(boxes), max(boxes)
+    if length and (first, last) == (1, length):
+        raise ConfigError(f"boxes: got image_id 1 to {length} in a video of {length} frames; expected numbers from 0")
+    if not any(n % stride == 0 and n < (length or math.inf) for n in boxes):
+        used = "every frame" if stride == 1 else f"frames 0, {stride}, ..."
+        raise ConfigError(
+            f"boxes: got image_id {first} to {last}, none of a frame; expected numbers from 0, of {used}"
+        )
 
 
 def _boxes_of_frames(file: Path, category: int | str | None) -> dict[int, list[Box]]:

@@ -156,10 +156,14 @@ def _record_further(run: RunFolder, checked: RunConfig, cores: int) -> None:
     from phd_exp.build import build_source
     from phd_exp.inference import tables
 
-    def record(file: Path, data: Any, origin: dict[str, str], said: str, shift: Any = tables.UNCHANGED) -> None:
+    def record(
+        file: Path, data: Any, origin: dict[str, str], said: str, fewer: str, shift: Any = tables.UNCHANGED
+    ) -> None:
         if not tables.is_recorded(file, origin):
             if isinstance(data, RenderedConfig):
-                ensure_rendered(DatasetFolder(data.folder), data.spec, 0, data.n_test, data.workers, cores)
+                ensure_rendered(
+                    DatasetFolder(data.folder), data.spec, 0, data.n_test, data.workers, cores, fewer=fewer
+                )
             tables.record(run, file, build_source(data), origin, shift)
             print(f"{file}: {said}", flush=True)
 
@@ -167,14 +171,16 @@ def _record_further(run: RunFolder, checked: RunConfig, cores: int) -> None:
         views = several.spec.views
         n = several.n_test // views
         scenes = f"{'1 scene' if n == 1 else f'{n} scenes'} seen by {views} cameras each"
-        record(run.views, several, tables.origin_of(run, checked, data=several.spec.fingerprint(), scenes=n), scenes)
+        origin = tables.origin_of(run, checked, data=several.spec.fingerprint(), scenes=n)
+        record(run.views, several, origin, scenes, "evaluation.multiview.scenes=...")
     for (frames, held_out), data in checked.sequences.items():
         file, n = run.sequence(frames, held_out=held_out), data.n_test // frames
         origin = tables.origin_of(run, checked, data=data.spec.fingerprint(), sequences=n)
-        record(file, data, origin, f"{n} sequence{'s' if n > 1 else ''} of {frames} frames")
+        words = f"{n} sequence{'s' if n > 1 else ''} of {frames} frames"
+        record(file, data, origin, words, "evaluation.sequences=[[N,FRAMES]]")
     for name, shift in checked.evaluation.shifts.items():
         origin = tables.origin_of_shift(run, checked, name)
-        record(run.shift(name), checked.data_of(name), origin, "recorded", shift)
+        record(run.shift(name), checked.data_of(name), origin, "recorded", "evaluation.n_shifted=...", shift)
     if checked.evaluation.eight_views:
         tables.record_eight_views(run, checked, build_source(checked.data))
 

@@ -14,7 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 from phd_exp.cli import choices_of, conf_folder, prefix_of
 from phd_exp.cli.help import OF_VERB, VERBS
 from phd_exp.records.choices import flatten
-from phd_exp.records.errors import ConfigError, end_of, install, nearest, one_line, shortened, unknown
+from phd_exp.records.errors import ConfigError, end_of, install, instead, one_line, shortened, unknown
 
 REFUSED = (HydraException, OmegaConfBaseException, ValueError, TypeError, ArithmeticError, RecursionError)
 """The errors that a bad override raises; ValueError for a group set to null, TypeError for one set to numbers."""
@@ -32,9 +32,8 @@ def require_overrides(words: Sequence[str]) -> None:
             raise ConfigError(f"{' '.join(parts)}: has spaces; expected {shlex.quote(word)}")
         if "=" not in word and not word.startswith("~"):
             choices = [f"{group}={name}" for group in OF_VERB["train"] for name in choices_of(group)]
-            remedy = nearest(word, [*VERBS, *choices])
-            verbs = ", ".join(VERBS)
-            raise ConfigError(f"{word}: no KEY=VALUE{remedy}; a verb ({verbs}) is the first word; {GRAMMAR}")
+            expected = f"a verb ({', '.join(VERBS)}) is the first word; {GRAMMAR}"
+            raise ConfigError(f"{word}: no KEY=VALUE{instead(word, [*VERBS, *choices], expected)}")
         if word.lstrip("+~").startswith(tuple(f"{section}." for section in SHARED)):
             key = word.partition("=")[0]
             raise ConfigError(
@@ -71,8 +70,7 @@ def explain(error: Exception, config_name: str) -> str:
     if found := re.search(r"Could not (?:find|load) '([^']+)/([^']+)'", text):
         group, name = found.groups()
         options = getattr(error, "options", None) or choices_of(group)
-        remedy = f"{nearest(name, options)}{install(name)}"
-        return f"{group}={name}: no such choice{remedy}; expected one of {', '.join(options)}"
+        return f"{group}={name}: no such choice{instead(name, options)}{install(name)}"
     return shortened(re.sub(r" Set the environment variable.*| Config search path:.*", "", text), LONGEST)
 
 

@@ -88,9 +88,14 @@ class RunConfig(Record):
         return self
 
     @model_validator(mode="after")
-    def sizes_fit(self) -> "RunConfig":
-        """Refuse a batch larger than the training set, and images larger than rendered."""
-        data = self.data
+    def sizes_fit(self, info: ValidationInfo) -> "RunConfig":
+        """Refuse a batch larger than the training set, images larger than rendered, and a sequence in two parts."""
+        data, frames = self.data, self.data.spec.frames if isinstance(self.data, RenderedConfig) else 1
+        if is_typed(info) and data.n_held_out and data.n_train and data.n_train % frames:
+            raise ValueError(
+                f"data.n_train: got {data.n_train}; expected a multiple of data.frames={frames}, since no sequence "
+                "may have training and held-out samples"
+            )
         if data.n_train is not None and data.batch_size > data.n_train:
             raise ValueError(
                 f"data: batch_size={data.batch_size} is larger than n_train={data.n_train}: not one batch is full"

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Tag, TypeAdapter, Va
 from pydantic.errors import PydanticSchemaGenerationError
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from phd_exp.records.errors import complaint, in_user_code, install, nearest, shown, unknown
+from phd_exp.records.errors import complaint, in_user_code, install, instead, shown, unknown
 
 OURS = tuple(f"phd_exp.{room}" for room in ("models", "losses", "optimizers", "geometry", "distributions"))
 KNOWN = (*OURS, "torch.optim", "lightning")
@@ -41,7 +41,7 @@ def check_target(node: dict[str, Any], trust: Trust, where: str = "") -> dict[st
             _check_value(path, value, parameters[key].annotation)
         elif key not in parameters and (key.startswith("_") or not takes_any):  # Hydra's own, as `_recursive_`
             taken = f"{node['_target_']} takes {', '.join(parameters)}"
-            raise _error(path, f"unknown key{nearest(key, parameters)}; {taken}")
+            raise _error(path, f"unknown key{instead(key, parameters, taken)}")
     return node
 
 
@@ -175,9 +175,7 @@ def describe(problem: ErrorDetails, model: type[BaseModel]) -> str:
         return f"{key}.{context['path']}: {context['reason']}"
     if problem["type"] == "extra_forbidden":
         return unknown(key, _valid_keys(model, place[:-1]))
-    if problem["type"] == "missing":
-        return f"{key}: missing; expected {key}=VALUE"
-    return complaint(key, problem)
+    return complaint(key, problem, expected=f"expected {key}=VALUE")
 
 
 def _valid_keys(model: Any, location: list[str]) -> list[str]:

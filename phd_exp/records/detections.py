@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, PlainValidator, ValidationError, mod
 from pydantic_core import ErrorDetails
 
 from phd_exp.records.cameras import CORNER, SHORTEST, Calibration, Size, read_camera, require_narrow
-from phd_exp.records.errors import DatasetError, complaint, unknown
+from phd_exp.records.errors import DatasetError, complaint
 from phd_exp.records.parsing import Record
 from phd_exp.records.scenes import Pose, SampleRecord
 from phd_exp.records.spec import Number, Positive
@@ -214,7 +214,4 @@ def _complaint(problem: ErrorDetails) -> str:
     key = ".".join(str(part) for part in problem["loc"])
     if problem["type"] == "extra_forbidden" and DISTORTION.fullmatch(key):
         return f"{key}: a line describes no lens; expected camera, a calibration file"
-    if problem["type"] == "extra_forbidden":
-        known = (Pose if key.startswith("pose.") else DetectionLine).model_fields
-        return unknown(key, known)
-    return f"{key}: missing" if problem["type"] == "missing" else complaint(key, problem)
+    return complaint(key, problem, (Pose if key.startswith("pose.") else DetectionLine).model_fields)

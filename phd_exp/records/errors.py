@@ -91,14 +91,26 @@ def end_of(word: str) -> str:
     return re.split("[.=]", word)[-1]
 
 
-def unknown(key: str, valid: Iterable[str], expected: str = "") -> str:
-    """The message about a key that is none of the valid ones; by default it lists all of these."""
+def instead(word: str, valid: Iterable[str], expected: str = "") -> str:
+    """The end of a message about a word that is none of the valid ones: the nearest one, and by default all."""
     names = list(valid)
-    return f"{key}: unknown key{nearest(key, names)}; {expected or 'expected one of ' + ', '.join(names)}"
+    return f"{nearest(word, names)}; {expected or 'expected one of ' + ', '.join(names)}"
 
 
-def complaint(key: str, problem: ErrorDetails) -> str:
-    """Pydantic's error as a message: the key, its value unless that is a whole section, and what was expected."""
+def unknown(key: str, valid: Iterable[str], expected: str = "") -> str:
+    """The message about a key that is none of the valid ones."""
+    return f"{key}: unknown key{instead(key, valid, expected)}"
+
+
+def complaint(key: str, problem: ErrorDetails, valid: Iterable[str] = (), expected: str = "") -> str:
+    """Pydantic's error as a message: the key, its value unless that is a whole section, and what was expected.
+
+    `valid` are the keys of the section; `expected` is said of a key that is none of them, or is missing.
+    """
+    if problem["type"] == "extra_forbidden":
+        return unknown(key, valid, expected)
+    if problem["type"] == "missing":
+        return f"{key}: missing" + f"; {expected}" * bool(expected)
     given = "" if isinstance(problem["input"], dict) else f"got {shown(problem['input'])}; "
     expected = problem["msg"].removeprefix("Value error, ").replace("Input should be", "expected to be")
     reason = given + expected.replace("expected to be a valid", "expected a valid")

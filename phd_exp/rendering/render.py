@@ -39,7 +39,6 @@ Samples = Sequence[tuple[Split, int]]
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # of each worker
 TOGETHER = 128  # samples
 FEWEST_PER_WORKER = 8  # starting one more process costs about as much as rendering this many images
-FEWER = "fewer images: preset=demo, or data.n_train=... data.n_test=..."
 WAITING = "waiting for it to finish"
 
 
@@ -51,6 +50,7 @@ def ensure_rendered(
     workers: int | None = None,
     cores: int | None = None,
     shard: Shard | None = None,
+    fewer: str = "preset=demo, or data.n_train=... data.n_test=...",
 ) -> bool:
     """Render those of the first `n_train` and `n_test` samples that are not on disk; returns whether all are there.
 
@@ -65,6 +65,7 @@ def ensure_rendered(
         cores: number of cores to use; by default all that this process may use.
         shard: the share of the samples to render; the last shard to finish seals the folder. Shares of different
             counts may overlap: samples that another shard has rendered are not rendered again.
+        fewer: overrides for fewer images, which a line names if the first forecast is long.
 
     Raises:
         DatasetError: the folder holds another data set, or a broken one.
@@ -77,7 +78,7 @@ def ensure_rendered(
     require_bpy()
     with writing(folder.root):
         folder.cache.mkdir(parents=True, exist_ok=True)
-        return _render_share(folder, spec, {"train": n_train, "test": n_test}, workers, cores, shard)
+        return _render_share(folder, spec, {"train": n_train, "test": n_test}, workers, cores, shard, fewer)
 
 
 def _render_share(
@@ -87,6 +88,7 @@ def _render_share(
     workers: int | None,
     cores: int | None,
     shard: Shard | None,
+    fewer: str,
 ) -> bool:
     """Render the missing samples of a shard, None for all, and seal the folder if it is whole, which is returned."""
     with _locked(folder, shard):
@@ -99,7 +101,7 @@ def _render_share(
         samples = [sample for sample in missing(known, wanted) if shard is None or shard.holds(sample[1])]
         try:
             if samples:
-                _render(folder, spec, samples, known, workers or worker_count(len(samples), cores), shard)
+                _render(folder, spec, samples, known, workers or worker_count(len(samples), cores), shard, fewer)
         except UserError:
             if not any(known.values()):  # the next command may have another specification
                 folder.manifest_path.unlink(missing_ok=True)
@@ -143,7 +145,13 @@ def _seal_if_last(folder: DatasetFolder, spec: DatasetSpec, wanted: Wanted, shar
 
 
 def _render(
-    folder: DatasetFolder, spec: DatasetSpec, samples: Samples, known: Known, workers: int, shard: Shard | None
+    folder: DatasetFolder,
+    spec: DatasetSpec,
+    samples: Samples,
+    known: Known,
+    workers: int,
+    shard: Shard | None,
+    fewer: str,
 ) -> None:
     """Render samples and add them to `known`.
 
@@ -154,7 +162,9 @@ def _render(
     title = spec.variant if shard is None else f"{spec.variant} {shard}"
     with ExitStack() as stack:
         journals = {split: stack.enter_context(open_journal(folder.journal_path(split, shard))) for split in SPLITS}
-        shown = shown_progress(len(samples), f"rendering {title}", min(workers, len(samples)), FEWER)
+        shown = shown_progress(
+            len(samples), f"rendering {title}", min(workers, len(samples)), f"fewer images: {fewer}"
+        )
         advance = stack.enter_context(shown)
         for record in stack.enter_context(closing(render_all(folder, spec, by_sky(spec, samples), workers))):
             journals[record.split].write(record.model_dump_json() + "\n")

@@ -13,7 +13,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from phd_exp.config.sections import EvaluationConfig
 from phd_exp.distributions.columns import Columns
-from phd_exp.records.errors import ConfigError, nearest, shown
+from phd_exp.records.errors import ConfigError, instead, shown
 from phd_exp.records.files import write_atomic
 from phd_exp.records.runs import RunFolder, epoch_name
 from phd_exp.training.predictions import TRAINING, calibration_curves
@@ -128,7 +128,7 @@ def require_monitored(trainer: Trainer, evaluated: Sequence[str]) -> None:
         if (monitor := getattr(one, "monitor", None)) is not None and monitor not in known:
             raise ConfigError(
                 f"callbacks: {type(one).__name__} monitors {shown(monitor)}, which is not logged"
-                f"{nearest(str(monitor), known)}; expected one of {', '.join(known)}"
+                f"{instead(str(monitor), known)}"
             )
 
 

@@ -48,7 +48,11 @@ WRONG_VALUES = [
     ([f"{MULTIVIEW}=9", "data=multiview"], ["data=multiview is not rendered with one view", "expected data=scale"]),
     ([f"{MULTIVIEW}=9", *FOLDER], ["is not rendered", "expected data=scale"]),
     ([f"{MULTIVIEW}=9", "data=scale", "model=mae_vz"], ["model=mae_vz has no density", "expected model=prob"]),
-    ([SEQUENCES, "data=sequence"], ["data=sequence is not rendered in single images", "expected data=scale"]),
+    (["data=sequence"], ["data.n_train: got 32", "multiple of data.frames=20"]),
+    (
+        [SEQUENCES, "data=sequence", "data.n_train=40"],
+        ["data=sequence is not rendered in single images", "expected data=scale"],
+    ),
     ([SEQUENCES, *FOLDER], ["is not rendered in single images", "expected data=scale"]),
     ([SEQUENCES, "model=mae_vz"], ["model=mae_vz predicts no Projected Huber density", "expected model=prob"]),
     (["evaluation.sequences=[[4,20],[2,20]]"], ["expected pairs [sequences, frames] of different frames"]),

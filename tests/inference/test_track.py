@@ -99,7 +99,7 @@ def test_a_bad_frame_is_refused_on_one_line_and_those_before_are_kept(
         (("folder=.", "f=3"), "folder: its metadata.jsonl has cameras"),
         (("video=a.mp4", "f=90", "box=1,2,3,4", "boxes=b.json"), "box: expected either box= of the first frame"),
         (("video=a.mp4", "f=90", "object=1"), "object: selects detections of boxes=FILE"),
-        (("folder=.", "coverage=0.9"), "coverage: is guaranteed for single predictions"),
+        (("folder=.", "coverage=0.9"), "coverage: unknown key"),
         (("folder=.", "lag=2"), "lag: got '2'; expected to be greater than or equal to 4"),
         (("folder=.", "noise=0"), "noise: got '0'; expected to be greater than or equal to 0.001"),
         (("folder=.", "noise=inf"), "noise: got 'inf'; expected to be less than or equal to 1000"),
