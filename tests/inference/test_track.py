@@ -1,7 +1,7 @@
 """`track` with a network of random weights: what it reads and writes, the boxes that follow a path, and mistakes."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -188,13 +188,20 @@ def test_a_video_is_followed_from_one_box(phd_exp: Callable, run: str, video: Pa
 
 
 @pytest.mark.parametrize(
-    ("frame", "score", "said"), [(1, 0.5, "none of a frame"), (99, 0.5, "none of a frame"), (0, None, "score None")]
+    ("frames", "score", "said"),
+    [
+        ([1], 0.5, "none of a frame"),
+        ([99], 0.5, "none of a frame"),
+        ([0], None, "score None"),
+        (range(1, N + 1), 0.5, f"image_id 1 to {N} in a video of {N} frames; expected numbers from 0"),
+    ],
 )
 def test_boxes_that_no_frame_can_use_are_refused(
-    phd_exp: Callable, video: Path, tmp_path: Path, frame: int, score: float | None, said: str
+    phd_exp: Callable, video: Path, tmp_path: Path, frames: Sequence[int], score: float | None, said: str
 ) -> None:
     boxes = tmp_path / "boxes.json"
-    boxes.write_text(json.dumps([{"image_id": frame, "category_id": 1, "bbox": [9, 9, 9, 9], "score": score}]))
+    given = [{"image_id": frame, "category_id": 1, "bbox": [9, 9, 9, 9], "score": score} for frame in frames]
+    boxes.write_text(json.dumps(given))
     outcome = phd_exp("track", "run=nowhere", f"video={video}", "f=900", f"boxes={boxes}", "stride=2")
     assert outcome.status == 2
     (line,) = outcome.err.splitlines()
