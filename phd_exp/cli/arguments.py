@@ -48,9 +48,7 @@ class Arguments(BaseModel):
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            problem = error.errors(include_url=False)[0]
-            key = ".".join(map(str, problem["loc"]))
-            raise ConfigError(complaint(key, problem, cls.model_fields, takes)) from None
+            raise ConfigError(complaint(error.errors(include_url=False)[0], cls.model_fields, takes)) from None
 
 
 def four_numbers(expected: str) -> BeforeValidator:

@@ -175,10 +175,10 @@ def _sequences(arguments: TrackArguments) -> Iterator[_Sequence]:
 
 
 def _require_frames(boxes: dict[int, list[Box]], length: int | None, stride: int) -> None:
-    """Raise ConfigError if no box is in a frame that is used, or numbers begin with 1; a length may be unknown."""
+    """Raise ConfigError if no box is in a frame that is used; a length may be unknown, or an estimate."""
     first, last = min(boxes), max(boxes)
-    if length and (first, last) == (1, length):
-        raise ConfigError(f"boxes: got image_id 1 to {length} in a video of {length} frames; expected numbers from 0")
+    if first == 1 and last >= (length or 0):
+        print(f"note: boxes: got image_id 1 to {last}; expected numbers of frames from 0", file=sys.stderr)
     if not any(n % stride == 0 and n < (length or math.inf) for n in boxes):
         used = "every frame" if stride == 1 else f"frames 0, {stride}, ..."
         raise ConfigError(

@@ -175,7 +175,7 @@ def describe(problem: ErrorDetails, model: type[BaseModel]) -> str:
         return f"{key}.{context['path']}: {context['reason']}"
     if problem["type"] == "extra_forbidden":
         return unknown(key, _valid_keys(model, place[:-1]))
-    return complaint(key, problem, expected=f"expected {key}=VALUE")
+    return complaint(problem, expected=f"expected {key}=VALUE", key=key)
 
 
 def _valid_keys(model: Any, location: list[str]) -> list[str]:
@@ -202,7 +202,7 @@ def _check_value(path: str, value: Any, annotation: Any) -> None:
     try:
         adapter.validate_python(value)
     except ValidationError as error:
-        raise _error(path, complaint("", error.errors()[0])) from None
+        raise _error(path, complaint(error.errors()[0], key="")) from None
 
 
 def _error(path: str, reason: str) -> PydanticCustomError:

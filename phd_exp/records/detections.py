@@ -214,4 +214,4 @@ def _complaint(problem: ErrorDetails) -> str:
     key = ".".join(str(part) for part in problem["loc"])
     if problem["type"] == "extra_forbidden" and DISTORTION.fullmatch(key):
         return f"{key}: a line describes no lens; expected camera, a calibration file"
-    return complaint(key, problem, (Pose if key.startswith("pose.") else DetectionLine).model_fields)
+    return complaint(problem, (Pose if key.startswith("pose.") else DetectionLine).model_fields)

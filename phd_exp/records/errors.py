@@ -102,11 +102,12 @@ def unknown(key: str, valid: Iterable[str], expected: str = "") -> str:
     return f"{key}: unknown key{instead(key, valid, expected)}"
 
 
-def complaint(key: str, problem: ErrorDetails, valid: Iterable[str] = (), expected: str = "") -> str:
+def complaint(problem: ErrorDetails, valid: Iterable[str] = (), expected: str = "", key: str | None = None) -> str:
     """Pydantic's error as a message: the key, its value unless that is a whole section, and what was expected.
 
-    `valid` are the keys of the section; `expected` is said of a key that is none of them, or is missing.
+    A key that is not `valid`, or is missing, is followed by what is `expected`.
     """
+    key = ".".join(map(str, problem["loc"])) if key is None else key
     if problem["type"] == "extra_forbidden":
         return unknown(key, valid, expected)
     if problem["type"] == "missing":
@@ -128,8 +129,7 @@ def install(text: str) -> str:
 def gist(error: BaseException) -> str:
     """The reason of an error on one line: the first complaint of a validation, or the reason of a system call."""
     if isinstance(error, ValidationError):
-        problem = error.errors(include_url=False)[0]
-        text = complaint(".".join(map(str, problem["loc"])), problem)
+        text = complaint(error.errors(include_url=False)[0])
     else:
         text = str(getattr(error, "strerror", None) or error)
     return " ".join(text.split())[:LONGEST_GIST]

@@ -193,19 +193,18 @@ def test_a_video_is_followed_from_one_box(phd_exp: Callable, run: str, video: Pa
         ([1], 0.5, "none of a frame"),
         ([99], 0.5, "none of a frame"),
         ([0], None, "score None"),
-        (range(1, N + 1), 0.5, f"image_id 1 to {N} in a video of {N} frames; expected numbers from 0"),
+        (range(1, N + 1), 0.5, f"got image_id 1 to {N}; expected numbers of frames from 0"),
     ],
 )
-def test_boxes_that_no_frame_can_use_are_refused(
+def test_boxes_of_other_frames_are_explained(
     phd_exp: Callable, video: Path, tmp_path: Path, frames: Sequence[int], score: float | None, said: str
 ) -> None:
     boxes = tmp_path / "boxes.json"
     given = [{"image_id": frame, "category_id": 1, "bbox": [9, 9, 9, 9], "score": score} for frame in frames]
     boxes.write_text(json.dumps(given))
     outcome = phd_exp("track", "run=nowhere", f"video={video}", "f=900", f"boxes={boxes}", "stride=2")
-    assert outcome.status == 2
-    (line,) = outcome.err.splitlines()
-    assert said in line
+    assert outcome.status  # a note, if the frames may count from 1; then there is no run
+    assert said in outcome.err.splitlines()[0]
 
 
 @pytest.mark.parametrize(
