@@ -1,5 +1,6 @@
 """A network in int8: what is quantised, what it costs, and that too much is refused."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,9 @@ import torch
 from phd_exp.data.batches import Batch
 from phd_exp.inference.loading import load
 from phd_exp.records.errors import ConfigError, UserError
+from phd_exp.records.runs import RunFolder
 from tests.support.portable import openvino_outputs, require_portable
-from tests.support.untrained import SIDE, SMALL, untrained
+from tests.support.untrained import SIDE, SMALL, untrained, write_photos
 
 pytest.importorskip("onnxruntime", reason="needs `pip install 'phd_exp[export]'`")
 numpy_helper = pytest.importorskip("onnx.numpy_helper")
@@ -47,22 +49,57 @@ def test_a_network_without_convolutions_is_refused() -> None:
         quantized(ModelProto(), None, None)  # type: ignore[arg-type]
 
 
-@pytest.mark.slow
-def test_convolutions_are_in_int8_and_errors_are_those_of_the_graph(
-    composed: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from phd_exp.inference.deployed import OfImages, pictures
+@pytest.fixture(scope="module")
+def exported(composed: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> tuple[RunFolder, Any, Any]:
+    """A run that holds out 40 of the user's own images, and its network as a graph in float32."""
+    from phd_exp.inference.deployed import OfImages
     from phd_exp.inference.onnx import graph
+
+    place = tmp_path_factory.mktemp("int8")
+    (place / "photos").mkdir()
+    for split, n in (("train", 48), ("test", 2)):
+        write_photos(place / "photos" / split, n)
+    own = ("data=folder", f"data.folder={place / 'photos'}", "data.n_held_out=40")
+    run = untrained(place / "run", composed(*SMALL, *own, "data.n_train=8", "data.batch_size=8"))
+    deployed = OfImages(load(run.path, "cpu"), "float32").eval()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("jaxtyping.config.jaxtyping_disable", True)  # a checked shape would be fixed in the graph
+        return run, deployed, graph(deployed)
+
+
+@pytest.mark.slow
+def test_the_command_measures_held_out_images_and_refuses_a_loss(
+    phd_exp: Callable[..., Any], exported: tuple[RunFolder, Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from phd_exp.inference import onnx, onnx_int8
+
+    run, _, model = exported
+    monkeypatch.setattr(onnx, "graph", lambda _: model)
+    words = ("export", f"run={run.path}", "out=here.onnx", "quantize=int8")
+    monkeypatch.setattr(onnx_int8, "MOST_NLL", -np.inf)
+    assert phd_exp(*words).error.startswith("here.onnx: not written: quantize=int8 costs too much: depth error ")
+    assert not (tmp_path / "here.onnx").exists()
+    monkeypatch.setattr(onnx_int8, "MOST_NLL", np.inf)
+    monkeypatch.setattr(onnx_int8, "MOST_DEPTH_ERROR", np.inf)
+    outcome = phd_exp(*words)
+    assert outcome.status == 0, outcome.err
+    assert " on 20 held-out images" in outcome.out
+    session = onnx.onnxruntime.InferenceSession(tmp_path / "here.onnx")
+    said = json.loads(session.get_modelmeta().custom_metadata_map["phd_exp"])["int8"]
+    assert said["images"] == 20
+    assert f"NLL {said['nll'][0]:.3f} -> {said['nll'][1]:.3f} nats" in outcome.out
+
+
+@pytest.mark.slow
+def test_convolutions_are_in_int8_and_errors_are_those_of_the_graph(exported: tuple[RunFolder, Any, Any]) -> None:
+    from phd_exp.inference.deployed import pictures
     from phd_exp.inference.onnx_int8 import measured_change, quantized
 
-    monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)  # a checked shape would be fixed in the graph
-    predictor = load(untrained(tmp_path / "run", composed(*SMALL)).path, "cpu")
-    images, f = pictures(80, SIDE, SIDE), torch.linspace(200, 300, 80)
+    _, deployed, before = exported
+    predictor, images, f = deployed.predictor, pictures(80, SIDE, SIDE), torch.linspace(200, 300, 80)
     p = predictor.predict(predictor.raw(images, f), f)
     xyz = p.rsample(generator=torch.Generator().manual_seed(0)).float()
     held_out = Batch(torch.from_numpy(images), xyz, f, float(SIDE), torch.arange(80))
-    deployed = OfImages(predictor, "float32").eval()
-    before = graph(deployed)
     after = quantized(before, deployed, held_out)
     require_portable(after)
     constants = {tensor.name: numpy_helper.to_array(tensor) for tensor in after.graph.initializer}
