@@ -53,6 +53,8 @@ class TrackArguments(CameraArguments):
     """use every stride-th frame of the video or recording"""
     noise: Annotated[float, Field(ge=1e-3, le=1e3)] = 1.0
     """how fast the velocity changes: by noise m/s in a second, growing with the root of time"""
+    speed: Annotated[float, Field(ge=1e-3, le=1e3)] = 10.0
+    """how fast the object may move in the first frame, m/s (standard deviation along each axis)"""
     lag: Annotated[int, Field(ge=LEAST_LAG, le=1000)] = 10
     """how many later frames the state of a frame takes into account; as many images are in memory"""
     depth_time: Annotated[float, Field(ge=0, le=1e6)] = 1.0
@@ -208,7 +210,7 @@ def _followed(
     from phd_exp.inference.following import follow
 
     slow = Slow(arguments.depth_time, arguments.projection_time)
-    motion, least = ConstantVelocity(arguments.noise), arguments.least_familiar
+    motion, least = ConstantVelocity(arguments.noise, arguments.speed), arguments.least_familiar
     followed = follow(predictor, sequence.frames, motion, arguments.lag, slow, least_familiar=least)
     if view is not None:
         from phd_exp.inference.rerun_view import viewed_path

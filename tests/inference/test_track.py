@@ -56,7 +56,7 @@ def frames(folder: Path, **changes: dict[int, Any]) -> str:
 
 
 def test_each_frame_of_a_folder_has_a_line(phd_exp: Callable, run: str, tmp_path: Path) -> None:
-    outcome = phd_exp("track", run, frames(tmp_path), "least_familiar=0.01", "depth_time=2", "projection_time=0")
+    outcome = phd_exp("track", run, frames(tmp_path), "least_familiar=0.01", "depth_time=2", "speed=0.5")
     assert (outcome.status, outcome.err) == (0, "")
     lines = read_lines(outcome.out)
     assert [line["frame"] for line in lines] == list(range(N))
@@ -102,6 +102,8 @@ def test_a_bad_frame_is_refused_on_one_line_and_those_before_are_kept(
         (("folder=.", "coverage=0.9"), "coverage: unknown key"),
         (("folder=.", "lag=2"), "lag: got '2'; expected to be greater than or equal to 4"),
         (("folder=.", "noise=0"), "noise: got '0'; expected to be greater than or equal to 0.001"),
+        (("folder=.", "speed=0"), "speed: got '0'; expected to be greater than or equal to 0.001"),
+        (("folder=.", "depth_time=-1"), "depth_time: got '-1'; expected to be greater than or equal to 0"),
         (("folder=.", "noise=inf"), "noise: got 'inf'; expected to be less than or equal to 1000"),
     ],
 )
