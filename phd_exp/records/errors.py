@@ -107,10 +107,10 @@ def complaint(problem: ErrorDetails, valid: Iterable[str] = (), expected: str = 
 
     A key that is not `valid`, or is missing, is followed by what is `expected`.
     """
-    key = ".".join(map(str, problem["loc"])) if key is None else key
-    if problem["type"] == "extra_forbidden":
-        return unknown(key, valid, expected)
-    if problem["type"] == "missing":
+    key, names = ".".join(map(str, problem["loc"])) if key is None else key, list(valid)
+    if problem["type"] == "extra_forbidden" and names:
+        return unknown(key, names, expected)
+    if problem["type"] == "missing" and (names or expected):
         return f"{key}: missing" + f"; {expected}" * bool(expected)
     given = "" if isinstance(problem["input"], dict) else f"got {shown(problem['input'])}; "
     expected = problem["msg"].removeprefix("Value error, ").replace("Input should be", "expected to be")

@@ -17,7 +17,7 @@ from phd_exp.records.errors import RenderError
 from phd_exp.records.scenes import SHAPES, Scene
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.importing import import_meshes
-from phd_exp.rendering.looks import prepare_looks
+from phd_exp.rendering.looks import ROUGHER, prepare_looks
 from phd_exp.rendering.pixels import Box, Light, read_light
 from phd_exp.rendering.sampling import remoteness
 from phd_exp.rendering.stage import CLIPPING, build_stage, show_scene
@@ -97,7 +97,7 @@ class Renderer:
             self.meshes: Meshes = import_meshes(self._bpy, spec) if spec else {}
             self._world = World(self._bpy, spec) if spec and spec.mesh else None
             if self.meshes:
-                _configure_for_meshes(self._scene)
+                _configure_for_meshes(self._bpy)
             self.is_opaque = all(mesh.is_opaque for mesh in self.meshes.values())
             if spec and spec.looks == "varied":
                 prepare_looks(self._bpy, [*SHAPES, *self.meshes])
@@ -179,18 +179,22 @@ def _configure_tracer(cycles: Any, settings: Settings) -> None:
         cycles.filter_width = 0.01
     cycles.use_denoising = settings.denoised
     cycles.denoiser = "OPENIMAGEDENOISE"
-    cycles.denoising_quality = "FAST"
-    # Cycles takes the albedo and the normals of smooth metal from what it reflects: they are as noisy as the image
-    cycles.denoising_input_passes = "RGB"
+    cycles.denoising_quality = "FAST"  # HIGH takes a quarter longer for half a dB
+    cycles.denoising_input_passes = "RGB"  # albedo and normals made FAST worse
     cycles.denoising_prefilter = "NONE"
 
 
-def _configure_for_meshes(scene: Any) -> None:
+def _configure_for_meshes(bpy: Any) -> None:
     """Change the options for transparent backgrounds, textures that may be transparent too, and dense reflections."""
+    scene, metal = bpy.context.scene, bpy.data.materials["metal"]
+    metal.node_tree.nodes["Principled BSDF"].inputs["Roughness"].default_value = ROUGHER
     scene.render.image_settings.color_mode = "RGBA"
     scene.render.film_transparent = True
     scene.cycles.transparent_max_bounces = 8
-    scene.cycles.denoising_quality = "BALANCED"  # a quarter less noise than FAST, for a tenth of the tracer's time
+    # a third less noise than FAST with RGB alone, for two fifths of the tracer's time. Albedo and normals need the
+    # prefilter: Cycles takes those of smooth metal from what it reflects, and they are as noisy as the image
+    scene.cycles.denoising_quality, scene.cycles.denoising_prefilter = "BALANCED", "ACCURATE"
+    scene.cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
 
 
 @contextmanager

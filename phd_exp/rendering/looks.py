@@ -17,6 +17,9 @@ from phd_exp.rendering.pixels import linear
 from phd_exp.rendering.sampling import LAMP_DISTANCE, LAMPS, Stream, remoteness
 
 HARD = 0.5  # share of the scenes with one small lamp, which casts hard shadows, in addition to the sky
+# Of metal in scenes with meshes, whose denoiser uses albedo and normals: where the squared roughness is below 0.075,
+# Cycles takes both from what the surface reflects, and they are as noisy as the image.
+ROUGHER = 0.28
 NODES = {"noise": "ShaderNodeTexNoise", "checker": "ShaderNodeTexChecker", "scratches": "ShaderNodeTexWave"}
 TONE = "phd_exp tone"
 TONES = (0.02, 0.5, 0.4)  # largest change of a texture's hue (turns), and of its saturation and value (factors)
@@ -83,7 +86,7 @@ def show_look(bpy: Any, item: SceneObject, look: Look) -> None:
         return
     material = bpy.data.materials[f"{look.pattern}-{item.shape}"]
     nodes = material.node_tree.nodes
-    nodes["Principled BSDF"].inputs["Roughness"].default_value = look.roughness
+    nodes["Principled BSDF"].inputs["Roughness"].default_value = max(look.roughness, ROUGHER * look.metallic)
     nodes["Principled BSDF"].inputs["Metallic"].default_value = look.metallic
     for place, rgb in ((0, item.colour), (1, look.second)):
         nodes["colours"].color_ramp.elements[place].color = (*(linear(channel) for channel in rgb), 1.0)

@@ -138,7 +138,7 @@ ARGUMENTS = [
     argument((*ONE, "groups=size", "coverage=0.9"), r"groups: got 'size'; expected to be 'spread', 'truncation' or.*"),
     argument((*ONE, "coverage=0.9"), r"runs/.*/held_out\.parquet: missing; held-out samples are needed: train with.*", 1),
     argument((*EXPORT, "coverage=0.9"), r"runs/.*/held_out\.parquet: missing.*", 1),
-    argument(("export",), r"run: missing; export takes run=, recalibrate=, coverage=, calibration=, trust=, views=, out=.*"),
+    argument(("export",), r"run: missing; export takes run=, recalibrate=, calibration=, trust=, views=, out=, coverage=.*"),
     argument(("export", "run=nowhere"), r"nowhere: no run; expected a folder with config\.yaml.*", 1),
     argument(("export", "run=.", "out=."), r"out=\.: is a folder.*"),
     argument(("export", "run=.", "precision=half"), r"precision: got 'half'; expected to be 'float32' or 'float64'"),
