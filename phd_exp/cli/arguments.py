@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
-from phd_exp.records.errors import ConfigError, DatasetError, RunError, complaint, writing
+from phd_exp.records.detections import Detection
+from phd_exp.records.errors import ConfigError, DatasetError, RunError, complaint, listed, writing
 from phd_exp.records.files import remove_temporaries
 from phd_exp.records.messages import MessageFile, require_rosbags
 from phd_exp.records.recordings import MCAP, Detections, Recording, is_recording
@@ -19,6 +20,7 @@ from phd_exp.records.recordings import MCAP, Detections, Recording, is_recording
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
     from phd_exp.evaluation.conformal import Guarantee
     from phd_exp.inference.answers import Sighting
+    from phd_exp.inference.detectors import Detector
     from phd_exp.inference.predictor import Predictor
 
 BEYOND = 1.1  # factor beyond the least and the largest focal length of held-out samples; training reaches further
@@ -247,13 +249,34 @@ def _record_held_out_views(predictor: "Predictor", trust: tuple[str, ...]) -> No
 
 
 def predicted(
-    predictor: "Predictor", detections: Detections, guarantee: "Guarantee | None" = None
+    predictor: "Predictor",
+    detections: Detections,
+    guarantee: "Guarantee | None" = None,
+    detector: "Detector | None" = None,
 ) -> Iterable["Sighting"]:
-    """The predictions, with a progress bar for several detections on a terminal."""
+    """The predictions, with a progress bar for several detections, or images of a detector, on a terminal."""
     from phd_exp.inference.answers import sightings
 
-    seen = _noting_focal_lengths(predictor, sightings(predictor, detections, guarantee))
-    return seen if len(detections) == 1 else with_bar(seen, "predicting", len(detections))
+    if detector is None:
+        seen: Iterable[Sighting] = sightings(predictor, detections, guarantee)
+    else:
+        seen = (one for some in _found(detector, detections) for one in sightings(predictor, some, guarantee))
+    seen = _noting_focal_lengths(predictor, seen)
+    total = len(detections) if detector is None else None
+    return seen if len(detections) == 1 else with_bar(seen, "predicting", total)
+
+
+def _found(detector: "Detector", images: Detections) -> Iterator[list[Detection]]:
+    """What a detector finds in each image. It may be nothing in some, which a note says, but not in all."""
+    empty = []
+    for image, found in zip(images, detector.each(images), strict=True):
+        if not found:
+            empty.append(image.where)
+        yield found
+    if len(empty) == len(images):
+        raise DatasetError(f"{listed(empty)}: {detector.name} finds nothing; expected a box in one image at least")
+    if empty:
+        print(f"note: {detector.name} finds nothing in {len(empty)} image(s): {listed(empty)}", file=sys.stderr)
 
 
 def with_bar(items: Iterable[Item], words: str, total: int | None) -> Iterable[Item]:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import model_validator
 
 from phd_exp.cli.arguments import (
-    CameraArguments,
     Coverage,
     Paths,
     loaded,
@@ -21,7 +20,8 @@ from phd_exp.cli.arguments import (
     require_covariance,
     require_output,
 )
-from phd_exp.records.detections import NumberOrName, detections_of
+from phd_exp.cli.detecting import DetectingArguments
+from phd_exp.records.detections import detections_of
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import write_atomic
 from phd_exp.records.foreign import boxes_in
@@ -35,7 +35,7 @@ if TYPE_CHECKING:  # imports of seconds, which follow the checks of the argument
 LONGEST_STEM = 50  # characters of an image's name in the name of its picture
 
 
-class PredictArguments(CameraArguments):
+class PredictArguments(DetectingArguments):
     """The run, the images and their cameras; lengths in pixels of the image file."""
 
     image: Paths | None = None
@@ -43,10 +43,6 @@ class PredictArguments(CameraArguments):
     folder: Path | None = None
     """instead of image=, a folder of images: alone with their camera, or with a metadata.jsonl, BOP, KITTI or COCO;
     or FILE.mcap or rosbag2, a recording of ROS 2 with camera_info"""
-    object: NumberOrName | None = None
-    """with annotations or boxes=: BOP's obj_id, KITTI's type or COCO's category; by default all objects"""
-    boxes: Path | None = None
-    """instead of box=, a file of COCO results, or of COCO, with the boxes of many objects"""
     out: Path | None = None
     """a folder for predictions.jsonl and a picture for each line; by default lines are printed, also with FILE.mcap,
     which receives messages of ROS 2"""
@@ -67,10 +63,13 @@ class PredictArguments(CameraArguments):
                 "predict: expected either image=FILE or folder=DIR with f=PIXELS or camera=FILE, or folder=DIR with "
                 "metadata.jsonl"
             )
-        if self.boxes and (self.box or self.folder or len(self.image or ()) > 1):
-            raise ValueError("boxes: the boxes of one image=FILE; expected no box=, no folder= and no further image")
-        has_none = self.image or self.of_camera or (self.folder and is_recording(self.folder))
-        if self.object is not None and has_none and not self.boxes:
+        several = self.folder or len(self.image or ()) > 1
+        if self.boxes and not self.function and several:
+            raise ValueError("boxes: the boxes of one image=FILE; expected no folder= and no further image")
+        is_recorded = self.folder is not None and is_recording(self.folder)
+        if self.detects and not (self.of_camera or is_recorded):
+            raise ValueError(f"{'detect' if self.detect else 'boxes'}: expected f=PIXELS or camera=FILE too")
+        if self.object is not None and (self.image or self.of_camera or is_recorded) and not self.boxes:
             raise ValueError("object: selects detections of folder=DIR or boxes=FILE; leave it out for one box")
         if self.groups and not self.coverage:
             raise ValueError("groups: guarantees a coverage; expected coverage=0.9, or another in (0, 1), too")
@@ -86,10 +85,12 @@ def main(words: list[str]) -> int:
     arguments = PredictArguments.parsed("predict", words)
     out, detections = arguments.out, _detections(arguments)
     _prepare(arguments, detections)
+    function = arguments.of_function()  # whose mistakes need no network
     predictor = loaded(arguments, coverage=arguments.coverage)
     guarantee = predictor.guarantee(arguments.coverage, arguments.groups) if arguments.coverage else None
     curve = _depth_curve(predictor) if arguments.curve else None
-    sightings = _viewed(arguments, predictor, predicted(predictor, detections, guarantee))
+    detector = function or arguments.of_network(predictor)
+    sightings = _viewed(arguments, predictor, predicted(predictor, detections, guarantee, detector))
     if out is not None and out.suffix != MCAP:
         _write(predictor, sightings, len(detections), out, curve, guarantee)
         return 0
@@ -123,13 +124,14 @@ def _prepare(arguments: PredictArguments, detections: Detections) -> None:
 
 
 def _detections(arguments: PredictArguments) -> Detections:
+    """The detections; of a detector, the images without boxes."""
     camera, folder = arguments.of_camera, arguments.folder
     if recording := arguments.recording(folder):
         return recording
     if folder and not camera:
         return detections_in(folder, object_name=arguments.object)
     files = images_in(folder) if folder else arguments.image or ()
-    boxes = boxes_in(arguments.boxes, arguments.object) if arguments.boxes else [{}]
+    boxes = boxes_in(arguments.boxes, arguments.object) if arguments.boxes and not arguments.function else [{}]
     return detections_of(files, camera, boxes)
 
 

@@ -11,16 +11,9 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from pydantic import Field, model_validator
 
-from phd_exp.cli.arguments import (
-    CameraArguments,
-    loaded,
-    message_file,
-    new_view,
-    output_folder,
-    require_output,
-    with_bar,
-)
-from phd_exp.records.detections import NumberOrName, detections_of
+from phd_exp.cli.arguments import loaded, message_file, new_view, output_folder, require_output, with_bar
+from phd_exp.cli.detecting import DetectingArguments
+from phd_exp.records.detections import detections_of
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.foreign import boxes_of_images
 from phd_exp.records.messages import optical_frame
@@ -37,7 +30,7 @@ Box = tuple[float, float, float, float]
 LEAST_LAG = 4  # five frames in a row that contradict a path end it
 
 
-class TrackArguments(CameraArguments):
+class TrackArguments(DetectingArguments):
     """The run, the video with its camera and box, or the folder; lengths in pixels of the images."""
 
     video: Path | None = None
@@ -45,10 +38,6 @@ class TrackArguments(CameraArguments):
     folder: Path | None = None
     """instead of video=, images with a metadata.jsonl whose lines have a time (s), and a track for several paths; or
     FILE.mcap or rosbag2, a recording of ROS 2 with camera_info"""
-    boxes: Path | None = None
-    """instead of box=, COCO results of a detector, whose image_id is the number of a frame, from 0"""
-    object: NumberOrName | None = None
-    """with boxes=: the category_id; by default all boxes"""
     stride: Annotated[int, Field(ge=1)] = 1
     """use every stride-th frame of the video or recording"""
     noise: Annotated[float, Field(ge=1e-3, le=1e3)] = 1.0
@@ -75,14 +64,12 @@ class TrackArguments(CameraArguments):
         if (self.video is None) == (self.folder is None):
             raise ValueError("track: expected either video=FILE with f=PIXELS or camera=FILE, or folder=DIR")
         described = self.folder and not is_recording(self.folder)
-        if described and (self.of_camera or self.boxes or self.stride > 1):
+        if described and (self.of_camera or (self.boxes and not self.function) or self.stride > 1):
             raise ValueError(
                 "folder: its metadata.jsonl has cameras and boxes; expected no f=, camera=, box=, stride="
             )
         if self.video and not self.of_camera.keys() - {"box"}:
             raise ValueError("video: has no camera; expected f=PIXELS, fx= and fy=, or camera=FILE too")
-        if self.box and self.boxes:
-            raise ValueError("box: expected either box= of the first frame, or boxes= of a detector")
         if self.object is not None and not self.boxes:
             raise ValueError("object: selects detections of boxes=FILE; leave it out for one box")
         return self
@@ -107,6 +94,7 @@ def main(words: list[str]) -> int:
     out = arguments.out
     if arguments.video or (out and out.suffix != MCAP):
         require_av("video" if arguments.video else "out")
+    arguments.of_function()  # whose mistakes need no network
     sequences = list(_sequences(arguments))
     _prepare(arguments)
     predictor = loaded(arguments)
@@ -152,12 +140,11 @@ def _sequences(arguments: TrackArguments) -> Iterator[_Sequence]:
         from phd_exp.inference.frames import folder_frames
 
         for name, detections in tracks.items():
-            yield _Sequence(
-                folder_frames(detections), len(detections), str(arguments.folder.name if name is None else name)
-            )
+            frames = folder_frames(detections, has_boxes=arguments.detects)
+            yield _Sequence(frames, len(detections), str(arguments.folder.name if name is None else name))
         return
-    boxes: dict[int, list[Box]] | None = None
-    if arguments.boxes:
+    boxes: dict[int, list[Box]] | None = {} if arguments.detects else None
+    if arguments.boxes and not arguments.function:
         boxes = _boxes_of_frames(arguments.boxes, arguments.object)
     elif arguments.box:
         boxes = {0: [arguments.box]}
@@ -211,7 +198,10 @@ def _followed(
 
     slow = Slow(arguments.depth_time, arguments.projection_time)
     motion, least = ConstantVelocity(arguments.noise, arguments.speed), arguments.least_familiar
-    followed = follow(predictor, sequence.frames, motion, arguments.lag, slow, least_familiar=least)
+    detector = arguments.of_function() or arguments.of_network(predictor)
+    followed = follow(
+        predictor, sequence.frames, motion, arguments.lag, slow, least_familiar=least, detector=detector
+    )
     if view is not None:
         from phd_exp.inference.rerun_view import viewed_path
 

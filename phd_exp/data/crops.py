@@ -10,7 +10,7 @@ from PIL import ExifTags, Image
 
 from phd_exp.data.areas import GREY, view
 from phd_exp.data.images import shrunk
-from phd_exp.optics.lens import PINHOLE
+from phd_exp.optics.lens import PINHOLE, Lens
 from phd_exp.optics.virtual import VirtualCamera, intrinsics, require_no_fold
 from phd_exp.records.detections import Detection
 from phd_exp.records.errors import DatasetError
@@ -55,16 +55,29 @@ def read_image(file: Path, content: bytes) -> Image.Image:
         return _as_rgb(file, image)
 
 
+def optics_of(detection: Detection, size: tuple[int, int]) -> tuple[Float[np.ndarray, "3 3"], Lens]:
+    """The camera matrix (pixels) and the lens of a detection's image of that width and height.
+
+    Raises DatasetError if the camera file is for another size, or its lens folds over inside.
+    """
+    K, file = intrinsics(*detection.focal_lengths_and_centre(*size)), detection.calibration
+    lens = file.lens if file else PINHOLE
+    try:
+        require_no_fold(K, lens, *size)
+    except ValueError as error:
+        raise DatasetError(f"{detection.where}: {error}") from None
+    return K, lens
+
+
 def facing(detection: Detection, size: tuple[int, int], side: int, largest_f: float = np.inf) -> VirtualCamera:
     """The virtual camera that faces a detection in an image of that width and height; its box, if it has one, is
     viewed with a focal length up to `largest_f`.
 
-    Raises DatasetError if the box is too wide, the camera file is for another size, or its lens folds over inside.
+    Raises DatasetError if the box is too wide, or as `optics_of`.
     """
-    box, K, file = detection.box(*size), intrinsics(*detection.focal_lengths_and_centre(*size)), detection.calibration
-    lens = file.lens if file else PINHOLE
+    box = detection.box(*size)
+    K, lens = optics_of(detection, size)
     try:
-        require_no_fold(K, lens, *size)
         return VirtualCamera.of_box(K, box, float(side), lens, largest_f if detection.line.box else np.inf)
     except ValueError as error:
         raise DatasetError(f"{detection.where}: {error}") from None

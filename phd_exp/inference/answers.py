@@ -25,7 +25,7 @@ from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
 from phd_exp.models.heads import Prediction
 from phd_exp.records.detections import Detection
 from phd_exp.records.errors import DatasetError, RunError, UserError
-from phd_exp.records.images import content_of, pillow_warnings
+from phd_exp.records.images import pillow_warnings
 
 if TYPE_CHECKING:  # imports of pyarrow
     from phd_exp.evaluation.conformal import Guarantee
@@ -287,9 +287,8 @@ def _seen(predictor: Predictor, detections: list[Detection] | UserError) -> tupl
     if isinstance(detections, UserError):
         return [], detections
     found: list[Seen] = []
-    file, recorded = detections[0].file, detections[0].recorded
     try:
-        image = read_image(file, recorded.content if recorded else content_of(file))
+        image = read_image(detections[0].file, detections[0].content)
         for detection in detections:
             camera = facing(detection, image.size, predictor.side, predictor.largest_f)
             found.append((detection, image, View(cut(image, camera), camera)))

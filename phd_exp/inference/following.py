@@ -17,6 +17,7 @@ from phd_exp.fusion import Pose
 from phd_exp.fusion.tracks import ConstantVelocity, Lost, Slow, State, Tracker
 from phd_exp.fusion.tracks.motion import Motion
 from phd_exp.inference.answers import PER_CENT, rounded, uncertainty
+from phd_exp.inference.detectors import Detector, overlap
 from phd_exp.inference.predictor import Predictor
 from phd_exp.optics.lens import PINHOLE, Lens
 from phd_exp.optics.virtual import Box, VirtualCamera, rays, towards
@@ -116,6 +117,7 @@ def follow(
     slow: Slow | None = None,
     lost: Lost | None = None,
     least_familiar: float = 0.0,
+    detector: Detector | None = None,
 ) -> Iterator[Followed]:
     """Each frame with its state, `lag` frames later; frames may come from a live camera.
 
@@ -123,11 +125,12 @@ def follow(
     predicted position; the box of a later frame is this outline, wider by the spread, at the position that the path
     predicts. Where boxes are given, the one that overlaps most with the predicted one replaces it. After a track is
     lost, the next box begins another, and so does the next whole image. A prediction whose `familiar` is less than
-    `least_familiar` takes no part after the first one: the object may be hidden.
+    `least_familiar` takes no part after the first one: the object may be hidden. A detector finds the boxes of frames
+    with none of their own, as long as no path predicts one: in the first frames, and after a track is lost.
 
     Raises:
         ConfigError: the predictor has no uncertainty.
-        DatasetError: a given box is not valid, a time is not later than the one before, or no path is found; the
+        DatasetError: a box is not valid, a time is not later than the one before, or no path is found; the
             states of earlier frames are yielded first.
     """
     if not predictor.is_probabilistic:
@@ -137,7 +140,8 @@ def follow(
         )
 
     def begun(track: int) -> _Track:
-        return _Track(predictor, Tracker(motion, lag, slow or Slow(), lost or Lost()), track, least_familiar)
+        tracker = Tracker(motion, lag, slow or Slow(), lost or Lost())
+        return _Track(predictor, tracker, track, least_familiar, detector)
 
     current = begun(0)
     try:
@@ -154,17 +158,18 @@ def follow(
 class _Track:
     """One track: its tracker, the frames that wait for their state, and the outline of the last given box."""
 
-    def __init__(self, predictor: Predictor, tracker: Tracker, number: int, least_familiar: float) -> None:
+    def __init__(
+        self, predictor: Predictor, tracker: Tracker, number: int, least_familiar: float, detector: Detector | None
+    ) -> None:
         self.predictor, self.tracker, self.number, self.least_familiar = predictor, tracker, number, least_familiar
+        self.detector = detector
         self.waiting: deque[Followed] = deque()
         self.last: tuple[ProjectedHuber, Pose] | None = None  # prediction and pose of the virtual camera
         self.outline: _Outline | None = None
 
     def add(self, number: int, frame: Frame) -> Iterator[Followed]:
         """The frames whose state is known with this one."""
-        predicted = self._predicted_box(frame)
-        box = _best(frame.boxes or (), predicted)
-        given, box = box is not None, box or predicted
+        box, given = self._box(frame)
         followed = Followed(number, frame, self.number)
         is_seen = frame.boxes is None or box is not None
         if is_seen:
@@ -222,6 +227,14 @@ class _Track:
         R, familiar = torch.from_numpy(camera.R), predictor.familiar(raw, f)
         pose = Pose(R @ frame.pose.R, R @ frame.pose.t)
         return (prediction, pose), None if familiar is None else float(familiar[0])
+
+    def _box(self, frame: Frame) -> tuple[Box | None, bool]:
+        """The part of the image to predict from, and whether the frame or the detector gives it."""
+        predicted, boxes = self._predicted_box(frame), frame.boxes or ()
+        if self.detector and frame.boxes == () and not predicted:
+            boxes = tuple(row["box"] for row in self.detector.boxes_in(frame.image, frame.K, frame.lens, frame.where))
+        box = _best(boxes, predicted)
+        return box or predicted, box is not None
 
     def _predicted_box(self, frame: Frame) -> Box | None:
         """The box at the position that the path predicts; None where that is outside the image."""
@@ -294,13 +307,5 @@ def _best(boxes: tuple[Box, ...], predicted: Box | None) -> Box | None:
     """The box that overlaps most with the predicted one, the first without one; None if there is none."""
     if predicted is None:
         return boxes[0] if boxes else None
-    overlap, place = max(((_overlap(box, predicted), -k) for k, box in enumerate(boxes)), default=(0.0, 0))
-    return boxes[-place] if overlap > 0 else None
-
-
-def _overlap(one: Box, other: Box) -> float:
-    """Area of the intersection of two boxes over that of their union."""
-    low, high = np.maximum(one[:2], other[:2]), np.minimum(one[2:], other[2:])
-    both = float(np.prod(np.maximum(high - low, 0)))
-    areas = [(right - left) * (bottom - top) for left, top, right, bottom in (one, other)]
-    return both / (sum(areas) - both)
+    share, place = max(((overlap(box, predicted), -k) for k, box in enumerate(boxes)), default=(0.0, 0))
+    return boxes[-place] if share > 0 else None

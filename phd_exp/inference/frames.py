@@ -5,11 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from phd_exp.data.crops import read_image
+from phd_exp.data.crops import optics_of, read_image
 from phd_exp.fusion import Pose
 from phd_exp.inference.following import HERE, Frame
-from phd_exp.optics.lens import PINHOLE
-from phd_exp.optics.virtual import Box, intrinsics, require_no_fold
+from phd_exp.optics.virtual import Box
 from phd_exp.records.detections import Detection
 from phd_exp.records.errors import DatasetError
 from phd_exp.records.images import content_of, pillow_warnings
@@ -57,10 +56,13 @@ def recorded_shots(recording: Recording, stride: int = 1) -> Iterator[Shot]:
             yield Shot(number, (image.time - recording.start) / SECOND, pixels)
 
 
-def folder_frames(detections: Sequence[Detection]) -> Iterator[Frame]:
-    """The frames of one track. Raises DatasetError if a time, pose, image or camera is missing or invalid."""
+def folder_frames(detections: Sequence[Detection], has_boxes: bool = False) -> Iterator[Frame]:
+    """The frames of one track; without any box, whole images unless `has_boxes`.
+
+    Raises DatasetError if a time, pose, image or camera is missing or invalid.
+    """
     has_poses = any(detection.line.pose for detection in detections)
-    has_boxes = any(detection.line.box for detection in detections)
+    has_boxes = has_boxes or any(detection.line.box for detection in detections)
     before, size = -np.inf, None
     for detection in detections:
         where, line = detection.where, detection.line
@@ -89,12 +91,7 @@ def _alike(where: str, image: np.ndarray, size: tuple[int, ...] | None) -> tuple
 def frame_of(detection: Detection, image: np.ndarray, time: float, boxes: tuple[Box, ...] | None) -> Frame:
     """A frame with the camera of a detection. Raises DatasetError if it is not that of this image."""
     height, width = image.shape[:2]
-    K = intrinsics(*detection.focal_lengths_and_centre(width, height))
-    lens = detection.calibration.lens if detection.calibration else PINHOLE
-    try:
-        require_no_fold(K, lens, width, height)
-    except ValueError as error:
-        raise DatasetError(f"{detection.where}: {error}") from None
+    K, lens = optics_of(detection, (width, height))
     pose = HERE
     if detection.line.pose:
         poses = Pose.from_scene([detection.line.pose])

@@ -12,6 +12,7 @@ from pydantic_core import ErrorDetails
 
 from phd_exp.records.cameras import CORNER, SHORTEST, Calibration, Size, read_camera, require_narrow
 from phd_exp.records.errors import DatasetError, complaint
+from phd_exp.records.images import content_of
 from phd_exp.records.parsing import Record
 from phd_exp.records.scenes import Pose, SampleRecord
 from phd_exp.records.spec import Number, Positive
@@ -129,6 +130,11 @@ class Detection:
     where: str
     calibration: Calibration | None = None
     recorded: RecordedImage | None = None
+
+    @property
+    def content(self) -> bytes:
+        """The bytes of the image file. Raises DatasetError if it cannot be read."""
+        return self.recorded.content if self.recorded else content_of(self.file)
 
     @property
     def position(self) -> tuple[float, float, float]:

@@ -1,0 +1,143 @@
+"""Detectors, which find boxes in images: functions of the user, checked, and the run's own map of its object."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from pydantic_core import PydanticCustomError
+
+from phd_exp.config.targets import locate
+from phd_exp.data.crops import optics_of, read_image
+from phd_exp.optics.lens import Lens
+from phd_exp.optics.virtual import Box
+from phd_exp.records.detections import Detection, line_of
+from phd_exp.records.errors import ConfigError, DatasetError, gist, in_user_code, one_line, shown
+from phd_exp.records.images import pillow_warnings
+
+
+class Found(NamedTuple):
+    """The boxes in one image, in any order.
+
+    Attributes:
+        boxes: left, top, right, bottom, pixels from the top left corner of the image.
+        scores: the higher, the more certain.
+        classes: whole numbers or names.
+    """
+
+    boxes: Any
+    scores: Any
+    classes: Any
+
+
+Find = Callable[[UInt8[np.ndarray, "height width 3"], Float[np.ndarray, "3 3"], Lens], Found]
+"""From an image, its camera matrix (pixels) and its lens to boxes."""
+
+
+@dataclass(frozen=True)
+class Detector:
+    """A function that finds boxes, with its name for messages.
+
+    Args:
+        name: the key and its value.
+        find: the function.
+        category: the class to keep; None: all.
+    """
+
+    name: str
+    find: Find
+    category: int | str | None = None
+
+    def boxes_in(
+        self, image: UInt8[np.ndarray, "height width 3"], K: Float[np.ndarray, "3 3"], lens: Lens, where: str
+    ) -> list[dict[str, Any]]:
+        """The `box`, `score` and `category_id` of what it finds, the most certain first.
+
+        Raises DatasetError if the function raises an error, or returns something else than boxes in the image.
+        """
+        where = f"{where}: {self.name}"
+        try:
+            with torch.no_grad():
+                found = self.find(image.copy(), K, lens)
+        except DatasetError as error:
+            raise DatasetError(f"{where}: {error}") from None
+        except Exception as error:
+            raise DatasetError(f"{where} raised {_reason(error)}; mend it") from None
+        rows = []
+        for given in _rows(found, where):
+            line = line_of({"file_name": "image", "f": 1.0} | given, where)  # of any camera
+            box = Detection(line, Path(), where).box(image.shape[1], image.shape[0])
+            if self.category is None or str(line.category_id) == str(self.category):
+                rows.append({"box": box, "score": line.score, "category_id": line.category_id})
+        return sorted(rows, key=lambda row: -row["score"])
+
+    def each(self, detections: Iterable[Detection]) -> Iterator[list[Detection]]:
+        """What it finds in the images of detections without boxes. Raises DatasetError, also for an invalid image."""
+        for detection in detections:
+            with pillow_warnings():
+                image = np.asarray(read_image(detection.file, detection.content))
+            K, lens = optics_of(detection, (image.shape[1], image.shape[0]))
+            rows = self.boxes_in(image, K, lens, detection.where)
+            yield [replace(detection, line=detection.line.model_copy(update=row)) for row in rows]
+
+
+def own_function(name: str, category: int | str | None = None) -> Detector:
+    """The detector MODULE:FUNCTION, from an image to boxes, scores and classes. Raises ConfigError without it."""
+    try:
+        function = locate(name.replace(":", "."), None)
+    except PydanticCustomError as error:
+        raise ConfigError(f"boxes={name}: {(error.context or {})['reason']}") from None
+
+    def find(image: UInt8[np.ndarray, "height width 3"], K: Float[np.ndarray, "3 3"], lens: Lens) -> Found:
+        found: Found = function(image)
+        return found
+
+    return Detector(f"boxes={name}", find, category)
+
+
+def _reason(error: Exception) -> str:
+    """What an error of somebody's function says, and where it was raised."""
+    return in_user_code(error) or one_line(f"{type(error).__name__}: {gist(error)}")
+
+
+def _rows(found: Any, where: str) -> list[dict[str, Any]]:
+    """The box, score and class of each detection. Raises DatasetError if there are not as many of each."""
+    try:
+        parts = tuple(found)
+        boxes, scores, classes = (np.asarray(part) for part in parts)
+        shapes = boxes.shape, scores.shape, classes.shape
+    except Exception as error:  # of a foreign class, too
+        got = f"{type(found).__name__} ({_reason(error)})"
+    else:
+        n = boxes.size // 4
+        if scores.shape == classes.shape == (n,) and (boxes.shape == (n, 4) or boxes.size == 0):
+            columns = {"box": boxes.reshape(n, 4).tolist(), "score": scores.tolist(), "category_id": classes.tolist()}
+            return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+        got = f"shapes {shown(shapes)}"
+    raise DatasetError(
+        f"{where}: got {got}; expected boxes, scores and classes of shapes (n, 4), (n,) and (n,), see "
+        "docs/guides/predict.md"
+    )
+
+
+def overlap(one: Box, other: Box) -> float:
+    """Area of the intersection of two boxes over that of their union.
+
+    Examples:
+        >>> overlap((0.0, 0.0, 2.0, 2.0), (1.0, 0.0, 3.0, 2.0)) == 1 / 3
+        True
+    """
+    return common_area(one, other) / (area(one) + area(other) - common_area(one, other))
+
+
+def common_area(one: Box, other: Box) -> float:
+    """Area of the intersection of two boxes."""
+    return area((max(one[0], other[0]), max(one[1], other[1]), min(one[2], other[2]), min(one[3], other[3])))
+
+
+def area(box: Box) -> float:
+    """Area of a box; 0 if it is reversed."""
+    return max(0.0, box[2] - box[0]) * max(0.0, box[3] - box[1])

@@ -1,0 +1,259 @@
+"""Detectors: functions of the user, whatever they return, and the network's own, on a map that is known."""
+
+import json
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torchvision.models.detection import fasterrcnn_mobilenet_v3_large_320_fpn
+from torchvision.transforms.functional import to_tensor
+
+import phd_exp as package
+from phd_exp.geometry import Lens, intrinsics
+from phd_exp.inference import own_detector
+from phd_exp.inference.detectors import overlap, own_function
+from phd_exp.optics.lens import PINHOLE
+from phd_exp.records.runs import RunFolder
+from tests.inference.test_track import frames
+from tests.support.untrained import SMALL, read_lines, untrained
+
+WIDTH, HEIGHT = 120, 90
+BOXES = np.array([[10.0, 5.0, 60.0, 70.0], [30.0, 20.0, 130.0, 85.0]])  # the second reaches beyond the image
+SCORES = np.array([0.25, 0.75])
+CLASSES = np.array([3, 8])
+
+
+@pytest.fixture(scope="module")
+def make(composed: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> Callable[..., RunFolder]:
+    return lambda *words: untrained(tmp_path_factory.mktemp("runs") / "run", composed(*SMALL, *words))
+
+
+@pytest.fixture(scope="module")
+def run(make: Callable[..., RunFolder]) -> RunFolder:
+    return make("data=folder", "data.folder=nowhere")
+
+
+@pytest.fixture(scope="module")
+def segmenting(make: Callable[..., RunFolder]) -> RunFolder:
+    return make("+backbone.segments=true", "recipe.segmentation=10")
+
+
+def green(self: Any, views: list[np.ndarray]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Instead of the maps of a network, the green of each cell, beyond grey; the greener, the less spread."""
+    maps = torch.nn.functional.avg_pool2d((torch.tensor(np.stack(views))[..., 1] / 127 - 1).relu(), 8)
+    return maps, 0.02 * (1 - maps.mean((1, 2)))
+
+
+@pytest.fixture
+def detector(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], str]:
+    """The word that names a function."""
+
+    def named(function: Any) -> str:
+        module = ModuleType("somebodys")
+        module.find = function  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, "somebodys", module)
+        return "boxes=somebodys:find"
+
+    return named
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> list[str]:
+    """The words of a folder of two photographs."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for name in "ab":
+        noise = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(folder / f"{name}.png")
+    return [f"folder={folder}", "f=300"]
+
+
+def test_a_function_is_as_good_as_its_boxes_in_a_file(
+    phd_exp: Callable, run: RunFolder, detector: Callable, photos: list[str], tmp_path: Path
+) -> None:
+    word = detector(lambda image: (BOXES, SCORES, CLASSES))
+    outcome = phd_exp("predict", f"run={run.path}", *photos, word)
+    assert (outcome.status, outcome.err) == (0, "")
+    results = [
+        {"bbox": [*box[:2], *(box[2:] - box[:2])], "score": score, "category_id": int(category)}
+        for box, score, category in zip(BOXES, SCORES, CLASSES, strict=True)
+    ]
+    (tmp_path / "boxes.json").write_text(json.dumps(results[::-1]))  # the most certain first
+    image = f"image={tmp_path / 'photos/a.png'}"
+    same = phd_exp("predict", f"run={run.path}", image, "f=300", f"boxes={tmp_path / 'boxes.json'}")
+    assert read_lines(outcome.out)[:2] == read_lines(same.out)
+    assert [line["file_name"] for line in read_lines(outcome.out)] == ["a.png", "a.png", "b.png", "b.png"]
+    one = phd_exp("predict", f"run={run.path}", *photos, word, "object=8")
+    assert [line["box"] for line in read_lines(one.out)] == [BOXES[1].tolist()] * 2
+
+
+@pytest.mark.parametrize(
+    ("returned", "said"),
+    [
+        (None, "got NoneType"),
+        ("abc", "got shapes"),
+        ((BOXES, SCORES), "got tuple"),
+        ({"boxes": BOXES, "scores": SCORES, "labels": CLASSES}, "got shapes"),
+        ((BOXES[0], SCORES[:1], CLASSES[:1]), r"got shapes ((4,), (1,), (1,)); expected boxes, scores and classes"),
+        ((BOXES, SCORES[:1], CLASSES), "got shapes ((2, 4), (1,), (2,))"),
+        ((BOXES[:0], SCORES, CLASSES), "got shapes ((0, 4), (2,), (2,))"),
+        (([[1, 2, 3, 4], [1]], SCORES, CLASSES), "got tuple (ValueError"),
+        ((BOXES * np.nan, SCORES, CLASSES), "box.0: got nan; expected to be a finite number"),
+        ((BOXES[:, [2, 1, 0, 3]], SCORES, CLASSES), "expected [left, top, right, bottom] of positive size"),
+        ((BOXES + 200, SCORES, CLASSES), "lies outside the image of 120 x 90 pixels"),
+        ((BOXES / 200, SCORES, CLASSES), "seems to be in units of the image"),
+        ((BOXES, SCORES + np.inf, CLASSES), "score: got inf; expected to be a finite number"),
+        ((BOXES, SCORES, CLASSES + 0.5), "category_id: got 3.5; expected a whole number or a name"),
+        (([["a"] * 4], ["b"], ["c"]), "box.0: got 'a'; expected a valid number"),
+        (([], [], []), "finds nothing; expected a box in one image at least"),
+        (KeyError("boom"), "raised KeyError: 'boom' ("),
+    ],
+)
+def test_nonsense_of_a_function_is_refused_on_one_line(
+    phd_exp: Callable, run: RunFolder, detector: Callable, photos: list[str], returned: Any, said: str
+) -> None:
+    def find(image: np.ndarray) -> Any:
+        image[:] = 0  # its own copy
+        if isinstance(returned, Exception):
+            raise returned
+        return returned
+
+    outcome = phd_exp("predict", f"run={run.path}", *photos, detector(find))
+    assert (outcome.status, outcome.out) == (1, "")
+    (line,) = outcome.err.splitlines()
+    assert re.search(r"a\.png.*: boxes=somebodys:find", line)
+    assert said in line
+
+
+def test_an_image_in_which_nothing_is_found_has_no_line(
+    phd_exp: Callable, run: RunFolder, detector: Callable, photos: list[str]
+) -> None:
+    calls = []
+
+    def find(image: np.ndarray) -> Any:
+        calls.append(image)
+        return (BOXES, SCORES, ["cup", "cat"]) if len(calls) == 2 else ([], [], [])
+
+    outcome = phd_exp("predict", f"run={run.path}", *photos, detector(find))
+    assert [(line["file_name"], line["category_id"]) for line in read_lines(outcome.out)] == [
+        ("b.png", "cat"),
+        ("b.png", "cup"),
+    ]
+    assert outcome.err.startswith("note: boxes=somebodys:find finds nothing in 1 image(s): ")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("boxes=somebodys:other",), "boxes=somebodys:other: 'somebodys.other' cannot be imported"),
+        (
+            ("boxes=nobodys:find",),
+            "boxes=nobodys:find: 'nobodys.find' cannot be imported (No module named 'nobodys')",
+        ),
+        (("boxes=somebodys:find", "box=1,2,3,4"), "box, boxes, detect: each of them says where objects are"),
+        (("boxes=somebodys:find", "detect=true"), "box, boxes, detect: each of them says where objects are"),
+        (("detect=true", "object=1"), "object: detect=true finds one kind of object; leave it out"),
+        (("detect=true",), "makes no map of its object; train with recipe=strong"),
+    ],
+)
+def test_wrong_arguments_are_refused(
+    phd_exp: Callable, run: RunFolder, detector: Callable, photos: list[str], words: tuple[str, ...], said: str
+) -> None:
+    detector(lambda image: (BOXES, SCORES, CLASSES))
+    outcome = phd_exp("predict", f"run={run.path}", *photos, *words)
+    assert outcome.status == 2
+    (line,) = outcome.err.splitlines()
+    assert said in line
+
+
+def test_a_detector_needs_a_camera(phd_exp: Callable) -> None:
+    outcome = phd_exp("predict", "run=nowhere", "folder=.", "detect=true")
+    assert (outcome.status, outcome.err) == (2, "error: detect: expected f=PIXELS or camera=FILE too\n")
+
+
+def test_torchvisions_detectors_need_two_lines(detector: Callable) -> None:
+    torch.manual_seed(0)
+    network = fasterrcnn_mobilenet_v3_large_320_fpn(
+        weights=None, weights_backbone=None, box_score_thresh=0.0, box_detections_per_img=5
+    ).eval()
+
+    def find(image: np.ndarray) -> Any:
+        found = network([to_tensor(image)])[0]
+        return found["boxes"], found["scores"], found["labels"]
+
+    name = detector(find).removeprefix("boxes=")
+    image = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    rows = own_function(name).boxes_in(image, np.eye(3), PINHOLE, "image")
+    assert len(rows) == 5
+    assert all(isinstance(row["category_id"], int) for row in rows)
+    assert sorted(rows, key=lambda row: -row["score"]) == rows
+
+
+def test_a_path_asks_a_detector_only_where_it_knows_no_box(
+    phd_exp: Callable, run: RunFolder, detector: Callable, tmp_path: Path
+) -> None:
+    calls = []
+
+    def find(image: np.ndarray) -> Any:
+        calls.append(image)
+        return ([[8.0, 12.0, 32.0, 38.0]], [1.0], [0]) if len(calls) > 2 else ([], [], [])
+
+    outcome = phd_exp("track", f"run={run.path}", frames(tmp_path), detector(find))
+    assert (outcome.status, outcome.err) == (0, "")
+    lines = read_lines(outcome.out)
+    assert [line["state"] for line in lines[:2]] == ["lost", "lost"]
+    assert lines[2]["box"] == [8, 12, 32, 38]
+    assert all(line["state"] != "lost" and "box" in line for line in lines[2:])
+    assert 3 <= len(calls) < len(lines)
+
+
+@pytest.mark.parametrize("lens", [PINHOLE, Lens((-0.2, 0.05, 0.001, -0.001))], ids=["pinhole", "distorted"])
+@pytest.mark.parametrize(
+    "boxes",
+    [[(60, 50, 90, 85)], [(0, 40, 36, 70)], [(150, 100, 180, 120), (20, 15, 60, 45)], []],
+    ids=["middle", "edge", "two", "none"],
+)
+def test_the_boxes_of_a_known_map_are_found(
+    segmenting: RunFolder, monkeypatch: pytest.MonkeyPatch, lens: Lens, boxes: list[tuple[int, ...]]
+) -> None:
+    """A network whose map is the green of each cell beyond grey finds green boxes anywhere, and these alone."""
+
+    monkeypatch.setattr(own_detector._Search, "_maps", green)
+    detector = own_detector.own_detector(package.load(segmenting.path))
+    image = np.zeros((150, 200, 3), np.uint8)
+    for left, top, right, bottom in boxes:
+        image[top:bottom, left:right, 1] = 255
+    found = detector.boxes_in(image, intrinsics(260.0, 260.0, 100.0, 75.0), lens, "image")
+    assert len(found) == len(boxes)
+    for box in boxes:
+        assert max(overlap(row["box"], tuple(map(float, box))) for row in found) > 0.7
+
+
+def test_whole_photographs_need_no_boxes(
+    phd_exp: Callable, segmenting: RunFolder, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(own_detector._Search, "_maps", green)
+    image = np.zeros((150, 200, 3), np.uint8)
+    image[50:85, 60:90, 1] = 255
+    Image.fromarray(image).save(tmp_path / "a.png")
+    words = ("predict", f"run={segmenting.path}", f"image={tmp_path / 'a.png'}", "detect=true")
+    outcome = phd_exp(*words, "f=260", f"out={tmp_path / 'out'}")
+    assert outcome.status == 0
+    (line,) = read_lines((tmp_path / "out/predictions.jsonl").read_text())
+    assert overlap(line["box"], (60, 50, 90, 85)) > 0.75
+    assert line["score"] > 0.5
+    assert "category_id" not in line
+    assert (tmp_path / "out" / line["picture"]).exists()
+    monkeypatch.setattr(own_detector, "MOST_VIEWS", 3)
+    refused = phd_exp(*words, "f=260")
+    assert refused.status == 1
+    assert re.search(
+        r"a\.png: detect=true: \d+ views cover an image of 200 x 150 pixels; expected at most 3", refused.err
+    )
