@@ -2,14 +2,13 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import ClassVar
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from phd_exp.data.batches import Batch
+from phd_exp.data.batches import Augment, Batch
 from phd_exp.data.photometry import change, levels, on
 
 NUMBERS = (1, 2, 4)  # per sample: whether it changes; two samples; zoom, two shifts and transposition of the backdrop
@@ -20,10 +19,6 @@ FINEST = 4.0  # largest factor by which a backdrop is shown smaller, with finer 
 class Backdrops:
     """What the training images of a data set show behind their objects.
 
-    In an `Exchange`, samples appear before other backdrops: image + clear (empty' - empty). empty' is that of one of
-    two random samples, the one with more texture, since smooth backdrops are easy; it is `tiled` and perhaps
-    transposed. The sum keeps shadows on the ground and the mixed colours of edges.
-
     Args:
         empty: the images without their objects.
         clear: share of each pixel of the images that shows no object, from 0 to 255.
@@ -31,8 +26,6 @@ class Backdrops:
 
     empty: UInt8[Tensor, "samples side side 3"]
     clear: UInt8[Tensor, "samples side side"]
-    name: ClassVar[str] = "the backdrops"
-    n_numbers: ClassVar[int] = sum(NUMBERS)
 
     @property
     def n_bytes(self) -> int:
@@ -43,20 +36,46 @@ class Backdrops:
         """The same on a device."""
         return Backdrops(self.empty.to(device), self.clear.to(device))
 
+
+@dataclass(frozen=True, eq=False)
+class BackdropExchange:
+    """An augmentation that first shows samples before other backdrops: image + clear (empty' - empty).
+
+    empty' is that of one of two random samples, the one with more texture, since smooth backdrops are easy; it is
+    `tiled` and perhaps transposed. The sum keeps shadows on the ground and the mixed colours of edges.
+
+    Args:
+        backdrops: of all training samples.
+        share: the share of the samples that change.
+        then: the augmentation that follows.
+    """
+
+    backdrops: Backdrops
+    share: float
+    then: Augment | None
+
     @cached_property
     def texture(self) -> Float[np.ndarray, " samples"]:
         """The mean difference between neighbouring pixels of each backdrop."""
-        rows = ((one[1:].float() - one[:-1].float()).abs().mean() for one in self.empty)
+        rows = ((one[1:].float() - one[:-1].float()).abs().mean() for one in self.backdrops.empty)
         return torch.stack(list(rows)).cpu().numpy()
 
-    def shown_in(self, batch: Batch, numbers: Float[Tensor, "batch 7"], share: float) -> Batch:
-        """The samples, a share of them before other backdrops, by uniform numbers from 0 to 1."""
-        changes, pairs, views = (part.numpy() for part in numbers.split(NUMBERS, dim=1))
-        pairs = (len(self.empty) * pairs).astype(np.int64)
+    @property
+    def n_numbers(self) -> int:
+        """Number of random numbers per sample; those of `then` come first."""
+        return sum(NUMBERS) + (self.then.n_numbers if self.then else 0)
+
+    def __call__(self, batch: Batch, numbers: Float[Tensor, "batch n_numbers"]) -> Batch:
+        """The samples, changed by uniform numbers from -1 to 1."""
+        of_then, own = numbers.tensor_split([-sum(NUMBERS)], dim=1)
+        changes, pairs, views = (part.numpy() for part in ((own + 1) / 2).split(NUMBERS, dim=1))
+        pairs = (len(self.backdrops.empty) * pairs).astype(np.int64)
         others = np.take_along_axis(pairs, self.texture[pairs].argmax(axis=1)[:, None], axis=1)[:, 0]
         image = batch.image.clone(memory_format=torch.contiguous_format)
-        change(image, changes[:, 0] < share, partial(self._before, batch.row), np.arange(len(batch)), others, views)
-        return replace(batch, image=image)
+        formula = partial(self._before, batch.row)
+        change(image, changes[:, 0] < self.share, formula, np.arange(len(batch)), others, views)
+        batch = replace(batch, image=image)
+        return self.then(batch, of_then) if self.then else batch
 
     def _before(
         self,
@@ -67,7 +86,7 @@ class Backdrops:
         views: Float[np.ndarray, "chosen 4"],
     ) -> UInt8[Tensor, "chosen side side 3"]:
         """The images of these places in the batch before views of other backdrops."""
-        empty, clear = self.empty, self.clear
+        empty, clear = self.backdrops.empty, self.backdrops.clear
         rows = row.index_select(0, on(row, place)).to(empty.device)
         old, share = (part.index_select(0, rows).to(image.device) for part in (empty, clear))
         new = tiled(empty, others, views).to(image.device)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -82,50 +82,6 @@ class Augment(Protocol):
     def __call__(self, batch: Batch, numbers: Float[Tensor, "batch n_numbers"]) -> Batch:
         """The samples, changed by uniform numbers from -1 to 1."""
         ...
-
-
-@runtime_checkable
-class Exchanged(Protocol):
-    """What an `Exchange` shows instead of samples or of parts of them; `name` is for messages."""
-
-    name: ClassVar[str]
-    n_numbers: ClassVar[int]
-
-    @property
-    def n_bytes(self) -> int:
-        """Memory that it takes."""
-        ...
-
-    def to(self, device: torch.device) -> "Exchanged":
-        """The same on a device."""
-        ...
-
-    def shown_in(self, batch: Batch, numbers: Float[Tensor, "batch n_numbers"], share: float) -> Batch:
-        """The samples, a share of them changed by uniform numbers from 0 to 1, of which the first chooses."""
-        ...
-
-
-@dataclass(frozen=True, eq=False)
-class Exchange:
-    """An augmentation that first changes a share of the samples by an exchange, and then applies another.
-
-    Random numbers of `then` come first.
-    """
-
-    held: Exchanged
-    share: float
-    then: Augment | None
-
-    @property
-    def n_numbers(self) -> int:
-        """Number of random numbers per sample."""
-        return self.held.n_numbers + (self.then.n_numbers if self.then else 0)
-
-    def __call__(self, batch: Batch, numbers: Float[Tensor, "batch n_numbers"]) -> Batch:
-        """The samples, changed by uniform numbers from -1 to 1."""
-        of_then, own = numbers.tensor_split([-self.held.n_numbers], dim=1)
-        batch = self.held.shown_in(batch, (own + 1) / 2, self.share)
-        return self.then(batch, of_then) if self.then else batch
 
 
 @dataclass(eq=False)

@@ -7,15 +7,16 @@ from typing import TypeVar
 import torch
 from lightning import LightningDataModule
 
-from phd_exp.data.batches import Augment, Batch, BatchLoader, Exchange, Exchanged
-from phd_exp.data.photographs import Photographs, Replacements
+from phd_exp.data.backdrops import BackdropExchange, Backdrops
+from phd_exp.data.batches import Augment, Batch, BatchLoader
+from phd_exp.data.photographs import PhotographExchange, Photographs
 from phd_exp.data.sources import PARTS, Part, Source
 from phd_exp.geometry.camera import Camera
 from phd_exp.records.errors import ConfigError, DatasetError
 from phd_exp.records.processes import announce
 from phd_exp.records.runs import CHOOSE
 
-Held = TypeVar("Held", Batch, Exchanged)
+Held = TypeVar("Held", Batch, Backdrops)
 
 
 class PositionData(LightningDataModule):
@@ -91,10 +92,9 @@ class PositionData(LightningDataModule):
         if self.train_batches is None:
             samples, augment = self.samples["train"], self.augment
             if self.photographs:
-                found = Replacements(self.photographs.samples(samples))
-                augment = Exchange(found, self.photographs.share, augment)
+                augment = PhotographExchange(self.photographs.samples(samples), self.photographs.share, augment)
             if self.backdrops:  # first, since what is behind photographs is not known
-                augment = Exchange(self.source.training_backdrops(), self.backdrops, augment)
+                augment = BackdropExchange(self.source.training_backdrops(), self.backdrops, augment)
             self.train_batches = self.batches(samples, shuffle=True, augment=augment)
 
     def move_to(self, device: torch.device) -> None:
@@ -135,10 +135,12 @@ class PositionData(LightningDataModule):
 
 def _moved(augment: Augment | None, device: torch.device) -> Augment | None:
     """An augmentation whose images are held on a device."""
-    if not isinstance(augment, Exchange):
-        return augment
-    held = held_on(device, augment.held, augment.held.name)
-    return replace(augment, held=held, then=_moved(augment.then, device))
+    if isinstance(augment, BackdropExchange):
+        backdrops = held_on(device, augment.backdrops, "the backdrops")
+        return replace(augment, backdrops=backdrops, then=_moved(augment.then, device))
+    if isinstance(augment, PhotographExchange):
+        return replace(augment, photographs=held_on(device, augment.photographs, "the photographs"))
+    return augment
 
 
 def held_on(device: torch.device, held: Held, words: str) -> Held:

@@ -2,19 +2,19 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from phd_exp.data.batches import Batch
+from phd_exp.data.batches import Augment, Batch
 from phd_exp.data.folder import crops_of, samples_of
 from phd_exp.data.photometry import on
 from phd_exp.records.errors import DatasetError
 from phd_exp.records.own_images import detections_in
 
+NUMBERS = 2  # per sample: whether a photograph replaces it, and which one
 LIKENESS = 2.0  # largest factor between the sizes at which photographs and renders show the object
 
 
@@ -57,30 +57,34 @@ def _sizes(batch: Batch) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, eq=False)
-class Replacements:
-    """Photographs that replace samples in an `Exchange`; their masks weigh nothing."""
+class PhotographExchange:
+    """An augmentation that first replaces samples by random photographs, whose masks weigh nothing.
+
+    Args:
+        photographs: all of them.
+        share: the share of the samples that is replaced.
+        then: the augmentation that follows.
+    """
 
     photographs: Batch
-    name: ClassVar[str] = "the photographs"
-    n_numbers: ClassVar[int] = 2  # whether a photograph replaces a sample, and which one
+    share: float
+    then: Augment | None
 
     @property
-    def n_bytes(self) -> int:
-        """Memory that they take."""
-        return self.photographs.n_bytes
+    def n_numbers(self) -> int:
+        """Number of random numbers per sample; those of `then` come first."""
+        return NUMBERS + (self.then.n_numbers if self.then else 0)
 
-    def to(self, device: torch.device) -> "Replacements":
-        """The same on a device."""
-        return Replacements(self.photographs.to(device))
-
-    def shown_in(self, batch: Batch, numbers: Float[Tensor, "batch 2"], share: float) -> Batch:
-        """The samples, a share of them replaced, by uniform numbers from 0 to 1; rows stay those of the replaced."""
-        replaced, which = numbers.double().numpy().T
-        places = np.flatnonzero(replaced < share)
+    def __call__(self, batch: Batch, numbers: Float[Tensor, "batch n_numbers"]) -> Batch:
+        """The samples, changed by uniform numbers from -1 to 1. Their rows stay those of the replaced samples."""
+        of_then, own = numbers.tensor_split([-NUMBERS], dim=1)
+        replaced, which = ((own + 1) / 2).double().numpy().T
+        places = np.flatnonzero(replaced < self.share)
         chosen = self.photographs.select(torch.from_numpy((len(self.photographs) * which[places]).astype(np.int64)))
         chosen, rows = chosen.to(batch.image.device), on(batch.image, places)
         parts = {
             name: getattr(batch, name).index_copy(0, rows, getattr(chosen, name)) for name in ("image", "xyz", "f")
         }
         weight = None if batch.mask is None else torch.ones_like(batch.f).index_fill(0, rows, 0.0)
-        return replace(batch, **parts, mask_weight=weight)
+        batch = replace(batch, **parts, mask_weight=weight)
+        return self.then(batch, of_then) if self.then else batch

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from phd_exp.data.backdrops import FINEST, Backdrops, tiled
-from phd_exp.data.batches import Batch, Exchange
+from phd_exp.data.backdrops import FINEST, NUMBERS, BackdropExchange, Backdrops, tiled
+from phd_exp.data.batches import Batch
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.sources import RenderedSource
 from phd_exp.records.dataset import DatasetFolder
@@ -58,7 +58,7 @@ def test_renders_without_objects_are_the_renders_where_no_object_is(source: Rend
 def test_an_object_appears_before_the_other_backdrop(source: RenderedSource) -> None:
     found, samples = source.training_backdrops(), source.samples("train")
     draw = torch.tensor([[-1.0, 0.5, 0.5, -1, -1, -1, 1], [-1.0, -0.5, -0.5, -1, 0, -1, -1]])
-    new = Exchange(found, 0.5, then=None)(samples, draw)
+    new = BackdropExchange(found, 0.5, then=None)(samples, draw)
     for row, other in ((0, found.empty[1]), (1, found.empty[0].flip(0).transpose(0, 1))):
         nothing, object_alone = found.clear[row] == 255, found.clear[row] == 0
         assert torch.equal(new.image[row][object_alone], samples.image[row][object_alone])
@@ -74,7 +74,7 @@ def test_the_backdrop_with_more_texture_is_preferred(batch: Batch) -> None:
     empty[::2] = batch.image[::2]
     clear = torch.full((N, SIDE, SIDE), 255, dtype=torch.uint8)
     black = replace(batch, image=empty[batch.row])
-    new = Exchange(Backdrops(empty, clear), 1.0, then=None)(black, numbers(Backdrops.n_numbers))
+    new = BackdropExchange(Backdrops(empty, clear), 1.0, then=None)(black, numbers(sum(NUMBERS)))
     assert (new.image != 0).any((1, 2, 3)).float().mean() == pytest.approx(0.75, abs=0.15)
 
 
@@ -108,10 +108,10 @@ def test_the_share_is_changed_and_then_augmented(batch: Batch) -> None:
 
     clear = torch.full((N, SIDE, SIDE), 255, dtype=torch.uint8)
     backdrops = Backdrops(torch.randint(0, 256, batch.image.shape, dtype=torch.uint8), clear)
-    draw = numbers(Backdrops.n_numbers + 2)
+    draw = numbers(sum(NUMBERS) + 2)
     for share in (0.0, 0.4, 1.0):
-        exchange = Exchange(backdrops, share, Darken())
-        assert exchange.n_numbers == Backdrops.n_numbers + 2
+        exchange = BackdropExchange(backdrops, share, Darken())
+        assert exchange.n_numbers == sum(NUMBERS) + 2
         changed = (exchange(batch, draw).image != batch.image // 2).any((1, 2, 3))
         assert changed.float().mean() == pytest.approx(share, abs=0.15)
 
