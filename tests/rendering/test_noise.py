@@ -31,7 +31,7 @@ def test_metal_is_at_most_twice_as_noisy_as_rubber_or_its_noise_is_invisible(
 ) -> None:
     file = tmp_path / "mesh.glb"
     _write_monkey(file) if shape == "monkey" else write_mesh(file, solid(shape))  # type: ignore[arg-type]
-    small = {"sensor_size": 64, "f_range": (960.0, 960.0), "z_range": (4.0, 4.0), "xy_range": 0.0}
+    small = {"sensor_size": 96, "f_range": (1600.0, 1600.0), "z_range": (4.0, 4.0), "xy_range": 0.0}
     spec = make_spec("object", mesh=str(file), backdrops=backdrops, **small)
     fast, exact = (dict(_images(settings, spec)) for settings in (fast_settings(spec), EXACT))
     noise = {
