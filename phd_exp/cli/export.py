@@ -52,8 +52,8 @@ def main(words: list[str]) -> int:
     from phd_exp.inference.onnx import TOLERANCE, export
 
     require_exportable(predictor)
-    precision = _precision(arguments, predictor)
     held_out = _held_out(predictor) if arguments.quantize else None
+    precision = _precision(arguments, predictor)
     sizes = [n for _, _, n in PHOTOGRAPHS] if arguments.photographs else batches(predictor.side)
     numbers = ", ".join(map(str, sizes))
     what = f"photographs with {numbers} boxes" if arguments.photographs else f"images in batches of {numbers}"
@@ -83,11 +83,19 @@ def _precision(arguments: ExportArguments, predictor: "Predictor") -> "Precision
 
 
 def _held_out(predictor: "Predictor") -> "Batch":
-    """The run's held-out samples. Raises ConfigError if there are too few."""
+    """The held-out samples of a run. Raises ConfigError for several runs, too few samples, and a source of code."""
     from phd_exp.build import build_source
+    from phd_exp.config import SourceConfig
     from phd_exp.inference.onnx_int8 import IMAGES_AT_LEAST
 
+    if predictor.others:
+        raise ConfigError(f"quantize: got {len(predictor.networks)} networks; expected a single run")
     data = predictor.config.data
+    if isinstance(data, SourceConfig):  # code, which a stored configuration does not run
+        raise ConfigError(
+            "quantize: got a run on a source of the user's own, whose code is not run here; expected a run on "
+            "rendered images or data=folder"
+        )
     if data.n_held_out < IMAGES_AT_LEAST:
         raise ConfigError(
             f"quantize: got a run with {data.n_held_out} held-out images; expected {IMAGES_AT_LEAST} at least, which "

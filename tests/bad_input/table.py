@@ -103,6 +103,11 @@ BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
     f"{name}: &{name} [{','.join([f'*{before}'] * 9)}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
 )
 
+CODE = {
+    "name": "own", "n_train": 8, "n_held_out": 100, "n_test": 2, "batch_size": 4, "image_size": 32,
+    "source": {"_target_": "fractions.Fraction", "numerator": {"_target_": "os.system", "command": "touch owned"}},
+}  # fmt: skip
+"""The data section of a stranger, who would run a command."""
 KINDS = r"not an image of any kind that is read here \(PNG, .*\)"
 PICTURES = [
     photo("zero bytes", b"", KINDS),
@@ -241,6 +246,7 @@ STORED = [
     *stored("a variable of the environment", r"data\.folder: got '\$\{oc\.env:HOME\}'; expected a value, .*", data__folder="${oc.env:HOME}"),
     *stored("a resolver", r"backbone\.depth: got '\$\{oc\.decode:18\}'; expected a value, .*", backbone__depth="${oc.decode:18}"),
     *stored("an image without end", r"data\.image_size: got 1000000; expected to be less than or equal to 4096", data__image_size=1_000_000),
+    Bad("stored configuration: a source of code, exported in int8", lambda place: place.put_config(data=CODE), (*EXPORT, "quantize=int8"), r"quantize: got a run on a source of the user's own, whose code is not run here; .*", 2),
     *stored("an abstract class", r"(backbone: .*|runs/.*/config\.yaml: describes no network \(.*\))", backbone={"_target_": "phd_exp.models.backbones.Backbone"}),
     *stored("an abstract head", r"(model\.head: .*|runs/.*/config\.yaml: describes no network \(.*\))", model__head={"_target_": "phd_exp.models.heads.Head"}),
     *stored("a network larger than its weights", r"runs/.*/last\.ckpt: not a whole checkpoint of this network \(.*\)", 1, backbone={"_target_": "phd_exp.models.locating.Locating", "depth": 50, "width": 64_000, "stride": 4, "channels": 64_000}),

@@ -49,6 +49,15 @@ def test_a_network_without_convolutions_is_refused() -> None:
         quantized(ModelProto(), None, None)  # type: ignore[arg-type]
 
 
+def test_several_networks_are_refused(
+    phd_exp: Callable[..., Any], composed: Callable[..., Any], tmp_path: Path
+) -> None:
+    """Which convolutions stay exact is known of one network."""
+    run = untrained(tmp_path / "run", composed(*SMALL, "data=folder", "data.folder=nowhere"))
+    outcome = phd_exp("export", f"run={run.path},{run.path}", "quantize=int8")
+    assert (outcome.status, outcome.error) == (2, "quantize: got 2 networks; expected a single run")
+
+
 @pytest.fixture(scope="module")
 def exported(composed: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> tuple[RunFolder, Any, Any]:
     """A run that holds out 40 of the user's own images, and its network as a graph in float32."""
