@@ -117,7 +117,8 @@ def _regressor(folder: RunFolder, config: RunConfig, depth: DepthScale) -> Regre
     It is first built without memory, and must fit: a stored configuration may describe a network of any size.
     """
     weights = regressor_weights(folder.best_checkpoint)
-    if not custom_parts(config.model_dump(mode="json")):  # the user's own networks may need their numbers
+    # the user's own networks may need their numbers
+    if not custom_parts({"head": config.model.head, "backbone": config.backbone}):
         with torch.device("meta"), _Uninitialised():
             fill(_built(folder, config, depth), weights, folder.best_checkpoint, assign=True)
     regressor = _built(folder, config, depth)
