@@ -16,7 +16,7 @@ from phd_exp.inference.following import HERE, Followed
 from phd_exp.inference.path_video import COLOURS, TRAIL
 from phd_exp.inference.rerun_recording import LEVELS, Place, Recording, Vector, named
 from phd_exp.optics.virtual import VirtualCamera, towards
-from phd_exp.records.own_images import Observed
+from phd_exp.records.own_images import Observed, views_of
 
 HALF_90 = 1.645  # standard deviations from the middle to an end of the central 90 % of a Gaussian
 
@@ -45,17 +45,16 @@ def viewed_scenes(
     recording: Recording, scenes: Sequence[Observed], sightings: Iterable[Sighting]
 ) -> Iterator[Sighting]:
     """The sightings of all scenes, in their order; each is recorded before it is yielded."""
-    remaining, most = iter(sightings), max(len(scene.detections) for scene in scenes)
-    for number, scene in enumerate(scenes):
-        poses = Pose.from_scene(scene.poses)
-        for k, (R, t) in enumerate(zip(poses.R, poses.t, strict=True)):
-            sighting, pose = next(remaining), Pose(R, t)
-            if k == 0:
-                recording.at("scene", number)
-                recording.clear(["views"], ["fused"], *map(_camera, range(len(scene.detections), most)))
-            recording.camera(_camera(k), sighting.image, sighting.view.camera.K, pose, sighting.mode)
-            recording.sighting(["views", k], [*_camera(k), "image", "object"], sighting, pose)
-            yield sighting
+    most = max(len(scene.detections) for scene in scenes)
+    for (number, k, scene), sighting in zip(views_of(scenes), sightings, strict=True):
+        if k == 0:
+            recording.at("scene", number)
+            recording.clear(["views"], ["fused"], *map(_camera, range(len(scene.detections), most)))
+        poses = Pose.from_scene([scene.poses[k]])
+        pose = Pose(poses.R[0], poses.t[0])
+        recording.camera(_camera(k), sighting.image, sighting.view.camera.K, pose, sighting.mode)
+        recording.sighting(["views", k], [*_camera(k), "image", "object"], sighting, pose)
+        yield sighting
 
 
 def add_fused(recording: Recording, answers: Sequence[Mapping[str, Any]]) -> None:

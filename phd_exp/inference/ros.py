@@ -18,9 +18,8 @@ from phd_exp.inference.answers import Sighting, together
 from phd_exp.inference.following import HERE, Followed
 from phd_exp.records.detections import Detection
 from phd_exp.records.errors import DatasetError
-from phd_exp.records.images import content_of
 from phd_exp.records.messages import SECOND, WORLD, Located, MessageFile, Photograph, optical_frame
-from phd_exp.records.own_images import Observed
+from phd_exp.records.own_images import Observed, views_of
 
 CAMERA = "camera"
 LATEST = 2**31  # seconds, which a message holds in 32 bits
@@ -47,8 +46,7 @@ def write_views(
     messages: MessageFile, scenes: Sequence[Observed], sightings: Iterable[Sighting]
 ) -> Iterator[Sighting]:
     """The sightings of all scenes, one after the other, as they are; writes their images, cameras and poses."""
-    views = ((n, k, scene) for n, scene in enumerate(scenes) for k in range(len(scene.detections)))
-    for (number, k, scene), sighting in zip(views, sightings, strict=True):
+    for (number, k, scene), sighting in zip(views_of(scenes), sightings, strict=True):
         time, camera = _time(scene.detections[0], number), f"{CAMERA}_{k + 1}"
         messages.photograph(time, optical_frame(camera), camera, _photograph(sighting))
         messages.pose(time, optical_frame(camera), *_in_world(Pose.from_scene([scene.poses[k]])))
@@ -117,7 +115,7 @@ def _located(sighting: Sighting) -> Located:
 
 def _photograph(sighting: Sighting) -> Photograph:
     detection, image, camera = sighting.detection, sighting.image, sighting.view.camera
-    content = detection.recorded.content if detection.recorded else content_of(detection.file)
+    content = detection.content
     kind = next((kind for kind, mark in MARKS.items() if content.startswith(mark)), None)
     if kind is None:
         kind, content = "png", _encoded(image, "png")

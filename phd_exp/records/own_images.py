@@ -143,6 +143,11 @@ class Observed:
     poses: tuple[Pose, ...]
 
 
+def views_of(scenes: Sequence[Observed]) -> Iterator[tuple[int, int, Observed]]:
+    """For each detection of all scenes, one scene after the other: numbers of scene and camera, and the scene."""
+    return ((number, k, scene) for number, scene in enumerate(scenes) for k in range(len(scene.detections)))
+
+
 def observed(detections: Sequence[Detection]) -> list[Observed]:
     """The scenes of detections, in the order in which they first appear.
 

@@ -13,6 +13,7 @@ import torch
 from matplotlib.path import Path as Outline
 from PIL import Image
 
+from phd_exp.cli import arguments
 from phd_exp.distributions.surfaces import gaussian_radius
 from phd_exp.geometry import Lens, intrinsics
 from phd_exp.records.runs import RunFolder
@@ -119,10 +120,14 @@ def test_an_outline_goes_through_the_lens(phd_exp: Callable, run: str, tmp_path:
         require_around(curve, projected(vertices, K, lens))
 
 
-def test_all_cameras_of_a_scene_see_the_regions_of_each(phd_exp: Callable, run: str, tmp_path: Path) -> None:
+def test_all_cameras_of_a_scene_see_the_regions_of_each(
+    phd_exp: Callable, run: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write_photos(tmp_path / "photos", 5)
     lines = poses(tmp_path / "photos")
+    monkeypatch.setattr(arguments, "_trained_focal_lengths", lambda _: (1e4, 1e5, "train with others"))
     outcome = phd_exp("fuse", run, "folder=photos", "view=a.rrd")
+    assert outcome.err.startswith("note: f: 5 view(s) have a focal length"), "notes come after the last view"
     answers = read_lines(outcome.out)
     rows = read_rrd(tmp_path / "a.rrd", "scene")
     for k in range(len(lines)):
