@@ -17,7 +17,7 @@ from phd_exp.cli.jobs import composed
 from phd_exp.cli.paths import quoted
 from phd_exp.cli.train import run_name, task
 from phd_exp.config import check
-from phd_exp.config.targets import build
+from phd_exp.config.targets import TrainingTarget, build
 from phd_exp.records.errors import ConfigError, RunError, UserError, gist
 from phd_exp.records.files import read_plain, write_atomic
 from phd_exp.records.parsing import parse_yaml
@@ -44,8 +44,8 @@ class Space(BaseModel):
 
     space: dict[str, str]
     overrides: list[str] = Field(default_factory=list)
-    sampler: dict[str, Any] = {"_target_": "optuna.samplers.TPESampler", "seed": 0}
-    pruner: dict[str, Any] = {"_target_": "optuna.pruners.MedianPruner"}
+    sampler: TrainingTarget = {"_target_": "optuna.samplers.TPESampler", "seed": 0}
+    pruner: TrainingTarget = {"_target_": "optuna.pruners.MedianPruner"}
 
 
 def main(words: list[str]) -> int:
@@ -58,7 +58,7 @@ def main(words: list[str]) -> int:
     ours = [word for word in words[1:] if word.partition("=")[0] in keys]
     arguments = SearchArguments.parsed("search", ours)
     try:
-        space = Space.model_validate(parse_yaml(read_plain(file).decode()))
+        space = Space.model_validate(parse_yaml(read_plain(file).decode()), context={"trust": None})
     except (OSError, ValueError) as error:
         raise ConfigError(f"{file}: {gist(error)}; expected `space`, as in docs/guides/search.md") from None
     given = [*space.overrides, *(word for word in words[1:] if word not in ours)]
