@@ -82,11 +82,13 @@ def require_file(out: Path, name: str) -> None:
 def require_output(out: Path, name: str, inputs: Iterable[Path]) -> None:
     """Make the folder of an output file; the message about a folder suggests `name` inside it.
 
-    Raises ConfigError if the file is a folder or an input, cannot be written, or needs rosbags, which is missing.
+    Raises ConfigError if the file is a folder, an input, or in a recording that is a folder, cannot be written, or
+    needs rosbags, which is missing.
     """
     require_file(out, name)
-    if out.resolve() in {file.resolve() for file in inputs}:
-        raise ConfigError(f"out={out}: is one of the files that are read; choose another")
+    read = {path.resolve() for path in inputs if not path.is_dir() or is_recording(path)}
+    if read & {out.resolve(), out.resolve().parent}:
+        raise ConfigError(f"out={out}: is one of the files that are read, or would be; choose another place")
     if out.suffix == MCAP:
         require_rosbags("out")
     output_folder(out.parent)
@@ -100,15 +102,6 @@ def message_file(out: Path | None) -> Iterator[MessageFile | None]:
         return
     with MessageFile(out) as messages:
         yield messages
-
-
-def require_covariance(arguments: "RunArguments", predictor: "Predictor") -> None:
-    """Raise ConfigError if a run predicts no covariance, which messages need."""
-    if not predictor.is_probabilistic:
-        raise ConfigError(
-            f"{arguments.run[0]}: predicts no covariance, which out=*{MCAP} needs; expected a run of "
-            "model=probabilistic"
-        )
 
 
 def new_view(view: Path) -> None:
@@ -269,8 +262,8 @@ def predicted(
 def _found(detector: "Detector", images: Detections) -> Iterator[list[Detection]]:
     """What a detector finds in each image. It may be nothing in some, which a note says, but not in all."""
     empty = []
-    for image, found in zip(images, detector.each(images), strict=True):
-        if not found:
+    for image in images:
+        if not (found := detector.found_in(image)):
             empty.append(image.where)
         yield found
     if len(empty) == len(images):

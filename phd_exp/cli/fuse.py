@@ -111,11 +111,7 @@ def _answers(
     if arguments.coverage and arguments.views != "1":
         raise ConfigError(single)
     predictor = loaded(arguments, coverage=arguments.coverage)
-    if not predictor.is_probabilistic:
-        raise ConfigError(
-            f"{arguments.run[0]}: predicts no Projected Huber densities, which fuse needs; expected a run of "
-            "model=probabilistic"
-        )
+    predictor.require_densities("fuse needs")
     if predictor.is_ensemble and arguments.coverage:
         raise ConfigError(single)
     if arguments.calibration and arguments.coverage:

@@ -30,7 +30,8 @@ def main(words: list[str]) -> int:
     from phd_exp.inference.packing import pack
 
     run = RunFolder(arguments.run)
-    output_folder(out.parent) if run.path.is_dir() else None
+    if run.path.is_dir():
+        output_folder(out.parent)
     sizes = pack(run, out, arguments.license, trusted(arguments.trust))
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {len(sizes)} files; README.md in it is the card")
     print(f"  use it: python -m phd_exp predict run={out} image=photo.jpg f=PIXELS")

@@ -17,7 +17,6 @@ from phd_exp.cli.arguments import (
     new_view,
     output_folder,
     predicted,
-    require_covariance,
     require_output,
 )
 from phd_exp.cli.detecting import DetectingArguments
@@ -100,7 +99,7 @@ def main(words: list[str]) -> int:
         if messages is not None:
             from phd_exp.inference.ros import write_predictions
 
-            require_covariance(arguments, predictor)
+            predictor.require_densities(f"out=*{MCAP} needs")
             sightings = write_predictions(messages, sightings)
         for sighting in sightings:
             print(json.dumps(answer(sighting, predictor.temperature), allow_nan=False), flush=True)
@@ -141,11 +140,7 @@ def _viewed(
     """The sightings, each of which is written to view= first."""
     if arguments.view is None:
         return sightings
-    if not predictor.is_probabilistic:
-        raise ConfigError(
-            f"view: {arguments.run[0]} predicts no Projected Huber densities, whose regions it shows; expected a run "
-            "of model=probabilistic"
-        )
+    predictor.require_densities("view= needs")
     from phd_exp.inference.rerun_view import viewed
 
     return viewed(arguments.view, sightings)

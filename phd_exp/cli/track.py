@@ -22,6 +22,7 @@ from phd_exp.records.recordings import MCAP, is_recording
 from phd_exp.records.videos import length_of, require_av, shots_in
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
+    from phd_exp.inference.detectors import Detector
     from phd_exp.inference.following import Followed, Frame
     from phd_exp.inference.predictor import Predictor
     from phd_exp.inference.rerun_recording import Recording
@@ -94,12 +95,14 @@ def main(words: list[str]) -> int:
     out = arguments.out
     if arguments.video or (out and out.suffix != MCAP):
         require_av("video" if arguments.video else "out")
-    arguments.of_function()  # whose mistakes need no network
+    function = arguments.of_function()  # whose mistakes need no network
     sequences = list(_sequences(arguments))
     _prepare(arguments)
     predictor = loaded(arguments)
+    predictor.require_densities("a path needs")  # before outputs of an earlier command are removed
+    detector = function or arguments.of_network(predictor)
     with _recording(arguments, sequences) as view:
-        paths = [(sequence, _followed(arguments, predictor, sequence, view)) for sequence in sequences]
+        paths = [(sequence, _followed(arguments, predictor, detector, sequence, view)) for sequence in sequences]
         if out is not None and out.suffix != MCAP:
             _write(arguments, predictor, paths, out)
         else:
@@ -190,7 +193,11 @@ def _boxes_of_frames(file: Path, category: int | str | None) -> dict[int, list[B
 
 
 def _followed(
-    arguments: TrackArguments, predictor: "Predictor", sequence: _Sequence, view: "Recording | None"
+    arguments: TrackArguments,
+    predictor: "Predictor",
+    detector: "Detector | None",
+    sequence: _Sequence,
+    view: "Recording | None",
 ) -> Iterator["Followed"]:
     """The frames with their states, in the recording for view= first, with a progress bar on a terminal."""
     from phd_exp.fusion.tracks import ConstantVelocity, Slow
@@ -198,7 +205,6 @@ def _followed(
 
     slow = Slow(arguments.depth_time, arguments.projection_time)
     motion, least = ConstantVelocity(arguments.noise, arguments.speed), arguments.least_familiar
-    detector = arguments.of_function() or arguments.of_network(predictor)
     followed = follow(
         predictor, sequence.frames, motion, arguments.lag, slow, least_familiar=least, detector=detector
     )

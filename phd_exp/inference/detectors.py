@@ -1,6 +1,6 @@
 """Detectors, which find boxes in images: functions of the user, checked, and the run's own map of its object."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -69,19 +69,20 @@ class Detector:
         rows = []
         for given in _rows(found, where):
             line = line_of({"file_name": "image", "f": 1.0} | given, where)  # of any camera
+            if line.score is None:
+                raise DatasetError(f"{where}: score: got None; expected a number")
             box = Detection(line, Path(), where).box(image.shape[1], image.shape[0])
             if self.category is None or str(line.category_id) == str(self.category):
                 rows.append({"box": box, "score": line.score, "category_id": line.category_id})
         return sorted(rows, key=lambda row: -row["score"])
 
-    def each(self, detections: Iterable[Detection]) -> Iterator[list[Detection]]:
-        """What it finds in the images of detections without boxes. Raises DatasetError, also for an invalid image."""
-        for detection in detections:
-            with pillow_warnings():
-                image = np.asarray(read_image(detection.file, detection.content))
-            K, lens = optics_of(detection, (image.shape[1], image.shape[0]))
-            rows = self.boxes_in(image, K, lens, detection.where)
-            yield [replace(detection, line=detection.line.model_copy(update=row)) for row in rows]
+    def found_in(self, detection: Detection) -> list[Detection]:
+        """What it finds in the image of a detection without a box. Raises DatasetError, also for an invalid image."""
+        with pillow_warnings():
+            image = np.asarray(read_image(detection.file, detection.content))
+        K, lens = optics_of(detection, (image.shape[1], image.shape[0]))
+        rows = self.boxes_in(image, K, lens, detection.where)
+        return [replace(detection, line=detection.line.model_copy(update=row)) for row in rows]
 
 
 def own_function(name: str, category: int | str | None = None) -> Detector:

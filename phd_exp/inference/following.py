@@ -21,7 +21,7 @@ from phd_exp.inference.detectors import Detector, overlap
 from phd_exp.inference.predictor import Predictor
 from phd_exp.optics.lens import PINHOLE, Lens
 from phd_exp.optics.virtual import Box, VirtualCamera, rays, towards
-from phd_exp.records.errors import ConfigError, DatasetError, RunError, UserError, gist
+from phd_exp.records.errors import DatasetError, RunError, UserError, gist
 
 USUAL = ConstantVelocity(noise=1.0)
 SPREADS = 2.0  # standard deviations of the predicted position by which each side of its box is moved outwards
@@ -133,11 +133,7 @@ def follow(
         DatasetError: a box is not valid, a time is not later than the one before, or no path is found; the
             states of earlier frames are yielded first.
     """
-    if not predictor.is_probabilistic:
-        raise ConfigError(
-            f"{predictor.folders[0].path}: predicts no Projected Huber densities, which a path needs; expected a run "
-            "of model=probabilistic"
-        )
+    predictor.require_densities("a path needs")
 
     def begun(track: int) -> _Track:
         tracker = Tracker(motion, lag, slow or Slow(), lost or Lost())

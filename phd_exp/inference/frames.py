@@ -11,7 +11,7 @@ from phd_exp.inference.following import HERE, Frame
 from phd_exp.optics.virtual import Box
 from phd_exp.records.detections import Detection
 from phd_exp.records.errors import DatasetError
-from phd_exp.records.images import content_of, pillow_warnings
+from phd_exp.records.images import pillow_warnings
 from phd_exp.records.messages import SECOND
 from phd_exp.records.recordings import Recording
 from phd_exp.records.videos import Shot
@@ -73,7 +73,7 @@ def folder_frames(detections: Sequence[Detection], has_boxes: bool = False) -> I
         if has_poses and line.pose is None:
             raise DatasetError(f"{where}: pose is missing; expected one on all lines of the track, or on none")
         with pillow_warnings():
-            image = np.asarray(read_image(detection.file, content_of(detection.file)))
+            image = np.asarray(read_image(detection.file, detection.content))
         size = _alike(where, image, size)
         before = line.time
         boxes = _boxes(detection, [line.box] if line.box else [], image, where) if has_boxes else None

@@ -106,7 +106,7 @@ class _Search:
         """The largest region of each view at a zoom. Its score is minus the spread of the object's place."""
         side, (columns, rows) = self.predictor.side, self._counts(picture, zoom)
         edge, width, height = round(OVERHANG * side), *(max(1, round(zoom * n)) for n in picture.size)
-        canvas = Image.new("RGB", ((columns + 1) * side, (rows + 1) * side), (GREY, GREY, GREY))
+        canvas = Image.new("RGB", ((columns + 1) * side // 2, (rows + 1) * side // 2), (GREY, GREY, GREY))
         resampling = Image.Resampling.BOX if zoom < 1 else Image.Resampling.BILINEAR
         canvas.paste(picture.resize((width, height), resampling), (edge, edge))
         pixels, unit = np.asarray(canvas), np.array(picture.size) / (width, height)

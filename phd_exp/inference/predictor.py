@@ -85,6 +85,14 @@ class Predictor:
         """Whether it predicts Projected Huber densities, which alone are fused, recalibrated and drawn."""
         return self.regressor.head.prediction.has_closed_forms
 
+    def require_densities(self, what: str) -> None:
+        """Raise ConfigError, with what needs them, unless it predicts Projected Huber densities."""
+        if not self.is_probabilistic:
+            raise ConfigError(
+                f"{self.folders[0].path}: predicts no Projected Huber densities, which {what}; expected a run of "
+                "model=probabilistic"
+            )
+
     @property
     def f_range(self) -> tuple[float, float]:
         """The focal lengths of the training images, px of the network's image.
@@ -128,11 +136,7 @@ class Predictor:
 
     def held_out(self) -> "Columns":
         """The recorded predictions of held-out samples. Raises ConfigError or RunError if there are none."""
-        if not self.is_probabilistic:
-            raise ConfigError(
-                f"{self.folders[0].path}: no Projected Huber densities, which recalibrate= and coverage= need; "
-                "expected a run of model=probabilistic"
-            )
+        self.require_densities("recalibrate= and coverage= need")
         if len(self.folders) > 1 and self.views > 1:
             raise RunError(
                 f"views={self.views}: held-out predictions of several views are recorded for single runs alone"

@@ -90,13 +90,12 @@ def record_held_out_views(predictor: Predictor, source: Source, trust: Trust) ->
 def record_labelled(predictor: Predictor, detections: Sequence[Detection], name: str) -> Columns:
     """Predict the user's labelled images and write the table NAME of `calibrate`; returns its columns.
 
-    Raises DatasetError if a label is missing or in millimetres, RunError for a baseline.
+    Raises DatasetError if a label is missing or in millimetres, ConfigError for a baseline.
     """
     folder, parts, n = predictor.folders[0], list[Columns](), 0
     if predictor.is_ensemble or predictor.state != "finished":
         raise RunError(f"{folder.path}: expected a single run, which is finished")
-    if not predictor.is_probabilistic:
-        raise RunError(f"{folder.path}: predicts no Projected Huber density; expected a run of model=probabilistic")
+    predictor.require_densities("calibrate needs")
     for batch in dict.fromkeys(sighting.batch for sighting in sightings(predictor, detections)):
         views = [view for _, _, view in batch.seen]
         xyz = [view.camera.to_virtual(np.array(one.position)) for one, _, view in batch.seen]

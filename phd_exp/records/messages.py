@@ -28,7 +28,6 @@ SECOND = 10**9  # nanoseconds
 UNKNOWN = 1e6
 """Variance of each angle (rad²): the rotation is not estimated."""
 WORLD = "world"
-DETECTIONS, POSITION = "vision_msgs/msg/Detection3DArray", "geometry_msgs/msg/PoseWithCovarianceStamped"
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO = "sensor_msgs/msg/CameraInfo"
 VISION = {

@@ -110,6 +110,7 @@ def test_a_function_is_as_good_as_its_boxes_in_a_file(
         ((BOXES + 200, SCORES, CLASSES), "lies outside the image of 120 x 90 pixels"),
         ((BOXES / 200, SCORES, CLASSES), "seems to be in units of the image"),
         ((BOXES, SCORES + np.inf, CLASSES), "score: got inf; expected to be a finite number"),
+        ((BOXES, [None, None], CLASSES), "score: got None; expected a number"),
         ((BOXES, SCORES, CLASSES + 0.5), "category_id: got 3.5; expected a whole number or a name"),
         (([["a"] * 4], ["b"], ["c"]), "box.0: got 'a'; expected a valid number"),
         (([], [], []), "finds nothing; expected a box in one image at least"),

@@ -11,10 +11,11 @@ from torch import Tensor, nn
 from phd_exp.config import check
 from phd_exp.distributions import Temperature
 from phd_exp.distributions.constraints import families
+from phd_exp.distributions.temperature import Slope
 from phd_exp.geometry import Camera, Cartesian, Chart, DepthScale, LogDepth, Projected
 from phd_exp.inference.deployed import answers, require_exportable
 from phd_exp.inference.predictor import Predictor
-from phd_exp.models.heads import ChartHead, DistributionHead, Head, MixtureHead
+from phd_exp.models.heads import ChartHead, DistributionHead, Head, MixtureHead, SurrogateHead
 from phd_exp.records.errors import ConfigError
 from tests.support.portable import openvino_outputs, require_portable
 from tests.support.raw_numbers import hostile
@@ -111,9 +112,13 @@ def require_accurate(found: dict[str, np.ndarray]) -> None:
         assert deviation.max() < TOLERANCES.get(name, 1e-5), name
 
 
-@pytest.mark.parametrize("free_axis", [False, True])
-def test_float32_has_the_digits_of_float64(free_axis: bool) -> None:
-    head, raw = DistributionHead(DEPTH, free_axis), draws(10_000, 10_000).float()
+HEADS = {"ray": DistributionHead(DEPTH), "free": DistributionHead(DEPTH, free_axis=True), "t": SurrogateHead(DEPTH)}
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_float32_has_the_digits_of_float64(name: str) -> None:
+    head, raw = HEADS[name], draws(10_000, 10_000).float()
+    raw = torch.cat([raw, torch.linspace(-10, 1000, len(raw))[:, None]], dim=1)  # the last is of degrees of freedom
     f = torch.linspace(2, 9, len(raw)) * SIDE
     here, there = (
         answers(head(raw[:, : head.n_outputs].to(dtype), Camera(f.to(dtype), float(SIDE))))
@@ -137,10 +142,13 @@ def test_float32_has_the_digits_of_float64_in_the_modes_of_other_densities(name:
     assert deviations([here], [there])[0].max() < 1e-5
 
 
+TEMPERATURE = Temperature(1.3, 0.7, Slope(0.1, 3.0, 8.0), Slope(-0.2, 2.0, 6.0))
+
+
 @pytest.mark.slow
 def test_the_distribution_is_that_of_torch_in_every_runtime(composed: Callable[..., Any]) -> None:
     numbers = draws(10_000, 2_000)
-    made = predictor(composed, DistributionHead(DEPTH, free_axis=True), numbers, temperature=Temperature(1.3, 0.7))
+    made = predictor(composed, DistributionHead(DEPTH, free_axis=True), numbers, temperature=TEMPERATURE)
     images, f = images_of(np.arange(len(numbers))), np.linspace(2, 9, len(numbers), dtype=np.float32) * SIDE
     model = exported(made, precision="float32")
     require_portable(model)

@@ -422,6 +422,8 @@ def test_a_folder_without_its_database_is_refused(phd_exp: Callable, run: str, t
     [
         (("predict", "folder=a.mcap", "out=a.mcap"), "out=a.mcap: is one of the files that are read"),
         (("track", "folder=a.mcap", "out=a.mcap"), "out=a.mcap: is one of the files that are read"),
+        (("predict", "folder=bag", "out=bag/bag_0.mcap"), "out=bag/bag_0.mcap: is one of the files that are read"),
+        (("track", "folder=bag", "out=bag/bag_0.mcap"), "out=bag/bag_0.mcap: is one of the files that are read"),
         (("predict", "folder=a.mcap", "out=taken.mcap"), "out=taken.mcap: is a folder; expected a file"),
         (("predict", "image=a.png", "f=90", "topic=/front"), "topic: selects images of a recording"),
         (("predict", "folder=a.mcap", "object=1"), "object: selects"),
@@ -431,6 +433,7 @@ def test_a_folder_without_its_database_is_refused(phd_exp: Callable, run: str, t
 def test_wrong_arguments_are_refused(
     phd_exp: Callable, run: str, tmp_path: Path, words: tuple[str, ...], said: str
 ) -> None:
+    as_sqlite(tmp_path, [info((WIDTH, HEIGHT), K, START), image(pictures(1)[0], "rgb8", START)])
     recorded(tmp_path / "a.mcap", n=1)
     (tmp_path / "taken.mcap").mkdir()
     outcome = phd_exp(words[0], run, *words[1:])
@@ -457,5 +460,5 @@ def test_a_baseline_has_no_messages(phd_exp: Callable, composed: Callable, tmp_p
     baseline = untrained(tmp_path / "run", config)
     Image.fromarray(pictures(1)[0]).save(tmp_path / "a.png")
     outcome = phd_exp("predict", f"run={baseline.path}", "image=a.png", "f=90", "out=a.mcap")
-    assert "predicts no covariance, which out=*.mcap needs" in outcome.error
+    assert "predicts no Projected Huber densities, which out=*.mcap needs" in outcome.error
     assert not (tmp_path / "a.mcap").exists()

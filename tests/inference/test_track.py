@@ -114,9 +114,12 @@ def test_wrong_arguments_are_refused(phd_exp: Callable, words: tuple[str, ...], 
 
 
 def test_a_baseline_is_refused(phd_exp: Callable, make: Callable[..., str], tmp_path: Path) -> None:
-    outcome = phd_exp("track", make("model=mae_constf"), frames(tmp_path))
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/track.jsonl").write_text("of an earlier command")
+    outcome = phd_exp("track", make("model=mae_constf"), frames(tmp_path), f"out={tmp_path / 'out'}")
     assert outcome.status == 2
     assert "predicts no Projected Huber densities, which a path needs" in outcome.err
+    assert (tmp_path / "out/track.jsonl").read_text() == "of an earlier command"
 
 
 @pytest.mark.parametrize("lens", [Lens(), Lens((-0.2, 0.05)), Lens((0.01,), is_fisheye=True)])
