@@ -88,7 +88,9 @@ def require_output(out: Path, name: str, inputs: Iterable[Path]) -> None:
     require_file(out, name)
     read = {path.resolve() for path in inputs if not path.is_dir() or is_recording(path)}
     if read & {out.resolve(), out.resolve().parent}:
-        raise ConfigError(f"out={out}: is one of the files that are read, or would be; choose another place")
+        raise ConfigError(
+            f"out={out}: is one of the files that are read, or lies in the recording; choose another place"
+        )
     if out.suffix == MCAP:
         require_rosbags("out")
     output_folder(out.parent)

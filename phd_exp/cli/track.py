@@ -97,6 +97,8 @@ def main(words: list[str]) -> int:
         require_av("video" if arguments.video else "out")
     function = arguments.of_function()  # whose mistakes need no network
     sequences = list(_sequences(arguments))
+    if out is not None and out.suffix == MCAP and len(sequences) > 1:
+        raise ConfigError(f"out: got {len(sequences)} tracks; expected one track for {out}, or out=DIR")
     _prepare(arguments)
     predictor = loaded(arguments)
     predictor.require_densities("a path needs")  # before outputs of an earlier command are removed

@@ -441,6 +441,15 @@ def test_wrong_arguments_are_refused(
     assert said in outcome.error
 
 
+def test_a_recording_has_one_path(phd_exp: Callable, run: str, tmp_path: Path) -> None:
+    """The topics and times of several would be the same."""
+    Image.fromarray(pictures(1)[0]).save(tmp_path / "a.png")
+    lines = [{"file_name": "a.png", "f": 90.0, "time": 0.0, "track": track} for track in "ab"]
+    (tmp_path / "metadata.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    outcome = phd_exp("track", run, f"folder={tmp_path}", "out=b.mcap")
+    assert (outcome.status, outcome.error) == (2, "out: got 2 tracks; expected one track for b.mcap, or out=DIR")
+
+
 def test_a_file_that_exists_is_replaced_and_nothing_else_stays(phd_exp: Callable, run: str, tmp_path: Path) -> None:
     recorded(tmp_path / "a.mcap", n=1)
     (tmp_path / "b.mcap").write_text("of last year")
