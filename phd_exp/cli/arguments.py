@@ -262,14 +262,14 @@ def predicted(
 
 
 def _found(detector: "Detector", images: Detections) -> Iterator[list[Detection]]:
-    """What a detector finds in each image. It may be nothing in some, which a note says, but not in all."""
+    """The detections in each image. Images without any are noted; DatasetError if no image has one."""
     empty = []
     for image in images:
         if not (found := detector.found_in(image)):
             empty.append(image.where)
         yield found
     if len(empty) == len(images):
-        raise DatasetError(f"{listed(empty)}: {detector.name} finds nothing; expected a box in one image at least")
+        raise DatasetError(f"{listed(empty)}: {detector.name} finds nothing; expected a box in at least one image")
     if empty:
         print(f"note: {detector.name} finds nothing in {len(empty)} image(s): {listed(empty)}", file=sys.stderr)
 

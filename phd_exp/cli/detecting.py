@@ -22,7 +22,7 @@ class DetectingArguments(CameraArguments):
     object: NumberOrName | None = None
     """with boxes= or annotations: the class to use, as COCO's category, BOP's obj_id, KITTI's type; by default all"""
     boxes: Path | None = None
-    """instead of box=, a file of COCO results (track: image_id is a frame from 0); or MODULE:FUNCTION, in Python"""
+    """instead of box=, a file of COCO results (track: image_id counts frames from 0); or MODULE:FUNCTION in Python"""
     detect: bool = False
     """instead of box=, find the object by the network's own map of it; for runs of recipe=strong"""
 
@@ -41,7 +41,7 @@ class DetectingArguments(CameraArguments):
     def one_detector(self) -> Self:
         """Refuse two origins of boxes."""
         if (self.box is not None) + (self.boxes is not None) + self.detect > 1:
-            raise ValueError("box, boxes, detect: each of them says where objects are; expected one of them")
+            raise ValueError("box, boxes, detect: got more than one of them; expected one")
         if self.detect and self.object is not None:
             raise ValueError("object: detect=true finds one kind of object; leave it out")
         return self

@@ -26,7 +26,7 @@ class ExportArguments(RunArguments):
     photographs: bool = False
     """the inputs are a photograph, its camera matrix and boxes, and the graph crops as predict does"""
     precision: Literal["float32", "float64"] | None = None
-    """of the numbers after the network: float32, which all runtimes take, unless only float64 is accurate enough"""
+    """of computations after the network; by default float32, or float64 where float32 is not accurate enough"""
     quantize: Literal["int8"] | None = None
     """convolutions in int8, calibrated and measured on the run's held-out images; refused if the errors grow"""
 
@@ -78,7 +78,7 @@ def _precision(arguments: ExportArguments, predictor: "Predictor") -> "Precision
     if reason and arguments.precision == "float32":
         raise ConfigError(f"precision: got float32; expected float64: {reason}")
     if reason and arguments.precision is None:
-        print(f"note: precision=float64, because {reason}; not every runtime takes it", file=sys.stderr)
+        print(f"note: precision=float64, because {reason}; not every runtime supports it", file=sys.stderr)
     return "float64" if reason else arguments.precision or "float32"
 
 
@@ -98,7 +98,7 @@ def _held_out(predictor: "Predictor") -> "Batch":
         )
     if data.n_held_out < IMAGES_AT_LEAST:
         raise ConfigError(
-            f"quantize: got a run with {data.n_held_out} held-out images; expected {IMAGES_AT_LEAST} at least, which "
-            "int8 is calibrated and measured on; train with data.n_held_out=100"
+            f"quantize: got a run with {data.n_held_out} held-out images; expected at least {IMAGES_AT_LEAST}, on "
+            "which int8 is calibrated and measured; train with data.n_held_out=100"
         )
     return build_source(data).samples("held_out")

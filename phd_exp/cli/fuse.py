@@ -49,7 +49,7 @@ class FuseArguments(RunArguments):
     coverage: Coverage = None
     """probability of regions that contain the true position, guaranteed by held-out samples"""
     out: Path | None = None
-    """a file for the lines; by default they are printed, also with FILE.mcap, which receives messages of ROS 2"""
+    """a file for the lines; or FILE.mcap for ROS 2 messages, in addition to printed lines"""
     view: Path | None = None
     """a new file *.rrd for the viewer Rerun: all cameras with their images and regions, and the fused position"""
 

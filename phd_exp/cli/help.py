@@ -10,11 +10,11 @@ VERBS = {
     "report": "the paper's tables, the dashboard and the figures of all recorded runs",
     "predict": "the object's position in an image and its uncertainty: JSON lines, and pictures with out=",
     "calibrate": "fit the uncertainty of a run to labelled images of yours, for predict calibration=NAME",
-    "fuse": "one position from the predictions of several cameras, and/or on a ground plane: a JSON line a scene",
-    "track": "the path of an object through a video or a folder: a JSON line a frame; a video and a page with out=",
+    "fuse": "one position from several cameras, or on a ground plane: one JSON line for each scene",
+    "track": "the path of an object through a video or a folder: one JSON line for each frame; a video with out=",
     "search": "search for good values of keys with Optuna, judged on held-out samples",
-    "pack": "write a run as one file with a card, for predict run=FILE on other machines",
-    "export": "write a run's network as ONNX, compared with torch; it needs onnxruntime and NumPy alone",
+    "pack": "write a run as one file to share, with a card: predict run=FILE",
+    "export": "write a run's network as ONNX, compared with torch; the file needs only onnxruntime and NumPy",
 }
 OF_VERB = {
     "train": (

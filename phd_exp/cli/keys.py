@@ -12,6 +12,7 @@ from pydantic.fields import FieldInfo
 from phd_exp.cli import conf_folder, prefix_of
 from phd_exp.config import RenderConfig, RunConfig
 from phd_exp.records.choices import flatten
+from phd_exp.records.errors import one_line
 from phd_exp.records.parsing import parse_yaml
 
 LINE = re.compile(r"( *)(\w+):(?: +([^#]*?))?(?: *# *(.*))?")
@@ -46,8 +47,12 @@ def keys_of(verb: str) -> dict[str, list[Key]]:
         model = RunConfig if verb == "train" else RenderConfig
         return {heading: list(_in(file, model)) for file, heading in FILES[verb].items()}
     arguments: type[BaseModel] = getattr(import_module(f"phd_exp.cli.{verb}"), f"{verb.title()}Arguments")
-    fields = arguments.model_fields.items()
-    return {"": [(name, _type(one.annotation), _default(one), one.description or "") for name, one in fields]}
+    return {"": [_described(name, one) for name, one in arguments.model_fields.items()]}
+
+
+def _described(name: str, field: FieldInfo) -> Key:
+    """A key of a verb; descriptions of several lines become one."""
+    return name, _type(field.annotation), _default(field), one_line(field.description or "")
 
 
 def _default(field: FieldInfo) -> str:

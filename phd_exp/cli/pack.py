@@ -10,7 +10,7 @@ from phd_exp.records.runs import RunFolder
 
 
 class PackArguments(Arguments):
-    """The run, the file, and what the card cannot know."""
+    """The run, the file, and the licence for the card."""
 
     run: Path
     """the folder of a finished run"""

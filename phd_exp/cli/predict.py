@@ -40,11 +40,9 @@ class PredictArguments(DetectingArguments):
     image: Paths | None = None
     """one image or several, separated by commas, with their camera as f=, fx= and fy=, or camera="""
     folder: Path | None = None
-    """instead of image=, a folder of images: alone with their camera, or with a metadata.jsonl, BOP, KITTI or COCO;
-    or FILE.mcap or rosbag2, a recording of ROS 2 with camera_info"""
+    """instead of image=: a folder with metadata.jsonl, BOP, KITTI or COCO, or camera= too; or a ROS 2 recording"""
     out: Path | None = None
-    """a folder for predictions.jsonl and a picture for each line; by default lines are printed, also with FILE.mcap,
-    which receives messages of ROS 2"""
+    """a folder for predictions.jsonl and pictures; or FILE.mcap for ROS 2 messages, in addition to printed lines"""
     view: Path | None = None
     """a new file *.rrd for the viewer Rerun: images with outlines, and the regions of 50 and 90 % in space"""
     coverage: Coverage = None

@@ -37,8 +37,7 @@ class TrackArguments(DetectingArguments):
     video: Path | None = None
     """a video file, with its camera as f=, fx= and fy=, or camera="""
     folder: Path | None = None
-    """instead of video=, images with a metadata.jsonl whose lines have a time (s), and a track for several paths; or
-    FILE.mcap or rosbag2, a recording of ROS 2 with camera_info"""
+    """instead of video=: images with metadata.jsonl that has time (s), and track for several; or a ROS 2 recording"""
     stride: Annotated[int, Field(ge=1)] = 1
     """use every stride-th frame of the video or recording"""
     noise: Annotated[float, Field(ge=1e-3, le=1e3)] = 1.0
@@ -48,14 +47,13 @@ class TrackArguments(DetectingArguments):
     lag: Annotated[int, Field(ge=LEAST_LAG, le=1000)] = 10
     """how many later frames the state of a frame takes into account; as many images are in memory"""
     depth_time: Annotated[float, Field(ge=0, le=1e6)] = 1.0
-    """how long depths err alike, s; 0 for independent frames"""
+    """correlation time of the errors of depth, s; 0 for independent frames"""
     projection_time: Annotated[float, Field(ge=0, le=1e6)] = 0.1
-    """how long directions err alike, s"""
+    """correlation time of the errors of direction, s"""
     least_familiar: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """leave out predictions that are more unusual than this, see familiar in the lines: the object may be hidden"""
     out: Path | None = None
-    """a folder for track.jsonl, a video with level curves, and a page with the path; by default lines are printed,
-    also with FILE.mcap, which receives messages of ROS 2"""
+    """a folder for track.jsonl, videos and a page; or FILE.mcap for ROS 2 messages, in addition to printed lines"""
     view: Path | None = None
     """a new file *.rrd for the viewer Rerun: images with outlines, ellipsoids and the path in space, over time"""
 

@@ -33,7 +33,7 @@ tags: [position-estimation, uncertainty, {data}]
 # {model} on {data}
 
 A network that estimates the 3-D position of an object in one image{uncertainty}. Written by `phd_exp pack` from the
-record of the run; nothing was computed anew.
+record of the run, without new computations.
 
 ## Use
 
@@ -129,7 +129,7 @@ def _conditions(config: RunConfig) -> str:
     n = config.data.n_held_out
     held_out = f"`recalibrate=true` and `coverage=0.9` use {n:,} held-out images. " if n else ""
     return (
-        "Test images were not used for training and are drawn by the same law as the training images, below. One "
+        "Test images were not used for training and have the distribution of the training images, below. One "
         f"network, seed {config.seed}: the intervals are those of the test images, not of other seeds. As trained, "
         f"without recalibration. {held_out}The projected error is the distance of the estimate from the true viewing "
         "ray, the depth error that along it."

@@ -1,4 +1,4 @@
-"""Detectors, which find boxes in images: functions of the user, checked, and the run's own map of its object."""
+"""Detectors, which find boxes in images: checked functions of the user, and the network itself."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -54,7 +54,7 @@ class Detector:
     def boxes_in(
         self, image: UInt8[np.ndarray, "height width 3"], K: Float[np.ndarray, "3 3"], lens: Lens, where: str
     ) -> list[dict[str, Any]]:
-        """The `box`, `score` and `category_id` of what it finds, the most certain first.
+        """The `box`, `score` and `category_id` of each detection, the most certain first.
 
         Raises DatasetError if the function raises an error, or returns something else than boxes in the image.
         """
@@ -65,7 +65,7 @@ class Detector:
         except DatasetError as error:
             raise DatasetError(f"{where}: {error}") from None
         except Exception as error:
-            raise DatasetError(f"{where} raised {_reason(error)}; mend it") from None
+            raise DatasetError(f"{where} raised {_reason(error)}; correct the function") from None
         rows = []
         for given in _rows(found, where):
             line = line_of({"file_name": "image", "f": 1.0} | given, where)  # of any camera
@@ -100,7 +100,7 @@ def own_function(name: str, category: int | str | None = None) -> Detector:
 
 
 def _reason(error: Exception) -> str:
-    """What an error of somebody's function says, and where it was raised."""
+    """The message of an error of the user's function, and where it was raised."""
     return in_user_code(error) or one_line(f"{type(error).__name__}: {gist(error)}")
 
 

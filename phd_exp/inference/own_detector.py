@@ -1,9 +1,10 @@
-"""A detector without further training: the map of its object that a network makes, in views that cover an image.
+"""A detector without further training: the network's map of the object, in views that cover an image.
 
-The map of a view holds for each cell the probability that it shows the object. Where there is none, a network that
-has always had one marks anything, but it does not know where the object is. So the views on a grid, at a few focal
-lengths of the training, are ordered by the spread of the other map, that of the object's place. In the first ones,
-the largest region proposes a box. Each is viewed again as in training, twice, and becomes that of the region there.
+For each cell of a view, the map holds the probability that it shows the object. The network was trained with the
+object in every image, so it marks some region in every view; where the object is absent, its map of the object's
+place is spread out. So the views, on a grid at a few focal lengths of the training, are ordered by this spread. In
+the first ones, the largest region proposes a box. Each box is viewed again as in training, twice, and replaced by
+that of the region found there.
 
 Source: own design; recall and precision are in docs/guides/predict.md.
 """
@@ -49,11 +50,11 @@ LEAST_FAMILIAR = 0.01  # share of true views that are taken for something else
 def own_detector(predictor: Predictor) -> Detector:
     """The detector of a run, of an ensemble that of its first network.
 
-    Raises ConfigError if the network was not trained to make a map of the object.
+    Raises ConfigError if the network was not trained with a map of the object.
     """
     backbone, folder = predictor.regressor.backbone, predictor.folders[0]
     if not (isinstance(backbone, Backbone) and backbone.segments and predictor.config.recipe.segmentation):
-        raise ConfigError(f"detect: {folder.path} makes no map of its object; train with recipe=strong")
+        raise ConfigError(f"detect: {folder.path} has no map of the object; expected a run of recipe=strong")
     low, high = predictor.f_range
     if folder.held_out.exists():
         from phd_exp.evaluation.parquet import read_table, require_columns  # imports pyarrow
@@ -88,7 +89,7 @@ class _Search:
         if n > MOST_VIEWS:
             raise DatasetError(
                 f"{n} views cover an image of {picture.width} x {picture.height} pixels; expected at most "
-                f"{MOST_VIEWS}: shrink it and its camera, or give boxes="
+                f"{MOST_VIEWS}; shrink the image and scale its camera, or use boxes="
             )
         found = _separate([region for zoom in zooms for region in self._proposed(picture, zoom)])[:MOST_BOXES]
         for _ in range(ROUNDS):

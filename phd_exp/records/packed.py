@@ -1,4 +1,4 @@
-"""A run as one file: an uncompressed zip archive of the files that predictions need, for somebody else.
+"""A run as one file to share: an uncompressed zip archive of the files that predictions need.
 
     run.zip
         README.md            the card: figures with their conditions, data, licence, use
@@ -8,8 +8,8 @@
         labelled/*.parquet, sequences/*.parquet
 
 Equal content has equal bytes. An archive may come from a stranger: it holds files of these names and no others, each
-once, stored as they are, so that they are no larger together than the archive. They are written to a folder of their
-own, which is removed when it is no longer used.
+once, uncompressed, so that together they are no larger than the archive. They are written to a temporary folder,
+which is removed when it is no longer used.
 """
 
 import io
@@ -55,7 +55,7 @@ def recorded_files(run: RunFolder) -> Iterator[tuple[str, Path]]:
 def write_packed(file: Path, contents: Mapping[str, bytes]) -> None:
     """Write files by name as an archive. Raises RunError if it would be too large, OSError as `write_atomic`."""
     if sum(map(len, contents.values())) > LARGEST:
-        raise RunError(f"{file}: would have more than {LARGEST // MB} MB, which no archive of a run has")
+        raise RunError(f"{file}: would have more than {LARGEST // MB} MB; expected at most that much")
     archive = io.BytesIO()
     with ZipFile(archive, "w", ZIP_STORED) as stream:
         for name, content in contents.items():
@@ -116,7 +116,7 @@ def _require_known(entries: list[ZipInfo], size: int) -> None:
         raise ValueError(f"{len(names)} files; expected at most {MOST_FILES}")
     for entry in entries:
         if not NAMES.fullmatch(entry.filename):
-            raise ValueError(f"{shown(entry.filename)} is none of the files of a run")
+            raise ValueError(f"{shown(entry.filename)} is not a file of a packed run")
         if names.count(entry.filename) > 1:
             raise ValueError(f"{entry.filename} is given twice")
         if stat.S_IFMT(entry.external_attr >> 16) not in (0, stat.S_IFREG):
@@ -124,4 +124,4 @@ def _require_known(entries: list[ZipInfo], size: int) -> None:
         if entry.compress_type != ZIP_STORED or entry.compress_size != entry.file_size or entry.flag_bits & 1:
             raise ValueError(f"{entry.filename} is compressed or encrypted; expected it as it is")
     if sum(entry.file_size for entry in entries) > size:
-        raise ValueError("its files are larger together than the archive, so that they overlap")
+        raise ValueError("its files together are larger than the archive; expected files that do not overlap")

@@ -35,7 +35,7 @@ class Scene:
 
 
 def first_scene(table: Columns) -> Scene | None:
-    """That of the first row, whatever its error; None if it has no Projected Huber density.
+    """The scene of the first row, which is not chosen by its error; None without a Projected Huber density.
 
     Raises RunError if the table lacks a column.
     """

@@ -11,7 +11,7 @@ NAMES: dict[Method, str] = {
     "single": "single frames",
     "kalman": "Kalman (RTS)",
     "independent": "ours, independent frames",
-    "slow": "ours, slow errors",
+    "slow": "ours, weighted frames",
 }
 LABELS = {
     "depth_error_mm": "depth (mm)",
@@ -33,8 +33,8 @@ OF_QUANTITIES = (
 )
 OF_METHODS = (
     "Single frames: the mode of each. Kalman (RTS): a Rauch-Tung-Striebel smoother of the frames' means and "
-    "covariances. Ours: the mean path under the frames' densities; slow errors: these have weights "
-    "by how much each frame tells that the others do not. All assume a velocity that changes by white noise."
+    "covariances. Ours: the mean path under the frames' densities; weighted frames: each density has a "
+    "weight, the information that neighbouring frames lack. All assume a velocity that changes by white noise."
 )
 
 
@@ -89,7 +89,7 @@ def _chosen(scores: TrackScores) -> str:
     return (
         f"Held-out sequences have a speed of {scores.choice.speed:.2g} m/s, and chose the noise of the motion, in "
         f"m/s² per √Hz: {noises}. Their errors have the time constants {whole.depth_time:.2g} s of depth and "
-        f"{whole.projection_time:.2g} s of the projection by autocorrelation; the smoother uses "
+        f"{whole.projection_time:.2g} s of the projection by autocorrelation; weighted frames use "
         f"{slow.depth_time:.2g} s and {slow.projection_time:.2g} s, with which the true held-out positions were most "
         "likely."
     )

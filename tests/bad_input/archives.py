@@ -116,7 +116,7 @@ def encrypted(entries: list[Entry]) -> bytes:
     return bytes(content)
 
 
-NOT_OURS = "is none of the files of a run"
+NOT_OURS = "is not a file of a packed run"
 ARCHIVES = [
     refused("no archive", lambda entries: b"no archive at all" * 10, "its end is no end of a plain zip archive"),
     refused("empty", lambda entries: b"", "its end is no end of a plain zip archive", again=True),
@@ -134,7 +134,7 @@ ARCHIVES = [
     refused("compressed", lambda entries: zipped(entries, ZIP_DEFLATED), r".* is compressed or encrypted; .*"),
     refused("encrypted", encrypted, r".* is compressed or encrypted; .*"),
     refused("sizes that are false", understated, r".*(CRC-32|compressed).*"),
-    refused("files that overlap", overlapping, r"its files are larger together than the archive, .*"),
+    refused("files that overlap", overlapping, r"its files together are larger than the archive; .*"),
     refused("a list without end", long_list, r"its list of files has \d+ bytes; expected at most 250000"),
     refused("many files", of_many, r"1001 files; expected at most 1000"),
     packed("no configuration", lambda entries: zipped(without(entries, "config.yaml")), r".*run\.zip: no run; .*"),

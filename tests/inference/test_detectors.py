@@ -113,7 +113,7 @@ def test_a_function_is_as_good_as_its_boxes_in_a_file(
         ((BOXES, [None, None], CLASSES), "score: got None; expected a number"),
         ((BOXES, SCORES, CLASSES + 0.5), "category_id: got 3.5; expected a whole number or a name"),
         (([["a"] * 4], ["b"], ["c"]), "box.0: got 'a'; expected a valid number"),
-        (([], [], []), "finds nothing; expected a box in one image at least"),
+        (([], [], []), "finds nothing; expected a box in at least one image"),
         (KeyError("boom"), "raised KeyError: 'boom' ("),
     ],
 )
@@ -158,10 +158,10 @@ def test_an_image_in_which_nothing_is_found_has_no_line(
             ("boxes=nobodys:find",),
             "boxes=nobodys:find: 'nobodys.find' cannot be imported (No module named 'nobodys')",
         ),
-        (("boxes=somebodys:find", "box=1,2,3,4"), "box, boxes, detect: each of them says where objects are"),
-        (("boxes=somebodys:find", "detect=true"), "box, boxes, detect: each of them says where objects are"),
+        (("boxes=somebodys:find", "box=1,2,3,4"), "box, boxes, detect: got more than one of them"),
+        (("boxes=somebodys:find", "detect=true"), "box, boxes, detect: got more than one of them"),
         (("detect=true", "object=1"), "object: detect=true finds one kind of object; leave it out"),
-        (("detect=true",), "makes no map of its object; train with recipe=strong"),
+        (("detect=true",), "has no map of the object; expected a run of recipe=strong"),
     ],
 )
 def test_wrong_arguments_are_refused(

@@ -54,7 +54,7 @@ def test_the_pages_have_a_section_of_paths(report: Report, tmp_path: Path) -> No
     write_site(report, all_tables(report), [], tmp_path)
     page = next((tmp_path / "runs").glob("*.html")).read_text()
     assert '<section id="tracks"' in page
-    assert "ours, slow errors" in page
+    assert "ours, weighted frames" in page
     assert "#tracks" in (tmp_path / "index.html").read_text()
 
 

@@ -1,10 +1,10 @@
-"""Coordinates in which motion and projections do not tell the distance, for paths with slow errors.
+"""Coordinates in which motion and projections carry no information about the distance, for weighted frames.
 
-A path twice as near moves half as far, and the rays to it are off the predicted ones by half as many metres. A law of
-motion and densities of projections in metres therefore draw a path to the camera, the more frames the more. That is
-no information: predictions are posterior densities, whose prior is uniform in the image at every depth, and the noise
-of the motion is a guess. Against the depths of all frames it is little; not so where slow errors leave these the
-weight of a few. Both are taken about a given path, that without slow errors:
+A path at half the distance moves half as far, and its rays deviate from the predicted ones by half as many metres. A
+motion model and densities of projections in metres therefore draw a path to the camera, more strongly with more
+frames. This is no information: predictions are posterior densities, whose prior is uniform in the image at every
+depth, and the noise of the motion is a guess. Next to the depths of all frames its effect is small, but it is large
+where these have the weight of a few frames. Both are therefore taken about a given path, that of independent frames:
 
 - The projection of a camera is that of the position which slides along its ray to the depth of the given path. With
   the ray d from the camera to the given position, q changes by -kappa (t - t_about), kappa = (q_v d)/(t_v d), where

@@ -1,4 +1,4 @@
-"""Errors that consecutive frames share: each frame counts by how much it tells that the others do not.
+"""Errors that consecutive frames share: the weight of a frame is the information that its neighbours lack.
 
 Let the standardised errors of a camera be an Ornstein-Uhlenbeck process, whose correlation over s seconds is
 exp(-s/time). Of the frames of an object at rest, the best mean has the weights of the rows of the inverse correlation
@@ -7,7 +7,7 @@ matrix. With decay = exp(-s/time) over the steps to the frames before and after,
     1 - decay_before/(1 + decay_before) - decay_after/(1 + decay_after),
 
 and the sum over the frames of a duration T is about 1 + T/(2 time). A path multiplies densities to the power of these
-weights. So nothing is extrapolated, and the energy of the path is as convex as without slow errors.
+weights. They are positive, so nothing is extrapolated and the energy of the path stays convex.
 
 Source: own derivation. The product of powers of densities is a logarithmic opinion pool (Genest and Zidek, "Combining
 probability distributions", 1986); compared with slow errors as unknowns in docs/guides/tracking.md.
@@ -28,7 +28,7 @@ from phd_exp.distributions.huber import HUBER_COVARIANCE
 
 @dataclass(frozen=True)
 class Slow:
-    """How long the predictions of a camera err alike.
+    """Correlation times of the errors of a camera's predictions.
 
     Args:
         depth_time: time constant of the errors of log depth, seconds; 0 for independent frames.
@@ -58,8 +58,8 @@ def weights(
     for camera in range(mask.shape[1] if time else 0):
         seen = mask[:, camera]
         decay = np.exp(-since[seen, camera] / time)
-        told = decay / (1 + decay)
-        found[seen, camera] -= told + np.append(told[1:], 0.0)
+        shared = decay / (1 + decay)
+        found[seen, camera] -= shared + np.append(shared[1:], 0.0)
     return found
 
 

@@ -1,4 +1,4 @@
-"""A path while it is seen: each frame's state a fixed number of frames later, in constant time a frame."""
+"""A live path: the state of each frame a fixed number of frames later, in constant time for each frame."""
 
 from dataclasses import dataclass
 
@@ -60,8 +60,8 @@ class Tracker:
     Args:
         motion: `ConstantVelocity` or `ConstantAcceleration`.
         lag: how many later frames the state of a frame takes into account; 0 gives a filter.
-        slow: how long frames err alike (default: not at all). This needs a lag of at least 1, because the next frame
-            changes the weight of a frame.
+        slow: correlation times of errors (default: independent frames). This needs a lag of at least 1, because the
+            next frame changes the weight of a frame.
         lost: when the track ends.
 
     Attributes:
