@@ -24,7 +24,7 @@ class DetectingArguments(CameraArguments):
     boxes: Path | None = None
     """instead of box=, a file of COCO results (track: image_id counts frames from 0); or MODULE:FUNCTION in Python"""
     detect: bool = False
-    """instead of box=, find the object by the network's own map of it; for runs of recipe=strong"""
+    """instead of box=, find the object with the network itself; for runs of recipe=strong"""
 
     @property
     def function(self) -> str | None:
