@@ -174,7 +174,7 @@ def test_boxes_of_one_photograph_are_predicted_as_single_ones(
         np.testing.assert_allclose(row["mode"], alone["mode"], rtol=1e-4)
     (of_category,) = read_lines(phd_exp(*words, "boxes=boxes.json", "object=0").out)
     assert of_category["box"] == found[0]["box"]
-    assert "box, boxes, detect: each of them" in phd_exp(*words, "boxes=boxes.json", "box=5,10,60,70").err
+    assert "box, boxes, detect: got more than one" in phd_exp(*words, "boxes=boxes.json", "box=5,10,60,70").err
     assert "no further image" in phd_exp(*words[:2], "image=0.png,1.png", "f=300", "boxes=boxes.json").err
 
 
