@@ -89,8 +89,8 @@ class DistributionHead:
 class SurrogateHead(DistributionHead):
     """Ten raw numbers -> the Projected Huber density with a free axis that is closest to a Student's t.
 
-    Training maximises the likelihood of the Student's t, whose tails let the network fit most images well although
-    it cannot fit a few. The tenth number gives the degrees of freedom.
+    Training maximises the likelihood of the Student's t, which leads to better networks (docs/ideas/heads.md). The
+    tenth number gives its degrees of freedom.
 
     Args:
         depth: constants of the data set.
