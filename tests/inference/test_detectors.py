@@ -22,7 +22,7 @@ from phd_exp.inference.detectors import overlap, own_function
 from phd_exp.optics.lens import PINHOLE
 from phd_exp.records.runs import RunFolder
 from tests.inference.test_track import frames
-from tests.support.untrained import SMALL, read_lines, untrained
+from tests.support.untrained import NOWHERE, read_lines
 
 WIDTH, HEIGHT = 120, 90
 BOXES = np.array([[10.0, 5.0, 60.0, 70.0], [30.0, 20.0, 130.0, 85.0]])  # the second reaches beyond the image
@@ -31,13 +31,8 @@ CLASSES = np.array([3, 8])
 
 
 @pytest.fixture(scope="module")
-def make(composed: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> Callable[..., RunFolder]:
-    return lambda *words: untrained(tmp_path_factory.mktemp("runs") / "run", composed(*SMALL, *words))
-
-
-@pytest.fixture(scope="module")
 def run(make: Callable[..., RunFolder]) -> RunFolder:
-    return make("data=folder", "data.folder=nowhere")
+    return make(*NOWHERE)
 
 
 @pytest.fixture(scope="module")

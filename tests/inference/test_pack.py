@@ -1,4 +1,4 @@
-"""A packed run predicts as its folder does, has the same bytes whoever packs it, and its card repeats the record.
+"""Packed runs: equal predictions, equal bytes for equal runs, and a card that repeats the record.
 
 Archives of an attacker are in tests/bad_input/archives.py.
 """

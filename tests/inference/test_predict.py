@@ -30,7 +30,7 @@ from phd_exp.records.runs import RunFolder
 from tests.evaluation.test_conformal import table_of
 from tests.support.foreign import WRITERS
 from tests.support.recorded import status_of
-from tests.support.untrained import SIDE, SMALL, read_lines, untrained, virtual_cameras, write_photos
+from tests.support.untrained import NOWHERE, SIDE, read_lines, virtual_cameras, write_photos
 
 
 @pytest.fixture(scope="module")
@@ -41,19 +41,13 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def make(composed: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> Callable[..., RunFolder]:
-    """An untrained run of some overrides."""
-    return lambda *words: untrained(tmp_path_factory.mktemp("runs") / "run", composed(*SMALL, *words))
-
-
-@pytest.fixture(scope="module")
 def run(make: Callable[..., RunFolder]) -> RunFolder:
-    return make("data=folder", "data.folder=nowhere")
+    return make(*NOWHERE)
 
 
 @pytest.fixture(scope="module")
 def baseline(make: Callable[..., RunFolder]) -> RunFolder:
-    return make("data=folder", "data.folder=nowhere", "model=mae_constf")
+    return make(*NOWHERE, "model=mae_constf")
 
 
 @pytest.fixture
@@ -392,7 +386,7 @@ def test_the_import_does_not_wait_for_torch_nor_a_prediction_for_lightning(run: 
 
 def test_a_prediction_imports_nothing_that_it_does_not_need(make: Callable[..., RunFolder], photos: Path) -> None:
     """With recorded held-out samples, which a prediction reads to say how familiar it is."""
-    run = make("data=folder", "data.folder=nowhere")
+    run = make(*NOWHERE)
     pq.write_table(pa.table(dict(table_of(100, 1))), run.held_out)
     code = (
         "import sys; from phd_exp.__main__ import main\n"

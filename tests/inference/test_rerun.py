@@ -19,33 +19,22 @@ from phd_exp.geometry import Lens, intrinsics
 from phd_exp.records.runs import RunFolder
 from tests.support.opencv import projected
 from tests.support.rrd import Rows, read_rrd
-from tests.support.untrained import SMALL, read_lines, untrained, write_photos
+from tests.support.untrained import NOWHERE, read_lines, write_photos
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed: pip install 'phd_exp[rerun]'")
 LEVELS = ("region_50", "region_90")
-NOWHERE = ("data=folder", "data.folder=nowhere")
 
 
 @pytest.fixture(scope="module")
-def make(composed: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> Callable[..., str]:
-    """The word that names an untrained run."""
-
-    def run(*words: str) -> str:
-        return f"run={untrained(tmp_path_factory.mktemp('runs') / 'run', composed(*SMALL, *NOWHERE, *words)).path}"
-
-    return run
-
-
-@pytest.fixture(scope="module")
-def run(make: Callable[..., str]) -> str:
+def run(make: Callable[..., RunFolder]) -> str:
     """A run that predicts with usual precisions, whatever the image."""
-    word = make()
-    file = RunFolder(Path(word.removeprefix("run="))).last_checkpoint
+    run = make(*NOWHERE)
+    file = run.last_checkpoint
     weights = torch.load(file, weights_only=True)["state_dict"]
     weights["regressor.last.weight"] *= 0.01
     weights["regressor.last.bias"] = torch.tensor([0.3, -0.2, 20.0, 3.0, 30.0, 8.0, 1.0])
     torch.save({"state_dict": weights}, file)
-    return word
+    return f"run={run.path}"
 
 
 def poses(folder: Path) -> list[dict[str, Any]]:
@@ -171,15 +160,16 @@ def test_a_path_has_its_times(phd_exp: Callable, run: str, tmp_path: Path) -> No
 
 
 def test_a_recording_is_new_and_of_a_density(
-    phd_exp: Callable, run: str, make: Callable[..., str], tmp_path: Path
+    phd_exp: Callable, run: str, make: Callable[..., RunFolder], tmp_path: Path
 ) -> None:
     write_photos(tmp_path / "photos", 2)
     (tmp_path / "a.rrd").write_text("earlier")
+    baseline = f"run={make(*NOWHERE, 'model=mae_constf').path}"
     for words, status, said in (
         ((run, "view=a.rrd"), 2, "view: got a.rrd, which exists; expected a new file; delete it, or choose another"),
         ((run, "view=photos"), 2, "view: got photos; expected a file *.rrd, such as view.rrd"),
         ((run, "view=/proc/no/a.rrd"), 2, "/proc/no: cannot be written (No such file or directory); make room, .*"),
-        ((make("model=mae_constf"), "view=b.rrd"), 2, "view: .* predicts no Projected Huber densities, .*"),
+        ((baseline, "view=b.rrd"), 2, "view: .* predicts no Projected Huber densities, .*"),
     ):
         outcome = phd_exp("predict", "folder=photos", *words)
         assert outcome.status == status

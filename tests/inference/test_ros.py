@@ -18,8 +18,9 @@ from phd_exp.inference import answers
 from phd_exp.records.errors import DatasetError
 from phd_exp.records.messages import RAW, SECOND, UNKNOWN, typestore
 from phd_exp.records.recordings import Recording
+from phd_exp.records.runs import RunFolder
 from tests.support.recordings import FRAME, Message, compressed, image, info, read, time_of, write
-from tests.support.untrained import SMALL, read_lines, untrained
+from tests.support.untrained import NOWHERE, read_lines
 
 pytest.importorskip("rosbags", reason="recordings need the extra `ros`")
 pytest.importorskip("mcap_ros2", reason="mcap-ros2-support reads and writes what rosbags has to agree with")
@@ -36,9 +37,8 @@ NEAR = {"rel": 1e-9, "abs": 1e-12}
 
 
 @pytest.fixture(scope="module")
-def run(composed: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> str:
-    config = composed(*SMALL, "data=folder", "data.folder=nowhere")
-    return f"run={untrained(tmp_path_factory.mktemp('runs') / 'run', config).path}"
+def run(make: Callable[..., RunFolder]) -> str:
+    return f"run={make(*NOWHERE).path}"
 
 
 @pytest.fixture(autouse=True)
@@ -464,9 +464,8 @@ def test_a_missing_extra_is_named(phd_exp: Callable, run: str, monkeypatch: pyte
         assert "pip install 'phd_exp[ros]'" in phd_exp("predict", run, *words).error
 
 
-def test_a_baseline_has_no_messages(phd_exp: Callable, composed: Callable, tmp_path: Path) -> None:
-    config = composed(*SMALL, "data=folder", "data.folder=nowhere", "model=mae_constf")
-    baseline = untrained(tmp_path / "run", config)
+def test_a_baseline_has_no_messages(phd_exp: Callable, make: Callable, tmp_path: Path) -> None:
+    baseline = make(*NOWHERE, "model=mae_constf")
     Image.fromarray(pictures(1)[0]).save(tmp_path / "a.png")
     outcome = phd_exp("predict", f"run={baseline.path}", "image=a.png", "f=90", "out=a.mcap")
     assert "predicts no Projected Huber densities, which out=*.mcap needs" in outcome.error

@@ -12,27 +12,17 @@ from PIL import Image
 from phd_exp.geometry import Lens, intrinsics
 from phd_exp.inference.following import Frame, _best, _Outline
 from phd_exp.records.errors import DatasetError
+from phd_exp.records.runs import RunFolder
 from phd_exp.records.videos import VideoWriter, shots_in
-from tests.support.untrained import SMALL, read_lines, untrained
+from tests.support.untrained import NOWHERE, read_lines
 
 N, WIDTH, HEIGHT = 14, 64, 48
 K = intrinsics(90.0, 90.0, WIDTH / 2, HEIGHT / 2)
-NOWHERE = ("data=folder", "data.folder=nowhere")
 
 
 @pytest.fixture(scope="module")
-def make(composed: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> Callable[..., str]:
-    """The word that names an untrained run."""
-
-    def run(*words: str) -> str:
-        return f"run={untrained(tmp_path_factory.mktemp('runs') / 'run', composed(*SMALL, *NOWHERE, *words)).path}"
-
-    return run
-
-
-@pytest.fixture(scope="module")
-def run(make: Callable[..., str]) -> str:
-    return make()
+def run(make: Callable[..., RunFolder]) -> str:
+    return f"run={make(*NOWHERE).path}"
 
 
 def images(n: int = N) -> list[np.ndarray]:
@@ -113,10 +103,11 @@ def test_wrong_arguments_are_refused(phd_exp: Callable, words: tuple[str, ...], 
     assert said in outcome.err
 
 
-def test_a_baseline_is_refused(phd_exp: Callable, make: Callable[..., str], tmp_path: Path) -> None:
+def test_a_baseline_is_refused(phd_exp: Callable, make: Callable[..., RunFolder], tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out/track.jsonl").write_text("of an earlier command")
-    outcome = phd_exp("track", make("model=mae_constf"), frames(tmp_path), f"out={tmp_path / 'out'}")
+    baseline = make(*NOWHERE, "model=mae_constf")
+    outcome = phd_exp("track", f"run={baseline.path}", frames(tmp_path), f"out={tmp_path / 'out'}")
     assert outcome.status == 2
     assert "predicts no Projected Huber densities, which a path needs" in outcome.err
     assert (tmp_path / "out/track.jsonl").read_text() == "of an earlier command"

@@ -21,6 +21,7 @@ LOCATING = "backbone._target_=phd_exp.models.locating.Locating"
 NARROW = (LOCATING, "+backbone.width=8", "+backbone.stride=4", "+backbone.channels=4")
 """A network of less than a megabyte. That of `preset=smoke` has 20, and 60 where a training is resumed."""
 SMALL = ("preset=smoke", *NARROW, f"data.image_size={SIDE}", "trainer.threads=1")
+NOWHERE = ("data=folder", "data.folder=nowhere")
 DEPTH = DepthScale.from_ranges(f_range=(200.0, 300.0), z_range=(2.0, 5.0))
 
 
