@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
@@ -252,11 +253,8 @@ def predicted(
     """The predictions, with a progress bar for several detections, or images of a detector, on a terminal."""
     from phd_exp.inference.answers import sightings
 
-    if detector is None:
-        seen: Iterable[Sighting] = sightings(predictor, detections, guarantee)
-    else:
-        seen = (one for some in _found(detector, detections) for one in sightings(predictor, some, guarantee))
-    seen = _noting_focal_lengths(predictor, seen)
+    each = detections if detector is None else chain.from_iterable(_found(detector, detections))
+    seen = _noting_focal_lengths(predictor, sightings(predictor, each, guarantee))
     total = len(detections) if detector is None else None
     return seen if len(detections) == 1 else with_bar(seen, "predicting", total)
 

@@ -97,7 +97,7 @@ class SurrogateHead(DistributionHead):
     """
 
     def __init__(self, depth: DepthScale) -> None:
-        super().__init__(depth, free_axis=True)
+        super().__init__(depth)
         self.n_outputs = 10
 
     def surrogate(self, raw: Float[Tensor, "*batch 10"], camera: Camera) -> Shaped:
