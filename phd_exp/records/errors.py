@@ -92,7 +92,7 @@ def end_of(word: str) -> str:
 
 
 def instead(word: str, valid: Iterable[str], expected: str = "") -> str:
-    """The end of a message about a word that is none of the valid ones: the nearest one, and by default all."""
+    """The end of a message about a wrong word: the nearest valid word, then what is expected (by default: all)."""
     names = list(valid)
     return f"{nearest(word, names)}; {expected or 'expected one of ' + ', '.join(names)}"
 

@@ -1,4 +1,4 @@
-"""The Dockerfile installs what the README, the Makefile and the wheel name, and nothing of its own list."""
+"""The Dockerfile installs what the README, the Makefile and the wheel name, and nothing else."""
 
 import re
 import tomllib
