@@ -185,7 +185,7 @@ class TrainerConfig(Record):
 
 
 class AugmentationConfig(Record):
-    """The arguments of `Augmentation` and of its `Photometry`, and the share of `BackdropExchange`."""
+    """The arguments of `Augmentation` and of its `Photometry`, and the share of other backdrops."""
 
     symmetries: StrictBool
     largest_zoom: Annotated[float, Field(ge=1, le=2)]

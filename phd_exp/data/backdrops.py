@@ -1,17 +1,17 @@
 """Exchange the backdrops of training images, so that a network cannot learn which object has which backdrop."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from phd_exp.data.batches import Augment, Batch
+from phd_exp.data.batches import Batch
 from phd_exp.data.photometry import change, levels, on
 
-NUMBERS = (1, 2, 4)  # per sample: whether it changes; two samples; zoom, two shifts and transposition of the backdrop
+BACKDROP_NUMBERS = 7  # per sample: whether it changes, and those of `before_others`
 FINEST = 4.0  # largest factor by which a backdrop is shown smaller, with finer texture
 
 
@@ -27,6 +27,12 @@ class Backdrops:
     empty: UInt8[Tensor, "samples side side 3"]
     clear: UInt8[Tensor, "samples side side"]
 
+    @cached_property
+    def texture(self) -> Float[np.ndarray, " samples"]:
+        """The mean difference between neighbouring pixels of each backdrop."""
+        rows = ((one[1:].float() - one[:-1].float()).abs().mean() for one in self.empty)
+        return torch.stack(list(rows)).cpu().numpy()
+
     @property
     def n_bytes(self) -> int:
         """Memory that they take."""
@@ -37,60 +43,39 @@ class Backdrops:
         return Backdrops(self.empty.to(device), self.clear.to(device))
 
 
-@dataclass(frozen=True, eq=False)
-class BackdropExchange:
-    """An augmentation that first shows samples before other backdrops: image + clear (empty' - empty).
+def before_others(
+    backdrops: Backdrops, batch: Batch, chosen: Bool[np.ndarray, " batch"], numbers: Float[np.ndarray, "batch 6"]
+) -> Batch:
+    """The batch, with some samples before other backdrops: image + clear (empty' - empty).
 
     empty' is that of one of two random samples, the one with more texture, since smooth backdrops are easy; it is
     `tiled` and perhaps transposed. The sum keeps shadows on the ground and the mixed colours of edges.
 
     Args:
         backdrops: of all training samples.
-        share: the share of the samples that change.
-        then: the augmentation that follows.
+        batch: some of these samples.
+        chosen: which of them to change.
+        numbers: from 0 to 1: for two samples; for zoom, two shifts and transposition of the backdrop.
     """
 
-    backdrops: Backdrops
-    share: float
-    then: Augment | None
-
-    @cached_property
-    def texture(self) -> Float[np.ndarray, " samples"]:
-        """The mean difference between neighbouring pixels of each backdrop."""
-        rows = ((one[1:].float() - one[:-1].float()).abs().mean() for one in self.backdrops.empty)
-        return torch.stack(list(rows)).cpu().numpy()
-
-    @property
-    def n_numbers(self) -> int:
-        """Number of random numbers per sample; those of `then` come first."""
-        return sum(NUMBERS) + (self.then.n_numbers if self.then else 0)
-
-    def __call__(self, batch: Batch, numbers: Float[Tensor, "batch n_numbers"]) -> Batch:
-        """The samples, changed by uniform numbers from -1 to 1."""
-        of_then, own = numbers.tensor_split([-sum(NUMBERS)], dim=1)
-        changes, pairs, views = (part.numpy() for part in ((own + 1) / 2).split(NUMBERS, dim=1))
-        pairs = (len(self.backdrops.empty) * pairs).astype(np.int64)
-        others = np.take_along_axis(pairs, self.texture[pairs].argmax(axis=1)[:, None], axis=1)[:, 0]
-        image = batch.image.clone(memory_format=torch.contiguous_format)
-        formula = partial(self._before, batch.row)
-        change(image, changes[:, 0] < self.share, formula, np.arange(len(batch)), others, views)
-        batch = replace(batch, image=image)
-        return self.then(batch, of_then) if self.then else batch
-
-    def _before(
-        self,
-        row: Int[Tensor, " batch"],
-        image: UInt8[Tensor, "chosen side side 3"],
-        place: Int[np.ndarray, " chosen"],
-        others: Int[np.ndarray, " chosen"],
-        views: Float[np.ndarray, "chosen 4"],
-    ) -> UInt8[Tensor, "chosen side side 3"]:
-        """The images of these places in the batch before views of other backdrops."""
-        empty, clear = self.backdrops.empty, self.backdrops.clear
-        rows = row.index_select(0, on(row, place)).to(empty.device)
-        old, share = (part.index_select(0, rows).to(image.device) for part in (empty, clear))
+    def exchanged(
+        image: UInt8[Tensor, "some side side 3"],
+        place: Int[np.ndarray, " some"],
+        others: Int[np.ndarray, " some"],
+        views: Float[np.ndarray, "some 4"],
+    ) -> UInt8[Tensor, "some side side 3"]:
+        empty, rows = backdrops.empty, batch.row.index_select(0, on(batch.row, place))
+        old, share = (
+            part.index_select(0, rows.to(part.device)).to(image.device) for part in (empty, backdrops.clear)
+        )
         new = tiled(empty, others, views).to(image.device)
         return levels((new.float() - old.float()).mul_(share[..., None] / 255).add_(image))
+
+    pairs = (len(backdrops.empty) * numbers[:, :2]).astype(np.int64)
+    others = np.take_along_axis(pairs, backdrops.texture[pairs].argmax(axis=1)[:, None], axis=1)[:, 0]
+    image = batch.image.clone(memory_format=torch.contiguous_format)
+    change(image, chosen, exchanged, np.arange(len(batch)), others, numbers[:, 2:])
+    return replace(batch, image=image)
 
 
 def tiled(

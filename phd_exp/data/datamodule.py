@@ -7,9 +7,10 @@ from typing import TypeVar
 import torch
 from lightning import LightningDataModule
 
-from phd_exp.data.backdrops import BackdropExchange, Backdrops
+from phd_exp.data.backdrops import BACKDROP_NUMBERS, Backdrops, before_others
 from phd_exp.data.batches import Augment, Batch, BatchLoader
-from phd_exp.data.photographs import PhotographExchange, Photographs
+from phd_exp.data.exchanges import Exchange
+from phd_exp.data.photographs import PHOTOGRAPH_NUMBERS, Photographs, replaced
 from phd_exp.data.sources import PARTS, Part, Source
 from phd_exp.geometry.camera import Camera
 from phd_exp.records.errors import ConfigError, DatasetError
@@ -92,9 +93,11 @@ class PositionData(LightningDataModule):
         if self.train_batches is None:
             samples, augment = self.samples["train"], self.augment
             if self.photographs:
-                augment = PhotographExchange(self.photographs.samples(samples), self.photographs.share, augment)
+                stock, share = self.photographs.samples(samples), self.photographs.share
+                augment = Exchange(stock, replaced, PHOTOGRAPH_NUMBERS, share, augment)
             if self.backdrops:  # first, since what is behind photographs is not known
-                augment = BackdropExchange(self.source.training_backdrops(), self.backdrops, augment)
+                backdrops = self.source.training_backdrops()
+                augment = Exchange(backdrops, before_others, BACKDROP_NUMBERS, self.backdrops, augment)
             self.train_batches = self.batches(samples, shuffle=True, augment=augment)
 
     def move_to(self, device: torch.device) -> None:
@@ -135,12 +138,10 @@ class PositionData(LightningDataModule):
 
 def _moved(augment: Augment | None, device: torch.device) -> Augment | None:
     """An augmentation whose images are held on a device."""
-    if isinstance(augment, BackdropExchange):
-        backdrops = held_on(device, augment.backdrops, "the backdrops")
-        return replace(augment, backdrops=backdrops, then=_moved(augment.then, device))
-    if isinstance(augment, PhotographExchange):
-        return replace(augment, photographs=held_on(device, augment.photographs, "the photographs"))
-    return augment
+    if not isinstance(augment, Exchange):
+        return augment
+    words = "the backdrops" if isinstance(augment.stock, Backdrops) else "the photographs"
+    return replace(augment, stock=held_on(device, augment.stock, words), then=_moved(augment.then, device))
 
 
 def held_on(device: torch.device, held: Held, words: str) -> Held:

@@ -1,20 +1,19 @@
 """Labelled photographs among the training samples of a rendered data set."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
+from jaxtyping import Bool, Float
 
-from phd_exp.data.batches import Augment, Batch
+from phd_exp.data.batches import Batch
 from phd_exp.data.folder import crops_of, samples_of
 from phd_exp.data.photometry import on
 from phd_exp.records.errors import DatasetError
 from phd_exp.records.own_images import detections_in
 
-NUMBERS = 2  # per sample: whether a photograph replaces it, and which one
+PHOTOGRAPH_NUMBERS = 2  # per sample: whether a photograph replaces it, and which one
 LIKENESS = 2.0  # largest factor between the sizes at which photographs and renders show the object
 
 
@@ -56,35 +55,19 @@ def _sizes(batch: Batch) -> tuple[float, float]:
     return float(low), float(high)
 
 
-@dataclass(frozen=True, eq=False)
-class PhotographExchange:
-    """An augmentation that first replaces samples by random photographs, whose masks weigh nothing.
+def replaced(
+    photographs: Batch, batch: Batch, chosen: Bool[np.ndarray, " batch"], numbers: Float[np.ndarray, "batch 1"]
+) -> Batch:
+    """The batch, with some samples replaced by random photographs, whose masks weigh nothing.
 
     Args:
         photographs: all of them.
-        share: the share of the samples that is replaced.
-        then: the augmentation that follows.
+        batch: renders.
+        chosen: which of them to replace.
+        numbers: from 0 to 1, for a photograph.
     """
-
-    photographs: Batch
-    share: float
-    then: Augment | None
-
-    @property
-    def n_numbers(self) -> int:
-        """Number of random numbers per sample; those of `then` come first."""
-        return NUMBERS + (self.then.n_numbers if self.then else 0)
-
-    def __call__(self, batch: Batch, numbers: Float[Tensor, "batch n_numbers"]) -> Batch:
-        """The samples, changed by uniform numbers from -1 to 1. Their rows stay those of the replaced samples."""
-        of_then, own = numbers.tensor_split([-NUMBERS], dim=1)
-        replaced, which = ((own + 1) / 2).double().numpy().T
-        places = np.flatnonzero(replaced < self.share)
-        chosen = self.photographs.select(torch.from_numpy((len(self.photographs) * which[places]).astype(np.int64)))
-        chosen, rows = chosen.to(batch.image.device), on(batch.image, places)
-        parts = {
-            name: getattr(batch, name).index_copy(0, rows, getattr(chosen, name)) for name in ("image", "xyz", "f")
-        }
-        weight = None if batch.mask is None else torch.ones_like(batch.f).index_fill(0, rows, 0.0)
-        batch = replace(batch, **parts, mask_weight=weight)
-        return self.then(batch, of_then) if self.then else batch
+    which = torch.from_numpy((len(photographs) * numbers[chosen, 0]).astype(np.int64))
+    others, rows = photographs.select(which).to(batch.image.device), on(batch.image, np.flatnonzero(chosen))
+    parts = {name: getattr(batch, name).index_copy(0, rows, getattr(others, name)) for name in ("image", "xyz", "f")}
+    weight = None if batch.mask is None else torch.ones_like(batch.f).index_fill(0, rows, 0.0)
+    return replace(batch, **parts, mask_weight=weight)

@@ -7,8 +7,9 @@ import torch
 from torch.testing import assert_close
 
 from phd_exp.data.augmentation import Augmentation, moved
-from phd_exp.data.backdrops import BackdropExchange, Backdrops
+from phd_exp.data.backdrops import BACKDROP_NUMBERS, Backdrops, before_others
 from phd_exp.data.batches import Batch
+from phd_exp.data.exchanges import Exchange
 from phd_exp.data.photometry import Photometry
 from phd_exp.geometry import Camera
 from phd_exp.geometry.motion import Motion, symmetries
@@ -142,10 +143,10 @@ def test_all_of_it_happens_where_the_images_are(noise: Batch, largest_zoom: floa
     """On a device without values: whatever reads one, or mixes in a tensor of the host, raises an error."""
     everything = Photometry(0.5, 2.0, 2.0, 2.0, 1.5, 2.5, 15.0, 25)
     augment = Augmentation(symmetries=True, largest_zoom=largest_zoom, colours=True, photometry=everything)
-    backdrops = Backdrops(noise.image, noise.image[..., 0])
-    exchange, batch = BackdropExchange(backdrops, 0.5, augment), replace(noise, mask=noise.image[..., 0])
-    assert len(exchange.texture) == N  # read once, before the first step
-    vars(exchange)["backdrops"] = backdrops.to(torch.device("meta"))
+    backdrops, batch = Backdrops(noise.image, noise.image[..., 0]), replace(noise, mask=noise.image[..., 0])
+    there = backdrops.to(torch.device("meta"))
+    vars(there)["texture"] = backdrops.texture  # read once, before the first step
+    exchange = Exchange(there, before_others, BACKDROP_NUMBERS, 0.5, augment)
     new = exchange(batch.to("meta"), 2 * torch.rand(N, exchange.n_numbers, dtype=torch.float64) - 1)
     for name in ("image", "xyz", "f", "mask"):
         found, expected = getattr(new, name), getattr(batch, name)

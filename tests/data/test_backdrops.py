@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from phd_exp.data.backdrops import FINEST, NUMBERS, BackdropExchange, Backdrops, tiled
-from phd_exp.data.batches import Batch
+from phd_exp.data.backdrops import BACKDROP_NUMBERS, FINEST, Backdrops, before_others, tiled
+from phd_exp.data.batches import Augment, Batch
 from phd_exp.data.datamodule import PositionData
+from phd_exp.data.exchanges import Exchange
 from phd_exp.data.sources import RenderedSource
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError
@@ -46,6 +47,10 @@ def numbers(columns: int) -> torch.Tensor:
     return 2 * torch.rand(N, columns, generator=torch.Generator().manual_seed(1)) - 1
 
 
+def exchange(backdrops: Backdrops, share: float, then: Augment | None = None) -> Exchange:
+    return Exchange(backdrops, before_others, BACKDROP_NUMBERS, share, then)
+
+
 def test_renders_without_objects_are_the_renders_where_no_object_is(source: RenderedSource) -> None:
     images, found = source.samples("train").image.int(), source.training_backdrops()
     nothing, object_alone = found.clear == 255, found.clear == 0
@@ -58,7 +63,7 @@ def test_renders_without_objects_are_the_renders_where_no_object_is(source: Rend
 def test_an_object_appears_before_the_other_backdrop(source: RenderedSource) -> None:
     found, samples = source.training_backdrops(), source.samples("train")
     draw = torch.tensor([[-1.0, 0.5, 0.5, -1, -1, -1, 1], [-1.0, -0.5, -0.5, -1, 0, -1, -1]])
-    new = BackdropExchange(found, 0.5, then=None)(samples, draw)
+    new = exchange(found, 0.5)(samples, draw)
     for row, other in ((0, found.empty[1]), (1, found.empty[0].flip(0).transpose(0, 1))):
         nothing, object_alone = found.clear[row] == 255, found.clear[row] == 0
         assert torch.equal(new.image[row][object_alone], samples.image[row][object_alone])
@@ -74,7 +79,7 @@ def test_the_backdrop_with_more_texture_is_preferred(batch: Batch) -> None:
     empty[::2] = batch.image[::2]
     clear = torch.full((N, SIDE, SIDE), 255, dtype=torch.uint8)
     black = replace(batch, image=empty[batch.row])
-    new = BackdropExchange(Backdrops(empty, clear), 1.0, then=None)(black, numbers(sum(NUMBERS)))
+    new = exchange(Backdrops(empty, clear), 1.0)(black, numbers(BACKDROP_NUMBERS))
     assert (new.image != 0).any((1, 2, 3)).float().mean() == pytest.approx(0.75, abs=0.15)
 
 
@@ -108,11 +113,11 @@ def test_the_share_is_changed_and_then_augmented(batch: Batch) -> None:
 
     clear = torch.full((N, SIDE, SIDE), 255, dtype=torch.uint8)
     backdrops = Backdrops(torch.randint(0, 256, batch.image.shape, dtype=torch.uint8), clear)
-    draw = numbers(sum(NUMBERS) + 2)
+    draw = numbers(BACKDROP_NUMBERS + 2)
     for share in (0.0, 0.4, 1.0):
-        exchange = BackdropExchange(backdrops, share, Darken())
-        assert exchange.n_numbers == sum(NUMBERS) + 2
-        changed = (exchange(batch, draw).image != batch.image // 2).any((1, 2, 3))
+        darkened = exchange(backdrops, share, Darken())
+        assert darkened.n_numbers == BACKDROP_NUMBERS + 2
+        changed = (darkened(batch, draw).image != batch.image // 2).any((1, 2, 3))
         assert changed.float().mean() == pytest.approx(share, abs=0.15)
 
 

@@ -10,7 +10,8 @@ import torch
 
 from phd_exp.data.batches import Batch
 from phd_exp.data.datamodule import PositionData
-from phd_exp.data.photographs import NUMBERS, PhotographExchange, Photographs
+from phd_exp.data.exchanges import Exchange
+from phd_exp.data.photographs import PHOTOGRAPH_NUMBERS, Photographs, replaced
 from phd_exp.data.sources import RenderedSource
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import DatasetError
@@ -47,9 +48,9 @@ def test_photographs_replace_their_share_with_labels_and_weigh_no_mask() -> None
 
     renders, photographs = batch_of(N, 0), batch_of(7, 249)
     renders = replace(renders, mask=torch.zeros(N, 2, 2, dtype=torch.uint8))
-    draw = 2 * torch.rand(N, 4 + NUMBERS, generator=torch.Generator().manual_seed(0)) - 1
-    exchange = PhotographExchange(photographs, 0.3, Inspect())
-    assert exchange.n_numbers == 4 + NUMBERS
+    draw = 2 * torch.rand(N, 4 + PHOTOGRAPH_NUMBERS, generator=torch.Generator().manual_seed(0)) - 1
+    exchange = Exchange(photographs, replaced, PHOTOGRAPH_NUMBERS, 0.3, Inspect())
+    assert exchange.n_numbers == 4 + PHOTOGRAPH_NUMBERS
     mixed = exchange(renders, draw)
     is_photograph = mixed.mask_weight == 0
     assert torch.equal(mixed.mask_weight == 1, ~is_photograph)

@@ -12,8 +12,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from phd_exp import build, hardware
 from phd_exp.config import RunConfig, check
-from phd_exp.data.backdrops import BackdropExchange, Backdrops
+from phd_exp.data.backdrops import BACKDROP_NUMBERS, Backdrops, before_others
 from phd_exp.data.batches import Batch, BatchLoader
+from phd_exp.data.exchanges import Exchange
 from phd_exp.data.images import SHRINKING
 from phd_exp.data.photometry import VERSION
 from phd_exp.records.errors import ConfigError, RunError
@@ -140,9 +141,10 @@ def test_a_training_step_and_its_data_read_nothing_back(checked: Callable, words
     )
     limits = {"contrast": 2.0, "white_balance": 1.5, "occluders": 1.0}
     augment = replace(data.augment, photometry=replace(data.augment.photometry, **limits))
-    augment = BackdropExchange(Backdrops(image, mask.new_zeros(n, 64, 64)), 1.0, augment)
+    backdrops = Backdrops(image, mask.new_zeros(n, 64, 64))
+    augment = Exchange(backdrops, before_others, BACKDROP_NUMBERS, 1.0, augment)
     loader = BatchLoader(batch, n, shuffle=True, seed=0, augment=augment)
-    assert len(augment.texture) == n  # computed once, before the first step
+    assert len(backdrops.texture) == n  # computed once, before the first step
     with Reads() as reads:
         (first,) = loader
         changed = augment(first, torch.full((n, augment.n_numbers), 0.9, dtype=torch.float64))  # all of it
