@@ -22,6 +22,7 @@ from phd_exp.rendering.rays import (
     rotation_matrix,
     trace_pixels,
 )
+from phd_exp.rendering.sequences import quaternion_of
 from phd_exp.rendering.triangles import Meshes
 
 FEWEST = 24  # visible pixels of the object, where it fills the image: fewer are no detection
@@ -97,5 +98,4 @@ def _box(visible: Mask, camera: VirtualCamera, size: tuple[int, int]) -> tuple[B
 
 
 def _pose(R: NDArray[np.float64]) -> Pose:
-    x, y, z, w = Rotation.from_matrix(R).as_quat().tolist()
-    return Pose(rotation=(w, x, y, z), translation=(0.0, 0.0, 0.0))
+    return Pose(rotation=quaternion_of(Rotation.from_matrix(R)), translation=(0.0, 0.0, 0.0))

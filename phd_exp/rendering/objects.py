@@ -14,6 +14,7 @@ from phd_exp.rendering.importing import in_blenders_axes
 from phd_exp.rendering.looks import varied
 from phd_exp.rendering.rays import rotation_matrix
 from phd_exp.rendering.sampling import MOST_TRIES, SIZE, Purpose, draw_object, sample_scene, stream_of
+from phd_exp.rendering.sequences import quaternion_of
 from phd_exp.rendering.triangles import Meshes
 
 REACH = SIZE * 0.5**0.5  # m, from the cylinder's centre to its rim
@@ -93,9 +94,7 @@ def _facing_rotation(spec: DatasetSpec, position: Vector, rng: np.random.Generat
     around, spin = rng.uniform(0, math.tau, 2)
     tilt = Rotation.from_euler("ZYZ", [around, math.acos(rng.uniform(farthest, nearest)), spin])
     to_camera = Rotation.align_vectors([-np.array(position)], [z])[0]
-    turned = to_camera * tilt * Rotation.align_vectors([z], [front])[0]
-    *vector, scalar = turned.as_quat().tolist()
-    return scalar, vector[0], vector[1], vector[2]
+    return quaternion_of(to_camera * tilt * Rotation.align_vectors([z], [front])[0])
 
 
 def upright_rotation(pitch: float, turn: float) -> Quaternion:

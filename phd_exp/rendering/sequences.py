@@ -38,7 +38,7 @@ def moved(item: SceneObject, spec: DatasetSpec, f: float, time: float, rng: Stre
     x, y = (depth * _slid(value / z, (-half_width, half_width), at_middle, time, rng) for value in (x, y))
     axis = rng.standard_normal(3)
     turn = time * math.radians(rng.uniform(*spec.spin_range)) * axis / np.linalg.norm(axis)
-    rotation = _quaternion(Rotation.from_rotvec(turn) * _rotation(item.rotation))
+    rotation = quaternion_of(Rotation.from_rotvec(turn) * _rotation(item.rotation))
     return item.model_copy(update={"position": (x, y, depth), "rotation": rotation})
 
 
@@ -51,14 +51,14 @@ def camera_pose(spec: DatasetSpec, time: float, rng: Stream) -> Pose:
     turn, centre = ([_wandered(time, rng) for _ in range(3)] for _ in range(2))
     R = Rotation.from_rotvec(math.radians(spec.camera_turn) * np.array(turn))
     x, y, z = (-R.apply(spec.camera_speed * np.array(centre))).tolist()
-    return Pose(rotation=_quaternion(R), translation=(x, y, z))
+    return Pose(rotation=quaternion_of(R), translation=(x, y, z))
 
 
 def in_scene(item: SceneObject, pose: Pose, *, turned: bool) -> SceneObject:
     """An object given in the camera's frame, in the scene's; its rotation too if it is to be `turned`."""
     back = _rotation(pose.rotation).inv()
     x, y, z = back.apply(np.array(item.position) - pose.translation).tolist()
-    rotation = _quaternion(back * _rotation(item.rotation)) if turned else item.rotation
+    rotation = quaternion_of(back * _rotation(item.rotation)) if turned else item.rotation
     return item.model_copy(update={"position": (x, y, z), "rotation": rotation})
 
 
@@ -93,6 +93,7 @@ def _rotation(quaternion: Quaternion) -> Rotation:
     return Rotation.from_quat(quaternion, scalar_first=True)
 
 
-def _quaternion(rotation: Rotation) -> Quaternion:
+def quaternion_of(rotation: Rotation) -> Quaternion:
+    """Unit quaternion (w, x, y, z)."""
     w, x, y, z = rotation.as_quat(scalar_first=True).tolist()
     return w, x, y, z

@@ -60,7 +60,7 @@ class World:
         self._frame.matrix_basis = np.eye(4).tolist()
         if around.is_sky and around.file:
             self._load(around.file)
-            self._frame.matrix_basis = _columns(to_sky(around))
+            self._frame.matrix_basis = matrix_of(TO_BLENDER @ to_sky(around), np.zeros(3))
         self._ground.hide_render = around.ground is None
         if around.ground is not None:
             level = rotation_matrix(about_axis((1.0, 0.0, 0.0), math.pi / 2 + around.pitch))
@@ -123,12 +123,6 @@ def _glowing(bpy: Any) -> Iterator[tuple[Any, float]]:
 def to_sky(around: Surroundings) -> Light:
     """Rotation (3, 3) from Blender's axes of a scene, where y is up for a level camera, to its sky's, where z is."""
     return Rotation.from_euler("xz", [math.pi / 2 - around.pitch, around.turn]).as_matrix()
-
-
-def _columns(rotation: Light) -> list[list[float]]:
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation.T
-    return matrix.tolist()
 
 
 def sky_light(panorama: NDArray[np.float32], turn: Light, f: float, S: int) -> Light:
