@@ -177,8 +177,8 @@ class ProjectedHuber(Density, Distribution):
         """The same distribution with a larger batch shape; nothing is copied."""
         return self._of(self._natural.expand(torch.Size(batch_shape)), self._validate_args)
 
-    def __getitem__(self, row: int | Tensor | None) -> "ProjectedHuber":
-        """One distribution of a batch, or those that a mask chooses; None adds a dimension."""
+    def __getitem__(self, row: int | slice | Tensor | tuple[int | slice | Tensor, ...] | None) -> "ProjectedHuber":
+        """Some distributions of a batch, chosen as in a tensor; None adds a dimension."""
         return self._of(self._natural.map(lambda _, value: value[row]), self._validate_args)
 
     def with_axis(self, k: Float[Tensor, "*#batch 2"]) -> "ProjectedHuber":

@@ -34,7 +34,7 @@ def conic_optimum(
     best: np.ndarray | None = None
     for tolerance, unit in SETTINGS:
         program = Program(cameras, origin if best is None else best, unit)
-        theirs, _ = (program if plane is None else program.on_plane(*plane)).solve(tolerance)
+        theirs = (program if plane is None else program.on_plane(*plane)).solve(tolerance)
         if best is None or energy(cameras, theirs) < energy(cameras, best):
             best = theirs
         if np.abs(best - ours).max() <= AGREE:

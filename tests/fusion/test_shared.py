@@ -13,7 +13,7 @@ from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion import Fused, Plane, Pose, fuse, fuse_shared
 from phd_exp.fusion.shared import own_part
 from phd_exp.metrics.errors import squared_mahalanobis
-from tests.support.random_problems import columns_of, random_problems
+from tests.support.random_problems import random_problems
 from tests.support.shared import sharing_scenes
 
 DEVIATION, OWN = 0.12, 40.0
@@ -78,8 +78,7 @@ def test_mean_and_covariance_are_those_of_a_dense_grid(angle: float) -> None:
     views, pose, _ = sharing_scenes(2, 2, deviation=DEVIATION, a=OWN, A=100.0, angle=angle)
     fused = fuse_shared(views, pose, share=SHARE)
     for i in range(2):
-        one = ProjectedHuber(*(column[i] for column in columns_of(views)))
-        mean, covariance = grid(one, Pose(pose.R[i], pose.t[i]), fused.mean[i], fused.covariance[i])
+        mean, covariance = grid(views[i], Pose(pose.R[i], pose.t[i]), fused.mean[i], fused.covariance[i])
         eigenvalues = torch.linalg.eigvals(torch.linalg.solve(covariance, fused.covariance[i])).real
         assert (eigenvalues - 1).abs().max() < 0.15
         assert squared_mahalanobis(fused.mean[i] - mean, covariance) < 0.2**2

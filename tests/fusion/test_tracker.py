@@ -9,7 +9,7 @@ import torch
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion import Pose
 from phd_exp.fusion.tracks import ConstantVelocity, Gaussian, Lost, Slow, State, Tracker, track
-from tests.support.paths import NO_ERRORS, Errors, around, chosen, drawn_paths
+from tests.support.paths import NO_ERRORS, Errors, around, drawn_paths
 
 LAW, TIMES = ConstantVelocity(noise=0.3, speed=0.3), np.arange(40) / 30
 NEVER = Lost(after=math.inf, contradictions=10**6)
@@ -18,7 +18,7 @@ POSE = around(1)
 
 def drawn(errors: Errors = NO_ERRORS) -> ProjectedHuber:
     predictions, _ = drawn_paths(1, TIMES, LAW, POSE, errors=errors, seed=1)
-    return chosen(predictions, 0)
+    return predictions[0]
 
 
 def fed(tracker: Tracker, predictions: ProjectedHuber | Gaussian, mask: torch.Tensor | None = None) -> list[State]:
@@ -28,7 +28,7 @@ def fed(tracker: Tracker, predictions: ProjectedHuber | Gaussian, mask: torch.Te
         if isinstance(predictions, Gaussian):
             frame: ProjectedHuber | Gaussian = Gaussian(predictions.mean[k], predictions.covariance[k])
         else:
-            frame = chosen(predictions, k)
+            frame = predictions[k]
         states.append(tracker.update(float(time), frame, POSE, None if mask is None else mask[k]))
     return [state for state in states if state is not None] + tracker.finish()
 
@@ -101,18 +101,18 @@ def test_another_object_ends_the_track() -> None:
     fed(tracker, ProjectedHuber(mu_xy, right.mu_z, right.A, right.a))
     assert tracker.lost_because is not None
     assert "5 frames in a row contradict the path" in tracker.lost_because
-    assert tracker.update(10.0, chosen(right, 0), POSE) is None
+    assert tracker.update(10.0, right[0], POSE) is None
 
 
 def test_bad_input_is_refused_on_one_line() -> None:
     tracker = Tracker(LAW)
-    tracker.update(1.0, chosen(drawn(), 0), POSE)
+    tracker.update(1.0, drawn()[0], POSE)
     with pytest.raises(ValueError, match=r"^time: got 1.0 after 1.0; expected a later time$"):
-        tracker.update(1.0, chosen(drawn(), 1), POSE)
+        tracker.update(1.0, drawn()[1], POSE)
     with pytest.raises(
         ValueError, match=r"^pose.R: got batch shape \(2,\); expected one that broadcasts to \(1, 1\)$"
     ):
-        tracker.update(1.1, chosen(drawn(), 1), Pose(POSE.R.expand(2, 3, 3), POSE.t.expand(2, 3)))
+        tracker.update(1.1, drawn()[1], Pose(POSE.R.expand(2, 3, 3), POSE.t.expand(2, 3)))
     with pytest.raises(ValueError, match=r"^lag: got -1; expected"):
         Tracker(LAW, lag=-1)
     with pytest.raises(ValueError, match=r"^lag: got 0; expected a number of frames, at least 1$"):

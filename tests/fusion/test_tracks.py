@@ -18,7 +18,7 @@ from phd_exp.fusion.tracks.motion import transitions
 from phd_exp.geometry import Camera, DepthScale
 from phd_exp.geometry.charts import Cartesian
 from tests.support.conic_path import PathProgram, motion, noise
-from tests.support.paths import around, chosen, drawn_paths
+from tests.support.paths import around, drawn_paths
 
 NEVER = Lost(after=math.inf, contradictions=10**6)
 
@@ -48,7 +48,7 @@ def test_the_path_is_that_of_a_conic_solver_and_its_certificate_holds(cameras: i
     for seed in range(15):
         times = irregular(12 + 2 * seed, seed)
         drawn, _ = drawn_paths(1, times, law, pose, a=5.0 + 4 * seed, A=100.0 + 20 * seed, seed=seed)
-        predictions = with_outliers(chosen(drawn, 0), 0.1, seed)
+        predictions = with_outliers(drawn[0], 0.1, seed)
         mask = torch.rand(len(times), cameras, generator=torch.Generator().manual_seed(seed)) > 0.2
         mask[0] = True
         program = PathProgram(times, predictions, pose, mask, law.noise, law.speed)
@@ -89,7 +89,7 @@ def smoothed(times: np.ndarray, means: np.ndarray, covariances: np.ndarray, law:
 def test_gaussian_predictions_give_the_rauch_tung_striebel_smoother() -> None:
     law, times = ConstantVelocity(noise=0.5, speed=1.0), irregular(40, 3)
     drawn, _ = drawn_paths(1, times, law, around(1), seed=3)
-    predictions = Gaussian.of(chosen(drawn, 0))
+    predictions = Gaussian.of(drawn[0])
     path = track(torch.from_numpy(times), predictions, around(1), law, lost=NEVER)
     mean, covariance = smoothed(times, predictions.mean[:, 0].numpy(), predictions.covariance[:, 0].numpy(), law)
     np.testing.assert_allclose(path.point, mean[:, :3], rtol=0, atol=1e-8)
@@ -168,7 +168,7 @@ def test_frames_that_contradict_the_path_end_the_track() -> None:
     end = int(path.point[:, 0].isfinite().sum())  # Huber tails let some frames pull the path over before
     assert 44 <= end <= 50
     assert path.lost == f"lost at {times[end]:g} s: from then on 5 frames in a row contradict the path"
-    alone = track(times[:end], chosen(predictions, slice(0, end)), pose, LAW)
+    alone = track(times[:end], predictions[0:end], pose, LAW)
     torch.testing.assert_close(path.point[:end], alone.point, rtol=0, atol=1e-9)
     assert path.covariance[end:].isnan().all()
 
@@ -178,7 +178,7 @@ def test_frames_before_the_first_prediction_are_not_part_of_the_track() -> None:
     mask = (torch.arange(20) >= 5)[:, None]
     path = track(times, predictions, pose, LAW, mask)
     assert path.point[:5].isnan().all()
-    torch.testing.assert_close(path.mean[5:], track(times[5:], chosen(predictions, slice(5, 20)), pose, LAW).mean)
+    torch.testing.assert_close(path.mean[5:], track(times[5:], predictions[5:20], pose, LAW).mean)
 
 
 def bad(**changes: Any) -> dict[str, Any]:
@@ -208,8 +208,8 @@ def bad_input() -> dict[str, tuple[dict[str, Any], str]]:
         "backward": (bad(times=times.flip(0)), r"times: got 0.06.* in frame 1 after 0.1; expected increasing"),
         "not finite": (bad(times=changed(times, 1, torch.nan)), r"times: got nan in frame 1; expected finite"),
         "too few times": (bad(times=times[:3]), r"times: got shape \(3,\); expected \(4,\)"),
-        "no frames": (bad(times=times[:0], predictions=chosen(predictions, slice(0, 0))), r"predictions: got batch "),
-        "no cameras": (bad(predictions=chosen(predictions, (slice(None), 0))), r"predictions: got batch shape"),
+        "no frames": (bad(times=times[:0], predictions=predictions[0:0]), r"predictions: got batch "),
+        "no cameras": (bad(predictions=predictions[:, 0]), r"predictions: got batch shape"),
         "poses missing": (bad(pose=Pose(R[:3], t[:3])), r"pose.R: got batch shape \(3, 1\); expected one that"),
         "a pose is missing": (bad(pose=Pose(changed(R, 3, torch.nan), t)), r"frame 3: a prediction, pose"),
         "no rotation": (bad(pose=Pose(1.01 * R, t)), r"frame 0: the R of a pose is not a rotation to 1e-6; exp"),
@@ -223,18 +223,10 @@ def bad_input() -> dict[str, tuple[dict[str, Any], str]]:
         ),
         "behind": (
             bad(pose=Pose(torch.stack([R[0, 0], torch.diag(torch.tensor([1.0, -1, -1]).double())]), 0 * t[:1, 0]),
-                predictions=replaced_cameras(predictions, 2)),
+                predictions=predictions.expand((4, 2))),
             r"predictions: no position is in front of every camera",
         ),
     }  # fmt: skip
-
-
-def replaced_cameras(predictions: ProjectedHuber, cameras: int) -> ProjectedHuber:
-    """The same prediction by several cameras."""
-    return ProjectedHuber(
-        predictions.mu_xy.expand(-1, cameras, 2), predictions.mu_z.expand(-1, cameras),
-        predictions.A.expand(-1, cameras, 2, 2), predictions.a.expand(-1, cameras),
-    )  # fmt: skip
 
 
 @pytest.mark.parametrize("case", bad_input())

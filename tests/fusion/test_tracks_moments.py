@@ -17,7 +17,7 @@ from phd_exp.fusion.tracks import (
 )
 from phd_exp.fusion.tracks.slow import weights
 from phd_exp.metrics.errors import squared_mahalanobis
-from tests.support.paths import NO_ERRORS, Errors, around, chosen, drawn_paths
+from tests.support.paths import NO_ERRORS, Errors, around, drawn_paths
 
 LAW, TIMES = ConstantVelocity(noise=0.3, speed=0.3), np.arange(60) / 30
 NEVER = Lost(contradictions=10**6)
@@ -43,7 +43,7 @@ def nees(n: int, used: Slow, *, cameras: int = 1, errors: Errors = NO_ERRORS, se
     drawn, truth = drawn_paths(n, TIMES, LAW, pose, errors=errors, seed=seed)
     found = []
     for i in range(n):
-        path = track(torch.from_numpy(TIMES), chosen(drawn, i), pose, LAW, slow=used, lost=NEVER)
+        path = track(torch.from_numpy(TIMES), drawn[i], pose, LAW, slow=used, lost=NEVER)
         found.append(float(squared_mahalanobis(truth[i] - path.mean, path.covariance).mean()) / 3)
     return float(np.mean(found)), float(stats.sem(found) * stats.t.ppf(0.975, n - 1))
 
@@ -112,5 +112,5 @@ def test_the_time_constant_of_slow_errors_is_found() -> None:
 def test_the_noise_of_the_motion_is_found() -> None:
     drawn, _ = drawn_paths(4, np.arange(100) / 30, ConstantVelocity(0.5, speed=0.3), around(2), seed=7)
     times = torch.arange(100).double() / 30
-    found = [estimated(times, chosen(drawn, i), around(2), ConstantVelocity(3.0, speed=0.3)).noise for i in range(4)]
+    found = [estimated(times, drawn[i], around(2), ConstantVelocity(3.0, speed=0.3)).noise for i in range(4)]
     assert 0.3 < np.exp(np.mean(np.log(found))) < 0.8

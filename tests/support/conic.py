@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import clarabel
 import numpy as np
@@ -49,34 +50,50 @@ def cones_of(
     yield clarabel.SecondOrderConeT(3), np.stack([w + t, w - t, np.zeros_like(t)]), np.array([t_0, -t_0, 2])
 
 
-class Program:
-    """minimise x.P x/2 + c.x with affine expressions of x in cones; x = (v - origin)/unit, then the rest."""
+class Conic:
+    """minimise diagonal.x^2/2 + c.x of n unknowns x with affine expressions of x in cones; if large, sparse ones."""
 
-    def __init__(self, cameras: list[Camera], origin: np.ndarray, unit: float) -> None:
-        self.n = 3 + 3 * len(cameras)
-        self.P, self.c = np.zeros((self.n, self.n)), np.zeros(self.n)
-        self.rows: list[np.ndarray] = []
+    def __init__(self, n: int, is_large: bool) -> None:
+        self.n, self.is_large = n, is_large
+        self.diagonal, self.c = np.zeros(n), np.zeros(n)
+        self.rows: list[Any] = []
         self.constants: list[np.ndarray] = []
         self.cones: list[object] = []
-        self.origin, self.unit = origin, unit
-        for i, camera in enumerate(cameras):
-            self.add_camera(camera, 3 + 3 * i)
 
     def require(self, cone: object, slope: np.ndarray, constant: np.ndarray) -> None:
         """slope x + constant lies in the cone."""
-        self.rows.append(-slope)
+        self.rows.append(sparse.csc_matrix(-slope) if self.is_large else -slope)
         self.constants.append(constant)
         self.cones.append(cone)
 
-    def add_camera(self, camera: Camera, first: int) -> None:
-        """The energy of a camera, with m, n and w from the unknown `first` on."""
-        m, n, w = np.eye(self.n)[first : first + 3]
-        self.P[first, first] = 1
+    def add_camera(self, camera: Camera, place: int, origin: np.ndarray, unit: float, first: int) -> None:
+        """The energy of a camera for v = origin + unit x[place:], with m, n and w from the unknown `first` on."""
+        m, n, w = (np.eye(1, self.n, first + i)[0] for i in range(3))
+        self.diagonal[first] = 1
         self.c[first + 1], self.c[first + 2] = 1, camera.a
         xyz = np.zeros((3, self.n))
-        xyz[:, :3] = camera.R * self.unit
-        for cone, slope, constant in cones_of(camera, xyz, camera.R @ self.origin + camera.t, m, n, w):
+        xyz[:, place : place + 3] = camera.R * unit
+        for cone, slope, constant in cones_of(camera, xyz, camera.R @ origin + camera.t, m, n, w):
             self.require(cone, slope, constant)
+
+    def solved(self, tolerance: float) -> np.ndarray:
+        """The unknowns."""
+        settings = clarabel.DefaultSettings()
+        settings.verbose = False
+        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
+        P, constants = sparse.diags(self.diagonal).tocsc(), np.concatenate(self.constants)
+        rows = sparse.vstack(self.rows).tocsc() if self.is_large else sparse.csc_matrix(np.vstack(self.rows))
+        return np.array(clarabel.DefaultSolver(P, self.c, rows, constants, self.cones, settings).solve().x)
+
+
+class Program(Conic):
+    """The problem of one position: x = (v - origin)/unit, then m, n, w of each camera."""
+
+    def __init__(self, cameras: list[Camera], origin: np.ndarray, unit: float) -> None:
+        super().__init__(3 + 3 * len(cameras), is_large=False)
+        self.origin, self.unit = origin, unit
+        for i, camera in enumerate(cameras):
+            self.add_camera(camera, 0, origin, unit, 3 + 3 * i)
 
     def on_plane(self, normal: np.ndarray, offset: float) -> "Program":
         """With the constraint normal . v = offset."""
@@ -85,12 +102,6 @@ class Program:
         self.require(clarabel.ZeroConeT(1), row, np.array([normal @ self.origin - offset]))
         return self
 
-    def solve(self, tolerance: float = 1e-14) -> tuple[np.ndarray, str]:
-        """The position v, and the status of the solver."""
-        settings = clarabel.DefaultSettings()
-        settings.verbose = False
-        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
-        P, rows = sparse.csc_matrix(self.P), sparse.csc_matrix(np.vstack(self.rows))
-        constants = np.concatenate(self.constants)
-        solution = clarabel.DefaultSolver(P, self.c, rows, constants, self.cones, settings).solve()
-        return self.origin + self.unit * np.array(solution.x[:3]), str(solution.status)
+    def solve(self, tolerance: float) -> np.ndarray:
+        """The position v."""
+        return self.origin + self.unit * self.solved(tolerance)[:3]

@@ -2,12 +2,11 @@
 
 import clarabel
 import numpy as np
-from scipy import sparse
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion import Pose
-from tests.support.conic import Camera, cameras_of, cones_of
+from tests.support.conic import Conic, cameras_of
 
 
 def noise(step: float, density: float) -> np.ndarray:
@@ -21,7 +20,7 @@ def motion(step: float) -> np.ndarray:
     return np.kron(np.array([[1, step], [0, 1]]), np.eye(3))
 
 
-class PathProgram:
+class PathProgram(Conic):
     """The problem of a path: unknowns (v_k - origin, velocity_k), noise e, and m, n, w of each view."""
 
     def __init__(
@@ -32,22 +31,12 @@ class PathProgram:
         self.times, self.density, self.speed = times, density, speed
         self.origin = np.array([0.0, 0.0, 4.0])
         N = len(times)
-        self.n = 6 * N + 6 * (N - 1) + 3 * len(self.views)
-        self.diagonal, self.c = np.zeros(self.n), np.zeros(self.n)
-        self.rows: list[sparse.csc_matrix] = []
-        self.constants: list[np.ndarray] = []
-        self.cones: list[object] = []
+        super().__init__(6 * N + 6 * (N - 1) + 3 * len(self.views), is_large=True)
         self.diagonal[3:6] = 1 / speed**2
         for k, step in enumerate(np.diff(times)):
             self.add_motion(k, step)
         for i, (k, camera) in enumerate(self.views):
-            self.add_camera(k, camera, 12 * N - 6 + 3 * i)
-
-    def require(self, cone: object, slope: np.ndarray, constant: np.ndarray) -> None:
-        """slope x + constant lies in the cone."""
-        self.rows.append(sparse.csc_matrix(-slope))
-        self.constants.append(constant)
-        self.cones.append(cone)
+            self.add_camera(camera, 6 * k, self.origin, 1.0, 12 * N - 6 + 3 * i)
 
     def add_motion(self, k: int, step: float) -> None:
         """x_(k+1) = F x_k + root e_k, with |e_k|^2/2 in the energy."""
@@ -59,26 +48,10 @@ class PathProgram:
         slope[:, first : first + 6] = np.eye(6)
         self.require(clarabel.ZeroConeT(6), slope, np.zeros(6))
 
-    def add_camera(self, k: int, camera: Camera, first: int) -> None:
-        """The energy of a camera in frame k, with m, n and w from the unknown `first` on."""
-        m, n, w = (np.eye(1, self.n, first + i)[0] for i in range(3))
-        self.diagonal[first] = 1
-        self.c[first + 1], self.c[first + 2] = 1, camera.a
-        xyz = np.zeros((3, self.n))
-        xyz[:, 6 * k : 6 * k + 3] = camera.R
-        for cone, slope, constant in cones_of(camera, xyz, camera.R @ self.origin + camera.t, m, n, w):
-            self.require(cone, slope, constant)
-
     def solve(self, tolerance: float) -> np.ndarray:
         """The unknowns (frames, 6)."""
-        settings = clarabel.DefaultSettings()
-        settings.verbose = False
-        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
-        P, rows = sparse.diags(self.diagonal).tocsc(), sparse.vstack(self.rows).tocsc()
-        solution = clarabel.DefaultSolver(
-            P, self.c, rows, np.concatenate(self.constants), self.cones, settings
-        ).solve()
-        return np.array(solution.x[: 6 * len(self.times)]).reshape(-1, 6) + np.append(self.origin, np.zeros(3))
+        x = self.solved(tolerance)[: 6 * len(self.times)]
+        return x.reshape(-1, 6) + np.append(self.origin, np.zeros(3))
 
     def energy(self, x: np.ndarray) -> np.longdouble:
         """-log density of position and velocity (frames, 6) up to constants."""

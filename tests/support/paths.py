@@ -100,9 +100,3 @@ def drawn_paths(
     predicted = with_shared_part(own, errors.deviation) if errors.deviation else own
     A_all = predicted.A * math.sqrt(1 - errors.share)
     return ProjectedHuber(predicted.mu_xy, predicted.mu_z, A_all, predicted.a), truth
-
-
-def chosen(predictions: ProjectedHuber, index: object) -> ProjectedHuber:
-    """Some of the predictions of a batch."""
-    columns = predictions.mu_xy, predictions.mu_z, predictions.A, predictions.a
-    return ProjectedHuber(*(column[index] for column in columns))

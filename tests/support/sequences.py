@@ -10,7 +10,7 @@ from phd_exp.data.batches import Batch
 from phd_exp.evaluation.several_views import ROTATION, TRANSLATION
 from phd_exp.fusion.tracks import ConstantVelocity, Slow
 from phd_exp.training.predictions import columns, write_parquet
-from tests.support.paths import HERTZ, NO_ERRORS, Errors, around, chosen, drawn_paths
+from tests.support.paths import HERTZ, NO_ERRORS, Errors, around, drawn_paths
 
 MOTION = ConstantVelocity(noise=0.3, speed=0.3)
 CAMERA = 1  # of two
@@ -25,7 +25,7 @@ def write_sequences(file: Path, n: int, frames: int, *, errors: Errors = NO_ERRO
     xyz, rows = pose.into_camera(truth[:, :, None])[:, :, CAMERA].flatten(0, 1), torch.arange(n * frames)
     image = torch.zeros(len(rows), 1, 1, 3, dtype=torch.uint8)
     batch = Batch(image, xyz, torch.full((len(rows),), 1500.0), S=224.0, row=rows)
-    table = columns(chosen(drawn, (rows // frames, rows % frames, CAMERA)), batch)
+    table = columns(drawn[rows // frames, rows % frames, CAMERA], batch)
     x, y, z, w = Rotation.from_matrix(pose.R[CAMERA].numpy()).as_quat()
     numbers = (w, x, y, z, *pose.t[CAMERA].tolist())
     known = {name: [value] * len(rows) for name, value in zip((*ROTATION, *TRANSLATION), numbers, strict=True)}
