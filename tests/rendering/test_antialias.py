@@ -1,17 +1,13 @@
 """Edges are averages over Blender's own pixel filter."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
 from phd_exp.records.scenes import Scene
-from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.antialias import FILTER_WIDTH, REACH, edges, filter_points, smoothed
 from phd_exp.rendering.rays import NOTHING, trace_pixels
 from phd_exp.rendering.sampling import sample_scene
-
-MakeSpec = Callable[..., DatasetSpec]
+from tests.support.renders import MakeSpec
 
 
 @pytest.fixture(scope="module")

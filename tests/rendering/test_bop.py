@@ -1,8 +1,6 @@
 """A rendered data set as BOP and back, its models against theory, and all of it by the BOP toolkit."""
 
-import io
 import json
-from collections.abc import Callable
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -12,16 +10,18 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from phd_exp.records.dataset import SPLITS, DatasetFolder, Manifest, Seal, image_name, sha256
+from phd_exp.records.dataset import SPLITS, DatasetFolder, sha256
 from phd_exp.records.own_images import detections_in, observed
-from phd_exp.records.scenes import SampleRecord
+from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.bop import number_of, write_bop
 from phd_exp.rendering.objects import sample_object_scene
 from phd_exp.rendering.rays import FACES, NOTHING, trace_pixels
 from phd_exp.rendering.samples import describe
 from phd_exp.rendering.sampling import sample_scene
+from tests.support.handmade import write_sealed
 from tests.support.meshes import solid, write_mesh
+from tests.support.renders import MakeSpec
 
 SIDE, N = 56, 6
 MESHES = {"mesh": solid("cube", 0.15, middle=(0.05, 0.0, 0.02))}
@@ -33,7 +33,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 @pytest.fixture(scope="module", params=VARIANTS)
 def folder(
-    request: pytest.FixtureRequest, make_spec: Callable[..., DatasetSpec], tmp_path_factory: pytest.TempPathFactory
+    request: pytest.FixtureRequest, make_spec: MakeSpec, tmp_path_factory: pytest.TempPathFactory
 ) -> DatasetFolder:
     """Records as they are rendered, and noise as images: nothing here depends on what an image shows."""
     place = tmp_path_factory.mktemp("renders")
@@ -44,23 +44,11 @@ def folder(
 
 
 def drawn(root: Path, spec: DatasetSpec) -> DatasetFolder:
-    folder, seals = DatasetFolder(root), {}
-    for split in SPLITS:
-        folder.split_folder(split).mkdir(parents=True)
-        lines = ""
-        for index in range(N):
-            stream = io.BytesIO()
-            noise = np.random.default_rng(index).integers(0, 256, (SIDE, SIDE, 3), dtype=np.uint8)
-            Image.fromarray(noise).save(stream, spec.image_format)
-            (folder.split_folder(split) / image_name(index, spec.image_format)).write_bytes(stream.getvalue())
-            scene = sample_object_scene(spec, split, index, MESHES) if spec.mesh else sample_scene(spec, split, index)
-            hits = trace_pixels(scene, MESHES)
-            record = describe(spec, split, index, scene, hits, sha256(stream.getvalue()), MESHES)
-            lines += record.model_dump_json() + "\n"
-        folder.metadata_path(split).write_text(lines)
-        seals[split] = Seal(n=N, metadata_sha256=sha256(lines.encode()))
-    folder.write_manifest(Manifest(generator=1, renderer="none", spec=spec, splits=seals))
-    return folder
+    def recorded(split: Split, index: int, content: bytes) -> SampleRecord:
+        scene = sample_object_scene(spec, split, index, MESHES) if spec.mesh else sample_scene(spec, split, index)
+        return describe(spec, split, index, scene, trace_pixels(scene, MESHES), sha256(content), MESHES)
+
+    return write_sealed(DatasetFolder(root), spec, dict.fromkeys(SPLITS, N), recorded, SIDE)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """Views of a detector's boxes: the box, the view and the labels against the geometry of the user's image."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +19,8 @@ from phd_exp.rendering.objects import sample_object_scene
 from phd_exp.rendering.rays import NOTHING, beyond_edges, in_camera_frame, rotation_matrix, trace_pixels
 from phd_exp.rendering.samples import GREY, make_sample, photograph
 from phd_exp.rendering.triangles import Triangles
-from tests.support.meshes import solid, write_mesh
-from tests.support.renders import decoded
+from tests.support.renders import MakeSpec, decoded, drawn
 
-MakeSpec = Callable[..., DatasetSpec]
 SIZE = {"width": 640, "height": 480, "K": (530.0, 0, 340, 0, 532.0, 236, 0, 0, 1)}
 CAMERA = SIZE | {"D": (-0.28, 0.03, 0.001, 0.0, 0.1), "model": "plumb_bob"}
 FISHEYE = CAMERA | {"D": (-0.03, 0.004, -0.002, 0.0003), "model": "equidistant"}
@@ -31,20 +28,9 @@ EXACT: dict[str, Any] = {"box_size": (1.0, 1.0), "box_shift": 0.0}
 
 
 @pytest.fixture(scope="module")
-def of_box(make_spec: MakeSpec, tmp_path_factory: pytest.TempPathFactory) -> MakeSpec:
+def of_box(of_mesh: MakeSpec) -> MakeSpec:
     """The data set of views of boxes of a cylinder of 0.2 m, with some values changed."""
-    file = write_mesh(tmp_path_factory.mktemp("mesh") / "part.stl", solid("cylinder"))
-    usual: dict[str, Any] = {"mesh": str(file), "camera": CAMERA, "z_range": (0.5, 1.5)}
-    return lambda **changes: make_spec("object", **usual | changes)
-
-
-@pytest.fixture(scope="module")
-def meshes() -> dict[str, Triangles]:
-    return {"mesh": solid("cylinder")}
-
-
-def drawn(spec: DatasetSpec, n: int, meshes: dict[str, Triangles]) -> list[Scene]:
-    return [sample_object_scene(spec, "train", index, meshes) for index in range(n)]
+    return lambda **changes: of_mesh(**{"camera": CAMERA, "z_range": (0.5, 1.5)} | changes)
 
 
 def outline(scene: Scene, mesh: Triangles) -> np.ndarray:

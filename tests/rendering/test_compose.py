@@ -1,6 +1,5 @@
 """Pictures show the objects where the scene says, and nothing but the backdrop elsewhere."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -8,14 +7,13 @@ import pytest
 
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.scenes import Backdrop, SampleRecord
-from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.antialias import REACH, edges
 from phd_exp.rendering.blender import Box
 from phd_exp.rendering.pixels import encoded
 from phd_exp.rendering.rays import Hits, cylinder_mask, trace_pixels
 from phd_exp.rendering.render import ensure_rendered
 from phd_exp.rendering.samples import backdrop_light, box_around
-from tests.support.renders import pixels, silhouettes
+from tests.support.renders import MakeSpec, pixels, silhouettes
 
 
 def backdrop_pixels(record: SampleRecord) -> np.ndarray:
@@ -80,7 +78,7 @@ def test_objects_are_where_the_scene_says(rendered: DatasetFolder) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_a_thousand_images_have_no_seam(make_spec: Callable[..., DatasetSpec], tmp_path: Path) -> None:
+def test_a_thousand_images_have_no_seam(make_spec: MakeSpec, tmp_path: Path) -> None:
     folder = DatasetFolder(tmp_path / "occl_scale")
     ensure_rendered(folder, make_spec("occl_scale", sensor_size=56, f_range=(300.0, 500.0)), 1000, 0)
     for record in folder.records("train"):

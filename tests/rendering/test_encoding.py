@@ -1,6 +1,9 @@
 """Image formats: the pixels that they keep, and data sets in each of them; light from OpenEXR files."""
 
-from collections.abc import Callable
+import importlib
+import json
+from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -8,11 +11,11 @@ import pytest
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.sources import RenderedSource
 from phd_exp.records.dataset import SPLITS, DatasetFolder
-from phd_exp.records.spec import DatasetSpec, ImageFormat
+from phd_exp.records.scenes import SampleRecord
+from phd_exp.records.spec import ImageFormat
 from phd_exp.rendering.pixels import encode, read_light
-from tests.support.renders import decoded
+from tests.support.renders import MakeSpec, decoded, pixels
 
-MakeSpec = Callable[..., DatasetSpec]
 LOSSY: tuple[ImageFormat, ...] = ("webp", "jpeg")
 
 
@@ -29,9 +32,9 @@ def psnr(one: np.ndarray, other: np.ndarray) -> float:
 
 def test_png_keeps_every_pixel(pictures: list[np.ndarray], make_spec: MakeSpec) -> None:
     rng = np.random.default_rng(0)
-    for pixels in (*pictures, rng.integers(0, 256, (20, 20, 3), dtype=np.uint8)):
+    for picture in (*pictures, rng.integers(0, 256, (20, 20, 3), dtype=np.uint8)):
         for quality in (1, 95):  # is not its business
-            assert (decoded(encode(pixels, make_spec(image_quality=quality))) == pixels).all()
+            assert (decoded(encode(picture, make_spec(image_quality=quality))) == picture).all()
 
 
 @pytest.mark.parametrize(("image_format", "share", "least"), [("webp", 0.25, 40.0), ("jpeg", 0.67, 45.0)])
@@ -40,17 +43,17 @@ def test_lossy_formats_are_small_and_near(
 ) -> None:
     """As configured: bytes against those of png, and the error in dB."""
     lossy = make_spec(image_format=image_format)
-    for pixels in pictures:
-        content = encode(pixels, lossy)
-        assert len(content) < share * len(encode(pixels, make_spec()))
-        assert psnr(decoded(content), pixels) > least
+    for picture in pictures:
+        content = encode(picture, lossy)
+        assert len(content) < share * len(encode(picture, make_spec()))
+        assert psnr(decoded(content), picture) > least
 
 
 @pytest.mark.parametrize("image_format", LOSSY)
 def test_quality_is_paid_in_bytes(pictures: list[np.ndarray], make_spec: MakeSpec, image_format: ImageFormat) -> None:
-    for pixels in pictures:
-        contents = [encode(pixels, make_spec(image_format=image_format, image_quality=q)) for q in (30, 60, 90, 100)]
-        sizes, errors = [len(content) for content in contents], [psnr(decoded(c), pixels) for c in contents]
+    for picture in pictures:
+        contents = [encode(picture, make_spec(image_format=image_format, image_quality=q)) for q in (30, 60, 90, 100)]
+        sizes, errors = [len(content) for content in contents], [psnr(decoded(c), picture) for c in contents]
         assert sizes == sorted(set(sizes))
         assert errors == sorted(set(errors))
 
@@ -62,8 +65,8 @@ def test_webp_files_hold_the_pixels_of_the_png_files(small: DatasetFolder, small
     for split, n in zip(SPLITS, (5, 2), strict=True):
         assert small_webp.images(split) == {f"{index:06d}.webp" for index in range(n)}
         for record, reference in zip(small_webp.records(split), small.records(split, n), strict=True):
-            pixels = decoded(small.image_path(split, record.index).read_bytes())
-            assert small_webp.image_path(split, record.index, "webp").read_bytes() == encode(pixels, spec)
+            reference_pixels = decoded(small.image_path(split, record.index).read_bytes())
+            assert small_webp.image_path(split, record.index, "webp").read_bytes() == encode(reference_pixels, spec)
             same = {"file_name": record.file_name, "sha256": record.sha256}
             assert record == reference.model_copy(update=same) != reference
 
@@ -109,3 +112,40 @@ def test_light_of_another_size_is_refused(light: np.ndarray, height: int, width:
 def test_a_file_of_another_kind_is_refused(content: bytes) -> None:
     with pytest.raises(ValueError, match="OpenEXR"):
         read_light(content, 4, 5)
+
+
+@pytest.fixture(params=["small", "small_webp"])
+def folder(request: pytest.FixtureRequest) -> DatasetFolder:
+    """Two splits, as PNG and as WebP."""
+    found = request.getfixturevalue(request.param)
+    assert isinstance(found, DatasetFolder)
+    return found
+
+
+@pytest.fixture
+def datasets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """Hugging Face `datasets`; what it may write and whom it may call, it asks once, as it is imported."""
+    for name in ("HF_HUB_OFFLINE", "HF_DATASETS_OFFLINE", "HF_HUB_DISABLE_TELEMETRY"):
+        monkeypatch.setenv(name, "1")
+    monkeypatch.setenv("HF_HOME", str(tmp_path / "home"))
+    return importlib.import_module("datasets")
+
+
+def as_read(record: SampleRecord) -> dict[str, object]:
+    """A record as JSON has it, but for the image's name."""
+    values: dict[str, object] = json.loads(record.model_dump_json())
+    del values["file_name"]
+    return values
+
+
+def test_hugging_face_reads_it(folder: DatasetFolder, datasets: ModuleType, tmp_path: Path) -> None:
+    data = datasets.load_dataset("imagefolder", data_dir=str(folder.root), cache_dir=str(tmp_path / "cache"))
+    assert set(data) == set(SPLITS)
+    for split in SPLITS:
+        records = folder.records(split)
+        assert data[split].num_rows == len(records) > 0
+        assert set(data[split].column_names) == {"image", *as_read(records[0])}
+        for row, record in zip(data[split], records, strict=True):
+            image = row.pop("image")
+            assert (np.asarray(image) == pixels(folder, record)).all()
+            assert row == as_read(record)

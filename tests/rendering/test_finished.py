@@ -2,7 +2,6 @@
 
 import io
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from phd_exp.rendering import finished as module
 from phd_exp.rendering.finished import require_elsewhere, verify
 from phd_exp.rendering.masks import write_masks
 from phd_exp.rendering.rays import cylinder_mask, trace_pixels
-from tests.support.renders import N_TEST, N_TRAIN
+from tests.support.renders import N_TEST, N_TRAIN, MakeSpec
 
 
 @pytest.fixture
@@ -119,9 +118,7 @@ def test_an_image_of_another_kind_is_named(
     assert said in line
 
 
-def test_another_data_set_and_none_are_refused(
-    small: DatasetFolder, make_spec: Callable[..., DatasetSpec], tmp_path: Path
-) -> None:
+def test_another_data_set_and_none_are_refused(small: DatasetFolder, make_spec: MakeSpec, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"f_range=\(300.0, 500.0\), but f_range=\(1200.0, 2000.0\) is asked for"):
         verify(small, make_spec(), rerender=0)
     with pytest.raises(DatasetError, match="no data set here"):

@@ -12,30 +12,29 @@ from PIL import Image
 
 from phd_exp.records.errors import RenderError
 from phd_exp.records.gltf import split_gltf
-from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering import importing
 from phd_exp.rendering.blender import Renderer, Settings
 from phd_exp.rendering.objects import sample_object_scene
 from phd_exp.rendering.rays import NOTHING, trace_pixels
 from phd_exp.rendering.triangles import Triangles
-from tests.support.meshes import ply_text, solid, write_mesh
+from tests.support.meshes import Y_UP, ply_text, solid, write_mesh
+from tests.support.renders import SMALL_MESH, MakeSpec
 
-MakeSpec = Callable[..., DatasetSpec]
 Change = Callable[[dict[str, Any]], None]
 CUBE = solid("cube")
+AT_MIDDLES = Settings(samples=1, denoised=False, at_middles=True)
 SIZE = pytest.approx((0.2, 0.2, 0.2), abs=1e-6)
-SMALL: dict[str, Any] = {"sensor_size": 56, "f_range": (300.0, 500.0), "xy_range": 0.2, "backdrops": None}
 COLOURS = [f"uchar {name}" for name in ("diffuse_red", "diffuse_green", "diffuse_blue")]
 SHORT = [f"uchar {name}" for name in "rgba"]
 
 
 @pytest.fixture
-def drawn(make_spec: MakeSpec) -> Callable[..., tuple[Renderer, np.ndarray]]:
+def drawn(of_mesh: MakeSpec) -> Callable[..., tuple[Renderer, np.ndarray]]:
     """A renderer of a mesh, and the mean colour of its opaque pixels, which are those of its labels."""
 
     def drawn(file: Path, index: int = 0, **changes: Any) -> tuple[Renderer, np.ndarray]:
-        spec = make_spec("object", mesh=str(file), **SMALL, **changes)
-        renderer = Renderer(Settings(samples=1, denoised=False, at_middles=True), spec)
+        spec = of_mesh(mesh=str(file), **SMALL_MESH, **changes)
+        renderer = Renderer(AT_MIDDLES, spec)
         scene = sample_object_scene(spec, "train", index, renderer.meshes)
         light = renderer.render(scene)
         opaque = light[..., 3] > 0.5
@@ -44,6 +43,41 @@ def drawn(make_spec: MakeSpec) -> Callable[..., tuple[Renderer, np.ndarray]]:
         return renderer, light[opaque][:, :3].mean(axis=0)
 
     return drawn
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".gltf", ".obj", ".ply", ".stl"])
+def test_every_format_gives_the_same_object_whatever_its_unit(tmp_path: Path, drawn: Callable, suffix: str) -> None:
+    """The reference point is in the file's axes and units; Blender draws what geometry says."""
+    middle = (0.03, -0.02, 0.05)
+    file = write_mesh(tmp_path / f"part{suffix}", solid("cylinder", 0.2, middle), per_metre=1000)
+    x, y, z = (1000 * value for value in middle)
+    point = (x, z, -y) if suffix in Y_UP else (x, y, z)
+    for index, (reference, away) in enumerate(((point, (0, 0, 0)), ("centroid", (0, 0, 0)), ("origin", middle))):
+        renderer, _ = drawn(file, index, reference=reference, unit=0.001)
+        expected = solid("cylinder", 0.2, away).vertices
+        assert bounds(renderer) == pytest.approx([*expected.min(axis=0), *expected.max(axis=0)], abs=1e-6)
+
+
+def bounds(renderer: Renderer) -> list[float]:
+    vertices = renderer.meshes["mesh"].vertices
+    return [*vertices.min(axis=0), *vertices.max(axis=0)]
+
+
+TURNED_PARENT = [{"children": [1], "rotation": [0, 0, 0.5**0.5, 0.5**0.5]}, {"mesh": 0, "translation": [0.1, 0, 0]}]
+ONE_MIRRORED = [{"mesh": 0, "translation": [0, 0, 1]}, {"mesh": 0, "scale": [-1, 2, 1]}, {"children": [0, 1]}]
+
+
+@pytest.mark.parametrize(
+    ("nodes", "expected"),
+    [(TURNED_PARENT, [-0.1, -0.1, 0.0, 0.1, 0.1, 0.2]), (ONE_MIRRORED, [-0.1, -1.1, -0.2, 0.1, 0.1, 0.2])],
+    ids=["a turned parent", "two instances, one mirrored"],
+)
+def test_the_parts_of_a_file_are_one_object(tmp_path: Path, drawn: Callable, nodes: Any, expected: Any) -> None:
+    """The axes of glTF are (x, y, z) = (x, z, -y) of the local frame."""
+    file = write_mesh(tmp_path / "part.gltf", CUBE)
+    roots = [number for number in range(len(nodes)) if not any(number in node.get("children", ()) for node in nodes)]
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"nodes": nodes, "scenes": [{"nodes": roots}]}))
+    assert bounds(drawn(file)[0]) == pytest.approx(expected, abs=1e-6)
 
 
 def scaled_with_targets(document: dict[str, Any]) -> None:
@@ -132,6 +166,7 @@ def test_colours_and_textures_are_drawn(tmp_path: Path, drawn: Callable) -> None
         "s": ply_text(CUBE, ("float s", "float t"), "0 0", comment="TextureFile my red.png").replace("\n", "\r\n"),
         "diffuse": ply_text(CUBE, COLOURS, "200 0 0"),
         "short": ply_text(CUBE, SHORT, "200 0 0 255"),
+        "plain": ply_text(CUBE, [f"uchar {name}" for name in ("red", "green", "blue")], "200 0 0"),
     }
     meshes = [tmp_path / f"{name}.ply" for name in files]
     for path, text in zip(meshes, files.values(), strict=True):
@@ -143,6 +178,17 @@ def test_colours_and_textures_are_drawn(tmp_path: Path, drawn: Callable) -> None
         assert renderer.meshes["mesh"].dimensions == SIZE
         _, plain = drawn(mesh, ignore=["materials"])
         assert colour[0] < 5 * max(plain[1:]), "the scene's own colour"
+
+
+def test_a_texture_is_part_of_the_mesh_and_must_be_there(tmp_path: Path, of_mesh: MakeSpec, drawn: Callable) -> None:
+    file = obj(tmp_path / "part.obj", "mtllib part.mtl\nusemtl wood\n", "newmtl wood\nmap_Kd wood.png\n")
+    with pytest.raises(RenderError, match=r"part\.obj: wood\.png is missing; .*data\.ignore=\[materials\]"):
+        drawn(file)
+    Image.new("RGB", (8, 8), (200, 0, 0)).save(tmp_path / "wood.png")
+    before = of_mesh(mesh=str(file)).mesh
+    assert list(before.files) == ["part.obj", "part.mtl", "wood.png"]
+    Image.new("RGB", (8, 8), (0, 200, 0)).save(tmp_path / "wood.png")
+    assert of_mesh(mesh=str(file)).mesh != before
 
 
 REFUSED = [
@@ -212,3 +258,40 @@ def test_the_reason_of_blenders_error_is_told(tmp_path: Path, drawn: Callable) -
         drawn(tmp_path / "a.stl")
     for text in (str(error.value), str(other.value)):
         assert not re.search(r"Location|\.py|/tmp", text)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "changes", "message"),
+    [
+        ("none.obj", b"v 0 0 0\n", {}, "has no faces; expected a surface"),
+        ("line.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", {}, "its faces have no area"),
+        ("text.stl", b"not a mesh", {}, "text.stl: .*Failed to read"),
+        ("short.ply", b"ply\nformat ascii 1.0\nelement face 10000000\nend_header\n", {}, "short.ply: "),
+        ("cup.stl", solid("cylinder", 200.0), {}, r"longest side is 200 m, .* set data\.unit=0\.001"),
+        ("cup.stl", solid("cylinder", 1e-4), {}, r"longest side is 0\.0001 m, .* set data\.unit=1000"),
+        ("cup.stl", solid("cylinder", 4.3), {}, r"farthest point 3\.04 m from the .* less than the least depth, 3 m"),
+        (
+            "cup.stl",
+            solid("cylinder", 2.4),
+            {"scale_range": (0.5, 2.0)},
+            r"farthest point 3\.39 m.* set data\.z_range",
+        ),
+        ("cup.stl", solid("cylinder", 0.2, (50, 0, 0)), {}, r"side is 0\.2 m, .* set data\.reference=centroid$"),
+        ("cup.stl", solid("cylinder", 200, (5e4, 0, 0)), {}, r"set data\.unit=0\.001 and data\.reference=centroid$"),
+        (
+            "cup.stl",
+            solid("cylinder", 0.2, (5e4, 0, 0)),
+            {"reference": "centroid"},
+            r"reach 5e\+04 units, .* move it",
+        ),
+    ],
+)
+def test_an_unusable_mesh_is_one_line(
+    of_mesh: MakeSpec, tmp_path: Path, name: str, content: Any, changes: dict[str, Any], message: str
+) -> None:
+    file = tmp_path / name
+    file.write_bytes(content) if isinstance(content, bytes) else write_mesh(file, content)
+    with pytest.raises(RenderError, match=message) as error:
+        Renderer(AT_MIDDLES, of_mesh(mesh=str(file), **changes))
+    assert "\n" not in str(error.value)
+    assert str(error.value).startswith(f"data.mesh: {name}: ")

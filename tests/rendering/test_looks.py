@@ -1,6 +1,5 @@
 """Varied looks: random surfaces and light, which change neither where things are nor the next image."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,22 +10,23 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer, Settings
 from phd_exp.rendering.objects import sample_object_scene
 from phd_exp.rendering.rays import NOTHING, trace_pixels
+from phd_exp.rendering.triangles import Triangles
 from tests.support.meshes import solid, write_mesh
+from tests.support.renders import SMALL_MESH, MakeSpec, drawn
 
-MakeSpec = Callable[..., DatasetSpec]
 ONE_SAMPLE = Settings(samples=1, denoised=False, at_middles=True)
 
 
 @pytest.fixture(scope="module")
-def spec(make_spec: MakeSpec, tmp_path_factory: pytest.TempPathFactory) -> DatasetSpec:
-    file = write_mesh(tmp_path_factory.mktemp("mesh") / "part.stl", solid("cylinder"))
-    return make_spec("object", mesh=str(file), looks="varied", distractors=3, sensor_size=56, f_range=(300.0, 500.0))
+def spec(of_mesh: MakeSpec) -> DatasetSpec:
+    return of_mesh(looks="varied", distractors=3, sensor_size=56, f_range=(300.0, 500.0))
 
 
-def test_every_object_has_a_look_and_objects_stay_where_they_are(spec: DatasetSpec) -> None:
-    meshes = {"mesh": solid("cylinder")}
-    scenes = [sample_object_scene(spec, "train", index, meshes) for index in range(40)]
-    plain = [sample_object_scene(spec.model_copy(update={"looks": "plain"}), "train", i, meshes) for i in range(40)]
+def test_every_object_has_a_look_and_objects_stay_where_they_are(
+    spec: DatasetSpec, meshes: dict[str, Triangles]
+) -> None:
+    scenes = drawn(spec, 40, meshes)
+    plain = drawn(spec.model_copy(update={"looks": "plain"}), 40, meshes)
     looks = [item.look for scene in scenes for item in scene.objects]
     assert {look.pattern for look in looks} == set(PATTERNS)
     assert 0.3 < np.mean([bool(scene.lamps) for scene in scenes]) < 0.7
@@ -41,7 +41,7 @@ def test_every_object_has_a_look_and_objects_stay_where_they_are(spec: DatasetSp
 def test_an_image_depends_on_its_scene_alone(spec: DatasetSpec) -> None:
     """Materials and lamps of the image before are gone; silhouettes are where the labels are."""
     renderer = Renderer(ONE_SAMPLE, spec)
-    scenes = [sample_object_scene(spec, "train", index, renderer.meshes) for index in range(6)]
+    scenes = drawn(spec, 6, renderer.meshes)
     images = [renderer.render(scene) for scene in scenes]
     for scene, image in reversed(list(zip(scenes, images, strict=True))):
         np.testing.assert_array_equal(renderer.render(scene), image)
@@ -49,12 +49,11 @@ def test_an_image_depends_on_its_scene_alone(spec: DatasetSpec) -> None:
         assert (opacity != (trace_pixels(scene, renderer.meshes).first != NOTHING)).mean() < 0.02
 
 
-def test_a_texture_changes_its_tone(make_spec: MakeSpec, tmp_path: Path) -> None:
+def test_a_texture_changes_its_tone(of_mesh: MakeSpec, tmp_path: Path) -> None:
     file = write_mesh(tmp_path / "part.obj", solid("cube"))
     file.write_text("mtllib part.mtl\n" + file.read_text().replace("f ", "usemtl red\nf ", 1))
     (tmp_path / "part.mtl").write_text("newmtl red\nKd 0.5 0.1 0.1\n")
-    small = {"sensor_size": 56, "f_range": (300.0, 500.0), "xy_range": 0.2, "backdrops": None}
-    spec = make_spec("object", mesh=str(file), looks="varied", **small)
+    spec = of_mesh(mesh=str(file), looks="varied", **SMALL_MESH)
     renderer = Renderer(ONE_SAMPLE, spec)
     scene = sample_object_scene(spec, "train", 0, renderer.meshes)
     item = scene.objects[0]

@@ -1,7 +1,6 @@
 """Masks and clearings next to the images: what they show, and when they are drawn."""
 
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,7 @@ from phd_exp.rendering.render import ensure_rendered
 from phd_exp.rendering.samples import describe
 from phd_exp.rendering.sampling import sample_scene
 from phd_exp.rendering.triangles import NO_MESHES
-from tests.support.meshes import solid, write_mesh
-from tests.support.renders import N_TEST, N_TRAIN
+from tests.support.renders import N_TEST, N_TRAIN, MakeSpec
 
 
 @pytest.fixture
@@ -34,9 +32,7 @@ def old(folder: DatasetFolder, small_spec: DatasetSpec, copied: None) -> Dataset
 
 
 @pytest.mark.parametrize("variant", ["default", "occl_scale"])
-def test_a_cell_is_the_share_of_its_pixels_that_show_the_object(
-    variant: str, make_spec: Callable[..., DatasetSpec]
-) -> None:
+def test_a_cell_is_the_share_of_its_pixels_that_show_the_object(variant: str, make_spec: MakeSpec) -> None:
     spec = make_spec(variant, sensor_size=224)
     for index in range(20):
         scene = sample_scene(spec, "train", index)
@@ -47,11 +43,8 @@ def test_a_cell_is_the_share_of_its_pixels_that_show_the_object(
         assert found.sum() == pytest.approx(share.sum(), rel=0.05, abs=0.3)
 
 
-def test_each_image_has_its_mask_and_each_of_a_mesh_its_clearing(
-    make_spec: Callable[..., DatasetSpec], tmp_path: Path
-) -> None:
-    part = write_mesh(tmp_path / "part.stl", solid("cylinder"))
-    spec = make_spec("object", mesh=str(part), distractors=1, sensor_size=60, f_range=(343.0, 571.0))
+def test_each_image_has_its_mask_and_each_of_a_mesh_its_clearing(of_mesh: MakeSpec, tmp_path: Path) -> None:
+    spec = of_mesh(distractors=1, sensor_size=60, f_range=(343.0, 571.0))
     folder, behind = (DatasetFolder(tmp_path / one.variant) for one in (spec, spec.without_objects))
     ensure_rendered(folder, spec, 2, 1, workers=1)
     ensure_rendered(behind, spec.without_objects, 2, 0, workers=1)

@@ -1,6 +1,6 @@
 """Images of a few samples are nearly as clean on metal as on rubber: none has speckles."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import get_args
 
@@ -15,6 +15,7 @@ from phd_exp.rendering.objects import sample_object_scene
 from phd_exp.rendering.rays import cylinder_mask, trace_pixels
 from phd_exp.rendering.samples import fast_settings
 from tests.support.meshes import solid, write_mesh
+from tests.support.renders import MakeSpec
 
 BORDER = 2  # px inside the silhouette: edges have errors of their own
 SCENES = 2
@@ -27,12 +28,12 @@ pytestmark = pytest.mark.slow
 @pytest.mark.parametrize("backdrops", ["hdri", None], ids=["sky", "lamps"])
 @pytest.mark.parametrize("shape", ["sphere", "cube", "monkey"])
 def test_metal_is_at_most_twice_as_noisy_as_rubber_or_its_noise_is_invisible(
-    make_spec: Callable[..., DatasetSpec], tmp_path: Path, shape: str, backdrops: str | None
+    of_mesh: MakeSpec, tmp_path: Path, shape: str, backdrops: str | None
 ) -> None:
     file = tmp_path / "mesh.glb"
     _write_monkey(file) if shape == "monkey" else write_mesh(file, solid(shape))  # type: ignore[arg-type]
     small = {"sensor_size": 96, "f_range": (1600.0, 1600.0), "z_range": (4.0, 4.0), "xy_range": 0.0}
-    spec = make_spec("object", mesh=str(file), backdrops=backdrops, **small)
+    spec = of_mesh(mesh=str(file), backdrops=backdrops, **small)
     fast, exact = (dict(_images(settings, spec)) for settings in (fast_settings(spec), EXACT))
     noise = {
         material: np.mean([_noise(fast[key][0] - exact[key][0], fast[key][1]) for key in fast if key[1] == material])

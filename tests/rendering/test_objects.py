@@ -1,8 +1,6 @@
 """Scenes of a mesh: its size, pose and surroundings, and its silhouette against geometry and Blender."""
 
-import json
 import time
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -12,42 +10,28 @@ import pytest
 from PIL import Image
 from scipy import stats
 
-from phd_exp.records.errors import RenderError
 from phd_exp.records.scenes import Pose, Scene, Surroundings
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.antialias import coverage
 from phd_exp.rendering.blender import Renderer, Settings, load_bpy
 from phd_exp.rendering.objects import REACH, sample_object_scene, upright_rotation
 from phd_exp.rendering.pixels import Box
-from phd_exp.rendering.rays import NOTHING, cylinder_mask, rotation_matrix, trace_pixels, truncation, visibility
+from phd_exp.rendering.rays import cylinder_mask, rotation_matrix, trace_pixels, truncation, visibility
 from phd_exp.rendering.render import by_sky
 from phd_exp.rendering.samples import fast_settings, make_sample, shadow
 from phd_exp.rendering.sampling import about_axis, sample_scene
 from phd_exp.rendering.surroundings import photo_light, shaken
 from phd_exp.rendering.triangles import Triangles
 from tests.support.meshes import solid, write_mesh
-from tests.support.renders import decoded
+from tests.support.renders import UNLIKELY, MakeSpec, decoded, drawn
 
-MakeSpec = Callable[..., DatasetSpec]
 SKIES = {"night", "city", "interior", "forest", "studio", "sunset", "sunrise", "courtyard"}
 AT_MIDDLES = Settings(samples=1, denoised=False, at_middles=True)
-UNLIKELY = 1e-3
 
 
 @pytest.fixture(scope="module")
-def of_mesh(make_spec: MakeSpec, tmp_path_factory: pytest.TempPathFactory) -> MakeSpec:
-    """The data set of a cylinder as a mesh, with some values changed."""
-    file = write_mesh(tmp_path_factory.mktemp("mesh") / "part.stl", solid("cylinder"))
-    return lambda **changes: make_spec("object", mesh=str(file), **changes)
-
-
-@pytest.fixture(scope="module")
-def meshes() -> dict[str, Triangles]:
-    return {"mesh": solid("cylinder"), "mesh1": solid("cube", 0.1)}
-
-
-def drawn(spec: DatasetSpec, n: int, meshes: dict[str, Triangles], split: Any = "train") -> list[Scene]:
-    return [sample_object_scene(spec, split, index, meshes) for index in range(n)]
+def meshes(meshes: dict[str, Triangles]) -> dict[str, Triangles]:
+    return meshes | {"mesh1": solid("cube", 0.1)}
 
 
 def test_a_cylinder_as_a_mesh_is_the_analytic_cylinder(of_mesh: MakeSpec, meshes: dict[str, Triangles]) -> None:
@@ -68,63 +52,6 @@ def test_a_cylinder_as_a_mesh_is_the_analytic_cylinder(of_mesh: MakeSpec, meshes
         assert np.quantile(error, 0.99) < 1e-3, "except where rays graze"
         cut += truncation(scene, hits, meshes) > 0
     assert cut > 3
-
-
-@pytest.mark.parametrize("suffix", [".glb", ".gltf", ".obj", ".ply", ".stl"])
-def test_every_format_gives_the_same_object_whatever_its_unit(
-    make_spec: MakeSpec, tmp_path: Path, suffix: str
-) -> None:
-    """The reference point is in the file's axes and units; Blender draws what geometry says."""
-    middle = (0.03, -0.02, 0.05)
-    file = write_mesh(tmp_path / f"part{suffix}", solid("cylinder", 0.2, middle), per_metre=1000)
-    x, y, z = (1000 * value for value in middle)
-    point = (x, z, -y) if suffix in (".glb", ".gltf", ".obj") else (x, y, z)
-    small: dict[str, Any] = {"sensor_size": 112, "f_range": (600.0, 1000.0), "backdrops": None, "unit": 0.001}
-    for reference, away in ((point, (0, 0, 0)), ("centroid", (0, 0, 0)), ("origin", middle)):
-        spec = make_spec("object", mesh=str(file), reference=reference, **small)
-        renderer = Renderer(AT_MIDDLES, spec)
-        vertices = renderer.meshes["mesh"].vertices
-        expected = solid("cylinder", 0.2, away).vertices
-        assert [vertices.min(axis=0), vertices.max(axis=0)] == [
-            pytest.approx(expected.min(axis=0), abs=1e-6),
-            pytest.approx(expected.max(axis=0), abs=1e-6),
-        ]
-    for index in range(2):
-        scene = sample_object_scene(spec, "train", index, renderer.meshes)
-        opaque = renderer.render(scene)[..., 3] > 0.5
-        assert (opaque != (trace_pixels(scene, renderer.meshes).surfaces[0] != NOTHING)).sum() <= 5
-
-
-@pytest.mark.parametrize(
-    ("nodes", "low", "high"),
-    [
-        (
-            [{"children": [1], "rotation": [0, 0, 0.5**0.5, 0.5**0.5]}, {"mesh": 0, "translation": [1, 0, 0]}],
-            (-0.1, -0.1, 0.9),
-            (0.1, 0.1, 1.1),
-        ),
-        (
-            [{"mesh": 0, "translation": [0, 0, 1]}, {"mesh": 0, "scale": [-1, 2, 1]}, {"children": [0, 1]}],
-            (-0.1, -1.1, -0.2),
-            (0.1, 0.1, 0.2),
-        ),
-    ],
-    ids=["a turned parent", "two instances, one mirrored"],
-)
-def test_the_parts_of_a_file_are_one_object(
-    make_spec: MakeSpec, tmp_path: Path, nodes: Any, low: Any, high: Any
-) -> None:
-    """The axes of glTF are (x, y, z) = (x, z, -y) of the local frame."""
-    file = write_mesh(tmp_path / "part.gltf", solid("cube"))
-    roots = [number for number in range(len(nodes)) if not any(number in node.get("children", ()) for node in nodes)]
-    file.write_text(json.dumps(json.loads(file.read_text()) | {"nodes": nodes, "scenes": [{"nodes": roots}]}))
-    spec = make_spec("object", mesh=str(file), backdrops=None, sensor_size=112, f_range=(300.0, 500.0))
-    renderer = Renderer(AT_MIDDLES, spec)
-    vertices = renderer.meshes["mesh"].vertices
-    assert [*vertices.min(axis=0), *vertices.max(axis=0)] == pytest.approx([*low, *high], abs=1e-6)
-    scene = sample_object_scene(spec, "train", 0, renderer.meshes)
-    opaque = renderer.render(scene)[..., 3] > 0.5
-    assert (opaque != (trace_pixels(scene, renderer.meshes).surfaces[0] != NOTHING)).sum() <= 5
 
 
 def test_depths_are_those_of_rays(meshes: dict[str, Triangles]) -> None:
@@ -268,81 +195,6 @@ def test_records_of_cylinders_stay_as_they_were(
     assert (stored, stored.fingerprint()) == (spec, spec.fingerprint())
     with pytest.raises(ValueError, match="no record says where part"):
         stored.mesh.path("part.stl")
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "changes", "message"),
-    [
-        ("none.obj", b"v 0 0 0\n", {}, "has no faces; expected a surface"),
-        ("line.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", {}, "its faces have no area"),
-        ("text.stl", b"not a mesh", {}, "text.stl: .*Failed to read"),
-        ("short.ply", b"ply\nformat ascii 1.0\nelement face 10000000\nend_header\n", {}, "short.ply: "),
-        ("cup.stl", solid("cylinder", 200.0), {}, r"longest side is 200 m, .* set data\.unit=0\.001"),
-        ("cup.stl", solid("cylinder", 1e-4), {}, r"longest side is 0\.0001 m, .* set data\.unit=1000"),
-        ("cup.stl", solid("cylinder", 4.3), {}, r"farthest point 3\.04 m from the .* less than the least depth, 3 m"),
-        (
-            "cup.stl",
-            solid("cylinder", 2.4),
-            {"scale_range": (0.5, 2.0)},
-            r"farthest point 3\.39 m.* set data\.z_range",
-        ),
-        ("cup.stl", solid("cylinder", 0.2, (50, 0, 0)), {}, r"side is 0\.2 m, .* set data\.reference=centroid$"),
-        ("cup.stl", solid("cylinder", 200, (5e4, 0, 0)), {}, r"set data\.unit=0\.001 and data\.reference=centroid$"),
-        (
-            "cup.stl",
-            solid("cylinder", 0.2, (5e4, 0, 0)),
-            {"reference": "centroid"},
-            r"reach 5e\+04 units, .* move it",
-        ),
-    ],
-)
-def test_an_unusable_mesh_is_one_line(
-    make_spec: MakeSpec, tmp_path: Path, name: str, content: Any, changes: dict[str, Any], message: str
-) -> None:
-    file = tmp_path / name
-    file.write_bytes(content) if isinstance(content, bytes) else write_mesh(file, content)
-    spec = make_spec("object", mesh=str(file), **changes)
-    with pytest.raises(RenderError, match=message) as error:
-        Renderer(AT_MIDDLES, spec)
-    assert "\n" not in str(error.value)
-    assert str(error.value).startswith(f"data.mesh: {name}: ")
-
-
-def test_a_texture_is_part_of_the_mesh_and_must_be_there(make_spec: MakeSpec, tmp_path: Path) -> None:
-    file = write_mesh(tmp_path / "part.obj", solid("cube"))
-    file.write_text("mtllib part.mtl\n" + file.read_text().replace("f ", "usemtl wood\nf ", 1))
-    (tmp_path / "part.mtl").write_text("newmtl wood\nmap_Kd wood.png\n")
-    with pytest.raises(RenderError, match=r"part\.obj: wood\.png is missing; .*data\.ignore=\[materials\]"):
-        Renderer(AT_MIDDLES, make_spec("object", mesh=str(file)))
-    Image.new("RGB", (8, 8), (200, 0, 0)).save(tmp_path / "wood.png")
-    spec = make_spec("object", mesh=str(file), backdrops=None, sensor_size=56, f_range=(300.0, 500.0), xy_range=0.2)
-    assert list(spec.mesh.files) == ["part.obj", "part.mtl", "wood.png"]
-    renderer = Renderer(AT_MIDDLES, spec)
-    scene = sample_object_scene(spec, "train", 0, renderer.meshes)
-    red, green, _, opacity = renderer.render(scene)[28, 28]
-    assert (opacity, red > 5 * green) == (1.0, True)
-    Image.new("RGB", (8, 8), (0, 200, 0)).save(tmp_path / "wood.png")
-    assert make_spec("object", mesh=str(file)).mesh != spec.mesh
-
-
-def test_vertices_keep_their_colours(make_spec: MakeSpec, tmp_path: Path) -> None:
-    mesh, axes = solid("cube"), "".join(f"property float {axis}\n" for axis in "xyz")
-    colours = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
-    faces = f"element face {len(mesh.corners)}\nproperty list uchar int vertex_indices\nend_header\n"
-    rows = [*(f"{x} {y} {z} 0 200 0" for x, y, z in mesh.vertices), *(f"3 {a} {b} {c}" for a, b, c in mesh.corners)]
-    head = f"ply\nformat ascii 1.0\nelement vertex {len(mesh.vertices)}\n{axes}{colours}{faces}"
-    (tmp_path / "part.ply").write_text(head + "\n".join(rows) + "\n")
-    spec = make_spec(
-        "object",
-        mesh=str(tmp_path / "part.ply"),
-        backdrops=None,
-        sensor_size=56,
-        f_range=(300.0, 500.0),
-        xy_range=0.2,
-    )
-    renderer = Renderer(AT_MIDDLES, spec)
-    red, green, _, opacity = renderer.render(sample_object_scene(spec, "train", 0, renderer.meshes))[28, 28]
-    assert (opacity, green > 5 * red) == (1.0, True)
 
 
 @pytest.fixture(scope="module")

@@ -1,16 +1,11 @@
 """Progress in a log file: a line now and then, and one at the end; no time before it can be measured."""
 
-import re
-from collections.abc import Callable, Iterable
-from pathlib import Path
+from collections.abc import Iterable
 
 import pytest
 
-from phd_exp.records.dataset import DatasetFolder
-from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering import progress
 from phd_exp.rendering.progress import FEWEST, PATIENCE, Forecast, shown_progress
-from phd_exp.rendering.render import _first_words
 
 
 @pytest.fixture
@@ -66,11 +61,3 @@ def test_a_long_render_names_the_smaller_choice_once(clock: list[float], capsys:
     assert text.count("about 2.2 h left; fewer images: preset=demo") == 1
     advanced(clock, (60.0 + 2 * image for image in range(12)), 100, remedy="fewer images: preset=demo")
     assert "preset=demo" not in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("variant", ["default", "occl_scale"])
-def test_no_time_is_promised_before_an_image_is_measured(make_spec: Callable[..., DatasetSpec], variant: str) -> None:
-    for resumed in (False, True):
-        words = _first_words(DatasetFolder(Path("x")), make_spec(variant), 4200, 2, resumed=resumed)
-        assert "4200 images" in words
-        assert not re.search(r"\d+(\.\d)? (s|min|h)\b", words)

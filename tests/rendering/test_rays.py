@@ -1,27 +1,19 @@
-"""Ray casting against a search along every ray, and counts of pixels; rotations against those of scipy."""
+"""Ray casting against a search along every ray, and counts of pixels; the meshes of the same solids; rotations."""
 
 import math
-from collections.abc import Callable
+from collections import Counter
+from typing import get_args
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from phd_exp.records.scenes import Scene, SceneObject
-from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.rays import (
-    NOTHING,
-    cylinder_mask,
-    rotation_matrix,
-    trace_pixels,
-    trace_points,
-    truncation,
-    visibility,
-)  # fmt: skip
+from phd_exp.records.scenes import Scene, SceneObject, Shape
+from phd_exp.rendering.meshes import Mesh, build_mesh
+from phd_exp.rendering.rays import rotation_matrix, trace_pixels, trace_points, truncation, visibility
 from phd_exp.rendering.sampling import about_axis, uniform_rotation
 from tests.support.renders import placed, silhouettes, with_objects
 
-MakeSpec = Callable[..., DatasetSpec]
 STEP = 2e-3  # m
 
 
@@ -68,39 +60,9 @@ def test_points_at_the_middles_of_pixels_meet_what_pixels_meet(scenes: list[Scen
         assert (points.surfaces == pixels.surfaces).all()
 
 
-def test_what_is_seen_is_the_nearest(scenes: list[Scene]) -> None:
-    for scene in scenes:
-        hits = trace_pixels(scene)
-        nothing = np.isinf(hits.depths).all(axis=0)
-        assert ((hits.first == NOTHING) == nothing).all()
-        depth_of_first = np.where(hits.surfaces == hits.first, hits.depths, np.inf).min(axis=0)
-        assert (depth_of_first[~nothing] == hits.depths.min(axis=0)[~nothing]).all()
-
-
 def test_what_lies_behind_the_camera_is_not_seen(scenes: list[Scene]) -> None:
     scene = with_objects(scenes[0], placed(scenes[0], position=(0.0, 0.0, -3.0)))
     assert not silhouettes(trace_pixels(scene)).any()
-
-
-def test_axes_and_pixel_middles(scenes: list[Scene]) -> None:
-    """x points right, y down, z away; the principal point lies between the four middle pixels."""
-    side, f = scenes[0].S, scenes[0].f
-    for direction, (row, column) in {(1, 0): (0, 10), (0, 1): (10, 0)}.items():
-        centre = tuple(10 * 4.0 / f * axis for axis in direction)
-        ball = placed(scenes[0], shape="sphere", position=(*centre, 4.0))
-        mask = cylinder_mask(trace_pixels(with_objects(scenes[0], ball)))
-        middle = np.argwhere(mask).mean(axis=0) + 0.5
-        assert middle == pytest.approx([side / 2 + row, side / 2 + column], abs=0.2)
-
-
-def test_the_axis_of_a_cylinder_is_its_local_z(scenes: list[Scene]) -> None:
-    """The silhouette is a disc along the axis, and a square from the side."""
-    area = (2 * 0.1 * scenes[0].f / 4.0) ** 2
-    along = placed(scenes[0], position=(0.0, 0.0, 4.1))
-    aside = placed(scenes[0], position=(0.0, 0.0, 4.1), rotation=(0.5**0.5, 0.5**0.5, 0.0, 0.0))
-    for item, share in ((along, np.pi / 4), (aside, 1.0)):
-        pixels = silhouettes(trace_pixels(with_objects(scenes[0], item))).sum()
-        assert pixels == pytest.approx(area * share, rel=0.12)
 
 
 def test_visibility_counts_pixels(scenes: list[Scene]) -> None:
@@ -146,3 +108,36 @@ def test_a_turn_about_an_axis_is_right_handed(angle: float) -> None:
     for axis in ((1.0, 0.0, 0.0), (0.0, 0.6, -0.8)):
         expected = Rotation.from_rotvec(angle * np.array(axis)).as_matrix()
         assert rotation_matrix(about_axis(axis, angle)) == pytest.approx(expected, abs=1e-12)
+
+
+VOLUME = {"cylinder": 2 * math.pi, "cube": 8.0, "sphere": 4 / 3 * math.pi}
+SHAPES = get_args(Shape)
+
+
+def directed_edges(mesh: Mesh) -> Counter[tuple[tuple[float, ...], tuple[float, ...]]]:
+    """Edges by the places of their ends: vertices that share a place are one."""
+    places = [tuple(np.round(point, 9).tolist()) for point in mesh.vertices]
+    return Counter(
+        (places[a], places[b]) for face in mesh.faces for a, b in zip(face, (*face[1:], face[0]), strict=True)
+    )
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_mesh_is_closed_faces_outward_and_is_its_solid(shape: Shape) -> None:
+    mesh = build_mesh(shape)
+    edges = directed_edges(mesh)
+    assert set(edges.values()) == {1}, "every edge is walked once in each direction"
+    assert all((b, a) in edges for a, b in edges)
+
+    points = np.array(mesh.vertices)
+    triangles = [(face[0], face[k], face[k + 1]) for face in mesh.faces for k in range(1, len(face) - 1)]
+    volume = np.linalg.det(points[np.array(triangles)]).sum() / 6
+    assert volume == pytest.approx(VOLUME[shape], rel=1e-3), "positive, since faces look outward"
+
+    x, y, z = points.T
+    distance = {
+        "cylinder": np.maximum(np.hypot(x, y), np.abs(z)),
+        "cube": np.abs(points).max(axis=1),
+        "sphere": np.linalg.norm(points, axis=1),
+    }[shape]
+    assert distance == pytest.approx(1.0), "every vertex lies on the surface"

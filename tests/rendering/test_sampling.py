@@ -1,6 +1,5 @@
 """Scenes follow the paper's laws, depend on (seed, split, index) alone, and are paired across variants."""
 
-from collections.abc import Callable
 from colorsys import rgb_to_hsv
 
 import numpy as np
@@ -8,14 +7,11 @@ import pytest
 from scipy import stats
 
 from phd_exp.records.scenes import Scene
-from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.rays import NOTHING, rotation_matrix, trace_pixels, truncation, visibility
 from phd_exp.rendering.sampling import sample_scene
-from tests.support.renders import VARIANTS, with_objects
+from tests.support.renders import UNLIKELY, VARIANTS, MakeSpec, with_objects
 
-MakeSpec = Callable[..., DatasetSpec]
 MANY = 1000
-UNLIKELY = 1e-3  # the seeds are fixed: a law either holds at this level for ever or never
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +90,7 @@ def unscaled(scene: Scene) -> Scene:
     return scene.model_copy(update={"objects": objects})
 
 
-@pytest.mark.parametrize(("variant", "index"), [("occl_scale", 5), ("multiview", 6)])
+@pytest.mark.parametrize(("variant", "index"), [("occl_scale", 5), ("multiview", 7), ("sequence", 39)])
 def test_a_scene_depends_only_on_seed_split_and_index(make_spec: MakeSpec, variant: str, index: int) -> None:
     spec = make_spec(variant)
     scene = sample_scene(spec, "train", index)

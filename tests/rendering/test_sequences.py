@@ -1,25 +1,19 @@
 """Sequences: smooth motions whose every frame has the distribution of single images, and whose first frame is one."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.scenes import SceneObject
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.rays import in_camera_frame, rotation_matrix, trace_pixels
-from phd_exp.rendering.render import ensure_rendered
 from phd_exp.rendering.samples import describe
 from phd_exp.rendering.sampling import sample_scene
 from phd_exp.rendering.triangles import NO_MESHES
-from tests.support.renders import contents
+from tests.support.renders import UNLIKELY, MakeSpec
 
-MakeSpec = Callable[..., DatasetSpec]
 SEQUENCES, FRAMES = 150, 25
-UNLIKELY = 1e-3  # the seeds are fixed: a law either holds at this level for ever or never
 MOVING_CAMERA = {"camera_speed": 0.3, "camera_turn": 8.0}
 
 
@@ -132,16 +126,3 @@ def test_the_camera_moves_as_specified(make_spec: MakeSpec) -> None:
     turns = [rotation_matrix(b.rotation) @ rotation_matrix(a.rotation).T for a, b in poses]
     rates = np.degrees(Rotation.from_matrix(turns).as_rotvec()) * spec.frame_rate
     np.testing.assert_allclose(np.sqrt((rates**2).mean(0)), 8.0, rtol=0.15)
-
-
-@pytest.mark.slow
-def test_bytes_do_not_depend_on_workers_or_interruptions(make_spec: MakeSpec, tmp_path) -> None:
-    small = {"sensor_size": 56, "f_range": (300.0, 500.0), "samples_per_pixel": 1}
-    spec = make_spec("sequence", frames=3, occluders=True, **small)
-    whole, resumed = DatasetFolder(tmp_path / "whole"), DatasetFolder(tmp_path / "resumed")
-    ensure_rendered(whole, spec, 3, 6, workers=1)
-    ensure_rendered(resumed, spec, 2, 1, workers=1)
-    ensure_rendered(resumed, spec, 3, 6, workers=2)
-    assert contents(whole) == contents(resumed)
-    records = whole.records("test")
-    assert [(record.track, record.time) for record in records] == [(n, k / 30) for n in "01" for k in range(3)]

@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 
 from phd_exp.records.scenes import Scene, Shape
-from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer, Settings, load_bpy
 from phd_exp.rendering.rays import FACES, NOTHING, cylinder_mask, in_camera_frame, trace_pixels, visibility
 from phd_exp.rendering.sampling import sample_scene
-from tests.support.renders import VARIANTS, with_objects
+from tests.support.renders import VARIANTS, MakeSpec, with_objects
 
-MakeSpec = Callable[..., DatasetSpec]
 SHAPES = get_args(Shape)
 # Meshes are polygons, up to 0.01 px inside their solids: a silhouette of a thousand pixels' length shifts ten.
 FEW = 10  # px

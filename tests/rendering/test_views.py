@@ -1,6 +1,5 @@
 """Several views of one scene: one geometry, and each view alone as any first view is."""
 
-from collections.abc import Callable
 from itertools import combinations
 
 import numpy as np
@@ -14,10 +13,9 @@ from phd_exp.rendering.rays import trace_pixels
 from phd_exp.rendering.samples import describe
 from phd_exp.rendering.sampling import CLEARANCE, sample_scene
 from phd_exp.rendering.triangles import NO_MESHES
+from tests.support.renders import UNLIKELY, MakeSpec
 
-MakeSpec = Callable[..., DatasetSpec]
 SCENES, VIEWS = 200, 4
-UNLIKELY = 1e-3  # the seeds are fixed: a law either holds at this level for ever or never
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,7 @@
 """A small data set made without a renderer: noise as images, known positions."""
 
 import io
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from PIL import Image
@@ -14,11 +14,11 @@ from phd_exp.rendering.masks import ensure_drawn
 SIDE = 64
 
 
-def picture(index: int) -> np.ndarray:
-    return np.random.default_rng(index).integers(0, 256, (SIDE, SIDE, 3), dtype=np.uint8)
+def picture(index: int, side: int) -> np.ndarray:
+    return np.random.default_rng(index).integers(0, 256, (side, side, 3), dtype=np.uint8)
 
 
-def record(index: int, split: Split, content: bytes) -> SampleRecord:
+def record(split: Split, index: int, content: bytes) -> SampleRecord:
     position = (0.01 * index, -0.01 * index, 3.5 + 0.1 * index)
     cylinder = SceneObject(
         shape="cylinder",
@@ -53,19 +53,31 @@ def record(index: int, split: Split, content: bytes) -> SampleRecord:
     )
 
 
+Recorded = Callable[[Split, int, bytes], SampleRecord]
+"""Split, index and image file of a sample -> its record."""
+
+
 def write_handmade(folder: DatasetFolder, spec: DatasetSpec, counts: Mapping[Split, int]) -> DatasetFolder:
     """Write a sealed data set of so many samples per split."""
+    write_sealed(folder, spec, counts, record, SIDE)
+    ensure_drawn(folder, spec, counts.get("train", 0))
+    return folder
+
+
+def write_sealed(
+    folder: DatasetFolder, spec: DatasetSpec, counts: Mapping[Split, int], recorded: Recorded, side: int
+) -> DatasetFolder:
+    """The same for records of any make, without masks."""
     seals = {}
     for split, n in counts.items():
         folder.split_folder(split).mkdir(parents=True)
         lines = ""
         for index in range(n):
             buffer = io.BytesIO()
-            Image.fromarray(picture(index)).save(buffer, format="png")
-            folder.image_path(split, index).write_bytes(buffer.getvalue())
-            lines += record(index, split, buffer.getvalue()).model_dump_json() + "\n"
+            Image.fromarray(picture(index, side)).save(buffer, spec.image_format)
+            folder.image_path(split, index, spec.image_format).write_bytes(buffer.getvalue())
+            lines += recorded(split, index, buffer.getvalue()).model_dump_json() + "\n"
         folder.metadata_path(split).write_text(lines)
         seals[split] = Seal(n=n, metadata_sha256=sha256(lines.encode()))
     folder.write_manifest(Manifest(generator=1, renderer="none", spec=spec, splits=seals))
-    ensure_drawn(folder, spec, counts.get("train", 0))
     return folder

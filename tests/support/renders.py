@@ -16,8 +16,15 @@ from phd_exp.records.dataset import SPLITS, DatasetFolder
 from phd_exp.records.files import read_jsonl, write_atomic
 from phd_exp.records.scenes import SampleRecord, Scene, SceneObject, Split
 from phd_exp.records.spec import DatasetSpec, Shard
+from phd_exp.rendering.objects import sample_object_scene
 from phd_exp.rendering.rays import NOTHING, Hits, Mask
+from phd_exp.rendering.triangles import Meshes
 
+MakeSpec = Callable[..., DatasetSpec]
+"""The fixture `make_spec`."""
+UNLIKELY = 1e-3  # the seeds are fixed: a law either holds at this level for ever or never
+SMALL_MESH: dict[str, Any] = {"sensor_size": 56, "f_range": (300.0, 500.0), "xy_range": 0.2, "backdrops": None}
+"""Values of a data set with a mesh whose images are cheap."""
 ROOT = Path(__file__).parents[2]
 PATIENCE = 60.0  # s
 N_TRAIN, N_TEST = 12, 4
@@ -130,6 +137,11 @@ def rendering_elsewhere(
 def silhouettes(hits: Hits) -> Mask:
     """Pixels (S, S) that show any object, rows from the top."""
     return np.asarray((hits.surfaces != NOTHING).any(axis=0))
+
+
+def drawn(spec: DatasetSpec, n: int, meshes: Meshes, split: Split = "train") -> list[Scene]:
+    """The first scenes of a mesh."""
+    return [sample_object_scene(spec, split, index, meshes) for index in range(n)]
 
 
 def placed(scene: Scene, **changes: Any) -> SceneObject:
