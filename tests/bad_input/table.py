@@ -129,6 +129,7 @@ PICTURES = [
     photo("Lab colours", lambda: images.saved(Image.new("LAB", (8, 8)), "tiff"), r"has colours of the kind 'LAB'; .*"),
     Bad("image: a pipe", lambda place: images.pipe(place.photo), PREDICT, r"photos/test/0\.png: cannot be read \(a pipe or a device; .*\)"),
     Bad("image: a pipe to train on", lambda place: images.pipe(place.root / "photos/train/0.png"), (*LEARN, "runs=others"), r".*line 1: .*0\.png: cannot be read as an image \(a pipe or a device; .*"),
+    Bad("image: 65535 x 65535 declared, to train on", lambda place: place.put("photos/train/0.png", images.declared_png(65535, 65535)), (*LEARN, "runs=others"), r".*line 1: .*0\.png: has more pixels than Pillow's limit of .*"),
     Bad("image: a device", nothing, ("predict", RUN, "image=/dev/zero", "f=300"), r"/dev/zero: cannot be read \(a pipe or a device; expected a plain file\)"),
     Bad("image: a folder", nothing, ("predict", RUN, "image=photos", "f=300"), r"photos: cannot be read \(Is a directory\)"),
     Bad("image: a detection in a folder", lambda place: place.put("dot/metadata.jsonl", '{"file_name": ".", "f": 400}'), ("predict", RUN, "folder=dot"), r"dot: cannot be read \(Is a directory\)"),

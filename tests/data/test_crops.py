@@ -1,6 +1,7 @@
 """The user's own images: read as what they are or refused in one line, and resampled to a fraction of a pixel."""
 
 import io
+import math
 import multiprocessing
 import resource
 from contextlib import suppress
@@ -12,8 +13,8 @@ import pytest
 import torch
 from PIL import ExifTags, Image
 
-from phd_exp.data.areas import GREY
-from phd_exp.data.crops import cut, image_size, pillow_warnings, read_image
+from phd_exp.data.areas import GREY, area_means, sums, view
+from phd_exp.data.crops import cut, pillow_warnings, read_image
 from phd_exp.data.images import shrunk
 from phd_exp.geometry import Camera
 from phd_exp.optics.virtual import Box, VirtualCamera, intrinsics, rays
@@ -163,13 +164,6 @@ def test_all_kinds_of_colour_become_rgb(content: bytes, colour: tuple[int, int, 
     assert np.abs(np.asarray(image).astype(int) - colour).max() <= 1
 
 
-@pytest.mark.parametrize("mode", ["I", "F"])
-def test_values_without_a_known_white_are_refused(mode: str) -> None:
-    content = saved(Image.new(mode, (4, 3)), "tiff")
-    with pytest.raises(DatasetError, match=rf"^a\.tif: has colours of the kind '{mode}'; save it as RGB"):
-        read_image(Path("a.tif"), content)
-
-
 NOISE = Image.fromarray(np.random.default_rng(0).integers(0, 256, (40, 40, 3), dtype=np.uint8))
 
 
@@ -197,26 +191,6 @@ def test_bytes_turned_over_never_raise_anything_else() -> None:
                 read_image(Path("a"), broken.tobytes())
 
 
-@pytest.mark.parametrize("content", [b"", b"no image", b"\x89PNG\r\n\x1a\n"], ids=["empty", "text", "head"])
-def test_no_image_is_one_line_at_first_sight(tmp_path: Path, content: bytes) -> None:
-    file = tmp_path / "a.png"
-    file.write_bytes(content)
-    with pytest.raises(DatasetError, match=r"a\.png: not an image of any kind that is read here"):
-        image_size(file)
-    with pytest.raises(DatasetError, match=r"b\.png: cannot be read as an image \(No such file"):
-        image_size(tmp_path / "b.png")
-
-
-@pytest.mark.parametrize("limit", [1000, 200], ids=["over the limit", "twice over the limit"])
-def test_a_decompression_bomb_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: int) -> None:
-    file = tmp_path / "a.png"
-    file.write_bytes(saved(NOISE))
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", limit)
-    for read in (lambda: image_size(file), lambda: read_image(file, file.read_bytes())):
-        with pillow_warnings(), pytest.raises(DatasetError, match=rf"a\.png: has more pixels .* {limit} "):
-            read()
-
-
 @pytest.mark.parametrize("kind", ["jpeg", "png", "tiff", "webp"])
 @pytest.mark.parametrize("orientation", [0, 1, 3, 6, 9])
 def test_an_orientation_is_neither_applied_nor_ignored(kind: str, orientation: int) -> None:
@@ -238,3 +212,22 @@ def test_sixteen_bits_with_twelve_in_use_are_refused_instead_of_black() -> None:
     shown = np.asarray(read_image(Path("a"), saved(Image.fromarray(16 * ramp), "png")))
     np.testing.assert_array_equal(shown[..., 0], ramp >> 4)
     assert not np.any(read_image(Path("a"), saved(Image.fromarray(0 * ramp), "png")))
+
+
+@pytest.mark.parametrize("zoom", [1.0, 1.7, 6.0, 0.4])
+@pytest.mark.parametrize("size", [(37, 50), (1, 1)], ids=str)
+def test_a_view_is_the_mean_over_areas(size: tuple[int, int], zoom: float) -> None:
+    """Also for a turned view, beyond the edges, where a corner is NaN, and where pixels are larger."""
+    random = torch.Generator().manual_seed(0)
+    image = torch.randint(0, 256, (*size, 3), dtype=torch.uint8, generator=random)
+    along = torch.arange(65, dtype=torch.float64) / zoom
+    x, y = torch.meshgrid(along, along, indexing="xy")
+    turn = math.radians(7)
+    corners = (
+        torch.stack([math.cos(turn) * x - math.sin(turn) * y, math.sin(turn) * x + math.cos(turn) * y], dim=-1) - 3
+    )
+    corners[-3:, -5:] = math.nan
+    found = view(image, corners)
+    assert torch.equal(found, area_means(sums(image), corners))
+    assert (found[-2:, -4:] == GREY).all()
+    assert (found != GREY).any()

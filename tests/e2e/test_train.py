@@ -19,8 +19,8 @@ from phd_exp.records.runs import RunFolder
 from phd_exp.reports.lines import command_of
 from phd_exp.reports.runs import read_report
 from phd_exp.training.module import PositionModule
-from tests.e2e.runs import only_run
-from tests.support.recorded import status_of
+from tests.e2e.conftest import QUICK, QUICKER
+from tests.support.recorded import only_run, status_of
 
 
 @pytest.mark.slow
@@ -147,3 +147,18 @@ def test_a_missing_bpy_is_one_line(phd_exp: Callable, tmp_path: Path, monkeypatc
     assert "phd_exp[render]" in line
     assert not list(tmp_path.rglob("*.png"))
     assert not list(tmp_path.glob("runs"))
+
+
+def test_it_begins_where_that_run_ended_with_its_constants_of_depth(
+    phd_exp: Callable, run: RunFolder, renders: Path, tmp_path: Path
+) -> None:
+    """On scenes at other distances, whose own constants are others."""
+    words = (*QUICK, *QUICKER, f"data.root={tmp_path / 'far'}", "data.variant=far", "data.z_range=[4,7]")
+    assert phd_exp(*words, f"init={run.path}").status == 0
+    mine = only_run(tmp_path / "runs")
+    assert mine.constants() == run.constants()
+    same = (*QUICK, *QUICKER, f"data.root={renders}", f"init={run.path}", f"runs={tmp_path / 'same'}")
+    assert phd_exp(*same).status == 0
+    before, after = run.results(), only_run(tmp_path / "same").results()
+    assert after["untrained/test/nll"] == pytest.approx(before["test/nll"], rel=1e-5)
+    assert after["test/nll"] != before["test/nll"]
