@@ -11,8 +11,8 @@ import torch
 
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.module import PositionModule
-from tests.e2e.runs import only_run, weights
 from tests.support.disks import KIB, leave_room, make_room, remount, small_disk
+from tests.support.recorded import only_run, weights
 
 QUIET = ("logger=none", "recipe=strong", "data.image_size=64", "backbone.width=8", "trainer.max_epochs=3")
 

@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from phd_exp.records.dataset import DatasetFolder
-from tests.e2e.runs import only_run
 from tests.support.meshes import solid, write_mesh
+from tests.support.recorded import only_run
 from tests.support.untrained import read_lines
 
 SMALL = ("preset=smoke", "data=object", "data.sensor_size=64", "data.f_range=[343,571]", "data.samples_per_pixel=1")

@@ -11,8 +11,7 @@ import pytest
 
 from phd_exp.data.folder import FolderSource
 from phd_exp.records.own_images import DetectionFolder
-from tests.e2e.runs import only_run
-from tests.support.recorded import status_of
+from tests.support.recorded import only_run, status_of
 from tests.support.untrained import NARROW, read_lines, virtual_cameras, write_photos
 
 N_TRAIN, N_TEST = 8, 2

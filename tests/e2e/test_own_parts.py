@@ -22,14 +22,9 @@ from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import CHOOSE, RunFolder
 from phd_exp.training.predictions import TRAINING
 from tests.support.own_parts import QUICK
-from tests.support.recorded import status_of
+from tests.support.recorded import only_run, status_of
 
 RUNS = Path("runs")
-
-
-def run_of(runs: Path) -> RunFolder:
-    (path,) = runs.glob("*/*/*/seed*")
-    return RunFolder(path)
 
 
 @pytest.mark.parametrize(
@@ -46,7 +41,7 @@ def run_of(runs: Path) -> RunFolder:
 def test_own_parts_train_and_are_recorded(own: Callable, words: list[str]) -> None:
     outcome = own(*words, "trainer.max_epochs=1")
     assert outcome.status == 0, outcome.err
-    run = run_of(RUNS)
+    run = only_run(RUNS)
     status = status_of(run)
     assert status.state == "finished"
     assert Path(status.custom["ownparts.Squares"]).name == "ownparts.py"
@@ -58,7 +53,7 @@ def test_pretrained_weights_are_loaded_once(own: Callable, tmp_path: Path) -> No
     torch.save(weights, tmp_path / "weights.pth")
     assert own("backbone=pooled", "+backbone.pretrained=weights.pth", "optimizer.lr=1e-12").status == 0
     (tmp_path / "weights.pth").unlink()  # of the checkpoint from here on
-    predictor = package.load(run_of(RUNS).path, trust=("ownnet",))
+    predictor = package.load(only_run(RUNS).path, trust=("ownnet",))
     layer = dict(predictor.regressor.named_parameters())["backbone.network.layer.weight"]
     torch.testing.assert_close(layer, torch.full_like(layer, 0.5), rtol=0, atol=1e-6)
 
@@ -107,7 +102,7 @@ def test_an_error_in_the_middle_is_recorded_and_the_run_resumes(own: Callable) -
     line = own(*words).error
     assert "ZeroDivisionError: my callback (" in line
     assert "ownparts.py, line" in line
-    run = run_of(RUNS)
+    run = only_run(RUNS)
     assert (status_of(run).state, status_of(run).error) == ("failed", "ZeroDivisionError: my callback")
     assert run.last_checkpoint.exists()
     del import_module("ownparts").Raising.on_train_epoch_end  # mended
@@ -118,7 +113,7 @@ def test_an_error_in_the_middle_is_recorded_and_the_run_resumes(own: Callable) -
 
 def test_a_stored_run_builds_foreign_parts_only_on_request(own: Callable, phd_exp: Callable, tmp_path: Path) -> None:
     assert own().status == 0
-    run = run_of(RUNS)
+    run = only_run(RUNS)
     words = ("predict", f"run={run.path}", "image=x.png", "f=60")
     Image.new("RGB", (32, 32)).save(tmp_path / "x.png")
     assert re.search("'ownnet.Mine' is not built from .*; .* add trust=ownnet", phd_exp(*words).error)
@@ -155,7 +150,7 @@ def test_a_strangers_configuration_executes_nothing(run: RunFolder, tmp_path: Pa
 def test_arguments_of_lightnings_trainer(own: Callable, words: str) -> None:
     outcome = own(*(f"+trainer.{word}" for word in words.split()))
     assert outcome.status == 0, outcome.err
-    run = run_of(RUNS)
+    run = only_run(RUNS)
     arguments = {name: yaml.safe_load(value) for name, value in (word.split("=") for word in words.split())}
     assert run.config()["trainer"].items() >= arguments.items()
     assert run.path.name.startswith("seed0-")
@@ -165,16 +160,16 @@ def test_a_limited_epoch_is_a_whole_one(own: Callable) -> None:
     """Each epoch has its own order of the batches, however many of them are used."""
     words = ("+trainer.limit_train_batches=1", "trainer.max_epochs=4", "model=mae_vz")
     assert own(*words).status == 0
-    whole = run_of(RUNS).metrics()
+    whole = only_run(RUNS).metrics()
     assert own(*words[:1], "trainer.max_epochs=2", words[2], "runs=resumed", "seed=0").status == 0
     assert [row["epoch"] for row in whole] == [-1, 0, 1, 2, 3]
-    assert run_of(Path("resumed")).metrics() == whole[:3]
+    assert only_run(Path("resumed")).metrics() == whole[:3]
 
 
 def test_callbacks_choose_by_held_out_samples(own: Callable) -> None:
     words = ("callbacks=[early_stopping,best_checkpoint]", "callbacks.early_stopping.patience=1")
     assert own(*words, "trainer.max_epochs=40", "optimizer.lr=0.1").status == 0
-    run = run_of(RUNS)
+    run = only_run(RUNS)
     losses = [row["held_out/loss"] for row in run.metrics() if "held_out/loss" in row]
     assert len(losses) < 40
     assert {key for key in run.metrics()[-1] if key.startswith("train/")} == {f"train/{name}" for name in TRAINING}
@@ -186,7 +181,7 @@ def test_callbacks_choose_by_held_out_samples(own: Callable) -> None:
 
 def test_a_run_without_its_best_checkpoint_uses_the_last(own: Callable) -> None:
     assert own("callbacks=ema", "+trainer.gradient_clip_val=1").status == 0
-    run = run_of(RUNS)
+    run = only_run(RUNS)
     assert run.best_checkpoint == run.last_checkpoint
     source = import_module("ownparts").Squares({"test": 16}, 32).samples("test")
     found = package.load(run.path, trust=("ownnet",))(source.image.numpy(), f=source.f)
@@ -200,7 +195,7 @@ def test_every_logger_receives_the_record(own: Callable, tmp_path: Path) -> None
     words = ("logger=[csv,wandb,tensorboard,mlflow]", "+logger.own._target_=ownparts.Keeping")
     outcome = own(*words)
     assert outcome.status == 0, outcome.err
-    run = run_of(RUNS)
+    run = only_run(RUNS)
     epochs = [row["test/nll"] for row in run.metrics()]
     kept = [row["test/nll"] for _, row in import_module("ownparts").Keeping.rows if "test/nll" in row]
     np.testing.assert_allclose(kept, epochs, rtol=1e-6)

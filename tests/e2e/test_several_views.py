@@ -15,20 +15,16 @@ from phd_exp.fusion import Pose
 from phd_exp.records import scenes
 from phd_exp.records.runs import RunFolder, find_runs
 from tests.e2e.conftest import QUICKER
+from tests.support.recorded import only_run, stamps
 
 
 def asked(n: int) -> tuple[str, ...]:
     return (*QUICKER, "evaluation.multiview.views=2", f"evaluation.multiview.scenes={n}")
 
 
-def stamps(run: RunFolder) -> dict[str, int]:
-    files = (run.last_checkpoint, run.predictions, run.views)
-    return {file.name: file.stat().st_mtime_ns for file in files if file.exists()}
-
-
 def test_views_are_recorded_once_and_the_run_stays_as_it_was(train: Callable, run: RunFolder, tmp_path: Path) -> None:
     shutil.copytree(run.path.parents[3], tmp_path / "runs")
-    (run,) = find_runs(tmp_path / "runs")
+    run = only_run(tmp_path / "runs")
     trained = stamps(run)
     assert "views.parquet" not in trained
     outcome = train(*asked(4))
@@ -77,7 +73,7 @@ def test_a_run_that_lacks_its_views_counts_as_begun(train: Callable, tmp_path: P
     first = train(*words)
     assert first.status == 0, first.err
     assert "1 of them finished already" in train(*words).out
-    (run,) = find_runs(tmp_path / "runs")
+    run = only_run(tmp_path / "runs")
     run.views.write_bytes(b"torn")
     outcome = train(*words)
     assert "views.parquet: 1 scene seen by 2" in outcome.out

@@ -11,19 +11,15 @@ import pytest
 import phd_exp as package
 from phd_exp.build import build_source
 from phd_exp.config import check
-from phd_exp.records.runs import RunFolder, find_runs
+from phd_exp.records.runs import find_runs
+from tests.support.recorded import only_run, stamps
 
 IMAGES = ("noise", "blur", "dark", "bright", "gamma_half", "gamma_two", "jpeg")
 
 
-def stamps(run: RunFolder) -> dict[str, int]:
-    files = (run.last_checkpoint, run.predictions, run.status_file, run.config_file, *run.shifts.glob("*"))
-    return {file.name: file.stat().st_mtime_ns for file in files}
-
-
 def test_shifts_are_recorded_once_without_training_again(own: Callable, tmp_path: Path) -> None:
     assert own("camera=shown").status == 0
-    (run,) = find_runs(tmp_path / "runs")
+    run = only_run(tmp_path / "runs")
     trained = stamps(run)
     assert not run.shifts.exists()
     words = ("camera=shown", "shift=[images,focal_length]")
@@ -32,7 +28,7 @@ def test_shifts_are_recorded_once_without_training_again(own: Callable, tmp_path
     assert len(find_runs(tmp_path / "runs")) == 1
     recorded = stamps(run)
     assert trained.items() <= recorded.items()
-    assert recorded.keys() - trained.keys() == {f"{name}.parquet" for name in (*IMAGES, "f_wrong")}
+    assert recorded.keys() - trained.keys() == {f"shifts/{name}.parquet" for name in (*IMAGES, "f_wrong")}
 
     # the tables against the network in Python, on images changed by hand
     predictor, samples = (
@@ -54,7 +50,7 @@ def test_shifts_are_recorded_once_without_training_again(own: Callable, tmp_path
     run.shift("blur").unlink()
     assert own(*words, "evaluation.shifts.dark.images.brightness=0.25").out.count(": recorded") == 2
     changed = {name for name, stamp in stamps(run).items() if recorded[name] != stamp}
-    assert changed == {"blur.parquet", "dark.parquet"}
+    assert changed == {"shifts/blur.parquet", "shifts/dark.parquet"}
 
 
 @pytest.mark.slow
@@ -63,7 +59,7 @@ def test_scenes_are_rendered_beside_the_run_s_own(train: Callable, renders: Path
     words = ("trainer.max_epochs=1", "logger=none", "shift=[scenes,variants]", "evaluation.n_shifted=3")
     outcome = train(*words, "data=occl")
     assert outcome.status == 0, outcome.err
-    (run,) = find_runs(tmp_path / "runs")
+    run = only_run(tmp_path / "runs")
     home = pd.read_parquet(run.predictions)[:3]
     found = {file.stem: pd.read_parquet(file) for file in run.shifts.iterdir()}
     assert found.keys() == {"short_f", "long_f", "near", "far", "grey", "hidden"} | {

@@ -21,7 +21,7 @@ from phd_exp.__main__ import main
 from phd_exp.evaluation.parquet import read_table
 from phd_exp.records.runs import CHOOSE, RunFolder, find_runs
 from tests.e2e.conftest import QUICK
-from tests.e2e.runs import weights
+from tests.support.recorded import stamps, weights
 
 ONE = ("model=mae_vz", "recipe=strong", "data.image_size=64", "logger=none")
 TWO = ("-m", *ONE, "seed=0,1")
@@ -29,14 +29,10 @@ SHORT = ("trainer.max_epochs=1", "backbone.width=8")
 FOUR = ("-m", "experiment=table2", "model=mae_xyz,mae_constf", "seed=0,1", "logger=none")
 
 
-def seen(run: RunFolder) -> dict[str, tuple[int, bytes]]:
-    """Every file of a run: when it was written, and what it holds."""
-    files = [file for file in run.path.rglob("*") if file.is_file() and file.name != ".lock"]
-    return {file.relative_to(run.path).as_posix(): (file.stat().st_mtime_ns, file.read_bytes()) for file in files}
-
-
 def finished(runs: Path) -> dict[Path, dict[str, tuple[int, bytes]]]:
-    return {run.path: seen(run) for run in find_runs(runs) if run.is_finished()}
+    """Every file of the finished runs: when it was written, and what it holds."""
+    done = {run.path: stamps(run) for run in find_runs(runs) if run.is_finished()}
+    return {run: {name: (at, (run / name).read_bytes()) for name, at in files.items()} for run, files in done.items()}
 
 
 def numbers(runs: Path) -> dict[str, Any]:

@@ -16,8 +16,7 @@ import pytest
 from phd_exp.records.runs import find_runs
 from phd_exp.training import ranks as ranks_module
 from tests.e2e.conftest import QUICK
-from tests.e2e.runs import only_run
-from tests.support.recorded import status_of
+from tests.support.recorded import only_run, status_of
 from tests.support.renders import wait_until
 
 THREE_EPOCHS = (

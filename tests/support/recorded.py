@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from filelock import FileLock
 
 from phd_exp.cli import report
 from phd_exp.records.choices import RunName
-from phd_exp.records.runs import RunFolder, RunStatus
+from phd_exp.records.runs import RunFolder, RunStatus, find_runs
 from phd_exp.reports.files import all_tables
 from phd_exp.reports.runs import read_report
 from phd_exp.reports.site import build
@@ -83,6 +84,24 @@ def record(
         if frame is not None:
             frame.to_parquet(folder.predictions)
     return folder
+
+
+def only_run(runs: Path) -> RunFolder:
+    """The one run that is recorded there."""
+    (run,) = find_runs(runs)
+    return run
+
+
+def weights(run: RunFolder) -> dict[str, torch.Tensor]:
+    """The network's weights in its last checkpoint."""
+    state = torch.load(run.last_checkpoint, weights_only=True)["state_dict"]
+    return {name: weight for name, weight in state.items() if name.startswith("regressor.")}
+
+
+def stamps(run: RunFolder) -> dict[str, int]:
+    """When each file of a run was written, ns."""
+    files = [file for file in run.path.rglob("*") if file.is_file() and file.name != ".lock"]
+    return {file.relative_to(run.path).as_posix(): file.stat().st_mtime_ns for file in files}
 
 
 HOSTILE = "\\end{table} $x_1$ & 5 % #1 ^~ {a} |b| `c` **d** <script> [red]e[/red] \x1b[31m 中 ' \" --"
