@@ -1,4 +1,4 @@
-"""A rendered data set as batches: the camera shrinks with the image, the depth scale grows."""
+"""A rendered data set as batches: the camera shrinks with the image, the depth scale grows; masks."""
 
 import math
 from typing import Any
@@ -9,9 +9,10 @@ import torch
 from phd_exp.data.batches import Batch
 from phd_exp.data.datamodule import PositionData, held_on
 from phd_exp.data.sources import Part, RenderedSource
-from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.dataset import CELLS, DatasetFolder
 from phd_exp.records.errors import DatasetError
 from phd_exp.records.spec import DatasetSpec
+from tests.support.handmade import SIDE
 
 
 def data(
@@ -104,3 +105,33 @@ def test_samples_on_the_host_serve_another_device(folder: DatasetFolder, spec: D
     assert module.samples["train"].image.device.type == "cpu"
     for loader in (module.train_dataloader(), *module.val_dataloader()):
         assert {batch.image.device.type for batch in loader} == {"meta"}
+
+
+@pytest.fixture
+def source(folder: DatasetFolder, spec: DatasetSpec) -> RenderedSource:
+    return RenderedSource(folder, spec, {"train": 3, "held_out": 2, "test": 3}, SIDE)
+
+
+def test_training_batches_alone_have_masks(source: RenderedSource) -> None:
+    data = PositionData(source, batch_size=3, masks=True)
+    data.setup()
+    masks = data.samples["train"].mask
+    assert masks.shape == (3, CELLS, CELLS)
+    assert masks.amax() == 255
+    assert data.samples["held_out"].mask is None
+    assert data.samples["test"].mask is None
+    (batch,) = data.train_dataloader()
+    assert torch.equal(batch.mask, masks[batch.row])
+    masks.zero_()
+    assert source.training_masks().amax() == 255, "the file does not change"
+
+
+def test_masks_that_are_missing_are_missed_by_their_loss_alone(source: RenderedSource) -> None:
+    (source.folder.root / "masks.npy").unlink()
+    data = PositionData(source, batch_size=3)
+    data.setup()
+    assert data.samples["train"].mask is None
+    needy = PositionData(source, batch_size=3, masks=True)
+    with pytest.raises(DatasetError, match=r"masks\.npy: .*No such file.* `python -m phd_exp render data=") as error:
+        needy.setup()
+    assert "\n" not in str(error.value)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.columns import distribution_columns, draws, from_columns, parameter_columns
+from phd_exp.distributions.columns import draws, from_columns, parameter_columns
 from phd_exp.distributions.temperature import Slope, Temperature
 
 
@@ -115,14 +115,6 @@ def test_refuses_what_cannot_be_fitted(positions: torch.Tensor) -> None:
 def test_refuses_errors_of_zero(truth: ProjectedHuber) -> None:
     with pytest.raises(ValueError, match="no temperature fits"):
         Temperature.fit(truth.tempered(1e-30, 1e-30), 1e3 * truth.mean)
-
-
-def test_a_table_rebuilds_its_distributions(truth: ProjectedHuber, xyz: torch.Tensor) -> None:
-    table = distribution_columns(truth, xyz)
-    again = distribution_columns(from_columns(table), xyz)
-    assert again.keys() == table.keys()
-    for name, column in table.items():
-        torch.testing.assert_close(again[name], column, rtol=1e-6, atol=1e-8)
 
 
 def test_draws_are_seeded_samples(truth: ProjectedHuber) -> None:

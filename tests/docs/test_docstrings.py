@@ -30,14 +30,6 @@ def test_every_public_name_has_a_docstring() -> None:
     assert not missing, "\n".join(["without a docstring:", *missing])
 
 
-def test_only_overrides_may_omit_the_docstring() -> None:
-    tree = ast.parse("class C:\n '''.'''\n def f(self): ...\n def _g(self): ...\n class D: ...\ndef h(): ...")
-    assert list(_undocumented(tree)) == ["C.f", "C.D", "h"]
-    assert _overrides("phd_exp.geometry.charts", "Projected.position")
-    assert not _overrides("phd_exp.geometry.charts", "Projected.__post_init__")
-    assert not _overrides("phd_exp.geometry.charts", "projected")
-
-
 def test_examples_run(capsys: pytest.CaptureFixture[str]) -> None:
     failed = [example.name for file in FILES for example in _examples(file) if _failures(example)]
     assert failed == [], capsys.readouterr().out

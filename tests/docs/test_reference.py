@@ -1,18 +1,25 @@
-"""The reference is complete, and every name in the pages is one of this programme."""
+"""The reference is complete, every name in the pages is one of this programme, and guides list every format."""
 
 import ast
 import importlib
 import re
 import runpy
+from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
 
 import phd_exp.geometry
 from phd_exp.cli import PACKAGE
+from phd_exp.records.assets import MESHES, PHOTOS, SKIES
+from phd_exp.records.cameras import COEFFICIENTS
+from phd_exp.records.foreign import COCO_FILES
+from phd_exp.records.images import FORMATS
 from tests.docs.pages import DOCS, PAGES, REFERENCE, ROOT, module, name
+from tests.records.test_cameras import SAME
 
 PRIVATE = {"cli"}
 """Packages that only this programme imports."""
@@ -104,3 +111,21 @@ def _is_module(dotted: str) -> bool:
 
 def _source(dotted: str) -> str:
     return Path(str(importlib.import_module(_module(dotted)[0]).__file__)).read_text()
+
+
+TOOLS = {re.sub(r"^JSON of |,.*| \d$", "", name) for name in SAME}  # which the tests of camera files read
+
+
+@pytest.mark.parametrize(
+    ("guide", "names"),
+    [
+        ("own_object", [suffix[1:].upper() for suffix in MESHES if suffix != ".gltf"]),
+        ("own_object", [*SKIES, "glTF", *{"JPEG" if "jp" in suffix else suffix[1:] for suffix in PHOTOS}]),
+        ("own_images", FORMATS),
+        ("own_images", {Path(name).name.replace("{}", "train") for name in COCO_FILES}),
+        ("own_images", [*TOOLS, *COEFFICIENTS]),
+    ],
+)
+def test_a_guide_names_all_that_is_read(guide: str, names: Iterable[str]) -> None:
+    text = (DOCS / "guides" / f"{guide}.md").read_text().lower()
+    assert [name for name in names if not re.search(rf"(?<!\w){re.escape(name.lower())}(?!\w)", text)] == []

@@ -1,8 +1,9 @@
-"""The parts that a configuration names: precision, learning rate, and values that are refused."""
+"""The parts that a configuration names: precision, learning rate, curves, and values that are refused."""
 
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from phd_exp import build, hardware
 from phd_exp.config import RunConfig, check
+from phd_exp.config.sections import EvaluationConfig
 from phd_exp.data.backdrops import BACKDROP_NUMBERS, Backdrops, before_others
 from phd_exp.data.batches import Batch, BatchLoader
 from phd_exp.data.exchanges import Exchange
@@ -21,6 +23,7 @@ from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import build_data, build_module
 from phd_exp.training.optimisation import factor
+from phd_exp.training.recorder import has_curves
 from phd_exp.training.train import require_same_photometry
 
 
@@ -153,3 +156,23 @@ def test_a_training_step_and_its_data_read_nothing_back(checked: Callable, words
         assert reads.found == []
         bool(batch.xyz.isfinite().all())
         assert reads.found == [READS[0]]
+
+
+@pytest.mark.parametrize("wanted", [1, 2, 7, 10])
+@pytest.mark.parametrize("every", [1, 2, 3, 4, 5, 10, 22])
+def test_curves_are_those_of_the_evaluations_nearest_to_the_wanted_epochs(wanted: int, every: int) -> None:
+    evaluation = EvaluationConfig(calibration_window=200, calibration_every_n_epochs=wanted, every_n_epochs=every)
+    evaluated = range(every, 400, every)
+    nearest = {
+        min(evaluated, key=lambda epochs: (abs(epochs - at), epochs))
+        for at in range(wanted, 300, wanted)
+        if Fraction(at, every) > Fraction(1, 2)  # else nearer to the untrained network
+    }
+    found = {epochs for epochs in evaluated if has_curves(epochs, evaluation)}
+    assert {epochs for epochs in found if epochs < 250} == {epochs for epochs in nearest if epochs < 250}
+    if wanted % every == 0:
+        assert found == {epochs for epochs in evaluated if epochs % wanted == 0}
+
+
+def test_the_interval_of_evaluations_is_free(composed: Callable) -> None:
+    assert check(composed("preset=smoke", "evaluation.every_n_epochs=22")).evaluation.every_n_epochs == 22

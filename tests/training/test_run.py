@@ -25,8 +25,7 @@ from phd_exp.training.module import PositionModule
 from phd_exp.training.progress import Progress
 from phd_exp.training.recorder import Recorder
 from phd_exp.training.train import require_same_config, train
-from tests.e2e.runs import weights
-from tests.support.recorded import once, status_of
+from tests.support.recorded import once, status_of, weights
 
 MODELS = ("probabilistic", "mae_vz", "mae_logz", "mae_xyz", "mae_constf")
 ERRORS = {"loss", "projected_error_mm", "depth_error_mm"}
