@@ -137,17 +137,18 @@ def test_light_tells_depth_less_than_its_jitter_hides(make_spec: MakeSpec) -> No
 @pytest.mark.parametrize("variant", ["default", "occl_scale"])
 def test_a_panel_hides_half_of_the_cylinder_and_changes_nothing_else(make_spec: MakeSpec, variant: str) -> None:
     visible, widths = [], []
+    bare, hidden = (make_spec(variant, xy_range=0.5, half_hidden=half) for half in (False, True))
     for index in range(100):
-        plain = sample_scene(make_spec(variant, xy_range=0.5), "test", index)
-        scene = sample_scene(make_spec(variant, xy_range=0.5, half_hidden=True), "test", index)
+        plain, scene = (sample_scene(spec, "test", index) for spec in (bare, hidden))
         *others, panel = scene.objects
         assert others == [item for item in plain.objects if item.shape != "cube"], "paired"
         assert scene.model_copy(update={"objects": plain.objects}) == plain
         assert 0.6 * plain.objects[0].position[2] <= panel.position[2] <= 0.8 * plain.objects[0].position[2]
         alone = with_objects(scene, scene.objects[0], panel)
-        if truncation(alone, trace_pixels(alone)) == 0:
-            visible.append(visibility(trace_pixels(alone)))
-            widths.append((trace_pixels(alone).surfaces[1] != NOTHING).mean())
+        hits = trace_pixels(alone)
+        if truncation(alone, hits) == 0:
+            visible.append(visibility(hits))
+            widths.append((hits.surfaces[1] != NOTHING).mean())
     assert len(visible) > 50
     assert np.mean(visible) == pytest.approx(0.5, abs=0.01)
     np.testing.assert_allclose(visible, 0.5, atol=0.12)  # a cylinder seen along its axis has a frustum's silhouette
