@@ -65,6 +65,11 @@ class Cell:
         """Ours over the paper's."""
         return self.mean / self.published if self.mean is not None and self.published else None
 
+    @property
+    def is_below_bound(self) -> bool:
+        """Whether the mean is smaller than its bound, which only chance or more information can do."""
+        return self.mean is not None and self.bound is not None and self.mean < self.bound
+
     def beats(self, other: "Cell") -> bool:
         """Whether this mean is significantly smaller: a paired bootstrap over seeds and the shared test images."""
         same = len(self.images | other.images) == 1

@@ -61,60 +61,21 @@ def bound_mm(model: str, data: str, quantity: Quantity, sees_f: bool) -> float |
 
 
 @dataclass(frozen=True)
-class Column:
-    """One column of a table: a data set, and an error unless the lines have theirs."""
-
-    data: str
-    quantity: Quantity | None = None
-
-
-@dataclass(frozen=True)
-class Line:
-    """One line of a table: a model's point estimate, and an error unless the columns have theirs."""
-
-    model: str
-    estimate: Estimate
-    quantity: Quantity | None = None
-
-    def error(self, column: Column) -> Quantity:
-        """The error in a column."""
-        quantity = self.quantity or column.quantity
-        assert quantity is not None, "a layout gives the error to its lines or to its columns"
-        return quantity
-
-
-@dataclass(frozen=True)
 class Layout:
-    """One of the paper's tables: columns, groups of lines, and below them bounds on depth error.
+    """One of the paper's tables: the data sets and models, in its order, and below them bounds on depth error.
 
-    `bounds` maps the label of a line to the bound on each data set.
+    A table of several data sets has a column for each, and a line for each error; of one, a column for each error.
+
+    Attributes:
+        bounds: label of a line -> the bound on each data set.
     """
 
     name: TableName
     title: str
-    columns: tuple[Column, ...]
-    groups: tuple[tuple[Line, ...], ...]
+    data: tuple[str, ...]
+    models: tuple[str, ...]
     bounds: Mapping[str, Mapping[str, float]]
     note: str
-
-    @property
-    def by_line(self) -> bool:
-        """Whether the lines have the errors, not the columns."""
-        return self.columns[0].quantity is None
-
-    @property
-    def choices(self) -> set[tuple[str, str]]:
-        """Every (data set, model) of the table."""
-        return {(column.data, line.model) for group in self.groups for line in group for column in self.columns}
-
-
-def _groups(models: tuple[str, ...], quantities: tuple[Quantity | None, ...]) -> tuple[tuple[Line, ...], ...]:
-    """The paper's lines, and below them the density's mean, median and mode of eight views, which the paper omits."""
-    others: tuple[Estimate, ...] = ("mean", "median", "eight views")
-    return (
-        tuple(Line(model, "mode", quantity) for model in models for quantity in quantities),
-        tuple(Line("probabilistic", estimate, quantity) for estimate in others for quantity in quantities),
-    )
 
 
 ASSUMED = (
@@ -130,8 +91,8 @@ OF_A_BOUND = (
 TABLE_1 = Layout(
     name="table1",
     title="Table 1",
-    columns=tuple(Column(data) for data in DATA),
-    groups=_groups(("mae_vz", "mae_logz", "probabilistic"), ("projected", "depth")),
+    data=DATA,
+    models=("mae_vz", "mae_logz", "probabilistic"),
     bounds={
         "bound, with f": {"scale": UNKNOWN_SIZE},
         "apparent size, f not an input": {"scale": UNKNOWN_SIZE_F_AFTERWARDS},
@@ -145,8 +106,8 @@ TABLE_1 = Layout(
 TABLE_2 = Layout(
     name="table2",
     title="Table 2",
-    columns=(Column("default", "projected"), Column("default", "depth")),
-    groups=_groups(("mae_xyz", "mae_constf", "probabilistic"), (None,)),
+    data=("default",),
+    models=("mae_xyz", "mae_constf", "probabilistic"),
     bounds={"apparent size, f unknown": {"default": UNKNOWN_F}, "guess without the image": {"default": GUESS}},
     note="mae_xyz and mae_constf do not use f ~ U(1200, 2000) px. From apparent size alone (weak perspective) their "
     "depth error is at least 331 mm; perspective also tells f and z apart, so an estimator can be better.",

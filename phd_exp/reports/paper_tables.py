@@ -2,18 +2,21 @@
 
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
+from itertools import chain, product
 
-from phd_exp.evaluation.point_errors import COLUMNS, READINGS, ErrorKey, Quantity, Reading
+from phd_exp.evaluation.point_errors import COLUMNS, READINGS, ErrorKey, Estimate, Quantity, Reading
 from phd_exp.records.choices import PLAIN_RECIPE, in_words, preset_and_recipe
 from phd_exp.records.errors import one_line
 from phd_exp.reports.cells import Cell, make_cell
-from phd_exp.reports.paper import ASSUMED, BELOW_BOUND, LAYOUTS, OF_A_BOUND, Column, Layout, Line, TableName
+from phd_exp.reports.paper import ASSUMED, BELOW_BOUND, LAYOUTS, OF_A_BOUND, Layout, TableName
 from phd_exp.reports.runs import PROBABILISTIC, Report, Run
 from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem, plus_minus
 
 DIGITS: dict[Quantity, int] = {"projected": 1, "depth": 0}  # decimals of a millimetre, as in the paper
+OTHERS: tuple[Estimate, ...] = ("mean", "median", "eight views")  # of the density; the paper has its mode alone
+Begun = Mapping[tuple[str, str], Mapping[int, Run]]
+"""(data set, model) -> seed -> run, where there are any."""
 ONE_SEED = "†"
 FEWER_SEEDS = "‡"
 
@@ -45,47 +48,39 @@ def paper_tables(report: Report) -> list[Table]:
     tables = []
     for preset in report.presets:
         for layout in LAYOUTS:
-            begun = {choice: runs for choice in layout.choices if (runs := report.at_defaults(preset, *choice))}
-            seeds = sorted({seed for runs in begun.values() for seed in runs})
-            shown = _begun(layout, begun)
-            tables += [_table(report, preset, layout, shown, reading, seeds) for reading in READINGS if begun]
+            choices = product(layout.data, layout.models)
+            begun = {choice: runs for choice in choices if (runs := report.at_defaults(preset, *choice))}
+            tables += [_table(report, preset, layout, begun, reading) for reading in READINGS if begun]
     return tables
 
 
-def _begun(layout: Layout, begun: Mapping[tuple[str, str], Mapping[int, Run]]) -> Layout:
-    """The columns and lines with a run; all estimates, but eight views only if a run has recorded them."""
-    data, models = ({choice[place] for choice in begun} for place in (0, 1))
-    estimates = {*COLUMNS, *(key.estimate for runs in begun.values() for run in runs.values() for key in run.errors)}
-    groups = (
-        tuple(line for line in group if line.model in models and line.estimate in estimates)
-        for group in layout.groups
-    )
-    columns = tuple(column for column in layout.columns if column.data in data)
-    return replace(layout, columns=columns, groups=tuple(filter(None, groups)))
+def _table(report: Report, preset: str, layout: Layout, begun: Begun, reading: Reading) -> Table:
+    """The table of a layout, reduced to the data sets and models with a run."""
+    data = [name for name in layout.data if any(name == choice[0] for choice in begun)]
+    models = [name for name in layout.models if any(name == choice[1] for choice in begun)]
+    seeds = sorted({seed for runs in begun.values() for seed in runs})
+    is_by_line = len(layout.data) > 1  # the errors
 
+    def rows(model: str, estimate: Estimate) -> list[list[Cell]]:
+        keys = [ErrorKey(estimate, reading, quantity) for quantity in DIGITS]
+        cells = [[make_cell(report, preset, name, model, key, seeds) for name in data] for key in keys]
+        return cells if is_by_line else [[*chain(*cells)]]
 
-def _table(report: Report, preset: str, layout: Layout, shown: Layout, reading: Reading, seeds: list[int]) -> Table:
-    """The table of a layout, reduced to the columns and lines of `shown`."""
-
-    def cell(line: Line, column: Column) -> Cell:
-        key = ErrorKey(line.estimate, reading, line.error(column))
-        return make_cell(report, preset, column.data, line.model, key, seeds)
-
-    measured = [[(line, [cell(line, one) for one in shown.columns]) for line in group] for group in shown.groups]
-    cells = [one for group in measured for _, row in group for one in row]
-    best = _best([one for _, row in measured[0] for one in row])
+    measured = [[row for line in group for row in rows(*line)] for group in _groups(models, begun)]
+    cells = [cell for group in measured for row in group for cell in row]
+    best = _best([*chain(*measured[0])])
     gaps = dict.fromkeys((reason, one.model, one.data, n) for one in cells for n, reason in one.gaps.items())
-    left_out = _left_out(layout, shown)
+    left_out = ", ".join(name for name in (*layout.data, *layout.models) if name not in (*data, *models))
     can_be_made = left_out or any(not reason.startswith("no sample") for reason, *_ in gaps)
-    rows = [tuple(_row(line, row, layout.name, best) for line, row in group) for group in measured]
+    groups = [tuple(_row(row, is_by_line, layout.name, best) for row in group) for group in measured]
     return Table(
         stem=file_stem(layout.name, preset, reading),
         kind="tables",
         title=f"The paper's {layout.title}, {one_line(in_words(preset))}: {IN_WORDS[reading]}{_samples(cells)}",
-        stub=("model", "error (mm)") if layout.by_line else ("model",),
-        columns=tuple(f"{c.quantity} error (mm)" if c.quantity else c.data for c in shown.columns),
-        groups=(*rows, tuple(_bound_rows(shown))),
-        notes=(*_notes(layout, reading, cells), *left_out),
+        stub=("model", "error (mm)") if is_by_line else ("model",),
+        columns=tuple(data if is_by_line else (f"{quantity} error (mm)" for quantity in DIGITS)),
+        groups=(*groups, tuple(_bound_rows(layout, data, is_by_line))),
+        notes=_notes(layout, reading, cells, left_out),
         below="paper (ratio)",
         gaps=tuple(gap_lines(gaps)),
         command=making_command(report, preset, layout.name, seeds) if can_be_made else "",
@@ -94,13 +89,12 @@ def _table(report: Report, preset: str, layout: Layout, shown: Layout, reading: 
     )
 
 
-def _left_out(layout: Layout, shown: Layout) -> list[str]:
-    """One line that names the columns and rows without a run."""
-    columns = [column.data for column in layout.columns if column not in shown.columns]
-    models = {line.model for group in shown.groups for line in group}
-    lines = [line.model for group in layout.groups for line in group if line.model not in models]
-    names = ", ".join(dict.fromkeys([*columns, *lines]))
-    return [f"Left out of {layout.title}, without a run: {names}."] if names else []
+def _groups(models: Sequence[str], begun: Begun) -> Iterator[list[tuple[str, Estimate]]]:
+    """The paper's lines, then the density's other estimates; eight views only if a run has recorded them."""
+    yield [(model, "mode") for model in models]
+    known = {*COLUMNS, *(key.estimate for runs in begun.values() for run in runs.values() for key in run.errors)}
+    if PROBABILISTIC in models:
+        yield [(PROBABILISTIC, estimate) for estimate in OTHERS if estimate in known]
 
 
 def _best(cells: Sequence[Cell]) -> set[int]:
@@ -114,57 +108,47 @@ def _best(cells: Sequence[Cell]) -> set[int]:
     return best
 
 
-def _row(line: Line, cells: Sequence[Cell], table: TableName, best: set[int]) -> TableRow:
-    label = f"{line.model} ({line.estimate})" if line.model == PROBABILISTIC else line.model
-    stub = (label, line.quantity) if line.quantity else (label,)
+def _row(cells: Sequence[Cell], is_by_line: bool, table: TableName, best: set[int]) -> TableRow:
+    model, key = cells[0].model, cells[0].key
+    label = f"{model} ({key.estimate})" if model == PROBABILISTIC else model
+    stub = (label, key.quantity) if is_by_line else (label,)
     return TableRow(stub, tuple(_table_cell(cell, table, id(cell) in best) for cell in cells))
 
 
 def _table_cell(cell: Cell, table: TableName, bold: bool) -> TableCell:
-    paper = "" if cell.published is None else _number(cell.key.quantity, cell.published)
+    number, numbers = partial(_number, cell.key.quantity), (cell.numbers(table, bold),)
+    paper = "" if cell.published is None else number(cell.published)
     if cell.mean is None:
-        return TableCell(cell.state, below=paper, numbers=(cell.numbers(table, bold),))
-    if cell.ratio is not None:
-        paper += f" (×{cell.ratio:.2f})"
-    number, numbers = _number(cell.key.quantity, cell.mean), (cell.numbers(table, bold),)
-    return TableCell(number, _spread(cell), paper, bold, numbers=numbers)
-
-
-def _spread(cell: Cell) -> str:
-    marks = BELOW_BOUND if _is_below(cell) else ""
-    marks += FEWER_SEEDS if cell.gaps else ""
-    if cell.scatter == "samples":
-        marks = ONE_SEED + marks
-    return plus_minus(cell.interval, partial(_number, cell.key.quantity)) + marks
-
-
-def _is_below(cell: Cell) -> bool:
-    return cell.mean is not None and cell.bound is not None and cell.mean < cell.bound
+        return TableCell(cell.state, below=paper, numbers=numbers)
+    paper += "" if cell.ratio is None else f" (×{cell.ratio:.2f})"
+    marks = {ONE_SEED: cell.scatter == "samples", BELOW_BOUND: cell.is_below_bound, FEWER_SEEDS: bool(cell.gaps)}
+    spread = plus_minus(cell.interval, number) + "".join(mark for mark, holds in marks.items() if holds)
+    return TableCell(number(cell.mean), spread, paper, bold, numbers=numbers)
 
 
 def _number(quantity: Quantity, value: float) -> str:
     return f"{value:.{DIGITS[quantity]}f}"
 
 
-def _bound_rows(shown: Layout) -> Iterator[TableRow]:
+def _bound_rows(layout: Layout, data: Sequence[str], is_by_line: bool) -> Iterator[TableRow]:
     """The rows of bounds on depth error that a column has."""
-    for label, bounds in shown.bounds.items():
-        known = [None if column.quantity == "projected" else bounds.get(column.data) for column in shown.columns]
+    for label, bounds in layout.bounds.items():
+        known = [*([] if is_by_line else [None]), *map(bounds.get, data)]
         if any(known):
             cells = (TableCell(f"{bound:.0f}" if bound else NOTHING) for bound in known)
-            yield TableRow((label, "depth") if shown.by_line else (label,), tuple(cells))
+            yield TableRow((label, "depth") if is_by_line else (label,), tuple(cells))
 
 
-def _notes(layout: Layout, reading: Reading, cells: Sequence[Cell]) -> list[str]:
+def _notes(layout: Layout, reading: Reading, cells: Sequence[Cell], left_out: str) -> tuple[str, ...]:
     """The notes that explain the contents of a table."""
     kinds = {cell.scatter for cell in cells if cell.means}
-    notes = [OF_THE_READING[reading], OF_A_CELL]
-    notes += [text for kind, text in OF_AN_INTERVAL.items() if kind in kinds]
-    if any(cell.means and cell.gaps for cell in cells):
-        notes.append(OF_FEWER_SEEDS)
-    if any(map(_is_below, cells)):
-        notes.append(OF_A_BOUND)
-    return [*notes, ASSUMED, layout.note, OF_THE_SPLITS]
+    notes = {OF_THE_READING[reading]: True, OF_A_CELL: True}
+    notes |= {text: kind in kinds for kind, text in OF_AN_INTERVAL.items()}
+    notes[OF_FEWER_SEEDS] = any(cell.means and cell.gaps for cell in cells)
+    notes[OF_A_BOUND] = any(cell.is_below_bound for cell in cells)
+    notes |= {ASSUMED: True, layout.note: True, OF_THE_SPLITS: True}
+    notes[f"Left out of {layout.title}, without a run: {left_out}."] = bool(left_out)
+    return tuple(text for text, applies in notes.items() if applies)
 
 
 def _samples(cells: Sequence[Cell]) -> str:

@@ -62,7 +62,7 @@ def test_bounds_apply_only_to_models_with_as_little_information() -> None:
 
 
 def test_every_published_figure_has_its_place() -> None:
-    places = {(model, data) for layout in LAYOUTS for data, model in layout.choices}
+    places = {(model, data) for layout in LAYOUTS for data, model in product(layout.data, layout.models)}
     assert places == PUBLISHED.keys()
 
 
