@@ -39,7 +39,6 @@ def main(words: list[str]) -> int:
 def _report(runs: Path, out: Path) -> None:
     # imports of seconds, which follow the check of the arguments
     from phd_exp.reports.files import all_tables, write_tables
-    from phd_exp.reports.lines import run_lines
     from phd_exp.reports.rehearsal import rehearsed
     from phd_exp.reports.runs import read_report
     from phd_exp.reports.terminal import print_report
@@ -52,7 +51,7 @@ def _report(runs: Path, out: Path) -> None:
     tables = all_tables(report)
     print_report(report, tables)
     if report.runs:
-        print(f"tables: {write_tables(tables, run_lines(report), out)}")
+        print(f"tables: {write_tables(report, tables, out)}")
         _draw(report, tables, out)
     for note in report.notes:
         announce(f"note: {note}")

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber, Temperature
@@ -53,22 +53,13 @@ class Guarantee:
     levels: list[float]
     n: list[int]
 
-    def region(self, prediction: ProjectedHuber, f: float) -> tuple[Region, dict[str, Any]]:
-        """The region of one prediction, and its guarantee for JSON; f is the focal length in sides of the image."""
-        (place,) = self._places(prediction, np.array(f)).ravel().tolist()
-        return Region(prediction, self.levels[place]), self._facts(place)
-
     def regions(
-        self, predictions: ProjectedHuber, f: Float[np.ndarray, " batch"]
+        self, predictions: ProjectedHuber, f: Float[np.ndarray, "*batch"]
     ) -> tuple[Region, list[dict[str, Any]]]:
-        """The regions of a batch, and the guarantee of each, as `region`."""
-        places = self._places(predictions, f)
-        return Region(predictions, np.array(self.levels)[places]), [self._facts(place) for place in places.tolist()]
-
-    def _places(self, predictions: ProjectedHuber, f: Float[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
-        """The group of each prediction."""
+        """The regions of predictions, and the guarantee of each for JSON; f is in sides of the image."""
         quantity = GROUPED_BY[self.groups](predictions, torch.from_numpy(f))
-        return np.asarray(np.searchsorted(self.edges, quantity.numpy(), side="right"))
+        places = np.searchsorted(self.edges, quantity.numpy(), side="right")
+        return Region(predictions, np.array(self.levels)[places]), [*map(self._facts, np.ravel(places).tolist())]
 
     def _facts(self, place: int) -> dict[str, Any]:
         facts = {"coverage": self.coverage, "level": self.levels[place], "held_out_samples": self.n[place]}

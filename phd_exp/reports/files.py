@@ -3,24 +3,28 @@
 import csv
 import io
 import re
-from collections.abc import Iterable, Mapping, Sequence
+import shlex
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 from phd_exp.distributions.constraints import SCALE, Finding
+from phd_exp.records.choices import PLAIN_RECIPE, preset_and_recipe
+from phd_exp.records.errors import one_line
 from phd_exp.records.files import remove_temporaries
 from phd_exp.reports.calibration_table import calibration_tables
+from phd_exp.reports.cells import interval
 from phd_exp.reports.ensembles import ensemble_tables
-from phd_exp.reports.fusion_table import fusion_tables
+from phd_exp.reports.fusion import fusion_tables
 from phd_exp.reports.heads_table import heads_tables
 from phd_exp.reports.paper_tables import paper_tables
-from phd_exp.reports.runs import Report
+from phd_exp.reports.runs import Report, Run
 from phd_exp.reports.searches import search_tables
 from phd_exp.reports.shift_tables import shift_tables
-from phd_exp.reports.table import Table, TableCell, TableRow, write_text
-from phd_exp.reports.tracks_table import tracks_tables
+from phd_exp.reports.table import Table, TableCell, TableRow, bounds, write_text
+from phd_exp.reports.tracks import tracks_tables
 from phd_exp.reports.variations import variation_tables
 
 SPECIAL = re.compile(r"([\\`*_\[\]<>#|~&@$])")
@@ -74,11 +78,8 @@ def all_tables(report: Report) -> list[Table]:
     return [table for tables in found for table in tables]
 
 
-def write_tables(tables: Sequence[Table], runs: Sequence[Mapping[str, Any]], out: Path) -> Path:
-    """Write `<out>/tables/<stem>.{md,tex}` of each table and `<kind>.csv` of each kind; returns that folder.
-
-    `runs` are the lines of `runs.csv`.
-    """
+def write_tables(report: Report, tables: Sequence[Table], out: Path) -> Path:
+    """Write to `<out>/tables/` the `<stem>.{md,tex}` of each table, `<kind>.csv` of each kind, and `runs.csv`."""
     folder = out / "tables"
     folder.mkdir(parents=True, exist_ok=True)
     remove_temporaries(folder)  # of a killed process
@@ -87,8 +88,40 @@ def write_tables(tables: Sequence[Table], runs: Sequence[Mapping[str, Any]], out
         write_text(folder / f"{table.stem}.tex", latex(table))
     for kind, alike in groupby(tables, key=lambda table: table.kind):
         write_text(folder / f"{kind}.csv", tidy([line for table in alike for line in table.numbers]))
-    write_text(folder / "runs.csv", tidy(runs))
+    write_text(folder / "runs.csv", tidy(run_lines(report)))
     return folder
+
+
+def run_lines(report: Report) -> list[dict[str, Any]]:
+    """A line for every error of every finished run, and one for its NLL, whose interval is not computed."""
+    return [
+        run.choice
+        | {"seed": run.seed, "overrides": run.digest}
+        | number
+        | {"command": command_of(run), "git_commit": run.status.git_commit, "machine": run.status.machine}
+        for run in report.runs
+        if run.state == "finished" and run.status
+        for number in _numbers(run)
+    ]
+
+
+def _numbers(run: Run) -> Iterator[dict[str, Any]]:
+    for key, mean in run.errors.items():
+        name = {"estimate": key.estimate, "reading": key.reading, "quantity": f"{key.quantity}_error_mm"}
+        yield name | {"mean": mean.value, **bounds(interval([mean])), "n_test": mean.n}
+    if run.nll is not None:
+        n = max(mean.n for mean in run.errors.values())
+        name = {"estimate": "", "reading": "whole", "quantity": "nll"}
+        yield name | {"mean": run.nll, **bounds(None), "n_test": n}
+
+
+def command_of(run: Run) -> str:
+    """The command line that makes a run."""
+    preset, recipe = preset_and_recipe(run.preset)
+    words = [f"preset={preset}", f"data={run.data}", f"model={run.model}", f"seed={run.seed}"]
+    words += [f"recipe={recipe}"] if recipe != PLAIN_RECIPE else []
+    words += run.status.overrides if run.status else []
+    return one_line(shlex.join(["python", "-m", "phd_exp", *words]))
 
 
 def tidy(numbers: Sequence[Mapping[str, Any]]) -> str:

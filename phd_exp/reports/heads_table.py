@@ -50,7 +50,8 @@ def _table(preset: str, data: str, digest: str, models: dict[str, list[Run]]) ->
     columns = [name for name in COLUMNS if any(means[model, name] for model in models)]
     gaps = {(model, name): _gap(models, means, model, name) for model in models for name in columns}
     known = {place: gap for place, gap in gaps.items() if gap and place[1] != COVERAGE}
-    sure = significant({(m, name): p_value(gap, _seeds(models, m)) for (m, name), gap in known.items()})
+    seeds = {model: len(runs) + len(models[PROBABILISTIC]) for model, runs in models.items()}
+    sure = significant({(model, name): p_value(gap, seeds[model]) for (model, name), gap in known.items()})
     for model, runs in models.items():
         broken = ", ".join(name[0] for name, row in constraints.items() if model in row and not row[model].holds)
         stub = (model, broken or NOTHING, ", ".join(str(run.seed) for run in runs))
@@ -67,10 +68,6 @@ def _table(preset: str, data: str, digest: str, models: dict[str, list[Run]]) ->
         below="difference",
         preset=preset,
     )
-
-
-def _seeds(models: dict[str, list[Run]], model: str) -> int:
-    return len(models[model]) + len(models[PROBABILISTIC])
 
 
 def _gap(

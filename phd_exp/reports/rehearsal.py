@@ -7,8 +7,7 @@ from dataclasses import asdict, replace
 from functools import partial
 
 from phd_exp.records.searches import Search
-from phd_exp.reports.files import all_tables, tidy
-from phd_exp.reports.lines import run_lines
+from phd_exp.reports.files import all_tables, run_lines, tidy
 from phd_exp.reports.measured import Notes
 from phd_exp.reports.runs import Report, Run, unreadable
 from phd_exp.reports.site.overview import search_charts

@@ -1,6 +1,6 @@
 """The prediction for one test image in space: the camera, the true position, and regions as surfaces."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,12 +9,16 @@ import numpy as np
 from phd_exp.distributions.surfaces import level_surface
 from phd_exp.evaluation.parquet import Columns, require_columns
 from phd_exp.reports.gallery import NEEDED, distribution_of
+from phd_exp.reports.site.charts import Trace
 
 LEVELS = (0.5, 0.9)
 DEPTHS, ANGLES = 11, 20  # of a surface; each has its place in the page
 DIGITS = 5
+OPACITY = {0.5: 0.45, 0.9: 0.2}
 Positions = list[list[float]]
 """Rows of x, y and z, metres in the frame of the camera."""
+Row = Sequence[float | None]
+GAP: Row = (None, None, None)
 
 
 @dataclass(frozen=True)
@@ -57,3 +61,33 @@ def _scene(row: Mapping[str, Any]) -> Scene | None:
 
 def _rounded(values: np.ndarray) -> Any:
     return np.vectorize(lambda value: float(f"{value:.{DIGITS}g}"))(values).tolist()
+
+
+def scene_traces(scene: Scene) -> list[Trace]:
+    """Plotly's traces of all parts; `meta.close` is true of those in the close-up."""
+    a, b, c, d = scene.corners
+    camera: Row = [0.0, 0.0, 0.0]
+    edges = [camera, a, b, camera, GAP, camera, c, d, camera, GAP, b, c, GAP, d, a]
+    return [
+        _trace("camera and the edges of its image", edges, mode="lines", line={"color": "var(--quiet)", "width": 3}),
+        *(_surface(*one) for one in zip(scene.levels, scene.regions, strict=True)),
+        _point("true position", scene.truth, "circle"),
+        _point("mode", scene.mode, "diamond-open"),
+    ]
+
+
+def _trace(name: str, points: Sequence[Row], close: bool = False, **more: Any) -> Trace:
+    axes = dict(zip("xyz", zip(*points, strict=True), strict=True))
+    return {"type": "scatter3d", "name": name, "meta": {"close": close}, **axes, **more}
+
+
+def _point(name: str, at: Row, symbol: str) -> Trace:
+    marker = {"color": "var(--ink)", "size": 4, "symbol": symbol}
+    return _trace(name, [at], close=True, mode="markers", marker=marker)
+
+
+def _surface(level: float, region: tuple[Positions, list[list[int]]]) -> Trace:
+    vertices, triangles = region
+    corners = dict(zip("ijk", zip(*triangles, strict=True), strict=True))
+    look = {"type": "mesh3d", "color": "var(--series-1)", "opacity": OPACITY[level]}
+    return _trace(f"{100 * level:g} % region", vertices, close=True, **look, **corners)

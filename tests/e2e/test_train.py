@@ -16,7 +16,7 @@ from PIL import Image
 from phd_exp.evaluation.point_errors import ErrorKey
 from phd_exp.records.processes import PROJECT
 from phd_exp.records.runs import RunFolder
-from phd_exp.reports.lines import command_of
+from phd_exp.reports.files import command_of
 from phd_exp.reports.runs import read_report
 from phd_exp.training.module import PositionModule
 from tests.e2e.conftest import QUICK, QUICKER

@@ -14,8 +14,7 @@ from markdown_it import MarkdownIt
 from rich.console import Console
 
 from phd_exp.distributions.constraints import Finding
-from phd_exp.reports.files import all_tables, constraints_table, latex, markdown, tidy, write_tables
-from phd_exp.reports.lines import run_lines
+from phd_exp.reports.files import all_tables, constraints_table, latex, markdown, run_lines, tidy
 from phd_exp.reports.runs import Report, Run, read_report
 from phd_exp.reports.table import Table, TableCell
 from phd_exp.reports.terminal import WIDTH, print_report
@@ -209,16 +208,6 @@ def test_runs_with_overrides_are_listed_apart(tmp_path: Path, capsys: pytest.Cap
 # files, and the table of several views
 
 
-def test_each_table_is_two_files_and_each_kind_one_csv(found: list[Table], records: Report, tmp_path: Path) -> None:
-    folder = write_tables(found, run_lines(records), tmp_path / "new" / "report")
-    assert folder == tmp_path / "new" / "report" / "tables"
-    names = {path.name for path in folder.iterdir()}
-    assert {"table1-small-whole.md", "table2-small-central.tex", f"{FUSION}.md"} <= names
-    assert {name for name in names if name.endswith(".csv")} == {"tables.csv", "fusion.csv", "runs.csv"}
-    assert len(names) == 2 * len(found) + 3
-    assert (folder / "table1-small-whole.md").read_text() == markdown(one(found, "table1-small-whole"))
-
-
 def test_each_run_is_lines_from_which_the_tables_follow(found: list[Table], records: Report) -> None:
     lines = pd.read_csv(io.StringIO(tidy(run_lines(records))), dtype={"overrides": str})
     cells = pd.read_csv(io.StringIO(tidy([cell for table in found for cell in table.numbers if "table" in cell])))
@@ -251,10 +240,3 @@ def test_the_fusion_table_holds_the_scores(found: list[Table], several: Run) -> 
     assert re.fullmatch(r"\(\d+(\.\d)?–\d+(\.\d)?\)", row.cells[1].spread)
     assert bold(table) == 0
     assert re.fullmatch(r"8[78]\.\d", table.groups[4][3].cells[0].below)
-
-
-def test_the_fusion_table_explains_common_errors(found: list[Table], several: Run) -> None:
-    notes, scores = " ".join(one(found, FUSION).notes), several.measured.fusion
-    assert scores is not None
-    views = scores.correlation
-    assert f"have the correlation {views.value:.2f} ({views.low:.2f}–{views.high:.2f})" in notes

@@ -46,21 +46,9 @@ def files(**contents: bytes | str) -> Spoil:
     return spoil
 
 
-def folder_for(file: Path) -> None:
-    file.unlink()
-    file.mkdir()
-
-
 def bad_status(spoil: Spoil) -> Spoil:
     """Spoil the status; the predictions are torn too, for there is nothing to learn from their measurement."""
     return lambda run: (run.predictions.write_bytes(b"PAR1"), spoil(run))
-
-
-def status(**changes: object) -> Spoil:
-    def spoil(run: RunFolder) -> None:
-        run.status_file.write_text(json.dumps(json.loads(run.status_file.read_text()) | changes))
-
-    return bad_status(spoil)
 
 
 RENAMED: dict[str, bytes | str] = {
@@ -115,15 +103,7 @@ BROKEN: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "predictions gone": (lambda run: run.predictions.unlink(), ("missing, though the run has finished",)),
     "a pipe of predictions": (lambda run: pipe(run.predictions), ("cannot be read (a pipe or a device",)),
     "no status": (bad_status(files(status=b"{")), ("status.json: not a run status",)),
-    "a status of bytes": (bad_status(files(status=b"\xff\x00")), ("status.json: not a run status",)),
-    "a status nested without end": (bad_status(files(status="[" * 100_000)), ("status.json: not a run status",)),
-    "a status of 20 MB": (bad_status(files(status=" " * 20_000_000)), ("(20 MB; expected at most 16 MB)",)),
     "a pipe of a status": (bad_status(lambda run: pipe(run.status_file)), ("not a run status (a pipe or a device",)),
-    "a folder for a status": (bad_status(lambda run: folder_for(run.status_file)), ("(Is a directory)",)),
-    "a date beyond all": (status(started=1e300), ("not a run status", "started")),
-    "an unknown state": (status(state="done"), ("not a run status", "state")),
-    "an unknown key": (status(__class__="os.system"), ("not a run status", "__class__")),
-    "a folder for a file": (lambda run: folder_for(run.metrics_file), ("directory",)),
 }
 """Lines that the page must contain; empty if the run may be measured all the same."""
 GOOD = "good"

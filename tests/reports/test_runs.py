@@ -14,7 +14,7 @@ from phd_exp.records.runs import RunFolder
 from phd_exp.reports import runs as runs_module
 from phd_exp.reports.measured import Measured, measure
 from phd_exp.reports.runs import Run, read_report
-from tests.support.recorded import predicted, record
+from tests.support.recorded import predicted, record, status_of
 from tests.support.synthetic import write_run
 
 DEPTH = ErrorKey("mode", "whole", "depth")
@@ -23,14 +23,6 @@ DEPTH = ErrorKey("mode", "whole", "depth")
 def only(runs: Path) -> Run:
     (run,) = read_report(runs).runs
     return run
-
-
-def unfinished(runs: Path, error: BaseException) -> RunFolder:
-    folder = RunFolder(RunName("small", "occl", "mae_vz", 0).folder(runs))
-    folder.path.mkdir(parents=True)
-    with pytest.raises(type(error)), folder.recording(data_manifest=None):
-        raise error
-    return folder
 
 
 def test_a_finished_run_has_its_errors(tmp_path: Path) -> None:
@@ -44,35 +36,18 @@ def test_a_finished_run_has_its_errors(tmp_path: Path) -> None:
     assert baseline.nll is None
 
 
-@pytest.mark.parametrize(
-    ("error", "state", "detail"),
-    [(ValueError("odd\nnumber"), "failed", "ValueError: odd number"), (KeyboardInterrupt(), "interrupted", None)],
-)
-def test_an_unfinished_run_has_its_reason_on_one_line(
-    tmp_path: Path, error: BaseException, state: str, detail: str | None
-) -> None:
-    unfinished(tmp_path, error)
-    run = only(tmp_path)
-    assert (run.state, run.errors) == (state, {})
-    assert detail in (None, run.detail)
-
-
 def test_a_killed_run_does_not_look_alive(tmp_path: Path) -> None:
     run = RunFolder(RunName("small", "occl", "mae_vz", 0).folder(tmp_path))
     with run.held():
         with run.recording(data_manifest=None):
-            status = run.status()
-        assert status is not None
+            status = status_of(run)
         run.write_status(status)  # as a SIGKILL would have left it
         assert only(tmp_path).state == "running"
     assert only(tmp_path).state == "interrupted"
 
 
 def test_a_lock_that_cannot_be_tried_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = unfinished(tmp_path, ValueError())
-    status = folder.status()
-    assert status is not None
-    folder.write_status(status.model_copy(update={"state": "running"}))
+    status_of(record(tmp_path, "occl", "mae_vz"), state="running")
 
     def read_only(self: RunFolder) -> bool:
         raise PermissionError(13, "Permission denied")
@@ -93,19 +68,10 @@ def test_runs_with_other_overrides_are_apart_and_say_which(tmp_path: Path) -> No
     chosen = records.at_defaults("small", "occl", "mae_vz")
     assert list(chosen) == [0]
     assert chosen[0].folder.path == plain.path
-    status = other.status()
-    assert status is not None
-    other.write_status(status.model_copy(update={"overrides": []}))
-    assert read_report(tmp_path).runs[1].overrides == other.path.name.removeprefix("seed0-")
-
-
-def test_settings_of_the_computation_are_not_overrides(tmp_path: Path) -> None:
-    """A run with other threads, logger or progress bar enters the tables."""
-    folder = record(tmp_path, "occl", "mae_vz", 0, predicted(0).frame)
-    status = folder.status()
-    assert status is not None
-    folder.write_status(status.model_copy(update={"overrides": ["trainer.threads=1", "logger=none"]}))
-    assert list(read_report(tmp_path).at_defaults("small", "occl", "mae_vz")) == [0]
+    status_of(other, overrides=[])
+    status_of(plain, overrides=["trainer.threads=1", "logger=none"])  # settings of the computation
+    overrides = [run.overrides for run in read_report(tmp_path).runs]
+    assert overrides == [None, other.path.name.removeprefix("seed0-")]
 
 
 @pytest.mark.parametrize("leaf", ["seed", "seedx", "seed00", "seed1-xyz", "seed-1"])

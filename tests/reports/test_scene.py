@@ -9,8 +9,7 @@ import torch
 from phd_exp.evaluation.parquet import Columns, read_table
 from phd_exp.records.errors import RunError
 from phd_exp.reports.gallery import distribution_of
-from phd_exp.reports.scene import LEVELS, first_scene
-from phd_exp.reports.site.scene_traces import scene_traces
+from phd_exp.reports.scene import LEVELS, first_scene, scene_traces
 from tests.support.synthetic import write_run
 
 

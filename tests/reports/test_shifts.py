@@ -78,7 +78,7 @@ def test_every_cell_is_recomputed(runs: list[RunFolder], report: Report) -> None
 
 def test_each_score_has_a_matrix_and_one_csv_has_all(runs: list[RunFolder], report: Report, tmp_path: Path) -> None:
     tables = all_tables(report)
-    folder = write_tables(tables, [], tmp_path)
+    folder = write_tables(report, tables, tmp_path)
     csv = pd.read_csv(folder / "shifts.csv")
     at = csv[(csv["data"] == "default") & (csv["shift"] == "dark")].set_index("quantity")
     frame = pd.read_parquet(runs[0].shift("dark"))

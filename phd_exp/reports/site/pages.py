@@ -9,15 +9,15 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from phd_exp.records.processes import duration
-from phd_exp.reports.fusion_table import fusion_table, headline
+from phd_exp.reports.fusion import fusion_table, headline
 from phd_exp.reports.paper import PUBLISHED
 from phd_exp.reports.quantities import SCORES, mark
 from phd_exp.reports.runs import Run
+from phd_exp.reports.scene import scene_traces
 from phd_exp.reports.site.overview import Drawn, Groups, presets_of
-from phd_exp.reports.site.scene_traces import scene_traces
 from phd_exp.reports.table import Table
-from phd_exp.reports.tracks_table import headline as headline_of_tracks
-from phd_exp.reports.tracks_table import tracks_table
+from phd_exp.reports.tracks import headline as headline_of_tracks
+from phd_exp.reports.tracks import tracks_table
 
 _ENVIRONMENT = Environment(
     loader=FileSystemLoader(Path(__file__).parent / "templates"),

@@ -1,18 +1,16 @@
-"""The charts of one run: calibration, training, errors by stratum, several cameras, and paths."""
+"""The charts of one run: calibration, training, and errors by stratum; those of other records from their files."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from phd_exp.evaluation.fusion import BINS, ERRORS, PER_CENT, FusionScores, Method
 from phd_exp.evaluation.predictions import Curve, Evaluation, Stratum
-from phd_exp.metrics.bootstrap import Interval
 from phd_exp.reports.figures import decades
-from phd_exp.reports.fusion_table import ON_GROUND, names_of
+from phd_exp.reports.fusion import fusion_charts
 from phd_exp.reports.quantities import METRICS, SCORES, Quantity
 from phd_exp.reports.runs import Run
 from phd_exp.reports.site.charts import DASHES, Chart, Trace, axis, bars, curve_line, identity, line, square
-from phd_exp.reports.site.track_charts import track_charts
+from phd_exp.reports.tracks import track_charts
 
 
 def run_charts(run: Run) -> dict[str, dict[str, Chart]]:
@@ -167,79 +165,3 @@ def _strata_chart(strata: Sequence[Stratum], name: str, key: str, colour: int) -
         "yaxis": axis(name) | {"type": "category", "autorange": "reversed"},
     }
     return Chart(f"{score.label} by {name}", f"{score.label} by {name}: {'; '.join(values)}.", [trace], layout)
-
-
-COLOURS: dict[Method, int] = {"mode": 1, "mean": 2, "average": 3, "gaussian": 4, "shared": 5}
-DASH = {False: "solid", True: "dash"}
-MAIN, ASIDE = "line", "aside"
-"""Roles: lines that the comparison of two runs includes, and lines that it omits."""
-
-
-def fusion_charts(scores: FusionScores) -> dict[str, Chart]:
-    """Charts of a run that recorded several views."""
-    squared = "Fused: squared error over predicted", "squared error / predicted"
-    return {
-        "fusion_depth_error_mm": _errors(scores, "depth_error_mm", "Depth error by cameras", "mean depth error (mm)"),
-        "fusion_distance_mm": _errors(
-            scores, "distance_mm", "Distance from the truth by cameras", "mean distance (mm)"
-        ),
-        "fusion_squared_error": _errors(scores, "normalised_squared_error", *squared),
-        "fusion_coverage": _coverage(scores),
-        "fusion_surprise": _surprise(scores),
-    }
-
-
-def _errors(scores: FusionScores, quantity: str, title: str, unit: str) -> Chart:
-    """An error against the number of cameras: a line for each method, in free space and on the ground."""
-    traces, cameras = [], range(1, scores.views + 1)
-    for on_plane in (False, True):
-        for method, name in names_of(quantity).items():
-            curve = _curve(cameras, [scores.band(quantity, method, k, on_plane) for k in cameras])
-            role = MAIN if method == "mean" and not on_plane else ASIDE
-            name += ON_GROUND if on_plane else ""
-            traces.append(curve_line(name, curve, COLOURS[method], DASH[on_plane], role))
-    courses = "; ".join(f"{trace['name']} from {trace['y'][0]:.3g} to {trace['y'][-1]:.3g}" for trace in traces)
-    text, y = f"{unit} against the number of cameras", axis(unit, log=True)
-    if quantity not in ERRORS:
-        text = "Squared error of the fused position over its prediction, 1 where calibrated"
-        y = axis(unit, rangemode="tozero")
-        traces.insert(0, line("calibrated", (1.0, scores.views), (1.0, 1.0), 0, dash="dash", role=ASIDE))
-    return Chart(title, f"{text}: {courses}.", traces, {"xaxis": axis("cameras", dtick=1), "yaxis": y})
-
-
-def _curve(x: Iterable[float], bands: list[Interval[float]], unit: float = 1.0) -> Curve:
-    ends = ([getattr(band, end) / unit for band in bands] for end in ("value", "low", "high"))
-    return Curve([float(value) for value in x], *ends)
-
-
-def _coverage(scores: FusionScores) -> Chart:
-    traces = [identity(0.0, 1.0, "Gaussian")]
-    for k in (1, scores.views):
-        for method, alone in names_of("coverage").items():
-            bands = [scores.band(f"coverage_{level}", method, k) for level in PER_CENT]
-            curve = _curve([level / 100 for level in PER_CENT], bands, unit=100)
-            name = f"{alone}, {k} camera{'s' if k > 1 else ''}"
-            role = MAIN if (k, method) == (scores.views, "mean") else ASIDE
-            traces.append(curve_line(name, curve, COLOURS[method], DASH[k == 1], role))
-    shares = "; ".join(f"{one['name']}: {', '.join(f'{100 * y:.0f} %' for y in one['y'])}" for one in traces[1:])
-    layout = {"xaxis": axis("share of a Gaussian inside"), "yaxis": axis("share of truths inside")}
-    label = f"Share of true positions inside the ellipsoids of {', '.join(map(str, PER_CENT))} %: {shares}."
-    return Chart("Fused: coverage of ellipsoids", label, traces, square(layout, 0.0, 1.0))
-
-
-def _surprise(scores: FusionScores) -> Chart:
-    total = sum(scores.surprise) or 1
-    x = [(place + 0.5) / BINS for place in range(BINS)]
-    trace = line("views", x, [count / total for count in scores.surprise], 1)
-    trace["line"]["shape"] = "hvh"
-    layout = {
-        "xaxis": axis("credible level of the fused position", range=[0, 1]),
-        "yaxis": axis("share of views", rangemode="tozero"),
-    }
-    label = (
-        f"Histogram of the credible level that each view gives the position fused from all {scores.views}: "
-        f"{100 * scores.surprise[-1] / total:.1f} % of the views find it beyond their "
-        f"{100 * (1 - 1 / BINS):.0f} % region. It is low where fusion follows a view, and high where a view is "
-        "outvoted."
-    )
-    return Chart("Surprise of the views", label, [trace], layout)

@@ -1,10 +1,11 @@
-"""Paths over time as a table: a column per length of the sequences, a line per method."""
+"""Paths over time: a table with a column per length of the sequences and a line per method, and charts."""
 
 from collections.abc import Mapping
 
 from phd_exp.evaluation.tracks import ERRORS, HIDDEN, METHODS, NEES, SMOOTHERS, Method, TrackScores, place
 from phd_exp.records.choices import in_words
 from phd_exp.reports.runs import Report, Run
+from phd_exp.reports.site.charts import Chart, Numbers, Trace, axis, curve_line, line
 from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, bounds, file_stem
 
 NAMES: dict[Method, str] = {
@@ -24,6 +25,13 @@ LABELS = {
     NEES: "squared error",
 }
 """Quantity -> its label; the errors, then comparisons, then calibration."""
+COLOURS: dict[Method, int] = {"slow": 1, "kalman": 2, "independent": 3, "single": 4}
+DASHES: dict[Method, str] = {"slow": "solid", "kalman": "dash", "independent": "dot", "single": "dashdot"}
+TITLES = {
+    ERRORS[0]: ("Depth error", "mean depth error (mm)"),
+    ERRORS[1]: ("Projected error", "mean projected error (mm)"),
+}
+SQUARED = "squared error / predicted"
 OF_QUANTITIES = (
     "Means over the frames of all sequences, of one camera; in brackets: 95 % bootstrap intervals over sequences. "
     "Depth: along the camera's true viewing ray; projected: across it, as in the paper's tables. Hidden: frames in "
@@ -70,10 +78,10 @@ def _cell(run: Run, scores: TrackScores, quantity: str, method: Method) -> Table
     band = scores.bands.get(place(quantity, method))
     if band is None:
         return TableCell(NOTHING)
-    line = run.choice | {"run": run.name, "frames": scores.frames, "quantity": quantity, "method": method}
-    line |= {"mean": band.value, **bounds(band), "n_sequences": scores.n, "n_hidden": scores.hidden}
+    numbers = run.choice | {"run": run.name, "frames": scores.frames, "quantity": quantity, "method": method}
+    numbers |= {"mean": band.value, **bounds(band), "n_sequences": scores.n, "n_hidden": scores.hidden}
     text = band.each(lambda value: number(quantity, value))
-    return TableCell(text.value, f"({text.low}{' to ' if band.low < 0 else '–'}{text.high})", numbers=(line,))
+    return TableCell(text.value, f"({text.low}{' to ' if band.low < 0 else '–'}{text.high})", numbers=(numbers,))
 
 
 def number(quantity: str, value: float) -> str:
@@ -106,3 +114,35 @@ def headline(scores: Mapping[str, TrackScores]) -> str:
     one = min(scores.values(), key=lambda each: each.frames)
     single, path = (number(ERRORS[0], one.bands[place(ERRORS[0], method)].value) for method in ("single", "slow"))
     return f"depth error {single} mm in single frames, {path} mm on paths of {one.frames}"
+
+
+def track_charts(scores: Mapping[str, TrackScores]) -> dict[str, Chart]:
+    """Both errors and the squared error over predicted, for each length of sequences."""
+    charts = {}
+    for one in sorted(scores.values(), key=lambda each: each.frames):
+        for quantity, (title, unit) in TITLES.items():
+            y = axis(unit, rangemode="tozero")
+            charts[f"tracks_{quantity}_{one.frames}"] = _over_time(one, quantity, f"{title}, {one.frames} frames", y)
+        chart = _over_time(one, NEES, f"Squared error over predicted, {one.frames} frames", axis(SQUARED, log=True))
+        low, high = one.calibrated
+        times = one.curves[place(NEES, "slow")].x
+        band = line("calibrated", times, [1.0] * len(times), 0, dash="dash", role="aside", low=[low] * len(times),
+                    high=[high] * len(times))  # fmt: skip
+        chart.data.insert(0, band)
+        charts[f"tracks_{NEES}_{one.frames}"] = chart
+    return charts
+
+
+def _over_time(scores: TrackScores, quantity: str, title: str, y: Trace) -> Chart:
+    traces = []
+    for method in METHODS:
+        curve, role = scores.curves[place(quantity, method)], "line" if method == "slow" else "aside"
+        traces.append(curve_line(NAMES[method], curve, COLOURS[method], DASHES[method], role))
+    ends = "; ".join(f"{trace['name']} {_mean(trace['y']):.3g}" for trace in traces)
+    label = f"{title}, over the time of {scores.n} sequences, on average: {ends}."
+    return Chart(title, label, traces, {"xaxis": axis("time (s)"), "yaxis": y})
+
+
+def _mean(values: Numbers) -> float:
+    known = [value for value in values if value is not None]
+    return sum(known) / max(len(known), 1)
