@@ -37,10 +37,6 @@ class DetectionFolder:
         """The folder of decoded crops."""
         return self.root / ".cache"
 
-    def metadata_path(self, split: Split) -> Path:
-        """The lines of a split."""
-        return self.root / split / "metadata.jsonl"
-
     def detections(self, split: Split, n: int | None = None) -> list[Detection]:
         """The detections of a split, as `detections_in` reads them."""
         return detections_in(self.root / split, n, f" (data.n_{split})", self.object_name)

@@ -50,7 +50,7 @@ def photos(tmp_path: Path) -> DetectionFolder:
         Image.fromarray(draw.integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)).save(file)
     for split, rows in lines.items():
         text = "".join(json.dumps(row) + "\n" for row in rows)
-        folder.metadata_path(split).write_text(text)  # type: ignore[arg-type]
+        (folder.root / split / "metadata.jsonl").write_text(text)  # type: ignore[arg-type]
     return folder
 
 
@@ -154,7 +154,7 @@ def test_decodes_each_image_once(photos: DetectionFolder, monkeypatch: pytest.Mo
 
 
 def change_line(photos: DetectionFolder, **changes: Any) -> None:
-    path = photos.metadata_path("train")
+    path = photos.root / "train/metadata.jsonl"
     first, *others = path.read_text().splitlines()
     path.write_text("\n".join([json.dumps(json.loads(first) | changes), *others]) + "\n")
 

@@ -72,18 +72,3 @@ def test_a_data_set_of_another_mesh_is_refused_by_name(make_spec: Callable, tmp_
     with pytest.raises(DatasetError, match=r"mesh=cube\.glb .*mesh=sphere\.glb .* another data\.variant") as refused:
         folder.require(specs[1])
     assert len(str(refused.value)) < len(str(tmp_path)) + 250
-
-
-def test_a_mesh_is_its_contents_and_those_of_the_files_it_names(tmp_path: Path) -> None:
-    for folder in (tmp_path / "one", tmp_path / "two"):
-        (folder / "textures").mkdir(parents=True)
-        (folder / "a.obj").write_text("mtllib a.mtl\n")
-        (folder / "a.mtl").write_text("map_Kd -s 1 1 1 textures/wood.png\n")
-        (folder / "textures" / "wood.png").write_bytes(b"brown")
-        (folder / "unrelated.png").write_bytes(b"")
-    one, two = (mesh_asset(str(tmp_path / folder / "a.obj")) for folder in ("one", "two"))
-    assert list(one.files) == ["a.obj", "a.mtl", "textures/wood.png"]
-    assert one == two
-    assert one.path("a.mtl") == tmp_path / "one" / "a.mtl"
-    (tmp_path / "two" / "textures" / "wood.png").write_bytes(b"black wood")
-    assert mesh_asset(tmp_path / "two" / "a.obj") != one

@@ -40,19 +40,17 @@ def ros(**changes: Any) -> dict[str, Any]:
     return {key: value for key, value in values.items() if value is not None}
 
 
+def ros_with(model: str | None, D: list[Any], **changes: Any) -> dict[str, Any]:
+    """The same with another lens."""
+    return ros(distortion_model=model, distortion_coefficients=matrix(D, 1, len(D)), **changes)
+
+
 def message(D: list[float], model: str, lower: bool = False) -> str:
     """A message of the topic `camera_info`, as `rostopic echo` and `ros2 topic echo` print it."""
     values = {
         "header": {"stamp": {"secs": 1, "nsecs": 2}, "frame_id": "camera"},
-        **{
-            "height": 480,
-            "width": 640,
-            "distortion_model": model,
-            "D": D,
-            "K": MATRIX,
-            "R": [*MATRIX],
-            "P": [1.0] * 12,
-        },
+        **{"height": 480, "width": 640, "distortion_model": model},
+        **{"D": D, "K": MATRIX, "R": [*MATRIX], "P": [1.0] * 12},
         "roi": {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False},
     }
     return yaml.safe_dump({key.lower() if lower else key: value for key, value in values.items()}) + "---\n"
@@ -120,28 +118,43 @@ F = named("fx fy cx cy", [400.5, 401.2, 319.5, 239.5])
 CORNER = named("fl_x fl_y cx cy w h", [400.5, 401.2, 320.0, 240.0, 640, 480])
 SIZE = {"Camera.width": 640, "Camera.height": 480}
 BROWN, RATIONAL, KB = "plumb_bob", "rational_polynomial", "equidistant"
-FIRST, ALL = "k1 k2 p1 p2", "k1 k2 p1 p2 k3 k4 k5 k6"
+FIRST, ALL, ANGLES = "k1 k2 p1 p2", "k1 k2 p1 p2 k3 k4 k5 k6", "k1 k2 k3 k4"
 ROWS = [MATRIX[:3], MATRIX[3:6], MATRIX[6:]]
 COLUMNS = [MATRIX[place] for place in (0, 3, 6, 1, 4, 7, 2, 5, 8)]
 NONE = [0.0] * 4
+PHOTON = {
+    "resolution": {"width": 640.0, "height": 480.0},
+    **{"cameraIntrinsics": matrix(MATRIX), "distCoeffs": matrix(FIVE, 1, 5)},
+    "calobjectSize": {"width": 7, "height": 7},
+    "observations": [{"pose": {"rotation": {"quaternion": {"W": 0.6, "X": 0.8}}}}],
+}
+COEFFICIENTS = named("k1 k2 k3 k4 k5 k6 p1 p2", [-0.28, 0.07, 0.01, 0, 0, 0, 5e-4, -3e-4])
+ORBBEC = {"intrinsic": F, "distortion": COEFFICIENTS, "model": 4}
+
+
+def realsense(model: Any, coefficients: list[float]) -> dict[str, Any]:
+    return named("fx fy ppx ppy", [*F.values()]) | {"model": model, "coeffs": coefficients}
+
+
+def orb_slam3(model: str, lens: dict[str, float]) -> str:
+    return settings({"Camera.type": model} | prefixed("Camera1", F | lens) | SIZE)
+
+
+def vins(model: str, projection: dict[str, float], lens: dict[str, float] | None = None) -> dict[str, Any]:
+    return {"model_type": model, "projection_parameters": projection} | (
+        {"distortion_parameters": lens} if lens else {}
+    )
+
 
 SAME: dict[str, tuple[Any, str, list[float]]] = {
     "ROS": (ros(), BROWN, FIVE),
-    "ROS, yaml-cpp": (ros(distortion_coefficients=matrix([*map("{:e}".format, FIVE)], 1, 5)), BROWN, FIVE),
-    "ROS, rational": (ros(distortion_model=RATIONAL, distortion_coefficients=matrix(EIGHT, 1, 8)), RATIONAL, EIGHT),
-    "ROS, fisheye": (ros(distortion_model=KB, distortion_coefficients=matrix(FISHEYE, 1, 4)), KB, FISHEYE),
-    "ROS, five of a fisheye": (
-        ros(distortion_model=KB, distortion_coefficients=matrix([*FISHEYE, 0], 1, 5)),
-        KB,
-        FISHEYE,
-    ),
-    "ROS, camera_model": (
-        ros(distortion_model=None, camera_model=KB, distortion_coefficients=matrix(FISHEYE, 1, 4)),
-        KB,
-        FISHEYE,
-    ),
-    "ROS, none": (ros(distortion_model="none", distortion_coefficients=matrix([], 1, 0)), BROWN, NONE),
-    "ROS, no name": (ros(distortion_model="", distortion_coefficients=matrix([0.0] * 7, 1, 7)), BROWN, NONE),
+    "ROS, yaml-cpp": (ros_with(BROWN, [*map("{:e}".format, FIVE)]), BROWN, FIVE),
+    "ROS, rational": (ros_with(RATIONAL, EIGHT), RATIONAL, EIGHT),
+    "ROS, fisheye": (ros_with(KB, FISHEYE), KB, FISHEYE),
+    "ROS, five of a fisheye": (ros_with(KB, [*FISHEYE, 0]), KB, FISHEYE),
+    "ROS, camera_model": (ros_with(None, FISHEYE, camera_model=KB), KB, FISHEYE),
+    "ROS, none": (ros_with("none", []), BROWN, NONE),
+    "ROS, no name": (ros_with("", [0.0] * 7), BROWN, NONE),
     "ROS, no coefficients": (ros(distortion_coefficients=matrix([], 0, 0)), BROWN, NONE),
     "rostopic echo": (message(FIVE, BROWN), BROWN, FIVE),
     "rostopic echo, two messages": (2 * message(FIVE, BROWN), BROWN, FIVE),
@@ -175,44 +188,15 @@ SAME: dict[str, tuple[Any, str, list[float]]] = {
         BROWN,
         FIVE,
     ),
-    "PhotonVision": (
-        {
-            "resolution": {"width": 640.0, "height": 480.0},
-            "cameraIntrinsics": matrix(MATRIX),
-            "distCoeffs": matrix(FIVE, 1, 5),
-        }
-        | {
-            "calobjectSize": {"width": 7, "height": 7},
-            "observations": [{"pose": {"rotation": {"quaternion": {"W": 0.6, "X": 0.8}}}}],
-        },
-        BROWN,
-        FIVE,
-    ),
+    "PhotonVision": (PHOTON, BROWN, FIVE),
     "BOP": (F | {"depth_scale": 0.1, "width": 640, "height": 480}, BROWN, NONE),
     "BOP, scene": ({"0": {"cam_K": MATRIX, "depth_scale": 1.0}, "7": {"cam_K": MATRIX}}, BROWN, NONE),
     "Open3D": ({"width": 640, "height": 480, "intrinsic_matrix": COLUMNS}, BROWN, NONE),
-    "RealSense": (
-        named("fx fy ppx ppy", [*F.values()]) | {"model": "distortion.inverse_brown_conrady", "coeffs": [0.0] * 5},
-        BROWN,
-        NONE,
-    ),
-    "RealSense, Brown-Conrady": (
-        named("fx fy ppx ppy", [*F.values()]) | {"model": "Brown Conrady", "coeffs": FIVE},
-        BROWN,
-        FIVE,
-    ),
-    "RealSense, by number": (named("fx fy ppx ppy", [*F.values()]) | {"model": 2, "coeffs": [0.0] * 5}, BROWN, NONE),
-    "Orbbec": (
-        {"intrinsic": F, "distortion": named("k1 k2 k3 k4 k5 k6 p1 p2", [-0.28, 0.07, 0.01, 0, 0, 0, 5e-4, -3e-4])}
-        | {"model": 4},
-        RATIONAL,
-        FIVE,
-    ),
-    "RealSense, fisheye": (
-        named("fx fy ppx ppy", [*F.values()]) | {"model": "kannala_brandt4", "coeffs": [*FISHEYE, 0.0]},
-        KB,
-        FISHEYE,
-    ),
+    "RealSense": (realsense("distortion.inverse_brown_conrady", [0.0] * 5), BROWN, NONE),
+    "RealSense, Brown-Conrady": (realsense("Brown Conrady", FIVE), BROWN, FIVE),
+    "RealSense, by number": (realsense(2, [0.0] * 5), BROWN, NONE),
+    "RealSense, fisheye": (realsense("kannala_brandt4", [*FISHEYE, 0.0]), KB, FISHEYE),
+    "Orbbec": (ORBBEC, RATIONAL, FIVE),
     "COLMAP": ("# Camera list\n1 OPENCV 640 480 400.5 401.2 320 240 -0.28 0.07 5e-4 -3e-4\n", BROWN, FOUR),
     "COLMAP, rational": ("1 FULL_OPENCV 640 480 400.5 401.2 320 240 " + " ".join(map(str, EIGHT)), RATIONAL, EIGHT),
     "COLMAP, fisheye": ("1 OPENCV_FISHEYE 640 480 400.5 401.2 320 240 -0.03 0.004 -0.002 0.0003\n", KB, FISHEYE),
@@ -229,39 +213,16 @@ SAME: dict[str, tuple[Any, str, list[float]]] = {
     "SVO, fisheye": (maplab("equidistant", FISHEYE), KB, FISHEYE),
     "SVO, none": (maplab("none", []), BROWN, NONE),
     "ORB_SLAM2": (settings(prefixed("Camera", F | named(FIRST + " k3", FIVE)) | SIZE), BROWN, FIVE),
-    "ORB_SLAM3": (
-        settings({"Camera.type": "PinHole"} | prefixed("Camera1", F | named(FIRST, FOUR)) | SIZE),
-        BROWN,
-        FOUR,
-    ),
-    "ORB_SLAM3, fisheye": (
-        settings({"Camera.type": "KannalaBrandt8"} | prefixed("Camera1", F | named("k1 k2 k3 k4", FISHEYE)) | SIZE),
-        KB,
-        FISHEYE,
-    ),
+    "ORB_SLAM3": (orb_slam3("PinHole", named(FIRST, FOUR)), BROWN, FOUR),
+    "ORB_SLAM3, fisheye": (orb_slam3("KannalaBrandt8", named(ANGLES, FISHEYE)), KB, FISHEYE),
     "stella_vslam": (
-        {"Camera": F | named("k1 k2 k3 k4", FISHEYE) | {"model": "fisheye", "cols": 640, "rows": 480}},
+        {"Camera": F | named(ANGLES, FISHEYE) | {"model": "fisheye", "cols": 640, "rows": 480}},
         KB,
         FISHEYE,
     ),
-    "VINS": (
-        {"model_type": "PINHOLE", "distortion_parameters": named(FIRST, FOUR), "projection_parameters": F},
-        BROWN,
-        FOUR,
-    ),
-    "VINS, rational": (
-        {"model_type": "PINHOLE_FULL", "distortion_parameters": named(ALL, EIGHT), "projection_parameters": F},
-        RATIONAL,
-        EIGHT,
-    ),
-    "VINS, fisheye": (
-        {
-            "model_type": "KANNALA_BRANDT",
-            "projection_parameters": named("k2 k3 k4 k5 mu mv u0 v0", [*FISHEYE, *F.values()]),
-        },
-        KB,
-        FISHEYE,
-    ),
+    "VINS": (vins("PINHOLE", F, named(FIRST, FOUR)), BROWN, FOUR),
+    "VINS, rational": (vins("PINHOLE_FULL", F, named(ALL, EIGHT)), RATIONAL, EIGHT),
+    "VINS, fisheye": (vins("KANNALA_BRANDT", named("k2 k3 k4 k5 mu mv u0 v0", [*FISHEYE, *F.values()])), KB, FISHEYE),
 }
 """Format -> one camera in it, and the model and coefficients that OpenCV needs for it."""
 
@@ -323,7 +284,7 @@ def test_a_focal_length_in_millimetres_is_refused_unless_the_lens_is_a_fisheye(f
         detections_of([Path("photo.jpg")], {"f": 18.0})[0].focal_lengths_and_centre(640, 480)
     K = [80.0, *MATRIX[1:4], 80.0, *MATRIX[5:]]
     for model, D in ((BROWN, FIVE), (KB, FISHEYE)):
-        read(file, ros(camera_matrix=matrix(K), distortion_model=model, distortion_coefficients=matrix(D, 1, len(D))))
+        read(file, ros_with(model, D, camera_matrix=matrix(K)))
         (detection,) = detections_of([Path("photo.jpg")], {"camera": str(file)})
         if model == KB:
             assert detection.focal_lengths_and_centre(640, 480)[0] == 80
@@ -339,35 +300,25 @@ BAD: list[tuple[Any, str]] = [
     (ros(camera_matrix=matrix(MATRIX[:8])), "camera_matrix: got 8 numbers in data; expected rows x cols = [3, 3]"),
     (ros(camera_matrix=matrix(MATRIX[:6], 2, 3)), "camera matrix: got [400.5"),
     (ros(camera_matrix=matrix([0.9, *MATRIX[1:4], 0.001, *MATRIX[5:]])), "expected [fx, 0, cx, 0, fy"),
-    (ros(camera_matrix=matrix([900, 2, *MATRIX[2:]])), "expected [fx, 0, cx, 0, fy"),
     (ros(camera_matrix=matrix([float("nan"), *MATRIX[1:]])), "camera_matrix: got nan; expected numbers"),
     (ros(camera_matrix="wide"), "camera_matrix: got 'wide'; expected numbers"),
-    (
-        ros(distortion_model="thin_plate"),
-        "distortion_model: got 'thin_plate'; expected plumb_bob, rational_polynomial",
-    ),
+    (ros(distortion_model="thin_plate"), "distortion_model: got 'thin_plate'; expected plumb_bob, "),
     (ros(distortion_model=KB), "got [-0.28, 0.07, 0.0005, -0.0003, 0.01]; expected k1, k2, k3, k4 for equidistant"),
-    (ros(distortion_model="none"), "expected none for none"),
-    (ros(distortion_coefficients=matrix([0.1] * 12, 1, 12), distortion_model=RATIONAL), "zero beyond"),
     (ros(distortion_coefficients=matrix([0.1] * 3, 1, 3)), "expected k1, k2, p1, p2, k3 for plumb_bob"),
     (ros(image_width=0), "width: got 0; expected to be greater than 0"),
     (ros(xi=1.2), "xi: got 1.2, a part of a lens that is not supported"),
     (ros(lens={"radial_terms": [0.1]}), "lens.radial_terms: got [0.1], a part of a lens"),
     ({"K": MATRIX, "D": FOUR}, "add distortion_model: plumb_bob (k1, k2, p1, p2) or equidistant"),
-    (opencv(D=FISHEYE), "add distortion_model: plumb_bob (k1, k2, p1, p2) or equidistant"),
-    (F | named("k1 k2 k3 k4", FISHEYE), "add distortion_model: plumb_bob"),
     (CORNER | named(FIRST + " k3 k4", [*FOUR, 0, 0.1]) | {"camera_model": "OPENCV"}, "zero beyond"),
     (named("fx fy", [1, 2]), "cx is missing: found fx, fy"),
     (F | {"K": [900, *MATRIX[1:]]}, "K and fx differ; expected the calibration of one camera alone"),
     (F | {"D": FIVE, "k1": 0.1}, "D and k1 are two lenses"),
     (F | {"coeffs": FOUR, "model": "inverse_brown_conrady"}, "expected none for none"),
     (TWO, "cam0.distortion_coeffs and cam1.distortion_coeffs differ; expected the calibration of one camera alone"),
-    ({"M1": ROWS, "M2": [*ROWS[:2], [0, 0, 2]]}, "M1 and M2 differ"),
     ({"K_left": ROWS, "K_right": [*ROWS[:2], [0, 0, 2]]}, "K_left and K_right differ"),
     ({"model_type": "MEI", "projection_parameters": F}, "model_type: got 'MEI'; expected plumb_bob"),
     (maplab("fisheye", [0.93]), "coefficients: got [0.93]; expected k1, k2, k3, k4 for equidistant"),
     ({"imu0": {"model": "kalibr"}}, "no camera matrix: found imu0.model"),
-    (F | {"coeffs": FIVE, "model": 2}, "expected none for none"),
     ("1 FOV 640 480 400 400 320 240 0.9", "FOV with 5 parameters; expected one of SIMPLE_PINHOLE"),
     ("<calibration><f>900</f></calibration>", "XML of <calibration>; expected <opencv_storage>"),
     ("<a", "XML: "),
@@ -375,7 +326,6 @@ BAD: list[tuple[Any, str]] = [
     ({"camera_angle_x": 0.7, "frames": []}, "no camera matrix: found camera_angle_x, frames; expected camera_matrix"),
     ("a: [1", "while parsing"),
     ('{"a": ', "Expecting value"),
-    ("just words", "no camera matrix: found no keys"),
     ("", "no camera matrix: found no keys"),
     ("a: !!python/object:os.system {}", "could not determine a constructor"),
 ]

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 
 from phd_exp.records.dataset import DatasetFolder
-from phd_exp.records.errors import CorruptFileError, DatasetError
+from phd_exp.records.errors import DatasetError
 from phd_exp.records.spec import DatasetSpec
 
 MakeSpec = Callable[..., DatasetSpec]
@@ -31,30 +31,6 @@ def test_what_is_deleted_is_missing(dataset: DatasetFolder, make_spec: MakeSpec)
     assert dataset.missing(make_spec(), 5, 2)["train"] == [3]
     dataset.metadata_path("test").unlink()
     assert dataset.missing(make_spec(), 5, 2)["test"] == [0, 1]
-
-
-def test_another_specification_is_refused(dataset: DatasetFolder, make_spec: MakeSpec) -> None:
-    with pytest.raises(DatasetError, match=r"default: holds .* seed=0, but seed=1 is asked for; move .* or choose"):
-        dataset.missing(make_spec(seed=1, xy_range=0.5), 5, 2)
-
-
-@pytest.mark.parametrize("content", ["", "nonsense", "{}", '{"generator": 1}'])
-def test_a_broken_manifest(dataset: DatasetFolder, make_spec: MakeSpec, content: str) -> None:
-    dataset.manifest_path.write_text(content)
-    with pytest.raises(DatasetError, match=r"manifest\.json: not a readable manifest") as error:
-        dataset.missing(make_spec(), 5, 2)
-    assert "\n" not in str(error.value)
-
-
-def test_a_broken_line_is_named(dataset: DatasetFolder) -> None:
-    path = dataset.metadata_path("train")
-    lines = path.read_text().splitlines()
-    lines[2] = lines[2].replace('"z":', '"Z":', 1)
-    path.write_text("\n".join(lines) + "\n")
-    with pytest.raises(CorruptFileError, match=r"metadata\.jsonl, line 3: .*") as error:
-        dataset.records("train")
-    assert "\n" not in str(error.value)
-    assert len(dataset.records("train", 2)) == 2
 
 
 def test_lost_shuffled_and_missing_records_are_named(dataset: DatasetFolder) -> None:

@@ -68,6 +68,8 @@ def test_a_changed_texture_is_a_changed_mesh(tmp_path: Path, case: tuple[str, st
     assert read_mesh(file).lost == []
     (tmp_path / texture).write_text("black")
     assert mesh_asset(file) != before
+    (tmp_path / texture).write_text("brown")
+    assert mesh_asset(file) == before
     (tmp_path / texture).unlink()
     (lost,) = read_mesh(file).lost
     assert lost.endswith(" is missing")

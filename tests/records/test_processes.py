@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from phd_exp.records.processes import Child, duration, held
+from phd_exp.records.processes import Child, held
 
 
 def test_shared_locks_are_compatible_and_exclude_an_exclusive_one(
@@ -49,8 +49,3 @@ def test_a_child_answers_until_it_dies_or_is_closed(tmp_path: Path, monkeypatch:
     assert closed.process.returncode is not None
     assert "ZeroDivisionError" in log.read_text()
     assert log.read_text().count("printed") == 2
-
-
-@pytest.mark.parametrize(("seconds", "words"), [(0, "0 s"), (90, "2 min"), (5399, "90 min"), (5400, "1.5 h")])
-def test_durations_are_readable(seconds: float, words: str) -> None:
-    assert duration(seconds) == words

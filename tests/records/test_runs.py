@@ -86,13 +86,6 @@ def test_a_broken_record_is_named(folder: RunFolder, read: str, content: str | N
         getattr(folder, read)()
 
 
-def test_metrics_survive_a_torn_last_line(folder: RunFolder) -> None:
-    folder.write_metrics([{"epoch": 0, "test/nll": 1.5}, {"epoch": 1, "test/nll": 1.25}])
-    with folder.metrics_file.open("a") as file:
-        file.write('{"epoch": 2, "te')
-    assert folder.metrics() == [{"epoch": 0, "test/nll": 1.5}, {"epoch": 1, "test/nll": 1.25}]
-
-
 def test_config_and_results_come_back(folder: RunFolder) -> None:
     folder.write_config({"seed": 0, "data": {"n_train": 3}})
     folder.write_results({"test/nll": -1.5, "test/calibration/depth_ence": math.nan, "epochs": 3})

@@ -26,13 +26,9 @@ def test_a_record_survives_the_disk_to_the_last_bit(record: SampleRecord) -> Non
     ("key", "value"),
     [
         ("z", -1.0),
-        ("f", 0.0),
         ("x", float("nan")),
         ("visibility", 1.5),
-        ("truncation", -0.1),
-        ("view", -1),
         ("pose", {"rotation": (2.0, 0.0, 0.0, 0.0), "translation": (0.0, 0.0, 0.0)}),
-        ("split", "validation"),
         ("sha256", "0"),
         ("objects", []),
         ("objects", [{"shape": "teapot"}]),

@@ -67,7 +67,5 @@ def test_every_published_figure_has_its_place() -> None:
 
 
 def test_the_paper_publishes_modes_alone() -> None:
-    assert published_mm("probabilistic", "occl", "mode", "projected") == 13.0
-    assert published_mm("probabilistic", "occl", "mode", "depth") == 168
     assert published_mm("probabilistic", "occl", "median", "depth") is None
     assert published_mm("probabilistic", "photos", "mode", "depth") is None

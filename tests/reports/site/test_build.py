@@ -225,21 +225,6 @@ def test_an_interrupted_report_leaves_the_old_pages(own: Path, monkeypatch: pyte
     assert {file: file.read_bytes() for file in _pages(site)} == before
 
 
-def test_an_error_of_drawing_affects_one_page(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = build.run_charts
-
-    def faulty(run: Run) -> dict:
-        if run.data == "occl":
-            raise ZeroDivisionError("of nothing")
-        return real(run)
-
-    monkeypatch.setattr(build, "run_charts", faulty)
-    sited(own / "runs", own / "out")
-    pages = own / "out" / "site" / "runs"
-    assert "ZeroDivisionError: of nothing" in (pages / "small-occl-mae_vz-seed0.html").read_text()
-    assert "Learning curves" in (pages / "small-default-mae_vz-seed0.html").read_text()
-
-
 def test_figures_for_a_paper(shared: Path) -> None:
     drawn = {file.name for file in (shared / "out" / "figures").iterdir()}
     names = ("calibration-small", "precision-small", "level_curves-small-default")

@@ -18,11 +18,6 @@ def test_a_script_holds_any_text(text: str) -> None:
     assert (name, content) == (text, {text: [text]})
 
 
-def test_numbers_that_json_lacks_are_null() -> None:
-    script = as_script("a", {"x": [float("nan"), float("inf"), -float("inf"), 1.5]})
-    assert script == 'phdExp.receive("a", {"x":[null,null,null,1.5]});\n'
-
-
 def test_decades_contain_all_positive_values() -> None:
     for values in ([3e-4, 0.2], [1.0], [0.1, 0.1], [0.0, -1.0, float("nan"), 2.0]):
         low, high = decades(values) or (0, 0)
