@@ -10,7 +10,7 @@ from scipy import stats
 from phd_exp.evaluation.point_errors import ErrorKey, SampleMean, difference
 from phd_exp.metrics.bootstrap import Interval
 from phd_exp.records.errors import one_line
-from phd_exp.reports.paper import bound_mm, published_mm
+from phd_exp.reports.paper import PUBLISHED, bound_mm
 from phd_exp.reports.runs import Report, Run
 from phd_exp.reports.table import bounds
 
@@ -23,7 +23,7 @@ class Cell:
         means: seed -> mean error, of the finished runs.
         images: digests of the test images; a single one if all runs were tested on the same images.
         interval: of the mean over seeds; None without a finished run, or with one seed and one test sample.
-        published: the paper's figure.
+        published: the paper's figure, of the mode.
         bound: the bound on the mean that applies to these runs.
         gaps: seed -> why it is missing, of the seeds that other cells of the table have or that were started.
     """
@@ -102,7 +102,7 @@ def make_cell(report: Report, preset: str, data: str, model: str, key: ErrorKey,
         means=means,
         images=frozenset(run.measured.images for run in measured.values()),
         interval=interval(list(means.values())),
-        published=published_mm(model, data, key.estimate, key.quantity),
+        published=PUBLISHED.get((model, data), {}).get(key.quantity) if key.estimate == "mode" else None,
         bound=bound_mm(model, data, key.quantity, sees_f),
         gaps={seed: _reason(runs.get(seed), key) for seed in seeds if seed not in measured},
     )

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from phd_exp.evaluation.point_errors import Estimate, Quantity
+from phd_exp.evaluation.point_errors import Quantity
 
 TableName = Literal["table1", "table2"]
 
@@ -23,12 +23,7 @@ PUBLISHED: Mapping[tuple[str, str], Mapping[Quantity, float]] = {
     for model, errors in _ERRORS.items()
     for data, (projected, depth) in zip(DATA, errors, strict=False)
 }
-"""(model, data set) -> mean errors over 2000 test samples, mm."""
-
-
-def published_mm(model: str, data: str, estimate: Estimate, quantity: Quantity) -> float | None:
-    """The paper's figure; None for means and medians, because its point estimate is the mode."""
-    return PUBLISHED.get((model, data), {}).get(quantity) if estimate == "mode" else None
+"""(model, data set) -> mean errors of the mode over 2000 test samples, mm."""
 
 
 UNKNOWN_SIZE = 291.0

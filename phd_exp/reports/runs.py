@@ -124,13 +124,10 @@ def read_report(runs: Path, kept: Path | None = None, progress: Callable[[str], 
         remove_temporaries(kept)  # of a killed process
     for folder in folders:
         progress("/".join(map(printable, folder.names)))
-        found.append(_read_run(folder, kept))
+        notes = Notes()
+        run = notes.attempt(partial(_whole_run, unreadable(folder, []), kept, notes))
+        found.append(run or unreadable(folder, notes))
     return Report(runs, tuple(found), tuple(read_searches(runs)))
-
-
-def _read_run(folder: RunFolder, kept: Path | None) -> Run:
-    notes = Notes()
-    return notes.attempt(lambda: _whole_run(unreadable(folder, []), kept, notes)) or unreadable(folder, notes)
 
 
 def unreadable(folder: RunFolder, notes: Sequence[str]) -> Run:

@@ -1,6 +1,6 @@
 """The prediction for one test image in space: the camera, the true position, and regions as surfaces."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,10 +44,7 @@ def first_scene(table: Columns) -> Scene | None:
     Raises RunError if the table lacks a column.
     """
     require_columns(NEEDED, table)
-    return _scene({name: column[0] for name, column in table.items()})
-
-
-def _scene(row: Mapping[str, Any]) -> Scene | None:
+    row = {name: column[0] for name, column in table.items()}
     truth = np.array([row[axis] for axis in "xyz"], float)
     if (distribution := distribution_of(row)) is None or not np.isfinite(truth).all():
         return None

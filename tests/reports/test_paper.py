@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import dblquad
 
 from phd_exp.reports import paper
-from phd_exp.reports.paper import LAYOUTS, PUBLISHED, bound_mm, published_mm
+from phd_exp.reports.paper import LAYOUTS, PUBLISHED, bound_mm
 
 
 def bound_of_a_ratio(low: float, high: float) -> float:
@@ -64,8 +64,3 @@ def test_bounds_apply_only_to_models_with_as_little_information() -> None:
 def test_every_published_figure_has_its_place() -> None:
     places = {(model, data) for layout in LAYOUTS for data, model in product(layout.data, layout.models)}
     assert places == PUBLISHED.keys()
-
-
-def test_the_paper_publishes_modes_alone() -> None:
-    assert published_mm("probabilistic", "occl", "median", "depth") is None
-    assert published_mm("probabilistic", "photos", "mode", "depth") is None
