@@ -121,7 +121,7 @@ def _samples(spec: DatasetSpec, indices: Sequence[int]) -> list[tuple[Image.Imag
 
 def _draw_truth(draw: ImageDraw.ImageDraw, record: SampleRecord) -> None:
     """The outline of the cylinder's mask, and its centre as the record's x, y, z, f and S place it."""
-    mask = np.pad(cylinder_mask(trace_pixels(record.shown)), 1)
+    mask = np.pad(cylinder_mask(trace_pixels(record.as_scene)), 1)
     for row, column in np.argwhere(mask[:, 1:] != mask[:, :-1]):
         draw.line([(ZOOM * column, ZOOM * (row - 1)), (ZOOM * column, ZOOM * row)], MARK, 2)
     for row, column in np.argwhere(mask[1:] != mask[:-1]):

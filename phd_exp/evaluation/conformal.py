@@ -21,7 +21,7 @@ from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber, Temperature
 from phd_exp.distributions.regions import Region
-from phd_exp.evaluation.parquet import Columns, require_columns
+from phd_exp.evaluation.parquet import Arrays, require_columns
 from phd_exp.evaluation.predictions import at_temperature
 from phd_exp.evaluation.several_views import read_views
 from phd_exp.evaluation.volumes import LOG_VOLUMES
@@ -68,7 +68,7 @@ class Guarantee:
 
 
 def guarantee(
-    held_out: Columns,
+    held_out: Arrays,
     coverage: float,
     groups: Groups | None,
     temperature: Temperature | None,
@@ -117,7 +117,7 @@ def fused_guarantee(file: Path, k: int, coverage: float, temperature: Temperatur
     return {"coverage": coverage, "squared_mahalanobis": found, "held_out_samples": len(scores)}
 
 
-def conformal_log_volumes(table: Columns, held_out: Columns, coverage: float = 0.9) -> Columns:
+def conformal_log_volumes(table: Arrays, held_out: Arrays, coverage: float = 0.9) -> Arrays:
     """Column `log_volume`: the log volume (m^3) of each sample's region with a guaranteed coverage.
 
     Held-out samples set the level of the regions, so that densities are compared at equal coverage. Between the

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from phd_exp.distributions import Temperature
 from phd_exp.distributions.columns import parameter_columns
-from phd_exp.evaluation.parquet import Columns, require_columns
+from phd_exp.evaluation.parquet import Arrays, require_columns
 from phd_exp.evaluation.predictions import at_temperature
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import CHOOSE, GUARANTEE
@@ -34,7 +34,7 @@ class Familiarity:
     Raises RunError if there are too few.
     """
 
-    def __init__(self, held_out: Columns, temperature: Temperature | None = None) -> None:
+    def __init__(self, held_out: Arrays, temperature: Temperature | None = None) -> None:
         distribution, _, kept = at_temperature(held_out, temperature)
         require_columns(("f", "S"), kept)
         columns = kept | {name: column.numpy() for name, column in parameter_columns(distribution).items()}
@@ -48,7 +48,7 @@ class Familiarity:
         self.chosen = torch.from_numpy((chosen - self.middle) @ self.whiten)
         self.usual = np.sort(self.distance(columns)[GUARANTEE])
 
-    def distance(self, columns: Columns) -> Float[np.ndarray, " samples"]:
+    def distance(self, columns: Arrays) -> Float[np.ndarray, " samples"]:
         """The score of predictions with these parameters, f and S (px); larger for less familiar ones."""
         points = torch.from_numpy((_features(columns) - self.middle) @ self.whiten)
         away = (
@@ -62,7 +62,7 @@ class Familiarity:
         return (1 + n - np.searchsorted(self.usual, distance)) / (1 + n)
 
 
-def _features(columns: Columns) -> Float[np.ndarray, "samples features"]:
+def _features(columns: Arrays) -> Float[np.ndarray, "samples features"]:
     determinant = columns["A_xx"] * columns["A_yy"] - np.square(columns["A_xy"])
     values = [columns["mu_z"], columns["f"] / columns["S"], columns["a"], determinant]
     values += [columns["disagreement"]] if "disagreement" in columns else []

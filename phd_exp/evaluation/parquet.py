@@ -14,15 +14,15 @@ from torch import Tensor
 from phd_exp.records.errors import RunError, gist
 from phd_exp.records.files import MB, require_plain
 
-Columns = Mapping[str, np.ndarray]
-"""Column name -> one value per sample: float64, or text for `TEXTS`."""
+Arrays = Mapping[str, np.ndarray]
+"""Column name -> one value per sample: float64, or text for `TEXTS`; `distributions.columns.Columns` are tensors."""
 
 LARGEST = 500 * MB  # bytes of the file, and of the table according to its metadata
 MOST_VALUES = 10**7  # rows times columns; predictions of 2,000 images have 80,000
 TEXTS = ("file_name",)
 
 
-def read_table(file: Path) -> Columns:
+def read_table(file: Path) -> Arrays:
     """All columns of a table that has at least one row.
 
     The size is checked before any row is read: a file of 100 kB can expand to gigabytes.

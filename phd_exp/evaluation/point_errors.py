@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float64
 from scipy import special
 from torch import Tensor
 
-from phd_exp.evaluation.parquet import Columns, require_columns, stacked
+from phd_exp.evaluation.parquet import Arrays, require_columns, stacked
 from phd_exp.metrics.bootstrap import Interval, means, resampled
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
 from phd_exp.records.errors import RunError
@@ -71,7 +71,7 @@ MeanErrors = Mapping[ErrorKey, SampleMean]
 """Mean errors in millimetres; a reading without a test sample has no key."""
 
 
-def mean_errors(table: Columns, estimates: Sequence[Estimate]) -> MeanErrors:
+def mean_errors(table: Arrays, estimates: Sequence[Estimate]) -> MeanErrors:
     """The mean errors of these estimates, in both readings.
 
     Raises RunError, one line, if the table lacks a column or a mean is not finite.

@@ -12,7 +12,7 @@ from torch import Tensor
 from phd_exp.distributions import Mixture, ProjectedHuber
 from phd_exp.distributions.columns import NEES, distribution_columns, from_columns, nees_columns, parameter_names
 from phd_exp.distributions.temperature import Temperature
-from phd_exp.evaluation.parquet import Columns, require_columns, stacked
+from phd_exp.evaluation.parquet import Arrays, require_columns, stacked
 from phd_exp.evaluation.point_errors import RESAMPLES, SEED
 from phd_exp.evaluation.reference import calibrated_reference, groups_of
 from phd_exp.evaluation.volumes import drawn_columns
@@ -85,7 +85,7 @@ class Evaluation:
     resampled: dict[str, list[float]] = field(default_factory=dict)
 
 
-def evaluate(table: Columns, resamples: int = RESAMPLES) -> Evaluation:
+def evaluate(table: Arrays, resamples: int = RESAMPLES) -> Evaluation:
     """Evaluate predictions: of a density if the table has its levels, else of points, which have no curves.
 
     Raises RunError if a column is missing, or if no sample has finite values.
@@ -120,7 +120,7 @@ def evaluation_of(statistic: Statistic, columns: Mapping[str, Tensor], left_out:
     )
 
 
-def fit_temperature(held_out: Columns, rows: slice = CHOOSE) -> Temperature:
+def fit_temperature(held_out: Arrays, rows: slice = CHOOSE) -> Temperature:
     """The temperatures fitted on predictions of held-out samples, those that may choose.
 
     Raises RunError if a column is missing, or if no temperature fits.
@@ -132,7 +132,7 @@ def fit_temperature(held_out: Columns, rows: slice = CHOOSE) -> Temperature:
         raise RunError(f"predictions: no temperature fits them ({error})") from None
 
 
-def recalibrated(table: Columns, temperature: Temperature) -> dict[str, np.ndarray]:
+def recalibrated(table: Arrays, temperature: Temperature) -> dict[str, np.ndarray]:
     """The same columns for A / projected and a / depth: modes are unchanged, all uncertainties and scores change.
 
     Drops samples whose parameters are not finite. Raises RunError if a column is missing, or if no sample is left.
@@ -151,7 +151,7 @@ def recalibrated(table: Columns, temperature: Temperature) -> dict[str, np.ndarr
     return kept | {name: column.numpy() for name, column in changed.items()}
 
 
-def ensemble_table(tables: Sequence[Columns]) -> Columns:
+def ensemble_table(tables: Sequence[Arrays]) -> Arrays:
     """The scores and parameters of the ensemble's closest distributions, and the members' `disagreement` (nats).
 
     Raises RunError if a column is missing, or the tables are of different samples.
@@ -170,7 +170,7 @@ def ensemble_table(tables: Sequence[Columns]) -> Columns:
 
 
 def at_temperature(
-    table: Columns, temperature: Temperature | None, rows: slice = slice(None)
+    table: Arrays, temperature: Temperature | None, rows: slice = slice(None)
 ) -> tuple[ProjectedHuber, Float[Tensor, "samples 3"], dict[str, np.ndarray]]:
     """Predictions (None: as trained), true positions (m) and all columns of the rows with finite parameters.
 
@@ -221,7 +221,7 @@ def _strata(statistic: Statistic, columns: Mapping[str, Tensor], resamples: int)
 
 
 def finite_columns(
-    table: Columns, names: Sequence[str], others: Sequence[str] = ()
+    table: Arrays, names: Sequence[str], others: Sequence[str] = ()
 ) -> tuple[dict[str, Tensor], Bool[Tensor, " samples"]]:
     """The columns `names` and `others` of the samples whose `names` are finite, and which samples these are.
 

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 
 from phd_exp.evaluation.conformal import threshold
 from phd_exp.evaluation.familiar import ALARM, Familiarity
-from phd_exp.evaluation.parquet import Columns, read_table
+from phd_exp.evaluation.parquet import Arrays, read_table
 from phd_exp.evaluation.predictions import ERRORS, finite_columns, inside, scalar_bands
 from phd_exp.metrics.bootstrap import Interval, means
 from phd_exp.metrics.calibration_scores import COLUMNS, calibration_scores, ordered
@@ -38,7 +38,7 @@ class ShiftScores:
     scores: dict[str, Interval[float]]
 
 
-def shift_scores(folder: Path, home: Columns, held_out: Columns | None) -> dict[str, ShiftScores]:
+def shift_scores(folder: Path, home: Arrays, held_out: Arrays | None) -> dict[str, ShiftScores]:
     """Name of each shift in a folder -> its scores, and those at `home`; empty without a shift, or for points.
 
     Raises RunError if a table cannot be read or lacks a column.
@@ -56,11 +56,11 @@ def shift_scores(folder: Path, home: Columns, held_out: Columns | None) -> dict[
     return found | {UNSHIFTED: _scores(home, levels, rated(home))} if found else {}
 
 
-def _unrated(table: Columns) -> Columns:
+def _unrated(table: Arrays) -> Arrays:
     return {}
 
 
-def _rated(familiarity: Familiarity, usual: np.ndarray, table: Columns) -> Columns:
+def _rated(familiarity: Familiarity, usual: np.ndarray, table: Arrays) -> Arrays:
     """Whether each sample is unfamiliar (per cent), and the share of `usual` distances, at home, that are smaller."""
     distance = familiarity.distance(table)
     below = sum(np.searchsorted(usual, distance, side) for side in ("left", "right"))  # ties count half
@@ -68,7 +68,7 @@ def _rated(familiarity: Familiarity, usual: np.ndarray, table: Columns) -> Colum
     return {"unfamiliar": unfamiliar, "auroc": np.asarray(below / (2 * len(usual)))}
 
 
-def _scores(table: Columns, levels: Mapping[str, float], rated: Columns, change: str = "") -> ShiftScores:
+def _scores(table: Arrays, levels: Mapping[str, float], rated: Arrays, change: str = "") -> ShiftScores:
     columns, finite = finite_columns({**table, **rated}, (*MEASURED, *rated))
     columns |= {f"inside_{name}": inside(columns["level"], level) for name, level in levels.items()}
     scores = scalar_bands(

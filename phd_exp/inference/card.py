@@ -7,7 +7,7 @@ import numpy as np
 
 from phd_exp.config import FolderConfig, RenderedConfig, RunConfig, SourceConfig
 from phd_exp.config.targets import custom_parts
-from phd_exp.evaluation.parquet import Columns, read_table, require_columns
+from phd_exp.evaluation.parquet import Arrays, read_table, require_columns
 from phd_exp.records.errors import RunError, one_line
 from phd_exp.records.runs import RunFolder, RunStatus
 
@@ -20,7 +20,7 @@ MEANS = {
     "depth_crps": "CRPS of depth, m",
 }
 """Column of the recorded predictions -> what its mean is."""
-LEVELS = (50, 90, 99)
+PER_CENT = (50, 90, 99)
 NORMAL = 1.96  # standard errors to either end of a 95 % interval
 
 _CARD = """\
@@ -112,14 +112,14 @@ def _rows(values: Mapping[str, Any]) -> Iterator[str]:
         yield f"| {name} | {text} |"
 
 
-def _figures(table: Columns) -> Iterator[tuple[str, str]]:
+def _figures(table: Arrays) -> Iterator[tuple[str, str]]:
     """Means over test samples with 1.96 standard errors, and shares of truths inside credible regions."""
     for column, words in MEANS.items():
         if column in table:
             values = table[column]
             half = NORMAL * values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
             yield words, f"{values.mean():.4g} ± {half:.2g}"
-    for level in LEVELS if "level" in table else ():
+    for level in PER_CENT if "level" in table else ():
         share = np.mean(table["level"] <= level / 100)
         half = NORMAL * np.sqrt(share * (1 - share) / len(table["level"]))
         yield f"truths inside the {level} % credible region, %", f"{100 * share:.1f} ± {100 * half:.1f}"

@@ -31,7 +31,7 @@ from phd_exp.records.runs import CHOOSE, RunFolder
 if TYPE_CHECKING:  # imports of pyarrow
     from phd_exp.evaluation.conformal import Groups, Guarantee
     from phd_exp.evaluation.familiar import Familiarity
-    from phd_exp.evaluation.parquet import Columns
+    from phd_exp.evaluation.parquet import Arrays
 
 BATCH = 64
 PIXELS = BATCH * 512**2  # of the images that a network sees at once
@@ -134,7 +134,7 @@ class Predictor:
         ]
         return self.see(views if images.ndim == 4 else views[0])
 
-    def held_out(self) -> "Columns":
+    def held_out(self) -> "Arrays":
         """The recorded predictions of held-out samples. Raises ConfigError or RunError if there are none."""
         self.require_densities("recalibrate= and coverage= need")
         if len(self.folders) > 1 and self.views > 1:

@@ -232,6 +232,6 @@ class SampleRecord(Record):
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
     @property
-    def shown(self) -> Scene:
+    def as_scene(self) -> Scene:
         """The scene of this image, the renderer's input."""
         return Scene(**{key: getattr(self, key) for key in Scene.model_fields})

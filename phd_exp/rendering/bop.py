@@ -58,7 +58,7 @@ def write_bop(folder: DatasetFolder, bop: Path, meshes: Meshes = NO_MESHES) -> i
             for record in images:
                 content = content_of(folder.split_folder(split) / record.file_name)
                 write_atomic(target / "rgb" / record.file_name, content)
-                hits, numbers = rays.trace_pixels(record.shown, meshes), range(len(record.objects))
+                hits, numbers = rays.trace_pixels(record.as_scene, meshes), range(len(record.objects))
                 tables["gt"][record.index] = [_pose(record, number) for number in numbers]
                 tables["gt_info"][record.index] = [
                     _write_mask(record, number, hits, meshes, target) for number in numbers
@@ -97,7 +97,7 @@ def _pose(record: SampleRecord, number: int) -> dict[str, Any]:
 def _write_mask(record: SampleRecord, number: int, hits: rays.Hits, meshes: Meshes, target: Path) -> dict[str, Any]:
     """Write the mask of an object; returns its boxes and pixels, of which those outside the image are not visible."""
     mask = rays.cylinder_mask(hits, number)
-    whole, rows, columns = rays.silhouette(record.shown, number, meshes)
+    whole, rows, columns = rays.silhouette(record.as_scene, number, meshes)
     file = target / "mask_visib" / f"{record.index:06d}_{number:06d}.png"
     write_atomic(file, file_of(Image.fromarray(np.uint8(255) * mask), "png"))
     return {

@@ -81,7 +81,7 @@ def _draw(folder: DatasetFolder, names: list[str], meshes: Meshes) -> None:
 def mask(record: SampleRecord, meshes: Meshes) -> NDArray[np.uint8]:
     """The share of each cell of the image that shows the object, 0 to 255: a row (CELLS, CELLS) of `masks.npy`."""
     side = CELLS * RAYS
-    scene = record.shown.model_copy(update={"S": side, "f": record.f * side / record.S})
+    scene = record.as_scene.model_copy(update={"S": side, "f": record.f * side / record.S})
     shown = cylinder_mask(trace_pixels(scene, meshes))
     share = shown.reshape(CELLS, RAYS, CELLS, RAYS).mean((1, 3))
     return np.rint(255 * share).astype(np.uint8)
@@ -89,8 +89,8 @@ def mask(record: SampleRecord, meshes: Meshes) -> NDArray[np.uint8]:
 
 def clearing(record: SampleRecord, meshes: Meshes) -> NDArray[np.uint8]:
     """The pixels that show no object and lie in the user's image, as bits: a row (S, S / 8) of `clearings.npy`."""
-    clear = trace_pixels(record.shown, meshes).first == NOTHING
-    return np.packbits(clear & ~beyond_edges(record.shown), axis=-1)
+    clear = trace_pixels(record.as_scene, meshes).first == NOTHING
+    return np.packbits(clear & ~beyond_edges(record.as_scene), axis=-1)
 
 
 DRAW = {"masks.npy": mask, "clearings.npy": clearing}
@@ -107,7 +107,7 @@ def write_masks(folder: DatasetFolder, masks: Path, meshes: Meshes = NO_MESHES) 
             (masks / split).mkdir(parents=True, exist_ok=True)
         with shown_progress(len(records), "drawing masks") as advance:
             for record in records:
-                image = Image.fromarray(cylinder_mask(trace_pixels(record.shown, meshes)))
+                image = Image.fromarray(cylinder_mask(trace_pixels(record.as_scene, meshes)))
                 path = (masks / record.split / record.file_name).with_suffix(".png")
                 write_atomic(path, file_of(image, "png"))
                 advance()

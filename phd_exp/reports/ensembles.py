@@ -7,7 +7,7 @@ from itertools import groupby
 import torch
 from torch import Tensor
 
-from phd_exp.evaluation.parquet import Columns, read_table
+from phd_exp.evaluation.parquet import Arrays, read_table
 from phd_exp.evaluation.predictions import ensemble_table, inside, scalar_bands
 from phd_exp.metrics.bootstrap import Interval, means
 from phd_exp.records.choices import in_words
@@ -75,7 +75,7 @@ def _scores(runs: Sequence[Run]) -> dict[str, Mapping[str, Interval[float]]]:
     return {kind: scalar_bands(means, of) for kind, of in columns.items()}
 
 
-def _columns(table: Columns) -> dict[str, Tensor]:
+def _columns(table: Arrays) -> dict[str, Tensor]:
     nll, level = torch.from_numpy(table["nll"]), torch.from_numpy(table["level"])
     return {"nll": nll, "inside_90": inside(level, 0.9), "level": level}
 

@@ -8,8 +8,8 @@ from phd_exp.evaluation.fusion import BINS, CALIBRATION, ERRORS, PER_CENT, PROBA
 from phd_exp.evaluation.predictions import Curve
 from phd_exp.metrics.bootstrap import Interval
 from phd_exp.records.choices import in_words
+from phd_exp.reports.charts import Chart, axis, curve_line, identity, line, square
 from phd_exp.reports.runs import Report, Run
-from phd_exp.reports.site.charts import Chart, axis, curve_line, identity, line, square
 from phd_exp.reports.table import Table, TableCell, TableRow, bounds, file_stem
 
 NAMES: dict[Method, str] = {

@@ -15,7 +15,7 @@ from PIL import Image
 from phd_exp.distributions.columns import from_columns, parameter_names
 from phd_exp.distributions.level_curves import LEVELS, LevelCurves, level_curves, on_image
 from phd_exp.distributions.projected_huber import ProjectedHuber
-from phd_exp.evaluation.parquet import Columns, require_columns
+from phd_exp.evaluation.parquet import Arrays, require_columns
 from phd_exp.records.errors import UserError
 from phd_exp.records.files import require_plain
 from phd_exp.records.images import LARGEST_IMAGE, RENDERED, decoding, pillow_warnings
@@ -92,7 +92,7 @@ def images_folder(config: Mapping[str, str]) -> Path | None:
     return Path(root) / variant / "test" if root and variant else None
 
 
-def make_gallery(table: Columns, config: Mapping[str, str]) -> Gallery:
+def make_gallery(table: Arrays, config: Mapping[str, str]) -> Gallery:
     """Choose and draw the pictures. Raises RunError if the table lacks a column."""
     require_columns(NEEDED, table)
     if "nll" in table:

@@ -15,7 +15,7 @@ from pydantic import TypeAdapter
 from phd_exp.distributions.temperature import Temperature
 from phd_exp.evaluation.conformal import conformal_log_volumes
 from phd_exp.evaluation.fusion import FusionScores, fusion_scores, two_cameras
-from phd_exp.evaluation.parquet import Columns
+from phd_exp.evaluation.parquet import Arrays
 from phd_exp.evaluation.predictions import Evaluation, evaluate, fit_temperature, recalibrated
 from phd_exp.evaluation.several_views import read_sequences, read_views
 from phd_exp.evaluation.shifts import ShiftScores, shift_scores
@@ -80,7 +80,7 @@ class Measured:
 
 
 def measure(
-    folder: RunFolder, config: Mapping[str, str], predictions: Columns | None, held_out: Columns | None
+    folder: RunFolder, config: Mapping[str, str], predictions: Arrays | None, held_out: Arrays | None
 ) -> Measured:
     """Measure all predictions of a run, its test samples and held-out samples as read; problems are noted."""
     notes = Notes()
@@ -102,7 +102,7 @@ def measure(
     return Measured(**found, notes=notes)
 
 
-def _with_volumes(predictions: Columns, held_out: Columns | None) -> Columns:
+def _with_volumes(predictions: Arrays, held_out: Arrays | None) -> Arrays:
     """The predictions with the volumes of their conformal regions, where the record permits it."""
     with suppress(RunError):  # too few held-out samples, or a record from before the volumes
         return {**predictions, **conformal_log_volumes(predictions, held_out or {})}
@@ -121,12 +121,12 @@ def _tracks(folder: RunFolder) -> dict[str, TrackScores]:
     return {frames: track_scores(sequences, choice) for frames, sequences in tested.items()}
 
 
-def _recalibrated(predictions: Columns, held_out: Columns) -> dict[str, Any]:
+def _recalibrated(predictions: Arrays, held_out: Arrays) -> dict[str, Any]:
     temperature = fit_temperature(held_out)
     return {"temperature": temperature, "after": evaluate(recalibrated(predictions, temperature))}
 
 
-def _images(folder: RunFolder, table: Columns) -> str:
+def _images(folder: RunFolder, table: Arrays) -> str:
     """A digest that includes the name of the data set: its variants have equal positions in other images."""
     name = os.fsencode(folder.path.parts[-3])
     positions = b"".join(table[axis].tobytes() for axis in "xyz" if axis in table)

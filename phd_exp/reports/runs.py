@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from phd_exp.evaluation.parquet import Columns, read_table
+from phd_exp.evaluation.parquet import Arrays, read_table
 from phd_exp.evaluation.point_errors import COLUMNS, Estimate, MeanErrors, mean_errors
 from phd_exp.records.choices import flatten, has_influence
 from phd_exp.records.errors import RunError, one_line
@@ -187,18 +187,18 @@ def _check_whole(folder: RunFolder, config: Mapping[str, Any], rows: Sequence[Ma
         raise RunError(f"{folder.metrics_file}: incomplete, with {last + 1} of {trained} epochs")
 
 
-def _table(file: Path, notes: Notes, needed: bool = False) -> Columns | None:
+def _table(file: Path, notes: Notes, needed: bool = False) -> Arrays | None:
     return notes.attempt(partial(read_table, file)) if needed or file.exists() else None
 
 
-def _tested(run: Run, predictions: Columns | None, notes: Notes) -> tuple[MeanErrors, float | None]:
+def _tested(run: Run, predictions: Arrays | None, notes: Notes) -> tuple[MeanErrors, float | None]:
     """The errors of all point estimates, those of eight views included, and the NLL."""
     errors, nll = _errors(predictions, tuple(COLUMNS) if run.model == PROBABILISTIC else ("mode",), notes)
     of_eight, _ = _errors(_table(run.folder.eight_views["test"], notes) if errors else None, ("mode",), notes)
     return {**errors, **{replace(key, estimate="eight views"): mean for key, mean in of_eight.items()}}, nll
 
 
-def _errors(table: Columns | None, estimates: Sequence[Estimate], notes: Notes) -> tuple[MeanErrors, float | None]:
+def _errors(table: Arrays | None, estimates: Sequence[Estimate], notes: Notes) -> tuple[MeanErrors, float | None]:
     """Mean errors and NLL, as far as they are known; no errors if the table cannot be measured."""
     errors = notes.attempt(lambda: mean_errors(table, estimates)) if table else None
     nll = float(table["nll"].mean()) if table and errors and "nll" in table else math.nan

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from phd_exp.distributions.surfaces import level_surface
-from phd_exp.evaluation.parquet import Columns, require_columns
+from phd_exp.evaluation.parquet import Arrays, require_columns
+from phd_exp.reports.charts import Trace
 from phd_exp.reports.gallery import NEEDED, distribution_of
-from phd_exp.reports.site.charts import Trace
 
 LEVELS = (0.5, 0.9)
 DEPTHS, ANGLES = 11, 20  # of a surface; each has its place in the page
@@ -38,7 +38,7 @@ class Scene:
     levels: tuple[float, ...] = LEVELS
 
 
-def first_scene(table: Columns) -> Scene | None:
+def first_scene(table: Arrays) -> Scene | None:
     """The scene of the first row, which is not chosen by its error; None without a Projected Huber density.
 
     Raises RunError if the table lacks a column.

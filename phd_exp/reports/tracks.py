@@ -4,8 +4,8 @@ from collections.abc import Mapping
 
 from phd_exp.evaluation.tracks import ERRORS, HIDDEN, METHODS, NEES, SMOOTHERS, Method, TrackScores, place
 from phd_exp.records.choices import in_words
+from phd_exp.reports.charts import Chart, Numbers, Trace, axis, curve_line, line
 from phd_exp.reports.runs import Report, Run
-from phd_exp.reports.site.charts import Chart, Numbers, Trace, axis, curve_line, line
 from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, bounds, file_stem
 
 NAMES: dict[Method, str] = {

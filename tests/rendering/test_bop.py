@@ -108,7 +108,7 @@ def test_detections_return(folder: DatasetFolder, bop: Path) -> None:
 def test_masks_pixel_for_pixel_and_their_boxes(folder: DatasetFolder, bop: Path) -> None:
     """Each pixel shows the object that its ray hits first."""
     for record, scene in records(folder):
-        first = trace_pixels(record.shown, MESHES).first
+        first = trace_pixels(record.as_scene, MESHES).first
         for number, info in enumerate(table(bop, record, scene, "gt_info")):
             name = f"{record.index:06d}_{number:06d}.png"
             mask = np.asarray(Image.open(bop / record.split / scene / "mask_visib" / name))

@@ -109,11 +109,11 @@ def test_what_lies_beyond_the_edges_is_grey_and_not_labelled(of_box: MakeSpec, t
     scenes = drawn(spec, 20, renderer.meshes)
     first = next(index for index, scene in enumerate(scenes) if beyond_edges(scene).any())
     content, record = make_sample(renderer, spec, "train", first)
-    outside = beyond_edges(record.shown)
+    outside = beyond_edges(record.as_scene)
     image = decoded(content)
     assert (image[outside] == GREY).all()
     assert not (image[~outside] == GREY).all()
-    assert (trace_pixels(record.shown, renderer.meshes).first[outside] == NOTHING).all()
+    assert (trace_pixels(record.as_scene, renderer.meshes).first[outside] == NOTHING).all()
     assert record.real_camera is not None
 
 

@@ -47,7 +47,7 @@ def away_from_objects(folder: DatasetFolder, record: SampleRecord) -> tuple[np.n
 
     So the box that the path tracer renders leaves no seam, and nothing but the objects tells where they are.
     """
-    image, hits = pixels(folder, record), trace_pixels(record.shown)
+    image, hits = pixels(folder, record), trace_pixels(record.as_scene)
     away = np.abs(image - backdrop_pixels(record)).max(axis=-1)
     mask = silhouettes(hits)
     near_an_edge = edges(mask.astype(np.int8), REACH)

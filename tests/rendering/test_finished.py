@@ -150,7 +150,7 @@ def test_a_mask_for_every_sample(rendered: DatasetFolder, tmp_path: Path) -> Non
         with Image.open(tmp_path / "masks" / "train" / record.file_name) as image:
             assert image.mode == "1"
             mask = np.asarray(image)
-        hits = trace_pixels(record.shown)
+        hits = trace_pixels(record.as_scene)
         assert (mask == cylinder_mask(hits)).all()
         alone = np.isfinite(hits.depths[0]).sum()
         assert mask.sum() == pytest.approx(record.visibility * alone)

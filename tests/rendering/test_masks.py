@@ -54,7 +54,7 @@ def test_each_image_has_its_mask_and_each_of_a_mesh_its_clearing(of_mesh: MakeSp
     for record, shares, clear in zip(folder.records("train"), cells, bits, strict=True):
         np.testing.assert_array_equal(shares, mask(record, meshes))
         pixels = np.unpackbits(clear, axis=-1, count=record.S)
-        np.testing.assert_array_equal(pixels, trace_pixels(record.shown, meshes).first == NOTHING)
+        np.testing.assert_array_equal(pixels, trace_pixels(record.as_scene, meshes).first == NOTHING)
 
 
 def test_an_older_data_set_gets_them_once_and_is_verified_before_and_after(

@@ -58,7 +58,7 @@ def test_a_record_holds_the_position_before_its_own_camera(spec: DatasetSpec) ->
     """(x, y, z) = R p + t; number of the scene and of the view are those of the index."""
     for index in range(12):
         record = told(spec, "test", index)
-        assert (record.x, record.y, record.z) == pytest.approx(tuple(places(record.shown)[0]), abs=1e-12)
+        assert (record.x, record.y, record.z) == pytest.approx(tuple(places(record.as_scene)[0]), abs=1e-12)
         assert (record.scene, record.view) == (index // VIEWS, index % VIEWS)
         assert record.objects == told(spec, "test", VIEWS * record.scene).objects
 

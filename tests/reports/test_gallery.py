@@ -7,23 +7,23 @@ import pytest
 from PIL import Image
 
 from phd_exp.distributions.level_curves import on_image
-from phd_exp.evaluation.parquet import Columns, read_table
+from phd_exp.evaluation.parquet import Arrays, read_table
 from phd_exp.records.errors import RunError
 from phd_exp.reports.gallery import EACH, LARGEST, birds_eye_view, close_up, curves_of, load_image, make_gallery
 from tests.support.synthetic import write_run
 
 
 @pytest.fixture(scope="module")
-def table(tmp_path_factory: pytest.TempPathFactory) -> Columns:
+def table(tmp_path_factory: pytest.TempPathFactory) -> Arrays:
     return read_table(write_run(tmp_path_factory.mktemp("distribution"), n=60).predictions)
 
 
 @pytest.fixture(scope="module")
-def row(table: Columns) -> dict:
+def row(table: Arrays) -> dict:
     return {name: column[0] for name, column in table.items()}
 
 
-def test_the_best_and_the_worst_by_their_density(table: Columns) -> None:
+def test_the_best_and_the_worst_by_their_density(table: Arrays) -> None:
     gallery = make_gallery(table, {})
     names = table["file_name"][np.argsort(table["nll"])].tolist()
     assert [picture.name for picture in gallery.best] == names[:EACH]
@@ -39,7 +39,7 @@ def test_a_baseline_is_ranked_by_distance_and_has_no_curves(tmp_path: Path) -> N
     assert (picture.paths, picture.birds_eye, picture.image) == ([], None, None)
 
 
-def test_marks_lie_where_the_camera_sees_them(table: Columns) -> None:
+def test_marks_lie_where_the_camera_sees_them(table: Arrays) -> None:
     picture = make_gallery(table, {}).best[0]
     (place,) = np.flatnonzero(table["file_name"] == picture.name)
     for mark, prefix in ((picture.truth, ""), (picture.mode, "mode_")):
@@ -83,7 +83,7 @@ def test_only_images_of_their_folder_are_read(tmp_path: Path) -> None:
         assert load_image(folder, name) is None, name
 
 
-def test_what_cannot_be_drawn_is_said_or_left_out(table: Columns, row: dict) -> None:
+def test_what_cannot_be_drawn_is_said_or_left_out(table: Arrays, row: dict) -> None:
     with pytest.raises(RunError, match="no column file_name, f, as in older records; run the model again"):
         make_gallery({name: table[name] for name in table if name not in ("file_name", "f")}, {})
     assert curves_of(row | {"a": -1.0}) is None

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from phd_exp.evaluation.parquet import Columns, read_table
+from phd_exp.evaluation.parquet import Arrays, read_table
 from phd_exp.records.errors import RunError
 from phd_exp.reports.gallery import distribution_of
 from phd_exp.reports.scene import LEVELS, first_scene, scene_traces
@@ -14,11 +14,11 @@ from tests.support.synthetic import write_run
 
 
 @pytest.fixture(scope="module")
-def table(tmp_path_factory: pytest.TempPathFactory) -> Columns:
+def table(tmp_path_factory: pytest.TempPathFactory) -> Arrays:
     return read_table(write_run(tmp_path_factory.mktemp("run"), n=30).predictions)
 
 
-def test_the_first_image_is_chosen_whatever_its_error(table: Columns) -> None:
+def test_the_first_image_is_chosen_whatever_its_error(table: Arrays) -> None:
     scene = first_scene(table)
     assert scene is not None
     assert scene.name == table["file_name"][0]
@@ -27,7 +27,7 @@ def test_the_first_image_is_chosen_whatever_its_error(table: Columns) -> None:
     assert backwards.name == table["file_name"][-1]
 
 
-def test_its_surfaces_have_their_levels_and_its_edges_are_those_of_the_image(table: Columns) -> None:
+def test_its_surfaces_have_their_levels_and_its_edges_are_those_of_the_image(table: Arrays) -> None:
     scene = first_scene(table)
     row = {name: column[0] for name, column in table.items()}
     distribution = distribution_of(row)
@@ -44,7 +44,7 @@ def test_its_surfaces_have_their_levels_and_its_edges_are_those_of_the_image(tab
     assert close == ["50 % region", "90 % region", "true position", "mode"]
 
 
-def test_without_a_density_or_a_position_there_is_none(table: Columns, tmp_path: Path) -> None:
+def test_without_a_density_or_a_position_there_is_none(table: Arrays, tmp_path: Path) -> None:
     assert first_scene(read_table(write_run(tmp_path, model="mae_vz", n=30).predictions)) is None
     for name in ("z", "a"):
         assert first_scene(table | {name: np.full_like(table[name], np.nan)}) is None

@@ -5,9 +5,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from phd_exp.records.searches import Search
+from phd_exp.reports.charts import Chart, Trace, axis, bars, identity, line, square
 from phd_exp.reports.quantities import METRICS
 from phd_exp.reports.runs import Run
-from phd_exp.reports.site.charts import Chart, Trace, axis, bars, identity, line, square
 
 CALIBRATION = ("depth_calibration", "projected_calibration", "coverage", "depth_pit")
 LEARNING = tuple(

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from phd_exp.evaluation.predictions import Curve, Evaluation, Stratum
+from phd_exp.reports.charts import DASHES, Chart, Trace, axis, bars, curve_line, identity, line, square
 from phd_exp.reports.figures import decades
 from phd_exp.reports.fusion import fusion_charts
 from phd_exp.reports.quantities import METRICS, SCORES, Quantity
 from phd_exp.reports.runs import Run
-from phd_exp.reports.site.charts import DASHES, Chart, Trace, axis, bars, curve_line, identity, line, square
 from phd_exp.reports.tracks import track_charts
 
 
