@@ -53,10 +53,15 @@ class Guarantee:
     levels: list[float]
     n: list[int]
 
+    def region(self, prediction: ProjectedHuber, f: float) -> tuple[Region, dict[str, Any]]:
+        """The region of one prediction, and its guarantee for JSON; f is the focal length in sides of the image."""
+        region, (facts,) = self.regions(prediction, np.array(f))
+        return region, facts
+
     def regions(
         self, predictions: ProjectedHuber, f: Float[np.ndarray, "*batch"]
     ) -> tuple[Region, list[dict[str, Any]]]:
-        """The regions of predictions, and the guarantee of each for JSON; f is in sides of the image."""
+        """The regions of predictions, and the guarantee of each, as `region`."""
         quantity = GROUPED_BY[self.groups](predictions, torch.from_numpy(f))
         places = np.searchsorted(self.edges, quantity.numpy(), side="right")
         return Region(predictions, np.array(self.levels)[places]), [*map(self._facts, np.ravel(places).tolist())]

@@ -66,24 +66,18 @@ def stacked(columns: Mapping[str, Any], names: Sequence[str]) -> Tensor:
 
 
 def _values(name: str, stored: pa.ChunkedArray) -> np.ndarray:
-    """The texts or numbers of a column, without pandas, which `to_numpy` imports.
-
-    Raises ValueError or TypeError for other values.
-    """
+    """The texts or numbers of a column, without pandas, which `to_numpy` imports; others are a TypeError."""
     if name in TEXTS and pa.types.is_dictionary(stored.type):
         column = stored.combine_chunks()
         rows = column.indices.fill_null(len(column.dictionary)) if column.null_count else column.indices
         texts = np.array([*column.dictionary.to_pylist(), None], dtype=object)
         return np.asarray(texts[np.from_dlpack(rows)])
     kinds = (pa.types.is_floating, pa.types.is_integer, pa.types.is_boolean, pa.types.is_null)
-    if any(is_kind(stored.type) for is_kind in kinds):
-        numbers = stored.cast(pa.float64(), safe=False)
-        numbers = numbers.fill_null(math.nan) if numbers.null_count else numbers
-        return np.array(np.from_dlpack(numbers.combine_chunks()))
-    column = stored.to_numpy()
-    if column.dtype == object and any(not isinstance(value, int | float | None) for value in column):
-        raise TypeError(f"column {name!r} holds {type(column[0]).__name__}; expected numbers")
-    return np.array(column, dtype=np.float64)
+    if not any(is_kind(stored.type) for is_kind in kinds):
+        raise TypeError(f"column {name!r} holds {stored.type}; expected numbers")
+    numbers = stored.cast(pa.float64(), safe=False)
+    numbers = numbers.fill_null(math.nan) if numbers.null_count else numbers
+    return np.array(np.from_dlpack(numbers.combine_chunks()))
 
 
 def _require_small(file: Path, metadata: pq.FileMetaData) -> None:

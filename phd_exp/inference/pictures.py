@@ -81,7 +81,7 @@ def _outlines(sighting: Sighting, guarantee: Any) -> tuple[Points | None, Points
     if not guarantee:
         return None, None
     camera = sighting.view.camera
-    on_image, above = guarantee.regions(sighting.density, np.array(camera.f / camera.S))[0].outlines()
+    on_image, above = guarantee.region(sighting.density, camera.f / camera.S)[0].outlines()
     return camera.real_pixels(on_image), above
 
 

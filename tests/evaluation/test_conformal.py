@@ -132,14 +132,14 @@ def test_a_region_is_that_of_its_group() -> None:
     fresh = table_of(1, 3)
     p = ProjectedHuber(torch.zeros(2), torch.tensor(4.0), 100 * torch.eye(2), torch.tensor(20.0))
     for place, f in enumerate([1250 / 224, 1500 / 224, 1700 / 224, 1900 / 224]):
-        region, (facts,) = found.regions(p, np.array(f))
+        region, facts = found.region(p, f)
         low, high = facts["focal_length"]
         assert (low or 0) <= f < (high or 10)
         assert (facts["level"], facts["held_out_samples"]) == (region.level, found.n[place])
     assert found.levels[0] > found.levels[3] + 0.05
     equal = guarantee(table_of(400, 2) | {"f": np.full(400, 400.0)}, 0.9, "focal_length", None)
     assert equal.n == [200]
-    assert equal.regions(predictions(fresh), np.ones(1))[1][0]["focal_length"] == [None, None]
+    assert equal.region(predictions(fresh).expand([1]), 1.0)[1]["focal_length"] == [None, None]
 
 
 def test_rows_that_choose_do_not_guarantee_and_the_others_choose_nothing() -> None:

@@ -71,7 +71,7 @@ def test_an_ensemble_of_equal_members_is_each_of_them(table: dict[str, np.ndarra
 def test_familiarity_guarantees_and_pictures_read_it(table: dict[str, np.ndarray], predicted: ProjectedHuber) -> None:
     familiarity = Familiarity(table)
     assert np.mean(familiarity.p_value(familiarity.distance(table)) < 0.5) == pytest.approx(0.5, abs=0.1)
-    region, _ = guarantee(table, 0.9, None, None).regions(predicted[0], np.array(1500 / 224))
+    region, _ = guarantee(table, 0.9, None, None).region(predicted[0], 1500 / 224)
     assert region.level == pytest.approx(0.9, abs=0.06)
     curves = curves_of({name: column[0] for name, column in table.items()})
     assert curves is not None

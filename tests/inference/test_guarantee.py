@@ -73,7 +73,7 @@ def test_regions_are_those_of_the_guarantee_along_the_real_axis(
         prediction = predictor.see(
             predictor.view(np.asarray(Image.open(photos / row["file_name"])), camera.K, row["box"])
         )
-        (facts,) = found.regions(prediction, np.array(camera.f / camera.S))[1]
+        facts = found.region(prediction, camera.f / camera.S)[1]
         assert facts.items() <= region.items()
         xyz = prediction.rsample((20_000,), torch.Generator().manual_seed(0))
         inside = (prediction.level(xyz) <= facts["level"]).numpy()
