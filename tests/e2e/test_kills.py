@@ -1,17 +1,19 @@
 """Report, predict and export, killed at any moment: they leave whole files, and in the end the same bytes."""
 
-import multiprocessing
+import os
 import random
 import shutil
+import signal
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import pytest
 
-from phd_exp.__main__ import main
 from phd_exp.records.runs import RunFolder
+from tests.e2e.conftest import begin
 from tests.support.site_runs import write_runs
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
@@ -44,20 +46,6 @@ def command(verb: str, request: pytest.FixtureRequest, tmp_path: Path) -> Callab
     return lambda out: [verb, f"run={run.path}", f"folder={images}", f"out={out}"]
 
 
-@pytest.fixture
-def begun(verb: str) -> Callable[[list[str]], BaseProcess]:
-    """A command in a process of its own, forked from one that has imported what it needs already."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(VERBS[verb])
-
-    def begin(words: list[str]) -> BaseProcess:
-        process = context.Process(target=main, args=(words,))
-        process.start()
-        return process
-
-    return begin
-
-
 def end(process: BaseProcess) -> None:
     process.join()
     assert process.exitcode == 0
@@ -73,17 +61,35 @@ def leftovers(out: Path) -> list[Path]:
     return list(out.rglob(".*.tmp"))
 
 
-def kill_amid_writing(process: BaseProcess, out: Path, most: int, moments: random.Random) -> bool:
-    """After a few more files, at `most` so many, and a moment; False where it ended before."""
+def killed(process: BaseProcess, out: Path, most: int, moments: random.Random, amid: bool) -> bool:
+    """Kill it after a few more files, at `most` so many, and a moment; False where it ended before.
+
+    With `amid`, the moment is that of the next file that has not its name yet.
+    """
     before, enough = written(out), moments.randint(1, most)
     deadline = time.monotonic() + PATIENCE
-    while process.is_alive() and len(written(out) - before) < enough:
+    while process.is_alive():
         assert time.monotonic() < deadline, "waited too long"
+        new = written(out) - before
+        if len(new) >= enough and (not amid or halted(process, [path for path, _ in new if path.suffix == ".tmp"])):
+            break
         time.sleep(0.001)
-    time.sleep(moments.uniform(0.0, 0.05))
+    if not amid:
+        time.sleep(moments.uniform(0.0, 0.05))
     process.kill()
     process.join()
     return process.exitcode != 0
+
+
+def halted(process: BaseProcess, unnamed: list[Path]) -> bool:
+    """Stop it; where all files have their names by then, it goes on."""
+    if unnamed:
+        with suppress(ProcessLookupError):  # it has ended
+            os.kill(process.pid or 0, signal.SIGSTOP)
+            if any(path.exists() for path in unnamed):
+                return True
+            os.kill(process.pid or 0, signal.SIGCONT)
+    return False
 
 
 def written(out: Path) -> set[tuple[Path, int]]:
@@ -98,19 +104,18 @@ def written(out: Path) -> set[tuple[Path, int]]:
 
 
 def test_killed_at_any_moment_it_leaves_whole_files_and_ends_as_undisturbed(
-    verb: str, begun: Callable, command: Callable, tmp_path: Path
+    verb: str, command: Callable, tmp_path: Path
 ) -> None:
     """Each file is, to the byte, the one that an undisturbed process writes; a journal is the beginning of it."""
     undisturbed, out = tmp_path / "undisturbed", tmp_path / "out"
-    end(begun(command(undisturbed)))
+    end(begin(command(undisturbed), VERBS[verb]))
     whole = contents(undisturbed)
-    moments, kills, torn = random.Random(0), 0, 0
+    moments, kills, torn, begins = random.Random(0), 0, 0, 0
     before: dict[str, bytes] = {}
     most = min(6, len(whole) + 1)  # a file is seen without its name, and with it
-    # under load the moment of a write may be missed
-    while kills < KILLS[verb] or (not torn and kills < 5 * KILLS[verb]):
-        process = begun(command(out))
-        if kill_amid_writing(process, out, most, moments):
+    while kills < KILLS[verb] and begins < 5 * KILLS[verb]:
+        process, begins = begin(command(out), VERBS[verb]), begins + 1
+        if killed(process, out, most, moments, amid=kills % 2 == 0):
             kills += 1
             torn += len(leftovers(out)) > 0
             now = contents(out)
@@ -122,7 +127,8 @@ def test_killed_at_any_moment_it_leaves_whole_files_and_ends_as_undisturbed(
             assert contents(out) == whole
             shutil.rmtree(out)
             before = {}
+    assert kills == KILLS[verb], "it has ended before most kills"
     assert torn, "a kill has met a file that was being written"
-    end(begun(command(out)))
+    end(begin(command(out), VERBS[verb]))
     assert contents(out) == whole
     assert not leftovers(out)

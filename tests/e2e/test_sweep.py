@@ -1,7 +1,6 @@
 """Sweeps on real renders: killed at any moment, with failures among them, with a configuration that has changed."""
 
 import math
-import multiprocessing
 import os
 import random
 import re
@@ -17,10 +16,9 @@ from typing import Any, ClassVar
 import pytest
 from hydra.experimental.callback import Callback
 
-from phd_exp.__main__ import main
 from phd_exp.evaluation.parquet import read_table
 from phd_exp.records.runs import CHOOSE, RunFolder, find_runs
-from tests.e2e.conftest import QUICK
+from tests.e2e.conftest import QUICK, begin
 from tests.support.recorded import stamps, weights
 
 ONE = ("model=mae_vz", "recipe=strong", "data.image_size=64", "logger=none")
@@ -48,37 +46,26 @@ def weight_bytes(run: RunFolder) -> dict[str, bytes]:
 
 
 @pytest.fixture
-def begun(tmp_path: Path, renders: Path) -> Callable[..., BaseProcess]:
-    """A command in a process of its own, forked from one that has imported torch already."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["phd_exp.cli.train", "phd_exp.training.run"])
-
-    def begin(*words: str) -> BaseProcess:
-        process = context.Process(target=main, args=([*QUICK, f"data.root={renders}", *words],))
-        process.start()
-        return process
-
-    return begin
+def begun(renders: Path) -> Callable[..., BaseProcess]:
+    preload = ["phd_exp.cli.train", "phd_exp.training.run"]
+    return lambda *words: begin([*QUICK, f"data.root={renders}", *words], preload)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kills", "words"), [(1, TWO), (20, FOUR)])
-def test_killed_at_any_moment_the_same_command_goes_on(
-    train: Callable, begun: Callable, tmp_path: Path, kills: int, words: tuple[str, ...]
-) -> None:
+def test_killed_at_any_moment_the_same_command_goes_on(train: Callable, begun: Callable, tmp_path: Path) -> None:
     """What is finished stays as it is, the rest comes to the numbers of one whole sweep, both to the bit."""
-    assert train(*words, f"runs={tmp_path / 'whole'}").status == 0
+    assert train(*FOUR, f"runs={tmp_path / 'whole'}").status == 0
     runs, before = tmp_path / "killed", dict[Path, Any]()
-    chance = random.Random(kills)
-    for _ in range(kills):
-        process = begun(*words, f"runs={runs}")
+    chance = random.Random(0)
+    for _ in range(20):
+        process = begun(*FOUR, f"runs={runs}")
         time.sleep(chance.uniform(0.5, 3))
         (process.kill if chance.random() < 0.5 else process.terminate)()
         process.join()
         now = finished(runs)
         assert {path: now[path] for path in before} == before
         before = now
-    outcome = train(*words, f"runs={runs}")
+    outcome = train(*FOUR, f"runs={runs}")
     assert outcome.status == 0, outcome.err
     now = finished(runs)
     assert f"{len(now)} jobs, {len(before)} of them finished already" in outcome.out
