@@ -29,7 +29,6 @@ class Bad:
         words: of the command line.
         said: the whole line after `error: `, as a regular expression.
         status: the exit status.
-        again: another verb or input is refused by the same check in the default tests already.
     """
 
     name: str
@@ -37,4 +36,3 @@ class Bad:
     words: tuple[str, ...]
     said: str
     status: int = 1
-    again: bool = False

@@ -22,8 +22,8 @@ def space(place: Place) -> None:
     place.put("space.yaml", "space: {optimizer.lr: 'interval(0.001,0.01)'}\n")
 
 
-def configured(name: str, word: str, said: str, again: bool = False) -> Bad:
-    return Bad(f"configuration: {name}", nothing, ("preset=smoke", "logger=none", word), said, 2, again)
+def configured(name: str, word: str, said: str) -> Bad:
+    return Bad(f"configuration: {name}", nothing, ("preset=smoke", "logger=none", word), said, 2)
 
 
 def argument(words: tuple[str, ...], said: str, status: int = 2, **view: Any) -> Bad:
@@ -36,18 +36,9 @@ def argument(words: tuple[str, ...], said: str, status: int = 2, **view: Any) ->
     return Bad(f"argument: {' '.join(words)}, {view}", spoil, words, said, status)
 
 
-ENDS = {
-    "optimiser.lr=0.01": "optimizer.lr", "lr=0.01": "optimizer.lr", "epochs=3": "trainer.max_epochs",
-    "batch_size=8": "data.batch_size", "n_train=9": "data.n_train", "folder=photos": "data.folder",
-}  # fmt: skip
+ENDS = {"optimiser.lr=0.01": "optimizer.lr", "epochs=3": "trainer.max_epochs"}
 """Words whose key is known by its end, and the key."""
-SPACES = {
-    "model = mae_vz": "model=mae_vz",
-    "model= mae_vz": "model=mae_vz",
-    "model =mae_vz": "model=mae_vz",
-    "-m seed=0, 1": "seed=0,1",
-    "data.z_range=[3, 5]": "'data.z_range=[3,5]'",
-}
+SPACES = {"model = mae_vz": "model=mae_vz", "-m seed=0, 1": "seed=0,1", "data.z_range=[3, 5]": "'data.z_range=[3,5]'"}
 """Words that a shell splits at spaces, and what was meant."""
 CONFIGURATIONS = [
     Bad("configuration: a flag that returns the carriage", nothing, ("preset=smoke", "--cfg\r"), r"--cfg: holds control characters; expected printable KEY=VALUE", 2),
@@ -55,9 +46,6 @@ CONFIGURATIONS = [
     configured("a flag without its value", "-c", r"argument --cfg/-c: expected one argument; .*"),
     configured("a group set to null", "model=null", r"Config group override must be a string or a list\..*"),
     configured("a part set to null", "model.head=null", r"model\.head: got None; expected a valid dictionary"),
-    configured("a layer as a head", "model.head._target_=torch.nn.Linear", r"model\.head\._target_: 'torch\.nn\.Linear' is no head; .*"),
-    configured("a private name", "optimizer._target_=torch.optim._adamw.x", r"optimizer\._target_: .* cannot be imported .*"),
-    configured("arguments by place", "+backbone._args_=[1]", r"backbone\._args_: unknown key; .* takes depth"),
     configured("a partial that is no bool", "+loss._partial_=3", r"loss\._partial_: got 3; expected a bool"),
     configured("an interpolation kept as text", r"model.name='a\${b}'", r"model\.name: got 'a\$\{b\}'; expected a value, since no interpolation .*"),
     configured("an interpolation to nowhere", "seed=${nope}", r"Interpolation key 'nope' not found.*"),
@@ -67,7 +55,7 @@ CONFIGURATIONS = [
     configured("a folder without a name", "runs=''", r"runs: got ''; expected the name of a folder"),
     configured("brackets without end", "+a=" + "[" * 2000, r"[^\n]{1,420}"),
     configured("an empty word", "", r": no KEY=VALUE; .*"),
-    *(configured(f"the end of a key, {word}", word, rf"{word.split('=')[0]}: unknown key, did you mean '{key}'\?; expected one of backbone, .*", word not in [*ENDS][:2]) for word, key in ENDS.items()),
+    *(configured(f"the end of a key, {word}", word, rf"{word.split('=')[0]}: unknown key, did you mean '{key}'\?; expected one of backbone, .*") for word, key in ENDS.items()),
     configured("an argument that the files do not name", "trainer.gradient_clip_val=1", r"trainer\.gradient_clip_val: unknown key; .* \+trainer\.gradient_clip_val=VALUE"),
     configured("a key of another section", "trainer.batch_size=8", r"trainer\.batch_size: unknown key, did you mean 'data\.batch_size'\?; .*"),
     configured("a key of a part that is not chosen", "callbacks.early_stopping.patience=3", r"callbacks\.early_stopping\.patience: .* of callbacks=early_stopping; name that choice too"),
@@ -77,7 +65,7 @@ CONFIGURATIONS = [
     configured("the ablation of earlier versions", "without=muon", r"without: unknown key.*; expected one of backbone, .*"),
     configured("a choice without its group", "strong", r"strong: no KEY=VALUE, did you mean 'recipe=strong'\?; .*"),
     configured("no end of a list", "data.n_train=[", r"data\.n_train=\[: .*; expected KEY=VALUE without spaces, or with the value in quotes, .*"),
-    *(Bad(f"configuration: spaces, {text}", nothing, (*text.split(" "), "preset=smoke"), rf"{re.escape(text.removeprefix('-m '))}: has spaces; expected {re.escape(mended)}", 2, text in ("model= mae_vz", "model =mae_vz")) for text, mended in SPACES.items()),
+    *(Bad(f"configuration: spaces, {text}", nothing, (*text.split(" "), "preset=smoke"), rf"{re.escape(text.removeprefix('-m '))}: has spaces; expected {re.escape(mended)}", 2) for text, mended in SPACES.items()),
     configured("a key that is nearly one", "data.ntrain=3", r"data\.ntrain: unknown key, did you mean 'data\.n_train'\?; expected one of n_train, .*"),
     configured("a group that is nearly one", "modle=mae_vz", r"modle: .*did you mean 'model'.*"),
     configured("a choice that is nearly one", "model=mae_log", r"model=mae_log: .*did you mean 'mae_logz'.*probabilistic.*"),
@@ -85,7 +73,7 @@ CONFIGURATIONS = [
     configured("several runs at once", "experiment=table1", r"experiment=table1: names several runs; write -m before it: -m .*experiment=table1"),
     Bad("configuration: a key that is nearly one of render", nothing, ("render", "preset=smoke", "shrad=0/2"), r"shrad: unknown key, did you mean 'shard'\?; expected one of backbone,.*", 2),
     Bad("configuration: an experiment that is nearly one", nothing, ("-m", "preset=smoke", "experiment=fusion,tabel2"), r"experiment=tabel2: no such choice, did you mean 'table2'\?.*", 2),
-    *(Bad(f"configuration: an experiment with {word}", nothing, ("-m", "preset=smoke", "experiment=ablation", word), rf"preset=smoke experiment=ablation {word}: its job .*optimizer\.weight_decay=0 cannot be composed: optimizer\.weight_decay: .*optimizer=muon; .*", 2, again=word == "recipe=paper") for word in ("optimizer=adam", "recipe=paper")),
+    Bad("configuration: an experiment with another optimizer", nothing, ("-m", "preset=smoke", "experiment=ablation", "optimizer=adam"), r"preset=smoke experiment=ablation optimizer=adam: its job .*optimizer\.weight_decay=0 cannot be composed: optimizer\.weight_decay: .*optimizer=muon; .*", 2),
     Bad("configuration: no experiment", nothing, ("-m", "preset=smoke", "experiment=glob(nothing*)"), r".*experiment=glob\(nothing\*\): .*not one combination.*", 2),
     Bad("configuration: an unknown verb", nothing, ("trian",), r"trian: no KEY=VALUE, did you mean 'train'\?; .*train, render, report.*", 2),
     Bad("configuration: a folder without images", nothing, (*LEARN, "data.folder=nowhere"), r"nowhere/train: no such folder.*"),
@@ -106,7 +94,7 @@ CONFIGURATIONS = [
     configured("a shift to an empty range", "+evaluation.shifts.a.data.z_range=[5,4]", r"evaluation\.shifts\.a\.data: z_range: got \[5, 4\].*"),
     configured("a shift of no data set", "+evaluation.shifts.a.data.depth=5", r"evaluation\.shifts\.a\.data: depth: got 5.*"),
     Bad("configuration: a zero byte", nothing, ("preset=smoke", "runs=a\0b"), r"runs=a\?b: holds control characters; .*", 2),
-    *(Bad(f"configuration: {word}", nothing, ("-m", "preset=smoke", word), r"seed=range\(0,.*\): more than 10000 jobs; .*", 2, again="1e9" not in word) for word in ("seed=range(0,1e9)", "seed=range(0,nan)", "seed=range(0,inf)")),
+    *(Bad(f"configuration: {word}", nothing, ("-m", "preset=smoke", word), r"seed=range\(0,.*\): more than 10000 jobs; .*", 2) for word in ("seed=range(0,1e9)", "seed=range(0,nan)")),
     Bad("configuration: two long ranges", nothing, ("-m", "preset=smoke", "seed=range(0,9999)", "data.seed=range(0,9999)"), r"preset=smoke seed=.*: more than 10000 jobs; .*", 2),
     Bad("configuration: a folder with a long name", nothing, ("preset=smoke", "logger=none", f"runs={'a' * 300}"), r"a{300}.*: File name too long; .*"),
     Bad("configuration: a folder that cannot be made", nothing, ("preset=smoke", "hydra.run.dir=/proc/nope"), r"/proc/nope: No such file or directory; .*"),
@@ -126,38 +114,26 @@ ARGUMENTS = [
     argument(("predict", RUN, "good.png"), r"good\.png: expected key=value.*"),
     argument((*ONE, "out=photos/test/0.png/x"), r"photos/test/0\.png/x: cannot be written.*"),
     argument((*ONE, "view=photos"), r"view: got photos; expected a file \*\.rrd, such as view\.rrd"),
-    argument((*ONE, "view=8"), r"view: got 8; expected a file \*\.rrd, such as view\.rrd"),
     argument((*ONE, "curve=true"), r"curve: is drawn into the pictures; expected out=.*"),
     argument(("predict", "run=x", "image=y", "views=3"), r"views: got '3'; expected to be '1' or '8'.*"),
     argument(("predict", "nonsense=1"), r"run: missing; predict takes run=.*"),
     argument((*ONE, "calibration=garden"), r"calibration: got garden; expected a name of `calibrate`.*", 1),
     argument((*ONE, "calibration=a", "recalibrate=true"), r"calibration: recalibrates a single run.*"),
-    argument(("calibrate", RUN, "folder=nowhere"), r"nowhere: no such folder.*", 1),
     argument(("calibrate", RUN, "folder=photos/test", "name=a/b"), r"name: got 'a/b'.*"),
     argument((*ONE, "coverage=1"), r"coverage: got '1'; expected to be less than 1"),
-    argument((*ONE, "coverage=0"), r"coverage: got '0'; expected to be greater than 0"),
     argument((*ONE, "coverage=nan"), r"coverage: got 'nan'; expected to be.*"),
-    argument((*ONE, "coverage=most"), r"coverage: got 'most'; expected.*"),
     argument((*ONE, "groups=spread"), r"groups: guarantees a coverage; expected coverage=0\.9.*"),
-    argument((*ONE, "groups=size", "coverage=0.9"), r"groups: got 'size'; expected to be 'spread', 'truncation' or.*"),
     argument((*ONE, "coverage=0.9"), r"runs/.*/held_out\.parquet: missing; held-out samples are needed: train with.*", 1),
-    argument((*EXPORT, "coverage=0.9"), r"runs/.*/held_out\.parquet: missing.*", 1),
     argument(("export",), r"run: missing; export takes run=, recalibrate=, calibration=, trust=, views=, out=, coverage=.*"),
-    argument(("export", "run=nowhere"), r"nowhere: no run; expected a folder with config\.yaml.*", 1),
     argument(("export", "run=.", "out=."), r"out=\.: is a folder.*"),
-    argument(("export", "run=.", "precision=half"), r"precision: got 'half'; expected to be 'float32' or 'float64'"),
-    argument(("export", "run=.", "quantize=int4"), r"quantize: got 'int4'; expected to be 'int8'"),
     argument((*EXPORT, "precision=float32", "photographs=true"), r"precision: got float32; expected float64: photographs=true.*"),
     argument((*EXPORT, "quantize=int8", "coverage=0.9"), r"coverage: is guaranteed for the network in float32.*"),
     argument((*EXPORT, "quantize=int8"), r"quantize: got a run with \d+ held-out images; expected at least 40, .*"),
     argument(("fuse", "run=nowhere"), r"folder: missing; fuse takes run=.*"),
     argument(NOWHERE, r"nowhere: no run; expected a folder with config\.yaml.*", 1, scene=1, pose=POSE),
-    argument((*NOWHERE, "plane=1,2,3"), r"plane: got '1,2,3'; expected plane=NX,NY,NZ,OFFSET.*", scene=1, pose=POSE),
     argument((*NOWHERE, "plane=0,0,0,1"), r"plane: .*a normal that is not zero.*", scene=1, pose=POSE),
     argument((*NOWHERE, "plane=0,nan,0,1"), r"plane: .*expected finite numbers.*", scene=1, pose=POSE),
-    argument((*NOWHERE, "out=."), r"out=\.: is a folder.*", scene=1, pose=POSE),
     argument((*NOWHERE, "out=photos/test/metadata.jsonl"), r"out=.*: is one of the files that are read.*", scene=1, pose=POSE),
-    argument((*NOWHERE, "out=photos/test/0.png"), r"out=.*: is one of the files that are read.*", scene=1, pose=POSE),
     argument(("fuse", RUN, "folder=photos/test", "coverage=0.9", "plane=0,0,1,3"), r"coverage: holds for views that are fused.*", scene=1, pose=POSE),
     argument(("fuse", RUN, "folder=photos/test", "coverage=0.9"), r"runs/.*/views\.parquet: no scenes with 1 cameras, as coverage= needs; .*", 1, scene=1, pose=POSE),
     argument(NOWHERE, r".*line 1: scene is missing.*", 1),
@@ -167,12 +143,9 @@ ARGUMENTS = [
     argument(NOWHERE, r".*line 1: pose\.translation: missing.*", 1, scene=1, pose={"rotation": [1, 0, 0, 0]}),
     argument(NOWHERE, r".*pose\.R: unknown key; expected one of rotation, translation.*", 1, scene=1, pose=POSE | {"R": 1}),
     argument(("report", "rnus=x"), r"rnus: unknown key, did you mean 'runs'\?; report takes runs=, out= \(see .*"),
-    argument(("report", "out="), r"out=: expected key=value; report takes runs=, out= \(see .*"),
-    argument(("report", "runs"), r"runs: expected key=value; report takes runs=, out= \(see .*"),
     argument(("report", "runs=x"), r"x: no such folder; train first, or name another by runs=DIR", 1),
     argument(("report", "out=photos/test/0.png"), r"photos/test/0\.png/measured: cannot be written \(.*", 1),
     argument(("search", "space.yaml", "trials=0"), r"trials: got '0'; expected to be greater than or equal to 1"),
-    argument(("search", "space.yaml", "trials=x"), r"trials: got 'x'; expected a valid integer.*"),
     argument(("render", "preset=smoke", "nonsense=1"), r"nonsense: unknown key.*"),
     argument(("render", "preset=smoke", "masks=renders/default/masks"), r"masks=renders/default/masks: lies in the data set itself.*", 1),
     argument(("render", "preset=smoke", "bop=renders/default/bop"), r"bop=renders/default/bop: lies in the data set itself.*", 1),

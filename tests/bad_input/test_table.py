@@ -15,9 +15,7 @@ NEEDS = {"export": "onnxruntime", "search": "optuna"}
 
 
 @pytest.mark.timeout(60)
-@pytest.mark.parametrize(
-    "bad", [pytest.param(bad, id=bad.name, marks=[pytest.mark.slow] * bad.again) for bad in TABLE]
-)
+@pytest.mark.parametrize("bad", TABLE, ids=lambda bad: bad.name)
 def test_one_line(place: Place, phd_exp: Callable, bad: Bad) -> None:
     if bad.words[0] in NEEDS:
         pytest.importorskip(NEEDS[bad.words[0]])
