@@ -51,8 +51,8 @@ def build_regressor(config: RunConfig, depth: DepthScale, is_new: bool = True) -
         if not isinstance(backbone, Backbone):
             raise ValueError(f"{node['_target_']} makes a {type(backbone).__name__}; expected a torch.nn.Module")
         is_input = config.camera.focal_length == "shown"
-        shown = FocalLengthInput(head.n_outputs, depth) if is_input else None
-        return Regressor(backbone, head, shown, config.recipe.exposure)
+        f_input = FocalLengthInput(head.n_outputs, depth) if is_input else None
+        return Regressor(backbone, head, f_input, config.recipe.exposure)
 
 
 def _without_weights(node: Any) -> Any:

@@ -1,11 +1,10 @@
-"""What the verbs without Hydra share: arguments `key=value`, places to write to, the predictions of a run."""
+"""What the verbs without Hydra share: arguments `key=value`, and the predictions of a run."""
 
 import gc
 import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
@@ -13,10 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from phd_exp.records.detections import Detection
-from phd_exp.records.errors import ConfigError, DatasetError, RunError, complaint, listed, writing
-from phd_exp.records.files import remove_temporaries
-from phd_exp.records.messages import MessageFile, require_rosbags
-from phd_exp.records.recordings import MCAP, Detections, Recording, is_recording
+from phd_exp.records.errors import ConfigError, DatasetError, RunError, complaint, listed
+from phd_exp.records.recordings import Detections
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
     from phd_exp.evaluation.conformal import Guarantee
@@ -67,58 +64,6 @@ def four_numbers(expected: str) -> BeforeValidator:
     return BeforeValidator(read)
 
 
-def output_folder(out: Path) -> None:
-    """Make a folder to write into. Raises ConfigError if that is impossible."""
-    with writing(out, "out=", ConfigError):
-        out.mkdir(parents=True, exist_ok=True)
-        remove_temporaries(out)  # of a killed process
-
-
-def require_file(out: Path, name: str) -> None:
-    """Raise ConfigError if an output file is a folder; the message suggests `name` inside it."""
-    if out.is_dir():
-        raise ConfigError(f"out={out}: is a folder; expected a file, such as {out / name}")
-
-
-def require_output(out: Path, name: str, inputs: Iterable[Path]) -> None:
-    """Make the folder of an output file; the message about a folder suggests `name` inside it.
-
-    Raises ConfigError if the file is a folder, an input, or in a recording that is a folder, cannot be written, or
-    needs rosbags, which is missing.
-    """
-    require_file(out, name)
-    read = {path.resolve() for path in inputs if not path.is_dir() or is_recording(path)}
-    if read & {out.resolve(), out.resolve().parent}:
-        raise ConfigError(
-            f"out={out}: is one of the files that are read, or lies in the recording; choose another place"
-        )
-    if out.suffix == MCAP:
-        require_rosbags("out")
-    output_folder(out.parent)
-
-
-@contextmanager
-def message_file(out: Path | None) -> Iterator[MessageFile | None]:
-    """The file of an out= that is a recording to write; None for another one."""
-    if out is None or out.suffix != MCAP:
-        yield None
-        return
-    with MessageFile(out) as messages:
-        yield messages
-
-
-def new_view(view: Path) -> None:
-    """Make the folder of a recording for Rerun. Raises ConfigError unless it can be a new file *.rrd."""
-    if view.suffix != ".rrd":
-        raise ConfigError(f"view: got {view}; expected a file *.rrd, such as {view.with_name('view.rrd')}")
-    if os.path.lexists(view):
-        raise ConfigError(f"view: got {view}, which exists; expected a new file; delete it, or choose another")
-    if find_spec("rerun") is None:
-        raise ConfigError("view: recordings for Rerun need `pip install 'phd_exp[rerun]'`")
-    with writing(view, "view=", ConfigError):
-        view.parent.mkdir(parents=True, exist_ok=True)
-
-
 Coverage = Annotated[float, Field(gt=0, lt=1)] | None
 Paths = Annotated[tuple[Path, ...], BeforeValidator(lambda text: [text] if os.path.exists(text) else text.split(","))]
 
@@ -145,44 +90,6 @@ class RunArguments(Arguments):
                 "calibration: recalibrates a single run; expected one run=, no recalibrate= and no views=8"
             )
         return self
-
-
-BOX = four_numbers("box=LEFT,TOP,RIGHT,BOTTOM in pixels")
-OF_A_CAMERA = ("f", "fx", "fy", "cx", "cy", "camera", "box")
-
-
-class CameraArguments(RunArguments):
-    """A run, and the camera of the images that it predicts from."""
-
-    f: float | None = None
-    """focal length, px"""
-    fx: float | None = None
-    """horizontal focal length, px"""
-    fy: float | None = None
-    """vertical focal length, px"""
-    cx: float | None = None
-    """column of the principal point, px; by default the middle"""
-    cy: float | None = None
-    """row of the principal point, px; by default the middle"""
-    camera: str | None = None
-    """instead of f=, a camera file of ROS, OpenCV, Kalibr, COLMAP or another tool, with the lens"""
-    box: Annotated[tuple[float, float, float, float], BOX] | None = None
-    """LEFT,TOP,RIGHT,BOTTOM of the object, px; by default the whole image"""
-    topic: str | None = None
-    """of a recording of several cameras: the topic of the images, or IMAGES,CAMERA_INFO"""
-
-    def recording(self, folder: Path | None) -> Recording | None:
-        """The images of a folder= that is a recording of ROS 2; None if it is not."""
-        if folder is None or not is_recording(folder):
-            if self.topic:
-                raise ConfigError("topic: selects images of a recording; expected folder=FILE.mcap")
-            return None
-        return Recording.of(folder, self.topic, self.of_camera)
-
-    @property
-    def of_camera(self) -> dict[str, Any]:
-        """The keys of a camera that were given."""
-        return {key: getattr(self, key) for key in OF_A_CAMERA if getattr(self, key) is not None}
 
 
 def trusted(packages: str | None) -> tuple[str, ...]:

@@ -1,30 +1,63 @@
-"""The keys of `predict` and `track` that find objects: boxes of a file, a detector in Python, or the run's own."""
+"""What `predict` and `track` share: the camera, and boxes of a file, a detector in Python, or the network itself."""
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import model_validator
 
-from phd_exp.cli.arguments import CameraArguments
+from phd_exp.cli.arguments import RunArguments, four_numbers
 from phd_exp.records.detections import NumberOrName
+from phd_exp.records.errors import ConfigError
+from phd_exp.records.recordings import Recording, is_recording
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
     from phd_exp.inference.detectors import Detector
     from phd_exp.inference.predictor import Predictor
 
+BOX = four_numbers("box=LEFT,TOP,RIGHT,BOTTOM in pixels")
+OF_A_CAMERA = ("f", "fx", "fy", "cx", "cy", "camera", "box")
 FUNCTION = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
-class DetectingArguments(CameraArguments):
+class DetectingArguments(RunArguments):
     """A run, the camera of its images, and how objects are found in them."""
 
+    f: float | None = None
+    """focal length, px"""
+    fx: float | None = None
+    """horizontal focal length, px"""
+    fy: float | None = None
+    """vertical focal length, px"""
+    cx: float | None = None
+    """column of the principal point, px; by default the middle"""
+    cy: float | None = None
+    """row of the principal point, px; by default the middle"""
+    camera: str | None = None
+    """instead of f=, a camera file of ROS, OpenCV, Kalibr, COLMAP or another tool, with the lens"""
+    box: Annotated[tuple[float, float, float, float], BOX] | None = None
+    """LEFT,TOP,RIGHT,BOTTOM of the object, px; by default the whole image"""
+    topic: str | None = None
+    """of a recording of several cameras: the topic of the images, or IMAGES,CAMERA_INFO"""
     object: NumberOrName | None = None
     """with boxes= or annotations: the class to use, as COCO's category, BOP's obj_id, KITTI's type; by default all"""
     boxes: Path | None = None
     """instead of box=, a file of COCO results (track: image_id counts frames from 0); or MODULE:FUNCTION in Python"""
     detect: bool = False
     """instead of box=, find the object with the network itself; for runs of recipe=strong"""
+
+    def recording(self, folder: Path | None) -> Recording | None:
+        """The images of a folder= that is a recording of ROS 2; None if it is not."""
+        if folder is None or not is_recording(folder):
+            if self.topic:
+                raise ConfigError("topic: selects images of a recording; expected folder=FILE.mcap")
+            return None
+        return Recording.of(folder, self.topic, self.of_camera)
+
+    @property
+    def of_camera(self) -> dict[str, Any]:
+        """The keys of a camera that were given."""
+        return {key: getattr(self, key) for key in OF_A_CAMERA if getattr(self, key) is not None}
 
     @property
     def function(self) -> str | None:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Literal, Self
 
 from pydantic import model_validator
 
-from phd_exp.cli.arguments import Coverage, RunArguments, loaded, output_folder, require_file
+from phd_exp.cli.arguments import Coverage, RunArguments, loaded
+from phd_exp.cli.outputs import output_folder, require_file
 from phd_exp.records.errors import ConfigError
 
 if TYPE_CHECKING:  # imports of torch, which follow the checks of the arguments

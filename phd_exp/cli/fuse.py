@@ -3,35 +3,23 @@
 import json
 import math
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
-from functools import partial
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any, Self
 
-from pydantic import field_validator
+from pydantic import field_validator, model_validator
 
-from phd_exp.cli.arguments import (
-    Coverage,
-    RunArguments,
-    four_numbers,
-    loaded,
-    message_file,
-    new_view,
-    predicted,
-    require_output,
-)
+from phd_exp.cli.arguments import Coverage, RunArguments, four_numbers, loaded, predicted
+from phd_exp.cli.outputs import message_file, new_view, require_output
 from phd_exp.records.detections import NumberOrName
 from phd_exp.records.errors import ConfigError, RunError, listed
 from phd_exp.records.files import write_atomic
 from phd_exp.records.messages import MessageFile
 from phd_exp.records.own_images import Observed, annotations, detections_in, observed
 from phd_exp.records.recordings import is_recording
-from phd_exp.records.runs import RunFolder
 
-if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
-    from phd_exp.inference.answers import Sighting
-
+ONE_RUN = "coverage: scenes with several cameras are recorded by single runs; expected one run= and no views=8"
 PLANE = four_numbers("plane=NX,NY,NZ,OFFSET: the points v with normal . v = offset, metres")
 
 
@@ -60,6 +48,17 @@ class FuseArguments(RunArguments):
         if plane and not (all(map(math.isfinite, plane)) and any(plane[:3])):
             raise ValueError("expected finite numbers, and a normal that is not zero")
         return plane
+
+    @model_validator(mode="after")
+    def of_recorded_scenes(self) -> Self:
+        """Refuse a coverage that recorded scenes do not guarantee."""
+        if self.coverage and (self.plane or self.shared_scale):
+            raise ValueError("coverage: holds for views that are fused alone; omit plane= and shared_scale=")
+        if self.coverage and self.views != "1":
+            raise ValueError(ONE_RUN)
+        if self.coverage and self.calibration:
+            raise ValueError("coverage: recorded scenes of renders guarantee it; expected no calibration=")
+        return self
 
 
 def main(words: list[str]) -> int:
@@ -96,7 +95,7 @@ def main(words: list[str]) -> int:
 def _answers(
     arguments: FuseArguments, scenes: Sequence[Observed], messages: MessageFile | None
 ) -> list[dict[str, Any]]:
-    """The answers for JSON, which are written to `messages` too."""
+    """The answers for JSON, which are written to `messages` and to the recording of view= too."""
     # imports of seconds, which follow the checks of the arguments
     import torch
 
@@ -105,66 +104,45 @@ def _answers(
     from phd_exp.inference.fused import for_json, fused_answers, fused_region
     from phd_exp.inference.tables import require_received
 
-    if arguments.coverage and (arguments.plane or arguments.shared_scale):
-        raise ConfigError("coverage: holds for views that are fused alone; omit plane= and shared_scale=")
-    single = "coverage: scenes with several cameras are recorded by single runs; expected one run= and no views=8"
-    if arguments.coverage and arguments.views != "1":
-        raise ConfigError(single)
-    predictor = loaded(arguments, coverage=arguments.coverage)
+    predictor, coverage = loaded(arguments), arguments.coverage
     predictor.require_densities("fuse needs")
-    if predictor.is_ensemble and arguments.coverage:
-        raise ConfigError(single)
-    if arguments.calibration and arguments.coverage:
-        raise ConfigError("coverage: recorded scenes of renders guarantee it; expected no calibration=")
+    if coverage and predictor.is_ensemble:
+        raise ConfigError(ONE_RUN)
     numbers = torch.tensor(arguments.plane or (), dtype=torch.float64)
     plane = Plane(numbers[:3], numbers[3]) if arguments.plane else None
-    detections = [detection for scene in scenes for detection in scene.detections]
-    guarantees = {}
-    if arguments.coverage or arguments.shared_scale:
-        require_received(predictor.folders[0].views, predictor.config)
-    if arguments.coverage:
-        views, cameras = predictor.folders[0].views, {len(scene.detections) for scene in scenes}
-        guarantees = {k: fused_guarantee(views, k, arguments.coverage, predictor.temperature) for k in cameras}
-    shared = _shared_share(predictor.folders[0]) if arguments.shared_scale else None
-    with _recorded(arguments.view, messages, scenes, predicted(predictor, detections)) as (sightings, add):
-        answers = fused_answers(scenes, sightings, predictor, plane, shared)
-        add(answers)
-    return [for_json(answer) | (fused_region(answer, guarantees) if guarantees else {}) for answer in answers]
-
-
-@contextmanager
-def _recorded(
-    view: Path | None, messages: MessageFile | None, scenes: Sequence[Observed], sightings: Iterable["Sighting"]
-) -> Iterator[tuple[Iterable["Sighting"], Callable[[list[dict[str, Any]]], None]]]:
-    """The sightings, written to the recordings of view= and out= as they pass, and a function that adds answers."""
-    recordings: list[Callable[[list[dict[str, Any]]], None]] = []
+    views, guarantees = predictor.folders[0].views, {}
+    if coverage or arguments.shared_scale:
+        require_received(views, predictor.config)
+    if coverage:
+        cameras = {len(scene.detections) for scene in scenes}
+        guarantees = {k: fused_guarantee(views, k, coverage, predictor.temperature) for k in cameras}
+    shared = _shared_share(views) if arguments.shared_scale else None
+    sightings = predicted(predictor, [detection for scene in scenes for detection in scene.detections])
     with ExitStack() as ends:
         if messages is not None:
             from phd_exp.inference.ros import write_fused, write_views
 
             sightings = write_views(messages, scenes, sightings)
-            recordings.append(partial(write_fused, messages, scenes))
-        if view is not None:
+        if arguments.view is not None:
             from phd_exp.inference.rerun_view import add_fused, of_scenes, viewed_scenes
 
-            shown = ends.enter_context(of_scenes(view, scenes))
-            sightings = viewed_scenes(shown, scenes, sightings)
-            recordings.append(partial(add_fused, shown))
+            recording = ends.enter_context(of_scenes(arguments.view, scenes))
+            sightings = viewed_scenes(recording, scenes, sightings)
+        answers = fused_answers(scenes, sightings, predictor, plane, shared)
+        if messages is not None:
+            write_fused(messages, scenes, answers)
+        if arguments.view is not None:
+            add_fused(recording, answers)
+    return [for_json(answer) | (fused_region(answer, guarantees) if guarantees else {}) for answer in answers]
 
-        def add(answers: list[dict[str, Any]]) -> None:
-            for recording in recordings:
-                recording(answers)
 
-        yield sightings, add
-
-
-def _shared_share(run: RunFolder) -> float:
+def _shared_share(file: Path) -> float:
     import torch
 
     from phd_exp.evaluation.fusion import shared_share
     from phd_exp.evaluation.several_views import read_views
 
-    if not (file := run.views).exists():
+    if not file.exists():
         raise RunError(
             f"{file}: missing; shared_scale is estimated from it: train with evaluation.multiview.scenes=500"
         )

@@ -11,6 +11,7 @@ from pydantic.fields import FieldInfo
 
 from phd_exp.cli import conf_folder, prefix_of
 from phd_exp.config import RenderConfig, RunConfig
+from phd_exp.config.targets import keys_of_section
 from phd_exp.records.choices import flatten
 from phd_exp.records.errors import one_line
 from phd_exp.records.parsing import parse_yaml
@@ -47,12 +48,12 @@ def keys_of(verb: str) -> dict[str, list[Key]]:
         model = RunConfig if verb == "train" else RenderConfig
         return {heading: list(_in(file, model)) for file, heading in FILES[verb].items()}
     arguments: type[BaseModel] = getattr(import_module(f"phd_exp.cli.{verb}"), f"{verb.title()}Arguments")
-    return {"": [_described(name, one) for name, one in arguments.model_fields.items()]}
-
-
-def _described(name: str, field: FieldInfo) -> Key:
-    """A key of a verb; descriptions of several lines become one."""
-    return name, _type(field.annotation), _default(field), one_line(field.description or "")
+    return {
+        "": [
+            (name, _type(field.annotation), _default(field), one_line(field.description or ""))
+            for name, field in arguments.model_fields.items()
+        ]
+    }
 
 
 def _default(field: FieldInfo) -> str:
@@ -85,15 +86,12 @@ def _in(file: str, model: type[BaseModel]) -> Iterator[Key]:
 
 
 def _annotation(annotation: Any, names: list[str]) -> Any:
-    """The type of a key below a model; None if it has no such key. Keys of `data.spec` are written one level up."""
+    """The type of a key below a model; None if it has no such key."""
     if not names:
         return annotation
     for model in _models(annotation):
-        fields = model.model_fields
-        if names[0] in fields:
-            return _annotation(fields[names[0]].annotation, names[1:])
-        if "spec" in fields and (found := _annotation(fields["spec"].annotation, names)):
-            return found
+        if found := keys_of_section(model).get(names[0]):
+            return _annotation(found, names[1:])
     return None
 
 

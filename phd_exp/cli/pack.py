@@ -5,7 +5,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from phd_exp.cli.arguments import Arguments, output_folder, require_file, trusted
+from phd_exp.cli.arguments import Arguments, trusted
+from phd_exp.cli.outputs import output_folder, require_file
 from phd_exp.records.runs import RunFolder
 
 

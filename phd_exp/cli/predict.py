@@ -3,25 +3,16 @@
 import json
 import sys
 from collections.abc import Iterable
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import model_validator
 
-from phd_exp.cli.arguments import (
-    Coverage,
-    Paths,
-    loaded,
-    message_file,
-    new_view,
-    output_folder,
-    predicted,
-    require_output,
-)
+from phd_exp.cli.arguments import Coverage, Paths, loaded, predicted
 from phd_exp.cli.detecting import DetectingArguments
+from phd_exp.cli.outputs import message_file, places
 from phd_exp.records.detections import detections_of
-from phd_exp.records.errors import ConfigError, RunError
+from phd_exp.records.errors import RunError
 from phd_exp.records.files import write_atomic
 from phd_exp.records.foreign import boxes_in
 from phd_exp.records.own_images import detections_in, images_in
@@ -81,7 +72,8 @@ def main(words: list[str]) -> int:
     """Predict each detection; returns the exit status."""
     arguments = PredictArguments.parsed("predict", words)
     out, detections = arguments.out, _detections(arguments)
-    _prepare(arguments, detections)
+    inputs = [detections.path] if isinstance(detections, Recording) else [one.file for one in detections]
+    places(out, arguments.view, inputs, "predictions", "pictures", "matplotlib")
     function = arguments.of_function()  # whose mistakes need no network
     predictor = loaded(arguments, coverage=arguments.coverage)
     guarantee = predictor.guarantee(arguments.coverage, arguments.groups) if arguments.coverage else None
@@ -102,22 +94,6 @@ def main(words: list[str]) -> int:
         for sighting in sightings:
             print(json.dumps(answer(sighting, predictor.temperature), allow_nan=False), flush=True)
     return 0
-
-
-def _prepare(arguments: PredictArguments, detections: Detections) -> None:
-    """Make the folders of the outputs. Raises ConfigError if one cannot be written, or is an input."""
-    out = arguments.out
-    inputs = [detections.path] if isinstance(detections, Recording) else [one.file for one in detections]
-    if out is not None and out.suffix == MCAP:
-        require_output(out, f"predictions{MCAP}", inputs)
-    elif out is not None:
-        if find_spec("matplotlib") is None:
-            raise ConfigError("out: pictures need `pip install 'phd_exp[report]'`; without out= there is JSON alone")
-        if out.resolve() in {file.resolve().parent for file in inputs}:
-            raise ConfigError(f"out={out}: holds the images themselves; choose another folder")
-        output_folder(out)
-    if arguments.view is not None:
-        new_view(arguments.view)
 
 
 def _detections(arguments: PredictArguments) -> Detections:

@@ -5,14 +5,14 @@ import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from pydantic import Field, model_validator
 
-from phd_exp.cli.arguments import loaded, message_file, new_view, output_folder, require_output, with_bar
+from phd_exp.cli.arguments import loaded, with_bar
 from phd_exp.cli.detecting import DetectingArguments
+from phd_exp.cli.outputs import message_file, places
 from phd_exp.records.detections import detections_of
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.foreign import boxes_of_images
@@ -97,7 +97,7 @@ def main(words: list[str]) -> int:
     sequences = list(_sequences(arguments))
     if out is not None and out.suffix == MCAP and len(sequences) > 1:
         raise ConfigError(f"out: got {len(sequences)} tracks; expected one track for {out}, or out=DIR")
-    _prepare(arguments)
+    places(out, arguments.view, [arguments.folder or Path(str(arguments.video))], "track", "pages", "plotly")
     predictor = loaded(arguments)
     predictor.require_densities("a path needs")  # before outputs of an earlier command are removed
     detector = function or arguments.of_network(predictor)
@@ -108,21 +108,6 @@ def main(words: list[str]) -> int:
         else:
             _print(arguments, predictor, paths)
     return 0
-
-
-def _prepare(arguments: TrackArguments) -> None:
-    """Make the places to write to. Raises ConfigError if that is impossible, or would change the source."""
-    out, source = arguments.out, arguments.folder or Path(str(arguments.video))
-    if out is not None and out.suffix == MCAP:
-        require_output(out, f"track{MCAP}", [source])
-    elif out is not None:
-        if find_spec("plotly") is None:
-            raise ConfigError("out: pages need `pip install 'phd_exp[report]'`; without out= there is JSON alone")
-        if out.resolve() == (source if source.is_dir() else source.parent).resolve():
-            raise ConfigError(f"out={out}: holds the images themselves; choose another folder")
-        output_folder(out)
-    if arguments.view is not None:
-        new_view(arguments.view)
 
 
 def _recording(

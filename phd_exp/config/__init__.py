@@ -22,6 +22,10 @@ from phd_exp.records.spec import Shard
 __all__ = ["FolderConfig", "RenderConfig", "RenderedConfig", "RunConfig", "SourceConfig", "check", "check_render"]
 
 Checked = TypeVar("Checked", bound=BaseModel)
+NO_UNCERTAINTY = "predicts points without uncertainty"
+NO_COVARIANCE = "has no density with a covariance, which fusion needs"
+NO_CLOSED_FORMS = "predicts no Projected Huber density, which the smoother needs"
+NO_SINGLE_IMAGES = "is not rendered in single images"
 
 
 class RenderConfig(Record):
@@ -62,11 +66,6 @@ class RunConfig(Record):
         made, taken = (_prediction(node) for node in (self.model.head, self.loss))
         if made is None:
             raise ValueError(f"model.head._target_: {self.model.head['_target_']!r} is no head; see conf/model")
-        if self.evaluation.eight_views and not hasattr(made, "log_prob"):
-            raise ValueError(
-                f"evaluation.eight_views: model={self.model.name} predicts points without uncertainty; "
-                "expected model=probabilistic, or evaluation.eight_views=false"
-            )
         if taken is not None and not issubclass(made, taken):
             raise ValueError(
                 f"loss: takes a {taken.__name__}, but model={self.model.name} predicts a {made.__name__}; "
@@ -149,50 +148,34 @@ class RunConfig(Record):
         return found
 
     @model_validator(mode="after")
-    def sequences_fit(self) -> "RunConfig":
-        """Refuse sequences for predictions that cannot be smoothed, and for data that cannot move."""
-        asked, expected = self.evaluation.sequences, "or evaluation.sequences=[]"
-        if not asked:
-            return self
-        if not getattr(_prediction(self.model.head), "has_closed_forms", False):
-            raise ValueError(
-                f"evaluation.sequences: model={self.model.name} predicts no Projected Huber density, which the "
-                f"smoother needs; expected model=probabilistic, {expected}"
-            )
-        if not isinstance(self.data, RenderedConfig) or self.data.spec.frames > 1 or self.data.spec.views > 1:
-            raise ValueError(
-                f"evaluation.sequences: data={self.data.name} is not rendered in single images; expected data=scale, "
-                f"{expected}"
-            )
-        if len({frames for _, frames in asked}) < len(asked):
+    def evaluations_fit(self) -> "RunConfig":
+        """Refuse further evaluations for a model or a data set that lacks what they need."""
+        asked, made = self.evaluation, _prediction(self.model.head)
+        spec = self.data.spec if isinstance(self.data, RenderedConfig) else None
+        scenes = asked.multiview is not None and asked.multiview.scenes > 0
+        is_one_view = spec is not None and spec.views == 1
+        is_single = spec is not None and spec.views == spec.frames == 1
+        needs = [  # whether it is asked for, the setting without it, whether the choice fits, and what it lacks
+            (asked.eight_views, "eight_views=false", hasattr(made, "log_prob"), "model", NO_UNCERTAINTY),
+            (scenes, "multiview.scenes=0", getattr(made, "has_covariance", False), "model", NO_COVARIANCE),
+            (scenes, "multiview.scenes=0", is_one_view, "data", "is not rendered with one view"),
+            (asked.sequences, "sequences=[]", getattr(made, "has_closed_forms", False), "model", NO_CLOSED_FORMS),
+            (asked.sequences, "sequences=[]", is_single, "data", NO_SINGLE_IMAGES),
+        ]
+        names = {"model": (self.model.name, "probabilistic"), "data": (self.data.name, "scale")}
+        for is_asked, without, fits, group, lacks in needs:
+            if is_asked and not fits:
+                (name, usual), key = names[group], without.partition("=")[0]
+                raise ValueError(
+                    f"evaluation.{key}: {group}={name} {lacks}; expected {group}={usual}, or evaluation.{without}"
+                )
+        if len({frames for _, frames in asked.sequences}) < len(asked.sequences):
             raise ValueError("evaluation.sequences: expected pairs [sequences, frames] of different frames")
-        try:
-            _ = self.sequences
-        except ValueError as error:
-            raise ValueError(f"evaluation.sequences: {gist(error)}") from None
-        return self
-
-    @model_validator(mode="after")
-    def several_views_fit(self) -> "RunConfig":
-        """Refuse several views for predictions that cannot be fused, and for data that is not rendered."""
-        multiview = self.evaluation.multiview
-        if multiview is None or multiview.scenes == 0:
-            return self
-        expected = "or evaluation.multiview.scenes=0"
-        if not getattr(_prediction(self.model.head), "has_covariance", False):
-            raise ValueError(
-                f"evaluation.multiview.scenes: model={self.model.name} has no density with a covariance, which "
-                f"fusion needs; expected model=probabilistic, {expected}"
-            )
-        if not isinstance(self.data, RenderedConfig) or self.data.spec.views > 1:
-            raise ValueError(
-                f"evaluation.multiview.scenes: data={self.data.name} is not rendered with one view; expected "
-                f"data=scale, {expected}"
-            )
-        try:
-            _ = self.several_views
-        except ValueError as error:
-            raise ValueError(f"evaluation.multiview: {gist(error)}") from None
+        for key, data in (("multiview", "several_views"), ("sequences", "sequences")):
+            try:
+                getattr(self, data)
+            except ValueError as error:
+                raise ValueError(f"evaluation.{key}: {gist(error)}") from None
         return self
 
 

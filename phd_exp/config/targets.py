@@ -1,7 +1,7 @@
 """Config nodes that name a class or function by `_target_`: who may name which, the keys it takes, and its call."""
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from importlib import import_module
 from typing import Annotated, Any, get_args, get_origin
@@ -28,21 +28,36 @@ def check_target(node: dict[str, Any], trust: Trust, where: str = "") -> dict[st
 
     Raises PydanticCustomError naming the key, the value, and what was expected.
     """
-    target, prefix = locate(node.get("_target_"), trust, where), f"{where}." if where else ""
+    nodes = list(_nodes_in({"_target_": None} | node, where))
+    # all are allowed before one is looked into
+    targets = [locate(one["_target_"], trust, path) for path, one in nodes]
+    for (path, one), target in zip(nodes, targets, strict=True):
+        _check_keys(one, target, f"{path}." if path else "")
+    return node
+
+
+def _nodes_in(value: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
+    """All nodes of a configuration with their dotted keys, each before those in it."""
+    if is_node(value):
+        yield path, value
+    children = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, child in children:
+        yield from _nodes_in(child, f"{path}.{key}" if path else str(key))
+
+
+def _check_keys(node: dict[str, Any], target: Any, prefix: str) -> None:
+    """Check the keys of one node against the signature of its target."""
     if not isinstance(node.get("_partial_", False), bool):
         raise _error(f"{prefix}_partial_", f"got {shown(node['_partial_'])}; expected a bool")
     parameters, takes_any = _parameters(target)
     for key, value in node.items():
         if key in ("_target_", "_partial_"):
             continue
-        path = f"{prefix}{key}"
-        _check_nodes(path, value, trust)
         if key in parameters and not is_node(value):
-            _check_value(path, value, parameters[key].annotation)
+            _check_value(f"{prefix}{key}", value, parameters[key].annotation)
         elif key not in parameters and (key.startswith("_") or not takes_any):  # Hydra's own, as `_recursive_`
             taken = f"{node['_target_']} takes {', '.join(parameters)}"
-            raise _error(path, f"unknown key{instead(key, parameters, taken)}")
-    return node
+            raise _error(f"{prefix}{key}", f"unknown key{instead(key, parameters, taken)}")
 
 
 def _parameters(target: Any) -> tuple[Mapping[str, inspect.Parameter], bool]:
@@ -52,16 +67,6 @@ def _parameters(target: Any) -> tuple[Mapping[str, inspect.Parameter], bool]:
     except ValueError:  # some built-in ones
         return {}, True
     return parameters, any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
-
-
-def _check_nodes(path: str, value: Any, trust: Trust) -> None:
-    """Check a node, or the nodes inside lists and mappings, which Hydra would build as well."""
-    if is_node(value):
-        check_target(value, trust, path)
-        return
-    children = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    for key, child in children:
-        _check_nodes(f"{path}.{key}", child, trust)
 
 
 def build(node: Mapping[str, Any], is_partial: bool = False) -> Any:
@@ -103,11 +108,12 @@ def custom_parts(config: Any) -> dict[str, str]:
     """The classes and functions that a checked configuration names outside this project and the libraries it is made
     of, with the files that define them.
     """
-    parts = config.values() if isinstance(config, dict) else config if isinstance(config, list) else ()
-    found = {name: file for part in parts for name, file in custom_parts(part).items()}
-    if is_node(config) and (name := config["_target_"]) and not _is_below(name, KNOWN):
-        found[name] = str(getattr(inspect.getmodule(locate(name, None)), "__file__", "built in"))
-    return found
+    names = [node["_target_"] for _, node in _nodes_in(config)]
+    return {
+        name: str(getattr(inspect.getmodule(locate(name, None)), "__file__", "built in"))
+        for name in names
+        if name and not _is_below(name, KNOWN)
+    }
 
 
 def _is_below(name: str, packages: tuple[str, ...]) -> bool:
@@ -187,9 +193,14 @@ def _valid_keys(model: Any, location: list[str]) -> list[str]:
             # of a mapping from names to sections, the section
             model = get_args(model)[1] if get_origin(model) is dict else model.model_fields[name].annotation
     model = next((member for member in get_args(model) if inspect.isclass(member)), model)  # of Section | None
-    fields = dict(model.model_fields)
-    inlined = fields.pop("spec", None)
-    return [*fields, *(inlined.annotation.model_fields if inlined else ())]
+    return [*keys_of_section(model)]
+
+
+def keys_of_section(model: Any) -> dict[str, Any]:
+    """The keys that a section has for the user, with their types; those of `spec` stand one level up."""
+    types = {name: field.annotation for name, field in model.model_fields.items()}
+    spec = types.pop("spec", None)
+    return types | (keys_of_section(spec) if spec else {})
 
 
 def _check_value(path: str, value: Any, annotation: Any) -> None:

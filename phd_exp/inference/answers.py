@@ -2,9 +2,9 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import islice
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -148,25 +148,13 @@ class PredictedBatch:
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """One detection of a batch."""
+    """One detection, its image and the input of the network, a row of a batch."""
 
+    detection: Detection
+    image: Image.Image
+    view: View
     batch: PredictedBatch
     row: int
-
-    @property
-    def detection(self) -> Detection:
-        """The detection."""
-        return self.batch.seen[self.row][0]
-
-    @property
-    def image(self) -> Image.Image:
-        """Its image."""
-        return self.batch.seen[self.row][1]
-
-    @property
-    def view(self) -> View:
-        """The input of the network."""
-        return self.batch.seen[self.row][2]
 
     @property
     def raw(self) -> Float[Tensor, "*members n_outputs"]:
@@ -218,7 +206,7 @@ def sightings(
         if n:
             made, familiar = predictor.predict(raw[:n], f[:n]), predictor.familiar(raw[:n], f[:n])
             batch = PredictedBatch(seen[:n], raw[:n], made, familiar, guarantee)
-            yield from (Sighting(batch, row) for row in range(n))
+            yield from (Sighting(*one, batch, row) for row, one in enumerate(batch.seen))
         if n < len(seen):
             raise RunError(
                 f"{seen[n][0].where}: the network returns numbers that are not finite; train the run again"
@@ -240,10 +228,8 @@ def _batches(predictor: Predictor, detections: Iterable[Detection]) -> Iterator[
     with ThreadPoolExecutor(threads) as pool:
         while some := list(islice(files, threads)):
             with pillow_warnings():
-                futures = [pool.submit(_seen, predictor, file) for file in some]
-                wait(futures)
-            for future in futures:
-                found, error = future.result()
+                seen = list(pool.map(partial(_seen, predictor), some))
+            for found, error in seen:
                 batch += found
                 if error:
                     if batch:

@@ -112,9 +112,9 @@ def _draw_image(axes: Axes, image: Image.Image, part: Box, marks: list[Mark], fr
     ends = (math.floor(left), math.floor(top), math.ceil(right), math.ceil(bottom))
     inside = np.clip(ends, 0, 2 * image.size).tolist()
     if inside[0] < inside[2] and inside[1] < inside[3]:
-        shown = image.crop(inside)
-        shown.thumbnail((LARGEST, LARGEST))
-        axes.imshow(np.asarray(shown), extent=(inside[0], inside[2], inside[3], inside[1]))
+        cropped = image.crop(inside)
+        cropped.thumbnail((LARGEST, LARGEST))
+        axes.imshow(np.asarray(cropped), extent=(inside[0], inside[2], inside[3], inside[1]))
     for dashes, frame in frames.items():
         if frame:
             corner, size = frame[:2], (frame[2] - frame[0], frame[3] - frame[1])

@@ -18,18 +18,6 @@ def config(composed) -> RunConfig:  # type: ignore[no-untyped-def]
     return check(composed("preset=smoke"))
 
 
-def test_choices_have_a_place_in_the_name(config: RunConfig) -> None:
-    name = run_name(config, ["preset=smoke", "data=default", "model=probabilistic", "seed=0"])
-    assert (name.preset, name.data, name.model, name.seed) == ("smoke", "default", "probabilistic", 0)
-    assert name.overrides == ()
-
-
-def test_a_recipe_has_a_place_beside_the_preset(composed) -> None:  # type: ignore[no-untyped-def]
-    name = run_name(check(composed("preset=smoke", "recipe=strong")), ["preset=smoke", "recipe=strong"])
-    assert (name.preset, name.overrides) == ("smoke+strong", ())
-    assert run_name(check(composed("recipe=paper")), ["recipe=paper"]).preset == "paper"
-
-
 def test_the_name_contains_the_overrides_that_can_change_a_number(config: RunConfig) -> None:
     for override in (
         *("runs=elsewhere", "logger=none", "logger.project=mine", "data.name=mine", "data.root=/data"),

@@ -57,14 +57,6 @@ def test_the_command_line_overrides_all_files(checked: Callable) -> None:
     assert (strong.data.image_size, strong.camera.focal_length) == (48, "known")
 
 
-@pytest.mark.parametrize("preset", sorted(file.stem for file in (conf_folder() / "preset").glob("*.yaml")))
-def test_a_folder_is_used_whole_with_every_preset(checked: Callable, preset: str) -> None:
-    own = checked(f"preset={preset}", "data=folder", "data.folder=photos").data
-    rendered = checked(f"preset={preset}").data
-    assert (own.n_train, own.n_held_out, own.n_test) == (None, 0, None)
-    assert (own.image_size, own.batch_size) == (rendered.image_size, rendered.batch_size)
-
-
 @pytest.mark.parametrize("variant", ["occl", "scale", "occl_scale", "multiview"])
 def test_variants_differ_only_in_the_keys_of_their_files(checked: Callable, variant: str) -> None:
     file = yaml.safe_load((conf_folder() / "data" / f"{variant}.yaml").read_text())

@@ -58,21 +58,9 @@ def test_a_run_on_views_of_boxes_predicts_boxes(phd_exp: Callable, part: Path, t
     ratio = [record.z / record.f for record in records]
     assert run.constants()["D"] == pytest.approx((max(ratio) / min(ratio)) ** 0.5)
     Image.new("RGB", (640, 480), (90, 120, 90)).save(tmp_path / "photo.png")
-    answer = phd_exp("predict", f"run={run.path}", "image=photo.png", "f=500", "box=10,20,80,90")
-    assert (answer.status, answer.err) == (0, "")
-    assert len(read_lines(answer.out)) == 1
-
-
-@pytest.mark.slow
-def test_a_run_on_an_object_predicts_its_test_images(phd_exp: Callable, part: Path, tmp_path: Path) -> None:
-    quick = ("recipe=strong", "data.n_train=16", "data.batch_size=8", "data.image_size=64", "trainer.threads=1")
-    words = (*SMALL, *FEW, *quick, f"data.mesh={part}", "data.unit=0.001", "data.distractors=2", "logger=none")
-    words += ("trainer.progress_bar=false",)
-    done = phd_exp(*words)
-    assert done.status == 0, done.err
-    run = only_run(tmp_path / "runs")
-    assert (run.results()["data"], run.results()["n_test"]) == ("object", 2)
-    part.unlink()  # predictions need the images alone
-    answer = phd_exp("predict", f"run={run.path}", f"folder={tmp_path / 'renders' / 'object' / 'test'}")
-    assert answer.status == 0, answer.err
-    assert len(read_lines(answer.out)) == 2
+    mesh = part.rename(tmp_path / "elsewhere.glb")  # predictions need the images alone
+    for words, n in ((("image=photo.png", "f=500", "box=10,20,80,90"), 1), (("folder=renders/object/test",), 2)):
+        answer = phd_exp("predict", f"run={run.path}", *words)
+        assert (answer.status, answer.err) == (0, "")
+        assert len(read_lines(answer.out)) == n
+    mesh.rename(part)

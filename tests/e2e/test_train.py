@@ -14,22 +14,12 @@ import pytest
 from PIL import Image
 
 from phd_exp.evaluation.point_errors import ErrorKey
-from phd_exp.records.processes import PROJECT
 from phd_exp.records.runs import RunFolder
 from phd_exp.reports.files import command_of
 from phd_exp.reports.runs import read_report
 from phd_exp.training.module import PositionModule
 from tests.e2e.conftest import QUICK, QUICKER
 from tests.support.recorded import only_run, status_of
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("data", ["default", "occl", "scale", "occl_scale"])
-def test_every_data_set_trains(train: Callable, tmp_path: Path, data: str) -> None:
-    """By default, all tests here train on the first."""
-    outcome = train(f"data={data}", "logger=none", "trainer.max_epochs=1")
-    assert outcome.status == 0, outcome.err
-    assert only_run(tmp_path / "runs").results()["data"] == data
 
 
 def test_a_run_with_pictures_and_wandb_which_repeating_the_command_finds(
@@ -102,16 +92,6 @@ def test_a_signal_ends_the_command_with_its_status(
     run = only_run(tmp_path / "runs")
     assert run.path.relative_to(tmp_path / "runs").as_posix().startswith("smoke+strong/default/")
     assert (status_of(run).state, status_of(run).error) == ("interrupted", "Stopped: SIGTERM")
-
-
-@pytest.mark.slow
-def test_the_strong_recipe_is_exported(train: Callable, tmp_path: Path) -> None:
-    """In a process without checked shapes, whose comparisons would fix the size of a batch."""
-    pytest.importorskip("onnxruntime", reason="export needs `pip install 'phd_exp[export]'`")
-    assert train("recipe=strong", "data.image_size=64", "logger=none", "trainer.max_epochs=1").status == 0
-    command = ["phd_exp", "export", f"run={only_run(tmp_path / 'runs').path}", "out=network.onnx"]
-    subprocess.run([sys.executable, "-m", *command], env={**os.environ, "PYTHONPATH": str(PROJECT)}, check=True)
-    assert (tmp_path / "network.onnx").exists()
 
 
 def test_the_report_computes_what_training_recorded(run: RunFolder, phd_exp: Callable) -> None:

@@ -14,7 +14,7 @@ import torch
 
 import phd_exp as package
 from phd_exp.data.batches import Batch
-from phd_exp.distributions import Mixture, ProjectedHuber
+from phd_exp.distributions import ProjectedHuber
 from phd_exp.geometry.motion import EIGHT, turned
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.predictions import columns, write_parquet
@@ -140,9 +140,10 @@ def test_familiar_needs_the_same_held_out_samples(make: Callable, phd_exp: Calla
 
 def test_fused_positions_are_those_of_the_closest_distributions(make: Callable) -> None:
     """The raw numbers of an ensemble predict in any batch."""
-    predictor = package.load([make("a").path, make("b", seed=1, factor=1.5).path])
+    predictor = package.load([make("a").path, make("b", seed=1, factor=1.5).path], views=8)
     images, f = pictures(4), torch.full((4,), 250.0)
     raw = predictor.raw(images.numpy(), f)
+    assert raw.shape == (4, 16, 7)
     scenes = predictor.predict(raw[torch.tensor([[0, 1], [2, 3]])], f.reshape(2, 2))
     torch.testing.assert_close(scenes.mode.flatten(0, 1), predictor.predict(raw, f).mode)
 
@@ -184,11 +185,3 @@ def test_seeds_of_two_configurations_are_no_ensemble(make: Callable, phd_exp: Ca
     make("seed0"), make("seed1-00000000", seed=1, optimizer__lr=0.5)
     refused = phd_exp("predict", "run=runs", "folder=photos").error
     assert "optimizer.lr=0.001, but optimizer.lr=0.5 in runs/seed1-00000000" in refused
-
-
-def test_a_mixture_has_the_members_of_its_predictor(make: Callable) -> None:
-    predictor = package.load([make("a").path, make("b", seed=1).path], views=8)
-    f = torch.full((1,), 250.0)
-    mixture = predictor.members(predictor.raw(pictures(1).numpy(), f), f)
-    assert isinstance(mixture, Mixture)
-    assert mixture.members.batch_shape == (1, 16)

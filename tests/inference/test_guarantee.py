@@ -14,15 +14,14 @@ from scipy import stats
 
 import phd_exp as package
 from phd_exp.distributions.level import PRECISIONS, credible_level
-from phd_exp.evaluation.conformal import fused_guarantee, guarantee
+from phd_exp.evaluation.conformal import fused_guarantee
 from phd_exp.inference import pictures
 from phd_exp.records.runs import RunFolder
 from tests.evaluation.test_conformal import table_of
 from tests.support.several import write_views
-from tests.support.untrained import SMALL, read_lines, untrained, virtual_cameras, write_photos
+from tests.support.untrained import NOWHERE, read_lines, virtual_cameras, write_photos
 
 POSES = [[0.0, 0.0, 0.0], [0.05, 0.0, 0.0]]
-CROPS = ("data=folder", "data.folder=nowhere")
 
 
 @pytest.fixture(scope="module")
@@ -40,21 +39,12 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def make(composed: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> Callable[..., RunFolder]:
-    """An untrained run of some overrides, with records of held-out samples and of scenes."""
-
-    def made(*words: str) -> RunFolder:
-        run = untrained(tmp_path_factory.mktemp("runs") / "run", composed(*SMALL, *CROPS, *words))
-        pd.DataFrame(table_of(400, 1, overconfidence=1.3)).to_parquet(run.held_out)
-        write_views(run.views, n=60)
-        return run
-
-    return made
-
-
-@pytest.fixture(scope="module")
 def run(make: Callable[..., RunFolder]) -> RunFolder:
-    return make()
+    """An untrained run with records of held-out samples and of scenes."""
+    run = make(*NOWHERE)
+    pd.DataFrame(table_of(400, 1, overconfidence=1.3)).to_parquet(run.held_out)
+    write_views(run.views, n=60)
+    return run
 
 
 @pytest.mark.parametrize("groups", [None, pytest.param("truncation", marks=pytest.mark.slow)])
@@ -172,10 +162,3 @@ def test_too_few_samples_are_one_line(
     Image.new("RGB", (64, 64)).save(tmp_path / "photo.png")
     (tmp_path / "test").symlink_to(photos)
     assert said in phd_exp(words[0], f"run={run.path}", *words[1:]).error
-
-
-def test_a_model_without_uncertainty_guarantees_nothing(phd_exp: Callable, make: Callable, photos: Path) -> None:
-    baseline = make("model=mae_vz")
-    outcome = phd_exp("predict", f"run={baseline.path}", f"folder={photos}", "coverage=0.9")
-    assert "no Projected Huber densities, which recalibrate= and coverage= need" in outcome.err
-    assert guarantee(table_of(40, 1), 0.9, None, None).n == [20]

@@ -259,7 +259,8 @@ def test_small_curves_have_a_close_up_and_the_box_a_frame(
     eye = torch.eye(2, dtype=torch.float64)
     prediction = ProjectedHuber(0 * eye[:1], 4 * eye[0, :1], precision * eye[None], 50 * eye[0, :1])
     view = View(cut(image, camera), camera)
-    sighting = Sighting(PredictedBatch([(detection, image, view)], torch.zeros(1, 7), prediction), 0)
+    seen = detection, image, view
+    sighting = Sighting(*seen, PredictedBatch([seen], torch.zeros(1, 7), prediction), 0)
     line = answer(sighting, None)
     figure: Any = pictures.picture(sighting, line)
     first, second, *_ = axes = figure.axes
