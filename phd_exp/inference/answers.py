@@ -204,8 +204,8 @@ def sightings(
         finite = raw.flatten(1).isfinite().all(-1)
         n = int(finite.long().cumprod(0).sum())  # of those before the first that is not
         if n:
-            made, familiar = predictor.predict(raw[:n], f[:n]), predictor.familiar(raw[:n], f[:n])
-            batch = PredictedBatch(seen[:n], raw[:n], made, familiar, guarantee)
+            made = predictor.predict(raw[:n], f[:n])
+            batch = PredictedBatch(seen[:n], raw[:n], made, predictor.familiar(raw[:n], f[:n], made), guarantee)
             yield from (Sighting(*one, batch, row) for row, one in enumerate(batch.seen))
         if n < len(seen):
             raise RunError(

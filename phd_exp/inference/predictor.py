@@ -265,15 +265,15 @@ class Predictor:
         return None
 
     def familiar(
-        self, raw: Float[Tensor, "batch *members n"], f: Float[Tensor, " batch"]
+        self, raw: Float[Tensor, "batch *members n"], f: Float[Tensor, " batch"], prediction: Prediction | None = None
     ) -> Float[np.ndarray, " batch"] | None:
         """How usual the predictions are among held-out ones, as p-values, see `evaluation.familiar`; None if unknown.
 
-        Small for images unlike the training images.
+        Small for images unlike the training images. `prediction` is that of `predict`, if it is there already.
         """
         if self.familiarity is None:
             return None
-        prediction = self.predict(raw, f)
+        prediction = self.predict(raw, f) if prediction is None else prediction
         assert prediction.has_closed_forms  # only those have a familiarity
         columns = parameter_columns(prediction) | {"f": f.double(), "S": torch.full_like(f, self.side)}
         if self.is_ensemble:

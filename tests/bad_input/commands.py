@@ -106,6 +106,8 @@ ARGUMENTS = [
     argument((*ONE, "folder=."), r"predict: expected either image=FILE.*"),
     argument((*PREDICT, "f=400"), r"photos/test: has annotations, .*metadata\.jsonl; expected images alone, or no f=.*", 1),
     argument((*PREDICT, "f=400", "object=1"), r"object: selects detections.*"),
+    argument((*ONE, "boxes=b.json", "box=1,2,3,4"), r"box, boxes, detect: got more than one of them; expected one"),
+    argument((*PREDICT, "f=400", "boxes=b.json"), r"boxes: the boxes of one image=FILE; expected no folder=.*"),
     argument(("predict", RUN, "folder=nowhere", "camera=c.yaml"), r"nowhere: no images; expected a folder with files \*\.png.*", 1),
     argument(("predict", RUN, "folder=nowhere"), r"nowhere: no such folder.*", 1),
     argument((*HERE, "camera=no.yaml"), r"no\.yaml: No such file or directory.*", 1),
@@ -148,7 +150,6 @@ ARGUMENTS = [
     argument(("search", "space.yaml", "trials=0"), r"trials: got '0'; expected to be greater than or equal to 1"),
     argument(("render", "preset=smoke", "nonsense=1"), r"nonsense: unknown key.*"),
     argument(("render", "preset=smoke", "masks=renders/default/masks"), r"masks=renders/default/masks: lies in the data set itself.*", 1),
-    argument(("render", "preset=smoke", "bop=renders/default/bop"), r"bop=renders/default/bop: lies in the data set itself.*", 1),
     argument(("render", "preset=smoke", "bop=bop", "data.image_format=webp"), r"data\.image_format: got webp; BOP has no such images.*"),
     argument(("render", "preset=smoke", "verify=true"), r".*no data set here.*", 1),
 ]  # fmt: skip

@@ -21,7 +21,7 @@ EIGHT = "evaluation.eight_views=true"
 
 def report_of(runs: list[RunFolder]) -> Report:
     """Finished runs with a density, without their other measurements."""
-    return Report(Path(), tuple(Run(run, *run.path.parts[-4:], state="finished", nll=0.0) for run in runs))
+    return Report(Path(), tuple(Run(run, *run.names, state="finished", nll=0.0) for run in runs))
 
 
 @pytest.mark.slow

@@ -148,8 +148,6 @@ def test_other_formats_are_predicted_as_lines(phd_exp: Callable, run: RunFolder,
     lines = [detection.line.model_dump_json(exclude_none=True) for detection in detections_in(folder)]
     (folder / "metadata.jsonl").write_text("\n".join(lines))
     assert found.out == phd_exp(*words).out
-    refused = phd_exp("predict", f"run={run.path}", "image=a.png", "f=900", "object=5")
-    assert refused.err == "error: object: selects detections of folder=DIR or boxes=FILE; leave it out for one box\n"
 
 
 def test_boxes_of_one_photograph_are_predicted_as_single_ones(
@@ -168,8 +166,6 @@ def test_boxes_of_one_photograph_are_predicted_as_single_ones(
         np.testing.assert_allclose(row["mode"], alone["mode"], rtol=1e-4)
     (of_category,) = read_lines(phd_exp(*words, "boxes=boxes.json", "object=0").out)
     assert of_category["box"] == found[0]["box"]
-    assert "box, boxes, detect: got more than one" in phd_exp(*words, "boxes=boxes.json", "box=5,10,60,70").err
-    assert "no further image" in phd_exp(*words[:2], "image=0.png,1.png", "f=300", "boxes=boxes.json").err
 
 
 def test_images_of_one_camera_are_predicted_as_single_ones(phd_exp: Callable, run: RunFolder, tmp_path: Path) -> None:
