@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import field_validator, model_validator
 
@@ -18,6 +18,9 @@ from phd_exp.records.files import write_atomic
 from phd_exp.records.messages import MessageFile
 from phd_exp.records.own_images import Observed, annotations, detections_in, observed
 from phd_exp.records.recordings import is_recording
+
+if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
+    from phd_exp.inference.predictor import Predictor
 
 ONE_RUN = "coverage: scenes with several cameras are recorded by single runs; expected one run= and no views=8"
 PLANE = four_numbers("plane=NX,NY,NZ,OFFSET: the points v with normal . v = offset, metres")
@@ -99,24 +102,14 @@ def _answers(
     # imports of seconds, which follow the checks of the arguments
     import torch
 
-    from phd_exp.evaluation.conformal import fused_guarantee
     from phd_exp.fusion import Plane
     from phd_exp.inference.fused import for_json, fused_answers, fused_region
-    from phd_exp.inference.tables import require_received
 
-    predictor, coverage = loaded(arguments), arguments.coverage
+    predictor = loaded(arguments)
     predictor.require_densities("fuse needs")
-    if coverage and predictor.is_ensemble:
-        raise ConfigError(ONE_RUN)
+    guarantees, shared = _of_recorded_scenes(arguments, predictor, {len(scene.detections) for scene in scenes})
     numbers = torch.tensor(arguments.plane or (), dtype=torch.float64)
     plane = Plane(numbers[:3], numbers[3]) if arguments.plane else None
-    views, guarantees = predictor.folders[0].views, {}
-    if coverage or arguments.shared_scale:
-        require_received(views, predictor.config)
-    if coverage:
-        cameras = {len(scene.detections) for scene in scenes}
-        guarantees = {k: fused_guarantee(views, k, coverage, predictor.temperature) for k in cameras}
-    shared = _shared_share(views) if arguments.shared_scale else None
     sightings = predicted(predictor, [detection for scene in scenes for detection in scene.detections])
     with ExitStack() as ends:
         if messages is not None:
@@ -136,15 +129,31 @@ def _answers(
     return [for_json(answer) | (fused_region(answer, guarantees) if guarantees else {}) for answer in answers]
 
 
-def _shared_share(file: Path) -> float:
+def _of_recorded_scenes(
+    arguments: FuseArguments, predictor: "Predictor", cameras: set[int]
+) -> tuple[dict[int, dict[str, Any]], float | None]:
+    """What the run's recorded scenes tell: for coverage= the guarantee of each number of cameras, for shared_scale=
+    the share of the errors of depth that views share.
+    """
     import torch
 
+    from phd_exp.evaluation.conformal import fused_guarantee
     from phd_exp.evaluation.fusion import shared_share
     from phd_exp.evaluation.several_views import read_views
+    from phd_exp.inference.tables import require_received
 
-    if not file.exists():
-        raise RunError(
-            f"{file}: missing; shared_scale is estimated from it: train with evaluation.multiview.scenes=500"
-        )
-    views = read_views(file)
-    return float(shared_share(views, torch.ones(views.n, dtype=torch.bool)))
+    file, guarantees, shared = predictor.folders[0].views, {}, None
+    if arguments.coverage:
+        if predictor.is_ensemble:
+            raise ConfigError(ONE_RUN)
+        require_received(file, predictor.config)
+        guarantees = {k: fused_guarantee(file, k, arguments.coverage, predictor.temperature) for k in cameras}
+    if arguments.shared_scale:
+        require_received(file, predictor.config)
+        if not file.exists():
+            raise RunError(
+                f"{file}: missing; shared_scale is estimated from it: train with evaluation.multiview.scenes=500"
+            )
+        views = read_views(file)
+        shared = float(shared_share(views, torch.ones(views.n, dtype=torch.bool)))
+    return guarantees, shared

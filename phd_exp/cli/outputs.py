@@ -64,8 +64,8 @@ def new_view(view: Path) -> None:
         view.parent.mkdir(parents=True, exist_ok=True)
 
 
-def places(out: Path | None, view: Path | None, inputs: Iterable[Path], name: str, needs: str, package: str) -> None:
-    """Make the places of out=, a folder or a recording NAME.mcap, and of view=; a folder `needs` a package.
+def places(out: Path | None, view: Path | None, inputs: Iterable[Path], name: str, holds: str, package: str) -> None:
+    """Make the places of out=, a recording NAME.mcap or a folder that `holds` what a package makes, and of view=.
 
     Raises ConfigError if one cannot be written, is or holds an input, or if the package is missing.
     """
@@ -73,7 +73,7 @@ def places(out: Path | None, view: Path | None, inputs: Iterable[Path], name: st
         require_output(out, f"{name}{MCAP}", inputs)
     elif out is not None:
         if find_spec(package) is None:
-            raise ConfigError(f"out: {needs} need `pip install 'phd_exp[report]'`; without out= there is JSON alone")
+            raise ConfigError(f"out: {holds} need `pip install 'phd_exp[report]'`; without out= there is JSON alone")
         if out.resolve() in {path if path.is_dir() else path.parent for path in map(Path.resolve, inputs)}:
             raise ConfigError(f"out={out}: holds the images themselves; choose another folder")
         output_folder(out)
