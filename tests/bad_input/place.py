@@ -19,7 +19,7 @@ from phd_exp.records.dataset import SPLITS, DatasetFolder, Seal, sha256
 from phd_exp.records.runs import RunFolder, find_runs
 from phd_exp.records.spec import DatasetSpec
 from tests.support.handmade import write_handmade
-from tests.support.untrained import NARROW
+from tests.support.untrained import NARROW, write_metadata
 
 TRAIN = (
     "preset=smoke", "logger=none", "data=folder", "data.batch_size=4", "data.image_size=32", "data.n_held_out=0",
@@ -105,7 +105,7 @@ def write_photos(folder: Path) -> None:
             Image.fromarray(noise).save(folder / split / f"{index}.png")
             line = {"file_name": f"{index}.png", "f": 300.0, "box": [10 + index, 10, 60, 70]}
             lines.append(line | {"x": -0.2, "y": -0.02, "z": 3.0 + 0.1 * index})
-        (folder / split / "metadata.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+        write_metadata(folder / split, lines)
 
 
 def handmade_spec() -> DatasetSpec:

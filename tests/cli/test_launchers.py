@@ -19,6 +19,7 @@ from hydra.experimental.callback import Callback
 from phd_exp.cli.frame import run_verb
 from phd_exp.cli.jobs import Job, launch
 from phd_exp.records.errors import UserError
+from tests.support.renders import wait_until
 
 LAUNCHERS = {
     "joblib": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
@@ -184,30 +185,23 @@ def test_keys_of_a_part_that_an_experiment_chooses_can_be_set(
 def test_queued_jobs_outlive_a_stopped_launcher(begin: Callable, tmp_path: Path) -> None:
     with begin("submitit", "seed=0,5", "preset=smoke") as launcher:
         submitted = tmp_path / "runs" / ".sweep"
-        wait_for(lambda: len(list(submitted.glob(".submitit/*/*_submitted.pkl"))) == 2)
+        wait_until(lambda: len(list(submitted.glob(".submitit/*/*_submitted.pkl"))) == 2)
         assert not list(tmp_path.glob("*.begun")), "no job has begun"
         launcher.send_signal(signal.SIGTERM)
         assert launcher.wait(60) == 143
-    wait_for(lambda: {path.name for path in tmp_path.glob("*.done")} == {"0.done", "5.done"})
+    wait_until(lambda: {path.name for path in tmp_path.glob("*.done")} == {"0.done", "5.done"})
 
 
 @pytest.mark.slow
 def test_jobs_of_joblib_end_with_a_killed_launcher(begin: Callable, tmp_path: Path) -> None:
     """Running jobs end, and jobs that a worker has received but not begun."""
     with begin("joblib", "seed=6", "preset=smoke,small,paper,demo") as launcher:
-        wait_for(lambda: len(list(tmp_path.glob("*.asleep"))) == 2)
+        wait_until(lambda: len(list(tmp_path.glob("*.asleep"))) == 2)
         launcher.kill()
-        wait_for(lambda: len(list(tmp_path.glob("*.awake"))) >= 2)
+        wait_until(lambda: len(list(tmp_path.glob("*.awake"))) >= 2)
     time.sleep(0.5)
     assert len(list(tmp_path.glob("*.awake"))) == len(list(tmp_path.glob("*.asleep")))
     assert not list(tmp_path.glob("*.done"))
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < deadline, "waited too long"
-        time.sleep(0.02)
 
 
 @pytest.mark.skipif(which("srun") is not None, reason="needs a machine without SLURM")

@@ -1,6 +1,5 @@
 """Scenes of several cameras become one position each; scenes that cannot be fused, and mistakes of a user."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from phd_exp.geometry import intrinsics
 from phd_exp.records.runs import RunFolder
 from tests.e2e.conftest import QUICK
 from tests.support.several import write_views
-from tests.support.untrained import SMALL, read_lines, untrained
+from tests.support.untrained import SMALL, read_lines, read_metadata, untrained, write_metadata
 
 VIEWS, SCENES = 3, 2
 
@@ -32,10 +31,6 @@ def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr("sys.argv", ["phd_exp"])
         assert main(["render", *QUICK, *sizes, *views, f"data.root={root}"]) == 0
     return root / "multiview" / "test"
-
-
-def metadata(folder: Path) -> list[dict[str, Any]]:
-    return read_lines((folder / "metadata.jsonl").read_text())
 
 
 def matrix(line: dict[str, Any]) -> np.ndarray:
@@ -63,7 +58,7 @@ def require_most_likely(run: RunFolder, folder: Path, views: list[dict[str, Any]
 def test_the_test_split_of_a_rendered_set_is_fused_as_it_is(phd_exp: Callable, run: RunFolder, several: Path) -> None:
     outcome = phd_exp("fuse", f"run={run.path}", f"folder={several}")
     assert (outcome.status, outcome.err) == (0, "")
-    rows, lines = read_lines(outcome.out), metadata(several)
+    rows, lines = read_lines(outcome.out), read_metadata(several)
     assert [row["scene"] for row in rows] == list(range(SCENES))
     for row in rows:
         views = [line for line in lines if line["scene"] == row["scene"]]
@@ -109,12 +104,8 @@ def photos(tmp_path: Path) -> Path:
         pose = {"rotation": [w, x, y, z], "translation": (0.05 * draw.standard_normal(3)).tolist()}
         camera = {"fx": 300.0, "fy": 310.0, "cx": 50.0, "cy": 40.0, "box": [15, 10, 90, 70 + index]}
         lines.append({"file_name": f"{index}.png", "scene": scene, "pose": pose} | camera)
-    write(folder, lines)
+    write_metadata(folder, lines)
     return folder
-
-
-def write(folder: Path, lines: list[dict[str, Any]]) -> None:
-    (folder / "metadata.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
 
 
 def test_crops_of_any_cameras_are_fused_in_the_world_of_their_poses(
@@ -122,7 +113,7 @@ def test_crops_of_any_cameras_are_fused_in_the_world_of_their_poses(
 ) -> None:
     outcome = phd_exp("fuse", f"run={run.path}", f"folder={photos}", "out=there/fused.jsonl")
     assert (outcome.status, outcome.out) == (0, ""), outcome.err
-    rows, lines = read_lines((tmp_path / "there" / "fused.jsonl").read_text()), metadata(photos)
+    rows, lines = read_lines((tmp_path / "there" / "fused.jsonl").read_text()), read_metadata(photos)
     assert [(row["scene"], len(row["surprise"])) for row in rows] == [("two", 2), ("three", 3), ("one", 1)]
     assert all("error_mm" not in row for row in rows)
     for row in rows:
@@ -134,7 +125,7 @@ def test_crops_of_any_cameras_are_fused_in_the_world_of_their_poses(
     world = matrix(lines[2]).T @ (np.array(alone["mode"]) - pose["translation"])
     np.testing.assert_allclose(rows[2]["point"], world, rtol=1e-5, atol=1e-5)
     # a scene does not depend on what else is in the file
-    write(photos, [line for line in lines if line["scene"] == "three"])
+    write_metadata(photos, [line for line in lines if line["scene"] == "three"])
     (three,) = read_lines(phd_exp("fuse", f"run={run.path}", f"folder={photos}").out)
     np.testing.assert_allclose(three["point"], rows[1]["point"], rtol=1e-5)
     np.testing.assert_allclose(three["covariance"], rows[1]["covariance"], rtol=1e-4)
@@ -142,11 +133,11 @@ def test_crops_of_any_cameras_are_fused_in_the_world_of_their_poses(
 
 def test_a_scene_that_fails_says_why_and_harms_no_other(phd_exp: Callable, run: RunFolder, photos: Path) -> None:
     before = read_lines(phd_exp("fuse", f"run={run.path}", f"folder={photos}").out)
-    lines = metadata(photos)
+    lines = read_metadata(photos)
     back_to_back = {"rotation": [0.0, 0.0, 1.0, 0.0], "translation": [0.0, 0.0, 0.0]}
     lines[4]["pose"] = back_to_back
     lines[0]["pose"] = {"rotation": [1.0, 0.0, 0.0, 0.0], "translation": [0.0, 0.0, 0.0]}
-    write(photos, lines)
+    write_metadata(photos, lines)
     outcome = phd_exp("fuse", f"run={run.path}", f"folder={photos}")
     assert outcome.status == 1
     *notes, error = outcome.err.splitlines()
@@ -193,8 +184,8 @@ def test_a_baseline_is_refused(phd_exp: Callable, several: Path, composed: Calla
 def test_truths_that_contradict_the_poses_are_found_before_anything_is_predicted(
     phd_exp: Callable, run: RunFolder, several: Path, tmp_path: Path
 ) -> None:
-    lines = metadata(several)
+    lines = read_metadata(several)
     lines[1]["pose"] = lines[2]["pose"]
-    write(tmp_path, lines)  # without the images
+    write_metadata(tmp_path, lines)  # without the images
     outcome = phd_exp("fuse", f"run={run.path}", "folder=.")
     assert "line 2: its x, y, z and pose place the object of scene 0" in outcome.error

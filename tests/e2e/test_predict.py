@@ -22,7 +22,7 @@ from phd_exp.inference import pictures
 from phd_exp.records.runs import RunFolder
 from tests.support.disks import small_disk
 from tests.support.portable import openvino_outputs, require_portable
-from tests.support.untrained import SIDE, read_lines
+from tests.support.untrained import SIDE, read_lines, read_metadata, write_metadata
 
 ALL = slice(None)
 GUIDE = Path(__file__).parents[2] / "docs" / "guides" / "predict.md"
@@ -77,12 +77,11 @@ def test_labelled_images_calibrate_a_run(
     assert predictor.temperature.depth == pytest.approx(fitted.depth, rel=1e-3)
     (line,) = read_lines(phd_exp("predict", f"run={mine}", *image, "calibration=garden").out)
     assert line["uncertainty"] == f"recalibrated: A / {fitted.projected:.4g}, a / {fitted.depth:.4g}"
-    lines = [json.loads(text) for text in (labelled / "metadata.jsonl").read_text().splitlines()]
+    lines = read_metadata(labelled)
     (wrong := tmp_path / "mm").mkdir()
     for one in lines:
         shutil.copy(labelled / one["file_name"], wrong)
-    scaled = [one | {axis: 1000 * one[axis] for axis in "xyz"} for one in lines]
-    (wrong / "metadata.jsonl").write_text("".join(json.dumps(one) + "\n" for one in scaled))
+    write_metadata(wrong, [one | {axis: 1000 * one[axis] for axis in "xyz"} for one in lines])
     outcome = phd_exp("calibrate", f"run={mine}", f"folder={wrong}")
     assert outcome.status == 1
     assert re.search(r"x, y, z are \d+ times the predicted positions .*divide millimetres by 1000", outcome.err)

@@ -19,7 +19,7 @@ from phd_exp.inference import pictures
 from phd_exp.records.runs import RunFolder
 from tests.evaluation.test_conformal import table_of
 from tests.support.several import write_views
-from tests.support.untrained import NOWHERE, read_lines, virtual_cameras, write_photos
+from tests.support.untrained import NOWHERE, read_lines, read_metadata, virtual_cameras, write_metadata, write_photos
 
 POSES = [[0.0, 0.0, 0.0], [0.05, 0.0, 0.0]]
 
@@ -29,12 +29,12 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Crops of two cameras that stand close together, in two scenes."""
     folder = tmp_path_factory.mktemp("photos") / "test"
     write_photos(folder, 4)
-    lines = read_lines((folder / "metadata.jsonl").read_text())
+    lines = read_metadata(folder)
     for row, line in enumerate(lines):
         line |= {"scene": row // 2, "pose": {"rotation": [1, 0, 0, 0], "translation": POSES[row % 2]}}
         for key in "xyz":
             del line[key]
-    (folder / "metadata.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_metadata(folder, lines)
     return folder
 
 

@@ -30,7 +30,7 @@ from phd_exp.records.runs import RunFolder
 from tests.evaluation.test_conformal import table_of
 from tests.support.foreign import WRITERS
 from tests.support.recorded import status_of
-from tests.support.untrained import NOWHERE, SIDE, read_lines, virtual_cameras, write_photos
+from tests.support.untrained import NOWHERE, SIDE, read_lines, virtual_cameras, write_metadata, write_photos
 
 
 @pytest.fixture(scope="module")
@@ -226,8 +226,7 @@ def test_every_line_has_its_own_picture(
     (tmp_path / "in").mkdir()
     for name in names:
         Image.new("RGB", (64, 64)).save(tmp_path / "in" / name)
-    text = "".join(json.dumps({"file_name": name, "f": 400.5}) + "\n" for name in names)
-    (tmp_path / "in" / "metadata.jsonl").write_text(text)
+    write_metadata(tmp_path / "in", [{"file_name": name, "f": 400.5} for name in names])
     outcome = phd_exp("predict", f"run={run.path}", "folder=in", "out=drawn")
     assert outcome.status == 0, outcome.err
     rows = read_lines((tmp_path / "drawn" / "predictions.jsonl").read_text())

@@ -19,7 +19,7 @@ from phd_exp.geometry import Lens, intrinsics
 from phd_exp.records.runs import RunFolder
 from tests.support.opencv import projected
 from tests.support.rrd import Rows, read_rrd
-from tests.support.untrained import NOWHERE, read_lines, write_photos
+from tests.support.untrained import NOWHERE, read_lines, read_metadata, write_metadata, write_photos
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed: pip install 'phd_exp[rerun]'")
 LEVELS = ("region_50", "region_90")
@@ -39,13 +39,13 @@ def run(make: Callable[..., RunFolder]) -> str:
 
 def poses(folder: Path) -> list[dict[str, Any]]:
     """The lines of the photographs as two scenes with three cameras, which have seen the objects somewhere."""
-    lines = read_lines((folder / "metadata.jsonl").read_text())
+    lines = read_metadata(folder)
     turned = [[math.cos(angle), 0.0, math.sin(angle), 0.0] for angle in (0.0, 0.03, -0.02)]
     for k, line in enumerate(lines):
         for key in ("x", "y", "z"):
             del line[key]
         line |= {"scene": k // 3, "pose": {"rotation": turned[k % 3], "translation": [0.01 * k, -0.05, 0.1]}}
-    (folder / "metadata.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_metadata(folder, lines)
     return lines
 
 
@@ -136,10 +136,10 @@ def test_all_cameras_of_a_scene_see_the_regions_of_each(
 def test_a_path_has_its_times(phd_exp: Callable, run: str, tmp_path: Path) -> None:
     """Before its first box there is the camera alone."""
     write_photos(tmp_path / "photos", 1)
-    (line,) = read_lines((tmp_path / "photos/metadata.jsonl").read_text())
+    (line,) = read_metadata(tmp_path / "photos")
     frames = [line | {"time": 0.5 + k / 20, "track": "ball"} for k in range(6)]
     del frames[0]["box"]
-    (tmp_path / "photos/metadata.jsonl").write_text("".join(json.dumps(frame) + "\n" for frame in frames))
+    write_metadata(tmp_path / "photos", frames)
     outcome = phd_exp("track", run, "folder=photos", "view=a.rrd")
     answers = read_lines(outcome.out)
     rows = read_rrd(tmp_path / "a.rrd", "time")

@@ -1,7 +1,7 @@
 """Runs as `predict` reads them, without a training: a configuration and a network of random weights."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -51,17 +51,27 @@ def write_photos(folder: Path, n: int) -> None:
         Image.fromarray(noise).save(folder / f"{index}.png")
         camera = {"fx": 300.0, "fy": 310.0, "cx": 50.0, "cy": 40.0, "box": [5 + index, 10, 60, 70 + index]}
         position = {"x": 0.01 * index, "y": -0.02, "z": 3.0 + 0.1 * index}
-        lines.append(json.dumps({"file_name": f"{index}.png"} | camera | position) + "\n")
-    (folder / "metadata.jsonl").write_text("".join(lines))
+        lines.append({"file_name": f"{index}.png"} | camera | position)
+    write_metadata(folder, lines)
 
 
 def virtual_cameras(photos: Path, side: int = SIDE) -> Iterator[VirtualCamera]:
     """The cameras of the boxes that a folder's metadata.jsonl has."""
-    for line in read_lines((photos / "metadata.jsonl").read_text()):
+    for line in read_metadata(photos):
         fx, fy = line.get("fx", line.get("f")), line.get("fy", line.get("f"))
         with Image.open(photos / line["file_name"]) as image:
             K = intrinsics(fx, fy, line.get("cx", image.width / 2), line.get("cy", image.height / 2))
         yield VirtualCamera.of_box(K, tuple(map(float, line["box"])), float(side))  # type: ignore[arg-type]
+
+
+def read_metadata(folder: Path) -> list[dict[str, Any]]:
+    """What a folder says of its images."""
+    return read_lines((folder / "metadata.jsonl").read_text())
+
+
+def write_metadata(folder: Path, lines: Iterable[dict[str, Any]]) -> None:
+    """Say this of the images of a folder."""
+    (folder / "metadata.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
 
 
 def read_lines(text: str) -> list[dict[str, Any]]:
