@@ -64,7 +64,10 @@ def four_numbers(expected: str) -> BeforeValidator:
     return BeforeValidator(read)
 
 
-Coverage = Annotated[float, Field(gt=0, lt=1)] | None
+GUARANTEED = "probability of regions that contain the true position, guaranteed by held-out samples"
+Coverage = Annotated[Annotated[float, Field(gt=0, lt=1)] | None, Field(description=GUARANTEED)]
+EXECUTED = "packages of the user's own parts that the run names, separated by commas; their code is executed"
+Trust = Annotated[str | None, Field(description=EXECUTED)]
 Paths = Annotated[tuple[Path, ...], BeforeValidator(lambda text: [text] if os.path.exists(text) else text.split(","))]
 
 
@@ -77,8 +80,7 @@ class RunArguments(Arguments):
     """apply the temperatures that fit the run's held-out samples"""
     calibration: str | None = None
     """a record of `calibrate`: recalibrate with its labelled images, which also guarantee a coverage"""
-    trust: str | None = None
-    """packages of the user's own parts that the run names, separated by commas; their code is executed"""
+    trust: Trust = None
     views: Literal["1", "8"] = "1"
     """8: an ensemble of the eight symmetric views of each image"""
 

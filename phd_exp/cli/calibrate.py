@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from phd_exp.cli.arguments import Arguments, trusted
+from phd_exp.cli.arguments import Arguments, Trust, trusted
 from phd_exp.records.detections import NumberOrName
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.own_images import detections_in
@@ -24,8 +24,7 @@ class CalibrateArguments(Arguments):
     """BOP's obj_id, KITTI's type or COCO's category; by default all objects"""
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")] = "photographs"
     """the name of the record, which predict calibration=NAME uses"""
-    trust: str | None = None
-    """packages of the user's own parts that the run names, separated by commas; their code is executed"""
+    trust: Trust = None
 
 
 def main(words: list[str]) -> int:

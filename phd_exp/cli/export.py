@@ -23,7 +23,6 @@ class ExportArguments(RunArguments):
     out: Path | None = None
     """the file; by default network.onnx in the (first) run's folder, or next to a file of `pack`"""
     coverage: Coverage = None
-    """probability of regions that contain the true position, guaranteed by held-out samples"""
     photographs: bool = False
     """the inputs are a photograph, its camera matrix and boxes, and the graph crops as predict does"""
     precision: Literal["float32", "float64"] | None = None

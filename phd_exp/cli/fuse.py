@@ -38,7 +38,6 @@ class FuseArguments(RunArguments):
     shared_scale: bool = False
     """estimate one factor that the depths of all views share, as they do in the run's recorded scenes"""
     coverage: Coverage = None
-    """probability of regions that contain the true position, guaranteed by held-out samples"""
     out: Path | None = None
     """a file for the lines; or FILE.mcap for ROS 2 messages, in addition to printed lines"""
     view: Path | None = None

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from phd_exp.cli.arguments import Arguments, trusted
+from phd_exp.cli.arguments import Arguments, Trust, trusted
 from phd_exp.cli.outputs import output_folder, require_file
 from phd_exp.records.runs import RunFolder
 
@@ -19,8 +19,7 @@ class PackArguments(Arguments):
     """the file; by default run.zip in the run's folder"""
     license: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9.+-]{0,99}$")] = "unknown"
     """identifier of the licence that you give the weights, such as CC-BY-4.0, for the card"""
-    trust: str | None = None
-    """packages of the user's own parts that the run names, separated by commas; their code is executed"""
+    trust: Trust = None
 
 
 def main(words: list[str]) -> int:

@@ -37,7 +37,6 @@ class PredictArguments(DetectingArguments):
     view: Path | None = None
     """a new file *.rrd for the viewer Rerun: images with outlines, and the regions of 50 and 90 % in space"""
     coverage: Coverage = None
-    """probability of regions that contain the true position, guaranteed by held-out samples"""
     groups: Literal["spread", "truncation", "focal_length"] | None = None
     """with coverage=: guarantee it in each of four groups of predictions by this quantity"""
     curve: bool = False

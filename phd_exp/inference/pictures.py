@@ -36,7 +36,8 @@ def picture(
     """
     curves = level_curves(sighting.density) if sighting.density else None
     on_image, above = _outlines(sighting, guarantee)
-    marks = _marks(sighting, curves, on_image)
+    pixels = sighting.view.camera.real_pixels
+    marks = marks_on_image(curves, sighting.mode, _truth(sighting), pixels, on_image, path_effects=_HALO)
     enlarged = _enlarged(marks, sighting.detection.box(*sighting.image.size))
     panels = 1 + (enlarged is not None) + (curves is not None) + (calibration is not None)
     figure = Figure(figsize=(max(6.0, 4.5 * panels), 4.7), layout="constrained")
@@ -83,12 +84,6 @@ def _outlines(sighting: Sighting, guarantee: Any) -> tuple[Points | None, Points
     camera = sighting.view.camera
     on_image, above = guarantee.region(sighting.density, camera.f / camera.S)[0].outlines()
     return camera.real_pixels(on_image), above
-
-
-def _marks(sighting: Sighting, curves: LevelCurves | None, outline: Points | None) -> list[Mark]:
-    """The level curves, the outline of a region, the mode and the truth on the image."""
-    pixels = sighting.view.camera.real_pixels
-    return marks_on_image(curves, sighting.mode, _truth(sighting), pixels, outline, path_effects=_HALO)
 
 
 def _around(sighting: Sighting) -> Box:
