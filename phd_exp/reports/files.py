@@ -10,7 +10,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from phd_exp.distributions.constraints import SCALE, Finding
 from phd_exp.records.choices import PLAIN_RECIPE, preset_and_recipe
 from phd_exp.records.errors import one_line
 from phd_exp.records.files import remove_temporaries
@@ -51,14 +50,6 @@ SYMBOLS = {
     "†": r"\textsuperscript{\dag}",
     "‡": r"\textsuperscript{\ddag}",
 }
-OF_CONSTRAINTS = f"""\
-- A baseline is the density exp(-|residual|/{SCALE:g}) in its own coordinates: minimising the mean norm of
-  residuals is maximum likelihood under it. The decomposed density is p(x/z, y/z) p(z)/z^2.
-- Columns are heads. A network with camera=shown breaks 2, whatever its head.
-- In brackets: 1 the factor by which wanted spreads are missed; 2 the relative change of log p with f;
-  3 the density behind the camera over that in front; 4 the share of positions ruled out; 5 nats above a
-  chord; 6 the least fall of log p over a factor of 1000 towards a limit, nats; 7 its largest jump, nats.
-"""
 
 
 def all_tables(report: Report) -> list[Table]:
@@ -182,24 +173,6 @@ def _markdown_cell(cell: TableCell) -> str:
 
 def _joined(texts: Iterable[str]) -> str:
     return f"| {' | '.join(texts)} |"
-
-
-def constraints_table(measured: Mapping[str, Mapping[str, Finding]]) -> str:
-    """Which of the paper's seven constraints each density satisfies, as Markdown; a dash if not measured.
-
-    `constraints_table(findings())` with `phd_exp.distributions.constraints.findings` is the table of the heads.
-    """
-    models = list(dict.fromkeys(model for row in measured.values() for model in row))
-    lines = [_joined(["constraint", *map(_plain, models)]), _joined(["---"] * (1 + len(models)))]
-    for constraint, row in measured.items():
-        lines.append(_joined([_plain(constraint), *(_finding(row.get(model)) for model in models)]))
-    return "\n".join(["## The seven constraints", "", *lines, "", OF_CONSTRAINTS])
-
-
-def _finding(finding: Finding | None) -> str:
-    if finding is None:
-        return "-"
-    return f"{'holds' if finding.holds else '**breaks**'} ({finding.measured:.2g})"
 
 
 def latex(table: Table) -> str:
