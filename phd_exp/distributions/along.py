@@ -16,7 +16,7 @@ from scipy import special
 
 from phd_exp.distributions.huber import RADIAL_NORMALISER, radial_icdf
 from phd_exp.distributions.projected_huber import ProjectedHuber
-from phd_exp.distributions.special import tail_moment
+from phd_exp.distributions.rounded import depth_law
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline
@@ -143,12 +143,13 @@ class _DepthLaw:
 
     def __init__(self, distribution: ProjectedHuber) -> None:
         mu_z, a = (one.detach().cpu().double() for one in (distribution.mu_z, distribution.a))
-        self.distribution, self.mu_z, self.a = distribution, mu_z.numpy(), a.numpy()
+        self.distribution, self.mu_z, self.log_a = distribution, mu_z.numpy(), a.log()
 
     @cached_property
     def height(self) -> Float[np.ndarray, " n"]:
         """The density at the mode, 1/m."""
-        return self.a / (self.mu_z * (1 + tail_moment(0, torch.from_numpy(self.a)).numpy()))
+        law = depth_law(self.log_a, self.distribution.rounding)
+        return np.asarray((-law.log_normaliser).exp().numpy() / self.mu_z)
 
     @cached_property
     def breaks(self) -> Float[np.ndarray, "n breaks"]:
@@ -169,12 +170,13 @@ class _DepthLaw:
         nodes: int,
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """P(kappa z + reach q_1 <= s), of the depth z of each row, and its derivative by s."""
-        breaks, mu_z, a = self.breaks[row], self.mu_z[row, None], self.a[row, None]
+        breaks, mu_z = self.breaks[row], self.mu_z[row, None]
         of_q = (s[:, None] - reach[:, None] * _BREAKS) / kappa[:, None]
         edges = np.sort(np.concatenate([breaks, of_q.clip(breaks[:, :1], breaks[:, -1:])], axis=1), axis=1)
         (x, w), half = np.polynomial.legendre.leggauss(nodes), np.diff(edges)[..., None] / 2
         z = (edges[:, :-1, None] + half * (x + 1)).reshape(len(s), -1)
-        energy = a * (np.maximum(z / mu_z, mu_z / z) - 1)
+        law = depth_law(self.log_a[row, None], self.distribution.rounding)
+        energy = law.energy(torch.from_numpy(np.log(z / mu_z))).numpy()
         weight = (half * w).reshape(len(s), -1) * self.height[row, None] * np.exp(-energy)
         at = ((s[:, None] - kappa[:, None] * z) / reach[:, None]).clip(-FURTHEST, FURTHEST)
         total, cdf = weight.sum(-1), _whitened_cdf()

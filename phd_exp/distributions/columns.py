@@ -16,28 +16,45 @@ Columns = dict[str, Tensor]
 PARAMETERS = ("mu_x", "mu_y", "mu_z", "A_xx", "A_xy", "A_yy", "a")
 FREE_AXIS = ("k_x", "k_y")
 """Further parameters of a distribution with a free axis."""
+ROUNDING = ("rounding",)
+"""How far its mode of depth is rounded, the same for all; without this column 0."""
 COVARIANCE = ("C_xx", "C_xy", "C_xz", "C_yy", "C_yz", "C_zz")
 NEES = ("nees", "nees_x", "nees_y", "nees_z")
 
 
 def parameter_names(table: Collection[str]) -> tuple[str, ...]:
-    """The columns of parameters that a table has, or lacks: `PARAMETERS`, and `FREE_AXIS` if it has one of those."""
-    return PARAMETERS if not set(FREE_AXIS) & set(table) else PARAMETERS + FREE_AXIS
+    """The columns of parameters that a table has, or lacks: `PARAMETERS`, and the further ones if it has one of them."""
+    further = (names for names in (FREE_AXIS, ROUNDING) if set(names) & set(table))
+    return sum(further, PARAMETERS)
 
 
 def parameter_columns(distribution: ProjectedHuber) -> Columns:
-    """The parameters of the camera frame: a distribution's columns from which `from_columns` rebuilds it."""
+    """The parameters of the camera frame that differ from sample to sample."""
     mu_xy, A = distribution.mu_xy, distribution.A
     values = (*mu_xy.unbind(-1), distribution.mu_z, A[:, 0, 0], A[:, 0, 1], A[:, 1, 1], distribution.a)
     table = dict(zip(PARAMETERS, values, strict=True))
     return table if distribution.k is None else table | dict(zip(FREE_AXIS, distribution.k.unbind(-1), strict=True))
 
 
+def to_columns(distribution: ProjectedHuber) -> Columns:
+    """The columns from which `from_columns` rebuilds a batch of distributions."""
+    table, rounding = parameter_columns(distribution), distribution.rounding
+    return table | {name: torch.full_like(table["a"], rounding) for name in ROUNDING if rounding}
+
+
 def from_columns(columns: Mapping[str, Tensor]) -> ProjectedHuber:
-    """The distributions with the parameters of a table. Raises ValueError where one violates its constraint."""
-    mu_x, mu_y, mu_z, A_xx, A_xy, A_yy, a, *k = (columns[name] for name in parameter_names(columns))
+    """The distributions with the parameters of a table.
+
+    Raises ValueError where one violates its constraint, or if the roundings differ.
+    """
+    mu_x, mu_y, mu_z, A_xx, A_xy, A_yy, a = (columns[name] for name in PARAMETERS)
     A = torch.stack([A_xx, A_xy, A_xy, A_yy], dim=-1).unflatten(-1, (2, 2))
-    return ProjectedHuber(torch.stack([mu_x, mu_y], dim=-1), mu_z, A, a, torch.stack(k, dim=-1) if k else None)
+    has_axis = FREE_AXIS[0] in columns
+    k = torch.stack([columns[name] for name in FREE_AXIS], dim=-1) if has_axis else None
+    roundings = columns.get(*ROUNDING, a.new_zeros(1)).unique().tolist() or [0.0]
+    if len(roundings) > 1:
+        raise ValueError(f"rounding: got {roundings}; expected one number for all predictions")
+    return ProjectedHuber(torch.stack([mu_x, mu_y], dim=-1), mu_z, A, a, k, rounding=roundings[0])
 
 
 def distribution_columns(distribution: Density, xyz: Float[Tensor, "samples 3"]) -> Columns:
@@ -49,7 +66,7 @@ def distribution_columns(distribution: Density, xyz: Float[Tensor, "samples 3"])
     """
     table = coordinates("mean_", distribution.mean) | {"median_z": distribution.depth_median}
     if isinstance(distribution, ProjectedHuber):
-        table |= parameter_columns(distribution) | {"projected_precision": distribution.log_det_A.exp()}
+        table |= to_columns(distribution) | {"projected_precision": distribution.log_det_A.exp()}
     else:
         rows, columns = torch.triu_indices(3, 3)
         table |= dict(zip(COVARIANCE, distribution.covariance_matrix[:, rows, columns].unbind(-1), strict=True))

@@ -95,15 +95,6 @@ def _newton_step(distance: Tensor, drop: Tensor, log_a: Tensor, log_e_2: Tensor)
     return distance - excess * e_2
 
 
-def depth_mean_and_variance(
-    log_a: Float[Tensor, "*batch"],
-) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-    """Mean and variance of t, from `depth_excess_moments`."""
-    a = log_a.exp()
-    mean, variance = depth_excess_moments(log_a)
-    return 1 + mean / a, variance / a.square()
-
-
 def depth_excess_moments(log_a: Float[Tensor, "*batch"]) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
     """Mean and variance of a (t - 1), the depth beyond the mode in units of the law's width.
 
@@ -139,11 +130,6 @@ def inverse_depth_shortfall(a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch
     near = 1 + tail_moment(0, below) - 2 * below * scaled_expint(1, below)
     far = weighted_integral(lambda s: (s / (above + s)).square(), above)
     return torch.where(small, near, far) / (1 + tail_moment(0, a))
-
-
-def depth_entropy(log_a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Entropy of t in nats, log(e^a N(a)) + E[w]."""
-    return log_scaled_normaliser(log_a) + depth_mean_energy(log_a)
 
 
 def depth_mean_energy(log_a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:

@@ -41,6 +41,16 @@ def radial_cdf(r: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     return torch.where(r <= 1, inner, outer) / RADIAL_NORMALISER
 
 
+def energy_cdf(energy: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """P(h(|q|) <= energy) for energies >= 0.
+
+    Source: own derivation (`radial_cdf` at the radius of this energy).
+    """
+    inner = -torch.expm1(-energy)
+    outer = RADIAL_NORMALISER - (energy + 1.5) * torch.exp(-energy)
+    return torch.where(energy <= 0.5, inner, outer) / RADIAL_NORMALISER
+
+
 def radial_icdf(p: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """The radius r with P(|q| <= r) = p, for p in [0, 1); it carries no gradient.
 

@@ -1,17 +1,13 @@
 """Credible levels: how much probability the smallest region of highest density around the mode holds."""
 
 import math
-from functools import cache
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from phd_exp.distributions.huber import RADIAL_NORMALISER
 from phd_exp.distributions.special import tail_moment
-
-PRECISIONS = torch.logspace(-4, 5, 91, dtype=torch.float64)
 
 
 def credible_level(energy: Float[Tensor, "*#batch"], a: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
@@ -33,20 +29,6 @@ def credible_level(energy: Float[Tensor, "*#batch"], a: Float[Tensor, "*#batch"]
     rest = math.exp(-0.5) * (torch.exp(-X) + tail_X - torch.exp(-W) - tail_W)
     outside = torch.exp(-W) + tail_W + (torch.exp(-W) * (linear + flat) + rest) / RADIAL_NORMALISER
     return (1 - outside / (1 + tail_moment(0, a))).clamp(0, 1)
-
-
-@cache
-def level_energies(level: float) -> Float[np.ndarray, " precisions"]:
-    """The W with `credible_level(W, a)` = level < 1 at each a of `PRECISIONS`, by bisection.
-
-    W depends so little on a that linear interpolation over log a errs by less than 1e-4 in level.
-    """
-    low, high = torch.zeros_like(PRECISIONS), torch.full_like(PRECISIONS, 64)
-    for _ in range(60):
-        middle = (low + high) / 2
-        inside = credible_level(middle, PRECISIONS) < level
-        low, high = torch.where(inside, middle, low), torch.where(inside, high, middle)
-    return high.numpy()
 
 
 def _lower_tail(w: Tensor, a: Tensor) -> Tensor:

@@ -20,8 +20,10 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize.elementwise import find_root
 
 from phd_exp.distributions.along import FURTHEST, whitened_marginal
+from phd_exp.distributions.depth_law import DepthLaw
 from phd_exp.distributions.huber import radial_cdf
 from phd_exp.distributions.projected_huber import ProjectedHuber
+from phd_exp.distributions.rounded import depth_law
 
 Points = Float[np.ndarray, "_ 2"]
 _LogDensity = Callable[[np.ndarray], np.ndarray]
@@ -117,7 +119,7 @@ def _free_curves(
     size = float(np.linalg.norm(k))
     along = k / size if size else np.array([1.0, 0.0])
     frame = np.stack([along, [-along[1], along[0]]])
-    s, t, weight = _depth_nodes(float(distribution.a), 64 + 40 * math.ceil(min(size, 20)))
+    s, t, weight = _depth_nodes(distribution, 64 + 40 * math.ceil(min(size, 20)))
 
     def log_density(w: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*points"]:
         r = np.hypot(t * w[..., :1] + size * s, t * w[..., 1:])
@@ -157,17 +159,19 @@ def _half(log_density: _LogDensity, centre: np.ndarray, rays: Points, threshold:
     return centre + np.sinh(find_root(outside, ends, args=(np.arange(len(rays)),)).x)[:, None] * rays
 
 
-def _depth_nodes(a: float, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """a (t - 1), t and weights times t^2, each (2 n), of a Gauss rule on each side of the mode in the excess energy.
+def _depth_nodes(distribution: ProjectedHuber, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """a (t - 1), t and weights times t^2, each (2 n), of a Gauss rule on each side of the mode.
 
-    The weights sum to a multiple of 1. Energies W, a multiple of y^2, are denser near the mode.
+    The weights sum to a multiple of 1. They are denser near the mode, since log t is a multiple of y^2.
     """
+    law = _depth_law(distribution)
+    end = float(law.farthest_log_t(torch.tensor(_FURTHEST_ENERGY, dtype=torch.float64)))
     y, weight = np.polynomial.legendre.leggauss(n)
-    y, W = (y + 1) / 2, _FURTHEST_ENERGY * ((y + 1) / 2) ** 2
-    weight = weight * y * np.exp(-W)
-    near = 1 / (1 + W / a)  # dt = -t^2 dW/a
-    s, t = np.concatenate([W, -W * near]), np.concatenate([1 + W / a, near])
-    return s, t, np.concatenate([weight, weight * near**2]) * t**2
+    y = (y + 1) / 2
+    log_t = np.concatenate([end * y**2, -end * y**2])
+    t = np.exp(log_t)
+    weight = np.tile(weight * y, 2) * t * np.exp(-law.energy(torch.from_numpy(log_t)).numpy())
+    return float(distribution.a) * np.expm1(log_t), t, weight * t**2
 
 
 @cache
@@ -179,12 +183,16 @@ def _marginal() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return s, -np.log(m / m[0]), cumulative / cumulative[-1]
 
 
+def _depth_law(distribution: ProjectedHuber) -> DepthLaw:
+    return depth_law(distribution.a.detach().cpu().double().log(), distribution.rounding)
+
+
 def _depth_energy(distribution: ProjectedHuber, t: np.ndarray) -> np.ndarray:
-    return float(distribution.a) * (np.maximum(t, 1 / t) - 1)
+    return np.asarray(_depth_law(distribution).energy(torch.from_numpy(np.log(t))).numpy())
 
 
 def _excess(distribution: ProjectedHuber, t: np.ndarray, level: float) -> float:
-    """The c with P(a (max(t, 1/t) - 1) + e(q_1) <= c) = level."""
+    """The c with P(energy of t + e(q_1) <= c) = level."""
     _, energy, cumulative = _marginal()
     of_depth = _depth_energy(distribution, t)
 
@@ -195,7 +203,7 @@ def _excess(distribution: ProjectedHuber, t: np.ndarray, level: float) -> float:
 
 
 def _outline(distribution: ProjectedHuber, excess: float) -> Points:
-    """The (x, z) with a (max(t, 1/t) - 1) + e(q_1) = c, once around.
+    """The (x, z) with energy of t + e(q_1) = c, once around.
 
     Given z, x is on the axis plus |g| q_1 in law, where g is the first row of mu_z A^(-1); so (x, z) has the density
     of t times that of q_1, both at their own scale.
@@ -204,9 +212,9 @@ def _outline(distribution: ProjectedHuber, excess: float) -> Points:
     """
     s, energy, _ = _marginal()
     mu_z = float(distribution.mu_z)
-    furthest = 1 + excess / float(distribution.a)
+    furthest = float(_depth_law(distribution).farthest_log_t(torch.tensor(excess, dtype=torch.float64)).expm1())
     bend = np.linspace(0, np.pi / 2, (_POINTS + 1) // 2)
-    above = 1 + (furthest - 1) * np.sin(bend)  # dense where the curve closes
+    above = 1 + furthest * np.sin(bend)  # dense where the curve closes
     t = np.concatenate([1 / above[:0:-1], above])
     of_depth = _depth_energy(distribution, t)
     half_width = mu_z * np.linalg.norm(np.linalg.inv(_float64(distribution.A))[0])

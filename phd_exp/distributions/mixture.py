@@ -15,6 +15,7 @@ from phd_exp.distributions.density import quantile_between
 from phd_exp.distributions.depth import depth_mean_energy
 from phd_exp.distributions.huber import RADIAL_NORMALISER
 from phd_exp.distributions.projected_huber import ProjectedHuber
+from phd_exp.distributions.rounded import Rounded
 from phd_exp.distributions.special import scaled_expints, tail_moment
 
 DRAWS = 10_240  # for a level, whose standard error is at most 0.5 / sqrt(DRAWS) = 0.0049
@@ -103,9 +104,10 @@ class Mixture:
         by itself. Its axis is free if the members' are. Parameters are wanted in float64. Source: own derivation;
         checked against a general optimiser in tests/distributions/test_mixture.py.
         """
-        mu_z, a = _closest_depth(self.members)
+        rounding = self.members.rounding
+        mu_z, a = (_closest_rounded_depth if rounding else _closest_depth)(self.members)
         m_xy, apex, A_xy = _closest_projection(self.members)
-        return ProjectedHuber.about_axis(m_xy, apex, mu_z, A_xy * mu_z[..., None, None], a)
+        return ProjectedHuber.about_axis(m_xy, apex, mu_z, A_xy * mu_z[..., None, None], a, rounding)
 
 
 def _closest_depth(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
@@ -140,6 +142,18 @@ def _closest_depth(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch"], Fl
         high = low + step
     middle = low + step / 2
     return middle.exp(), conditions(middle)[1]
+
+
+def _closest_rounded_depth(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """The same for rounded modes, from the nodes of all members; see `Rounded.closest_to`."""
+    law, log_mu = members.depth_law, members.mu_z.log()
+    assert isinstance(law, Rounded)
+    log_t, share = law.nodes
+    middle = log_mu.mean(-1)
+    place, log_a = Rounded(law.log_a.mean(-1), law.r).closest_to(
+        (log_t + (log_mu - middle[..., None])[..., None]).flatten(-2), (share / log_mu.shape[-1]).flatten(-2)
+    )
+    return (middle + place).exp(), log_a.exp()
 
 
 def _closest_projection(

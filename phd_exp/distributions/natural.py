@@ -35,6 +35,7 @@ class Natural:
         log_mu_z: log of the depth's centre, mu_z in metres.
         log_a: log of the depth's precision.
         k: turns the axis about the mode; None for the paper's.
+        rounding: the r of `phd_exp.distributions.rounded`; 0 for the paper's law of depth.
     """
 
     A_xy: Float[Tensor, "*#batch 2 2"]
@@ -43,6 +44,7 @@ class Natural:
     log_mu_z: Float[Tensor, "*#batch"]
     log_a: Float[Tensor, "*#batch"]
     k: Float[Tensor, "*#batch 2"] | None = None
+    rounding: float = 0.0
 
     @classmethod
     def from_camera_frame(
@@ -52,15 +54,16 @@ class Natural:
         A: Float[Tensor, "*#batch 2 2"],
         a: Float[Tensor, "*#batch"],
         k: Float[Tensor, "*#batch 2"] | None = None,
+        rounding: float = 0.0,
     ) -> "Natural":
-        """From the centre and precision of (x, y)/z and of z (metres), and the k of a free axis.
+        """From the centre and precision of (x, y)/z and of z (metres), the k of a free axis and the rounding.
 
         Source: paper, section "Projected Huber distribution".
         """
         A_xy = A / mu_z[..., None, None]
         log_mu_z = mu_z.log()
         log_det_A_xy = spd.log_det(A) - 2 * log_mu_z
-        return cls(A_xy, spd.matvec(A_xy, mu_xy), log_det_A_xy, log_mu_z, a.log(), k)
+        return cls(A_xy, spd.matvec(A_xy, mu_xy), log_det_A_xy, log_mu_z, a.log(), k, rounding)
 
     @classmethod
     def from_raw(
@@ -90,8 +93,7 @@ class Natural:
     @property
     def batch_shape(self) -> torch.Size:
         """The common batch shape of the parameters."""
-        parameters = ((name, value) for name, value in vars(self).items() if value is not None)
-        first, *others = (_batch_shape(name, value) for name, value in parameters)
+        first, *others = (_batch_shape(name, value) for name, value in self._tensors.items())
         if all(shape == first for shape in others):  # broadcasting takes 50 us
             return first
         return torch.broadcast_shapes(first, *others)
@@ -102,8 +104,12 @@ class Natural:
 
     def map(self, change: Callable[[str, Tensor], Tensor]) -> "Natural":
         """A function of the name and value of each parameter."""
-        parameters = ((name, value) for name, value in vars(self).items() if value is not None)
-        return type(self)(**{name: change(name, value) for name, value in parameters})
+        changed = {name: change(name, value) for name, value in self._tensors.items()}
+        return type(self)(**changed, rounding=self.rounding)
+
+    @property
+    def _tensors(self) -> dict[str, Tensor]:
+        return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
 
 
 def precision(b: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 2 2"], Float[Tensor, "*batch"]]:

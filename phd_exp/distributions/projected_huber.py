@@ -5,9 +5,11 @@ With q = A_xy (x, y) - nu_xy z + k a (t - 1) and t = z / mu_z,
     -log p(v) = h(|q|) - log|A_xy| + log(2 pi (1 + e^(-1/2))) + a max(t, 1/t) + log(mu_z N(a))   for z > 0.
 
 q and t are independent, and v is affine in (q, t). Every statistic below follows from that. In the paper's density
-k = 0: its axis, the line q = 0, passes through the camera. A free axis passes through `apex` in the plane z = 0.
+k = 0: its axis, the line q = 0, passes through the camera. A free axis passes through `apex` in the plane z = 0. The
+law of t may have a rounded mode in place of the kink at t = 1; then its energy and normaliser are those of `Rounded`.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar, Literal, final
@@ -19,11 +21,11 @@ from torch.distributions import Distribution, constraints
 from torch.distributions.constraints import Constraint
 from torch.nn.functional import pad
 
-from phd_exp.distributions import depth, huber, spd
+from phd_exp.distributions import huber, spd
 from phd_exp.distributions.density import Density
-from phd_exp.distributions.level import credible_level
+from phd_exp.distributions.depth_law import DepthLaw
 from phd_exp.distributions.natural import Natural, require, require_positions
-from phd_exp.distributions.special import log_scaled_normaliser
+from phd_exp.distributions.rounded import depth_law
 from phd_exp.geometry.camera import at_depth
 
 LARGEST_RAW = 1e9  # squares of larger raw numbers, and their products, would overflow in float32
@@ -40,6 +42,7 @@ class ProjectedHuber(Density, Distribution):
         a: precision of z; Var[z] is about 2 mu_z^2/a^2 where a is large.
         k: adds k a (t - 1) to q, so that the axis, the line of centres of (x, y) given z, leaves the viewing ray of
             the mode; None for the paper's density. With k = 0 all values are those of the paper's density.
+        rounding: how far the mode of depth is rounded, in units of mu_z/a; 0 for the paper's law of depth.
         validate_args: check parameters here and positions later (default: True). A check synchronises with the GPU
             and does not run under `torch.func.vmap`; pass False there.
 
@@ -55,7 +58,7 @@ class ProjectedHuber(Density, Distribution):
 
     Source: paper, section "Projected Huber distribution"; the free axis is an own generalisation. It keeps the
     normaliser, the law of depth, the levels and convexity, because (q, t) stays affine in v with the same slope in
-    (x, y).
+    (x, y). The rounded law of depth is an own one, see `phd_exp.distributions.rounded`.
     """
 
     has_closed_forms: ClassVar[Literal[True]] = True
@@ -79,12 +82,15 @@ class ProjectedHuber(Density, Distribution):
         a: Float[Tensor, "*#batch"],
         k: Float[Tensor, "*#batch 2"] | None = None,
         validate_args: bool | None = None,
+        rounding: float = 0.0,
     ) -> None:
         if _wants_validation(validate_args):
             for name, value in (("mu_xy", mu_xy), ("mu_z", mu_z), ("A", A), ("a", a), ("k", k)):
                 if value is not None:
                     require(name, value, self.arg_constraints[name])
-        self._adopt(Natural.from_camera_frame(mu_xy, mu_z, A, a, k), validate_args)
+            if not 0 <= rounding < math.inf:
+                raise ValueError(f"rounding: got {rounding}; expected a finite number of at least 0")
+        self._adopt(Natural.from_camera_frame(mu_xy, mu_z, A, a, k, rounding), validate_args)
         self._require_representable()
 
     @classmethod
@@ -95,15 +101,16 @@ class ProjectedHuber(Density, Distribution):
         mu_z: Float[Tensor, "*#batch"],
         A: Float[Tensor, "*#batch 2 2"],
         a: Float[Tensor, "*#batch"],
+        rounding: float = 0.0,
     ) -> "ProjectedHuber":
         """The distribution whose axis has the slope m_xy and the (x, y) of `apex` at z = 0 (metres), not validated.
 
         Without an apex it is the paper's density, whose axis passes through the camera.
         """
         if apex is None:
-            return cls(m_xy, mu_z, A, a, validate_args=False)
+            return cls(m_xy, mu_z, A, a, None, False, rounding)
         place = apex / mu_z[..., None]
-        return cls(m_xy + place, mu_z, A, a, spd.matvec(A, place) / a[..., None], validate_args=False)
+        return cls(m_xy + place, mu_z, A, a, spd.matvec(A, place) / a[..., None], False, rounding)
 
     @classmethod
     def from_raw(
@@ -185,6 +192,10 @@ class ProjectedHuber(Density, Distribution):
         """The paper's density with its axis turned about the mode; see the argument k."""
         return self._of(replace(self._natural, k=k), self._validate_args)
 
+    def with_rounding(self, rounding: float) -> "ProjectedHuber":
+        """The density with the same parameters and the mode of depth rounded by this much."""
+        return self._of(replace(self._natural, rounding=rounding), self._validate_args)
+
     def tempered(
         self, projected: Float[Tensor, "*#batch"] | float, depth: Float[Tensor, "*#batch"] | float
     ) -> "ProjectedHuber":
@@ -196,7 +207,8 @@ class ProjectedHuber(Density, Distribution):
         log_det_A_xy, log_a = n.log_det_A_xy - 2 * projected.log(), n.log_a - depth.log()
         across = projected[..., None]
         k = None if n.k is None else n.k * (depth[..., None] / across)
-        tempered = Natural(n.A_xy / across[..., None], n.nu_xy / across, log_det_A_xy, n.log_mu_z, log_a, k)
+        A_xy, nu_xy = n.A_xy / across[..., None], n.nu_xy / across
+        tempered = replace(n, A_xy=A_xy, nu_xy=nu_xy, log_det_A_xy=log_det_A_xy, log_a=log_a, k=k)
         return self._of(tempered, self._validate_args)
 
     def __repr__(self) -> str:
@@ -204,7 +216,7 @@ class ProjectedHuber(Density, Distribution):
 
     @property
     def parameters(self) -> dict[str, Tensor]:
-        """The arguments of the constructor; with a free axis also k."""
+        """The tensors that the constructor takes; with a free axis also k."""
         found = {"mu_xy": self.mu_xy, "mu_z": self.mu_z, "A": self.A, "a": self.a}
         return found if self.k is None else found | {"k": self.k}
 
@@ -255,6 +267,16 @@ class ProjectedHuber(Density, Distribution):
         return self._natural.log_a.exp()
 
     @property
+    def rounding(self) -> float:
+        """How far the mode of depth is rounded; 0 for the paper's law."""
+        return self._natural.rounding
+
+    @property
+    def depth_law(self) -> DepthLaw:
+        """The law of z/mu_z."""
+        return depth_law(self._natural.log_a, self._natural.rounding)
+
+    @property
     def log_det_A(self) -> Float[Tensor, "*batch"]:
         """log|A|; half of it is the log of the typical precision of (x, y)/z."""
         return self._natural.log_det_A_xy + 2 * self._natural.log_mu_z
@@ -284,8 +306,8 @@ class ProjectedHuber(Density, Distribution):
         return n.k * (torch.exp(n.log_a - n.log_mu_z) * z - n.log_a.exp())[..., None]
 
     def depth_energy(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
-        """The excess energy of a depth z > 0 (metres), a (max(t, 1/t) - 1) with t = z/mu_z."""
-        return depth.depth_energy(z.log() - self._natural.log_mu_z, self._natural.log_a)
+        """The excess energy of a depth z > 0 (metres), a (max(t, 1/t) - 1) with t = z/mu_z unless it is rounded."""
+        return self.depth_law.energy(z.log() - self._natural.log_mu_z)
 
     def log_prob(self, value: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch"]:
         """Log density of a position (metres), nats per cubic metre; -inf, with zero gradient, for z <= 0.
@@ -300,7 +322,7 @@ class ProjectedHuber(Density, Distribution):
         """
         energy, visible = self._excess_energy(value)
         n = self._natural
-        log_mode = n.log_det_A_xy - huber.HUBER_LOG_NORMALISER - n.log_mu_z - log_scaled_normaliser(n.log_a)
+        log_mode = n.log_det_A_xy - huber.HUBER_LOG_NORMALISER - n.log_mu_z - self.depth_law.log_normaliser
         return (log_mode - energy).masked_fill(~visible, -torch.inf)
 
     def _excess_energy(self, xyz: Tensor) -> tuple[Tensor, Tensor]:
@@ -320,7 +342,7 @@ class ProjectedHuber(Density, Distribution):
         Source: own derivation, see `credible_level`.
         """
         energy, visible = self._excess_energy(xyz)
-        return credible_level(energy, self.a).masked_fill(~visible, 1)
+        return self.depth_law.level(energy).masked_fill(~visible, 1)
 
     @property
     def mode(self) -> Float[Tensor, "*batch 3"]:
@@ -333,7 +355,7 @@ class ProjectedHuber(Density, Distribution):
         mean = at_depth(self.mu_xy, self.depth_mean)
         if self.k is None:
             return mean
-        excess = depth.depth_excess_moments(self._natural.log_a)[0]
+        excess = self.depth_law.excess_moments[0]
         return mean - pad(spd.matvec(self._A_xy_inverse, self.k * excess[..., None]), (0, 1))
 
     @property
@@ -360,7 +382,7 @@ class ProjectedHuber(Density, Distribution):
         """
         if self.k is None:
             return self.mu_xy
-        return self.mu_xy + self._drift * depth.inverse_depth_shortfall(self.a)[..., None]
+        return self.mu_xy + self._drift * self.depth_law.inverse_moments[0][..., None]
 
     @property
     def _drift(self) -> Float[Tensor, "*batch 2"]:
@@ -376,37 +398,36 @@ class ProjectedHuber(Density, Distribution):
         across = huber.HUBER_COVARIANCE * spd.square(spd.inverse(self.A, self.log_det_A))
         if self.k is None:
             return across
-        shortfall = depth.inverse_depth_shortfall(self.a)
-        d = self._drift * (shortfall * (2 - shortfall)).sqrt()[..., None]  # E[1/t^2] = 1
+        d = self._drift * self.depth_law.inverse_moments[1].sqrt()[..., None]
         return across + d[..., :, None] * d[..., None, :]
 
     @property
     def depth_mean(self) -> Float[Tensor, "*batch"]:
-        return self.mu_z * depth.depth_mean_and_variance(self._natural.log_a)[0]
+        return self.mu_z * self.depth_law.moments[0]
 
     @property
     def depth_variance(self) -> Float[Tensor, "*batch"]:
-        return self.mu_z.square() * depth.depth_mean_and_variance(self._natural.log_a)[1]
+        return self.mu_z.square() * self.depth_law.moments[1]
 
     def depth_cdf(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
         """P(depth <= z), z in metres; 0 for z <= 0."""
         visible = z > 0
         log_t = z.masked_fill(~visible, 1).log() - self._natural.log_mu_z
-        return depth.depth_cdf(log_t, self._natural.log_a).masked_fill(~visible, 0)
+        return self.depth_law.cdf(log_t).masked_fill(~visible, 0)
 
     def depth_crps(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
         """Continuous ranked probability score of a depth z (metres), int (P(depth <= u) - 1[u >= z])^2 du, metres.
 
-        Source: own derivation, see `crps_beyond_distance`.
+        Source: own derivation, see `DepthLaw.crps_beyond_distance`.
         """
         log_t = z.clamp_min(torch.finfo(z.dtype).tiny).log() - self._natural.log_mu_z
         width = torch.exp(self._natural.log_mu_z - self._natural.log_a)
-        return (z - self.mu_z).abs() + width * depth.crps_beyond_distance(log_t, self._natural.log_a)
+        return (z - self.mu_z).abs() + width * self.depth_law.crps_beyond_distance(log_t)
 
     def depth_icdf(self, p: Float[Tensor, "*#batch"] | float) -> Float[Tensor, "*#batch"]:
         """The depth z, metres, with P(depth <= z) = p, for p in [0, 1]; 0 at p = 0, inf at p = 1."""
         p = torch.as_tensor(p, dtype=self._natural.log_a.dtype, device=self._natural.log_a.device)
-        return torch.exp(self._natural.log_mu_z + depth.depth_icdf(p, self._natural.log_a))
+        return torch.exp(self._natural.log_mu_z + self.depth_law.icdf(p))
 
     def rsample(
         self, sample_shape: torch.Size | Sequence[int] = (), generator: torch.Generator | None = None
@@ -430,7 +451,7 @@ class ProjectedHuber(Density, Distribution):
         Source: own derivation from the independence of q and t; checked against samples.
         """
         projection = huber.HUBER_LOG_NORMALISER + huber.HUBER_MEAN_ENERGY - self._natural.log_det_A_xy
-        return projection + self._natural.log_mu_z + depth.depth_entropy(self._natural.log_a)
+        return projection + self._natural.log_mu_z + self.depth_law.log_normaliser + self.depth_law.mean_energy
 
 
 def _wants_validation(validate_args: bool | None) -> bool:

@@ -1,21 +1,23 @@
-"""The smallest region of a credible level: h(|q|) + a (max(t, 1/t) - 1) <= W, which is convex.
+"""The smallest region of a credible level: h(|q|) + e(t) <= W with the excess energy e of depth, which is convex.
 
-The depth t runs over [1/T, T] with T = 1 + W/a. Given t, q runs over a disc of radius r(W - a (max(t, 1/t) - 1)),
-where r is the inverse of h.
+The depth t runs over [1/T, T] with e(T) = W. Given t, q runs over a disc of radius r(W - e(t)), where r is the
+inverse of h.
 """
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from scipy import integrate
 from scipy.spatial import ConvexHull
 
-from phd_exp.distributions.level import PRECISIONS, level_energies
 from phd_exp.distributions.projected_huber import ProjectedHuber
+from phd_exp.distributions.rounded import depth_law
 
+PRECISIONS = torch.logspace(-4, 5, 91, dtype=torch.float64)
 OPTICAL_AXIS = np.array([0.0, 0.0, 1.0])
 _BENDS = np.sin(np.linspace(-np.pi / 2, np.pi / 2, 401))  # depths, denser where the region closes
 
@@ -71,11 +73,27 @@ class Region:
     @cached_property
     def _discs(self) -> tuple[Float[np.ndarray, "*batch depths"], Float[np.ndarray, "*batch depths"]]:
         """log t and the radius of the disc of q at several depths."""
-        a = self.distribution.a.double().numpy()[..., None]
-        log_a, known = np.log(a), PRECISIONS.log().numpy()
-        level, W = np.asarray(self.level)[..., None], np.empty_like(a)
+        log_a, rounding = self.distribution.a.double().log()[..., None], self.distribution.rounding
+        law = depth_law(log_a, rounding)
+        level, W = np.asarray(self.level)[..., None], np.empty(log_a.shape)
         for one in np.unique(level):
-            W = np.where(level == one, np.interp(log_a, known, level_energies(float(one))), W)
-        log_t = np.log1p(W / a) * _BENDS
-        left = np.maximum(W - a * np.expm1(np.abs(log_t)), 0)
-        return log_t, np.where(left < 0.5, np.sqrt(2 * left), left + 0.5)
+            energies = np.interp(log_a, PRECISIONS.log(), level_energies(float(one), rounding))
+            W = np.where(level == one, energies, W)
+        log_t = law.farthest_log_t(torch.from_numpy(W)) * torch.from_numpy(_BENDS)
+        left = np.maximum(W - law.energy(log_t).numpy(), 0)
+        return log_t.numpy(), np.where(left < 0.5, np.sqrt(2 * left), left + 0.5)
+
+
+@cache
+def level_energies(level: float, rounding: float = 0.0) -> Float[np.ndarray, " precisions"]:
+    """The W of the region with the probability `level` < 1 at each a of `PRECISIONS`, by bisection.
+
+    W depends so little on a that linear interpolation over log a errs by less than 1e-4 in level.
+    """
+    law = depth_law(PRECISIONS.log(), rounding)
+    low, high = torch.zeros_like(PRECISIONS), torch.full_like(PRECISIONS, 64)
+    for _ in range(60):
+        middle = (low + high) / 2
+        inside = law.level(middle) < level
+        low, high = torch.where(inside, middle, low), torch.where(inside, high, middle)
+    return high.numpy()

@@ -14,9 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from phd_exp.distributions.depth import depth_mean_energy
 from phd_exp.distributions.projected_huber import ProjectedHuber
-from phd_exp.distributions.special import log_scaled_normaliser
+from phd_exp.distributions.rounded import depth_law
 
 _WIDEST = 80.0  # of log(1/temperature); a fit beyond has no minimum
 _ENDS = (0.05, 0.95)  # quantiles of the fitted predictions between which temperatures vary
@@ -67,8 +66,8 @@ class Temperature:
     def fit(cls, distribution: ProjectedHuber, xyz: Float[Tensor, "samples 3"]) -> "Temperature":
         """The temperatures that minimise the mean NLL of true positions (metres) under a batch of predictions.
 
-        With log T = -v it is the sum of the means of h(e^v |q|) - 2 v and of a e^v max(t, 1/t) + log N(a e^v). If all
-        have one v, it is the root of a derivative; the slope is found from there, with a normal prior about 0.
+        With log T = -v it is the sum of the means of h(e^v |q|) - 2 v and of the NLL of depth with the precision a e^v.
+        If all have one v, it is the root of a derivative; the slope is found from there, with a normal prior about 0.
 
         Raises ValueError if there are no samples, if one is not finite or not in front of the camera, or if all lie
         at their modes, so that no temperature is low enough.
@@ -77,16 +76,16 @@ class Temperature:
         """
         xyz = xyz.detach().double()
         radius = distribution.whiten(xyz).norm(dim=-1).detach().double()
-        energy = distribution.depth_energy(xyz[..., 2]).detach().double()
-        log_A, log_a = (u.detach().double().expand_as(energy) for u in _log_precisions(distribution))
-        for values in (xyz, radius, energy, log_A, log_a):
+        log_t = (xyz[..., 2].log() - distribution.mu_z.log()).detach().double()
+        log_A, log_a = (u.detach().double().expand_as(log_t) for u in _log_precisions(distribution))
+        for values in (xyz, radius, log_t, log_A, log_a):
             if values.numel() == 0 or not bool(values.isfinite().all()):
                 raise ValueError(
                     "temperatures are fitted to finite predictions and positions with z > 0, at least one, but "
                     f"{int((~values.isfinite()).sum())} of {values.numel()} numbers are not finite"
                 )
         projected, projected_slope = _fit(partial(_projected_nll, radius), log_A)
-        depth, depth_slope = _fit(partial(_depth_nll, energy, log_a), log_a)
+        depth, depth_slope = _fit(partial(_depth_nll, log_t, log_a, distribution.rounding), log_a)
         return cls(projected, depth, projected_slope, depth_slope)
 
     def apply(self, distribution: ProjectedHuber) -> ProjectedHuber:
@@ -109,12 +108,10 @@ def _projected_nll(radius: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(r > 1, r - 0.5, derivative / 2) - 2 * v, derivative - 2
 
 
-def _depth_nll(energy: Tensor, log_a: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """e^v w + log(e^(a') N(a')) with the excess energy w and a' = e^v a, and its derivative by v: actual minus
-    predicted energies.
-    """
-    scaled = v.exp() * energy
-    return scaled + log_scaled_normaliser(log_a + v), scaled - depth_mean_energy(log_a + v)
+def _depth_nll(log_t: Tensor, log_a: Tensor, rounding: float, v: Tensor) -> tuple[Tensor, Tensor]:
+    """-log p(t) at the precision a e^v, and its derivative by v."""
+    law = depth_law(log_a + v, rounding)
+    return law.energy(log_t) + law.log_normaliser, law.slope(log_t) - law.mean_slope
 
 
 def _fit(nll: Callable[[Tensor], tuple[Tensor, Tensor]], log_precision: Tensor) -> tuple[float, Slope]:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.depth import depth_mean_and_variance
+from phd_exp.distributions.rounded import depth_law
 from phd_exp.fusion.fuse import Fused, fuse
 from phd_exp.fusion.pose import Plane, Pose
 
@@ -26,19 +26,19 @@ def own_part(
     is the product of those of e^s, which is e^(deviation^2), and of z'; the ratio of z' is 1 - share of that of z.
     """
     mu_z, A, a = (getattr(predictions, name).double().cpu() for name in ("mu_z", "A", "a"))
-    mean, ratio = _mean_and_ratio(a.log())
+    mean, ratio = _mean_and_ratio(a.log(), predictions.rounding)
     own_ratio = (1 - share) * ratio
-    ratios = _mean_and_ratio(torch.from_numpy(_LOG_A))[1].log().numpy()
+    ratios = _mean_and_ratio(torch.from_numpy(_LOG_A), predictions.rounding)[1].log().numpy()
     log_a = torch.from_numpy(np.interp(-own_ratio.log().numpy(), -ratios, _LOG_A))
     growth = (1 + ratio) / (1 + own_ratio)
-    change = mean / _mean_and_ratio(log_a)[0] / growth.sqrt()  # of mu_z
+    change = mean / _mean_and_ratio(log_a, predictions.rounding)[0] / growth.sqrt()  # of mu_z
     own = _along_axis(predictions, mu_z * change, A * (change * growth)[..., None, None], log_a.exp())
     return own, growth.log().sqrt()
 
 
-def _mean_and_ratio(log_a: Tensor) -> tuple[Tensor, Tensor]:
+def _mean_and_ratio(log_a: Tensor, rounding: float) -> tuple[Tensor, Tensor]:
     """E[t], and Var[t]/E[t]^2, which falls with a."""
-    mean, variance = depth_mean_and_variance(log_a)
+    mean, variance = depth_law(log_a, rounding).moments
     return mean, variance / mean.square()
 
 
@@ -112,4 +112,4 @@ def _grown(own: ProjectedHuber, deviations: Tensor, at: Tensor) -> ProjectedHube
 def _along_axis(views: ProjectedHuber, mu_z: Tensor, A: Tensor, a: Tensor) -> ProjectedHuber:
     """The distributions about the same axes with these parameters, in float64 on the CPU."""
     apex = None if views.k is None else views.apex[..., :2].double().cpu()
-    return ProjectedHuber.about_axis(views.m_xy.double().cpu(), apex, mu_z, A, a)
+    return ProjectedHuber.about_axis(views.m_xy.double().cpu(), apex, mu_z, A, a, views.rounding)

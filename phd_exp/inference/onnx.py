@@ -18,7 +18,7 @@ from onnxscript import optimizer
 from torch import Tensor, nn
 
 from phd_exp.data.batches import Batch
-from phd_exp.distributions.level import PRECISIONS, level_energies
+from phd_exp.distributions.regions import PRECISIONS, level_energies
 from phd_exp.inference.deployed import Deployed, OfImages, OfPhotographs, Precision
 from phd_exp.inference.onnx_int8 import Change, measured_change, quantized
 from phd_exp.inference.predictor import Predictor

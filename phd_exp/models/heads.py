@@ -94,18 +94,19 @@ class SurrogateHead(DistributionHead):
 
     Args:
         depth: constants of the data set.
+        is_rounded: the mode of depth is rounded.
     """
 
-    def __init__(self, depth: DepthScale) -> None:
+    def __init__(self, depth: DepthScale, is_rounded: bool = False) -> None:
         super().__init__(depth)
-        self.n_outputs = 10
+        self.n_outputs, self.is_rounded = 10, is_rounded
 
     def surrogate(self, raw: Float[Tensor, "*batch 10"], camera: Camera) -> Shaped:
         """The Student's t that training fits."""
         return StudentT(super().__call__(raw[..., :7], camera), raw[..., 7:])
 
     def __call__(self, raw: Float[Tensor, "*batch 10"], camera: Camera) -> ProjectedHuber:
-        return closest_to_student(super().__call__(raw[..., :7], camera), raw[..., 7:])
+        return closest_to_student(super().__call__(raw[..., :7], camera), raw[..., 7:], self.is_rounded)
 
 
 class ShapedHead:

@@ -34,8 +34,14 @@ def test_log_prob_is_the_papers_density(distribution: ProjectedHuber, samples: t
     t = z / mu_z
     q = q if distribution.k is None else q + distribution.k * (a * (t - 1))[:, None]
     log_K_proj = torch.log(2 * math.pi * (1 + math.exp(-0.5)) * mu_z**2 / torch.linalg.det(A))
-    log_K_depth = torch.log(mu_z) + log_normaliser(a)
-    expected = -(huber_energy(q) + a * torch.maximum(t, 1 / t) + log_K_proj + log_K_depth)
+    if distribution.rounding:  # an own law of depth, normalised in test_rounded.py
+        sinh, r = a * (t - 1 / t) / 2, distribution.rounding
+        depth_energy = a * (t + 1 / t) / 2 + (sinh.square() + r**2).sqrt() - a - r
+        log_K_depth = torch.log(mu_z) + distribution.depth_law.log_normaliser
+    else:
+        depth_energy = a * torch.maximum(t, 1 / t)
+        log_K_depth = torch.log(mu_z) + log_normaliser(a)
+    expected = -(huber_energy(q) + depth_energy + log_K_proj + log_K_depth)
     torch.testing.assert_close(distribution.log_prob(xyz), expected, rtol=1e-8, atol=1e-8)
 
 

@@ -13,8 +13,8 @@ from scipy.spatial import ConvexHull
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.huber import radial_cdf
-from phd_exp.distributions.level import PRECISIONS, credible_level, level_energies
-from phd_exp.distributions.regions import Region
+from phd_exp.distributions.level import credible_level
+from phd_exp.distributions.regions import PRECISIONS, Region, level_energies
 from phd_exp.distributions.special import tail_moment
 
 LEVELS = (0.2, 0.9, 0.999)
@@ -66,7 +66,7 @@ def test_depth_reaches_from_mu_z_over_t_to_mu_z_times_t(distribution: ProjectedH
     low, high = Region(distribution, 0.9).depth_interval()
     assert low * high == pytest.approx(float(distribution.mu_z) ** 2)
     W = float(distribution.depth_energy(torch.tensor(high, dtype=torch.float64)))
-    assert float(credible_level(torch.tensor(W), distribution.a)) == pytest.approx(0.9, abs=2e-5)
+    assert float(distribution.depth_law.level(torch.tensor(W).double())) == pytest.approx(0.9, abs=2e-5)
 
 
 @pytest.mark.parametrize("level", LEVELS)

@@ -13,7 +13,8 @@ from PIL import Image
 from scipy import stats
 
 import phd_exp as package
-from phd_exp.distributions.level import PRECISIONS, credible_level
+from phd_exp.distributions.level import credible_level
+from phd_exp.distributions.regions import PRECISIONS
 from phd_exp.evaluation.conformal import fused_guarantee
 from phd_exp.inference import pictures
 from phd_exp.records.runs import RunFolder

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.depth import depth_mean_and_variance
+from phd_exp.distributions.depth_law import Kinked
 from phd_exp.fusion import Pose
 
 CANDIDATES = 400
@@ -50,7 +50,7 @@ def with_shared_part(own: ProjectedHuber, deviation: float) -> ProjectedHuber:
     known = torch.linspace(-8, 14, 20001).double()  # log a
 
     def mean_and_ratio(log_a: Tensor) -> tuple[Tensor, Tensor]:
-        mean, variance = depth_mean_and_variance(log_a)
+        mean, variance = Kinked(log_a).moments
         return mean, variance / mean**2
 
     mean, ratio = mean_and_ratio(own.a.log())
