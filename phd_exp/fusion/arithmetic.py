@@ -1,7 +1,11 @@
 """The arithmetic of one problem: what a camera measures of a position, the energy, and systems of three unknowns.
 
 Every camera measures (q_x, q_y, t) of a position (`ProjectedHuber.whiten`, t = z/mu_z), which is affine in
-the unknowns u: `at_origin` (3) plus `slope` (3 x 3) times u. On a plane there are two unknowns; the third column of
+the unknowns u: `at_origin` (3) plus `slope` (3 x 3) times u. Its energy is h(|q|) + a m(t) with the precision a and
+
+    m(t) = (t + 1/t)/2 + sqrt(g^2 + width^2),    g = (t - 1/t)/2,
+
+which is max(t, 1/t) for the width 0, that of the paper's law; see `phd_exp.distributions.rounded` for others. On a plane there are two unknowns; the third column of
 each slope is zero, and so is H_22 below. A camera that takes no part has slope 0, q = 0, t = 1 and a = 0.
 
 A gradient and a symmetric matrix are one tuple (g_0, g_1, g_2, H_00, H_10, H_11, H_20, H_21, H_22), which stays in
@@ -50,6 +54,25 @@ def huber_weight(q_x, q_y):
     if weight < 1:
         return weight, q_x * weight, q_y * weight
     return weight, 0.0, 0.0
+
+
+@compiled
+def depth_excess(t, width):
+    """m(t) - m(1)."""
+    if width == 0:
+        return max(t, 1 / t) - 1
+    g = (t - 1 / t) / 2
+    return (t - 1) * (t - 1) / (2 * t) + g * g / (math.sqrt(g * g + width * width) + width)
+
+
+@compiled
+def rounded_slopes(t, width):
+    """The first two derivatives of m at t, for a positive width."""
+    g, by_t = (t - 1 / t) / 2, (1 + 1 / (t * t)) / 2
+    s = math.sqrt(g * g + width * width)
+    share = width / s
+    first = (1 - 1 / (t * t)) / 2 + g / s * by_t
+    return first, (1 - g / s) / (t * t * t) + share * share * by_t * by_t / s
 
 
 @compiled

@@ -12,7 +12,7 @@ from scipy import stats
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.level import credible_level
+from phd_exp.distributions.rounded import depth_law
 from phd_exp.fusion.pose import Plane, Pose
 from phd_exp.fusion.problems import Problems, Status
 from phd_exp.hardware import one_thread
@@ -48,7 +48,7 @@ class Fused:
     def surprise(self) -> Float[Tensor, "*problems cameras"]:
         """Credible level of `point` in each view, near 1 where it contradicts the view; NaN where masked out."""
         with one_thread():
-            level = credible_level(self.excess, self.problems.a)
+            level = depth_law(self.problems.a.log(), self.problems.predictions.rounding).level(self.excess)
         return _entered(level.masked_fill(~self.problems.mask, torch.nan), self.status)
 
     @property
@@ -170,7 +170,7 @@ def _improbable(
         return torch.zeros_like(problems.mask)
     # they have at least e^(-excess)/2, which rules out most views without the exact level
     rest = (excess > -math.log(2 * probability)) & problems.mask
-    level = credible_level(excess[rest], problems.a[rest])
+    level = depth_law(problems.a[rest].log(), problems.predictions.rounding).level(excess[rest])
     return rest.masked_scatter(rest, level > 1 - probability)
 
 

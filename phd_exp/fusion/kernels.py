@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numba import njit, prange
 
-from phd_exp.fusion.arithmetic import compiled, huber, measured
+from phd_exp.fusion.arithmetic import compiled, depth_excess, huber, measured
 from phd_exp.fusion.certificate import certify
 from phd_exp.fusion.moments import moments
 from phd_exp.fusion.newton import optimum, polish
@@ -19,17 +19,17 @@ _NO_COMMON_VIEW, _PLANE_BEHIND_CAMERA = int(Status.NO_COMMON_VIEW), int(Status.P
 
 
 @compiled
-def _solve(slope, at_origin, a, free_slope, u, certificate, excess):
+def _solve(slope, at_origin, a, own, free_slope, u, certificate, excess):
     """Moves u to the optimum of one problem; returns its status."""
     lam = np.zeros(len(a))
-    if not optimum(slope, at_origin, a, u, lam):
-        visible = optimum(free_slope, at_origin, a, np.zeros(3), lam)
+    if not optimum(slope, at_origin, a, own, u, lam):
+        visible = optimum(free_slope, at_origin, a, own, np.zeros(3), lam)
         return _PLANE_BEHIND_CAMERA if visible else _NO_COMMON_VIEW
-    polish(slope, at_origin, a, u, lam)
-    certificate[:] = certify(slope, at_origin, a, u, lam)
+    polish(slope, at_origin, a, own, u, lam)
+    certificate[:] = certify(slope, at_origin, a, own, u, lam)
     for c in range(len(a)):
         q_x, q_y, t = measured(slope[c], at_origin[c], u)
-        excess[c] = huber(q_x * q_x + q_y * q_y) + a[c] * (max(t, 1 / t) - 1)
+        excess[c] = huber(q_x * q_x + q_y * q_y) + a[c] * depth_excess(t, own[c])
     return _FUSED if certificate[1] <= CONVERGED else _NOT_CONVERGED
 
 
@@ -41,7 +41,7 @@ def _loops(sources):
     """
 
     @njit(cache=True, error_model="numpy", parallel=True)
-    def solve(slope, at_origin, a, free_slope, status, u, certificate, excess):
+    def solve(slope, at_origin, a, own, free_slope, status, u, certificate, excess):
         """Solves the problems whose status is FUSED, from u, and sets their status.
 
         `free_slope` is the slope without the plane. Fills `certificate` with the values of `certify`, and `excess`
@@ -50,16 +50,16 @@ def _loops(sources):
         assert len(sources) > 0
         for i in prange(len(a)):
             if status[i] == _FUSED:
-                views = slope[i], at_origin[i], a[i]
+                views = slope[i], at_origin[i], a[i], own[i]
                 status[i] = _solve(*views, free_slope[i], u[i], certificate[i], excess[i])
 
     @njit(cache=True, error_model="numpy", parallel=True)
-    def all_moments(chosen, slope, at_origin, a, u, points, log_density, radii, mean, covariance, inside):
+    def all_moments(chosen, slope, at_origin, a, own, u, points, log_density, radii, mean, covariance, inside):
         """Calls `moments` for the chosen problems."""
         assert len(sources) > 0
         for i in prange(len(a)):
             if chosen[i]:
-                views = slope[i], at_origin[i], a[i]
+                views = slope[i], at_origin[i], a[i], own[i]
                 moments(views, u[i], points, log_density, radii, mean[i], covariance[i], inside[i])
 
     return solve, all_moments

@@ -59,21 +59,21 @@ def moments(views, u, points, log_density, radii, mean, covariance, inside):
 
     Source: own derivation; checked against closed forms and Markov chains in tests/fusion/test_moments.py.
     """
-    slope, at_origin, a = views
+    slope, at_origin, a, own = views
     root, value = np.eye(3), np.empty(len(log_density), dtype=np.float32)
-    L = factor(_averaged_precision(slope, at_origin, a, u))
+    L = factor(_averaged_precision(slope, at_origin, a, own, u))
     for j in range(3):
         root[:, j] = backward(L, root[:, j])
     mean[:] = u
     for points_used in (PILOT, PILOT, len(value)):
-        first, second, total = _weighted(slope, at_origin, a, mean, root, points, log_density, value[:points_used])
+        first, second, total = _weighted(slope, at_origin, a, own, mean, root, points, log_density, value[:points_used])
         if points_used == len(value):
             _probabilities(points, value, total, first, second, radii, inside)
         _move(mean, root, covariance, first, second)
 
 
 @compiled
-def _weighted(slope, at_origin, a, centre, root, points, log_density, value):
+def _weighted(slope, at_origin, a, own, centre, root, points, log_density, value):
     """Mean and covariance of the points x, weighted by the density at centre + root x; fills `value` with weights.
 
     In float32, for twice the speed: what is rounded is the change of the energy with x, not the energy.
@@ -83,7 +83,7 @@ def _weighted(slope, at_origin, a, centre, root, points, log_density, value):
     for c in range(len(a)):
         x, y, t = measured(slope[c], at_origin[c], centre)
         columns = change(slope[c], root[:, 0]), change(slope[c], root[:, 1]), change(slope[c], root[:, 2])
-        _subtract_energy(x, y, t, columns, a[c], points, value)
+        _subtract_energy(x, y, t, columns, a[c], own[c], points, value)
     highest = value.max()
     for p in range(len(value)):
         # e^x = (e^(x/64))^64 by a polynomial, which vector units can do; to 1e-5 where the weight is not negligible
@@ -115,13 +115,13 @@ def _sums(points, weight):
 
 
 @compiled
-def _subtract_energy(x, y, t, columns, a, points, value):
+def _subtract_energy(x, y, t, columns, a, own, points, value):
     """Subtracts the energy of one camera at each point from its value; without a branch, for vector units."""
     (x_0, y_0, t_0), (x_1, y_1, t_1), (x_2, y_2, t_2) = columns
     x_0, x_1, x_2 = np.float32(x_0), np.float32(x_1), np.float32(x_2)
     y_0, y_1, y_2 = np.float32(y_0), np.float32(y_1), np.float32(y_2)
     t_0, t_1, t_2 = np.float32(t_0), np.float32(t_1), np.float32(t_2)
-    x, y, beyond, a = np.float32(x), np.float32(y), np.float32(t - 1), np.float32(a)
+    x, y, beyond, a, own = np.float32(x), np.float32(y), np.float32(t - 1), np.float32(a), np.float32(own)
     for p in range(len(value)):
         p_0, p_1, p_2 = points[0, p], points[1, p], points[2, p]
         q_x = x + x_0 * p_0 + x_1 * p_1 + x_2 * p_2
@@ -129,7 +129,12 @@ def _subtract_energy(x, y, t, columns, a, points, value):
         s = beyond + t_0 * p_0 + t_1 * p_1 + t_2 * p_2  # t - 1
         squared = q_x * q_x + q_y * q_y
         huber = math.sqrt(squared) - _HALF if squared > _ONE else _HALF * squared
-        depth = max(s, -s / (_ONE + s)) if s > -_ONE else np.float32(np.inf)
+        inverse = -s / (_ONE + s)  # 1/t - 1
+        depth = max(s, inverse)
+        if own > 0:
+            g = (s - inverse) * _HALF
+            depth = (s + inverse) * _HALF + g * g / (math.sqrt(g * g + own * own) + own)
+        depth = depth if s > -_ONE else np.float32(np.inf)
         value[p] -= huber + a * depth
 
 
@@ -160,11 +165,11 @@ def _move(mean, root, covariance, first, second):
 
 
 @compiled
-def _averaged_precision(slope, at_origin, a, u):
+def _averaged_precision(slope, at_origin, a, own, u):
     """About the second derivative of the energy averaged over N(u, its inverse), a fixed point; 1/square metres.
 
     For h the weight 1/sqrt(1 + E|q|^2); for a max(t, 1/t), t Gaussian with deviation s, its jump of slope at the kink
-    times the density there, and its curvature before: a (2 N(1; t, s^2) + 2 P(T < 1)/t^3).
+    times the density there, and its curvature before: a (2 N(1; t, s^2) + 2 P(T < 1)/t^3). A rounded mode widens the jump.
 
     Source: own derivation.
     """
@@ -184,8 +189,8 @@ def _averaged_precision(slope, at_origin, a, u):
             q_x, q_y, t = at[c]
             across = squared_norm(forward(L, slope[c, 0])) + squared_norm(forward(L, slope[c, 1]))
             deviation = max(math.sqrt(squared_norm(forward(L, slope[c, 2]))), TINY)
-            standard = (1 - t) / deviation
-            at_kink = math.exp(-standard * standard / 2) / (deviation * math.sqrt(2 * math.pi))
+            standard, width = (1 - t) / deviation, math.hypot(deviation, own[c])
+            at_kink = math.exp(-(((1 - t) / width) ** 2) / 2) / (width * math.sqrt(2 * math.pi))
             weight[c] = 1 / math.sqrt(1 + q_x * q_x + q_y * q_y + across)
             bend[c] = a[c] * (2 * at_kink + math.erfc(-standard / math.sqrt(2)) / (t * t * t))
     return H

@@ -2,7 +2,8 @@
 
 The energy of a camera is h(|q|) + a max(t, 1/t). With g = (t - 1/t)/2 the maximum is (t + 1/t)/2 + |g|, and |g| is
 smoothed to s = sqrt(g^2 + width^2). This is the w of the epigraph's barrier, (w - t)(w - 1/t) = width^2. It is convex
-in t, because its second derivative is (1 - g/s)/t^3 + width^2 g'^2/s^3, and at most `width` too large.
+in t, because its second derivative is (1 - g/s)/t^3 + width^2 g'^2/s^3, and at most `width` too large. A camera whose
+law of depth is rounded has a width of its own, below which that of the search does not fall; it has no kink.
 
 Plain Newton steps overshoot where h or max(t, 1/t) is linear, because their curvature is zero there. As in
 total-variation denoising (Chan, Golub and Mulet, 1999), the directions of both are therefore unknowns too:
@@ -21,7 +22,7 @@ import math
 
 import numpy as np
 
-from phd_exp.fusion.arithmetic import ZERO, add, change, compiled, huber, huber_weight, measured, newton_step
+from phd_exp.fusion.arithmetic import ZERO, add, change, compiled, huber, huber_weight, measured, newton_step, rounded_slopes
 
 WIDTH_FLOOR = 1e-9
 FIRST_WIDTH, SHRINK = 1.0, 0.01
@@ -39,14 +40,14 @@ LEAST_DEPTHS = (1e-2, 1e-4, 1e-6)
 
 
 @compiled
-def optimum(slope, at_origin, a, u, lam):
+def optimum(slope, at_origin, a, own, u, lam):
     """Moves u to the optimum and lam to its multipliers; returns whether one has t >= 1e-6 in every camera.
 
-    If not, every position in front of all cameras is worse than what 1/t = 1e6 costs in one of them.
+    `own` is the width of each camera. If not, every position in front of all cameras is worse than what 1/t = 1e6 costs in one of them.
     """
     for least in LEAST_DEPTHS:
         lam[:] = 0.0
-        minimise(slope, at_origin, a, u, lam, least)
+        minimise(slope, at_origin, a, own, u, lam, least)
         nearest = np.inf
         for c in range(len(a)):
             nearest = min(nearest, measured(slope[c], at_origin[c], u)[2])
@@ -56,7 +57,7 @@ def optimum(slope, at_origin, a, u, lam):
 
 
 @compiled
-def minimise(slope, at_origin, a, u, lam, least):
+def minimise(slope, at_origin, a, own, u, lam, least):
     """Moves u to the minimum with 1/t continued below t = least, and lam to the multipliers of the kinks.
 
     It stops after 80 steps at the latest; the certificate bounds the error.
@@ -66,12 +67,12 @@ def minimise(slope, at_origin, a, u, lam, least):
     y, terms = np.zeros((cameras, 2)), np.empty((cameras, 6))
     width = FIRST_WIDTH
     for _ in range(MOST_STEPS):
-        before, sums = _linearise_smooth(slope, at_origin, a, u, y, lam, width, least, at, terms)
+        before, sums = _linearise_smooth(slope, at_origin, a, own, u, y, lam, width, least, at, terms)
         du = newton_step(sums)
         for c in range(cameras):
             moved[c] = change(slope[c], du)
         descent = sums[0] * du[0] + sums[1] * du[1] + sums[2] * du[2]
-        share = _line_search(before, at, moved, a, descent, width, least)
+        share = _line_search(before, at, moved, a, own, descent, width, least)
         settled = _step(at, terms, moved, y, lam, share)
         for j in range(3):
             u[j] += share * du[j]
@@ -101,13 +102,13 @@ def smooth_depth_energy(t, inverse, width):
 
 
 @compiled
-def _linearise_smooth(slope, at_origin, a, u, y, lam, width, least, at, terms):
+def _linearise_smooth(slope, at_origin, a, own, u, y, lam, width, least, at, terms):
     """The smoothed energy, its gradient and Hessian; fills `at` with (q_x, q_y, t) and `terms` for `_step`."""
     value, sums = 0.0, ZERO
     for c in range(len(a)):
         q_x, q_y, t = at[c] = measured(slope[c], at_origin[c], u)
         inverse, first, second = extended_inverse(t, least)
-        depth, g, s = smooth_depth_energy(t, inverse, width)
+        depth, g, s = smooth_depth_energy(t, inverse, max(width, own[c]))
         value += huber(q_x * q_x + q_y * q_y) + a[c] * depth
         weight, unit_x, unit_y = huber_weight(q_x, q_y)
         g_slope, side = (1 - first) / 2, g / s
@@ -122,7 +123,7 @@ def _linearise_smooth(slope, at_origin, a, u, y, lam, width, least, at, terms):
 
 
 @compiled
-def _line_search(before, at, moved, a, descent, width, least):
+def _line_search(before, at, moved, a, own, descent, width, least):
     """The share of the step to take: halved until the energy falls by Armijo's rule."""
     enough = before + 1e-12 * abs(before)  # rounding may add this much where nothing is left to gain
     share = 1.0
@@ -131,7 +132,7 @@ def _line_search(before, at, moved, a, descent, width, least):
         for c in range(len(a)):
             q_x, q_y = at[c, 0] + share * moved[c, 0], at[c, 1] + share * moved[c, 1]
             t = at[c, 2] + share * moved[c, 2]
-            depth, _, _ = smooth_depth_energy(t, extended_inverse(t, least)[0], width)
+            depth, _, _ = smooth_depth_energy(t, extended_inverse(t, least)[0], max(width, own[c]))
             value += huber(q_x * q_x + q_y * q_y) + a[c] * depth
         if not value > enough + ARMIJO * share * descent:
             break
@@ -158,8 +159,8 @@ def _step(at, terms, moved, y, lam, share):
 
 
 @compiled
-def polish(slope, at_origin, a, u, lam):
-    """Moves u to the optimum, to rounding, and lam to the subgradients of max(t, 1/t) at kinks.
+def polish(slope, at_origin, a, own, u, lam):
+    """Moves u to the optimum, to the last bits, and lam to the subgradients of max(t, 1/t) at kinks.
 
     The method of multipliers: at a kink the energy is a (lam (t - 1) + penalty (t - 1)^2 / 2), and lam moves by the
     penalty times the remaining t - 1. A kink whose lam leaves [-1, 1] does not hold the optimum: its camera goes to
@@ -171,7 +172,7 @@ def polish(slope, at_origin, a, u, lam):
     start, first = u.copy(), lam.copy()
     kink = np.zeros(cameras, dtype=np.bool_)
     for _ in range(ROUNDS):
-        du = newton_step(_linearise_exact(slope, at_origin, a, u, lam, kink))
+        du = newton_step(_linearise_exact(slope, at_origin, a, own, u, lam, kink))
         for j in range(3):
             u[j] += du[j]
         for c in range(cameras):
@@ -187,19 +188,27 @@ def polish(slope, at_origin, a, u, lam):
 
 
 @compiled
-def _linearise_exact(slope, at_origin, a, u, lam, kink):
+def exact_slopes(t, own, lam):
+    """Whether the optimum may be at the kink, lam, and the derivatives of the energy over a: of the exact one, or of
+    the method of multipliers at a kink.
+    """
+    if own > 0:
+        return (False, lam, *rounded_slopes(t, own))
+    near = abs(t - 1) <= KINK
+    if near and abs(lam) < 1:
+        return True, lam, lam + PENALTY * (t - 1), PENALTY
+    side = np.sign(lam if near else t - 1)
+    by_t, bend = (1.0, 0.0) if side > 0 else (-1 / (t * t), 2 / (t * t * t))
+    return False, side, by_t, bend
+
+
+@compiled
+def _linearise_exact(slope, at_origin, a, own, u, lam, kink):
     """Gradient and Hessian; fills `kink` with the cameras at one, and lam of the others with their side."""
     sums = ZERO
     for c in range(len(a)):
         q_x, q_y, t = measured(slope[c], at_origin[c], u)
-        near = abs(t - 1) <= KINK
-        side = np.sign(lam[c] if near else t - 1)
-        kink[c] = near and abs(lam[c]) < 1
-        by_t, bend = (1.0, 0.0) if side > 0 else (-1 / (t * t), 2 / (t * t * t))
-        if kink[c]:
-            by_t, bend = lam[c] + PENALTY * (t - 1), PENALTY
-        else:
-            lam[c] = side
+        kink[c], lam[c], by_t, bend = exact_slopes(t, own[c], lam[c])
         weight, unit_x, unit_y = huber_weight(q_x, q_y)
         xx, xy = weight * (1 + EXACT_RIDGE - unit_x * unit_x), -weight * unit_x * unit_y
         yy, tt = weight * (1 + EXACT_RIDGE - unit_y * unit_y), a[c] * (bend + EXACT_RIDGE)

@@ -109,8 +109,8 @@ class Problems:
 
     @property
     def views(self) -> list[Float[np.ndarray, "problems ..."]]:
-        """Slope, value at the origin and precision, as the compiled functions take them."""
-        return [values.numpy() for values in (self.slope, self.at_origin, self.a)]
+        """Slope, value at the origin, precision and width of the rounded mode, as the compiled functions take them."""
+        return [values.numpy() for values in (self.slope, self.at_origin, self.a, own_width(self.a, self.predictions))]
 
     def in_world(self, u: Float[Tensor, "problems 3"]) -> Float[Tensor, "problems 3"]:
         """origin + directions u."""
@@ -125,6 +125,11 @@ class Problems:
         covariance = flat("covariance", self.predictions.covariance_matrix, shape, event=2)[camera]
         pose = Pose(self.pose.R[camera], self.pose.t[camera])
         return alone, pose.into_world(mean), pose.R.mT @ covariance @ pose.R
+
+
+def own_width(a: Float[Tensor, "*views"], predictions: ProjectedHuber) -> Float[Tensor, "*views"]:
+    """The width of a rounded mode of t, see `phd_exp.fusion.arithmetic`; 0 for cameras that take no part."""
+    return torch.where(a > 0, predictions.rounding / a.clamp_min(torch.finfo(a.dtype).tiny), 0)
 
 
 def status_of(mask: Tensor, valid: Tensor, rigid: Tensor, plane: Plane | None) -> Int[Tensor, " problems"]:

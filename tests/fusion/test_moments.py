@@ -79,9 +79,11 @@ def test_one_camera_has_exactly_the_moments_of_its_prediction(free_axis: bool) -
     torch.testing.assert_close(fused.covariance, R.mT @ predictions.covariance_matrix[:, 1] @ R)
 
 
-@pytest.mark.parametrize(("cameras", "free_axis"), [(2, False), (4, False), (2, True)])
-def test_several_cameras_have_the_moments_of_a_dense_grid(cameras: int, free_axis: bool) -> None:
-    predictions, pose, _ = random_problems(4, cameras, seed=21, outliers=0.0, free_axis=free_axis)
+@pytest.mark.parametrize(
+    ("cameras", "free_axis", "rounding"), [(2, False, 0.0), (4, False, 0.0), (2, True, 0.0), (3, True, 2.0)]
+)
+def test_several_cameras_have_the_moments_of_a_dense_grid(cameras: int, free_axis: bool, rounding: float) -> None:
+    predictions, pose, _ = random_problems(4, cameras, 21, 0.0, free_axis, rounding)
     fused = fuse(predictions, pose, contradiction=0.0)
     mean, covariance, coverage = grid_moments(predictions, pose, fused)
     error = (ratios(fused.covariance, covariance) - 1).abs()

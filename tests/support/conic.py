@@ -22,32 +22,45 @@ class Camera:
     A: np.ndarray
     a: float
     k: np.ndarray
+    rounding: float
     R: np.ndarray
     t: np.ndarray
 
 
 def cameras_of(predictions: ProjectedHuber, pose: Pose) -> list[list[Camera]]:
     k = torch.zeros_like(predictions.mu_xy) if predictions.k is None else predictions.k
-    columns = (predictions.mu_xy, predictions.mu_z, predictions.A, predictions.a, k, pose.R, pose.t)
+    rounding = torch.full_like(predictions.a, predictions.rounding)
+    columns = (predictions.mu_xy, predictions.mu_z, predictions.A, predictions.a, k, rounding, pose.R, pose.t)
     arrays = [column.numpy() for column in columns]
     problems, cameras = predictions.batch_shape
     return [[Camera(*(array[i, j] for array in arrays)) for j in range(cameras)] for i in range(problems)]
 
 
+def unknowns_of(camera: Camera) -> int:
+    """The number of unknowns m, n, w, ... of `cones_of`."""
+    return 4 if camera.rounding else 3
+
+
 def cones_of(
-    camera: Camera, xyz: np.ndarray, at: np.ndarray, m: np.ndarray, n: np.ndarray, w: np.ndarray
+    camera: Camera, xyz: np.ndarray, at: np.ndarray, m: np.ndarray, n: np.ndarray, w: np.ndarray, *v: np.ndarray
 ) -> Iterator[tuple[object, np.ndarray, np.ndarray]]:
     """Cones that contain slope x + constant, of a camera whose position of the object is xyz x + at.
 
-    h(|q|) = min m^2/2 + n over |q| <= m + n, n >= 0; max(t, 1/t) = min w over w >= t, w t >= 1.
+    h(|q|) = min m^2/2 + n over |q| <= m + n, n >= 0; max(t, 1/t) = min w over w >= t, w t >= 1. With a rounded mode
+    w is restricted by (w - t)(w - v) >= (rounding/a)^2 and v t >= 1.
     """
     q = camera.A @ (xyz[:2] - np.outer(camera.mu_xy, xyz[2])) / camera.mu_z
     q_0 = camera.A @ (at[:2] - camera.mu_xy * at[2]) / camera.mu_z
     t, t_0 = xyz[2] / camera.mu_z, at[2] / camera.mu_z
     q, q_0 = q + camera.a * np.outer(camera.k, t), q_0 + camera.a * camera.k * (t_0 - 1)
+    inverse = v[0] if v else w
     yield clarabel.NonnegativeConeT(2), np.stack([n, w - t]), np.array([0, -t_0])
     yield clarabel.SecondOrderConeT(3), np.vstack([m + n, q]), np.array([0, *q_0])
-    yield clarabel.SecondOrderConeT(3), np.stack([w + t, w - t, np.zeros_like(t)]), np.array([t_0, -t_0, 2])
+    above = np.stack([inverse + t, inverse - t, np.zeros_like(t)])
+    yield clarabel.SecondOrderConeT(3), above, np.array([t_0, -t_0, 2])
+    for one in v:
+        barrier = np.stack([2 * w - t - one, one - t, np.zeros_like(t)])
+        yield clarabel.SecondOrderConeT(3), barrier, np.array([-t_0, -t_0, 2 * camera.rounding / camera.a])
 
 
 class Conic:
@@ -66,15 +79,19 @@ class Conic:
         self.constants.append(constant)
         self.cones.append(cone)
 
-    def add_camera(self, camera: Camera, place: int, origin: np.ndarray, unit: float, first: int) -> None:
-        """The energy of a camera for v = origin + unit x[place:], with m, n and w from the unknown `first` on."""
-        m, n, w = (np.eye(1, self.n, first + i)[0] for i in range(3))
+    def add_camera(self, camera: Camera, place: int, origin: np.ndarray, unit: float, first: int) -> int:
+        """The energy of a camera for v = origin + unit x[place:], with its own unknowns from `first` on.
+
+        Returns the first unknown after them.
+        """
+        own = [np.eye(1, self.n, first + i)[0] for i in range(unknowns_of(camera))]
         self.diagonal[first] = 1
         self.c[first + 1], self.c[first + 2] = 1, camera.a
         xyz = np.zeros((3, self.n))
         xyz[:, place : place + 3] = camera.R * unit
-        for cone, slope, constant in cones_of(camera, xyz, camera.R @ origin + camera.t, m, n, w):
+        for cone, slope, constant in cones_of(camera, xyz, camera.R @ origin + camera.t, *own):
             self.require(cone, slope, constant)
+        return first + len(own)
 
     def solved(self, tolerance: float) -> np.ndarray:
         """The unknowns."""
@@ -87,13 +104,13 @@ class Conic:
 
 
 class Program(Conic):
-    """The problem of one position: x = (v - origin)/unit, then m, n, w of each camera."""
+    """The problem of one position: x = (v - origin)/unit, then the unknowns of each camera."""
 
     def __init__(self, cameras: list[Camera], origin: np.ndarray, unit: float) -> None:
-        super().__init__(3 + 3 * len(cameras), is_large=False)
-        self.origin, self.unit = origin, unit
-        for i, camera in enumerate(cameras):
-            self.add_camera(camera, 0, origin, unit, 3 + 3 * i)
+        super().__init__(3 + sum(map(unknowns_of, cameras)), is_large=False)
+        self.origin, self.unit, first = origin, unit, 3
+        for camera in cameras:
+            first = self.add_camera(camera, 0, origin, unit, first)
 
     def on_plane(self, normal: np.ndarray, offset: float) -> "Program":
         """With the constraint normal . v = offset."""

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion import Pose
-from tests.support.conic import Conic, cameras_of
+from tests.support.conic import Conic, cameras_of, unknowns_of
 
 
 def noise(step: float, density: float) -> np.ndarray:
@@ -31,12 +31,13 @@ class PathProgram(Conic):
         self.times, self.density, self.speed = times, density, speed
         self.origin = np.array([0.0, 0.0, 4.0])
         N = len(times)
-        super().__init__(6 * N + 6 * (N - 1) + 3 * len(self.views), is_large=True)
+        first = 12 * N - 6
+        super().__init__(first + sum(unknowns_of(camera) for _, camera in self.views), is_large=True)
         self.diagonal[3:6] = 1 / speed**2
         for k, step in enumerate(np.diff(times)):
             self.add_motion(k, step)
-        for i, (k, camera) in enumerate(self.views):
-            self.add_camera(camera, 6 * k, self.origin, 1.0, 12 * N - 6 + 3 * i)
+        for k, camera in self.views:
+            first = self.add_camera(camera, 6 * k, self.origin, 1.0, first)
 
     def add_motion(self, k: int, step: float) -> None:
         """x_(k+1) = F x_k + root e_k, with |e_k|^2/2 in the energy."""
@@ -66,5 +67,6 @@ class PathProgram(Conic):
             t = v[2] / camera.mu_z
             q = q + camera.a * camera.k * (t - 1)
             r = np.sqrt((q**2).sum())
-            value += (r**2 / 2 if r <= 1 else r - np.longdouble(0.5)) + camera.a * max(t, 1 / t)
+            width, g = camera.rounding / camera.a, (t - 1 / t) / 2
+            value += (r**2 / 2 if r <= 1 else r - np.longdouble(0.5)) + camera.a * (t - g + np.sqrt(g**2 + width**2))
         return value

@@ -18,11 +18,11 @@ def rotations(n: int, generator: torch.Generator) -> Tensor:
 
 
 def random_problems(
-    n: int, cameras: int, seed: int = 0, outliers: float = 0.1, free_axis: bool = False
+    n: int, cameras: int, seed: int = 0, outliers: float = 0.1, free_axis: bool = False, rounding: float = 0.0
 ) -> tuple[ProjectedHuber, Pose, Tensor]:
     """Predictions, poses and true positions; a share of the predictions has errors far beyond its uncertainty.
 
-    With a free axis they have k about 1, and their errors follow it.
+    With a free axis they have k about 1; their errors follow it, and a rounded law of depth.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -44,12 +44,12 @@ def random_problems(
     a = uniform(n, cameras, low=math.log(2), high=math.log(100)).exp()
     centre = torch.zeros(n, cameras, 2, dtype=torch.float64), torch.ones(n, cameras, dtype=torch.float64)
     k = torch.randn(n, cameras, 2, generator=generator, dtype=torch.float64) if free_axis else None
-    error = ProjectedHuber(*centre, A, a, k).rsample((), generator)  # (A^(-1) (q - k a (t - 1)), t)
+    error = ProjectedHuber(*centre, A, a, k, rounding=rounding).rsample((), generator)  # (A^(-1) (q - k a (t - 1)), t)
     mu_xy, mu_z = xy_over_z - error[..., :2] / error[..., 2:], z / error[..., 2]
     wild = (uniform(n, cameras, low=0, high=1) < outliers).double()
     mu_xy = mu_xy + 0.1 * wild[..., None] * torch.randn(n, cameras, 2, generator=generator, dtype=torch.float64)
     mu_z = mu_z * torch.exp(0.5 * wild * torch.randn(n, cameras, generator=generator, dtype=torch.float64))
-    return ProjectedHuber(mu_xy, mu_z, A, a, k), pose, truth.squeeze(1)
+    return ProjectedHuber(mu_xy, mu_z, A, a, k, rounding=rounding), pose, truth.squeeze(1)
 
 
 def columns_of(predictions: ProjectedHuber) -> tuple[Tensor, ...]:
