@@ -88,13 +88,17 @@ class GaussianMixture(Density):
 
         At a maximum, v is the mean of the Gaussians' modes, weighted with their densities and inverse covariances.
         """
-        inverse = torch.linalg.inv(self.parts.covariance_matrix)
-        pull = (inverse @ self.parts.mode[..., None]).squeeze(-1)
+        # in float64, and without covariances: a network may make them so wide or narrow that they have no inverse
+        around = self.parts.whitening.around
+        root = around.measure.double() * pad(around.a.double()[..., None], (2, 0), value=1)[..., None]  # to (q, a t)
+        inverse = root.mT @ root
+        pull = (inverse @ self.parts.mode.double()[..., None]).squeeze(-1)
         found = self.parts.mode.movedim(-2, 0)  # the starts come first
         for _ in range(_STEPS):
             share = (self.parts.log_prob(found[..., None, :]) + self.log_weight).softmax(-1)
             total = (share[..., None, None] * inverse).sum(-3)
-            found = torch.linalg.solve(total, (share[..., None] * pull).sum(-2))
+            moved = torch.linalg.solve_ex(total, (share[..., None] * pull).sum(-2)).result.to(found)
+            found = torch.where(moved.isfinite(), moved, found)
         best = self.log_prob(found).argmax(0)
         return found.gather(0, best[None, ..., None].expand(1, *best.shape, 3)).squeeze(0)
 
