@@ -6,7 +6,7 @@ import math
 import numpy as np
 
 from phd_exp.fusion.arithmetic import compiled, huber_weight
-from phd_exp.fusion.certificate import RADII, least_curvature_of_camera
+from phd_exp.fusion.certificate import RADII, least_curvature_of_camera, subgradient
 from phd_exp.fusion.newton import KINK
 from phd_exp.fusion.tracks.energy import GAUSSIAN, add_camera, motion_energy
 from phd_exp.fusion.tracks.newton import measure_all
@@ -66,9 +66,10 @@ def _subgradient(chain, work, lam, G):
             if a == GAUSSIAN:
                 add_camera(slope, q_x, q_y, t, 0.0, 0.0, 0.0, 0.0, G[k], nothing)
                 continue
-            kink = abs(t - 1) <= KINK and abs(lam[k, c]) < 1
+            own = chain.own[k, c]
+            kink = own == 0 and abs(t - 1) <= KINK and abs(lam[k, c]) < 1
             weight = chain.p[k, c] * huber_weight(q_x, q_y)[0]
-            by_t = lam[k, c] if kink else 1.0 if t >= 1 else -1 / (t * t)
+            by_t = subgradient(t, own, lam[k, c], kink)
             add_camera(slope, weight * q_x, weight * q_y, a * by_t, 0.0, 0.0, 0.0, 0.0, G[k], nothing)
             error += 3 * a * abs(t - 1) if kink else 0.0
     return error
@@ -80,10 +81,10 @@ def _add_least_curvature(chain, work, lam, radius):
     nothing = np.zeros(3)
     for k in range(len(lam)):
         for c in range(lam.shape[1]):
-            slope, a, p = chain.slope[k, c], chain.a[k, c], chain.p[k, c]
+            slope, a, p, own = chain.slope[k, c], chain.a[k, c], chain.p[k, c], chain.own[k, c]
             if a == GAUSSIAN:
                 add_camera(slope, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 1.0, nothing, work.L[k])
                 continue
-            is_at_kink = abs(work.at[k, c, 2] - 1) <= KINK and abs(lam[k, c]) < 1
-            xx, xy, yy, tt = least_curvature_of_camera(slope, work.at[k, c], a, lam[k, c], is_at_kink, radius)
+            is_at_kink = own == 0 and abs(work.at[k, c, 2] - 1) <= KINK and abs(lam[k, c]) < 1
+            xx, xy, yy, tt = least_curvature_of_camera(slope, work.at[k, c], a, own, lam[k, c], is_at_kink, radius)
             add_camera(slope, 0.0, 0.0, 0.0, p * xx, p * xy, p * yy, tt, nothing, work.L[k])

@@ -1,7 +1,7 @@
 """The energy of a path: that of the frames' predictions, and a quadratic one of the motion from frame to frame.
 
 A frame has d unknowns x_k, of which the first three, the position, are measured. Each camera measures (q_x, q_y, t) =
-at_origin + slope x_k, as in `phd_exp.fusion.arithmetic`. Its energy is p h(|q|) + a max(t, 1/t), or
+at_origin + slope x_k, as in `phd_exp.fusion.arithmetic`. Its energy is p h(|q|) + a m(t) with the m there, or
 (q_x^2 + q_y^2 + t^2)/2 of a Gaussian prediction, which has a = GAUSSIAN. A camera that takes no part has slope 0,
 q = 0, t = 1 and a = p = 0.
 
@@ -31,6 +31,7 @@ class Chain(NamedTuple):
         a: weighted precision of the depth, or GAUSSIAN, N x C.
         p: weight of the projection, N x C.
         sharpness: precision of the depth without its weight, N x C.
+        own: the width of a rounded mode of t, N x C.
         mean: expected unknowns of the first frame, d.
         precision: inverse of their covariance, d x d; 0 in a direction that is not known before.
         F: the motion from one frame to the next, N-1 x d x d.
@@ -42,6 +43,7 @@ class Chain(NamedTuple):
     a: np.ndarray
     p: np.ndarray
     sharpness: np.ndarray
+    own: np.ndarray
     mean: np.ndarray
     precision: np.ndarray
     F: np.ndarray
@@ -138,36 +140,36 @@ def add_camera(slope, by_x, by_y, by_t, xx, xy, yy, tt, gradient, curvature):
 
 
 @compiled
-def camera_energy(q_x, q_y, t, a, p, width, least):
+def camera_energy(q_x, q_y, t, a, p, own, width, least):
     """The energy of one camera, smoothed as in `phd_exp.fusion.newton`; exact for the width 0."""
     if a == GAUSSIAN:
         return (q_x * q_x + q_y * q_y + t * t) / 2
-    depth, _, _ = smooth_depth_energy(t, extended_inverse(t, least)[0], width)
+    depth, _, _ = smooth_depth_energy(t, extended_inverse(t, least)[0], max(own, width))
     return p * huber(q_x * q_x + q_y * q_y) + a * depth
 
 
 @compiled
-def frames_energy(at, moved, share, a, p, width, least):
+def frames_energy(chain, at, moved, share, width, least):
     """The energy of all cameras at `at` + share `moved`."""
-    frames, cameras = a.shape
+    frames, cameras = chain.a.shape
     value = 0.0
     for k in range(frames):
         for c in range(cameras):
             q_x, q_y = at[k, c, 0] + share * moved[k, c, 0], at[k, c, 1] + share * moved[k, c, 1]
             t = at[k, c, 2] + share * moved[k, c, 2]
-            value += camera_energy(q_x, q_y, t, a[k, c], p[k, c], width, least)
+            value += camera_energy(q_x, q_y, t, chain.a[k, c], chain.p[k, c], chain.own[k, c], width, least)
     return value
 
 
 @compiled
-def add_smoothed(slope, at, a, p, y, lam, width, least, terms, gradient, curvature):
+def add_smoothed(slope, at, a, p, own, y, lam, width, least, terms, gradient, curvature):
     """Adds one camera's smoothed gradient and its curvature given the duals; fills `terms`; see `fusion.newton`."""
     q_x, q_y, t = at
     if a == GAUSSIAN:
         add_camera(slope, q_x, q_y, t, 1.0, 0.0, 1.0, 1.0, gradient, curvature)
         return
     inverse, first, second = extended_inverse(t, least)
-    _, g, s = smooth_depth_energy(t, inverse, width)
+    _, g, s = smooth_depth_energy(t, inverse, max(own, width))
     weight, unit_x, unit_y = huber_weight(q_x, q_y)
     g_slope, side = (1 - first) / 2, g / s
     terms[:] = weight, unit_x, unit_y, g, g_slope, s

@@ -11,7 +11,7 @@ from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.density import Density
 from phd_exp.fusion.gaussian import average
 from phd_exp.fusion.pose import Pose
-from phd_exp.fusion.problems import Problems, Status, flat, status_of
+from phd_exp.fusion.problems import Problems, Status, flat, own_width, status_of
 from phd_exp.fusion.tracks.energy import GAUSSIAN
 
 
@@ -48,6 +48,7 @@ class Frames:
         slope: d(q_x, q_y, t)/dv, 1/metres; 0 where a camera takes no part.
         at_origin: (q_x, q_y, t) at the origin.
         a: precision of the depth, or GAUSSIAN; 0 where a camera takes no part.
+        own: the width of a rounded mode of t.
         mask: which cameras take part.
         near: the average of each frame's predicted positions; those of the nearest frames where there is none.
         since: seconds since the camera's prediction before; inf without one.
@@ -61,6 +62,7 @@ class Frames:
     slope: Float[np.ndarray, "frames cameras 3 3"]
     at_origin: Float[np.ndarray, "frames cameras 3"]
     a: Float[np.ndarray, "frames cameras"]
+    own: Float[np.ndarray, "frames cameras"]
     mask: Bool[np.ndarray, "frames cameras"]
     near: Float[np.ndarray, "frames 3"]
     since: Float[np.ndarray, "frames cameras"]
@@ -109,7 +111,7 @@ class Frames:
         since = seconds[:, None] - np.concatenate([np.full_like(latest[:1], -np.inf), latest[:-1]])
         slope = np.ascontiguousarray(views.slope.numpy())
         centres = np.where(shown[..., None], views.centres.numpy() - origin, 0.0)
-        of_cameras = slope, at_origin, views.a.numpy(), shown
+        of_cameras = slope, at_origin, views.a.numpy(), views.own.numpy(), shown
         shear = np.tile(np.eye(3, 4), (len(seconds), 1, 1))
         return cls(seconds, origin, *of_cameras, near, since, centres, near, shear)
 
@@ -120,7 +122,7 @@ class Frames:
 
     def unseen(self, time: float) -> "Frames":
         """One later frame, in which no camera takes part."""
-        nothing = {name: np.zeros_like(getattr(self, name)[-1:]) for name in ("slope", "at_origin", "a", "mask")}
+        nothing = {name: np.zeros_like(getattr(self, name)[-1:]) for name in ("slope", "at_origin", "a", "own", "mask")}
         nothing["at_origin"][..., 2] = 1.0
         return replace(self[-1:], times=np.array([time]), **nothing)
 
@@ -161,6 +163,7 @@ class _Views:
     slope: Float[Tensor, "frames cameras 3 3"]
     at_zero: Float[Tensor, "frames cameras 3"]
     a: Float[Tensor, "frames cameras"]
+    own: Float[Tensor, "frames cameras"]
     mask: Bool[Tensor, "frames cameras"]
     position: Float[Tensor, "frames 3"]
     centres: Float[Tensor, "frames cameras 3"]
@@ -174,7 +177,8 @@ def _views(predictions: ProjectedHuber | Gaussian, pose: Pose, mask: Tensor | No
     origin = problems.origin.nan_to_num()[:, None, :, None]
     at_zero = problems.at_origin - (problems.slope @ origin).squeeze(-1)
     centres = problems.pose.into_world(predictions.apex.double().cpu())
-    return _Views(problems.slope, at_zero, problems.a, problems.mask, problems.origin, centres, problems.status)
+    own = own_width(problems.a, predictions)
+    return _Views(problems.slope, at_zero, problems.a, own, problems.mask, problems.origin, centres, problems.status)
 
 
 def _gaussian_views(predictions: Gaussian, pose: Pose, mask: Tensor | None) -> _Views:
@@ -191,4 +195,4 @@ def _gaussian_views(predictions: Gaussian, pose: Pose, mask: Tensor | None) -> _
     status = status_of(mask, valid, pose.is_rigid, None)
     centres = pose.into_world(torch.zeros(3, dtype=torch.float64))
     a = torch.where(mask, GAUSSIAN, 0.0).double()
-    return _Views(slope, at_zero, a, mask, average(pose.into_world(mean), mask), centres, status)
+    return _Views(slope, at_zero, a, torch.zeros_like(a), mask, average(pose.into_world(mean), mask), centres, status)

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from phd_exp.fusion.arithmetic import TINY, compiled, huber
+from phd_exp.fusion.arithmetic import TINY, compiled, depth_excess, huber
 from phd_exp.fusion.tracks.energy import GAUSSIAN, add_camera, motion_energy
 from phd_exp.fusion.tracks.newton import measure_all, newton_step
 from phd_exp.fusion.tracks.tridiagonal import log_determinant, selected_inverse
@@ -39,7 +39,7 @@ def propagate(chain, work, mean, covariance, factors):
     measure_all(chain, mean, work.at)
     for k in range(frames):
         for c in range(cameras):
-            first_factor(work.at[k, c], chain.a[k, c], chain.p[k, c], chain.sharpness[k, c], factors[k, c])
+            first_factor(work.at[k, c], chain.a[k, c], chain.p[k, c], chain.sharpness[k, c], chain.own[k, c], factors[k, c])
     for _ in range(STEPS):
         _gaussian_path(chain, work, mean, factors)
         selected_inverse(work.L, work.below, covariance)
@@ -47,7 +47,7 @@ def propagate(chain, work, mean, covariance, factors):
         for k in range(frames):
             for c in range(cameras):
                 marginal = work.at[k, c], spread(chain.slope[k, c], covariance[k])
-                moved, gained = update(*marginal, chain.a[k, c], chain.p[k, c], factors[k, c])
+                moved, gained = update(*marginal, chain.a[k, c], chain.p[k, c], chain.own[k, c], factors[k, c])
                 change, log_ratio = max(change, moved), log_ratio + gained
         if not change > SETTLED:
             break
@@ -55,7 +55,7 @@ def propagate(chain, work, mean, covariance, factors):
 
 
 @compiled
-def first_factor(at, a, p, sharpness, factor):
+def first_factor(at, a, p, sharpness, own, factor):
     """Fills in a factor whose curvature and gradient at the optimum resemble those of the density's energy."""
     if a == GAUSSIAN:
         factor[:4] = 1.0, 0.0, 1.0, 1.0
@@ -64,7 +64,7 @@ def first_factor(at, a, p, sharpness, factor):
     squared = q_x * q_x + q_y * q_y
     weight = p / math.sqrt(3 + squared)
     rest = weight - p / math.sqrt(max(squared, 1.0))
-    bend = a / (2 / max(sharpness, TINY) + abs(t - 1))
+    bend = a / (2 / max(sharpness, TINY) + math.hypot(t - 1, own))
     factor[:] = weight, 0.0, weight, bend, rest * q_x, rest * q_y, bend * (t - (t - 1) / 2)
 
 
@@ -110,7 +110,7 @@ def spread(slope, covariance):
 
 
 @compiled
-def update(at, spread, a, p, factor):
+def update(at, spread, a, p, own, factor):
     """Replaces the factors of one camera; returns the largest change, and the log of that of the integral.
 
     With mean m and covariance S = R R^T of q, and those of the path with the true density, m + R z and R Z R^T, the
@@ -132,7 +132,7 @@ def update(at, spread, a, p, factor):
     factor[4] += xx * at[0] + xy * at[1] + u * p_x + w * p_y
     factor[5] += xy * at[0] + yy * at[1] + v * p_y
     deviation = math.sqrt(max(spread[3], TINY))
-    log_t, mean, variance = _tilted_depth(at[2], deviation, a, factor[3], factor[6])
+    log_t, mean, variance = _tilted_depth(at[2], deviation, a, own, factor[3], factor[6])
     tt = 1 / variance - 1 / spread[3]
     factor[3] += tt
     factor[6] += mean / variance - at[2] / spread[3]
@@ -164,10 +164,10 @@ def _tilted_projection(q_x, q_y, r_xx, r_yx, r_yy, p, factor):
 
 
 @compiled
-def _tilted_depth(t, deviation, a, precision, linear):
+def _tilted_depth(t, deviation, a, own, precision, linear):
     """log E[ratio], and mean and variance of t weighted by the ratio of density and factor.
 
-    By Gauss's rule on each side of the kink.
+    By Gauss's rule on each side of the mode, which may be a kink.
     """
     points = len(_PLACES)
     place, log_weight = np.empty(2 * points), np.full(2 * points, -np.inf)
@@ -181,7 +181,7 @@ def _tilted_depth(t, deviation, a, precision, linear):
             standard = (x - t) / deviation
             log_factor = linear * x - precision * x * x / 2
             log_weight[i] = _LOG_SHARES[i % points] + math.log((high - low) / deviation) - standard * standard / 2
-            log_weight[i] -= a * max(x, 1 / x) + log_factor
+            log_weight[i] -= a * (1 + depth_excess(x, own)) + log_factor
     highest = log_weight.max()
     total = first = second = 0.0
     for i in range(2 * points):

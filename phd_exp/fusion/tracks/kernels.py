@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from phd_exp.fusion import arithmetic
+from phd_exp.fusion import certificate as fusion_certificate
 from phd_exp.fusion import newton as fusion_newton
 from phd_exp.fusion.tracks import certificate, energy, gaussian, newton, tridiagonal
 from phd_exp.fusion.tracks.certificate import certify
@@ -33,7 +34,7 @@ def _functions(sources):
         gap = certify(chain, work, x, lam, distance)
         measure_all(chain, x, work.at)
         motion = motion_energy(chain, 1.0, x, work.g)
-        return True, motion + frames_energy(work.at, work.at, 0.0, chain.a, chain.p, 0.0, 1e-6), gap
+        return True, motion + frames_energy(chain, work.at, work.at, 0.0, 0.0, 1e-6), gap
 
     @njit(cache=True, error_model="numpy")
     def moments(chain, mean, covariance, factors):
@@ -44,6 +45,6 @@ def _functions(sources):
     return most_likely, moments
 
 
-_COMPILED = (arithmetic, fusion_newton, certificate, energy, gaussian, newton, tridiagonal)
+_COMPILED = (arithmetic, fusion_newton, fusion_certificate, certificate, energy, gaussian, newton, tridiagonal)
 _SOURCES = b"".join(Path(str(module.__file__)).read_bytes() for module in _COMPILED)
 most_likely, moments = _functions(hashlib.sha256(_SOURCES).hexdigest())

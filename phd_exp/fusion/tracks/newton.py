@@ -17,7 +17,6 @@ from phd_exp.fusion.newton import (
     EXACT_RIDGE,
     FARTHEST,
     FIRST_WIDTH,
-    KINK,
     LEAST_DEPTHS,
     MOST_HALVINGS,
     MOST_STEPS,
@@ -27,6 +26,7 @@ from phd_exp.fusion.newton import (
     SHRINK,
     STILL,
     WIDTH_FLOOR,
+    exact_slopes,
 )
 from phd_exp.fusion.tracks.energy import (
     GAUSSIAN,
@@ -149,8 +149,8 @@ def _linearise_smoothed(chain, work, x, y, lam, width, least):
     work.L[:] = work.motion
     for k in range(len(x)):
         for c in range(chain.a.shape[1]):
-            views = chain.slope[k, c], work.at[k, c], chain.a[k, c], chain.p[k, c], y[k, c], lam[k, c]
-            add_smoothed(*views, width, least, work.terms[k, c], work.g[k], work.L[k])
+            views = chain.slope[k, c], work.at[k, c], chain.a[k, c], chain.p[k, c], chain.own[k, c]
+            add_smoothed(*views, y[k, c], lam[k, c], width, least, work.terms[k, c], work.g[k], work.L[k])
     return motion
 
 
@@ -161,12 +161,12 @@ def _line_search(chain, work, motion, width, least):
     measure(chain.slope, work.dx, work.moved)
     descent, by_motion = (work.g * work.dx).sum(), (work.pull * work.dx).sum()
     bend = motion_energy(chain, 0.0, work.dx, work.pull)
-    before = motion + frames_energy(work.at, work.moved, 0.0, chain.a, chain.p, width, least)
+    before = motion + frames_energy(chain, work.at, work.moved, 0.0, width, least)
     enough = before + 1e-12 * abs(before)  # rounding may add this much where nothing is left to gain
     share = 1.0
     for _ in range(MOST_HALVINGS):
         value = motion + share * (by_motion + share * bend)
-        value += frames_energy(work.at, work.moved, share, chain.a, chain.p, width, least)
+        value += frames_energy(chain, work.at, work.moved, share, width, least)
         if not value > enough + ARMIJO * share * descent:
             break
         share /= 2
@@ -230,14 +230,7 @@ def _add_exact(chain, work, k, c, lam, kink):
     if a == GAUSSIAN:
         add_camera(slope, q_x, q_y, t, 1.0, 0.0, 1.0, 1.0, g, L)
         return
-    near = abs(t - 1) <= KINK
-    side = np.sign(lam[k, c] if near else t - 1)
-    kink[k, c] = near and abs(lam[k, c]) < 1
-    by_t, bend = (1.0, 0.0) if side > 0 else (-1 / (t * t), 2 / (t * t * t))
-    if kink[k, c]:
-        by_t, bend = lam[k, c] + PENALTY * (t - 1), PENALTY
-    else:
-        lam[k, c] = side
+    kink[k, c], lam[k, c], by_t, bend = exact_slopes(t, chain.own[k, c], lam[k, c])
     weight, unit_x, unit_y = huber_weight(q_x, q_y)
     weight *= chain.p[k, c]
     xx, xy = weight * (1 + EXACT_RIDGE - unit_x * unit_x), -weight * unit_x * unit_y

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from scipy import special
 
-from phd_exp.distributions.level import credible_level
+from phd_exp.distributions.rounded import depth_law
 from phd_exp.fusion.problems import Status
 from phd_exp.fusion.tracks.chain import Array, moving, start
 from phd_exp.fusion.tracks.energy import GAUSSIAN, Chain
@@ -86,21 +86,26 @@ class Solved:
         at = frames.at_origin + (frames.slope @ self.unknowns[:, None, :3, None])[..., 0]
         q_x, q_y, t = np.moveaxis(at, -1, 0)
         inverse = 1 / np.where(t == 0, np.inf, t)  # t of a Gaussian prediction may be 0
-        squared, a = q_x**2 + q_y**2, frames.a
-        huber = np.where(squared > 1, np.sqrt(squared) - 0.5, squared / 2) + a * (np.maximum(t, inverse) - 1)
+        squared, a, g = q_x**2 + q_y**2, frames.a, (t - inverse) / 2
+        depth = (t + inverse) / 2 + np.hypot(g, frames.own) - 1 - frames.own
+        huber = np.where(squared > 1, np.sqrt(squared) - 0.5, squared / 2) + a * depth
         return np.where(a == GAUSSIAN, (squared + t**2) / 2, huber)
 
     @property
     def surprise(self) -> Float[Array, "frames cameras"]:
         """Credible level of the path in each view; NaN where masked out."""
-        return np.where(self.frames.mask, levels(self.excess, self.frames.a), np.nan)
+        return np.where(self.frames.mask, levels(self.excess, self.frames.a, self.frames.own), np.nan)
 
 
-def levels(excess: Float[Array, "*views"], a: Float[Array, "*views"]) -> Float[Array, "*views"]:
+def levels(
+    excess: Float[Array, "*views"], a: Float[Array, "*views"], own: Float[Array, "*views"]
+) -> Float[Array, "*views"]:
     """Credible levels of excess energies, under Gaussian predictions where a is GAUSSIAN."""
     if (a == GAUSSIAN).any():
         return special.gammainc(1.5, excess)
-    return credible_level(torch.from_numpy(excess), torch.from_numpy(a)).numpy()
+    log_a = torch.from_numpy(np.log(np.maximum(a, np.finfo(float).tiny)))
+    found: Array = depth_law(log_a, float((own * a).max())).level(torch.from_numpy(excess)).numpy()
+    return found
 
 
 def solve(
@@ -119,7 +124,7 @@ def solve(
     if slow != NONE:
         a, p = (weights(time, frames.since, frames.mask) for time in vars(slow).values())
         a, views = a * frames.a, apart(frames)
-    chain = Chain(*views, a, p, frames.a, *motion)
+    chain = Chain(*views, a, p, frames.a, frames.own, *motion)
     x, distance = x.copy(), np.empty(len(x))
     in_front, energy, gap = most_likely(chain, x, distance)
     if not in_front:

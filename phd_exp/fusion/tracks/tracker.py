@@ -33,6 +33,7 @@ class State:
         velocity_covariance: square metres per square second.
         excess: energy of the position in each view above the view's lowest energy, nats.
         a: precision of each view's depth.
+        own: the width of its rounded mode, over its distance.
     """
 
     time: float
@@ -43,11 +44,12 @@ class State:
     velocity_covariance: Float[Tensor, "3 3"]
     excess: Float[Tensor, " cameras"]
     a: Float[Tensor, " cameras"]
+    own: Float[Tensor, " cameras"]
 
     @property
     def surprise(self) -> Float[Tensor, " cameras"]:
         """Credible level of the position in each view, near 1 where they contradict; NaN where masked out."""
-        level = torch.from_numpy(levels(self.excess.numpy(), self.a.numpy()))
+        level = torch.from_numpy(levels(self.excess.numpy(), self.a.numpy(), self.own.numpy()))
         return level.masked_fill(self.a == 0, torch.nan)
 
 
@@ -196,7 +198,7 @@ class Tracker:
         mean, covariance, origin = window.mean[k], window.covariance[k], window.frames.origin
         numbers = (
             window.unknowns[k, :3] + origin, window.unknowns[k, v], mean[:3] + origin,
-            covariance[:3, :3], covariance[v, v], window.excess[k], window.frames.a[k],
+            covariance[:3, :3], covariance[v, v], window.excess[k], window.frames.a[k], window.frames.own[k],
         )  # fmt: skip
         return State(float(window.frames.times[k]), *(torch.from_numpy(value.copy()) for value in numbers))
 
