@@ -31,14 +31,16 @@ def irregular(frames: int, seed: int) -> np.ndarray:
 
 
 def with_outliers(predictions: ProjectedHuber, share: float, seed: int) -> ProjectedHuber:
-    """A share of the predictions far beyond their uncertainty; those of odd seeds have a free axis."""
+    """A share of the predictions far beyond their uncertainty; those of odd seeds have a free axis, every third
+    a rounded mode.
+    """
     generator = torch.Generator().manual_seed(seed)
     shape = predictions.batch_shape
     wild = (torch.rand(shape, generator=generator) < share).double()
     mu_xy = predictions.mu_xy + 0.1 * wild[..., None] * torch.randn(*shape, 2, generator=generator).double()
     mu_z = predictions.mu_z * (0.5 * wild * torch.randn(shape, generator=generator).double()).exp()
     k = 0.5 * torch.randn(*shape, 2, generator=generator).double() if seed % 2 else None
-    return ProjectedHuber(mu_xy, mu_z, predictions.A, predictions.a, k)
+    return ProjectedHuber(mu_xy, mu_z, predictions.A, predictions.a, k, rounding=0.0 if seed % 3 else 2.0)
 
 
 @pytest.mark.parametrize("cameras", [1, 2])

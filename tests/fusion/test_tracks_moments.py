@@ -25,11 +25,11 @@ DEPTH = Errors(deviation=0.05, depth_time=1.0)  # 38 % of the variance
 BOTH = Errors(0.05, 1.0, share=0.4, projection_time=0.5)
 
 
-@pytest.mark.parametrize("a", [3.0, 20.0, 100.0])
-def test_one_frame_has_the_moments_of_its_density(a: float) -> None:
+@pytest.mark.parametrize(("a", "rounding"), [(3.0, 0.0), (20.0, 0.0), (100.0, 0.0), (20.0, 2.0)])
+def test_one_frame_has_the_moments_of_its_density(a: float, rounding: float) -> None:
     one = torch.ones(1, 1).double()
     A = 100 * torch.tensor([[2.0, 0.5], [0.5, 1.0]]).double().expand(1, 1, 2, 2)
-    density = ProjectedHuber(torch.tensor([[[0.05, -0.02]]]).double(), 4 * one, A, a * one)
+    density = ProjectedHuber(torch.tensor([[[0.05, -0.02]]]).double(), 4 * one, A, a * one, rounding=rounding)
     path = track(torch.zeros(1), density, around(1), LAW)
     off = squared_mahalanobis(path.mean - density.mean[:, 0], density.covariance_matrix[:, 0])
     ratios = torch.linalg.eigvals(torch.linalg.solve(density.covariance_matrix[0, 0], path.covariance[0])).real
