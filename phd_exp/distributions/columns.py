@@ -23,7 +23,7 @@ NEES = ("nees", "nees_x", "nees_y", "nees_z")
 
 
 def parameter_names(table: Collection[str]) -> tuple[str, ...]:
-    """The columns of parameters that a table has, or lacks: `PARAMETERS`, and the further ones if it has one of them."""
+    """The columns of parameters that a table has or lacks: `PARAMETERS`, and further ones if it has one of them."""
     further = (names for names in (FREE_AXIS, ROUNDING) if set(names) & set(table))
     return sum(further, PARAMETERS)
 

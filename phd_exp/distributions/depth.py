@@ -13,13 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from phd_exp.distributions.special import (
-    log_scaled_normaliser,
-    scaled_expint,
-    signed_log1p,
-    tail_moment,
-    weighted_integral,
-)
+from phd_exp.distributions.special import scaled_expint, signed_log1p, tail_moment, weighted_integral
 
 LARGEST_ENERGY = 700.0  # the excess energy above which 1 + e^(-w) rounds to 1 in any precision
 _NEWTON_STEPS = 6  # to rounding from any a and p; test_icdf_inverts_cdf covers both tails

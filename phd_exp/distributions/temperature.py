@@ -66,7 +66,7 @@ class Temperature:
     def fit(cls, distribution: ProjectedHuber, xyz: Float[Tensor, "samples 3"]) -> "Temperature":
         """The temperatures that minimise the mean NLL of true positions (metres) under a batch of predictions.
 
-        With log T = -v it is the sum of the means of h(e^v |q|) - 2 v and of the NLL of depth with the precision a e^v.
+        With log T = -v it is the sum of the means of h(e^v |q|) - 2 v and of the NLL of depth at the precision a e^v.
         If all have one v, it is the root of a derivative; the slope is found from there, with a normal prior about 0.
 
         Raises ValueError if there are no samples, if one is not finite or not in front of the camera, or if all lie

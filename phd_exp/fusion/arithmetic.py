@@ -5,8 +5,9 @@ the unknowns u: `at_origin` (3) plus `slope` (3 x 3) times u. Its energy is h(|q
 
     m(t) = (t + 1/t)/2 + sqrt(g^2 + width^2),    g = (t - 1/t)/2,
 
-which is max(t, 1/t) for the width 0, that of the paper's law; see `phd_exp.distributions.rounded` for others. On a plane there are two unknowns; the third column of
-each slope is zero, and so is H_22 below. A camera that takes no part has slope 0, q = 0, t = 1 and a = 0.
+which is max(t, 1/t) for the width 0, that of the paper's law; others have a rounded mode, see
+`phd_exp.distributions.rounded`. On a plane there are two unknowns; the third column of each slope is zero, and so is
+H_22 below. A camera that takes no part has slope 0, q = 0, t = 1 and a = 0.
 
 A gradient and a symmetric matrix are one tuple (g_0, g_1, g_2, H_00, H_10, H_11, H_20, H_21, H_22), which stays in
 registers. Arguments of compiled functions have no annotations: the types are those of the values. Division by zero

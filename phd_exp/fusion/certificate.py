@@ -5,7 +5,18 @@ import math
 
 import numpy as np
 
-from phd_exp.fusion.arithmetic import TINY, ZERO, add, compiled, factor, forward, huber_weight, measured, rounded_slopes, squared_norm
+from phd_exp.fusion.arithmetic import (
+    TINY,
+    ZERO,
+    add,
+    compiled,
+    factor,
+    forward,
+    huber_weight,
+    measured,
+    rounded_slopes,
+    squared_norm,
+)
 from phd_exp.fusion.newton import KINK
 
 RADII = (1e-8, 1e-6, 1e-4, 1e-2)  # metres; balls in which the curvature is bounded from below

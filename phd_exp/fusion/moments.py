@@ -66,7 +66,8 @@ def moments(views, u, points, log_density, radii, mean, covariance, inside):
         root[:, j] = backward(L, root[:, j])
     mean[:] = u
     for points_used in (PILOT, PILOT, len(value)):
-        first, second, total = _weighted(slope, at_origin, a, own, mean, root, points, log_density, value[:points_used])
+        here = mean, root, points, log_density, value[:points_used]
+        first, second, total = _weighted(slope, at_origin, a, own, *here)
         if points_used == len(value):
             _probabilities(points, value, total, first, second, radii, inside)
         _move(mean, root, covariance, first, second)
@@ -169,7 +170,8 @@ def _averaged_precision(slope, at_origin, a, own, u):
     """About the second derivative of the energy averaged over N(u, its inverse), a fixed point; 1/square metres.
 
     For h the weight 1/sqrt(1 + E|q|^2); for a max(t, 1/t), t Gaussian with deviation s, its jump of slope at the kink
-    times the density there, and its curvature before: a (2 N(1; t, s^2) + 2 P(T < 1)/t^3). A rounded mode widens the jump.
+    times the density there, and its curvature before: a (2 N(1; t, s^2) + 2 P(T < 1)/t^3). A rounded mode widens the
+    jump.
 
     Source: own derivation.
     """

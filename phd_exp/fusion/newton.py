@@ -22,7 +22,17 @@ import math
 
 import numpy as np
 
-from phd_exp.fusion.arithmetic import ZERO, add, change, compiled, huber, huber_weight, measured, newton_step, rounded_slopes
+from phd_exp.fusion.arithmetic import (
+    ZERO,
+    add,
+    change,
+    compiled,
+    huber,
+    huber_weight,
+    measured,
+    newton_step,
+    rounded_slopes,
+)
 
 WIDTH_FLOOR = 1e-9
 FIRST_WIDTH, SHRINK = 1.0, 0.01
@@ -43,7 +53,8 @@ LEAST_DEPTHS = (1e-2, 1e-4, 1e-6)
 def optimum(slope, at_origin, a, own, u, lam):
     """Moves u to the optimum and lam to its multipliers; returns whether one has t >= 1e-6 in every camera.
 
-    `own` is the width of each camera. If not, every position in front of all cameras is worse than what 1/t = 1e6 costs in one of them.
+    If not, every position in front of all cameras is worse than what 1/t = 1e6 costs in one of them. `own` is the
+    width of each camera's rounded mode.
     """
     for least in LEAST_DEPTHS:
         lam[:] = 0.0

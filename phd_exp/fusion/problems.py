@@ -109,8 +109,9 @@ class Problems:
 
     @property
     def views(self) -> list[Float[np.ndarray, "problems ..."]]:
-        """Slope, value at the origin, precision and width of the rounded mode, as the compiled functions take them."""
-        return [values.numpy() for values in (self.slope, self.at_origin, self.a, own_width(self.a, self.predictions))]
+        """Slope, value at the origin, precision and width of a rounded mode, as the compiled functions take them."""
+        own = own_width(self.a, self.predictions)
+        return [values.numpy() for values in (self.slope, self.at_origin, self.a, own)]
 
     def in_world(self, u: Float[Tensor, "problems 3"]) -> Float[Tensor, "problems 3"]:
         """origin + directions u."""

@@ -24,7 +24,8 @@ def from_camera_frame(
     U = torch.tensor([[c, -s], [s, c]], dtype=torch.float64)
     A = U @ torch.diag(torch.tensor(eigenvalues, dtype=torch.float64)) @ U.T
     centre, mu_z_, a_ = (torch.tensor(x, dtype=torch.float64) for x in (mu_xy, mu_z, a))
-    return ProjectedHuber(centre, mu_z_, (A + A.T) / 2, a_, k and torch.tensor(k, dtype=torch.float64), rounding=rounding)
+    k_ = k and torch.tensor(k, dtype=torch.float64)
+    return ProjectedHuber(centre, mu_z_, (A + A.T) / 2, a_, k_, rounding=rounding)
 
 
 def from_raw(*raw: float) -> ProjectedHuber:

@@ -16,7 +16,7 @@ AROUND = ProjectedHuber.from_raw(RAW, f=1550.0, S=224.0, mu_z0=2.5e-3)
 
 @pytest.mark.parametrize("is_rounded", [False, True])
 @pytest.mark.parametrize("freedom", [2.2, 3.0, 6.0, 30.0, 1e6])
-def test_no_other_temperatures_give_the_students_samples_a_higher_likelihood(freedom: float, is_rounded: bool) -> None:
+def test_no_other_temperatures_give_samples_a_higher_likelihood(freedom: float, is_rounded: bool) -> None:
     further = torch.tensor([*AXIS, freedom - 3 if freedom > 3 else math.log(freedom - 2)]).double()
     xyz = StudentT(AROUND, further).rsample((100_000,), torch.Generator().manual_seed(0))
     closest = closest_to_student(AROUND, further, is_rounded)

@@ -44,7 +44,8 @@ def random_problems(
     a = uniform(n, cameras, low=math.log(2), high=math.log(100)).exp()
     centre = torch.zeros(n, cameras, 2, dtype=torch.float64), torch.ones(n, cameras, dtype=torch.float64)
     k = torch.randn(n, cameras, 2, generator=generator, dtype=torch.float64) if free_axis else None
-    error = ProjectedHuber(*centre, A, a, k, rounding=rounding).rsample((), generator)  # (A^(-1) (q - k a (t - 1)), t)
+    law = ProjectedHuber(*centre, A, a, k, rounding=rounding)
+    error = law.rsample((), generator)  # (A^(-1) (q - k a (t - 1)), t)
     mu_xy, mu_z = xy_over_z - error[..., :2] / error[..., 2:], z / error[..., 2]
     wild = (uniform(n, cameras, low=0, high=1) < outliers).double()
     mu_xy = mu_xy + 0.1 * wild[..., None] * torch.randn(n, cameras, 2, generator=generator, dtype=torch.float64)

@@ -122,7 +122,8 @@ class Frames:
 
     def unseen(self, time: float) -> "Frames":
         """One later frame, in which no camera takes part."""
-        nothing = {name: np.zeros_like(getattr(self, name)[-1:]) for name in ("slope", "at_origin", "a", "own", "mask")}
+        masked = "slope", "at_origin", "a", "own", "mask"
+        nothing = {name: np.zeros_like(getattr(self, name)[-1:]) for name in masked}
         nothing["at_origin"][..., 2] = 1.0
         return replace(self[-1:], times=np.array([time]), **nothing)
 

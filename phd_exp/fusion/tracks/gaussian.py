@@ -39,7 +39,8 @@ def propagate(chain, work, mean, covariance, factors):
     measure_all(chain, mean, work.at)
     for k in range(frames):
         for c in range(cameras):
-            first_factor(work.at[k, c], chain.a[k, c], chain.p[k, c], chain.sharpness[k, c], chain.own[k, c], factors[k, c])
+            camera = chain.a[k, c], chain.p[k, c], chain.sharpness[k, c], chain.own[k, c]
+            first_factor(work.at[k, c], *camera, factors[k, c])
     for _ in range(STEPS):
         _gaussian_path(chain, work, mean, factors)
         selected_inverse(work.L, work.below, covariance)
