@@ -1,6 +1,6 @@
 """Views of an image whose pixels are means over areas: plain functions of torch, which exported graphs share."""
 
-from collections.abc import Callable
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float, UInt8
@@ -28,17 +28,11 @@ def area_means(
     the pixel along both axes (the root of the sum of squares of its two edges), and at least that of a pixel of the
     image, so that views of more pixels are interpolated linearly. Beyond the image, and at NaN, all is grey.
     """
-    return _means(corners, lambda x, y: _at(table, x, y))
-
-
-def _means(corners: Tensor, at: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-    """`area_means`, given the sums up to the places (x, y)."""
-    middle, side = _rectangles(corners)
-    side = side.clamp_min(1)
-    (left, top), (right, bottom) = ((middle + sign * side / 2).unbind(-1) for sign in (-1, 1))
-    total = at(right, bottom) - at(left, bottom) - at(right, top) + at(left, top)
-    mean = (GREY + total / side.prod(-1, keepdim=True)).nan_to_num(float(GREY))  # where a corner is NaN
-    return _rounded(mean)
+    (x, width), (y, height) = (_extents(axis) for axis in corners.unbind(-1))
+    width, height = width.clamp_min(1), height.clamp_min(1)
+    left, right, top, bottom = x - width / 2, x + width / 2, y - height / 2, y + height / 2
+    total = _at(table, right, bottom) - _at(table, left, bottom) - _at(table, right, top) + _at(table, left, top)
+    return _rounded((total / (width * height)[..., None]).nan_to_num(0.0))  # NaN where a corner is
 
 
 def view(
@@ -49,37 +43,64 @@ def view(
     If no pixel is larger than those of the image, the means are bilinear interpolations, which need a quarter of the
     look-ups and no sums. All are computed in float64 and differ in its rounding alone.
     """
-    middle, side = _rectangles(corners)
-    if side.nan_to_num(0.0).max() > 1:
-        bands = sums(image).permute(2, 0, 1).contiguous()
-        return _means(corners, lambda x, y: _sampled(bands, x, y))
-    size = middle.new_tensor([image.shape[1], image.shape[0]])
-    place = (2 * middle / size - 1).nan_to_num(BEYOND).clamp(-BEYOND, BEYOND)
-    values = image.permute(2, 0, 1)[None].to(middle.dtype).sub_(GREY)  # zero beyond the edges
-    return _rounded(GREY + grid_sample(values, place[None], align_corners=False)[0].permute(1, 2, 0))
+    extents = [_extents(axis) for axis in corners.unbind(-1)]
+    is_shrunk = any((side > 1).any() for _, side in extents)
+    means = (_shrunk if is_shrunk else _enlarged)(image.permute(2, 0, 1), extents)
+    return _rounded(means.permute(1, 2, 0))
 
 
-def _rectangles(
-    corners: Float[Tensor, "*views lower further 2"],
-) -> tuple[Float[Tensor, "*views rows columns 2"], Float[Tensor, "*views rows columns 2"]]:
-    """The middles and the sides (across, down) of the rectangles about pixels with these corners."""
-    a, b = corners[..., :-1, :-1, :], corners[..., :-1, 1:, :]
-    c, d = corners[..., 1:, :-1, :], corners[..., 1:, 1:, :]
-    across, down = (b + d - a - c) / 2, (c + d - a - b) / 2
-    return (a + b + c + d) / 4, (across.square() + down.square()).sqrt()
+def _extents(
+    corners: Float[Tensor, "*views lower further"],
+) -> tuple[Float[Tensor, "*views rows columns"], Float[Tensor, "*views rows columns"]]:
+    """Along one axis: the middles of pixels with these corners, and the sides of their rectangles."""
+    upper, lower = corners[..., :-1, :], corners[..., 1:, :]
+    both, edge = upper + lower, lower - upper
+    across, down = both[..., 1:] - both[..., :-1], edge[..., 1:] + edge[..., :-1]
+    return (both[..., 1:] + both[..., :-1]) / 4, (across.square() + down.square()).sqrt() / 2
+
+
+def _enlarged(
+    image: UInt8[Tensor, "bands height width"], extents: Sequence[tuple[Tensor, Tensor]]
+) -> Float[Tensor, "bands rows columns"]:
+    """The interpolated values, less grey."""
+    less_grey = torch.empty(image.shape, dtype=torch.float64).copy_(image).sub_(GREY)  # zero beyond the edges
+    x, y = (
+        (middle * (2 / n) - 1).nan_to_num_(BEYOND).clamp_(-BEYOND, BEYOND)
+        for (middle, _), n in zip(extents, image.shape[:0:-1], strict=True)
+    )
+    return grid_sample(less_grey[None], torch.stack([x, y], dim=-1)[None], align_corners=False)[0]
+
+
+def _shrunk(
+    image: UInt8[Tensor, "bands height width"], extents: Sequence[tuple[Tensor, Tensor]]
+) -> Float[Tensor, "bands rows columns"]:
+    """The means, less grey, by torch's own interpolation of the `sums`, in half the time; graphs do not have it."""
+    bands, height, width = image.shape
+    table = torch.zeros(bands, height + 1, width + 1, dtype=torch.float64)
+    table[:, 1:, 1:].copy_(image).sub_(GREY)
+    table.cumsum_(1).cumsum_(2)
+    area, ends = torch.ones(()), []
+    for (middle, side), n in zip(extents, (width, height), strict=True):
+        side = side.clamp_min(1)
+        area, place, half = area * side, middle * (2 / n) - 1, side / n
+        ends.append((place - half, place + half))
+    (left, right), (top, bottom) = ends
+    total = _summed(table, right, bottom).sub_(_summed(table, left, bottom))
+    total.sub_(_summed(table, right, top)).add_(_summed(table, left, top))
+    return total.div_(area).nan_to_num_(0.0)  # NaN where a corner is
+
+
+def _summed(
+    table: Float[Tensor, "bands bottom right"], x: Float[Tensor, "rows columns"], y: Float[Tensor, "rows columns"]
+) -> Float[Tensor, "bands rows columns"]:
+    """`_at`, for places from -1 to 1; NaN counts as -1."""
+    place = torch.stack([x, y], dim=-1)[None]
+    return grid_sample(table[None], place, padding_mode="border", align_corners=True)[0]
 
 
 def _rounded(mean: Float[Tensor, "*views rows columns bands"]) -> UInt8[Tensor, "*views rows columns bands"]:
-    return ((mean * TIES).round() / TIES).round().clamp(0, 255).to(torch.uint8)
-
-
-def _sampled(
-    bands: Float[Tensor, "bands bottom right"], x: Float[Tensor, "rows columns"], y: Tensor
-) -> Float[Tensor, "rows columns bands"]:
-    """`_at` by torch's own interpolation, in half the time; graphs in float64 do not have it."""
-    size = bands.new_tensor([bands.shape[2] - 1, bands.shape[1] - 1])
-    place = (2 * torch.stack([x, y], dim=-1) / size - 1).nan_to_num(-1.0)
-    return grid_sample(bands[None], place[None], padding_mode="border", align_corners=True)[0].permute(1, 2, 0)
+    """The values whose means, less grey, these are."""
+    return ((mean * TIES).round() / TIES + GREY).round().to(torch.uint8)
 
 
 def _at(

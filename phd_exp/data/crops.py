@@ -23,7 +23,7 @@ SIXTEEN_BITS = ("I;16", "I;16L", "I;16B", "I;16N")
 TURNED = range(2, 9)  # EXIF orientations; others than 1 to 8 mean nothing
 TWELVE_BITS = 1 << 12
 ONE_PICTURE = ("JPEG", "MPO")  # formats whose further frames are previews and depth maps
-LARGEST_SUMS = 1 << 23  # pixels whose sums of three bands are held at the same time, 200 MB
+STRIP = 1 << 17  # pixels of the image, about, that a strip of a view reads; the sums of their three bands take 3 MB
 MARGIN = 1  # pixels around a view of more pixels than the image has, which are interpolated
 
 
@@ -83,36 +83,48 @@ def facing(detection: Detection, size: tuple[int, int], side: int, largest_f: fl
         raise DatasetError(f"{detection.where}: {error}") from None
 
 
-def cut(image: Image.Image, camera: VirtualCamera) -> UInt8[np.ndarray, "S S 3"]:
+Picture = Image.Image | UInt8[np.ndarray, "height width 3"]
+"""An RGB image, of Pillow, whose parts are copied fast, or as an array."""
+
+
+def cut(image: Picture, camera: VirtualCamera) -> UInt8[np.ndarray, "S S 3"]:
     """The virtual camera's view of an RGB image of its real camera; grey beyond the edges of the image.
 
     The pixels are means over areas, see `view`. A square image viewed as a whole is `shrunk`, to the same pixels in
-    less time.
+    less time. Other views are computed in strips, whose numbers fit in the cache of a processor.
     """
-    if _is_whole(image, camera) and image.width >= camera.S:
+    size = image.size if isinstance(image, Image.Image) else (image.shape[1], image.shape[0])
+    if _is_whole(size, camera) and size[0] >= camera.S:
         return shrunk(np.asarray(image), int(camera.S))
     corners = camera.corners
-    part = _reach(corners, image.size)
-    places = torch.from_numpy(corners - part[:2])
-    pixels = torch.from_numpy(np.array(image.crop(part)))
-    # of a large image band by band, for the sums take eight bytes per pixel
-    at_once = 3 if pixels[..., 0].numel() <= LARGEST_SUMS else 1
-    return torch.cat([view(bands, places) for bands in pixels.split(at_once, dim=-1)], dim=-1).numpy()
+    left, top, right, bottom = _reach(corners, size)
+    rows = max(1, int(camera.S * STRIP / ((right - left) * (bottom - top))))
+    firsts = range(0, int(camera.S), rows)
+    return np.concatenate([_strip(image, size, corners[first : first + rows + 1]) for first in firsts])
 
 
-def _is_whole(image: Image.Image, camera: VirtualCamera) -> bool:
-    """Whether the view is a whole square image, on fewer or more pixels."""
-    zoom = camera.S / image.width
-    whole = image.width == image.height and np.array_equal(camera.R, np.eye(3))
+def _strip(
+    image: Picture, size: tuple[int, int], corners: Float[np.ndarray, "lower further 2"]
+) -> UInt8[np.ndarray, "rows columns 3"]:
+    """The pixels with these corners."""
+    left, top, right, bottom = part = _reach(corners, size)
+    pixels = np.array(image.crop(part)) if isinstance(image, Image.Image) else image[top:bottom, left:right]
+    return view(torch.from_numpy(pixels), torch.from_numpy(corners - part[:2])).numpy()
+
+
+def _is_whole(size: tuple[int, int], camera: VirtualCamera) -> bool:
+    """Whether the view is a whole square image of that size, on fewer or more pixels."""
+    zoom = camera.S / size[0]
+    whole = size[0] == size[1] and np.array_equal(camera.R, np.eye(3))
     whole = whole and camera.lens.is_pinhole
     return whole and np.allclose(camera.homography, np.diag([zoom, zoom, 1]), rtol=0, atol=1e-9)
 
 
 def _reach(corners: Float[np.ndarray, "rows columns 2"], size: tuple[int, int]) -> tuple[int, int, int, int]:
     """Left, top, right and bottom of the part of the image that the pixels with these corners read; never empty."""
-    flat = np.ascontiguousarray(corners.reshape(-1, 2).T)  # NaN where the real camera sees nothing
-    left, top = np.floor(np.fmin.reduce(flat, 1) - MARGIN).clip(0, np.array(size) - 1).astype(int).tolist()
-    right, bottom = np.ceil(np.fmax.reduce(flat, 1) + MARGIN).clip(1, size).astype(int).tolist()
+    places = corners.reshape(-1, 2)  # NaN where the real camera sees nothing
+    left, top = np.floor(np.fmin.reduce(places) - MARGIN).clip(0, np.array(size) - 1).astype(int).tolist()
+    right, bottom = np.ceil(np.fmax.reduce(places) + MARGIN).clip(1, size).astype(int).tolist()
     return left, top, right, bottom
 
 
@@ -129,5 +141,5 @@ def _as_rgb(file: Path, image: Image.Image) -> Image.Image:
         ground.paste(over, mask=over)
         return ground
     if image.mode in PLAIN:
-        return image.convert("RGB")
+        return image if image.mode == "RGB" else image.convert("RGB")  # which copies an image that is RGB
     raise DatasetError(f"{file}: has colours of the kind {image.mode!r}; save it as RGB of 8 bits")

@@ -8,7 +8,6 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image
 from scipy import special
 
 from phd_exp.data.crops import cut
@@ -213,7 +212,7 @@ class _Track:
             camera = VirtualCamera.of_box(frame.K, box or whole, float(predictor.side), frame.lens, largest_f)
         except ValueError as error:
             raise DatasetError(f"{frame.where}: {error}") from None
-        view = cut(Image.fromarray(frame.image), camera)
+        view = cut(frame.image, camera)
         f = torch.tensor([camera.f], dtype=torch.float64)
         raw = predictor.raw(np.stack([view]), f)
         if not bool(raw.isfinite().all()):

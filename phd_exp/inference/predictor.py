@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image
 from torch import Tensor
 
 from phd_exp.config import RenderedConfig, RunConfig
@@ -211,7 +210,7 @@ class Predictor:
             camera = VirtualCamera.of_box(K, (left, top, right, bottom), float(self.side), largest_f=largest_f)
         except ValueError as error:
             raise DatasetError(f"image: {error}") from None
-        return View(cut(Image.fromarray(array), camera), camera)
+        return View(cut(array, camera), camera)
 
     def see(self, views: View | Sequence[View]) -> Prediction:
         """Predictions for views, each in the frame of its own virtual camera; for one view, one without a batch."""

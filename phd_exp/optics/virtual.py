@@ -14,6 +14,8 @@ from jaxtyping import Bool, Float
 from phd_exp.optics.lens import PINHOLE, Lens
 
 BORDER = 33  # places along a side of a box whose rays a lens bends
+NODES = 16  # along a side of a view, between which the corners of its pixels are interpolated
+CLOSE = 1e-9  # px; the largest error of interpolated corners
 
 Box = tuple[float, float, float, float]
 """Left, top, right, bottom: pixels of the real image, counted from its top left corner."""
@@ -96,9 +98,22 @@ class VirtualCamera:
 
     @property
     def corners(self) -> Float[np.ndarray, "places places 2"]:
-        """Pixels of the real image at the corners of the pixels of the virtual image."""
-        along = (np.arange(int(self.S) + 1) - self.S / 2) / self.f
-        return self.real_pixels(np.stack(np.meshgrid(along, along), axis=-1))
+        """Pixels of the real image at the corners of the pixels of the virtual image.
+
+        Lenses take long: the corners are interpolated by the polynomials through `real_pixels` at Chebyshev points,
+        unless these err by more than `CLOSE` halfway between the points, as at the edge of the field.
+        """
+        half, n = self.S / self.f / 2, int(self.S)
+        coarse = self._grid(half * _chebyshev(NODES))
+        halfway, corners = _interpolations(n)
+        error = halfway @ coarse @ halfway.T - self._grid(half * _chebyshev(2 * NODES - 1)[1::2])
+        if (np.abs(error) < CLOSE).all():  # NaN is not
+            return np.moveaxis(corners @ coarse @ corners.T, 0, -1)
+        return np.moveaxis(self._grid(half * np.linspace(-1, 1, n + 1)), 0, -1)
+
+    def _grid(self, along: Float[np.ndarray, " n"]) -> Float[np.ndarray, "2 n n"]:
+        """`real_pixels`, all columns before all rows, where x/z and y/z have these values."""
+        return np.moveaxis(self.real_pixels(np.stack(np.meshgrid(along, along), axis=-1)), -1, 0)
 
     def outside(self, width: float, height: float) -> Bool[np.ndarray, "S S"]:
         """The pixels of the virtual image whose middles lie outside the real image of that size, px."""
@@ -162,8 +177,24 @@ def _fold(rows: tuple[tuple[float, ...], ...], lens: Lens, width: int, height: i
     )
 
 
+def _chebyshev(n: int) -> Float[np.ndarray, " n"]:
+    """n Chebyshev points, from -1 to 1."""
+    return -np.cos(np.pi * np.arange(n) / (n - 1))
+
+
+@lru_cache(maxsize=16)
+def _interpolations(n: int) -> tuple[Float[np.ndarray, "halfway nodes"], Float[np.ndarray, "corners nodes"]]:
+    """From values at `NODES` Chebyshev points to those halfway between them, and at the ends of n equal parts."""
+    vandermonde = np.polynomial.chebyshev.chebvander
+    to_coefficients = np.linalg.inv(vandermonde(_chebyshev(NODES), NODES - 1))
+    places = (_chebyshev(2 * NODES - 1)[1::2], np.linspace(-1, 1, n + 1))
+    halfway, corners = (vandermonde(along, NODES - 1) @ to_coefficients for along in places)
+    return halfway, corners
+
+
 def _border(box: Box, n: int) -> Float[np.ndarray, "places 2"]:
     """Places along the four sides of a box, n a side, from corner to corner."""
     left, top, right, bottom = box
     x, y = np.linspace(left, right, n), np.linspace(top, bottom, n)
-    return np.array([*((u, v) for u in x for v in (top, bottom)), *((u, v) for u in (left, right) for v in y)])
+    u = np.concatenate([x, x, np.full(n, left), np.full(n, right)])
+    return np.stack([u, np.concatenate([np.full(n, top), np.full(n, bottom), y, y])], axis=-1)

@@ -9,6 +9,7 @@ Source: documentation of OpenCV (FileStorage, calib3d), ROS (camera_info), Kalib
 
 import math
 import re
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -89,9 +90,9 @@ class Calibration(Record):
         K[:2, 2] += CORNER
         return K
 
-    @property
+    @cached_property
     def lens(self) -> Lens:
-        """The lens."""
+        """The lens, which keeps what it computes for all detections of the camera."""
         return Lens(self.D[:8], self.model == "equidistant")
 
     @model_validator(mode="after")

@@ -15,8 +15,12 @@ from PIL import Image
 from phd_exp.data.batches import Batch
 from phd_exp.hardware import one_thread
 from phd_exp.inference.answers import answer, sightings
+from phd_exp.inference.following import follow
+from phd_exp.inference.frames import video_frames
 from phd_exp.inference.loading import load
+from phd_exp.records.detections import detections_of
 from phd_exp.records.own_images import detections_in
+from phd_exp.records.videos import VideoWriter, shots_in
 from tests.support.untrained import untrained
 
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(1800)]
@@ -60,6 +64,38 @@ def test_predictions_of_photographs_on_one_core(
     speed = N / median(seconds)
     record("predict, boxes with a lens", f"{speed:.0f} images/s", "one core", f"{speed:.0f}", "100")
     assert speed >= 100
+
+
+@pytest.mark.parametrize(("width", "height"), [(640, 480), (1280, 960)], ids=str)
+def test_frames_of_a_video_on_one_core(
+    unchecked: None, composed: Callable[..., Any], record: Callable, tmp_path: Path, width: int, height: int
+) -> None:
+    """A box of each frame is predicted, since an untrained network cannot follow one."""
+    pytest.importorskip("av", reason="needs `pip install 'phd_exp[video]'`")
+    coarse = np.random.default_rng(0).integers(0, 256, (15, 20, 3), dtype=np.uint8)
+    image = np.asarray(Image.fromarray(coarse).resize((width, height), Image.Resampling.BICUBIC))
+    with VideoWriter(tmp_path / "clip.mp4", (width, height)) as video:
+        for n in range(N):
+            video.add(n / 30, np.roll(image, n, axis=1))
+    scale = width / 640
+    K = [530 * scale, 0, width / 2, 0, 530 * scale, height / 2, 0, 0, 1]
+    matrix = {"rows": 3, "cols": 3, "data": K}
+    camera = CAMERA | {"image_width": width, "image_height": height, "camera_matrix": matrix}
+    (tmp_path / "camera.yaml").write_text(json.dumps(camera))
+    (detection,) = detections_of([tmp_path / "clip.mp4"], {"camera": str(tmp_path / "camera.yaml")})
+    boxes = {n: [tuple(scale * (one + n / 4) for one in (170, 90, 410, 330))] for n in range(N)}
+    run = untrained(tmp_path / "run", composed("preset=small", "recipe=strong", "data=default"))
+    predictor, seconds = load(run.path, "cpu"), []
+    with one_thread():
+        for _ in range(ROUNDS):
+            start = time.process_time()
+            followed = follow(predictor, video_frames(detection, boxes, shots_in(tmp_path / "clip.mp4")))
+            lines = [json.dumps(one.answer(predictor)) for one in followed]
+            seconds.append(time.process_time() - start)
+    assert len(lines) == N
+    speed = N / median(seconds)
+    record(f"track, {width} x {height} pixels with a lens", f"{speed:.0f} frames/s", "one core", f"{speed:.0f}", "30")
+    assert speed >= 30
 
 
 def test_exported_graphs_on_one_core(

@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
-from phd_exp.data.areas import GREY
+from phd_exp.data import crops
+from phd_exp.data.areas import GREY, area_means, sums
 from phd_exp.data.crops import cut
 from phd_exp.optics.lens import Lens
-from phd_exp.optics.virtual import VirtualCamera, intrinsics, rays
+from phd_exp.optics.virtual import Box, VirtualCamera, intrinsics, rays
 from tests.support.opencv import projected
 
 WIDTH, HEIGHT, FINE = 1280, 960, 8
@@ -91,3 +93,15 @@ def test_what_has_no_image_is_grey() -> None:
     assert (view[columns > 603] == GREY).all()
     assert lost.sum() > 100
     assert (view[lost] == GREY).mean() > 0.9, "but for pixels at the edge"
+
+
+@pytest.mark.parametrize("box", [(100.0, 80.0, 900.0, 800.0), (500.0, 300.0, 540.0, 350.0)], ids=str)
+def test_a_view_in_strips_is_that_of_the_whole_image(box: Box, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an array and of Pillow's image, to the bit, also beyond the edge and where the lens folds over."""
+    noise = np.random.default_rng(0).integers(0, 256, (700, 900, 3), dtype=np.uint8)
+    camera = VirtualCamera.of_box(intrinsics(900.0, 900.0, 450.0, 350.0), box, 64.0, Lens((-0.3,)))
+    whole = area_means(sums(torch.from_numpy(noise)), torch.from_numpy(camera.corners)).numpy()
+    for pixels in (crops.STRIP, 10_000, 1):
+        monkeypatch.setattr(crops, "STRIP", pixels)
+        np.testing.assert_array_equal(cut(noise, camera), whole)
+        np.testing.assert_array_equal(cut(Image.fromarray(noise), camera), whole)

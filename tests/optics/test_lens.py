@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from phd_exp.optics.lens import PINHOLE, Lens
-from phd_exp.optics.virtual import VirtualCamera, intrinsics, rays, require_no_fold
+from phd_exp.optics.virtual import Box, VirtualCamera, intrinsics, rays, require_no_fold
 from tests.support.opencv import projected, undistorted
 
 K = intrinsics(500.0, 510.0, 320.5, 240.5)
@@ -89,6 +89,18 @@ def test_the_view_contains_the_border_of_the_box_and_faces_its_middle(lens: Lens
     seen = camera.to_virtual(rays(K, np.stack([u, v], axis=-1), lens))
     places = np.abs(seen[:, :2] / seen[:, 2:]) * camera.f
     assert places.max() < 48.05
+
+
+@pytest.mark.parametrize("box", [(60.0, 30.0, 300.0, 220.0), (0.0, 0.0, 640.0, 480.0)], ids=["box", "whole"])
+@pytest.mark.parametrize("lens", [*LENSES.values(), Lens((-0.3,)), PINHOLE], ids=[*LENSES, "folds", "pinhole"])
+def test_interpolated_corners_of_pixels_are_exact(lens: Lens, box: Box) -> None:
+    """Also where a fisheye's view is too wide to be interpolated, or a lens folds over, which leaves NaN."""
+    box = (320.0, 0.0, 840.0, 480.0) if lens.coefficients == (-0.3,) else box
+    camera = VirtualCamera.of_box(K, box, 96.0, lens)
+    along = (np.arange(97) - 48) / camera.f
+    exact = camera.real_pixels(np.stack(np.meshgrid(along, along), axis=-1))
+    assert np.isnan(exact).any() == (lens.coefficients == (-0.3,))
+    np.testing.assert_allclose(camera.corners, exact, rtol=0, atol=2e-9)
 
 
 def test_a_fisheye_has_views_beyond_90_degrees() -> None:
