@@ -108,8 +108,8 @@ def _strip(
 ) -> UInt8[np.ndarray, "rows columns 3"]:
     """The pixels with these corners."""
     left, top, right, bottom = part = _reach(corners, size)
-    pixels = np.array(image.crop(part)) if isinstance(image, Image.Image) else image[top:bottom, left:right]
-    return view(torch.from_numpy(pixels), torch.from_numpy(corners - part[:2])).numpy()
+    pixels = image.crop(part) if isinstance(image, Image.Image) else image[top:bottom, left:right]
+    return view(torch.from_numpy(np.array(pixels)), torch.from_numpy(corners - part[:2])).numpy()
 
 
 def _is_whole(size: tuple[int, int], camera: VirtualCamera) -> bool:
