@@ -1,8 +1,6 @@
 """Real renders, small enough for seconds: a quarter of the sensor, the same field of view."""
 
-import multiprocessing
 from collections.abc import Callable
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import pytest
@@ -36,15 +34,6 @@ def trained(runs: Path, *arguments: str) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", ["phd_exp"])
         assert main([*arguments, *QUICKER, f"runs={runs}"]) == 0
-
-
-def begin(words: list[str], preload: list[str]) -> BaseProcess:
-    """A command in a process of its own, forked from one that has imported these modules already."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(preload)
-    process = context.Process(target=main, args=(words,))
-    process.start()
-    return process
 
 
 @pytest.fixture(scope="session")

@@ -18,7 +18,8 @@ from hydra.experimental.callback import Callback
 
 from phd_exp.evaluation.parquet import read_table
 from phd_exp.records.runs import CHOOSE, RunFolder, find_runs
-from tests.e2e.conftest import QUICK, begin
+from tests.e2e.conftest import QUICK
+from tests.support.processes import begin
 from tests.support.recorded import stamps, weights
 
 ONE = ("model=mae_vz", "recipe=strong", "data.image_size=64", "logger=none")
