@@ -10,7 +10,7 @@ Source: paper, section "Desired constraints for estimated distribution".
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import torch
 from jaxtyping import Float
@@ -63,6 +63,7 @@ def families() -> dict[str, Family]:
         "probabilistic": Family(_projected_huber, _seven_numbers),
         "free_axis": Family(_projected_huber, _nine_numbers),
         "free_axis_t": _shaped(closest_to_student),
+        "rounded_t": _shaped(partial(closest_to_student, is_rounded=True)),
         "gaussian": _shaped(shaped.Gaussian),
         "gaussian_ray": _shaped(shaped.RayGaussian),
         "gaussian_mixture": Family(_mixture, _thirty_numbers),

@@ -1,7 +1,7 @@
 """Recalibration: temperatures that change the uncertainty of every prediction but not its mode.
 
 A network's small spreads may be too large and its large ones too small, or the other way round. So the log of a
-temperature is linear in the log of the predicted precision.
+temperature is a parabola in the log of the predicted precision.
 """
 
 import math
@@ -19,22 +19,30 @@ from phd_exp.distributions.rounded import depth_law
 
 _WIDEST = 80.0  # of log(1/temperature); a fit beyond has no minimum
 _ENDS = (0.05, 0.95)  # quantiles of the fitted predictions between which temperatures vary
-_PRIOR = 0.5  # standard deviation of a normal prior of slopes about 0, for few or equal predictions
+_PRIORS = (0.5, 0.3)  # standard deviations of normal priors of slope and bend about 0, for few or equal predictions
+
+_NARROWEST = 1e-9  # half of the range of log precisions; equal ones have no slope
 
 Values = Float[np.ndarray, " samples"]
 
 
 @dataclass(frozen=True)
 class Slope:
-    """The change of log T with the log precision u: `slope` (u - middle), constant below `low` and above `high`."""
+    """The change of log T with the log precision u: `slope` x + `bend` (y^2 - 1/3), constant outside `low` to `high`.
+
+    x = u - (low + high)/2 is the distance from the middle, and y runs from -1 at `low` to 1 at `high`.
+    """
 
     slope: float
     low: float
     high: float
+    bend: float = 0.0
 
     def change(self, log_precision: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """log T less its value in the middle of `low` and `high`."""
-        return self.slope * (log_precision.clamp(self.low, self.high) - (self.low + self.high) / 2)
+        """log T less that of a typical prediction."""
+        x = log_precision.clamp(self.low, self.high) - (self.low + self.high) / 2
+        y = x / max((self.high - self.low) / 2, _NARROWEST)
+        return self.slope * x + self.bend * (y.square() - 1 / 3)
 
 
 @dataclass(frozen=True)
@@ -115,24 +123,23 @@ def _depth_nll(log_t: Tensor, log_a: Tensor, rounding: float, v: Tensor) -> tupl
 
 
 def _fit(nll: Callable[[Tensor], tuple[Tensor, Tensor]], log_precision: Tensor) -> tuple[float, Slope]:
-    """The typical temperature and the slope with the least mean of nll(v), which returns values and derivatives."""
+    """The typical temperature and its change with the least mean of nll(v), which returns values and derivatives."""
     low, high = log_precision.quantile(torch.tensor(_ENDS).double()).tolist()
-    change = Slope(1.0, low, high).change(log_precision)
-    n = len(log_precision)
+    slope, bend = Slope(1.0, low, high), Slope(0.0, low, high, 1.0)
+    changes = [torch.ones_like(log_precision), *(-one.change(log_precision) for one in (slope, bend))]
+    by = torch.stack(changes)  # of v = -log T
+    weight = np.array([0.0, *(1 / (prior**2 * len(log_precision)) for prior in _PRIORS)])
 
     def loss(parameters: Values) -> tuple[float, Values]:
-        start, slope = parameters.tolist()
-        value, derivative = nll(start - slope * change)
-        penalty = slope / (_PRIOR**2 * n)
-        gradient = derivative.mean(), -(derivative * change).mean() + penalty
-        return float(value.mean()) + slope * penalty / 2, np.array([float(one) for one in gradient])
+        value, derivative = nll(torch.from_numpy(parameters) @ by)
+        penalty = weight * parameters
+        return float(value.mean() + penalty @ parameters / 2), (derivative * by).mean(-1).numpy() + penalty
 
     from scipy.optimize import minimize  # imported slowly, and only fits need it
 
-    found = minimize(
-        loss, (_root(lambda v: loss(np.array([v, 0.0]))[1][0]), 0.0), jac=True, method="BFGS", tol=1e-9
-    ).x
-    return math.exp(-found[0]), Slope(float(found[1]), low, high)
+    start = _root(lambda v: loss(np.array([v, 0.0, 0.0]))[1][0])
+    found = minimize(loss, (start, 0.0, 0.0), jac=True, method="BFGS", tol=1e-9).x.tolist()
+    return math.exp(-found[0]), Slope(found[1], low, high, found[2])
 
 
 def _root(derivative: Callable[[float], float]) -> float:
