@@ -14,6 +14,7 @@ a. They end where the energy is 50 and are sums of Gauss's rule.
 Source: own derivation; checked against mpmath in tests/distributions/test_rounded.py.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import NamedTuple, final
@@ -27,7 +28,7 @@ from phd_exp.distributions.depth_law import DepthLaw, Kinked, Numbers
 from phd_exp.distributions.huber import energy_cdf
 
 _LEAST_LOG_A = -13.0
-_FARTHEST_LOG_T = 80.0  # whose sinh does not overflow in float32
+_SHARE = 0.95  # of the largest exponent
 _LARGEST_ENERGY = 50.0
 _NODES, _PART, _LEVEL = 64, 40, 24  # nodes for the whole law, one of its tails, and each part of a level
 _NEWTON_STEPS, _CLOSEST_STEPS = 5, 20
@@ -48,7 +49,9 @@ class Rounded(DepthLaw):
     r: float
 
     def energy(self, log_t: Numbers) -> Numbers:
-        return self._energy(self._a * _sinh(log_t[..., None])).squeeze(-1)
+        # a (cosh l - 1) = y tanh(l/2) and sqrt(y^2 + r^2) - r = y tanh(u/2) with y = a sinh l = r sinh u: no square
+        y, l = self._scaled_sinh(log_t)
+        return y * (torch.tanh(l / 2) + torch.tanh(torch.asinh(y / self.r) / 2))
 
     def farthest_log_t(self, energy: Numbers) -> Numbers:
         # from sqrt(a^2 (c^2 - 1) + r^2) = energy + a + r - a c with c = cosh l
@@ -105,7 +108,8 @@ class Rounded(DepthLaw):
         return self._moments(self._whole[0].energy)[0]
 
     def slope(self, log_t: Numbers) -> Numbers:
-        return self._slope(self._a * _sinh(log_t[..., None])).squeeze(-1)
+        y, l = self._scaled_sinh(log_t)
+        return y * (torch.tanh(l / 2) + torch.tanh(torch.asinh(y / self.r)))
 
     @property
     def mean_slope(self) -> Numbers:
@@ -131,6 +135,12 @@ class Rounded(DepthLaw):
     @cached_property
     def _a(self) -> Tensor:
         return self.log_a.clamp_min(_LEAST_LOG_A).exp()[..., None]
+
+    def _scaled_sinh(self, log_t: Numbers) -> tuple[Numbers, Numbers]:
+        """a sinh l and l; an l at which that would overflow is replaced by a smaller one."""
+        farthest = _SHARE * math.log(torch.finfo(log_t.dtype).max) - self.log_a.clamp_min(0)
+        l = torch.minimum(torch.maximum(log_t, -farthest), farthest)
+        return self._a.squeeze(-1) * l.sinh(), l
 
     @property
     def _scale(self) -> Tensor:
@@ -163,7 +173,7 @@ class Rounded(DepthLaw):
         return _Points(log_t, energy, torch.exp(log_t - energy) * by_x)
 
     def _x(self, log_t: Numbers) -> Numbers:
-        x = torch.asinh(self._a * _sinh(log_t[..., None]) / self._scale)
+        x = torch.asinh(self._scaled_sinh(log_t)[0][..., None] / self._scale)
         return torch.minimum(torch.maximum(x, -self._end), self._end).squeeze(-1)
 
     def _between(self, low: Points, high: Points, n: int) -> tuple["_Points", Points]:
@@ -248,10 +258,6 @@ class _Points(NamedTuple):
     log_t: Points
     energy: Points
     density: Points
-
-
-def _sinh(log_t: Tensor) -> Tensor:
-    return log_t.clamp(-_FARTHEST_LOG_T, _FARTHEST_LOG_T).sinh()
 
 
 def _gauss(n: int, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
