@@ -84,7 +84,7 @@ def facing(detection: Detection, size: tuple[int, int], side: int, largest_f: fl
 
 
 Picture = Image.Image | UInt8[np.ndarray, "height width 3"]
-"""An RGB image, of Pillow, whose parts are copied fast, or as an array."""
+"""An RGB image: of Pillow, or an array."""
 
 
 def cut(image: Picture, camera: VirtualCamera) -> UInt8[np.ndarray, "S S 3"]:
