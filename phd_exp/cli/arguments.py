@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from phd_exp.records.detections import Detection
-from phd_exp.records.errors import ConfigError, DatasetError, RunError, complaint, listed
+from phd_exp.records.errors import ConfigError, DatasetError, RunError, complaint, listed, unknown
 from phd_exp.records.recordings import Detections
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
@@ -35,20 +35,22 @@ class Arguments(BaseModel):
     @classmethod
     def parsed(cls, verb: str, words: Sequence[str]) -> Self:
         """The arguments of `key=value` words. Raises ConfigError, in one line, for the first that is invalid."""
-        keys = ", ".join(f"{key}=" for key in cls.model_fields)
-        takes = f"{verb} takes {keys} (see `python -m phd_exp {verb} --help`)"
+        keys = cls.model_fields
+        takes = f"{verb} takes {', '.join(f'{key}=' for key in keys)} (see `python -m phd_exp {verb} --help`)"
         values: dict[str, str] = {}
         for word in words:
             key, _, value = word.partition("=")
             if not value:
                 raise ConfigError(f"{word}: expected key=value; {takes}")
+            if key not in keys:
+                raise ConfigError(unknown(key, keys, takes))
             if key in values:
                 raise ConfigError(f"{key}: given twice")
             values[key] = value
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            raise ConfigError(complaint(error.errors(include_url=False)[0], cls.model_fields, takes)) from None
+            raise ConfigError(complaint(error.errors(include_url=False)[0], missing=takes)) from None
 
 
 def four_numbers(expected: str) -> BeforeValidator:

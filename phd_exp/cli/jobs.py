@@ -1,6 +1,7 @@
 """Hydra for the verbs `train` and `render`: a job, and its launch, once or with -m as a sweep."""
 
 import os
+import shlex
 import sys
 import uuid
 from collections.abc import Callable
@@ -97,7 +98,7 @@ class Job:
         if composed.mode == RunMode.MULTIRUN:
             print(f"job {composed.job.num + 1}/{self.n_jobs}: {' '.join(overrides)}", flush=True)
         elif experiment := composed.runtime.choices.get("experiment"):
-            words = " ".join(map(str, overrides))
+            words = shlex.join(map(str, overrides))
             raise ConfigError(f"experiment={experiment}: names several runs; write -m before it: -m {words}")
         return self.task(plain(config), overrides, self.cores or usable_cores())
 

@@ -11,9 +11,8 @@ from pydantic.fields import FieldInfo
 
 from phd_exp.cli import conf_folder, prefix_of
 from phd_exp.config import RenderConfig, RunConfig
-from phd_exp.config.targets import keys_of_section
 from phd_exp.records.choices import flatten
-from phd_exp.records.errors import one_line
+from phd_exp.records.errors import keys_of_section, one_line
 from phd_exp.records.parsing import parse_yaml
 
 LINE = re.compile(r"( *)(\w+):(?: +([^#]*?))?(?: *# *(.*))?")

@@ -1,5 +1,6 @@
 """`python -m phd_exp [train]`: render missing data, train, measure and record a run."""
 
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 from itertools import product
@@ -137,7 +138,7 @@ def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> Non
     if equal := equal_run(checked, folder):
         print(f"  {equal.path} is finished, with an equal configuration: its command uses that run again", flush=True)
     if checked.preset == "paper" and not gpu:
-        words = " ".join([*(word for word in overrides if not word.startswith("preset=")), "preset=small"])
+        words = shlex.join([*(word for word in overrides if not word.startswith("preset=")), "preset=small"])
         print("  the authors' protocol takes many hours without a GPU: an estimate follows the first batches")
         print(f"  in about ten minutes: python -m phd_exp {words}", flush=True)
 

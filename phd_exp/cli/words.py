@@ -14,7 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 from phd_exp.cli import choices_of, conf_folder, prefix_of
 from phd_exp.cli.help import OF_VERB, VERBS
 from phd_exp.records.choices import flatten
-from phd_exp.records.errors import ConfigError, end_of, install, instead, one_line, shortened, unknown
+from phd_exp.records.errors import ConfigError, install, one_line, shortened, unknown
 
 REFUSED = (HydraException, OmegaConfBaseException, ValueError, TypeError, ArithmeticError, RecursionError)
 """The errors that a bad override raises; ValueError for a group set to null, TypeError for one set to numbers."""
@@ -33,7 +33,7 @@ def require_overrides(words: Sequence[str]) -> None:
         if "=" not in word and not word.startswith("~"):
             choices = [f"{group}={name}" for group in OF_VERB["train"] for name in choices_of(group)]
             expected = f"a verb ({', '.join(VERBS)}) is the first word; {GRAMMAR}"
-            raise ConfigError(f"{word}: no KEY=VALUE{instead(word, [*VERBS, *choices], expected)}")
+            raise ConfigError(unknown(word, [*VERBS, *choices], expected, fault="no KEY=VALUE"))
         if word.lstrip("+~").startswith(tuple(f"{section}." for section in SHARED)):
             key = word.partition("=")[0]
             raise ConfigError(
@@ -70,7 +70,7 @@ def explain(error: Exception, config_name: str) -> str:
     if found := re.search(r"Could not (?:find|load) '([^']+)/([^']+)'", text):
         group, name = found.groups()
         options = getattr(error, "options", None) or choices_of(group)
-        return f"{group}={name}: no such choice{instead(name, options)}{install(name)}"
+        return unknown(f"{group}={name}", options, fault="no such choice") + install(name)
     return shortened(re.sub(r" Set the environment variable.*| Config search path:.*", "", text), LONGEST)
 
 
@@ -91,7 +91,7 @@ def _unknown_key(key: str, config_name: str) -> str:
     if not isinstance(node, DictConfig):
         return unknown(key, everything, f"expected one of {', '.join(top)}")
     valid = [str(name) for name in node if not str(name).startswith("_")]
-    near = [f"{section}.{name}" for name in valid] + [name for name in everything if end_of(name) == end_of(key)]
+    near = [*(f"{section}.{name}" for name in valid), *everything]
     takes_more = section == "trainer" or "_target_" in node
     further = f"; a further argument of its class has a plus sign: +{key}=VALUE" if takes_more else ""
     return unknown(key, near, f"expected one of {', '.join(valid)}{further}")

@@ -4,13 +4,13 @@ import inspect
 from collections.abc import Iterator, Mapping
 from functools import partial
 from importlib import import_module
-from typing import Annotated, Any, get_args, get_origin
+from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Tag, TypeAdapter, ValidationError, ValidationInfo
+from pydantic import AfterValidator, BaseModel, ConfigDict, TypeAdapter, ValidationError, ValidationInfo
 from pydantic.errors import PydanticSchemaGenerationError
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from phd_exp.records.errors import complaint, in_user_code, install, instead, shown, unknown
+from phd_exp.records.errors import complaint, in_user_code, install, shown, unknown
 
 OURS = tuple(f"phd_exp.{room}" for room in ("models", "losses", "optimizers", "geometry", "distributions"))
 KNOWN = (*OURS, "torch.optim", "lightning")
@@ -48,7 +48,7 @@ def _nodes_in(value: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]
 def _check_keys(node: dict[str, Any], target: Any, prefix: str) -> None:
     """Check the keys of one node against the signature of its target."""
     if not isinstance(node.get("_partial_", False), bool):
-        raise _error(f"{prefix}_partial_", f"got {shown(node['_partial_'])}; expected a bool")
+        raise _error(f"{prefix}_partial_: got {shown(node['_partial_'])}; expected a bool")
     parameters, takes_any = _parameters(target)
     for key, value in node.items():
         if key in ("_target_", "_partial_"):
@@ -57,7 +57,7 @@ def _check_keys(node: dict[str, Any], target: Any, prefix: str) -> None:
             _check_value(f"{prefix}{key}", value, parameters[key].annotation)
         elif key not in parameters and (key.startswith("_") or not takes_any):  # Hydra's own, as `_recursive_`
             taken = f"{node['_target_']} takes {', '.join(parameters)}"
-            raise _error(f"{prefix}{key}", f"unknown key{instead(key, parameters, taken)}")
+            raise _error(unknown(f"{prefix}{key}", parameters, taken))
 
 
 def _parameters(target: Any) -> tuple[Mapping[str, inspect.Parameter], bool]:
@@ -124,22 +124,22 @@ def locate(name: Any, trust: Trust, where: str = "") -> Any:
     """The object that a `_target_` names. Raises PydanticCustomError if it is not allowed or cannot be imported."""
     path = f"{where}._target_".lstrip(".")
     if not isinstance(name, str) or "." not in name:
-        raise _error(path, f"got {shown(name)}; expected MODULE.NAME of a class or function")
+        raise _error(f"{path}: got {shown(name)}; expected MODULE.NAME of a class or function")
     if trust is not None and not _is_below(name, allowed := (*OURS, *trust)):
         package = name.partition(".")[0]
         advice = "" if package == "phd_exp" else f"; if you trust this run, add trust={package}"
-        raise _error(path, f"{shown(name)} is not built from a stored configuration{advice}")
+        raise _error(f"{path}: {shown(name)} is not built from a stored configuration{advice}")
     module, _, attribute = name.rpartition(".")
     try:
         target = getattr(import_module(module), attribute)
     except Exception as error:  # a module of the user may raise any
         remedy = install(str(error)) if isinstance(error, ImportError) else ""
-        raise _error(path, f"{name!r} cannot be imported ({in_user_code(error) or error}){remedy}") from None
+        raise _error(f"{path}: {name!r} cannot be imported ({in_user_code(error) or error}){remedy}") from None
     if not callable(target):
-        raise _error(path, f"{name!r} is a {type(target).__name__}; expected a class or function")
+        raise _error(f"{path}: {name!r} is a {type(target).__name__}; expected a class or function")
     # an imported name is somebody else's code
     if trust is not None and not _is_below(str(getattr(target, "__module__", None)), allowed):
-        raise _error(path, f"{name!r} is only imported there; expected a class or function that is defined there")
+        raise _error(f"{path}: {name!r} is only imported there; expected a class or function that is defined there")
     return target
 
 
@@ -159,7 +159,7 @@ def _checked_if_typed(node: dict[str, Any], info: ValidationInfo) -> dict[str, A
 def _each_checked_if_typed(nodes: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
     for name, node in nodes.items() if is_typed(info) else ():
         if not is_node(node):
-            raise _error(name, f"got {shown(node)}; expected a node with a _target_")
+            raise _error(f"{name}: got {shown(node)}; expected a node with a _target_")
         check_target(node, None, name)
     return nodes
 
@@ -174,33 +174,9 @@ TrainingTargets = Annotated[dict[str, Any], AfterValidator(_each_checked_if_type
 
 def describe(problem: ErrorDetails, model: type[BaseModel]) -> str:
     """One line for one error of pydantic: the key, the value, what was expected, the nearest valid key."""
-    place = [str(part) for part in problem["loc"]]
-    location = [part for part in place if part not in ("spec", "<rendered>", "<folder>", "<source>")]
-    key, context = ".".join(location), problem.get("ctx", {})
     if problem["type"] == "target":
-        return f"{key}.{context['path']}: {context['reason']}"
-    if problem["type"] == "extra_forbidden":
-        return unknown(key, _valid_keys(model, place[:-1]))
-    return complaint(problem, expected=f"expected {key}=VALUE", key=key)
-
-
-def _valid_keys(model: Any, location: list[str]) -> list[str]:
-    """The keys of the section at a location, which holds names of fields and tags of unions."""
-    for name in location:
-        if name.startswith("<"):
-            model = next(get_args(member)[0] for member in get_args(model) if Tag(name) in get_args(member))
-        else:
-            # of a mapping from names to sections, the section
-            model = get_args(model)[1] if get_origin(model) is dict else model.model_fields[name].annotation
-    model = next((member for member in get_args(model) if inspect.isclass(member)), model)  # of Section | None
-    return [*keys_of_section(model)]
-
-
-def keys_of_section(model: Any) -> dict[str, Any]:
-    """The keys that a section has for the user, with their types; those of `spec` stand one level up."""
-    types = {name: field.annotation for name, field in model.model_fields.items()}
-    spec = types.pop("spec", None)
-    return types | (keys_of_section(spec) if spec else {})
+        return ".".join([*map(str, problem["loc"]), problem["ctx"]["text"]])
+    return complaint(problem, model, "expected {key}=VALUE")
 
 
 def _check_value(path: str, value: Any, annotation: Any) -> None:
@@ -213,8 +189,8 @@ def _check_value(path: str, value: Any, annotation: Any) -> None:
     try:
         adapter.validate_python(value)
     except ValidationError as error:
-        raise _error(path, complaint(error.errors()[0], key="")) from None
+        raise _error(complaint({**error.errors()[0], "loc": (path,)})) from None
 
 
-def _error(path: str, reason: str) -> PydanticCustomError:
-    return PydanticCustomError("target", "{path}: {reason}", {"path": path, "reason": reason})
+def _error(text: str) -> PydanticCustomError:
+    return PydanticCustomError("target", "{text}", {"text": text})

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, PlainValidator, ValidationError, model_validator
-from pydantic_core import ErrorDetails
 
 from phd_exp.records.cameras import CORNER, SHORTEST, Calibration, Size, read_camera, require_narrow
 from phd_exp.records.errors import DatasetError, complaint
@@ -212,12 +211,7 @@ def line_of(values: Any, where: str) -> DetectionLine:
     try:
         return DetectionLine.model_validate(values)
     except ValidationError as error:
-        raise DatasetError(f"{where}: {_complaint(error.errors(include_url=False)[0])}") from None
-
-
-def _complaint(problem: ErrorDetails) -> str:
-    """The fault of a line: the key, the value, and what was expected."""
-    key = ".".join(str(part) for part in problem["loc"])
-    if problem["type"] == "extra_forbidden" and DISTORTION.fullmatch(key):
-        return f"{key}: a line describes no lens; expected camera, a calibration file"
-    return complaint(problem, (Pose if key.startswith("pose.") else DetectionLine).model_fields)
+        problem = error.errors(include_url=False)[0]
+        is_of_lens = problem["type"] == "extra_forbidden" and DISTORTION.fullmatch(key := str(problem["loc"][-1]))
+        advice = f"{key}: a line describes no lens; expected camera, a calibration file" if is_of_lens else ""
+        raise DatasetError(f"{where}: {advice or complaint(problem, DetectionLine)}") from None

@@ -1,14 +1,16 @@
 """Errors that a user can fix: one line with the fault, its place, what was expected and what to do."""
 
 import difflib
+import inspect
 import re
 import sysconfig
 import traceback
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, get_args, get_origin
 
-from pydantic import ValidationError
+from pydantic import BaseModel, Tag, ValidationError
 from pydantic_core import ErrorDetails
 
 LONGEST_GIST = 200  # characters of an error that a message repeats
@@ -74,48 +76,57 @@ def listed(names: Sequence[str]) -> str:
     return f"{', '.join(names[:NAMED])}{rest}"
 
 
-def nearest(word: str, valid: Iterable[str]) -> str:
-    """`, did you mean 'lr'?` if the end of a valid word resembles that of the given one, else an empty string.
+def unknown(word: str, valid: Iterable[str], expected: str = "", fault: str = "unknown key") -> str:
+    """The message about a wrong word: its fault, the nearest valid word, and what is expected (by default: all).
+
+    Of words with `.` or `=`, the ends are compared.
 
     Examples:
-        >>> nearest("epochs", ["data.n_train", "trainer.max_epochs"])
-        ", did you mean 'trainer.max_epochs'?"
+        >>> unknown("epochs", ["data.n_train", "trainer.max_epochs"], "expected a key")
+        "epochs: unknown key, did you mean 'trainer.max_epochs'?; expected a key"
     """
-    ends = {end_of(name): name for name in reversed(list(valid))}  # of equal ends the first
-    close = difflib.get_close_matches(end_of(word), ends, n=1)
-    return f", did you mean {ends[close[0]]!r}?" if close else ""
-
-
-def end_of(word: str) -> str:
-    """The part of a word after its last `.` or `=`; the whole word without either."""
-    return re.split("[.=]", word)[-1]
-
-
-def instead(word: str, valid: Iterable[str], expected: str = "") -> str:
-    """The end of a message about a wrong word: the nearest valid word, then what is expected (by default: all)."""
     names = list(valid)
-    return f"{nearest(word, names)}; {expected or 'expected one of ' + ', '.join(names)}"
+    ends = {re.split("[.=]", name)[-1]: name for name in reversed(names)}  # of equal ends the first
+    close = difflib.get_close_matches(re.split("[.=]", word)[-1], ends, n=1)
+    near = f", did you mean {ends[close[0]]!r}?" if close else ""
+    return f"{word}: {fault}{near}; {expected or 'expected one of ' + ', '.join(names)}"
 
 
-def unknown(key: str, valid: Iterable[str], expected: str = "") -> str:
-    """The message about a key that is none of the valid ones."""
-    return f"{key}: unknown key{instead(key, valid, expected)}"
-
-
-def complaint(problem: ErrorDetails, valid: Iterable[str] = (), expected: str = "", key: str | None = None) -> str:
+def complaint(problem: ErrorDetails, model: type[BaseModel] | None = None, missing: str = "") -> str:
     """Pydantic's error as a message: the key, its value unless that is a whole section, and what was expected.
 
-    A key that is not `valid`, or is missing, is followed by what is `expected`.
+    A key that the `model` does not have is followed by those of its section; one that is missing by `missing`, in
+    which `{key}` stands for it.
     """
-    key, names = ".".join(map(str, problem["loc"])) if key is None else key, list(valid)
-    if problem["type"] == "extra_forbidden" and names:
-        return unknown(key, names, expected)
-    if problem["type"] == "missing" and (names or expected):
-        return f"{key}: missing" + f"; {expected}" * bool(expected)
+    place = [str(part) for part in problem["loc"]]
+    key = ".".join(part for part in place if part != "spec" and not part.startswith("<"))
+    if problem["type"] == "extra_forbidden" and model:
+        return unknown(key, _keys(model, place[:-1]))
+    if problem["type"] == "missing":
+        return f"{key}: missing" + f"; {missing.format(key=key)}" * bool(missing)
     given = "" if isinstance(problem["input"], dict) else f"got {shown(problem['input'])}; "
     expected = problem["msg"].removeprefix("Value error, ").replace("Input should be", "expected to be")
     reason = given + expected.replace("expected to be a valid", "expected a valid")
     return f"{key}: {reason}" if key else reason
+
+
+def _keys(model: Any, place: list[str]) -> list[str]:
+    """The keys of the section at a place, which holds names of fields and tags of unions."""
+    for name in place:
+        if name.startswith("<"):
+            model = next(get_args(member)[0] for member in get_args(model) if Tag(name) in get_args(member))
+        else:
+            # of a mapping from names to sections, the section
+            model = get_args(model)[1] if get_origin(model) is dict else model.model_fields[name].annotation
+    model = next((member for member in get_args(model) if inspect.isclass(member)), model)  # of Section | None
+    return [*keys_of_section(model)]
+
+
+def keys_of_section(model: Any) -> dict[str, Any]:
+    """The keys that a section has for the user, with their types; those of `spec` stand one level up."""
+    types = {name: field.annotation for name, field in model.model_fields.items()}
+    spec = types.pop("spec", None)
+    return types | (keys_of_section(spec) if spec else {})
 
 
 def install(text: str) -> str:

@@ -3,6 +3,7 @@
 import importlib
 import importlib.metadata
 import importlib.util
+import math
 import os
 import sys
 import tempfile
@@ -16,11 +17,12 @@ from typing import Any, Literal
 from phd_exp.records.errors import RenderError
 from phd_exp.records.scenes import SHAPES, Scene
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.antialias import filtered
 from phd_exp.rendering.importing import import_meshes
 from phd_exp.rendering.looks import ROUGHER, prepare_looks
 from phd_exp.rendering.pixels import Box, Light, read_light
 from phd_exp.rendering.sampling import remoteness
-from phd_exp.rendering.stage import CLIPPING, build_stage, show_scene
+from phd_exp.rendering.stage import CLIPPING, build_stage, show_scene, shows_metal
 from phd_exp.rendering.surroundings import World
 from phd_exp.rendering.triangles import Meshes
 
@@ -65,14 +67,17 @@ class Settings:
     """Settings of the path tracer.
 
     Attributes:
-        samples: light paths per pixel.
+        samples: light paths per pixel; of several points, at least one each.
         denoised: use Open Image Denoise.
-        at_middles: compute the light at the middle of each pixel, instead of Blender's filtered mean.
+        points: points along a side of each pixel at which the light is computed; of several, a pixel has the mean
+            over Blender's filter. None: Blender draws the points at random.
+        of_metal: factor of the samples in scenes with metal.
     """
 
     samples: int
     denoised: bool
-    at_middles: bool
+    points: int | None
+    of_metal: int = 1
 
 
 class Renderer:
@@ -88,6 +93,7 @@ class Renderer:
         memory = Path("/dev/shm")  # a folder in memory, where the system has one
         place = memory if os.access(memory, os.W_OK) else Path(tempfile.gettempdir())
         self._output = place / f"phd_exp-{uuid.uuid4().hex}.exr"
+        self._settings, self._finer = settings, settings.points or 1
         with silence():
             self._bpy = load_bpy()
             build_stage(self._bpy)
@@ -112,7 +118,16 @@ class Renderer:
         background is transparent: a fourth channel is the opacity, by which the light is multiplied. The layer
         "ground" shows the ground without the objects; its opacity is their shadow.
         """
-        box = box or Box(0, 0, scene.S, scene.S)
+        box, finer = box or Box(0, 0, scene.S, scene.S), self._finer
+        if finer == 1:
+            return self._traced(scene, box, layer)
+        # a pixel more on each side, because the filter reaches that far
+        wider = scene.model_copy(update={"S": finer * (scene.S + 2), "f": finer * scene.f})
+        around = Box(finer * box.left, finer * box.top, finer * (box.right + 2), finer * (box.bottom + 2))
+        return filtered(self._traced(wider, around, layer), finer)
+
+    def _traced(self, scene: Scene, box: Box, layer: Layer) -> Light:
+        """The light that the tracer computes for a box of the pixels of a scene."""
         self._frame(box, scene.S)
         brightness = self._world.show(scene.surroundings) if self._world and scene.surroundings else 1.0
         show_scene(self._bpy, scene, self.meshes, brightness)
@@ -120,6 +135,8 @@ class Renderer:
             self._world.show_layer(scene, layer)
             # chooses among lamps, and takes a fifth of the time
             self._scene.cycles.use_light_tree = bool(scene.lamps)
+        factor = self._settings.of_metal if shows_metal(self._bpy, scene) else 1
+        self._scene.cycles.samples = math.ceil(factor * self._settings.samples / self._finer**2)
         self._scene.cycles.seed = scene.noise_seed
         self._scene.render.filepath = str(self._output)
         try:
@@ -166,7 +183,6 @@ def _configure_image(scene: Any) -> None:
 def _configure_tracer(cycles: Any, settings: Settings) -> None:
     """Set the options of the path tracer that differ from Blender's factory settings."""
     cycles.device = "CPU"
-    cycles.samples = settings.samples
     cycles.use_adaptive_sampling = False  # would vary the number of samples, which is small anyway
     # the denoiser sometimes takes the default pattern's noise for texture
     cycles.sampling_pattern = "BLUE_NOISE"
@@ -174,13 +190,13 @@ def _configure_tracer(cycles: Any, settings: Settings) -> None:
     cycles.max_bounces = 2  # objects colour each other once; more bounces change nothing measurable
     cycles.diffuse_bounces = cycles.glossy_bounces = 2
     cycles.transmission_bounces = cycles.volume_bounces = cycles.transparent_max_bounces = 0
-    if settings.at_middles:
+    if settings.points:
         cycles.pixel_filter_type = "GAUSSIAN"  # the only filter whose width may be almost zero
         cycles.filter_width = 0.01
     cycles.use_denoising = settings.denoised
     cycles.denoiser = "OPENIMAGEDENOISE"
     cycles.denoising_quality = "FAST"  # HIGH takes a quarter longer for half a dB
-    cycles.denoising_input_passes = "RGB"  # albedo and normals made FAST worse
+    cycles.denoising_input_passes = "RGB"  # albedo and normals made FAST worse; those of a mirror are noisy
     cycles.denoising_prefilter = "NONE"
 
 
@@ -191,10 +207,7 @@ def _configure_for_meshes(bpy: Any) -> None:
     scene.render.image_settings.color_mode = "RGBA"
     scene.render.film_transparent = True
     scene.cycles.transparent_max_bounces = 8
-    # a third less noise than FAST with RGB alone, for two fifths of the tracer's time. Albedo and normals need the
-    # prefilter: Cycles takes those of smooth metal from what it reflects, and they are as noisy as the image
-    scene.cycles.denoising_quality, scene.cycles.denoising_prefilter = "BALANCED", "ACCURATE"
-    scene.cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
+    scene.cycles.denoising_quality = "BALANCED"
 
 
 @contextmanager

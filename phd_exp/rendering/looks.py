@@ -17,9 +17,7 @@ from phd_exp.rendering.pixels import linear
 from phd_exp.rendering.sampling import LAMP_DISTANCE, LAMPS, Stream, remoteness
 
 HARD = 0.5  # share of the scenes with one small lamp, which casts hard shadows, in addition to the sky
-# Of metal in scenes with meshes, whose denoiser uses albedo and normals: where the squared roughness is below 0.075,
-# Cycles takes both from what the surface reflects, and they are as noisy as the image.
-ROUGHER = 0.28
+ROUGHER = 0.28  # of metal in scenes with meshes: small convex parts have highlights of few pixels
 NODES = {"noise": "ShaderNodeTexNoise", "checker": "ShaderNodeTexChecker", "scratches": "ShaderNodeTexWave"}
 TONE = "phd_exp tone"
 TONES = (0.02, 0.5, 0.4)  # largest change of a texture's hue (turns), and of its saturation and value (factors)

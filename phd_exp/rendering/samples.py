@@ -33,12 +33,14 @@ from phd_exp.rendering.surroundings import photo_light, shaken
 from phd_exp.rendering.triangles import Meshes
 
 GREY = 128  # of all colours beyond the edges of the user's image, as in the views of photographs
+OF_METAL = 3  # the denoiser keeps more of the noise along the edges of its highlights
 MARGIN = 4  # px around the objects: the denoiser is less accurate along the border of its image
 
 
 def fast_settings(spec: DatasetSpec) -> Settings:
     """Settings of the tracer for the images of a data set."""
-    return Settings(samples=spec.samples_per_pixel, denoised=True, at_middles=spec.mesh is None)
+    n = spec.samples_per_pixel
+    return Settings(n, True, points=1) if spec.mesh is None else Settings(n, True, points=2, of_metal=OF_METAL)
 
 
 def make_sample(renderer: Renderer, spec: DatasetSpec, split: Split, index: int) -> tuple[bytes, SampleRecord]:
@@ -100,8 +102,9 @@ def photograph(renderer: Renderer, scene: Scene, hits: Hits, spec: DatasetSpec) 
         box = box_around(shown, MARGIN)
         inside = box.slices
         front, opacity = np.split(renderer.render(scene, box), [3], axis=-1)
-        if renderer.is_opaque:
-            opacity = coverage(scene, box, renderer.meshes)
+        if renderer.is_opaque:  # more points decide its edges than its light
+            covered = coverage(scene, box, renderer.meshes) * (opacity > 0)
+            front, opacity = front * covered / np.where(opacity > 0, opacity, 1), covered
         light[inside] = front + (1 - opacity) * light[inside]
     picture = encoded(shaken(light, around.shake))
     picture[beyond_edges(scene)] = GREY

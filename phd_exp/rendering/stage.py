@@ -50,6 +50,15 @@ def show_scene(bpy: Any, scene: Scene, meshes: Iterable[str] = (), brightness: f
     show_backdrop(bpy.data.worlds["world"].node_tree.nodes, scene.backdrop)
 
 
+def shows_metal(bpy: Any, scene: Scene) -> bool:
+    """Whether an object of a scene, without materials of its own, is metal."""
+    return any(
+        item.look.metallic > 0 if item.look else item.material == "metal"
+        for item in scene.objects
+        if not any(bpy.data.objects[item.shape].data.materials)
+    )
+
+
 def _place_object(bpy: Any, item: SceneObject) -> None:
     handle = bpy.data.objects[item.shape]
     handle.hide_render = False

@@ -13,7 +13,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from phd_exp.config.sections import EvaluationConfig
 from phd_exp.distributions.columns import Columns
-from phd_exp.records.errors import ConfigError, instead, shown
+from phd_exp.records.errors import ConfigError, unknown
 from phd_exp.records.files import write_atomic
 from phd_exp.records.runs import RunFolder, epoch_name
 from phd_exp.training.predictions import TRAINING, calibration_curves
@@ -126,10 +126,8 @@ def require_monitored(trainer: Trainer, evaluated: Sequence[str]) -> None:
     known += [f"train/{name}" for name in evaluated if name in TRAINING]
     for one in callbacks:
         if (monitor := getattr(one, "monitor", None)) is not None and monitor not in known:
-            raise ConfigError(
-                f"callbacks: {type(one).__name__} monitors {shown(monitor)}, which is not logged"
-                f"{instead(str(monitor), known)}"
-            )
+            fault = f"not logged, but monitored by {type(one).__name__}"
+            raise ConfigError(f"callbacks: {unknown(str(monitor), known, fault=fault)}")
 
 
 def epoch_metrics(trainer: Trainer) -> dict[str, float]:

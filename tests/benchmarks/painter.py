@@ -33,7 +33,7 @@ Paint = Callable[[Scene, int, Path], None]
 
 def reference(spec: DatasetSpec, folder: Path, samples: int) -> Paint:
     # Blender's own picture, as good as converged
-    renderer = Renderer(Settings(samples=1024, denoised=False, at_middles=False))
+    renderer = Renderer(Settings(samples=1024, denoised=False, points=None))
     return lambda scene, index, path: Image.fromarray(encoded(renderer.render(scene))).save(path)
 
 

@@ -72,7 +72,7 @@ def test_a_view_shows_what_the_crop_of_a_whole_photograph_shows(of_box: MakeSpec
     camera = {"f": 500.0, "width": 448, "height": 448}
     changes: dict[str, Any] = {"camera": camera, "xy_range": 0.5, "backdrops": None, "samples_per_pixel": 8}
     whole, box = of_box(view="field", sensor_size=448, **changes), of_box(sensor_size=96, **changes)
-    renderer = Renderer(Settings(samples=16, denoised=True, at_middles=False), whole)
+    renderer = Renderer(Settings(samples=16, denoised=True, points=None), whole)
     scene = sample_object_scene(whole, "train", 3, renderer.meshes)
     view = view_of_box(scene.model_copy(update={"S": 96}), box, np.random.default_rng(0), renderer.meshes)
     assert view is not None
@@ -105,7 +105,7 @@ def test_the_apparent_size_is_nearly_constant(of_box: MakeSpec, meshes: dict[str
 
 def test_what_lies_beyond_the_edges_is_grey_and_not_labelled(of_box: MakeSpec, tmp_path: Path) -> None:
     spec = of_box(sensor_size=56, samples_per_pixel=1, backdrops=None)
-    renderer = Renderer(Settings(samples=1, denoised=False, at_middles=False), spec)
+    renderer = Renderer(Settings(samples=1, denoised=False, points=None), spec)
     scenes = drawn(spec, 20, renderer.meshes)
     first = next(index for index, scene in enumerate(scenes) if beyond_edges(scene).any())
     content, record = make_sample(renderer, spec, "train", first)
@@ -123,7 +123,7 @@ def test_blender_draws_at_any_distance_where_the_labels_are(of_box: MakeSpec, z_
     f = 530.0 if z_range[0] < 10 else 3e6
     camera = {"f": f, "width": 640, "height": 480}
     spec = of_box(camera=camera, z_range=z_range, backdrops=None, sensor_size=64, distractors=0, xy_range=0.2)
-    renderer = Renderer(Settings(samples=1, denoised=False, at_middles=True), spec)
+    renderer = Renderer(Settings(samples=1, denoised=False, points=1), spec)
     for scene in drawn(spec, 3, renderer.meshes):
         opacity = renderer.render(scene)[..., 3] > 0.5
         mask = trace_pixels(scene, renderer.meshes).first != NOTHING
@@ -147,7 +147,7 @@ def test_the_front_faces_the_camera(of_box: MakeSpec, meshes: dict[str, Triangle
 
 def test_grey_images_are_grey(of_box: MakeSpec) -> None:
     spec = of_box(grey=True, sensor_size=32, samples_per_pixel=1)
-    renderer = Renderer(Settings(samples=1, denoised=False, at_middles=False), spec)
+    renderer = Renderer(Settings(samples=1, denoised=False, points=None), spec)
     image = decoded(make_sample(renderer, spec, "train", 0)[0])
     assert (image == image[..., :1]).all()
     assert image.std() > 1

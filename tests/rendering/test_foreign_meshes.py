@@ -22,7 +22,7 @@ from tests.support.renders import SMALL_MESH, MakeSpec
 
 Change = Callable[[dict[str, Any]], None]
 CUBE = solid("cube")
-AT_MIDDLES = Settings(samples=1, denoised=False, at_middles=True)
+AT_MIDDLES = Settings(samples=1, denoised=False, points=1)
 SIZE = pytest.approx((0.2, 0.2, 0.2), abs=1e-6)
 COLOURS = [f"uchar {name}" for name in ("diffuse_red", "diffuse_green", "diffuse_blue")]
 SHORT = [f"uchar {name}" for name in "rgba"]

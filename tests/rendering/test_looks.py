@@ -14,7 +14,7 @@ from phd_exp.rendering.triangles import Triangles
 from tests.support.meshes import solid, write_mesh
 from tests.support.renders import SMALL_MESH, MakeSpec, drawn
 
-ONE_SAMPLE = Settings(samples=1, denoised=False, at_middles=True)
+ONE_SAMPLE = Settings(samples=1, denoised=False, points=1)
 
 
 @pytest.fixture(scope="module")

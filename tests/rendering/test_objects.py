@@ -26,7 +26,7 @@ from tests.support.meshes import solid, write_mesh
 from tests.support.renders import UNLIKELY, MakeSpec, decoded, drawn
 
 SKIES = {"night", "city", "interior", "forest", "studio", "sunset", "sunrise", "courtyard"}
-AT_MIDDLES = Settings(samples=1, denoised=False, at_middles=True)
+AT_MIDDLES = Settings(samples=1, denoised=False, points=1)
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +201,7 @@ def test_records_of_cylinders_stay_as_they_were(
 def under_a_sky(of_mesh: MakeSpec) -> tuple[Renderer, Scene]:
     """A renderer without denoiser, and a scene whose object is in the middle."""
     spec = of_mesh(sensor_size=32, f_range=(60.0, 60.0), xy_range=0.0)
-    renderer = Renderer(Settings(samples=64, denoised=False, at_middles=False), spec)
+    renderer = Renderer(Settings(samples=1024, denoised=False, points=None), spec)
     return renderer, sample_object_scene(spec, "train", 0, renderer.meshes)
 
 
@@ -218,12 +218,12 @@ AWAY = Pose(rotation=about_axis((0.6, 0.8, 0.0), 1.0), translation=(0.0, 0.0, 0.
 def test_a_sky_is_looked_up_as_it_is_traced(under_a_sky: tuple[Renderer, Scene], pose: Pose | None) -> None:
     renderer, scene = under_a_sky
     empty = changed(scene, pose=pose, pitch=0.4).model_copy(update={"objects": (), "lamps": ()})
-    film, tracer = load_bpy().context.scene.render, load_bpy().context.scene.cycles
-    film.film_transparent, tracer.samples = False, 1024
+    film = load_bpy().context.scene.render
+    film.film_transparent = False
     try:
         traced = renderer.render(empty)
     finally:
-        film.film_transparent, tracer.samples = True, 64
+        film.film_transparent = True
     light = renderer.sky(empty)
     assert (traced[..., 3] == 1).all()
     np.testing.assert_allclose(light, traced[..., :3], rtol=0.07, atol=0.01)
@@ -265,14 +265,29 @@ def test_computed_edges_are_those_of_the_tracer(under_a_sky: tuple[Renderer, Sce
     box = Box(2, 3, 30, 31)
     computed, traced = coverage(near, box, renderer.meshes), renderer.render(near, box)[..., 3:]
     assert ((traced > 0.1) & (traced < 0.9)).sum() > 20, "there are edges"
-    assert np.abs(computed - traced).max() < 0.2, "of 64 random points"
+    assert np.abs(computed - traced).max() < 0.2, "of random points"
     assert np.abs(computed - traced)[(traced > 0) & (traced < 1)].mean() < 0.04
+
+
+def test_points_of_pixels_have_the_mean_of_the_filter(of_mesh: MakeSpec) -> None:
+    """Along edges, as random points have; in any box, which may touch the borders of the image."""
+    spec = of_mesh(sensor_size=32, f_range=(450.0, 450.0), xy_range=0.0)
+    exact = Renderer(Settings(samples=256, denoised=False, points=None), spec)
+    scene = sample_object_scene(spec, "train", 0, exact.meshes)
+    traced = exact.render(scene)[..., 3]
+    ours = Renderer(Settings(samples=1, denoised=False, points=2), spec)
+    computed, part = ours.render(scene)[..., 3], ours.render(scene, Box(0, 3, 30, 32))[..., 3]
+    assert traced[:, 0].any() or traced[0].any(), "the object touches the borders"
+    assert ((traced > 0.1) & (traced < 0.9)).sum() > 20, "there are edges"
+    assert np.abs(computed - traced).max() < 0.15
+    assert np.abs(computed - traced)[(traced > 0) & (traced < 1)].mean() < 0.03
+    np.testing.assert_allclose(part, computed[3:32, :30], atol=1e-6)
 
 
 def test_the_ground_has_a_shadow_below_the_object(of_mesh: MakeSpec) -> None:
     """Its layer shows it without the objects; a scene without an object has no shadow."""
     spec = of_mesh(sensor_size=48, f_range=(300.0, 300.0), upright=True, ground=True, pitch_range=(30.0, 31.0))
-    renderer = Renderer(Settings(samples=16, denoised=False, at_middles=False), spec)
+    renderer = Renderer(Settings(samples=16, denoised=False, points=None), spec)
     scene = sample_object_scene(spec, "train", 3, renderer.meshes)
     dark = shadow(renderer, scene)[..., 0]
     shown = cylinder_mask(trace_pixels(scene, renderer.meshes))
@@ -342,7 +357,7 @@ def test_fifty_thousand_faces_take_a_sixtieth_of_1024_samples_at_38_decibels(
         return images, time.process_time() - begun
 
     ours, seconds = made(renderer)
-    exact, longer = made(Renderer(Settings(samples=1024, denoised=False, at_middles=False), spec))
+    exact, longer = made(Renderer(Settings(samples=1024, denoised=False, points=None), spec))
     decibels = [-10 * np.log10(np.mean((a - b) ** 2) / 255**2) for a, b in zip(ours, exact, strict=True)]
     print(f"{seconds / 2:.2f} s, 1/{longer / seconds:.0f}, {decibels} dB")
     assert longer / seconds >= 60

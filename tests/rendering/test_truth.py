@@ -21,7 +21,7 @@ EVERY = 5  # takes the views of `multiview` in turn
 @pytest.fixture(scope="module")
 def drawn() -> Callable[[Scene], np.ndarray]:
     """Blender's own picture of which object shows in each pixel: 0 for none, 1 for the first of SHAPES, and so on."""
-    renderer = Renderer(Settings(samples=1, denoised=False, at_middles=True))
+    renderer = Renderer(Settings(samples=1, denoised=False, points=1))
     bpy = load_bpy()
     for number, shape in enumerate(SHAPES, start=1):
         bpy.data.objects[shape].pass_index = number
