@@ -12,9 +12,9 @@ from pydantic import BaseModel, BeforeValidator, Field, StrictBool, ValidationEr
 
 from phd_exp.config import sections
 from phd_exp.config.sections import FolderConfig, RenderedConfig, SourceConfig
-from phd_exp.config.targets import Target, TrainingTarget, TrainingTargets, Trust, describe, is_typed, locate
+from phd_exp.config.targets import Target, TrainingTarget, TrainingTargets, Trust, is_typed, locate
 from phd_exp.records.choices import flatten
-from phd_exp.records.errors import ConfigError, gist, shown
+from phd_exp.records.errors import ConfigError, complaint, gist, shown
 from phd_exp.records.parsing import Record
 from phd_exp.records.runs import HELD_OUT
 from phd_exp.records.spec import Shard
@@ -216,5 +216,6 @@ def _validated(model: type[Checked], config: dict[str, Any], trust: Trust) -> Ch
     try:
         return model.model_validate(config, context={"trust": trust})
     except ValidationError as error:
-        lines = [describe(problem, model) for problem in error.errors(include_url=False)]
+        problems = error.errors(include_url=False)
+        lines = [complaint(problem, model, "expected {key}=VALUE") for problem in problems]
         raise ConfigError("\n".join(dict.fromkeys(lines))) from None

@@ -6,9 +6,9 @@ from functools import partial
 from importlib import import_module
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, TypeAdapter, ValidationError, ValidationInfo
+from pydantic import AfterValidator, ConfigDict, TypeAdapter, ValidationError, ValidationInfo
 from pydantic.errors import PydanticSchemaGenerationError
-from pydantic_core import ErrorDetails, PydanticCustomError
+from pydantic_core import PydanticCustomError
 
 from phd_exp.records.errors import complaint, in_user_code, install, shown, unknown
 
@@ -170,13 +170,6 @@ TrainingTarget = Annotated[dict[str, Any], AfterValidator(_checked_if_typed)]
 """The same for a part that only training builds: in a stored configuration it may name anything."""
 TrainingTargets = Annotated[dict[str, Any], AfterValidator(_each_checked_if_typed)]
 """Any number of such nodes, each with a name."""
-
-
-def describe(problem: ErrorDetails, model: type[BaseModel]) -> str:
-    """One line for one error of pydantic: the key, the value, what was expected, the nearest valid key."""
-    if problem["type"] == "target":
-        return ".".join([*map(str, problem["loc"]), problem["ctx"]["text"]])
-    return complaint(problem, model, "expected {key}=VALUE")
 
 
 def _check_value(path: str, value: Any, annotation: Any) -> None:

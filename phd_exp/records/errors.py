@@ -100,6 +100,8 @@ def complaint(problem: ErrorDetails, model: type[BaseModel] | None = None, missi
     """
     place = [str(part) for part in problem["loc"]]
     key = ".".join(part for part in place if part != "spec" and not part.startswith("<"))
+    if problem["type"] == "target":  # of a class or function, whose parameter the text names
+        return f"{key}.{problem['ctx']['text']}"
     if problem["type"] == "extra_forbidden" and model:
         return unknown(key, _keys(model, place[:-1]))
     if problem["type"] == "missing":

@@ -81,7 +81,7 @@ CONFIGURATIONS = [
     Bad("configuration: runs in a file", in_the_way, ("preset=smoke", "logger=none", "runs=file/runs"), r".*file.*runs=DIR.*"),
     Bad("configuration: a sweep in a file", in_the_way, ("-m", "preset=smoke", "runs=file/runs"), r"file/runs/\.sweep: Not a directory; mend that, and the same command resumes"),
     Bad("configuration: a search without held-out samples", space, ("search", "space.yaml", "trials=1", *LEARN), r"data\.n_held_out: got 0.*", 2),
-    Bad("configuration: a search with a sampler that there is not", lambda place: place.put("space.yaml", "space: {}\nsampler: {_target_: optuna.samplers.Nope}\n"), ("search", "space.yaml", "trials=1", *LEARN), r"space\.yaml: sampler: _target_: 'optuna\.samplers\.Nope' cannot be imported .*", 2),
+    Bad("configuration: a search with a sampler that there is not", lambda place: place.put("space.yaml", "space: {}\nsampler: {_target_: optuna.samplers.Nope}\n"), ("search", "space.yaml", "trials=1", *LEARN), r"space\.yaml: sampler\._target_: 'optuna\.samplers\.Nope' cannot be imported .*", 2),
     Bad("configuration: a search with a wrong key", space, ("search", "space.yaml", "trials=1", *LEARN, "optimizer.lrr=1"), r"optimizer\.lrr: unknown key.*", 2),
     Bad("configuration: a shift of what is not rendered", nothing, (*LEARN, "shift=scenes"), r"evaluation\.shifts\.short_f\.data: data=folder is not rendered; leave out this shift.*", 2),
     Bad("configuration: an error of a focal length that is not used", nothing, ("preset=smoke", "camera=constant", "camera.f_error=0.1"), r"camera: f_error: got 0\.1; camera=constant uses no focal length; .*", 2),
