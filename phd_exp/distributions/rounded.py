@@ -31,7 +31,7 @@ _LEAST_LOG_A = -13.0
 _SHARE = 0.95  # of the largest exponent
 _LARGEST_ENERGY = 50.0
 _NODES, _PART, _LEVEL = 64, 40, 24  # nodes for the whole law, one of its tails, and each part of a level
-_NEWTON_STEPS, _CLOSEST_STEPS = 5, 20
+_NEWTON_STEPS, _CLOSEST_STEPS = 3, 20
 Points = Float[Tensor, "*#batch points"]
 
 
@@ -83,16 +83,14 @@ class Rounded(DepthLaw):
 
         The last step is taken with gradients, which makes them those of the implicit function.
         """
-        p, log_a = torch.broadcast_tensors(p, self.log_a)
         is_end = (p == 0) | (p == 1)
         inner = p.masked_fill(is_end, 0.5)
         with torch.no_grad():
-            law = Rounded(log_a, self.r)
+            law = Rounded(self.log_a, self.r)  # whose cached values need no gradient
             x = law._start(inner)
             for _ in range(_NEWTON_STEPS):
                 x = law._nearer(x, inner)
-        law = Rounded(log_a, self.r)
-        log_t = law._at(law._nearer(x, inner)[..., None]).log_t.squeeze(-1)
+        log_t = self._at(self._nearer(x, inner)[..., None]).log_t.squeeze(-1)
         return torch.where(is_end, torch.where(p == 0, -torch.inf, torch.inf), log_t)
 
     @property
