@@ -1,6 +1,5 @@
 """`python -m phd_exp export`: a run's network as an ONNX file, compared with torch."""
 
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Self
@@ -13,7 +12,6 @@ from phd_exp.records.errors import ConfigError
 
 if TYPE_CHECKING:  # imports of torch, which follow the checks of the arguments
     from phd_exp.data.batches import Batch
-    from phd_exp.inference.deployed import Precision
     from phd_exp.inference.predictor import Predictor
 
 
@@ -25,8 +23,8 @@ class ExportArguments(RunArguments):
     coverage: Coverage = None
     photographs: bool = False
     """the inputs are a photograph, its camera matrix and boxes, and the graph crops as predict does"""
-    precision: Literal["float32", "float64"] | None = None
-    """of computations after the network; by default float32, or float64 where float32 is not accurate enough"""
+    precision: Literal["float32", "float64"] = "float32"
+    """of computations before and after the network, and of the camera and boxes of photographs"""
     quantize: Literal["int8"] | None = None
     """convolutions in int8, calibrated and measured on the run's held-out images; refused if the errors grow"""
 
@@ -53,7 +51,6 @@ def main(words: list[str]) -> int:
 
     require_exportable(predictor)
     held_out = _held_out(predictor) if arguments.quantize else None
-    precision = _precision(arguments, predictor)
     sizes = [n for _, _, n in PHOTOGRAPHS] if arguments.photographs else batches(predictor.side)
     numbers = ", ".join(map(str, sizes))
     what = f"photographs with {numbers} boxes" if arguments.photographs else f"images in batches of {numbers}"
@@ -61,25 +58,13 @@ def main(words: list[str]) -> int:
         predictor.guarantee(arguments.coverage)  # is refused, if at all, before the work that is printed
     print(f"{file}: converting the network to ONNX, then comparing it with torch on {what}", flush=True)
     deviation, change = export(
-        predictor, file, arguments.coverage, arguments.photographs, precision=precision, held_out=held_out
+        predictor, file, arguments.coverage, arguments.photographs, arguments.precision, held_out
     )
-    print(f"{file}: {file.stat().st_size / 1e6:.1f} MB, {precision} after the network")
+    print(f"{file}: {file.stat().st_size / 1e6:.1f} MB, {arguments.precision} after the network")
     print(f"  largest relative deviation from torch: {deviation:.1e} (at most {TOLERANCE:g})")
     if change:
         print(f"  int8: {change}")
     return 0
-
-
-def _precision(arguments: ExportArguments, predictor: "Predictor") -> "Precision":
-    """The precision that was asked for, or the default. Raises ConfigError if it is not accurate enough."""
-    from phd_exp.inference.deployed import needs_float64
-
-    reason = needs_float64(predictor, arguments.photographs)
-    if reason and arguments.precision == "float32":
-        raise ConfigError(f"precision: got float32; expected float64: {reason}")
-    if reason and arguments.precision is None:
-        print(f"note: precision=float64, because {reason}; not every runtime supports it", file=sys.stderr)
-    return "float64" if reason else arguments.precision or "float32"
 
 
 def _held_out(predictor: "Predictor") -> "Batch":

@@ -3,36 +3,68 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int32, UInt8
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
 GREY = 128  # all colours of transparent pixels and of those beyond the edges of an image
-TIES = 1e6  # means are rounded to 1/TIES first, so that halves are exact whatever the order of the sums
+TIES = {torch.float64: 1e6, torch.float32: 2.0**15}
+"""Means are rounded to 1/TIES first, so that halves are exact whatever the order of the sums."""
 
 BEYOND = 3.0  # a place outside every image, in units of half its size from the middle
 
 
-def sums(image: UInt8[Tensor, "height width bands"]) -> Float[Tensor, "height+1 width+1 bands"]:
-    """Exact sums of an image, less grey, over the rectangle from its top left corner to every corner of a pixel."""
-    table = pad(image, (0, 0, 1, 0, 1, 0), value=GREY).double().sub_(GREY)
-    return table.cumsum_(0).cumsum_(1)
+def sums(image: UInt8[Tensor, "height width bands"]) -> Int32[Tensor, "height+1 width+1 bands"]:
+    """Exact sums of an image, less grey, over the rectangle from its top left corner to every corner of a pixel.
+
+    The sums of large images wrap around; their differences over a rectangle remain exact.
+    """
+    table = pad(image, (0, 0, 1, 0, 1, 0), value=GREY).int().sub_(GREY)
+    return table.cumsum_(0, dtype=torch.int32).cumsum_(1, dtype=torch.int32)
 
 
 def area_means(
-    table: Float[Tensor, "bottom right bands"], corners: Float[Tensor, "*views lower further 2"]
-) -> UInt8[Tensor, "*views rows columns bands"]:
+    table: Int32[Tensor, "bottom right bands"],
+    origin: Float[Tensor, "views 2"],
+    corners: Float[Tensor, "views lower further 2"],
+) -> UInt8[Tensor, "views rows columns bands"]:
     """The views whose pixels have their corners at these places (column, row) of an image, given its `sums`.
 
     Each pixel is the mean over an upright rectangle about the middle of its corners. The rectangle has the extent of
     the pixel along both axes (the root of the sum of squares of its two edges), and at least that of a pixel of the
     image, so that views of more pixels are interpolated linearly. Beyond the image, and at NaN, all is grey.
+
+    Places are relative to whole numbers, `origin`, and sums are subtracted before they are rounded, so that float32
+    suffices.
     """
-    (x, width), (y, height) = (_extents(axis) for axis in corners.unbind(-1))
-    width, height = width.clamp_min(1), height.clamp_min(1)
-    left, right, top, bottom = x - width / 2, x + width / 2, y - height / 2, y + height / 2
-    total = _at(table, right, bottom) - _at(table, left, bottom) - _at(table, right, top) + _at(table, left, top)
-    return _rounded((total / (width * height)[..., None]).nan_to_num(0.0))  # NaN where a corner is
+    height, width, bands = table.shape
+    (x, wide), (y, high) = (_extents(axis) for axis in corners.unbind(-1))
+    wide, high = wide.clamp_min(1), high.clamp_min(1)
+    columns, across = _ends(x, wide, origin[:, None, None, 0], width - 1)
+    rows, down = _ends(y, high, origin[:, None, None, 1], height - 1)
+    flat = table.reshape(-1, bands)
+
+    def at(row: Tensor, column: Tensor) -> Tensor:
+        return flat.index_select(0, (row * width + column).flatten()).reshape(*row.shape, bands)
+
+    lines = [[at(row, column) - at(row, columns[0]) for column in columns[1:]] for row in rows]
+    total = torch.zeros_like(x[..., None])
+    for line, share in zip(lines[1:], down, strict=True):
+        for value, first, weight in zip(line, lines[0], across, strict=True):
+            total = total + (share * weight)[..., None] * (value - first).to(x.dtype)
+    return _rounded((total / (wide * high)[..., None]).nan_to_num(0.0))  # NaN where a corner is
+
+
+def _ends(middle: Tensor, side: Tensor, origin: Tensor, size: int) -> tuple[list[Tensor], list[Tensor]]:
+    """The corners between pixels before and after the lower and the upper end of intervals within 0 and `size`, and
+    the weights, in the integral over an interval, of the last three; that of the first is minus their sum.
+    """
+    ends = torch.stack([middle - side / 2, middle + side / 2]).nan_to_num(0.0)
+    ends = ends.maximum(-origin).minimum(size - origin)
+    before = ends.floor()
+    (lower, upper), part = (before + origin).long(), ends - before
+    places = [lower, (lower + 1).clamp_max(size), upper, (upper + 1).clamp_max(size)]
+    return places, [-part[0], 1 - part[1], part[1]]
 
 
 def view(
@@ -93,27 +125,12 @@ def _shrunk(
 def _summed(
     table: Float[Tensor, "bands bottom right"], x: Float[Tensor, "rows columns"], y: Float[Tensor, "rows columns"]
 ) -> Float[Tensor, "bands rows columns"]:
-    """`_at`, for places from -1 to 1; NaN counts as -1."""
+    """The table at corners between pixels, from -1 to 1: linear along both axes; NaN counts as -1."""
     place = torch.stack([x, y], dim=-1)[None]
     return grid_sample(table[None], place, padding_mode="border", align_corners=True)[0]
 
 
 def _rounded(mean: Float[Tensor, "*views rows columns bands"]) -> UInt8[Tensor, "*views rows columns bands"]:
     """The values whose means, less grey, these are."""
-    return ((mean * TIES).round() / TIES + GREY).round().to(torch.uint8)
-
-
-def _at(
-    table: Float[Tensor, "bottom right bands"], x: Float[Tensor, "*views rows columns"], y: Tensor
-) -> Float[Tensor, "*views rows columns bands"]:
-    """The table at corners between pixels: linear along both axes, as the sums are inside a pixel."""
-    height, width, bands = table.shape
-    x, y = (value.nan_to_num(-1.0).clamp(0, size - 1) for value, size in ((x, width), (y, height)))
-    column, row = x.floor().long(), y.floor().long()
-    next_column = (column + 1).clamp_max(width - 1)
-    upper, lower = row * width, (row + 1).clamp_max(height - 1) * width
-    flat = table.reshape(-1, bands)
-    places = (upper + column, upper + next_column, lower + column, lower + next_column)
-    a, b, c, d = (flat.index_select(0, place.flatten()).reshape(*place.shape, bands) for place in places)
-    x, y = (x - column)[..., None], (y - row)[..., None]
-    return (a * (1 - x) + b * x) * (1 - y) + (c * (1 - x) + d * x) * y
+    ties = TIES[mean.dtype]
+    return ((mean * ties).round() / ties + GREY).round().to(torch.uint8)

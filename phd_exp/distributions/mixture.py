@@ -16,7 +16,7 @@ from phd_exp.distributions.depth import depth_mean_energy
 from phd_exp.distributions.huber import RADIAL_NORMALISER
 from phd_exp.distributions.projected_huber import ProjectedHuber
 from phd_exp.distributions.rounded import Rounded
-from phd_exp.distributions.special import scaled_expints, tail_moment
+from phd_exp.distributions.special import expint_differences
 
 DRAWS = 10_240  # for a level, whose standard error is at most 0.5 / sqrt(DRAWS) = 0.0049
 _AT_ONCE = 512  # draws in memory at a time
@@ -101,35 +101,53 @@ class Mixture:
         """The Projected Huber distribution p with the least KL(mixture || p): that of maximum E[log p].
 
         -E[log p] is a function of A_xy, A_xy m_xy and A_xy apex, convex, plus one of (mu_z, a); each has its minimum
-        by itself. Its axis is free if the members' are. Parameters are wanted in float64. Source: own derivation;
-        checked against a general optimiser in tests/distributions/test_mixture.py.
+        by itself. Its axis is free if the members' are. Source: own derivation; checked against a general optimiser
+        in tests/distributions/test_mixture.py.
         """
-        rounding = self.members.rounding
-        mu_z, a = (_closest_rounded_depth if rounding else _closest_depth)(self.members)
-        m_xy, apex, A_xy = _closest_projection(self.members)
-        return ProjectedHuber.about_axis(m_xy, apex, mu_z, A_xy * mu_z[..., None, None], a, rounding)
+        members = self.members
+        first, first_mu_z = members.mu_xy[..., 0, :], members.mu_z[..., :1]
+        rounding = members.rounding
+        log_ratio, a = (_closest_rounded_depth if rounding else _closest_depth)(members)
+        z, xy, slope, A_xy = _closest_projection(members)
+        mu_z = first_mu_z[..., 0] * log_ratio.exp()
+        A = A_xy * mu_z[..., None, None]
+        if members.k is None:
+            return ProjectedHuber(first + slope, mu_z, A, a, None, False, rounding)
+        further = first_mu_z * torch.expm1(log_ratio)[..., None]
+        on_first = first * first_mu_z + members.m_xy[..., 0, :] * further
+        mu_xy = (on_first + xy + slope * (further - z)) / mu_z[..., None]
+        apex = members.apex[..., 0, :2] + xy - slope * (first_mu_z + z)
+        return ProjectedHuber(mu_xy, mu_z, A, a, spd.matvec(A_xy, apex) / a[..., None], False, rounding)
 
 
 def _closest_depth(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
     """The mu_z and a that minimise the mean of a max(z/mu_z, mu_z/z) + log(mu_z N(a)) over depths of the mixture.
 
-    With far = E[z/mu_z; z > mu_z] and near = E[mu_z/z; z < mu_z] the derivatives vanish where a (far - near) = 1 and
-    a (far + near - 1) is the mean excess energy of a. The first gives a; then the second determines log mu_z.
+    mu_z is returned as its logarithm less that of the first member. With far = E[z/mu_z; z > mu_z] and
+    near = E[mu_z/z; z < mu_z] the derivatives vanish where a (far - near) = 1 and a (far + near - 1) is the mean
+    excess energy of a. The first gives a; then the second determines log mu_z. Both are computed from the excess of
+    far and near over the probabilities of z > mu_z and z < mu_z, since they themselves cancel where a is large.
     """
-    log_mu, a = members.mu_z.log(), members.a
-    E_1, E_3 = scaled_expints((1, 3), a)
-    norm = 1 + tail_moment(0, a)
+    first, a = members.mu_z[..., :1], members.a
+    log_mu = torch.log1p((members.mu_z - first) / first)
+    second, first, third = expint_differences(a)
+    norm = 1 + a * second  # 1 + g
+    beyond = 1 / a - a * third  # E[t - 1], less 1 / a - E[t - 1; t > 1]
+    short = second - a * first  # 1 - E[1/t]
 
     def conditions(place: Tensor) -> tuple[Tensor, Tensor]:
         """Whether log mu_z is larger than `place`, and the best a there."""
         distance = place[..., None] - log_mu
         x, s = a * distance.abs().exp(), distance.exp()
-        decay, (one, three) = torch.exp(a - x), scaled_expints((1, 3), x)
-        # E[t; t > s] and E[1/t; t < s] for t = z / mu_z of a member, in units of 1 / (1 + g)
-        far = torch.where(s > 1, decay * (s + 1 / a), 1 + 1 / a + a * (E_3 - decay * s.square() * three))
-        near = a * torch.where(s < 1, decay * one, 2 * E_1 - decay * one)
-        far, near = (far / s / norm).mean(-1), (near * s / norm).mean(-1)
-        difference, excess = (far - near).clamp_min(torch.finfo(a.dtype).tiny), far + near - 1
+        decay, (two, one_two, two_three) = torch.exp(-a * torch.expm1(distance.abs())), expint_differences(x)
+        is_beyond, gap = distance > 0, torch.expm1(distance.abs()) * norm
+        # E[t/s - 1; t > s], E[s/t - 1; t < s] and P(t > s) - P(t < s) for t = z / mu_z of a member, in units of
+        # 1 / (1 + g)
+        far = torch.where(is_beyond, decay / x, beyond / s + gap + decay * a * s * two_three)
+        near = torch.where(is_beyond, gap - s * short + decay * two, a * s * decay * one_two)
+        ahead = torch.where(is_beyond, 2 * decay - norm, norm - 2 * a * s * decay * two)
+        far, near, ahead = ((value / norm).mean(-1) for value in (far, near, ahead))
+        difference, excess = (far - near + ahead).clamp_min(torch.finfo(a.dtype).tiny), far + near
         energy = depth_mean_energy(-difference.log())
         return excess / difference < energy, energy / excess
 
@@ -141,7 +159,7 @@ def _closest_depth(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch"], Fl
         low = low + step * conditions(low + step * inner)[0].sum(0)
         high = low + step
     middle = low + step / 2
-    return middle.exp(), conditions(middle)[1]
+    return middle, conditions(middle)[1]
 
 
 def _closest_rounded_depth(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
@@ -153,26 +171,30 @@ def _closest_rounded_depth(members: ProjectedHuber) -> tuple[Float[Tensor, "*bat
     place, log_a = Rounded(law.log_a.mean(-1), law.r).closest_to(
         (log_t + (log_mu - middle[..., None])[..., None]).flatten(-2), (share / log_mu.shape[-1]).flatten(-2)
     )
-    return (middle + place).exp(), log_a.exp()
+    return middle + place - log_mu[..., 0], log_a.exp()
 
 
 def _closest_projection(
     members: ProjectedHuber,
-) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch 2"] | None, Float[Tensor, "*batch 2 2"]]:
-    """The m_xy, apex and A_xy that minimise the mean of h(|q|) - log|A_xy| over the mixture.
+) -> tuple[
+    Float[Tensor, "*batch 1"], Float[Tensor, "*batch 2"], Float[Tensor, "*batch 2"], Float[Tensor, "*batch 2 2"]
+]:
+    """A point (z, (x, y)) and the slope of the axis, in the coordinates of `_nodes`, and A_xy.
 
-    q = A_xy ((x, y) - m_xy z - apex), without an apex (None) unless the members' axes are free. h(|q|) is at most
-    |q|^2 / (2 max(1, |q_0|)) + constant, with equality at q_0: where that replaces it, the axis is a weighted
+    They minimise the mean of h(|q|) - log|A_xy| over the mixture, with q = A_xy times the distance of (x, y) from the
+    axis at z. Unless the members' axes are free the axis passes through the camera, and the point is 0. h(|q|) is at
+    most |q|^2 / (2 max(1, |q_0|)) + constant, with equality at q_0: where that replaces it, the axis is a weighted
     regression and A_xy^(-2) a weighted covariance C, and each such step lowers the mean. The integral is a sum over
     `_nodes`.
     """
     z, xy, weight = _nodes(members)
-    has_apex, pull = members.k is not None, weight
+    pull = weight
     for _ in range(_STEPS):
-        mean_z, mean_xy = ((pull * v).sum(-2, keepdim=True) / pull.sum(-2, keepdim=True) for v in (z, xy))
-        z_0, xy_0 = (mean_z, mean_xy) if has_apex else (torch.zeros_like(mean_z), torch.zeros_like(mean_xy))
-        m_xy = (pull * (z - z_0) * (xy - xy_0)).sum(-2) / (pull * (z - z_0).square()).sum(-2)
-        off = xy - xy_0 - m_xy[..., None, :] * (z - z_0)
+        z_0, xy_0 = ((pull * v).sum(-2, keepdim=True) / pull.sum(-2, keepdim=True) for v in (z, xy))
+        if members.k is None:
+            z_0, xy_0 = torch.zeros_like(z_0), torch.zeros_like(xy_0)
+        slope = (pull * (z - z_0) * (xy - xy_0)).sum(-2) / (pull * (z - z_0).square()).sum(-2)
+        off = xy - xy_0 - slope[..., None, :] * (z - z_0)
         C = ((pull * off)[..., :, None] * off[..., None, :]).sum(-3)
         log_det = spd.log_det(C)
         inverse = spd.inverse(C, log_det)
@@ -181,7 +203,7 @@ def _closest_projection(
     root_det = torch.exp(-log_det / 2)[..., None, None]  # C^(-1/2) by the theorem of Cayley and Hamilton
     trace = inverse.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
     A_xy = (inverse + root_det * torch.eye(2).to(C)) / (trace + 2 * root_det).sqrt()
-    return m_xy, (xy_0.squeeze(-2) - m_xy * z_0.squeeze(-2)) if has_apex else None, A_xy
+    return z_0.squeeze(-2), xy_0.squeeze(-2), slope, A_xy
 
 
 def _nodes(
@@ -189,16 +211,26 @@ def _nodes(
 ) -> tuple[Float[Tensor, "*batch nodes 1"], Float[Tensor, "*batch nodes 2"], Float[Tensor, "nodes 1"]]:
     """Depths, (x, y) and weights of the `_whitened_nodes` of all members.
 
-    They are at the root mean square of each member's depth, with a free axis at its mean less and plus its deviation.
+    (x, y) are relative to the axis of the first member, with a free axis depths to that of its mode, so that digits
+    of narrow densities are kept. They are at the root mean square of each member's depth, with a free axis at its
+    mean less and plus its deviation.
     """
     nodes, weight = (torch.from_numpy(values).to(members.a) for values in _whitened_nodes())
-    mean, variance = members.depth_mean, members.depth_variance
-    around = mean - variance.sqrt(), mean + variance.sqrt()
-    depths = ((variance + mean.square()).sqrt(),) if members.k is None else around
-    spread = spd.inverse(members.A, members.log_det_A) * members.mu_z[..., None, None]
-    axis = [z[..., None] * members.m_xy + members.apex[..., :2] for z in depths]
+    mu_z, mu_xy, m_xy = members.mu_z, members.mu_xy, members.m_xy
+    turned = m_xy - m_xy[..., :1, :]
+    if members.k is None:
+        depths = [(members.depth_variance + members.depth_mean.square()).sqrt()]
+        axes = [depths[0][..., None] * turned]
+    else:
+        mean, variance = members.depth_law.excess_moments
+        width, apart = mu_z / members.a, mu_z - mu_z[..., :1]
+        beyond = [width * (mean + sign * variance.sqrt()) for sign in (-1, 1)]  # the mode
+        at_mode = mu_z[..., None] * (mu_xy - mu_xy[..., :1, :])
+        at_mode = at_mode + apart[..., None] * members.apex[..., :1, :2] / mu_z[..., :1, None]
+        depths, axes = [apart + z for z in beyond], [at_mode + z[..., None] * turned for z in beyond]
+    spread = spd.inverse(members.A, members.log_det_A) * mu_z[..., None, None]
     across = spd.matvec(spread[..., None, :, :], nodes)
-    xy = torch.cat([across + at[..., None, :] for at in axis], dim=-2)
+    xy = torch.cat([across + at[..., None, :] for at in axes], dim=-2)
     z = torch.cat([at[..., None, None].expand_as(across[..., :1]) for at in depths], dim=-2)
     count = len(depths) * members.batch_shape[-1]
     return z.flatten(-3, -2), xy.flatten(-3, -2), (weight / count).repeat(count)[:, None]

@@ -3,6 +3,7 @@
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from phd_exp.geometry.motion import smallest_rotation
 
@@ -14,24 +15,41 @@ def facing(
 
     f is NaN where that raises ValueError, and for K and boxes that are not finite.
     """
-    left, top, right, bottom = boxes.unbind(-1)
-    pixels = [((left + right) / 2, (top + bottom) / 2), (left, top), (right, top), (left, bottom), (right, bottom)]
-    places = (torch.stack([torch.stack(pixel, -1) for pixel in pixels], 1) - K[:2, 2]) / K.diagonal()[:2]
-    directions = torch.cat([places, torch.ones_like(places[..., :1])], dim=-1)
-    R = smallest_rotation(directions[:, 0] / directions[:, 0].norm(dim=-1, keepdim=True))
-    corners = directions[:, 1:] @ R.mT
-    half_width = (corners[..., :2] / corners[..., 2:]).abs().amax((1, 2)).clamp_min(S / (2 * largest_f))
+    lower, upper = boxes.tensor_split(2, dim=-1)
+    half, focal_lengths = (upper - lower) / 2, K.diagonal()[:2]
+    middle = pad((lower + half - K[:2, 2]) / focal_lengths, (0, 1), value=1)
+    length = middle.norm(dim=-1, keepdim=True)
+    R = smallest_rotation(middle / length)
+    signs = torch.tensor([[-1, -1], [1, -1], [-1, 1], [1, 1]]).to(half)
+    # from the middle to the corners, since differences of their directions would lose the digits of small boxes
+    corners = (signs * half[:, None] / focal_lengths) @ R[..., :2].mT
+    ahead = length + corners[..., 2]
+    half_width = (corners[..., :2] / ahead[..., None]).abs().amax((1, 2)).clamp_min(S / (2 * largest_f))
     nearest = R[:, 2, 2] - half_width * R[:, :2, 2].abs().sum(-1)  # z of a corner of the view in the real frame
-    is_view = (corners[..., 2] > 0).all(-1) & (nearest > 0) & half_width.isfinite()
+    is_view = (ahead > 0).all(-1) & (nearest > 0) & half_width.isfinite()
     return R, torch.where(is_view, S / (2 * half_width), torch.nan)
 
 
 def pixel_corners(
-    K: Float[Tensor, "3 3"], R: Float[Tensor, "boxes 3 3"], f: Float[Tensor, " boxes"], S: int
-) -> Float[Tensor, "boxes places places 2"]:
-    """Pixels of the real image at the corners of the pixels of each virtual image, `VirtualCamera.corners`."""
+    K: Float[Tensor, "3 3"],
+    boxes: Float[Tensor, "boxes 4"],
+    R: Float[Tensor, "boxes 3 3"],
+    f: Float[Tensor, " boxes"],
+    S: int,
+) -> tuple[Float[Tensor, "boxes 2"], Float[Tensor, "boxes places places 2"]]:
+    """Pixels of the real image at the corners of the pixels of each virtual image, `VirtualCamera.corners`.
+
+    Returned are the whole numbers next to the middle of each box, and the corners relative to these: from the middle
+    on, whose place is known, rounding errors are those of the distance.
+    """
+    lower, upper = boxes.tensor_split(2, dim=-1)
+    half = (upper - lower) / 2
+    origin = (lower + half).floor()
     along = torch.arange(S + 1, dtype=K.dtype) - S / 2
     y, x = torch.meshgrid(along, along, indexing="ij")
-    x, y = x / f[:, None, None], y / f[:, None, None]
-    real = torch.stack([x, y, torch.ones_like(x)], dim=-1) @ R[:, None]
-    return K[:2, 2] + K.diagonal()[:2] * (real[..., :2] / real[..., 2:])
+    x, y = ((value / f[:, None, None])[..., None] for value in (x, y))
+    right, down, middle = R[:, None, None].unbind(-2)  # the axes of the virtual cameras
+    slope = middle[..., :2] / middle[..., 2:]
+    across = x * (right[..., :2] - slope * right[..., 2:]) + y * (down[..., :2] - slope * down[..., 2:])
+    away = across / (x * right[..., 2:] + y * down[..., 2:] + middle[..., 2:])
+    return origin, (lower - origin + half)[:, None, None] + K.diagonal()[:2] * away

@@ -1,6 +1,6 @@
 """The predictor as a network of its own, from images, or from a photograph with boxes, to positions with uncertainty.
 
-An exported graph is traced from it. The network computes in float32, everything after it in float32 or float64.
+An exported graph is traced from it. The network computes in float32, everything else in float32 or float64.
 """
 
 from abc import ABC, abstractmethod
@@ -23,7 +23,7 @@ from phd_exp.optics.virtual import intrinsics
 from phd_exp.records.errors import ConfigError
 
 Precision = Literal["float32", "float64"]
-"""The type of all numbers after the network."""
+"""The type of all numbers before and after the network."""
 FOCAL_LENGTHS = (5.0, 9.0)  # range for the comparison with torch, in sides of the image
 NUMBER = Dim("n", min=0)
 PHOTOGRAPHS = ((150, 150, 1), (180, 240, 7), (301, 199, 24))  # width, height and number of boxes
@@ -34,14 +34,14 @@ class Deployed(nn.Module, ABC):
 
     Args:
         predictor: the network or ensemble.
-        precision: the type of all numbers after the network.
+        precision: the type of all numbers before and after the network.
     """
 
     inputs: tuple[str, ...]
     dynamic_shapes: tuple[dict[int, Dim] | None, ...]
     """Of each input: the dimensions whose size is free."""
 
-    def __init__(self, predictor: Predictor, precision: Precision = "float64") -> None:
+    def __init__(self, predictor: Predictor, precision: Precision = "float32") -> None:
         super().__init__()
         self.predictor, self.dtype = predictor, torch.float32 if precision == "float32" else torch.float64
         self.networks = nn.ModuleList(predictor.networks)
@@ -101,9 +101,9 @@ class OfPhotographs(Deployed):
         self, photograph: UInt8[Tensor, "height width 3"], K: Float[Tensor, "3 3"], boxes: Float[Tensor, "boxes 4"]
     ) -> tuple[Tensor, ...]:
         R, f = facing(K, boxes, self.predictor.side, self.predictor.largest_f)
-        image = area_means(sums(photograph), pixel_corners(K, R, f, self.predictor.side))
+        image = area_means(sums(photograph), *pixel_corners(K, boxes, R, f, self.predictor.side))
         raw = self.predictor.outputs(image, self.predictor.camera(f.float()).f)
-        answers = self.answers(self.predictor.predict(raw, f.float()), photograph, K, boxes)
+        answers = self.answers(self.predictor.predict(raw, f.float(), self.dtype), photograph, K, boxes)
         left, top, right, bottom = boxes.unbind(-1)
         height, width = photograph.shape[:2]
         is_inside = (left < width) & (top < height) & (right > 0) & (bottom > 0)
@@ -111,7 +111,7 @@ class OfPhotographs(Deployed):
         return self.outputs(is_valid, raw, answers.values())
 
     def answers(self, prediction: Prediction, *inputs: Tensor) -> dict[str, Tensor]:
-        _, K, boxes = inputs
+        K, boxes = (value.to(prediction.mode.dtype) for value in inputs[1:])
         R, _ = facing(K, boxes, self.predictor.side, self.predictor.largest_f)
         here = answers(prediction)
         for name in ("mode", "mean", "position"):
@@ -125,23 +125,23 @@ class OfPhotographs(Deployed):
 
     def samples(self, images: UInt8[Tensor, "n S S 3"], f: Float[Tensor, " n"]) -> Iterator[tuple[Tensor, ...]]:
         side = float(self.predictor.side)
-        box = torch.tensor([[0, 0, side, side]], dtype=torch.float64)
+        box = torch.tensor([[0, 0, side, side]], dtype=self.dtype)
         for image, value in zip(images, f.tolist(), strict=True):
-            yield image, torch.from_numpy(intrinsics(value, value, side / 2, side / 2)), box
+            yield image, torch.from_numpy(intrinsics(value, value, side / 2, side / 2)).to(self.dtype), box
 
     def cases(self) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Prediction]]:
         draw, predictor = np.random.default_rng(1), self.predictor
         for width, height, n in PHOTOGRAPHS:
             (photograph,) = pictures(1, height, width)
             f = max(width, height) * draw.uniform(1, 2)
-            K = intrinsics(f, 1.1 * f, 0.45 * width, 0.55 * height)
+            K = torch.from_numpy(intrinsics(f, 1.1 * f, 0.45 * width, 0.55 * height)).to(self.dtype)
             middle, half = draw.uniform(0.1, 0.9, (n, 2)), draw.uniform(0.05, 0.3, (n, 2))
-            boxes = np.concatenate([middle - half, middle + half], axis=1) * np.tile([width, height], 2)
-            views = [predictor.view(photograph, K, tuple(box)) for box in boxes.tolist()]
+            ends = np.concatenate([middle - half, middle + half], axis=1) * np.tile([width, height], 2)
+            boxes = torch.from_numpy(ends).to(self.dtype)
+            views = [predictor.view(photograph, K.double().numpy(), tuple(box)) for box in boxes.tolist()]
             known = torch.tensor([view.camera.f for view in views], dtype=torch.float32)
             raw = predictor.raw(np.stack([view.image for view in views]), known)
-            inputs = torch.from_numpy(photograph), torch.from_numpy(K), torch.from_numpy(boxes)
-            yield inputs, raw, predictor.predict(raw.double(), known.double())
+            yield (torch.from_numpy(photograph), K, boxes), raw, predictor.predict(raw.double(), known.double())
 
 
 def require_exportable(predictor: Predictor) -> None:
@@ -151,13 +151,6 @@ def require_exportable(predictor: Predictor) -> None:
             f"{predictor.config.model.name}: cannot be exported, because the mode of a mixture of Gaussians needs "
             "inverse matrices, which ONNX lacks; expected a run of another model"
         )
-
-
-def needs_float64(predictor: Predictor, photographs: bool) -> str | None:
-    """Why the numbers after the network must be float64; None if float32 is accurate enough."""
-    if photographs:
-        return "photographs=true computes the pixels of crops"
-    return "the density closest to an ensemble is searched for" if predictor.is_ensemble else None
 
 
 def batches(side: int) -> list[int]:

@@ -130,7 +130,6 @@ ARGUMENTS = [
     argument((*ONE, "coverage=0.9"), r"runs/.*/held_out\.parquet: missing; held-out samples are needed: train with.*", 1),
     argument(("export",), r"run: missing; export takes run=, recalibrate=, calibration=, trust=, views=, out=, coverage=.*"),
     argument(("export", "run=.", "out=."), r"out=\.: is a folder.*"),
-    argument((*EXPORT, "precision=float32", "photographs=true"), r"precision: got float32; expected float64: photographs=true.*"),
     argument((*EXPORT, "quantize=int8", "coverage=0.9"), r"coverage: is guaranteed for the network in float32.*"),
     argument((*EXPORT, "quantize=int8"), r"quantize: got a run with \d+ held-out images; expected at least 40, .*"),
     argument(("fuse", "run=nowhere"), r"folder: missing; fuse takes run=.*"),

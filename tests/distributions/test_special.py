@@ -55,6 +55,12 @@ def test_scaled_expint(n: int, a: torch.Tensor) -> None:
     assert relative_error(special.scaled_expint(n, a), truth) < TOLERANCE[a.dtype]
 
 
+@pytest.mark.parametrize("n", [1, 2])
+def test_differences_of_exponential_integrals(n: int, a: torch.Tensor) -> None:
+    truth = exact(lambda x: scaled_expint(n, x) - scaled_expint(n + 1, x))
+    assert relative_error(special.expint_differences(a)[n], truth) < TOLERANCE[a.dtype]
+
+
 @pytest.mark.parametrize("n", [0, 6, 20])
 def test_scaled_expint_refuses_orders_the_rule_was_not_built_for(n: int) -> None:
     with pytest.raises(ValueError, match=f"n: got {n}; expected 1 to 5"):

@@ -146,7 +146,7 @@ def test_the_lines_of_the_guide_deploy_it_without_torch(
         (row,) = read_lines(phd_exp(*command, words).out)
         row["depth_interval"] = list(row["depth_interval"].values())
         for key, values in zip(shared, here, strict=False):
-            assert np.abs(np.array(values[number]) - row[key]).max() < 1e-5 * np.abs(row[key]).max()
+            assert np.abs(np.array(values[number]) - row[key]).max() < 1e-4 * np.abs(row[key]).max()
 
 
 @pytest.mark.slow
@@ -154,31 +154,37 @@ def test_the_exported_file_describes_its_inputs_and_outputs(exported: Path) -> N
     import onnxruntime
     from onnx import load
 
-    require_portable(load(exported))
-
     for file in (exported, exported.with_name("photographs.onnx")):
+        require_portable(load(file))
         session = onnxruntime.InferenceSession(file)
         said = json.loads(session.get_modelmeta().custom_metadata_map["phd_exp"])
         names = [value.name for value in (*session.get_inputs(), *session.get_outputs())]
         assert {*names} <= said.keys()
         assert (said["side"], said["temperature"]) == (SIDE, None)
-        assert said["precision"] == ("float32" if file == exported else "float64")
+        assert said["precision"] == "float32"
 
 
 @pytest.mark.slow
-def test_openvino_gives_the_answers_of_onnxruntime(exported: Path) -> None:
+@pytest.mark.parametrize("name", ["network.onnx", "photographs.onnx"])
+def test_openvino_gives_the_answers_of_onnxruntime(exported: Path, name: str) -> None:
     import onnxruntime
 
     from phd_exp.inference.deployed import pictures
 
+    file = exported.with_name(name)
     given = {"image": pictures(20, SIDE, SIDE), "f": np.linspace(200, 400, 20, dtype=np.float32)}
-    here = openvino_outputs(exported.read_bytes(), given)
-    session = onnxruntime.InferenceSession(exported)
+    if file != exported:
+        (photograph,) = pictures(1, 180, 240)
+        K = np.array([[300, 0, 110], [0, 310, 95], [0, 0, 1]], np.float32)
+        given = {"photograph": photograph, "K": K, "boxes": np.array([[30, 20, 60 + k, 90] for k in range(20)], "f")}
+    here = openvino_outputs(file.read_bytes(), given)
+    session = onnxruntime.InferenceSession(file)
     for place, (value, expected) in enumerate(zip(here, session.run(None, given), strict=True)):
         name = session.get_outputs()[place].name
         rows = expected.reshape(20, -1)
         deviation = np.abs(value.reshape(20, -1) - rows).max(1) / np.abs(rows).max(1)
-        assert deviation.max() < (1e-3 if name == "covariance" else 2e-5), name
+        most = 2e-5 if file == exported else 2e-4  # where a colour is rounded otherwise
+        assert deviation.max() < (1e-3 if name == "covariance" else most), name
 
 
 @pytest.mark.slow

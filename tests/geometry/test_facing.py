@@ -14,8 +14,11 @@ S = 64
 
 @pytest.mark.parametrize("largest_f", [float("inf"), 500.0])
 def test_they_are_those_of_each_box(largest_f: float) -> None:
-    R, f = facing(torch.from_numpy(K), torch.from_numpy(BOXES), S, largest_f)
-    corners = pixel_corners(torch.from_numpy(K), R, f, S)
+    given = torch.from_numpy(K), torch.from_numpy(BOXES)
+    R, f = facing(*given, S, largest_f)
+    origin, corners = pixel_corners(*given, R, f, S)
+    assert torch.equal(origin, origin.round())
+    corners = origin[:, None, None] + corners
     assert (f <= largest_f).all()
     for number, box in enumerate(BOXES.tolist()):
         camera = VirtualCamera.of_box(K, tuple(box), float(S), largest_f=largest_f)

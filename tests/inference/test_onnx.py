@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from phd_exp.config import check
-from phd_exp.distributions import Temperature
+from phd_exp.distributions import Mixture, Temperature
 from phd_exp.distributions.constraints import families
 from phd_exp.distributions.temperature import Slope
 from phd_exp.geometry import Camera, Cartesian, Chart, DepthScale, LogDepth, Projected
@@ -71,7 +71,7 @@ def predictor(composed: Callable[..., Any], head: Head, numbers: Tensor, **chang
     )
 
 
-def exported(made: Predictor, kind: str = "OfImages", precision: str = "float64") -> Any:
+def exported(made: Predictor, kind: str = "OfImages", precision: str = "float32") -> Any:
     """The graph of images or of photographs."""
     from phd_exp.inference import deployed, onnx
 
@@ -150,7 +150,7 @@ def test_the_distribution_is_that_of_torch_in_every_runtime(composed: Callable[.
     numbers = draws(10_000, 2_000)
     made = predictor(composed, DistributionHead(DEPTH, free_axis=True), numbers, temperature=TEMPERATURE)
     images, f = images_of(np.arange(len(numbers))), np.linspace(2, 9, len(numbers), dtype=np.float32) * SIDE
-    model = exported(made, precision="float32")
+    model = exported(made)
     require_portable(model)
     session = session_of(model)
     found = worst(made, session, images, f)
@@ -163,16 +163,47 @@ def test_the_distribution_is_that_of_torch_in_every_runtime(composed: Callable[.
     require_accurate(dict(zip(found, deviations(other[1:], [value.numpy() for value in there]), strict=True)))
 
 
+def disagreeing(raw: Tensor, widths: float, members: int) -> Tensor:
+    """Raw numbers of members whose modes differ by about so many widths of their densities, a at least 1."""
+    noise = torch.randn((len(raw), members, 9), generator=torch.Generator().manual_seed(0), dtype=raw.dtype)
+    raw = raw[:, None] + widths * noise * (raw[:, None].abs() * torch.tensor([0, 0, 0.05, 0.05, 0.05, 0.05, 0, 0, 0]))
+    raw = raw + widths * noise * torch.tensor([1, 1, 0, 0, 0, 0, 1, 0.3, 0.3])
+    return torch.cat([raw[..., :5], raw[..., 5:6].clamp_min(0), raw[..., 6:]], dim=-1).float()
+
+
+@pytest.mark.parametrize("widths", [0.0, 1.0])
+@pytest.mark.parametrize("n_outputs", [7, 9])
+def test_float32_has_the_digits_of_float64_in_ensembles(widths: float, n_outputs: int) -> None:
+    """Of eight members, for which digits cancel most where they are equal."""
+    raw = families()["free_axis"].inputs(1_000, torch.Generator().manual_seed(0))
+    raw = disagreeing(torch.cat([raw[:, :5], raw[:, 5:6].abs(), raw[:, 6:]], dim=-1), widths, 8)[..., :n_outputs]
+    f, head = torch.linspace(2, 9, len(raw))[:, None] * SIDE, DistributionHead(DEPTH, free_axis=n_outputs == 9)
+    here, there = (
+        answers(Mixture(head(raw.to(dtype), Camera(f.to(dtype), float(SIDE)))).closest)
+        for dtype in (torch.float32, torch.float64)
+    )
+    values = ([value.numpy() for value in one.values()] for one in (here, there))
+    for name, deviation in zip(there, deviations(*values), strict=True):
+        tolerance = TOLERANCES.get(name, 1e-5)
+        assert deviation.max() < 10 * tolerance, name  # mode and mean along a steep axis, and a
+        assert np.quantile(deviation, 0.99) < tolerance * (10 if name == "a" else 1), name
+
+
 @pytest.mark.slow
-def test_an_ensemble_is_that_of_torch(composed: Callable[..., Any]) -> None:
-    """Two networks with eight views each, in float64."""
+def test_an_ensemble_is_that_of_torch_in_every_runtime(composed: Callable[..., Any]) -> None:
+    """Two networks with eight views each."""
     head = DistributionHead(DEPTH, free_axis=True)
-    numbers = torch.randn(100, 2, 9, generator=torch.Generator().manual_seed(0)) * 3
+    numbers = disagreeing(torch.tensor([[0.0, 0, 90, 15, 120, 60, 4, 1.2, -0.5]]).expand(100, 9), 1.0, 2)
     made = predictor(composed, head, numbers[:, 0], others=(Table(head, numbers[:, 1]),), views=8)
-    images, f = images_of(np.arange(100)), np.linspace(600, 1000, 100, dtype=np.float32)
-    for name, deviation in worst(made, session_of(exported(made)), images, f).items():
-        assert np.quantile(deviation, 0.9) < 1e-5, name
-        assert deviation.max() < 1e-3, name
+    images, f = images_of(np.arange(100)), np.linspace(2, 9, 100, dtype=np.float32) * SIDE
+    model = exported(made)
+    require_portable(model)
+    found = worst(made, session_of(model), images, f)
+    require_accurate(found)
+    other = openvino_outputs(model.SerializeToString(), {"image": images, "f": f})
+    raw, known = made.raw(images, torch.from_numpy(f)).double(), torch.from_numpy(f).double()
+    there = [value.numpy() for value in answers(made.predict(raw, known)).values()]
+    require_accurate(dict(zip(found, deviations(other[1:], there), strict=True)))
 
 
 POINTS = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
@@ -182,8 +213,9 @@ POINTS = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
 def sessions(composed: Callable[..., Any]) -> dict[str, Any]:
     """The graphs of a baseline, of photographs and of images."""
     made = predictor(composed, ChartHead(DEPTH, Projected), POINTS)
-    graphs = {"OfPhotographs": exported(made, "OfPhotographs"), "OfImages": exported(made, precision="float32")}
-    require_portable(graphs["OfImages"])
+    graphs = {kind: exported(made, kind) for kind in ("OfPhotographs", "OfImages")}
+    for graph in graphs.values():
+        require_portable(graph)
     return {kind: session_of(graph) for kind, graph in graphs.items()}
 
 
@@ -195,7 +227,7 @@ def test_baselines_are_points(
     composed: Callable[..., Any], sessions: dict[str, Any], chart: Callable[..., Chart], constant_f: float | None
 ) -> None:
     made = predictor(composed, ChartHead(DEPTH, chart), POINTS, constant_f=constant_f)
-    session = sessions["OfImages"] if chart is Projected else session_of(exported(made, precision="float32"))
+    session = sessions["OfImages"] if chart is Projected else session_of(exported(made))
     images, f = images_of(np.arange(50)), np.linspace(600, 1000, 50, dtype=np.float32)
     (deviation,) = worst(made, session, images, f).values()
     assert deviation.max() < 1e-6
@@ -225,7 +257,7 @@ def test_a_graph_answers_no_boxes_with_nothing_and_boxes_that_are_none_with_nan(
     def answers(
         boxes: list[list[float]], photograph: np.ndarray = PHOTOGRAPH, camera: np.ndarray = K
     ) -> list[np.ndarray]:
-        given = {"photograph": photograph, "K": camera, "boxes": np.array(boxes, float).reshape(-1, 4)}
+        given = {"photograph": photograph, "K": camera.astype("f"), "boxes": np.array(boxes, "f").reshape(-1, 4)}
         return sessions["OfPhotographs"].run(None, given)
 
     alone = answers([BOX])
