@@ -111,7 +111,7 @@ def loaded(arguments: RunArguments, device: str = "auto", coverage: Coverage = N
         print(f"note: {arguments.run[0]}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
     if arguments.calibration:
         return predictor.calibrated(arguments.calibration, guarantees=coverage is not None)
-    if predictor.views > 1 and (arguments.recalibrate or coverage):
+    if predictor.views > 1 and (arguments.recalibrate or coverage) and not arguments.run[0].is_file():
         _record_held_out_views(predictor, trust)
     return predictor.recalibrated() if arguments.recalibrate else predictor
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # imports of seconds, which follow the checks of the argument
     from phd_exp.inference.detectors import Detector
     from phd_exp.inference.following import Followed, Frame
     from phd_exp.inference.predictor import Predictor
-    from phd_exp.inference.rerun_recording import Recording
+    from phd_exp.inference.rerun_recording import SceneFile
 
 Box = tuple[float, float, float, float]
 LEAST_LAG = 4  # five frames in a row that contradict a path end it
@@ -112,7 +112,7 @@ def main(words: list[str]) -> int:
 
 def _recording(
     arguments: TrackArguments, sequences: Sequence[_Sequence]
-) -> AbstractContextManager["Recording | None"]:
+) -> AbstractContextManager["SceneFile | None"]:
     """The recording for view=, if it is given."""
     if arguments.view is None:
         return nullcontext()
@@ -182,7 +182,7 @@ def _followed(
     predictor: "Predictor",
     detector: "Detector | None",
     sequence: _Sequence,
-    view: "Recording | None",
+    view: "SceneFile | None",
 ) -> Iterator["Followed"]:
     """The frames with their states, in the recording for view= first, with a progress bar on a terminal."""
     from phd_exp.fusion.tracks import ConstantVelocity, Slow

@@ -13,7 +13,7 @@ from phd_exp.config import RunConfig, check
 from phd_exp.config.targets import Trust, custom_parts
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.inference.predictor import Predictor
-from phd_exp.models.heads import DistributionHead
+from phd_exp.models.heads import SymmetricHead
 from phd_exp.models.regressor import Regressor
 from phd_exp.models.weights import fill, regressor_weights
 from phd_exp.records.choices import first_difference, has_influence
@@ -79,7 +79,7 @@ def _require_alike(predictors: Sequence[Predictor], matters: Callable[[str], boo
                 f"run: {place} has {difference} in {other.folders[0].path}; expected runs on one kind of data with "
                 "one camera and image size, and a folder of seeds with one configuration"
             )
-    if not isinstance(first.regressor.head, DistributionHead):
+    if not isinstance(first.regressor.head, SymmetricHead):
         raise ConfigError(
             f"{place}: predicts no uncertainty, so that it joins no ensemble; expected model=probabilistic"
         )

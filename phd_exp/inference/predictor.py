@@ -21,7 +21,7 @@ from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.geometry.motion import EIGHT, turned
 from phd_exp.inference.views import View, focal_lengths, image_batch
-from phd_exp.models.heads import DistributionHead, Prediction
+from phd_exp.models.heads import Prediction, SymmetricHead
 from phd_exp.models.regressor import Regressor
 from phd_exp.optics.virtual import Box, VirtualCamera, intrinsics
 from phd_exp.records.errors import ConfigError, DatasetError, RunError, listed
@@ -145,7 +145,7 @@ class Predictor:
             if not file.exists():
                 remedy = "train with data.n_held_out > 0"
                 if self.views > 1 and self.config.data.n_held_out:
-                    remedy = "repeat the command of the training with evaluation.eight_views=true"
+                    remedy = "repeat the command of the training with evaluation.eight_views=true, and `pack` again"
                 raise RunError(f"{file}: missing; held-out samples are needed: {remedy}")
         from phd_exp.evaluation.parquet import read_table  # imports pyarrow
         from phd_exp.evaluation.predictions import ensemble_table
@@ -241,7 +241,7 @@ class Predictor:
         f = f.repeat_interleave(self.views)
         raw = torch.stack([network.raw(views, f).unflatten(0, (-1, self.views)) for network in self.networks], dim=1)
         head = self.regressor.head
-        assert isinstance(head, DistributionHead)  # checked by `load`
+        assert isinstance(head, SymmetricHead)  # checked by `load`
         return head.turned_back(raw, torch.tensor(signs).to(raw)).flatten(1, 2)
 
     def members(

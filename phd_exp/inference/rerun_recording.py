@@ -36,7 +36,7 @@ Vector = Float[np.ndarray, "3"]
 Matrix = Float[np.ndarray, "3 3"]
 
 
-class Recording:
+class SceneFile:
     """A `.rrd` file, begun with the first camera; what is written can be opened after an interruption.
 
     Args:

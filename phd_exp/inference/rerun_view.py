@@ -14,7 +14,7 @@ from phd_exp.fusion import Pose
 from phd_exp.inference.answers import Sighting
 from phd_exp.inference.following import HERE, Followed
 from phd_exp.inference.path_video import COLOURS, TRAIL
-from phd_exp.inference.rerun_recording import LEVELS, Place, Recording, Vector, named
+from phd_exp.inference.rerun_recording import LEVELS, Place, SceneFile, Vector, named
 from phd_exp.optics.virtual import VirtualCamera, towards
 from phd_exp.records.own_images import Observed, views_of
 
@@ -24,7 +24,7 @@ HALF_90 = 1.645  # standard deviations from the middle to an end of the central 
 def viewed(file: Path, sightings: Iterable[Sighting]) -> Iterator[Sighting]:
     """The sightings; each is recorded before it is yielded. One image is one step of the timeline."""
     objects, on_image = ["objects"], ["camera", "image", "objects"]
-    with Recording(file, [["camera"]]) as recording:
+    with SceneFile(file, [["camera"]]) as recording:
         for number, (_, same) in enumerate(groupby(sightings, lambda one: one.detection.file)):
             for k, sighting in enumerate(same):
                 if k == 0:
@@ -36,13 +36,13 @@ def viewed(file: Path, sightings: Iterable[Sighting]) -> Iterator[Sighting]:
                 yield sighting
 
 
-def of_scenes(file: Path, scenes: Sequence[Observed]) -> Recording:
+def of_scenes(file: Path, scenes: Sequence[Observed]) -> SceneFile:
     """An empty recording with a place for each camera of the scene that has most."""
-    return Recording(file, [_camera(k) for k in range(max(len(scene.detections) for scene in scenes))])
+    return SceneFile(file, [_camera(k) for k in range(max(len(scene.detections) for scene in scenes))])
 
 
 def viewed_scenes(
-    recording: Recording, scenes: Sequence[Observed], sightings: Iterable[Sighting]
+    recording: SceneFile, scenes: Sequence[Observed], sightings: Iterable[Sighting]
 ) -> Iterator[Sighting]:
     """The sightings of all scenes, in their order; each is recorded before it is yielded."""
     most = max(len(scene.detections) for scene in scenes)
@@ -57,7 +57,7 @@ def viewed_scenes(
         yield sighting
 
 
-def add_fused(recording: Recording, answers: Sequence[Mapping[str, Any]]) -> None:
+def add_fused(recording: SceneFile, answers: Sequence[Mapping[str, Any]]) -> None:
     """Record the fused position of each scene that has one."""
     for number, answer in enumerate(answers):
         if answer["status"] == "fused":
@@ -66,12 +66,12 @@ def add_fused(recording: Recording, answers: Sequence[Mapping[str, Any]]) -> Non
             recording.gaussian(["fused"], mean, covariance, f"scene {answer['scene']}")
 
 
-def of_paths(file: Path, names: Sequence[str]) -> Recording:
+def of_paths(file: Path, names: Sequence[str]) -> SceneFile:
     """An empty recording with a camera for each path."""
-    return Recording(file, [[name, "camera"] for name in names], has_time=True)
+    return SceneFile(file, [[name, "camera"] for name in names], has_time=True)
 
 
-def viewed_path(recording: Recording, name: str, path: Iterable[Followed]) -> Iterator[Followed]:
+def viewed_path(recording: SceneFile, name: str, path: Iterable[Followed]) -> Iterator[Followed]:
     """The frames of a path; each is recorded before it is yielded, with the latest positions of its track."""
     for _, track in groupby(path, lambda one: one.track):
         trail: deque[Vector] = deque(maxlen=TRAIL)
@@ -87,7 +87,7 @@ def viewed_path(recording: Recording, name: str, path: Iterable[Followed]) -> It
             yield one
 
 
-def _add_frame(recording: Recording, name: str, one: Followed) -> None:
+def _add_frame(recording: SceneFile, name: str, one: Followed) -> None:
     """The camera with the image, and what is in its frame: box, outlines, depth with its 90 % interval."""
     frame, place = one.frame, [name, "camera"]
     recording.at_time(frame.time)

@@ -39,6 +39,17 @@ class Head(Protocol):
         ...
 
 
+@runtime_checkable
+class SymmetricHead(Head, Protocol):
+    """A head whose raw numbers of a symmetric view can be brought back, as ensembles need."""
+
+    def turned_back(
+        self, raw: Float[Tensor, "*views n"], signs: Float[Tensor, "*#views 3"]
+    ) -> Float[Tensor, "*views n"]:
+        """Raw numbers in the frame of an image, given those of its views after `symmetries` of these signs."""
+        ...
+
+
 class DistributionHead:
     """Seven raw numbers -> the Projected Huber distribution, `ProjectedHuber.from_raw`.
 
@@ -86,7 +97,7 @@ class DistributionHead:
         return torch.cat([n, b, w, k, other], dim=-1)
 
 
-class SurrogateHead(DistributionHead):
+class SurrogateHead:
     """Ten raw numbers -> the Projected Huber density with a free axis that is closest to a Student's t.
 
     Training maximises the likelihood of the Student's t, which leads to better networks (docs/ideas/heads.md). The
@@ -97,16 +108,19 @@ class SurrogateHead(DistributionHead):
         is_rounded: the mode of depth is rounded.
     """
 
+    n_outputs = 10
+    prediction = ProjectedHuber
+
     def __init__(self, depth: DepthScale, is_rounded: bool = False) -> None:
-        super().__init__(depth)
-        self.n_outputs, self.is_rounded = 10, is_rounded
+        self.seven, self.is_rounded = DistributionHead(depth), is_rounded
+        self.placed, self.turned_back = self.seven.placed, self.seven.turned_back
 
     def surrogate(self, raw: Float[Tensor, "*batch 10"], camera: Camera) -> Shaped:
         """The Student's t that training fits."""
-        return StudentT(super().__call__(raw[..., :7], camera), raw[..., 7:])
+        return StudentT(self.seven(raw[..., :7], camera), raw[..., 7:])
 
     def __call__(self, raw: Float[Tensor, "*batch 10"], camera: Camera) -> ProjectedHuber:
-        return closest_to_student(super().__call__(raw[..., :7], camera), raw[..., 7:], self.is_rounded)
+        return closest_to_student(self.seven(raw[..., :7], camera), raw[..., 7:], self.is_rounded)
 
 
 class ShapedHead:

@@ -101,11 +101,16 @@ class Regressor(nn.Module):
         return self.head(self.numbers(output, camera.f), camera)
 
     def trained(self, output: BackboneOutput, camera: Camera) -> tuple[Prediction, Prediction]:
-        """The prediction, and the one whose loss training minimises: the same, unless the head has a surrogate."""
+        """The prediction, and the one whose loss training minimises.
+
+        They are the same, unless the head has a surrogate; the prediction is then without gradients.
+        """
         numbers = self.numbers(output, camera.f)
-        prediction = self.head(numbers, camera)
         surrogate = getattr(self.head, "surrogate", None)
-        return prediction, prediction if surrogate is None else surrogate(numbers, camera)
+        if surrogate is None:
+            prediction = self.head(numbers, camera)
+            return prediction, prediction
+        return self.head(numbers.detach(), camera), surrogate(numbers, camera)
 
     def raw(
         self, image: UInt8[Tensor, "batch height width 3"], f: Float[Tensor, " batch"] | None = None

@@ -31,8 +31,18 @@ EXTRAS = {
 NAMED = 5  # names that a message lists
 
 
+UNPACKED: dict[str, str] = {}
+"""Temporary folder of a packed run, as messages would begin with it -> the folder of its file, which they show."""
+
+
 class UserError(Exception):
     """An error that the user can fix; the command line prints it without a traceback."""
+
+    def __str__(self) -> str:
+        text = super().__str__()
+        for temporary, folder in UNPACKED.items():
+            text = text.replace(temporary, folder)
+        return text
 
 
 class ConfigError(UserError):

@@ -22,7 +22,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from zipfile import ZIP_STORED, ZipFile, ZipInfo
 
-from phd_exp.records.errors import RunError, gist, shown
+from phd_exp.records.errors import UNPACKED, RunError, gist, shown
 from phd_exp.records.files import MB, require_plain, write_atomic
 from phd_exp.records.runs import RunFolder
 
@@ -73,7 +73,8 @@ def opened(path: Path) -> RunFolder:
     if not path.is_file():
         return RunFolder(path)
     outer = Path(tempfile.mkdtemp(prefix="phd_exp-"))
-    folder = RunFolder(outer / path.name)  # messages name the archive
+    folder = RunFolder(outer / path.name)
+    UNPACKED[f"{outer}/"] = f"{path.parent}/".removeprefix("./")  # so that messages name the archive
     weakref.finalize(folder, shutil.rmtree, outer, ignore_errors=True)
     try:
         _unpack(path, folder.path)
