@@ -62,7 +62,7 @@ def _ends(middle: Tensor, side: Tensor, origin: Tensor, size: int) -> tuple[list
     ends = torch.stack([middle - side / 2, middle + side / 2]).nan_to_num(0.0)
     ends = ends.maximum(-origin).minimum(size - origin)
     before = ends.floor()
-    (lower, upper), part = (before + origin).long(), ends - before
+    (lower, upper), part = (before + origin).nan_to_num(0.0).clamp(0, size).long(), ends - before
     places = [lower, (lower + 1).clamp_max(size), upper, (upper + 1).clamp_max(size)]
     return places, [-part[0], 1 - part[1], part[1]]
 

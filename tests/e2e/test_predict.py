@@ -131,7 +131,7 @@ def test_the_lines_of_the_guide_deploy_it_without_torch(
     coarse = Image.fromarray(draw.integers(0, 256, (6, 6, 3), dtype=np.uint8))
     coarse.resize((150, 150), Image.Resampling.BICUBIC).save(tmp_path / "photo.png")
     block = "import sys\nfor name in ('torch', 'phd_exp', 'onnx', 'scipy'): sys.modules[name] = None\n"
-    tell = "import json\nprint(json.dumps([x.tolist() for x in (mode, mean, covariance, median, interval)]))\n"
+    tell = "import json\nprint(json.dumps([x.tolist() for x in (mean, covariance, interval)]))\n"
     (tmp_path / "deployed.py").write_text(block + textwrap.dedent(indented) + tell)
     done = subprocess.run(
         [sys.executable, "-P", "-c", "import sys; sys.path.insert(0, '.'); exec(open('deployed.py').read())"],
@@ -139,10 +139,10 @@ def test_the_lines_of_the_guide_deploy_it_without_torch(
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     command = ("predict", f"run={run.path}", "image=photo.png", "f=1550")
-    keys = ("mode", "mean", "covariance", "median_depth", "depth_interval")
+    keys = ("mean", "covariance", "depth_interval")
     here = json.loads(done.stdout.splitlines()[-1])
     # off the middle of the photograph, depth is not the coordinate along the ray
-    for number, (words, shared) in enumerate([("box=20,15,90,140", keys[:3]), ("box=0,0,150,150", keys)]):
+    for number, (words, shared) in enumerate([("box=20,15,90,140", keys[:2]), ("box=0,0,150,150", keys)]):
         (row,) = read_lines(phd_exp(*command, words).out)
         row["depth_interval"] = list(row["depth_interval"].values())
         for key, values in zip(shared, here, strict=False):
