@@ -18,7 +18,7 @@ from phd_exp.records.spec import DatasetSpec
 
 # before anything is imported: every annotated function of these modules checks its shapes while tests run; numba
 # compiles the other modules of fusion
-FUSION = ("fusion.fuse", "fusion.gaussian", "fusion.pose", "fusion.problems")
+FUSION = ("fusion.fuse", "fusion.gaussian", "fusion.pose", "fusion.problems", "fusion.views")
 TRACKS = tuple(f"fusion.tracks.{name}" for name in ("chain", "lost", "motion", "shear", "slow"))
 NUMERIC = ("optics", "geometry", "distributions", "losses", "metrics", "models", "data", "evaluation")
 HOOKED = (*NUMERIC, *FUSION, *TRACKS)

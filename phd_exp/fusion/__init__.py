@@ -8,7 +8,7 @@ runs them on a batch, and `fuse.py` is the interface.
 from phd_exp.fusion.fuse import Fused, fuse
 from phd_exp.fusion.gaussian import average, gaussian_fusion
 from phd_exp.fusion.pose import Plane, Pose
-from phd_exp.fusion.problems import Status
 from phd_exp.fusion.shared import fuse_shared
+from phd_exp.fusion.views import Status
 
 __all__ = ["Fused", "Plane", "Pose", "Status", "average", "fuse", "fuse_shared", "gaussian_fusion"]

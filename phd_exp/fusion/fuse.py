@@ -14,7 +14,8 @@ from torch import Tensor
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.rounded import depth_law
 from phd_exp.fusion.pose import Plane, Pose
-from phd_exp.fusion.problems import Problems, Status
+from phd_exp.fusion.problems import Problems
+from phd_exp.fusion.views import Status
 from phd_exp.hardware import one_thread
 
 # `kernels` and `moments` are imported in the functions that use them: importing numba takes a second

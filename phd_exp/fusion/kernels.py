@@ -11,7 +11,7 @@ from phd_exp.fusion.arithmetic import compiled, depth_excess, huber, measured
 from phd_exp.fusion.certificate import certify
 from phd_exp.fusion.moments import moments
 from phd_exp.fusion.newton import optimum, polish
-from phd_exp.fusion.problems import Status
+from phd_exp.fusion.views import Status
 
 CONVERGED = 1e-6  # the largest relative subgradient at which a problem counts as solved
 _FUSED, _NOT_CONVERGED = int(Status.FUSED), int(Status.NOT_CONVERGED)

@@ -36,13 +36,6 @@ class Pose:
         t = torch.tensor([pose.translation for pose in poses], dtype=torch.float64).reshape(-1, 3)
         return cls(torch.from_numpy(R), t)
 
-    @property
-    def is_rigid(self) -> Bool[Tensor, "*batch"]:
-        """Whether R is a rotation, R R^T = I within 1e-6 and |R| > 0; false where R is not finite."""
-        R = self.R.double()
-        error = (R @ R.mT - torch.eye(3, dtype=R.dtype, device=R.device)).abs().amax((-2, -1))
-        return (error <= RIGID_WITHIN) & (torch.linalg.det(R) > 0)
-
     def into_camera(self, v: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
         """World to camera frame, R v + t."""
         return _product(self.R, v) + self.t
@@ -50,6 +43,14 @@ class Pose:
     def into_world(self, v: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
         """Camera frame to world, R^T (v - t)."""
         return _product(self.R.mT, v - self.t)
+
+
+@np.errstate(invalid="ignore")
+def is_rotation(R: Float[np.ndarray, "*batch 3 3"]) -> Bool[np.ndarray, "*batch"]:
+    """Whether R R^T = I within 1e-6 and |R| > 0; false where R is not finite."""
+    error = abs(R @ R.swapaxes(-1, -2) - np.eye(3)).max((-2, -1))
+    found: np.ndarray = (error <= RIGID_WITHIN) & (np.linalg.det(R) > 0)
+    return found
 
 
 def _product(A: Float[Tensor, "*#batch 3 3"], b: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:

@@ -218,7 +218,7 @@ class _Track:
         if not bool(raw.isfinite().all()):
             raise RunError(f"{frame.where}: the network returns numbers that are not finite; train the run again")
         prediction = predictor.predict(raw, f)
-        assert isinstance(prediction, ProjectedHuber)  # checked by `follow`
+        assert prediction.has_closed_forms  # checked by `follow`
         R, familiar = torch.from_numpy(camera.R), predictor.familiar(raw, f, prediction)
         pose = Pose(R @ frame.pose.R, R @ frame.pose.t)
         return (prediction, pose), None if familiar is None else float(familiar[0])

@@ -109,9 +109,7 @@ def test_bad_input_is_refused_on_one_line() -> None:
     tracker.update(1.0, drawn()[0], POSE)
     with pytest.raises(ValueError, match=r"^time: got 1.0 after 1.0; expected a later time$"):
         tracker.update(1.0, drawn()[1], POSE)
-    with pytest.raises(
-        ValueError, match=r"^pose.R: got batch shape \(2,\); expected one that broadcasts to \(1, 1\)$"
-    ):
+    with pytest.raises(ValueError, match=r"^pose.R: got batch shape \(2,\); expected one that broadcasts to \(1,\)$"):
         tracker.update(1.1, drawn()[1], Pose(POSE.R.expand(2, 3, 3), POSE.t.expand(2, 3)))
     with pytest.raises(ValueError, match=r"^lag: got -1; expected"):
         Tracker(LAW, lag=-1)

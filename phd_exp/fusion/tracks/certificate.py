@@ -8,9 +8,10 @@ import numpy as np
 from phd_exp.fusion.arithmetic import compiled, huber_weight
 from phd_exp.fusion.certificate import RADII, least_curvature_of_camera, subgradient
 from phd_exp.fusion.newton import KINK
-from phd_exp.fusion.tracks.energy import GAUSSIAN, add_camera, motion_energy
+from phd_exp.fusion.tracks.energy import add_camera, motion_energy
 from phd_exp.fusion.tracks.newton import measure_all
 from phd_exp.fusion.tracks.tridiagonal import factorise, forward, selected_inverse
+from phd_exp.fusion.views import GAUSSIAN
 
 
 @compiled

@@ -21,4 +21,12 @@ def moving(
 ) -> tuple[Float[Array, "steps d d"], Float[Array, "steps d d"]]:
     """The transitions and the precisions of their noise over these times (seconds)."""
     F, W = transitions(motion, steps)
-    return np.kron(F, np.eye(3)), np.kron(W, np.eye(3))
+    return in_space(F), in_space(W)
+
+
+def in_space(M: Float[Array, "*batch m n"]) -> Float[Array, "*batch d e"]:
+    """The matrix that does the same in each of the three axes: its Kronecker product with I."""
+    m, n = M.shape[-2:]
+    spread = M[..., :, None, :, None] * np.eye(3)[:, None]
+    found: Array = spread.reshape(*M.shape[:-2], 3 * m, 3 * n)
+    return found

@@ -17,9 +17,7 @@ import numpy as np
 
 from phd_exp.fusion.arithmetic import compiled, huber, huber_weight
 from phd_exp.fusion.newton import RIDGE, extended_inverse, smooth_depth_energy
-
-GAUSSIAN = -1.0
-"""In place of a: the prediction is Gaussian."""
+from phd_exp.fusion.views import GAUSSIAN
 
 
 class Chain(NamedTuple):

@@ -1,23 +1,21 @@
 """The frames of a path: checked, and written as affine functions of the object's position."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.density import Density
-from phd_exp.fusion.gaussian import average
-from phd_exp.fusion.pose import Pose
-from phd_exp.fusion.problems import Problems, Status, flat, own_width, status_of
-from phd_exp.fusion.tracks.energy import GAUSSIAN
+from phd_exp.fusion.views import GAUSSIAN, Status, Views, own_width
 
 
 @dataclass(frozen=True)
 class Gaussian:
     """Predictions given by their moments in the camera frame, as those of densities without closed forms.
+
+    (q_x, q_y, t) are the deviations from the mean, divided by the Cholesky factor of the covariance.
 
     Args:
         mean: expected position, metres.
@@ -37,6 +35,34 @@ class Gaussian:
         """Shape of the batch."""
         return self.mean.shape[:-1]
 
+    @property
+    def measure(self) -> Float[Tensor, "*batch 3 3"]:
+        """The matrix from deviations (metres) to (q, t); NaN where the covariance is not positive definite."""
+        covariance = self.covariance.double()
+        L, failed = torch.linalg.cholesky_ex(covariance.nan_to_num())
+        valid = (failed == 0) & covariance.isfinite().all(-1).all(-1)
+        return torch.linalg.inv_ex(L)[0].masked_fill(~valid[..., None, None], torch.nan)
+
+    @property
+    def apex(self) -> Float[Tensor, "*batch 3"]:
+        """Where q and t are 0: the mean, metres."""
+        return self.mean
+
+    @property
+    def mode(self) -> Float[Tensor, "*batch 3"]:
+        """The mean, metres."""
+        return self.mean
+
+    @property
+    def a(self) -> Float[Tensor, "*batch"]:
+        """GAUSSIAN."""
+        return torch.full_like(self.mean[..., 0], GAUSSIAN)
+
+    @property
+    def rounding(self) -> float:
+        """None."""
+        return 0.0
+
 
 @dataclass(frozen=True)
 class Frames:
@@ -49,11 +75,10 @@ class Frames:
         at_origin: (q_x, q_y, t) at the origin.
         a: precision of the depth, or GAUSSIAN; 0 where a camera takes no part.
         own: the width of a rounded mode of t.
-        mask: which cameras take part.
-        near: the average of each frame's predicted positions; those of the nearest frames where there is none.
         since: seconds since the camera's prediction before; inf without one.
         centres: the apices of the densities, without a free axis the positions of the cameras.
-        about: a path, see `phd_exp.fusion.tracks.shear`; at first `near`.
+        about: a path, see `phd_exp.fusion.tracks.shear`; at first the average of each frame's predicted positions,
+            between those of the frames next to it where there is none.
         shear: S and offset there; at first I and 0.
     """
 
@@ -63,137 +88,80 @@ class Frames:
     at_origin: Float[np.ndarray, "frames cameras 3"]
     a: Float[np.ndarray, "frames cameras"]
     own: Float[np.ndarray, "frames cameras"]
-    mask: Bool[np.ndarray, "frames cameras"]
-    near: Float[np.ndarray, "frames 3"]
     since: Float[np.ndarray, "frames cameras"]
     centres: Float[np.ndarray, "frames cameras 3"]
     about: Float[np.ndarray, "frames 3"]
     shear: Float[np.ndarray, "frames 3 4"]
 
     @classmethod
-    def checked(
-        cls,
-        times: Float[Tensor, " frames"],
-        predictions: ProjectedHuber | Gaussian,
-        pose: Pose,
-        mask: Bool[Tensor, "frames cameras"] | None,
-    ) -> "Frames":
-        """The frames of the arguments of `track`.
+    def checked(cls, times: Float[np.ndarray, " frames"], views: Views) -> "Frames":
+        """The frames at these times, seconds.
 
         Raises:
             ValueError: an argument is not valid; one line.
         """
-        if not isinstance(predictions, ProjectedHuber | Gaussian):
-            raise ValueError(
-                f"predictions: got {type(predictions).__name__}; expected ProjectedHuber or Gaussian; use "
-                "Gaussian.of for other densities; a point estimate has no uncertainty"
-            )
-        shape = predictions.batch_shape
-        if len(shape) != 2 or 0 in shape:
-            raise ValueError(
-                f"predictions: got batch shape {tuple(shape)}; expected (frames, cameras), none of them 0"
-            )
-        seconds = checked_times(times, shape[0])
-        views = _views(predictions, pose, mask)
-        for k, status in enumerate(views.status.tolist()):
-            if status not in (Status.FUSED, Status.NO_CAMERA):
-                raise ValueError(f"frame {k}: {Status(status).reason}")
-        seen = views.mask.any(-1).numpy()
+        _require_valid(times, views)
+        seen = views.mask.any(-1)
         if not seen.any():
             raise ValueError("mask: got no prediction in any frame; expected at least one")
-        position = views.position.numpy()
-        origin = position[seen].mean(0)
-        near = np.stack([np.interp(seconds, seconds[seen], axis) for axis in (position[seen] - origin).T], -1)
-        at_origin = views.at_zero.numpy() + (views.slope.numpy() @ origin)
-        shown = views.mask.numpy()
-        at_origin = np.where(shown[..., None], at_origin, (0.0, 0.0, 1.0))
-        latest = np.maximum.accumulate(np.where(shown, seconds[:, None], -np.inf))
-        since = seconds[:, None] - np.concatenate([np.full_like(latest[:1], -np.inf), latest[:-1]])
-        slope = np.ascontiguousarray(views.slope.numpy())
-        centres = np.where(shown[..., None], views.centres.numpy() - origin, 0.0)
-        of_cameras = slope, at_origin, views.a.numpy(), views.own.numpy(), shown
-        shear = np.tile(np.eye(3, 4), (len(seconds), 1, 1))
-        return cls(seconds, origin, *of_cameras, near, since, centres, near, shear)
+        middle = views.middle
+        origin = middle[seen].mean(0)
+        about = np.stack([np.interp(times, times[seen], axis) for axis in (middle[seen] - origin).T], -1)
+        latest = np.maximum.accumulate(np.where(views.mask, times[:, None], -np.inf))
+        since = times[:, None] - np.concatenate([np.full_like(latest[:1], -np.inf), latest[:-1]])
+        own = own_width(views.a, views.predictions)
+        of_views = views.slope, views.at(origin), views.a, own, since, _centres(views, origin)
+        return cls(times, origin, *of_views, about, np.tile(np.eye(3, 4), (len(times), 1, 1)))
+
+    @property
+    def mask(self) -> Bool[np.ndarray, "frames cameras"]:
+        """Which cameras take part."""
+        return self.a != 0
 
     def __getitem__(self, part: slice) -> "Frames":
         """Some of the frames."""
         values = {name: value if name == "origin" else value[part] for name, value in vars(self).items()}
         return Frames(**values)
 
-    def unseen(self, time: float) -> "Frames":
-        """One later frame, in which no camera takes part."""
-        masked = "slope", "at_origin", "a", "own", "mask"
-        nothing = {name: np.zeros_like(getattr(self, name)[-1:]) for name in masked}
-        nothing["at_origin"][..., 2] = 1.0
-        return replace(self[-1:], times=np.array([time]), **nothing)
+    def followed_by(
+        self, time: float, views: Views | None, about: Float[np.ndarray, "1 3"], drop: int = 0
+    ) -> "Frames":
+        """With one more frame, about a position, and without the first `drop` ones; None for `views` masks all out.
 
-    def followed_by(self, later: "Frames") -> "Frames":
-        """With one frame more, relative to the same origin."""
-        shift = self.origin - later.origin
-        at_origin = later.at_origin + later.slope @ shift
+        Raises ValueError as `checked`.
+        """
+        times = np.array([time], dtype=float)
         latest = self.times[-1] - np.where(self.mask[-1], 0.0, self.since[-1])
-        moved = {name: getattr(later, name) - shift for name in ("near", "centres", "about")}
-        later = replace(later, at_origin=at_origin, since=later.times[:, None] - latest, **moved)
-        values = {name: np.concatenate([value, getattr(later, name)]) for name, value in vars(self).items()}
-        return Frames(**(values | {"origin": self.origin}))
+        further = {"times": times, "since": time - latest[None], "about": about, "shear": np.eye(3, 4)[None]}
+        if views is None:
+            masked = "slope", "at_origin", "a", "own", "centres"
+            further |= {name: np.zeros_like(getattr(self, name)[-1:]) for name in masked}
+            further["at_origin"][..., 2] = 1.0
+        else:
+            _require_valid(times, views)
+            further |= {"slope": views.slope, "at_origin": views.at(self.origin), "a": views.a}
+            further |= {"own": own_width(views.a, views.predictions), "centres": _centres(views, self.origin)}
+        joined = {name: np.concatenate([getattr(self, name)[drop:], value]) for name, value in further.items()}
+        return Frames(origin=self.origin, **joined)
 
 
-def checked_times(times: Float[Tensor, " frames"], frames: int) -> Float[np.ndarray, " frames"]:
-    """The times in float64. Raises ValueError where they are not one increasing number for each frame."""
-    if tuple(times.shape) != (frames,):
-        raise ValueError(f"times: got shape {tuple(times.shape)}; expected ({frames},), one time for each frame")
-    seconds = times.double().cpu().numpy()
-    if not np.isfinite(seconds).all():
-        k = int(np.argmin(np.isfinite(seconds)))
-        raise ValueError(f"times: got {seconds[k]} in frame {k}; expected finite times in seconds")
-    for k in (np.diff(seconds) <= 0).nonzero()[0]:
+def _centres(views: Views, origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "frames cameras 3"]:
+    """The apices relative to the origin; 0 where masked out."""
+    return np.where(views.mask[..., None], views.apex - origin, 0.0)
+
+
+def _require_valid(times: Float[np.ndarray, " times"], views: Views) -> None:
+    """Raise ValueError unless the times are one increasing number for each frame, and all views are valid."""
+    frames = len(views.a)
+    if times.shape != (frames,):
+        raise ValueError(f"times: got shape {times.shape}; expected ({frames},), one time for each frame")
+    if not np.isfinite(times).all():
+        k = int(np.argmin(np.isfinite(times)))
+        raise ValueError(f"times: got {times[k]} in frame {k}; expected finite times in seconds")
+    for k in (np.diff(times) <= 0).nonzero()[0]:
         raise ValueError(
-            f"times: got {seconds[k + 1]} in frame {k + 1} after {seconds[k]}; expected increasing times; remove "
+            f"times: got {times[k + 1]} in frame {k + 1} after {times[k]}; expected increasing times; remove "
             "repeated frames and sort the others"
         )
-    return seconds
-
-
-@dataclass(frozen=True)
-class _Views:
-    """The views of all frames in the world: as in `Frames`, but `at_zero` is at the world's origin.
-
-    `position` is the average of each frame's predicted positions; NaN where no camera takes part.
-    """
-
-    slope: Float[Tensor, "frames cameras 3 3"]
-    at_zero: Float[Tensor, "frames cameras 3"]
-    a: Float[Tensor, "frames cameras"]
-    own: Float[Tensor, "frames cameras"]
-    mask: Bool[Tensor, "frames cameras"]
-    position: Float[Tensor, "frames 3"]
-    centres: Float[Tensor, "frames cameras 3"]
-    status: Int[Tensor, " frames"]
-
-
-def _views(predictions: ProjectedHuber | Gaussian, pose: Pose, mask: Tensor | None) -> _Views:
-    if isinstance(predictions, Gaussian):
-        return _gaussian_views(predictions, pose, mask)
-    problems = Problems.posed(predictions, pose, None, mask)
-    origin = problems.origin.nan_to_num()[:, None, :, None]
-    at_zero = problems.at_origin - (problems.slope @ origin).squeeze(-1)
-    centres = problems.pose.into_world(predictions.apex.double().cpu())
-    own = own_width(problems.a, predictions)
-    return _Views(problems.slope, at_zero, problems.a, own, problems.mask, problems.origin, centres, problems.status)
-
-
-def _gaussian_views(predictions: Gaussian, pose: Pose, mask: Tensor | None) -> _Views:
-    """q_x, q_y and t are the deviations from the mean, divided by the Cholesky factor of the covariance."""
-    shape = predictions.batch_shape
-    pose = Pose(flat("pose.R", pose.R, shape, event=2), flat("pose.t", pose.t, shape, event=1))
-    mask = flat("mask", torch.ones(shape) if mask is None else mask, shape) > 0
-    mean = flat("predictions", predictions.mean, shape, event=1)
-    L, failed = torch.linalg.cholesky_ex(flat("predictions", predictions.covariance, shape, event=2).nan_to_num())
-    whiten = torch.linalg.inv_ex(L)[0]
-    slope = torch.where(mask[..., None, None], whiten @ pose.R, 0)
-    at_zero = torch.where(mask[..., None], (whiten @ (pose.t - mean)[..., None]).squeeze(-1), 0)
-    valid = (failed == 0) & predictions.covariance.isfinite().all(-1).all(-1).cpu() & mean.isfinite().all(-1)
-    status = status_of(mask, valid, pose.is_rigid, None)
-    centres = pose.into_world(torch.zeros(3, dtype=torch.float64))
-    a = torch.where(mask, GAUSSIAN, 0.0).double()
-    return _Views(slope, at_zero, a, torch.zeros_like(a), mask, average(pose.into_world(mean), mask), centres, status)
+    for k in (views.status > Status.NO_CAMERA).nonzero()[0]:
+        raise ValueError(f"frame {k}: {Status(int(views.status[k])).reason}")

@@ -14,9 +14,10 @@ import math
 import numpy as np
 
 from phd_exp.fusion.arithmetic import TINY, compiled, depth_excess, huber
-from phd_exp.fusion.tracks.energy import GAUSSIAN, add_camera, motion_energy
+from phd_exp.fusion.tracks.energy import add_camera, motion_energy
 from phd_exp.fusion.tracks.newton import measure_all, newton_step
 from phd_exp.fusion.tracks.tridiagonal import log_determinant, selected_inverse
+from phd_exp.fusion.views import GAUSSIAN
 
 STEPS, SETTLED = 40, 1e-5  # the latter as a share of the precision of q and t
 WIDEST = 8.0  # standard deviations of t that count

@@ -4,37 +4,49 @@
 import hashlib
 from pathlib import Path
 
-import numpy as np
 from numba import njit
 
 from phd_exp.fusion import arithmetic
 from phd_exp.fusion import certificate as fusion_certificate
 from phd_exp.fusion import newton as fusion_newton
+from phd_exp.fusion.newton import LEAST_DEPTHS
 from phd_exp.fusion.tracks import certificate, energy, gaussian, newton, tridiagonal
 from phd_exp.fusion.tracks.certificate import certify
-from phd_exp.fusion.tracks.energy import frames_energy, motion_energy
+from phd_exp.fusion.tracks.energy import camera_energy, measure
 from phd_exp.fusion.tracks.gaussian import propagate
-from phd_exp.fusion.tracks.newton import measure_all, optimum, polish, workspace
+from phd_exp.fusion.tracks.newton import optimum, polish, workspace
 
 
 def _functions(sources):
-    """Both functions, compiled from these sources; see `phd_exp.fusion.kernels`."""
+    """The functions, compiled from these sources; see `phd_exp.fusion.kernels`."""
 
     @njit(cache=True, error_model="numpy")
-    def most_likely(chain, x, distance):
-        """Moves x to the optimum; returns whether a position is in front of all cameras, the energy and its bound.
-
-        Fills `distance` with the bounds of `certify`.
-        """
+    def most_likely(chain, x, lam):
+        """Moves x to the optimum and lam to its multipliers; returns whether it is in front of all cameras."""
         assert len(sources) > 0
-        work, lam = workspace(chain), np.zeros(chain.a.shape)
-        if not optimum(chain, work, x, lam):
-            return False, np.nan, np.inf
-        polish(chain, work, x, lam)
-        gap = certify(chain, work, x, lam, distance)
-        measure_all(chain, x, work.at)
-        motion = motion_energy(chain, 1.0, x, work.g)
-        return True, motion + frames_energy(chain, work.at, work.at, 0.0, 0.0, 1e-6), gap
+        work = workspace(chain)
+        found = optimum(chain, work, x, lam)
+        if found:
+            polish(chain, work, x, lam)
+        return found
+
+    @njit(cache=True, error_model="numpy")
+    def bounds(chain, x, lam, distance):
+        """Calls `certify`."""
+        assert len(sources) > 0
+        return certify(chain, workspace(chain), x, lam, distance)
+
+    @njit(cache=True, error_model="numpy")
+    def excesses(slope, at_origin, a, own, x, found):
+        """Fills in the energy of each camera at x above its lowest, without weights."""
+        assert len(sources) > 0
+        at = at_origin.copy()
+        measure(slope, x, at)
+        for k in range(len(a)):
+            for c in range(a.shape[1]):
+                q_x, q_y, t = at[k, c]
+                energy = camera_energy(q_x, q_y, t, a[k, c], 1.0, own[k, c], 0.0, LEAST_DEPTHS[-1])
+                found[k, c] = energy - max(a[k, c], 0.0) * (1 + own[k, c])
 
     @njit(cache=True, error_model="numpy")
     def moments(chain, mean, covariance, factors):
@@ -42,9 +54,9 @@ def _functions(sources):
         assert len(sources) > 0
         return propagate(chain, workspace(chain), mean, covariance, factors)
 
-    return most_likely, moments
+    return most_likely, bounds, excesses, moments
 
 
 _COMPILED = (arithmetic, fusion_newton, fusion_certificate, certificate, energy, gaussian, newton, tridiagonal)
 _SOURCES = b"".join(Path(str(module.__file__)).read_bytes() for module in _COMPILED)
-most_likely, moments = _functions(hashlib.sha256(_SOURCES).hexdigest())
+most_likely, bounds, excesses, moments = _functions(hashlib.sha256(_SOURCES).hexdigest())

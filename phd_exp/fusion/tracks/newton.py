@@ -29,7 +29,6 @@ from phd_exp.fusion.newton import (
     exact_slopes,
 )
 from phd_exp.fusion.tracks.energy import (
-    GAUSSIAN,
     add_camera,
     add_smoothed,
     frames_energy,
@@ -39,6 +38,7 @@ from phd_exp.fusion.tracks.energy import (
     move_duals,
 )
 from phd_exp.fusion.tracks.tridiagonal import factorise, solve
+from phd_exp.fusion.views import GAUSSIAN
 
 
 class Work(NamedTuple):

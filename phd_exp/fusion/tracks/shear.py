@@ -36,9 +36,8 @@ def sheared(frames: Frames, about: Float[Array, "later 3"], first: Frames | None
     `first` is the first frame of the track, from whose camera to whose position the axis leads (default: that here).
     """
     first = frames if first is None else first
-    whole = np.concatenate([frames.about[: -len(about)], about])
-    shear = np.tile(np.eye(3, 4), (len(whole), 1, 1))
-    shear[: -len(about)] = frames.shear[: -len(about)]
+    whole, shear = frames.about.copy(), frames.shear.copy()
+    whole[-len(about) :] = about
     one = frames.mask.shape[1] == 1
     if one and (abs(frames.centres[frames.mask] - first.centres[0, 0]) < AT_REST).all():
         axis = first.about[0] - first.centres[0, 0]
@@ -82,5 +81,6 @@ def unsheared_covariance(
     shear: Float[Array, "frames 3 4"], C: Float[Array, "frames d d"]
 ) -> Float[Array, "frames d d"]:
     """Their covariance."""
-    S = np.kron(np.eye(C.shape[-1] // 3), shear[..., :3])
-    return S @ C @ S.swapaxes(-1, -2)
+    S, n = shear[:, None, None, :, :3], C.shape[-1] // 3
+    blocks = C.reshape(len(C), n, 3, n, 3).swapaxes(2, 3)
+    return (S @ blocks @ S.swapaxes(-1, -2)).swapaxes(2, 3).reshape(C.shape)

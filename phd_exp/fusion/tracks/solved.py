@@ -10,13 +10,13 @@ from jaxtyping import Float
 from scipy import special
 
 from phd_exp.distributions.rounded import depth_law
-from phd_exp.fusion.problems import Status
 from phd_exp.fusion.tracks.chain import Array, moving, start
-from phd_exp.fusion.tracks.energy import GAUSSIAN, Chain
+from phd_exp.fusion.tracks.energy import Chain
 from phd_exp.fusion.tracks.frames import Frames
 from phd_exp.fusion.tracks.motion import Motion
 from phd_exp.fusion.tracks.shear import apart, sheared, unsheared, unsheared_covariance
 from phd_exp.fusion.tracks.slow import NONE, Slow, weights
+from phd_exp.fusion.views import GAUSSIAN, Status
 
 # `kernels` is imported in the functions that use it: importing numba takes a second
 
@@ -42,17 +42,22 @@ class Solved:
         frames: of the track.
         chain: the energy.
         x: the most likely unknowns, see `phd_exp.fusion.tracks.chain`, sheared.
-        energy: -log density up to constants, nats.
-        gap: its bound.
-        distance: bounds of each position, metres.
+        lam: multipliers of the kinks.
     """
 
     frames: Frames
     chain: Chain
     x: Float[Array, "frames d"]
-    energy: float
-    gap: float
-    distance: Float[Array, " frames"]
+    lam: Float[Array, "frames cameras"]
+
+    @cached_property
+    def bounds(self) -> tuple[float, Float[Array, " frames"]]:
+        """The certificate: of the energy, nats, and of each position, metres."""
+        from phd_exp.fusion.tracks.kernels import bounds
+
+        distance = np.empty(len(self.x))
+        gap = bounds(self.chain, self.x, self.lam, distance)
+        return gap, distance * np.linalg.norm(self.frames.shear[:, :, :3], 2, (1, 2))
 
     @cached_property
     def unknowns(self) -> Float[Array, "frames d"]:
@@ -82,14 +87,11 @@ class Solved:
     @cached_property
     def excess(self) -> Float[Array, "frames cameras"]:
         """Energy of the path in each view above the view's lowest energy, nats."""
-        frames = self.frames
-        at = frames.at_origin + (frames.slope @ self.unknowns[:, None, :3, None])[..., 0]
-        q_x, q_y, t = np.moveaxis(at, -1, 0)
-        inverse = 1 / np.where(t == 0, np.inf, t)  # t of a Gaussian prediction may be 0
-        squared, a, g = q_x**2 + q_y**2, frames.a, (t - inverse) / 2
-        depth = (t + inverse) / 2 + np.hypot(g, frames.own) - 1 - frames.own
-        huber = np.where(squared > 1, np.sqrt(squared) - 0.5, squared / 2) + a * depth
-        return np.where(a == GAUSSIAN, (squared + t**2) / 2, huber)
+        from phd_exp.fusion.tracks.kernels import excesses
+
+        frames, found = self.frames, np.empty(self.frames.a.shape)
+        excesses(frames.slope, frames.at_origin, frames.a, frames.own, self.unknowns, found)
+        return found
 
     @property
     def surprise(self) -> Float[Array, "frames cameras"]:
@@ -125,20 +127,18 @@ def solve(
         a, p = (weights(time, frames.since, frames.mask) for time in vars(slow).values())
         a, views = a * frames.a, apart(frames)
     chain = Chain(*views, a, p, frames.a, frames.own, *motion)
-    x, distance = x.copy(), np.empty(len(x))
-    in_front, energy, gap = most_likely(chain, x, distance)
-    if not in_front:
+    x, lam = x.copy(), np.zeros(a.shape)
+    if not most_likely(chain, x, lam):
         status = Status.NO_COMMON_VIEW if np.isfinite(x).all() else Status.NOT_CONVERGED
         raise ValueError(f"predictions: {status.reason}")
-    distance *= np.linalg.norm(frames.shear[:, :, :3], 2, (1, 2))
-    return Solved(frames, chain, x, energy, gap, distance)
+    return Solved(frames, chain, x, lam)
 
 
 def smoothed(frames: Frames, motion: Motion, slow: Slow) -> Solved:
     """The optimum of a whole track; with slow errors about that without them."""
     mean, precision = start(motion)
     x = np.zeros((len(frames.times), len(mean)))
-    x[:, :3] = frames.near
+    x[:, :3] = frames.about
     law = mean, precision, *moving(motion, np.diff(frames.times))
     solved = solve(frames, x, law, NONE)
     return solved if slow == NONE else solve(sheared(frames, solved.x[:, :3]), solved.x, law, slow)

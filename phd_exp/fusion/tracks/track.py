@@ -10,14 +10,14 @@ from jaxtyping import Bool, Float
 from scipy import optimize
 from torch import Tensor
 
-from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion.pose import Pose
 from phd_exp.fusion.tracks.chain import VELOCITY, Array
-from phd_exp.fusion.tracks.frames import Frames, Gaussian
+from phd_exp.fusion.tracks.frames import Frames
 from phd_exp.fusion.tracks.lost import USUAL, Lost
 from phd_exp.fusion.tracks.motion import ConstantAcceleration, ConstantVelocity, Motion
 from phd_exp.fusion.tracks.slow import NONE, Slow
 from phd_exp.fusion.tracks.solved import Solved, smoothed
+from phd_exp.fusion.views import GAUSSIAN, Affine, Views
 from phd_exp.hardware import one_thread
 
 M = TypeVar("M", ConstantVelocity, ConstantAcceleration)
@@ -55,12 +55,12 @@ class Path:
     @property
     def gap(self) -> float:
         """Upper bound on the energy of the path above the lowest energy, nats; inf where that is too flat."""
-        return self.solved.gap
+        return self.solved.bounds[0]
 
     @property
     def certificate(self) -> Float[Tensor, " frames"]:
         """Upper bound on the distance of each position from the true optimum, metres; inf as `gap`."""
-        return self._entered(self.solved.distance)
+        return self._entered(self.solved.bounds[1])
 
     @property
     def surprise(self) -> Float[Tensor, "frames cameras"]:
@@ -97,7 +97,7 @@ class Path:
 @torch.no_grad()
 def track(
     times: Float[Tensor, " frames"],
-    predictions: ProjectedHuber | Gaussian,
+    predictions: Affine,
     pose: Pose,
     motion: Motion,
     mask: Bool[Tensor, "frames cameras"] | None = None,
@@ -113,7 +113,7 @@ def track(
 
     Args:
         times: of the frames, increasing, seconds.
-        predictions: of batch shape (frames, cameras).
+        predictions: ProjectedHuber, or `Gaussian`, of batch shape (frames, cameras).
         pose: of each camera in each frame; its batch shape broadcasts to that.
         motion: `ConstantVelocity` or `ConstantAcceleration`; `estimated` finds its noise.
         mask: which cameras take part in each frame (default: all); the others' predictions and poses are ignored.
@@ -127,7 +127,13 @@ def track(
     of paths; the densities are the paper's.
     """
     with one_thread():
-        frames = checked(times, predictions, pose, mask, slow)
+        views = viewed(predictions, pose, mask, slow)
+        shape = predictions.batch_shape
+        if len(shape) != 2 or 0 in shape:
+            raise ValueError(
+                f"predictions: got batch shape {tuple(shape)}; expected (frames, cameras), none of them 0"
+            )
+        frames = Frames.checked(times.double().cpu().numpy(), views)
         seen = frames.mask.any(-1)
         first = int(np.argmax(seen))
         length, why = lost.gap(frames.times[first:], seen[first:])
@@ -139,18 +145,22 @@ def track(
             why = contradicted
 
 
-def checked(
-    times: Tensor, predictions: ProjectedHuber | Gaussian, pose: Pose, mask: Tensor | None, slow: Slow
-) -> Frames:
-    """The frames of the arguments of `track`. Raises ValueError where one is not valid."""
-    if slow != NONE and isinstance(predictions, Gaussian):
+def viewed(predictions: Affine, pose: Pose, mask: Tensor | None, slow: Slow) -> Views:
+    """The views of these arguments. Raises ValueError where one is not valid."""
+    if not hasattr(type(predictions), "measure"):
+        raise ValueError(
+            f"predictions: got {type(predictions).__name__}; expected ProjectedHuber or Gaussian; use Gaussian.of "
+            "for other densities; a point estimate has no uncertainty"
+        )
+    views = Views.of(predictions, pose, mask)
+    if slow != NONE and (views.a == GAUSSIAN).any():
         raise ValueError("slow: got Gaussian predictions; expected ProjectedHuber")
-    return Frames.checked(times, predictions, pose, mask)
+    return views
 
 
 def estimated(
     times: Float[Tensor, " frames"],
-    predictions: ProjectedHuber | Gaussian,
+    predictions: Affine,
     pose: Pose,
     motion: M,
     mask: Bool[Tensor, "frames cameras"] | None = None,

@@ -7,16 +7,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion.pose import Pose
 from phd_exp.fusion.tracks.chain import VELOCITY, Array, moving, start
-from phd_exp.fusion.tracks.frames import Frames, Gaussian
+from phd_exp.fusion.tracks.frames import Frames
 from phd_exp.fusion.tracks.lost import USUAL, Lost
 from phd_exp.fusion.tracks.motion import Motion
 from phd_exp.fusion.tracks.shear import sheared
 from phd_exp.fusion.tracks.slow import NONE, Slow
 from phd_exp.fusion.tracks.solved import Solved, levels, solve
-from phd_exp.fusion.tracks.track import checked
+from phd_exp.fusion.tracks.track import viewed
+from phd_exp.fusion.views import Affine, Views
 from phd_exp.hardware import one_thread
 
 
@@ -103,40 +103,39 @@ class Tracker:
 
     @torch.no_grad()
     def update(
-        self,
-        time: float,
-        predictions: ProjectedHuber | Gaussian,
-        pose: Pose,
-        mask: Bool[Tensor, " cameras"] | None = None,
+        self, time: float, predictions: Affine, pose: Pose, mask: Bool[Tensor, " cameras"] | None = None
     ) -> State | None:
         """The state `lag` frames before this one; None until there is one, and after the track is lost.
 
         Args:
             time: of this frame, later than that of the frame before, seconds.
-            predictions: of batch shape (cameras,).
+            predictions: ProjectedHuber, or `Gaussian`, of batch shape (cameras,).
             pose: of each camera; its batch shape broadcasts to that.
             mask: which cameras take part (default: all). A frame without any is bridged.
 
         Raises:
             ValueError: an argument is not valid.
         """
-        seen = mask is None or bool(mask.any())
-        if self.lost_because is not None or (self._window is None and not seen):
+        if self.lost_because is not None:
             return None
-        if self._window is not None and not time > self._window.frames.times[-1]:
-            raise ValueError(f"time: got {time} after {self._window.frames.times[-1]}; expected a later time")
-        if time - self._seen > self.lost.after and self._window is not None:
+        window, seen = self._window, mask is None or bool(mask.any())
+        if window is not None and not time > window.frames.times[-1]:
+            raise ValueError(f"time: got {time} after {window.frames.times[-1]}; expected a later time")
+        if window is not None and time - self._seen > self.lost.after:
             self.lost_because = self.lost.late(self._seen)
             return None
         with one_thread():
-            window = self._window
-            frame = window.frames.unseen(time) if window and not seen else self._frame(time, predictions, pose, mask)
-            self._window = self._next(window, frame) if window else self._first(frame)
-            self._seen = time if seen else self._seen
-            full = len(self._window.frames.times) == self.lag + 1
-            if (self._window.excess > self.lost.least_excess).any():
-                times = self._window.frames.times
-                self._end, self.lost_because = self.lost.contradicted(times, self._window.surprise, full)
+            views = viewed(predictions, pose, mask, self.slow) if seen else None
+            if window is not None:
+                window = self._next(window, time, views)
+            elif views is not None:
+                window = self._first(time, views)
+            else:
+                return None
+            self._window, self._seen = window, time if seen else self._seen
+            full = len(window.x) == self.lag + 1
+            if (window.excess > self.lost.least_excess).any():
+                self._end, self.lost_because = self.lost.contradicted(window.frames.times, window.surprise, full)
             self._given = full and self.lost_because is None
             return self._state(0) if self._given else None
 
@@ -161,35 +160,28 @@ class Tracker:
             mean, covariance = F @ mean, F @ covariance @ F.T + np.linalg.inv(W)
         return mean[:3] + window.frames.origin, covariance[:3, :3]
 
-    def _frame(self, time: float, predictions: ProjectedHuber | Gaussian, pose: Pose, mask: Tensor | None) -> Frames:
-        """One frame, checked."""
-        if isinstance(predictions, ProjectedHuber):
-            predictions = predictions[None]
-        elif isinstance(predictions, Gaussian):
-            predictions = Gaussian(predictions.mean[None], predictions.covariance[None])
-        times = torch.tensor([time], dtype=torch.float64)
-        return checked(times, predictions, pose, None if mask is None else mask[None], self.slow)
-
-    def _first(self, frame: Frames) -> Solved:
+    def _first(self, time: float, views: Views) -> Solved:
         """The window of the first frame."""
+        frame = Frames.checked(np.array([time], dtype=float), views)
         self._start = start(self.motion)
         x = np.zeros((1, len(self._start[0])))
-        x[0, :3] = frame.near[0]
-        frame = sheared(frame, frame.near) if self.slow != NONE else frame
+        x[0, :3] = frame.about[0]
+        frame = sheared(frame, frame.about) if self.slow != NONE else frame
         self._first_seen = frame
         return solve(frame, x, (*self._start, *moving(self.motion, np.empty(0))), self.slow)
 
-    def _next(self, window: Solved, frame: Frames) -> Solved:
+    def _next(self, window: Solved, time: float, views: Views | None) -> Solved:
         """The window with one more frame, without its first one if it is full."""
-        frames = window.frames.followed_by(frame)
-        F, W = moving(self.motion, np.diff(frames.times))
-        x = np.concatenate([window.x, (F[-1] @ window.unknowns[-1])[None]])
+        drop = int(len(window.x) > self.lag)
+        F, W = moving(self.motion, time - window.frames.times[-1:])
+        x = np.concatenate([window.x[drop:], F @ window.unknowns[-1]])
+        frames = window.frames.followed_by(time, views, x[-1:, :3], drop)
         if self.slow != NONE:
             frames = sheared(frames, x[-1:, :3], self._first_seen)
-        if len(frames.times) > self.lag + 1:
-            self._start = after_first(window, self._start, F[0], W[0])
-            frames, x, F, W = frames[1:], x[1:], F[1:], W[1:]
-        return solve(frames, x, (*self._start, F, W), self.slow)
+        F, W = np.concatenate([window.chain.F, F]), np.concatenate([window.chain.W, W])
+        if drop:
+            self._start = after_first(window, F[0], W[0])
+        return solve(frames, x, (*self._start, F[drop:], W[drop:]), self.slow)
 
     def _state(self, k: int) -> State:
         """That of a frame of the window."""
@@ -204,23 +196,19 @@ class Tracker:
 
 
 def after_first(
-    window: Solved,
-    start: tuple[Float[Array, " d"], Float[Array, "d d"]],
-    F: Float[Array, "d d"],
-    W: Float[Array, "d d"],
+    window: Solved, F: Float[Array, "d d"], W: Float[Array, "d d"]
 ) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
     """Mean and precision of the second frame's unknowns given the first frame, by its Gaussian factors.
 
-    F and W are those between the two, and `start` holds before the first.
+    F and W are those between the two.
     """
-    mean, precision = start
-    information, precision = precision @ mean, precision.copy()
-    views = window.chain.slope[0], window.chain.at_origin[0], window.moments.factors[0]
-    for slope, at, factor in zip(*views, strict=True):
-        xx, xy, yy, tt = factor[:4]
-        K = np.array([[xx, xy, 0], [xy, yy, 0], [0, 0, tt]])
-        precision[:3, :3] += slope.T @ K @ slope
-        information[:3] += slope.T @ (factor[4:] - K @ at)
+    chain, factors = window.chain, window.moments.factors[0]
+    slope, K = chain.slope[0], np.zeros((len(factors), 3, 3))
+    K[:, (0, 0, 1, 1, 2), (0, 1, 0, 1, 2)] = factors[:, (0, 1, 1, 2, 3)]
+    precision, pull = chain.precision.copy(), chain.precision @ chain.mean
+    across = slope.swapaxes(-1, -2)
+    precision[:3, :3] += (across @ K @ slope).sum(0)
+    pull[:3] += (across @ (factors[:, 4:, None] - K @ chain.at_origin[0, :, :, None])).sum(0)[:, 0]
     covariance = np.linalg.inv(precision)
     moved = F @ covariance @ F.T + np.linalg.inv(W)
-    return F @ covariance @ information, np.linalg.inv((moved + moved.T) / 2)
+    return F @ covariance @ pull, np.linalg.inv((moved + moved.T) / 2)
