@@ -175,9 +175,10 @@ def _record_further(run: RunFolder, checked: RunConfig, cores: int) -> None:
         origin = tables.origin_of(run, checked, data=several.spec.fingerprint(), scenes=n)
         record(run.views, several, origin, scenes, "evaluation.multiview.scenes=...")
     for (frames, held_out), data in checked.sequences.items():
-        file, n = run.sequence(frames, held_out=held_out), data.n_test // frames
+        cameras = data.spec.views
+        file, n = run.sequence(frames, held_out=held_out), data.n_test // (frames * cameras)
         origin = tables.origin_of(run, checked, data=data.spec.fingerprint(), sequences=n)
-        words = f"{n} sequence{'s' if n > 1 else ''} of {frames} frames"
+        words = f"{n} sequence{'s' if n > 1 else ''} of {frames} frames{' from two cameras' if cameras > 1 else ''}"
         record(file, data, origin, words, "evaluation.sequences=[[N,FRAMES]]")
     for name, shift in checked.evaluation.shifts.items():
         origin = tables.origin_of_shift(run, checked, name)

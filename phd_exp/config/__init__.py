@@ -89,11 +89,13 @@ class RunConfig(Record):
     @model_validator(mode="after")
     def sizes_fit(self, info: ValidationInfo) -> "RunConfig":
         """Refuse a batch larger than the training set, images larger than rendered, and a sequence in two parts."""
-        data, frames = self.data, self.data.spec.frames if isinstance(self.data, RenderedConfig) else 1
-        if is_typed(info) and data.n_held_out and data.n_train and data.n_train % frames:
+        data, images = self.data, 1
+        if isinstance(data, RenderedConfig) and data.spec.frames > 1:
+            images = data.spec.frames * data.spec.views
+        if is_typed(info) and data.n_held_out and data.n_train and data.n_train % images:
             raise ValueError(
-                f"data.n_train: got {data.n_train}; expected a multiple of data.frames={frames}, since no sequence "
-                "may have training and held-out samples"
+                f"data.n_train: got {data.n_train}; expected a multiple of data.frames x data.views = {images}, "
+                "since no sequence may have training and held-out samples"
             )
         if data.n_train is not None and data.batch_size > data.n_train:
             raise ValueError(
@@ -135,15 +137,19 @@ class RunConfig(Record):
     def sequences(self) -> dict[tuple[int, bool], RenderedConfig]:
         """The sequences that follow the training, as test samples: by their frames, and whether they are held out.
 
-        Half as many are held out; they have another seed.
+        Half as many are held out, from one camera; they have another seed.
         """
+        asked, multiview = self.evaluation, self.evaluation.multiview
         if not isinstance(data := self.data, RenderedConfig):
             return {}
-        found = {}
-        for n, frames in self.evaluation.sequences:
+        found, cameras, further = {}, asked.sequence_cameras, dict[str, Any]()
+        if cameras > 1 and multiview:
+            further = {"views": cameras, "view_angle_range": multiview.angle_range}
+        for n, frames in asked.sequences:
             changes: dict[str, Any] = {"variant": f"{data.name}-sequences-{frames}", "frames": frames}
             held_out = {"variant": f"{changes['variant']}{HELD_OUT}", "seed": (data.spec.seed + 1) % 2**63}
-            found[frames, False] = data.changed(changes, n * frames)
+            tested = further and further | {"variant": f"{changes['variant']}-cameras-{cameras}"}
+            found[frames, False] = data.changed(changes | tested, n * frames * cameras)
             found[frames, True] = data.changed(changes | held_out, -(-n // 2) * frames)
         return found
 

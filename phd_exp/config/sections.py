@@ -251,5 +251,6 @@ class EvaluationConfig(Record):
     eight_views: StrictBool = False  # default for older run records
     multiview: MultiviewConfig | None = None  # default for older run records
     sequences: tuple[SizesOfSequences, ...] = ()  # default for older run records
+    sequence_cameras: Annotated[Whole, Field(ge=1, le=2)] = 1  # default for older run records
     shifts: dict[Name, ShiftConfig] = Field(default_factory=dict)  # default for older run records
     n_shifted: Count | None = None  # default for older run records

@@ -131,8 +131,8 @@ def read_views(file: Path) -> SeveralViews:
     return _finite(flat, views, file)
 
 
-def read_sequences(file: Path) -> SeveralViews:
-    """The recorded sequences of a run: its views are the frames of one camera, with `time` (s) and `visibility`.
+def read_sequences(file: Path) -> list[SeveralViews]:
+    """The recorded sequences of a run, of each camera: views are its frames, with `time` (s) and `visibility`.
 
     Raises RunError if they cannot be read, or are not sequences of equal length.
     """
@@ -140,14 +140,18 @@ def read_sequences(file: Path) -> SeveralViews:
     needed = (*NEEDED, *OF_FRAMES, *parameter_names(table))
     require_columns(needed, table, file.name)
     flat = {name: torch.from_numpy(table[name]) for name in needed}
-    frames = int((flat["track"] == 0).sum())
-    n, rest = divmod(len(flat["track"]), max(frames, 1))
-    expected = torch.arange(n, dtype=torch.float64).repeat_interleave(frames)
-    if frames < 2 or rest or not torch.equal(flat["track"], expected):
+    images, cameras = int((flat["track"] == 0).sum()), int(flat["view"].max()) + 1
+    n, rest = divmod(len(flat["track"]), max(images, 1))
+    tracks, views = torch.arange(n).repeat_interleave(images), torch.arange(images).repeat(n) % cameras
+    in_order = not rest and torch.equal(flat["track"], tracks.double()) and torch.equal(flat["view"], views.double())
+    if images < 2 * cameras or images % cameras or not in_order:
         raise RunError(f"{file.name}: not sequences of equal length, two frames or more, in order; {AGAIN}")
-    if not bool((flat["time"].reshape(n, frames).diff() > 0).all()):
+    found = _finite(flat, images, file)
+    each = [{name: values[:, camera::cameras] for name, values in found.columns.items()} for camera in range(cameras)]
+    time = each[0]["time"]
+    if not bool((time.diff() > 0).all()) or any(not torch.equal(one["time"], time) for one in each):
         raise RunError(f"{file.name}: the times of a sequence do not increase; {AGAIN}")
-    return _finite(flat, frames, file)
+    return [SeveralViews(columns, found.left_out) for columns in each]
 
 
 def _finite(flat: Mapping[str, Tensor], views: int, file: Path) -> SeveralViews:

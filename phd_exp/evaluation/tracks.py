@@ -10,11 +10,12 @@ from jaxtyping import Float
 from scipy import optimize, stats
 from torch import Tensor
 
+from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.columns import from_columns
 from phd_exp.evaluation.point_errors import SEED
 from phd_exp.evaluation.predictions import Curve, scalar_bands
 from phd_exp.evaluation.several_views import SeveralViews
-from phd_exp.fusion import Pose
+from phd_exp.fusion import Pose, Status, fuse
 from phd_exp.fusion.tracks import ConstantVelocity, Gaussian, Lost, Path, Slow, correlation_time, standardised_errors
 from phd_exp.fusion.tracks import track as smoothed
 from phd_exp.metrics.bootstrap import Interval, bands
@@ -22,8 +23,8 @@ from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error, sq
 from phd_exp.records.errors import RunError
 
 Method = Literal["single", "kalman", "independent", "slow"]
-"""Each frame alone (its mode); a Rauch-Tung-Striebel smoother of the frames' means and covariances; the mean path of
-`fusion.tracks.track` without and with slow errors."""
+"""Each frame alone (its mode, or the position fused from two cameras); a Rauch-Tung-Striebel smoother of means and
+covariances; the mean path of `fusion.tracks.track` without and with slow errors."""
 METHODS: tuple[Method, ...] = ("single", "kalman", "independent", "slow")
 SMOOTHERS = METHODS[1:]
 ERRORS = ("depth_error_mm", "projected_error_mm")
@@ -54,10 +55,11 @@ class Choice:
 
 @dataclass(frozen=True)
 class TrackScores:
-    """Scores of n sequences of one camera.
+    """Scores of n sequences of one or two cameras.
 
     Attributes:
-        n, frames, hidden: number of sequences, of frames in each, and of all frames that hide the object.
+        n, frames, hidden: number of sequences, of frames in each, and of all frames that hide the object from the
+            first camera.
         left_out: further sequences, with a value that is not finite or without a path in front of the camera.
         choice: of the held-out sequences.
         bands: by `place`, means over frames with 95 % bootstrap intervals over sequences. `nees` is the squared
@@ -66,6 +68,7 @@ class TrackScores:
             the Kalman smoother minus that of a method, mm.
         curves: by `place`, means over sequences at each time (s).
         calibrated: 95 % interval of the mean NEES of n frames, one of each sequence, if calibrated.
+        cameras: their number.
     """
 
     n: int
@@ -76,6 +79,12 @@ class TrackScores:
     bands: dict[str, Interval[float]]
     curves: dict[str, Curve]
     calibrated: tuple[float, float]
+    cameras: int = 1
+
+    @property
+    def name(self) -> str:
+        """The length of the sequences and the number of cameras, in words."""
+        return f"{self.frames} frames" + (f", {self.cameras} cameras" if self.cameras > 1 else "")
 
 
 def place(quantity: str, method: Method) -> str:
@@ -118,7 +127,7 @@ def _surprisal(held_out: Sequence[SeveralViews], choice: Choice) -> float:
     found = 0.0
     for one in held_out:
         truth = one.pose.into_world(one.xyz)
-        for row, path in enumerate(_paths(one, "slow", choice)):
+        for row, path in enumerate(_paths([one], "slow", choice)):
             if path:
                 distance = squared_mahalanobis(truth[row] - path.mean, path.covariance)
                 found += float((distance + torch.linalg.slogdet(path.covariance)[1]).sum()) / 2
@@ -149,7 +158,7 @@ def _noise(held_out: Sequence[SeveralViews], known: Choice, method: Method) -> f
 
     def loss(log_noise: float) -> float:
         choice = replace(known, noise={method: math.exp(log_noise)})
-        found = [path.log_evidence for one in held_out for path in _paths(one, method, choice) if path]
+        found = [path.log_evidence for one in held_out for path in _paths([one], method, choice) if path]
         if not found:
             raise RunError("sequences: not one held-out sequence has a path; train longer")
         return -sum(found)
@@ -158,13 +167,20 @@ def _noise(held_out: Sequence[SeveralViews], known: Choice, method: Method) -> f
     return math.exp(optimize.minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": PRECISION}).x)
 
 
-def _paths(sequences: SeveralViews, method: Method, choice: Choice) -> Iterator[Path | None]:
-    """The path of each sequence; None where there is none in front of the camera."""
-    predictions = from_columns({name: column[..., None] for name, column in sequences.columns.items()})
+def _together(cameras: Sequence[SeveralViews]) -> tuple[ProjectedHuber, Pose]:
+    """Predictions and poses (sequences, frames, cameras)."""
+    columns = {name: torch.stack([one.columns[name] for one in cameras], -1) for name in cameras[0].columns}
+    R, t = (torch.stack([getattr(one.pose, name) for one in cameras], 2) for name in "Rt")
+    return from_columns(columns), Pose(R, t)
+
+
+def _paths(cameras: Sequence[SeveralViews], method: Method, choice: Choice) -> Iterator[Path | None]:
+    """The path of each sequence; None where there is none in front of the cameras."""
+    predictions, poses = _together(cameras)
     motion = ConstantVelocity(choice.noise[method], choice.speed)
     slow = choice.slow if method == "slow" else Slow()
-    for row, times in enumerate(sequences.columns["time"]):
-        pose = Pose(sequences.pose.R[row, :, None], sequences.pose.t[row, :, None])
+    for row, times in enumerate(cameras[0].columns["time"]):
+        pose = Pose(poses.R[row], poses.t[row])
         given = Gaussian.of(predictions[row]) if method == "kalman" else predictions[row]
         try:
             yield smoothed(times, given, pose, motion, slow=slow, lost=WHOLE)
@@ -172,14 +188,19 @@ def _paths(sequences: SeveralViews, method: Method, choice: Choice) -> Iterator[
             yield None
 
 
-def track_scores(sequences: SeveralViews, choice: Choice, resamples: int = 1000) -> TrackScores:
-    """Smooth with every method and score. Raises RunError if no sequence has a path by all of them."""
-    paths = {method: list(_paths(sequences, method, choice)) for method in SMOOTHERS}
+def track_scores(cameras: Sequence[SeveralViews], choice: Choice, resamples: int = 1000) -> TrackScores:
+    """Smooth with every method and score, in the frame of the first camera.
+
+    Raises RunError if no sequence has a path by all of them.
+    """
+    paths = {method: list(_paths(cameras, method, choice)) for method in SMOOTHERS}
+    alone = fuse(*_together(cameras), contradiction=0.0)
     sound = torch.tensor([all(each) for each in zip(*paths.values(), strict=True)])
+    sound &= (alone.status == Status.FUSED).all(-1)
     if not bool(sound.any()):
         raise RunError("sequences: not one has a path by every method; train longer")
-    kept = sequences.subset(sound)
-    found = _scored(kept, "single", kept.pose.into_world(kept.predictions.mode), *kept.world_moments)
+    kept = cameras[0].subset(sound)
+    found = _scored(kept, "single", *(values[sound] for values in (alone.point, alone.mean, alone.covariance)))
     for method, of_all in paths.items():
         whole = [path for path, good in zip(of_all, sound, strict=True) if path and good]
         mean = torch.stack([path.mean for path in whole])
@@ -199,6 +220,7 @@ def track_scores(sequences: SeveralViews, choice: Choice, resamples: int = 1000)
             for at, band in bands(_over_time, found, resamples, SEED).items()
         },
         calibrated=(float(low), float(high)),
+        cameras=len(cameras),
     )
 
 

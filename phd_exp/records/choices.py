@@ -40,6 +40,7 @@ WITHOUT_INFLUENCE = (
     "evaluation.every_n_epochs",
     "evaluation.held_out",
     "evaluation.multiview",
+    "evaluation.sequence_cameras",
     "evaluation.sequences",
     "evaluation.shifts",
     "evaluation.n_shifted",

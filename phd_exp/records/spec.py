@@ -77,8 +77,9 @@ class DatasetSpec(Record):
         image_quality: of webp and jpeg, per cent.
         saturation_range: bounds of the saturation of every colour; near 0 it is grey.
         half_hidden: whether a panel in front of the cylinder hides half of it. It replaces the cube of `occluders`.
-        frames: images of each scene, one after the other; sample i is frame i mod frames of scene i div frames. The
-            motion is described in `rendering/sequences.py`.
+        frames: images of each scene and camera, one after the other; without further views, sample i is frame i mod
+            frames of scene i div frames, and with them all views of a frame follow one another. The motion is
+            described in `rendering/sequences.py`.
         frame_rate: frames per second.
         speed: root mean square speed of each object along each axis, m/s.
         spin_range: bounds of the rate at which each object turns, degrees per second.
@@ -191,8 +192,8 @@ class DatasetSpec(Record):
 
     @model_validator(mode="after")
     def _frames_fit(self) -> "DatasetSpec":
-        if self.frames > 1 and (self.mesh is not None or self.views > 1):
-            raise ValueError(f"frames: got {self.frames}; sequences are of the cylinder, from one camera; expected 1")
+        if self.frames > 1 and self.mesh is not None:
+            raise ValueError(f"frames: got {self.frames}; sequences are of the cylinder; expected 1")
         motion = ("frame_rate", "speed", "spin_range", "camera_speed", "camera_turn")
         if self.frames == 1 and (given := [key for key in motion if not self._is_usual(key)]):
             raise ValueError(f"{given[0]}: nothing moves in single images; expected data=sequence")

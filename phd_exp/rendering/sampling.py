@@ -8,6 +8,7 @@ from functools import partial
 from typing import get_args
 
 import numpy as np
+from jaxtyping import Float
 
 from phd_exp.optics.virtual import rays
 from phd_exp.records.scenes import (
@@ -25,7 +26,7 @@ from phd_exp.records.scenes import (
 )  # fmt: skip
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.rays import optics, rotation_matrix
-from phd_exp.rendering.sequences import camera_pose, in_scene, moved
+from phd_exp.rendering.sequences import camera_pose, in_scene, moved, slid
 
 # Increment one when the same specification starts to give other scenes or other pixels. Folders of another version
 # are refused, not continued with samples that do not match.
@@ -59,7 +60,8 @@ class Purpose(IntEnum):
     LOOKS = 82
     MOTION = 90  # followed by the place of the shape
     CAMERA_MOTION = 91
-    FRAME_NOISE = 92  # followed by the number of the frame
+    FRAME_NOISE = 92  # followed by the number of the frame, and of a further view
+    VIEW_MOTION = 93  # followed by the view's number
 
 
 POSE, LOOK, SCALE = range(3)
@@ -88,24 +90,26 @@ def sample_scene(spec: DatasetSpec, split: Split, index: int) -> Scene:
     number, frame = divmod(number, spec.frames)
     stream = partial(stream_of, spec, split, number)
     f = _uniform(stream(Purpose.CAMERA), spec.f_range)
-    pose = camera_pose(spec, frame / spec.frame_rate, stream(Purpose.CAMERA_MOTION)) if frame else FIRST_VIEW
     scene = Scene(
         f=f,
         S=spec.sensor_size,
-        pose=pose,
-        objects=_objects(spec, f, pose, frame, stream),
+        pose=_first_pose(spec, frame, stream),
+        objects=_objects(spec, f, frame, stream),
         lamps=_lamps(spec, stream(Purpose.LAMPS)),
         backdrop=_backdrop(stream(Purpose.BACKDROP)),
         noise_seed=_seed(stream(Purpose.FRAME_NOISE, frame) if frame else stream(Purpose.NOISE)),
     )
-    return _seen_again(scene, spec, stream(Purpose.VIEW, view)) if view else scene
+    return _seen_again(scene, spec, frame, view, stream) if view else scene
 
 
-def _objects(
-    spec: DatasetSpec, f: float, pose: Pose, frame: int, stream: Callable[..., Stream]
-) -> tuple[SceneObject, ...]:
+def _first_pose(spec: DatasetSpec, frame: int, stream: Callable[..., Stream]) -> Pose:
+    """The pose of the first camera in a frame of its sequence."""
+    return camera_pose(spec, frame / spec.frame_rate, stream(Purpose.CAMERA_MOTION)) if frame else FIRST_VIEW
+
+
+def _objects(spec: DatasetSpec, f: float, frame: int, stream: Callable[..., Stream]) -> tuple[SceneObject, ...]:
     """The objects in front of the first view, in a frame of its sequence."""
-    objects = []
+    objects, pose = [], _first_pose(spec, frame, stream)
     for place, shape in enumerate(SHAPES if spec.occluders else SHAPES[:1]):
         where, look, size = (stream(Purpose.OBJECT + 10 * place + part) for part in (POSE, LOOK, SCALE))
         item = draw_object(spec, shape, f, where, look, size)
@@ -147,30 +151,42 @@ def stream_of(spec: DatasetSpec, split: Split, scene: int, *purpose: int) -> Str
     return np.random.default_rng(np.random.SeedSequence(entropy=spec.seed, spawn_key=key))
 
 
-def _seen_again(scene: Scene, spec: DatasetSpec, rng: Stream) -> Scene:
+def _seen_again(scene: Scene, spec: DatasetSpec, frame: int, view: int, stream: Callable[..., Stream]) -> Scene:
     """The same scene in front of another camera, turned about an axis orthogonal to the first one's line of sight.
 
     The focal length and the cylinder's position in the camera frame have the distribution of the first view. The
     cylinder's rotation is uniform in every camera frame, because it is so in one. The lamps do not move.
     """
+    rng = stream(Purpose.VIEW, view)
     f = _uniform(rng, spec.f_range)
-    changes = {"f": f, "pose": _pose(scene.objects, spec, f, rng), "backdrop": _backdrop(rng)}
-    return scene.model_copy(update=changes | {"noise_seed": _seed(rng)})
+    places = [[item.position for item in _objects(spec, scene.f, k, stream)] for k in range(spec.frames)]
+    pose = _poses(np.array(places), spec, f, rng, partial(stream, Purpose.VIEW_MOTION, view))[frame]
+    changes = {"f": f, "pose": pose, "backdrop": _backdrop(rng), "noise_seed": _seed(rng)}
+    if frame:
+        changes["noise_seed"] = _seed(stream(Purpose.FRAME_NOISE, frame, view))
+    return scene.model_copy(update=changes)
 
 
-def _pose(objects: tuple[SceneObject, ...], spec: DatasetSpec, f: float, rng: Stream) -> Pose:
-    """The pose of a further camera that has all objects in front of it."""
-    places = np.array([item.position for item in objects])
+def _poses(
+    places: Float[np.ndarray, "frames objects 3"],
+    spec: DatasetSpec,
+    f: float,
+    rng: Stream,
+    motion: Callable[[], Stream],
+) -> list[Pose]:
+    """The poses of a further camera in all frames, which has all objects in front of it in each of them."""
+    times = [frame / spec.frame_rate for frame in range(1, spec.frames)]
     for _ in range(MOST_TRIES):
         direction = _uniform(rng, (0.0, math.tau))
         angle = math.radians(_uniform(rng, spec.view_angle_range))
         rotation = about_axis((math.cos(direction), math.sin(direction), 0.0), angle)
         matrix = rotation_matrix(rotation)
-        shift = np.array(_position(spec, f, rng)) - matrix @ places[0]
-        if (places @ matrix.T + shift)[:, 2].min() >= min(CLEARANCE, spec.z_range[0]):
-            x, y, z = shift.tolist()
-            return Pose(rotation=rotation, translation=(x, y, z))
-    raise ValueError(f"no camera sees all {len(objects)} objects: lower view_angle_range")
+        first = _position(spec, f, rng)
+        seen = [first, *(slid(first, spec, f, time, motion()) for time in times)]
+        shifts = np.array(seen) - places[:, 0] @ matrix.T
+        if (places @ matrix.T + shifts[:, None])[..., 2].min() >= min(CLEARANCE, spec.z_range[0]):
+            return [Pose(rotation=rotation, translation=(x, y, z)) for x, y, z in shifts.tolist()]
+    raise ValueError(f"no camera sees all {places.shape[1]} objects: lower view_angle_range")
 
 
 def draw_object(spec: DatasetSpec, shape: str, f: float, pose: Stream, look: Stream, size: Stream) -> SceneObject:

@@ -2,7 +2,8 @@
 
 Each coordinate of an object is a function of a smooth stationary Gaussian process, such that in every frame it has
 the distribution of single images: depth is uniform in `z_range`, x and y are uniform over the field of view at that
-depth. Objects therefore never leave the field. The first frame is a single image.
+depth. Objects therefore never leave the field. The first frame is a single image. A further camera of a sequence
+keeps its direction and moves so that the same holds for the cylinder in its frame.
 """
 
 import math
@@ -12,7 +13,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
 
-from phd_exp.records.scenes import Pose, Quaternion, SceneObject
+from phd_exp.records.scenes import Pose, Quaternion, SceneObject, Vector
 from phd_exp.records.spec import DatasetSpec
 
 Stream = np.random.Generator
@@ -27,19 +28,27 @@ RMS_SLOPE = math.sqrt(2 / (math.pi * math.sqrt(3)))
 def moved(item: SceneObject, spec: DatasetSpec, f: float, time: float, rng: Stream) -> SceneObject:
     """An object in the camera's frame at a time (seconds), given that at time 0.
 
-    Each coordinate has the root mean square speed `spec.speed` (m/s; x and y at the middle depth). The object turns
-    about a random axis at a constant rate, uniform in `spec.spin_range` (degrees per second).
+    The object turns about a random axis at a constant rate, uniform in `spec.spin_range` (degrees per second).
     """
-    near, far = spec.z_range
-    half_width = 0.5 * spec.xy_range * spec.sensor_size / f
-    x, y, z = item.position
-    depth = _slid(z, (near, far), spec.speed, time, rng)
-    at_middle = spec.speed / ((near + far) / 2)
-    x, y = (depth * _slid(value / z, (-half_width, half_width), at_middle, time, rng) for value in (x, y))
+    position = slid(item.position, spec, f, time, rng)
     axis = rng.standard_normal(3)
     turn = time * math.radians(rng.uniform(*spec.spin_range)) * axis / np.linalg.norm(axis)
     rotation = quaternion_of(Rotation.from_rotvec(turn) * _rotation(item.rotation))
-    return item.model_copy(update={"position": (x, y, depth), "rotation": rotation})
+    return item.model_copy(update={"position": position, "rotation": rotation})
+
+
+def slid(position: Vector, spec: DatasetSpec, f: float, time: float, rng: Stream) -> Vector:
+    """A position in the camera's frame at a time (seconds), given that at time 0.
+
+    Each coordinate has the root mean square speed `spec.speed` (m/s; x and y at the middle depth).
+    """
+    near, far = spec.z_range
+    half_width = 0.5 * spec.xy_range * spec.sensor_size / f
+    x, y, z = position
+    depth = _slid(z, (near, far), spec.speed, time, rng)
+    at_middle = spec.speed / ((near + far) / 2)
+    x, y = (depth * _slid(value / z, (-half_width, half_width), at_middle, time, rng) for value in (x, y))
+    return x, y, depth
 
 
 def camera_pose(spec: DatasetSpec, time: float, rng: Stream) -> Pose:

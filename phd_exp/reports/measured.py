@@ -61,7 +61,7 @@ class Measured:
         after: evaluation of the recalibrated predictions; None without held-out samples.
         pairs: scores of the positions fused from two cameras; None without a record of several views.
         scene: the first test sample in space; None without a Projected Huber density.
-        tracks: scores of sequences, by their frames; empty without sequences.
+        tracks: scores of sequences, by their frames, with _2 from two cameras; empty without sequences.
         shifts: scores at home and under each shift; empty without a shift.
         images: a digest of data set and true positions, equal for runs tested on the same images.
     """
@@ -111,14 +111,18 @@ def _with_volumes(predictions: Arrays, held_out: Arrays | None) -> Arrays:
 
 def _tracks(folder: RunFolder) -> dict[str, TrackScores]:
     files = sorted(folder.sequences.glob("*.parquet"))
-    choosing = [read_sequences(file) for file in files if file.stem.endswith(HELD_OUT)]
+    choosing = [read_sequences(file)[0] for file in files if file.stem.endswith(HELD_OUT)]
     tested = {file.stem: read_sequences(file) for file in files if not file.stem.endswith(HELD_OUT)}
     if not tested:
         return {}
     if not choosing:
         raise RunError(f"{folder.sequences.name}: no held-out sequences; repeat the command of the training")
     choice = choose(choosing)
-    return {frames: track_scores(sequences, choice) for frames, sequences in tested.items()}
+    return {
+        frames if k == 1 else f"{frames}_{k}": track_scores(each[:k], choice)
+        for frames, each in sorted(tested.items(), key=lambda pair: int(pair[0]))
+        for k in range(1, len(each) + 1)
+    }
 
 
 def _recalibrated(predictions: Arrays, held_out: Arrays) -> dict[str, Any]:

@@ -33,14 +33,15 @@ TITLES = {
 }
 SQUARED = "squared error / predicted"
 OF_QUANTITIES = (
-    "Means over the frames of all sequences, of one camera; in brackets: 95 % bootstrap intervals over sequences. "
+    "Means over the frames of all sequences; in brackets: 95 % bootstrap intervals over sequences. "
     "Depth: along the camera's true viewing ray; projected: across it, as in the paper's tables. Hidden: frames in "
     f"which less than {100 * HIDDEN:.0f} % of the object is visible. Ratios are those of mean errors. Squared error: "
     "the squared Mahalanobis distance per dimension, averaged over the path, 1 where calibrated, above 1 where "
     "overconfident."
 )
 OF_METHODS = (
-    "Single frames: the mode of each. Kalman (RTS): a Rauch-Tung-Striebel smoother of the frames' means and "
+    "Single frames: the mode of each, of two cameras the position fused from both. Kalman (RTS): a "
+    "Rauch-Tung-Striebel smoother of the frames' means and "
     "covariances. Ours: the mean path under the frames' densities; weighted frames: each density has a "
     "weight, the information that neighbouring frames lack. All assume a velocity that changes by white noise."
 )
@@ -53,7 +54,7 @@ def tracks_tables(report: Report) -> list[Table]:
 
 def tracks_table(run: Run, scores: Mapping[str, TrackScores]) -> Table:
     """The table of a run's scores, by the frames of a sequence."""
-    every = sorted(scores.values(), key=lambda one: one.frames)
+    every = sorted(scores.values(), key=lambda one: (one.frames, one.cameras))
     found = {
         quantity: tuple(
             TableRow((label, NAMES[method]), tuple(_cell(run, one, quantity, method) for one in every))
@@ -67,7 +68,7 @@ def tracks_table(run: Run, scores: Mapping[str, TrackScores]) -> Table:
         kind="tracks",
         title=f"Paths, {in_words(run.preset)}, {run.title}, {run.name}",
         stub=("quantity", "method"),
-        columns=tuple(f"{one.n} × {one.frames} frames" for one in every),
+        columns=tuple(f"{one.n} × {one.name}" for one in every),
         groups=tuple(rows for rows in found.values() if rows),
         notes=(OF_QUANTITIES, OF_METHODS, *map(_chosen, every[:1]), *map(_frames, every)),
         preset=run.preset,
@@ -78,8 +79,9 @@ def _cell(run: Run, scores: TrackScores, quantity: str, method: Method) -> Table
     band = scores.bands.get(place(quantity, method))
     if band is None:
         return TableCell(NOTHING)
-    numbers = run.choice | {"run": run.name, "frames": scores.frames, "quantity": quantity, "method": method}
-    numbers |= {"mean": band.value, **bounds(band), "n_sequences": scores.n, "n_hidden": scores.hidden}
+    numbers = run.choice | {"run": run.name, "frames": scores.frames, "cameras": scores.cameras}
+    numbers |= {"quantity": quantity, "method": method, "mean": band.value, **bounds(band)}
+    numbers |= {"n_sequences": scores.n, "n_hidden": scores.hidden}
     text = band.each(lambda value: number(quantity, value))
     return TableCell(text.value, f"({text.low}{' to ' if band.low < 0 else '–'}{text.high})", numbers=(numbers,))
 
@@ -106,12 +108,12 @@ def _chosen(scores: TrackScores) -> str:
 def _frames(scores: TrackScores) -> str:
     left = f" {scores.left_out} further sequences are left out." if scores.left_out else ""
     n = scores.n * scores.frames
-    return f"{scores.hidden} of {n} frames of the sequences of {scores.frames} frames hide the object.{left}"
+    return f"{scores.hidden} of {n} frames of the sequences of {scores.name} hide the object.{left}"
 
 
 def headline(scores: Mapping[str, TrackScores]) -> str:
     """The depth error of single frames and of the path, in words."""
-    one = min(scores.values(), key=lambda each: each.frames)
+    one = min(scores.values(), key=lambda each: (each.frames, each.cameras))
     single, path = (number(ERRORS[0], one.bands[place(ERRORS[0], method)].value) for method in ("single", "slow"))
     return f"depth error {single} mm in single frames, {path} mm on paths of {one.frames}"
 
@@ -119,17 +121,17 @@ def headline(scores: Mapping[str, TrackScores]) -> str:
 def track_charts(scores: Mapping[str, TrackScores]) -> dict[str, Chart]:
     """Both errors and the squared error over predicted, for each length of sequences."""
     charts = {}
-    for one in sorted(scores.values(), key=lambda each: each.frames):
+    for key, one in scores.items():
         for quantity, (title, unit) in TITLES.items():
             y = axis(unit, rangemode="tozero")
-            charts[f"tracks_{quantity}_{one.frames}"] = _over_time(one, quantity, f"{title}, {one.frames} frames", y)
-        chart = _over_time(one, NEES, f"Squared error over predicted, {one.frames} frames", axis(SQUARED, log=True))
+            charts[f"tracks_{quantity}_{key}"] = _over_time(one, quantity, f"{title}, {one.name}", y)
+        chart = _over_time(one, NEES, f"Squared error over predicted, {one.name}", axis(SQUARED, log=True))
         low, high = one.calibrated
         times = one.curves[place(NEES, "slow")].x
         band = line("calibrated", times, [1.0] * len(times), 0, dash="dash", role="aside", low=[low] * len(times),
                     high=[high] * len(times))  # fmt: skip
         chart.data.insert(0, band)
-        charts[f"tracks_{NEES}_{one.frames}"] = chart
+        charts[f"tracks_{NEES}_{key}"] = chart
     return charts
 
 

@@ -44,7 +44,7 @@ WRONG_VALUES = [
     ([f"{MULTIVIEW}=9", "data=multiview"], ["data=multiview is not rendered with one view", "expected data=scale"]),
     ([f"{MULTIVIEW}=9", *FOLDER], ["is not rendered", "expected data=scale"]),
     ([f"{MULTIVIEW}=9", "data=scale", "model=mae_vz"], ["model=mae_vz has no density", "expected model=prob"]),
-    (["data=sequence"], ["data.n_train: got 32", "multiple of data.frames=20"]),
+    (["data=sequence"], ["data.n_train: got 32", "multiple of data.frames x data.views = 20"]),
     (
         [SEQUENCES, "data=sequence", "data.n_train=40"],
         ["data=sequence is not rendered in single images", "expected data=scale"],
@@ -52,6 +52,7 @@ WRONG_VALUES = [
     ([SEQUENCES, *FOLDER], ["is not rendered in single images", "expected data=scale"]),
     ([SEQUENCES, "model=mae_vz"], ["model=mae_vz predicts no Projected Huber density", "expected model=prob"]),
     (["evaluation.sequences=[[4,20],[2,20]]"], ["expected pairs [sequences, frames] of different frames"]),
+    (["evaluation.sequence_cameras=3"], ["evaluation.sequence_cameras", "got 3"]),
     ([SEQUENCES, "data=multiview"], ["evaluation.sequences", "data=multiview is not rendered in single images"]),
     (["evaluation.eight_views=true", "model=mae_vz"], ["evaluation.eight_views", "model=mae_vz predicts points"]),
     (["loss=mae"], ["loss", "PointEstimate", "model=probabilistic", "ProjectedHuber"]),

@@ -73,8 +73,14 @@ def test_sequences_are_of_the_runs_own_scenes_and_others_are_held_out(checked: C
         assert differing(single, tested) == {"variant", "frames"}
         assert differing(tested, choosing) == {"variant", "seed"}
         assert [one.n_test for one in found] == [n * frames, held_out * frames]
+    both = checked("data=occl", "evaluation.sequences=[[5,20]]", "evaluation.sequence_cameras=2").sequences
+    spec = both[20, False].spec
+    assert (spec.views, spec.view_angle_range, both[20, False].n_test) == (2, (20, 60), 200)
+    assert (both[20, True].spec.views, both[20, True].n_test) == (1, 60)
+    assert both[20, False].name == "occl-sequences-20-cameras-2"
     assert checked("data=occl").sequences == {}
     assert not has_influence("evaluation.sequences")
+    assert not has_influence("evaluation.sequence_cameras")
 
 
 def pairs(config: RunConfig) -> list[tuple[RenderedConfig, RenderedConfig]]:

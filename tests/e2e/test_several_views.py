@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
+from phd_exp.evaluation.several_views import read_sequences
 from phd_exp.fusion import Pose
 from phd_exp.records import scenes
 from phd_exp.records.runs import RunFolder, find_runs
@@ -65,6 +66,24 @@ def test_views_are_recorded_once_and_the_run_stays_as_it_was(train: Callable, ru
     untrained = train(*asked(2), "evaluation.multiview.views=3", "seed=1")
     assert (untrained.status, untrained.err) == (1, refused.err)
     assert len(find_runs(tmp_path / "runs")) == 1, "found before the training"
+
+
+def test_sequences_from_two_cameras_are_recorded(train: Callable, run: RunFolder, tmp_path: Path) -> None:
+    shutil.copytree(run.path.parents[3], tmp_path / "runs")
+    (run,) = find_runs(tmp_path / "runs")
+    words = (*QUICKER, "evaluation.sequences=[[2,3]]", "evaluation.sequence_cameras=2")
+    outcome = train(*words)
+    assert outcome.status == 0, outcome.err
+    assert "3.parquet: 2 sequences of 3 frames from two cameras" in outcome.out
+    (held_out,) = read_sequences(run.sequence(3, held_out=True))
+    first, second = read_sequences(run.sequence(3, held_out=False))
+    assert (held_out.n, first.n, first.views) == (1, 2, 3)
+    torch.testing.assert_close(first.columns["time"][0], torch.arange(3).double() / 30)
+    same = (one.pose.into_world(one.xyz) for one in (first, second))
+    torch.testing.assert_close(*same, rtol=0, atol=1e-5)
+    single = pd.read_parquet(run.predictions)  # the first frame of the first camera is an image of its test set
+    np.testing.assert_allclose(first.columns["mu_z"][:, 0], single["mu_z"][:2], rtol=1e-5)
+    assert "3.parquet" not in train(*words).out
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def independent(folder: Path) -> SeveralViews:
     write_sequences(folder / "independent.parquet", N, FRAMES)
-    return read_sequences(folder / "independent.parquet")
+    return read_sequences(folder / "independent.parquet")[0]
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def known() -> Choice:
 
 @pytest.fixture(scope="module")
 def scores(independent: SeveralViews, known: Choice) -> TrackScores:
-    return track_scores(independent, known, resamples=50)
+    return track_scores([independent], known, resamples=50)
 
 
 @pytest.fixture(scope="module")
@@ -88,9 +88,22 @@ def test_the_interval_of_calibrated_frames_is_that_of_draws(scores: TrackScores)
     np.testing.assert_allclose(np.quantile(inside, [0.025, 0.975]), scores.calibrated, rtol=0.02)
 
 
+def test_two_cameras_are_closer_than_one_and_calibrated(folder: Path, known: Choice) -> None:
+    write_sequences(folder / "two.parquet", 30, 12, cameras=2, seed=6)
+    both = read_sequences(folder / "two.parquet")
+    one, two = (track_scores(both[:k], known, resamples=50) for k in (1, 2))
+    assert (one.name, two.name) == ("12 frames", "12 frames, 2 cameras")
+    for method in METHODS:
+        assert value(two, "depth_error_mm", method) < 0.7 * value(one, "depth_error_mm", method)
+    for method in ("single", "independent"):
+        assert value(two, "nees", method) == pytest.approx(1, abs=0.25)
+    seen_again = both[1].pose.into_world(both[1].xyz)
+    torch.testing.assert_close(both[0].pose.into_world(both[0].xyz), seen_again)
+
+
 def test_held_out_sequences_choose_noise_and_slow_errors(folder: Path) -> None:
     write_sequences(folder / "held.parquet", 40, FRAMES, errors=ERRORS, seed=2)
-    choice = choose([read_sequences(folder / "held.parquet")])
+    choice = choose(read_sequences(folder / "held.parquet"))
     assert choice.speed == pytest.approx(MOTION.speed, rel=0.3)
     for name in ("depth_time", "projection_time"):
         for found in (choice.correlated, choice.slow):  # of 40 short sequences
@@ -101,7 +114,7 @@ def test_held_out_sequences_choose_noise_and_slow_errors(folder: Path) -> None:
 
 def test_independent_errors_choose_no_slow_ones(folder: Path) -> None:
     write_sequences(folder / "none.parquet", 20, FRAMES, seed=3)
-    choice = choose([read_sequences(folder / "none.parquet")])
+    choice = choose(read_sequences(folder / "none.parquet"))
     assert choice.slow.depth_time < 0.03  # seconds: less than a frame
     assert choice.slow.projection_time < 0.03
 
@@ -110,7 +123,7 @@ def test_a_sequence_with_a_value_that_is_not_finite_is_left_out(independent: Sev
     table = pd.read_parquet(folder / "independent.parquet")
     table.loc[FRAMES + 3, "mu_z"] = np.nan
     table.to_parquet(folder / "broken.parquet")
-    broken = read_sequences(folder / "broken.parquet")
+    (broken,) = read_sequences(folder / "broken.parquet")
     assert (broken.n, broken.left_out) == (N - 1, 1)
     assert torch.equal(broken.xyz[1], independent.xyz[2])
 

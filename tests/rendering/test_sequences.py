@@ -119,6 +119,31 @@ def test_a_record_has_the_name_of_its_sequence_its_time_and_its_pose(make_spec: 
     assert not single.keys() & {"track", "time"}, "records of single images stay as they were"
 
 
+def test_a_further_camera_follows_the_cylinder_and_sees_the_same_scene(make_spec: MakeSpec) -> None:
+    """View 0 is that of one camera, and frame 0 that of single images from two; the later frames are smooth."""
+    several, places = {"views": 2, "view_angle_range": (20.0, 60.0)}, []
+    for scene in range(3):
+        single = sample_scene(make_spec("scale", **several), "test", 2 * scene + 1)
+        assert single == sample_scene(make_spec("sequence", frames=6, **several), "test", 12 * scene + 1)
+    spec = make_spec("sequence", frames=6, occluders=True, **several)
+    one = make_spec("sequence", frames=6, occluders=True)
+    for index in range(60):
+        first, second = (sample_scene(spec, "test", 2 * index + view) for view in range(2))
+        assert first == sample_scene(one, "test", index)
+        assert second.objects == first.objects
+        seen = np.array([in_camera_frame(np.array(item.position), second.pose) for item in second.objects])
+        assert seen[:, 2].min() >= 0.5
+        places.append(np.append(seen[0, :2] / seen[0, 2] * (2 * second.f / spec.sensor_size), seen[0, 2]))
+        assert second.pose.rotation == sample_scene(spec, "test", 12 * (index // 6) + 1).pose.rotation
+    across, depth = np.array(places)[:, :2], np.array(places)[:, 2]
+    assert np.abs(across).max() <= 1
+    assert 3 <= depth.min() < depth.max() <= 5
+    steps = np.diff(np.array(places).reshape(10, 6, 3), axis=1)
+    assert 0.001 < np.abs(steps).max() < 0.5
+    record = described(spec, 15)
+    assert (record.track, record.time, record.scene, record.view) == ("1", 1 / 30, 7, 1)
+
+
 def test_the_camera_moves_as_specified(make_spec: MakeSpec) -> None:
     spec = make_spec("sequence", frames=3, frame_rate=100.0, **MOVING_CAMERA)
     poses = [[sample_scene(spec, "test", 3 * n + k).pose for k in (1, 2)] for n in range(300)]

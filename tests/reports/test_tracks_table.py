@@ -20,21 +20,22 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Report:
     run = write_run(folder, "occl", n=40, epochs=1)
     for held_out in (False, True):
         write_sequences(run.sequence(8, held_out=held_out), 8, 8, errors=SLOW_ERRORS, seed=int(held_out))
-    write_sequences(run.sequence(12, held_out=False), 3, 12, seed=5)
+    write_sequences(run.sequence(12, held_out=False), 3, 12, cameras=2, seed=5)
     return read_report(folder)
 
 
 def test_the_table_holds_the_scores_of_each_length(report: Report) -> None:
     (run,) = report.runs
     (table,) = (one for one in all_tables(report) if one.kind == "tracks")
-    assert table.columns == ("8 × 8 frames", "3 × 12 frames")
-    lines = {(line["frames"], line["quantity"], line["method"]): line for line in table.numbers}
-    for frames, scores in run.measured.tracks.items():
+    assert table.columns == ("8 × 8 frames", "3 × 12 frames", "3 × 12 frames, 2 cameras")
+    lines = {(line["frames"], line["cameras"], line["quantity"], line["method"]): line for line in table.numbers}
+    for scores in run.measured.tracks.values():
+        which = scores.frames, scores.cameras
         for key, band in scores.bands.items():
             quantity, _, method = key.rpartition("/")
-            if (line := lines.get((int(frames), quantity, method))) is not None:
+            if (line := lines.get((*which, quantity, method))) is not None:
                 assert (line["mean"], line["low"], line["high"]) == (band.value, band.low, band.high)
-        assert {(int(frames), name, method) for name in (*ERRORS, "nees") for method in METHODS} <= lines.keys()
+        assert {(*which, name, method) for name in (*ERRORS, "nees") for method in METHODS} <= lines.keys()
     text = markdown(table)
     assert f"{run.measured.tracks['8'].hidden} of 64 frames" in text
 
@@ -42,7 +43,7 @@ def test_the_table_holds_the_scores_of_each_length(report: Report) -> None:
 def test_every_length_has_its_charts_over_time(report: Report) -> None:
     charts = run_charts(report.runs[0])["tracks"]
     quantities = (*ERRORS, "nees")
-    assert list(charts) == [f"tracks_{quantity}_{frames}" for frames in (8, 12) for quantity in quantities]
+    assert list(charts) == [f"tracks_{quantity}_{key}" for key in ("8", "12", "12_2") for quantity in quantities]
     chart = charts["tracks_nees_8"]
     band, *traces = chart.data
     assert band["meta"]["low"][0] < 1 < band["meta"]["high"][0]
