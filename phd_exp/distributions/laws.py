@@ -114,7 +114,8 @@ class StudentLaw(Law):
 
     @property
     def variance(self) -> Float[Tensor, "*batch"]:
-        return self.freedom / (self.freedom - 2)
+        # finite where n - 2 is lost in rounding
+        return self.freedom / (self.freedom - 2).clamp_min(torch.finfo(self.freedom.dtype).eps)
 
     depth_variance = variance
 
