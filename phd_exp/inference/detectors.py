@@ -90,7 +90,7 @@ def own_function(name: str, category: int | str | None = None) -> Detector:
     try:
         function = locate(name.replace(":", "."), None)
     except PydanticCustomError as error:
-        raise ConfigError(f"boxes={name}: {(error.context or {})['reason']}") from None
+        raise ConfigError(f"boxes={name}: {error.message().removeprefix('_target_: ')}") from None
 
     def find(image: UInt8[np.ndarray, "height width 3"], K: Float[np.ndarray, "3 3"], lens: Lens) -> Found:
         found: Found = function(image)

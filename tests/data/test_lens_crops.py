@@ -100,7 +100,8 @@ def test_a_view_in_strips_is_that_of_the_whole_image(box: Box, monkeypatch: pyte
     """Of an array and of Pillow's image, to the bit, also beyond the edge and where the lens folds over."""
     noise = np.random.default_rng(0).integers(0, 256, (700, 900, 3), dtype=np.uint8)
     camera = VirtualCamera.of_box(intrinsics(900.0, 900.0, 450.0, 350.0), box, 64.0, Lens((-0.3,)))
-    whole = area_means(sums(torch.from_numpy(noise)), torch.from_numpy(camera.corners)).numpy()
+    corners = torch.from_numpy(camera.corners)[None]
+    (whole,) = area_means(sums(torch.from_numpy(noise)), corners.new_zeros(1, 2), corners).numpy()
     for pixels in (crops.STRIP, 10_000, 1):
         monkeypatch.setattr(crops, "STRIP", pixels)
         np.testing.assert_array_equal(cut(noise, camera), whole)

@@ -57,11 +57,12 @@ def test_a_table_of_one_two_three_and_five_seeds(tmp_path: Path) -> None:
     """Calibrated seeds with independent errors: their mixture is better and, by its spread, underconfident."""
     runs = [write_run(tmp_path, seed=seed, n=100) for seed in range(5)]
     runs += [write_run(tmp_path, n=20, overrides=("optimizer.lr=0.1",)), write_run(tmp_path, n=20, data="occl")]
-    (table,) = ensembles.ensemble_tables(report_of(runs))
+    report = report_of(runs)
+    (table,) = ensembles.ensemble_tables(report)
     assert [row.stub for row in table.rows] == [
         ("probabilistic on default", kind) for kind in ("one network", "2 seeds", "3 seeds", "5 seeds")
     ]
-    folder = write_tables([table], [], tmp_path / "report")
+    folder = write_tables(report, [table], tmp_path / "report")
     rows = list(csv.DictReader((folder / "ensembles.csv").read_text().splitlines()))
     found = {(row["prediction"], row["quantity"]): float(row["value"]) for row in rows}
     tables = [read_table(run.predictions) for run in runs[:5]]
