@@ -1,4 +1,4 @@
-"""What `predict` and `track` share: the camera, and boxes of a file, a detector in Python, or the network itself."""
+"""What `predict` and `track` share: the camera, and boxes from a file, from Python, or from the network itself."""
 
 import re
 from pathlib import Path

@@ -97,7 +97,7 @@ def main(words: list[str]) -> int:
 def _answers(
     arguments: FuseArguments, scenes: Sequence[Observed], messages: MessageFile | None
 ) -> list[dict[str, Any]]:
-    """The answers for JSON, which are written to `messages` and to the recording of view= too."""
+    """Return the answers for JSON, and write them to `messages` and to the recording of view=."""
     # imports of seconds, which follow the checks of the arguments
     import torch
 
@@ -131,8 +131,8 @@ def _answers(
 def _of_recorded_scenes(
     arguments: FuseArguments, predictor: "Predictor", cameras: set[int]
 ) -> tuple[dict[int, dict[str, Any]], float | None]:
-    """What the run's recorded scenes tell: for coverage= the guarantee of each number of cameras, for shared_scale=
-    the share of the errors of depth that views share.
+    """From the run's recorded scenes: the guarantee for each number of cameras (coverage=), and the share of the
+    depth errors that is common to all views (shared_scale=).
     """
     import torch
 

@@ -1,4 +1,4 @@
-"""The places that out= and view= name: made, or refused, before anything is computed."""
+"""Outputs of out= and view=: prepared, or refused, before anything is computed."""
 
 import os
 from collections.abc import Iterable, Iterator
@@ -44,7 +44,7 @@ def require_output(out: Path, name: str, inputs: Iterable[Path]) -> None:
 
 @contextmanager
 def message_file(out: Path | None) -> Iterator[MessageFile | None]:
-    """The file of an out= that is a recording to write; None for another one."""
+    """The recording that out= names, open for writing; None if out= names no recording."""
     if out is None or out.suffix != MCAP:
         yield None
         return
@@ -53,7 +53,7 @@ def message_file(out: Path | None) -> Iterator[MessageFile | None]:
 
 
 def new_view(view: Path) -> None:
-    """Make the folder of a recording for Rerun. Raises ConfigError unless it can be a new file *.rrd."""
+    """Make the folder of a recording for Rerun. Raises ConfigError unless `view` is a new file *.rrd."""
     if view.suffix != ".rrd":
         raise ConfigError(f"view: got {view}; expected a file *.rrd, such as {view.with_name('view.rrd')}")
     if os.path.lexists(view):
@@ -65,9 +65,12 @@ def new_view(view: Path) -> None:
 
 
 def places(out: Path | None, view: Path | None, inputs: Iterable[Path], name: str, holds: str, package: str) -> None:
-    """Make the places of out=, a recording NAME.mcap or a folder that `holds` what a package makes, and of view=.
+    """Prepare out=, a recording or a folder, and view=, a new recording for Rerun.
 
-    Raises ConfigError if one cannot be written, is or holds an input, or if the package is missing.
+    The message about a folder suggests the recording `name`.mcap inside it. A folder `holds` pictures or pages, which
+    the `package` makes.
+
+    Raises ConfigError if an output cannot be written, is an input or holds one, or if the package is missing.
     """
     if out is not None and out.suffix == MCAP:
         require_output(out, f"{name}{MCAP}", inputs)

@@ -29,7 +29,7 @@ def check_target(node: dict[str, Any], trust: Trust, where: str = "") -> dict[st
     Raises PydanticCustomError naming the key, the value, and what was expected.
     """
     nodes = list(_nodes_in({"_target_": None} | node, where))
-    # all are allowed before one is looked into
+    # every target is allowed before any is inspected
     targets = [locate(one["_target_"], trust, path) for path, one in nodes]
     for (path, one), target in zip(nodes, targets, strict=True):
         _check_keys(one, target, f"{path}." if path else "")
@@ -37,7 +37,7 @@ def check_target(node: dict[str, Any], trust: Trust, where: str = "") -> dict[st
 
 
 def _nodes_in(value: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
-    """All nodes of a configuration with their dotted keys, each before those in it."""
+    """All nodes of a configuration with their dotted keys; a node comes before those inside it."""
     if is_node(value):
         yield path, value
     children = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()

@@ -94,7 +94,7 @@ def _extents(
 def _enlarged(
     image: UInt8[Tensor, "bands height width"], extents: Sequence[tuple[Tensor, Tensor]]
 ) -> Float[Tensor, "bands rows columns"]:
-    """The interpolated values, less grey."""
+    """The interpolated values minus grey."""
     less_grey = torch.empty(image.shape, dtype=torch.float64).copy_(image).sub_(GREY)  # zero beyond the edges
     x, y = (
         (middle * (2 / n) - 1).nan_to_num_(BEYOND).clamp_(-BEYOND, BEYOND)
@@ -106,7 +106,7 @@ def _enlarged(
 def _shrunk(
     image: UInt8[Tensor, "bands height width"], extents: Sequence[tuple[Tensor, Tensor]]
 ) -> Float[Tensor, "bands rows columns"]:
-    """The means, less grey, by torch's own interpolation of the `sums`, in half the time; graphs do not have it."""
+    """The means minus grey, by torch's own interpolation of the `sums`: half the time of `_at`, but not in graphs."""
     bands, height, width = image.shape
     table = torch.zeros(bands, height + 1, width + 1, dtype=torch.float64)
     table[:, 1:, 1:].copy_(image).sub_(GREY)
@@ -131,6 +131,6 @@ def _summed(
 
 
 def _rounded(mean: Float[Tensor, "*views rows columns bands"]) -> UInt8[Tensor, "*views rows columns bands"]:
-    """The values whose means, less grey, these are."""
+    """The values of pixels, given their means minus grey."""
     ties = TIES[mean.dtype]
     return ((mean * ties).round() / ties + GREY).round().to(torch.uint8)

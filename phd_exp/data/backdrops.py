@@ -46,7 +46,7 @@ class Backdrops:
 def before_others(
     backdrops: Backdrops, batch: Batch, chosen: Bool[np.ndarray, " batch"], numbers: Float[np.ndarray, "batch 6"]
 ) -> Batch:
-    """The batch, with some samples before other backdrops: image + clear (empty' - empty).
+    """The batch, with some samples in front of other backdrops: image + clear (empty' - empty).
 
     empty' is that of one of two random samples, the one with more texture, since smooth backdrops are easy; it is
     `tiled` and perhaps transposed. The sum keeps shadows on the ground and the mixed colours of edges.
@@ -55,7 +55,7 @@ def before_others(
         backdrops: of all training samples.
         batch: some of these samples.
         chosen: which of them to change.
-        numbers: from 0 to 1: for two samples; for zoom, two shifts and transposition of the backdrop.
+        numbers: from 0 to 1; two choose samples, four the zoom, both shifts and the transposition of the backdrop.
     """
 
     def exchanged(

@@ -23,7 +23,7 @@ SIXTEEN_BITS = ("I;16", "I;16L", "I;16B", "I;16N")
 TURNED = range(2, 9)  # EXIF orientations; others than 1 to 8 mean nothing
 TWELVE_BITS = 1 << 12
 ONE_PICTURE = ("JPEG", "MPO")  # formats whose further frames are previews and depth maps
-STRIP = 1 << 17  # pixels of the image, about, that a strip of a view reads; the sums of their three bands take 3 MB
+STRIP = 1 << 17  # about the pixels of the image that a strip of a view reads; the sums of three bands take 3 MB
 MARGIN = 1  # pixels around a view of more pixels than the image has, which are interpolated
 
 
@@ -84,14 +84,14 @@ def facing(detection: Detection, size: tuple[int, int], side: int, largest_f: fl
 
 
 Picture = Image.Image | UInt8[np.ndarray, "height width 3"]
-"""An RGB image: of Pillow, or an array."""
+"""An RGB image, as an array or of Pillow."""
 
 
 def cut(image: Picture, camera: VirtualCamera) -> UInt8[np.ndarray, "S S 3"]:
     """The virtual camera's view of an RGB image of its real camera; grey beyond the edges of the image.
 
     The pixels are means over areas, see `view`. A square image viewed as a whole is `shrunk`, to the same pixels in
-    less time. Other views are computed in strips, whose numbers fit in the cache of a processor.
+    less time. Other views are computed in strips that fit in the cache of a processor.
     """
     size = image.size if isinstance(image, Image.Image) else (image.shape[1], image.shape[0])
     if _is_whole(size, camera) and size[0] >= camera.S:
@@ -141,5 +141,5 @@ def _as_rgb(file: Path, image: Image.Image) -> Image.Image:
         ground.paste(over, mask=over)
         return ground
     if image.mode in PLAIN:
-        return image if image.mode == "RGB" else image.convert("RGB")  # which copies an image that is RGB
+        return image if image.mode == "RGB" else image.convert("RGB")  # `convert` copies an image that is RGB
     raise DatasetError(f"{file}: has colours of the kind {image.mode!r}; save it as RGB of 8 bits")

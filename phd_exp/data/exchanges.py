@@ -1,4 +1,4 @@
-"""An augmentation that first exchanges a part of some training samples: their backdrops, or all of them."""
+"""An augmentation that first replaces some training samples, or their backdrops."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ class Exchange:
     """An augmentation that first changes a share of the samples by means of a stock of images.
 
     Args:
-        stock: what the change takes the images from.
+        stock: the images that replace others.
         change: (stock, batch, which samples to change, numbers from 0 to 1 of each sample) -> the changed batch.
-        n_own: number of random numbers of a sample: whether it changes, and those of the change.
+        n_own: random numbers per sample: one decides whether it changes, `change` uses the others.
         share: the share of the samples that change.
         then: the augmentation that follows.
     """
@@ -35,7 +35,7 @@ class Exchange:
         return self.n_own + (self.then.n_numbers if self.then else 0)
 
     def __call__(self, batch: Batch, numbers: Float[Tensor, "batch n_numbers"]) -> Batch:
-        """The samples, changed by uniform numbers from -1 to 1. Their rows stay."""
+        """The samples, changed by uniform numbers from -1 to 1; their `row` is that of the originals."""
         of_then, own = numbers.tensor_split([-self.n_own], dim=1)
         uniform = ((own + 1) / 2).numpy()
         batch = self.change(self.stock, batch, uniform[:, 0] < self.share, uniform[:, 1:])

@@ -61,10 +61,10 @@ def replaced(
     """The batch, with some samples replaced by random photographs, whose masks weigh nothing.
 
     Args:
-        photographs: all of them.
+        photographs: all photographs.
         batch: renders.
-        chosen: which of them to replace.
-        numbers: from 0 to 1, for a photograph.
+        chosen: which renders to replace.
+        numbers: from 0 to 1; each chooses a photograph.
     """
     which = torch.from_numpy((len(photographs) * numbers[chosen, 0]).astype(np.int64))
     others, rows = photographs.select(which).to(batch.image.device), on(batch.image, np.flatnonzero(chosen))

@@ -8,7 +8,7 @@ from phd_exp.distributions.projected_huber import ProjectedHuber
 from phd_exp.distributions.shaped import student_freedom
 
 ROUNDING = 2.0
-"""Of densities with a rounded mode, chosen by the NLL of held-out samples; see docs/ideas/heads.md."""
+"""The rounding of `model=rounded_t`, chosen by the NLL of held-out samples; see docs/ideas/heads.md."""
 # log factors of A and a, as polynomials in 1/n: least squares over n >= 2, within 1e-3
 _LOG_PROJECTED = (0.48232, -0.75329, -0.29228, -0.83828)
 _LOG_DEPTH = (0.22614, -0.77194, -0.30254, -0.88518)
@@ -20,10 +20,11 @@ def closest_to_student(
 ) -> ProjectedHuber:
     """The density with a free axis that gives samples of `shaped.StudentT(around, further)` the highest likelihood.
 
-    Mode and axis stay, since both laws are symmetric about them. A and a are multiplied by factors c_q and c_s of the
-    degrees of freedom n alone: E[c r h'(c r)] = 2 at c = c_q and E[c |s| e'(c |s|)] = 1 at c = c_s, with r and s the
-    radius of the projection and the depth of a standard Student's t and e the energy of depth, |s| or, with a mode
-    rounded by r = `ROUNDING`, sqrt(s^2 + r^2). This is exact as a grows, where depths near and far have equal laws.
+    Mode and axis stay, since both laws are symmetric about them. A and a are multiplied by factors that depend on the
+    degrees of freedom n alone. That of A is the c with E[c r h'(c r)] = 2, where r is the radius of the projection of
+    a standard Student's t. That of a is the c with E[c |s| e'(c |s|)] = 1, where s is its depth and e the energy of
+    depth: e(s) = |s|, or sqrt(s^2 + ROUNDING^2) with a rounded mode. Both are exact in the limit of a large a, where
+    depths in front of the mode and behind it have the same law.
 
     Source: own derivation; tests/distributions/test_closest.py checks the factors by samples.
     """

@@ -17,19 +17,19 @@ PARAMETERS = ("mu_x", "mu_y", "mu_z", "A_xx", "A_xy", "A_yy", "a")
 FREE_AXIS = ("k_x", "k_y")
 """Further parameters of a distribution with a free axis."""
 ROUNDING = ("rounding",)
-"""How far its mode of depth is rounded, the same for all; without this column 0."""
+"""How far the mode of depth is rounded: one number for all distributions, 0 without this column."""
 COVARIANCE = ("C_xx", "C_xy", "C_xz", "C_yy", "C_yz", "C_zz")
 NEES = ("nees", "nees_x", "nees_y", "nees_z")
 
 
 def parameter_names(table: Collection[str]) -> tuple[str, ...]:
-    """The columns of parameters that a table has or lacks: `PARAMETERS`, and further ones if it has one of them."""
+    """The columns of parameters that a table needs: `PARAMETERS`, and further ones if it has one of them."""
     further = (names for names in (FREE_AXIS, ROUNDING) if set(names) & set(table))
     return sum(further, PARAMETERS)
 
 
 def parameter_columns(distribution: ProjectedHuber) -> Columns:
-    """The parameters of the camera frame that differ from sample to sample."""
+    """The parameters in the camera frame that differ between samples."""
     mu_xy, A = distribution.mu_xy, distribution.A
     values = (*mu_xy.unbind(-1), distribution.mu_z, A[:, 0, 0], A[:, 0, 1], A[:, 1, 1], distribution.a)
     table = dict(zip(PARAMETERS, values, strict=True))

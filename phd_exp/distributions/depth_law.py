@@ -18,7 +18,7 @@ Numbers = Float[Tensor, "*#batch"]
 class DepthLaw(ABC):
     """The law of t, whose density is proportional to exp(-energy); energies are 0 at the mode t = 1.
 
-    Logarithms of a, the precision of z, and of t stay finite where a or t underflows.
+    Arguments are logarithms of t and of a, the precision of z: they stay finite where a or t underflows.
     """
 
     log_a: Numbers
@@ -38,7 +38,7 @@ class DepthLaw(ABC):
 
     @abstractmethod
     def level(self, energy: Numbers) -> Numbers:
-        """P(h(|q|) + energy of t <= `energy`), in [0, 1]: a credible level of the whole density."""
+        """P(h(|q|) + energy of t <= `energy`), in [0, 1]: a credible level of the density of positions."""
 
     @abstractmethod
     def cdf(self, log_t: Numbers) -> Numbers:
@@ -72,7 +72,7 @@ class DepthLaw(ABC):
 
     @abstractmethod
     def slope(self, log_t: Numbers) -> Numbers:
-        """The derivative of the energy by log a. That of `log_normaliser` is -`mean_slope`."""
+        """The derivative of the energy with respect to log a; that of `log_normaliser` is -`mean_slope`."""
 
     @property
     @abstractmethod

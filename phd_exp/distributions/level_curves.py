@@ -162,7 +162,7 @@ def _half(log_density: _LogDensity, centre: np.ndarray, rays: Points, threshold:
 def _depth_nodes(distribution: ProjectedHuber, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """a (t - 1), t and weights times t^2, each (2 n), of a Gauss rule on each side of the mode.
 
-    The weights sum to a multiple of 1. They are denser near the mode, since log t is a multiple of y^2.
+    The weights are known up to a factor. The nodes are denser near the mode, since log t is a multiple of y^2.
     """
     law = _depth_law(distribution)
     end = float(law.farthest_log_t(torch.tensor(_FURTHEST_ENERGY, dtype=torch.float64)))

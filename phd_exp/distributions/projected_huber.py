@@ -39,7 +39,7 @@ class ProjectedHuber(Density, Distribution):
         mu_xy: centre of (x, y)/z.
         mu_z: centre of z, metres; the mode is mu_z (mu_xy, 1).
         A: precision of (x, y)/z, symmetric positive definite; (x, y)/z has covariance 3.0765 A^(-2).
-        a: precision of z; Var[z] is about 2 mu_z^2/a^2 where a is large.
+        a: precision of z; Var[z] is about 2 mu_z^2/a^2 where a is large and nothing is rounded.
         k: adds k a (t - 1) to q, so that the axis, the line of centres of (x, y) given z, leaves the viewing ray of
             the mode; None for the paper's density. With k = 0 all values are those of the paper's density.
         rounding: how far the mode of depth is rounded, in units of mu_z/a; 0 for the paper's law of depth.
@@ -185,7 +185,7 @@ class ProjectedHuber(Density, Distribution):
         return self._of(self._natural.expand(torch.Size(batch_shape)), self._validate_args)
 
     def __getitem__(self, row: int | slice | Tensor | tuple[int | slice | Tensor, ...] | None) -> "ProjectedHuber":
-        """Some distributions of a batch, chosen as in a tensor; None adds a dimension."""
+        """Some distributions of a batch, indexed like a tensor; None adds a dimension."""
         return self._of(self._natural.map(lambda _, value: value[row]), self._validate_args)
 
     def with_axis(self, k: Float[Tensor, "*#batch 2"]) -> "ProjectedHuber":
@@ -306,7 +306,7 @@ class ProjectedHuber(Density, Distribution):
         return n.k * (torch.exp(n.log_a - n.log_mu_z) * z - n.log_a.exp())[..., None]
 
     def depth_energy(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
-        """The excess energy of a depth z > 0 (metres), a (max(t, 1/t) - 1) with t = z/mu_z unless it is rounded."""
+        """The excess energy of a depth z > 0 (metres); a (max(t, 1/t) - 1) with t = z/mu_z if nothing is rounded."""
         return self.depth_law.energy(z.log() - self._natural.log_mu_z)
 
     def log_prob(self, value: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch"]:

@@ -20,8 +20,7 @@ from phd_exp.distributions.rounded import depth_law
 _WIDEST = 80.0  # of log(1/temperature); a fit beyond has no minimum
 _ENDS = (0.05, 0.95)  # quantiles of the fitted predictions between which temperatures vary
 _PRIORS = (0.5, 0.3)  # standard deviations of normal priors of slope and bend about 0, for few or equal predictions
-
-_NARROWEST = 1e-9  # half of the range of log precisions; equal ones have no slope
+_NARROWEST = 1e-9  # replaces half the range of log precisions where it is 0, because all are equal
 
 Values = Float[np.ndarray, " samples"]
 
@@ -50,10 +49,10 @@ class Temperature:
     """A' = A / projected and a' = a / depth: above 1 for overconfident predictions, below 1 for underconfident ones.
 
     Args:
-        projected: the temperature of the projection, with a slope that of a typical prediction.
-        depth: that of depth.
-        projected_slope: its change with log|A|/2; None: it is the same for all predictions.
-        depth_slope: the change of the other with log a.
+        projected: the temperature of the projection; with a slope, that of a typical prediction.
+        depth: the temperature of depth, likewise.
+        projected_slope: change of the log of `projected` with log|A|/2; None: all predictions share one.
+        depth_slope: change of the log of `depth` with log a, likewise.
 
     Examples:
         >>> p = ProjectedHuber(torch.zeros(2), torch.tensor(4.0), 100 * torch.eye(2), torch.tensor(20.0))
@@ -74,8 +73,9 @@ class Temperature:
     def fit(cls, distribution: ProjectedHuber, xyz: Float[Tensor, "samples 3"]) -> "Temperature":
         """The temperatures that minimise the mean NLL of true positions (metres) under a batch of predictions.
 
-        With log T = -v it is the sum of the means of h(e^v |q|) - 2 v and of the NLL of depth at the precision a e^v.
-        If all have one v, it is the root of a derivative; the slope is found from there, with a normal prior about 0.
+        With log T = -v this NLL is the sum of the means of h(e^v |q|) - 2 v and of the NLL of depth at the precision
+        a e^v. The best v that all predictions share is the root of the derivative. It starts the search for v, slope
+        and bend; the last two have normal priors about 0.
 
         Raises ValueError if there are no samples, if one is not finite or not in front of the camera, or if all lie
         at their modes, so that no temperature is low enough.

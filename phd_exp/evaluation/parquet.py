@@ -66,7 +66,7 @@ def stacked(columns: Mapping[str, Any], names: Sequence[str]) -> Tensor:
 
 
 def _values(name: str, stored: pa.ChunkedArray) -> np.ndarray:
-    """The texts or numbers of a column, without pandas, which `to_numpy` imports; others are a TypeError."""
+    """The texts or numbers of a column, without pandas, which `to_numpy` imports. Raises TypeError for others."""
     if name in TEXTS and pa.types.is_dictionary(stored.type):
         column = stored.combine_chunks()
         rows = column.indices.fill_null(len(column.dictionary)) if column.null_count else column.indices

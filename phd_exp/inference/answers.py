@@ -148,7 +148,7 @@ class PredictedBatch:
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """One detection, its image and the input of the network, a row of a batch."""
+    """One detection with its image, the input of the network, and its row of a predicted batch."""
 
     detection: Detection
     image: Image.Image

@@ -268,7 +268,7 @@ class Predictor:
     ) -> Float[np.ndarray, " batch"] | None:
         """How usual the predictions are among held-out ones, as p-values, see `evaluation.familiar`; None if unknown.
 
-        Small for images unlike the training images. `prediction` is that of `predict`, if it is there already.
+        Small for images unlike the training images. `prediction` is the result of `predict`, if it is known already.
         """
         if self.familiarity is None:
             return None

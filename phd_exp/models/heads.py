@@ -105,7 +105,7 @@ class SurrogateHead:
 
     Args:
         depth: constants of the data set.
-        is_rounded: the mode of depth is rounded.
+        is_rounded: whether the mode of depth is rounded.
     """
 
     n_outputs = 10

@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float
 from phd_exp.optics.lens import PINHOLE, Lens
 
 BORDER = 33  # places along a side of a box whose rays a lens bends
-NODES = 16  # along a side of a view, between which the corners of its pixels are interpolated
-CLOSE = 1e-9  # px; the largest error of interpolated corners
+NODES = 16  # Chebyshev points along a side of a view, between which the corners of its pixels are interpolated
+CLOSE = 1e-9  # largest error of interpolated corners, px
 
 Box = tuple[float, float, float, float]
 """Left, top, right, bottom: pixels of the real image, counted from its top left corner."""
@@ -100,19 +100,20 @@ class VirtualCamera:
     def corners(self) -> Float[np.ndarray, "places places 2"]:
         """Pixels of the real image at the corners of the pixels of the virtual image.
 
-        Lenses take long: the corners are interpolated by the polynomials through `real_pixels` at Chebyshev points,
-        unless these err by more than `CLOSE` halfway between the points, as at the edge of the field.
+        A lens takes long, so the corners are interpolated by polynomials through `real_pixels` at Chebyshev points.
+        If these err by more than `CLOSE` halfway between the points, as at the edge of the field, each corner is
+        computed.
         """
         half, n = self.S / self.f / 2, int(self.S)
         coarse = self._grid(half * _chebyshev(NODES))
         halfway, corners = _interpolations(n)
         error = halfway @ coarse @ halfway.T - self._grid(half * _chebyshev(2 * NODES - 1)[1::2])
-        if (np.abs(error) < CLOSE).all():  # NaN is not
+        if (np.abs(error) < CLOSE).all():  # False for NaN
             return np.moveaxis(corners @ coarse @ corners.T, 0, -1)
         return np.moveaxis(self._grid(half * np.linspace(-1, 1, n + 1)), 0, -1)
 
     def _grid(self, along: Float[np.ndarray, " n"]) -> Float[np.ndarray, "2 n n"]:
-        """`real_pixels`, all columns before all rows, where x/z and y/z have these values."""
+        """`real_pixels` where x/z and y/z take these values: the columns of all places, then the rows."""
         return np.moveaxis(self.real_pixels(np.stack(np.meshgrid(along, along), axis=-1)), -1, 0)
 
     def outside(self, width: float, height: float) -> Bool[np.ndarray, "S S"]:
@@ -184,7 +185,7 @@ def _chebyshev(n: int) -> Float[np.ndarray, " n"]:
 
 @lru_cache(maxsize=16)
 def _interpolations(n: int) -> tuple[Float[np.ndarray, "halfway nodes"], Float[np.ndarray, "corners nodes"]]:
-    """From values at `NODES` Chebyshev points to those halfway between them, and at the ends of n equal parts."""
+    """Matrices from values at Chebyshev points to those halfway between them, and at the ends of n equal parts."""
     vandermonde = np.polynomial.chebyshev.chebvander
     to_coefficients = np.linalg.inv(vandermonde(_chebyshev(NODES), NODES - 1))
     places = (_chebyshev(2 * NODES - 1)[1::2], np.linspace(-1, 1, n + 1))

@@ -92,7 +92,7 @@ class Calibration(Record):
 
     @cached_property
     def lens(self) -> Lens:
-        """The lens, which keeps what it computes for all detections of the camera."""
+        """The lens: one object for all detections of the camera, which caches what it computes."""
         return Lens(self.D[:8], self.model == "equidistant")
 
     @model_validator(mode="after")

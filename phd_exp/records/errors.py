@@ -105,8 +105,8 @@ def unknown(word: str, valid: Iterable[str], expected: str = "", fault: str = "u
 def complaint(problem: ErrorDetails, model: type[BaseModel] | None = None, missing: str = "") -> str:
     """Pydantic's error as a message: the key, its value unless that is a whole section, and what was expected.
 
-    A key that the `model` does not have is followed by those of its section; one that is missing by `missing`, in
-    which `{key}` stands for it.
+    The message about an unknown key lists the keys of its section of the `model`; that about a missing one ends with
+    `missing`, where `{key}` is replaced by the key.
     """
     place = [str(part) for part in problem["loc"]]
     key = ".".join(part for part in place if part != "spec" and not part.startswith("<"))
@@ -123,7 +123,7 @@ def complaint(problem: ErrorDetails, model: type[BaseModel] | None = None, missi
 
 
 def _keys(model: Any, place: list[str]) -> list[str]:
-    """The keys of the section at a place, which holds names of fields and tags of unions."""
+    """The keys of the section at a place: names of fields, and tags of unions."""
     for name in place:
         if name.startswith("<"):
             model = next(get_args(member)[0] for member in get_args(model) if Tag(name) in get_args(member))
@@ -135,7 +135,7 @@ def _keys(model: Any, place: list[str]) -> list[str]:
 
 
 def keys_of_section(model: Any) -> dict[str, Any]:
-    """The keys that a section has for the user, with their types; those of `spec` stand one level up."""
+    """The keys of a section as a user writes them, with their types; keys of `spec` are one level up."""
     types = {name: field.annotation for name, field in model.model_fields.items()}
     spec = types.pop("spec", None)
     return types | (keys_of_section(spec) if spec else {})

@@ -132,7 +132,7 @@ def _write_model(shape: str, size: np.ndarray, mesh: Triangles | None, folder: P
     rows = (" ".join(map(str, row)) for row in (*vertices.round(6).tolist(), *faces))
     write_atomic(folder / f"obj_{number_of(shape):06d}.ply", header + "\n".join(rows) + "\n")
     outermost = vertices[ConvexHull(vertices, qhull_options="QJ").vertices]  # QJ: a mesh may be flat
-    # block by block: all distances at once take a gigabyte for a ball of 18,000 vertices, and nine times as long
+    # in blocks, because all distances of a ball's 18,000 vertices at once take a gigabyte, and nine times as long
     farthest = (cdist(outermost[i : i + 64], outermost[i:]).max() for i in range(0, len(outermost), 64))
     info: dict[str, Any] = {"diameter": float(max(farthest))}
     for axis, values in zip("xyz", vertices.T, strict=True):

@@ -67,7 +67,7 @@ class Cell:
 
     @property
     def is_below_bound(self) -> bool:
-        """Whether the mean is smaller than its bound, which only chance or more information can do."""
+        """Whether the mean is smaller than its bound, by chance or because more is known than the bound assumes."""
         return self.mean is not None and self.bound is not None and self.mean < self.bound
 
     def beats(self, other: "Cell") -> bool:

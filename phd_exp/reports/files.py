@@ -70,7 +70,7 @@ def all_tables(report: Report) -> list[Table]:
 
 
 def write_tables(report: Report, tables: Sequence[Table], out: Path) -> Path:
-    """Write to `<out>/tables/` the `<stem>.{md,tex}` of each table, `<kind>.csv` of each kind, and `runs.csv`."""
+    """Write `<stem>.{md,tex}` per table, `<kind>.csv` per kind and `runs.csv`; returns the folder, `<out>/tables`."""
     folder = out / "tables"
     folder.mkdir(parents=True, exist_ok=True)
     remove_temporaries(folder)  # of a killed process

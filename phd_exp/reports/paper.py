@@ -59,7 +59,7 @@ def bound_mm(model: str, data: str, quantity: Quantity, sees_f: bool) -> float |
 class Layout:
     """One of the paper's tables: the data sets and models, in its order, and below them bounds on depth error.
 
-    A table of several data sets has a column for each, and a line for each error; of one, a column for each error.
+    With several data sets, each has a column and each error a line; with one, each error has a column.
 
     Attributes:
         bounds: label of a line -> the bound on each data set.

@@ -14,7 +14,7 @@ from phd_exp.reports.runs import PROBABILISTIC, Report, Run
 from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem, plus_minus
 
 DIGITS: dict[Quantity, int] = {"projected": 1, "depth": 0}  # decimals of a millimetre, as in the paper
-OTHERS: tuple[Estimate, ...] = ("mean", "median", "eight views")  # of the density; the paper has its mode alone
+OTHERS: tuple[Estimate, ...] = ("mean", "median", "eight views")  # of the density; the paper reports its mode alone
 Begun = Mapping[tuple[str, str], Mapping[int, Run]]
 """(data set, model) -> seed -> run, where there are any."""
 ONE_SEED = "†"
@@ -59,7 +59,7 @@ def _table(report: Report, preset: str, layout: Layout, begun: Begun, reading: R
     data = [name for name in layout.data if any(name == choice[0] for choice in begun)]
     models = [name for name in layout.models if any(name == choice[1] for choice in begun)]
     seeds = sorted({seed for runs in begun.values() for seed in runs})
-    is_by_line = len(layout.data) > 1  # the errors
+    is_by_line = len(layout.data) > 1  # whether each error has a line
 
     def rows(model: str, estimate: Estimate) -> list[list[Cell]]:
         keys = [ErrorKey(estimate, reading, quantity) for quantity in DIGITS]
