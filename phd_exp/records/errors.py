@@ -87,9 +87,9 @@ def listed(names: Sequence[str]) -> str:
 
 
 def unknown(word: str, valid: Iterable[str], expected: str = "", fault: str = "unknown key") -> str:
-    """The message about a wrong word: its fault, the nearest valid word, and what is expected (by default: all).
+    """The message about a wrong word: its fault, the nearest valid word, and what is expected (default: all of them).
 
-    Of words with `.` or `=`, the ends are compared.
+    Words are compared by what follows their last `.` or `=`.
 
     Examples:
         >>> unknown("epochs", ["data.n_train", "trainer.max_epochs"], "expected a key")

@@ -67,11 +67,11 @@ class Settings:
     """Settings of the path tracer.
 
     Attributes:
-        samples: light paths per pixel; of several points, at least one each.
+        samples: light paths per pixel, at least one for each of its points.
         denoised: use Open Image Denoise.
-        points: points along a side of each pixel at which the light is computed; of several, a pixel has the mean
-            over Blender's filter. None: Blender draws the points at random.
-        of_metal: factor of the samples in scenes with metal.
+        points: points along a side of each pixel at which the light is computed; a pixel is the mean of several over
+            Blender's filter. None: Blender draws the points at random.
+        of_metal: multiplies the samples in scenes with metal.
     """
 
     samples: int

@@ -33,7 +33,7 @@ from phd_exp.rendering.surroundings import photo_light, shaken
 from phd_exp.rendering.triangles import Meshes
 
 GREY = 128  # of all colours beyond the edges of the user's image, as in the views of photographs
-OF_METAL = 3  # the denoiser keeps more of the noise along the edges of its highlights
+OF_METAL = 3  # multiplies the samples: the denoiser keeps more of the noise along the edges of metal's highlights
 MARGIN = 4  # px around the objects: the denoiser is less accurate along the border of its image
 
 
@@ -102,7 +102,7 @@ def photograph(renderer: Renderer, scene: Scene, hits: Hits, spec: DatasetSpec) 
         box = box_around(shown, MARGIN)
         inside = box.slices
         front, opacity = np.split(renderer.render(scene, box), [3], axis=-1)
-        if renderer.is_opaque:  # more points decide its edges than its light
+        if renderer.is_opaque:  # its edges are those of more points than its light
             covered = coverage(scene, box, renderer.meshes) * (opacity > 0)
             front, opacity = front * covered / np.where(opacity > 0, opacity, 1), covered
         light[inside] = front + (1 - opacity) * light[inside]
