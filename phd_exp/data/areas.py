@@ -15,7 +15,7 @@ BEYOND = 3.0  # a place outside every image, in units of half its size from the 
 
 
 def sums(image: UInt8[Tensor, "height width bands"]) -> Int32[Tensor, "height+1 width+1 bands"]:
-    """Exact sums of an image, less grey, over the rectangle from its top left corner to every corner of a pixel.
+    """Exact sums of an image minus grey over the rectangle from its top left corner to every corner of a pixel.
 
     The sums of large images wrap around; their differences over a rectangle remain exact.
     """
@@ -34,8 +34,8 @@ def area_means(
     the pixel along both axes (the root of the sum of squares of its two edges), and at least that of a pixel of the
     image, so that views of more pixels are interpolated linearly. Beyond the image, and at NaN, all is grey.
 
-    Places are relative to whole numbers, `origin`, and sums are subtracted before they are rounded, so that float32
-    suffices.
+    Places are relative to `origin`, which has whole numbers, and sums are subtracted before they are rounded, so that
+    float32 suffices.
     """
     height, width, bands = table.shape
     (x, wide), (y, high) = (_extents(axis) for axis in corners.unbind(-1))
@@ -56,8 +56,8 @@ def area_means(
 
 
 def _ends(middle: Tensor, side: Tensor, origin: Tensor, size: int) -> tuple[list[Tensor], list[Tensor]]:
-    """The corners between pixels before and after the lower and the upper end of intervals within 0 and `size`, and
-    the weights, in the integral over an interval, of the last three; that of the first is minus their sum.
+    """The four corners of pixels next to both ends of intervals, which are cut to [0, `size`], and the weights of the
+    last three in the integral over an interval; the weight of the first is minus their sum.
     """
     ends = torch.stack([middle - side / 2, middle + side / 2]).nan_to_num(0.0)
     ends = ends.maximum(-origin).minimum(size - origin)
@@ -106,7 +106,7 @@ def _enlarged(
 def _shrunk(
     image: UInt8[Tensor, "bands height width"], extents: Sequence[tuple[Tensor, Tensor]]
 ) -> Float[Tensor, "bands rows columns"]:
-    """The means minus grey, by torch's own interpolation of the `sums`: half the time of `_at`, but not in graphs."""
+    """The means minus grey, by torch's own interpolation of the sums, in half the time; graphs do not have it."""
     bands, height, width = image.shape
     table = torch.zeros(bands, height + 1, width + 1, dtype=torch.float64)
     table[:, 1:, 1:].copy_(image).sub_(GREY)

@@ -123,7 +123,7 @@ class Mixture:
 def _closest_depth(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
     """The mu_z and a that minimise the mean of a max(z/mu_z, mu_z/z) + log(mu_z N(a)) over depths of the mixture.
 
-    mu_z is returned as its logarithm less that of the first member. With far = E[z/mu_z; z > mu_z] and
+    mu_z is returned as its logarithm minus that of the first member. With far = E[z/mu_z; z > mu_z] and
     near = E[mu_z/z; z < mu_z] the derivatives vanish where a (far - near) = 1 and a (far + near - 1) is the mean
     excess energy of a. The first gives a; then the second determines log mu_z. Both are computed from the excess of
     far and near over the probabilities of z > mu_z and z < mu_z, since they themselves cancel where a is large.
@@ -211,9 +211,9 @@ def _nodes(
 ) -> tuple[Float[Tensor, "*batch nodes 1"], Float[Tensor, "*batch nodes 2"], Float[Tensor, "nodes 1"]]:
     """Depths, (x, y) and weights of the `_whitened_nodes` of all members.
 
-    (x, y) are relative to the axis of the first member, with a free axis depths to that of its mode, so that digits
-    of narrow densities are kept. They are at the root mean square of each member's depth, with a free axis at its
-    mean less and plus its deviation.
+    (x, y) are relative to the axis of the first member. With a free axis, depths are relative to that of its mode.
+    This keeps the digits of narrow densities. The nodes are at the root mean square of each member's depth; with a
+    free axis, at its mean minus and plus one standard deviation.
     """
     nodes, weight = (torch.from_numpy(values).to(members.a) for values in _whitened_nodes())
     mu_z, mu_xy, m_xy = members.mu_z, members.mu_xy, members.m_xy

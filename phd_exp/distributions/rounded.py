@@ -5,11 +5,11 @@ The energy a max(t, 1/t) of the paper has a kink at the mode. With l = log t and
     a (cosh l - 1) + sqrt(a^2 sinh^2 l + r^2) - r,
 
 which is a (max(t, 1/t) - 1) for r = 0. Where a is large it depends on s = a (t - 1) alone: it is about s^2/(2 r) near
-the mode and |s| - r far from it. The energy is the least w with (w - a t) (w - a/t) >= r^2, plus a constant, hence
-convex in t: the density stays log-concave, with the same support and limits.
+the mode and |s| - r far from it. Up to a constant, the energy is the least w >= a max(t, 1/t) with
+(w - a t) (w - a/t) >= r^2, hence convex in t: the density stays log-concave, with the same support and limits.
 
 Integrals over t become integrals over x with a sinh l = min(a, r) sinh x, where the integrands are smooth for every
-a. They end where the energy is 50 and are sums of Gauss's rule.
+a. They end where the energy is 50, and are computed by Gauss's rule.
 
 Source: own derivation; checked against mpmath in tests/distributions/test_rounded.py.
 """
@@ -28,7 +28,7 @@ from phd_exp.distributions.depth_law import DepthLaw, Kinked, Numbers
 from phd_exp.distributions.huber import energy_cdf
 
 _LEAST_LOG_A = -13.0
-_SHARE = 0.95  # of the largest exponent
+_SHARE = 0.95  # of the largest exponent, up to which e^l is computed
 _LARGEST_ENERGY = 50.0
 _NODES, _PART, _LEVEL = 64, 40, 24  # nodes for the whole law, one of its tails, and each part of a level
 _NEWTON_STEPS, _CLOSEST_STEPS = 3, 20
@@ -49,7 +49,8 @@ class Rounded(DepthLaw):
     r: float
 
     def energy(self, log_t: Numbers) -> Numbers:
-        # a (cosh l - 1) = y tanh(l/2) and sqrt(y^2 + r^2) - r = y tanh(u/2) with y = a sinh l = r sinh u: no square
+        # without y^2, which could overflow: with y = a sinh l = r sinh u, a (cosh l - 1) = y tanh(l/2) and
+        # sqrt(y^2 + r^2) - r = y tanh(u/2)
         y, l = self._scaled_sinh(log_t)
         return y * (torch.tanh(l / 2) + torch.tanh(torch.asinh(y / self.r) / 2))
 
@@ -64,7 +65,7 @@ class Rounded(DepthLaw):
         return self._mass.log() - self.log_a.clamp_min(_LEAST_LOG_A)
 
     def level(self, energy: Numbers) -> Numbers:
-        # below `inner` the energy that is left for the projection is beyond the knee of h
+        # up to the first bound, the energy that is left for the projection is beyond the knee of h
         W = energy.clamp_max(_LARGEST_ENERGY)
         bounds = self._x(self.farthest_log_t((W - 0.5).clamp_min(0))), self._x(self.farthest_log_t(W))
         inside = torch.zeros_like(W * self._mass)
@@ -175,14 +176,14 @@ class Rounded(DepthLaw):
         return torch.minimum(torch.maximum(x, -self._end), self._end).squeeze(-1)
 
     def _between(self, low: Points, high: Points, n: int) -> tuple["_Points", Points]:
-        """Points of Gauss's rule with n nodes, and their weights: the integral of the density."""
+        """n points of Gauss's rule, and weights that sum to the integral of the density from low to high."""
         nodes, weight, _ = _gauss(n, self._a)
         half = (high - low) / 2
         points = self._at(low + half * (nodes + 1))
         return points, points.density * weight * half
 
     def _tail(self, x: Numbers) -> tuple["_Points", Points]:
-        """Those of the side of x that is away from the mode."""
+        """Points and weights from x to the end on its side of the mode."""
         x = x[..., None]
         below = x < 0
         return self._between(torch.where(below, -self._end, x), torch.where(below, x, self._end), _PART)
@@ -222,8 +223,9 @@ class Rounded(DepthLaw):
     def closest_to(self, log_t: Points, share: Points) -> tuple[Numbers, Numbers]:
         """The log mu_z and log a of the law with the highest mean log density over depths of these shares.
 
-        By Newton's method from log mu_z = 0 and log a; the energy is convex in log mu_z. Of J = E[energy] + log mu_z
-        + `log_normaliser` with s, c = a sinh l, a cosh l and R = sqrt(s^2 + r^2), l the log depth over mu_z.
+        By Newton's method from log mu_z = 0 and log a; the energy is convex in log mu_z. The derivatives are those of
+        J = E[energy] + log mu_z + `log_normaliser`, with l the log of depth over mu_z, s = a sinh l, c = a cosh l and
+        R = sqrt(s^2 + r^2).
         """
         place, log_a = torch.zeros_like(self.log_a), self.log_a
         for _ in range(_CLOSEST_STEPS):

@@ -16,7 +16,7 @@ from the top left corner of the image; the centre of the pixel in column c and r
 | mu_xy | `mu_xy` | centre of (x, y)/z | - | `distributions.projected_huber.ProjectedHuber` |
 | mu_z | `mu_z` | centre of z: its mode, and the mode of the whole density is mu_z (mu_xy, 1) | metres | `distributions.projected_huber.ProjectedHuber` |
 | A | `A` | precision of (x, y)/z, symmetric positive definite 2 x 2 | - | `distributions.projected_huber.ProjectedHuber` |
-| a | `a` | precision of z: E[(z - mu_z)^2] is about 2 mu_z^2 / a^2 where a is large | - | `distributions.projected_huber.ProjectedHuber` |
+| a | `a` | precision of z: E[(z - mu_z)^2] is about 2 mu_z^2 / a^2 where a is large and r = 0 | - | `distributions.projected_huber.ProjectedHuber` |
 | k | `k` | free axis: q has the further term k a (t - 1); none in the paper's density | - | `distributions.projected_huber.ProjectedHuber` |
 | r | `rounding` | how far the mode of depth is rounded, in units of mu_z/a; 0 in the paper's density | - | `distributions.rounded.Rounded` |
 | m_xy | `m_xy` | slope of the axis, the change of the centre of (x, y) with z: mu_xy without a free axis | - | `distributions.projected_huber.ProjectedHuber.m_xy` |

@@ -39,8 +39,8 @@ def pixel_corners(
 ) -> tuple[Float[Tensor, "boxes 2"], Float[Tensor, "boxes places places 2"]]:
     """Pixels of the real image at the corners of the pixels of each virtual image, `VirtualCamera.corners`.
 
-    Returned are the whole numbers next to the middle of each box, and the corners relative to these: from the middle
-    on, whose place is known, rounding errors are those of the distance.
+    Returns whole numbers next to the middle of each box, and the corners relative to these. Corners are computed from
+    the middle, so their rounding errors are those of the distance to it.
     """
     lower, upper = boxes.tensor_split(2, dim=-1)
     half = (upper - lower) / 2

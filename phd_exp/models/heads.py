@@ -41,7 +41,7 @@ class Head(Protocol):
 
 @runtime_checkable
 class SymmetricHead(Head, Protocol):
-    """A head whose raw numbers of a symmetric view can be brought back, as ensembles need."""
+    """A head that can transform raw numbers of a symmetric view back, as `views=8` needs."""
 
     def turned_back(
         self, raw: Float[Tensor, "*views n"], signs: Float[Tensor, "*#views 3"]

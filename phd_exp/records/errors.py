@@ -32,7 +32,7 @@ NAMED = 5  # names that a message lists
 
 
 UNPACKED: dict[str, str] = {}
-"""Temporary folder of a packed run, as messages would begin with it -> the folder of its file, which they show."""
+"""Temporary folder of a packed run -> the folder of its file, which messages name instead."""
 
 
 class UserError(Exception):
