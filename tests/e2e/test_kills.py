@@ -59,7 +59,7 @@ def leftovers(out: Path) -> list[Path]:
 
 
 def killed(process: BaseProcess, out: Path, most: int, moments: random.Random) -> None:
-    """Kill it after a few more files, at `most` so many, and a moment, unless it ends before."""
+    """Kill the process a moment after 1 to `most` further files, unless it ends before."""
     before, enough = written(out), moments.randint(1, most)
     while process.is_alive() and len(written(out) - before) < enough:
         time.sleep(0.001)

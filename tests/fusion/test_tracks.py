@@ -31,8 +31,9 @@ def irregular(frames: int, seed: int) -> np.ndarray:
 
 
 def with_outliers(predictions: ProjectedHuber, share: float, seed: int) -> ProjectedHuber:
-    """A share of the predictions far beyond their uncertainty; those of odd seeds have a free axis, every third
-    a rounded mode.
+    """The predictions, a share of them wrong far beyond their uncertainty.
+
+    With an odd seed they have a free axis, with a multiple of 3 a rounded mode.
     """
     generator = torch.Generator().manual_seed(seed)
     shape = predictions.batch_shape

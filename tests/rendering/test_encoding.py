@@ -124,7 +124,7 @@ def folder(request: pytest.FixtureRequest) -> DatasetFolder:
 
 @pytest.fixture
 def datasets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """Hugging Face `datasets`; what it may write and whom it may call, it asks once, as it is imported."""
+    """Hugging Face `datasets`, which reads these variables once, on import."""
     for name in ("HF_HUB_OFFLINE", "HF_DATASETS_OFFLINE", "HF_HUB_DISABLE_TELEMETRY"):
         monkeypatch.setenv(name, "1")
     monkeypatch.setenv("HF_HOME", str(tmp_path / "home"))
@@ -132,7 +132,7 @@ def datasets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def as_read(record: SampleRecord) -> dict[str, object]:
-    """A record as JSON has it, but for the image's name."""
+    """The JSON of a record without the name of its image."""
     values: dict[str, object] = json.loads(record.model_dump_json())
     del values["file_name"]
     return values

@@ -64,7 +64,7 @@ def cones_of(
 
 
 class Conic:
-    """minimise diagonal.x^2/2 + c.x of n unknowns x with affine expressions of x in cones; if large, sparse ones."""
+    """minimise diagonal.x^2/2 + c.x over n unknowns x, with affine expressions of x in cones; sparse if large."""
 
     def __init__(self, n: int, is_large: bool) -> None:
         self.n, self.is_large = n, is_large

@@ -67,7 +67,7 @@ def write_handmade(folder: DatasetFolder, spec: DatasetSpec, counts: Mapping[Spl
 def write_sealed(
     folder: DatasetFolder, spec: DatasetSpec, counts: Mapping[Split, int], recorded: Recorded, side: int
 ) -> DatasetFolder:
-    """The same for records of any make, without masks."""
+    """Write a sealed data set of the `recorded` samples, without masks."""
     seals = {}
     for split, n in counts.items():
         folder.split_folder(split).mkdir(parents=True)

@@ -13,7 +13,7 @@ from phd_exp.__main__ import main
 def begin(words: list[str], preload: list[str], torn: int = 0) -> BaseProcess:
     """A command in a process that is forked from one that has imported these modules already.
 
-    It is killed when the file with the number `torn`, from 1, is written but has not its name yet; 0: it is not.
+    It is killed when it has written file number `torn` (from 1) but not yet renamed it into place; 0: never.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(preload)

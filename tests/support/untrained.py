@@ -65,12 +65,12 @@ def virtual_cameras(photos: Path, side: int = SIDE) -> Iterator[VirtualCamera]:
 
 
 def read_metadata(folder: Path) -> list[dict[str, Any]]:
-    """What a folder says of its images."""
+    """The lines of `metadata.jsonl` in a folder."""
     return read_lines((folder / "metadata.jsonl").read_text())
 
 
 def write_metadata(folder: Path, lines: Iterable[dict[str, Any]]) -> None:
-    """Say this of the images of a folder."""
+    """Write `metadata.jsonl` in a folder."""
     (folder / "metadata.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
 
 
