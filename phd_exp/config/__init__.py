@@ -95,7 +95,7 @@ class RunConfig(Record):
         if is_typed(info) and data.n_held_out and data.n_train and data.n_train % images:
             raise ValueError(
                 f"data.n_train: got {data.n_train}; expected a multiple of data.frames x data.views = {images}, "
-                "since no sequence may have training and held-out samples"
+                "since no sequence may have both training and held-out samples"
             )
         if data.n_train is not None and data.batch_size > data.n_train:
             raise ValueError(

@@ -132,7 +132,7 @@ def read_views(file: Path) -> SeveralViews:
 
 
 def read_sequences(file: Path) -> list[SeveralViews]:
-    """The recorded sequences of a run, of each camera: views are its frames, with `time` (s) and `visibility`.
+    """The recorded sequences of a run, one item per camera: views are frames, with `time` (s) and `visibility`.
 
     Raises RunError if they cannot be read, or are not sequences of equal length.
     """

@@ -68,7 +68,7 @@ class TrackScores:
             the Kalman smoother minus that of a method, mm.
         curves: by `place`, means over sequences at each time (s).
         calibrated: 95 % interval of the mean NEES of n frames, one of each sequence, if calibrated.
-        cameras: their number.
+        cameras: number of cameras.
     """
 
     n: int

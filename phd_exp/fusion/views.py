@@ -14,7 +14,7 @@ from phd_exp.fusion.pose import Pose, is_rotation
 
 @runtime_checkable
 class Affine(Protocol):
-    """A density of (q_x, q_y, t) = measure (v - apex) with the precision a, as `ProjectedHuber`."""
+    """A density whose (q_x, q_y, t) are measure (v - apex) at a position v, such as `ProjectedHuber`."""
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -38,7 +38,7 @@ class Affine(Protocol):
 
     @property
     def rounding(self) -> float:
-        """Of the mode of t, see `phd_exp.distributions.rounded`."""
+        """How far the mode of t is rounded, see `phd_exp.distributions.rounded`."""
 
 
 GAUSSIAN = -1.0

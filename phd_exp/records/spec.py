@@ -77,9 +77,9 @@ class DatasetSpec(Record):
         image_quality: of webp and jpeg, per cent.
         saturation_range: bounds of the saturation of every colour; near 0 it is grey.
         half_hidden: whether a panel in front of the cylinder hides half of it. It replaces the cube of `occluders`.
-        frames: images of each scene and camera, one after the other; without further views, sample i is frame i mod
-            frames of scene i div frames, and with them all views of a frame follow one another. The motion is
-            described in `rendering/sequences.py`.
+        frames: images of each scene and camera. With one view, sample i is frame (i mod frames) of scene
+            (i div frames); with several, the views of a frame follow one another. `rendering/sequences.py` describes
+            the motion.
         frame_rate: frames per second.
         speed: root mean square speed of each object along each axis, m/s.
         spin_range: bounds of the rate at which each object turns, degrees per second.

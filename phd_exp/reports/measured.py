@@ -61,7 +61,7 @@ class Measured:
         after: evaluation of the recalibrated predictions; None without held-out samples.
         pairs: scores of the positions fused from two cameras; None without a record of several views.
         scene: the first test sample in space; None without a Projected Huber density.
-        tracks: scores of sequences, by their frames, with _2 from two cameras; empty without sequences.
+        tracks: scores by the frames of a sequence, followed by _2 for two cameras; empty without sequences.
         shifts: scores at home and under each shift; empty without a shift.
         images: a digest of data set and true positions, equal for runs tested on the same images.
     """

@@ -40,7 +40,7 @@ OF_QUANTITIES = (
     "overconfident."
 )
 OF_METHODS = (
-    "Single frames: the mode of each, of two cameras the position fused from both. Kalman (RTS): a "
+    "Single frames: the mode of each; with two cameras, the position fused from both. Kalman (RTS): a "
     "Rauch-Tung-Striebel smoother of the frames' means and "
     "covariances. Ours: the mean path under the frames' densities; weighted frames: each density has a "
     "weight, the information that neighbouring frames lack. All assume a velocity that changes by white noise."

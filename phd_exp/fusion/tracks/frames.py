@@ -60,7 +60,7 @@ class Gaussian:
 
     @property
     def rounding(self) -> float:
-        """None."""
+        """0, since a Gaussian has no kink."""
         return 0.0
 
 
@@ -74,11 +74,11 @@ class Frames:
         slope: d(q_x, q_y, t)/dv, 1/metres; 0 where a camera takes no part.
         at_origin: (q_x, q_y, t) at the origin.
         a: precision of the depth, or GAUSSIAN; 0 where a camera takes no part.
-        own: the width of a rounded mode of t.
+        own: the width of a rounded mode of t; 0 for a kink.
         since: seconds since the camera's prediction before; inf without one.
         centres: the apices of the densities, without a free axis the positions of the cameras.
         about: a path, see `phd_exp.fusion.tracks.shear`; at first the average of each frame's predicted positions,
-            between those of the frames next to it where there is none.
+            interpolated in frames without a prediction.
         shear: S and offset there; at first I and 0.
     """
 
@@ -126,7 +126,7 @@ class Frames:
     def followed_by(
         self, time: float, views: Views | None, about: Float[np.ndarray, "1 3"], drop: int = 0
     ) -> "Frames":
-        """With one more frame, about a position, and without the first `drop` ones; None for `views` masks all out.
+        """Without the first `drop` frames, and with one more, about a position; without `views`, it has no camera.
 
         Raises ValueError as `checked`.
         """

@@ -33,7 +33,7 @@ class State:
         velocity_covariance: square metres per square second.
         excess: energy of the position in each view above the view's lowest energy, nats.
         a: precision of each view's depth.
-        own: the width of its rounded mode, over its distance.
+        own: the width of the rounded mode of each view's t = z/mu_z; 0 for a kink.
     """
 
     time: float
