@@ -174,7 +174,7 @@ def _poses(
     rng: Stream,
     motion: Callable[[], Stream],
 ) -> list[Pose]:
-    """The poses of a further camera in all frames, which has all objects in front of it in each of them."""
+    """The poses, in all frames, of a further camera that has all objects in front of it in each of them."""
     times = [frame / spec.frame_rate for frame in range(1, spec.frames)]
     for _ in range(MOST_TRIES):
         direction = _uniform(rng, (0.0, math.tau))
