@@ -85,7 +85,7 @@ class Region:
 
 
 @cache
-def level_energies(level: float, rounding: float = 0.0) -> Float[np.ndarray, " precisions"]:
+def level_energies(level: float, rounding: float) -> Float[np.ndarray, " precisions"]:
     """The W of the region with the probability `level` < 1 at each a of `PRECISIONS`, by bisection.
 
     W depends so little on a that linear interpolation over log a errs by less than 1e-4 in level.

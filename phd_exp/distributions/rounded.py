@@ -58,7 +58,7 @@ class Rounded(DepthLaw):
         # from sqrt(a^2 (c^2 - 1) + r^2) = energy + a + r - a c with c = cosh l
         a = self._a.squeeze(-1)
         excess = energy * (energy + 2 * self.r) / (2 * a * (a + self.r + energy))  # c - 1
-        return torch.log1p(excess + (excess * (excess + 2)).sqrt())
+        return _arcosh_of_1_plus(excess)
 
     @property
     def log_normaliser(self) -> Numbers:
@@ -96,7 +96,7 @@ class Rounded(DepthLaw):
 
     @property
     def excess_moments(self) -> tuple[Numbers, Numbers]:
-        return self._moments(self._a * torch.expm1(self._whole[0].log_t))
+        return self._moments(self._excess(self._whole[0].y))
 
     @property
     def inverse_moments(self) -> tuple[Numbers, Numbers]:
@@ -112,8 +112,7 @@ class Rounded(DepthLaw):
 
     @property
     def mean_slope(self) -> Numbers:
-        y = self._a * self._whole[0].log_t.sinh()
-        return self._moments(self._slope(y))[0]
+        return self._moments(self._slope(self._whole[0].y))[0]
 
     def crps_beyond_distance(self, log_t: Numbers) -> Numbers:
         """With S = a (T - 1), E|S - s| - |s| is 2 E[(s - S)_+] + E[S] before the mode and 2 E[(S - s)_+] - E[S]
@@ -121,9 +120,9 @@ class Rounded(DepthLaw):
         """
         at = self._x(log_t)
         tail, weight = self._tail(at)
-        here = self._a * torch.expm1(self._at(at[..., None]).log_t)
-        apart = (weight * (self._a * torch.expm1(tail.log_t) - here)).sum(-1).abs() / self._mass
-        s, share = self._a * torch.expm1(self._whole[0].log_t), self._whole[1] / self._mass[..., None]
+        here = self._excess(self._at(at[..., None]).y)
+        apart = (weight * (self._excess(tail.y) - here)).sum(-1).abs() / self._mass
+        s, share = self._excess(self._whole[0].y), self._whole[1] / self._mass[..., None]
         mean = (share * s).sum(-1)
         _, nodes_weight, integral = _gauss(_NODES, self._a)
         below = (share / nodes_weight) @ integral.mT
@@ -148,7 +147,11 @@ class Rounded(DepthLaw):
     @property
     def _end(self) -> Tensor:
         """The x beyond which the energy is more than 50."""
-        return torch.acosh(1 + _LARGEST_ENERGY / self._scale)
+        return _arcosh_of_1_plus(_LARGEST_ENERGY / self._scale)
+
+    def _excess(self, y: Tensor) -> Tensor:
+        """a (t - 1) = a sinh l + a (cosh l - 1) where a sinh l = y."""
+        return y + y.square() / (self._a + (self._a.square() + y.square()).sqrt())
 
     def _energy(self, y: Tensor) -> Tensor:
         """The excess energy where a sinh l = y."""
@@ -166,10 +169,15 @@ class Rounded(DepthLaw):
         return squared / (self._a + (self._a.square() + squared).sqrt()) + over_R * (2 - over_R.square() / squared)
 
     def _at(self, x: Points) -> "_Points":
-        y = self._scale * x.sinh()
-        log_t, energy = torch.asinh(y / self._a), self._energy(y)
-        by_x = self._scale * x.cosh() / (1 + (y / self._a).square()).sqrt()  # a dl/dx
-        return _Points(log_t, energy, torch.exp(log_t - energy) * by_x)
+        # by exp and log, because runtimes of exported graphs have hyperbolic functions in float32 alone
+        grown, shrunk = x.exp(), (-x).exp()
+        y = self._scale * (grown - shrunk) / 2
+        cosh_l = (1 + (y / self._a).square()).sqrt()
+        size = y.abs() / self._a
+        log_t = torch.log1p(size + size.square() / (1 + cosh_l))  # arsinh
+        log_t, energy = torch.where(y < 0, -log_t, log_t), self._energy(y)
+        by_x = self._scale * (grown + shrunk) / 2 / cosh_l  # a dl/dx
+        return _Points(y, log_t, energy, torch.exp(log_t - energy) * by_x)
 
     def _x(self, log_t: Numbers) -> Numbers:
         x = torch.asinh(self._scaled_sinh(log_t)[0][..., None] / self._scale)
@@ -231,13 +239,14 @@ class Rounded(DepthLaw):
         for _ in range(_CLOSEST_STEPS):
             law = Rounded(log_a, self.r)
             l = log_t - place[..., None]
-            s, c = law._a * l.sinh(), law._a * l.cosh()
+            far, near = law._a * l.exp() / 2, law._a * (-l).exp() / 2
+            s, c = far - near, far + near
             R = (s.square() + self.r**2).sqrt()
             by_place = 1 - (share * (s + s * c / R)).sum(-1)
             by_a = (share * law._slope(s)).sum(-1) - law.mean_slope
             bend = (share * (c + (c.square() * self.r**2 / R.square() + s.square()) / R)).sum(-1)
             both = -(share * (s + s * c / R * (2 - (s / R).square()))).sum(-1)
-            own = law._a * law._whole[0].log_t.sinh()
+            own = law._whole[0].y
             varied = law._moments(law._slope(own))[1]
             bend_a = varied + (share * law._curvature(s)).sum(-1) - law._moments(law._curvature(own))[0]
             bend_a = bend_a.maximum(varied / 2)
@@ -253,11 +262,17 @@ def depth_law(log_a: Numbers, rounding: float) -> DepthLaw:
 
 
 class _Points(NamedTuple):
-    """Points x of each law: log t, the excess energy, and exp(-energy) a dt/dx."""
+    """Points x of each law: a sinh(log t), log t, the excess energy, and exp(-energy) a dt/dx."""
 
+    y: Points
     log_t: Points
     energy: Points
     density: Points
+
+
+def _arcosh_of_1_plus(x: Tensor) -> Tensor:
+    """For x >= 0."""
+    return torch.log1p(x + (x * (x + 2)).sqrt())
 
 
 def _gauss(n: int, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -156,14 +156,14 @@ def ensemble_table(tables: Sequence[Arrays]) -> Arrays:
 
     Raises RunError if a column is missing, or the tables are of different samples.
     """
-    parameters = parameter_names(tables[0])
+    parameters = parameter_names({name for table in tables for name in table})
     for table in tables:
         require_columns((*parameters, *XYZ), table)
         names = [name for name in (*XYZ, "file_name") if name in table]
         if not all(name in tables[0] and np.array_equal(table[name], tables[0][name]) for name in names):
             raise RunError("predictions: those of an ensemble are of different samples; train on one data set")
     columns = {name: torch.tensor(np.stack([table[name] for table in tables], axis=-1)) for name in parameters}
-    mixture = Mixture(from_columns(columns))
+    mixture = Mixture(_distribution(columns))
     scores = distribution_columns(mixture.closest, stacked(tables[0], XYZ)) | {"disagreement": mixture.disagreement}
     kept = {name: tables[0][name] for name in (*XYZ, "f", "S") if name in tables[0]}
     return kept | {name: column.numpy() for name, column in scores.items()}

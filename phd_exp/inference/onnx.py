@@ -46,6 +46,11 @@ DESCRIPTIONS = {
     "interval_along_ray": "(n, 3, 2) float32: central 50, 90 and 99 % intervals of that coordinate, m",
     "position": "(n, 3) float32: estimated position of a baseline, m; camera frame as above",
 }
+ENERGY = (
+    "h(|q|) + a (c - 1) + sqrt((a s)^2 + r^2) - r with c = (t + 1/t)/2, s = (t - 1/t)/2, r = rounding and t the depth "
+    "over that of the mode; h(x) = x^2/2 up to 1, x - 1/2 beyond. A region has the positions of energy up to W, which "
+    "is interpolated linearly over log a"
+)
 OPSET = 18
 TOLERANCE = 1e-5
 IN_FLOAT32 = {"covariance": 1e-3}
@@ -66,14 +71,14 @@ def export(
 ) -> tuple[float, Change | None]:
     """Write the file after comparing it with torch; returns the largest relative deviation.
 
-    With a coverage, the metadata has the level of its regions and their energy W at each depth precision a. With
-    held-out samples the network computes in int8; the deviation is then that of the float32 network from which it is
-    made, and the change of the errors of these samples comes second.
+    With a coverage, the metadata has the level of its regions, the `ENERGY` and its W at several depth precisions a.
+    With held-out samples the network computes in int8; the deviation is then that of the float32 network from which
+    it is made, and the change of the errors of these samples comes second.
 
     Raises UserError, and writes no file, if the deviation exceeds the tolerance or int8 changes the errors too much.
     """
     deployed = (OfPhotographs if photographs else OfImages)(predictor, precision).eval()
-    metadata = _metadata(deployed) | (_region(predictor, coverage) if coverage else {})
+    metadata = _metadata(deployed) | (_region(deployed, coverage) if coverage else {})
     model, change = graph(deployed), None  # last, because it takes half a minute
     deviation = largest_deviation(deployed, model.SerializeToString())
     if not deviation <= TOLERANCE:
@@ -199,11 +204,15 @@ def _metadata(deployed: Deployed) -> dict[str, Any]:
     }
 
 
-def _region(predictor: Predictor, coverage: float) -> dict[str, Any]:
+def _region(deployed: Deployed, coverage: float) -> dict[str, Any]:
     """The metadata of regions with a guaranteed coverage."""
-    guarantee = predictor.guarantee(coverage)
+    guarantee = deployed.predictor.guarantee(coverage)
+    *_, prediction = next(deployed.cases())
+    assert prediction.has_closed_forms  # only those have a guarantee
+    W = level_energies(guarantee.levels[0], prediction.rounding)
     facts = {"coverage": coverage, "level": guarantee.levels[0], "held_out_samples": guarantee.n[0]}
-    return {"region": facts | {"a": PRECISIONS.tolist(), "W": level_energies(guarantee.levels[0]).tolist()}}
+    energy = {"energy": ENERGY, "rounding": prediction.rounding, "a": PRECISIONS.tolist(), "W": W.tolist()}
+    return {"region": facts | energy}
 
 
 def largest_deviation(deployed: Deployed, content: bytes) -> float:

@@ -34,6 +34,9 @@ MIXTURES = {
     "with free axes": ensemble(1.0, 5, numbers=9),
     "apart": Mixture(ProjectedHuber.from_raw(torch.tensor(APART, dtype=torch.float64), f=F, S=S, mu_z0=MU_Z0)),
 }
+MIXTURES |= {
+    f"{name}, rounded": Mixture(MIXTURES[name].members.with_rounding(2.0)) for name in ("with free axes", "apart")
+}
 every_mixture = pytest.mark.parametrize("mixture", MIXTURES.values(), ids=MIXTURES.keys())
 
 
@@ -114,7 +117,8 @@ def test_no_distribution_is_closer_than_the_closest(name: str, drawn: dict[str, 
 
     def loss(raw: np.ndarray) -> tuple[float, np.ndarray]:
         leaf = torch.tensor(raw, requires_grad=True)
-        value = -ProjectedHuber.from_raw(leaf, f=F, S=S, mu_z0=MU_Z0).log_prob(v).mean()
+        p = ProjectedHuber.from_raw(leaf, f=F, S=S, mu_z0=MU_Z0).with_rounding(mixture.members.rounding)
+        value = -p.log_prob(v).mean()
         value.backward()
         return value.item(), leaf.grad.numpy()
 

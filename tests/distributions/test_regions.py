@@ -15,6 +15,7 @@ from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.huber import radial_cdf
 from phd_exp.distributions.level import credible_level
 from phd_exp.distributions.regions import PRECISIONS, Region, level_energies
+from phd_exp.distributions.rounded import depth_law
 from phd_exp.distributions.special import tail_moment
 
 LEVELS = (0.2, 0.9, 0.999)
@@ -36,10 +37,11 @@ def border(p: ProjectedHuber, level: float, n: int = 1500) -> np.ndarray:
 
 
 @pytest.mark.parametrize("level", LEVELS)
-def test_energies_are_those_of_the_level(level: float) -> None:
-    a = torch.logspace(-4, 5, 1000, dtype=torch.float64)
-    W = np.interp(a.log(), PRECISIONS.log(), level_energies(level))
-    np.testing.assert_allclose(credible_level(torch.from_numpy(W), a), level, atol=1e-4)
+@pytest.mark.parametrize("rounding", [0.0, 2.0])
+def test_energies_are_those_of_the_level(level: float, rounding: float) -> None:
+    log_a = torch.linspace(math.log(1e-4), math.log(1e5), 1000, dtype=torch.float64)
+    W = np.interp(log_a, PRECISIONS.log(), level_energies(level, rounding))
+    np.testing.assert_allclose(depth_law(log_a, rounding).level(torch.from_numpy(W)), level, atol=1e-4)
 
 
 @pytest.mark.parametrize("level", LEVELS)

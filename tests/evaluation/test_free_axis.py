@@ -1,4 +1,4 @@
-"""Records of a density with a free axis: evaluated, recalibrated, mixed and guaranteed as those of the paper's."""
+"""Records of densities with a free axis, and with a rounded mode: read wherever those of the paper's density are."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from phd_exp.distributions import ProjectedHuber, Temperature
-from phd_exp.distributions.columns import FREE_AXIS, coordinates, distribution_columns
+from phd_exp.distributions.columns import FREE_AXIS, ROUNDING, coordinates, distribution_columns
 from phd_exp.evaluation.conformal import guarantee
 from phd_exp.evaluation.familiar import Familiarity
 from phd_exp.evaluation.parquet import read_table
@@ -23,12 +23,12 @@ from tests.support.several import write_views
 N = 400
 
 
-@pytest.fixture(scope="module")
-def predicted() -> ProjectedHuber:
+@pytest.fixture(scope="module", params=[0.0, 2.0], ids=["free axis", "rounded mode"])
+def predicted(request: pytest.FixtureRequest) -> ProjectedHuber:
     raw = torch.randn(N, 9, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     raw[:, 2:6] = 8 + 20 * raw[:, 2:6].abs()
     raw[:, 3] = 0
-    return ProjectedHuber.from_raw(raw, f=1500.0, S=224.0, mu_z0=2.5e-3)
+    return ProjectedHuber.from_raw(raw, f=1500.0, S=224.0, mu_z0=2.5e-3).with_rounding(request.param)
 
 
 @pytest.fixture(scope="module")
@@ -56,16 +56,20 @@ def test_a_temperature_keeps_the_axis(table: dict[str, np.ndarray], predicted: P
     changed = recalibrated(table, Temperature(projected=2.0, depth=4.0))
     for name in FREE_AXIS:
         np.testing.assert_allclose(changed[name], 2 * table[name])  # k a over the projected temperature
-    torch.testing.assert_close(at_temperature(changed, None)[0].apex, predicted.apex)
+    read = at_temperature(changed, None)[0]
+    torch.testing.assert_close(read.apex, predicted.apex)
+    assert read.rounding == predicted.rounding
 
 
 def test_an_ensemble_of_equal_members_is_each_of_them(table: dict[str, np.ndarray]) -> None:
     mixed = ensemble_table([table, table])
     for name in ("mu_x", "mu_z", *FREE_AXIS):
         np.testing.assert_allclose(mixed[name], table[name], rtol=1e-4, atol=1e-4)
-    lacking = {name: column for name, column in table.items() if name != "k_y"}
-    with pytest.raises(RunError, match="no column k_y"):
-        ensemble_table([table, lacking])
+    for name in {"k_y", *ROUNDING} & set(table):
+        lacking = {key: column for key, column in table.items() if key != name}
+        for tables in ([table, lacking], [lacking, table]):
+            with pytest.raises(RunError, match=f"no column {name}"):
+                ensemble_table(tables)
 
 
 def test_familiarity_guarantees_and_pictures_read_it(table: dict[str, np.ndarray], predicted: ProjectedHuber) -> None:
@@ -82,12 +86,12 @@ def test_several_views_of_it_are_fused(tmp_path: Path) -> None:
     write_views(file := tmp_path / "views.parquet", n=20)
     columns = dict(read_table(file))
     paper = read_views(file)
-    for k in (np.zeros(80), np.linspace(-1, 1, 80)):
+    for k, rounding in ((np.zeros(80), 0.0), (np.linspace(-1, 1, 80), 0.0), (np.zeros(80), 2.0)):
         known = {name: column for name, column in columns.items() if name != "file_name"}
-        pq.write_table(pa.table(known | {"k_x": k, "k_y": -k}), file)
+        pq.write_table(pa.table(known | {"k_x": k, "k_y": -k, "rounding": np.full(80, rounding)}), file)
         views = read_views(file)
-        assert views.predictions.k is not None
+        assert views.predictions.k is not None and views.predictions.rounding == rounding
         fused = fuse(views.predictions, views.pose)
         same = fuse(paper.predictions, paper.pose)
         assert (fused.certificate < 1e-6).all()
-        assert torch.equal(fused.point, same.point) == bool((k == 0).all())
+        assert torch.equal(fused.point, same.point) == bool((k == 0).all() and not rounding)

@@ -13,8 +13,8 @@ from PIL import Image
 from scipy import stats
 
 import phd_exp as package
-from phd_exp.distributions.level import credible_level
 from phd_exp.distributions.regions import PRECISIONS
+from phd_exp.distributions.rounded import depth_law
 from phd_exp.evaluation.conformal import fused_guarantee
 from phd_exp.inference import pictures
 from phd_exp.records.runs import RunFolder
@@ -126,13 +126,18 @@ def test_fused_regions_are_ellipsoids_that_recorded_scenes_guarantee(
         assert region["volume"] == pytest.approx(volume, rel=1e-5)
 
 
+@pytest.mark.parametrize("rounding", [0.0, 2.0])
 def test_the_exported_file_has_the_threshold_and_the_energy_of_its_regions(
-    phd_exp: Callable, run: RunFolder, monkeypatch: pytest.MonkeyPatch
+    phd_exp: Callable, make: Callable[..., RunFolder], run: RunFolder, monkeypatch: pytest.MonkeyPatch, rounding: float
 ) -> None:
     models = pytest.importorskip("onnx", reason="export needs `pip install 'phd_exp[export]'`")
     pytest.importorskip("onnxruntime")
     from phd_exp.inference import onnx
 
+    if rounding:
+        run = make(*NOWHERE, "model=rounded_t")
+        table = table_of(400, 1, overconfidence=1.3) | {"rounding": np.full(400, rounding)}
+        pd.DataFrame(table).to_parquet(run.held_out)
     monkeypatch.setattr(onnx, "graph", lambda predictor: models.ModelProto())
     monkeypatch.setattr(onnx, "largest_deviation", lambda *_: 0.0)
     for words in ((), ("recalibrate=true",)):
@@ -142,7 +147,9 @@ def test_the_exported_file_has_the_threshold_and_the_energy_of_its_regions(
         found = package.load(run.path, recalibrate=bool(words)).guarantee(0.9)
         assert (region["coverage"], region["level"], region["held_out_samples"]) == (0.9, found.levels[0], 200)
         W, a = (torch.tensor(region[name], dtype=torch.float64) for name in "Wa")
-        torch.testing.assert_close(credible_level(W, a), torch.full_like(PRECISIONS, region["level"]))
+        assert region["rounding"] == rounding
+        found_level = depth_law(a.log(), rounding).level(W)
+        torch.testing.assert_close(found_level, torch.full_like(PRECISIONS, region["level"]))
     assert phd_exp("export", f"run={run.path}", "out=network.onnx").status == 0
     assert "region" not in json.loads(models.load("network.onnx").metadata_props[0].value)
 

@@ -112,7 +112,12 @@ def require_accurate(found: dict[str, np.ndarray]) -> None:
         assert deviation.max() < TOLERANCES.get(name, 1e-5), name
 
 
-HEADS = {"ray": DistributionHead(DEPTH), "free": DistributionHead(DEPTH, free_axis=True), "t": SurrogateHead(DEPTH)}
+HEADS = {
+    "ray": DistributionHead(DEPTH),
+    "free": DistributionHead(DEPTH, free_axis=True),
+    "t": SurrogateHead(DEPTH),
+    "rounded": SurrogateHead(DEPTH, is_rounded=True),
+}
 
 
 @pytest.mark.parametrize("name", HEADS)
@@ -163,6 +168,18 @@ def test_the_distribution_is_that_of_torch_in_every_runtime(composed: Callable[.
     require_accurate(dict(zip(found, deviations(other[1:], [value.numpy() for value in there]), strict=True)))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_a_rounded_mode_is_that_of_torch(composed: Callable[..., Any], precision: str) -> None:
+    numbers = families()["rounded_t"].inputs(1_000, torch.Generator().manual_seed(0))
+    made = predictor(composed, HEADS["rounded"], numbers, temperature=TEMPERATURE)
+    images, f = images_of(np.arange(len(numbers))), np.linspace(2, 9, len(numbers), dtype=np.float32) * SIDE
+    model = exported(made, precision=precision)
+    if precision == "float32":
+        require_portable(model)
+    require_accurate(worst(made, session_of(model), images, f))
+
+
 def disagreeing(raw: Tensor, widths: float, members: int) -> Tensor:
     """Raw numbers of members whose modes differ by about so many widths of their densities, a at least 1."""
     noise = torch.randn((len(raw), members, 9), generator=torch.Generator().manual_seed(0), dtype=raw.dtype)
@@ -172,14 +189,14 @@ def disagreeing(raw: Tensor, widths: float, members: int) -> Tensor:
 
 
 @pytest.mark.parametrize("widths", [0.0, 1.0])
-@pytest.mark.parametrize("n_outputs", [7, 9])
-def test_float32_has_the_digits_of_float64_in_ensembles(widths: float, n_outputs: int) -> None:
+@pytest.mark.parametrize(("n_outputs", "rounding"), [(7, 0.0), (9, 0.0), (9, 2.0)])
+def test_float32_has_the_digits_of_float64_in_ensembles(widths: float, n_outputs: int, rounding: float) -> None:
     """Of eight members, for which digits cancel most where they are equal."""
     raw = families()["free_axis"].inputs(1_000, torch.Generator().manual_seed(0))
     raw = disagreeing(torch.cat([raw[:, :5], raw[:, 5:6].abs(), raw[:, 6:]], dim=-1), widths, 8)[..., :n_outputs]
     f, head = torch.linspace(2, 9, len(raw))[:, None] * SIDE, DistributionHead(DEPTH, free_axis=n_outputs == 9)
     here, there = (
-        answers(Mixture(head(raw.to(dtype), Camera(f.to(dtype), float(SIDE)))).closest)
+        answers(Mixture(head(raw.to(dtype), Camera(f.to(dtype), float(SIDE))).with_rounding(rounding)).closest)
         for dtype in (torch.float32, torch.float64)
     )
     values = ([value.numpy() for value in one.values()] for one in (here, there))
