@@ -96,7 +96,13 @@ class Rounded(DepthLaw):
 
     @property
     def excess_moments(self) -> tuple[Numbers, Numbers]:
-        return self._moments(self._excess(self._whole[0].y))
+        # of both signs of l together, a (t - 1) t is 2 a (sinh^2 l + (cosh l - 1) cosh l): its terms do not cancel
+        points, weight = self._whole
+        y, excess = points.y, self._excess(points.y)
+        both = y.square() / self._a + (excess - y) * (1 + (y / self._a).square()).sqrt()
+        share = weight / self._mass[..., None]
+        mean = (share * torch.exp(-points.log_t) * both).sum(-1)
+        return mean, (share * (excess - mean[..., None]).square()).sum(-1)
 
     @property
     def inverse_moments(self) -> tuple[Numbers, Numbers]:
