@@ -47,9 +47,9 @@ DESCRIPTIONS = {
     "position": "(n, 3) float32: estimated position of a baseline, m; camera frame as above",
 }
 ENERGY = (
-    "h(|q|) + a (c - 1) + sqrt((a s)^2 + r^2) - r with c = (t + 1/t)/2, s = (t - 1/t)/2, r = rounding and t the depth "
-    "over that of the mode; h(x) = x^2/2 up to 1, x - 1/2 beyond. A region has the positions of energy up to W, which "
-    "is interpolated linearly over log a"
+    "h(|q|) + a (c - 1) + sqrt((a s)^2 + r^2) - r with c = (t + 1/t)/2, s = (t - 1/t)/2, r = rounding and t the "
+    "depth over that of the mode; h(x) = x^2/2 up to 1, x - 1/2 beyond. A region has the positions of energy up to "
+    "W, which is interpolated linearly over log a"
 )
 OPSET = 18
 TOLERANCE = 1e-5

@@ -10,6 +10,7 @@ import torch
 
 from phd_exp.distributions import ProjectedHuber, Temperature
 from phd_exp.distributions.columns import FREE_AXIS, ROUNDING, coordinates, distribution_columns
+from phd_exp.evaluation import reference
 from phd_exp.evaluation.conformal import guarantee
 from phd_exp.evaluation.familiar import Familiarity
 from phd_exp.evaluation.parquet import read_table
@@ -42,7 +43,8 @@ def table(predicted: ProjectedHuber) -> dict[str, np.ndarray]:
     return {name: column.numpy() for name, column in columns.items()}
 
 
-def test_a_calibrated_model_scores_as_one(table: dict[str, np.ndarray]) -> None:
+def test_a_calibrated_model_scores_as_one(table: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reference, "_DRAWS", 80_000)  # as many as 400 samples need at least
     found = evaluate(table, resamples=20)
     for name in ("nees", "inside_90", "depth_pit_ks"):
         band = found.reference[name]
@@ -90,7 +92,8 @@ def test_several_views_of_it_are_fused(tmp_path: Path) -> None:
         known = {name: column for name, column in columns.items() if name != "file_name"}
         pq.write_table(pa.table(known | {"k_x": k, "k_y": -k, "rounding": np.full(80, rounding)}), file)
         views = read_views(file)
-        assert views.predictions.k is not None and views.predictions.rounding == rounding
+        assert views.predictions.k is not None
+        assert views.predictions.rounding == rounding
         fused = fuse(views.predictions, views.pose)
         same = fuse(paper.predictions, paper.pose)
         assert (fused.certificate < 1e-6).all()

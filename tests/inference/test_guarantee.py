@@ -128,7 +128,7 @@ def test_fused_regions_are_ellipsoids_that_recorded_scenes_guarantee(
 
 @pytest.mark.parametrize("rounding", [0.0, 2.0])
 def test_the_exported_file_has_the_threshold_and_the_energy_of_its_regions(
-    phd_exp: Callable, make: Callable[..., RunFolder], run: RunFolder, monkeypatch: pytest.MonkeyPatch, rounding: float
+    phd_exp: Callable, make: Callable, run: RunFolder, monkeypatch: pytest.MonkeyPatch, rounding: float
 ) -> None:
     models = pytest.importorskip("onnx", reason="export needs `pip install 'phd_exp[export]'`")
     pytest.importorskip("onnxruntime")
