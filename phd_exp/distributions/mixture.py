@@ -163,15 +163,25 @@ def _closest_depth(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch"], Fl
 
 
 def _closest_rounded_depth(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-    """The same for rounded modes, from the nodes of all members; see `Rounded.closest_to`."""
-    law, log_mu = members.depth_law, members.mu_z.log()
+    """The same for rounded modes, from the nodes of all members; see `Rounded.closest_to`.
+
+    The search starts from the precision whose log depths have the variance of those of the mixture.
+    """
+    law, first = members.depth_law, members.mu_z[..., :1]
     assert isinstance(law, Rounded)
-    log_t, share = law.nodes
+    log_mu = torch.log1p((members.mu_z - first) / first)
     middle = log_mu.mean(-1)
-    place, log_a = Rounded(law.log_a.mean(-1), law.r).closest_to(
-        (log_t + (log_mu - middle[..., None])[..., None]).flatten(-2), (share / log_mu.shape[-1]).flatten(-2)
-    )
-    return middle + place - log_mu[..., 0], log_a.exp()
+    log_t, share = law.nodes
+    own = _variance(log_t, share)
+    log_t, share = (log_t + (log_mu - middle[..., None])[..., None]).flatten(-2), (share / own.shape[-1]).flatten(-2)
+    log_a = (law.log_a + own.log() / 2).mean(-1) - _variance(log_t, share).log() / 2
+    place, log_a = Rounded(log_a, law.r).closest_to(log_t, share)
+    return middle + place, log_a.exp()
+
+
+def _variance(values: Float[Tensor, "*batch nodes"], share: Float[Tensor, "*batch nodes"]) -> Float[Tensor, "*batch"]:
+    mean = (share * values).sum(-1, keepdim=True)
+    return (share * (values - mean).square()).sum(-1)
 
 
 def _closest_projection(

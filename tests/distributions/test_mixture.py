@@ -129,6 +129,18 @@ def test_no_distribution_is_closer_than_the_closest(name: str, drawn: dict[str, 
     assert all(-p.log_prob(v).mean() > ours for p in worse)
 
 
+@pytest.mark.parametrize("rounding", [0.0, 2.0])
+@pytest.mark.parametrize("apart", [1e-4, 0.01, 2.0])
+def test_the_closest_distribution_of_sharp_members_is_found(apart: float, rounding: float) -> None:
+    """It may be far wider than they are."""
+    mu_z = 3 * (1 + apart * torch.tensor([0.0, 1.0, 1.0], dtype=torch.float64))
+    A, a = 300 * torch.eye(2).double().expand(3, 2, 2), torch.full_like(mu_z, 1e5)
+    mixture = Mixture(ProjectedHuber(torch.zeros(3, 2).double(), mu_z, A, a, rounding=rounding))
+    v = mixture.rsample((4_000,), torch.Generator().manual_seed(0))
+    ours = mixture.closest.log_prob(v).mean()
+    assert all(mixture.closest.tempered(1.0, t).log_prob(v).mean() < ours for t in (0.8, 1.25))
+
+
 def test_a_batch_is_treated_row_by_row() -> None:
     mixture = ensemble(2.0, 4, batch=(3, 2))
     one = Mixture(mixture.members[2][1])
