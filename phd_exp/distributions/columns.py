@@ -16,7 +16,7 @@ Columns = dict[str, Tensor]
 PARAMETERS = ("mu_x", "mu_y", "mu_z", "A_xx", "A_xy", "A_yy", "a")
 FREE_AXIS = ("k_x", "k_y")
 """Further parameters of a distribution with a free axis."""
-ROUNDING = ("rounding",)
+ROUNDING = "rounding"
 """How far the mode of depth is rounded: one number for all distributions, 0 without this column."""
 COVARIANCE = ("C_xx", "C_xy", "C_xz", "C_yy", "C_yz", "C_zz")
 NEES = ("nees", "nees_x", "nees_y", "nees_z")
@@ -24,7 +24,7 @@ NEES = ("nees", "nees_x", "nees_y", "nees_z")
 
 def parameter_names(table: Collection[str]) -> tuple[str, ...]:
     """The columns of parameters that a table needs: `PARAMETERS`, and further ones if it has one of them."""
-    further = (names for names in (FREE_AXIS, ROUNDING) if set(names) & set(table))
+    further = (names for names in (FREE_AXIS, (ROUNDING,)) if set(names) & set(table))
     return sum(further, PARAMETERS)
 
 
@@ -39,7 +39,7 @@ def parameter_columns(distribution: ProjectedHuber) -> Columns:
 def to_columns(distribution: ProjectedHuber) -> Columns:
     """The columns from which `from_columns` rebuilds a batch of distributions."""
     table, rounding = parameter_columns(distribution), distribution.rounding
-    return table | {name: torch.full_like(table["a"], rounding) for name in ROUNDING if rounding}
+    return table | {ROUNDING: torch.full_like(table["a"], rounding)} if rounding else table
 
 
 def from_columns(columns: Mapping[str, Tensor]) -> ProjectedHuber:
@@ -51,7 +51,7 @@ def from_columns(columns: Mapping[str, Tensor]) -> ProjectedHuber:
     A = torch.stack([A_xx, A_xy, A_xy, A_yy], dim=-1).unflatten(-1, (2, 2))
     has_axis = FREE_AXIS[0] in columns
     k = torch.stack([columns[name] for name in FREE_AXIS], dim=-1) if has_axis else None
-    roundings = columns.get(*ROUNDING, a.new_zeros(1)).unique().tolist() or [0.0]
+    roundings = columns.get(ROUNDING, a.new_zeros(1)).unique().tolist() or [0.0]
     if len(roundings) > 1:
         raise ValueError(f"rounding: got {roundings}; expected one number for all predictions")
     return ProjectedHuber(torch.stack([mu_x, mu_y], dim=-1), mu_z, A, a, k, rounding=roundings[0])

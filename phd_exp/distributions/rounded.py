@@ -97,12 +97,11 @@ class Rounded(DepthLaw):
     @property
     def excess_moments(self) -> tuple[Numbers, Numbers]:
         # of both signs of l together, a (t - 1) t is 2 a (sinh^2 l + (cosh l - 1) cosh l): its terms do not cancel
-        points, weight = self._whole
+        points = self._whole[0]
         y, excess = points.y, self._excess(points.y)
         both = y.square() / self._a + (excess - y) * (1 + (y / self._a).square()).sqrt()
-        share = weight / self._mass[..., None]
-        mean = (share * torch.exp(-points.log_t) * both).sum(-1)
-        return mean, (share * (excess - mean[..., None]).square()).sum(-1)
+        mean = (self._share * torch.exp(-points.log_t) * both).sum(-1)
+        return mean, (self._share * (excess - mean[..., None]).square()).sum(-1)
 
     @property
     def inverse_moments(self) -> tuple[Numbers, Numbers]:
@@ -128,7 +127,7 @@ class Rounded(DepthLaw):
         tail, weight = self._tail(at)
         here = self._excess(self._at(at[..., None]).y)
         apart = (weight * (self._excess(tail.y) - here)).sum(-1).abs() / self._mass
-        s, share = self._excess(self._whole[0].y), self._whole[1] / self._mass[..., None]
+        s, share = self._excess(self._whole[0].y), self._share
         mean = (share * s).sum(-1)
         _, nodes_weight, integral = _gauss(_NODES, self._a)
         below = (share / nodes_weight) @ integral.mT
@@ -155,24 +154,32 @@ class Rounded(DepthLaw):
         """The x beyond which the energy is more than 50."""
         return _arcosh_of_1_plus(_LARGEST_ENERGY / self._scale)
 
+    # functions of y = a sinh l
+
+    def _rise(self, y: Tensor) -> Tensor:
+        """a (cosh l - 1)."""
+        squared = y.square()
+        return squared / (self._a + (self._a.square() + squared).sqrt())
+
     def _excess(self, y: Tensor) -> Tensor:
-        """a (t - 1) = a sinh l + a (cosh l - 1) where a sinh l = y."""
-        return y + y.square() / (self._a + (self._a.square() + y.square()).sqrt())
+        """a (t - 1)."""
+        return y + self._rise(y)
 
     def _energy(self, y: Tensor) -> Tensor:
-        """The excess energy where a sinh l = y."""
+        """The excess energy."""
         squared = y.square()
-        kink = squared / (self.r + (self.r**2 + squared).sqrt())
-        return squared / (self._a + (self._a.square() + squared).sqrt()) + kink
+        return self._rise(y) + squared / (self.r + (self.r**2 + squared).sqrt())
 
     def _slope(self, y: Tensor) -> Tensor:
+        """Its derivative by log a."""
         squared = y.square()
-        return squared / (self._a + (self._a.square() + squared).sqrt()) + squared / (self.r**2 + squared).sqrt()
+        return self._rise(y) + squared / (self.r**2 + squared).sqrt()
 
     def _curvature(self, y: Tensor) -> Tensor:
+        """Its second derivative by log a."""
         squared = y.square()
         over_R = squared / (self.r**2 + squared).sqrt()
-        return squared / (self._a + (self._a.square() + squared).sqrt()) + over_R * (2 - over_R.square() / squared)
+        return self._rise(y) + over_R * (2 - over_R.square() / squared)
 
     def _at(self, x: Points) -> "_Points":
         # by exp and log, because runtimes of exported graphs have hyperbolic functions in float32 alone
@@ -210,15 +217,18 @@ class Rounded(DepthLaw):
     def _mass(self) -> Numbers:
         return self._whole[1].sum(-1)
 
+    @cached_property
+    def _share(self) -> Points:
+        """The shares of the probability at the points of the whole law."""
+        return self._whole[1] / self._mass[..., None]
+
     def _moments(self, values: Points) -> tuple[Numbers, Numbers]:
-        share = self._whole[1] / self._mass[..., None]
-        mean = (share * values).sum(-1)
-        return mean, (share * (values - mean[..., None]).square()).sum(-1)
+        mean = (self._share * values).sum(-1)
+        return mean, (self._share * (values - mean[..., None]).square()).sum(-1)
 
     def _start(self, p: Numbers) -> Numbers:
         """The x of the node that is nearest to the probability p."""
-        share = self._whole[1] / self._mass[..., None]
-        before = (share.cumsum(-1) - share / 2 < p[..., None]).sum(-1).clamp_max(_NODES - 1)
+        before = (self._share.cumsum(-1) - self._share / 2 < p[..., None]).sum(-1).clamp_max(_NODES - 1)
         return self._end.squeeze(-1) * _gauss(_NODES, self._a)[0][before]
 
     def _nearer(self, x: Numbers, p: Numbers) -> Numbers:
@@ -232,7 +242,7 @@ class Rounded(DepthLaw):
     @property
     def nodes(self) -> tuple[Points, Points]:
         """log t at nodes, and their shares of the probability."""
-        return self._whole[0].log_t, self._whole[1] / self._mass[..., None]
+        return self._whole[0].log_t, self._share
 
     def closest_to(self, log_t: Points, share: Points) -> tuple[Numbers, Numbers]:
         """The log mu_z and log a of the law with the highest mean log density over depths of these shares.

@@ -2,8 +2,8 @@
 
 The energy of a camera is h(|q|) + a max(t, 1/t). With g = (t - 1/t)/2 the maximum is (t + 1/t)/2 + |g|, and |g| is
 smoothed to s = sqrt(g^2 + width^2). This is the w of the epigraph's barrier, (w - t)(w - 1/t) = width^2. It is convex
-in t, because its second derivative is (1 - g/s)/t^3 + width^2 g'^2/s^3, and at most `width` too large. A camera whose
-law of depth is rounded has a width of its own, below which that of the search does not fall; it has no kink.
+in t, because its second derivative is (1 - g/s)/t^3 + width^2 g'^2/s^3, and at most `width` too large. A camera with
+a rounded law of depth has no kink: its energy has a width of its own, and the search never uses a smaller one for it.
 
 Plain Newton steps overshoot where h or max(t, 1/t) is linear, because their curvature is zero there. As in
 total-variation denoising (Chan, Golub and Mulet, 1999), the directions of both are therefore unknowns too:

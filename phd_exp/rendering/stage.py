@@ -51,7 +51,7 @@ def show_scene(bpy: Any, scene: Scene, meshes: Iterable[str] = (), brightness: f
 
 
 def shows_metal(bpy: Any, scene: Scene) -> bool:
-    """Whether a scene has a metal object without materials of its own."""
+    """Whether the renderer makes an object of the scene metal, because its mesh defines no material."""
     return any(
         item.look.metallic > 0 if item.look else item.material == "metal"
         for item in scene.objects

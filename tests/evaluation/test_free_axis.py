@@ -67,7 +67,7 @@ def test_an_ensemble_of_equal_members_is_each_of_them(table: dict[str, np.ndarra
     mixed = ensemble_table([table, table])
     for name in ("mu_x", "mu_z", *FREE_AXIS):
         np.testing.assert_allclose(mixed[name], table[name], rtol=1e-4, atol=1e-4)
-    for name in {"k_y", *ROUNDING} & set(table):
+    for name in {"k_y", ROUNDING} & set(table):
         lacking = {key: column for key, column in table.items() if key != name}
         for tables in ([table, lacking], [lacking, table]):
             with pytest.raises(RunError, match=f"no column {name}"):

@@ -24,7 +24,7 @@ Source: https://github.com/onnx/onnx-tensorrt/blob/96e7811/docs/operators.md
 """
 TENSORRT = frozenset(OPERATORS.split())
 AXES_INPUT = {"Pad": 3, "Slice": 3, "Squeeze": 1, "Unsqueeze": 1, "CumSum": 1}
-"""Operator (besides Reduce...) whose axes must be constants in TensorRT -> the number of the input with the axes."""
+"""Operator, apart from Reduce..., whose axes TensorRT needs as constants -> the number of its input of axes."""
 
 
 def require_portable(model: Any) -> None:
