@@ -1,7 +1,8 @@
 """`python -m phd_exp [train]`: render missing data, train, measure and record a run."""
 
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
@@ -18,7 +19,7 @@ from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, RunError, shown
 from phd_exp.records.processes import usable_cores
 from phd_exp.records.runs import RunFolder
-from phd_exp.rendering.render import ensure_rendered
+from phd_exp.rendering.render import FEWER, ensure_rendered
 
 if TYPE_CHECKING:
     from phd_exp.inference.trained import TrainedRun
@@ -55,20 +56,18 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
     """
     checked = check(config)
     # imports of seconds, which follow the check of the configuration
+    from phd_exp.inference.further import record_further
     from phd_exp.training.pruning import held_out_score
     from phd_exp.training.train import require_possible, train
 
-    folder = RunFolder(run_name(checked, overrides).folder(checked.runs))
+    folder, render = RunFolder(run_name(checked, overrides).folder(checked.runs)), partial(rendered, cores=cores)
     skipped = folder.is_finished()
     if not skipped:
         require_possible(checked, folder)
         announce(checked, folder, overrides)
-        for data in _renders(checked):
-            counts = data.n_training_split, data.n_test
-            ensure_rendered(DatasetFolder(data.folder), data.spec, *counts, data.workers, cores)
     words = [str(item.input_line) for item in _unnamed(overrides)]
-    results = train(checked, folder, draw=_draw(), cores=cores, callbacks=callbacks, overrides=words)
-    _record_further(folder, checked, cores)
+    results = train(checked, folder, _draw(), cores, callbacks, words, render)
+    record_further(folder, checked, render)
     print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
     for key in filter(results.__contains__, SHOWN):
         print(f"  {key} {_number(results[key])} (untrained {_number(results.get(f'untrained/{key}'))})")
@@ -126,7 +125,7 @@ def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> Non
 
     data, epochs = checked.data, checked.trainer.max_epochs
     n_missing = 0
-    for one in _renders(checked):
+    for one in checked.rendered:
         missing = DatasetFolder(one.folder).missing(one.spec, one.n_training_split, one.n_test)
         n_missing += sum(map(len, missing.values()))
     render = f"{n_missing} images to render, then " if n_missing else ""
@@ -143,48 +142,10 @@ def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> Non
         print(f"  in about ten minutes: python -m phd_exp {words}", flush=True)
 
 
-def _renders(checked: RunConfig) -> Iterator[RenderedConfig]:
-    """The rendered data sets of a training."""
-    data = checked.data
-    if isinstance(data, RenderedConfig):
-        yield data
-        if checked.recipe.augmentation.backdrops:
-            yield data.model_copy(update={"spec": data.spec.without_objects, "n_held_out": 0, "n_test": 0})
-
-
-def _record_further(run: RunFolder, checked: RunConfig, cores: int) -> None:
-    """Render the missing samples of several views and shifts, and record the run's predictions of them, once."""
-    from phd_exp.build import build_source
-    from phd_exp.inference import tables
-
-    def record(
-        file: Path, data: Any, origin: dict[str, str], said: str, fewer: str, shift: Any = tables.UNCHANGED
-    ) -> None:
-        if not tables.is_recorded(file, origin):
-            if isinstance(data, RenderedConfig):
-                ensure_rendered(
-                    DatasetFolder(data.folder), data.spec, 0, data.n_test, data.workers, cores, fewer=fewer
-                )
-            tables.record(run, file, build_source(data), origin, shift)
-            print(f"{file}: {said}", flush=True)
-
-    if several := checked.several_views:
-        views = several.spec.views
-        n = several.n_test // views
-        scenes = f"{'1 scene' if n == 1 else f'{n} scenes'} seen by {views} cameras each"
-        origin = tables.origin_of(run, checked, data=several.spec.fingerprint(), scenes=n)
-        record(run.views, several, origin, scenes, "evaluation.multiview.scenes=...")
-    for (frames, held_out), data in checked.sequences.items():
-        cameras = data.spec.views
-        file, n = run.sequence(frames, held_out=held_out), data.n_test // (frames * cameras)
-        origin = tables.origin_of(run, checked, data=data.spec.fingerprint(), sequences=n)
-        words = f"{n} sequence{'s' if n > 1 else ''} of {frames} frames{' from two cameras' if cameras > 1 else ''}"
-        record(file, data, origin, words, "evaluation.sequences=[[N,FRAMES]]")
-    for name, shift in checked.evaluation.shifts.items():
-        origin = tables.origin_of_shift(run, checked, name)
-        record(run.shift(name), checked.data_of(name), origin, "recorded", "evaluation.n_shifted=...", shift)
-    if checked.evaluation.eight_views:
-        tables.record_eight_views(run, checked, build_source(checked.data))
+def rendered(data: RenderedConfig, fewer: str = FEWER, *, cores: int) -> None:
+    """Render the missing samples of a data set."""
+    counts = data.n_training_split, data.n_test
+    ensure_rendered(DatasetFolder(data.folder), data.spec, *counts, data.workers, cores, fewer=fewer)
 
 
 def _number(value: Any) -> str:

@@ -124,6 +124,15 @@ class RunConfig(Record):
             raise ConfigError(f"evaluation.shifts.{shift}.data: {gist(error)}") from None
 
     @property
+    def rendered(self) -> list[RenderedConfig]:
+        """The rendered data sets that the training reads: its own, and what is behind the objects of its images."""
+        data = self.data
+        if not isinstance(data, RenderedConfig):
+            return []
+        backdrops = {"spec": data.spec.without_objects, "n_held_out": 0, "n_test": 0}
+        return [data, *([data.model_copy(update=backdrops)] if self.recipe.augmentation.backdrops else [])]
+
+    @property
     def several_views(self) -> RenderedConfig | None:
         """The scenes with several cameras that follow the training, as test samples of a data set."""
         asked, data = self.evaluation.multiview, self.data

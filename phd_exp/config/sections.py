@@ -1,5 +1,6 @@
 """The sections of a configuration: their keys, types and ranges."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -100,9 +101,13 @@ class RenderedConfig(SizesConfig):
         return self.root / self.spec.variant
 
     def changed(self, changes: dict[str, Any], n_test: int) -> "RenderedConfig":
-        """The first `n_test` test samples of the data set with other values. Raises ValueError for wrong ones."""
+        """The first `n_test` test samples alone, with other values. Raises ValueError for wrong ones."""
         spec = DatasetSpec(**(dict(self.spec) | changes))
-        return self.model_copy(update={"spec": spec, "n_test": n_test})
+        return self.model_copy(update={"spec": spec, "n_train": 0, "n_held_out": 0, "n_test": n_test})
+
+
+Render = Callable[..., None]
+"""Renders the missing samples of a `RenderedConfig`; `fewer=WORDS` names the overrides for fewer of them."""
 
 
 class FolderConfig(SizesConfig):

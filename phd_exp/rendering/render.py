@@ -40,6 +40,7 @@ ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # of each wo
 TOGETHER = 128  # samples
 FEWEST_PER_WORKER = 8  # starting one more process costs about as much as rendering this many images
 WAITING = "waiting for it to finish"
+FEWER = "preset=demo, or data.n_train=... data.n_test=..."
 
 
 def ensure_rendered(
@@ -50,7 +51,7 @@ def ensure_rendered(
     workers: int | None = None,
     cores: int | None = None,
     shard: Shard | None = None,
-    fewer: str = "preset=demo, or data.n_train=... data.n_test=...",
+    fewer: str = FEWER,
 ) -> bool:
     """Render those of the first `n_train` and `n_test` samples that are not on disk; returns whether all are there.
 

@@ -3,7 +3,8 @@
 import logging
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -54,61 +55,109 @@ def run(
         recorder = Recorder(folder, config.evaluation, draw, loggers)
         trainer = build_trainer(config, recorder, callbacks)
         data.move_to(trainer.strategy.root_device)
-        _fit(trainer, module, data, recorder)
-        if not folder.last_checkpoint.exists():
-            raise RunError(
-                f"{folder.path}: trained no whole epoch, so there is no run; set other arguments of trainer"
-            )
-        if (best := folder.best_checkpoint) != folder.last_checkpoint:
-            module.load_state_dict(load_checkpoint(best)["state_dict"])
-        tables = {part: evaluate(trainer, module, data.in_order(part)) for part in data.samples if part != "train"}
-        untrained = recorder.rows[UNTRAINED].items()
-        results = summary(tables["test"])
-        results |= {f"untrained/{key}": value for key, value in untrained if "test/" in key}
-        results |= _circumstances(config, data, trainer)
-        if rank == 0:
-            recorder.record_curves("final", tables["test"], trainer.global_step)
-            for part, table in tables.items():
-                file = folder.held_out if part == "held_out" else folder.predictions
-                write_parquet(file, table, data.source.known(part))
+        training = Training(trainer, module, data, recorder)
+        training.fit()
+        results = training.measure() | {
+            "preset": config.preset,
+            "recipe": config.recipe.name,
+            "data": config.data.name,
+            "model": config.model.name,
+            "seed": config.seed,
+            **training.circumstances(),
+        }
         send_results(loggers, results)
     return results
 
 
-def _fit(trainer: Trainer, module: PositionModule, data: PositionData, recorder: Recorder) -> None:
-    """Train to the last epoch, from the last checkpoint if there is one.
+@dataclass(frozen=True)
+class Training:
+    """The built parts of a run: Lightning's trainer, what it trains, on which samples, and the record of it."""
 
-    A new run has none; the metrics of its untrained network are recorded first.
+    trainer: Trainer
+    module: PositionModule
+    data: PositionData
+    recorder: Recorder
 
-    Raises RunError if the checkpoint, or the record of the epochs before it, does not belong to this run.
-    """
-    checkpoint = recorder.folder.last_checkpoint
-    if not checkpoint.exists():
-        recorder.forget_after(UNTRAINED)
-        recorder.record(UNTRAINED, summary(evaluate(trainer, module, data.in_order("test"))), step=0)
+    def fit(self) -> None:
+        """Train to the last epoch, from the last checkpoint if there is one.
+
+        A new run has none; the metrics of its untrained network are recorded first.
+
+        Raises RunError if no epoch was trained, or if the checkpoint, or the record of the epochs before it, does not
+        belong to this run.
+        """
+        checkpoint = self.recorder.folder.last_checkpoint
+        if checkpoint.exists():
+            self._resume(checkpoint)
+        else:
+            self.recorder.forget_after(UNTRAINED)
+            self.recorder.record(UNTRAINED, summary(self.evaluate(self.data.in_order("test"))), step=0)
+            self.recorder.send_recorded()
+            self.trainer.fit(self.module, datamodule=self.data)
+        if not checkpoint.exists():
+            raise RunError(
+                f"{self.recorder.folder.path}: trained no whole epoch, so there is no run; set other arguments of "
+                "trainer"
+            )
+
+    def _resume(self, checkpoint: Path) -> None:
+        trainer, recorder = self.trainer, self.recorder
+        content, epochs = load_checkpoint(checkpoint), trainer.max_epochs or 0
+        epoch = content.get("epoch")
+        if type(epoch) is not int or not 0 <= epoch < epochs:
+            raise RunError(f"{checkpoint}: not a checkpoint of this run (epoch {shown(epoch)} of {epochs}); {ADVICE}")
+        is_whole = _ends_an_epoch(content)
+        recorder.forget_after(epoch if is_whole else epoch - 1)
+        if not any(key.startswith("test/") for key in recorder.rows.get(UNTRAINED, {})):
+            raise RunError(
+                f"{recorder.folder.metrics_file}: not the record of the epochs before {checkpoint.name}; "
+                "delete both to begin the run again"
+            )
+        if trainer.is_global_zero and epoch + is_whole < epochs:
+            print(f"{recorder.folder.path}: resuming at epoch {epoch + is_whole + 1} of {epochs}", flush=True)
         recorder.send_recorded()
-        trainer.fit(module, datamodule=data)
-        return
-    content, epochs = load_checkpoint(checkpoint), trainer.max_epochs or 0
-    epoch = content.get("epoch")
-    if type(epoch) is not int or not 0 <= epoch < epochs:
-        raise RunError(f"{checkpoint}: not a checkpoint of this run (epoch {shown(epoch)} of {epochs}); {ADVICE}")
-    is_whole = _ends_an_epoch(content)
-    recorder.forget_after(epoch if is_whole else epoch - 1)
-    if not any(key.startswith("test/") for key in recorder.rows.get(UNTRAINED, {})):
-        raise RunError(
-            f"{recorder.folder.metrics_file}: not the record of the epochs before {checkpoint.name}; "
-            "delete both to begin the run again"
-        )
-    if trainer.is_global_zero and epoch + is_whole < epochs:
-        print(f"{recorder.folder.path}: resuming at epoch {epoch + is_whole + 1} of {epochs}", flush=True)
-    recorder.send_recorded()
-    try:
-        trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
-    except (KeyError, ValueError, TypeError, AttributeError, RuntimeError, IndexError) as error:
-        if recorder.begun:
-            raise
-        raise RunError(f"{checkpoint}: not a checkpoint of this run ({gist(error)}); {ADVICE}") from None
+        try:
+            trainer.fit(self.module, datamodule=self.data, ckpt_path=checkpoint, weights_only=True)
+        except (KeyError, ValueError, TypeError, AttributeError, RuntimeError, IndexError) as error:
+            if recorder.begun:
+                raise
+            raise RunError(f"{checkpoint}: not a checkpoint of this run ({gist(error)}); {ADVICE}") from None
+
+    def evaluate(self, loader: BatchLoader) -> Columns:
+        """The rows of all samples of a loader with the current weights, gathered from all processes."""
+        self.trainer.predict(self.module, dataloaders=loader, return_predictions=False)
+        table = self.module.evaluation_rows.columns()
+        self.module.evaluation_rows.reset()
+        return table
+
+    def measure(self) -> dict[str, float]:
+        """Evaluate the best weights on the test and held-out samples, and record the tables; returns the metrics.
+
+        Those of the untrained network are among them.
+        """
+        folder = self.recorder.folder
+        if (best := folder.best_checkpoint) != folder.last_checkpoint:
+            self.module.load_state_dict(load_checkpoint(best)["state_dict"])
+        tables = {part: self.evaluate(self.data.in_order(part)) for part in self.data.samples if part != "train"}
+        if self.trainer.is_global_zero:
+            self.recorder.record_curves("final", tables["test"], self.trainer.global_step)
+            for part, table in tables.items():
+                file = folder.held_out if part == "held_out" else folder.predictions
+                write_parquet(file, table, self.data.source.known(part))
+        untrained = self.recorder.rows[UNTRAINED].items()
+        return summary(tables["test"]) | {f"untrained/{key}": value for key, value in untrained if "test/" in key}
+
+    def circumstances(self) -> dict[str, Any]:
+        """The sizes of the training, and what computed it."""
+        device = self.trainer.strategy.root_device
+        return {
+            **{f"n_{part}": self.data.source.count(part) for part in PARTS},
+            "epochs": self.trainer.current_epoch,
+            "devices": self.trainer.world_size,
+            "threads": torch.get_num_threads(),  # of each process
+            "device": torch.cuda.get_device_name(device) if device.type == "cuda" else str(device),
+            "precision": str(self.trainer.precision),
+        }
 
 
 def _ends_an_epoch(checkpoint: Mapping[str, Any]) -> bool:
@@ -117,34 +166,6 @@ def _ends_an_epoch(checkpoint: Mapping[str, Any]) -> bool:
         return bool(checkpoint["loops"]["fit_loop"]["epoch_loop.batch_progress"]["is_last_batch"])
     except (KeyError, TypeError):
         return True
-
-
-def evaluate(trainer: Trainer, module: PositionModule, loader: BatchLoader) -> Columns:
-    """The rows of all samples of a loader with the current weights, gathered from all processes."""
-    trainer.predict(module, dataloaders=loader, return_predictions=False)
-    table = module.evaluation_rows.columns()
-    module.evaluation_rows.reset()
-    return table
-
-
-def _circumstances(config: RunConfig, data: PositionData, trainer: Trainer) -> dict[str, Any]:
-    return {
-        "preset": config.preset,
-        "recipe": config.recipe.name,
-        "data": config.data.name,
-        "model": config.model.name,
-        "seed": config.seed,
-        **{f"n_{part}": data.source.count(part) for part in PARTS},
-        "epochs": trainer.current_epoch,
-        "devices": trainer.world_size,
-        "threads": torch.get_num_threads(),  # of each process
-        "device": _name_of(trainer.strategy.root_device),
-        "precision": str(trainer.precision),
-    }
-
-
-def _name_of(device: torch.device) -> str:
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else str(device)
 
 
 def quiet_lightning() -> None:

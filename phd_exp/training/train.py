@@ -10,6 +10,7 @@ from lightning import Callback
 
 from phd_exp.build import require_same_shrinking
 from phd_exp.config import FolderConfig, RenderedConfig, RunConfig, SourceConfig
+from phd_exp.config.sections import Render
 from phd_exp.config.targets import custom_parts
 from phd_exp.data.photometry import VERSION
 from phd_exp.hardware import default_threads
@@ -34,8 +35,9 @@ def train(
     cores: int,
     callbacks: Sequence[Callback] = (),
     overrides: Sequence[str] = (),
+    render: Render | None = None,
 ) -> dict[str, Any]:
-    """Train, evaluate and record one run; returns its results. A finished run is not run again.
+    """Complete the data, train, evaluate and record one run; returns its results. A finished run is not run again.
 
     An interrupted run resumes with its next batch, a killed one after its last whole epoch.
 
@@ -46,10 +48,14 @@ def train(
         cores: number of threads, unless trainer.threads or OMP_NUM_THREADS is set.
         callbacks: of Lightning, further ones than the configuration's; with trainer.devices=1 only.
         overrides: words of the command line, for the record.
+        render: renders missing samples; None if there are none.
 
     Raises RunError if the folder holds a run of another configuration or another process uses it, DatasetError if the
     data set is incomplete.
     """
+    if render and not folder.is_finished():
+        for data in config.rendered:
+            render(data)
     with folder.held():
         require_same_config(folder, config)
         if folder.is_finished():

@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,13 @@ from scipy.stats import kstest
 
 import phd_exp as package
 from phd_exp.build import build_source
-from phd_exp.cli.train import _record_further
+from phd_exp.cli.train import rendered
 from phd_exp.config import RunConfig, check
 from phd_exp.data.batches import Batch
 from phd_exp.data.sources import Part, Source
 from phd_exp.evaluation.parquet import read_table
 from phd_exp.inference import tables
+from phd_exp.inference.further import record_further
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import build_data, build_module
@@ -69,7 +71,7 @@ def run(run_in: Callable, tmp_path_factory: pytest.TempPathFactory) -> RunFolder
     def make(path: Path) -> None:
         run = run_in(path, *WORDS)
         config = check(run.config())
-        _record_further(run, config, cores=1)
+        record_further(run, config, partial(rendered, cores=1))
         source = build_source(config.data)
         tables.record(run, run.views, source, tables.origin_of(run, config))
 
