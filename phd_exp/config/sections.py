@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, StrictBool, Tag, model_validator
 
 from phd_exp.config.targets import Target, TrainingTarget
+from phd_exp.records.dataset import SPLITS
 from phd_exp.records.detections import NumberOrName
 from phd_exp.records.parsing import Record
 from phd_exp.records.spec import Angle, DatasetSpec, Range
@@ -37,6 +38,11 @@ class SizesConfig(Record):
     n_test: Count | None
     image_size: Annotated[Whole, Field(ge=32, le=4096)]  # a ResNet halves the side five times
     batch_size: Count
+
+    @property
+    def labelled(self) -> tuple[Path, ...]:
+        """Folders of the user's own images, with annotations, on which a run trains or is tested."""
+        return ()
 
 
 def _with_camera(values: dict[str, Any]) -> dict[str, Any]:
@@ -86,6 +92,10 @@ class RenderedConfig(SizesConfig):
         return {key: value for key, value in values.items() if key not in spec} | {"spec": spec}
 
     @property
+    def labelled(self) -> tuple[Path, ...]:
+        return (self.photographs.folder,) if self.photographs.folder else ()
+
+    @property
     def n_training_split(self) -> int:
         """Samples to render of the training split."""
         return self.n_train + self.n_held_out
@@ -116,6 +126,10 @@ class FolderConfig(SizesConfig):
     name: Name
     folder: Folder
     object: NumberOrName | None = None  # default for older run records
+
+    @property
+    def labelled(self) -> tuple[Path, ...]:
+        return tuple(self.folder / split for split in SPLITS)
 
 
 class SourceConfig(SizesConfig):

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from phd_exp.records.cameras import Calibration, read_camera
-from phd_exp.records.dataset import SPLITS, sha256
+from phd_exp.records.dataset import sha256
 from phd_exp.records.detections import Detection, line_of
 from phd_exp.records.errors import UNPRINTABLE, DatasetError, gist, listed, shown
 from phd_exp.records.files import checksum, read_jsonl
@@ -40,10 +40,6 @@ class DetectionFolder:
     def detections(self, split: Split, n: int | None = None) -> list[Detection]:
         """The detections of a split, as `detections_in` reads them."""
         return detections_in(self.root / split, n, f" (data.n_{split})", self.object_name)
-
-    def fingerprint(self) -> str:
-        """The `fingerprint` of both splits."""
-        return fingerprint(*(self.root / split for split in SPLITS))
 
 
 def fingerprint(*folders: Path) -> str:

@@ -1,4 +1,4 @@
-"""Training one run with several processes, which end together.
+"""Work of several processes, which end together.
 
 Lightning would start the command of this process again, which in a sweep is the whole sweep. Here each process is a
 `Child` that runs this module, whatever launcher runs the job. It exits when the connection to its parent closes, and
@@ -10,26 +10,25 @@ import socket
 import sys
 import threading
 import traceback
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from multiprocessing.connection import Connection, wait
-from pathlib import Path
 from typing import Any
 
 import torch.distributed as dist
 
-from phd_exp.config import RunConfig
 from phd_exp.records.errors import RunError, UserError
 from phd_exp.records.processes import Child, parent
-from phd_exp.records.runs import RunFolder
-from phd_exp.training.recorder import Draw
+
+Work = Callable[[int, int], dict[str, Any]]
+"""Number of threads and rank -> results. It is sent to each process, so it must pickle."""
 
 
-def train_together(config: RunConfig, folder: Path, draw: Draw | None, threads: int) -> dict[str, Any]:
-    """Train one run with `trainer.devices` processes, which share the threads; returns its results.
+def together(work: Work, world: int, threads: int) -> dict[str, Any]:
+    """Work with `world` processes, which share the threads; returns the results of rank 0.
 
     Raises the error of the first process to fail; the others are ended.
     """
-    world = config.trainer.devices
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -40,7 +39,7 @@ def train_together(config: RunConfig, folder: Path, draw: Draw | None, threads: 
         for rank in range(world):
             of_rank = environment | {"RANK": str(rank), "LOCAL_RANK": str(rank)}
             child = stack.enter_context(Child("phd_exp.training.ranks", of_rank))
-            child.send((config, folder, draw, max(1, threads // world), rank))
+            child.send((work, max(1, threads // world), rank, world))
             ranks[child.connection] = (rank, child)
         try:
             while ranks:
@@ -72,7 +71,7 @@ def _received(child: Child, rank: int, world: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Train as one of the processes, and send back the results or the error."""
+    """Work as one of the processes, and send back the results or the error."""
     connection = parent()
     sys.path.append(os.getcwd())  # for the user's own parts
     share = connection.recv()
@@ -82,18 +81,14 @@ def main() -> None:
         dist.destroy_process_group()
 
 
-def _outcome(
-    config: RunConfig, folder: Path, draw: Draw | None, threads: int, rank: int
-) -> dict[str, Any] | Exception:
-    from phd_exp.training.run import run  # imports of seconds, in which the parent may die
-
+def _outcome(work: Work, threads: int, rank: int, world: int) -> dict[str, Any] | Exception:
     try:
-        return run(config, RunFolder(folder), draw, threads, rank)
+        return work(threads, rank)
     except UserError as error:
         return error
     except Exception as error:  # it may not pickle, its traceback does
         last = traceback.format_exception_only(error)[-1].strip()
-        fault = RuntimeError(f"rank {rank} of {config.trainer.devices} failed with {last}")
+        fault = RuntimeError(f"rank {rank} of {world} failed with {last}")
         fault.add_note(traceback.format_exc())
         return fault
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import torch
@@ -18,10 +18,10 @@ from phd_exp.records.choices import first_difference, flatten
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import checksum, remove_temporaries
-from phd_exp.records.own_images import DetectionFolder, fingerprint
+from phd_exp.records.own_images import fingerprint
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import build_augmentation, build_data, build_module
-from phd_exp.training.ranks import train_together
+from phd_exp.training.ranks import together
 from phd_exp.training.recorder import Draw
 from phd_exp.training.run import run
 from phd_exp.training.tracking import require_possible_loggers
@@ -65,8 +65,8 @@ def train(
         folder.write_config(config.model_dump(mode="json"))
         threads = config.trainer.threads or default_threads(cores)
         with folder.recording(_manifest_hash(config), custom_parts(config.model_dump(mode="json")), overrides):
-            if config.trainer.devices > 1:
-                results = train_together(config, folder.path, draw, threads)
+            if (world := config.trainer.devices) > 1:
+                results = together(partial(run, config, folder, draw), world, threads)
             else:
                 results = run(config, folder, draw, threads, callbacks=callbacks)
             folder.write_results(results)
@@ -110,8 +110,9 @@ def require_same_config(folder: RunFolder, config: RunConfig) -> None:
     # the user's own data may change under the same name; a rendered set only grows
     status, own = folder.status(), _fingerprint(config.data)
     if own and status and not (status.data_manifest or "").endswith(own):
+        where = " and ".join(map(str, config.data.labelled))
         raise RunError(
-            f"{folder.path}: holds a run on {_own_images(config.data)} as it was before its annotations changed; "
+            f"{folder.path}: holds a run on {where} as it was before its annotations changed; "
             "move that run's folder away, or choose another place by runs=DIR"
         )
 
@@ -159,18 +160,8 @@ def _manifest_hash(config: RunConfig) -> str | None:
     return None
 
 
-def _own_images(data: FolderConfig | RenderedConfig | SourceConfig) -> Path | None:
-    """The folder of the user's own images that a run trains on."""
-    if isinstance(data, FolderConfig):
-        return data.folder
-    return data.photographs.folder if isinstance(data, RenderedConfig) else None
-
-
 def _fingerprint(data: FolderConfig | RenderedConfig | SourceConfig) -> str | None:
-    """Checksum of the annotations of the user's own images."""
-    own = _own_images(data)
+    """Checksum of the annotations of the user's own images, if there are any."""
     with suppress(OSError):
-        if isinstance(data, FolderConfig):
-            return DetectionFolder(data.folder).fingerprint()
-        return fingerprint(own) if own else None
+        return fingerprint(*data.labelled) if data.labelled else None
     return None

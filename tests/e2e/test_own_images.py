@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from phd_exp.data.folder import FolderSource
-from phd_exp.records.own_images import DetectionFolder
+from phd_exp.records.own_images import DetectionFolder, fingerprint
 from tests.support.recorded import only_run, status_of
 from tests.support.untrained import NARROW, read_lines, virtual_cameras, write_photos
 
@@ -51,7 +51,7 @@ def test_a_run_on_own_images_leaves_a_whole_record_and_predicts_the_same(
     results = run.results()
     assert (results["data"], results["n_train"], results["n_test"]) == ("mycams", N_TRAIN, N_TEST)
     assert np.isfinite(results["test/depth_error_mm"])
-    assert status_of(run).data_manifest == DetectionFolder(photos).fingerprint()
+    assert status_of(run).data_manifest == fingerprint(photos / "train", photos / "test")
     table = pd.read_parquet(run.predictions)
     assert {"file_name", "f", "S", "x", "y", "z"} <= set(table.columns)
     assert not {"scale", "visibility"} & set(table.columns)

@@ -11,7 +11,7 @@ import pytest
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.detections import Detection
 from phd_exp.records.errors import DatasetError, UserError
-from phd_exp.records.own_images import DetectionFolder
+from phd_exp.records.own_images import DetectionFolder, fingerprint
 
 GOOD: dict[str, Any] = {"file_name": "a.png", "f": 900.0, "x": 0.1, "y": -0.2, "z": 4.0}
 PLACED = {"x": 0.1, "y": -0.2, "z": 4.0}
@@ -145,16 +145,16 @@ def test_too_few_none_and_no_file_at_all(read: Callable, folder: DetectionFolder
 def test_the_fingerprint_is_of_both_splits(read: Callable, folder: DetectionFolder) -> None:
     (folder.root / "test").mkdir()
     (folder.root / "test/metadata.jsonl").write_text("")
-    seen = set()
+    seen, folders = set(), [folder.root / "train", folder.root / "test"]
     for split in ("train", "test"):
         read(GOOD)
         for f in (901.0, 902.0):
             (folder.root / split / "metadata.jsonl").write_text(json.dumps(GOOD | {"f": f}) + "\n")  # type: ignore[arg-type]
-            seen.add(folder.fingerprint())
+            seen.add(fingerprint(*folders))
     assert len(seen) == 4
     camera = folder.root / "test" / "camera.yaml"
     (folder.root / "test/metadata.jsonl").write_text('{"file_name": "a.png", "camera": "camera.yaml"}\n')
     for text in ("K: 1", "K: 2"):
         camera.write_text(text)
-        seen.add(folder.fingerprint())
+        seen.add(fingerprint(*folders))
     assert len(seen) == 6, "of the camera files too"

@@ -13,7 +13,7 @@ from phd_exp.records.dataset import SPLITS
 from phd_exp.records.detections import Detection, detections_of
 from phd_exp.records.errors import DatasetError, UserError
 from phd_exp.records.foreign import boxes_in
-from phd_exp.records.own_images import DetectionFolder, annotations, detections_in, observed
+from phd_exp.records.own_images import annotations, detections_in, fingerprint, observed
 from tests.support.foreign import BOP, COCO, P2, PEDESTRIAN, TURN, WRITERS, image
 
 
@@ -233,14 +233,13 @@ def test_a_metadata_jsonl_comes_first_and_has_no_objects(read: Callable, tmp_pat
 
 @pytest.mark.parametrize("name", WRITERS)
 def test_the_fingerprint_is_of_all_annotations(name: str, tmp_path: Path) -> None:
-    folder = DetectionFolder(tmp_path)
-    for split in SPLITS:
-        WRITERS[name](tmp_path / split)
-    files = [file for split in SPLITS for file in annotations(tmp_path / split)[0]]
-    prints = [folder.fingerprint()]
-    for file in files:
+    folders = [tmp_path / split for split in SPLITS]
+    for folder in folders:
+        WRITERS[name](folder)
+    prints = [fingerprint(*folders)]
+    for file in (file for folder in folders for file in annotations(folder)[0]):
         file.write_text(file.read_text() + "\n")
-        prints.append(folder.fingerprint())
+        prints.append(fingerprint(*folders))
     assert len(set(prints)) == len(prints) == {"bop": 7, "kitti": 5, "coco": 3}[name]
 
 
