@@ -27,6 +27,8 @@ from phd_exp.rendering.surroundings import World
 from phd_exp.rendering.triangles import Meshes
 
 Layer = Literal["objects", "ground"]
+METAL_POINTS = 2**17  # in a small box of metal: the points of a box of 90 x 90 px, four along a side of each pixel
+FINEST_METAL = 8  # largest number of points along a side of a pixel
 X_LIBRARIES = "libx11-6 libxext6 libxfixes3 libxi6 libxrender1 libxkbcommon0 libsm6 libice6 libgl1"
 
 
@@ -71,13 +73,25 @@ class Settings:
         denoised: use Open Image Denoise.
         points: points along a side of each pixel at which the light is computed; a pixel is the mean of several over
             Blender's filter. None: Blender draws the points at random.
-        of_metal: multiplies the samples in scenes with metal.
+        of_metal: the least number of such points in scenes with metal, each with as many samples; None: `points`.
     """
 
     samples: int
     denoised: bool
     points: int | None
-    of_metal: int = 1
+    of_metal: int | None = None
+
+    @property
+    def samples_at_point(self) -> int:
+        """Light paths from each point of a pixel."""
+        return math.ceil(self.samples / (self.points or 1) ** 2)
+
+    def finer(self, box: Box, *, metal: bool) -> int:
+        """Points along a side of each pixel of a box; for metal more in a small box."""
+        if not metal or self.of_metal is None:
+            return self.points or 1
+        area = (box.right - box.left) * (box.bottom - box.top)
+        return min(max(self.of_metal, math.isqrt(METAL_POINTS // area)), FINEST_METAL)
 
 
 class Renderer:
@@ -93,7 +107,7 @@ class Renderer:
         memory = Path("/dev/shm")  # a folder in memory, where the system has one
         place = memory if os.access(memory, os.W_OK) else Path(tempfile.gettempdir())
         self._output = place / f"phd_exp-{uuid.uuid4().hex}.exr"
-        self._settings, self._finer = settings, settings.points or 1
+        self._settings = settings
         with silence():
             self._bpy = load_bpy()
             build_stage(self._bpy)
@@ -118,8 +132,9 @@ class Renderer:
         background is transparent: a fourth channel is the opacity, by which the light is multiplied. The layer
         "ground" shows the ground without the objects; its opacity is their shadow.
         """
-        box, finer = box or Box(0, 0, scene.S, scene.S), self._finer
-        if finer == 1:
+        box = box or Box(0, 0, scene.S, scene.S)
+        metal = layer == "objects" and shows_metal(self._bpy, scene)
+        if (finer := self._settings.finer(box, metal=metal)) == 1:
             return self._traced(scene, box, layer)
         # a pixel more on each side, because the filter reaches that far
         wider = scene.model_copy(update={"S": finer * (scene.S + 2), "f": finer * scene.f})
@@ -135,8 +150,6 @@ class Renderer:
             self._world.show_layer(scene, layer)
             # chooses among lamps, and takes a fifth of the time
             self._scene.cycles.use_light_tree = bool(scene.lamps)
-        factor = self._settings.of_metal if shows_metal(self._bpy, scene) else 1
-        self._scene.cycles.samples = math.ceil(factor * self._settings.samples / self._finer**2)
         self._scene.cycles.seed = scene.noise_seed
         self._scene.render.filepath = str(self._output)
         try:
@@ -183,6 +196,9 @@ def _configure_image(scene: Any) -> None:
 def _configure_tracer(cycles: Any, settings: Settings) -> None:
     """Set the options of the path tracer that differ from Blender's factory settings."""
     cycles.device = "CPU"
+    # never changed: blue noise is arranged by the largest number since the meshes were loaded, so that an image with
+    # fewer samples would depend on the images before it
+    cycles.samples = settings.samples_at_point
     cycles.use_adaptive_sampling = False  # would vary the number of samples, which is small anyway
     # the denoiser sometimes takes the default pattern's noise for texture
     cycles.sampling_pattern = "BLUE_NOISE"

@@ -33,7 +33,7 @@ from phd_exp.rendering.surroundings import photo_light, shaken
 from phd_exp.rendering.triangles import Meshes
 
 GREY = 128  # of all colours beyond the edges of the user's image, as in the views of photographs
-OF_METAL = 5  # multiplies the samples: the denoiser keeps more of the noise along the edges of metal's highlights
+OF_METAL = 4  # points along a side of a pixel: the denoiser keeps more of the noise along the edges of highlights
 MARGIN = 4  # px around the objects: the denoiser is less accurate along the border of its image
 
 

@@ -10,6 +10,7 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer, Settings
 from phd_exp.rendering.objects import sample_object_scene
 from phd_exp.rendering.rays import NOTHING, trace_pixels
+from phd_exp.rendering.samples import fast_settings
 from phd_exp.rendering.triangles import Triangles
 from tests.support.meshes import solid, write_mesh
 from tests.support.renders import SMALL_MESH, MakeSpec, drawn
@@ -39,9 +40,11 @@ def test_every_object_has_a_look_and_objects_stay_where_they_are(
 
 
 def test_an_image_depends_on_its_scene_alone(spec: DatasetSpec) -> None:
-    """Materials and lamps of the image before are gone; silhouettes are where the labels are."""
-    renderer = Renderer(ONE_SAMPLE, spec)
-    scenes = drawn(spec, 6, renderer.meshes)
+    """Materials, lamps and samples of the image before are gone; silhouettes are where the labels are."""
+    fast = spec.model_copy(update={"samples_per_pixel": 1})
+    renderer = Renderer(fast_settings(fast), fast)
+    scenes = drawn(fast, 5, renderer.meshes)
+    assert {any(item.look.metallic for item in scene.objects) for scene in scenes} == {True, False}
     images = [renderer.render(scene) for scene in scenes]
     for scene, image in reversed(list(zip(scenes, images, strict=True))):
         np.testing.assert_array_equal(renderer.render(scene), image)
