@@ -109,11 +109,12 @@ def loaded(arguments: RunArguments, device: str = "auto", coverage: Coverage = N
     predictor = load(arguments.run, device, trust=trust, views=int(arguments.views))
     if predictor.state != "finished":
         print(f"note: {arguments.run[0]}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
+    guarantees = coverage is not None
     if arguments.calibration:
-        return predictor.calibrated(arguments.calibration, guarantees=coverage is not None)
+        return predictor.calibrated(arguments.calibration, guarantees=guarantees)
     if predictor.views > 1 and (arguments.recalibrate or coverage) and not arguments.run[0].is_file():
         _record_held_out_views(predictor, trust)
-    return predictor.recalibrated() if arguments.recalibrate else predictor
+    return predictor.recalibrated(guarantees=guarantees) if arguments.recalibrate else predictor
 
 
 @contextmanager

@@ -22,7 +22,6 @@ from phd_exp.metrics.errors import MILLIMETRES
 from phd_exp.metrics.groups import worst_group
 from phd_exp.metrics.strata import strata
 from phd_exp.records.errors import RunError
-from phd_exp.records.runs import CHOOSE
 
 XYZ = ("x", "y", "z")
 ERRORS = ("projected_error_mm", "depth_error_mm")
@@ -120,8 +119,8 @@ def evaluation_of(statistic: Statistic, columns: Mapping[str, Tensor], left_out:
     )
 
 
-def fit_temperature(held_out: Arrays, rows: slice = CHOOSE) -> Temperature:
-    """The temperatures fitted on predictions of held-out samples, those that may choose.
+def fit_temperature(held_out: Arrays, rows: slice = slice(None)) -> Temperature:
+    """The temperatures fitted on predictions of held-out samples: all, or `CHOOSE` where the others guarantee.
 
     Raises RunError if a column is missing, or if no temperature fits.
     """

@@ -50,6 +50,7 @@ class Predictor:
         constant_f: the focal length that the network receives for every image, px; None: the true one.
         temperature: temperatures of recalibrated predictions; None: as trained.
         state: the state of the run, "finished" if it completed.
+        guarantees: whether the samples that guarantee regions chose no temperature.
         folders: the runs, whose held-out samples guarantee regions.
         labelled: a record of `calibrate`, whose images replace those samples; see `calibrated`.
         others: the further networks of an ensemble.
@@ -64,6 +65,7 @@ class Predictor:
     device: torch.device
     temperature: Temperature | None
     state: str
+    guarantees: bool = True
     folders: tuple[RunFolder, ...] = ()
     labelled: Path | None = None
     others: tuple[Regressor, ...] = ()
@@ -153,16 +155,17 @@ class Predictor:
         tables = [read_table(file) for file in files]
         return tables[0] if len(tables) == 1 else ensemble_table(tables)
 
-    def recalibrated(self) -> "Predictor":
-        """The same with the temperatures that fit its held-out samples. Raises as `held_out`."""
-        from phd_exp.evaluation.predictions import fit_temperature  # imports pyarrow
+    def recalibrated(self, *, guarantees: bool = False) -> "Predictor":
+        """The same with the temperatures that fit its held-out samples; every second if others are to `guarantee`.
 
-        return replace(self, temperature=fit_temperature(self.held_out()))
+        Raises as `held_out`.
+        """
+        return self._tempered(self.held_out(), guarantees)
 
     def calibrated(self, name: str, *, guarantees: bool = False) -> "Predictor":
-        """The same with the temperatures that fit a record of `calibrate`, which guarantees regions too.
+        """The same with the temperatures that fit a record of `calibrate`; every second if others are to `guarantee`.
 
-        If it is to do so, only every second image chooses the temperatures. Raises RunError if there is no record.
+        Raises RunError if there is no record.
         """
         file = self.folders[0].labelled(name)
         if self.is_ensemble:
@@ -173,17 +176,26 @@ class Predictor:
                 f"calibration: got {name}; expected {listed(known) or 'a name'} of `calibrate`; {file} is missing"
             )
         from phd_exp.evaluation.parquet import read_table  # imports pyarrow
-        from phd_exp.evaluation.predictions import fit_temperature
 
-        rows = CHOOSE if guarantees else slice(None)
-        return replace(self, temperature=fit_temperature(read_table(file), rows), labelled=file)
+        return replace(self._tempered(read_table(file), guarantees), labelled=file)
+
+    def _tempered(self, table: "Arrays", guarantees: bool) -> "Predictor":
+        from phd_exp.evaluation.predictions import fit_temperature  # imports pyarrow
+
+        temperature = fit_temperature(table, CHOOSE if guarantees else slice(None))
+        return replace(self, temperature=temperature, guarantees=guarantees)
 
     def guarantee(self, coverage: float, groups: "Groups | None" = None) -> "Guarantee":
         """Regions that contain the true position with a probability in (0, 1); see `evaluation.conformal`.
 
         Raises RunError if there are too few held-out samples or labelled images, ConfigError if the run predicts no
-        uncertainty.
+        uncertainty, or if all samples chose the temperatures.
         """
+        if not self.guarantees:
+            raise ConfigError(
+                "guarantee: all samples chose the temperatures, so that none can guarantee a coverage; expected a "
+                "predictor of recalibrated(guarantees=True) or calibrated(NAME, guarantees=True)"
+            )
         from phd_exp.evaluation.conformal import guarantee
         from phd_exp.evaluation.parquet import read_table  # imports pyarrow
 

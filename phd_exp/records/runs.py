@@ -53,8 +53,9 @@ PACKAGES = ("phd_exp", "torch", "torchvision", "lightning", "hydra-core", "numpy
 CHOOSE, GUARANTEE = slice(0, None, 2), slice(1, None, 2)
 """Rows of held-out samples, and scenes of several views: even ones choose, odd ones guarantee.
 
-Whatever is chosen by held-out samples (temperatures, epochs, trials of a search, recipes, borders of groups) uses the
-even rows. The odd rows determine the thresholds of conformal regions and nothing else.
+Whatever the training chooses by held-out samples (epochs, trials of a search, recipes) uses the even rows. Conformal
+regions have their temperatures and borders of groups from the even rows and their thresholds from the odd ones. Only
+temperatures of predictions without guaranteed regions are fitted to all rows.
 """
 _NUMBERS: TypeAdapter[dict[str, int | float | None]] = TypeAdapter(dict[str, int | FiniteFloat | None])
 

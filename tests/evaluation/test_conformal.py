@@ -152,7 +152,9 @@ def test_rows_that_choose_do_not_guarantee_and_the_others_choose_nothing() -> No
         return changed
 
     chosen, guaranteed = mixed(CHOOSE), mixed(GUARANTEE)
-    assert fit_temperature(guaranteed) == fit_temperature(table) != fit_temperature(chosen)
+    temperature = fit_temperature(table, CHOOSE)
+    assert fit_temperature(guaranteed, CHOOSE) == temperature != fit_temperature(chosen, CHOOSE)
+    assert temperature != fit_temperature(table)
     before = guarantee(table, 0.9, "spread", None)
     np.testing.assert_array_equal(guarantee(guaranteed, 0.9, "spread", None).edges, before.edges)
     assert guarantee(chosen, 0.9, None, None).levels == guarantee(table, 0.9, None, None).levels

@@ -17,6 +17,7 @@ from phd_exp.distributions.regions import PRECISIONS
 from phd_exp.distributions.rounded import depth_law
 from phd_exp.evaluation.conformal import fused_guarantee
 from phd_exp.inference import pictures
+from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import RunFolder
 from tests.evaluation.test_conformal import table_of
 from tests.support.several import write_views
@@ -144,7 +145,8 @@ def test_the_exported_file_has_the_threshold_and_the_energy_of_its_regions(
         assert phd_exp("export", f"run={run.path}", "out=network.onnx", "coverage=0.9", *words).status == 0
         (entry,) = models.load("network.onnx").metadata_props
         region = json.loads(entry.value)["region"]
-        found = package.load(run.path, recalibrate=bool(words)).guarantee(0.9)
+        predictor = package.load(run.path)
+        found = (predictor.recalibrated(guarantees=True) if words else predictor).guarantee(0.9)
         assert (region["coverage"], region["level"], region["held_out_samples"]) == (0.9, found.levels[0], 200)
         W, a = (torch.tensor(region[name], dtype=torch.float64) for name in "Wa")
         assert region["rounding"] == rounding
@@ -152,6 +154,14 @@ def test_the_exported_file_has_the_threshold_and_the_energy_of_its_regions(
         torch.testing.assert_close(found_level, torch.full_like(PRECISIONS, region["level"]))
     assert phd_exp("export", f"run={run.path}", "out=network.onnx").status == 0
     assert "region" not in json.loads(models.load("network.onnx").metadata_props[0].value)
+
+
+def test_samples_that_chose_temperatures_guarantee_nothing(run: RunFolder) -> None:
+    predictor = package.load(run.path, recalibrate=True)
+    every, second = predictor.temperature, predictor.recalibrated(guarantees=True).temperature
+    assert every != second
+    with pytest.raises(ConfigError, match=r"^guarantee: all samples .* recalibrated\(guarantees=True\)"):
+        predictor.guarantee(0.9)
 
 
 ONE = ("predict", "image=photo.png", "f=100")
