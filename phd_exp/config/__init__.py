@@ -129,8 +129,9 @@ class RunConfig(Record):
         data = self.data
         if not isinstance(data, RenderedConfig):
             return []
-        backdrops = {"spec": data.spec.without_objects, "n_held_out": 0, "n_test": 0}
-        return [data, *([data.model_copy(update=backdrops)] if self.recipe.augmentation.backdrops else [])]
+        if not (self.recipe.augmentation.backdrops or self.recipe.augmentation.prints):
+            return [data]
+        return [data, data.model_copy(update={"spec": data.spec.without_objects, "n_held_out": 0, "n_test": 0})]
 
     @property
     def several_views(self) -> RenderedConfig | None:

@@ -210,6 +210,8 @@ class AugmentationConfig(Record):
     largest_zoom: Annotated[float, Field(ge=1, le=2)]
     colours: StrictBool
     backdrops: Annotated[float, Field(ge=0, le=1)] = 0.0  # default for older run records
+    plain: Annotated[float, Field(ge=0, le=1)] = 0.0  # default for older run records
+    prints: Annotated[float, Field(ge=0, le=1)] = 0.0  # default for older run records
     occluders: Annotated[float, Field(ge=0, le=1)] = 0.0  # default for older run records
     brightness: Factor
     contrast: Factor

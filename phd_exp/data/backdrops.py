@@ -9,9 +9,11 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from phd_exp.data.batches import Batch
-from phd_exp.data.photometry import change, levels, on
+from phd_exp.data.photometry import change, levels, many, on
 
 BACKDROP_NUMBERS = 7  # per sample: whether it changes, and those of `before_others`
+MOST_CONTRAST = 0.5  # of plain backdrops
+NEAR = 40  # levels: the largest distance of a plain backdrop that is near the objects'
 FINEST = 4.0  # largest factor by which a backdrop is shown smaller, with finer texture
 
 
@@ -44,18 +46,26 @@ class Backdrops:
 
 
 def before_others(
-    backdrops: Backdrops, batch: Batch, chosen: Bool[np.ndarray, " batch"], numbers: Float[np.ndarray, "batch 6"]
+    backdrops: Backdrops,
+    batch: Batch,
+    chosen: Bool[np.ndarray, " batch"],
+    numbers: Float[np.ndarray, "batch 6"],
+    plain: float = 0.0,
 ) -> Batch:
     """The batch, with some samples in front of other backdrops: image + clear (empty' - empty).
 
     empty' is that of one of two random samples, the one with more texture, since smooth backdrops are easy; it is
     `tiled` and perhaps transposed. The sum keeps shadows on the ground and the mixed colours of edges.
 
+    The share `plain` of the new backdrops loses most of its contrast, as the top of a table, and gets a random level.
+    For half of these it is near that of the objects, whose outlines are then hard to see.
+
     Args:
         backdrops: of all training samples.
         batch: some of these samples.
         chosen: which of them to change.
         numbers: from 0 to 1; two choose samples, four the zoom, both shifts and the transposition of the backdrop.
+        plain: share of the new backdrops that are nearly plain.
     """
 
     def exchanged(
@@ -63,19 +73,46 @@ def before_others(
         place: Int[np.ndarray, " some"],
         others: Int[np.ndarray, " some"],
         views: Float[np.ndarray, "some 4"],
+        kinds: Float[np.ndarray, "some 4"],
     ) -> UInt8[Tensor, "some side side 3"]:
         empty, rows = backdrops.empty, batch.row.index_select(0, on(batch.row, place))
         old, share = (
             part.index_select(0, rows.to(part.device)).to(image.device) for part in (empty, backdrops.clear)
         )
-        new = tiled(empty, others, views).to(image.device)
-        return levels((new.float() - old.float()).mul_(share[..., None] / 255).add_(image))
+        new = tiled(empty, others, views).to(image.device).float()
+        if plain:
+            new = _toned(new, _level_of_objects(image, share), on(image, kinds))
+        return levels((new - old.float()).mul_(share[..., None] / 255).add_(image))
 
     pairs = (len(backdrops.empty) * numbers[:, :2]).astype(np.int64)
     others = np.take_along_axis(pairs, backdrops.texture[pairs].argmax(axis=1)[:, None], axis=1)[:, 0]
     image = batch.image.clone(memory_format=torch.contiguous_format)
-    change(image, chosen, exchanged, np.arange(len(batch)), others, numbers[:, 2:])
+    is_plain, *tones = many(numbers[:, :2], 4).T
+    kinds = np.column_stack([is_plain < plain, *tones])
+    change(image, chosen, exchanged, np.arange(len(batch)), others, numbers[:, 2:], kinds)
     return replace(batch, image=image)
+
+
+def _level_of_objects(
+    image: UInt8[Tensor, "some side side 3"], clear: UInt8[Tensor, "some side side"]
+) -> Float[Tensor, " some"]:
+    """The mean level (some,) of the pixels that show objects."""
+    covered = 1 - clear.flatten(1).float() / 255
+    return (covered * image.float().mean(-1).flatten(1)).sum(1) / covered.sum(1).clamp_min(1)
+
+
+def _toned(
+    new: Float[Tensor, "some side side 3"], of_objects: Float[Tensor, " some"], kinds: Float[Tensor, "some 4"]
+) -> Float[Tensor, "some side side 3"]:
+    """Backdrops, nearly plain where the first of four numbers from 0 to 1 is 1.
+
+    The second decides their contrast, the third their level: any if the fourth is below 1/2, else near the objects'.
+    """
+    is_plain, contrast, level, is_free = kinds.T
+    level = torch.where(is_free < 0.5, 255 * level, of_objects + NEAR * (2 * level - 1))
+    contrast = torch.where(is_plain > 0, MOST_CONTRAST * contrast**2, 1.0)
+    shift = torch.where(is_plain > 0, level - contrast * new.flatten(1).mean(1), 0.0)
+    return new.mul_(contrast[:, None, None, None]).add_(shift[:, None, None, None])
 
 
 def tiled(

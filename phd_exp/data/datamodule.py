@@ -11,6 +11,7 @@ from phd_exp.data.backdrops import BACKDROP_NUMBERS, Backdrops, before_others
 from phd_exp.data.batches import Augment, Batch, BatchLoader
 from phd_exp.data.exchanges import Exchange
 from phd_exp.data.photographs import PHOTOGRAPH_NUMBERS, Photographs, replaced
+from phd_exp.data.prints import PRINT_NUMBERS, printed
 from phd_exp.data.sources import PARTS, Part, Source
 from phd_exp.geometry.camera import Camera
 from phd_exp.records.errors import ConfigError, DatasetError
@@ -23,8 +24,9 @@ Held = TypeVar("Held", Batch, Backdrops)
 class PositionData(LightningDataModule):
     """The samples of a source in batches, or the share of one of several processes (`rank` of `world`).
 
-    `augment` changes training batches only; the share `backdrops` of their samples is shown before other backdrops
-    first, and `photographs` replace their share of them. With `masks`, these batches have the masks of the source, if
+    `augment` changes training batches only. Before that, the share `backdrops` of their samples is shown before other
+    backdrops, of which the share `plain` is nearly plain; the share `prints` gets prints on its objects; and
+    `photographs` replace their share of them. With `masks`, these batches have the masks of the source, if
     it has any. The validation evaluates the test samples, which choose nothing, and with `held_out` also the held-out
     samples that may choose; all of these are the source's.
 
@@ -44,14 +46,17 @@ class PositionData(LightningDataModule):
         held_out: bool = False,
         masks: bool = False,
         backdrops: float = 0.0,
+        plain: float = 0.0,
+        prints: float = 0.0,
         photographs: Photographs | None = None,
     ) -> None:
         super().__init__()
-        if backdrops and not source.has_backdrops:
-            raise ConfigError(
-                f"recipe.augmentation.backdrops: got {backdrops}, but what these images show behind their objects is "
-                "not known; expected 0, or data=object"
-            )
+        for key, share in (("backdrops", backdrops), ("prints", prints)):
+            if share and not source.has_backdrops:
+                raise ConfigError(
+                    f"recipe.augmentation.{key}: got {share}, but what these images show behind their objects is "
+                    "not known; expected 0, or data=object"
+                )
         if batch_size > source.count("train"):
             raise ConfigError(
                 f"data: batch_size={batch_size} is larger than the {source.count('train')} training samples there "
@@ -69,7 +74,7 @@ class PositionData(LightningDataModule):
         self.source = source
         self.augment = augment
         self.masks = masks
-        self.backdrops = backdrops
+        self.backdrops, self.plain, self.prints = backdrops, plain, prints
         self.photographs = photographs
         self.validated: tuple[Part, ...] = ("test", "held_out") if held_out else ("test",)
         self.batches = partial(BatchLoader, batch_size=batch_size, seed=seed, rank=rank, world=world)
@@ -91,14 +96,24 @@ class PositionData(LightningDataModule):
                 if self.masks and part == "train":
                     self.samples[part] = replace(self.samples[part], mask=self.source.training_masks())
         if self.train_batches is None:
-            samples, augment = self.samples["train"], self.augment
-            if self.photographs:
-                stock, share = self.photographs.samples(samples), self.photographs.share
-                augment = Exchange(stock, replaced, PHOTOGRAPH_NUMBERS, share, augment)
-            if self.backdrops:  # first, since what is behind photographs is not known
-                backdrops = self.source.training_backdrops()
-                augment = Exchange(backdrops, before_others, BACKDROP_NUMBERS, self.backdrops, augment)
-            self.train_batches = self.batches(samples, shuffle=True, augment=augment)
+            samples = self.samples["train"]
+            self.train_batches = self.batches(samples, shuffle=True, augment=self._training_augment(samples))
+
+    def _training_augment(self, samples: Batch) -> Augment | None:
+        """The augmentation of training samples, with the exchanges before it."""
+        augment = self.augment
+        if self.photographs:
+            stock, share = self.photographs.samples(samples), self.photographs.share
+            augment = Exchange(stock, replaced, PHOTOGRAPH_NUMBERS, share, augment)
+        if not (self.backdrops or self.prints):
+            return augment
+        backdrops = self.source.training_backdrops()  # used first, since what is behind photographs is not known
+        if self.prints:
+            augment = Exchange(backdrops, printed, PRINT_NUMBERS, self.prints, augment)
+        if self.backdrops:
+            change = partial(before_others, plain=self.plain)
+            augment = Exchange(backdrops, change, BACKDROP_NUMBERS, self.backdrops, augment)
+        return augment
 
     def move_to(self, device: torch.device) -> None:
         """Hold the samples on the device that trains, as far as half of its free memory suffices for each part.

@@ -184,7 +184,7 @@ def occluded(image: Images, shape: NDArray[np.float64]) -> Images:
     Its corners lie on a circle; it is the intersection of the half planes inside the chords between neighbours.
     """
     _, height, width, _ = image.shape
-    x, y, radius, corners, *others = _many(shape, 7 + CORNERS[1]).T
+    x, y, radius, corners, *others = many(shape, 7 + CORNERS[1]).T
     radius = width * (ACROSS[0] + (ACROSS[1] - ACROSS[0]) * radius)
     angle, colour = 2 * np.pi * np.array(others[3:]).T, (256 * np.array(others[:3])).astype(np.uint8).T
     used = np.arange(CORNERS[1]) < CORNERS[0] + ((CORNERS[1] - CORNERS[0] + 1) * corners).astype(int)[:, None]
@@ -200,7 +200,7 @@ def occluded(image: Images, shape: NDArray[np.float64]) -> Images:
     return torch.where(hidden[..., None], on(image, colour)[:, None, None], image)
 
 
-def _many(few: Float[np.ndarray, "batch 2"], n: int) -> Float[np.ndarray, "batch n"]:
+def many(few: Float[np.ndarray, "batch 2"], n: int) -> Float[np.ndarray, "batch n"]:
     """Many numbers from 0 to 1 from two: fractional parts of large multiples."""
     multiples = 1e4 * np.sqrt(np.arange(2, 2 + n) + 0.5)
     return np.asarray((few[:, :1] * multiples + few[:, 1:] * multiples[::-1]) % 1)

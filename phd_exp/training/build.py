@@ -49,6 +49,8 @@ def build_data(config: RunConfig, rank: int = 0) -> PositionData:
         held_out=config.evaluation.held_out and config.data.n_held_out > 0,
         masks=config.recipe.segmentation > 0,
         backdrops=config.recipe.augmentation.backdrops,
+        plain=config.recipe.augmentation.plain,
+        prints=config.recipe.augmentation.prints,
         photographs=_photographs(config.data),
     )
 
@@ -63,7 +65,7 @@ def _photographs(data: RenderedConfig | FolderConfig | SourceConfig) -> Photogra
 
 def build_augmentation(recipe: RecipeConfig) -> Augmentation | None:
     """The augmentation of a recipe; None if it changes nothing."""
-    keys = recipe.augmentation.model_dump(exclude={"backdrops"})
+    keys = recipe.augmentation.model_dump(exclude={"backdrops", "plain", "prints"})
     photometry = Photometry(**{field.name: keys.pop(field.name) for field in fields(Photometry)})
     augmentation = Augmentation(**keys, photometry=photometry)
     return augmentation if augmentation.changes_anything else None

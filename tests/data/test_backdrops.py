@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -121,18 +122,22 @@ def test_the_share_is_changed_and_then_augmented(batch: Batch) -> None:
         assert changed.float().mean() == pytest.approx(share, abs=0.15)
 
 
-def test_training_batches_alone_get_other_backdrops(source: RenderedSource) -> None:
-    plain, other = (PositionData(source, batch_size=2, backdrops=share) for share in (0.0, 1.0))
-    for data in (plain, other):
+def test_training_batches_alone_get_other_backdrops_and_prints(source: RenderedSource) -> None:
+    shares = ({}, {"backdrops": 1.0}, {"prints": 1.0}, {"backdrops": 1.0, "prints": 1.0})
+    first, *others = (PositionData(source, batch_size=2, **share) for share in shares)
+    for data in (first, *others):
         data.setup()
-    (before,), (after,) = plain.train_dataloader(), other.train_dataloader()
-    assert torch.equal(before.row, after.row)
-    assert not torch.equal(before.image, after.image)
-    assert torch.equal(plain.samples["train"].image, other.samples["train"].image)
+    batches = [batch for data in (first, *others) for batch in data.train_dataloader()]
+    assert all(torch.equal(batches[0].row, batch.row) for batch in batches)
+    assert not any(torch.equal(one.image, other.image) for one, other in combinations(batches, 2))
+    assert all(torch.equal(first.samples["train"].image, data.samples["train"].image) for data in others)
 
 
-def test_images_of_unknown_backdrops_are_refused(make_spec: Callable[..., DatasetSpec], tmp_path: Path) -> None:
+@pytest.mark.parametrize("key", ["backdrops", "prints"])
+def test_images_of_unknown_backdrops_are_refused(
+    make_spec: Callable[..., DatasetSpec], tmp_path: Path, key: str
+) -> None:
     sizes = {"train": 2, "held_out": 0, "test": 0}
     cylinder = RenderedSource(DatasetFolder(tmp_path), make_spec("default"), sizes, SIDE)  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match=r"recipe.augmentation.backdrops: got 0.5.*expected 0, or data=object"):
-        PositionData(cylinder, batch_size=2, backdrops=0.5)
+    with pytest.raises(ConfigError, match=rf"recipe.augmentation.{key}: got 0.5.*expected 0, or data=object"):
+        PositionData(cylinder, batch_size=2, **{key: 0.5})

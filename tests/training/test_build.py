@@ -4,6 +4,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from phd_exp.data.batches import Batch, BatchLoader
 from phd_exp.data.exchanges import Exchange
 from phd_exp.data.images import SHRINKING
 from phd_exp.data.photometry import VERSION
+from phd_exp.data.prints import PRINT_NUMBERS, printed
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import build_data, build_module
@@ -145,7 +147,8 @@ def test_a_training_step_and_its_data_read_nothing_back(checked: Callable, words
     limits = {"contrast": 2.0, "white_balance": 1.5, "occluders": 1.0}
     augment = replace(data.augment, photometry=replace(data.augment.photometry, **limits))
     backdrops = Backdrops(image, mask.new_zeros(n, 64, 64))
-    augment = Exchange(backdrops, before_others, BACKDROP_NUMBERS, 1.0, augment)
+    augment = Exchange(backdrops, printed, PRINT_NUMBERS, 1.0, augment)
+    augment = Exchange(backdrops, partial(before_others, plain=0.5), BACKDROP_NUMBERS, 1.0, augment)
     loader = BatchLoader(batch, n, shuffle=True, seed=0, augment=augment)
     assert len(backdrops.texture) == n  # computed once, before the first step
     with Reads() as reads:
