@@ -88,7 +88,7 @@ class RunConfig(Record):
 
     @model_validator(mode="after")
     def sizes_fit(self, info: ValidationInfo) -> "RunConfig":
-        """Refuse a batch larger than the training set, images larger than rendered, and a sequence in two parts."""
+        """Refuse images larger than rendered, and a sequence in two parts."""
         data, images = self.data, 1
         if isinstance(data, RenderedConfig) and data.spec.frames > 1:
             images = data.spec.frames * data.spec.views
@@ -96,10 +96,6 @@ class RunConfig(Record):
             raise ValueError(
                 f"data.n_train: got {data.n_train}; expected a multiple of data.frames x data.views = {images}, "
                 "since no sequence may have both training and held-out samples"
-            )
-        if data.n_train is not None and data.batch_size > data.n_train:
-            raise ValueError(
-                f"data: batch_size={data.batch_size} is larger than n_train={data.n_train}: not one batch is full"
             )
         if isinstance(data, RenderedConfig) and data.image_size > data.spec.sensor_size:
             raise ValueError(
