@@ -27,7 +27,7 @@ from phd_exp.records.processes import machine
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import build_augmentation, build_module
 from phd_exp.training.recorder import Recorder
-from phd_exp.training.run import quiet_lightning
+from phd_exp.training.run import UNTRAINED, quiet_lightning
 from phd_exp.training.trainer import build_trainer
 
 RECIPES = {
@@ -83,6 +83,7 @@ def seconds(config: RunConfig, data: PositionData, loader: Iterable[Batch], step
     clock = Clock()
     with tempfile.TemporaryDirectory() as folder:
         recorder = Recorder(RunFolder(Path(folder)), config.evaluation, None, [])
+        recorder.record(UNTRAINED, {}, step=0)
         trainer = build_trainer(config, recorder, [clock])
         trainer.limit_train_batches, trainer.limit_val_batches = WARM_UP + steps, 0
         trainer.fit(build_module(config, data), Batches(loader))

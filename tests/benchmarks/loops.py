@@ -37,6 +37,7 @@ from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import build_data, build_module
 from phd_exp.training.module import PositionModule
 from phd_exp.training.recorder import Recorder
+from phd_exp.training.run import UNTRAINED
 from phd_exp.training.trainer import build_trainer
 
 WORKERS = 2
@@ -188,7 +189,9 @@ def main(kind: str, folder: Path, epochs: int, *overrides: str) -> None:
         print_peak_memory()
         return
     folder.mkdir(parents=True, exist_ok=True)
-    trainer = build_trainer(config, Recorder(RunFolder(folder), config.evaluation, None, []))
+    recorder = Recorder(RunFolder(folder), config.evaluation, None, [])
+    recorder.record(UNTRAINED, {}, step=0)
+    trainer = build_trainer(config, recorder)
     trainer.callbacks.append(Alternating(kind, loop) if loop else Memory())  # type: ignore[attr-defined]
     trainer.fit(module, datamodule=data)
 
