@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from phd_exp.data.batches import SIGNS, Batch
-from phd_exp.data.photometry import Photometry, blocks, levels, on, write
+from phd_exp.data.photometry import Photometry, blocks, levels, on
 from phd_exp.geometry.camera import Camera, middles
 from phd_exp.geometry.motion import Motion, small_turns, symmetries
 
@@ -68,15 +68,17 @@ def rearranged(
     channels: Int[np.ndarray, "batch n"],
 ) -> UInt8[Tensor, "batch side side channels"]:
     """The images `moved` by `symmetries` of these signs, without interpolation; with their channels in that order."""
-    result = torch.empty_like(image, memory_format=torch.contiguous_format)
     kinds, kind = np.unique(np.column_stack([signs < 0, channels]), axis=0, return_inverse=True)
-    for number, (across, down, is_exchanged, *order) in enumerate(kinds.tolist()):
-        rows = on(image, np.flatnonzero(kind == number))
-        part = image.index_select(0, rows)
+    order, counts = kind.argsort(kind="stable"), np.bincount(kind).tolist()
+    sorted_images = image.index_select(0, on(image, order))
+    result = torch.empty_like(sorted_images)
+    parts = zip(kinds.tolist(), sorted_images.split(counts), result.split(counts), strict=True)
+    for (across, down, is_exchanged, *of_channels), part, out in parts:
+        mirrored = ((2 - is_exchanged, across), (1 + is_exchanged, down))
+        part = part.flip([axis for axis, is_mirrored in mirrored if is_mirrored])
         part = part.transpose(1, 2) if is_exchanged else part
-        part = torch.stack([part[..., channel] for channel in order], dim=-1)
-        write(result, rows, part.flip([axis for axis, is_mirrored in ((2, across), (1, down)) if is_mirrored]))
-    return result
+        torch.stack([part[..., channel] for channel in of_channels], dim=-1, out=out)
+    return result.index_select(0, on(image, order.argsort()))
 
 
 def moved(batch: Batch, motion: Motion) -> Batch:

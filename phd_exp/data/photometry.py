@@ -15,7 +15,7 @@ from phd_exp.data.jpeg import compressed
 
 NUMBERS = {"tone": 6, "blur": 1, "noise": 1, "place": 1, "jpeg": 1, "occluder": 1, "shape": 2}
 """The random numbers of an image: what each is for, and how many there are."""
-VERSION = 2  # of the changes; another version trains on other images, so that an interrupted run cannot be resumed
+VERSION = 3  # of the changes; another version trains on other images, so that an interrupted run cannot be resumed
 AT_ONCE = 4  # images whose intermediate values fit in a CPU's cache
 FIELD = 512  # side of the field of standard normal numbers from which the noise of each image is cut, pixels
 CORNERS = (3, 8)  # least and most of an occluder
