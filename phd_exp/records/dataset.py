@@ -14,6 +14,8 @@
 """
 
 import hashlib
+import sys
+from mmap import MAP_PRIVATE, mmap
 from pathlib import Path
 from typing import Annotated, get_args
 
@@ -29,6 +31,7 @@ from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec, ImageFormat, Shard
 
 SPLITS: tuple[Split, ...] = get_args(Split)
+NO_RESERVE = 0x4000 if sys.platform == "linux" else 0  # MAP_NORESERVE, which Python 3.11 does not name
 SUFFIXES: dict[ImageFormat, str] = {"png": ".png", "webp": ".webp", "jpeg": ".jpg"}
 CELLS = 28  # cells along each side of a mask: 8 x 8 pixels of a render of 224
 DRAWING = {"drawing": 1}  # version of masks and clearings, recorded with each; raise it if they are drawn otherwise
@@ -182,14 +185,16 @@ class DatasetFolder:
 def mapped(file: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     """The first rows of an array on disk, which together have this shape, mapped into memory.
 
-    The array is writable, as torch requires; the file does not change. Raises OSError or ValueError if the file does
-    not hold such rows.
+    The array is writable, as torch requires; the file does not change. It may be larger than the memory. Raises
+    OSError or ValueError if the file does not hold such rows.
     """
     require_plain(file)
-    array: NDArray[np.uint8] = np.lib.format.open_memmap(file, mode="c")
+    array: np.memmap = np.lib.format.open_memmap(file, mode="r")
     if array.dtype != np.uint8 or array.shape[1:] != shape[1:] or len(array) < shape[0]:
         raise ValueError(f"holds {array.dtype} {array.shape}; expected uint8 {shape}")
-    return array[: shape[0]]
+    with open(file, "rb") as stream:  # NumPy's copy-on-write mode reserves memory for the whole file
+        pages = mmap(stream.fileno(), 0, flags=MAP_PRIVATE | NO_RESERVE)
+    return np.frombuffer(pages, np.uint8, array.size, array.offset).reshape(array.shape)[: shape[0]]
 
 
 def image_name(index: int, image_format: ImageFormat = "png") -> str:

@@ -1,14 +1,17 @@
 """Images decoded once: exact, found again, and never taken for others."""
 
+import os
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from phd_exp.data import images
 from phd_exp.data.images import cached_images, shrunk
-from phd_exp.records.dataset import DatasetFolder, sha256
+from phd_exp.records.dataset import DatasetFolder, mapped, sha256
 from phd_exp.records.errors import DatasetError
 
 SIDE, N = 64, 5
@@ -89,6 +92,16 @@ def test_writing_into_the_array_leaves_the_file_alone(folder: DatasetFolder) -> 
     before = np.array(array)
     array[:] = 0
     np.testing.assert_array_equal(cached_images(folder, "train", folder.records("train"), SIDE), before)
+
+
+def test_images_that_exceed_the_memory_are_read_where_they_are(tmp_path: Path) -> None:
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    n, file = 4 * memory // (SIDE * SIDE * 3), tmp_path / "images.npy"
+    sparse = np.lib.format.open_memmap(file, mode="w+", dtype=np.uint8, shape=(n, SIDE, SIDE, 3))
+    sparse[-1] = 7
+    sparse.flush()
+    images = torch.from_numpy(mapped(file, sparse.shape)).index_select(0, torch.tensor([0, n - 1]))
+    assert images.flatten(1).amax(1).tolist() == [0, 7]
 
 
 @pytest.mark.parametrize(
