@@ -1,4 +1,4 @@
-"""Measurements on a GPU: images a second of training at `preset=paper`, and two whole runs. `make gpu` prints the first.
+"""Measurements on a GPU: images a second at `preset=paper`, which `make gpu` prints, and two whole runs.
 
 Each recipe is trained on noise in memory, first with its own data path, then with one batch repeated. The difference
 of both times is the wait for data. Prints a JSON line for each recipe.
@@ -128,8 +128,8 @@ def trained(name: str, words: list[str], runs: Path) -> dict[str, Any]:
     run = RunFolder(status_file.parent)
     status, parts = run.status(), {"held_out": run.held_out, "test": run.predictions}
     tables = {part: read_table(file) for part, file in parts.items() if file.exists()}
-    means = {f"{part}/{key}": float(table[key].mean()) for part, table in tables.items() for key in PRINTED}
-    return {"seconds": (status.ended - status.started).total_seconds()} | means
+    means = {f"{part}/{key}": round(table[key].mean(), 3) for part, table in tables.items() for key in PRINTED}
+    return {"seconds": round((status.ended - status.started).total_seconds())} | means
 
 
 def main() -> None:
