@@ -100,6 +100,12 @@ def phd_exp(
     return run
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs do not draw their calibration curves, which takes half a second each."""
+    monkeypatch.setattr("phd_exp.reports.figures.draw_calibration", lambda curves, file: None)
+
+
 @pytest.fixture(scope="session")
 def chromium() -> Iterator[Any]:
     """A real browser, without a network."""

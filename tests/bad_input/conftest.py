@@ -15,5 +15,5 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def place(sound: Path, tmp_path: Path) -> Place:
+def place(sound: Path, tmp_path: Path, undrawn: None) -> Place:
     return copied(sound, tmp_path)

@@ -7,7 +7,6 @@ import pytest
 
 from phd_exp.__main__ import main
 from phd_exp.records.runs import RunFolder, find_runs
-from phd_exp.reports import figures
 from tests.support import own_parts
 from tests.support.recorded import once, shared
 from tests.support.untrained import NARROW, SIDE
@@ -33,6 +32,7 @@ def trained(runs: Path, *arguments: str) -> None:
     """Train one run into its own folder."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", ["phd_exp"])
+        patch.setattr("phd_exp.reports.figures.draw_calibration", lambda curves, file: None)
         assert main([*arguments, *QUICKER, f"runs={runs}"]) == 0
 
 
@@ -51,10 +51,9 @@ def renders(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def own(phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable:
+def own(phd_exp: Callable, tmp_path: Path, undrawn: None, monkeypatch: pytest.MonkeyPatch) -> Callable:
     """A run of a second in a folder with own parts, without the picture of its calibration."""
     own_parts.write_own_parts(tmp_path)
-    monkeypatch.setattr(figures, "draw_calibration", lambda curves, file: None)
     monkeypatch.syspath_prepend(tmp_path)
     return lambda *words: phd_exp(*own_parts.QUICK, *words)
 

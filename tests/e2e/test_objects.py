@@ -46,15 +46,16 @@ def test_an_object_is_rendered_masked_and_verified(phd_exp: Callable, part: Path
     assert (changed.status, "holds a data set with mesh=" in changed.err) == (1, True)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_run_on_views_of_boxes_predicts_boxes(phd_exp: Callable, part: Path, tmp_path: Path) -> None:
     """One command renders and trains; the depth scale follows from the rendered views."""
-    quick = ("recipe=strong", "data.n_train=8", "data.batch_size=4", "data.image_size=64", "trainer.threads=1")
+    quick = ("recipe=strong", "data.batch_size=4", "data.image_size=64", "trainer.threads=1")
     camera = ("data.f=500", "data.width=640", "data.height=480", "data.z_range=[0.6,1.2]")
     words = ("preset=smoke", "data=object", "data.sensor_size=64", "data.samples_per_pixel=1", *FEW, *quick, *camera)
     words += (f"data.mesh={part}", "data.unit=0.001", "logger=none", "trainer.progress_bar=false")
     done = phd_exp(*words, "trainer.max_epochs=1", "data.looks=varied")
     assert done.status == 0, done.err
-    run, records = only_run(tmp_path / "runs"), DatasetFolder(tmp_path / "renders" / "object").records("train", 8)
+    run, records = only_run(tmp_path / "runs"), DatasetFolder(tmp_path / "renders" / "object").records("train", 4)
     ratio = [record.z / record.f for record in records]
     assert run.constants()["D"] == pytest.approx((max(ratio) / min(ratio)) ** 0.5)
     Image.new("RGB", (640, 480), (90, 120, 90)).save(tmp_path / "photo.png")

@@ -129,12 +129,14 @@ def test_a_missing_bpy_is_one_line(phd_exp: Callable, tmp_path: Path, monkeypatc
     assert not list(tmp_path.glob("runs"))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_it_begins_where_that_run_ended_with_its_constants_of_depth(
     phd_exp: Callable, run: RunFolder, renders: Path, tmp_path: Path
 ) -> None:
     """On scenes at other distances, whose own constants are others."""
     words = (*QUICK, *QUICKER, f"data.root={tmp_path / 'far'}", "data.variant=far", "data.z_range=[4,7]")
-    assert phd_exp(*words, f"init={run.path}").status == 0
+    few = ("data.n_train=8", "data.n_held_out=0", "data.n_test=2")
+    assert phd_exp(*words, *few, f"init={run.path}").status == 0
     mine = only_run(tmp_path / "runs")
     assert mine.constants() == run.constants()
     same = (*QUICK, *QUICKER, f"data.root={renders}", f"init={run.path}", f"runs={tmp_path / 'same'}")
