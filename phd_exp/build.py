@@ -7,7 +7,8 @@ from typing import Any
 
 from torch import nn
 
-from phd_exp.config import FolderConfig, RenderedConfig, RunConfig, SourceConfig
+from phd_exp.config import FolderConfig, RenderedConfig, RunConfig
+from phd_exp.config.sections import DataConfig
 from phd_exp.config.targets import build, custom_parts
 from phd_exp.data.folder import FolderSource
 from phd_exp.data.images import SHRINKING
@@ -21,7 +22,7 @@ from phd_exp.records.own_images import DetectionFolder
 from phd_exp.records.runs import RunFolder
 
 
-def build_source(data: RenderedConfig | FolderConfig | SourceConfig) -> Source:
+def build_source(data: DataConfig) -> Source:
     """The source of samples that a `data` section describes. Raises ConfigError, naming the key, for bad values."""
     if isinstance(data, FolderConfig):
         folder = DetectionFolder(data.folder, data.object)
@@ -80,9 +81,8 @@ def naming(key: str, node: dict[str, Any]) -> Iterator[None]:
         raise ConfigError(f"{key}: {reason}{install(str(cause)) if isinstance(cause, ImportError) else ''}") from None
 
 
-def require_same_shrinking(folder: RunFolder, config: RunConfig) -> None:
+def require_same_shrinking(folder: RunFolder, data: DataConfig) -> None:
     """Raise RunError for a run trained with another version of `shrunk`, whose images differ."""
-    data = config.data
     if not isinstance(data, RenderedConfig) or not folder.last_checkpoint.exists():
         return
     constants = folder.constants() if folder.constants_file.exists() else {}

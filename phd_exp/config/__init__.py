@@ -11,7 +11,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, BeforeValidator, Field, StrictBool, ValidationError, ValidationInfo, model_validator
 
 from phd_exp.config import sections
-from phd_exp.config.sections import FolderConfig, RenderedConfig, SourceConfig
+from phd_exp.config.sections import DataConfig, FolderConfig, RenderedConfig, SourceConfig
 from phd_exp.config.targets import Target, TrainingTarget, TrainingTargets, Trust, is_typed, locate
 from phd_exp.records.choices import flatten
 from phd_exp.records.errors import ConfigError, complaint, gist, shown
@@ -45,7 +45,7 @@ class RunConfig(Record):
     seed: Annotated[sections.Whole, Field(ge=0, lt=2**32)]
     runs: sections.Folder
     preset: sections.Name
-    data: sections.DataConfig
+    data: DataConfig
     model: sections.ModelConfig
     camera: sections.CameraConfig
     recipe: sections.RecipeConfig
@@ -104,7 +104,7 @@ class RunConfig(Record):
             )
         return self
 
-    def data_of(self, shift: str) -> RenderedConfig | FolderConfig | SourceConfig:
+    def data_of(self, shift: str) -> DataConfig:
         """The data whose test samples a shift changes. Raises ConfigError for values that no such set has."""
         changes, data, n = self.evaluation.shifts[shift].data, self.data, self.evaluation.n_shifted
         try:

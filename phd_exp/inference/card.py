@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from phd_exp.config import FolderConfig, RenderedConfig, RunConfig, SourceConfig
+from phd_exp.config import FolderConfig, RenderedConfig, RunConfig
+from phd_exp.config.sections import DataConfig
 from phd_exp.config.targets import custom_parts
 from phd_exp.evaluation.parquet import Arrays, read_table, require_columns
 from phd_exp.records.errors import RunError, one_line
@@ -153,7 +154,7 @@ def _trust(config: RunConfig) -> str:
     )
 
 
-def _law(data: RenderedConfig | FolderConfig | SourceConfig) -> dict[str, Any]:
+def _law(data: DataConfig) -> dict[str, Any]:
     """What is known of the images: all of rendered ones, little of the user's own."""
     sizes = f"{data.n_train or 'all'} to train, {data.n_held_out} held out, {data.n_test or 'all'} to test"
     about: dict[str, Any] = {"images": sizes, "seen by the network as": f"{data.image_size} x {data.image_size} px"}

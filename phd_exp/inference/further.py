@@ -3,19 +3,17 @@
 from pathlib import Path
 
 from phd_exp.build import build_source
-from phd_exp.config import FolderConfig, RenderedConfig, RunConfig, SourceConfig
-from phd_exp.config.sections import Render, ShiftConfig
+from phd_exp.config import RenderedConfig, RunConfig
+from phd_exp.config.sections import DataConfig, Render, ShiftConfig
 from phd_exp.inference.tables import UNCHANGED, is_recorded, origin_of, origin_of_shift, record, record_eight_views
 from phd_exp.records.runs import RunFolder
-
-Data = RenderedConfig | FolderConfig | SourceConfig
 
 
 def record_further(run: RunFolder, config: RunConfig, render: Render) -> None:
     """Record a run's predictions of all further samples that its configuration asks for, once; first render them."""
 
     def once(
-        file: Path, data: Data, origin: dict[str, str], words: str, fewer: str, shift: ShiftConfig = UNCHANGED
+        file: Path, data: DataConfig, origin: dict[str, str], words: str, fewer: str, shift: ShiftConfig = UNCHANGED
     ) -> None:
         if not is_recorded(file, origin):
             if isinstance(data, RenderedConfig):

@@ -93,7 +93,7 @@ def _load(folder: RunFolder, device: str, trust: Trust) -> Predictor:
             "of `pack`"
         )
     config = check(folder.config(), trust)
-    require_same_shrinking(folder, config)
+    require_same_shrinking(folder, config.data)
     depth, constant_f = recorded_constants(folder)
     place = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)
     regressor = _regressor(folder, config, depth)

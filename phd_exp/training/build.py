@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from phd_exp.build import build_regressor, build_source, naming, recorded_constants
-from phd_exp.config import FolderConfig, RenderedConfig, RunConfig, SourceConfig
-from phd_exp.config.sections import RecipeConfig
+from phd_exp.config import RenderedConfig, RunConfig
+from phd_exp.config.sections import DataConfig, RecipeConfig
 from phd_exp.config.targets import build, custom_parts, locate
 from phd_exp.data.augmentation import Augmentation
 from phd_exp.data.datamodule import PositionData
@@ -55,7 +55,7 @@ def build_data(config: RunConfig, rank: int = 0) -> PositionData:
     )
 
 
-def _photographs(data: RenderedConfig | FolderConfig | SourceConfig) -> Photographs | None:
+def _photographs(data: DataConfig) -> Photographs | None:
     """The photographs to train on in addition to renders, if any."""
     asked = data.photographs if isinstance(data, RenderedConfig) else None
     if asked is None or asked.folder is None:

@@ -51,7 +51,7 @@ def run(
         constants = asdict(data.source.depth) | {"constant_f": data.source.constant_f}
         folder.write_constants(constants | {"shrinking": SHRINKING, "photometry": VERSION})
     module = build_module(config, data)
-    with tracked(config, folder, rank) as loggers:
+    with tracked(config.logger if rank == 0 else {}, config.model_dump(mode="json"), folder) as loggers:
         recorder = Recorder(folder, config.evaluation, draw, loggers)
         trainer = build_trainer(config, recorder, callbacks)
         data.move_to(trainer.strategy.root_device)

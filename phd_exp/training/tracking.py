@@ -10,7 +10,6 @@ from typing import Any
 from lightning.pytorch.loggers import Logger, WandbLogger
 
 from phd_exp.build import naming
-from phd_exp.config import RunConfig
 from phd_exp.config.targets import build, locate
 from phd_exp.records.choices import flatten
 from phd_exp.records.errors import ConfigError
@@ -37,21 +36,21 @@ def require_possible_loggers(loggers: Mapping[str, Any]) -> None:
 
 
 @contextmanager
-def tracked(config: RunConfig, folder: RunFolder, rank: int) -> Iterator[list[Logger]]:
-    """The loggers of a run, in the process of rank 0 alone; finished on exit, as failed after an exception.
+def tracked(nodes: Mapping[str, Any], config: dict[str, Any], folder: RunFolder) -> Iterator[list[Logger]]:
+    """The loggers of a run, which receive its configuration; finished on exit, as failed after an exception.
 
     What an interrupted run has sent to their folders is removed: the record sends it again.
     """
     with ExitStack() as stack:
         loggers = []
-        for name, node in config.logger.items() if rank == 0 else ():
+        for name, node in nodes.items():
             shutil.rmtree(folder.path / name, ignore_errors=True)
             begin = _wandb if node["_target_"] == WANDB else _logger
             loggers.append(begin(name, node, config, folder, stack))
         yield loggers
 
 
-def _logger(name: str, node: dict[str, Any], config: RunConfig, folder: RunFolder, stack: ExitStack) -> Logger:
+def _logger(name: str, node: dict[str, Any], config: dict[str, Any], folder: RunFolder, stack: ExitStack) -> Logger:
     os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")  # files need no database, and outlive MLflow
     with naming(f"logger.{name}", node):
         takes_folder = "save_dir" in inspect.signature(locate(node["_target_"], None)).parameters
@@ -59,7 +58,7 @@ def _logger(name: str, node: dict[str, Any], config: RunConfig, folder: RunFolde
         logger = build(place | node)
         if not isinstance(logger, Logger):
             raise ValueError(f"makes a {type(logger).__name__}; expected a Logger of Lightning")
-        logger.log_hyperparams(flatten(config.model_dump(mode="json")))
+        logger.log_hyperparams(flatten(config))
 
     def finish(kind: object, *error: object) -> None:
         logger.finalize("failed" if kind else "success")
@@ -68,7 +67,7 @@ def _logger(name: str, node: dict[str, Any], config: RunConfig, folder: RunFolde
     return logger
 
 
-def _wandb(name: str, node: dict[str, Any], config: RunConfig, folder: RunFolder, stack: ExitStack) -> Logger:
+def _wandb(name: str, node: dict[str, Any], config: dict[str, Any], folder: RunFolder, stack: ExitStack) -> Logger:
     """A run of wandb; an unfinished one would receive the metrics of the next run of a sweep."""
     import wandb
 
@@ -85,7 +84,7 @@ def _wandb(name: str, node: dict[str, Any], config: RunConfig, folder: RunFolder
         name="/".join(folder.names),
         dir=folder.path.absolute(),  # the service may have another working folder
         mode="offline" if node.get("offline") else "online",
-        config=config.model_dump(mode="json"),
+        config=config,
         settings=wandb.Settings(silent=True, console="off"),
         **arguments,
     )

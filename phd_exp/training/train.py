@@ -9,8 +9,8 @@ import torch
 from lightning import Callback
 
 from phd_exp.build import require_same_shrinking
-from phd_exp.config import FolderConfig, RenderedConfig, RunConfig, SourceConfig
-from phd_exp.config.sections import Render
+from phd_exp.config import RenderedConfig, RunConfig
+from phd_exp.config.sections import DataConfig, RecipeConfig, Render
 from phd_exp.config.targets import custom_parts
 from phd_exp.data.photometry import VERSION
 from phd_exp.hardware import default_threads
@@ -64,7 +64,7 @@ def train(
             remove_temporaries(place)  # of a killed process
         folder.write_config(config.model_dump(mode="json"))
         threads = config.trainer.threads or default_threads(cores)
-        with folder.recording(_manifest_hash(config), custom_parts(config.model_dump(mode="json")), overrides):
+        with folder.recording(_manifest_hash(config.data), custom_parts(config.model_dump(mode="json")), overrides):
             if (world := config.trainer.devices) > 1:
                 results = together(partial(run, config, folder, draw), world, threads)
             else:
@@ -82,9 +82,9 @@ def require_possible(config: RunConfig, folder: RunFolder) -> None:
     """
     require_same_config(folder, config)
     folder.require_writable()
-    trainer_arguments(config)
+    trainer_arguments(config.trainer)
     require_possible_loggers(config.logger)
-    build_callbacks(config, folder)
+    build_callbacks(config.callbacks, folder)
     trainer, found = config.trainer, torch.cuda.device_count()
     if trainer.accelerator == "gpu" and not torch.cuda.is_available():
         raise ConfigError("trainer.accelerator: got 'gpu', but torch sees none here; expected 'cpu' or 'auto'")
@@ -100,8 +100,8 @@ def require_same_config(folder: RunFolder, config: RunConfig) -> None:
     """Raise RunError if the folder holds a run with other results, naming the first key that differs."""
     if not folder.config_file.exists():
         return
-    require_same_shrinking(folder, config)
-    require_same_photometry(folder, config)
+    require_same_shrinking(folder, config.data)
+    require_same_photometry(folder, config.recipe)
     if difference := _difference(folder, config):
         raise RunError(
             f"{folder.path}: holds a run with {difference} is asked for; "
@@ -117,9 +117,9 @@ def require_same_config(folder: RunFolder, config: RunConfig) -> None:
         )
 
 
-def require_same_photometry(folder: RunFolder, config: RunConfig) -> None:
+def require_same_photometry(folder: RunFolder, recipe: RecipeConfig) -> None:
     """Raise RunError for an interrupted run that trained on images changed by another version of `Photometry`."""
-    augmentation = build_augmentation(config.recipe)
+    augmentation = build_augmentation(recipe)
     if augmentation is None or not augmentation.photometry.changes_anything:
         return
     if folder.is_finished() or not folder.last_checkpoint.exists():
@@ -149,9 +149,9 @@ def equal_run(config: RunConfig, folder: RunFolder) -> RunFolder | None:
     return None
 
 
-def _manifest_hash(config: RunConfig) -> str | None:
+def _manifest_hash(data: DataConfig) -> str | None:
     """Checksum of the data set's manifest, and of the annotations of the user's own images, if there are any."""
-    data, own = config.data, _fingerprint(config.data)
+    own = _fingerprint(data)
     if not isinstance(data, RenderedConfig):
         return own
     with suppress(OSError):  # the data of a finished run may be gone
@@ -160,7 +160,7 @@ def _manifest_hash(config: RunConfig) -> str | None:
     return None
 
 
-def _fingerprint(data: FolderConfig | RenderedConfig | SourceConfig) -> str | None:
+def _fingerprint(data: DataConfig) -> str | None:
     """Checksum of the annotations of the user's own images, if there are any."""
     with suppress(OSError):
         return fingerprint(*data.labelled) if data.labelled else None

@@ -1,7 +1,7 @@
 """Lightning's Trainer for a run: its arguments, its callbacks, and those of the user."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from inspect import signature
 from typing import Any
 
@@ -11,6 +11,7 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar
 
 from phd_exp.build import naming
 from phd_exp.config import RunConfig
+from phd_exp.config.sections import TrainerConfig
 from phd_exp.config.targets import build
 from phd_exp.hardware import precision
 from phd_exp.records.errors import ConfigError, shown, unknown
@@ -54,7 +55,7 @@ def build_trainer(config: RunConfig, recorder: Recorder, callbacks: Sequence[Cal
         ours.append(StopBetweenBatches(folder.last_checkpoint))
     if config.trainer.progress_bar:
         ours.append(Progress(sys.stderr.isatty(), config.preset))
-    every = [*ours, *build_callbacks(config, folder), *callbacks]
+    every = [*ours, *build_callbacks(config.callbacks, folder), *callbacks]
     arguments: dict[str, Any] = {
         "accelerator": config.trainer.accelerator,
         "devices": config.trainer.devices,
@@ -74,15 +75,15 @@ def build_trainer(config: RunConfig, recorder: Recorder, callbacks: Sequence[Cal
         "default_root_dir": folder.path,
     }
     with naming("trainer", {}):
-        return Trainer(**arguments | trainer_arguments(config))
+        return Trainer(**arguments | trainer_arguments(config.trainer))
 
 
-def trainer_arguments(config: RunConfig) -> dict[str, Any]:
+def trainer_arguments(trainer: TrainerConfig) -> dict[str, Any]:
     """The arguments of Lightning's Trainer that are no keys of ours.
 
     Raises ConfigError for one that it does not take, or that the run record depends on.
     """
-    given, ours = config.trainer.model_extra or {}, type(config.trainer).model_fields
+    given, ours = trainer.model_extra or {}, TrainerConfig.model_fields
     known = [*ours, *(key for key in signature(Trainer).parameters if key not in OWNED and key not in ours)]
     for key in given:
         if key in OWNED:
@@ -92,13 +93,13 @@ def trainer_arguments(config: RunConfig) -> dict[str, Any]:
     return given
 
 
-def build_callbacks(config: RunConfig, folder: RunFolder) -> list[Callback]:
+def build_callbacks(nodes: Mapping[str, Any], folder: RunFolder) -> list[Callback]:
     """The callbacks of the configuration; those that write checkpoints write next to the run's own.
 
     Raises ConfigError for what is no callback, and for one that writes elsewhere.
     """
     found = []
-    for name, node in config.callbacks.items():
+    for name, node in nodes.items():
         with naming(f"callbacks.{name}", node):
             callback = build(node)
             if not isinstance(callback, Callback):

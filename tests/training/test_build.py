@@ -90,7 +90,7 @@ def test_images_shrunk_by_another_version_are_refused_where_they_differ(
     config = checked("data.sensor_size=224", f"data.image_size={side}")
     refused = begun and side == 64 and version != SHRINKING
     with pytest.raises(RunError, match="shrunk from 224 to 64 pixels") if refused else nullcontext():
-        build.require_same_shrinking(folder, config)
+        build.require_same_shrinking(folder, config.data)
 
 
 @pytest.mark.parametrize("words", [["photometry=robust"], ["recipe=strong"]], ids=" ".join)
@@ -108,7 +108,7 @@ def test_a_run_with_photometry_of_another_version_is_not_resumed(
     folder.write_constants({"photometry": version} if version else {})
     refused = state == "interrupted" and words == ["photometry=robust"] and version is None
     with pytest.raises(RunError, match="move the folder away and train again") if refused else nullcontext():
-        require_same_photometry(folder, checked(*words))
+        require_same_photometry(folder, checked(*words).recipe)
 
 
 READS = ("aten::_local_scalar_dense", "aten::nonzero", "aten::is_nonzero", "aten::equal")
