@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize(
-    ("shape", "backdrops", "side"), product(("sphere", "cube", "monkey"), ("hdri", None), (48, 80)), ids=str
+    ("shape", "backdrops", "side"), [*product(("sphere", "cube", "monkey"), ("hdri", None), (48, 80))], ids=str
 )
 def test_metal_is_at_most_twice_as_noisy_as_rubber(
     of_mesh: MakeSpec, tmp_path: Path, shape: str, backdrops: str | None, side: int
