@@ -6,6 +6,7 @@ optimizer, callbacks, logger) names a `_target_`; its keys are checked against t
 """
 
 import math
+from itertools import product
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, Field, StrictBool, ValidationError, ValidationInfo, model_validator
@@ -143,7 +144,7 @@ class RunConfig(Record):
     def sequences(self) -> dict[tuple[int, bool], RenderedConfig]:
         """The sequences that follow the training, as test samples: by their frames, and whether they are held out.
 
-        Half as many are held out, from one camera; they have another seed.
+        Half as many are held out, from as many cameras; they have another seed.
         """
         asked, multiview = self.evaluation, self.evaluation.multiview
         if not isinstance(data := self.data, RenderedConfig):
@@ -151,12 +152,12 @@ class RunConfig(Record):
         found, cameras, further = {}, asked.sequence_cameras, dict[str, Any]()
         if cameras > 1 and multiview:
             further = {"views": cameras, "view_angle_range": multiview.angle_range}
-        for n, frames in asked.sequences:
-            changes: dict[str, Any] = {"variant": f"{data.name}-sequences-{frames}", "frames": frames}
-            held_out = {"variant": f"{changes['variant']}{HELD_OUT}", "seed": (data.spec.seed + 1) % 2**63}
-            tested = further and further | {"variant": f"{changes['variant']}-cameras-{cameras}"}
-            found[frames, False] = data.changed(changes | tested, n * frames * cameras)
-            found[frames, True] = data.changed(changes | held_out, -(-n // 2) * frames)
+        seeds = data.spec.seed, (data.spec.seed + 1) % 2**63
+        for (n, frames), held_out in product(asked.sequences, (False, True)):
+            name = f"{data.name}-sequences-{frames}{HELD_OUT * held_out}"
+            name += f"-cameras-{cameras}" if further else ""
+            changes = {"variant": name, "frames": frames, "seed": seeds[held_out]} | further
+            found[frames, held_out] = data.changed(changes, (-(-n // 2) if held_out else n) * frames * cameras)
         return found
 
     @model_validator(mode="after")

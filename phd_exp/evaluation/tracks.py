@@ -18,10 +18,13 @@ from phd_exp.evaluation.several_views import SeveralViews
 from phd_exp.fusion import Pose, Status, fuse
 from phd_exp.fusion.tracks import ConstantVelocity, Gaussian, Lost, Path, Slow, correlation_time, standardised_errors
 from phd_exp.fusion.tracks import track as smoothed
+from phd_exp.hardware import one_thread
 from phd_exp.metrics.bootstrap import Interval, bands
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error, squared_mahalanobis
 from phd_exp.records.errors import RunError
 
+Cameras = Sequence[SeveralViews]
+"""The same sequences, in which views are frames, as seen by each camera."""
 Method = Literal["single", "kalman", "independent", "slow"]
 """Each frame alone (its mode, or the position fused from two cameras); a Rauch-Tung-Striebel smoother of means and
 covariances; the mean path of `fusion.tracks.track` without and with slow errors."""
@@ -92,8 +95,8 @@ def place(quantity: str, method: Method) -> str:
     return f"{quantity}/{method}"
 
 
-def choose(held_out: Sequence[SeveralViews]) -> Choice:
-    """The motion and the slow errors that suit held-out sequences.
+def choose(held_out: Sequence[Cameras]) -> Choice:
+    """The motion and the slow errors that suit held-out sequences, each set seen by as many cameras as the test.
 
     The speed is that of the true positions. The noise of smoothers of independent frames makes the predictions most
     likely. With slow errors, where the predictions hardly tell the noise, it makes the true positions most likely
@@ -103,10 +106,11 @@ def choose(held_out: Sequence[SeveralViews]) -> Choice:
     """
     start, speed = correlated(held_out), _speed(held_out)
     found = Choice({}, speed, start, start)
-    noise = {method: _noise(held_out, found, method) for method in SMOOTHERS[:2]}
-    found = replace(found, noise=noise | {"slow": noise["independent"]})
-    for change in (_with_noise, _with_depth_time, _with_projection_time, _with_noise):
-        found = min((change(found, factor) for factor in FACTORS), key=lambda one: _surprisal(held_out, one))
+    with one_thread():
+        noise = {method: _noise(held_out, found, method) for method in SMOOTHERS[:2]}
+        found = replace(found, noise=noise | {"slow": noise["independent"]})
+        for change in (_with_noise, _with_depth_time, _with_projection_time, _with_noise):
+            found = min((change(found, factor) for factor in FACTORS), key=lambda one: _surprisal(held_out, one))
     return found
 
 
@@ -122,43 +126,44 @@ def _with_projection_time(choice: Choice, factor: float) -> Choice:
     return replace(choice, slow=replace(choice.slow, projection_time=factor * choice.slow.projection_time))
 
 
-def _surprisal(held_out: Sequence[SeveralViews], choice: Choice) -> float:
+def _surprisal(held_out: Sequence[Cameras], choice: Choice) -> float:
     """-log density of the true positions under the Gaussians of paths with slow errors, up to a constant."""
     found = 0.0
-    for one in held_out:
-        truth = one.pose.into_world(one.xyz)
-        for row, path in enumerate(_paths([one], "slow", choice)):
+    for cameras in held_out:
+        truth = cameras[0].pose.into_world(cameras[0].xyz)
+        for row, path in enumerate(_paths(cameras, "slow", choice)):
             if path:
                 distance = squared_mahalanobis(truth[row] - path.mean, path.covariance)
                 found += float((distance + torch.linalg.slogdet(path.covariance)[1]).sum()) / 2
     return found if math.isfinite(found) else math.inf
 
 
-def _speed(held_out: Sequence[SeveralViews]) -> float:
+def _speed(held_out: Sequence[Cameras]) -> float:
     """Root mean square of the velocity of the true positions along an axis, m/s."""
     squares = []
-    for one in held_out:
+    for one, *_ in held_out:
         moved = one.pose.into_world(one.xyz).diff(dim=1) / one.columns["time"].diff(dim=1)[..., None]
         squares.append(moved.square().flatten())
     return float(torch.cat(squares).mean().sqrt())
 
 
-def correlated(held_out: Sequence[SeveralViews]) -> Slow:
-    """The time constants by the autocorrelation of standardised errors."""
-    times = [row for one in held_out for row in one.columns["time"].numpy()]
-    both = [standardised_errors(one.predictions, one.xyz) for one in held_out]
+def correlated(held_out: Sequence[Cameras]) -> Slow:
+    """The time constants by the autocorrelation of the standardised errors of all cameras."""
+    every = [one for cameras in held_out for one in cameras]
+    times = [row for one in every for row in one.columns["time"].numpy()]
+    both = [standardised_errors(one.predictions, one.xyz) for one in every]
     depth = [row for errors, _ in both for row in errors.numpy()]
     across = [row for _, errors in both for axis in errors.unbind(-1) for row in axis.numpy()]
-    of_axes = [row for one in held_out for _ in range(2) for row in one.columns["time"].numpy()]
+    of_axes = [row for one in every for _ in range(2) for row in one.columns["time"].numpy()]
     return Slow(correlation_time(times, depth), correlation_time(of_axes, across))
 
 
-def _noise(held_out: Sequence[SeveralViews], known: Choice, method: Method) -> float:
+def _noise(held_out: Sequence[Cameras], known: Choice, method: Method) -> float:
     """The noise of highest total `log_evidence`."""
 
     def loss(log_noise: float) -> float:
         choice = replace(known, noise={method: math.exp(log_noise)})
-        found = [path.log_evidence for one in held_out for path in _paths([one], method, choice) if path]
+        found = [path.log_evidence for cameras in held_out for path in _paths(cameras, method, choice) if path]
         if not found:
             raise RunError("sequences: not one held-out sequence has a path; train longer")
         return -sum(found)
@@ -167,14 +172,14 @@ def _noise(held_out: Sequence[SeveralViews], known: Choice, method: Method) -> f
     return math.exp(optimize.minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": PRECISION}).x)
 
 
-def _together(cameras: Sequence[SeveralViews]) -> tuple[ProjectedHuber, Pose]:
+def _together(cameras: Cameras) -> tuple[ProjectedHuber, Pose]:
     """Predictions and poses (sequences, frames, cameras)."""
     columns = {name: torch.stack([one.columns[name] for one in cameras], -1) for name in cameras[0].columns}
     R, t = (torch.stack([getattr(one.pose, name) for one in cameras], 2) for name in "Rt")
     return from_columns(columns), Pose(R, t)
 
 
-def _paths(cameras: Sequence[SeveralViews], method: Method, choice: Choice) -> Iterator[Path | None]:
+def _paths(cameras: Cameras, method: Method, choice: Choice) -> Iterator[Path | None]:
     """The path of each sequence; None where there is none in front of the cameras."""
     predictions, poses = _together(cameras)
     motion = ConstantVelocity(choice.noise[method], choice.speed)
@@ -188,7 +193,7 @@ def _paths(cameras: Sequence[SeveralViews], method: Method, choice: Choice) -> I
             yield None
 
 
-def track_scores(cameras: Sequence[SeveralViews], choice: Choice, resamples: int = 1000) -> TrackScores:
+def track_scores(cameras: Cameras, choice: Choice, resamples: int = 1000) -> TrackScores:
     """Smooth with every method and score, in the frame of the first camera.
 
     Raises RunError if no sequence has a path by all of them.

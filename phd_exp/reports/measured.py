@@ -29,7 +29,7 @@ from phd_exp.reports.table import file_stem
 
 Found = TypeVar("Found")
 
-VERSIONS = {"before": 2, "after": 4, "fusion": 1, "pairs": 1, "tracks": 2, "gallery": 1, "scene": 1, "shifts": 1}
+VERSIONS = {"before": 2, "after": 4, "fusion": 1, "pairs": 1, "tracks": 3, "gallery": 1, "scene": 1, "shifts": 1}
 """Measurement -> its version. Raise it when the measurement gives other numbers: all runs are measured again."""
 
 
@@ -111,17 +111,19 @@ def _with_volumes(predictions: Arrays, held_out: Arrays | None) -> Arrays:
 
 def _tracks(folder: RunFolder) -> dict[str, TrackScores]:
     files = sorted(folder.sequences.glob("*.parquet"))
-    choosing = [read_sequences(file)[0] for file in files if file.stem.endswith(HELD_OUT)]
+    held_out = [read_sequences(file) for file in files if file.stem.endswith(HELD_OUT)]
     tested = {file.stem: read_sequences(file) for file in files if not file.stem.endswith(HELD_OUT)}
     if not tested:
         return {}
-    if not choosing:
-        raise RunError(f"{folder.sequences.name}: no held-out sequences; repeat the command of the training")
-    choice = choose(choosing)
+    cameras = max(map(len, tested.values()))
+    if not any(len(each) >= cameras for each in held_out):
+        several = f" from {cameras} cameras" if cameras > 1 else ""
+        raise RunError(f"{folder.sequences.name}: no held-out sequences{several}; repeat the command of the training")
+    chosen = [choose([each[:k] for each in held_out if len(each) >= k]) for k in range(1, cameras + 1)]
     return {
         frames if k == 1 else f"{frames}_{k}": track_scores(each[:k], choice)
         for frames, each in sorted(tested.items(), key=lambda pair: int(pair[0]))
-        for k in range(1, len(each) + 1)
+        for k, choice in enumerate(chosen[: len(each)], 1)
     }
 
 

@@ -55,6 +55,7 @@ def tracks_tables(report: Report) -> list[Table]:
 def tracks_table(run: Run, scores: Mapping[str, TrackScores]) -> Table:
     """The table of a run's scores, by the frames of a sequence."""
     every = sorted(scores.values(), key=lambda one: (one.frames, one.cameras))
+    by_cameras = {one.cameras: one for one in every}
     found = {
         quantity: tuple(
             TableRow((label, NAMES[method]), tuple(_cell(run, one, quantity, method) for one in every))
@@ -70,7 +71,7 @@ def tracks_table(run: Run, scores: Mapping[str, TrackScores]) -> Table:
         stub=("quantity", "method"),
         columns=tuple(f"{one.n} × {one.name}" for one in every),
         groups=tuple(rows for rows in found.values() if rows),
-        notes=(OF_QUANTITIES, OF_METHODS, *map(_chosen, every[:1]), *map(_frames, every)),
+        notes=(OF_QUANTITIES, OF_METHODS, *map(_chosen, by_cameras.values()), *map(_frames, every)),
         preset=run.preset,
     )
 
@@ -97,12 +98,16 @@ def _chosen(scores: TrackScores) -> str:
     noise, slow, whole = scores.choice.noise, scores.choice.slow, scores.choice.correlated
     noises = ", ".join(f"{noise[method]:.2g} ({NAMES[method]})" for method in SMOOTHERS)
     return (
-        f"Held-out sequences have a speed of {scores.choice.speed:.2g} m/s, and chose the noise of the motion, in "
-        f"m/s² per √Hz: {noises}. Their errors have the time constants {whole.depth_time:.2g} s of depth and "
-        f"{whole.projection_time:.2g} s of the projection by autocorrelation; weighted frames use "
-        f"{slow.depth_time:.2g} s and {slow.projection_time:.2g} s, with which the true held-out positions were most "
-        "likely."
+        f"Held-out sequences from {_cameras(scores.cameras)} have a speed of {scores.choice.speed:.2g} m/s, and "
+        f"chose the noise of the motion, in m/s² per √Hz: {noises}. Their errors have the time constants "
+        f"{whole.depth_time:.2g} s of depth and {whole.projection_time:.2g} s of the projection by autocorrelation; "
+        f"weighted frames use {slow.depth_time:.2g} s and {slow.projection_time:.2g} s, with which the true held-out "
+        "positions were most likely."
     )
+
+
+def _cameras(n: int) -> str:
+    return "one camera" if n == 1 else f"{n} cameras"
 
 
 def _frames(scores: TrackScores) -> str:

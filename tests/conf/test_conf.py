@@ -74,10 +74,12 @@ def test_sequences_are_of_the_runs_own_scenes_and_others_are_held_out(checked: C
         assert differing(tested, choosing) == {"variant", "seed"}
         assert [one.n_test for one in found] == [n * frames, held_out * frames]
     both = checked("data=occl", "evaluation.sequences=[[5,20]]", "evaluation.sequence_cameras=2").sequences
-    spec = both[20, False].spec
-    assert (spec.views, spec.view_angle_range, both[20, False].n_test) == (2, (20, 60), 200)
-    assert (both[20, True].spec.views, both[20, True].n_test) == (1, 60)
-    assert both[20, False].name == "occl-sequences-20-cameras-2"
+    for held_out, name, n in (
+        (False, "occl-sequences-20-cameras-2", 200),
+        (True, "occl-sequences-20-held-out-cameras-2", 120),
+    ):
+        one = both[20, held_out]
+        assert (one.name, one.n_test, one.spec.views, one.spec.view_angle_range) == (name, n, 2, (20, 60))
     assert checked("data=occl").sequences == {}
     assert not has_influence("evaluation.sequences")
     assert not has_influence("evaluation.sequence_cameras")

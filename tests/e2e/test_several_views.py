@@ -75,7 +75,7 @@ def test_sequences_from_two_cameras_are_recorded(train: Callable, run: RunFolder
     outcome = train(*words)
     assert outcome.status == 0, outcome.err
     assert "3.parquet: 2 sequences of 3 frames from two cameras" in outcome.out
-    (held_out,) = read_sequences(run.sequence(3, held_out=True))
+    held_out, _ = read_sequences(run.sequence(3, held_out=True))
     first, second = read_sequences(run.sequence(3, held_out=False))
     assert (held_out.n, first.n, first.views) == (1, 2, 3)
     torch.testing.assert_close(first.columns["time"][0], torch.arange(3).double() / 30)

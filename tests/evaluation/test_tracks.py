@@ -8,7 +8,17 @@ import pytest
 import torch
 
 from phd_exp.evaluation.several_views import SeveralViews, read_sequences
-from phd_exp.evaluation.tracks import HIDDEN, METHODS, SMOOTHERS, Choice, TrackScores, choose, place, track_scores
+from phd_exp.evaluation.tracks import (
+    HIDDEN,
+    METHODS,
+    SMOOTHERS,
+    Choice,
+    TrackScores,
+    choose,
+    correlated,
+    place,
+    track_scores,
+)
 from phd_exp.records.errors import RunError
 from tests.support.sequences import ERRORS, MOTION, SLOW, write_sequences
 
@@ -101,9 +111,13 @@ def test_two_cameras_are_closer_than_one_and_calibrated(folder: Path, known: Cho
     torch.testing.assert_close(both[0].pose.into_world(both[0].xyz), seen_again)
 
 
-def test_held_out_sequences_choose_noise_and_slow_errors(folder: Path) -> None:
-    write_sequences(folder / "held.parquet", 40, FRAMES, errors=ERRORS, seed=2)
-    choice = choose(read_sequences(folder / "held.parquet"))
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_held_out_sequences_choose_noise_and_slow_errors(folder: Path, cameras: int) -> None:
+    write_sequences(folder / "held.parquet", 40 // cameras, FRAMES, cameras=cameras, errors=ERRORS, seed=2)
+    every = read_sequences(folder / "held.parquet")
+    choice = choose([every])
+    assert choice.correlated == correlated([every])
+    assert (choice.correlated == correlated([every[:1]])) == (cameras == 1)
     assert choice.speed == pytest.approx(MOTION.speed, rel=0.3)
     for name in ("depth_time", "projection_time"):
         for found in (choice.correlated, choice.slow):  # of 40 short sequences
@@ -114,7 +128,7 @@ def test_held_out_sequences_choose_noise_and_slow_errors(folder: Path) -> None:
 
 def test_independent_errors_choose_no_slow_ones(folder: Path) -> None:
     write_sequences(folder / "none.parquet", 20, FRAMES, seed=3)
-    choice = choose(read_sequences(folder / "none.parquet"))
+    choice = choose([read_sequences(folder / "none.parquet")])
     assert choice.slow.depth_time < 0.03  # seconds: less than a frame
     assert choice.slow.projection_time < 0.03
 

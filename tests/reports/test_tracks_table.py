@@ -19,7 +19,10 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Report:
     folder = tmp_path_factory.mktemp("tracks")
     run = write_run(folder, "occl", n=40, epochs=1)
     for held_out in (False, True):
-        write_sequences(run.sequence(8, held_out=held_out), 8, 8, errors=SLOW_ERRORS, seed=int(held_out))
+        cameras = 1 + held_out
+        write_sequences(
+            run.sequence(8, held_out=held_out), 8, 8, cameras=cameras, errors=SLOW_ERRORS, seed=int(held_out)
+        )
     write_sequences(run.sequence(12, held_out=False), 3, 12, cameras=2, seed=5)
     return read_report(folder)
 
@@ -59,9 +62,13 @@ def test_the_pages_have_a_section_of_paths(report: Report, tmp_path: Path) -> No
     assert "#tracks" in (tmp_path / "index.html").read_text()
 
 
-def test_tested_sequences_without_held_out_ones_are_noted(tmp_path: Path) -> None:
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_tested_sequences_without_held_out_ones_of_as_many_cameras_are_noted(tmp_path: Path, cameras: int) -> None:
     run = write_run(tmp_path, n=20, epochs=1)
-    write_sequences(run.sequence(8, held_out=False), 2, 8)
+    write_sequences(run.sequence(8, held_out=False), 2, 8, cameras=cameras)
+    if cameras > 1:
+        write_sequences(run.sequence(8, held_out=True), 2, 8)
     (found,) = read_report(tmp_path).runs
     assert not found.measured.tracks
-    assert any("no held-out sequences" in note for note in found.notes)
+    several = " from 2 cameras" if cameras > 1 else ""
+    assert any(f"no held-out sequences{several};" in note for note in found.notes)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from numba import njit
 
-from phd_exp.fusion import arithmetic
+from phd_exp.fusion import arithmetic, views
 from phd_exp.fusion import certificate as fusion_certificate
 from phd_exp.fusion import newton as fusion_newton
 from phd_exp.fusion.newton import LEAST_DEPTHS
@@ -57,6 +57,6 @@ def _functions(sources):
     return most_likely, bounds, excesses, moments
 
 
-_COMPILED = (arithmetic, fusion_newton, fusion_certificate, certificate, energy, gaussian, newton, tridiagonal)
+_COMPILED = (arithmetic, views, fusion_newton, fusion_certificate, certificate, energy, gaussian, newton, tridiagonal)
 _SOURCES = b"".join(Path(str(module.__file__)).read_bytes() for module in _COMPILED)
 most_likely, bounds, excesses, moments = _functions(hashlib.sha256(_SOURCES).hexdigest())
