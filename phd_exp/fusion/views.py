@@ -124,6 +124,11 @@ class Views:
         modes = _into_world(self.R, self.t, flat("predictions", self.predictions.mode, shape, event=1))
         return np.where(self.mask[..., None], modes, 0.0).sum(1) / self.mask.sum(-1, keepdims=True)
 
+    @property
+    def cameras(self) -> Float[np.ndarray, "problems cameras 3"]:
+        """The positions of the cameras, world, metres."""
+        return _into_world(self.R, self.t, np.zeros(3))
+
     def at(self, v: Float[np.ndarray, "*#problems 3"]) -> Float[np.ndarray, "problems cameras 3"]:
         """(q_x, q_y, t) at positions in the world, metres; (0, 0, 1) where a camera is masked out."""
         values = (self.slope @ (v[..., None, :] - self.apex)[..., None])[..., 0]

@@ -76,7 +76,8 @@ class Frames:
         a: precision of the depth, or GAUSSIAN; 0 where a camera takes no part.
         own: the width of a rounded mode of t; 0 for a kink.
         since: seconds since the camera's prediction before; inf without one.
-        centres: the apices of the densities, without a free axis the positions of the cameras.
+        centres: the positions of the cameras; 0 where a camera takes no part.
+        apices: those of the densities, without a free axis the positions of the cameras; 0 there too.
         about: a path, see `phd_exp.fusion.tracks.shear`; at first the average of each frame's predicted positions,
             interpolated in frames without a prediction.
         shear: S and offset there; at first I and 0.
@@ -90,6 +91,7 @@ class Frames:
     own: Float[np.ndarray, "frames cameras"]
     since: Float[np.ndarray, "frames cameras"]
     centres: Float[np.ndarray, "frames cameras 3"]
+    apices: Float[np.ndarray, "frames cameras 3"]
     about: Float[np.ndarray, "frames 3"]
     shear: Float[np.ndarray, "frames 3 4"]
 
@@ -110,8 +112,10 @@ class Frames:
         latest = np.maximum.accumulate(np.where(views.mask, times[:, None], -np.inf))
         since = times[:, None] - np.concatenate([np.full_like(latest[:1], -np.inf), latest[:-1]])
         own = own_width(views.a, views.predictions)
-        of_views = views.slope, views.at(origin), views.a, own, since, _centres(views, origin)
-        return cls(times, origin, *of_views, about, np.tile(np.eye(3, 4), (len(times), 1, 1)))
+        of_views = views.slope, views.at(origin), views.a, own, since
+        return cls(
+            times, origin, *of_views, *_places(views, origin), about, np.tile(np.eye(3, 4), (len(times), 1, 1))
+        )
 
     @property
     def mask(self) -> Bool[np.ndarray, "frames cameras"]:
@@ -134,20 +138,24 @@ class Frames:
         latest = self.times[-1] - np.where(self.mask[-1], 0.0, self.since[-1])
         further = {"times": times, "since": time - latest[None], "about": about, "shear": np.eye(3, 4)[None]}
         if views is None:
-            masked = "slope", "at_origin", "a", "own", "centres"
+            masked = "slope", "at_origin", "a", "own", "centres", "apices"
             further |= {name: np.zeros_like(getattr(self, name)[-1:]) for name in masked}
             further["at_origin"][..., 2] = 1.0
         else:
             _require_valid(times, views)
             further |= {"slope": views.slope, "at_origin": views.at(self.origin), "a": views.a}
-            further |= {"own": own_width(views.a, views.predictions), "centres": _centres(views, self.origin)}
+            centres, apices = _places(views, self.origin)
+            further |= {"own": own_width(views.a, views.predictions), "centres": centres, "apices": apices}
         joined = {name: np.concatenate([getattr(self, name)[drop:], value]) for name, value in further.items()}
         return Frames(origin=self.origin, **joined)
 
 
-def _centres(views: Views, origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "frames cameras 3"]:
-    """The apices relative to the origin; 0 where masked out."""
-    return np.where(views.mask[..., None], views.apex - origin, 0.0)
+def _places(
+    views: Views, origin: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, "frames cameras 3"], Float[np.ndarray, "frames cameras 3"]]:
+    """Cameras and apices relative to the origin; 0 where masked out."""
+    mask = views.mask[..., None]
+    return np.where(mask, views.cameras - origin, 0.0), np.where(mask, views.apex - origin, 0.0)
 
 
 def _require_valid(times: Float[np.ndarray, " times"], views: Views) -> None:

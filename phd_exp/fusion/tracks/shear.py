@@ -7,8 +7,8 @@ depth, and the noise of the motion is a guess. Next to the depths of all frames 
 where these have the weight of a few frames. Both are therefore taken about a given path, that of independent frames:
 
 - The projection of a camera is that of the position which slides along its ray to the depth of the given path. With
-  the ray d from the camera to the given position, q changes by -kappa (t - t_about), kappa = (q_v d)/(t_v d), where
-  q_v and t_v are the slopes.
+  the ray d from the apex (the camera, without a free axis) to the given position, q changes by -kappa (t - t_about),
+  kappa = (q_v d)/(t_v d), where q_v and t_v are the slopes.
 - If there is one camera, at rest, so is the motion. With the depth n.v along an axis n and n.d = 1, both from the
   camera, v~ slides to v = S v~ + offset, S = I + (d - n) n^T, offset = -(d - n) n.about. Several cameras, or one that
   moves, measure the distance by the motion; then S = I.
@@ -59,7 +59,7 @@ def _along_rays(
 
 def apart(frames: Frames) -> tuple[Float[Array, "frames cameras 3 3"], Float[Array, "frames cameras 3"]]:
     """What cameras measure of v~: the slopes, and the values at the origin."""
-    rays = (frames.about[:, None] - frames.centres)[..., None]
+    rays = (frames.about[:, None] - frames.apices)[..., None]
     along = (frames.slope @ rays)[..., 0]
     kappa = along / np.where(frames.mask, along[..., 2], 1.0)[..., None]
     kappa[..., 2] = 0.0
