@@ -66,8 +66,7 @@ class Photometry:
         image = image.clone(memory_format=torch.contiguous_format)
         change(image, drawn["occluder"][:, 0] < 2 * self.occluders - 1, occluded, drawn["shape"])
         if (self.brightness, self.contrast, self.gamma, self.white_balance) != (1, 1, 1, 1):
-            tables = self._tones(drawn["tone"])
-            image = torch.cat([toned(image[block], tables[block]) for block in blocks(image, len(image))])
+            image = toned(image, self._tones(drawn["tone"]))
         change(image, self.blur * blur, blurred, self.blur * blur)
         change(image, self.noise * noise, noisy, self.noise * noise, drawn["place"][:, 0])
         change(image, loss * (self.jpeg < 100), compressed, quality)
@@ -97,28 +96,22 @@ def change(image: Images, strength: np.ndarray, formula: Callable[..., Images], 
     """Change the images of a strength above zero in place, given their numbers.
 
     The strengths are on the host, so that nothing waits for the device. Images of like strength are changed together.
+    They are written by words of 16 bytes if these fit, since a CPU copies element by element.
     """
+    word = torch.uint8 if image[0].numel() % 16 else torch.complex128
+    words = image.view(len(image), -1).view(word)
     rows = np.flatnonzero(strength)
     rows = rows[strength[rows].argsort(kind="stable")]
     for block in blocks(image, len(rows)):
         chosen = on(image, rows[block])
-        write(image, chosen, formula(image.index_select(0, chosen), *(part[rows[block]] for part in numbers)))
+        part = formula(image.index_select(0, chosen), *(values[rows[block]] for values in numbers))
+        words.index_copy_(0, chosen, part.flatten(1).view(word))
 
 
 def blocks(image: Tensor, n: int) -> list[slice]:
     """Slices of n images that are changed together: a CPU's cache holds few of them, a GPU takes all at once."""
     step = AT_ONCE if image.device.type == "cpu" else max(1, n)
     return [slice(start, start + step) for start in range(0, n, step)]
-
-
-def write(
-    image: UInt8[Tensor, "batch height width channels"],
-    rows: Int[Tensor, " rows"],
-    part: UInt8[Tensor, "rows height width channels"],
-) -> None:
-    """image[rows] = part, in place; by words of four bytes if they fit, since a CPU copies element by element."""
-    word = torch.uint8 if image[0].numel() % 4 else torch.int32
-    image.view(len(image), -1).view(word).index_copy_(0, rows, part.flatten(1).view(word))
 
 
 def on(image: Tensor, numbers: np.ndarray) -> Tensor:
@@ -134,9 +127,12 @@ def levels(values: Tensor) -> UInt8[Tensor, "..."]:
 
 def toned(image: Images, tables: UInt8[np.ndarray, "batch bands 256"]) -> Images:
     """tables[image]."""
-    first = 256 * np.arange(tables.shape[0] * tables.shape[1], dtype=np.int32).reshape(-1, 1, 1, tables.shape[1])
-    places = image.int().add_(on(image, first))
-    return on(image, tables.ravel()).index_select(0, places.flatten()).view_as(image)
+    first = on(image, 256 * np.arange(tables[..., 0].size, dtype=np.int32).reshape(len(tables), 1, 1, -1))
+    values, result = on(image, tables.ravel()), torch.empty_like(image)
+    for block in blocks(image, len(image)):
+        places = image[block].int().add_(first[block])
+        torch.index_select(values, 0, places.flatten(), out=result[block].view(-1))
+    return result
 
 
 def blurred(image: Images, deviation: NDArray[np.float64]) -> Images:

@@ -22,7 +22,6 @@ from typing import Any
 import torch
 from lightning import Callback, LightningModule, Trainer
 from loops import Noise
-from torch import Tensor
 from torch.utils.data import IterableDataset
 
 from phd_exp.cli.jobs import composed
@@ -45,15 +44,6 @@ RECIPES = {
 RUNS = {"protocol": ["data.xy_range=0.5", "data.variant=central"], "record": ["-m", "experiment=speed"]}
 PRINTED = ("projected_error_mm", "depth_error_mm", "nll")  # means over the held-out and the test images
 WARM_UP = 10  # steps
-CELLS = 28  # along each side of a mask
-
-
-class MaskedNoise(Noise):
-    """Noise with masks of noise."""
-
-    def training_masks(self) -> Tensor:
-        random = torch.Generator().manual_seed(0)
-        return torch.randint(0, 256, (self.count("train"), CELLS, CELLS), dtype=torch.uint8, generator=random)
 
 
 class Batches(IterableDataset[Batch]):
@@ -105,7 +95,7 @@ def measured(overrides: list[str], steps: int) -> dict[str, Any]:
     settings = ["logger=none", "trainer.progress_bar=false", "trainer.max_epochs=1", "data.n_train=640"]
     config = check(composed(["preset=paper", *settings, *overrides]))
     data = PositionData(
-        MaskedNoise(config),
+        Noise(config),
         batch_size=config.data.batch_size,
         augment=build_augmentation(config.recipe),
         masks=config.recipe.segmentation > 0,

@@ -32,7 +32,7 @@ from phd_exp.geometry.charts import DepthScale
 from phd_exp.hardware import precision
 from phd_exp.metrics.errors import depth_error, projected_error
 from phd_exp.models.regressor import IMAGENET_MEAN, IMAGENET_STD
-from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.dataset import CELLS, DatasetFolder
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import build_data, build_module
 from phd_exp.training.module import PositionModule
@@ -44,7 +44,7 @@ WORKERS = 2
 
 
 class Noise(Source):
-    """As many samples of noise as a configuration asks for, of its size."""
+    """As many samples of noise as a configuration asks for, of its size, with masks of noise."""
 
     def __init__(self, config: RunConfig) -> None:
         self.data = config.data
@@ -65,6 +65,10 @@ class Noise(Source):
     def count(self, part: Part) -> int:
         sizes = {"train": self.data.n_train, "held_out": 0, "test": self.data.n_test}
         return sizes[part] or 0
+
+    def training_masks(self) -> Tensor:
+        random = torch.Generator().manual_seed(0)
+        return torch.randint(0, 256, (self.count("train"), CELLS, CELLS), dtype=torch.uint8, generator=random)
 
 
 class Bare:
