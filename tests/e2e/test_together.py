@@ -97,6 +97,7 @@ def killing_a_rank() -> Iterator[Callable[[Path, int], list[int]]]:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("run")  # on whose data: no renders among the lines
 @pytest.mark.parametrize(("place", "delay"), [(0, 0.0), (1, 0.0), (1, 3.0)])
 def test_one_killed_ends_all_and_the_same_command_goes_on(
     train: Callable,
