@@ -27,8 +27,6 @@ from phd_exp.rendering.surroundings import World
 from phd_exp.rendering.triangles import Meshes
 
 Layer = Literal["objects", "ground"]
-METAL_POINTS = 2**17  # in a small box of metal: the points of a box of 90 x 90 px, four along a side of each pixel
-FINEST_METAL = 8  # largest number of points along a side of a pixel
 X_LIBRARIES = "libx11-6 libxext6 libxfixes3 libxi6 libxrender1 libxkbcommon0 libsm6 libice6 libgl1"
 
 
@@ -73,25 +71,11 @@ class Settings:
         denoised: use Open Image Denoise.
         points: points along a side of each pixel at which the light is computed; a pixel is the mean of several over
             Blender's filter. None: Blender draws the points at random.
-        of_metal: the least number of such points in scenes with metal, each with as many samples; None: `points`.
     """
 
     samples: int
     denoised: bool
     points: int | None
-    of_metal: int | None = None
-
-    @property
-    def samples_at_point(self) -> int:
-        """Light paths from each point of a pixel."""
-        return math.ceil(self.samples / (self.points or 1) ** 2)
-
-    def finer(self, box: Box, *, metal: bool) -> int:
-        """Points along a side of each pixel of a box; for metal more in a small box."""
-        if not metal or self.of_metal is None:
-            return self.points or 1
-        area = (box.right - box.left) * (box.bottom - box.top)
-        return min(max(self.of_metal, math.isqrt(METAL_POINTS // area)), FINEST_METAL)
 
 
 class Renderer:
@@ -125,16 +109,19 @@ class Renderer:
                 lens, (near, far) = self._scene.camera.data, CLIPPING
                 lens.clip_start, lens.clip_end = near * min(1, 2 * spec.z_range[0]), far * remoteness(spec)
 
-    def render(self, scene: Scene, box: Box | None = None, layer: Layer = "objects") -> Light:
+    def render(
+        self, scene: Scene, box: Box | None = None, layer: Layer = "objects", points: int | None = None
+    ) -> Light:
         """Linear light of a box of pixels (height, width, 3), by default of all (S, S, 3); rows from the top.
 
-        An image is white from 1 upwards. A pure function of the scene, the box and the settings. With meshes, the
+        An image is white from 1 upwards. A pure function of the arguments and the settings. With meshes, the
         background is transparent: a fourth channel is the opacity, by which the light is multiplied. The layer
-        "ground" shows the ground without the objects; its opacity is their shadow.
+        "ground" shows the ground without the objects; its opacity is their shadow. `points` replaces that of the
+        settings; each point then has as many samples as theirs.
         """
-        box = box or Box(0, 0, scene.S, scene.S)
-        metal = layer == "objects" and shows_metal(self._bpy, scene)
-        if (finer := self._settings.finer(box, metal=metal)) == 1:
+        box, points = box or Box(0, 0, scene.S, scene.S), points or self._settings.points
+        self._set_filter(points)
+        if (finer := points or 1) == 1:
             return self._traced(scene, box, layer)
         # a pixel more on each side, because the filter reaches that far
         wider = scene.model_copy(update={"S": finer * (scene.S + 2), "f": finer * scene.f})
@@ -162,10 +149,19 @@ class Renderer:
         light[..., :3] *= brightness
         return light
 
+    def shows_metal(self, scene: Scene) -> list[bool]:
+        """Of each object of a scene, whether the renderer makes it metal, because its mesh defines no material."""
+        return shows_metal(self._bpy, scene)
+
     def sky(self, scene: Scene) -> Light:
         """Linear light (S, S, 3) of the sky behind the objects of a scene with a mesh."""
         assert self._world is not None
         return self._world.behind(scene)
+
+    def _set_filter(self, points: int | None) -> None:
+        """Blender's own filter of pixels, or for light at points the only one whose width may be almost zero."""
+        cycles = self._scene.cycles
+        cycles.pixel_filter_type, cycles.filter_width = ("GAUSSIAN", 0.01) if points else ("BLACKMAN_HARRIS", 1.5)
 
     def _frame(self, box: Box, side: int) -> None:
         """Set the box as fractions of the image from the bottom left corner, which Blender truncates to whole pixels.
@@ -198,7 +194,7 @@ def _configure_tracer(cycles: Any, settings: Settings) -> None:
     cycles.device = "CPU"
     # never changed: blue noise is arranged by the largest number since the meshes were loaded, so that an image with
     # fewer samples would depend on the images before it
-    cycles.samples = settings.samples_at_point
+    cycles.samples = math.ceil(settings.samples / (settings.points or 1) ** 2)
     cycles.use_adaptive_sampling = False  # would vary the number of samples, which is small anyway
     # the denoiser sometimes takes the default pattern's noise for texture
     cycles.sampling_pattern = "BLUE_NOISE"
@@ -206,9 +202,6 @@ def _configure_tracer(cycles: Any, settings: Settings) -> None:
     cycles.max_bounces = 2  # objects colour each other once; more bounces change nothing measurable
     cycles.diffuse_bounces = cycles.glossy_bounces = 2
     cycles.transmission_bounces = cycles.volume_bounces = cycles.transparent_max_bounces = 0
-    if settings.points:
-        cycles.pixel_filter_type = "GAUSSIAN"  # the only filter whose width may be almost zero
-        cycles.filter_width = 0.01
     cycles.use_denoising = settings.denoised
     cycles.denoiser = "OPENIMAGEDENOISE"
     cycles.denoising_quality = "FAST"  # HIGH takes a quarter longer for half a dB
@@ -224,6 +217,7 @@ def _configure_for_meshes(bpy: Any) -> None:
     scene.render.film_transparent = True
     scene.cycles.transparent_max_bounces = 8
     scene.cycles.denoising_quality = "BALANCED"
+    scene.cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"  # 2 dB better on textures
 
 
 @contextmanager

@@ -14,11 +14,12 @@ from phd_exp.records.assets import Asset
 from phd_exp.records.dataset import image_name, sha256
 from phd_exp.records.scenes import Backdrop, SampleRecord, Scene, Split
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.antialias import coverage, smoothed
+from phd_exp.rendering.antialias import REACH, coverage, smoothed
 from phd_exp.rendering.blender import Renderer, Settings
 from phd_exp.rendering.objects import sample_object_scene
 from phd_exp.rendering.pixels import Box, Light, Pixels, encode, encoded
 from phd_exp.rendering.rays import (
+    FACES,
     NOTHING,
     Hits,
     Mask,
@@ -33,14 +34,14 @@ from phd_exp.rendering.surroundings import photo_light, shaken
 from phd_exp.rendering.triangles import Meshes
 
 GREY = 128  # of all colours beyond the edges of the user's image, as in the views of photographs
-OF_METAL = 4  # points along a side of a pixel: the denoiser keeps more of the noise along the edges of highlights
+METAL_SIDE = 150  # px: smaller boxes of metal have more points in each pixel, since highlights have few pixels
+FINEST = 4  # most points along a side of a pixel
 MARGIN = 4  # px around the objects: the denoiser is less accurate along the border of its image
 
 
 def fast_settings(spec: DatasetSpec) -> Settings:
     """Settings of the tracer for the images of a data set."""
-    n = spec.samples_per_pixel
-    return Settings(n, True, points=1) if spec.mesh is None else Settings(n, True, points=2, of_metal=OF_METAL)
+    return Settings(spec.samples_per_pixel, denoised=True, points=1 if spec.mesh is None else None)
 
 
 def make_sample(renderer: Renderer, spec: DatasetSpec, split: Split, index: int) -> tuple[bytes, SampleRecord]:
@@ -99,16 +100,36 @@ def photograph(renderer: Renderer, scene: Scene, hits: Hits, spec: DatasetSpec) 
     if around.ground is not None and not spec.empty:
         light *= 1 - shadow(renderer, scene)
     if shown.any() and not spec.empty:
-        box = box_around(shown, MARGIN)
-        inside = box.slices
-        front, opacity = np.split(renderer.render(scene, box), [3], axis=-1)
+        inside = box_around(shown, MARGIN).slices
+        front, opacity = np.split(front_light(renderer, scene, hits)[inside], [3], axis=-1)
         if renderer.is_opaque:  # its edges are those of more points than its light
-            covered = coverage(scene, box, renderer.meshes) * (opacity > 0)
+            covered = coverage(scene, box_around(shown, MARGIN), renderer.meshes) * (opacity > 0)
             front, opacity = front * covered / np.where(opacity > 0, opacity, 1), covered
         light[inside] = front + (1 - opacity) * light[inside]
     picture = encoded(shaken(light, around.shake))
     picture[beyond_edges(scene)] = GREY
     return picture
+
+
+def front_light(renderer: Renderer, scene: Scene, hits: Hits) -> Light:
+    """Light and opacity (S, S, 4) of the objects of a scene with a mesh, traced in the box of each object."""
+    shown, number = hits.first != NOTHING, (hits.first - 1) // FACES
+    light = np.zeros((scene.S, scene.S, 4))
+    for item, metal in enumerate(renderer.shows_metal(scene)):
+        part = shown & (number == item)
+        if part.any():
+            box = box_around(part, MARGIN)
+            inside = box.slices
+            near = part | ~shown & ndimage.maximum_filter(part, 2 * REACH + 1)  # and its smooth edge
+            traced = renderer.render(scene, box, points=points_of_metal(box) if metal else None)
+            light[inside] = np.where(near[inside][..., None], traced, light[inside])
+    return light
+
+
+def points_of_metal(box: Box) -> int | None:
+    """Points along a side of each pixel of a box that shows metal; None in a large box, where Blender draws them."""
+    side = math.sqrt((box.right - box.left) * (box.bottom - box.top))
+    return min(math.ceil(math.sqrt(METAL_SIDE / side)), FINEST) if side < METAL_SIDE else None
 
 
 def shadow(renderer: Renderer, scene: Scene) -> Light:

@@ -50,13 +50,13 @@ def show_scene(bpy: Any, scene: Scene, meshes: Iterable[str] = (), brightness: f
     show_backdrop(bpy.data.worlds["world"].node_tree.nodes, scene.backdrop)
 
 
-def shows_metal(bpy: Any, scene: Scene) -> bool:
-    """Whether the renderer makes an object of the scene metal, because its mesh defines no material."""
-    return any(
-        item.look.metallic > 0 if item.look else item.material == "metal"
+def shows_metal(bpy: Any, scene: Scene) -> list[bool]:
+    """Of each object of a scene, whether the renderer makes it metal, because its mesh defines no material."""
+    return [
+        (item.look.metallic > 0 if item.look else item.material == "metal")
+        and not any(bpy.data.objects[item.shape].data.materials)
         for item in scene.objects
-        if not any(bpy.data.objects[item.shape].data.materials)
-    )
+    ]
 
 
 def _place_object(bpy: Any, item: SceneObject) -> None:

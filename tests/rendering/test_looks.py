@@ -10,7 +10,7 @@ from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer, Settings
 from phd_exp.rendering.objects import sample_object_scene
 from phd_exp.rendering.rays import NOTHING, trace_pixels
-from phd_exp.rendering.samples import fast_settings
+from phd_exp.rendering.samples import fast_settings, front_light, make_sample
 from phd_exp.rendering.triangles import Triangles
 from tests.support.meshes import solid, write_mesh
 from tests.support.renders import SMALL_MESH, MakeSpec, drawn
@@ -45,11 +45,12 @@ def test_an_image_depends_on_its_scene_alone(spec: DatasetSpec) -> None:
     renderer = Renderer(fast_settings(fast), fast)
     scenes = drawn(fast, 5, renderer.meshes)
     assert {any(item.look.metallic for item in scene.objects) for scene in scenes} == {True, False}
-    images = [renderer.render(scene) for scene in scenes]
-    for scene, image in reversed(list(zip(scenes, images, strict=True))):
-        np.testing.assert_array_equal(renderer.render(scene), image)
-        opacity = image[..., 3] > 0.5
-        assert (opacity != (trace_pixels(scene, renderer.meshes).first != NOTHING)).mean() < 0.02
+    images = [make_sample(renderer, fast, "train", index)[0] for index in range(5)]
+    for index, scene in reversed(list(enumerate(scenes))):
+        assert make_sample(renderer, fast, "train", index)[0] == images[index]
+        hits = trace_pixels(scene, renderer.meshes)
+        opacity = front_light(renderer, scene, hits)[..., 3] > 0.5
+        assert (opacity != (hits.first != NOTHING)).mean() < 0.02
 
 
 def test_a_texture_changes_its_tone(of_mesh: MakeSpec, tmp_path: Path) -> None:
