@@ -127,6 +127,16 @@ def test_focal_lengths_that_follow_from_a_camera_are_not_shifted(checked: Callab
     assert config.data_of("far").spec.z_range == (5.0, 7.0)
 
 
+@pytest.mark.parametrize(("words", "n"), [((0, 0), 1), ((0.5, 0), 2), ((0, 0.5), 2)])
+def test_what_is_behind_objects_is_rendered_for_other_backdrops_and_prints(
+    checked: Callable, tmp_path: Path, words: tuple[float, float], n: int
+) -> None:
+    (tmp_path / "part.obj").touch()
+    keys = (f"recipe.augmentation.{key}={share}" for key, share in zip(("backdrops", "prints"), words, strict=True))
+    rendered = checked("data=object", f"data.mesh={tmp_path}/part.obj", *keys).rendered
+    assert [data.spec.empty for data in rendered] == [False, True][:n]
+
+
 def test_older_records_without_several_views_are_valid(composed: Callable[..., dict[str, Any]]) -> None:
     config = composed()
     for key in ("multiview", "sequences", "shifts", "n_shifted"):
