@@ -126,30 +126,25 @@ def _closest_depth(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch"], Fl
     mu_z is returned as its logarithm minus that of the first member. With far = E[z/mu_z; z > mu_z] and
     near = E[mu_z/z; z < mu_z] the derivatives vanish where a (far - near) = 1 and a (far + near - 1) is the mean
     excess energy of a. The first gives a; then the second determines log mu_z. Both are computed from the excess of
-    far and near over the probabilities of z > mu_z and z < mu_z, since they themselves cancel where a is large.
+    far and near over the probabilities of z > mu_z and z < mu_z, since they themselves cancel where a is large. Where
+    a is small, near = a e^a E_1(a) / (1 + g(a)), its value for the closest law, takes the place of the second.
     """
     first, a = members.mu_z[..., :1], members.a
     log_mu = torch.log1p((members.mu_z - first) / first)
-    second, first, third = expint_differences(a)
-    norm = 1 + a * second  # 1 + g
-    beyond = 1 / a - a * third  # E[t - 1], less 1 / a - E[t - 1; t > 1]
-    short = second - a * first  # 1 - E[1/t]
+    of_a = expint_differences(a)
 
     def conditions(place: Tensor) -> tuple[Tensor, Tensor]:
         """Whether log mu_z is larger than `place`, and the best a there."""
-        distance = place[..., None] - log_mu
-        x, s = a * distance.abs().exp(), distance.exp()
-        decay, (two, one_two, two_three) = torch.exp(-a * torch.expm1(distance.abs())), expint_differences(x)
-        is_beyond, gap = distance > 0, torch.expm1(distance.abs()) * norm
-        # E[t/s - 1; t > s], E[s/t - 1; t < s] and P(t > s) - P(t < s) for t = z / mu_z of a member, in units of
-        # 1 / (1 + g)
-        far = torch.where(is_beyond, decay / x, beyond / s + gap + decay * a * s * two_three)
-        near = torch.where(is_beyond, gap - s * short + decay * two, a * s * decay * one_two)
-        ahead = torch.where(is_beyond, 2 * decay - norm, norm - 2 * a * s * decay * two)
-        far, near, ahead = ((value / norm).mean(-1) for value in (far, near, ahead))
-        difference, excess = (far - near + ahead).clamp_min(torch.finfo(a.dtype).tiny), far + near
-        energy = depth_mean_energy(-difference.log())
-        return excess / difference < energy, energy / excess
+        far, near, ahead, before = _partial_moments(a, of_a, place[..., None] - log_mu)
+        best = 1 / (far - near + ahead).clamp_min(torch.finfo(a.dtype).tiny)
+        energy = depth_mean_energy(best.log())
+        two, one_two, _ = expint_differences(best)
+        is_larger = torch.where(
+            best < 1,
+            before < best * (one_two + two) / (1 + best * two),  # the same, without a difference of large numbers
+            (far + near) * best < energy,
+        )
+        return is_larger, energy / (far + near)
 
     margin = torch.log1p(4 / a)
     low, high = (log_mu - margin).amin(-1), (log_mu + margin).amax(-1)
@@ -160,6 +155,26 @@ def _closest_depth(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch"], Fl
         high = low + step
     middle = low + step / 2
     return middle, conditions(middle)[1]
+
+
+def _partial_moments(a: Tensor, of_a: tuple[Tensor, ...], distance: Tensor) -> tuple[Tensor, ...]:
+    """E[t/s - 1; t > s], E[s/t - 1; t < s], P(t > s) - P(t < s) and E[s/t; t < s] of the mixture, s = e^distance.
+
+    t is z/mu_z of a member, `of_a` its `expint_differences`; the last dimension counts the members.
+    """
+    second, first, third = of_a
+    norm = 1 + a * second  # 1 + g, by which all are divided at the end
+    beyond = 1 / a - a * third  # E[t - 1], less 1 / a - E[t - 1; t > 1]
+    short = second - a * first  # 1 - E[1/t]
+    x, s = a * distance.abs().exp(), distance.exp()
+    decay, (two, one_two, two_three) = torch.exp(-a * torch.expm1(distance.abs())), expint_differences(x)
+    is_beyond, gap = distance > 0, torch.expm1(distance.abs()) * norm
+    far = torch.where(is_beyond, decay / x, beyond / s + gap + decay * a * s * two_three)
+    near = torch.where(is_beyond, gap - s * short + decay * two, a * s * decay * one_two)
+    ahead = torch.where(is_beyond, 2 * decay - norm, norm - 2 * a * s * decay * two)
+    one = decay * (one_two + two)
+    before = a * s * torch.where(is_beyond, 2 * (first + second) - one, one)
+    return tuple((value / norm).mean(-1) for value in (far, near, ahead, before))
 
 
 def _closest_rounded_depth(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
