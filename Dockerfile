@@ -2,7 +2,7 @@
 # Images for CPUs, from the lists of this repository:
 #
 #     docker build --target predict --tag phd_exp .
-#     docker run --rm --volume "$PWD:/data" phd_exp predict run=run.zip image=photo.jpg f=1550
+#     docker run --rm --user "$(id -u):$(id -g)" --volume "$PWD:/data" phd_exp predict run=run.zip image=photo.jpg f=1550
 #
 #     docker build --target render --tag phd_exp:render .     # all extras, and Blender with its X libraries
 #     docker build --target check .                           # both commands of the README
@@ -23,6 +23,9 @@ COPY conf conf
 COPY hydra_plugins hydra_plugins
 COPY phd_exp phd_exp
 RUN pip install --constraint constraints.txt ".${EXTRAS}"
+# compiled here, since a container has no earlier call of fuse and track; any user may add to it
+ENV NUMBA_CACHE_DIR=/var/cache/numba
+RUN python -m phd_exp.fusion && chmod --recursive a+rwX "$NUMBA_CACHE_DIR"
 RUN useradd --create-home user
 USER user
 WORKDIR /data

@@ -178,8 +178,8 @@ class Rounded(DepthLaw):
     def _curvature(self, y: Tensor) -> Tensor:
         """Its second derivative by log a."""
         squared = y.square()
-        over_R = squared / (self.r**2 + squared).sqrt()
-        return self._rise(y) + over_R * (2 - over_R.square() / squared)
+        R_squared = self.r**2 + squared
+        return self._rise(y) + squared / R_squared.sqrt() * (2 - squared / R_squared)
 
     def _at(self, x: Points) -> "_Points":
         # by exp and log, because runtimes of exported graphs have hyperbolic functions in float32 alone

@@ -120,6 +120,12 @@ def test_the_farthest_depth_has_the_energy(law: Rounded) -> None:
         torch.testing.assert_close(law.energy(side), energy)
 
 
+def test_a_depth_at_the_mode_has_its_closest_law(law: Rounded) -> None:
+    width = 1 / law.log_a.exp().clamp_min(1)
+    log_t = width[..., None] * torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)
+    assert all(value.isfinite().all() for value in law.closest_to(log_t, torch.full_like(log_t, 1 / 3)))
+
+
 @pytest.mark.parametrize("a", [1e-3, 0.5, 3.0, 200.0])
 def test_a_small_rounding_leaves_the_law_of_the_paper(a: float) -> None:
     log_a = torch.tensor(a, dtype=torch.float64).log()
