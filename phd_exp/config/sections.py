@@ -204,7 +204,7 @@ class TrainerConfig(Record):
 
 
 class AugmentationConfig(Record):
-    """The arguments of `Augmentation` and of its `Photometry`, and the share of other backdrops."""
+    """The arguments of `Augmentation` and of its `Photometry`, and the shares of `PositionData` before them."""
 
     symmetries: StrictBool
     largest_zoom: Annotated[float, Field(ge=1, le=2)]

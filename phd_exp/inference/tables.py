@@ -17,7 +17,7 @@ from phd_exp.config import RenderedConfig, RunConfig
 from phd_exp.config.sections import ShiftConfig
 from phd_exp.config.targets import Trust
 from phd_exp.data.batches import Batch
-from phd_exp.data.photometry import Photometry
+from phd_exp.data.photometry import VERSION, Photometry
 from phd_exp.data.sources import PARTS, Known, Part, RenderedSource, Source
 from phd_exp.distributions.columns import Columns
 from phd_exp.evaluation.parquet import read_table, stacked
@@ -183,12 +183,13 @@ def origin_of(folder: RunFolder, config: RunConfig, **choices: Any) -> dict[str,
 
 
 def origin_of_shift(folder: RunFolder, config: RunConfig, name: str) -> dict[str, str]:
-    """The metadata of a shift's table."""
-    changes, data = flatten(config.evaluation.shifts[name].model_dump(exclude_defaults=True)), config.data_of(name)
+    """The metadata of a shift's table; that of changed images has the version of the changes."""
+    shift, data = config.evaluation.shifts[name], config.data_of(name)
+    changes = flatten(shift.model_dump(exclude_defaults=True))
     samples = f"{data.spec.fingerprint()}, {data.n_test}" if isinstance(data, RenderedConfig) else data.name
-    return origin_of(
-        folder, config, shift=", ".join(f"{key}={value}" for key, value in changes.items()), data=samples
-    )
+    version = {"photometry": VERSION} if shift.images else {}
+    words = ", ".join(f"{key}={value}" for key, value in changes.items())
+    return origin_of(folder, config, shift=words, data=samples, **version)
 
 
 def is_recorded(file: Path, origin: Mapping[str, str]) -> bool:

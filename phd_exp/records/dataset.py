@@ -194,7 +194,7 @@ def mapped(file: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
         raise ValueError(f"holds {array.dtype} {array.shape}; expected uint8 {shape}")
     with open(file, "rb") as stream:  # NumPy's copy-on-write mode reserves memory for the whole file
         pages = mmap(stream.fileno(), 0, flags=MAP_PRIVATE | NO_RESERVE)
-    return np.frombuffer(pages, np.uint8, array.size, array.offset).reshape(array.shape)[: shape[0]]
+    return np.ndarray(array.shape, np.uint8, pages, array.offset, array.strides)[: shape[0]]
 
 
 def image_name(index: int, image_format: ImageFormat = "png") -> str:

@@ -3,6 +3,7 @@
 import os
 import shutil
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -102,6 +103,13 @@ def test_images_that_exceed_the_memory_are_read_where_they_are(tmp_path: Path) -
     sparse.flush()
     images = torch.from_numpy(mapped(file, sparse.shape)).index_select(0, torch.tensor([0, n - 1]))
     assert images.flatten(1).amax(1).tolist() == [0, 7]
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_a_mapped_array_has_the_values_of_its_file_in_either_order(tmp_path: Path, order: Literal["C", "F"]) -> None:
+    array = np.arange(2 * 3 * 4, dtype=np.uint8).reshape(2, 3, 4)
+    np.save(tmp_path / "array.npy", np.asarray(array, order=order))
+    np.testing.assert_array_equal(mapped(tmp_path / "array.npy", (1, 3, 4)), array[:1])
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from phd_exp.data.exchanges import Exchange
 from phd_exp.data.images import SHRINKING
 from phd_exp.data.photometry import VERSION
 from phd_exp.data.prints import PRINT_NUMBERS, printed
+from phd_exp.inference import tables
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import build_data, build_module
@@ -94,7 +95,7 @@ def test_images_shrunk_by_another_version_are_refused_where_they_differ(
 
 
 @pytest.mark.parametrize("words", [["photometry=robust"], ["recipe=strong"]], ids=" ".join)
-@pytest.mark.parametrize("version", [None, VERSION])
+@pytest.mark.parametrize("version", [None, 2, VERSION])
 @pytest.mark.parametrize("state", ["new", "interrupted", "finished"])
 def test_a_run_with_photometry_of_another_version_is_not_resumed(
     checked: Callable, tmp_path: Path, words: list[str], version: int | None, state: str
@@ -106,9 +107,20 @@ def test_a_run_with_photometry_of_another_version_is_not_resumed(
     if state != "new":
         folder.last_checkpoint.touch()
     folder.write_constants({"photometry": version} if version else {})
-    refused = state == "interrupted" and words == ["photometry=robust"] and version is None
+    refused = state == "interrupted" and words == ["photometry=robust"] and version != VERSION
     with pytest.raises(RunError, match="move the folder away and train again") if refused else nullcontext():
         require_same_photometry(folder, checked(*words).recipe)
+
+
+def test_shifted_images_are_recorded_again_with_another_version_of_photometry(
+    checked: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, config = RunFolder(tmp_path), checked("shift=[images,focal_length]")
+    names = set(config.evaluation.shifts)
+    before = {name: tables.origin_of_shift(folder, config, name) for name in names}
+    monkeypatch.setattr(tables, "VERSION", VERSION + 1)
+    changed = {name for name in names if tables.origin_of_shift(folder, config, name) != before[name]}
+    assert changed == names - {"f_wrong"}
 
 
 READS = ("aten::_local_scalar_dense", "aten::nonzero", "aten::is_nonzero", "aten::equal")
