@@ -89,7 +89,7 @@ class RunConfig(Record):
 
     @model_validator(mode="after")
     def sizes_fit(self, info: ValidationInfo) -> "RunConfig":
-        """Refuse images larger than rendered, and a sequence in two parts."""
+        """Refuse images larger than rendered, and a sequence with both training and held-out samples."""
         data, images = self.data, 1
         if isinstance(data, RenderedConfig) and data.spec.frames > 1:
             images = data.spec.frames * data.spec.views
@@ -122,7 +122,7 @@ class RunConfig(Record):
 
     @property
     def rendered(self) -> list[RenderedConfig]:
-        """The rendered data sets that the training reads: its own, and what is behind the objects of its images."""
+        """The rendered data sets that the training reads: its own, and the backdrops without objects, if used."""
         data = self.data
         if not isinstance(data, RenderedConfig):
             return []
@@ -144,7 +144,7 @@ class RunConfig(Record):
     def sequences(self) -> dict[tuple[int, bool], RenderedConfig]:
         """The sequences that follow the training, as test samples: by their frames, and whether they are held out.
 
-        Half as many are held out, from as many cameras; they have another seed.
+        Half as many are held out, from the same number of cameras and with another seed.
         """
         asked, multiview = self.evaluation, self.evaluation.multiview
         if not isinstance(data := self.data, RenderedConfig):

@@ -41,7 +41,7 @@ class SizesConfig(Record):
 
     @property
     def labelled(self) -> tuple[Path, ...]:
-        """Folders of the user's own images, with annotations, on which a run trains or is tested."""
+        """Folders of the user's own annotated images, for training or test."""
         return ()
 
 
@@ -111,13 +111,13 @@ class RenderedConfig(SizesConfig):
         return self.root / self.spec.variant
 
     def changed(self, changes: dict[str, Any], n_test: int) -> "RenderedConfig":
-        """The first `n_test` test samples alone, with other values. Raises ValueError for wrong ones."""
+        """The first `n_test` test samples of this data set with other values. Raises ValueError for invalid ones."""
         spec = DatasetSpec(**(dict(self.spec) | changes))
         return self.model_copy(update={"spec": spec, "n_train": 0, "n_held_out": 0, "n_test": n_test})
 
 
 Render = Callable[..., None]
-"""Renders the missing samples of a `RenderedConfig`; `fewer=WORDS` names the overrides for fewer of them."""
+"""Renders the missing samples of a `RenderedConfig`; messages suggest the overrides `fewer` for fewer samples."""
 
 
 class FolderConfig(SizesConfig):

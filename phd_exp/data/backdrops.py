@@ -12,8 +12,8 @@ from phd_exp.data.batches import Batch
 from phd_exp.data.photometry import change, levels, many, on
 
 BACKDROP_NUMBERS = 7  # per sample: whether it changes, and those of `before_others`
-MOST_CONTRAST = 0.5  # of plain backdrops
-NEAR = 40  # levels: the largest distance of a plain backdrop that is near the objects'
+MOST_CONTRAST = 0.5  # largest factor of the contrast of a plain backdrop
+NEAR = 40  # levels: largest difference between the objects and a plain backdrop near their level
 FINEST = 4.0  # largest factor by which a backdrop is shown smaller, with finer texture
 
 
@@ -57,8 +57,8 @@ def before_others(
     empty' is that of one of two random samples, the one with more texture, since smooth backdrops are easy; it is
     `tiled` and perhaps transposed. The sum keeps shadows on the ground and the mixed colours of edges.
 
-    The share `plain` of the new backdrops loses most of its contrast, as the top of a table, and gets a random level.
-    For half of these it is near that of the objects, whose outlines are then hard to see.
+    The share `plain` of the new backdrops is nearly plain, like a table top: little contrast and a random level. For
+    half of these, the level is near that of the objects, whose outlines are then hard to see.
 
     Args:
         backdrops: of all training samples.
@@ -96,7 +96,7 @@ def before_others(
 def _level_of_objects(
     image: UInt8[Tensor, "some side side 3"], clear: UInt8[Tensor, "some side side"]
 ) -> Float[Tensor, " some"]:
-    """The mean level (some,) of the pixels that show objects."""
+    """The mean level of the pixels that show objects."""
     covered = 1 - clear.flatten(1).float() / 255
     return (covered * image.float().mean(-1).flatten(1)).sum(1) / covered.sum(1).clamp_min(1)
 
@@ -104,9 +104,10 @@ def _level_of_objects(
 def _toned(
     new: Float[Tensor, "some side side 3"], of_objects: Float[Tensor, " some"], kinds: Float[Tensor, "some 4"]
 ) -> Float[Tensor, "some side side 3"]:
-    """Backdrops, nearly plain where the first of four numbers from 0 to 1 is 1.
+    """The backdrops, nearly plain where the first of four numbers is 1.
 
-    The second decides their contrast, the third their level: any if the fourth is below 1/2, else near the objects'.
+    The others are from 0 to 1. The second sets the contrast and the third the level: any level if the fourth is below
+    1/2, otherwise one near that of the objects.
     """
     is_plain, contrast, level, is_free = kinds.T
     level = torch.where(is_free < 0.5, 255 * level, of_objects + NEAR * (2 * level - 1))

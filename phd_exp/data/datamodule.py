@@ -24,9 +24,9 @@ Held = TypeVar("Held", Batch, Backdrops)
 class PositionData(LightningDataModule):
     """The samples of a source in batches, or the share of one of several processes (`rank` of `world`).
 
-    `augment` changes training batches only. Before that, the share `backdrops` of their samples is shown before other
-    backdrops, of which the share `plain` is nearly plain; the share `prints` gets prints on its objects; and
-    `photographs` replace their share of them. With `masks`, these batches have the masks of the source, if
+    `augment` changes training batches only. Before it, the share `backdrops` of their samples is put in front of
+    other backdrops (the share `plain` of these is nearly plain), the share `prints` gets prints on the objects, and
+    `photographs` replace their share of the samples. With `masks`, these batches have the masks of the source, if
     it has any. The validation evaluates the test samples, which choose nothing, and with `held_out` also the held-out
     samples that may choose; all of these are the source's.
 
@@ -100,14 +100,14 @@ class PositionData(LightningDataModule):
             self.train_batches = self.batches(samples, shuffle=True, augment=self._training_augment(samples))
 
     def _training_augment(self, samples: Batch) -> Augment | None:
-        """The augmentation of training samples, with the exchanges before it."""
+        """The augmentation of training samples, after the exchanges of backdrops, prints and photographs."""
         augment = self.augment
         if self.photographs:
             stock, share = self.photographs.samples(samples), self.photographs.share
             augment = Exchange(stock, replaced, PHOTOGRAPH_NUMBERS, share, augment)
         if not (self.backdrops or self.prints):
             return augment
-        backdrops = self.source.training_backdrops()  # used first, since what is behind photographs is not known
+        backdrops = self.source.training_backdrops()  # changed first, since those of photographs are not known
         if self.prints:
             augment = Exchange(backdrops, printed, PRINT_NUMBERS, self.prints, augment)
         if self.backdrops:

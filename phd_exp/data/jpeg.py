@@ -28,7 +28,7 @@ CHROMA = (
 # fmt: on
 TO_YCC = ((0.299, 0.587, 0.114), (-0.168736, -0.331264, 0.5), (0.5, -0.418688, -0.081312))
 """R, G, B -> luma, blue and red chroma. Source: ITU-T T.871."""
-MIDDLE = 128  # the level of luma that is 0 for the cosine transform
+MIDDLE = 128  # subtracted from luma before the cosine transform
 
 
 def compressed(
@@ -89,8 +89,8 @@ def _to_rgb(
 ) -> UInt8[Tensor, "batch height width 3"]:
     """Rounded colours, given luma less `MIDDLE` and chroma of half the resolution, which is interpolated linearly.
 
-    Even and odd columns are computed apart, which needs no planes of interpolated columns, and each channel apart,
-    since rounding them together takes longer.
+    Even and odd columns are computed separately, so that no plane of interpolated columns is stored. So are channels,
+    because rounding them together takes longer.
     """
     edged = pad(chroma, (1, 1, 1, 1), mode="replicate")
     here = edged[:, :, 1:-1]

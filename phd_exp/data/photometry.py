@@ -96,7 +96,7 @@ def change(image: Images, strength: np.ndarray, formula: Callable[..., Images], 
     """Change the images of a strength above zero in place, given their numbers.
 
     The strengths are on the host, so that nothing waits for the device. Images of like strength are changed together.
-    They are written by words of 16 bytes if these fit, since a CPU copies element by element.
+    They are written in words of 16 bytes if the size allows it, since a CPU copies element by element.
     """
     word = torch.uint8 if image[0].numel() % 16 else torch.complex128
     words = image.view(len(image), -1).view(word)
@@ -136,9 +136,9 @@ def toned(image: Images, tables: UInt8[np.ndarray, "batch bands 256"]) -> Images
 
 
 def blurred(image: Images, deviation: NDArray[np.float64]) -> Images:
-    """The convolution with a Gaussian of that standard deviation, up to three of them; the border is repeated.
+    """The convolution with a Gaussian, up to three times its standard deviation; the border is repeated.
 
-    Weights are rounded to 1/256, so that 16 bits hold all sums of levels from -128 to 127: half the time of float32.
+    Weights are multiples of 1/256, so that 16 bits hold all sums of the levels less 128, in half the time of float32.
     """
     reach = np.ceil(3 * deviation)[:, None]
     place = np.arange(int(reach.max()) + 1)
@@ -154,7 +154,7 @@ def blurred(image: Images, deviation: NDArray[np.float64]) -> Images:
 def _smooth(
     values: Int[Tensor, "batch others places inner"], weights: Int[Tensor, "reach batch 1 1 1"]
 ) -> Int[Tensor, "batch others places inner"]:
-    """weights[0] v[i] + sum over k of weights[k] (v[i - k] + v[i + k]), over 256 and rounded."""
+    """(weights[0] v[i] + sum over k of weights[k] (v[i - k] + v[i + k])) / 256, rounded."""
     reach, n = len(weights) - 1, values.shape[2]
     first, last = values[:, :, :1], values[:, :, -1:]
     around = torch.cat([*[first] * reach, values, *[last] * reach], dim=2)  # `pad` takes as long as all the sums
@@ -202,7 +202,7 @@ def occluded(image: Images, shape: NDArray[np.float64]) -> Images:
 
 
 def many(few: Float[np.ndarray, "batch 2"], n: int) -> Float[np.ndarray, "batch n"]:
-    """Many numbers from 0 to 1 from two: fractional parts of large multiples."""
+    """n numbers from 0 to 1, given two: fractional parts of large multiples."""
     multiples = 1e4 * np.sqrt(np.arange(2, 2 + n) + 0.5)
     return np.asarray((few[:, :1] * multiples + few[:, 1:] * multiples[::-1]) % 1)
 

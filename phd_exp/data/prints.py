@@ -13,20 +13,20 @@ from phd_exp.data.batches import Batch
 from phd_exp.data.photometry import change, levels, on
 
 PRINT_NUMBERS = 14  # per sample: whether it changes, and those of `printed`
-LARGEST = math.log(4)  # of the log factor by which a part of a print changes the light
-DETAIL = 2.0  # standard deviations of a backdrop, at which its print is lightest or darkest
-GREY = 128  # of all colours beyond the edges of the user's image
-SOFTEST = 8.0  # levels: the least standard deviation of a backdrop that its print stretches to the full range
+LARGEST = math.log(4)  # largest log factor by which a print changes values
+DETAIL = 2.0  # standard deviations from the mean of a backdrop at which its print is lightest or darkest
+GREY = 128  # level of all colours beyond the edges of the user's image
+SOFTEST = 8.0  # levels: backdrops with a smaller standard deviation have fainter prints
 
 
 def printed(
     backdrops: Backdrops, batch: Batch, chosen: Bool[np.ndarray, " batch"], numbers: Float[np.ndarray, "batch 13"]
 ) -> Batch:
-    """The batch, with a print on everything before the backdrops of some samples: image exp(covered log factor).
+    """The batch, with a print on the objects of some samples: image * exp(covered * log factor).
 
-    Two random lines divide the image into four pieces, as edges divide the faces of an object. The log factor is that
-    of the piece, plus that of a random backdrop, which is `tiled`, and mirrored beyond the first line. The print
-    multiplies the light: shading stays. Pixels beyond the edges of the user's image stay grey.
+    Two random lines divide the image into four pieces, as edges divide an object into faces. The log factor is the
+    sum of a constant for each piece and the texture of a random backdrop, `tiled`, and mirrored on one side of the
+    first line. Values are multiplied, so that shading remains. Pixels beyond the edges of the user's image stay grey.
 
     Source: own design, after the random textures of Tobin et al., "Domain randomization" (2017).
 
@@ -64,8 +64,11 @@ def _log_factor(
 ) -> Float[Tensor, "some side side 1"]:
     """The log factors of prints of these textures, from -1 to 1.
 
-    The numbers of the lines are from 0 to 1: the point through which both go, in the middle quarter of the image, and
-    their directions over pi. Those of the pieces are from -1 to 1: of the sides of each line, and of their product.
+    Args:
+        texture: mean of the colours of a backdrop.
+        lines: from 0 to 1: x and y of the point where both lines cross, in the middle half of each axis, and the
+            direction of each over pi.
+        pieces: from -1 to 1: weights of the side of each line (-1 or 1), and of the product of both sides.
     """
     side = texture.shape[1]
     x, y, *angles = lines.T

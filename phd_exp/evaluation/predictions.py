@@ -120,7 +120,7 @@ def evaluation_of(statistic: Statistic, columns: Mapping[str, Tensor], left_out:
 
 
 def fit_temperature(held_out: Arrays, rows: slice = slice(None)) -> Temperature:
-    """The temperatures fitted on predictions of held-out samples: all, or `CHOOSE` where the others guarantee.
+    """The temperatures fitted on predictions of held-out samples: of all rows, or `CHOOSE` if the others guarantee.
 
     Raises RunError if a column is missing, or if no temperature fits.
     """

@@ -24,7 +24,7 @@ from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error, sq
 from phd_exp.records.errors import RunError
 
 Cameras = Sequence[SeveralViews]
-"""The same sequences, in which views are frames, as seen by each camera."""
+"""The same sequences from each camera; their views are frames."""
 Method = Literal["single", "kalman", "independent", "slow"]
 """Each frame alone (its mode, or the position fused from two cameras); a Rauch-Tung-Striebel smoother of means and
 covariances; the mean path of `fusion.tracks.track` without and with slow errors."""
@@ -96,7 +96,7 @@ def place(quantity: str, method: Method) -> str:
 
 
 def choose(held_out: Sequence[Cameras]) -> Choice:
-    """The motion and the slow errors that suit held-out sequences, each set seen by as many cameras as the test.
+    """The motion and the slow errors, chosen on held-out sequences from as many cameras as those of the test.
 
     The speed is that of the true positions. The noise of smoothers of independent frames makes the predictions most
     likely. With slow errors, where the predictions hardly tell the noise, it makes the true positions most likely

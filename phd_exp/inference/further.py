@@ -1,4 +1,4 @@
-"""What a training records beyond its own samples: of several views, sequences, shifts and turned images."""
+"""Predictions of further samples after a training: several views, sequences, shifts and eight symmetric views."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from phd_exp.records.runs import RunFolder
 
 
 def record_further(run: RunFolder, config: RunConfig, render: Render) -> None:
-    """Record a run's predictions of all further samples that its configuration asks for, once; first render them."""
+    """Render and predict the further samples that the configuration asks for, unless they are recorded already."""
 
     def once(
         file: Path, data: DataConfig, origin: dict[str, str], words: str, fewer: str, shift: ShiftConfig = UNCHANGED

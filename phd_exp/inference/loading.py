@@ -37,7 +37,7 @@ def load(
     Args:
         run: the run's folder, or a file of `pack`; several, or a folder of seeds, for an ensemble.
         device: "auto" chooses a GPU if there is one.
-        recalibrate: apply the temperatures that fit the run's predictions of all held-out samples.
+        recalibrate: apply temperatures fitted to the run's predictions of all held-out samples.
         trust: packages other than phd_exp whose classes the run may build; None: any.
         views: 8 for an ensemble of the eight symmetric views of each image.
 

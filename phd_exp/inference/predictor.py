@@ -50,7 +50,7 @@ class Predictor:
         constant_f: the focal length that the network receives for every image, px; None: the true one.
         temperature: temperatures of recalibrated predictions; None: as trained.
         state: the state of the run, "finished" if it completed.
-        guarantees: whether the samples that guarantee regions chose no temperature.
+        guarantees: whether the temperatures leave samples for `guarantee`.
         folders: the runs, whose held-out samples guarantee regions.
         labelled: a record of `calibrate`, whose images replace those samples; see `calibrated`.
         others: the further networks of an ensemble.
@@ -156,16 +156,17 @@ class Predictor:
         return tables[0] if len(tables) == 1 else ensemble_table(tables)
 
     def recalibrated(self, *, guarantees: bool = False) -> "Predictor":
-        """The same with the temperatures that fit its held-out samples; every second if others are to `guarantee`.
+        """The same with temperatures fitted to its held-out samples.
 
-        Raises as `held_out`.
+        With `guarantees`, only every second one is used, so that the others can `guarantee`. Raises as `held_out`.
         """
         return self._tempered(self.held_out(), guarantees)
 
     def calibrated(self, name: str, *, guarantees: bool = False) -> "Predictor":
-        """The same with the temperatures that fit a record of `calibrate`; every second if others are to `guarantee`.
+        """The same with temperatures fitted to a record of `calibrate`.
 
-        Raises RunError if there is no record.
+        With `guarantees`, only every second image is used, so that the others can `guarantee`. Raises RunError if
+        there is no record.
         """
         file = self.folders[0].labelled(name)
         if self.is_ensemble:
@@ -189,12 +190,12 @@ class Predictor:
         """Regions that contain the true position with a probability in (0, 1); see `evaluation.conformal`.
 
         Raises RunError if there are too few held-out samples or labelled images, ConfigError if the run predicts no
-        uncertainty, or if all samples chose the temperatures.
+        uncertainty, or if its temperatures were fitted to all samples.
         """
         if not self.guarantees:
             raise ConfigError(
-                "guarantee: all samples chose the temperatures, so that none can guarantee a coverage; expected a "
-                "predictor of recalibrated(guarantees=True) or calibrated(NAME, guarantees=True)"
+                "guarantee: all samples were used to fit the temperatures, so none is left to guarantee a coverage; "
+                "expected a predictor from recalibrated(guarantees=True) or calibrated(NAME, guarantees=True)"
             )
         from phd_exp.evaluation.conformal import guarantee
         from phd_exp.evaluation.parquet import read_table  # imports pyarrow

@@ -53,9 +53,9 @@ PACKAGES = ("phd_exp", "torch", "torchvision", "lightning", "hydra-core", "numpy
 CHOOSE, GUARANTEE = slice(0, None, 2), slice(1, None, 2)
 """Rows of held-out samples, and scenes of several views: even ones choose, odd ones guarantee.
 
-Whatever the training chooses by held-out samples (epochs, trials of a search, recipes) uses the even rows. Conformal
-regions have their temperatures and borders of groups from the even rows and their thresholds from the odd ones. Only
-temperatures of predictions without guaranteed regions are fitted to all rows.
+The training uses the even rows to choose epochs, trials of a search and recipes. For guaranteed regions, even rows
+determine temperatures and borders of groups, odd rows the thresholds. Without guaranteed regions, temperatures are
+fitted to all rows.
 """
 _NUMBERS: TypeAdapter[dict[str, int | float | None]] = TypeAdapter(dict[str, int | FiniteFloat | None])
 

@@ -98,8 +98,8 @@ def _chosen(scores: TrackScores) -> str:
     noise, slow, whole = scores.choice.noise, scores.choice.slow, scores.choice.correlated
     noises = ", ".join(f"{noise[method]:.2g} ({NAMES[method]})" for method in SMOOTHERS)
     return (
-        f"Held-out sequences from {_cameras(scores.cameras)} have a speed of {scores.choice.speed:.2g} m/s, and "
-        f"chose the noise of the motion, in m/s² per √Hz: {noises}. Their errors have the time constants "
+        f"Held-out sequences from {_cameras(scores.cameras)} have a speed of {scores.choice.speed:.2g} m/s. They "
+        f"determine the noise of the motion, in m/s² per √Hz: {noises}. Their errors have the time constants "
         f"{whole.depth_time:.2g} s of depth and {whole.projection_time:.2g} s of the projection by autocorrelation; "
         f"weighted frames use {slow.depth_time:.2g} s and {slow.projection_time:.2g} s, with which the true held-out "
         "positions were most likely."

@@ -1,4 +1,4 @@
-"""Work of several processes, which end together.
+"""One task in several processes, which end together.
 
 Lightning would start the command of this process again, which in a sweep is the whole sweep. Here each process is a
 `Child` that runs this module, whatever launcher runs the job. It exits when the connection to its parent closes, and
@@ -25,7 +25,7 @@ Work = Callable[[int, int], dict[str, Any]]
 
 
 def together(work: Work, world: int, threads: int) -> dict[str, Any]:
-    """Work with `world` processes, which share the threads; returns the results of rank 0.
+    """Do the work in `world` processes, which share the threads; returns the results of rank 0.
 
     Raises the error of the first process to fail; the others are ended.
     """
@@ -71,7 +71,7 @@ def _received(child: Child, rank: int, world: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Work as one of the processes, and send back the results or the error."""
+    """Do the work of one process, and send back the results or the error."""
     connection = parent()
     sys.path.append(os.getcwd())  # for the user's own parts
     share = connection.recv()

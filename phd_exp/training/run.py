@@ -71,7 +71,7 @@ def run(
 
 @dataclass(frozen=True)
 class Training:
-    """The built parts of a run: Lightning's trainer, what it trains, on which samples, and the record of it."""
+    """The built parts of a run: Lightning's trainer, the module, its data and the recorder."""
 
     trainer: Trainer
     module: PositionModule
@@ -131,9 +131,9 @@ class Training:
         return table
 
     def measure(self) -> dict[str, float]:
-        """Evaluate the best weights on the test and held-out samples, and record the tables; returns the metrics.
+        """Evaluate the best weights on the test and held-out samples, and record the tables.
 
-        Those of the untrained network are among them.
+        Returns the test metrics, and those of the untrained network.
         """
         folder = self.recorder.folder
         if (best := folder.best_checkpoint) != folder.last_checkpoint:
@@ -148,7 +148,7 @@ class Training:
         return summary(tables["test"]) | {f"untrained/{key}": value for key, value in untrained if "test/" in key}
 
     def circumstances(self) -> dict[str, Any]:
-        """The sizes of the training, and what computed it."""
+        """Numbers of samples and epochs, device, threads and precision."""
         device = self.trainer.strategy.root_device
         return {
             **{f"n_{part}": self.data.source.count(part) for part in PARTS},

@@ -37,7 +37,7 @@ def train(
     overrides: Sequence[str] = (),
     render: Render | None = None,
 ) -> dict[str, Any]:
-    """Complete the data, train, evaluate and record one run; returns its results. A finished run is not run again.
+    """Render missing data, train, evaluate and record one run; returns its results. A finished run is not repeated.
 
     An interrupted run resumes with its next batch, a killed one after its last whole epoch.
 
@@ -48,7 +48,7 @@ def train(
         cores: number of threads, unless trainer.threads or OMP_NUM_THREADS is set.
         callbacks: of Lightning, further ones than the configuration's; with trainer.devices=1 only.
         overrides: words of the command line, for the record.
-        render: renders missing samples; None if there are none.
+        render: renders missing samples; None if all are there.
 
     Raises RunError if the folder holds a run of another configuration or another process uses it, DatasetError if the
     data set is incomplete.

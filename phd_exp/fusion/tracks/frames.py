@@ -77,7 +77,7 @@ class Frames:
         own: the width of a rounded mode of t; 0 for a kink.
         since: seconds since the camera's prediction before; inf without one.
         centres: the positions of the cameras; 0 where a camera takes no part.
-        apices: those of the densities, without a free axis the positions of the cameras; 0 there too.
+        apices: apices of the densities, which without a free axis are the positions of the cameras; 0 as above.
         about: a path, see `phd_exp.fusion.tracks.shear`; at first the average of each frame's predicted positions,
             interpolated in frames without a prediction.
         shear: S and offset there; at first I and 0.
