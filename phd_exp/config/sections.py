@@ -204,7 +204,7 @@ class TrainerConfig(Record):
 
 
 class AugmentationConfig(Record):
-    """The arguments of `Augmentation` and of its `Photometry`, and the shares of `PositionData` before them."""
+    """The arguments of `Augmentation` and of its `Photometry`, and the shares that `PositionData` changes before."""
 
     symmetries: StrictBool
     largest_zoom: Annotated[float, Field(ge=1, le=2)]

@@ -116,8 +116,8 @@ class Renderer:
 
         An image is white from 1 upwards. A pure function of the arguments and the settings. With meshes, the
         background is transparent: a fourth channel is the opacity, by which the light is multiplied. The layer
-        "ground" shows the ground without the objects; its opacity is their shadow. `points` replaces that of the
-        settings; each point then has as many samples as theirs.
+        "ground" shows the ground without the objects; its opacity is their shadow. `points` replaces the points of
+        the settings, not the number of samples at each.
         """
         box, points = box or Box(0, 0, scene.S, scene.S), points or self._settings.points
         self._set_filter(points)
@@ -159,7 +159,7 @@ class Renderer:
         return self._world.behind(scene)
 
     def _set_filter(self, points: int | None) -> None:
-        """Blender's own filter of pixels, or for light at points the only one whose width may be almost zero."""
+        """Set Blender's own pixel filter, or with points the only one whose width may be almost zero."""
         cycles = self._scene.cycles
         cycles.pixel_filter_type, cycles.filter_width = ("GAUSSIAN", 0.01) if points else ("BLACKMAN_HARRIS", 1.5)
 
@@ -192,8 +192,8 @@ def _configure_image(scene: Any) -> None:
 def _configure_tracer(cycles: Any, settings: Settings) -> None:
     """Set the options of the path tracer that differ from Blender's factory settings."""
     cycles.device = "CPU"
-    # never changed: blue noise is arranged by the largest number since the meshes were loaded, so that an image with
-    # fewer samples would depend on the images before it
+    # never changed: blue noise depends on the largest number of samples since the meshes were loaded, so that an
+    # image with fewer samples would depend on the images before it
     cycles.samples = math.ceil(settings.samples / (settings.points or 1) ** 2)
     cycles.use_adaptive_sampling = False  # would vary the number of samples, which is small anyway
     # the denoiser sometimes takes the default pattern's noise for texture

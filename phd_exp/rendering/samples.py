@@ -35,7 +35,7 @@ from phd_exp.rendering.triangles import Meshes
 
 GREY = 128  # of all colours beyond the edges of the user's image, as in the views of photographs
 METAL_SIDE = 150  # px: smaller boxes of metal have more points in each pixel, since highlights have few pixels
-FINEST = 4  # most points along a side of a pixel
+FINEST = 4  # largest number of points along a side of a pixel
 MARGIN = 4  # px around the objects: the denoiser is less accurate along the border of its image
 
 
@@ -120,7 +120,7 @@ def front_light(renderer: Renderer, scene: Scene, hits: Hits) -> Light:
         if part.any():
             box = box_around(part, MARGIN)
             inside = box.slices
-            near = part | ~shown & ndimage.maximum_filter(part, 2 * REACH + 1)  # and its smooth edge
+            near = part | ~shown & ndimage.maximum_filter(part, 2 * REACH + 1)  # the object and its smooth edge
             traced = renderer.render(scene, box, points=points_of_metal(box) if metal else None)
             light[inside] = np.where(near[inside][..., None], traced, light[inside])
     return light
