@@ -66,7 +66,7 @@ def test_the_numbers_are_those_of_one_process(train: Callable, tmp_path: Path) -
     for name in ("predictions.parquet", "held_out.parquet"):
         one, other = pd.read_parquet(alone.path / name), pd.read_parquet(together.path / name)
         assert list(other["file_name"]) == list(one["file_name"])
-        drawn = ["energy_score", *LOG_VOLUMES.values()]  # from random numbers that depend on who shares a batch
+        drawn = ["energy_score", *LOG_VOLUMES.values()]  # at random, depending on which samples share a batch
         pd.testing.assert_frame_equal(one.drop(columns=drawn), other.drop(columns=drawn), rtol=1e-3, atol=1e-5)
     for curve in ("epoch-0000", "final"):
         curves = [json.loads(run.curves(curve).read_text()) for run in (alone, together)]
@@ -97,7 +97,7 @@ def killing_a_rank() -> Iterator[Callable[[Path, int], list[int]]]:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("run")  # on whose data: no renders among the lines
+@pytest.mark.usefixtures("run")  # its data exists, so that no line is about rendering
 @pytest.mark.parametrize(("place", "delay"), [(0, 0.0), (1, 0.0), (1, 3.0)])
 def test_one_killed_ends_all_and_the_same_command_goes_on(
     train: Callable,
