@@ -57,6 +57,11 @@ class PositionData(LightningDataModule):
                     f"recipe.augmentation.{key}: got {share}, but what these images show behind their objects is "
                     "not known; expected 0, or data=object"
                 )
+        if plain and not backdrops:
+            raise ConfigError(
+                f"recipe.augmentation.plain: got {plain}, a share of the other backdrops, but backdrops=0 has none; "
+                "expected 0, or recipe.augmentation.backdrops above 0, as in recipe=strong"
+            )
         if batch_size > source.count("train"):
             raise ConfigError(
                 f"data: batch_size={batch_size} is larger than the {source.count('train')} training samples there "

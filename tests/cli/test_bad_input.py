@@ -51,6 +51,8 @@ WRONG_VALUES = [
     ([SEQUENCES, "model=mae_vz"], ["model=mae_vz predicts no Projected Huber density", "expected model=prob"]),
     (["evaluation.sequences=[[4,20],[2,20]]"], ["expected pairs [sequences, frames] of different frames"]),
     (["evaluation.sequence_cameras=3"], ["evaluation.sequence_cameras", "got 3"]),
+    (["photometry=surfaces"], ["recipe.augmentation.prints: got 0.6", "expected 0, or data=object"]),
+    (["recipe.augmentation.plain=0.5"], ["recipe.augmentation.plain: got 0.5", "augmentation.backdrops above 0"]),
     (["evaluation.eight_views=true", "model=mae_vz"], ["evaluation.eight_views", "model=mae_vz predicts points"]),
     (["loss=mae"], ["loss", "PointEstimate", "model=probabilistic", "ProjectedHuber"]),
     (["model=mae_vz", "loss=nll"], ["loss", "Density", "model=mae_vz"]),
