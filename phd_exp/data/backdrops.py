@@ -44,6 +44,16 @@ class Backdrops:
         """The same on a device."""
         return Backdrops(self.empty.to(device), self.clear.to(device))
 
+    def of(
+        self, batch: Batch, place: Int[np.ndarray, " some"]
+    ) -> tuple[UInt8[Tensor, "some side side 3"], UInt8[Tensor, "some side side"]]:
+        """`empty` and `clear` of the samples at these places of a batch, on the device of its images."""
+        rows = batch.row.index_select(0, on(batch.row, place))
+        empty, clear = (
+            part.index_select(0, rows.to(part.device)).to(batch.image.device) for part in (self.empty, self.clear)
+        )
+        return empty, clear
+
 
 def before_others(
     backdrops: Backdrops,
@@ -75,11 +85,8 @@ def before_others(
         views: Float[np.ndarray, "some 4"],
         kinds: Float[np.ndarray, "some 4"],
     ) -> UInt8[Tensor, "some side side 3"]:
-        empty, rows = backdrops.empty, batch.row.index_select(0, on(batch.row, place))
-        old, share = (
-            part.index_select(0, rows.to(part.device)).to(image.device) for part in (empty, backdrops.clear)
-        )
-        new = tiled(empty, others, views).to(image.device).float()
+        old, share = backdrops.of(batch, place)
+        new = tiled(backdrops.empty, others, views).to(image.device).float()
         if plain:
             new = _toned(new, _level_of_objects(image, share), on(image, kinds))
         return levels((new - old.float()).mul_(share[..., None] / 255).add_(image))

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from phd_exp.data.areas import GREY
 from phd_exp.data.backdrops import Backdrops, tiled
 from phd_exp.data.batches import Batch
 from phd_exp.data.photometry import change, levels, on
@@ -15,7 +16,6 @@ from phd_exp.data.photometry import change, levels, on
 PRINT_NUMBERS = 14  # per sample: whether it changes, and those of `printed`
 LARGEST = math.log(4)  # largest log factor by which a print changes values
 DETAIL = 2.0  # standard deviations from the mean of a backdrop at which its print is lightest or darkest
-GREY = 128  # level of all colours beyond the edges of the user's image
 SOFTEST = 8.0  # levels: backdrops with a smaller standard deviation have fainter prints
 
 
@@ -41,10 +41,8 @@ def printed(
     def changed(
         image: UInt8[Tensor, "some side side 3"], place: Int[np.ndarray, " some"], drawn: Float[np.ndarray, "some 13"]
     ) -> UInt8[Tensor, "some side side 3"]:
-        empty, rows = backdrops.empty, batch.row.index_select(0, on(batch.row, place))
-        clear, behind = (
-            part.index_select(0, rows.to(part.device)).to(image.device) for part in (backdrops.clear, empty)
-        )
+        empty = backdrops.empty
+        behind, clear = backdrops.of(batch, place)
         is_grey = ((image == GREY) & (behind == GREY)).all(-1)
         covered = torch.where(is_grey, 0.0, 1 - clear.float() / 255)[..., None]
         texture = tiled(empty, (len(empty) * drawn[:, 0]).astype(np.int64), drawn[:, 1:5]).to(image.device)

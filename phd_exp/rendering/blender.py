@@ -3,7 +3,6 @@
 import importlib
 import importlib.metadata
 import importlib.util
-import math
 import os
 import sys
 import tempfile
@@ -67,7 +66,7 @@ class Settings:
     """Settings of the path tracer.
 
     Attributes:
-        samples: light paths per pixel, at least one for each of its points.
+        samples: light paths from each point of a pixel, or from all of a pixel without points.
         denoised: use Open Image Denoise.
         points: points along a side of each pixel at which the light is computed; a pixel is the mean of several over
             Blender's filter. None: Blender draws the points at random.
@@ -194,7 +193,7 @@ def _configure_tracer(cycles: Any, settings: Settings) -> None:
     cycles.device = "CPU"
     # never changed: blue noise depends on the largest number of samples since the meshes were loaded, so that an
     # image with fewer samples would depend on the images before it
-    cycles.samples = math.ceil(settings.samples / (settings.points or 1) ** 2)
+    cycles.samples = settings.samples
     cycles.use_adaptive_sampling = False  # would vary the number of samples, which is small anyway
     # the denoiser sometimes takes the default pattern's noise for texture
     cycles.sampling_pattern = "BLUE_NOISE"

@@ -100,10 +100,11 @@ def photograph(renderer: Renderer, scene: Scene, hits: Hits, spec: DatasetSpec) 
     if around.ground is not None and not spec.empty:
         light *= 1 - shadow(renderer, scene)
     if shown.any() and not spec.empty:
-        inside = box_around(shown, MARGIN).slices
+        box = box_around(shown, MARGIN)
+        inside = box.slices
         front, opacity = np.split(front_light(renderer, scene, hits)[inside], [3], axis=-1)
         if renderer.is_opaque:  # its edges are those of more points than its light
-            covered = coverage(scene, box_around(shown, MARGIN), renderer.meshes) * (opacity > 0)
+            covered = coverage(scene, box, renderer.meshes) * (opacity > 0)
             front, opacity = front * covered / np.where(opacity > 0, opacity, 1), covered
         light[inside] = front + (1 - opacity) * light[inside]
     picture = encoded(shaken(light, around.shake))

@@ -28,6 +28,8 @@ from phd_exp.training.module import PositionModule
 from phd_exp.training.objective import Objective
 from phd_exp.training.optimisation import Optimisation, factor
 
+EXCHANGED = {"backdrops", "plain", "prints"}  # shares of a recipe's augmentation that are arguments of `PositionData`
+
 
 def build_data(config: RunConfig, rank: int = 0) -> PositionData:
     """The data set of a run, or of one of its processes. `setup` opens the images.
@@ -48,9 +50,7 @@ def build_data(config: RunConfig, rank: int = 0) -> PositionData:
         augment=build_augmentation(config.recipe),
         held_out=config.evaluation.held_out and config.data.n_held_out > 0,
         masks=config.recipe.segmentation > 0,
-        backdrops=config.recipe.augmentation.backdrops,
-        plain=config.recipe.augmentation.plain,
-        prints=config.recipe.augmentation.prints,
+        **config.recipe.augmentation.model_dump(include=EXCHANGED),
         photographs=_photographs(config.data),
     )
 
@@ -65,7 +65,7 @@ def _photographs(data: DataConfig) -> Photographs | None:
 
 def build_augmentation(recipe: RecipeConfig) -> Augmentation | None:
     """The augmentation of a recipe; None if it changes nothing."""
-    keys = recipe.augmentation.model_dump(exclude={"backdrops", "plain", "prints"})
+    keys = recipe.augmentation.model_dump(exclude=EXCHANGED)
     photometry = Photometry(**{field.name: keys.pop(field.name) for field in fields(Photometry)})
     augmentation = Augmentation(**keys, photometry=photometry)
     return augmentation if augmentation.changes_anything else None

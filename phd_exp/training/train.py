@@ -62,9 +62,10 @@ def train(
             return folder.results()
         for place in (folder.path, folder.checkpoints, folder.calibration):
             remove_temporaries(place)  # of a killed process
-        folder.write_config(config.model_dump(mode="json"))
+        written = config.model_dump(mode="json")
+        folder.write_config(written)
         threads = config.trainer.threads or default_threads(cores)
-        with folder.recording(_manifest_hash(config.data), custom_parts(config.model_dump(mode="json")), overrides):
+        with folder.recording(_manifest_hash(config.data), custom_parts(written), overrides):
             if (world := config.trainer.devices) > 1:
                 results = together(partial(run, config, folder, draw), world, threads)
             else:
