@@ -39,11 +39,12 @@ def load(
     recalibrate: bool = False,
     trust: tuple[str, ...] = (),
     views: int = 1,
+    margin: float = 1.0,
 ) -> Predictor:
     """A trained run or an ensemble as a callable from images to predictions; see `inference.loading.load`."""
     from phd_exp.inference import loading
 
-    return loading.load(run, device, recalibrate, trust, views)
+    return loading.load(run, device, recalibrate, trust, views, margin)
 
 
 def runs(folder: str | Path = "runs") -> Any:

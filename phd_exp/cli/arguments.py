@@ -70,6 +70,8 @@ GUARANTEED = "probability of regions that contain the true position, guaranteed 
 Coverage = Annotated[Annotated[float, Field(gt=0, lt=1)] | None, Field(description=GUARANTEED)]
 EXECUTED = "packages of the user's own parts that the run names, separated by commas; their code is executed"
 Trust = Annotated[str | None, Field(description=EXECUTED)]
+ENLARGED = "side of the view of each box over that of the box; 1.2 for tight boxes"
+Margin = Annotated[Annotated[float, Field(ge=1, le=3)], Field(description=ENLARGED)]
 Paths = Annotated[tuple[Path, ...], BeforeValidator(lambda text: [text] if os.path.exists(text) else text.split(","))]
 
 
@@ -85,6 +87,7 @@ class RunArguments(Arguments):
     trust: Trust = None
     views: Literal["1", "8"] = "1"
     """8: an ensemble of the eight symmetric views of each image"""
+    margin: Margin = 1.0
 
     @model_validator(mode="after")
     def one_calibration(self) -> Self:
@@ -106,7 +109,7 @@ def loaded(arguments: RunArguments, device: str = "auto", coverage: Coverage = N
     with _without_collector():
         from phd_exp.inference.loading import load
     trust = trusted(arguments.trust)
-    predictor = load(arguments.run, device, trust=trust, views=int(arguments.views))
+    predictor = load(arguments.run, device, trust=trust, views=int(arguments.views), margin=arguments.margin)
     if predictor.state != "finished":
         print(f"note: {arguments.run[0]}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
     guarantees = coverage is not None

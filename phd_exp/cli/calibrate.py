@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from phd_exp.cli.arguments import Arguments, Trust, trusted
+from phd_exp.cli.arguments import Arguments, Margin, Trust, trusted
 from phd_exp.records.detections import NumberOrName
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.own_images import detections_in
@@ -24,6 +24,7 @@ class CalibrateArguments(Arguments):
     """BOP's obj_id, KITTI's type or COCO's category; by default all objects"""
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")] = "photographs"
     """the name of the record, which predict calibration=NAME uses"""
+    margin: Margin = 1.0
     trust: Trust = None
 
 
@@ -37,7 +38,7 @@ def main(words: list[str]) -> int:
     from phd_exp.inference.loading import load
     from phd_exp.inference.tables import record_labelled
 
-    predictor = load(arguments.run, trust=trusted(arguments.trust))
+    predictor = load(arguments.run, trust=trusted(arguments.trust), margin=arguments.margin)
     table, name = record_labelled(predictor, detections, arguments.name), arguments.name
     temperature, n = predictor.calibrated(name).temperature, len(detections)
     assert temperature is not None
@@ -50,5 +51,6 @@ def main(words: list[str]) -> int:
     print(
         f"  coverage= can guarantee {', '.join(enough) or 'nothing'}; 0.9 needs {2 * samples_needed(0.9)} detections"
     )
-    print(f"  use them: python -m phd_exp predict run={arguments.run} calibration={name} ...")
+    margin = f" margin={arguments.margin:g}" if arguments.margin != 1 else ""
+    print(f"  use them: python -m phd_exp predict run={arguments.run} calibration={name}{margin} ...")
     return 0

@@ -30,9 +30,11 @@ class ExportArguments(RunArguments):
 
     @model_validator(mode="after")
     def one_network(self) -> Self:
-        """Refuse a guarantee that was made for another network."""
+        """Refuse a guarantee that was made for another network, and a margin without boxes."""
         if self.quantize and self.coverage:
             raise ValueError("coverage: is guaranteed for the network in float32; expected no quantize=")
+        if self.margin != 1 and not self.photographs:
+            raise ValueError("margin: enlarges boxes; expected photographs=true too")
         return self
 
 

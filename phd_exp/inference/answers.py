@@ -276,7 +276,7 @@ def _seen(predictor: Predictor, detections: list[Detection] | UserError) -> tupl
     try:
         image = read_image(detections[0].file, detections[0].content)
         for detection in detections:
-            camera = facing(detection, image.size, predictor.side, predictor.largest_f)
+            camera = facing(detection, image.size, predictor.side, predictor.largest_f, predictor.margin)
             found.append((detection, image, View(cut(image, camera), camera)))
     except DatasetError as error:
         return found, error

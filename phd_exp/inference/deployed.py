@@ -100,8 +100,11 @@ class OfPhotographs(Deployed):
     def forward(
         self, photograph: UInt8[Tensor, "height width 3"], K: Float[Tensor, "3 3"], boxes: Float[Tensor, "boxes 4"]
     ) -> tuple[Tensor, ...]:
-        R, f = facing(K, boxes, self.predictor.side, self.predictor.largest_f)
-        image = area_means(sums(photograph), *pixel_corners(K, boxes, R, f, self.predictor.side))
+        lower, upper = boxes.tensor_split(2, dim=-1)
+        further = (self.predictor.margin - 1) * (upper - lower) / 2
+        seen = torch.cat([lower - further, upper + further], dim=-1)
+        R, f = facing(K, seen, self.predictor.side, self.predictor.largest_f)
+        image = area_means(sums(photograph), *pixel_corners(K, seen, R, f, self.predictor.side))
         raw = self.predictor.outputs(image, self.predictor.camera(f.float()).f)
         answers = self.answers(self.predictor.predict(raw, f.float(), self.dtype), photograph, K, boxes)
         left, top, right, bottom = boxes.unbind(-1)
@@ -125,7 +128,8 @@ class OfPhotographs(Deployed):
 
     def samples(self, images: UInt8[Tensor, "n S S 3"], f: Float[Tensor, " n"]) -> Iterator[tuple[Tensor, ...]]:
         side = float(self.predictor.side)
-        box = torch.tensor([[0, 0, side, side]], dtype=self.dtype)
+        edge = side * (1 - 1 / self.predictor.margin) / 2  # the margin makes a whole view of it
+        box = torch.tensor([[edge, edge, side - edge, side - edge]], dtype=self.dtype)
         for image, value in zip(images, f.tolist(), strict=True):
             yield image, torch.from_numpy(intrinsics(value, value, side / 2, side / 2)).to(self.dtype), box
 

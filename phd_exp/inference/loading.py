@@ -31,6 +31,7 @@ def load(
     recalibrate: bool = False,
     trust: Trust = (),
     views: int = 1,
+    margin: float = 1.0,
 ) -> Predictor:
     """The network of a run's best checkpoint, or its last; or an ensemble of several runs or views.
 
@@ -40,6 +41,7 @@ def load(
         recalibrate: apply temperatures fitted to the run's predictions of all held-out samples.
         trust: packages other than phd_exp whose classes the run may build; None: any.
         views: 8 for an ensemble of the eight symmetric views of each image.
+        margin: side of the view of each box over that of the box.
 
     Raises:
         RunError: the folder holds no usable run.
@@ -53,6 +55,7 @@ def load(
         state = next((one.state for one in predictors if one.state != "finished"), "finished")
         networks = tuple(other.regressor for other in others)
         first = replace(first, folders=tuple(folders), others=networks, views=views, state=state)
+    first = replace(first, margin=margin)
     return first.recalibrated() if recalibrate else first
 
 

@@ -198,6 +198,7 @@ def _metadata(deployed: Deployed) -> dict[str, Any]:
         "version": versions().get("phd_exp", "unknown"),
         "run": run,
         "side": predictor.side,
+        "margin": predictor.margin,
         "temperature": asdict(temperature) if temperature else None,
         "precision": str(deployed.dtype).removeprefix("torch."),
         **{name: DESCRIPTIONS[name] for name in (*deployed.inputs, "raw", *_names(deployed))},

@@ -23,7 +23,7 @@ from phd_exp.geometry.motion import EIGHT, turned
 from phd_exp.inference.views import View, focal_lengths, image_batch
 from phd_exp.models.heads import Prediction, SymmetricHead
 from phd_exp.models.regressor import Regressor
-from phd_exp.optics.virtual import Box, VirtualCamera, intrinsics
+from phd_exp.optics.virtual import Box, VirtualCamera, enlarged, intrinsics
 from phd_exp.records.errors import ConfigError, DatasetError, RunError, listed
 from phd_exp.records.runs import CHOOSE, RunFolder
 
@@ -55,6 +55,7 @@ class Predictor:
         labelled: a record of `calibrate`, whose images replace those samples; see `calibrated`.
         others: the further networks of an ensemble.
         views: number of symmetric views of each image, 1 or 8.
+        margin: side of the view of a box over that of the box.
     """
 
     config: RunConfig
@@ -70,6 +71,7 @@ class Predictor:
     labelled: Path | None = None
     others: tuple[Regressor, ...] = ()
     views: int = 1
+    margin: float = 1.0
 
     @property
     def networks(self) -> tuple[Regressor, ...]:
@@ -166,7 +168,7 @@ class Predictor:
         """The same with temperatures fitted to a record of `calibrate`.
 
         With `guarantees`, only every second image is used, so that the others can `guarantee`. Raises RunError if
-        there is no record.
+        there is no record, or one with another margin.
         """
         file = self.folders[0].labelled(name)
         if self.is_ensemble:
@@ -178,7 +180,13 @@ class Predictor:
             )
         from phd_exp.evaluation.parquet import read_table  # imports pyarrow
 
-        return replace(self._tempered(read_table(file), guarantees), labelled=file)
+        table = read_table(file)
+        if (recorded := float(table.get("margin", np.ones(1))[0])) != self.margin:
+            raise RunError(
+                f"calibration: {file} is of views with margin={recorded:g}; got margin={self.margin:g}; expected the "
+                "same: `calibrate` again, or change margin="
+            )
+        return replace(self._tempered(table, guarantees), labelled=file)
 
     def _tempered(self, table: "Arrays", guarantees: bool) -> "Predictor":
         from phd_exp.evaluation.predictions import fit_temperature  # imports pyarrow
@@ -210,17 +218,17 @@ class Predictor:
     ) -> View:
         """The network's input for a box (left, top, right, bottom, px; None: all) in an image of a camera K.
 
-        A small box is viewed with a focal length of `largest_f` pixels, and the pixels around it. Predictions are in
-        the frame of `view.camera`; `view.camera.to_real` maps them back.
+        A box is viewed `margin` times as large, a small one with a focal length of `largest_f` pixels and the pixels
+        around it. Predictions are in the frame of `view.camera`; `view.camera.to_real` maps them back.
 
         Raises DatasetError if the image is invalid or the box is outside the field of every pinhole camera.
         """
         (array,) = image_batch(image[None])
-        whole = (0, 0, array.shape[1], array.shape[0])
-        left, top, right, bottom = map(float, whole if box is None else box)
+        whole = 0.0, 0.0, float(array.shape[1]), float(array.shape[0])
+        seen = whole if box is None else enlarged(box, self.margin)
         largest_f = math.inf if box is None else self.largest_f
         try:
-            camera = VirtualCamera.of_box(K, (left, top, right, bottom), float(self.side), largest_f=largest_f)
+            camera = VirtualCamera.of_box(K, seen, float(self.side), largest_f=largest_f)
         except ValueError as error:
             raise DatasetError(f"image: {error}") from None
         return View(cut(array, camera), camera)

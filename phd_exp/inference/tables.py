@@ -109,6 +109,7 @@ def record_labelled(predictor: Predictor, detections: Sequence[Detection], name:
         parts.append(columns(batch.predictions, samples))
         n += len(views)
     found = _joined(parts)
+    found["margin"] = torch.full_like(found["f"], predictor.margin)
     _require_metres(found, detections[0])
     file = folder.labelled(name)
     with folder.held():

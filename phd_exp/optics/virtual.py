@@ -132,6 +132,13 @@ class VirtualCamera:
         return intrinsics(self.f, self.f, self.S / 2, self.S / 2) @ self.R @ np.linalg.inv(self.K)
 
 
+def enlarged(box: Box, factor: float) -> Box:
+    """The box with the same middle and sides `factor` times as long."""
+    left, top, right, bottom = box
+    across, down = (factor - 1) * (right - left) / 2, (factor - 1) * (bottom - top) / 2
+    return left - across, top - down, right + across, bottom + down
+
+
 def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
     """K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: positions to homogeneous pixels; all in pixels."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])

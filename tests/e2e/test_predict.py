@@ -77,6 +77,11 @@ def test_labelled_images_calibrate_a_run(
     assert predictor.temperature.depth == pytest.approx(fitted.depth, rel=1e-3)
     (line,) = read_lines(phd_exp("predict", f"run={mine}", *image, "calibration=garden").out)
     assert line["uncertainty"] == f"recalibrated: A / {fitted.projected:.4g}, a / {fitted.depth:.4g}"
+    refused = phd_exp("predict", f"run={mine}", *image, "calibration=garden", "margin=1.2")
+    assert "garden.parquet is of views with margin=1; got margin=1.2; expected the same" in refused.error
+    outcome = phd_exp("calibrate", f"run={mine}", f"folder={labelled}", "name=garden", "margin=1.2")
+    assert "calibration=garden margin=1.2 ..." in outcome.out
+    assert phd_exp("predict", f"run={mine}", *image, "calibration=garden", "margin=1.2").status == 0
     lines = read_metadata(labelled)
     (wrong := tmp_path / "mm").mkdir()
     for one in lines:

@@ -13,7 +13,7 @@ from phd_exp.distributions import Mixture, Temperature
 from phd_exp.distributions.constraints import families
 from phd_exp.distributions.temperature import Slope
 from phd_exp.geometry import Camera, Cartesian, Chart, DepthScale, LogDepth, Projected
-from phd_exp.inference.deployed import answers, require_exportable
+from phd_exp.inference.deployed import OfPhotographs, answers, require_exportable
 from phd_exp.inference.predictor import Predictor
 from phd_exp.models.heads import ChartHead, DistributionHead, Head, MixtureHead, SurrogateHead
 from phd_exp.records.errors import ConfigError
@@ -268,6 +268,15 @@ NO_BOXES = {
     "infinite": [20, 10, np.inf, 60],
     "90 degrees from the axis": [-1e5, 10, 1e5, 60],
 }
+
+
+def test_a_margin_enlarges_the_boxes_of_photographs(composed: Callable[..., Any]) -> None:
+    head, numbers = DistributionHead(DEPTH), torch.randn(50, 7, generator=torch.Generator().manual_seed(0))
+    narrow, wide = (OfPhotographs(predictor(composed, head, numbers, margin=margin)) for margin in (1.0, 1.5))
+    given = torch.from_numpy(PHOTOGRAPH), torch.from_numpy(K).float()
+    larger = narrow(*given, torch.tensor([[7.5, -2.5, 82.5, 72.5]]))
+    for value, expected in zip(wide(*given, torch.tensor([BOX])), larger, strict=True):
+        torch.testing.assert_close(value, expected)
 
 
 def test_a_graph_answers_no_boxes_with_nothing_and_boxes_that_are_none_with_nan(sessions: dict[str, Any]) -> None:

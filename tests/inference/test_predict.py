@@ -168,6 +168,27 @@ def test_boxes_of_one_photograph_are_predicted_as_single_ones(
     assert of_category["box"] == found[0]["box"]
 
 
+def test_a_margin_enlarges_the_view_of_each_box(
+    phd_exp: Callable, run: RunFolder, photos: Path, tmp_path: Path
+) -> None:
+    """The view is that of the larger box, on the command line and from Python; the line has its own box."""
+    words = ("predict", f"run={run.path}", f"image={photos / '0.png'}", "f=900")
+    (wide,) = read_lines(phd_exp(*words, "box=20,30,60,70", "margin=1.5").out)
+    (same,) = read_lines(phd_exp(*words, "box=10,20,70,80").out)
+    assert wide.pop("box") == [20.0, 30.0, 60.0, 70.0]
+    assert same.pop("box") == [10.0, 20.0, 70.0, 80.0]
+    assert wide == same
+    (whole,), (margin,) = (read_lines(phd_exp(*words, *more).out) for more in ((), ("margin=1.5",)))
+    assert whole == margin
+    predictor = package.load(run.path, margin=1.5)
+    with Image.open(photos / "0.png") as image:
+        array = np.asarray(image.convert("RGB"))
+    K = intrinsics(900.0, 900.0, array.shape[1] / 2, array.shape[0] / 2)
+    view = predictor.view(array, K, (20, 30, 60, 70))
+    seen = view.camera.to_real(predictor.see(view).mode.numpy())
+    np.testing.assert_allclose(seen, wide["mode"], rtol=1e-4, atol=1e-5)
+
+
 def test_images_of_one_camera_are_predicted_as_single_ones(phd_exp: Callable, run: RunFolder, tmp_path: Path) -> None:
     """A folder needs no metadata.jsonl; images of several folders are named by theirs."""
     names = ["a.png", "b.JPG"]
