@@ -41,7 +41,7 @@ def compressed(
     """
     height, width = image.shape[1:3]
     below, beside = -height % TWO_UNITS, -width % TWO_UNITS
-    rgb = image.permute(3, 0, 1, 2).float().contiguous()
+    rgb = image.permute(3, 0, 1, 2).to(torch.float32, memory_format=torch.contiguous_format)
     rgb = pad(rgb, (0, beside, 0, below), mode="replicate") if below or beside else rgb
     ycc = _to_ycc(rgb)
     luma = _lossy(ycc[0].sub_(MIDDLE), _steps(LUMA, quality))
@@ -62,19 +62,12 @@ def _lossy(
     planes: Float[Tensor, "*planes batch height width"], steps: Float[np.ndarray, "batch 8 8"]
 ) -> Float[Tensor, "*planes batch height width"]:
     """The planes, with the cosine transform of each block rounded to multiples of the steps."""
-    cosines, n = _cosines(planes.device), planes.shape[-1] // BLOCK
-    of_rows = torch.from_numpy(np.tile(steps, (1, 1, n))[:, None]).to(planes.device, non_blocking=True)
-    values = _along_both(planes, cosines).unflatten(-2, (-1, BLOCK))
-    return _along_both((values / of_rows).round_().mul_(of_rows).flatten(-3, -2), cosines.T).round_()
-
-
-def _along_both(
-    planes: Float[Tensor, "*planes height width"], matrix: Float[Tensor, "unit unit"]
-) -> Float[Tensor, "*planes height width"]:
-    """The planes with the matrix applied to every unit of rows, and then to every unit of columns."""
-    unit = len(matrix)
-    down = matrix @ planes.unflatten(-2, (-1, unit))
-    return (down.view(-1, unit) @ matrix.T).view(planes.shape)
+    one, two = _cosines(planes.device)
+    tiled = np.tile(steps, (1, 1, planes.shape[-1] // BLOCK))[:, None]
+    of_rows = torch.from_numpy(tiled).to(planes.device, non_blocking=True)
+    down = one @ planes.unflatten(-2, (-1, BLOCK))
+    rounded = (down.view(-1, UNIT) @ two.T).view(down.shape).div_(of_rows).round_().mul_(of_rows)
+    return ((one.T @ rounded).view(-1, UNIT) @ two).view(planes.shape).round_()
 
 
 def _halved(planes: Float[Tensor, "*planes height width"]) -> Float[Tensor, "*planes rows columns"]:
@@ -108,12 +101,12 @@ def _to_rgb(
 
 
 @cache
-def _cosines(device: torch.device) -> Float[Tensor, "16 16"]:
-    """The orthonormal cosine transform of two blocks, frequencies by places: three times as fast as that of one."""
+def _cosines(device: torch.device) -> tuple[Float[Tensor, "8 8"], Float[Tensor, "16 16"]]:
+    """The orthonormal cosine transform of one block, frequencies by places, and of two: faster from the right."""
     frequency, place = torch.meshgrid(torch.arange(BLOCK), torch.arange(BLOCK), indexing="ij")
     waves = (math.pi * frequency * (2 * place + 1) / (2 * BLOCK)).cos() / math.sqrt(BLOCK / 2)
     waves[0] /= math.sqrt(2)
-    return torch.block_diag(waves, waves).to(device)
+    return waves.to(device), torch.block_diag(waves, waves).to(device)
 
 
 def _steps(at_50: tuple[int, ...], quality: NDArray[np.float64]) -> Float[np.ndarray, "batch 8 8"]:
