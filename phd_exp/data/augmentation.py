@@ -68,11 +68,13 @@ def rearranged(
     channels: Int[np.ndarray, "batch n"],
 ) -> UInt8[Tensor, "batch side side channels"]:
     """The images `moved` by `symmetries` of these signs, without interpolation; with their channels in that order."""
-    kinds, kind = np.unique(np.column_stack([signs < 0, channels]), axis=0, return_inverse=True)
+    rows = np.column_stack([signs < 0, channels])
+    code = rows @ COLOURS ** np.arange(rows.shape[1])  # `unique` of whole rows takes five times as long
+    _, first, kind = np.unique(code, return_index=True, return_inverse=True)
     order, counts = kind.argsort(kind="stable"), np.bincount(kind).tolist()
     sorted_images = image.index_select(0, on(image, order))
     result = torch.empty_like(sorted_images)
-    parts = zip(kinds.tolist(), sorted_images.split(counts), result.split(counts), strict=True)
+    parts = zip(rows[first].tolist(), sorted_images.split(counts), result.split(counts), strict=True)
     for (across, down, is_exchanged, *of_channels), part, out in parts:
         mirrored = ((2 - is_exchanged, across), (1 + is_exchanged, down))
         part = part.flip([axis for axis, is_mirrored in mirrored if is_mirrored])

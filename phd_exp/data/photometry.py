@@ -66,9 +66,12 @@ class Photometry:
         drawn = {name: part.numpy() for name, part in zip(NUMBERS, parts, strict=True)}
         blur, noise, loss = (_strength(drawn[name][:, 0]) for name in ("blur", "noise", "jpeg"))
         quality = (100 - (100 - self.jpeg) * loss).round().clip(1)
-        image = image.clone(memory_format=torch.contiguous_format)
-        change(image, drawn["occluder"][:, 0] < 2 * self.occluders - 1, occluded, drawn["shape"])
-        if (self.brightness, self.contrast, self.gamma, self.white_balance) != (1, 1, 1, 1):
+        is_hidden = drawn["occluder"][:, 0] < 2 * self.occluders - 1
+        is_toned = (self.brightness, self.contrast, self.gamma, self.white_balance) != (1, 1, 1, 1)
+        if is_hidden.any() or not is_toned:  # changed in place
+            image = image.clone(memory_format=torch.contiguous_format)
+        change(image, is_hidden, occluded, drawn["shape"])
+        if is_toned:
             image = toned(image, self._tones(drawn["tone"]))
         change(image, self.blur * blur, blurred, self.blur * blur)
         change(image, self.noise * noise, noisy, self.noise * noise, drawn["place"][:, 0])
