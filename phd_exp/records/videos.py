@@ -1,5 +1,6 @@
 """Video files, decoded and encoded one frame at a time by PyAV, which the extra `video` installs."""
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from fractions import Fraction
@@ -48,15 +49,25 @@ def shots_in(file: Path, stride: int = 1) -> Iterator[Shot]:
     Raises DatasetError, after the frames before, if the file is no whole video of upright frames of one size with
     increasing times, or has no frame.
     """
-    number, before = 0, -np.inf
+    number, before, longest = 0, -np.inf, 0.0
     with _opened(file) as (container, stream):
         for frame in _decoded(file, container, stream):
             _require_alike(f"{file}, frame {number}", frame, stream, before)
             if number % stride == 0:
                 yield Shot(number, frame.time, frame.to_ndarray(format="rgb24"))
+            longest = max(longest, frame.time - before if number else 0.0)
             number, before = number + 1, frame.time
+        end = _end_of(stream)
     if number == 0:
         raise DatasetError(f"{file}: no frame can be decoded; expected a video with a key frame")
+    if before + 2 * longest < end:  # decoders pass over some broken frames in silence
+        raise DatasetError(f"{file}: ends at {before:g} s of {end:g} s, after {number} frames; copy the file again")
+
+
+def _end_of(stream: Any) -> float:
+    """The time (seconds) at which the last frame ends as a file of MKV or WEBM states it; 0 without one."""
+    clock = re.fullmatch(r"(\d+):(\d+):(\d+(?:\.\d+)?)", stream.metadata.get("DURATION", "").strip("\0 "))
+    return sum(float(part) * unit for part, unit in zip(clock.groups(), (3600, 60, 1), strict=True)) if clock else 0.0
 
 
 def _decoded(file: Path, container: Any, stream: Any) -> Iterator[Any]:

@@ -218,6 +218,24 @@ def test_a_broken_video_is_refused(video: Path, spoil: Callable[[bytes], bytes],
         list(shots_in(video))
 
 
+def test_a_video_that_ends_early_is_refused_after_its_frames(tmp_path: Path) -> None:
+    av = pytest.importorskip("av")
+    file = tmp_path / "clip.mkv"
+    with av.open(str(file), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"tune": "zerolatency"})
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        for image in images():
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+    assert len(list(shots_in(file))) == N
+    content = file.read_bytes()
+    file.write_bytes(content[: len(content) * 3 // 4])
+    shots = shots_in(file)
+    next(shots)
+    with pytest.raises(DatasetError, match=r"clip\.mkv: ends at .* s of .* s, after \d+ frames"):
+        list(shots)
+
+
 def test_a_camera_of_another_size_is_refused(phd_exp: Callable, run: str, video: Path, tmp_path: Path) -> None:
     matrix = "{rows: 3, cols: 3, data: [90, 0, 32, 0, 90, 24, 0, 0, 1]}"
     (tmp_path / "camera.yaml").write_text(f"image_width: 640\nimage_height: 48\ncamera_matrix: {matrix}\n")
