@@ -124,6 +124,8 @@ def test_held_out_sequences_choose_noise_and_slow_errors(folder: Path, cameras: 
             assert getattr(SLOW, name) / 8 < getattr(found, name) < 4 * getattr(SLOW, name)
     for method in SMOOTHERS:
         assert 0.05 < choice.noise[method] < 1.5, "0.3 made them"
+    if cameras > 1:
+        assert value(track_scores(every, choice, resamples=2), "nees", "slow") == pytest.approx(1.1, abs=0.15)
 
 
 def test_independent_errors_choose_no_slow_ones(folder: Path) -> None:
