@@ -139,12 +139,10 @@ def _closest_depth(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch"], Fl
         best = 1 / (far - near + ahead).clamp_min(torch.finfo(a.dtype).tiny)
         energy = depth_mean_energy(best.log())
         two, one_two, _ = expint_differences(best)
-        is_larger = torch.where(
-            best < 1,
-            before < best * (one_two + two) / (1 + best * two),  # the same, without a difference of large numbers
-            (far + near) * best < energy,
-        )
-        return is_larger, energy / (far + near)
+        is_flat = best < 1  # the same is then compared without a difference of large numbers
+        value = torch.where(is_flat, before, (far + near) * best)
+        bound = torch.where(is_flat, best * (one_two + two) / (1 + best * two), energy)
+        return value < bound, energy / (far + near)
 
     margin = torch.log1p(4 / a)
     low, high = (log_mu - margin).amin(-1), (log_mu + margin).amax(-1)
