@@ -106,7 +106,7 @@ def test_the_search_finds_a_name_from_the_file_system(visit: Visit) -> None:
     ("word", "page"),
     [
         ("confidence", "guides/guarantee"),
-        ("video", "guides/predict"),
+        ("video", "guides/tracking"),
         ("licence", "index"),
         ("export", "guides/predict"),
         ("mesh", "guides/own_object"),
