@@ -11,7 +11,7 @@ from PIL import ExifTags, Image
 from phd_exp.data.areas import GREY, view
 from phd_exp.data.images import shrunk
 from phd_exp.optics.lens import PINHOLE, Lens
-from phd_exp.optics.virtual import VirtualCamera, enlarged, intrinsics, require_no_fold
+from phd_exp.optics.virtual import VirtualCamera, intrinsics, require_no_fold
 from phd_exp.records.detections import Detection
 from phd_exp.records.errors import DatasetError
 from phd_exp.records.files import require_plain
@@ -69,19 +69,14 @@ def optics_of(detection: Detection, size: tuple[int, int]) -> tuple[Float[np.nda
     return K, lens
 
 
-def facing(
-    detection: Detection, size: tuple[int, int], side: int, largest_f: float = np.inf, margin: float = 1.0
-) -> VirtualCamera:
-    """The virtual camera that faces a detection in an image of that width and height; its box, if it has one, is
-    viewed `margin` times as large, with a focal length up to `largest_f`.
+def facing(detection: Detection, size: tuple[int, int], side: int) -> VirtualCamera:
+    """The virtual camera that faces a detection in an image of that width and height.
 
     Raises DatasetError if the box is too wide, or as `optics_of`.
     """
     box = detection.box(*size)
     K, lens = optics_of(detection, size)
     try:
-        if detection.line.box:
-            return VirtualCamera.of_box(K, enlarged(box, margin), float(side), lens, largest_f)
         return VirtualCamera.of_box(K, box, float(side), lens)
     except ValueError as error:
         raise DatasetError(f"{detection.where}: {error}") from None

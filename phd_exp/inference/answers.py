@@ -15,7 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from phd_exp.data.cache import DECODERS, LARGEST_AT_ONCE
-from phd_exp.data.crops import cut, facing, read_image
+from phd_exp.data.crops import cut, optics_of, read_image
 from phd_exp.distributions import Density, ProjectedHuber, Temperature
 from phd_exp.distributions.along import quantiles_along
 from phd_exp.geometry.camera import Camera
@@ -23,6 +23,7 @@ from phd_exp.inference.predictor import BATCH, Predictor
 from phd_exp.inference.views import View
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
 from phd_exp.models.heads import Prediction
+from phd_exp.optics.virtual import VirtualCamera
 from phd_exp.records.detections import Detection
 from phd_exp.records.errors import DatasetError, RunError, UserError
 from phd_exp.records.images import pillow_warnings
@@ -276,11 +277,21 @@ def _seen(predictor: Predictor, detections: list[Detection] | UserError) -> tupl
     try:
         image = read_image(detections[0].file, detections[0].content)
         for detection in detections:
-            camera = facing(detection, image.size, predictor.side, predictor.largest_f, predictor.margin)
+            camera = _facing(predictor, detection, image.size)
             found.append((detection, image, View(cut(image, camera), camera)))
     except DatasetError as error:
         return found, error
     return found, None
+
+
+def _facing(predictor: Predictor, detection: Detection, size: tuple[int, int]) -> VirtualCamera:
+    """The camera of the view of a detection. Raises DatasetError as `data.crops.facing`."""
+    box = detection.box(*size)
+    K, lens = optics_of(detection, size)
+    try:
+        return predictor.virtual_camera(K, size, box if detection.line.box else None, lens)
+    except ValueError as error:
+        raise DatasetError(f"{detection.where}: {error}") from None
 
 
 def answer(sighting: Sighting, temperature: Temperature | None) -> dict[str, Any]:

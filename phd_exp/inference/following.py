@@ -19,7 +19,7 @@ from phd_exp.inference.answers import PER_CENT, rounded, uncertainty
 from phd_exp.inference.detectors import Detector, overlap
 from phd_exp.inference.predictor import Predictor
 from phd_exp.optics.lens import PINHOLE, Lens
-from phd_exp.optics.virtual import Box, VirtualCamera, enlarged, rays, towards
+from phd_exp.optics.virtual import Box, VirtualCamera, rays, towards
 from phd_exp.records.errors import DatasetError, RunError, UserError, gist
 
 USUAL = ConstantVelocity(noise=1.0)
@@ -206,10 +206,8 @@ class _Track:
     def _predict(self, frame: Frame, box: Box | None) -> tuple[tuple[ProjectedHuber, Pose], float | None]:
         """The prediction from a box, or the whole image, the pose of its virtual camera, and `familiar`."""
         predictor, (height, width) = self.predictor, frame.image.shape[:2]
-        seen = enlarged(box, predictor.margin) if box else (0.0, 0.0, float(width), float(height))
-        largest_f = predictor.largest_f if box else np.inf
         try:
-            camera = VirtualCamera.of_box(frame.K, seen, float(predictor.side), frame.lens, largest_f)
+            camera = predictor.virtual_camera(frame.K, (width, height), box, frame.lens)
         except ValueError as error:
             raise DatasetError(f"{frame.where}: {error}") from None
         view = cut(frame.image, camera)

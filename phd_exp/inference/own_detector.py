@@ -29,7 +29,7 @@ from phd_exp.inference.detectors import Detector, Found, area, common_area, over
 from phd_exp.inference.predictor import BATCH, Predictor
 from phd_exp.models.backbones import Backbone
 from phd_exp.optics.lens import Lens
-from phd_exp.optics.virtual import Box, VirtualCamera
+from phd_exp.optics.virtual import Box, VirtualCamera, enlarged
 from phd_exp.records.errors import ConfigError, DatasetError
 
 FOCAL_LENGTHS = (0.02, 0.6)  # quantiles of those of held-out views: an object is found smaller, but not larger
@@ -175,13 +175,10 @@ class _Search:
 
     def _camera(self, K: Float[np.ndarray, "3 3"], lens: Lens, box: Box) -> VirtualCamera | None:
         """The camera of a view with a margin around a box, or without one where the view would be too wide."""
-        left, top, right, bottom = box
-        across, down = (right - left) / 2, (bottom - top) / 2
         side, largest_f = float(self.predictor.side), self.predictor.largest_f
-        for more in (MARGIN - 1, 0.0):
-            wide = left - more * across, top - more * down, right + more * across, bottom + more * down
+        for factor in (MARGIN, 1.0):
             with suppress(ValueError):
-                return VirtualCamera.of_box(K, wide, side, lens, largest_f)
+                return VirtualCamera.of_box(K, enlarged(box, factor), side, lens, largest_f)
         return None
 
 

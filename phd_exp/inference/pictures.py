@@ -15,7 +15,7 @@ from PIL import Image
 
 from phd_exp.distributions.level_curves import LevelCurves, Points, level_curves
 from phd_exp.inference.answers import Sighting
-from phd_exp.optics.virtual import Box
+from phd_exp.optics.virtual import Box, enlarged
 from phd_exp.records.errors import one_line
 from phd_exp.reports.figures import Mark, draw_birds_eye, draw_curve, encoded, marks_on_image
 from phd_exp.reports.gallery import close_up
@@ -89,9 +89,8 @@ def _outlines(sighting: Sighting, guarantee: Any) -> tuple[Points | None, Points
 def _around(sighting: Sighting) -> Box:
     """The part of the image around the box."""
     width, height = sighting.image.size
-    left, top, right, bottom = sighting.detection.box(width, height)
-    across, down = MARGIN * (right - left), MARGIN * (bottom - top)
-    return max(0, left - across), max(0, top - down), min(width, right + across), min(height, bottom + down)
+    left, top, right, bottom = enlarged(sighting.detection.box(width, height), 1 + 2 * MARGIN)
+    return max(0, left), max(0, top), min(width, right), min(height, bottom)
 
 
 def _enlarged(marks: Sequence[Mark], box: Box) -> Box | None:

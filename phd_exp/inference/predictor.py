@@ -23,6 +23,7 @@ from phd_exp.geometry.motion import EIGHT, turned
 from phd_exp.inference.views import View, focal_lengths, image_batch
 from phd_exp.models.heads import Prediction, SymmetricHead
 from phd_exp.models.regressor import Regressor
+from phd_exp.optics.lens import PINHOLE, Lens
 from phd_exp.optics.virtual import Box, VirtualCamera, enlarged, intrinsics
 from phd_exp.records.errors import ConfigError, DatasetError, RunError, listed
 from phd_exp.records.runs import CHOOSE, RunFolder
@@ -224,14 +225,23 @@ class Predictor:
         Raises DatasetError if the image is invalid or the box is outside the field of every pinhole camera.
         """
         (array,) = image_batch(image[None])
-        whole = 0.0, 0.0, float(array.shape[1]), float(array.shape[0])
-        seen = whole if box is None else enlarged(box, self.margin)
-        largest_f = math.inf if box is None else self.largest_f
         try:
-            camera = VirtualCamera.of_box(K, seen, float(self.side), largest_f=largest_f)
+            camera = self.virtual_camera(K, (array.shape[1], array.shape[0]), box)
         except ValueError as error:
             raise DatasetError(f"image: {error}") from None
         return View(cut(array, camera), camera)
+
+    def virtual_camera(
+        self, K: Float[np.ndarray, "3 3"], size: tuple[int, int], box: Box | None, lens: Lens = PINHOLE
+    ) -> VirtualCamera:
+        """The camera of the view of a box, see `view`, or of a whole image of that width and height (px).
+
+        Raises ValueError as `VirtualCamera.of_box`.
+        """
+        if box is None:
+            width, height = map(float, size)
+            return VirtualCamera.of_box(K, (0.0, 0.0, width, height), float(self.side), lens)
+        return VirtualCamera.of_box(K, enlarged(box, self.margin), float(self.side), lens, self.largest_f)
 
     def see(self, views: View | Sequence[View]) -> Prediction:
         """Predictions for views, each in the frame of its own virtual camera; for one view, one without a batch."""

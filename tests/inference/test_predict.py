@@ -168,9 +168,7 @@ def test_boxes_of_one_photograph_are_predicted_as_single_ones(
     assert of_category["box"] == found[0]["box"]
 
 
-def test_a_margin_enlarges_the_view_of_each_box(
-    phd_exp: Callable, run: RunFolder, photos: Path, tmp_path: Path
-) -> None:
+def test_a_margin_enlarges_the_view_of_each_box(phd_exp: Callable, run: RunFolder, photos: Path) -> None:
     """The view is that of the larger box, on the command line and from Python; the line has its own box."""
     words = ("predict", f"run={run.path}", f"image={photos / '0.png'}", "f=900")
     (wide,) = read_lines(phd_exp(*words, "box=20,30,60,70", "margin=1.5").out)
