@@ -124,7 +124,7 @@ ARGUMENTS = [
     argument((*ONE, "coverage=nan"), r"coverage: got 'nan'; expected to be.*"),
     argument((*ONE, "groups=spread"), r"groups: guarantees a coverage; expected coverage=0\.9.*"),
     argument((*ONE, "coverage=0.9"), r"runs/.*/held_out\.parquet: missing; held-out samples are needed: train with.*", 1),
-    argument(("export",), r"run: missing; export takes run=, recalibrate=, calibration=, trust=, views=, margin=, out=.*"),
+    argument(("export",), r"run: missing; export takes run=, recalibrate=, calibration=, trust=, views=, margin=, out=, coverage=.*"),
     argument(("export", "run=.", "out=."), r"out=\.: is a folder.*"),
     argument((*EXPORT, "margin=1.2"), r"margin: enlarges boxes; expected photographs=true too"),
     argument((*EXPORT, "quantize=int8", "coverage=0.9"), r"coverage: is guaranteed for the network in float32.*"),

@@ -104,9 +104,12 @@ def test_noise_is_normal_and_rounded(deviation: float) -> None:
     assert (noise[1] == 128).all()
 
 
-def test_compression_loses_more_with_a_larger_number() -> None:
+def test_noise_and_compression() -> None:
     edge = images(1)
     edge[:, :, SIDE // 2 :] = 255
+    noise = value(Photometry(noise=10.0)(images(1), drawn(1.0, "noise"))) - value(images(1))
+    assert noise.std() * 255 == pytest.approx(10, rel=0.05)
+    assert abs(noise.mean()) * 255 < 1
     lossy = [value(Photometry(jpeg=20)(edge, drawn(strength, "jpeg"))) - value(edge) for strength in (0.8, 1.0)]
     assert 0 < lossy[0].std() < lossy[1].std() < 0.2
 

@@ -17,7 +17,7 @@ from tests.support.untrained import NOWHERE, SMALL, untrained
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 
-KILLS = {"report": 20, "predict": 20, "export": 3}
+KILLS = {"report": 20, "predict": 20, "export": 5}
 VERBS = {
     "report": ["phd_exp.cli.report", "phd_exp.reports.paper_figures", "phd_exp.reports.site.build"],
     "predict": ["phd_exp.cli.predict", "phd_exp.inference.loading", "phd_exp.inference.pictures"],
