@@ -90,9 +90,10 @@ class DatasetSpec(Record):
         reference: the point whose position is predicted: the file's origin, the centroid of the surface, or a point
             in the file's units and axes.
         upright: whether the object is only turned about the vertical.
+        resting: whether it lies on a random one of the sides on which it is stable.
         pitch_range: bounds of the angle by which the first camera looks down, degrees; negative: up.
         backdrops: Blender's skies, or the user's photographs and skies; None: the grey backdrop.
-        ground: whether the object stands on a plane, which shows its shadow.
+        ground: whether the upright or resting object lies on a plane, which shows its shadow.
         distractors: number of other objects, of the three solids and `distractor_meshes`.
         motion_blur: the longest path of the image during the exposure, px.
         ignore: parts of the meshes' files: the materials, in whose place are random ones.
@@ -153,6 +154,7 @@ class DatasetSpec(Record):
     looks: Literal["plain", "varied"] = "plain"
     front: tuple[Number, Number, Number] | None = None
     front_range: Annotated[tuple[Turn, Turn], Range] = (0.0, 90.0)
+    resting: StrictBool = False
 
     @model_validator(mode="before")
     @classmethod
@@ -186,8 +188,10 @@ class DatasetSpec(Record):
         if not (self.is_box or (self._is_usual("box_size") and self._is_usual("box_shift"))):
             raise ValueError("box_size, box_shift: got view=field; expected view=box")
         has_front = self.front is not None and any(self.front)
-        if (self.front and self.upright) or not (has_front or self._is_usual("front_range")):
-            raise ValueError("front: expected a direction [x, y, z] with front_range, and upright=false")
+        if not (has_front or self._is_usual("front_range")):
+            raise ValueError("front: expected a direction [x, y, z] with front_range")
+        if len(given := [key for key in ("upright", "resting", "front") if getattr(self, key)]) > 1:
+            raise ValueError(f"{given[1]}: got also {given[0]}, another law of rotations; expected one of them")
         return self
 
     @model_validator(mode="after")
@@ -214,8 +218,13 @@ class DatasetSpec(Record):
             raise ValueError(f"distractors: got {self.distractors}; expected at most {n_others}, and 0 if views > 1")
         # the camera is above the ground at the upper border of the image
         steepest = math.degrees(math.atan(self.sensor_size / 2 / self.f_range[0]))
-        if self.ground and not (self.upright and self.views == 1 and self.pitch_range[0] > steepest):
-            raise ValueError(f"ground: expected upright=true, views=1, pitch_range above {steepest:.3g} degrees")
+        lies = self.upright or self.resting
+        if self.ground and not (lies and self.views == 1 and self.pitch_range[0] > steepest):
+            raise ValueError(
+                f"ground: got upright={self.upright}, resting={self.resting}, views={self.views}, "
+                f"pitch_range={list(self.pitch_range)}; expected upright or resting, views=1, and pitch_range above "
+                f"{steepest:.3g} degrees, so that no horizon is in view"
+            )
         return self
 
     @property

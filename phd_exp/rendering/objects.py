@@ -14,7 +14,7 @@ from phd_exp.rendering.importing import in_blenders_axes
 from phd_exp.rendering.looks import varied
 from phd_exp.rendering.rays import rotation_matrix
 from phd_exp.rendering.sampling import MOST_TRIES, SIZE, Purpose, draw_object, sample_scene, stream_of
-from phd_exp.rendering.sequences import quaternion_of
+from phd_exp.rendering.sequences import quaternion_of, rotation_of
 from phd_exp.rendering.triangles import Meshes
 
 REACH = SIZE * 0.5**0.5  # m, from the cylinder's centre to its rim
@@ -48,13 +48,19 @@ def _whole_scene(spec: DatasetSpec, split: Split, index: int, meshes: Meshes) ->
     cylinder, *panel = scene.objects
     mesh = meshes["mesh"]
     around, turn = surroundings_of(spec, split, number)
-    rotation = upright_rotation(around.pitch, turn) if spec.upright else cylinder.rotation
+    rotation, upwards = cylinder.rotation, np.array([0.0, 0.0, 1.0])
+    if spec.upright or spec.resting:
+        rotation = upright_rotation(around.pitch, turn)
+    if spec.resting:
+        onto_side = mesh.rests.draw(stream_of(spec, split, number, Purpose.RESTING))
+        rotation = quaternion_of(rotation_of(rotation) * onto_side)
+        upwards = onto_side.inv().apply(upwards)
     if spec.front:
         rotation = _facing_rotation(spec, cylinder.position, stream_of(spec, split, number, Purpose.FRONT))
     item = cylinder.model_copy(update={"shape": "mesh", "dimensions": mesh.dimensions, "rotation": rotation})
     if spec.ground:  # which the object touches
-        up = item.scale * rotation_matrix(rotation)[:, 2]
-        point = np.array(item.position) + mesh.vertices[:, 2].min() * up
+        up = item.scale * rotation_matrix(rotation) @ upwards
+        point = np.array(item.position) + (mesh.vertices @ upwards).min() * up
         around = around.model_copy(update={"ground": tuple(point.tolist())})
     others = [_resized(other, cylinder.position, mesh.radius / REACH) for other in panel]
     others += _distractors(spec, split, number, scene, meshes)

@@ -33,7 +33,7 @@ def moved(item: SceneObject, spec: DatasetSpec, f: float, time: float, rng: Stre
     position = slid(item.position, spec, f, time, rng)
     axis = rng.standard_normal(3)
     turn = time * math.radians(rng.uniform(*spec.spin_range)) * axis / np.linalg.norm(axis)
-    rotation = quaternion_of(Rotation.from_rotvec(turn) * _rotation(item.rotation))
+    rotation = quaternion_of(Rotation.from_rotvec(turn) * rotation_of(item.rotation))
     return item.model_copy(update={"position": position, "rotation": rotation})
 
 
@@ -65,9 +65,9 @@ def camera_pose(spec: DatasetSpec, time: float, rng: Stream) -> Pose:
 
 def in_scene(item: SceneObject, pose: Pose, *, turned: bool) -> SceneObject:
     """An object given in the camera's frame, in the scene's; its rotation too if it is to be `turned`."""
-    back = _rotation(pose.rotation).inv()
+    back = rotation_of(pose.rotation).inv()
     x, y, z = back.apply(np.array(item.position) - pose.translation).tolist()
-    rotation = quaternion_of(back * _rotation(item.rotation)) if turned else item.rotation
+    rotation = quaternion_of(back * rotation_of(item.rotation)) if turned else item.rotation
     return item.model_copy(update={"position": (x, y, z), "rotation": rotation})
 
 
@@ -98,7 +98,7 @@ def _waves(rng: Stream) -> tuple[Float[np.ndarray, " waves"], ...]:
     return omega, rng.standard_normal(WAVES), rng.standard_normal(WAVES)
 
 
-def _rotation(quaternion: Quaternion) -> Rotation:
+def rotation_of(quaternion: Quaternion) -> Rotation:
     return Rotation.from_quat(quaternion, scalar_first=True)
 
 

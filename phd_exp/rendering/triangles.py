@@ -3,9 +3,12 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+
+from phd_exp.rendering.resting import Rests, rests_of
 
 Depths = NDArray[np.float64]
 
@@ -43,6 +46,11 @@ class Triangles:
         """Centroid (3,) of the surface, m."""
         middles = np.add.reduce(np.moveaxis(self.vertices[self.corners], 1, 0)) / 3
         return np.average(middles, axis=0, weights=self.areas + 1e-300)
+
+    @cached_property
+    def rests(self) -> Rests:
+        """How it can lie on a table."""
+        return rests_of(self.vertices)
 
     def window(self, turn: Depths, shift: Depths, f: float, S: int) -> tuple[range, range]:
         """Rows and columns of the bounding box of its silhouette, possibly outside the image (S, S)."""
