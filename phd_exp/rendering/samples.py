@@ -36,6 +36,8 @@ from phd_exp.rendering.triangles import Meshes
 GREY = 128  # of all colours beyond the edges of the user's image, as in the views of photographs
 METAL_SIDE = 150  # px: smaller boxes of metal have more points in each pixel, since highlights have few pixels
 FINEST = 4  # largest number of points along a side of a pixel
+SOLID = 0.5  # share of a pixel from which its own light is that of the surface
+LEAST_SHARE = 1e-9  # larger than rounding errors of a mean
 MARGIN = 4  # px around the objects: the denoiser is less accurate along the border of its image
 
 
@@ -104,8 +106,8 @@ def photograph(renderer: Renderer, scene: Scene, hits: Hits, spec: DatasetSpec) 
         inside = box.slices
         front, opacity = np.split(front_light(renderer, scene, hits)[inside], [3], axis=-1)
         if renderer.is_opaque:  # its edges are those of more points than its light
-            covered = coverage(scene, box, renderer.meshes) * (opacity > 0)
-            front, opacity = front * covered / np.where(opacity > 0, opacity, 1), covered
+            covered = coverage(scene, box, renderer.meshes)
+            front, opacity = unmixed(front, opacity) * covered, covered
         light[inside] = front + (1 - opacity) * light[inside]
     picture = encoded(shaken(light, around.shake))
     picture[beyond_edges(scene)] = GREY
@@ -125,6 +127,24 @@ def front_light(renderer: Renderer, scene: Scene, hits: Hits) -> Light:
             traced = renderer.render(scene, box, points=points_of_metal(box) if metal else None)
             light[inside] = np.where(near[inside][..., None], traced, light[inside])
     return light
+
+
+def unmixed(front: Light, opacity: Light) -> Light:
+    """Light (height, width, 3) of the surfaces in each pixel, given the sum over the shares of it that they cover.
+
+    Where a few random rays found little of a surface, their sum is nearly all error. There, the light is the mean of
+    the pixels within REACH that it covers for the most part; around surfaces without such pixels, of all.
+    """
+
+    def nearby(shown: Light) -> tuple[Light, Light]:
+        size = (2 * REACH + 1, 2 * REACH + 1, 1)
+        light, share = (ndimage.uniform_filter(shown * part, size, mode="constant") for part in (front, opacity))
+        return light / np.maximum(share, LEAST_SHARE), share
+
+    solid = opacity >= SOLID
+    (near, share), (thin, _) = nearby(solid), nearby(opacity > 0)
+    own = front / np.where(solid, opacity, 1)
+    return np.where(solid, own, np.where(share > LEAST_SHARE, near, thin))
 
 
 def points_of_metal(box: Box) -> int | None:

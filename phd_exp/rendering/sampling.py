@@ -31,7 +31,7 @@ from phd_exp.rendering.sequences import camera_pose, in_scene, moved, slid
 # Increment one when the same specification starts to give other scenes or other pixels. Folders of another version
 # are refused, not continued with samples that do not match.
 GENERATOR_VERSION = 2
-OBJECT_VERSION = 10  # of data sets with a mesh
+OBJECT_VERSION = 11  # of data sets with a mesh
 
 SIZE = 0.2  # m: height and diameter of the cylinder, side of the cube, diameter of the sphere
 CLEARANCE = 0.5  # m: least depth of an object in a further view, unless those of the first are smaller

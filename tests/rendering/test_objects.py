@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from scipy import stats
+from scipy import ndimage, stats
 
 from phd_exp.records.scenes import Pose, Scene, Surroundings
 from phd_exp.records.spec import DatasetSpec
@@ -18,7 +18,7 @@ from phd_exp.rendering.objects import REACH, sample_object_scene, upright_rotati
 from phd_exp.rendering.pixels import Box
 from phd_exp.rendering.rays import cylinder_mask, rotation_matrix, trace_pixels, truncation, visibility
 from phd_exp.rendering.render import by_sky
-from phd_exp.rendering.samples import fast_settings, make_sample, shadow
+from phd_exp.rendering.samples import fast_settings, make_sample, photograph, shadow, unmixed
 from phd_exp.rendering.sampling import about_axis, sample_scene
 from phd_exp.rendering.surroundings import photo_light, shaken
 from phd_exp.rendering.triangles import Triangles
@@ -282,6 +282,39 @@ def test_points_of_pixels_have_the_mean_of_the_filter(of_mesh: MakeSpec) -> None
     assert np.abs(computed - traced).max() < 0.15
     assert np.abs(computed - traced)[(traced > 0) & (traced < 1)].mean() < 0.03
     np.testing.assert_allclose(part, computed[3:32, :30], atol=1e-6)
+
+
+def test_the_light_of_a_surface_does_not_depend_on_the_share_of_the_pixel_that_it_covers() -> None:
+    """Two surfaces, of light 0.2 and 0.6; rays found 0.1 % of the pixels around them, and light of their neighbours."""
+    surface = np.repeat([0.2, 0.6], 8)[None, :, None] * np.ones((12, 1, 3))
+    opacity = np.full((12, 16, 1), 1e-3)
+    opacity[3:9] = 1.0
+    opacity[2], opacity[9] = 0.7, 0.3
+    front = opacity * surface + np.where(opacity < 0.5, 0.01, 0.0)
+    light = unmixed(front, opacity)
+    far = np.r_[:6, 10:16]  # from the border between both, within whose reach they are averaged
+    np.testing.assert_allclose(light[1:11, far], surface[1:11, far])
+    assert (unmixed(0 * front, 0 * opacity) == 0).all()
+    thin = np.where(np.arange(16)[:, None] == 8, 0.1, 0.0) * np.ones((12, 1, 1))
+    np.testing.assert_allclose(unmixed(0.4 * np.repeat(thin, 3, axis=2), thin)[:, 7:10], 0.4)
+
+
+def test_outlines_are_no_brighter_than_surfaces(make_spec: MakeSpec, tmp_path: Path) -> None:
+    """A ball with needles, against many rays without a denoiser: no pixel is far above all of those around it."""
+    ball, rng = solid("sphere"), np.random.default_rng(2)
+    needles = ball.vertices * np.where(rng.random((len(ball.vertices), 1)) < 0.003, 1, 0.3)
+    file = write_mesh(tmp_path / "needles.ply", Triangles(needles, ball.corners))
+    spec = make_spec("object", mesh=str(file), sensor_size=96, f_range=(1100.0, 1100.0), xy_range=0.0)
+    images = []
+    for settings in (fast_settings(spec), Settings(128, denoised=False, points=None)):
+        renderer = Renderer(settings, spec)
+        renderer.is_opaque = settings.denoised  # the exact images have the tracer's own edges
+        scenes = (sample_object_scene(spec, "train", index, renderer.meshes) for index in range(2))
+        hits = ((scene, trace_pixels(scene, renderer.meshes)) for scene in scenes)
+        images.append([photograph(renderer, scene, seen, spec).astype(int) for scene, seen in hits])
+    above = [(ours - ndimage.maximum_filter(exact, (5, 5, 1))).max() for ours, exact in zip(*images, strict=True)]
+    print(above)
+    assert max(above) < 60
 
 
 def test_the_ground_has_a_shadow_below_the_object(of_mesh: MakeSpec) -> None:
