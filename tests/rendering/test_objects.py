@@ -285,7 +285,7 @@ def test_points_of_pixels_have_the_mean_of_the_filter(of_mesh: MakeSpec) -> None
 
 
 def test_the_light_of_a_surface_does_not_depend_on_the_share_of_the_pixel_that_it_covers() -> None:
-    """Two surfaces, of light 0.2 and 0.6; rays found 0.1 % of the pixels around them, and light of their neighbours."""
+    """Two surfaces, of light 0.2 and 0.6; rays found 0.1 % of the pixels around them, and light of others."""
     surface = np.repeat([0.2, 0.6], 8)[None, :, None] * np.ones((12, 1, 3))
     opacity = np.full((12, 16, 1), 1e-3)
     opacity[3:9] = 1.0
