@@ -57,7 +57,8 @@ class DatasetSpec(Record):
     """Everything that a sample depends on, except its split and index. It does not hold the number of samples.
 
     Positions have the distribution z ~ U(z_range) and x, y ~ (S z / f) xy_range U(-1/2, 1/2). With view=box, their
-    pixels in the image of `camera` have it instead, and S and f are those of the view of the object's box.
+    pixels in the image of `camera` are uniform instead: in the central share xy_range of the part at least half the
+    object's radius away from the edges. S and f are then those of the view of the object's box.
 
     Attributes:
         variant: name of the data set, and of its folder.

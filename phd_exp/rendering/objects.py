@@ -44,9 +44,9 @@ def _whole_scene(spec: DatasetSpec, split: Split, index: int, meshes: Meshes) ->
 
     It is paired with that of `sample_scene`: the pose, the lamps and the panel are the cylinder's.
     """
-    scene, number = sample_scene(spec, split, index), index // spec.views
+    mesh, number = meshes["mesh"], index // spec.views
+    scene = sample_scene(spec, split, index, mesh.radius * spec.scale_range[1])
     cylinder, *panel = scene.objects
-    mesh = meshes["mesh"]
     around, turn = surroundings_of(spec, split, number)
     rotation, upwards = cylinder.rotation, np.array([0.0, 0.0, 1.0])
     if spec.upright or spec.resting:

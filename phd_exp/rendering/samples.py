@@ -8,6 +8,7 @@ pixels that show an object are used. The box therefore leaves no seam that could
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from phd_exp.records.assets import Asset
@@ -136,9 +137,11 @@ def unmixed(front: Light, opacity: Light) -> Light:
     the pixels within REACH that it covers for the most part; around surfaces without such pixels, of all.
     """
 
-    def nearby(shown: Light) -> tuple[Light, Light]:
+    def nearby(shown: NDArray[np.bool_]) -> tuple[Light, Light]:
         size = (2 * REACH + 1, 2 * REACH + 1, 1)
-        light, share = (ndimage.uniform_filter(shown * part, size, mode="constant") for part in (front, opacity))
+        light, share = (
+            ndimage.uniform_filter(np.where(shown, part, 0), size, mode="constant") for part in (front, opacity)
+        )
         return light / np.maximum(share, LEAST_SHARE), share
 
     solid = opacity >= SOLID

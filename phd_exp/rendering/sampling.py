@@ -36,6 +36,7 @@ OBJECT_VERSION = 11  # of data sets with a mesh
 SIZE = 0.2  # m: height and diameter of the cylinder, side of the cube, diameter of the sphere
 CLEARANCE = 0.5  # m: least depth of an object in a further view, unless those of the first are smaller
 MOST_TRIES = 10_000
+CUT_OFF = 0.5  # least distance of an object's reference point from the edges of the user's image, in its radii
 PANEL = (0.2, 0.4, 0.02)  # m: wider than half of the largest silhouette at its depth
 Stream = np.random.Generator
 
@@ -82,8 +83,10 @@ def generator_version(spec: DatasetSpec) -> int:
     return GENERATOR_VERSION if spec.mesh is None else OBJECT_VERSION
 
 
-def sample_scene(spec: DatasetSpec, split: Split, index: int) -> Scene:
-    """Draw the scene of one sample, a pure function of the three arguments.
+def sample_scene(spec: DatasetSpec, split: Split, index: int, radius: float = 0.0) -> Scene:
+    """Draw the scene of one sample, a pure function of the arguments.
+
+    `radius` (m) is that of the object in views of boxes, where it shall rarely be cut off.
 
     Source: paper, section "Dataset"; lamps after CLEVR (key, fill and back area lamps with jitter).
     """
@@ -95,7 +98,7 @@ def sample_scene(spec: DatasetSpec, split: Split, index: int) -> Scene:
         f=f,
         S=spec.sensor_size,
         pose=_first_pose(spec, frame, stream),
-        objects=_objects(spec, f, frame, stream),
+        objects=_objects(spec, f, frame, stream, radius),
         lamps=_lamps(spec, stream(Purpose.LAMPS)),
         backdrop=_backdrop(stream(Purpose.BACKDROP)),
         noise_seed=_seed(stream(Purpose.FRAME_NOISE, frame) if frame else stream(Purpose.NOISE)),
@@ -108,12 +111,14 @@ def _first_pose(spec: DatasetSpec, frame: int, stream: Callable[..., Stream]) ->
     return camera_pose(spec, frame / spec.frame_rate, stream(Purpose.CAMERA_MOTION)) if frame else FIRST_VIEW
 
 
-def _objects(spec: DatasetSpec, f: float, frame: int, stream: Callable[..., Stream]) -> tuple[SceneObject, ...]:
+def _objects(
+    spec: DatasetSpec, f: float, frame: int, stream: Callable[..., Stream], radius: float = 0.0
+) -> tuple[SceneObject, ...]:
     """The objects in front of the first view, in a frame of its sequence."""
     objects, pose = [], _first_pose(spec, frame, stream)
     for place, shape in enumerate(SHAPES if spec.occluders else SHAPES[:1]):
         where, look, size = (stream(Purpose.OBJECT + 10 * place + part) for part in (POSE, LOOK, SCALE))
-        item = draw_object(spec, shape, f, where, look, size)
+        item = draw_object(spec, shape, f, where, look, size, radius)
         if frame:
             item = moved(item, spec, f, frame / spec.frame_rate, stream(Purpose.MOTION, place))
         objects.append(item)
@@ -190,11 +195,13 @@ def _poses(
     raise ValueError(f"no camera sees all {places.shape[1]} objects: lower view_angle_range")
 
 
-def draw_object(spec: DatasetSpec, shape: str, f: float, pose: Stream, look: Stream, size: Stream) -> SceneObject:
+def draw_object(
+    spec: DatasetSpec, shape: str, f: float, pose: Stream, look: Stream, size: Stream, radius: float = 0.0
+) -> SceneObject:
     """An object as large as the cylinder, whose pose, look and scale come from three streams."""
     return SceneObject(
         shape=shape,
-        position=_position(spec, f, pose),
+        position=_position(spec, f, pose, radius),
         rotation=uniform_rotation(pose),
         dimensions=(SIZE, SIZE, SIZE),
         scale=_uniform(size, spec.scale_range),
@@ -217,23 +224,28 @@ def _panel(spec: DatasetSpec, hidden: Vector, f: float, rng: Stream) -> SceneObj
     return panel.model_copy(update=changes)
 
 
-def _position(spec: DatasetSpec, f: float, rng: Stream) -> tuple[float, float, float]:
+def _position(spec: DatasetSpec, f: float, rng: Stream, radius: float = 0.0) -> tuple[float, float, float]:
     """A position in the camera frame; z is drawn first, because x and y span the field of view at that depth."""
     z = _uniform(rng, spec.z_range)
     if spec.is_box:
-        return _in_image(spec, z, rng)
+        return _in_image(spec, z, rng, radius)
     half_width = 0.5 * spec.xy_range * spec.sensor_size * z / f
     x, y = (_uniform(rng, (-half_width, half_width)) for _ in range(2))
     return x, y, z
 
 
-def _in_image(spec: DatasetSpec, z: float, rng: Stream) -> tuple[float, float, float]:
-    """A position at depth z whose pixel is uniform in the central share xy_range of the user's image."""
+def _in_image(spec: DatasetSpec, z: float, rng: Stream, radius: float) -> tuple[float, float, float]:
+    """A position at depth z whose pixel is uniform in a part of the user's image.
+
+    The edges of the image are CUT_OFF times the radius (m) of the object outside this part, of which xy_range is the
+    central share.
+    """
     assert spec.camera is not None
     K, lens = optics(spec.camera)
     size = np.array([spec.camera.width, spec.camera.height], dtype=float)
+    room = spec.xy_range * (size - 2 * CUT_OFF * spec.camera.K[0] * radius / z).clip(0)
     for _ in range(MOST_TRIES):
-        x, y, ahead = rays(K, size / 2 + spec.xy_range * size * (rng.random(2) - 0.5), lens).tolist()
+        x, y, ahead = rays(K, size / 2 + room * (rng.random(2) - 0.5), lens).tolist()
         if ahead > 0:  # not where a fisheye shows nothing, or what is behind
             return x / ahead * z, y / ahead * z, z
     raise ValueError("data.camera shows nothing in front of it; check its coefficients")

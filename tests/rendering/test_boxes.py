@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from scipy import stats
 
 from phd_exp.data.crops import cut
 from phd_exp.optics.virtual import VirtualCamera
@@ -18,8 +19,9 @@ from phd_exp.rendering.boxes import view_of_box
 from phd_exp.rendering.objects import sample_object_scene
 from phd_exp.rendering.rays import NOTHING, beyond_edges, in_camera_frame, rotation_matrix, trace_pixels
 from phd_exp.rendering.samples import GREY, make_sample, photograph
+from phd_exp.rendering.sampling import sample_scene
 from phd_exp.rendering.triangles import Triangles
-from tests.support.renders import MakeSpec, decoded, drawn
+from tests.support.renders import UNLIKELY, MakeSpec, decoded, drawn
 
 SIZE = {"width": 640, "height": 480, "K": (530.0, 0, 340, 0, 532.0, 236, 0, 0, 1)}
 CAMERA = SIZE | {"D": (-0.28, 0.03, 0.001, 0.0, 0.1), "model": "plumb_bob"}
@@ -101,6 +103,22 @@ def test_the_apparent_size_is_nearly_constant(of_box: MakeSpec, meshes: dict[str
     exact = [np.ptp(outline(s, meshes["mesh"]), axis=0).max() for s in jittered]
     ratio = np.array(sides) / exact
     assert (0.88 < ratio.min() < 1.0, 1.4 < ratio.max() < 1.53) == (True, True)
+
+
+def test_few_objects_are_cut_off(of_box: MakeSpec, meshes: dict[str, Triangles]) -> None:
+    """Reference points are uniform in the part of the image at least half a radius away from its edges."""
+    spec = of_box(camera={"f": 500.0, "width": 400, "height": 300}, z_range=(0.3, 0.6), xy_range=0.8)
+    inside = []
+    for index in range(400):
+        item = sample_scene(spec, "train", index, meshes["mesh"].radius).objects[0]
+        x, y, z = item.position
+        room = np.array([400, 300]) - 500 * meshes["mesh"].radius / z
+        inside.append(np.array([x, y]) / z * 500 / room)
+    across, down = np.array(inside).T
+    for places in (across, down):
+        assert stats.kstest(places, stats.uniform(-0.4, 0.8).cdf).pvalue > UNLIKELY
+    large = sample_scene(spec, "train", 0, radius=10.0).objects[0].position
+    assert large[:2] == (0.0, 0.0), "an object larger than the image is in its middle"
 
 
 def test_what_lies_beyond_the_edges_is_grey_and_not_labelled(of_box: MakeSpec, tmp_path: Path) -> None:
