@@ -17,6 +17,7 @@ from phd_exp.records.mesh_files import MATERIALS, MeshFile, read_mesh
 from phd_exp.records.spec import NEAREST, DatasetSpec
 from phd_exp.rendering.triangles import Meshes, Triangles
 
+TEXELS = 4  # of a texture along a side of an image: Cycles takes its value at a point, so finer ones are noise
 MOST_FACES = 1_000_000
 SIZES = (0.001, 20.0)  # m: bounds of an object's longest side
 TOLERANCE = 1e-3  # of an object's size, within which what is drawn and what is labelled agree
@@ -45,7 +46,19 @@ def import_meshes(bpy: Any, spec: DatasetSpec) -> Meshes:
             key = "distractor_meshes" if number else "mesh"
             raise RenderError(f"data.{key}: {file}: {one_line(str(error))}") from None
         handle.name = name
+    _shrink_textures(bpy, TEXELS * spec.sensor_size)
     return meshes
+
+
+def _shrink_textures(bpy: Any, largest: int) -> None:
+    """Halve textures until as many binary digits as `largest` has suffice for the pixels along their longer side."""
+    for image in bpy.data.images:
+        width, height = image.size
+        halvings = max(width, height).bit_length() - largest.bit_length()
+        for _ in range(halvings):  # one at a time, because each is the mean of two pixels
+            image.scale(max(1, image.size[0] // 2), max(1, image.size[1] // 2))
+        if halvings > 0:
+            image.pack()  # otherwise Cycles reads the file
 
 
 def _one_object(bpy: Any, file: MeshFile, *, is_plain: bool) -> Any:

@@ -180,6 +180,39 @@ def test_colours_and_textures_are_drawn(tmp_path: Path, drawn: Callable) -> None
         assert colour[0] < 5 * max(plain[1:]), "the scene's own colour"
 
 
+PLATE = """ply
+format ascii 1.0
+comment TextureFile fine.png
+element vertex 4
+property float x
+property float y
+property float z
+property float s
+property float t
+element face 1
+property list uchar int vertex_indices
+end_header
+-0.1 -0.1 0 0 0
+0.1 -0.1 0 1 0
+0.1 0.1 0 1 1
+-0.1 0.1 0 0 1
+4 0 1 2 3
+"""
+
+
+def test_a_texture_much_finer_than_the_image_is_no_noise(tmp_path: Path, of_mesh: MakeSpec) -> None:
+    """A plate printed with random dots, nine or more to a pixel, is grey even at one point of each pixel."""
+    dots = 255 * np.random.default_rng(0).integers(0, 2, (1024, 1024, 1)).repeat(3, axis=2).astype(np.uint8)
+    Image.fromarray(dots).save(tmp_path / "fine.png")
+    (tmp_path / "plate.ply").write_text(PLATE)
+    spec = of_mesh(mesh=str(tmp_path / "plate.ply"), **SMALL_MESH)
+    renderer = Renderer(Settings(samples=256, denoised=False, points=1), spec)
+    light = renderer.render(sample_object_scene(spec, "train", 0, renderer.meshes))
+    shown = light[..., 0][light[..., 3] > 0.5]
+    assert len(shown) > 100
+    assert shown.std() < 0.25 * shown.mean()
+
+
 def test_a_texture_is_part_of_the_mesh_and_must_be_there(tmp_path: Path, of_mesh: MakeSpec, drawn: Callable) -> None:
     file = obj(tmp_path / "part.obj", "mtllib part.mtl\nusemtl wood\n", "newmtl wood\nmap_Kd wood.png\n")
     with pytest.raises(RenderError, match=r"part\.obj: wood\.png is missing; .*data\.ignore=\[materials\]"):
