@@ -51,14 +51,13 @@ def import_meshes(bpy: Any, spec: DatasetSpec) -> Meshes:
 
 
 def _shrink_textures(bpy: Any, largest: int) -> None:
-    """Halve textures until as many binary digits as `largest` has suffice for the pixels along their longer side."""
+    """Halve textures until their longer side has at most `largest` pixels."""
     for image in bpy.data.images:
-        width, height = image.size
-        halvings = max(width, height).bit_length() - largest.bit_length()
-        for _ in range(halvings):  # one at a time, because each is the mean of two pixels
+        if max(image.size) <= largest:
+            continue
+        while max(image.size) > largest:  # each time the mean of two pixels along both sides
             image.scale(max(1, image.size[0] // 2), max(1, image.size[1] // 2))
-        if halvings > 0:
-            image.pack()  # otherwise Cycles reads the file
+        image.pack()  # otherwise Cycles reads the file
 
 
 def _one_object(bpy: Any, file: MeshFile, *, is_plain: bool) -> Any:
