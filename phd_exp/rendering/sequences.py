@@ -99,6 +99,7 @@ def _waves(rng: Stream) -> tuple[Float[np.ndarray, " waves"], ...]:
 
 
 def rotation_of(quaternion: Quaternion) -> Rotation:
+    """The rotation of a unit quaternion (w, x, y, z)."""
     return Rotation.from_quat(quaternion, scalar_first=True)
 
 
