@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 UP = (0.0, 0.0, 1.0)
 THIN = 1e-12  # share of the thickness of a flat mesh, whose centre of mass is between two triangles
+FEWEST = 4  # vertices of a hull
 JOGGLED = "QJ"  # Qhull moves vertices by rounding errors, so that flat meshes have a hull too
 
 
@@ -40,6 +41,8 @@ def rests_of(vertices: Float[np.ndarray, "vertices 3"]) -> Rests:
 
     Source: quasi-static poses of K. Goldberg et al., "Part pose statistics" (1999).
     """
+    if len(vertices) < FEWEST:  # a single triangle
+        vertices = np.vstack([vertices, vertices])
     hull = ConvexHull(vertices, qhull_options=JOGGLED)
     corners, down = vertices[hull.simplices], hull.equations[:, :3]
     doubled_areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
