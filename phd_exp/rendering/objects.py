@@ -13,6 +13,7 @@ from phd_exp.rendering.boxes import beside, view_of_box
 from phd_exp.rendering.importing import in_blenders_axes
 from phd_exp.rendering.looks import varied
 from phd_exp.rendering.rays import rotation_matrix
+from phd_exp.rendering.resting import rests_of
 from phd_exp.rendering.sampling import MOST_TRIES, SIZE, Purpose, draw_object, sample_scene, stream_of
 from phd_exp.rendering.sequences import quaternion_of, rotation_of
 from phd_exp.rendering.triangles import Meshes
@@ -52,7 +53,7 @@ def _whole_scene(spec: DatasetSpec, split: Split, index: int, meshes: Meshes) ->
     if spec.upright or spec.resting:
         rotation = upright_rotation(around.pitch, turn)
     if spec.resting:
-        onto_side = mesh.rests.draw(stream_of(spec, split, number, Purpose.RESTING))
+        onto_side = rests_of(mesh).draw(stream_of(spec, split, number, Purpose.RESTING))
         rotation = quaternion_of(rotation_of(rotation) * onto_side)
         upwards = onto_side.inv().apply(upwards)
     if spec.front:

@@ -1,11 +1,14 @@
 """How an object can lie on a table: on which of its sides it comes to rest, and how often."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
+
+from phd_exp.rendering.triangles import Triangles
 
 UP = (0.0, 0.0, 1.0)
 THIN = 1e-12  # share of the thickness of a flat mesh, whose centre of mass is between two triangles
@@ -31,7 +34,8 @@ class Rests:
         return Rotation.align_vectors([UP], [-self.down[side]])[0]
 
 
-def rests_of(vertices: Float[np.ndarray, "vertices 3"]) -> Rests:
+@cache  # of each mesh, which is the same for every picture
+def rests_of(mesh: Triangles) -> Rests:
     """The sides of the convex hull of an object on which it lies stably.
 
     An object that is dropped in a random orientation, without momentum, first touches a triangle of the hull with a
@@ -41,12 +45,12 @@ def rests_of(vertices: Float[np.ndarray, "vertices 3"]) -> Rests:
 
     Source: quasi-static poses of K. Goldberg et al., "Part pose statistics" (1999).
     """
+    vertices = mesh.vertices
     if len(vertices) < FEWEST:  # a single triangle
         vertices = np.vstack([vertices, vertices])
     hull = ConvexHull(vertices, qhull_options=JOGGLED)
-    corners, down = vertices[hull.simplices], hull.equations[:, :3]
-    doubled_areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    corners = corners - np.average(corners.mean(axis=1), axis=0, weights=doubled_areas)
+    corners = vertices[hull.simplices] - Triangles(vertices, hull.simplices).centroid
+    down = hull.equations[:, :3]
     share = np.bincount(_rolled(corners, down, hull.neighbors), _solid_angles(corners), len(down))
     sides = np.flatnonzero(share)
     return Rests(down[sides], share[sides] / share.sum())

@@ -8,12 +8,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from phd_exp.rendering.resting import Rests, rests_of
-
 Depths = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Triangles:
     """A mesh in its local frame: vertices (n, 3), m, and the three vertices of each triangle (m, 3).
 
@@ -30,7 +28,7 @@ class Triangles:
         x, y, z = np.maximum(np.ptp(self.vertices, axis=0), 1e-6).tolist()
         return x, y, z
 
-    @property
+    @cached_property
     def radius(self) -> float:
         """Distance of the farthest vertex from the reference point, m."""
         return float(np.linalg.norm(self.vertices, axis=1).max())
@@ -46,11 +44,6 @@ class Triangles:
         """Centroid (3,) of the surface, m."""
         middles = np.add.reduce(np.moveaxis(self.vertices[self.corners], 1, 0)) / 3
         return np.average(middles, axis=0, weights=self.areas + 1e-300)
-
-    @cached_property
-    def rests(self) -> Rests:
-        """How it can lie on a table."""
-        return rests_of(self.vertices)
 
     def window(self, turn: Depths, shift: Depths, f: float, S: int) -> tuple[range, range]:
         """Rows and columns of the bounding box of its silhouette, possibly outside the image (S, S)."""

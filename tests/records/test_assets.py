@@ -53,7 +53,11 @@ def refused(composed: Callable[..., dict[str, Any]], tmp_path: Path, monkeypatch
         ((PART, "data.distractors=1", "data.views=2"), "and 0 if views > 1"),
         ((PART, "data.occluders=true"), "occluders: for the cylinder alone; expected data.distractors=2"),
         ((PART, "data.pitch_range=[-91,0]"), "data.pitch_range.0: got -91; expected to be greater than or equal"),
-        ((*STANDING, "data.pitch_range=[5,30]"), "pitch_range above 5.33"),
+        (
+            (*STANDING, "data.pitch_range=[5,30]"),
+            "ground: got upright=True, resting=False, views=1, pitch_range=[5.0, 30.0]; "
+            "expected upright or resting, views=1, and pitch_range above 5.33 degrees",
+        ),
         ((PART, "data.ground=true"), "got upright=False, resting=False, views=1"),
         ((PART, "data.upright=true", "data.resting=true"), "resting: got also upright, another law of rotations"),
         (("data=default", "+data.unit=2.0"), "unit: for meshes alone; expected data=object data.mesh=FILE"),

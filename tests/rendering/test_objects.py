@@ -313,7 +313,6 @@ def test_outlines_are_no_brighter_than_surfaces(make_spec: MakeSpec, tmp_path: P
         hits = ((scene, trace_pixels(scene, renderer.meshes)) for scene in scenes)
         images.append([photograph(renderer, scene, seen, spec).astype(int) for scene, seen in hits])
     above = [(ours - ndimage.maximum_filter(exact, (5, 5, 1))).max() for ours, exact in zip(*images, strict=True)]
-    print(above)
     assert max(above) < 60
 
 
