@@ -3,6 +3,7 @@
 import fcntl
 import os
 import platform
+import random
 import re
 import signal
 import subprocess
@@ -124,6 +125,25 @@ def parent() -> Connection:
     """In a `Child`, the connection to its parent. The child ignores Ctrl-C from here on; its parent handles it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     return Connection(int(sys.argv[1]))
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """This process runs on a random one of its cores, if the system can do that, and afterwards on all of them again.
+
+    Some libraries start a thread for each core when they are first used. If this happens here, they start none.
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {random.choice(sorted(cores))})
+    try:
+        yield
+    finally:
+        for thread in os.listdir("/proc/self/task"):
+            with suppress(ProcessLookupError):  # it has ended
+                os.sched_setaffinity(int(thread), cores)
 
 
 def usable_cores() -> int:

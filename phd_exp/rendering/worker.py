@@ -1,12 +1,12 @@
 """`python -m phd_exp.rendering.worker FD`: a process that receives samples to render and returns their records."""
 
 import traceback
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from multiprocessing.connection import Connection
 
 from phd_exp.records.errors import RenderError, UserError, writing
 from phd_exp.records.files import write_atomic
-from phd_exp.records.processes import parent
+from phd_exp.records.processes import one_core, parent
 from phd_exp.records.scenes import SampleRecord
 from phd_exp.rendering.blender import Renderer
 from phd_exp.rendering.samples import fast_settings, make_sample
@@ -23,7 +23,8 @@ def serve(connection: Connection) -> None:
         split, index = connection.recv()
         answer: SampleRecord | UserError
         try:
-            with writing(folder.root):
+            # Blender and its denoiser would start threads that take cores from the other workers
+            with writing(folder.root), one_core() if renderer is None else nullcontext():
                 renderer = renderer or Renderer(fast_settings(spec), spec)
                 image, answer = make_sample(renderer, spec, split, index)
                 write_atomic(folder.image_path(split, index, spec.image_format), image)

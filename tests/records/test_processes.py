@@ -1,10 +1,12 @@
 """Locks exclude other processes, and a child that dies is noticed."""
 
+import os
+import threading
 from pathlib import Path
 
 import pytest
 
-from phd_exp.records.processes import Child, held
+from phd_exp.records.processes import Child, held, one_core
 
 
 def test_shared_locks_are_compatible_and_exclude_an_exclusive_one(
@@ -49,3 +51,26 @@ def test_a_child_answers_until_it_dies_or_is_closed(tmp_path: Path, monkeypatch:
     assert closed.process.returncode is not None
     assert "ZeroDivisionError" in log.read_text()
     assert log.read_text().count("printed") == 2
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system binds no process to cores")
+def test_one_core_is_for_the_body_alone_also_of_threads_that_it_starts() -> None:
+    before = os.sched_getaffinity(0)
+    seen: list[set[int]] = []
+    begin, noted = threading.Event(), threading.Event()
+
+    def note() -> None:
+        seen.append(os.sched_getaffinity(0))
+        noted.set()
+        begin.wait()
+        seen.append(os.sched_getaffinity(0))
+
+    thread = threading.Thread(target=note)
+    with one_core():
+        assert len(os.sched_getaffinity(0)) == 1
+        thread.start()
+        assert noted.wait(10)
+    begin.set()
+    thread.join()
+    assert len(seen[0]) == 1
+    assert seen[1] == os.sched_getaffinity(0) == before

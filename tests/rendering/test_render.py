@@ -1,15 +1,17 @@
 """A folder ends with the same bytes whatever the workers, the order, and the interruptions."""
 
+import os
 from pathlib import Path
 
 import pytest
 
 from phd_exp.records.dataset import DatasetFolder, sha256
 from phd_exp.records.errors import DatasetError, RenderError
+from phd_exp.records.processes import Child
 from phd_exp.records.scenes import Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering import blender
-from phd_exp.rendering.render import ensure_rendered, render_all, worker_count
+from phd_exp.rendering.render import ONE_THREAD, ensure_rendered, render_all, worker_count
 from tests.support.renders import contents
 
 
@@ -35,6 +37,25 @@ def test_a_sample_is_the_same_alone_and_in_another_order(
     order: list[tuple[Split, int]] = [("train", 7), ("test", 2), ("train", 3), ("train", 0)]
     for record in render_all(folder, small_spec, order, workers=1):
         assert record == small.records(record.split)[record.index]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system binds no process to cores")
+def test_a_worker_has_as_many_threads_on_many_cores_as_on_one(folder: DatasetFolder, small_spec: DatasetSpec) -> None:
+    folder.split_folder("train").mkdir(parents=True)
+    cores, threads = os.sched_getaffinity(0), []
+    for some in (cores, {min(cores)}):
+        os.sched_setaffinity(0, some)  # a worker inherits it
+        try:
+            with Child("phd_exp.rendering.worker", ONE_THREAD) as worker:
+                worker.send((folder, small_spec))
+                for index in range(2):
+                    worker.send(("train", index))
+                    worker.receive()
+                threads.append(len(os.listdir(f"/proc/{worker.process.pid}/task")))
+        finally:
+            os.sched_setaffinity(0, cores)
+    assert threads[0] == threads[1]
 
 
 def test_a_folder_grows_and_keeps_what_it_has(
