@@ -30,7 +30,13 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> None:
         print(f"{folder.root}: all {n} samples are as they were rendered")
         return
     n_train, n_test = data.n_training_split, data.n_test
-    if not ensure_rendered(folder, data.spec, n_train, n_test, data.workers, cores, checked.shard):
+    finished = [
+        ensure_rendered(
+            DatasetFolder(one.folder), one.spec, one.n_training_split, one.n_test, one.workers, cores, checked.shard
+        )
+        for one in checked.rendered
+    ]
+    if not all(finished):
         return  # other shards are missing
     try:
         ensure_drawn(folder, data.spec, n_train)

@@ -30,14 +30,20 @@ NO_SINGLE_IMAGES = "is not rendered in single images"
 
 
 class RenderConfig(Record):
-    """The configuration of `render`: the data, and the keys of conf/render.yaml."""
+    """The configuration of `render`: the data, the recipe that they are for, and the keys of conf/render.yaml."""
 
     data: RenderedConfig
+    recipe: sections.RecipeConfig
     shard: Annotated[Shard, BeforeValidator(Shard.parse)] | None
     verify: StrictBool
     rerender: sections.Natural
     masks: sections.Folder | None
     bop: sections.Folder | None
+
+    @property
+    def rendered(self) -> list[RenderedConfig]:
+        """The data sets that a training with this recipe reads."""
+        return _rendered(self.data, self.recipe)
 
 
 class RunConfig(Record):
@@ -122,13 +128,8 @@ class RunConfig(Record):
 
     @property
     def rendered(self) -> list[RenderedConfig]:
-        """The rendered data sets that the training reads: its own, and the backdrops without objects, if used."""
-        data = self.data
-        if not isinstance(data, RenderedConfig):
-            return []
-        if not (self.recipe.augmentation.backdrops or self.recipe.augmentation.prints):
-            return [data]
-        return [data, data.model_copy(update={"spec": data.spec.without_objects, "n_held_out": 0, "n_test": 0})]
+        """The rendered data sets that the training reads."""
+        return _rendered(self.data, self.recipe) if isinstance(self.data, RenderedConfig) else []
 
     @property
     def several_views(self) -> RenderedConfig | None:
@@ -204,6 +205,13 @@ def check(config: dict[str, Any], trust: Trust = None) -> RunConfig:
     `trust` decides which classes it may name, see `targets.Trust`.
     """
     return _validated(RunConfig, config, trust)
+
+
+def _rendered(data: RenderedConfig, recipe: sections.RecipeConfig) -> list[RenderedConfig]:
+    """A data set, and its backdrops without objects if the recipe uses them."""
+    if not (recipe.augmentation.backdrops or recipe.augmentation.prints):
+        return [data]
+    return [data, data.model_copy(update={"spec": data.spec.without_objects, "n_held_out": 0, "n_test": 0})]
 
 
 def check_render(config: dict[str, Any]) -> RenderConfig:

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.meshes import solid, write_mesh
+
 TINY = (
     "data.sensor_size=56", "data.f_range=[300,500]", "preset=smoke", "data.image_size=32", "data.n_train=3",
     "data.n_held_out=1", "data.n_test=2", "data.samples_per_pixel=1",
@@ -48,3 +50,16 @@ def test_a_data_set_is_rendered_in_shards_and_verified_and_repaired(
     assert {path.name for path in (tmp_path / "masks" / "test").iterdir()} == {"000000.png", "000001.png"}
     assert "bop: 6 images as BOP" in repaired.out
     assert (tmp_path / "bop" / "train" / "000000" / "rgb" / "000002.png").read_bytes() == whole
+
+
+@pytest.mark.slow
+def test_all_that_a_training_reads_is_rendered(render: Callable, phd_exp: Callable, tmp_path: Path) -> None:
+    """Machines that train may lack Blender."""
+    write_mesh(tmp_path / "part.stl", solid("cube"))
+    words = ("data=object", "data.mesh=part.stl", "data.backdrops=null", "recipe=strong")
+    outcome = render(*words, "recipe.augmentation.backdrops=0.5")
+    assert outcome.status == 0, outcome.err
+    names = {"object": (4, 2), "object-backdrops": (3, 0)}
+    for name, counts in names.items():
+        folder = tmp_path / "renders" / name
+        assert tuple(len(list((folder / split).glob("*.png"))) for split in ("train", "test")) == counts

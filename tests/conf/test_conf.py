@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from phd_exp.cli import conf_folder
-from phd_exp.config import RenderedConfig, RunConfig, check
+from phd_exp.config import RenderedConfig, RunConfig, check, check_render
 from phd_exp.records.choices import has_influence
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import SECTIONS
@@ -129,12 +129,15 @@ def test_focal_lengths_that_follow_from_a_camera_are_not_shifted(checked: Callab
 
 @pytest.mark.parametrize(("words", "n"), [((0, 0), 1), ((0.5, 0), 2), ((0, 0.5), 2)])
 def test_what_is_behind_objects_is_rendered_for_other_backdrops_and_prints(
-    checked: Callable, tmp_path: Path, words: tuple[float, float], n: int
+    composed: Callable[..., dict[str, Any]], tmp_path: Path, words: tuple[float, float], n: int
 ) -> None:
     (tmp_path / "part.obj").touch()
     keys = (f"recipe.augmentation.{key}={share}" for key, share in zip(("backdrops", "prints"), words, strict=True))
-    rendered = checked("data=object", f"data.mesh={tmp_path}/part.obj", *keys).rendered
+    config = composed("data=object", f"data.mesh={tmp_path}/part.obj", *keys)
+    rendered = check(config).rendered
     assert [data.spec.empty for data in rendered] == [False, True][:n]
+    render = {"shard": None, "verify": False, "rerender": 0, "masks": None, "bop": None}
+    assert check_render(config | render).rendered == rendered
 
 
 def test_older_records_without_several_views_are_valid(composed: Callable[..., dict[str, Any]]) -> None:

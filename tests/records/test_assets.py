@@ -30,7 +30,7 @@ def refused(composed: Callable[..., dict[str, Any]], tmp_path: Path, monkeypatch
 
     def line(*overrides: str) -> str:
         with pytest.raises(ConfigError) as error:
-            check_render({"data": composed("data=object", *overrides)["data"]} | RENDER)
+            check_render(composed("data=object", *overrides) | RENDER)
         assert "\n" not in str(error.value)
         return str(error.value)
 
