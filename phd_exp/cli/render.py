@@ -3,6 +3,7 @@
 from typing import Any
 
 from phd_exp.cli.jobs import Job, launch
+from phd_exp.cli.train import rendered
 from phd_exp.config import check_render
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, RenderError
@@ -10,7 +11,6 @@ from phd_exp.records.processes import announce
 from phd_exp.rendering.bop import write_bop
 from phd_exp.rendering.finished import require_elsewhere, verify
 from phd_exp.rendering.masks import ensure_drawn, meshes_of, write_masks
-from phd_exp.rendering.render import ensure_rendered
 
 
 def main(words: list[str]) -> int:
@@ -29,20 +29,14 @@ def task(config: dict[str, Any], overrides: list[str], cores: int) -> None:
         n = verify(folder, data.spec, checked.rerender)
         print(f"{folder.root}: all {n} samples are as they were rendered")
         return
-    n_train, n_test = data.n_training_split, data.n_test
-    finished = [
-        ensure_rendered(
-            DatasetFolder(one.folder), one.spec, one.n_training_split, one.n_test, one.workers, cores, checked.shard
-        )
-        for one in checked.rendered
-    ]
+    finished = [rendered(one, cores=cores, shard=checked.shard) for one in checked.rendered]
     if not all(finished):
         return  # other shards are missing
     try:
-        ensure_drawn(folder, data.spec, n_train)
+        ensure_drawn(folder, data.spec, data.n_training_split)
     except RenderError as error:  # a data set that cannot be written is whole without masks
         announce(f"note: {error}; recipe=strong needs masks")
-    print(f"{folder.root}: {n_train} training and {n_test} test samples are there")
+    print(f"{folder.root}: {data.n_training_split} training and {data.n_test} test samples are there")
     if checked.masks or checked.bop:
         meshes = meshes_of(data.spec)
     if checked.masks:

@@ -19,6 +19,7 @@ from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, RunError, shown
 from phd_exp.records.processes import usable_cores
 from phd_exp.records.runs import RunFolder
+from phd_exp.records.spec import Shard
 from phd_exp.rendering.render import FEWER, ensure_rendered
 
 if TYPE_CHECKING:
@@ -142,10 +143,10 @@ def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> Non
         print(f"  in about ten minutes: python -m phd_exp {words}", flush=True)
 
 
-def rendered(data: RenderedConfig, fewer: str = FEWER, *, cores: int) -> None:
-    """Render the missing samples of a data set."""
+def rendered(data: RenderedConfig, fewer: str = FEWER, *, cores: int, shard: Shard | None = None) -> bool:
+    """Render the missing samples of a data set, or of a shard of it; returns whether all samples are there."""
     counts = data.n_training_split, data.n_test
-    ensure_rendered(DatasetFolder(data.folder), data.spec, *counts, data.workers, cores, fewer=fewer)
+    return ensure_rendered(DatasetFolder(data.folder), data.spec, *counts, data.workers, cores, shard, fewer)
 
 
 def _number(value: Any) -> str:

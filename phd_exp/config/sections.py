@@ -116,7 +116,7 @@ class RenderedConfig(SizesConfig):
         return self.model_copy(update={"spec": spec, "n_train": 0, "n_held_out": 0, "n_test": n_test})
 
 
-Render = Callable[..., None]
+Render = Callable[..., object]
 """Renders the missing samples of a `RenderedConfig`; messages suggest the overrides `fewer` for fewer samples."""
 
 

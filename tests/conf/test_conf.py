@@ -14,6 +14,7 @@ from phd_exp.records.choices import has_influence
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import SECTIONS
 from phd_exp.records.spec import DatasetSpec
+from tests.support.renders import RENDER
 
 CHOICES = {
     group.name: [f"{group.name}={file.stem}" for file in sorted(group.glob("*.yaml"))]
@@ -136,8 +137,7 @@ def test_what_is_behind_objects_is_rendered_for_other_backdrops_and_prints(
     config = composed("data=object", f"data.mesh={tmp_path}/part.obj", *keys)
     rendered = check(config).rendered
     assert [data.spec.empty for data in rendered] == [False, True][:n]
-    render = {"shard": None, "verify": False, "rerender": 0, "masks": None, "bop": None}
-    assert check_render(config | render).rendered == rendered
+    assert check_render(config | RENDER).rendered == rendered
 
 
 def test_older_records_without_several_views_are_valid(composed: Callable[..., dict[str, Any]]) -> None:

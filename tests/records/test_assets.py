@@ -11,9 +11,9 @@ from phd_exp.records.assets import mesh_asset
 from phd_exp.records.dataset import DatasetFolder, Manifest
 from phd_exp.records.errors import ConfigError, DatasetError
 from tests.support.meshes import solid, write_mesh
+from tests.support.renders import RENDER
 
 PART = "data.mesh=part.glb"
-RENDER = {"shard": None, "verify": False, "rerender": 0, "masks": None, "bop": None}
 STANDING = (PART, "data.upright=true", "data.ground=true")
 
 
