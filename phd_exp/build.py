@@ -53,7 +53,7 @@ def build_regressor(config: RunConfig, depth: DepthScale, is_new: bool = True) -
             raise ValueError(f"{node['_target_']} makes a {type(backbone).__name__}; expected a torch.nn.Module")
         is_input = config.camera.focal_length == "shown"
         f_input = FocalLengthInput(head.n_outputs, depth) if is_input else None
-        return Regressor(backbone, head, f_input, config.recipe.exposure)
+        return Regressor(backbone, head, f_input, config.recipe.exposure, config.recipe.hidden)
 
 
 def _without_weights(node: Any) -> Any:

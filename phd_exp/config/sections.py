@@ -230,6 +230,7 @@ class RecipeConfig(Record):
     warmup_steps: Natural
     localisation: Annotated[float, Field(ge=0, le=1000)]
     exposure: StrictBool = False  # default for older run records
+    hidden: Annotated[Whole, Field(ge=0, le=4096)] = 0  # default for older run records
     segmentation: Annotated[float, Field(ge=0, le=1000)] = 0.0  # default for older run records
     augmentation: AugmentationConfig
 

@@ -69,6 +69,16 @@ def _parameters(target: Any) -> tuple[Mapping[str, inspect.Parameter], bool]:
     return parameters, any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
 
 
+def at_defaults(config: Any) -> dict[str, Any]:
+    """The dotted keys of a configuration whose values are the defaults of what their nodes name."""
+    found = {}
+    for path, node in _nodes_in(config):
+        parameters, _ = _parameters(locate(node["_target_"], None))
+        defaults = {key: parameter.default for key, parameter in parameters.items()}
+        found |= {f"{path}.{key}": value for key, value in node.items() if defaults.get(key) == value}
+    return found
+
+
 def build(node: Mapping[str, Any], is_partial: bool = False) -> Any:
     """Call what a checked node names with its keys; if it `is_partial`, or has `_partial_: true`, defer the call.
 

@@ -28,6 +28,10 @@ class Locating(Backbone):
     With `segments`, the map also holds the probability that each cell shows the object. The features then include
     those of the level averaged with these probabilities too, and the area, centre and shape of the visible part.
 
+    With `points`, further maps without supervision hold the probabilities of so many points. Their mean places
+    relative to the object's, and the log variances of their maps, are features, from which the hidden layers of a
+    `Regressor` can learn distances on the object.
+
     The map and its means are computed in float32: bfloat16 would round places to a tenth of a pixel.
 
     Args:
@@ -36,9 +40,11 @@ class Locating(Backbone):
         stride: of the first convolution.
         channels: of the pyramid.
         segments: whether the map holds the visible part of the object.
+        points: number of points.
 
     Source: the pyramid is Lin et al., "Feature pyramid networks for object detection" (2017); the mean over a map,
-    Sun et al., "Integral human pose regression" (2018).
+    Sun et al., "Integral human pose regression" (2018); points without supervision, Levine et al., "End-to-end
+    training of deep visuomotor policies" (2016).
     """
 
     locates = True
@@ -50,6 +56,7 @@ class Locating(Backbone):
         stride: Literal[2, 4],
         channels: Annotated[int, Ge(1)],
         segments: bool = False,
+        points: Annotated[int, Ge(0)] = 0,
     ) -> None:
         super().__init__()
         block, counts = BLOCKS[depth]
@@ -68,7 +75,8 @@ class Locating(Backbone):
         nn.init.zeros_(self.map.weight)
         nn.init.zeros_(self.map.bias)  # type: ignore[arg-type]  # it has one
         self.segments = segments
-        self.n_features = channels + outputs[-1] + (channels + 6 if segments else 0)
+        self.points = nn.Conv2d(channels, points, 1) if points else None
+        self.n_features = channels + outputs[-1] + (channels + 6 if segments else 0) + 3 * points
 
     def forward(self, pixels: Float[Tensor, "batch 3 height width"]) -> BackboneOutput:
         stages, level = [], self.stem(pixels)
@@ -95,9 +103,12 @@ class Locating(Backbone):
         features = [(weight * finest.flatten(2)).sum(-1), last.mean((2, 3))]
         if self.segments:
             features += _of_segment(log_odds.sigmoid().flatten(1), finest.flatten(2), cells.flatten(1))
+        place = (weight * (cells + offset).flatten(2)).sum(-1)
+        if self.points is not None:
+            features.append(_of_points(self.points(finest).flatten(2).softmax(-1), cells.flatten(1), place))
         return BackboneOutput(
             features=torch.cat(features, dim=-1),
-            place=(weight * (cells + offset).flatten(2)).sum(-1),
+            place=place,
             log_heat=log_heat.unflatten(-1, score.shape[-2:]),
             log_odds=log_odds[:, 0] if self.segments else None,
         )
@@ -118,3 +129,12 @@ def _of_segment(
     x, y = (cells - centre[:, :, None]).unbind(1)
     covariance = torch.stack([(weight * product).sum(-1) for product in (x * x, x * y, y * y)], dim=-1)
     return [(weight[:, None] * level).sum(-1), area.log(), centre, 4 * math.pi * covariance / area]
+
+
+def _of_points(
+    probability: Float[Tensor, "batch points cells"], cells: Float[Tensor, "2 cells"], place: Float[Tensor, "batch 2"]
+) -> Float[Tensor, "batch features"]:
+    """The mean places of points relative to the object's, and the log variances of their maps."""
+    mean = probability @ cells.T
+    variance = probability @ cells.square().sum(0) - mean.square().sum(-1)
+    return torch.cat([(mean - place[:, None]).flatten(1), variance.clamp_min(1e-4).log()], dim=-1)

@@ -49,10 +49,19 @@ class FocalLengthInput(nn.Module):
         return raw + shown
 
 
-class Regressor(nn.Module):
-    """backbone -> linear layer, zero at the start -> correction by the focal length, if it is an input -> head.
+def _hidden_layers(n_features: int, units: int) -> nn.Sequential:
+    first, second = nn.Linear(n_features, units), nn.Linear(units, units)
+    return nn.Sequential(nn.LayerNorm(n_features), first, nn.GELU(), second, nn.GELU())
 
-    The backbone runs in the precision of the enclosing autocast; the linear layer and everything after it run in
+
+class Regressor(nn.Module):
+    """backbone -> hidden layers, if any -> linear layer, zero at the start -> correction by the focal length, if f is
+    an input -> head.
+
+    The linear layer reads the features and the outputs of the hidden layers: how large an object appears depends on
+    its orientation in ways that are not linear.
+
+    The backbone runs in the precision of the enclosing autocast; all that follows runs in
     float32, since nu_p = B v_p rounded to bfloat16 has errors up to 0.2 pixels at the border of the image.
     Images keep their memory format, channels last, which is at least as fast on CPUs and GPUs.
 
@@ -62,6 +71,7 @@ class Regressor(nn.Module):
         shown: the correction by the focal length; None: it is no input.
         exposure: multiply each channel of each image by the factor that makes its mean that of ImageNet, so that
             predictions do not depend on brightness and white balance.
+        hidden: units of each of two hidden layers; 0 for none.
 
     Examples:
         >>> import torch
@@ -79,12 +89,18 @@ class Regressor(nn.Module):
     std: Tensor
 
     def __init__(
-        self, backbone: Backbone, head: Head, shown: FocalLengthInput | None = None, exposure: bool = False
+        self,
+        backbone: Backbone,
+        head: Head,
+        shown: FocalLengthInput | None = None,
+        exposure: bool = False,
+        hidden: int = 0,
     ) -> None:
         super().__init__()
         self.backbone = backbone.to(memory_format=torch.channels_last)
         self.head = head
-        self.last = nn.Linear(backbone.n_features, head.n_outputs)
+        self.hidden = _hidden_layers(backbone.n_features, hidden) if hidden else None
+        self.last = nn.Linear(backbone.n_features + hidden, head.n_outputs)
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)
         self.shown = shown
@@ -137,7 +153,10 @@ class Regressor(nn.Module):
         """The raw numbers for the head, given the output of the backbone, and f if it is an input."""
         dtype = self.last.weight.dtype
         with torch.autocast(output.features.device.type, enabled=False):
-            raw: Tensor = self.last(output.features.to(dtype))
+            features = output.features.to(dtype)
+            if self.hidden is not None:
+                features = torch.cat([features, self.hidden(features)], dim=-1)
+            raw: Tensor = self.last(features)
             if self.shown is not None:
                 raw = self.shown(raw, f)
             return raw if output.place is None else self.head.placed(raw, output.place.to(dtype))

@@ -11,7 +11,7 @@ from lightning import Callback
 from phd_exp.build import require_same_shrinking
 from phd_exp.config import RenderedConfig, RunConfig
 from phd_exp.config.sections import DataConfig, RecipeConfig, Render
-from phd_exp.config.targets import custom_parts
+from phd_exp.config.targets import at_defaults, custom_parts
 from phd_exp.data.photometry import VERSION
 from phd_exp.hardware import default_threads
 from phd_exp.records.choices import first_difference, flatten
@@ -135,9 +135,10 @@ def require_same_photometry(folder: RunFolder, recipe: RecipeConfig) -> None:
 
 def _difference(folder: RunFolder, config: RunConfig) -> str | None:
     """The first key with another value in the run that a folder holds; None if its results are the same."""
-    asked = flatten(config.model_dump(mode="json"))
+    asked = flatten(whole := config.model_dump(mode="json"))
     chosen = flatten(config.model_dump(mode="json", exclude_defaults=True))
-    younger = {key: value for key, value in asked.items() if key not in chosen}  # may be absent in an older record
+    # may be absent in an older record
+    younger = {key: value for key, value in asked.items() if key not in chosen} | at_defaults(whole)
     return first_difference(younger | flatten(folder.config()), asked)
 
 

@@ -50,5 +50,6 @@ def test_an_ablation_changes_what_the_strong_recipe_sets(composed: Callable[...,
         assert changed, overrides
         parts |= changed
     of_recipe = {key for key in whole | paper if whole.get(key) != paper.get(key)} - {"recipe.name"}
-    # the class of the network, whose parts are left out; and the learning rate of both optimizers
-    assert of_recipe - parts == {"backbone._target_", "optimizer.lr"}
+    # the class of the network, whose parts are left out; its points, which only data=object has; and the learning
+    # rate of both optimizers
+    assert of_recipe - parts == {"backbone._target_", "backbone.points", "optimizer.lr"}

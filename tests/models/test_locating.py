@@ -12,7 +12,7 @@ from phd_exp.geometry import Camera, Cartesian, DepthScale, LogDepth, Projected
 from phd_exp.geometry.camera import middles
 from phd_exp.geometry.charts import projected
 from phd_exp.models.heads import ChartHead, DistributionHead, Head
-from phd_exp.models.locating import Locating, _of_segment
+from phd_exp.models.locating import Locating, _of_points, _of_segment
 from phd_exp.models.regressor import Regressor
 from tests.support.heads import SHAPED
 
@@ -32,9 +32,9 @@ def images() -> torch.Tensor:
     return torch.randint(0, 256, (4, 64, 64, 3), generator=generator, dtype=torch.uint8)
 
 
-def locating(depth: int = 10, segments: bool = False) -> Locating:
+def locating(depth: int = 10, segments: bool = False, points: int = 0) -> Locating:
     torch.manual_seed(0)
-    return Locating(depth, width=8, stride=2, channels=6, segments=segments)
+    return Locating(depth, width=8, stride=2, channels=6, segments=segments, points=points)
 
 
 @pytest.mark.parametrize("depth", [10, 18, 50])
@@ -111,9 +111,29 @@ def test_the_shape_of_an_ellipse(stretch: float) -> None:
     assert_close(covariance, torch.tensor([[stretch, 0, 1 / stretch]]), rtol=0, atol=0.02)
 
 
+def test_points_add_their_places_relative_to_the_objects_and_their_variances() -> None:
+    network = locating(points=2)
+    torch.nn.init.normal_(network.map.weight)
+    with torch.no_grad():
+        network.points.weight.zero_()  # uniform maps: both points lie in the middle of the image
+        seen = network(torch.randn(3, 3, 64, 64))
+    places, variances = seen.features[:, -6:].split([4, 2], dim=1)
+    assert_close(places, -seen.place.repeat(1, 2), atol=1e-6, rtol=0)
+    assert_close(variances.exp(), torch.full((3, 2), 2 * (1 - 1 / 16**2) / 3))
+    assert seen.features.shape == (3, network.n_features)
+
+
+def test_a_point_lies_at_the_mean_of_its_map() -> None:
+    cells = middles(4, 4).flatten(0, 1).T
+    probability = torch.zeros(1, 1, 16)
+    probability[..., [5, 6]] = 0.5  # the second row, both cells next to its middle
+    x, y, log_variance = _of_points(probability, cells, torch.tensor([[0.5, 0.25]]))[0]
+    assert_close(torch.stack([x, y, log_variance.exp()]), torch.tensor([-0.5, -0.5, 0.25**2]))
+
+
 def test_what_it_reads_is_float32_under_autocast() -> None:
     with torch.autocast("cpu", torch.bfloat16):
-        seen = locating(segments=True)(torch.randn(1, 3, 64, 64))
+        seen = locating(segments=True, points=3)(torch.randn(1, 3, 64, 64))
     assert {part.dtype for part in seen} == {torch.float32}
 
 

@@ -4,12 +4,14 @@ from functools import partial
 
 import pytest
 import torch
+from torch import nn
+from torch.nn.functional import layer_norm
 from torchvision.models.resnet import BasicBlock, Bottleneck
 from torchvision.models.resnet import ResNet as TorchvisionResNet
 
 from phd_exp.geometry import Camera, Cartesian, DepthScale, LogDepth, Projected
 from phd_exp.losses import MeanAbsoluteError, NegativeLogLikelihood, Pinball
-from phd_exp.models.backbones import resnet
+from phd_exp.models.backbones import BackboneOutput, PooledFeatures, resnet
 from phd_exp.models.heads import ChartHead, DistributionHead, Head, SurrogateHead
 from phd_exp.models.regressor import Regressor
 from phd_exp.models.residual import Depth
@@ -63,6 +65,26 @@ def test_every_output_learns_from_the_first_step(
     gradient = network.last.weight.grad
     assert gradient.isfinite().all()
     assert (gradient.abs().amax(dim=1) > 1e-4).all(), gradient.abs().amax(dim=1)
+
+
+def test_hidden_layers_predict_what_no_linear_layer_can() -> None:
+    """The product of two features."""
+    features = layer_norm(torch.randn(256, 4, generator=torch.Generator().manual_seed(0)), (4,))
+    product = features[:, :1] * features[:, 1:2]
+
+    def error(hidden: int) -> float:
+        torch.manual_seed(0)
+        network = Regressor(PooledFeatures(nn.Identity(), 4), HEADS["mae_vz"], hidden=hidden)
+        assert (network.numbers(BackboneOutput(features), None) == 0).all()
+        optimizer = torch.optim.Adam([*network.parameters()], lr=0.01)
+        for _ in range(150):
+            loss = (network.numbers(BackboneOutput(features), None) - product).square().mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        return loss.item()
+
+    assert error(hidden=32) < 0.02 < 0.5 < error(hidden=0)
 
 
 def test_channels_last_changes_no_number(image: torch.Tensor, camera: Camera) -> None:

@@ -216,6 +216,19 @@ def test_a_finished_run_is_not_run_again_and_never_taken_for_another(
         run_in(whole.path, *LONG, "optimizer.lr=0.5")
 
 
+def test_a_record_without_an_argument_that_is_younger_is_of_the_same_run(
+    run_in: Callable, whole: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("phd_exp.training.train.run", lambda *_: pytest.fail("run again"))
+    old = RunFolder(shutil.copytree(whole.path, tmp_path / "old"))
+    record = old.config()
+    assert record["backbone"].pop("points") == 0
+    old.write_config(record)
+    run_in(old.path, *LONG)
+    with pytest.raises(RunError, match=r"backbone.points=nothing, but backbone.points=2 is asked"):
+        run_in(old.path, *LONG, "backbone.points=2")
+
+
 def test_a_loss_that_is_not_finite_names_its_samples(
     run_in: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
