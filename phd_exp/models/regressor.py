@@ -61,9 +61,9 @@ class Regressor(nn.Module):
     The linear layer reads the features and the outputs of the hidden layers: how large an object appears depends on
     its orientation in ways that are not linear.
 
-    The backbone runs in the precision of the enclosing autocast; all that follows runs in
-    float32, since nu_p = B v_p rounded to bfloat16 has errors up to 0.2 pixels at the border of the image.
-    Images keep their memory format, channels last, which is at least as fast on CPUs and GPUs.
+    The backbone runs in the precision of the enclosing autocast; all that follows runs in float32, since nu_p = B v_p
+    rounded to bfloat16 has errors up to 0.2 pixels at the border of the image.
+    Images keep their memory format, channels last, which is at least as fast on CPUs.
 
     Args:
         backbone: images -> features, and the object's place if it locates the object.

@@ -18,7 +18,10 @@ from phd_exp.records.runs import RunFolder
 
 SIDE = 48
 LOCATING = "backbone._target_=phd_exp.models.locating.Locating"
-NARROW = (LOCATING, "+backbone.width=8", "+backbone.stride=4", "+backbone.channels=4")
+NARROW = (
+    LOCATING, "+backbone.width=8", "+backbone.stride=4", "+backbone.channels=4", "+backbone.points=2",
+    "recipe.hidden=8",
+)  # fmt: skip
 """A network of less than a megabyte. That of `preset=smoke` has 20, and 60 where a training is resumed."""
 SMALL = ("preset=smoke", *NARROW, f"data.image_size={SIDE}", "trainer.threads=1")
 NOWHERE = ("data=folder", "data.folder=nowhere")
