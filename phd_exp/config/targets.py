@@ -71,7 +71,7 @@ def _parameters(target: Any) -> tuple[Mapping[str, inspect.Parameter], bool]:
 
 def at_defaults(config: Any) -> dict[str, Any]:
     """The dotted keys of a configuration whose values are the defaults of what their nodes name."""
-    found = {}
+    found: dict[str, Any] = {}
     for path, node in _nodes_in(config):
         parameters, _ = _parameters(locate(node["_target_"], None))
         defaults = {key: parameter.default for key, parameter in parameters.items()}
