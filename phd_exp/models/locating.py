@@ -28,9 +28,9 @@ class Locating(Backbone):
     With `segments`, the map also holds the probability that each cell shows the object. The features then include
     those of the level averaged with these probabilities too, and the area, centre and shape of the visible part.
 
-    With `points`, further maps without supervision hold the probabilities of so many points. Their mean places
-    relative to the object's, and the log variances of their maps, are features, from which the hidden layers of a
-    `Regressor` can learn distances on the object.
+    With `points`, the network also finds that many points, which it chooses itself, without labels. A further map
+    for each point holds the probability of each cell. The mean of the map, relative to `place`, and its log variance
+    are features, from which the hidden layers of a `Regressor` can learn distances on the object.
 
     The map and its means are computed in float32: bfloat16 would round places to a tenth of a pixel.
 
@@ -40,7 +40,7 @@ class Locating(Backbone):
         stride: of the first convolution.
         channels: of the pyramid.
         segments: whether the map holds the visible part of the object.
-        points: number of points.
+        points: number of points that the network chooses.
 
     Source: the pyramid is Lin et al., "Feature pyramid networks for object detection" (2017); the mean over a map,
     Sun et al., "Integral human pose regression" (2018); points without supervision, Levine et al., "End-to-end

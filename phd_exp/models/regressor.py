@@ -17,6 +17,10 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 WIDTH = 64  # of the hidden layers that take the focal length
 
 
+def _hidden_layers(n_inputs: int, units: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(n_inputs, units), nn.GELU(), nn.Linear(units, units), nn.GELU())
+
+
 class FocalLengthInput(nn.Module):
     """Corrects a head's raw numbers given the focal length; the identity at the start of training.
 
@@ -36,7 +40,7 @@ class FocalLengthInput(nn.Module):
         super().__init__()
         self.middle = math.log(depth.z_centre / depth.mu_z0)
         self.half_range = max(math.log(depth.D), 1e-3)
-        self.layers = nn.Sequential(nn.Linear(n_outputs + 1, WIDTH), nn.GELU(), nn.Linear(WIDTH, WIDTH), nn.GELU())
+        self.layers = _hidden_layers(n_outputs + 1, WIDTH)
         self.last = nn.Linear(WIDTH, n_outputs)
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)
@@ -47,11 +51,6 @@ class FocalLengthInput(nn.Module):
         log_f = ((f.log() - self.middle) / self.half_range).clamp(-1, 1)
         shown: Tensor = self.last(self.layers(torch.cat([raw, log_f.to(raw)[:, None]], dim=-1)))
         return raw + shown
-
-
-def _hidden_layers(n_features: int, units: int) -> nn.Sequential:
-    first, second = nn.Linear(n_features, units), nn.Linear(units, units)
-    return nn.Sequential(nn.LayerNorm(n_features), first, nn.GELU(), second, nn.GELU())
 
 
 class Regressor(nn.Module):
@@ -99,8 +98,9 @@ class Regressor(nn.Module):
         super().__init__()
         self.backbone = backbone.to(memory_format=torch.channels_last)
         self.head = head
-        self.hidden = _hidden_layers(backbone.n_features, hidden) if hidden else None
-        self.last = nn.Linear(backbone.n_features + hidden, head.n_outputs)
+        n = backbone.n_features
+        self.hidden = nn.Sequential(nn.LayerNorm(n), *_hidden_layers(n, hidden)) if hidden else None
+        self.last = nn.Linear(n + hidden, head.n_outputs)
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)
         self.shown = shown

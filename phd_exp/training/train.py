@@ -135,7 +135,8 @@ def require_same_photometry(folder: RunFolder, recipe: RecipeConfig) -> None:
 
 def _difference(folder: RunFolder, config: RunConfig) -> str | None:
     """The first key with another value in the run that a folder holds; None if its results are the same."""
-    asked = flatten(whole := config.model_dump(mode="json"))
+    whole = config.model_dump(mode="json")
+    asked = flatten(whole)
     chosen = flatten(config.model_dump(mode="json", exclude_defaults=True))
     # may be absent in an older record
     younger = {key: value for key, value in asked.items() if key not in chosen} | at_defaults(whole)

@@ -24,8 +24,8 @@ MakeSpec = Callable[..., DatasetSpec]
 """The fixture `make_spec`."""
 UNLIKELY = 1e-3  # the seeds are fixed: a law either holds at this level for ever or never
 SMALL_MESH: dict[str, Any] = {"sensor_size": 56, "f_range": (300.0, 500.0), "xy_range": 0.2, "backdrops": None}
-RENDER = {"shard": None, "verify": False, "rerender": 0, "masks": None, "bop": None}  # the keys of conf/render.yaml
 """Values of a data set with a mesh whose images are cheap."""
+RENDER = {"shard": None, "verify": False, "rerender": 0, "masks": None, "bop": None}  # the keys of conf/render.yaml
 ROOT = Path(__file__).parents[2]
 PATIENCE = 60.0  # s
 N_TRAIN, N_TEST = 12, 4
