@@ -1,6 +1,6 @@
 """Networks from image to features: ResNets, trained from scratch, and any other network."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -69,6 +69,22 @@ def pooled(network: nn.Module, side: int = 224, pretrained: str | None = None) -
         >>> pooled(nn.Conv2d(3, 8, 3), side=32).n_features
         8
     """
+    features = of_black_images(network, side, pretrained)
+    if not isinstance(features, Tensor) or features.ndim not in (2, 4) or len(features) != 2:
+        given = tuple(features.shape) if isinstance(features, Tensor) else type(features).__name__
+        raise ValueError(
+            f"returned {given} for 2 images of {side} px; expected (2, n) or feature maps (2, n, rows, columns)"
+        )
+    if not features.isfinite().all():
+        raise ValueError("returned features that are not finite for a black image")
+    return PooledFeatures(network, features.shape[1])
+
+
+def of_black_images(network: nn.Module, side: int, pretrained: str | None) -> Any:
+    """What a network returns for two black images, with the weights of a file, or those it has.
+
+    Raises ValueError for a file with other content.
+    """
     if pretrained is not None:
         try:
             state = torch.load(pretrained, "cpu", weights_only=True)
@@ -79,16 +95,9 @@ def pooled(network: nn.Module, side: int = 224, pretrained: str | None = None) -
             ) from None
     network.eval()
     with torch.no_grad():
-        features = network(torch.zeros(2, 3, side, side))
+        output = network(torch.zeros(2, 3, side, side))
     network.train()
-    if not isinstance(features, Tensor) or features.ndim not in (2, 4) or len(features) != 2:
-        given = tuple(features.shape) if isinstance(features, Tensor) else type(features).__name__
-        raise ValueError(
-            f"returned {given} for 2 images of {side} px; expected (2, n) or feature maps (2, n, rows, columns)"
-        )
-    if not features.isfinite().all():
-        raise ValueError("returned features that are not finite for a black image")
-    return PooledFeatures(network, features.shape[1])
+    return output
 
 
 def resnet(depth: Depth) -> PooledFeatures:

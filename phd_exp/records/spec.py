@@ -57,8 +57,8 @@ class DatasetSpec(Record):
     """Everything that a sample depends on, except its split and index. It does not hold the number of samples.
 
     Positions have the distribution z ~ U(z_range) and x, y ~ (S z / f) xy_range U(-1/2, 1/2). With view=box, their
-    pixels in the image of `camera` are uniform instead: in the central share xy_range of the part at least half the
-    object's radius away from the edges. S and f are then those of the view of the object's box.
+    pixels in the image of `camera` are uniform instead: in the central share xy_range of the part at least
+    edge_distance away from the edges. S and f are then those of the view of the object's box.
 
     Attributes:
         variant: name of the data set, and of its folder.
@@ -103,6 +103,8 @@ class DatasetSpec(Record):
         view: field, the whole image; box, the view of a detector's box, which `predict boxes=` makes too. None, to
             which the other values are reduced where possible: box if there is a camera, field if not.
         box_size, box_shift: bounds of the side of that box, and its largest shift, over the side of the exact one.
+        edge_distance: least distance of its reference point from the edges of the user's image, in its radii. Smaller
+            values cut more objects off; negative ones have reference points outside the image.
         grey: whether the images are grey.
         looks: varied: random patterns, materials and tones, other shapes of distractors, and hard light.
         front: a direction in the file's axes; its angle to the way to the camera is in `front_range`, degrees.
@@ -151,6 +153,7 @@ class DatasetSpec(Record):
     view: Literal["field", "box"] | None = None
     box_size: Annotated[tuple[Side, Side], Range] = (0.9, 1.5)
     box_shift: Annotated[Number, Field(ge=0, le=0.5)] = 0.15
+    edge_distance: Annotated[Number, Field(ge=-1, le=2)] = 0.5
     grey: StrictBool = False
     looks: Literal["plain", "varied"] = "plain"
     front: tuple[Number, Number, Number] | None = None
@@ -186,8 +189,9 @@ class DatasetSpec(Record):
             raise ValueError("view: got box; expected data.camera=FILE, or data.f, data.width and data.height")
         if self.is_box and self.views > 1:
             raise ValueError(f"views: got {self.views} with view=box; expected 1")
-        if not (self.is_box or (self._is_usual("box_size") and self._is_usual("box_shift"))):
-            raise ValueError("box_size, box_shift: got view=field; expected view=box")
+        of_boxes = ("box_size", "box_shift", "edge_distance")
+        if not (self.is_box or all(map(self._is_usual, of_boxes))):
+            raise ValueError(f"{', '.join(of_boxes)}: got view=field; expected view=box")
         has_front = self.front is not None and any(self.front)
         if not (has_front or self._is_usual("front_range")):
             raise ValueError("front: expected a direction [x, y, z] with front_range")

@@ -36,7 +36,6 @@ OBJECT_VERSION = 11  # of data sets with a mesh
 SIZE = 0.2  # m: height and diameter of the cylinder, side of the cube, diameter of the sphere
 CLEARANCE = 0.5  # m: least depth of an object in a further view, unless those of the first are smaller
 MOST_TRIES = 10_000
-CUT_OFF = 0.5  # least distance of an object's reference point from the edges of the user's image, in its radii
 PANEL = (0.2, 0.4, 0.02)  # m: wider than half of the largest silhouette at its depth
 Stream = np.random.Generator
 
@@ -237,13 +236,13 @@ def _position(spec: DatasetSpec, f: float, rng: Stream, radius: float = 0.0) -> 
 def _in_image(spec: DatasetSpec, z: float, rng: Stream, radius: float) -> tuple[float, float, float]:
     """A position at depth z whose pixel is uniform in a part of the user's image.
 
-    The edges of the image are CUT_OFF times the radius (m) of the object outside this part, of which xy_range is the
-    central share.
+    The edges of the image are edge_distance times the radius (m) of the object outside this part, of which xy_range
+    is the central share.
     """
     assert spec.camera is not None
     K, lens = optics(spec.camera)
     size = np.array([spec.camera.width, spec.camera.height], dtype=float)
-    room = spec.xy_range * (size - 2 * CUT_OFF * spec.camera.K[0] * radius / z).clip(0)
+    room = spec.xy_range * (size - 2 * spec.edge_distance * spec.camera.K[0] * radius / z).clip(0)
     for _ in range(MOST_TRIES):
         x, y, ahead = rays(K, size / 2 + room * (rng.random(2) - 0.5), lens).tolist()
         if ahead > 0:  # not where a fisheye shows nothing, or what is behind

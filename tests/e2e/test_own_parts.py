@@ -30,6 +30,7 @@ RUNS = Path("runs")
     "words",
     [
         ["loss=l1", "backbone=pooled"],
+        ["recipe=strong", "backbone=located", "recipe.localisation=1"],
         ["model=own", "camera=shown", "optimizer._target_=torch.optim.RMSprop", "~optimizer.fused"],
         ["model=student_t", "backbone._target_=torchvision.models.shufflenet_v2_x0_5"],
         ["camera=constant", "model=mae_vz"],
@@ -82,6 +83,7 @@ def test_pretrained_weights_are_loaded_once(own: Callable, tmp_path: Path) -> No
         (["+trainer.fast_dev_run=true"], "trainer.fast_dev_run: the run record depends on it; instead set trainer"),
         (["+trainer.limit_train_batches=0"], "trained no whole epoch, so there is no run"),
         (["backbone=pooled", "+backbone.pretrained=no.pth"], "backbone: pretrained: got 'no.pth'; expected a file"),
+        (["backbone=located", "backbone.network._target_=ownnet.Mine"], "expected feature maps (2, n, rows,"),
         (["+trainer.callbacks=[]"], "trainer.callbacks: the run record depends on it; instead set callbacks=NAME"),
         (["+trainer.gradient_clip=1"], "trainer.gradient_clip: unknown key, did you mean 'gradient_clip_val'?"),
     ],

@@ -2,9 +2,11 @@
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
+from torch import nn
 from torch.testing import assert_close
 
 from phd_exp.config.targets import build
@@ -12,7 +14,7 @@ from phd_exp.geometry import Camera, Cartesian, DepthScale, LogDepth, Projected
 from phd_exp.geometry.camera import middles
 from phd_exp.geometry.charts import projected
 from phd_exp.models.heads import ChartHead, DistributionHead, Head
-from phd_exp.models.locating import Locating, _of_points, _of_segment
+from phd_exp.models.locating import Locating, LocatingNetwork, _of_points, _of_segment
 from phd_exp.models.regressor import Regressor
 from tests.support.heads import SHAPED
 
@@ -129,6 +131,43 @@ def test_a_point_lies_at_the_mean_of_its_map() -> None:
     probability[..., [5, 6]] = 0.5  # the second row, both cells next to its middle
     x, y, log_variance = _of_points(probability, cells, torch.tensor([[0.5, 0.25]]))[0]
     assert_close(torch.stack([x, y, log_variance.exp()]), torch.tensor([-0.5, -0.5, 0.25**2]))
+
+
+class Maps(nn.Module):
+    """Feature maps of strides 4 and 8, as a list or by name."""
+
+    def __init__(self, names: tuple[str, ...] = ()) -> None:
+        super().__init__()
+        self.names = names
+        self.layers = nn.ModuleList(nn.Conv2d(n, m, 3, s, padding=1) for n, m, s in ((3, 5, 4), (5, 7, 2)))
+
+    def forward(self, pixels: torch.Tensor) -> list[torch.Tensor] | dict[str, torch.Tensor]:
+        fine = self.layers[0](pixels)
+        maps = [fine, self.layers[1](fine.relu())]
+        return dict(zip(self.names, maps, strict=True)) if self.names else maps
+
+
+class Backwards(Maps):
+    def forward(self, pixels: torch.Tensor) -> list[torch.Tensor]:
+        return super().forward(pixels)[::-1]
+
+
+@pytest.mark.parametrize("names", [(), ("fine", "coarse")])
+def test_any_network_with_feature_maps_locates(names: tuple[str, ...], tmp_path: Path) -> None:
+    trained = Maps()
+    torch.save(trained.state_dict(), tmp_path / "maps.pth")
+    network = LocatingNetwork(Maps(names), channels=6, side=64, points=2, pretrained=str(tmp_path / "maps.pth"))
+    assert_close(network.network.state_dict(), trained.state_dict())
+    seen = network(torch.randn(2, 3, 64, 96))
+    assert seen.features.shape == (2, network.n_features) == (2, 6 + 7 + 6 + 6 + 3 * 2)
+    assert (seen.log_heat.shape, seen.log_odds.shape) == ((2, 16, 24), (2, 16, 24))
+    assert_close(seen.place, torch.zeros(2, 2), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("network", [nn.Conv2d(3, 4, 3), nn.Flatten(), Backwards()], ids=lambda n: type(n).__name__)
+def test_a_network_without_feature_maps_is_refused(network: nn.Module) -> None:
+    with pytest.raises(ValueError, match=r"for 2 images of 64 px; expected feature maps .* each coarser than"):
+        LocatingNetwork(network, channels=6, side=64)
 
 
 def test_what_it_reads_is_float32_under_autocast() -> None:

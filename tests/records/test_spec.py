@@ -27,6 +27,7 @@ BAD: dict[str, list[Any]] = {
     "f_range": [(2000.0, 1200.0), (0.0, 1200.0), (-1.0, 1200.0), (1200.0,), 1200.0, ("1", "2"), (1200.0, math.inf)],
     "z_range": [(0.0, 5.0), (3.0, math.nan)],
     "xy_range": [1.1, -0.1],
+    "edge_distance": [-1.1, 2.1],
     "scale_range": [(0.0, 1.0), (1.0, 3.0)],
     "occluders": [1, "yes"],
     "lamp_jitter": [1.0],
@@ -116,6 +117,7 @@ def test_a_fingerprint_depends_on_every_value_and_on_nothing_else(make_spec: Mak
         "view": "field",
         "box_size": (1.0, 1.2),
         "box_shift": 0.1,
+        "edge_distance": 0.0,
         "grey": True,
         "looks": "varied",
         "front": (0.0, 0.0, 1.0),
@@ -123,7 +125,7 @@ def test_a_fingerprint_depends_on_every_value_and_on_nothing_else(make_spec: Mak
         "resting": True,
     }
     needed = {"ground": {"upright": True, "pitch_range": (20.0, 30.0)}, "front_range": {"front": (0.0, 0.0, 1.0)}}
-    needed |= {key: {"camera": CAMERA} for key in ("view", "box_size", "box_shift")}
+    needed |= {key: {"camera": CAMERA} for key in ("view", "box_size", "box_shift", "edge_distance")}
     assert changes.keys() | of_sequences.keys() | of_meshes.keys() == DatasetSpec.model_fields.keys()
     prints = {make_spec(**{key: value}).fingerprint() for key, value in changes.items()}
     prints |= {make_spec(frames=2, **{key: value}).fingerprint() for key, value in of_sequences.items()}

@@ -105,20 +105,27 @@ def test_the_apparent_size_is_nearly_constant(of_box: MakeSpec, meshes: dict[str
     assert (0.88 < ratio.min() < 1.0, 1.4 < ratio.max() < 1.53) == (True, True)
 
 
-def test_few_objects_are_cut_off(of_box: MakeSpec, meshes: dict[str, Triangles]) -> None:
-    """Reference points are uniform in the part of the image at least half a radius away from its edges."""
-    spec = of_box(camera={"f": 500.0, "width": 400, "height": 300}, z_range=(0.3, 0.6), xy_range=0.8)
+@pytest.mark.parametrize("distance", [0.5, 0.0, -0.5])
+def test_reference_points_keep_their_distance_from_the_edges(
+    of_box: MakeSpec, meshes: dict[str, Triangles], distance: float
+) -> None:
+    """They are uniform in a part of the image, or, if the distance is negative, in a larger rectangle."""
+    camera = {"f": 500.0, "width": 400, "height": 300}
+    spec = of_box(camera=camera, z_range=(0.3, 0.6), xy_range=0.8, edge_distance=distance)
     inside = []
     for index in range(400):
         item = sample_scene(spec, "train", index, meshes["mesh"].radius).objects[0]
         x, y, z = item.position
-        room = np.array([400, 300]) - 500 * meshes["mesh"].radius / z
+        room = np.array([400, 300]) - 2 * distance * 500 * meshes["mesh"].radius / z
         inside.append(np.array([x, y]) / z * 500 / room)
     across, down = np.array(inside).T
     for places in (across, down):
         assert stats.kstest(places, stats.uniform(-0.4, 0.8).cdf).pvalue > UNLIKELY
-    large = sample_scene(spec, "train", 0, radius=10.0).objects[0].position
-    assert large[:2] == (0.0, 0.0), "an object larger than the image is in its middle"
+
+
+def test_an_object_larger_than_the_image_is_in_its_middle(of_box: MakeSpec) -> None:
+    spec = of_box(camera={"f": 500.0, "width": 400, "height": 300})
+    assert sample_scene(spec, "train", 0, radius=10.0).objects[0].position[:2] == (0.0, 0.0)
 
 
 def test_what_lies_beyond_the_edges_is_grey_and_not_labelled(of_box: MakeSpec, tmp_path: Path) -> None:
@@ -180,7 +187,8 @@ def test_grey_images_are_grey(of_box: MakeSpec) -> None:
         ({"camera": CAMERA | {"width": None}}, "camera: .* does not say the size"),
         ({"camera": {"f": 18.0, "width": 4000, "height": 3000}}, "shows 179 degrees; .* f in millimetres"),
         ({"camera": "nowhere.yaml"}, "camera: nowhere.yaml: No such file"),
-        ({"view": "field", "box_shift": 0.1}, "box_shift: got view=field; expected view=box"),
+        ({"view": "field", "box_shift": 0.1}, "box_shift, edge_distance: got view=field; expected view=box"),
+        ({"view": "field", "edge_distance": 0.0}, "box_shift, edge_distance: got view=field; expected view=box"),
         ({"front_range": (0.0, 60.0)}, "front: expected a direction"),
         ({"views": 2}, "views: got 2 with view=box; expected 1"),
     ],

@@ -35,6 +35,11 @@ class Later(Mine):
             raise RuntimeError("later")
         return super().forward(images)
 
+class Maps(Mine):
+    def forward(self, images):
+        fine = super().forward(images)
+        return {"fine": fine, "coarse": fine[..., ::2, ::2]}
+
 class NoModule:
     pass
 """
@@ -96,6 +101,8 @@ FILES = {
     "my_conf/backbone/mine.yaml": "_target_: ownnet.Mine\n",
     "my_conf/backbone/pooled.yaml": "_target_: phd_exp.models.backbones.pooled\nnetwork: {_target_: ownnet.Mine}\n"
     "side: ${data.image_size}\n",
+    "my_conf/backbone/located.yaml": "_target_: phd_exp.models.locating.LocatingNetwork\n"
+    "network: {_target_: ownnet.Maps}\nside: ${data.image_size}\nchannels: 8\nsegments: false\n",
     "my_conf/loss/l1.yaml": "_target_: ownloss.l1\nweight: 2.0\n",
     "my_conf/model/own.yaml": "defaults: [/loss@_global_.loss: nll]\nname: own\nhead: {_target_: ownparts.Head}\n",
     "my_conf/data/squares.yaml": "name: squares\nsource: {_target_: ownparts.Squares}\nn_train: 32\nn_held_out: 8\n"
