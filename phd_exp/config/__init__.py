@@ -106,8 +106,8 @@ class RunConfig(Record):
             )
         if isinstance(data, RenderedConfig) and data.image_size > data.spec.sensor_size:
             raise ValueError(
-                f"data: image_size={data.image_size} is larger than sensor_size={data.spec.sensor_size}: "
-                "images are only ever shrunk"
+                f"data: image_size={data.image_size} is larger than sensor_size={data.spec.sensor_size}, but images "
+                f"are only ever shrunk; write data.image_size={data.spec.sensor_size}, or render larger images"
             )
         return self
 
