@@ -103,8 +103,9 @@ class DatasetSpec(Record):
         view: field, the whole image; box, the view of a detector's box, which `predict boxes=` makes too. None, to
             which the other values are reduced where possible: box if there is a camera, field if not.
         box_size, box_shift: bounds of the side of that box, and its largest shift, over the side of the exact one.
-        edge_distance: least distance of its reference point from the edges of the user's image, in its radii. Smaller
-            values cut more objects off; negative ones have reference points outside the image.
+        edge_distance: least distance of the object's reference point from the edges of the user's image, in radii of
+            the object. With smaller values more objects are cut off; with negative ones, reference points may lie
+            outside the image.
         grey: whether the images are grey.
         looks: varied: random patterns, materials and tones, other shapes of distractors, and hard light.
         front: a direction in the file's axes; its angle to the way to the camera is in `front_range`, degrees.
