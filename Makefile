@@ -15,7 +15,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	  { echo "make: Blender's bpy needs Python 3.11; found $$($(PYTHON) --version). Name one: make PYTHON=/path/to/python3.11" >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
-	$(BIN)/pip install --quiet --editable '.[train,render,report,rerun,export,launchers,search,loggers,video,ros,dev]' --constraint constraints.txt
+	$(BIN)/pip install --quiet --editable '.[train,render,report,rerun,export,launchers,search,loggers,timm,video,ros,dev]' --constraint constraints.txt
 	$(BIN)/python -m phd_exp.fusion  # otherwise the first call of fuse compiles it
 	@touch $@
 

@@ -180,5 +180,7 @@ def quiet_lightning() -> None:
     warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
     # the first steps are timed without an evaluation
     warnings.filterwarnings("ignore", "You defined a `validation_step` but have no `val_dataloader`")
+    # BatchNorm that keeps its means and variances
+    warnings.filterwarnings("ignore", r"Found .* module\(s\) in eval mode")
     # the logged values are already sums over all processes
     warnings.filterwarnings("ignore", "It is recommended to use .*sync_dist=True")

@@ -48,7 +48,7 @@ LACKS: dict[str, tuple[tuple[str, ...], ...]] = {
     "video": (("track", "run=RUN", "video=clip.mp4", "f=300"),),
     "ros": ((*ONE, "out=a.mcap"), ("track", "run=RUN", "folder=a.mcap")),
     "rerun": ((*ONE, "view=a.rrd"),),
-    "timm": ((*LEARN, "runs=c", "backbone._target_=timm.create_model"),),
+    "timm": ((*LEARN, "runs=c", "backbone=imagenet"),),
     "ray": (("-m", *OTHERS, "seed=1,2", "hydra/launcher=ray"),),
 }
 WITHOUT = """

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import timm
 import torch
 import yaml
 from PIL import Image
@@ -56,6 +57,19 @@ def test_pretrained_weights_are_loaded_once(own: Callable, tmp_path: Path) -> No
     predictor = package.load(only_run(RUNS).path, trust=("ownnet",))
     layer = dict(predictor.regressor.named_parameters())["backbone.network.layer.weight"]
     torch.testing.assert_close(layer, torch.full_like(layer, 0.5), rtol=0, atol=1e-6)
+
+
+def test_a_network_of_timm_trains_and_is_built_without_its_file(own: Callable, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    theirs = timm.create_model("test_resnet").state_dict()
+    torch.save(theirs, tmp_path / "tiny.pth")
+    words = ("name=test_resnet", "pretrained=tiny.pth", "frozen=[bn1]")
+    outcome = own("backbone=imagenet", "recipe=strong", *(f"backbone.network.{word}" for word in words))
+    assert outcome.status == 0, outcome.err
+    (tmp_path / "tiny.pth").unlink()
+    network = package.load(only_run(RUNS).path).regressor.backbone.network.network
+    torch.testing.assert_close(network.bn1.weight.cpu(), theirs["bn1.weight"])
+    assert not torch.equal(network.layer2[0].conv1.weight.cpu(), theirs["layer2.0.conv1.weight"])
 
 
 @pytest.mark.parametrize(

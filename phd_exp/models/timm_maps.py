@@ -1,0 +1,102 @@
+"""Feature maps of the networks of timm, with weights that were trained on photographs."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
+
+from phd_exp.models.regressor import IMAGENET_MEAN, IMAGENET_STD
+from phd_exp.records.errors import gist, unknown
+
+
+class TimmMaps(nn.Module):
+    """A network of timm without its last layers, for `LocatingNetwork`.
+
+    The first layers of a network that was trained on photographs find edges and textures better than those trained on
+    a few thousand renders. If they stay as they are (`frozen`), training needs fewer renders and fewer steps.
+
+    Images are normalised once more, as timm prescribes for this network.
+
+    Args:
+        name: of the network, one of `timm.list_models()`.
+        pretrained: True downloads timm's weights. A string is a file with them, the state dict of the network with or
+            without its last layers. False starts from random weights.
+        frozen: names of modules whose parameters training does not change. If there are any, the means and variances
+            of BatchNorm stay too, in all layers.
+        out_indices: the feature maps to return; 0 has stride 2, 1 has stride 4.
+
+    Raises:
+        ValueError: an unknown name, or a file with other content.
+
+    Examples:
+        >>> maps = TimmMaps("tf_efficientnet_lite0", frozen=["conv_stem", "blocks.0"])
+        >>> [tuple(m.shape[1:]) for m in maps(torch.zeros(1, 3, 64, 64))]
+        [(24, 16, 16), (40, 8, 8), (112, 4, 4), (320, 2, 2)]
+    """
+
+    scale: Tensor
+    shift: Tensor
+
+    def __init__(
+        self,
+        name: str,
+        pretrained: bool | str = False,
+        frozen: Sequence[str] = (),
+        out_indices: Sequence[int] = (1, 2, 3, 4),
+    ) -> None:
+        super().__init__()
+        import timm  # an extra
+
+        # timm would read a name such as hf-hub:USER/MODEL from the network
+        if name not in (names := timm.list_models()):
+            raise ValueError(unknown(name, names, "expected one of timm.list_models()", "unknown network"))
+        self.network = timm.create_model(
+            name, pretrained=pretrained is True, features_only=True, out_indices=tuple(out_indices)
+        )
+        if isinstance(pretrained, str):
+            _fill(self.network, pretrained)
+        self.keeps_statistics = bool(frozen)
+        modules = dict(self.network.named_modules())
+        for part in frozen:
+            if part not in modules:
+                raise ValueError(unknown(part, modules, f"expected a module of {name}", "unknown module"))
+            modules[part].requires_grad_(False)
+        normalised = timm.get_pretrained_cfg(name)
+        std = np.array(normalised.std)
+        for key, value in (
+            ("scale", np.array(IMAGENET_STD) / std),
+            ("shift", (np.array(IMAGENET_MEAN) - np.array(normalised.mean)) / std),
+        ):
+            self.register_buffer(key, torch.tensor(value, dtype=torch.float32)[:, None, None], persistent=False)
+
+    def train(self, mode: bool = True) -> "TimmMaps":
+        """Set the mode; BatchNorm keeps its means and variances in eval mode."""
+        super().train(mode)
+        if self.keeps_statistics:
+            for module in self.modules():
+                if isinstance(module, _BatchNorm):
+                    module.eval()
+        return self
+
+    def forward(self, pixels: Float[Tensor, "batch 3 height width"]) -> list[Float[Tensor, "batch _ _ _"]]:
+        maps: list[Tensor] = self.network(pixels * self.scale + self.shift)
+        return maps
+
+
+def _fill(network: nn.Module, file: str) -> None:
+    """Load weights from a file. Raises ValueError unless it has all of the network's."""
+    from timm.models import load_state_dict
+
+    try:
+        missing: Any = network.load_state_dict(load_state_dict(file), strict=False).missing_keys
+        if missing:
+            raise ValueError(f"no {missing[0]}")
+    except Exception as error:  # timm and torch raise any for another file
+        reason = gist(error) or type(error).__name__
+        raise ValueError(
+            f"pretrained: got {file!r}; expected a file with this network's state dict ({reason})"
+        ) from None
