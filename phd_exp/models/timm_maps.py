@@ -1,5 +1,6 @@
 """Feature maps of the networks of timm, with weights that were trained on photographs."""
 
+import fnmatch
 from collections.abc import Sequence
 from typing import Any
 
@@ -25,8 +26,9 @@ class TimmMaps(nn.Module):
         name: of the network, one of `timm.list_models()`.
         pretrained: True downloads timm's weights. A string is a file with them, the state dict of the network with or
             without its last layers. False starts from random weights.
-        frozen: names of modules whose parameters training does not change. If there are any, the means and variances
-            of BatchNorm stay too, in all layers.
+        frozen: names of modules whose parameters training does not change, as patterns: `*.conv_dw` for all depthwise
+            convolutions, whose gradients are slow on CPUs. If there are any, the means and variances of BatchNorm
+            stay too, in all layers.
         out_indices: the feature maps to return; 0 has stride 2, 1 has stride 4.
 
     Raises:
@@ -61,10 +63,12 @@ class TimmMaps(nn.Module):
             _fill(self.network, pretrained)
         self.keeps_statistics = bool(frozen)
         modules = dict(self.network.named_modules())
-        for part in frozen:
-            if part not in modules:
-                raise ValueError(unknown(part, modules, f"expected a module of {name}", "unknown module"))
-            modules[part].requires_grad_(False)
+        for pattern in frozen:
+            named = fnmatch.filter(modules, pattern)
+            if not named:
+                raise ValueError(unknown(pattern, modules, f"expected modules of {name}", "unknown module"))
+            for module in named:
+                modules[module].requires_grad_(False)
         normalised = timm.get_pretrained_cfg(name)
         std = np.array(normalised.std)
         for key, value in (
