@@ -79,7 +79,7 @@ def build_module(config: RunConfig, data: PositionData) -> PositionModule:
     Raises ConfigError, naming the key, for values that a part refuses, and if the run to start from has
     another network.
     """
-    recipe, regressor = config.recipe, build_regressor(config, data.source.depth)
+    recipe, regressor = config.recipe, build_regressor(config, data.source.depth, is_new=config.init is None)
     if config.init:
         start = RunFolder(config.init).best_checkpoint
         try:

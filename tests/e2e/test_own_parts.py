@@ -59,17 +59,20 @@ def test_pretrained_weights_are_loaded_once(own: Callable, tmp_path: Path) -> No
     torch.testing.assert_close(layer, torch.full_like(layer, 0.5), rtol=0, atol=1e-6)
 
 
-def test_a_network_of_timm_trains_and_is_built_without_its_file(own: Callable, tmp_path: Path) -> None:
+def test_a_network_of_timm_trains_and_needs_its_file_once(own: Callable, tmp_path: Path) -> None:
     torch.manual_seed(0)
     theirs = timm.create_model("test_resnet").state_dict()
     torch.save(theirs, tmp_path / "tiny.pth")
-    words = ("name=test_resnet", "pretrained=tiny.pth", "frozen=[bn1]")
-    outcome = own("backbone=imagenet", "recipe=strong", *(f"backbone.network.{word}" for word in words))
+    parts = ("name=test_resnet", "pretrained=tiny.pth", "frozen=[bn1]")
+    words = ("backbone=imagenet", "recipe=strong", *(f"backbone.network.{part}" for part in parts))
+    outcome = own(*words)
     assert outcome.status == 0, outcome.err
     (tmp_path / "tiny.pth").unlink()
-    network = package.load(only_run(RUNS).path).regressor.backbone.network.network
+    run = only_run(RUNS)
+    network = package.load(run.path).regressor.backbone.network.network
     torch.testing.assert_close(network.bn1.weight.cpu(), theirs["bn1.weight"])
     assert not torch.equal(network.layer2[0].conv1.weight.cpu(), theirs["layer2.0.conv1.weight"])
+    assert own(*words, f"init={run.path}", "runs=further").status == 0
 
 
 @pytest.mark.parametrize(
