@@ -1,5 +1,7 @@
 """Networks from image to features: ResNets, trained from scratch, and any other network."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch
@@ -86,18 +88,26 @@ def of_black_images(network: nn.Module, side: int, pretrained: str | None) -> An
     Raises ValueError for a file with other content.
     """
     if pretrained is not None:
-        try:
+        with reading_weights(pretrained):
             state = torch.load(pretrained, "cpu", weights_only=True)
             network.load_state_dict(state.get("state_dict", state))
-        except Exception as error:  # torch raises any for another file
-            raise ValueError(
-                f"pretrained: got {pretrained!r}; expected a file with this network's state dict ({gist(error)})"
-            ) from None
     network.eval()
     with torch.no_grad():
         output = network(torch.zeros(2, 3, side, side))
     network.train()
     return output
+
+
+@contextmanager
+def reading_weights(file: str) -> Iterator[None]:
+    """Convert the errors of reading a network's weights to a ValueError that names the file."""
+    try:
+        yield
+    except Exception as error:  # torch raises any for another file
+        reason = gist(error) or type(error).__name__
+        raise ValueError(
+            f"pretrained: got {file!r}; expected a file with this network's state dict ({reason})"
+        ) from None
 
 
 def resnet(depth: Depth) -> PooledFeatures:

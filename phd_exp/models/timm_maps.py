@@ -2,7 +2,6 @@
 
 import fnmatch
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -10,8 +9,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
+from phd_exp.models.backbones import reading_weights
 from phd_exp.models.regressor import IMAGENET_MEAN, IMAGENET_STD
-from phd_exp.records.errors import gist, unknown
+from phd_exp.records.errors import unknown
 
 
 class TimmMaps(nn.Module):
@@ -52,23 +52,23 @@ class TimmMaps(nn.Module):
     ) -> None:
         super().__init__()
         import timm  # an extra
+        from timm.models import load_state_dict
 
         # timm would read a name such as hf-hub:USER/MODEL from the network
-        if name not in (names := timm.list_models()):
-            raise ValueError(unknown(name, names, "expected one of timm.list_models()", "unknown network"))
+        if not timm.is_model(name):
+            raise ValueError(
+                unknown(name, timm.list_models(), "expected one of timm.list_models()", "unknown network")
+            )
         self.network = timm.create_model(
             name, pretrained=pretrained is True, features_only=True, out_indices=tuple(out_indices)
         )
         if isinstance(pretrained, str):
-            _fill(self.network, pretrained)
+            with reading_weights(pretrained):
+                missing = self.network.load_state_dict(load_state_dict(pretrained), strict=False).missing_keys
+                if missing:
+                    raise ValueError(f"no {missing[0]}")
+        _freeze(self.network, frozen)
         self.keeps_statistics = bool(frozen)
-        modules = dict(self.network.named_modules())
-        for pattern in frozen:
-            named = fnmatch.filter(modules, pattern)
-            if not named:
-                raise ValueError(unknown(pattern, modules, f"expected modules of {name}", "unknown module"))
-            for module in named:
-                modules[module].requires_grad_(False)
         normalised = timm.get_pretrained_cfg(name)
         std = np.array(normalised.std)
         for key, value in (
@@ -91,16 +91,12 @@ class TimmMaps(nn.Module):
         return maps
 
 
-def _fill(network: nn.Module, file: str) -> None:
-    """Load weights from a file. Raises ValueError unless it has all of the network's."""
-    from timm.models import load_state_dict
-
-    try:
-        missing: Any = network.load_state_dict(load_state_dict(file), strict=False).missing_keys
-        if missing:
-            raise ValueError(f"no {missing[0]}")
-    except Exception as error:  # timm and torch raise any for another file
-        reason = gist(error) or type(error).__name__
-        raise ValueError(
-            f"pretrained: got {file!r}; expected a file with this network's state dict ({reason})"
-        ) from None
+def _freeze(network: nn.Module, patterns: Sequence[str]) -> None:
+    """Take modules out of the training. Raises ValueError for a pattern that matches none."""
+    modules = dict(network.named_modules())
+    for pattern in patterns:
+        matched = fnmatch.filter(modules, pattern)
+        if not matched:
+            raise ValueError(unknown(pattern, modules, "expected modules of the network", "unknown module"))
+        for name in matched:
+            modules[name].requires_grad_(False)

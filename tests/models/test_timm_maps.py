@@ -69,7 +69,7 @@ def test_without_frozen_modules_all_is_trained(weights: Path) -> None:
     [
         ({"name": "test_resnt"}, "test_resnt: unknown network, did you mean 'test_resnet'"),
         ({"name": "hf-hub:timm/test_resnet"}, r"expected one of timm\.list_models"),
-        ({"frozen": ["layer5"]}, "layer5: unknown module, did you mean 'layer.'.?; expected modules of test_resnet"),
+        ({"frozen": ["layer5"]}, "layer5: unknown module, did you mean 'layer.'.?; expected modules of the network"),
         ({"pretrained": "no.pth"}, r"pretrained: got 'no\.pth'; expected a file with .* \(FileNotFoundError\)"),
         ({"name": "test_efficientnet", "pretrained": "tiny.pth"}, r"expected a file with this .* \(.*bn1\."),
         ({"name": "test_vit", "pretrained": "tiny.pth"}, r"expected a file with this .* \(no .*\)"),
