@@ -17,8 +17,8 @@ from phd_exp.records.errors import unknown
 class TimmMaps(nn.Module):
     """A network of timm without its last layers, for `LocatingNetwork`.
 
-    The first layers of a network that was trained on photographs find edges and textures better than those trained on
-    a few thousand renders. If they stay as they are (`frozen`), training needs fewer renders and fewer steps.
+    The first layers of a pretrained network have learned edges and textures from many photographs. If they stay as they are
+    (`frozen`), training needs fewer renders and fewer steps.
 
     Images are normalised once more, as timm prescribes for this network.
 
@@ -54,7 +54,7 @@ class TimmMaps(nn.Module):
         import timm  # an extra
         from timm.models import load_state_dict
 
-        # timm would read a name such as hf-hub:USER/MODEL from the network
+        # timm would download what a name such as hf-hub:USER/MODEL says
         if not timm.is_model(name):
             raise ValueError(
                 unknown(name, timm.list_models(), "expected one of timm.list_models()", "unknown network")
