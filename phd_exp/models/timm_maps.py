@@ -17,8 +17,8 @@ from phd_exp.records.errors import unknown
 class TimmMaps(nn.Module):
     """A network of timm without its last layers, for `LocatingNetwork`.
 
-    The first layers of a pretrained network have learned edges and textures from many photographs. If they stay as they are
-    (`frozen`), training needs fewer renders and fewer steps.
+    The first layers of a pretrained network have learned edges and textures from many photographs. If they
+    stay as they are (`frozen`), training needs fewer renders and fewer steps.
 
     Images are normalised once more, as timm prescribes for this network.
 
