@@ -58,6 +58,15 @@ def test_the_command_line_overrides_all_files(checked: Callable) -> None:
     assert (strong.data.image_size, strong.camera.focal_length) == (48, "known")
 
 
+def test_pretrained_weights_come_with_smaller_steps(checked: Callable) -> None:
+    strong = checked("recipe=strong").optimizer
+    assert checked("recipe=strong", "optimizer=muon", "backbone=imagenet").optimizer == strong
+    gentle = checked("recipe=strong", "backbone=imagenet").optimizer
+    changed = {key for key in strong | gentle if strong[key] != gentle[key]}
+    assert changed == {"lr", "orthogonal_lr"}
+    assert all(gentle[key] <= strong[key] / 2 for key in changed)
+
+
 @pytest.mark.parametrize("variant", ["occl", "scale", "occl_scale", "multiview"])
 def test_variants_differ_only_in_the_keys_of_their_files(checked: Callable, variant: str) -> None:
     file = yaml.safe_load((conf_folder() / "data" / f"{variant}.yaml").read_text())
