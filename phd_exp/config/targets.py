@@ -126,6 +126,11 @@ def custom_parts(config: Any) -> dict[str, str]:
     }
 
 
+def is_ours(config: Any) -> bool:
+    """Whether a configuration names nothing but parts of this project. Nothing is imported."""
+    return all(_is_below(str(node["_target_"]), OURS) for _, node in _nodes_in(config))
+
+
 def _is_below(name: str, packages: tuple[str, ...]) -> bool:
     return any(f"{name}.".startswith(f"{package}.") for package in packages)
 

@@ -21,7 +21,6 @@ from phd_exp.data.sources import Source
 from phd_exp.geometry.camera import Camera
 from phd_exp.models.backbones import Backbone
 from phd_exp.models.weights import fill, regressor_weights
-from phd_exp.records.choices import flatten
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.cameras import CameraPolicy
@@ -29,7 +28,6 @@ from phd_exp.training.module import PositionModule
 from phd_exp.training.objective import Objective
 from phd_exp.training.optimisation import Optimisation, factor
 
-OF_NETWORK = ("backbone.", "model.head.", "recipe.hidden", "camera.focal_length")  # keys that set its weights
 EXCHANGED = {"backdrops", "plain", "prints"}  # shares of a recipe's augmentation that are arguments of `PositionData`
 
 
@@ -40,8 +38,6 @@ def build_data(config: RunConfig, rank: int = 0) -> PositionData:
     """
     source = build_source(config.data)
     if config.init:
-        if not RunFolder(config.init).is_finished():
-            raise ConfigError(f"init: got {config.init}; expected the folder of a finished run")
         source.depth, source.constant_f = recorded_constants(RunFolder(config.init))
     return PositionData(
         source,
@@ -85,7 +81,10 @@ def build_module(config: RunConfig, data: PositionData) -> PositionModule:
         try:
             fill(regressor, regressor_weights(start), start)
         except RunError as error:
-            raise ConfigError(f"init: {error}; {_remedy(config, RunFolder(config.init))}") from None
+            name = RunFolder(config.init).config()["model"]["name"]
+            raise ConfigError(
+                f"init: {error}; expected model={name}, and no words for the network, which is that of the run"
+            ) from None
     with naming("optimizer", config.optimizer):
         optimizer = build(config.optimizer, is_partial=True)
         optimizer(regressor.parameters())  # refuses bad values before hours of rendering
@@ -103,17 +102,6 @@ def build_module(config: RunConfig, data: PositionData) -> PositionModule:
     if custom_parts({"head": config.model.head, "backbone": config.backbone, "loss": config.loss}):
         _try_out(module, config, data.source)
     return module
-
-
-def _remedy(config: RunConfig, start: RunFolder) -> str:
-    """What to do so that a configuration has the network of another run."""
-    asked, recorded = flatten(config.model_dump(mode="json")), flatten(start.config())
-    words = [
-        f"{key}={value}"
-        for key, value in recorded.items()
-        if key.startswith(OF_NETWORK) and key in asked and value != asked[key]
-    ]
-    return f"write {' '.join(words)}" if words else "expected a run with this backbone and head"
 
 
 def _require_maps(recipe: RecipeConfig, backbone: Backbone) -> None:

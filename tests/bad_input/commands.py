@@ -84,7 +84,7 @@ CONFIGURATIONS = [
     Bad("configuration: a shift of what is not rendered", nothing, (*LEARN, "shift=scenes"), r"evaluation\.shifts\.short_f\.data: data=folder is not rendered; leave out this shift.*", 2),
     Bad("configuration: an error of a focal length that is not used", nothing, ("preset=smoke", "camera=constant", "camera.f_error=0.1"), r"camera: f_error: got 0\.1; camera=constant uses no focal length; .*", 2),
     configured("a start from no run", "init=nowhere", r"init: got nowhere; expected the folder of a finished run"),
-    Bad("configuration: a start from another network", nothing, (*LEARN, "runs=others", "init=RUN", "backbone.width=16"), r"init: .*\(.*size mismatch.*\); write backbone\.width=8", 2),
+    Bad("configuration: a start from another network", nothing, (*LEARN, "runs=others", "init=RUN", "backbone.width=16"), r"init: .*\(.*size mismatch.*\); expected model=probabilistic, and no words for the network, .*", 2),
     configured("a shift by a negative factor", "+evaluation.shifts.a.f_factor=-1", r"evaluation\.shifts\.a\.f_factor: got -1; expected .*"),
     configured("a shift of images without a name", "+evaluation.shifts.a.images.hue=1", r"evaluation\.shifts\.a\.images\.hue.*"),
     configured("a shift that is no file name", "+evaluation.shifts={a/b:{f_factor:2}}", r"evaluation\.shifts\.a/b\.\[key\]: got 'a/b'.*"),
