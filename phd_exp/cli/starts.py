@@ -4,6 +4,7 @@ from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
+from phd_exp.config import RunConfig, check
 from phd_exp.config.targets import is_ours
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.runs import RunFolder
@@ -16,6 +17,15 @@ OF_NETWORK = (
     ("data", "image_size"),
 )
 """The sections and keys that describe a network and its inputs."""
+
+
+def checked_start(config: dict[str, Any], overrides: list[str]) -> RunConfig:
+    """The checked configuration of a training, with the network of the run that it starts from, if any.
+
+    Raises ConfigError and RunError as `check` and `with_network_of` do.
+    """
+    checked = check(config)
+    return check(with_network_of(RunFolder(checked.init), config, overrides)) if checked.init else checked
 
 
 def with_network_of(start: RunFolder, config: dict[str, Any], overrides: list[str]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from hydra.core.override_parser.types import Override
 
 from phd_exp.cli.jobs import Job, composed, launch
 from phd_exp.cli.paths import quoted
-from phd_exp.cli.starts import with_network_of
+from phd_exp.cli.starts import checked_start
 from phd_exp.config import RenderedConfig, RunConfig, check
 from phd_exp.records.choices import RunName, has_influence, setting
 from phd_exp.records.dataset import DatasetFolder
@@ -56,9 +56,7 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
 
     `callbacks` are Lightning's, in addition to those of the configuration.
     """
-    checked = check(config)
-    if checked.init:
-        checked = check(with_network_of(RunFolder(checked.init), config, overrides))
+    checked = checked_start(config, overrides)
     # imports of seconds, which follow the check of the configuration
     from phd_exp.inference.further import record_further
     from phd_exp.training.pruning import held_out_score
@@ -103,8 +101,9 @@ def cost(configs: list[dict[str, Any]], cores: int) -> float:
     if sum(images) < LONG:
         return 0.0
     try:
-        first = check(configs[0])
-    except ConfigError:  # the job itself reports it
+        # words for the network change nothing here: it must be that of the start
+        first = checked_start(configs[0], [])
+    except (ConfigError, RunError):  # the job itself reports it
         return 0.0
     from phd_exp.hardware import has_gpu
     from phd_exp.training.duration import seconds_a_step
