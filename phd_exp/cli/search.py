@@ -15,8 +15,8 @@ from phd_exp.cli.arguments import Arguments
 from phd_exp.cli.frame import print_errors
 from phd_exp.cli.jobs import composed
 from phd_exp.cli.paths import quoted
+from phd_exp.cli.starts import checked_start
 from phd_exp.cli.train import run_name, task
-from phd_exp.config import check
 from phd_exp.config.targets import TrainingTarget, build
 from phd_exp.records.errors import ConfigError, RunError, UserError, gist
 from phd_exp.records.files import read_plain, write_atomic
@@ -63,7 +63,7 @@ def main(words: list[str]) -> int:
         raise ConfigError(f"{file}: {gist(error)}; expected `space`, as in docs/guides/search.md") from None
     given = [*space.overrides, *(word for word in words[1:] if word not in ours)]
     fixed = [*quoted(given), "evaluation.held_out=true"]
-    config = check(composed(fixed, arguments.config_dir))
+    config = checked_start(composed(fixed, arguments.config_dir), fixed)
     if config.data.n_held_out == 0:
         raise ConfigError("data.n_held_out: got 0; a search is judged by held-out samples, expected at least 1")
     folder = config.runs / SEARCHES / file.stem
@@ -158,7 +158,7 @@ class _Search:
         overrides = [*self.fixed, *own]
         print(f"trial {trial.number + 1}/{trials}: {' '.join(own)}", flush=True)
         config = composed(overrides, self.config_dir)
-        checked = check(config)
+        checked = checked_start(config, overrides)
         run = run_name(checked, overrides).folder(checked.runs)
         trial.set_user_attr("run", str(run))
         try:

@@ -1,5 +1,6 @@
 """A training that starts from a finished run (`init=`) has the network of that run."""
 
+from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -24,8 +25,10 @@ def checked_start(config: dict[str, Any], overrides: list[str]) -> RunConfig:
 
     Raises ConfigError and RunError as `check` and `with_network_of` do.
     """
-    checked = check(config)
-    return check(with_network_of(RunFolder(checked.init), config, overrides)) if checked.init else checked
+    start = config.get("init")  # the configuration alone may have larger images than it renders: not checked before
+    if start and isinstance(start, str):
+        config = with_network_of(RunFolder(Path(start)), config, overrides)
+    return check(config)
 
 
 def with_network_of(start: RunFolder, config: dict[str, Any], overrides: list[str]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from hydra.core.override_parser.types import Override
 from phd_exp.cli.jobs import Job, composed, launch
 from phd_exp.cli.paths import quoted
 from phd_exp.cli.starts import checked_start
-from phd_exp.config import RenderedConfig, RunConfig, check
+from phd_exp.config import RenderedConfig, RunConfig
 from phd_exp.records.choices import RunName, has_influence, setting
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, RunError, shown
@@ -89,7 +89,7 @@ def trained(overrides: Sequence[str], config_dir: str | Path | None) -> "Trained
     words = quoted(overrides)
     config = composed(words, config_dir)
     task(config, words, usable_cores())
-    return TrainedRun(run_name(check(config), words).folder(Path(config["runs"])))
+    return TrainedRun(run_name(checked_start(config, words), words).folder(Path(config["runs"])))
 
 
 def cost(configs: list[dict[str, Any]], cores: int) -> float:

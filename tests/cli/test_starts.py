@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import yaml
 
-from phd_exp.cli.starts import with_network_of
+from phd_exp.cli.starts import checked_start, with_network_of
 from phd_exp.cli.train import cost
 from phd_exp.config import RunConfig, check
 from phd_exp.records.errors import ConfigError, RunError
@@ -53,6 +53,16 @@ def test_what_the_command_line_names_is_not_changed(
     else:
         key = word.partition("=")[0].partition(".")[2]
         assert changed[section][key] == config[section][key] != start.config()[section][key]
+
+
+def test_images_are_no_larger_than_those_of_the_run(
+    composed: Callable[..., dict[str, Any]], start: RunFolder
+) -> None:
+    words = ["data=object", "data.mesh=part.glb", "recipe=strong", "data.sensor_size=112", f"init={start.path}"]
+    config = composed(*words)
+    with pytest.raises(ConfigError, match="image_size=224 is larger than sensor_size=112"):
+        check(config)
+    assert checked_start(config, words).data.image_size == 112
 
 
 def test_older_records_have_the_defaults_of_keys_that_they_lack(

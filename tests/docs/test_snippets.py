@@ -11,21 +11,23 @@ from pathlib import Path
 
 import hydra
 import pytest
+import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from phd_exp.cli import conf_folder
 from phd_exp.cli.help import EXAMPLES, OF_VERB, VERBS
-from phd_exp.cli.jobs import plain
-from phd_exp.config import check, check_render
+from phd_exp.cli.jobs import composed, plain
+from phd_exp.cli.starts import checked_start
+from phd_exp.config import check_render
 from tests.docs.pages import PAGES, ROOT, blocks, commands, name
 from tests.support.meshes import solid, write_mesh
+from tests.support.synthetic import write_run
 
 WIDTH = 86  # characters of code that a page shows at 1280 px
 TRAINS = "guides/own_parts.md"
 README, HELP = ROOT / "README.md", ROOT / "phd_exp" / "cli" / "help.py"
 COMMANDS = {tuple(words): page for page in (*PAGES, README) for words in commands(page)}
 COMMANDS |= {tuple(line.partition(" >")[0].split()[3:]): HELP for lines in EXAMPLES.values() for line in lines}
-CHECKS = {"train": ("config", check), "render": ("render", check_render)}
 
 
 def of_a_page(page: Path) -> object:
@@ -89,9 +91,12 @@ def _single_runs(words: list[str]) -> list[tuple[str, ...]]:
 
 @cache  # many pages repeat a command
 def _check(verb: str, overrides: tuple[str, ...]) -> None:
-    config_name, checked = CHECKS[verb]
     with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
-        checked(plain(hydra.compose(config_name, list(overrides))))
+        config = plain(hydra.compose("config" if verb == "train" else "render", list(overrides)))
+    if verb == "train":
+        checked_start(config, list(overrides))
+    else:
+        check_render(config)
 
 
 def test_commands_fit_a_page() -> None:
@@ -114,6 +119,9 @@ def _write_files(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> N
     for mesh in ("part.glb", "cup.stl"):
         write_mesh(folder / mesh, solid("cube"))
     (folder / "camera.yaml").write_text("image_width: 640\nimage_height: 480\nfx: 900\nfy: 900\ncx: 320\ncy: 240\n")
+    write_run(folder, n=4).path.rename("DIR")
+    start = composed(["preset=small", "recipe=strong", "backbone=imagenet"])
+    (folder / "DIR" / "config.yaml").write_text(yaml.safe_dump(start))
     (folder / "rooms").mkdir()
     for number in range(4):
         (folder / f"rooms/{number}.jpg").touch()
