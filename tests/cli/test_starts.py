@@ -58,7 +58,7 @@ def test_what_the_command_line_names_is_not_changed(
 def test_images_are_no_larger_than_those_of_the_run(
     composed: Callable[..., dict[str, Any]], start: RunFolder
 ) -> None:
-    words = ["data=object", "data.mesh=part.glb", "recipe=strong", "data.sensor_size=112", f"init={start.path}"]
+    words = ["recipe=strong", "data.sensor_size=112", f"init={start.path}"]
     config = composed(*words)
     with pytest.raises(ConfigError, match="image_size=224 is larger than sensor_size=112"):
         check(config)
