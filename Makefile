@@ -43,7 +43,7 @@ lint: $(INSTALLED)  ## ruff, mypy, import contracts, and a check for known bad r
 	$(BIN)/lint-imports --no-cache  # a cache from before a merge reports imports that no longer exist
 	$(BIN)/python .ci/audit.py
 
-test: lint  ## lint and the default tests (5 to 8 minutes on 2 cores)
+test: lint  ## lint and the default tests (5 to 16 minutes on 2 cores)
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-all: lint  ## the slow tests too
