@@ -148,7 +148,8 @@ FIRST_VIEW = Pose(rotation=(1.0, 0.0, 0.0, 0.0), translation=(0.0, 0.0, 0.0))
 
 def _one_of_each(objects: tuple[SceneObject, ...]) -> tuple[SceneObject, ...]:
     shapes = [item.shape for item in objects]
-    if shapes[0] not in ("cylinder", "mesh") or len(set(shapes)) < len(shapes):
+    others = [shape for shape in shapes if shape != "mesh" or shapes[0] != "mesh"]  # a mesh may have copies
+    if shapes[0] not in ("cylinder", "mesh") or len(set(others)) < len(others):
         raise ValueError(f"a scene is a cylinder or mesh first, then other shapes, each once; these are {shapes}")
     return objects
 

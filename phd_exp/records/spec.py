@@ -96,6 +96,7 @@ class DatasetSpec(Record):
         backdrops: Blender's skies, or the user's photographs and skies; None: the grey backdrop.
         ground: whether the upright or resting object lies on a plane, which shows its shadow.
         distractors: number of other objects, of the three solids and `distractor_meshes`.
+        copies: number of further objects like the first one, with the same look, beside it.
         motion_blur: the longest path of the image during the exposure, px.
         ignore: parts of the meshes' files: the materials, in whose place are random ones.
         empty: whether the images show the scenes without their objects.
@@ -160,6 +161,7 @@ class DatasetSpec(Record):
     front: tuple[Number, Number, Number] | None = None
     front_range: Annotated[tuple[Turn, Turn], Range] = (0.0, 90.0)
     resting: StrictBool = False
+    copies: Annotated[int, Field(strict=True, ge=0, le=12)] = 0
 
     @model_validator(mode="before")
     @classmethod
@@ -222,6 +224,8 @@ class DatasetSpec(Record):
             raise ValueError("occluders: for the cylinder alone; expected data.distractors=2")
         if self.distractors > n_others or (self.distractors and self.views > 1):
             raise ValueError(f"distractors: got {self.distractors}; expected at most {n_others}, and 0 if views > 1")
+        if self.copies and self.views > 1:
+            raise ValueError(f"copies: got {self.copies}; expected 0 if views > 1")
         # the camera is above the ground at the upper border of the image
         steepest = math.degrees(math.atan(self.sensor_size / 2 / self.f_range[0]))
         lies = self.upright or self.resting

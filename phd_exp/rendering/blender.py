@@ -21,7 +21,7 @@ from phd_exp.rendering.importing import import_meshes
 from phd_exp.rendering.looks import ROUGHER, prepare_looks
 from phd_exp.rendering.pixels import Box, Light, read_light
 from phd_exp.rendering.sampling import remoteness
-from phd_exp.rendering.stage import CLIPPING, build_stage, show_scene, shows_metal
+from phd_exp.rendering.stage import CLIPPING, build_stage, copy_name, show_scene, shows_metal
 from phd_exp.rendering.surroundings import World
 from phd_exp.rendering.triangles import Meshes
 
@@ -98,6 +98,8 @@ class Renderer:
             _configure_image(self._scene)
             _configure_tracer(self._scene.cycles, settings)
             self.meshes: Meshes = import_meshes(self._bpy, spec) if spec else {}
+            copies = [copy_name("mesh", number + 1) for number in range(spec.copies if spec else 0)]
+            self._imported = [*self.meshes, *copies]
             self._world = World(self._bpy, spec) if spec and spec.mesh else None
             if self.meshes:
                 _configure_for_meshes(self._bpy)
@@ -131,7 +133,7 @@ class Renderer:
         """The light that the tracer computes for a box of the pixels of a scene."""
         self._frame(box, scene.S)
         brightness = self._world.show(scene.surroundings) if self._world and scene.surroundings else 1.0
-        show_scene(self._bpy, scene, self.meshes, brightness)
+        show_scene(self._bpy, scene, self._imported, brightness)
         if self._world:
             self._world.show_layer(scene, layer)
             # chooses among lamps, and takes a fifth of the time

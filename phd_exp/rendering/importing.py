@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from phd_exp.records.errors import RenderError, listed, one_line
 from phd_exp.records.mesh_files import MATERIALS, MeshFile, read_mesh
 from phd_exp.records.spec import NEAREST, DatasetSpec
+from phd_exp.rendering.stage import copy_name
 from phd_exp.rendering.triangles import Meshes, Triangles
 
 TEXELS = 4  # of a texture along a side of an image: Cycles takes its value at a point, so finer ones are noise
@@ -26,7 +27,9 @@ Y_UP = (".glb", ".gltf", ".obj")  # Blender turns their (x, y, z) to (x, -z, y)
 
 
 def import_meshes(bpy: Any, spec: DatasetSpec) -> Meshes:
-    """Add the objects `mesh`, `mesh1`, ... of a specification to Blender's scene; returns their triangles.
+    """Add the objects `mesh`, `mesh1`, ... of a specification and its copies to Blender's scene.
+
+    Returns the triangles of the objects.
 
     Raises RenderError if a file or its texture cannot be read, has no faces or too many, or is of another size than
     its unit and the data's depths allow.
@@ -46,6 +49,10 @@ def import_meshes(bpy: Any, spec: DatasetSpec) -> Meshes:
             key = "distractor_meshes" if number else "mesh"
             raise RenderError(f"data.{key}: {file}: {one_line(str(error))}") from None
         handle.name = name
+    for number in range(1, spec.copies + 1):
+        copy = bpy.data.objects["mesh"].copy()
+        copy.name = copy_name("mesh", number)
+        bpy.context.scene.collection.objects.link(copy)
     _shrink_textures(bpy, TEXELS * spec.sensor_size)
     return meshes
 

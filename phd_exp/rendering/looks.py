@@ -72,9 +72,8 @@ def prepare_looks(bpy: Any, names: Iterable[str]) -> None:
             _build_patterned(bpy, f"{pattern}-{name}", pattern)
 
 
-def show_look(bpy: Any, item: SceneObject, look: Look) -> None:
+def show_look(bpy: Any, item: SceneObject, look: Look, handle: Any) -> None:
     """Give an object of Blender's scene a look."""
-    handle = bpy.data.objects[item.shape]
     own = list(filter(None, handle.data.materials))
     for node in [node for material in own for node in material.node_tree.nodes if node.name.startswith(TONE)]:
         node.inputs["Hue"].default_value = 0.5 + look.hue

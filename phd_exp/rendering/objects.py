@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from phd_exp.records.assets import PHOTOS
@@ -14,15 +15,27 @@ from phd_exp.rendering.importing import in_blenders_axes
 from phd_exp.rendering.looks import varied
 from phd_exp.rendering.rays import rotation_matrix
 from phd_exp.rendering.resting import rests_of
-from phd_exp.rendering.sampling import MOST_TRIES, SIZE, Purpose, draw_object, sample_scene, stream_of
+from phd_exp.rendering.sampling import (
+    MOST_TRIES,
+    SIZE,
+    Purpose,
+    Stream,
+    draw_object,
+    sample_scene,
+    stream_of,
+    uniform_rotation,
+)
 from phd_exp.rendering.sequences import quaternion_of, rotation_of
-from phd_exp.rendering.triangles import Meshes
+from phd_exp.rendering.triangles import Meshes, Triangles
+
+Array = NDArray[np.float64]
 
 REACH = SIZE * 0.5**0.5  # m, from the cylinder's centre to its rim
 BRIGHTNESS = (0.5, 2.0)  # factors of a sky's light
 LARGEST_SPAN = 8.0  # of a sky: 8 degrees, all that a long lens sees, are 23 pixels of Blender's panoramas
 STRETCH = (math.log(0.25), math.log(1.5))  # of the sides of solids with varied looks
 AGAIN = 10**9  # the number of a sample that is drawn again grows by this, beyond those of all samples
+BESIDE = (0.9, 2.0)  # distance of copies, in radii of the object
 LEAST_SIDE = 0.4  # of a photograph's square, in units of its shorter side
 
 
@@ -49,25 +62,59 @@ def _whole_scene(spec: DatasetSpec, split: Split, index: int, meshes: Meshes) ->
     scene = sample_scene(spec, split, index, mesh.radius * spec.scale_range[1])
     cylinder, *panel = scene.objects
     around, turn = surroundings_of(spec, split, number)
-    rotation, upwards = cylinder.rotation, np.array([0.0, 0.0, 1.0])
-    if spec.upright or spec.resting:
-        rotation = upright_rotation(around.pitch, turn)
-    if spec.resting:
-        onto_side = rests_of(mesh).draw(stream_of(spec, split, number, Purpose.RESTING))
-        rotation = quaternion_of(rotation_of(rotation) * onto_side)
-        upwards = onto_side.inv().apply(upwards)
+    item = cylinder.model_copy(update={"shape": "mesh", "dimensions": mesh.dimensions})
     if spec.front:
         rotation = _facing_rotation(spec, cylinder.position, stream_of(spec, split, number, Purpose.FRONT))
-    item = cylinder.model_copy(update={"shape": "mesh", "dimensions": mesh.dimensions, "rotation": rotation})
+        item = item.model_copy(update={"rotation": rotation})
+    item, upwards = _lying(spec, item, around, turn, mesh, stream_of(spec, split, number, Purpose.RESTING))
     if spec.ground:  # which the object touches
-        up = item.scale * rotation_matrix(rotation) @ upwards
-        point = np.array(item.position) + (mesh.vertices @ upwards).min() * up
-        around = around.model_copy(update={"ground": tuple(point.tolist())})
+        around = around.model_copy(update={"ground": tuple(_foot(item, upwards, mesh).tolist())})
     others = [_resized(other, cylinder.position, mesh.radius / REACH) for other in panel]
     others += _distractors(spec, split, number, scene, meshes)
     lamps = () if around.is_sky else scene.lamps
     whole = scene.model_copy(update={"objects": (item, *others), "surroundings": around, "lamps": lamps})
-    return whole if spec.looks == "plain" else varied(whole, spec, stream_of(spec, split, number, Purpose.LOOKS))
+    if spec.looks == "varied":
+        whole = varied(whole, spec, stream_of(spec, split, number, Purpose.LOOKS))
+    streams = (stream_of(spec, split, number, Purpose.COPIES, place) for place in range(spec.copies))
+    copies = [_copy(spec, whole.objects[0], upwards, around, mesh, rng) for rng in streams]
+    return whole.model_copy(update={"objects": (*whole.objects, *filter(None, copies))})
+
+
+def _lying(
+    spec: DatasetSpec, item: SceneObject, around: Surroundings, turn: float, mesh: Triangles, rng: Stream
+) -> tuple[SceneObject, Array]:
+    """An object as it lies, if it is upright or resting, and the direction upwards in its local frame."""
+    rotation, upwards = item.rotation, np.array([0.0, 0.0, 1.0])
+    if spec.upright or spec.resting:
+        rotation = upright_rotation(around.pitch, turn)
+    if spec.resting:
+        onto_side = rests_of(mesh).draw(rng)
+        rotation = quaternion_of(rotation_of(rotation) * onto_side)
+        upwards = onto_side.inv().apply(upwards)
+    return item.model_copy(update={"rotation": rotation}), upwards
+
+
+def _foot(item: SceneObject, upwards: Array, mesh: Triangles) -> Array:
+    """The point below the reference point of an object that is as low as its lowest point, scene frame."""
+    up = item.scale * rotation_matrix(item.rotation) @ upwards
+    foot: Array = np.array(item.position) + (mesh.vertices @ upwards).min() * up
+    return foot
+
+
+def _copy(
+    spec: DatasetSpec, item: SceneObject, upwards: Array, around: Surroundings, mesh: Triangles, rng: Stream
+) -> SceneObject | None:
+    """A further object like the first one, beside it, on the same plane if it lies; None behind the camera."""
+    free = item.model_copy(update={"rotation": uniform_rotation(rng)})
+    other, others_upwards = _lying(spec, free, around, rng.uniform(0, math.tau), mesh, rng)
+    direction, radius = rng.normal(size=3), item.scale * mesh.radius
+    up, lies = rotation_matrix(item.rotation) @ upwards, spec.upright or spec.resting
+    direction -= lies * (direction @ up) * up
+    shift = rng.uniform(*BESIDE) * radius * direction / np.linalg.norm(direction)
+    if lies:
+        shift += (_foot(item, upwards, mesh) - _foot(other, others_upwards, mesh)) @ up * up
+    x, y, z = (np.array(item.position) + shift).tolist()
+    return other.model_copy(update={"position": (x, y, z)}) if z > radius else None
 
 
 def surroundings_of(spec: DatasetSpec, split: Split, number: int) -> tuple[Surroundings, float]:

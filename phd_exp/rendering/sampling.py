@@ -59,6 +59,7 @@ class Purpose(IntEnum):
     FRONT = 81
     LOOKS = 82
     RESTING = 83
+    COPIES = 90  # followed by the number of each
     MOTION = 90  # followed by the place of the shape
     CAMERA_MOTION = 91
     FRAME_NOISE = 92  # followed by the number of the frame, and of a further view

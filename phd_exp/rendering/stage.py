@@ -29,6 +29,17 @@ SURFACES: dict[Material, dict[str, float]] = {
 SURROUNDINGS = (0.10, 0.75)
 
 
+def copy_name(shape: str, number: int) -> str:
+    """The name in Blender of one of several equal objects of a scene, which has one look."""
+    return f"{shape} copy {number}" if number else shape
+
+
+def handles(bpy: Any, scene: Scene) -> list[Any]:
+    """Blender's objects for those of a scene."""
+    shapes = [item.shape for item in scene.objects]
+    return [bpy.data.objects[copy_name(shape, shapes[:place].count(shape))] for place, shape in enumerate(shapes)]
+
+
 def show_scene(bpy: Any, scene: Scene, meshes: Iterable[str] = (), brightness: float = 1.0) -> None:
     """Arrange everything on the stage as in a scene whose image will become brighter by a factor.
 
@@ -41,8 +52,8 @@ def show_scene(bpy: Any, scene: Scene, meshes: Iterable[str] = (), brightness: f
     objects["camera"].matrix_basis = matrix_of(back @ TO_BLENDER, -back @ np.array(scene.pose.translation))
     for shape in (*SHAPES, *meshes):
         objects[shape].hide_render = True
-    for item in scene.objects:
-        _place_object(bpy, item)
+    for item, handle in zip(scene.objects, handles(bpy, scene), strict=True):
+        _place_object(bpy, item, handle)
     for name in get_args(LampName):
         objects[name].hide_render = name not in {lamp.name for lamp in scene.lamps}
     for lamp in scene.lamps:
@@ -59,14 +70,13 @@ def shows_metal(bpy: Any, scene: Scene) -> list[bool]:
     ]
 
 
-def _place_object(bpy: Any, item: SceneObject) -> None:
-    handle = bpy.data.objects[item.shape]
+def _place_object(bpy: Any, item: SceneObject, handle: Any) -> None:
     handle.hide_render = False
     size = 0.5 * np.array(item.dimensions) if item.shape in SHAPES else np.ones(3)
     stretch = item.scale * size
     handle.matrix_basis = matrix_of(rotation_matrix(item.rotation) * stretch, np.array(item.position))
     if item.look:
-        show_look(bpy, item, item.look)
+        show_look(bpy, item, item.look, handle)
         return
     if handle.data.materials[0] is not None:  # its own
         return

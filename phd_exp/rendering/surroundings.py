@@ -23,7 +23,7 @@ from phd_exp.rendering.antialias import filtered
 from phd_exp.rendering.pixels import Light, linear
 from phd_exp.rendering.rays import rotation_matrix
 from phd_exp.rendering.sampling import about_axis, remoteness
-from phd_exp.rendering.stage import TO_BLENDER, matrix_of, new_nodes
+from phd_exp.rendering.stage import TO_BLENDER, handles, matrix_of, new_nodes
 
 GROUND = 1000.0  # m: side of the plane
 IMPORTANCE_MAP = 512  # px: that of a sky's own resolution, 1024, would take a second for each image
@@ -72,8 +72,8 @@ class World:
 
     def show_layer(self, scene: Scene, layer: str) -> None:
         """Let the camera show either the objects or the ground; each lights and shades the other."""
-        for item in scene.objects:
-            self._bpy.data.objects[item.shape].visible_camera = layer == "objects"
+        for handle in handles(self._bpy, scene):
+            handle.visible_camera = layer == "objects"
         self._ground.visible_camera = layer == "ground"
 
     def behind(self, scene: Scene) -> Light:

@@ -40,10 +40,19 @@ def test_what_is_no_record_is_refused(record: SampleRecord, key: str, value: Any
         SampleRecord.model_validate(record.model_dump() | {key: value})
 
 
-def test_a_scene_is_one_cylinder_and_at_most_one_of_each_other_shape(record: SampleRecord) -> None:
+def test_a_scene_is_one_cylinder_or_several_equal_meshes_and_at_most_one_of_each_other_shape(
+    record: SampleRecord,
+) -> None:
     fields = record.model_dump()
     (cylinder,) = fields["objects"]
-    for objects in ([cylinder, cylinder], [cylinder | {"shape": "cube"}]):
+    mesh, other = cylinder | {"shape": "mesh"}, cylinder | {"shape": "mesh1"}
+    assert len(SampleRecord.model_validate(fields | {"objects": [mesh, other, mesh]}).objects) == 3
+    for objects in (
+        [cylinder, cylinder],
+        [cylinder | {"shape": "cube"}],
+        [cylinder, mesh, mesh],
+        [mesh, other, other],
+    ):
         with pytest.raises(ValidationError, match="a cylinder or mesh first, then other shapes, each once"):
             SampleRecord.model_validate(fields | {"objects": objects})
     with pytest.raises(ValidationError, match="unit quaternion"):

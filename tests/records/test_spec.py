@@ -123,6 +123,7 @@ def test_a_fingerprint_depends_on_every_value_and_on_nothing_else(make_spec: Mak
         "front": (0.0, 0.0, 1.0),
         "front_range": (0.0, 60.0),
         "resting": True,
+        "copies": 2,
     }
     needed = {"ground": {"upright": True, "pitch_range": (20.0, 30.0)}, "front_range": {"front": (0.0, 0.0, 1.0)}}
     needed |= {key: {"camera": CAMERA} for key in ("view", "box_size", "box_shift", "edge_distance")}
