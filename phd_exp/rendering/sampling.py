@@ -3,7 +3,7 @@
 import colorsys
 import math
 from collections.abc import Callable
-from enum import IntEnum
+from enum import IntEnum, unique
 from functools import partial
 from typing import get_args
 
@@ -40,6 +40,7 @@ PANEL = (0.2, 0.4, 0.02)  # m: wider than half of the largest silhouette at its 
 Stream = np.random.Generator
 
 
+@unique
 class Purpose(IntEnum):
     """One random stream per purpose, so that variants are paired: an addition to a variant changes nothing else.
 
@@ -59,7 +60,7 @@ class Purpose(IntEnum):
     FRONT = 81
     LOOKS = 82
     RESTING = 83
-    COPIES = 90  # followed by the number of each
+    COPIES = 84  # followed by the number of each
     MOTION = 90  # followed by the place of the shape
     CAMERA_MOTION = 91
     FRAME_NOISE = 92  # followed by the number of the frame, and of a further view
