@@ -112,6 +112,11 @@ def test_every_idea_has_snippets() -> None:
             assert commands(page), name(page)
 
 
+@cache
+def _config_of_a_start() -> str:
+    return yaml.safe_dump(composed(["preset=small", "recipe=strong", "backbone=imagenet"]))
+
+
 def _write_files(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Write the files that a page shows, and go there."""
     monkeypatch.chdir(folder)
@@ -120,8 +125,7 @@ def _write_files(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> N
         write_mesh(folder / mesh, solid("cube"))
     (folder / "camera.yaml").write_text("image_width: 640\nimage_height: 480\nfx: 900\nfy: 900\ncx: 320\ncy: 240\n")
     write_run(folder, n=4).path.rename("DIR")
-    start = composed(["preset=small", "recipe=strong", "backbone=imagenet"])
-    (folder / "DIR" / "config.yaml").write_text(yaml.safe_dump(start))
+    (folder / "DIR" / "config.yaml").write_text(_config_of_a_start())
     (folder / "rooms").mkdir()
     for number in range(4):
         (folder / f"rooms/{number}.jpg").touch()
