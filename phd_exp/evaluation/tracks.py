@@ -33,7 +33,7 @@ SMOOTHERS = METHODS[1:]
 ERRORS = ("depth_error_mm", "projected_error_mm")
 NEES = "nees"
 HIDDEN = 0.3  # visibility below which the object counts as hidden
-WHOLE = Lost(after=math.inf, contradictions=10**9)  # no track ends early: all methods have the same frames
+WHOLE = Lost(after=math.inf, probability=0.0)  # no track ends early: all methods have the same frames
 NOISES = (0.01, 100.0)  # m/s^2 per sqrt(Hz), among which the noise of the motion is chosen
 PRECISION = 0.05  # of its logarithm
 OUTLYING = 0.05  # share of the held-out sequences of several cameras that do not count for their NEES

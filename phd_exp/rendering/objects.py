@@ -35,7 +35,7 @@ BRIGHTNESS = (0.5, 2.0)  # factors of a sky's light
 LARGEST_SPAN = 8.0  # of a sky: 8 degrees, all that a long lens sees, are 23 pixels of Blender's panoramas
 STRETCH = (math.log(0.25), math.log(1.5))  # of the sides of solids with varied looks
 AGAIN = 10**9  # the number of a sample that is drawn again grows by this, beyond those of all samples
-BESIDE = (0.9, 2.0)  # distance of copies, in radii of the object
+BESIDE = (1.0, 1.5)  # distance of copies, as a factor of that at which a plane between the two touches both
 LEAST_SIDE = 0.4  # of a photograph's square, in units of its shorter side
 
 
@@ -96,25 +96,35 @@ def _lying(
 
 def _foot(item: SceneObject, upwards: Array, mesh: Triangles) -> Array:
     """The point below the reference point of an object that is as low as its lowest point, scene frame."""
-    up = item.scale * rotation_matrix(item.rotation) @ upwards
-    foot: Array = np.array(item.position) + (mesh.vertices @ upwards).min() * up
+    up = rotation_matrix(item.rotation) @ upwards
+    foot: Array = np.array(item.position) - _extent(item, -up, mesh) * up
     return foot
 
 
 def _copy(
     spec: DatasetSpec, item: SceneObject, upwards: Array, around: Surroundings, mesh: Triangles, rng: Stream
 ) -> SceneObject | None:
-    """A further object like the first one, beside it, on the same plane if it lies; None behind the camera."""
+    """A further object like the first one, beside it, on the same plane if it lies; None behind the camera.
+
+    A plane separates the two, so that they never run into each other.
+    """
     free = item.model_copy(update={"rotation": uniform_rotation(rng)})
     other, others_upwards = _lying(spec, free, around, rng.uniform(0, math.tau), mesh, rng)
-    direction, radius = rng.normal(size=3), item.scale * mesh.radius
+    direction = rng.normal(size=3)
     up, lies = rotation_matrix(item.rotation) @ upwards, spec.upright or spec.resting
     direction -= lies * (direction @ up) * up
-    shift = rng.uniform(*BESIDE) * radius * direction / np.linalg.norm(direction)
+    direction /= np.linalg.norm(direction)
+    shift = rng.uniform(*BESIDE) * (_extent(item, direction, mesh) + _extent(other, -direction, mesh)) * direction
     if lies:
         shift += (_foot(item, upwards, mesh) - _foot(other, others_upwards, mesh)) @ up * up
     x, y, z = (np.array(item.position) + shift).tolist()
-    return other.model_copy(update={"position": (x, y, z)}) if z > radius else None
+    return other.model_copy(update={"position": (x, y, z)}) if z > item.scale * mesh.radius else None
+
+
+def _extent(item: SceneObject, direction: Array, mesh: Triangles) -> float:
+    """How far an object reaches from its reference point along a unit vector of the scene's frame, m."""
+    local = direction @ rotation_matrix(item.rotation)
+    return float(item.scale * (mesh.vertices @ local).max())
 
 
 def surroundings_of(spec: DatasetSpec, split: Split, number: int) -> tuple[Surroundings, float]:

@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from phd_exp.records.scenes import SceneObject
 from phd_exp.rendering.blender import Renderer, Settings
 from phd_exp.rendering.objects import BESIDE, sample_object_scene
 from phd_exp.rendering.rays import NOTHING, rotation_matrix, trace_pixels
@@ -10,6 +12,12 @@ from tests.support.meshes import solid
 from tests.support.renders import MakeSpec, drawn
 
 MESHES = {"mesh": solid("cube", 0.1)}
+
+
+def corners(item: SceneObject) -> NDArray[np.float64]:
+    """Vertices of an object in the scene's frame, m, shape (n, 3)."""
+    moved: NDArray[np.float64] = item.scale * MESHES["mesh"].vertices @ rotation_matrix(item.rotation).T
+    return moved + item.position
 
 
 @pytest.mark.parametrize("looks", ["plain", "varied"])
@@ -25,9 +33,12 @@ def test_copies_lie_around_an_unchanged_scene_and_look_like_its_object(of_mesh: 
         assert len(copies) == 3
         for copy in copies:
             assert copy.model_copy(update={"position": first.position, "rotation": first.rotation}) == first
-            shift = (np.array(copy.position) - first.position) / (first.scale * MESHES["mesh"].radius)
-            assert BESIDE[0] <= np.linalg.norm(shift) <= BESIDE[1]
-            directions.append(shift / np.linalg.norm(shift))
+            shift = np.subtract(copy.position, first.position)
+            direction = shift / np.linalg.norm(shift)
+            gap = (corners(copy) @ direction).min() - (corners(first) @ direction).max()
+            touching = np.linalg.norm(shift) - gap
+            assert BESIDE[0] <= np.linalg.norm(shift) / touching <= BESIDE[1]
+            directions.append(direction)
             rotations.add(copy.rotation)
     assert len(rotations) == 300
     assert np.abs(np.mean(directions, axis=0)).max() < 0.15, "3.5 standard errors of the mean of 600 directions"
@@ -41,11 +52,12 @@ def test_copies_of_an_object_on_a_table_lie_on_the_table(of_mesh: MakeSpec, law:
         assert scene.surroundings.ground is not None
         up = np.array([0.0, -np.cos(scene.surroundings.pitch), -np.sin(scene.surroundings.pitch)])
         for item in scene.objects:
-            corners = item.scale * MESHES["mesh"].vertices @ rotation_matrix(item.rotation).T + item.position
-            assert (corners @ up).min() == pytest.approx(np.array(scene.surroundings.ground) @ up)
-        reach = scene.objects[0].scale * MESHES["mesh"].radius
-        shifts = [np.array(copy.position) - scene.objects[0].position for copy in scene.objects[1:]]
-        assert all(np.linalg.norm(shift - (shift @ up) * up) >= 0.999 * BESIDE[0] * reach for shift in shifts)
+            assert (corners(item) @ up).min() == pytest.approx(np.array(scene.surroundings.ground) @ up)
+        first, *copies = scene.objects
+        for copy in copies:
+            shift = np.subtract(copy.position, first.position)
+            aside = shift - (shift @ up) * up
+            assert (corners(first) @ aside).max() <= (corners(copy) @ aside).min() + 1e-9, "a plane is between them"
 
 
 def test_blender_shows_each_copy_where_its_rays_are_and_none_in_a_scene_without(of_mesh: MakeSpec) -> None:

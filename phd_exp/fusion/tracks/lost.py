@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from phd_exp.fusion.tracks.solved import Solved
+
 
 @dataclass(frozen=True)
 class Lost:
@@ -60,14 +62,16 @@ class Lost:
         """The reason of an end by a gap after the last prediction."""
         return f"lost after {last:g} s: no prediction for more than {self.after:g} s"
 
-    def contradicted(
-        self, times: Float[np.ndarray, " frames"], surprise: Float[np.ndarray, "frames cameras"], begun: bool = False
-    ) -> tuple[int, str | None]:
+    def contradicted(self, solved: Solved, begun: bool = False) -> tuple[int, str | None]:
         """The number of frames before the first run of contradictions that is too long, and the reason.
 
         Unless the track has `begun` before, a run from the first frame on does not end it: then it is the later
         frames that agree.
         """
+        times = solved.frames.times
+        if not (solved.excess > self.least_excess).any():  # levels take a third of the time of a track
+            return len(times), None
+        surprise = solved.surprise
         against, seen = self.contradicts(surprise), (~np.isnan(surprise)).any(-1)
         run, begin = 0, 0
         for k in seen.nonzero()[0]:

@@ -139,7 +139,7 @@ def track(
         length, why = lost.gap(frames.times[first:], seen[first:])
         while True:
             solved = smoothed(frames[first : first + length], motion, slow)
-            length, contradicted = lost.contradicted(solved.frames.times, solved.surprise)
+            length, contradicted = lost.contradicted(solved)
             if contradicted is None:
                 return Path(torch.from_numpy(frames.times), first, why, solved)
             why = contradicted

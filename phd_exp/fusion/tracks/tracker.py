@@ -134,8 +134,7 @@ class Tracker:
                 return None
             self._window, self._seen = window, time if seen else self._seen
             full = len(window.x) == self.lag + 1
-            if (window.excess > self.lost.least_excess).any():
-                self._end, self.lost_because = self.lost.contradicted(window.frames.times, window.surprise, full)
+            self._end, self.lost_because = self.lost.contradicted(window, full)
             self._given = full and self.lost_because is None
             return self._state(0) if self._given else None
 
