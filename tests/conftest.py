@@ -15,6 +15,7 @@ from jaxtyping import install_import_hook
 from phd_exp.cli import conf_folder, jobs
 from phd_exp.records import runs
 from phd_exp.records.spec import DatasetSpec
+from tests.support.shapes import next_test
 
 # before anything is imported: every annotated function of these modules checks its shapes while tests run; numba
 # compiles the other modules of fusion
@@ -22,11 +23,17 @@ FUSION = ("fusion.fuse", "fusion.gaussian", "fusion.pose", "fusion.problems", "f
 TRACKS = tuple(f"fusion.tracks.{name}" for name in ("chain", "lost", "motion", "shear", "slow"))
 NUMERIC = ("optics", "geometry", "distributions", "losses", "metrics", "models", "data", "evaluation")
 HOOKED = (*NUMERIC, *FUSION, *TRACKS)
-install_import_hook([f"phd_exp.{name}" for name in HOOKED], "beartype.beartype")
+install_import_hook([f"phd_exp.{name}" for name in HOOKED], "tests.support.shapes.first_calls")
 
 
 torch.set_num_threads(1)
 runs.git_commit = cache(runs.git_commit)  # some 400 runs are recorded
+
+
+@pytest.fixture(autouse=True)
+def checked_shapes() -> None:
+    """The first calls of each function in this test have their shapes checked."""
+    next_test()
 
 
 @pytest.fixture(autouse=True)
