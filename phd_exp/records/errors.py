@@ -150,11 +150,14 @@ def install(text: str) -> str:
 
 
 def gist(error: BaseException) -> str:
-    """The reason of an error on one line: the first complaint of a validation, or the reason of a system call."""
+    """The reason of an error on one line: the first complaint of a validation, or the reason of a system call.
+
+    Of an error without a message, the name of its class.
+    """
     if isinstance(error, ValidationError):
         text = complaint(error.errors(include_url=False)[0])
     else:
-        text = str(getattr(error, "strerror", None) or error)
+        text = str(getattr(error, "strerror", None) or error) or type(error).__name__
     return " ".join(text.split())[:LONGEST_GIST]
 
 

@@ -220,7 +220,7 @@ def _reading(path: Path) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:
-        reason = one_line(gist(error)) or type(error).__name__
+        reason = one_line(gist(error))
         raise DatasetError(
             f"{path}: cannot be read as a recording of ROS 2 ({reason}); copy the file again; if its writer was "
             "interrupted, `mcap recover` or `ros2 bag reindex` repairs it"
