@@ -4,9 +4,6 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-# containers often set it; every process of the tests would then compile all modules again
-unexport PYTHONDONTWRITEBYTECODE
-
 .DEFAULT_GOAL := help
 .PHONY: help install demo tables test test-all lint bench gpu docs notebooks clean
 
@@ -46,7 +43,7 @@ lint: $(INSTALLED)  ## ruff, mypy, import contracts, and a check for known bad r
 	$(BIN)/lint-imports --no-cache  # a cache from before a merge reports imports that no longer exist
 	$(BIN)/python .ci/audit.py
 
-test: lint  ## lint and the default tests (5 to 16 minutes on 2 cores)
+test: lint  ## lint and the default tests (5 to 15 minutes on 2 cores)
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-all: lint  ## the slow tests too
