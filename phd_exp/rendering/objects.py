@@ -95,9 +95,12 @@ def _lying(
 
 
 def _foot(item: SceneObject, upwards: Array, mesh: Triangles) -> Array:
-    """The point below the reference point of an object that is as low as its lowest point, scene frame."""
-    up = rotation_matrix(item.rotation) @ upwards
-    foot: Array = np.array(item.position) - _extent(item, -up, mesh) * up
+    """The point below the reference point of an object that is as low as its lowest point, scene frame.
+
+    Records of data sets with a ground hold its last bit, which `verify` compares.
+    """
+    up = item.scale * rotation_matrix(item.rotation) @ upwards
+    foot: Array = np.array(item.position) + (mesh.vertices @ upwards).min() * up
     return foot
 
 
