@@ -21,6 +21,7 @@ from phd_exp.rendering.rays import NOTHING, beyond_edges, in_camera_frame, rotat
 from phd_exp.rendering.samples import GREY, make_sample, photograph
 from phd_exp.rendering.sampling import sample_scene
 from phd_exp.rendering.triangles import Triangles
+from tests.support.meshes import placed
 from tests.support.renders import UNLIKELY, MakeSpec, decoded, drawn
 
 SIZE = {"width": 640, "height": 480, "K": (530.0, 0, 340, 0, 532.0, 236, 0, 0, 1)}
@@ -38,8 +39,8 @@ def of_box(of_mesh: MakeSpec) -> MakeSpec:
 def outline(scene: Scene, mesh: Triangles) -> np.ndarray:
     """The vertices of the object in the user's image, px."""
     item, camera = scene.objects[0], scene.real_camera
-    xyz = item.scale * mesh.vertices @ rotation_matrix(item.rotation).T + np.array(item.position)
-    return camera.intrinsics[:2, 2] + np.diagonal(camera.intrinsics)[:2] * camera.lens.distort(xyz)
+    distorted = camera.lens.distort(placed(mesh, item))
+    return camera.intrinsics[:2, 2] + np.diagonal(camera.intrinsics)[:2] * distorted
 
 
 @pytest.mark.parametrize("camera", [CAMERA, FISHEYE], ids=["radial", "fisheye"])

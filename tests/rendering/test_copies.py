@@ -2,22 +2,15 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from phd_exp.records.scenes import SceneObject
 from phd_exp.rendering.blender import Renderer, Settings
 from phd_exp.rendering.objects import BESIDE, sample_object_scene
-from phd_exp.rendering.rays import NOTHING, rotation_matrix, trace_pixels
-from tests.support.meshes import solid
+from phd_exp.rendering.rays import NOTHING, trace_pixels
+from tests.support.meshes import placed, solid
 from tests.support.renders import MakeSpec, drawn
 
-MESHES = {"mesh": solid("cube", 0.1)}
-
-
-def corners(item: SceneObject) -> NDArray[np.float64]:
-    """Vertices of an object in the scene's frame, m, shape (n, 3)."""
-    moved: NDArray[np.float64] = item.scale * MESHES["mesh"].vertices @ rotation_matrix(item.rotation).T
-    return moved + item.position
+CUBE = solid("cube", 0.1)
+MESHES = {"mesh": CUBE}
 
 
 @pytest.mark.parametrize("looks", ["plain", "varied"])
@@ -35,7 +28,7 @@ def test_copies_lie_around_an_unchanged_scene_and_look_like_its_object(of_mesh: 
             assert copy.model_copy(update={"position": first.position, "rotation": first.rotation}) == first
             shift = np.subtract(copy.position, first.position)
             direction = shift / np.linalg.norm(shift)
-            gap = (corners(copy) @ direction).min() - (corners(first) @ direction).max()
+            gap = (placed(CUBE, copy) @ direction).min() - (placed(CUBE, first) @ direction).max()
             touching = np.linalg.norm(shift) - gap
             assert BESIDE[0] <= np.linalg.norm(shift) / touching <= BESIDE[1]
             directions.append(direction)
@@ -52,12 +45,14 @@ def test_copies_of_an_object_on_a_table_lie_on_the_table(of_mesh: MakeSpec, law:
         assert scene.surroundings.ground is not None
         up = np.array([0.0, -np.cos(scene.surroundings.pitch), -np.sin(scene.surroundings.pitch)])
         for item in scene.objects:
-            assert (corners(item) @ up).min() == pytest.approx(np.array(scene.surroundings.ground) @ up)
+            assert (placed(CUBE, item) @ up).min() == pytest.approx(np.array(scene.surroundings.ground) @ up)
         first, *copies = scene.objects
         for copy in copies:
             shift = np.subtract(copy.position, first.position)
             aside = shift - (shift @ up) * up
-            assert (corners(first) @ aside).max() <= (corners(copy) @ aside).min() + 1e-9, "a plane is between them"
+            assert (placed(CUBE, first) @ aside).max() <= (placed(CUBE, copy) @ aside).min() + 1e-9, (
+                "a plane is between them"
+            )
 
 
 def test_blender_shows_each_copy_where_its_rays_are_and_none_in_a_scene_without(of_mesh: MakeSpec) -> None:

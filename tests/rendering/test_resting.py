@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 from phd_exp.rendering.rays import rotation_matrix
 from phd_exp.rendering.resting import Rests, rests_of
 from phd_exp.rendering.triangles import Triangles
-from tests.support.meshes import solid
+from tests.support.meshes import placed, solid
 from tests.support.renders import UNLIKELY, MakeSpec, drawn
 
 CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
@@ -84,7 +84,7 @@ def test_resting_objects_touch_the_table_with_a_side(of_mesh: MakeSpec, ground: 
         item, pitch = scene.objects[0], scene.surroundings.pitch
         up = np.array([0.0, -np.cos(pitch), -np.sin(pitch)])
         R = rotation_matrix(item.rotation)
-        height = np.sort((item.scale * meshes["mesh"].vertices @ R.T + item.position) @ up)
+        height = np.sort(placed(meshes["mesh"], item) @ up)
         assert height[3] == pytest.approx(height[0])
         assert height[4] == pytest.approx(height[0] + 0.2 * item.scale)
         if ground:

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from phd_exp.records.scenes import Shape
+from phd_exp.records.scenes import SceneObject, Shape
 from phd_exp.rendering.meshes import build_mesh
+from phd_exp.rendering.rays import rotation_matrix
 from phd_exp.rendering.triangles import Triangles
 
 Y_UP = (".glb", ".gltf", ".obj")
@@ -20,6 +21,11 @@ def solid(shape: Shape, size: float = 0.2, middle: tuple[float, float, float] = 
     mesh = build_mesh(shape)
     corners = [(face[0], face[k], face[k + 1]) for face in mesh.faces for k in range(1, len(face) - 1)]
     return Triangles(0.5 * size * np.array(mesh.vertices) + middle, np.array(corners, np.int32))
+
+
+def placed(mesh: Triangles, item: SceneObject) -> np.ndarray:
+    """The vertices of an object in its scene's frame, m, shape (n, 3)."""
+    return item.scale * mesh.vertices @ rotation_matrix(item.rotation).T + np.array(item.position)
 
 
 def write_mesh(path: Path, mesh: Triangles, per_metre: float = 1.0) -> Path:
