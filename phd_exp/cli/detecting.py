@@ -1,4 +1,4 @@
-"""What `predict` and `track` share: the camera, and boxes from a file, from Python, or from the network itself."""
+"""What `predict` and `track` share: the camera, and boxes from a file or from a function in Python."""
 
 import re
 from pathlib import Path
@@ -13,7 +13,6 @@ from phd_exp.records.recordings import Recording, is_recording
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
     from phd_exp.inference.detectors import Detector
-    from phd_exp.inference.predictor import Predictor
 
 BOX = four_numbers("box=LEFT,TOP,RIGHT,BOTTOM in pixels")
 OF_A_CAMERA = ("f", "fx", "fy", "cx", "cy", "camera", "box")
@@ -43,8 +42,6 @@ class DetectingArguments(RunArguments):
     """with boxes= or annotations: the class to use, as COCO's category, BOP's obj_id, KITTI's type; by default all"""
     boxes: Path | None = None
     """instead of box=, a file of COCO results (track: image_id counts frames from 0); or MODULE:FUNCTION in Python"""
-    detect: bool = False
-    """instead of box=, find the object with the network itself; for runs of recipe=strong"""
 
     def recording(self, folder: Path | None) -> Recording | None:
         """The images of a folder= that is a recording of ROS 2; None if it is not."""
@@ -65,32 +62,17 @@ class DetectingArguments(RunArguments):
         name = str(self.boxes or "")
         return name if FUNCTION.fullmatch(name) and not Path(name).exists() else None
 
-    @property
-    def detects(self) -> bool:
-        """Whether a function or the network finds the boxes."""
-        return self.detect or self.function is not None
-
     @model_validator(mode="after")
     def one_detector(self) -> Self:
         """Refuse two origins of boxes."""
-        if (self.box is not None) + (self.boxes is not None) + self.detect > 1:
-            raise ValueError("box, boxes, detect: got more than one of them; expected one")
-        if self.detect and self.object is not None:
-            raise ValueError("object: detect=true finds one kind of object; leave it out")
+        if self.box is not None and self.boxes is not None:
+            raise ValueError("box, boxes: got both; expected one of them")
         return self
 
-    def of_function(self) -> "Detector | None":
+    def detector(self) -> "Detector | None":
         """The function that boxes= names, if it names one. Raises ConfigError if it cannot be imported."""
         if self.function is None:
             return None
         from phd_exp.inference.detectors import own_function
 
         return own_function(self.function, self.object)
-
-    def of_network(self, predictor: "Predictor") -> "Detector | None":
-        """The network's own, if detect=true. Raises ConfigError if it makes no map of the object."""
-        if not self.detect:
-            return None
-        from phd_exp.inference.own_detector import own_detector
-
-        return own_detector(predictor)

@@ -49,7 +49,7 @@ EXAMPLES = {
     "predict": [
         "python -m phd_exp predict run=runs/small/default/probabilistic/seed0 image=photo.jpg f=1550",
         "python -m phd_exp predict run=DIR image=a.jpg fx=900 fy=900 cx=320 cy=240 box=400,30,620,140 out=pictures",
-        "python -m phd_exp predict run=DIR folder=photos camera=camera.yaml detect=true out=pictures",
+        "python -m phd_exp predict run=DIR folder=photos camera=camera.yaml boxes=mydetector:find out=pictures",
         "python -m phd_exp predict run=DIR folder=photos/test recalibrate=true > predictions.jsonl",
         "python -m phd_exp predict run=runs/small/default/probabilistic folder=photos/test",
         "python -m phd_exp predict run=DIR,DIR,DIR views=8 folder=photos/test",
@@ -66,7 +66,7 @@ EXAMPLES = {
     ],
     "track": [
         "python -m phd_exp track run=DIR video=clip.mp4 camera=camera.yaml box=400,30,620,140 out=tracked",
-        "python -m phd_exp track run=DIR video=clip.mp4 f=900 detect=true",
+        "python -m phd_exp track run=DIR video=clip.mp4 f=900 boxes=mydetector:find",
         "python -m phd_exp track run=DIR video=clip.mp4 f=900 boxes=detections.json",
         "python -m phd_exp track run=DIR folder=frames > track.jsonl",
     ],

@@ -54,8 +54,8 @@ class PredictArguments(DetectingArguments):
         if self.boxes and not self.function and several:
             raise ValueError("boxes: the boxes of one image=FILE; expected no folder= and no further image")
         is_recorded = self.folder is not None and is_recording(self.folder)
-        if self.detects and not (self.of_camera or is_recorded):
-            raise ValueError(f"{'detect' if self.detect else 'boxes'}: expected f=PIXELS or camera=FILE too")
+        if self.function and not (self.of_camera or is_recorded):
+            raise ValueError("boxes: expected f=PIXELS or camera=FILE too")
         if self.object is not None and (self.image or self.of_camera or is_recorded) and not self.boxes:
             raise ValueError("object: selects detections of folder=DIR or boxes=FILE; leave it out for one box")
         if self.groups and not self.coverage:
@@ -73,11 +73,10 @@ def main(words: list[str]) -> int:
     out, detections = arguments.out, _detections(arguments)
     inputs = [detections.path] if isinstance(detections, Recording) else [one.file for one in detections]
     places(out, arguments.view, inputs, "predictions", "pictures", "matplotlib")
-    function = arguments.of_function()  # whose mistakes need no network
+    detector = arguments.detector()  # whose mistakes need no network
     predictor = loaded(arguments, coverage=arguments.coverage)
     guarantee = predictor.guarantee(arguments.coverage, arguments.groups) if arguments.coverage else None
     curve = _depth_curve(predictor) if arguments.curve else None
-    detector = function or arguments.of_network(predictor)
     sightings = _viewed(arguments, predictor, predicted(predictor, detections, guarantee, detector))
     if out is not None and out.suffix != MCAP:
         _write(predictor, sightings, len(detections), out, curve, guarantee)

@@ -93,14 +93,13 @@ def main(words: list[str]) -> int:
     out = arguments.out
     if arguments.video or (out and out.suffix != MCAP):
         require_av("video" if arguments.video else "out")
-    function = arguments.of_function()  # whose mistakes need no network
+    detector = arguments.detector()  # whose mistakes need no network
     sequences = list(_sequences(arguments))
     if out is not None and out.suffix == MCAP and len(sequences) > 1:
         raise ConfigError(f"out: got {len(sequences)} tracks; expected one track for {out}, or out=DIR")
     places(out, arguments.view, [arguments.folder or Path(str(arguments.video))], "track", "pages", "plotly")
     predictor = loaded(arguments)
     predictor.require_densities("a path needs")  # before outputs of an earlier command are removed
-    detector = function or arguments.of_network(predictor)
     with _recording(arguments, sequences) as view:
         paths = [(sequence, _followed(arguments, predictor, detector, sequence, view)) for sequence in sequences]
         if out is not None and out.suffix != MCAP:
@@ -128,10 +127,10 @@ def _sequences(arguments: TrackArguments) -> Iterator[_Sequence]:
         from phd_exp.inference.frames import folder_frames
 
         for name, detections in tracks.items():
-            frames = folder_frames(detections, has_boxes=arguments.detects)
+            frames = folder_frames(detections, has_boxes=bool(arguments.function))
             yield _Sequence(frames, len(detections), str(arguments.folder.name if name is None else name))
         return
-    boxes: dict[int, list[Box]] | None = {} if arguments.detects else None
+    boxes: dict[int, list[Box]] | None = {} if arguments.function else None
     if arguments.boxes and not arguments.function:
         boxes = _boxes_of_frames(arguments.boxes, arguments.object)
     elif arguments.box:

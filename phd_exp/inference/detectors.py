@@ -1,4 +1,4 @@
-"""Detectors, which find boxes in images: checked functions of the user, and the network itself."""
+"""Detectors, which find boxes in images: checked functions of the user."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -7,12 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from pydantic_core import PydanticCustomError
 
 from phd_exp.config.targets import locate
-from phd_exp.data.crops import optics_of, read_image
-from phd_exp.optics.lens import Lens
+from phd_exp.data.crops import read_image
 from phd_exp.optics.virtual import Box
 from phd_exp.records.detections import Detection, line_of
 from phd_exp.records.errors import ConfigError, DatasetError, gist, in_user_code, one_line, shown
@@ -33,8 +32,7 @@ class Found(NamedTuple):
     classes: Any
 
 
-Find = Callable[[UInt8[np.ndarray, "height width 3"], Float[np.ndarray, "3 3"], Lens], Found]
-"""From an image, its camera matrix (pixels) and its lens to boxes."""
+Find = Callable[[UInt8[np.ndarray, "height width 3"]], Found]
 
 
 @dataclass(frozen=True)
@@ -51,9 +49,7 @@ class Detector:
     find: Find
     category: int | str | None = None
 
-    def boxes_in(
-        self, image: UInt8[np.ndarray, "height width 3"], K: Float[np.ndarray, "3 3"], lens: Lens, where: str
-    ) -> list[dict[str, Any]]:
+    def boxes_in(self, image: UInt8[np.ndarray, "height width 3"], where: str) -> list[dict[str, Any]]:
         """The `box`, `score` and `category_id` of each detection, the most certain first.
 
         Raises DatasetError if the function raises an error, or returns something else than boxes in the image.
@@ -61,9 +57,7 @@ class Detector:
         where = f"{where}: {self.name}"
         try:
             with torch.no_grad():
-                found = self.find(image.copy(), K, lens)
-        except DatasetError as error:
-            raise DatasetError(f"{where}: {error}") from None
+                found = self.find(image.copy())
         except Exception as error:
             raise DatasetError(f"{where} raised {_reason(error)}; correct the function") from None
         rows = []
@@ -80,8 +74,7 @@ class Detector:
         """What it finds in the image of a detection without a box. Raises DatasetError, also for an invalid image."""
         with pillow_warnings():
             image = np.asarray(read_image(detection.file, detection.content))
-        K, lens = optics_of(detection, (image.shape[1], image.shape[0]))
-        rows = self.boxes_in(image, K, lens, detection.where)
+        rows = self.boxes_in(image, detection.where)
         return [replace(detection, line=detection.line.model_copy(update=row)) for row in rows]
 
 
@@ -91,12 +84,7 @@ def own_function(name: str, category: int | str | None = None) -> Detector:
         function = locate(name.replace(":", "."), None)
     except PydanticCustomError as error:
         raise ConfigError(f"boxes={name}: {error.message().removeprefix('_target_: ')}") from None
-
-    def find(image: UInt8[np.ndarray, "height width 3"], K: Float[np.ndarray, "3 3"], lens: Lens) -> Found:
-        found: Found = function(image)
-        return found
-
-    return Detector(f"boxes={name}", find, category)
+    return Detector(f"boxes={name}", function, category)
 
 
 def _reason(error: Exception) -> str:
@@ -131,14 +119,10 @@ def overlap(one: Box, other: Box) -> float:
         >>> overlap((0.0, 0.0, 2.0, 2.0), (1.0, 0.0, 3.0, 2.0)) == 1 / 3
         True
     """
-    return common_area(one, other) / (area(one) + area(other) - common_area(one, other))
+    common = _area((max(one[0], other[0]), max(one[1], other[1]), min(one[2], other[2]), min(one[3], other[3])))
+    return common / (_area(one) + _area(other) - common)
 
 
-def common_area(one: Box, other: Box) -> float:
-    """Area of the intersection of two boxes."""
-    return area((max(one[0], other[0]), max(one[1], other[1]), min(one[2], other[2]), min(one[3], other[3])))
-
-
-def area(box: Box) -> float:
+def _area(box: Box) -> float:
     """Area of a box; 0 if it is reversed."""
     return max(0.0, box[2] - box[0]) * max(0.0, box[3] - box[1])

@@ -225,7 +225,7 @@ class _Track:
         """The part of the image to predict from, and whether the frame or the detector gives it."""
         predicted, boxes = self._predicted_box(frame), frame.boxes or ()
         if self.detector and frame.boxes == () and not predicted:
-            boxes = tuple(row["box"] for row in self.detector.boxes_in(frame.image, frame.K, frame.lens, frame.where))
+            boxes = tuple(row["box"] for row in self.detector.boxes_in(frame.image, frame.where))
         box = _best(boxes, predicted)
         return box or predicted, box is not None
 

@@ -103,7 +103,7 @@ ARGUMENTS = [
     argument((*ONE, "folder=."), r"predict: expected either image=FILE.*"),
     argument((*PREDICT, "f=400"), r"photos/test: has annotations, .*metadata\.jsonl; expected images alone, or no f=.*", 1),
     argument((*PREDICT, "f=400", "object=1"), r"object: selects detections.*"),
-    argument((*ONE, "boxes=b.json", "box=1,2,3,4"), r"box, boxes, detect: got more than one of them; expected one"),
+    argument((*ONE, "boxes=b.json", "box=1,2,3,4"), r"box, boxes: got both; expected one of them"),
     argument((*PREDICT, "f=400", "boxes=b.json"), r"boxes: the boxes of one image=FILE; expected no folder=.*"),
     argument(("predict", RUN, "folder=nowhere", "camera=c.yaml"), r"nowhere: no images; expected a folder with files \*\.png.*", 1),
     argument(("predict", RUN, "folder=nowhere"), r"nowhere: no such folder.*", 1),

@@ -1,4 +1,4 @@
-"""Detectors: functions of the user, whatever they return, and the network's own, on a map that is known."""
+"""Detectors: functions of the user, whatever they return."""
 
 import json
 import re
@@ -15,11 +15,7 @@ from PIL import Image
 from torchvision.models.detection import fasterrcnn_mobilenet_v3_large_320_fpn
 from torchvision.transforms.functional import to_tensor
 
-import phd_exp as package
-from phd_exp.geometry import Lens, intrinsics
-from phd_exp.inference import own_detector
-from phd_exp.inference.detectors import overlap, own_function
-from phd_exp.optics.lens import PINHOLE
+from phd_exp.inference.detectors import own_function
 from phd_exp.records.runs import RunFolder
 from tests.inference.test_track import frames
 from tests.support.untrained import NOWHERE, read_lines
@@ -33,17 +29,6 @@ CLASSES = np.array([3, 8])
 @pytest.fixture(scope="module")
 def run(make: Callable[..., RunFolder]) -> RunFolder:
     return make(*NOWHERE)
-
-
-@pytest.fixture(scope="module")
-def segmenting(make: Callable[..., RunFolder]) -> RunFolder:
-    return make("+backbone.segments=true", "recipe.segmentation=10")
-
-
-def green(self: Any, views: list[np.ndarray]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Instead of the maps of a network, the green of each cell, beyond grey; the greener, the less spread."""
-    maps = torch.nn.functional.avg_pool2d((torch.tensor(np.stack(views))[..., 1] / 127 - 1).relu(), 8)
-    return maps, 0.02 * (1 - maps.mean((1, 2)))
 
 
 @pytest.fixture
@@ -153,10 +138,8 @@ def test_an_image_in_which_nothing_is_found_has_no_line(
             ("boxes=nobodys:find",),
             "boxes=nobodys:find: 'nobodys.find' cannot be imported (No module named 'nobodys')",
         ),
-        (("boxes=somebodys:find", "box=1,2,3,4"), "box, boxes, detect: got more than one of them"),
-        (("boxes=somebodys:find", "detect=true"), "box, boxes, detect: got more than one of them"),
-        (("detect=true", "object=1"), "object: detect=true finds one kind of object; leave it out"),
-        (("detect=true",), "has no map of the object; expected a run of recipe=strong"),
+        (("boxes=somebodys:find", "box=1,2,3,4"), "box, boxes: got both; expected one of them"),
+        (("detect=true",), "detect: unknown key"),
     ],
 )
 def test_wrong_arguments_are_refused(
@@ -170,8 +153,8 @@ def test_wrong_arguments_are_refused(
 
 
 def test_a_detector_needs_a_camera(phd_exp: Callable) -> None:
-    outcome = phd_exp("predict", "run=nowhere", "folder=.", "detect=true")
-    assert (outcome.status, outcome.err) == (2, "error: detect: expected f=PIXELS or camera=FILE too\n")
+    outcome = phd_exp("predict", "run=nowhere", "folder=.", "boxes=somebodys:find")
+    assert (outcome.status, outcome.err) == (2, "error: boxes: expected f=PIXELS or camera=FILE too\n")
 
 
 def test_torchvisions_detectors_need_two_lines(detector: Callable) -> None:
@@ -186,7 +169,7 @@ def test_torchvisions_detectors_need_two_lines(detector: Callable) -> None:
 
     name = detector(find).removeprefix("boxes=")
     image = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
-    rows = own_function(name).boxes_in(image, np.eye(3), PINHOLE, "image")
+    rows = own_function(name).boxes_in(image, "image")
     assert len(rows) == 5
     assert all(isinstance(row["category_id"], int) for row in rows)
     assert sorted(rows, key=lambda row: -row["score"]) == rows
@@ -208,48 +191,3 @@ def test_a_path_asks_a_detector_only_where_it_knows_no_box(
     assert lines[2]["box"] == [8, 12, 32, 38]
     assert all(line["state"] != "lost" and "box" in line for line in lines[2:])
     assert 3 <= len(calls) < len(lines)
-
-
-@pytest.mark.parametrize("lens", [PINHOLE, Lens((-0.2, 0.05, 0.001, -0.001))], ids=["pinhole", "distorted"])
-@pytest.mark.parametrize(
-    "boxes",
-    [[(60, 50, 90, 85)], [(0, 40, 36, 70)], [(150, 100, 180, 120), (20, 15, 60, 45)], []],
-    ids=["middle", "edge", "two", "none"],
-)
-def test_the_boxes_of_a_known_map_are_found(
-    segmenting: RunFolder, monkeypatch: pytest.MonkeyPatch, lens: Lens, boxes: list[tuple[int, ...]]
-) -> None:
-    """A network whose map is the green of each cell beyond grey finds green boxes anywhere, and these alone."""
-
-    monkeypatch.setattr(own_detector._Search, "_maps", green)
-    detector = own_detector.own_detector(package.load(segmenting.path))
-    image = np.zeros((150, 200, 3), np.uint8)
-    for left, top, right, bottom in boxes:
-        image[top:bottom, left:right, 1] = 255
-    found = detector.boxes_in(image, intrinsics(260.0, 260.0, 100.0, 75.0), lens, "image")
-    assert len(found) == len(boxes)
-    for box in boxes:
-        assert max(overlap(row["box"], tuple(map(float, box))) for row in found) > 0.7
-
-
-def test_whole_photographs_need_no_boxes(
-    phd_exp: Callable, segmenting: RunFolder, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(own_detector._Search, "_maps", green)
-    image = np.zeros((150, 200, 3), np.uint8)
-    image[50:85, 60:90, 1] = 255
-    Image.fromarray(image).save(tmp_path / "a.png")
-    words = ("predict", f"run={segmenting.path}", f"image={tmp_path / 'a.png'}", "detect=true")
-    outcome = phd_exp(*words, "f=260", f"out={tmp_path / 'out'}")
-    assert outcome.status == 0
-    (line,) = read_lines((tmp_path / "out/predictions.jsonl").read_text())
-    assert overlap(line["box"], (60, 50, 90, 85)) > 0.75
-    assert line["score"] > 0.5
-    assert "category_id" not in line
-    assert (tmp_path / "out" / line["picture"]).exists()
-    monkeypatch.setattr(own_detector, "MOST_VIEWS", 3)
-    refused = phd_exp(*words, "f=260")
-    assert refused.status == 1
-    assert re.search(
-        r"a\.png: detect=true: \d+ views cover an image of 200 x 150 pixels; expected at most 3", refused.err
-    )

@@ -87,7 +87,7 @@ def test_a_bad_frame_is_refused_on_one_line_and_those_before_are_kept(
         ((), "track: expected either video=FILE with f=PIXELS or camera=FILE, or folder=DIR"),
         (("video=a.mp4",), "video: has no camera"),
         (("folder=.", "f=3"), "folder: its metadata.jsonl has cameras"),
-        (("video=a.mp4", "f=90", "box=1,2,3,4", "boxes=b.json"), "box, boxes, detect: got more than one of them"),
+        (("video=a.mp4", "f=90", "box=1,2,3,4", "boxes=b.json"), "box, boxes: got both; expected one of them"),
         (("video=a.mp4", "f=90", "object=1"), "object: selects detections of boxes=FILE"),
         (("folder=.", "coverage=0.9"), "coverage: unknown key"),
         (("folder=.", "lag=2"), "lag: got '2'; expected to be greater than or equal to 4"),
