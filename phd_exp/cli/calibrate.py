@@ -19,9 +19,9 @@ class CalibrateArguments(Arguments):
     run: Path
     """the folder of a run"""
     folder: Path
-    """images with their true positions: with a metadata.jsonl, or as BOP, KITTI or COCO"""
+    """images with their true positions: with a metadata.jsonl, or as BOP or COCO"""
     object: NumberOrName | None = None
-    """BOP's obj_id, KITTI's type or COCO's category; by default all objects"""
+    """BOP's obj_id or COCO's category; by default all objects"""
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")] = "photographs"
     """the name of the record, which predict calibration=NAME uses"""
     margin: Margin = 1.0

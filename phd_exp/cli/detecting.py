@@ -39,7 +39,7 @@ class DetectingArguments(RunArguments):
     topic: str | None = None
     """of a recording of several cameras: the topic of the images, or IMAGES,CAMERA_INFO"""
     object: NumberOrName | None = None
-    """with boxes= or annotations: the class to use, as COCO's category, BOP's obj_id, KITTI's type; by default all"""
+    """with boxes= or annotations: the class to use, as COCO's category or BOP's obj_id; by default all"""
     boxes: Path | None = None
     """instead of box=, a file of COCO results (track: image_id counts frames from 0); or MODULE:FUNCTION in Python"""
 

@@ -31,7 +31,7 @@ class PredictArguments(DetectingArguments):
     image: Paths | None = None
     """one image or several, separated by commas, with their camera as f=, fx= and fy=, or camera="""
     folder: Path | None = None
-    """instead of image=: a folder with metadata.jsonl, BOP, KITTI or COCO, or images and f=; or a ROS 2 recording"""
+    """instead of image=: a folder with metadata.jsonl, BOP or COCO, or images and f=; or a ROS 2 recording"""
     out: Path | None = None
     """a folder for predictions.jsonl and pictures; or FILE.mcap for ROS 2 messages, in addition to printed lines"""
     view: Path | None = None

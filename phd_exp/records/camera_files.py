@@ -1,13 +1,16 @@
-"""The text of a camera file as plain containers: JSON, YAML, OpenCV's XML, ROS's INI, or COLMAP's `cameras.txt`.
+"""The text of a camera file as plain containers: JSON, YAML, TOML, OpenCV's XML, ROS's INI, COLMAP's `cameras.txt`,
+or numbers alone.
 
 Source: documentation of OpenCV's FileStorage, of ROS's camera_calibration_parsers, and of COLMAP's text format.
 """
 
 import re
+import tomllib
 from collections.abc import Iterator
 from typing import Any
 from xml.etree import ElementTree
 
+from phd_exp.records.errors import gist, shortened
 from phd_exp.records.parsing import parse_json, parse_yaml
 
 COLMAP = {
@@ -20,19 +23,41 @@ COLMAP = {
     "OPENCV_FISHEYE": "fl_x fl_y cx cy k1 k2 k3 k4",
 }
 """The parameters of COLMAP's models, named as in nerfstudio's `transforms.json`."""
+READ = (
+    "ROS (camera_info, ost.ini), OpenCV's FileStorage, Kalibr, COLMAP (cameras.txt), nerfstudio (transforms.json), "
+    "Anipose (TOML), the numbers of K or fx fy cx cy, or JSON or YAML with K, D, distortion_model, width and height"
+)
+NOT_READ = {
+    "cameraData": "DepthAI's calibration: write intrinsicMatrix, distortionCoeff, width and height of one camera as K, "
+    "D, width and height",
+    "FocalLength": "MATLAB's cameraIntrinsics: write K with both coordinates of PrincipalPoint less by one, since "
+    "MATLAB counts from one, and D as k1, k2, p1, p2, k3",
+}
+"""A key of a file -> what the file is, and how to write it in a form that is read."""
 _SECTION = re.compile(r"\[([A-Za-z][^\]\"'{}:,]*)\]")
 _ROW = re.compile(r"\d+\s+[A-Z_]+\s+\d+\s+\d+(\s+[-+.\deE]+)+")
 _OF_OPENCV = re.compile(r"^%YAML.*$|!!opencv-(nd-)?matrix", re.MULTILINE)
 _NO_SPACE = re.compile(r"^(\s*[\w.]+):(?=[\w\[-])", re.MULTILINE)  # which OpenCV does not need
-_ELSEWHERE = ("roi", "calobjectSize", "rotation", "quaternion", "orientation")
+_ELSEWHERE = ("roi", "rotation", "quaternion", "orientation")
 """Sections whose width, height and w are not those of the image."""
 
 
 def content_of(text: str) -> Any:
-    """The content of a file; its format is that of its first lines. Raises ValueError if it is in none of them."""
+    """The content of a file. Raises ValueError if it is in no format that is read."""
+    try:
+        return _content_of(text)
+    except ValueError as error:
+        raise ValueError(f"{shortened(gist(error))}; expected {READ}") from None
+
+
+def _content_of(text: str) -> Any:
+    """The content of a file, whose format is that of its first lines."""
     lines = [line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if lines and _SECTION.fullmatch(lines[0]):
-        return _ini(lines)
+        return tomllib.loads(text) if any("=" in line for line in lines) else _ini(lines)
+    rows = [line.replace(",", " ").split() for line in lines]
+    if rows and all(_is_number(word) for row in rows for word in row):
+        return _of_numbers(rows)
     if lines and all(map(_ROW.fullmatch, lines)):
         return [_of_colmap(line.split()) for line in lines]
     if text.lstrip().startswith("<"):
@@ -57,17 +82,27 @@ def entries(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _ini(lines: list[str]) -> dict[str, Any]:
-    """Sections of names, with the numbers of each on the lines below it, or after `=`."""
+    """Sections of names, with the numbers of each on the lines below it."""
     sections: dict[str, dict[str, list[str]]] = {}
     words: list[str] = []
-    for part in (part.strip() for line in lines for part in line.split("=")):
-        if found := _SECTION.fullmatch(part):
+    for line in lines:
+        if found := _SECTION.fullmatch(line):
             section = sections.setdefault(found[1], {})
-        elif re.fullmatch(r"[-+.\deE\s]+", part):
-            words.extend(part.split())
+        elif all(map(_is_number, line.split())):
+            words.extend(line.split())
         else:
-            words = section.setdefault(part, [])
+            words = section.setdefault(line, [])
     return {name: {key: _one(given) for key, given in section.items()} for name, section in sections.items()}
+
+
+def _of_numbers(rows: list[list[str]]) -> dict[str, Any]:
+    """K, as `numpy.savetxt` writes it, or fx, fy, cx, cy, and maybe k1, k2, p1, p2 and k3, on one line."""
+    if [len(row) for row in rows] == [3, 3, 3]:
+        return {"K": rows}
+    (row,) = rows if len(rows) == 1 else [[word for row in rows for word in row]]
+    if len(rows) == 1 and len(row) in (4, 8, 9):
+        return {"K": row[:4], "D": row[4:], "distortion_model": "plumb_bob" if row[4:] else "none"}
+    raise ValueError(f"{len(row)} numbers; expected K, 3 x 3, or one line of fx fy cx cy, or with k1 k2 p1 p2")
 
 
 def _of_colmap(words: list[str]) -> dict[str, Any]:
@@ -96,6 +131,10 @@ def _of_element(element: ElementTree.Element) -> Any:
         return {child.tag: _of_element(child) for child in element}
     words = (element.text or "").split()
     return words if element.tag == "data" else _one(words)
+
+
+def _is_number(word: str) -> bool:
+    return re.fullmatch(r"[-+]?[\d.]+([eE][-+]?\d+)?", word) is not None
 
 
 def _one(words: list[str]) -> Any:

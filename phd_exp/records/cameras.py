@@ -4,7 +4,7 @@ The whole file is searched for the names in `NAMES`. Two values of one quantity 
 several cameras.
 
 Source: documentation of OpenCV (FileStorage, calib3d), ROS (camera_info), Kalibr, COLMAP (cameras.txt), nerfstudio
-(transforms.json), librealsense, BOP (camera.json), Open3D, ORB_SLAM, stella_vslam, VINS (camodocal), maplab and SVO.
+(transforms.json), BOP (camera.json) and Anipose (calibration.toml).
 """
 
 import math
@@ -19,10 +19,10 @@ from pydantic import Field, model_validator
 
 from phd_exp.optics.lens import Lens
 from phd_exp.optics.virtual import require_no_fold
-from phd_exp.records.camera_files import content_of, entries
+from phd_exp.records.camera_files import NOT_READ, READ, content_of, entries
 from phd_exp.records.errors import DatasetError, gist, listed, shown
 from phd_exp.records.files import LARGEST_RECORD, MB, read_plain
-from phd_exp.records.parsing import Record
+from phd_exp.records.parsing import Record, parse_json
 
 CORNER = 0.5  # px from the corner of the first pixel to its centre
 LARGEST = 1e6  # of any number in a camera file
@@ -35,31 +35,28 @@ COEFFICIENTS = {
     "equidistant": ("k1", "k2", "k3", "k4"),
 }
 NAMES = {
-    "width": "width imagewidth imgwidth w cameracols",
-    "height": "height imageheight imgheight h camerarows",
-    "size": "resolution imagesize cameraresolution",
-    "K": "k m cameramatrix camk intrinsics intrinsicmatrix cameraintrinsics mtx",
-    **{"fx": "fx flx fu mu", "fy": "fy fly fv mv", "cx": "cx ppx cu u0", "cy": "cy ppy cv v0"},
-    "D": "d dist distortion distortioncoef distcoef coef distortionparameters",
-    "model": "distortionmodel cameramodel model modeltype cameratype distortiontype",
-    "fisheye": "fisheyemodel fisheye isfisheye",
+    "width": "imagewidth width w",
+    "height": "imageheight height h",
+    "size": "resolution imagesize cameraresolution size",
+    "K": "k cameramatrix camk mtx intrinsics matrix",
+    **{"fx": "fx flx", "fy": "fy fly", "cx": "cx", "cy": "cy"},
+    "D": "d dist distcoeff distcoeffs distortion distortions distortioncoeffs distortioncoefficients",
+    "model": "distortionmodel cameramodel",
+    "fisheye": "fisheyemodel isfisheye fisheye",
     **{name: name for name in COEFFICIENTS["rational_polynomial"]},
 }
-"""Quantity -> its names in files, in small letters and digits, without what `_NOT_OF_A_NAME` matches in a list's."""
+"""Quantity -> its names in files, in small letters and digits."""
 MODELS = {
-    "plumb_bob": "plumbbob radtan radialtangential brownconrady opencv radial simpleradial",
-    "rational_polynomial": "rationalpolynomial rational fullopencv full radtan8",
-    "equidistant": "equidistant equi fisheye opencvfisheye kannalabrandt kannalabrandt4 kannalabrandt8 kb4 "
-    "radialfisheye simpleradialfisheye",
-    # those of librealsense, by number too, are read if zero
-    "none": "none nodistortion inversebrownconrady modifiedbrownconrady 0 1 2",
-    "": "pinhole perspective simplepinhole rectified 4",  # the coefficients tell which
+    "plumb_bob": "plumbbob radtan brownconrady opencv radial simpleradial",
+    "rational_polynomial": "rationalpolynomial fullopencv",
+    "equidistant": "equidistant equi fisheye kannalabrandt opencvfisheye radialfisheye simpleradialfisheye",
+    "none": "none",
+    "": "pinhole perspective simplepinhole",  # the coefficients tell which
 }
-"""Model -> its names in files, in small letters and digits, without `pinhole` and `distortion` before them."""
+"""Model -> its names in files, in small letters and digits."""
 _QUANTITIES = {alias: name for name, aliases in NAMES.items() for alias in aliases.split()}
 _MODELS = {"": "none"} | {alias: model for model, aliases in MODELS.items() for alias in aliases.split()}
-_NOT_OF_A_NAME = re.compile(r"^(left|right)|(left|right|\d+)$|(?<=coef)f?(icient)?s?\d*$")
-_COEFFICIENT, _LENS = re.compile(r"[kps]\d|xi|skew"), re.compile(r"distor|radial|tangential|coef(?!.*stddev)")
+_COEFFICIENT, _LENS = re.compile(r"[dkps]\d|xi|skew"), re.compile(r"distor|radial|tangential|coef(?!.*stddev)")
 """Names that belong to a lens even where they are none of `NAMES`."""
 
 Size = Annotated[int, Field(gt=0)]
@@ -160,8 +157,11 @@ def _found(content: Any) -> Found:
     values = list(entries(content))
     names = [_quantity(key, value) for key, value in values]
     if not {"K", "fx"} & set(names):
-        keys, expected = listed(list(dict(values))), "camera_matrix, K or intrinsics, or fx, fy, cx, cy"
-        raise ValueError(f"no camera matrix: found {keys or 'no keys'}; expected {expected}")
+        keys = list(dict(values))
+        known = [text for name, text in NOT_READ.items() if any(name in key for key in keys)]
+        raise ValueError(
+            known[0] if known else f"no camera matrix: found {listed(keys) or 'no keys'}; expected {READ}"
+        )
     found: Found = {}
     for name, (key, given) in zip(names, values, strict=True):
         value = _model(key, given) if name == "model" else given
@@ -172,22 +172,21 @@ def _found(content: Any) -> Found:
 
 def _quantity(key: str, value: Any) -> str | None:
     """The quantity with a key, if it is one. Raises ValueError for a part of a lens that is none."""
-    *outer, name = (re.sub(r"[^a-z\d]", "", part) for part in key.lower().split("."))
-    if name in ("type", "cols", "rows", "parameters"):  # of anything
-        name = "".join(outer[-1:]).rstrip("0123456789") + name
+    *outer, name = map(_plain, key.split("."))
     is_list = isinstance(value, list | dict)
-    quantity = _QUANTITIES.get(_NOT_OF_A_NAME.sub("", name) if is_list else name)
-    if quantity in ("K", "D") and isinstance(value, int | float):
-        return None
+    quantity = _QUANTITIES.get(name)
     of_a_lens = _COEFFICIENT.fullmatch(name) or any(map(_LENS.search, [*outer, name] if is_list else outer))
     if quantity is None and of_a_lens and not isinstance(value, str) and re.search("[1-9]", str(value)):
         raise ValueError(f"{key}: got {shown(value)}, a part of a lens that is not supported; expected zero")
     return quantity
 
 
+def _plain(name: Any) -> str:
+    return re.sub(r"[^a-z\d]", "", str(name).lower())
+
+
 def _model(key: str, value: Any) -> str:
-    name = re.sub(r"[^a-z\d]", "", str(value).lower())
-    model = _MODELS.get(re.sub(r"^(rs2)?distortion|^pinhole(?=.)", "", name))
+    model = _MODELS.get(_plain(value))
     if model is None:
         raise ValueError(f"{key}: got {shown(value)}; expected {', '.join(COEFFICIENTS)}, or another name of these")
     return model
@@ -200,6 +199,8 @@ def _numbers(key: str, value: Any) -> list[float]:
         if None not in sizes and math.prod(map(int, sizes)) != len(numbers):
             raise ValueError(f"{key}: got {len(numbers)} numbers in data; expected rows x cols = {sizes}")
         return numbers
+    if isinstance(value, str) and value.startswith("["):  # a matrix in quotation marks
+        value = parse_json(value)
     if isinstance(value, list):
         return [number for item in value for number in _numbers(key, item)]
     try:
@@ -224,8 +225,6 @@ def _size(found: Found) -> list[Any]:
 def _matrix(found: Found) -> list[float]:
     """K by rows. COLMAP and nerfstudio, which name the focal length fl_x, count pixels from the corner."""
     K, names = _numbers(*found["K"]) if "K" in found else [], ("fx", "fy", "cx", "cy")
-    if len(K) == 9 and (K[2], K[5], K[8]) == (0, 0, 1):  # by columns, as Open3D writes it
-        K = [K[3 * column + row] for row in range(3) for column in range(3)]
     if "fx" not in found and len(K) != 4:
         return K
     if missing := [name for name in names if len(K) != 4 and name not in found]:
@@ -242,8 +241,6 @@ def _lens(found: Found) -> tuple[Any, list[float]]:
     """The model, and its coefficients, with zeros for those that the file leaves out."""
     D = _numbers(*found["D"]) if "D" in found else []
     named = {name: _numbers(*found[name])[0] for name in COEFFICIENTS["rational_polynomial"] if name in found}
-    if found.get("fx", ("",))[0].endswith("mu"):  # VINS numbers the powers of a fisheye's angle
-        named = {f"k{int(name[1:]) - 1}": value for name, value in named.items()}
     if D and any(named.values()):
         raise ValueError(f"{found['D'][0]} and {', '.join(named)} are two lenses; expected one")
     flag = str(found["fisheye"][1]).lower() in ("1", "1.0", "true") if "fisheye" in found else None

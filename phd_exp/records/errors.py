@@ -13,7 +13,7 @@ from typing import Any, get_args, get_origin
 from pydantic import BaseModel, Tag, ValidationError
 from pydantic_core import ErrorDetails
 
-LONGEST_GIST = 200  # characters of an error that a message repeats
+LONGEST_GIST = 400  # characters of an error that a message repeats
 LONGEST_VALUE = 120  # characters of a value that a message repeats
 UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 """Characters that would end the line of a message, or control the terminal."""

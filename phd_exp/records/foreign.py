@@ -1,17 +1,16 @@
-"""Annotations in the formats of BOP, KITTI and COCO, as the values of `DetectionLine`s.
+"""Annotations in the formats of BOP and COCO, as the values of `DetectionLine`s.
 
     BOP      <folder>/000000/scene_gt.json, scene_gt_info.json, scene_camera.json, and rgb/000000.png or gray/; of
              several sensors scene_gt_SENSOR.json and so on, and rgb_SENSOR/, gray_SENSOR/ or SENSOR/
-    KITTI    <folder>/label_2/000000.txt, calib/000000.txt, image_2/000000.png
     COCO     <folder>/../annotations/instances_<name of the folder>.json, and the images in the folder; or one of
              the other `COCO_FILES`
 
 COCO has no cameras and no positions: `camera`, of an image or at the top for all, has the keys f, or fx and fy, cx
-and cy, and an annotation may have `position` [x, y, z]. BOP and KITTI count pixels from the centre of the first one,
-COCO and a `DetectionLine` from its corner.
+and cy, and an annotation may have `position` [x, y, z]. BOP counts pixels from the centre of the first one, COCO and a
+`DetectionLine` from its corner.
 
 Source: bop_toolkit, docs/bop_datasets_format.md (scripts/calc_gt_info.py for the width of a box) and BlenderProc,
-CameraUtility.py (the principal point); readme of KITTI's object development kit; cocodataset.org/#format-data.
+CameraUtility.py (the principal point); cocodataset.org/#format-data.
 """
 
 import os
@@ -32,7 +31,6 @@ from phd_exp.records.parsing import parse_json
 Entry = tuple[str, str, dict[str, Any]]
 """A place for messages, the name of an object, and the values of its `DetectionLine`."""
 METRE = 1000.0  # mm
-VISIBILITY = {0.0: 1.0, 1.0: 2 / 3, 2.0: 1 / 3}  # of KITTI's levels of occlusion, not measured; level 3 is unknown
 LARGEST = 1000 * MB  # bytes of a file; the instances of COCO's training images have 450 MB
 RULE = "see `Standard formats` in docs/guides/own_images.md"
 COCO_FILES = {
@@ -47,11 +45,9 @@ COCO_FILES = {
 
 
 def format_of(folder: Path) -> tuple[list[Path], Callable[[Path], Iterator[Entry]]] | None:
-    """The annotation files of a folder and the reader of their format; None if it is none of the three."""
+    """The annotation files of a folder and the reader of their format; None if it is neither."""
     if any(folder.glob("*/scene_gt*.json")):
         return sorted(folder.glob("*/scene_*.json")), _bop
-    if files := sorted(folder.glob("label_2/*.txt")):
-        return [*files, *sorted(folder.glob("calib/*.txt"))], _kitti
     for name, subfolder in COCO_FILES.items():
         file = Path(normpath(folder.absolute() / name.format(folder.absolute().name)))
         if file.exists():
@@ -70,7 +66,7 @@ def expected_in(folder: Path) -> str:
     coco = ", ".join(COCO_FILES).format(*[folder.absolute().name] * 2)
     return (
         f"no annotations; found {_names_in(folder)}; expected metadata.jsonl, */scene_gt.json (BOP), "
-        f"label_2/*.txt (KITTI), or one of {coco} (COCO); {RULE}"
+        f"or one of {coco} (COCO); {RULE}"
     )
 
 
@@ -112,38 +108,6 @@ def _bop(folder: Path) -> Iterator[Entry]:
                     rank = sum(other["obj_id"] == model for other in scene[image][:number])
                     values["scene"] = f"{file.parent.name}/{model}/{rank}"
                 yield where, str(model), _pinhole(camera["cam_K"]) | values
-
-
-def _kitti(folder: Path) -> Iterator[Entry]:
-    """All objects except `DontCare`; positions are centres of 3-D boxes in the frame of the left colour camera.
-
-    A label is the centre of the bottom in the frame of the reference camera, which P2 = K [I | t] maps to the image.
-    """
-    images = _images(folder / "image_2")
-    if not (folder / "image_2").exists():
-        boxes = "image_2/, of the left colour camera, which the boxes refer to"
-        raise DatasetError(f"{folder}: found {_names_in(folder)}; expected {boxes}; {RULE}")
-    for file in sorted(folder.glob("label_2/*.txt")):
-        calibration = folder / "calib" / file.name
-        with _reading(f"{calibration}, P2"):
-            rows = dict(line.split(":", 1) for line in _read(calibration, str.splitlines) if ":" in line)
-            K, last = np.split(np.array(rows["P2"].split(), dtype=float).reshape(3, 4), [3], axis=1)
-            camera, t = _pinhole(K.ravel().tolist()), np.linalg.solve(K, last).ravel()
-        for number, line in enumerate(_read(file, str.splitlines), start=1):
-            with _reading(where := f"{file}, line {number}"):
-                name, *words = line.split() or ["DontCare"]
-                if name == "DontCare":
-                    continue
-                truncated, occluded, _, *box, h, _, _, x, y, z, _ = map(float, words[:14])
-                left, top, right, bottom = (value + CORNER for value in box)
-                values = {
-                    "file_name": images[f"image_2/{file.stem}"],
-                    "box": [left, top, right, bottom],
-                    **dict(zip("xyz", np.add(t, (x, y - h / 2, z)).tolist(), strict=True)),
-                    "visibility": VISIBILITY.get(occluded),
-                    "truncation": truncated if truncated >= 0 else None,
-                }
-                yield where, name, camera | values
 
 
 def _coco(file: Path, subfolder: str, folder: Path) -> Iterator[Entry]:
@@ -236,9 +200,9 @@ def _reading(where: Path | str) -> Iterator[None]:
         raise DatasetError(f"{where}: cannot be read ({reason}); {RULE}") from None
 
 
-def _read(file: Path, parse: Callable[[str], Any] = parse_json) -> Any:
+def _read(file: Path) -> Any:
     with _reading(file):
-        return parse(read_plain(file, LARGEST).decode("utf-8-sig"))
+        return parse_json(read_plain(file, LARGEST).decode("utf-8-sig"))
 
 
 def _images(folder: Path) -> dict[str, str]:

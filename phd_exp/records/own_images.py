@@ -64,7 +64,7 @@ def detections_in(
 ) -> list[Detection]:
     """The first n detections of a folder's annotations, all by default, in their order.
 
-    `object_name` selects those of one object: BOP's `obj_id`, KITTI's type, or COCO's category.
+    `object_name` selects those of one object: BOP's `obj_id` or COCO's category.
 
     Raises:
         DatasetError: a file cannot be read, an entry is not a detection, there are fewer than n, or no such object.

@@ -22,7 +22,7 @@ from phd_exp.records.dataset import SPLITS, DatasetFolder
 from phd_exp.records.errors import ConfigError, DatasetError
 from phd_exp.records.own_images import DetectionFolder
 from phd_exp.records.spec import DatasetSpec
-from tests.support.foreign import write_kitti
+from tests.support.foreign import write_bop
 
 BOXED: dict[str, Any] = {"file_name": "wide.jpg", "fx": 300.0, "fy": 320.0, "cx": 70.0, "cy": 40.0, "z": 2.0}
 
@@ -122,17 +122,14 @@ def test_what_is_held_out_follows_what_is_trained_on(
     assert own.depth.mu_z0 == pytest.approx(math.sqrt(ratio.max() * ratio.min())), "of those trained on alone"
 
 
-def test_a_type_of_kitti_is_a_source(composed: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
+def test_an_object_of_bop_is_a_source(composed: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
     for split in SPLITS:
-        write_kitti(tmp_path / split)
-    words = ("preset=smoke", "data=folder", f"data.folder={tmp_path}", "data.batch_size=2", "data.object=Car")
+        write_bop(tmp_path / split)
+    words = ("preset=smoke", "data=folder", f"data.folder={tmp_path}", "data.batch_size=2", "data.object=5")
     own = build_source(check(composed(*words)).data)
-    assert own.count("train") == 2
-    assert own.known("train")["truncation"] == [0.25, 0]
-    assert own.known("test")["visibility"] == [1 / 3, None]
-    for row, detection in zip(
-        own.samples("test").xyz, DetectionFolder(tmp_path, "Car").detections("test"), strict=True
-    ):
+    assert own.count("train") == 3
+    assert own.known("test")["visibility"] == [0.75, 1, 1]
+    for row, detection in zip(own.samples("test").xyz, DetectionFolder(tmp_path, 5).detections("test"), strict=True):
         assert float(row.norm()) == pytest.approx(float(np.linalg.norm(detection.position)))
 
 

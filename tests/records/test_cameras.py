@@ -93,59 +93,22 @@ def kalibr(D: list[float], model: str) -> dict[str, Any]:
     return {"cam0": camera | {"intrinsics": [400.5, 401.2, 319.5, 239.5], "resolution": [640, 480], "rostopic": "/a"}}
 
 
-def maplab(model: str, D: list[float]) -> dict[str, Any]:
-    """A rig of one camera."""
-    camera = {"image_width": 640, "image_height": 480, "type": "pinhole", "intrinsics": matrix([*F.values()], 4, 1)}
-    lens = {"type": model, "parameters": matrix(D, len(D), 1)}
-    return {"label": "rig", "cameras": [{"camera": camera | {"distortion": lens}, "T_B_C": matrix([1.0] * 16, 4, 4)}]}
+def anipose(D: list[float], more: str = "") -> str:
+    rows = str(ROWS).replace("]", ",]")
+    lens = f"size = [ 640, 480,]\nmatrix = {rows}\ndistortions = {D}\n{more}rotation = [ 0.1, 0.2, 0.3,]\n"
+    return f'[cam_0]\nname = "A"\n{lens}translation = [ -17.68, 8.876, -34.37,]\n[metadata]\nadjusted = false\n'
 
 
 def named(names: str, values: list[float]) -> dict[str, float]:
     return dict(zip(names.split(), values, strict=True))
 
 
-def settings(values: dict[str, Any]) -> str:
-    """Settings of ORB_SLAM, which OpenCV reads without a space after a colon."""
-    lines = [f"{key}: {json.dumps(value)}" for key, value in values.items()]
-    return "\n".join(["%YAML:1.0", "# Camera", *lines, "Viewer.PointSize:2", "ORBextractor.scaleFactor: 1.2", ""])
-
-
-def prefixed(prefix: str, values: dict[str, Any]) -> dict[str, Any]:
-    return {f"{prefix}.{key}": value for key, value in values.items()}
-
-
 F = named("fx fy cx cy", [400.5, 401.2, 319.5, 239.5])
 CORNER = named("fl_x fl_y cx cy w h", [400.5, 401.2, 320.0, 240.0, 640, 480])
-SIZE = {"Camera.width": 640, "Camera.height": 480}
 BROWN, RATIONAL, KB = "plumb_bob", "rational_polynomial", "equidistant"
-FIRST, ALL, ANGLES = "k1 k2 p1 p2", "k1 k2 p1 p2 k3 k4 k5 k6", "k1 k2 k3 k4"
+FIRST = "k1 k2 p1 p2"
 ROWS = [MATRIX[:3], MATRIX[3:6], MATRIX[6:]]
-COLUMNS = [MATRIX[place] for place in (0, 3, 6, 1, 4, 7, 2, 5, 8)]
 NONE = [0.0] * 4
-PHOTON = {
-    "resolution": {"width": 640.0, "height": 480.0},
-    **{"cameraIntrinsics": matrix(MATRIX), "distCoeffs": matrix(FIVE, 1, 5)},
-    "calobjectSize": {"width": 7, "height": 7},
-    "observations": [{"pose": {"rotation": {"quaternion": {"W": 0.6, "X": 0.8}}}}],
-}
-COEFFICIENTS = named("k1 k2 k3 k4 k5 k6 p1 p2", [-0.28, 0.07, 0.01, 0, 0, 0, 5e-4, -3e-4])
-ORBBEC = {"intrinsic": F, "distortion": COEFFICIENTS, "model": 4}
-
-
-def realsense(model: Any, coefficients: list[float]) -> dict[str, Any]:
-    return named("fx fy ppx ppy", [*F.values()]) | {"model": model, "coeffs": coefficients}
-
-
-def orb_slam3(model: str, lens: dict[str, float]) -> str:
-    return settings({"Camera.type": model} | prefixed("Camera1", F | lens) | SIZE)
-
-
-def vins(model: str, projection: dict[str, float], lens: dict[str, float] | None = None) -> dict[str, Any]:
-    return {"model_type": model, "projection_parameters": projection} | (
-        {"distortion_parameters": lens} if lens else {}
-    )
-
-
 SAME: dict[str, tuple[Any, str, list[float]]] = {
     "ROS": (ros(), BROWN, FIVE),
     "ROS, yaml-cpp": (ros_with(BROWN, [*map("{:e}".format, FIVE)]), BROWN, FIVE),
@@ -169,8 +132,6 @@ SAME: dict[str, tuple[Any, str, list[float]]] = {
     "OpenCV, fisheye": (opencv("fisheye_model: 1\n", D=FISHEYE), KB, FISHEYE),
     "OpenCV, three zeros": (opencv(D=[0, 0, 0]), BROWN, NONE),
     "OpenCV, cameraMatrix": (opencv(names="cameraMatrix distCoeffs"), BROWN, FIVE),
-    "OpenCV, M1": (opencv(names="M1 D1"), BROWN, FIVE),
-    "OpenCV, M": (opencv(names="M D"), BROWN, FIVE),
     "OpenCV, K": (opencv("distortion_model: radtan\n", names="K D", D=FOUR), BROWN, FOUR),
     "OpenCV, fisheye by name": (opencv("distortion_model: fisheye\n", names="K D", D=FISHEYE), KB, FISHEYE),
     "OpenCV, XML": (xml(FIVE), BROWN, FIVE),
@@ -182,21 +143,21 @@ SAME: dict[str, tuple[Any, str, list[float]]] = {
     "Kalibr": (kalibr(FOUR, "radtan"), BROWN, FOUR),
     "Kalibr, fisheye": (kalibr(FISHEYE, "equidistant"), KB, FISHEYE),
     "Kalibr, none": (kalibr([], "none"), BROWN, NONE),
+    "Anipose": (anipose(FIVE), BROWN, FIVE),
+    "Anipose, fisheye": (anipose(FISHEYE, "fisheye = true\n"), KB, FISHEYE),
+    "cam_K.txt": ("\n".join("\t".join(map("{:.18e}".format, row)) + "\t" for row in ROWS) + "\n", BROWN, NONE),
+    "cam_K.txt, commas": ("\n".join(", ".join(map(str, row)) for row in ROWS), BROWN, NONE),
+    "fx fy cx cy": ("  400.5 401.2 319.5 239.5\n", BROWN, NONE),
+    "fx fy cx cy, DROID-SLAM": (" ".join(map(str, [400.5, 401.2, 319.5, 239.5, *FIVE])), BROWN, FIVE),
+    "JSON of NumPy, quoted": ({"K": str(ROWS), "D": str([FIVE])}, BROWN, FIVE),
     "JSON of NumPy": ({"K": ROWS, "dist": [FIVE]}, BROWN, FIVE),
     "JSON of NumPy, camera_matrix": (
         {"camera_matrix": ROWS, "dist_coeff": [FIVE], "image_size": [640, 480]},
         BROWN,
         FIVE,
     ),
-    "PhotonVision": (PHOTON, BROWN, FIVE),
     "BOP": (F | {"depth_scale": 0.1, "width": 640, "height": 480}, BROWN, NONE),
     "BOP, scene": ({"0": {"cam_K": MATRIX, "depth_scale": 1.0}, "7": {"cam_K": MATRIX}}, BROWN, NONE),
-    "Open3D": ({"width": 640, "height": 480, "intrinsic_matrix": COLUMNS}, BROWN, NONE),
-    "RealSense": (realsense("distortion.inverse_brown_conrady", [0.0] * 5), BROWN, NONE),
-    "RealSense, Brown-Conrady": (realsense("Brown Conrady", FIVE), BROWN, FIVE),
-    "RealSense, by number": (realsense(2, [0.0] * 5), BROWN, NONE),
-    "RealSense, fisheye": (realsense("kannala_brandt4", [*FISHEYE, 0.0]), KB, FISHEYE),
-    "Orbbec": (ORBBEC, RATIONAL, FIVE),
     "COLMAP": ("# Camera list\n1 OPENCV 640 480 400.5 401.2 320 240 -0.28 0.07 5e-4 -3e-4\n", BROWN, FOUR),
     "COLMAP, rational": ("1 FULL_OPENCV 640 480 400.5 401.2 320 240 " + " ".join(map(str, EIGHT)), RATIONAL, EIGHT),
     "COLMAP, fisheye": ("1 OPENCV_FISHEYE 640 480 400.5 401.2 320 240 -0.03 0.004 -0.002 0.0003\n", KB, FISHEYE),
@@ -209,20 +170,6 @@ SAME: dict[str, tuple[Any, str, list[float]]] = {
     "nerfstudio, frames": ({"frames": [CORNER | named(FIRST, FOUR)] * 2}, BROWN, FOUR),
     "nerfstudio, fisheye": (CORNER | named("k1 k2 k3 k4", FISHEYE) | {"camera_model": "OPENCV_FISHEYE"}, KB, FISHEYE),
     "instant-ngp": (CORNER | named(FIRST + " k3 k4", [*FOUR, 0, 0]) | {"is_fisheye": False}, BROWN, FOUR),
-    "maplab": (maplab("radial-tangential", FOUR), BROWN, FOUR),
-    "SVO, fisheye": (maplab("equidistant", FISHEYE), KB, FISHEYE),
-    "SVO, none": (maplab("none", []), BROWN, NONE),
-    "ORB_SLAM2": (settings(prefixed("Camera", F | named(FIRST + " k3", FIVE)) | SIZE), BROWN, FIVE),
-    "ORB_SLAM3": (orb_slam3("PinHole", named(FIRST, FOUR)), BROWN, FOUR),
-    "ORB_SLAM3, fisheye": (orb_slam3("KannalaBrandt8", named(ANGLES, FISHEYE)), KB, FISHEYE),
-    "stella_vslam": (
-        {"Camera": F | named(ANGLES, FISHEYE) | {"model": "fisheye", "cols": 640, "rows": 480}},
-        KB,
-        FISHEYE,
-    ),
-    "VINS": (vins("PINHOLE", F, named(FIRST, FOUR)), BROWN, FOUR),
-    "VINS, rational": (vins("PINHOLE_FULL", F, named(ALL, EIGHT)), RATIONAL, EIGHT),
-    "VINS, fisheye": (vins("KANNALA_BRANDT", named("k2 k3 k4 k5 mu mv u0 v0", [*FISHEYE, *F.values()])), KB, FISHEYE),
 }
 """Format -> one camera in it, and the model and coefficients that OpenCV needs for it."""
 
@@ -313,17 +260,31 @@ BAD: list[tuple[Any, str]] = [
     (named("fx fy", [1, 2]), "cx is missing: found fx, fy"),
     (F | {"K": [900, *MATRIX[1:]]}, "K and fx differ; expected the calibration of one camera alone"),
     (F | {"D": FIVE, "k1": 0.1}, "D and k1 are two lenses"),
-    (F | {"coeffs": FOUR, "model": "inverse_brown_conrady"}, "expected none for none"),
+    (F | {"D": FOUR, "camera_model": "none"}, "expected none for none"),
+    (F | {"coeffs": FOUR, "model": "inverse_brown_conrady"}, "coeffs: got [-0.28, 0.07, 0.0005, -0.0003], a part of"),
+    (F | {"D1": FOUR}, "D1: got [-0.28, 0.07, 0.0005, -0.0003], a part of a lens that is not supported"),
     (TWO, "cam0.distortion_coeffs and cam1.distortion_coeffs differ; expected the calibration of one camera alone"),
-    ({"K_left": ROWS, "K_right": [*ROWS[:2], [0, 0, 2]]}, "K_left and K_right differ"),
-    ({"model_type": "MEI", "projection_parameters": F}, "model_type: got 'MEI'; expected plumb_bob"),
-    (maplab("fisheye", [0.93]), "coefficients: got [0.93]; expected k1, k2, k3, k4 for equidistant"),
+    (
+        {"K_left": ROWS, "K_right": [*ROWS[:2], [0, 0, 2]]},
+        "no camera matrix: found K_left, K_right; expected ROS (camera_info, ost.ini), ",
+    ),
+    (
+        anipose(FOUR) + anipose(FOUR).replace("cam_0", "cam_1").replace("400.5", "900"),
+        "cam_0.matrix and cam_1.matrix",
+    ),
+    (
+        {"cameraData": [[2, {"intrinsicMatrix": ROWS, "width": 640}]]},
+        "DepthAI's calibration: write intrinsicMatrix, ",
+    ),
+    ({"FocalLength": [1200.5, 1199.8], "PrincipalPoint": [640, 358]}, "MATLAB's cameraIntrinsics: write K with both"),
+    ("{K: '[[400, 0], [0, 400]]'}\n{D: '[[0.1], [0]]'}\n", "Expecting property name enclosed in double quotes"),
+    ("400 400 320\n", "3 numbers; expected K, 3 x 3, or one line of fx fy cx cy, or with k1 k2 p1 p2; expected ROS"),
     ({"imu0": {"model": "kalibr"}}, "no camera matrix: found imu0.model"),
     ("1 FOV 640 480 400 400 320 240 0.9", "FOV with 5 parameters; expected one of SIMPLE_PINHOLE"),
     ("<calibration><f>900</f></calibration>", "XML of <calibration>; expected <opencv_storage>"),
     ("<a", "XML: "),
     ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage/>', "XML with a document type declaration"),
-    ({"camera_angle_x": 0.7, "frames": []}, "no camera matrix: found camera_angle_x, frames; expected camera_matrix"),
+    ({"camera_angle_x": 0.7, "frames": []}, "no camera matrix: found camera_angle_x, frames; expected ROS"),
     ("a: [1", "while parsing"),
     ('{"a": ', "Expecting value"),
     ("", "no camera matrix: found no keys"),

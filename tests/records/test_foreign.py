@@ -1,4 +1,4 @@
-"""BOP, KITTI and COCO as detections: conventions against the formats' own equations, and each broken in many ways."""
+"""BOP and COCO as detections: conventions against the formats' own equations, and each broken in many ways."""
 
 import json
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from phd_exp.records.detections import Detection, detections_of
 from phd_exp.records.errors import DatasetError, UserError
 from phd_exp.records.foreign import boxes_in
 from phd_exp.records.own_images import annotations, detections_in, fingerprint, observed
-from tests.support.foreign import BOP, COCO, P2, PEDESTRIAN, TURN, WRITERS, image
+from tests.support.foreign import BOP, COCO, TURN, WRITERS, image
 
 
 @pytest.fixture
@@ -62,21 +62,6 @@ def test_bop_cameras_with_poses_form_scenes_of_one_object_each(read: Callable) -
     w, x, y, z = pose.rotation
     np.testing.assert_allclose(Rotation.from_quat([x, y, z, w]).as_matrix().ravel(), TURN, atol=1e-15)
     assert pose.translation == (0.001, 2.0, 0.003)
-
-
-def test_kitti_positions_project_as_p2_says(read: Callable) -> None:
-    """y = P2 x for the middle of the 3-D box, whose bottom the label names: the baseline of P2 is in the position."""
-    found = read("kitti")
-    P = np.array(P2.split(), dtype=float).reshape(3, 4)
-    h, x, y, z = (float(PEDESTRIAN.split()[place]) for place in (8, 11, 12, 13))
-    u, v, s = P @ (x, y - h / 2, z, 1)
-    np.testing.assert_allclose(pixel(found[0], 1224, 370), (u / s + 0.5, v / s + 0.5), rtol=1e-12)
-    assert found[0].position[2] == pytest.approx(s)  # the depth in the frame of the left colour camera
-    left, top, right, bottom = found[0].box(1224, 370)
-    assert left < u / s < right
-    assert top < v / s < bottom
-    assert (left, bottom) == (712.4 + 0.5, 307.92 + 0.5)
-    assert [(d.line.visibility, d.line.truncation) for d in found] == [(1, 0), (1 / 3, 0.25), (None, 0)]
 
 
 def test_coco_boxes_cameras_and_positions(read: Callable) -> None:
@@ -164,7 +149,7 @@ def test_a_folder_without_annotations_says_what_is_there_and_what_is_read(tmp_pa
     with pytest.raises(DatasetError) as caught:
         detections_in(folder)
     assert str(caught.value).startswith(f"{folder}: no annotations; found a.xml, images/; expected metadata.jsonl, ")
-    layouts = ("*/scene_gt.json (BOP)", "label_2/*.txt (KITTI)", "../annotations/instances_voc.json", "labels.json")
+    layouts = ("*/scene_gt.json (BOP)", "../annotations/instances_voc.json", "labels.json")
     assert all(layout in str(caught.value) for layout in layouts)
 
 
@@ -176,13 +161,6 @@ def test_a_folder_near_annotations_names_theirs(tmp_path: Path, name: str, given
     (tmp_path / given).mkdir(exist_ok=True)
     with pytest.raises(DatasetError, match=r"no annotations; expected one of the folders .*: \S*/deep/test$"):
         detections_in(tmp_path / given)
-
-
-def test_boxes_of_kitti_are_not_those_of_a_grey_camera(tmp_path: Path) -> None:
-    WRITERS["kitti"](tmp_path / "test")
-    (tmp_path / "test/image_2").rename(tmp_path / "test/image_0")
-    with pytest.raises(DatasetError, match=r"test: found calib/, image_0/, label_2/; expected image_2/, of the left"):
-        detections_in(tmp_path / "test")
 
 
 def test_results_are_the_boxes_of_one_image(tmp_path: Path) -> None:
@@ -213,8 +191,7 @@ def test_results_are_the_boxes_of_one_image(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "selected", "n", "names"),
-    [("bop", 5, 3, "5, 12"), ("kitti", "Car", 2, "Car, Pedestrian"), ("coco", "cup", 1, "cup, spoon")],
+    ("name", "selected", "n", "names"), [("bop", 5, 3, "5, 12"), ("coco", "cup", 1, "cup, spoon")]
 )
 def test_an_object_is_selected(read: Callable, name: str, selected: int | str, n: int, names: str) -> None:
     assert len(read(name, selected)) == len(read(name, str(selected))) == n
@@ -240,7 +217,7 @@ def test_the_fingerprint_is_of_all_annotations(name: str, tmp_path: Path) -> Non
     for file in (file for folder in folders for file in annotations(folder)[0]):
         file.write_text(file.read_text() + "\n")
         prints.append(fingerprint(*folders))
-    assert len(set(prints)) == len(prints) == {"bop": 7, "kitti": 5, "coco": 3}[name]
+    assert len(set(prints)) == len(prints) == {"bop": 7, "coco": 3}[name]
 
 
 def bop(file: str, change: Callable[[Any], Any]) -> tuple[str, Callable[[Path], Any]]:
@@ -250,14 +227,6 @@ def bop(file: str, change: Callable[[Any], Any]) -> tuple[str, Callable[[Path], 
         (folder / "000002" / file).write_text(json.dumps(content))
 
     return "bop", spoil
-
-
-def kitti(folder: str, old: str, new: str) -> tuple[str, Callable[[Path], Any]]:
-    def spoil(root: Path) -> None:
-        file = root / folder / "000000.txt"
-        file.write_text(file.read_text().replace(old, new))
-
-    return "kitti", spoil
 
 
 def coco(change: Callable[[Any], Any]) -> tuple[str, Callable[[Path], Any]]:
@@ -283,12 +252,6 @@ BAD = [
     (bop(CAMERA, lambda camera: camera["3"].update(cam_R_w2c=[1, 0, 0, 0, 1, 0, 0, 0.1, 1])), "a rotation matrix"),
     (bop(CAMERA, lambda camera: camera["3"].update(cam_R_w2c=[np.nan, *TURN[1:]])), "a rotation matrix"),
     (("bop", lambda folder: (folder / "000002/rgb/000003.jpg").unlink()), "image 3, .*'rgb/000003' is missing"),
-    (kitti("label_2", "8.41", "far"), "line 1: cannot be read .could not convert string to float: 'far'"),
-    (kitti("label_2", "712.40 143.00", "810.73 143.00"), "line 1: box=.* positive size"),
-    (kitti("label_2", "Car 0.25", "Car 1.25"), r"line 3: truncation: got 1\.25"),
-    (kitti("calib", "P2: ", "P2: 1 "), "P2: cannot be read"),
-    (kitti("calib", "7.070493e+02", "0"), "P2: cannot be read .Singular matrix"),
-    (("kitti", lambda folder: (folder / "label_2/000000.txt").write_bytes(b"\xff")), "cannot be read"),
     (("coco", lambda folder: (folder.parent / "annotations/instances_test.json").write_text("[]")), "an object"),
     (coco(lambda content: content.pop("images")), "'images' is missing"),
     (coco(lambda content: content.pop("camera")), r"annotation 1: .*no camera; add \"camera\""),
@@ -309,5 +272,5 @@ def test_a_broken_folder_is_one_line_that_names_the_file(
     with pytest.raises(UserError, match=said) as caught:
         read(name)
     assert str(caught.value).startswith(str(tmp_path))
-    assert {"bop": "/000002", "kitti": "/000000.txt", "coco": "/instances_test.json"}[name] in str(caught.value)
+    assert {"bop": "/000002", "coco": "/instances_test.json"}[name] in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -1,6 +1,6 @@
-"""Small folders in the formats of BOP, KITTI and COCO, written by hand as their documentation describes them.
+"""Small folders in the formats of BOP and COCO, written by hand as their documentation describes them.
 
-Source: bop_toolkit, docs/bop_datasets_format.md; readme of KITTI's object development kit, and its image 000000;
+Source: bop_toolkit, docs/bop_datasets_format.md;
 https://cocodataset.org/#format-data.
 """
 
@@ -43,14 +43,6 @@ BOP: dict[str, dict[str, Any]] = {
         },
     },
 }
-P2 = "7.070493e+02 0.0 6.040814e+02 4.575831e+01 0.0 7.070493e+02 1.805066e+02 -3.454157e-01 0.0 0.0 1.0 4.981016e-03"
-PEDESTRIAN = "Pedestrian 0.00 0 -0.20 712.40 143.00 810.73 307.92 1.89 0.48 1.20 1.84 1.47 8.41 0.01"
-KITTI = [
-    PEDESTRIAN,
-    "DontCare -1 -1 -10 503.89 169.71 590.61 190.13 -1 -1 -1 -1000 -1000 -1000 -10",
-    "Car 0.25 2 1.85 387.63 181.54 423.81 203.12 1.67 1.87 3.69 -16.53 2.39 58.49 1.57",
-    "Car 0.00 3 1.85 387.63 181.54 423.81 203.12 1.67 1.87 3.69 -16.53 2.39 58.49 1.57 0.9",
-]
 COCO: dict[str, Any] = {
     "camera": {"f": 110.0},
     "images": [
@@ -80,17 +72,6 @@ def write_bop(folder: Path) -> Path:
     return folder
 
 
-def write_kitti(folder: Path) -> Path:
-    image(folder / "image_2" / "000000.png", (1224, 370))
-    for name, text in (
-        ("label_2", "\n".join(KITTI)),
-        ("calib", f"P1: {P2}\nP2: {P2}\n\nR0_rect: 1 0 0 0 1 0 0 0 1\n"),
-    ):
-        (folder / name).mkdir()
-        (folder / name / "000000.txt").write_text(text + "\n")
-    return folder
-
-
 def write_coco(folder: Path) -> Path:
     image(folder / "a.png")
     image(folder / "b.png")
@@ -99,4 +80,4 @@ def write_coco(folder: Path) -> Path:
     return folder
 
 
-WRITERS: dict[str, Callable[[Path], Path]] = {"bop": write_bop, "kitti": write_kitti, "coco": write_coco}
+WRITERS: dict[str, Callable[[Path], Path]] = {"bop": write_bop, "coco": write_coco}
