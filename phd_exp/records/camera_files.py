@@ -28,8 +28,8 @@ READ = (
     "Anipose (TOML), the numbers of K or fx fy cx cy, or JSON or YAML with K, D, distortion_model, width and height"
 )
 NOT_READ = {
-    "cameraData": "DepthAI's calibration: write intrinsicMatrix, distortionCoeff, width and height of one camera as K, "
-    "D, width and height",
+    "cameraData": "DepthAI's calibration: write intrinsicMatrix, distortionCoeff, width and height of one camera as "
+    "K, D, width and height",
     "FocalLength": "MATLAB's cameraIntrinsics: write K with both coordinates of PrincipalPoint less by one, since "
     "MATLAB counts from one, and D as k1, k2, p1, p2, k3",
 }

@@ -155,13 +155,12 @@ def require_narrow(fx: float, fy: float, width: int, height: int) -> None:
 def _found(content: Any) -> Found:
     """The quantities of a file. Raises ValueError if one has two values, or there is no focal length."""
     values = list(entries(content))
+    keys = list(dict(values))
+    if known := [text for name, text in NOT_READ.items() if any(name in key for key in keys)]:
+        raise ValueError(known[0])
     names = [_quantity(key, value) for key, value in values]
     if not {"K", "fx"} & set(names):
-        keys = list(dict(values))
-        known = [text for name, text in NOT_READ.items() if any(name in key for key in keys)]
-        raise ValueError(
-            known[0] if known else f"no camera matrix: found {listed(keys) or 'no keys'}; expected {READ}"
-        )
+        raise ValueError(f"no camera matrix: found {listed(keys) or 'no keys'}; expected {READ}")
     found: Found = {}
     for name, (key, given) in zip(names, values, strict=True):
         value = _model(key, given) if name == "model" else given

@@ -6,8 +6,8 @@
              the other `COCO_FILES`
 
 COCO has no cameras and no positions: `camera`, of an image or at the top for all, has the keys f, or fx and fy, cx
-and cy, and an annotation may have `position` [x, y, z]. BOP counts pixels from the centre of the first one, COCO and a
-`DetectionLine` from its corner.
+and cy, and an annotation may have `position` [x, y, z]. BOP counts pixels from the centre of the first one, COCO and
+a `DetectionLine` from its corner.
 
 Source: bop_toolkit, docs/bop_datasets_format.md (scripts/calc_gt_info.py for the width of a box) and BlenderProc,
 CameraUtility.py (the principal point); cocodataset.org/#format-data.

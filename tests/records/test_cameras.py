@@ -240,6 +240,7 @@ def test_a_focal_length_in_millimetres_is_refused_unless_the_lens_is_a_fisheye(f
                 detection.focal_lengths_and_centre(640, 480)
 
 
+RIG = anipose(FOUR).replace("cam_0", "cam_1").replace("400.5", "900").replace("metadata", "more")
 TWO = kalibr(FOUR, "radtan") | {"cam1": kalibr(FISHEYE, "equidistant")["cam0"]}
 BAD: list[tuple[Any, str]] = [
     (ros(camera_matrix=None), "no camera matrix: found image_width, image_height, camera_name, distortion_model"),
@@ -268,15 +269,15 @@ BAD: list[tuple[Any, str]] = [
         {"K_left": ROWS, "K_right": [*ROWS[:2], [0, 0, 2]]},
         "no camera matrix: found K_left, K_right; expected ROS (camera_info, ost.ini), ",
     ),
-    (
-        anipose(FOUR) + anipose(FOUR).replace("cam_0", "cam_1").replace("400.5", "900"),
-        "cam_0.matrix and cam_1.matrix",
-    ),
+    (anipose(FOUR) + RIG, "cam_0.matrix and cam_1.matrix"),
     (
         {"cameraData": [[2, {"intrinsicMatrix": ROWS, "width": 640}]]},
         "DepthAI's calibration: write intrinsicMatrix, ",
     ),
-    ({"FocalLength": [1200.5, 1199.8], "PrincipalPoint": [640, 358]}, "MATLAB's cameraIntrinsics: write K with both"),
+    (
+        {"FocalLength": [1200.5, 1199.8], "RadialDistortion": [640, 358]},
+        "MATLAB's cameraIntrinsics: write K with both",
+    ),
     ("{K: '[[400, 0], [0, 400]]'}\n{D: '[[0.1], [0]]'}\n", "Expecting property name enclosed in double quotes"),
     ("400 400 320\n", "3 numbers; expected K, 3 x 3, or one line of fx fy cx cy, or with k1 k2 p1 p2; expected ROS"),
     ({"imu0": {"model": "kalibr"}}, "no camera matrix: found imu0.model"),
