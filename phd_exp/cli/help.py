@@ -81,7 +81,6 @@ EXAMPLES = {
     "export": [
         "python -m phd_exp export run=runs/small/default/probabilistic/seed0",
         "python -m phd_exp export run=DIR out=network.onnx photographs=true",
-        "python -m phd_exp export run=DIR out=int8.onnx quantize=int8",
     ],
 }
 

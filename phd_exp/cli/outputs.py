@@ -64,19 +64,16 @@ def new_view(view: Path) -> None:
         view.parent.mkdir(parents=True, exist_ok=True)
 
 
-def places(out: Path | None, view: Path | None, inputs: Iterable[Path], name: str, holds: str, package: str) -> None:
+def places(out: Path | None, view: Path | None, inputs: Iterable[Path], name: str) -> None:
     """Prepare out=, a recording or a folder, and view=, a new recording for Rerun.
 
-    The message about a folder suggests the recording `name`.mcap inside it. A folder `holds` pictures or pages, which
-    the `package` makes.
+    The message about a folder suggests the recording `name`.mcap inside it.
 
-    Raises ConfigError if an output cannot be written, is an input or holds one, or if the package is missing.
+    Raises ConfigError if an output cannot be written, is an input or holds one.
     """
     if out is not None and out.suffix == MCAP:
         require_output(out, f"{name}{MCAP}", inputs)
     elif out is not None:
-        if find_spec(package) is None:
-            raise ConfigError(f"out: {holds} need `pip install 'phd_exp[report]'`; without out= there is JSON alone")
         if out.resolve() in {path if path.is_dir() else path.parent for path in map(Path.resolve, inputs)}:
             raise ConfigError(f"out={out}: holds the images themselves; choose another folder")
         output_folder(out)

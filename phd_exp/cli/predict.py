@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Iterable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -12,7 +13,7 @@ from phd_exp.cli.arguments import Coverage, Paths, loaded, predicted
 from phd_exp.cli.detecting import DetectingArguments
 from phd_exp.cli.outputs import message_file, places
 from phd_exp.records.detections import detections_of
-from phd_exp.records.errors import RunError
+from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import write_atomic
 from phd_exp.records.foreign import boxes_in
 from phd_exp.records.own_images import detections_in, images_in
@@ -72,7 +73,9 @@ def main(words: list[str]) -> int:
     arguments = PredictArguments.parsed("predict", words)
     out, detections = arguments.out, _detections(arguments)
     inputs = [detections.path] if isinstance(detections, Recording) else [one.file for one in detections]
-    places(out, arguments.view, inputs, "predictions", "pictures", "matplotlib")
+    if out is not None and out.suffix != MCAP and find_spec("matplotlib") is None:
+        raise ConfigError("out: pictures need `pip install 'phd_exp[report]'`; without out= there is JSON alone")
+    places(out, arguments.view, inputs, "predictions")
     detector = arguments.detector()  # whose mistakes need no network
     predictor = loaded(arguments, coverage=arguments.coverage)
     guarantee = predictor.guarantee(arguments.coverage, arguments.groups) if arguments.coverage else None

@@ -4,7 +4,7 @@ import json
 import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -53,7 +53,7 @@ class TrackArguments(DetectingArguments):
     least_familiar: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """leave out predictions that are more unusual than this, see familiar in the lines: the object may be hidden"""
     out: Path | None = None
-    """a folder for track.jsonl, videos and a page; or FILE.mcap for ROS 2 messages, in addition to printed lines"""
+    """a folder for track.jsonl and videos; or FILE.mcap for ROS 2 messages, in addition to printed lines"""
     view: Path | None = None
     """a new file *.rrd for the viewer Rerun: images with outlines, ellipsoids and the path in space, over time"""
 
@@ -97,7 +97,7 @@ def main(words: list[str]) -> int:
     sequences = list(_sequences(arguments))
     if out is not None and out.suffix == MCAP and len(sequences) > 1:
         raise ConfigError(f"out: got {len(sequences)} tracks; expected one track for {out}, or out=DIR")
-    places(out, arguments.view, [arguments.folder or Path(str(arguments.video))], "track", "pages", "plotly")
+    places(out, arguments.view, [arguments.folder or Path(str(arguments.video))], "track")
     predictor = loaded(arguments)
     predictor.require_densities("a path needs")  # before outputs of an earlier command are removed
     with _recording(arguments, sequences) as view:
@@ -227,20 +227,18 @@ def _write(
     out: Path,
 ) -> None:
     """Write each line before its frame of the video, whose name begins with the number of its sequence."""
-    from phd_exp.inference.path_page import write_page
     from phd_exp.inference.path_video import PathVideo
 
-    file, page = out / "track.jsonl", out / "track.html"
-    if file.exists():  # of an earlier command, which may have had more paths, or a page
-        for earlier in (*out.glob("*.mp4"), page, file):
-            if earlier in (file, page) or earlier.stem == "track" or earlier.stem.isdecimal():
+    file = out / "track.jsonl"
+    if file.exists():  # of an earlier command, which may have had more paths
+        for earlier in (*out.glob("*.mp4"), file):
+            if earlier == file or earlier.stem == "track" or earlier.stem.isdecimal():
                 earlier.unlink(missing_ok=True)
-    with ExitStack() as ends, open(file, "x", buffering=1) as lines:
-        ends.callback(write_page, file, page)  # also of the frames before an error
+    with open(file, "x", buffering=1) as lines:
         for number, (sequence, path) in enumerate(paths, start=1):
             name = "track" if len(paths) == 1 else f"{number:0{len(str(len(paths)))}}"
             with PathVideo(out / f"{name}.mp4") as video:
                 for followed in path:
                     lines.write(_line(arguments, predictor, sequence, followed) + "\n")
                     video.add(followed)
-    print(f"{file}, a video for each path{f', and {page}' * page.exists()}", file=sys.stderr)
+    print(f"{file}, and a video for each path", file=sys.stderr)

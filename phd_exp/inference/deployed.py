@@ -17,7 +17,7 @@ from phd_exp.data.areas import area_means, sums
 from phd_exp.distributions.gaussian_mixture import GaussianMixture
 from phd_exp.geometry.facing import facing, pixel_corners
 from phd_exp.inference.answers import PER_CENT
-from phd_exp.inference.predictor import BATCH, PIXELS, Predictor
+from phd_exp.inference.predictor import PIXELS, Predictor
 from phd_exp.models.heads import Prediction
 from phd_exp.optics.virtual import intrinsics
 from phd_exp.records.errors import ConfigError
@@ -47,10 +47,6 @@ class Deployed(nn.Module, ABC):
         self.networks = nn.ModuleList(predictor.networks)
 
     @abstractmethod
-    def samples(self, images: UInt8[Tensor, "n S S 3"], f: Float[Tensor, " n"]) -> Iterator[tuple[Tensor, ...]]:
-        """The inputs that show whole images of the network's size, with the principal point in the middle."""
-
-    @abstractmethod
     def cases(self) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Prediction]]:
         """Inputs on which the graph is compared with `predict`: inputs, raw numbers, predictions in float64."""
 
@@ -74,9 +70,6 @@ class OfImages(Deployed):
         raw = self.predictor.outputs(image, self.predictor.camera(f).f)
         answers = self.answers(self.predictor.predict(raw, f, self.dtype), image, f)
         return self.outputs((f > 0) & f.isfinite(), raw, answers.values())
-
-    def samples(self, images: UInt8[Tensor, "n S S 3"], f: Float[Tensor, " n"]) -> Iterator[tuple[Tensor, ...]]:
-        return zip(images.split(BATCH), f.split(BATCH), strict=True)
 
     def cases(self) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Prediction]]:
         side = self.predictor.side
@@ -125,13 +118,6 @@ class OfPhotographs(Deployed):
             here["median_along_ray"] = here.pop("median_depth")
             here["interval_along_ray"] = here.pop("depth_interval")
         return here | {"ray": R[:, 2]}
-
-    def samples(self, images: UInt8[Tensor, "n S S 3"], f: Float[Tensor, " n"]) -> Iterator[tuple[Tensor, ...]]:
-        side = float(self.predictor.side)
-        edge = side * (1 - 1 / self.predictor.margin) / 2  # the margin makes a whole view of it
-        box = torch.tensor([[edge, edge, side - edge, side - edge]], dtype=self.dtype)
-        for image, value in zip(images, f.tolist(), strict=True):
-            yield image, torch.from_numpy(intrinsics(value, value, side / 2, side / 2)).to(self.dtype), box
 
     def cases(self) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Prediction]]:
         draw, predictor = np.random.default_rng(1), self.predictor

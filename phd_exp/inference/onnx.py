@@ -17,10 +17,8 @@ from onnx_ir.passes import common as passes
 from onnxscript import optimizer
 from torch import Tensor, nn
 
-from phd_exp.data.batches import Batch
 from phd_exp.distributions.regions import PRECISIONS, level_energies
 from phd_exp.inference.deployed import Deployed, OfImages, OfPhotographs, Precision
-from phd_exp.inference.onnx_int8 import Change, measured_change, quantized
 from phd_exp.inference.predictor import Predictor
 from phd_exp.records.errors import UserError
 from phd_exp.records.files import write_atomic
@@ -67,19 +65,16 @@ def export(
     coverage: float | None = None,
     photographs: bool = False,
     precision: Precision = "float32",
-    held_out: Batch | None = None,
-) -> tuple[float, Change | None]:
+) -> float:
     """Write the file after comparing it with torch; returns the largest relative deviation.
 
     With a coverage, the metadata has the level of its regions, the `ENERGY` and its W at several depth precisions a.
-    With held-out samples the network computes in int8; the deviation is then that of the float32 network from which
-    it is made, and the change of the errors of these samples comes second.
 
-    Raises UserError, and writes no file, if the deviation exceeds the tolerance or int8 changes the errors too much.
+    Raises UserError, and writes no file, if the deviation exceeds the tolerance.
     """
     deployed = (OfPhotographs if photographs else OfImages)(predictor, precision).eval()
     metadata = _metadata(deployed) | (_region(deployed, coverage) if coverage else {})
-    model, change = graph(deployed), None  # last, because it takes half a minute
+    model = graph(deployed)  # last, because it takes half a minute
     deviation = largest_deviation(deployed, model.SerializeToString())
     if not deviation <= TOLERANCE:
         raise UserError(
@@ -87,14 +82,9 @@ def export(
             f"{'precision=float64' if precision == 'float32' else 'another version of onnxruntime or torch'} "
             "may do better"
         )
-    if held_out is not None:
-        model = quantized(model, deployed, held_out)
-        change = measured_change(model, deployed, held_out)
-        change.require_small(file)
-        metadata["int8"] = asdict(change)
     model.metadata_props.add(key=METADATA, value=json.dumps(metadata))
     write_atomic(file, model.SerializeToString())
-    return deviation, change
+    return deviation
 
 
 class AxisByAxis(nn.Module):

@@ -127,8 +127,6 @@ ARGUMENTS = [
     argument(("export",), r"run: missing; export takes run=, recalibrate=, calibration=, trust=, views=, margin=, out=, coverage=.*"),
     argument(("export", "run=.", "out=."), r"out=\.: is a folder.*"),
     argument((*EXPORT, "margin=1.2"), r"margin: enlarges boxes; expected photographs=true too"),
-    argument((*EXPORT, "quantize=int8", "coverage=0.9"), r"coverage: is guaranteed for the network in float32.*"),
-    argument((*EXPORT, "quantize=int8"), r"quantize: got a run with \d+ held-out images; expected at least 40, .*"),
     argument(("fuse", "run=nowhere"), r"folder: missing; fuse takes run=.*"),
     argument(NOWHERE, r"nowhere: no run; expected a folder with config\.yaml.*", 1, scene=1, pose=POSE),
     argument((*NOWHERE, "plane=0,0,0,1"), r"plane: .*a normal that is not zero.*", scene=1, pose=POSE),

@@ -10,7 +10,7 @@ from PIL import Image
 
 from tests.bad_input import images
 from tests.bad_input.archives import ARCHIVES
-from tests.bad_input.bad import EXPORT, LEARN, LEARN_HANDMADE, ONE, PREDICT, RUN, VERIFY, Bad
+from tests.bad_input.bad import LEARN, LEARN_HANDMADE, ONE, PREDICT, RUN, VERIFY, Bad
 from tests.bad_input.commands import ARGUMENTS, CONFIGURATIONS, nothing
 from tests.bad_input.place import Place
 from tests.support.foreign import WRITERS
@@ -90,11 +90,6 @@ BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
     f"{name}: &{name} [{','.join([f'*{before}'] * 9)}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
 )
 
-CODE = {
-    "name": "own", "n_train": 8, "n_held_out": 100, "n_test": 2, "batch_size": 4, "image_size": 32,
-    "source": {"_target_": "fractions.Fraction", "numerator": {"_target_": "os.system", "command": "touch owned"}},
-}  # fmt: skip
-"""The data section of a stranger, who would run a command."""
 KINDS = r"not an image of any kind that is read here \(PNG, .*\)"
 PICTURES = [
     photo("zero bytes", b"", KINDS),
@@ -223,7 +218,6 @@ STORED = [
     stored("a system call", rf"backbone\._target_: 'os\.system' {REFUSED}", backbone={"_target_": "os.system", "command": "touch owned"}),
     stored("what a module imports", r"backbone\._target_: .* is only imported there; .*", backbone={"_target_": "torchvision.models._api.importlib.import_module"} | {"_target_": "phd_exp.models.residual.partial"}),
     stored("a variable of the environment", r"data\.folder: got '\$\{oc\.env:HOME\}'; expected a value, .*", data__folder="${oc.env:HOME}"),
-    Bad("stored configuration: a source of code, exported in int8", lambda place: place.put_config(data=CODE), (*EXPORT, "quantize=int8"), r"quantize: got a run on a source of the user's own, whose code is not run here; .*", 2),
     stored("an abstract class", r"(backbone: .*|runs/.*/config\.yaml: describes no network \(.*\))", backbone={"_target_": "phd_exp.models.backbones.Backbone"}),
     stored("a network larger than its weights", r"runs/.*/last\.ckpt: not a whole checkpoint of this network \(.*\)", 1, backbone={"_target_": "phd_exp.models.locating.Locating", "depth": 50, "width": 64_000, "stride": 4, "channels": 64_000}),
     stored("a wrong type", r"data: got 'x'; expected a valid dictionary.*", data="x"),

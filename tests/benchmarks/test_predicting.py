@@ -12,7 +12,6 @@ import pytest
 import torch
 from PIL import Image
 
-from phd_exp.data.batches import Batch
 from phd_exp.hardware import one_thread
 from phd_exp.inference.answers import answer, sightings
 from phd_exp.inference.following import follow
@@ -104,15 +103,12 @@ def test_exported_graphs_on_one_core(
     onnxruntime = pytest.importorskip("onnxruntime", reason="needs `pip install 'phd_exp[export]'`")
     from phd_exp.inference.deployed import OfImages, pictures
     from phd_exp.inference.onnx import graph
-    from phd_exp.inference.onnx_int8 import quantized
 
     run = untrained(tmp_path / "run", composed("preset=small", "recipe=strong", "data=default"))
     predictor = load(run.path, "cpu")
     image, f = torch.from_numpy(pictures(N, predictor.side, predictor.side)), torch.full((N,), 1550.0)
-    batch = Batch(image, torch.zeros(N, 3), f, float(predictor.side), torch.arange(N))
     deployed = {name: OfImages(predictor, name).eval() for name in ("float32", "float64")}
     graphs = {name: graph(one) for name, one in deployed.items()}
-    graphs["int8"] = quantized(graphs["float32"], deployed["float32"], batch)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     sessions = {name: onnxruntime.InferenceSession(one.SerializeToString(), options) for name, one in graphs.items()}
@@ -126,5 +122,5 @@ def test_exported_graphs_on_one_core(
     speed = {name: 32 / median(one[1:]) for name, one in seconds.items()}
     for name, value in speed.items():
         ratio = value / speed["float64"]
-        record(f"exported graph, {name}", f"{value:.0f} images/s", "float64", f"{ratio:.2f}", "0.9, int8: none")
+        record(f"exported graph, {name}", f"{value:.0f} images/s", "float64", f"{ratio:.2f}", "0.9")
     assert speed["float32"] > 0.9 * speed["float64"]
