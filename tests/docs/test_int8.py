@@ -28,11 +28,12 @@ class Network(nn.Module):
         return self.convolutions(image.permute(0, 3, 1, 2).float()).mean((1, 2, 3)) * f
 
 
+@pytest.mark.filterwarnings("ignore")  # of torch about the way it exports
 def test_the_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     images, f = np.random.default_rng(0).integers(0, 256, (8, 16, 16, 3), np.uint8), np.ones(8, np.float32)
     given = torch.from_numpy(images), torch.from_numpy(f)
-    torch.onnx.export(Network().float(), given, "network.onnx", input_names=["image", "f"], dynamo=True)
+    torch.onnx.export(Network().float().eval(), given, "network.onnx", input_names=["image", "f"], dynamo=True)
     logging.disable(logging.WARNING)  # onnxruntime advises to prepare the graph
     exec(EXAMPLE, {"images": images, "f": f})
     logging.disable(logging.NOTSET)
