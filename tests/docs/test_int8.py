@@ -39,6 +39,6 @@ def test_the_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     logging.disable(logging.NOTSET)
     graph = onnx.load("int8.onnx").graph
     makers = {output: node.op_type for node in graph.node for output in node.output}
-    assert [makers.get(node.input[0]) == "DequantizeLinear" for node in graph.node if node.op_type == "Conv"] == [
+    assert [makers.get(node.input[1]) == "DequantizeLinear" for node in graph.node if node.op_type == "Conv"] == [
         False, True, True, False, False,
     ]  # fmt: skip
