@@ -38,8 +38,8 @@ _SECTION = re.compile(r"\[([A-Za-z][^\]\"'{}:,]*)\]")
 _ROW = re.compile(r"\d+\s+[A-Z_]+\s+\d+\s+\d+(\s+[-+.\deE]+)+")
 _OF_OPENCV = re.compile(r"^%YAML.*$|!!opencv-(nd-)?matrix", re.MULTILINE)
 _NO_SPACE = re.compile(r"^(\s*[\w.]+):(?=[\w\[-])", re.MULTILINE)  # which OpenCV does not need
-_ELSEWHERE = ("roi", "rotation", "quaternion", "orientation")
-"""Sections whose width, height and w are not those of the image."""
+_ELSEWHERE = ("rotation", "quaternion", "orientation")
+"""Sections whose w is not the width of the image."""
 
 
 def content_of(text: str) -> Any:
@@ -69,8 +69,10 @@ def _content_of(text: str) -> Any:
 
 
 def entries(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """All values with their keys, those of outer containers before a dot; OpenCV's and ROS's matrices are values."""
-    if isinstance(node, dict) and "data" not in node:
+    """All values with their keys, those of outer containers before a dot; OpenCV's and ROS's matrices are values, and
+    so is ROS's region of interest.
+    """
+    if isinstance(node, dict) and not {"data", "x_offset"} & node.keys():
         for name, inner in node.items():
             if name not in _ELSEWHERE:
                 yield from entries(inner, f"{key}.{name}" if key else str(name))

@@ -43,6 +43,7 @@ NAMES = {
     "D": "d dist distcoeff distcoeffs distortion distortions distortioncoeffs distortioncoefficients",
     "model": "distortionmodel cameramodel",
     "fisheye": "fisheyemodel isfisheye fisheye",
+    **{"binning_x": "binningx", "binning_y": "binningy", "roi": "roi"},
     **{name: name for name in COEFFICIENTS["rational_polynomial"]},
 }
 """Quantity -> its names in files, in small letters and digits."""
@@ -111,11 +112,52 @@ def read_camera(path: Path) -> Calibration:
         raise DatasetError(f"{path}: {gist(error)}; see `Lenses` in docs/guides/own_images.md") from None
 
 
-def calibration_in(content: Any) -> Calibration:
-    """The calibration in the content of a camera file. Raises ValueError if there is none."""
+def calibration_in(content: Any, image: tuple[int, int] | None = None) -> Calibration:
+    """The calibration in the content of a camera file. Raises ValueError if there is none.
+
+    `image` is the size of the images, where it is known.
+    """
     found = _found(content)
     (width, height), (model, D) = _size(found), _lens(found)
-    return Calibration(width=width, height=height, K=tuple(_matrix(found)), D=tuple(D), model=model)
+    sensor = Calibration(width=width, height=height, K=tuple(_matrix(found)), D=tuple(D), model=model)
+    return _read_out(sensor, found, image)
+
+
+def _read_out(sensor: Calibration, found: Found, image: tuple[int, int] | None) -> Calibration:
+    """The camera of the pixels that ROS's region of interest and binning leave of a sensor.
+
+    The region is in pixels of the sensor; a binned pixel covers a rectangle of them. Raises ValueError if the images
+    have another size. Some drivers give the size of their images as that of the sensor, which is accepted where the
+    principal point is then nearer to the middle.
+
+    Source: the definition of sensor_msgs/CameraInfo.
+    """
+    region = found.get("roi", ("roi", {}))[1]
+    x, y, width, height = (_whole("roi", region.get(key, 0)) for key in ("x_offset", "y_offset", "width", "height"))
+    bins = [max(1, _whole(*found[name]) if name in found else 1) for name in ("binning_x", "binning_y")]
+    if (x, y, width, height, *bins) == (0, 0, 0, 0, 1, 1):
+        return sensor
+    size, full = np.array([width or sensor.width or 0, height or sensor.height or 0]) // bins, sensor.intrinsics
+    scaled = np.diag([*np.divide(1, bins), 1]) @ (full - [[0, 0, x], [0, 0, y], [0, 0, 0]])
+    if image and tuple(size) != image:
+        away = [np.linalg.norm(K[:2, 2] - np.divide(image, 2)) for K in (scaled, full)]
+        if image != (sensor.width, sensor.height) or away[0] > away[1]:
+            raise ValueError(
+                f"binning {bins[0]} x {bins[1]} and the region of {width} x {height} pixels at ({x}, {y}) of "
+                f"{sensor.width} x {sensor.height} make no images of {image[0]} x {image[1]}; expected width, height "
+                "and K of the whole sensor"
+            )
+        size = np.array(image)
+    scaled[:2, 2] -= CORNER
+    return Calibration(
+        width=int(size[0]) or None, height=int(size[1]) or None, K=tuple(scaled.ravel().tolist()),
+        D=sensor.D, model=sensor.model,
+    )  # fmt: skip
+
+
+def _whole(key: str, value: Any) -> int:
+    (number,) = _numbers(key, value)
+    return int(number)
 
 
 def calibration(given: Any) -> Calibration | None:

@@ -6,25 +6,33 @@ ROS 2, not by those in a stranger's file.
 Source: the definitions of sensor_msgs; image_pipeline's names of topics.
 """
 
+import io
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 from pydantic import ValidationError
 
 from phd_exp.records.cameras import Calibration, calibration_in, read_camera
 from phd_exp.records.detections import Detection, RecordedImage, line_of
 from phd_exp.records.errors import UNPRINTABLE, DatasetError, UserError, gist, listed, one_line, shown
 from phd_exp.records.files import require_plain
+from phd_exp.records.images import FORMATS, decoding, pillow_warnings
 from phd_exp.records.messages import COMPRESSED, INFO, RAW, SECOND, require_rosbags, typestore
 
 MCAP = ".mcap"
-FILES = (MCAP, ".db3")
-ENCODINGS = {"mono8": 1, "rgb8": 3, "bgr8": 3}
-"""Encoding of an image that is not compressed -> bytes a pixel."""
+ROS_1 = ".bag"
+FILES = (MCAP, ".db3", ROS_1)
+GREY, RGB, BGR = [0], [0, 1, 2], [2, 1, 0]
+ENCODINGS = {
+    **{"mono8": (1, GREY), "8UC1": (1, GREY), "mono16": (2, GREY)},
+    **{"rgb8": (3, RGB), "bgr8": (3, BGR), "8UC3": (3, BGR), "rgba8": (4, RGB), "bgra8": (4, BGR)},
+}
+"""Encoding of an image that is not compressed -> bytes a pixel, and the places of its colours; 8UC3 as in OpenCV."""
 RECTIFIED = "image_rect"
 """Beginning of the names of topics whose images have no distortion, and the camera P instead of K."""
 
@@ -75,7 +83,8 @@ class Recording:
         infos, calibration = None, None
         if camera.keys() <= {"box"}:
             infos = _info_of(path, images, given, [one for one, kind in topics.items() if kind == INFO])
-            calibration = _calibration(path, images, infos, _first(path, infos)[1])
+            size = _size_of(_first(path, images)[1])
+            calibration = _calibration(path, images, infos, _first(path, infos)[1], size)
             camera = {"camera": infos, **camera}
         elif "camera" in camera:
             calibration = read_camera(Path(camera["camera"]))
@@ -92,12 +101,14 @@ class Recording:
     def __iter__(self) -> Iterator[Detection]:
         """The images one by one. Raises DatasetError, after those before, where one cannot be read."""
         n = 0
+        camera = self.template.calibration
         for time, topic, message in _messages(self.path, [self.topic, *([self.infos] if self.infos else [])]):
             time = _time(message, time)
             stamp = f"{time // SECOND}.{time % SECOND:09}"
             where = f"{self.path}, {topic} at {stamp}"
             if topic == self.infos:
-                if _calibration(self.path, self.topic, topic, message) != self.template.calibration:
+                size = (camera.width, camera.height) if camera and camera.width and camera.height else None
+                if _calibration(self.path, self.topic, topic, message, size) != camera:
                     raise DatasetError(f"{where}: the camera changes; expected one camera; cut the recording there")
                 continue
             image = RecordedImage(_image_file(where, message), time, str(message.header.frame_id))
@@ -131,16 +142,26 @@ def _info_of(path: Path, images: str, name: str, topics: list[str]) -> str:
     )
 
 
-def _calibration(path: Path, images: str, infos: str, message: Any) -> Calibration:
+def _calibration(path: Path, images: str, infos: str, message: Any, image: tuple[int, int] | None) -> Calibration:
     """The camera of a `camera_info`; ROS counts pixels from the centre of the first one, as camera files do."""
-    size = {"width": message.width, "height": message.height}
+    sensor = {name: getattr(message, name) for name in ("width", "height", "binning_x", "binning_y")}
+    sensor["roi"] = vars(message.roi)
     camera = {"K": message.k.tolist(), "D": message.d.tolist(), "distortion_model": message.distortion_model}
     if images.removesuffix("/compressed").rpartition("/")[2].startswith(RECTIFIED):
         camera = {"K": message.p.reshape(3, 4)[:, :3].ravel().tolist(), "D": []}
     try:
-        return calibration_in(size | camera)
+        return calibration_in(sensor | camera, image)
     except (ValueError, ValidationError) as error:
         raise DatasetError(f"{path}, {infos}: {gist(error)}; expected a calibrated camera, or camera=FILE") from None
+
+
+def _size_of(message: Any) -> tuple[int, int] | None:
+    """Width and height of an image; None if it is broken, which its reading reports."""
+    if message.__msgtype__ != COMPRESSED:
+        return message.width, message.height
+    with suppress(DatasetError), pillow_warnings(), decoding(Path()):
+        return Image.open(io.BytesIO(bytes(message.data)), formats=FORMATS).size
+    return None
 
 
 def _time(message: Any, recorded: int) -> int:
@@ -150,14 +171,16 @@ def _time(message: Any, recorded: int) -> int:
 
 
 def _image_file(where: str, message: Any) -> bytes:
-    """The bytes of an image file: those of a compressed image, or a PPM with the pixels of another one."""
+    """The bytes of an image file: those of a compressed image, or a PPM or TIFF with the pixels of another one."""
     if message.__msgtype__ == COMPRESSED:
         return bytes(message.data)
-    encoding, bands = message.encoding, ENCODINGS.get(message.encoding)
-    if bands is None:
+    encoding = message.encoding
+    bands, colours = ENCODINGS.get(encoding, (0, GREY))
+    if not bands:
+        remedy = "debayer it with image_proc" if "bayer" in encoding else "convert it with cv_bridge"
         raise DatasetError(
             f"{where}: got the encoding {shown(encoding)}; expected {', '.join(ENCODINGS)}, or a compressed image; "
-            "convert it with image_proc or cv_bridge"
+            f"{remedy}"
         )
     height, width, step = message.height, message.width, message.step
     if not 0 < width * bands <= step or height * step != len(message.data):
@@ -166,8 +189,13 @@ def _image_file(where: str, message: Any) -> bytes:
             "expected height x step"
         )
     pixels = message.data.reshape(height, step)[:, : width * bands].reshape(height, width, bands)
-    pixels = pixels[..., ::-1] if encoding == "bgr8" else pixels
-    return b"P%d %d %d 255\n" % (5 if bands == 1 else 6, width, height) + np.ascontiguousarray(pixels).tobytes()
+    if bands == 2:
+        order = ">u2" if message.is_bigendian else "<u2"
+        stream = io.BytesIO()
+        Image.fromarray(np.ascontiguousarray(pixels).view(order)[..., 0].astype(np.uint16)).save(stream, "TIFF")
+        return stream.getvalue()
+    kind = 5 if colours == GREY else 6
+    return b"P%d %d %d 255\n" % (kind, width, height) + np.ascontiguousarray(pixels[..., colours]).tobytes()
 
 
 def _first(path: Path, topic: str) -> tuple[int, Any]:
@@ -201,6 +229,8 @@ def _opened(path: Path) -> Iterator[Any]:
     """The recording as rosbags reads it."""
     from rosbags.rosbag2 import Reader
 
+    if path.suffix == ROS_1:
+        raise DatasetError(f"{path}: a bag of ROS 1; `rosbags-convert --src {path} --dst FOLDER` makes one of ROS 2")
     with _reading(path):
         if not path.is_dir():
             require_plain(path)

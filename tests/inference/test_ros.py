@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from phd_exp.data.crops import read_image
 from phd_exp.inference import answers
 from phd_exp.records.errors import DatasetError
 from phd_exp.records.messages import RAW, SECOND, UNKNOWN, typestore
-from phd_exp.records.recordings import Recording
+from phd_exp.records.recordings import ENCODINGS, Recording
 from phd_exp.records.runs import RunFolder
 from tests.support.recordings import FRAME, Message, compressed, image, info, read, time_of, write
 from tests.support.untrained import NOWHERE, read_lines
@@ -220,6 +221,57 @@ def test_images_of_all_encodings_are_those_of_files(
     assert rows == [{key: row[key] for key in row if key != "file_name"} for row in read_lines(expected.out)]
 
 
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_pixels_do_not_depend_on_their_encoding(tmp_path: Path, encoding: str) -> None:
+    (picture,) = pictures(1)
+    is_grey = encoding in ("mono8", "8UC1", "mono16")
+    write(tmp_path / "a.mcap", [CAMERA, image(picture[..., 0] if is_grey else picture, encoding, START)])
+    (found,) = Recording.of(tmp_path / "a.mcap", None, {})
+    expected = np.repeat(picture[..., :1], 3, axis=2) if is_grey else picture
+    np.testing.assert_array_equal(np.asarray(read_image(found.file, found.content)), expected)
+
+
+def region(x: int, y: int, width: int, height: int) -> dict[str, Any]:
+    return {"x_offset": x, "y_offset": y, "width": width, "height": height, "do_rectify": False}
+
+
+SENSOR = ((256, 144), (400.0, 0, 120.0, 0, 410.0, 70.0, 0, 0, 1))
+READ_OUT: dict[str, tuple[tuple[int, int], dict[str, Any], tuple[float, float, float, float]]] = {
+    "nothing": ((256, 144), {}, (1, 1, 0, 0)),
+    "the whole region": ((256, 144), {"roi": region(0, 0, 256, 144)}, (1, 1, 0, 0)),
+    "binning": ((64, 48), {"binning_x": 4, "binning_y": 3}, (4, 3, 0, 0)),
+    "a region": ((64, 48), {"roi": region(90, 40, 64, 48)}, (1, 1, 90, 40)),
+    "a binned region": ((64, 48), {"roi": region(40, 20, 128, 96), "binning_x": 2, "binning_y": 2}, (2, 2, 40, 20)),
+    "a region, the size of the image": (
+        (64, 48),
+        {"roi": region(90, 40, 64, 48), "width": 64, "height": 48},
+        (1, 1, 90, 40),
+    ),
+    "binning, the size of the image": (
+        (64, 48),
+        {"binning_x": 4, "binning_y": 3, "width": 64, "height": 48},
+        (4, 3, 0, 0),
+    ),
+}
+"""Size of the images, fields of `camera_info`, and what follows from its definition: binning and offset."""
+
+
+@pytest.mark.parametrize("name", READ_OUT)
+@pytest.mark.parametrize("is_compressed", [False, True], ids=["raw", "compressed"])
+def test_a_camera_is_that_of_the_pixels_that_are_read_out(tmp_path: Path, name: str, is_compressed: bool) -> None:
+    """A pixel covers a rectangle of those of the sensor: its corner lies at (offset + binning times the corner)."""
+    (width, height), fields, (bin_x, bin_y, x, y) = READ_OUT[name]
+    picture = np.full((height, width, 3), 90, np.uint8)
+    shot = compressed(png(picture), "png", START) if is_compressed else image(picture, "rgb8", START)
+    write(tmp_path / "a.mcap", [info(*SENSOR, START, **fields), shot])
+    (found,) = Recording.of(tmp_path / "a.mcap", None, {})
+    fx, fy, cx, cy = found.focal_lengths_and_centre(width, height)
+    xyz = np.array([0.3, -0.2, 2.0])
+    on_sensor = 410 * xyz[1] / xyz[2] + 70.5
+    assert bin_y * (cy + fy * xyz[1] / xyz[2]) + y == pytest.approx(on_sensor)
+    assert bin_x * (cx + fx * xyz[0] / xyz[2]) + x == pytest.approx(400 * xyz[0] / xyz[2] + 120.5)
+
+
 def test_a_path_has_the_times_of_the_recording(phd_exp: Callable, run: str, tmp_path: Path) -> None:
     recorded(tmp_path / "a.mcap")
     outcome = phd_exp("track", run, "folder=a.mcap", "box=8,12,32,38", "stride=2", "lag=4", "out=b.mcap")
@@ -332,13 +384,25 @@ SPOILED: dict[str, tuple[Callable[[Path], Any], str, int]] = {
         lambda file: write(file, [SHOT, NOT_CALIBRATED]),
         r"/front/camera_info: .*camera matrix: got .*; expected a calibrated camera, or camera=FILE", 0,
     ),
+    "a camera that is binned already": (
+        lambda file: write(file, [SHOT, info((WIDTH, HEIGHT), K, START, binning_x=2, binning_y=2)]),
+        r"binning 2 x 2 and the region of 0 x 0 .* of 64 x 48 make no images of 64 x 48; expected .* sensor", 0,
+    ),
+    "a region of another size": (
+        lambda file: write(file, [SHOT, info(*SENSOR, START, roi=region(8, 8, 32, 32))]),
+        r"the region of 32 x 32 pixels at \(8, 8\) of 256 x 144 make no images of 64 x 48", 0,
+    ),
     "a lens of no known model": (
         lambda file: write(file, [SHOT, THIN]),
         r"/front/camera_info: distortion_model: got 'thin'; expected plumb_bob, rational_polynomial, equidistant", 0,
     ),
     "an encoding": (
         lambda file: write(file, [CAMERA, SHOT, DEPTH]),
-        r"at 1700000000.123456798: got the encoding '16UC1'; expected mono8, rgb8, bgr8, or a compressed image", 1,
+        r"at 1700000000.123456798: got the encoding '16UC1'; expected mono8, .*, or a compressed image; convert", 1,
+    ),
+    "a Bayer pattern": (
+        lambda file: write(file, [CAMERA, image(pictures(1)[0][..., 0], "bayer_rggb8", START)]),
+        r"got the encoding 'bayer_rggb8'; expected .*; debayer it with image_proc", 0,
     ),
     "too few bytes": (
         lambda file: write(file, [CAMERA, SHORT]),
@@ -377,6 +441,13 @@ def test_a_bad_recording_is_refused_on_one_line(phd_exp: Callable, run: str, tmp
     assert line.startswith("error: a.mcap")
     assert re.search(said, line), line
     assert len(read_lines(outcome.out)) == kept
+
+
+def test_a_bag_of_ros_1_is_named() -> None:
+    with pytest.raises(
+        DatasetError, match=r"b\.bag: a bag of ROS 1; `rosbags-convert --src b\.bag --dst FOLDER` makes"
+    ):
+        Recording.of(Path("b.bag"), None, {})
 
 
 def test_damage_anywhere_is_found_or_does_not_matter(tmp_path: Path) -> None:

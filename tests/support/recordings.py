@@ -21,8 +21,10 @@ class Message(NamedTuple):
 
 
 def image(array: np.ndarray, encoding: str, time: int, topic: str = "/front/image_raw", padding: int = 3) -> Message:
-    """An image that is not compressed, of RGB pixels or grey ones, with bytes between the rows."""
-    stored = array[..., ::-1] if encoding == "bgr8" else array
+    """An image that is not compressed, of RGB pixels or grey ones, with bytes between the rows; alpha is 0."""
+    stored = array[..., ::-1] if encoding in ("bgr8", "bgra8", "8UC3") else array
+    stored = np.pad(stored, ((0, 0), (0, 0), (0, 1))) if encoding in ("rgba8", "bgra8") else stored
+    stored = (array * np.uint16(256)).astype("<u2").view(np.uint8) if encoding == "mono16" else stored
     height, width = array.shape[:2]
     rows = np.pad(stored.reshape(height, -1), ((0, 0), (0, padding)))
     content = {"height": height, "width": width, "encoding": encoding, "is_bigendian": 0, "step": rows.shape[1]}
