@@ -1,7 +1,8 @@
 """Annotations in the formats of BOP and COCO, as the values of `DetectionLine`s.
 
     BOP      <folder>/000000/scene_gt.json, scene_gt_info.json, scene_camera.json, and rgb/000000.png or gray/; of
-             several sensors scene_gt_SENSOR.json and so on, and rgb_SENSOR/, gray_SENSOR/ or SENSOR/
+             several sensors scene_gt_SENSOR.json and so on, and rgb_SENSOR/, gray_SENSOR/ or SENSOR/; or of each
+             image 000000.gt.json, 000000.gt_info.json, 000000.camera.json, and 000000.rgb.png
     COCO     <folder>/../annotations/instances_<name of the folder>.json, and the images in the folder; or one of
              the other `COCO_FILES`
 
@@ -14,18 +15,22 @@ CameraUtility.py (the principal point); cocodataset.org/#format-data.
 """
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
+from itertools import chain
 from os.path import normpath
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from phd_exp.records.cameras import CORNER
 from phd_exp.records.errors import DatasetError, gist, listed
 from phd_exp.records.files import MB, read_plain
+from phd_exp.records.images import FORMATS, decoding, pillow_warnings
+from phd_exp.records.mesh_files import read_mesh
 from phd_exp.records.parsing import parse_json
 
 Entry = tuple[str, str, dict[str, Any]]
@@ -46,8 +51,10 @@ COCO_FILES = {
 
 def format_of(folder: Path) -> tuple[list[Path], Callable[[Path], Iterator[Entry]]] | None:
     """The annotation files of a folder and the reader of their format; None if it is neither."""
-    if any(folder.glob("*/scene_gt*.json")):
-        return sorted(folder.glob("*/scene_*.json")), _bop
+    if any(folder.glob("*/scene_gt*.json")) or any(folder.glob("*/*.gt.json")):
+        listing = _targets(folder)
+        parts = [*folder.glob("*/scene_*.json"), *folder.glob("*/*.gt.json"), *folder.glob("*/*.camera.json")]
+        return sorted([*parts, *folder.glob("*/*.gt_info.json"), *([listing] if listing else [])]), _bop
     for name, subfolder in COCO_FILES.items():
         file = Path(normpath(folder.absolute() / name.format(folder.absolute().name)))
         if file.exists():
@@ -76,38 +83,121 @@ def _names_in(folder: Path) -> str:
 
 
 def _bop(folder: Path) -> Iterator[Entry]:
-    """The visible instances; positions are those of the models' origins, boxes contain what a detector could find."""
-    for file in sorted(folder.glob("*/scene_gt*.json")):
-        sensor = file.stem.removeprefix("scene_gt")
-        if sensor.startswith("_info"):
-            continue
-        parts = (file.with_name(f"scene_{name}{sensor}.json") for name in ("camera", "gt_info", "gt"))
-        cameras, infos, scene = map(_read, parts)
-        kinds = (f"rgb{sensor}", sensor.removeprefix("_"), f"gray{sensor}")
-        kind = next((name for name in kinds if name and file.with_name(name).exists()), kinds[-1])
-        images = _images(file.with_name(kind))
-        with _reading(f"{file} and scene_gt_info.json"):
-            pairs = {image: list(zip(items, infos[image], strict=True)) for image, items in scene.items()}
-            objects = [(image, *found) for image, items in pairs.items() for found in enumerate(items)]
-        for image, number, (item, info) in objects:
-            with _reading(where := f"{file.parent}, image {image}, object {number}"):
-                camera, model = cameras[image], item["obj_id"]
+    """The visible instances; positions are those of the models' origins, boxes contain what a detector could find.
+
+    Of a folder `test*` with BOP's list of targets next to it, those alone.
+    """
+    wanted, n, n_visible = None, 0, 0
+    if listing := _targets(folder):
+        with _reading(listing):
+            wanted = {(one["scene_id"], one["im_id"], one["obj_id"]) for one in _read(listing)}
+    for image, file, camera, items, infos in chain(_scenewise(folder), _imagewise(folder)):
+        scene = file.relative_to(folder).parts[0]
+        with _reading(f"{folder / scene}, image {image}"):
+            pairs = list(zip(items, infos, strict=True))
+        for number, (item, info) in enumerate(pairs):
+            with _reading(where := f"{folder / scene}, image {image}, object {number}"):
+                model, n = item["obj_id"], n + 1
                 left, top, width, height = info["bbox_visib"]
-                if width < 0:  # invisible objects have the box -1, -1, -1, -1
+                # invisible objects have the box -1, -1, -1, -1
+                if width < 0 or (wanted is not None and (int(scene), image, model) not in wanted):
                     continue
+                n_visible += 1
                 values = {
-                    "file_name": f"{file.parent.name}/{images[f'{kind}/{int(image):06d}']}",
+                    "file_name": file.relative_to(folder).as_posix(),
                     "box": [left, top, left + width + 1, top + height + 1],  # a width is last minus first column
                     **dict(zip("xyz", (value / METRE for value in item["cam_t_m2c"]), strict=True)),
-                    "visibility": info["visib_fract"],
+                    "visibility": info.get("visib_fract"),
                     "scale": item.get("scale"),  # written by `rendering/bop.py`
                 }
                 if "cam_R_w2c" in camera:
                     translation = [value / METRE for value in camera["cam_t_w2c"]]
                     values["pose"] = {"rotation": _quaternion(camera["cam_R_w2c"]), "translation": translation}
-                    rank = sum(other["obj_id"] == model for other in scene[image][:number])
-                    values["scene"] = f"{file.parent.name}/{model}/{rank}"
+                    rank = sum(other["obj_id"] == model for other in items[:number])
+                    values["scene"] = f"{scene}/{model}/{rank}"
                 yield where, str(model), _pinhole(camera["cam_K"]) | values
+    if n and not n_visible:
+        here = f" and in {listing.name}" if listing else ""
+        raise DatasetError(
+            f"{folder}: {n} objects, none of them visible{here} (bbox_visib is -1, -1, -1, -1); {RULE}"
+        )
+
+
+def _targets(folder: Path) -> Path | None:
+    file = folder.parent / "test_targets_bop19.json"
+    return file if folder.name.startswith("test") and file.exists() else None
+
+
+Pictured = tuple[int, Path, dict[str, Any], list[dict[str, Any]], Iterable[dict[str, Any]]]
+"""Number and file of an image of BOP, its camera, and the `gt` and `gt_info` of its objects."""
+
+
+def _scenewise(folder: Path) -> Iterator[Pictured]:
+    for file in sorted(folder.glob("*/scene_gt*.json")):
+        sensor = file.stem.removeprefix("scene_gt")
+        if sensor.startswith("_info"):
+            continue
+        folders = [
+            file.with_name(name) for name in (f"rgb{sensor}", sensor.removeprefix("_"), f"gray{sensor}") if name
+        ]
+        place = next((one for one in folders if one.exists()), folders[-1])
+        pictures = {picture.stem: picture for picture in sorted(place.glob("*.*"))}
+        calibrated, described = (file.with_name(f"scene_{name}{sensor}.json") for name in ("camera", "gt_info"))
+        scene, cameras = _by_image(file), _by_image(calibrated)
+        infos = _by_image(described) if described.exists() else None
+        for image, items in scene.items():
+            camera, picture = _of(image, calibrated, cameras), _of(f"{image:06d}", place, pictures)
+            masks = file.with_name(f"mask_visib{sensor}") / picture.stem
+            known = _without_info(folder, masks, camera, items) if infos is None else _of(image, described, infos)
+            yield image, picture, camera, items, known
+
+
+def _of(image: int | str, place: Path, found: dict[Any, Any]) -> Any:
+    with _reading(f"{place}, image {image}"):
+        return found[image]
+
+
+def _imagewise(folder: Path) -> Iterator[Pictured]:
+    for file in sorted(folder.glob("*/*.gt.json")):
+        stem = file.name.removesuffix(".gt.json")
+        items, camera, known = (_read(file.with_name(f"{stem}.{name}.json")) for name in ("gt", "camera", "gt_info"))
+        with _reading(file):
+            pictures = sorted([*file.parent.glob(f"{stem}.rgb.*"), *file.parent.glob(f"{stem}.gray.*")])
+            yield int(stem.rpartition("_")[2]), pictures[0], camera, items, known
+
+
+def _by_image(file: Path) -> dict[int, Any]:
+    """The values by the number of the image, whose key may have zeros before it."""
+    content = _read(file)
+    with _reading(file):
+        return {int(image): value for image, value in content.items()}
+
+
+def _without_info(
+    folder: Path, masks: Path, camera: dict[str, Any], items: list[dict[str, Any]]
+) -> Iterator[dict[str, Any]]:
+    """The boxes of the objects of an image: of `mask_visib/`, or else of all vertices of their models."""
+    for number, item in enumerate(items):
+        mask, name = Path(f"{masks}_{number:06d}.png"), f"models*/obj_{item['obj_id']:06d}.ply"
+        if mask.exists():
+            with decoding(mask), pillow_warnings(), Image.open(mask, formats=FORMATS) as image:
+                left, top, right, bottom = image.getbbox() or (-1, -1, -1, -1)
+        elif models := sorted(folder.parent.glob(name)):
+            to_camera, K = np.reshape(item["cam_R_m2c"], (3, 3)), np.reshape(camera["cam_K"], (3, 3))
+            u = (_vertices(models[0]) @ to_camera.T + item["cam_t_m2c"]) @ K.T
+            if not (u[:, 2] > 0).all():
+                raise ValueError(f"{models[0].name} reaches behind the camera")
+            pixels = u[:, :2] / u[:, 2:] + CORNER
+            left, top, right, bottom = *pixels.min(axis=0).tolist(), *pixels.max(axis=0).tolist()
+        else:
+            written = "scene_gt_info.json, which bop_toolkit's calc_gt_info.py writes"
+            raise ValueError(f"expected {written}, {mask}, or {folder.parent / name}")
+        yield {"bbox_visib": [left, top, right - left - 1, bottom - top - 1]}
+
+
+@cache
+def _vertices(model: Path) -> Any:
+    return np.concatenate(read_mesh(model).coordinates())
 
 
 def _coco(file: Path, subfolder: str, folder: Path) -> Iterator[Entry]:
@@ -203,11 +293,6 @@ def _reading(where: Path | str) -> Iterator[None]:
 def _read(file: Path) -> Any:
     with _reading(file):
         return parse_json(read_plain(file, LARGEST).decode("utf-8-sig"))
-
-
-def _images(folder: Path) -> dict[str, str]:
-    """Path without suffix -> path of the images of a folder, in its parent."""
-    return {f"{folder.name}/{file.stem}": f"{folder.name}/{file.name}" for file in sorted(folder.glob("*.*"))}
 
 
 def _pinhole(K: Sequence[float]) -> dict[str, float]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from phd_exp.records.dataset import SPLITS
@@ -142,6 +143,72 @@ def test_bop_of_several_sensors_is_read_as_each_of_them(tmp_path: Path, sensor: 
     ]
 
 
+def test_bop_of_other_programs_means_the_same(tmp_path: Path) -> None:
+    """Keys with zeros, a file for each image, and boxes of masks or of a model instead of `scene_gt_info.json`."""
+    scene = WRITERS["bop"](tmp_path / "test") / "000002"
+    lines = [detection.line for detection in detections_in(tmp_path / "test")]
+    for name, content in BOP.items():
+        (scene / name).write_text(json.dumps({f"{int(key):06d}": value for key, value in content.items()}))
+    assert [detection.line for detection in detections_in(tmp_path / "test")] == lines
+
+    (scene / "scene_gt_info.json").unlink()
+    for image_name, infos in BOP["scene_gt_info.json"].items():
+        for number, info in enumerate(infos):
+            left, top, width, height = info["bbox_visib"]
+            pixels = np.zeros((90, 120), np.uint8)
+            pixels[max(top, 0) : top + height + 1, max(left, 0) : left + width + 1] = 255 * (width >= 0)
+            (scene / "mask_visib").mkdir(exist_ok=True)
+            Image.fromarray(pixels).save(scene / f"mask_visib/{int(image_name):06d}_{number:06d}.png")
+    unknown = [line.model_copy(update={"visibility": None}) for line in lines]
+    assert [detection.line for detection in detections_in(tmp_path / "test")] == unknown
+
+    single = tmp_path / "imagewise/000002"
+    for picture in sorted((scene / "rgb").iterdir()):
+        image(single / f"{picture.stem}.rgb{picture.suffix}")
+        for name, content in BOP.items():
+            kind = name.removeprefix("scene_")
+            (single / f"{picture.stem}.{kind}").write_text(json.dumps(content[str(int(picture.stem))]))
+    found = [detection.line for detection in detections_in(single.parent)]
+    assert [line.file_name for line in found] == ["000002/000000.rgb.png"] + 2 * ["000002/000003.rgb.jpg"]
+    assert [line.model_copy(update={"file_name": ""}) for line in found] == [
+        line.model_copy(update={"file_name": ""}) for line in lines
+    ]
+
+
+def test_a_box_without_mask_is_that_of_the_model(tmp_path: Path) -> None:
+    scene = WRITERS["bop"](tmp_path / "test") / "000002"
+    (scene / "scene_gt_info.json").unlink()
+    vertices = np.random.default_rng(0).uniform(-50, 50, (9, 3))
+    rows = "\n".join(" ".join(map(str, row)) for row in vertices)
+    names = "".join(f"property float {name}\n" for name in "xyz")
+    text = f"ply\nformat ascii 1.0\nelement vertex 9\n{names}element face 0\nproperty list uchar int vertex_indices\n"
+    (tmp_path / "models").mkdir()
+    for model in (5, 12):
+        (tmp_path / f"models/obj_{model:06d}.ply").write_text(f"{text}end_header\n{rows}\n")
+    item = BOP["scene_gt.json"]["3"][0]
+    place = vertices @ np.reshape(TURN, (3, 3)).T + item["cam_t_m2c"]
+    u, v = 107.5 * place[:, 0] / place[:, 2] + 60.5, 108.5 * place[:, 1] / place[:, 2] + 45.5
+    found = detections_in(tmp_path / "test")[2].line.box
+    np.testing.assert_allclose(found, [u.min(), v.min(), u.max(), v.max()], rtol=1e-6)
+
+
+def test_bop_without_anything_visible_says_so(tmp_path: Path) -> None:
+    file = WRITERS["bop"](tmp_path / "test") / "000002/scene_gt_info.json"
+    hidden = {image: [{"bbox_visib": [-1] * 4} for _ in infos] for image, infos in BOP[file.name].items()}
+    file.write_text(json.dumps(hidden))
+    with pytest.raises(DatasetError, match=r"test: 4 objects, none of them visible .bbox_visib is -1, -1, -1, -1."):
+        detections_in(tmp_path / "test")
+
+
+def test_targets_of_bop_are_those_of_a_test(tmp_path: Path) -> None:
+    for split in ("test", "train"):
+        WRITERS["bop"](tmp_path / split)
+    target = {"scene_id": 2, "im_id": 3, "obj_id": 5, "inst_count": 2}
+    (tmp_path / "test_targets_bop19.json").write_text(json.dumps([target]))
+    files = [[one.file.name for one in detections_in(tmp_path / split)] for split in ("test", "train")]
+    assert files == [2 * ["000003.jpg"], ["000000.png", *2 * ["000003.jpg"]]]
+
+
 def test_a_folder_without_annotations_says_what_is_there_and_what_is_read(tmp_path: Path) -> None:
     folder = tmp_path / "voc"
     image(folder / "images" / "a.png")
@@ -246,12 +313,15 @@ BAD = [
     (bop(GT, lambda gt: gt["3"][0].pop("cam_t_m2c")), "image 3, object 0: cannot be read .'cam_t_m2c' is missing"),
     (bop(GT, lambda gt: gt["3"][0].update(cam_t_m2c=[0, 0, -900])), r"image 3, object 0: z: got -0\.9"),
     (bop(GT, lambda gt: gt.update({"3": 1})), "cannot be read"),
-    (bop(CAMERA, lambda camera: camera.pop("3")), "image 3, object 0: cannot be read .'3' is missing"),
+    (bop(CAMERA, lambda camera: camera.pop("3")), r"scene_camera\.json, image 3: cannot be read .3 is missing"),
     (bop(INFO, lambda info: info["3"][0].update(visib_fract=2)), "visibility: got 2"),
+    (bop(INFO, lambda info: info.pop("3")), r"scene_gt_info\.json, image 3: cannot be read .3 is missing"),
+    (bop(INFO, lambda info: info["3"].pop()), "000002, image 3: cannot be read .zip.. argument 2 is shorter"),
+    (("bop", lambda folder: (folder / "000002" / INFO).unlink()), "expected scene_gt_info.json, which bop_toolkit"),
     (bop(CAMERA, lambda camera: camera["3"].update(cam_K=SKEW)), "camera without skew"),
     (bop(CAMERA, lambda camera: camera["3"].update(cam_R_w2c=[1, 0, 0, 0, 1, 0, 0, 0.1, 1])), "a rotation matrix"),
     (bop(CAMERA, lambda camera: camera["3"].update(cam_R_w2c=[np.nan, *TURN[1:]])), "a rotation matrix"),
-    (("bop", lambda folder: (folder / "000002/rgb/000003.jpg").unlink()), "image 3, .*'rgb/000003' is missing"),
+    (("bop", lambda folder: (folder / "000002/rgb/000003.jpg").unlink()), "rgb, image 000003: .*'000003' is missing"),
     (("coco", lambda folder: (folder.parent / "annotations/instances_test.json").write_text("[]")), "an object"),
     (coco(lambda content: content.pop("images")), "'images' is missing"),
     (coco(lambda content: content.pop("camera")), r"annotation 1: .*no camera; add \"camera\""),
