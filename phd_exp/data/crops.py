@@ -12,7 +12,7 @@ from phd_exp.data.areas import GREY, view
 from phd_exp.data.images import shrunk
 from phd_exp.optics.lens import PINHOLE, Lens
 from phd_exp.optics.virtual import VirtualCamera, intrinsics, require_no_fold
-from phd_exp.records.detections import Detection
+from phd_exp.records.detections import LARGEST_BOX, Detection
 from phd_exp.records.errors import DatasetError
 from phd_exp.records.files import require_plain
 from phd_exp.records.images import FORMATS, LARGEST_IMAGE, decoding, pillow_warnings
@@ -24,6 +24,7 @@ TURNED = range(2, 9)  # EXIF orientations; others than 1 to 8 mean nothing
 TWELVE_BITS = 1 << 12
 ONE_PICTURE = ("JPEG", "MPO")  # formats whose further frames are previews and depth maps
 STRIP = 1 << 17  # about the pixels of the image that a strip of a view reads; the sums of three bands take 3 MB
+WIDEST = 100.0  # m that the view of an object may show at its distance
 MARGIN = 1  # pixels around a view of more pixels than the image has, which are interpolated
 
 
@@ -80,6 +81,30 @@ def facing(detection: Detection, size: tuple[int, int], side: int) -> VirtualCam
         return VirtualCamera.of_box(K, box, float(side), lens)
     except ValueError as error:
         raise DatasetError(f"{detection.where}: {error}") from None
+
+
+def true_position(
+    detection: Detection, size: tuple[int, int], camera: VirtualCamera, widest: float = WIDEST
+) -> Float[np.ndarray, "3"]:
+    """The true position of a detection in the frame of its virtual camera, m.
+
+    `size` is the width and height of the image, and `widest` the most that the view may show at that distance, m.
+    Raises DatasetError if the detection has none, or one that cannot be right.
+    """
+    xyz = camera.to_virtual(np.array(detection.position))
+    fault = f"{detection.where}: the position {list(detection.position)}"
+    off_centre = camera.real_pixels(xyz[:2] / xyz[2]) - np.array(size) / 2 if xyz[2] > 0 else np.nan
+    if not np.all(np.abs(off_centre) <= LARGEST_BOX * max(size)):
+        raise DatasetError(
+            f"{fault} is far outside the image of {size[0]} x {size[1]} pixels, or 90 degrees or more from the middle"
+            " of its box; check x, y, z (m) and the camera"
+        )
+    if (width := camera.S * xyz[2] / camera.f) > widest:
+        raise DatasetError(
+            f"{fault} is so far away that its box is {width:.3g} m wide there; expected metres, and a width of at "
+            f"most {widest:.3g} m; if these are millimetres, divide them by 1000"
+        )
+    return xyz
 
 
 Picture = Image.Image | UInt8[np.ndarray, "height width 3"]

@@ -12,12 +12,12 @@ from jaxtyping import Float
 
 from phd_exp.data.batches import Batch
 from phd_exp.data.cache import cached
-from phd_exp.data.crops import cut, facing, image_size, read_image
+from phd_exp.data.crops import cut, facing, image_size, read_image, true_position
 from phd_exp.data.sources import Known, Part, Source
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.optics.virtual import VirtualCamera
 from phd_exp.records.dataset import sha256
-from phd_exp.records.detections import LARGEST_BOX, Detection
+from phd_exp.records.detections import Detection
 from phd_exp.records.errors import ConfigError, DatasetError
 from phd_exp.records.images import content_of, pillow_warnings
 from phd_exp.records.own_images import DetectionFolder
@@ -141,11 +141,4 @@ def _crop(detection: Detection, side: int, sizes: dict[Path, tuple[int, int]]) -
         raise DatasetError(f"{detection.where}: {error}") from None
     size = sizes[detection.file]
     camera = facing(detection, size, side)
-    xyz = camera.to_virtual(np.array(detection.position))
-    off_centre = camera.real_pixels(xyz[:2] / xyz[2]) - np.array(size) / 2 if xyz[2] > 0 else np.nan
-    if not np.all(np.abs(off_centre) <= LARGEST_BOX * max(size)):
-        raise DatasetError(
-            f"{detection.where}: the position {list(detection.position)} is far outside the image of {size[0]} x "
-            f"{size[1]} pixels, or 90 degrees or more from the middle of its box; check x, y, z (m) and the camera"
-        )
-    return Crop(detection, size, camera, xyz)
+    return Crop(detection, size, camera, true_position(detection, size, camera))

@@ -15,7 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from phd_exp.data.cache import DECODERS, LARGEST_AT_ONCE
-from phd_exp.data.crops import cut, optics_of, read_image
+from phd_exp.data.crops import cut, optics_of, read_image, true_position
 from phd_exp.distributions import Density, ProjectedHuber, Temperature
 from phd_exp.distributions.along import quantiles_along
 from phd_exp.geometry.camera import Camera
@@ -278,6 +278,8 @@ def _seen(predictor: Predictor, detections: list[Detection] | UserError) -> tupl
         image = read_image(detections[0].file, detections[0].content)
         for detection in detections:
             camera = _facing(predictor, detection, image.size)
+            if detection.line.z is not None:
+                true_position(detection, image.size, camera, predictor.widest)
             found.append((detection, image, View(cut(image, camera), camera)))
     except DatasetError as error:
         return found, error

@@ -115,6 +115,11 @@ class Predictor:
         """The largest focal length at which boxes are viewed, px."""
         return self.f_range[1]
 
+    @property
+    def widest(self) -> float:
+        """Ten times what a view shows at the largest distance of the training, m."""
+        return 10 * self.side * self.depth.mu_z0 * self.depth.D
+
     def __call__(
         self,
         images: UInt8[np.ndarray | Tensor, "*batch height width 3"],

@@ -28,7 +28,7 @@ from phd_exp.inference.loading import load
 from phd_exp.inference.predictor import BATCH, Predictor
 from phd_exp.records.choices import flatten
 from phd_exp.records.detections import Detection
-from phd_exp.records.errors import DatasetError, RunError
+from phd_exp.records.errors import RunError
 from phd_exp.records.processes import announce
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.cameras import f_factor
@@ -110,22 +110,11 @@ def record_labelled(predictor: Predictor, detections: Sequence[Detection], name:
         n += len(views)
     found = _joined(parts)
     found["margin"] = torch.full_like(found["f"], predictor.margin)
-    _require_metres(found, detections[0])
     file = folder.labelled(name)
     with folder.held():
         file.parent.mkdir(exist_ok=True)
         write_parquet(file, found, {"file_name": [one.line.file_name for one in detections]})
     return found
-
-
-def _require_metres(table: Columns, first: Detection) -> None:
-    """Raise DatasetError if true depths are about a thousand times the predicted ones."""
-    ratio = float((table["z"] / table["mode_z"]).median())
-    if 200 < ratio < 5000:
-        raise DatasetError(
-            f"{first.where}: x, y, z are {ratio:.0f} times the predicted positions (median); expected metres: divide "
-            "millimetres by 1000"
-        )
 
 
 def _poses_and_times(source: RenderedSource) -> Known:

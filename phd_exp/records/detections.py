@@ -1,5 +1,6 @@
 """One detection in the user's own images: its image, camera and true position, a line of `metadata.jsonl`."""
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from phd_exp.records.spec import Number, Positive
 
 DISTORTION = re.compile(r"[kp][1-8]|.*distort.*|dist(_?coeff.*)?|.*fisheye.*", re.IGNORECASE)
 NORMALISED = 1.5  # px; the largest right or bottom of a box in units of the image, even of one by its middle
+NEAREST = 0.005  # m from the camera to the nearest object
 LARGEST_BOX = 3
 """Sides of a box over the longer side of its image; the part outside the image is grey and holds no information."""
 
@@ -97,12 +99,17 @@ class DetectionLine(Record):
         cameras = [given for given in (self.f, self.fx or self.fy, self.camera) if given]
         if len(cameras) != 1 or (self.camera and self.cx is not None):
             raise ValueError("expected either f, or fx and fy (focal length in pixels), or camera (a file) alone")
-        if not self.camera and self.z is not None and self.z < 1e-6:  # a fisheye may show what is behind
-            raise ValueError(f"z: got {self.z:g}; expected to be greater than or equal to 0.000001")
+        if not self.camera and self.z is not None and self.z <= 0:  # a fisheye may show what is behind
+            raise ValueError(f"z: got {self.z:g}; expected to be greater than 0")
         for names in (("fx", "fy"), ("cx", "cy"), ("width", "height"), ("x", "y", "z")):
             given = [name for name in names if getattr(self, name) is not None]
             if 0 < len(given) < len(names):
                 raise ValueError(f"{', '.join(given)} is given alone; expected all of {', '.join(names)}")
+        if self.z is not None and math.hypot(self.x or 0, self.y or 0, self.z) < NEAREST:
+            raise ValueError(
+                f"x, y, z: got a position {self.z:g} m from the camera; expected metres, and at least {NEAREST:g} m; "
+                "of BOP, expected cam_t_m2c in millimetres"
+            )
         if self.box and not (self.box[0] < self.box[2] and self.box[1] < self.box[3]):
             raise ValueError(f"box={list(self.box)}: expected [left, top, right, bottom] of positive size")
         return self

@@ -188,7 +188,7 @@ def _without_info(
             if not (u[:, 2] > 0).all():
                 raise ValueError(f"{models[0].name} reaches behind the camera")
             pixels = u[:, :2] / u[:, 2:] + CORNER
-            left, top, right, bottom = *pixels.min(axis=0).tolist(), *pixels.max(axis=0).tolist()
+            left, top, right, bottom = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)]).tolist()
         else:
             written = "scene_gt_info.json, which bop_toolkit's calc_gt_info.py writes"
             raise ValueError(f"expected {written}, {mask}, or {folder.parent / name}")

@@ -140,6 +140,8 @@ LABELS = [
     label("NaN", r"x: got nan; expected to be a finite number", x=float("nan")),
     label("a focal length in metres", r"f: got 0\.004; expected a focal length in pixels, at least 0\.01", f=0.004),
     label("no position", r"x, y, z are missing; .*", x=None, y=None, z=None),
+    label("millimetres", r"the position \[0\.0, 0\.0, 4000\.0\] is so far away that its box is .* m wide there; .*; if these are millimetres, divide them by 1000", x=0, y=0, z=4000),
+    Bad("label: millimetres to predict", lambda place: place.put(place.metadata, f'{{{GOOD}, "x": 0, "y": 0, "z": 4000}}\n'), PREDICT, r"photos/test/metadata\.jsonl, line 1: the position .* is so far away that its box is .*"),
     label("millimetres across", r"the position \[-200\.0, .*\] is far outside the image of .*; check x, y, z \(m\) and the camera", x=-200),
 ]  # fmt: skip
 

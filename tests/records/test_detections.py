@@ -68,7 +68,11 @@ BAD: list[tuple[Any, str]] = [
     (PLACED | {"file_name": "a.png", "camera": "../c.yaml"}, "camera='../c.yaml' leaves"),
     (GOOD | {"cx": 10}, "cx is given alone; expected all of cx, cy"),
     ({"file_name": "a.png", "f": 900, "x": 1, "z": 3}, "x, z is given alone; expected all of x, y, z"),
-    (GOOD | {"z": 0}, "z: got 0; expected to be greater than or equal to 0.000001"),
+    (GOOD | {"z": 0}, "z: got 0; expected to be greater than 0"),
+    (
+        GOOD | {"x": 0, "y": 0, "z": 0.00085},
+        "got a position 0.00085 m from the camera; expected metres, and at least 0.005",
+    ),
     (GOOD | {"f": 0}, "f: got 0; expected to be greater than 0"),
     (GOOD | {"f": True}, "f: got True; expected a valid number"),
     (GOOD | {"box": [3, 0, 3, 5]}, "expected [left, top, right, bottom] of positive size"),
