@@ -1,0 +1,51 @@
+"""Runs that earlier versions recorded stay readable: `old_runs.tar.xz` is never written again.
+
+`old_runs.md` says how each was made.
+"""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import phd_exp as package
+from tests.golden.compare import PLACE, read
+from tests.golden.conftest import boxed, photograph, placed
+from tests.support.untrained import read_lines
+
+OF = "runs/smoke/default"
+
+
+@pytest.fixture
+def old_runs(tmp_path: Path) -> Path:
+    """The folder of the old runs, in the folder where commands are run."""
+    shutil.unpack_archive(PLACE / "old_runs.tar.xz", tmp_path, filter="data")
+    return tmp_path / "runs"
+
+
+def test_old_runs_are_reported(
+    golden: Callable, phd_exp: Callable, old_runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("phd_exp.cli.report.find_spec", lambda name: None)  # no figures and pages, for speed
+    outcome = phd_exp("report", "runs=runs", "out=report")
+    assert outcome.status == 0, outcome.err
+    assert outcome.err == ""
+    golden("report", {file.name: read(file) for file in (tmp_path / "report" / "tables").glob("*.csv")})
+
+
+def test_old_runs_are_listed(golden: Callable, old_runs: Path) -> None:
+    listed = package.runs(old_runs).drop(columns="path")
+    golden("listed", {"runs.csv": listed.astype(object).where(listed.notna(), "").to_dict("records")})
+
+
+def test_old_networks_predict(golden: Callable, phd_exp: Callable, old_runs: Path, tmp_path: Path) -> None:
+    folder = photograph(tmp_path / "photographs", [boxed(placed(number)) for number in range(3)])
+    words = {"probabilistic": ("recalibrate=true", "coverage=0.5"), "mae_logz": ()}
+    made = {}
+    for model, more in words.items():
+        (run,) = (old_runs / "smoke" / "default" / model).glob("seed0*")
+        outcome = phd_exp("predict", f"run={run}", f"folder={folder}", *more)
+        assert outcome.status == 0, outcome.err
+        made[f"{model}.jsonl"] = read_lines(outcome.out)
+    golden("old_networks", made)
