@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from tests.golden.compare import PLACE, TOLERANCES, compared, read, write
-from tests.support.untrained import SIDE, untrained, write_metadata
+from tests.support.untrained import SIDE, read_lines, untrained, write_metadata
 
 WIDTH, HEIGHT, F, RADIUS = 160, 120, 500.0, 0.3
 
@@ -39,6 +39,12 @@ def golden(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[..., None
             assert differences[:20] == []
 
     return require
+
+
+def lines(outcome: Any) -> list[dict[str, Any]]:
+    """The printed JSON lines of a command."""
+    assert outcome.status == 0, outcome.err
+    return read_lines(outcome.out)
 
 
 def photograph(folder: Path, lines: Iterable[dict[str, Any]], size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:

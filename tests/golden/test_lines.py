@@ -2,28 +2,23 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from tests.golden.conftest import F, boxed, photograph, placed
-from tests.support.untrained import read_lines
+from tests.golden.conftest import F, boxed, lines, photograph, placed
 
 STRONG = (
     "recipe=strong", "backbone.width=8", "backbone.stride=4", "backbone.channels=4", "backbone.points=2",
     "recipe.hidden=8",
 )  # fmt: skip
-LENS = """{image_width: 160, image_height: 120, distortion_model: plumb_bob,
-camera_matrix: {rows: 3, cols: 3, data: [500, 0, 80, 0, 500, 60, 0, 0, 1]},
-distortion_coefficients: {rows: 1, cols: 5, data: [-0.2, 0.05, 0.001, -0.001, 0]}}"""
-
-
-def lines(outcome: Any) -> list[dict[str, Any]]:
-    """The printed JSON lines of a command."""
-    assert outcome.status == 0, outcome.err
-    return read_lines(outcome.out)
+LENS = """image_width: 160
+image_height: 120
+distortion_model: plumb_bob
+camera_matrix: {rows: 3, cols: 3, data: [500, 0, 80, 0, 500, 60, 0, 0, 1]}
+distortion_coefficients: {rows: 1, cols: 5, data: [-0.2, 0.05, 0.001, -0.001, 0]}
+"""
 
 
 def test_lines_of_predict(golden: Callable, phd_exp: Callable, network: Callable, tmp_path: Path) -> None:

@@ -11,10 +11,7 @@ import pytest
 
 import phd_exp as package
 from tests.golden.compare import PLACE, read
-from tests.golden.conftest import boxed, photograph, placed
-from tests.support.untrained import read_lines
-
-OF = "runs/smoke/default"
+from tests.golden.conftest import boxed, lines, photograph, placed
 
 
 @pytest.fixture
@@ -29,8 +26,7 @@ def test_old_runs_are_reported(
 ) -> None:
     monkeypatch.setattr("phd_exp.cli.report.find_spec", lambda name: None)  # no figures and pages, for speed
     outcome = phd_exp("report", "runs=runs", "out=report")
-    assert outcome.status == 0, outcome.err
-    assert outcome.err == ""
+    assert (outcome.status, outcome.err) == (0, "")
     golden("report", {file.name: read(file) for file in (tmp_path / "report" / "tables").glob("*.csv")})
 
 
@@ -41,11 +37,8 @@ def test_old_runs_are_listed(golden: Callable, old_runs: Path) -> None:
 
 def test_old_networks_predict(golden: Callable, phd_exp: Callable, old_runs: Path, tmp_path: Path) -> None:
     folder = photograph(tmp_path / "photographs", [boxed(placed(number)) for number in range(3)])
-    words = {"probabilistic": ("recalibrate=true", "coverage=0.5"), "mae_logz": ()}
     made = {}
-    for model, more in words.items():
+    for model, words in {"probabilistic": ("recalibrate=true", "coverage=0.5"), "mae_logz": ()}.items():
         (run,) = (old_runs / "smoke" / "default" / model).glob("seed0*")
-        outcome = phd_exp("predict", f"run={run}", f"folder={folder}", *more)
-        assert outcome.status == 0, outcome.err
-        made[f"{model}.jsonl"] = read_lines(outcome.out)
+        made[f"{model}.jsonl"] = lines(phd_exp("predict", f"run={run}", f"folder={folder}", *words))
     golden("old_networks", made)
