@@ -43,8 +43,9 @@ lint: $(INSTALLED)  ## ruff, mypy, import contracts, and a check for known bad r
 	$(BIN)/lint-imports --no-cache  # a cache from before a merge reports imports that no longer exist
 	$(BIN)/python .ci/audit.py
 
-test: lint  ## lint and the default tests (5 to 15 minutes on 2 cores)
+test: lint  ## lint and the default tests (9 to 17 minutes on 2 cores)
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+	OPENBLAS_CORETYPE=Prescott $(BIN)/python -m pytest -m kernels tests/fusion/test_fuse.py tests/rendering/test_sequences.py
 
 test-all: lint  ## the slow tests too
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not bench'

@@ -171,7 +171,7 @@ def _step(at, terms, moved, y, lam, share):
 
 @compiled
 def polish(slope, at_origin, a, own, u, lam):
-    """Moves u to the optimum, to the last bits, and lam to the subgradients of max(t, 1/t) at kinks.
+    """Moves u to the optimum, to rounding, and lam to the subgradients of max(t, 1/t) at kinks.
 
     The method of multipliers: at a kink the energy is a (lam (t - 1) + penalty (t - 1)^2 / 2), and lam moves by the
     penalty times the remaining t - 1. A kink whose lam leaves [-1, 1] does not hold the optimum: its camera goes to

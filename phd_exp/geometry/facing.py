@@ -37,7 +37,7 @@ def pixel_corners(
     f: Float[Tensor, " boxes"],
     S: int,
 ) -> tuple[Float[Tensor, "boxes 2"], Float[Tensor, "boxes places places 2"]]:
-    """Pixels of the real image at the corners of the pixels of each virtual image, `VirtualCamera.corners`.
+    """Pixels of the real image at the corners of the pixels of each virtual image, as `data.crops.corners_of`.
 
     Returns whole numbers next to the middle of each box, and the corners relative to these. Corners are computed from
     the middle, so their rounding errors are those of the distance to it.

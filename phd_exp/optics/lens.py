@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Inexact
+from numpy.polynomial.polynomial import polyval
 
 ANGLES = 2000  # of the table from which Newton's method starts
 STEPS = 12  # of Newton's method at most, whose convergence is quadratic
@@ -22,6 +23,7 @@ CLOSE = 1e-10  # largest error of `undistort`, in focal lengths
 TINY = 1e-30  # length that replaces zero in a quotient, and the step of the complex-step derivative
 
 _Numbers = Inexact[np.ndarray, "*batch"]
+_arctan2 = np.frompyfunc(math.atan2, 2, 1)  # numpy's own has other last bits on processors with AVX-512
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class Lens:
         x, y, z = (xyz[..., axis] for axis in range(3))
         if self.is_fisheye:
             across = np.hypot(x, y)
-            angle = np.arctan2(across, z)
+            angle = np.asarray(_arctan2(across, z), float)
             scale = np.where(angle < self.limit, angle, np.nan) / np.maximum(across, TINY)
             moved = self._moved(x * scale, y * scale)
         else:
@@ -87,7 +89,7 @@ class Lens:
         """The `limit`; and from the axis to there |b|, and the distance of its place, which grows."""
         widest = math.pi if self.is_fisheye else math.pi / 2
         angle = np.linspace(0, widest, ANGLES, endpoint=False)
-        s = angle if self.is_fisheye else np.tan(angle)
+        s = angle if self.is_fisheye else np.sin(angle) / np.cos(angle)
         # without the tangential terms, which are even
         distance = (self._moved(s, 0 * s)[0] - self._moved(-s, 0 * s)[0]) / 2
         falls = np.flatnonzero(~(np.diff(distance) > 0))
@@ -101,9 +103,9 @@ class Lens:
             return x, y
         r2, k = x * x + y * y, (*self.coefficients, *[0.0] * 8)
         if self.is_fisheye:
-            scale = _polynomial(r2, 1.0, *k[:4])
+            scale = polyval(r2, (1.0, *k[:4]))
             return x * scale, y * scale
-        ratio = _polynomial(r2, 1.0, k[0], k[1], k[4]) / _polynomial(r2, 1.0, *k[5:8])
+        ratio = polyval(r2, (1.0, k[0], k[1], k[4])) / polyval(r2, (1.0, *k[5:8]))
         scale = ratio + 2 * (k[3] * x + k[2] * y)
         return x * scale + r2 * k[3], y * scale + r2 * k[2]
 
@@ -125,15 +127,6 @@ class Lens:
         error = np.hypot(moved_x - u, moved_y - v)
         found = (error <= CLOSE * (1 + far)) & (np.hypot(x, y) <= s[-1])
         return np.where(found[..., None], np.stack([x, y], axis=-1), np.nan)
-
-
-def _polynomial(x: _Numbers, *coefficients: float) -> _Numbers:
-    """The polynomial with these coefficients, the lowest first, by Horner's rule."""
-    *lower, last_but_one, last = coefficients
-    value = last_but_one + last * x
-    for coefficient in reversed(lower):
-        value = value * x + coefficient
-    return value
 
 
 PINHOLE = Lens()

@@ -6,7 +6,7 @@ pinhole whatever the lens of the real camera.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, reduce
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -14,8 +14,6 @@ from jaxtyping import Bool, Float
 from phd_exp.optics.lens import PINHOLE, Lens
 
 BORDER = 33  # places along a side of a box whose rays a lens bends
-NODES = 16  # Chebyshev points along a side of a view, between which the corners of its pixels are interpolated
-CLOSE = 1e-9  # largest error of interpolated corners, px
 
 Box = tuple[float, float, float, float]
 """Left, top, right, bottom: pixels of the real image, counted from its top left corner."""
@@ -70,12 +68,12 @@ class VirtualCamera:
         if not (np.isfinite(middle).all() and len(border)):
             raise ValueError(f"box={list(box)}: its middle or its whole border lies beyond the field of the lens")
         R = towards(middle)
-        border = border @ R.T
+        border = product(border, R.T)
         if not (border[:, 2] > 0).all():
             raise ValueError(f"box={list(box)}: its corners are 90 degrees or more from its middle")
         half_width = max(np.abs(border[:, :2] / border[:, 2:]).max(), S / (2 * largest_f))
         seen = np.array([[x, y, 1.0] for x in (-half_width, half_width) for y in (-half_width, half_width)])
-        if not (lens.is_fisheye or (seen @ R[:, 2] > 0).all()):  # z in the frame of the real camera, from R^T
+        if not (lens.is_fisheye or (product(seen, R[:, 2]) > 0).all()):  # z in the frame of the real camera, from R^T
             raise ValueError(
                 f"box={list(box)}: a square view of it reaches 90 degrees or more from the camera's axis"
             )
@@ -83,11 +81,11 @@ class VirtualCamera:
 
     def to_virtual(self, xyz: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Positions (metres) of the frame of the real camera in that of the virtual one: R xyz."""
-        return xyz @ self.R.T
+        return product(xyz, self.R.T)
 
     def to_real(self, xyz: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Positions (metres) of the frame of the virtual camera in that of the real one: R^T xyz."""
-        return xyz @ self.R
+        return product(xyz, self.R)
 
     def real_pixels(self, xy_over_z: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         """Pixels of the real image at (x, y)/z of the virtual camera; NaN where the real camera sees nothing."""
@@ -96,25 +94,9 @@ class VirtualCamera:
         # axis by axis: numpy takes ten times as long for rows of two
         return np.stack([self.K[axis, 2] + self.K[axis, axis] * place[..., axis] for axis in (0, 1)], axis=-1)
 
-    @property
-    def corners(self) -> Float[np.ndarray, "places places 2"]:
-        """Pixels of the real image at the corners of the pixels of the virtual image.
-
-        A lens takes long, so the corners are interpolated by polynomials through `real_pixels` at Chebyshev points.
-        If these err by more than `CLOSE` halfway between the points, as at the edge of the field, each corner is
-        computed.
-        """
-        half, n = self.S / self.f / 2, int(self.S)
-        coarse = self._grid(half * _chebyshev(NODES))
-        halfway, corners = _interpolations(n)
-        error = halfway @ coarse @ halfway.T - self._grid(half * _chebyshev(2 * NODES - 1)[1::2])
-        if (np.abs(error) < CLOSE).all():  # False for NaN
-            return np.moveaxis(corners @ coarse @ corners.T, 0, -1)
-        return np.moveaxis(self._grid(half * np.linspace(-1, 1, n + 1)), 0, -1)
-
-    def _grid(self, along: Float[np.ndarray, " n"]) -> Float[np.ndarray, "2 n n"]:
-        """`real_pixels` where x/z and y/z take these values: the columns of all places, then the rows."""
-        return np.moveaxis(self.real_pixels(np.stack(np.meshgrid(along, along), axis=-1)), -1, 0)
+    def grid(self, along: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n 2"]:
+        """Pixels of the real image at places along both sides of the virtual image, from -1 to 1."""
+        return self.real_pixels(self.S / self.f / 2 * np.stack(np.meshgrid(along, along), axis=-1))
 
     def outside(self, width: float, height: float) -> Bool[np.ndarray, "S S"]:
         """The pixels of the virtual image whose middles lie outside the real image of that size, px."""
@@ -129,7 +111,23 @@ class VirtualCamera:
     @property
     def homography(self) -> Float[np.ndarray, "3 3"]:
         """H = K_v R K^-1, from homogeneous pixels of a real image without distortion to those of the virtual one."""
-        return intrinsics(self.f, self.f, self.S / 2, self.S / 2) @ self.R @ np.linalg.inv(self.K)
+        (fx, fy), (cx, cy) = np.diagonal(self.K)[:2], self.K[:2, 2]
+        inverse = intrinsics(1 / fx, 1 / fy, -cx / fx, -cy / fy)
+        return product(product(intrinsics(self.f, self.f, self.S / 2, self.S / 2), self.R), inverse)
+
+
+def product(a: Float[np.ndarray, "*batch n"], b: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
+    """a @ b for a vector or matrix b, with the same bits on every processor and for any number of rows.
+
+    The sums of BLAS depend on both. Whatever a data set records is computed by this function.
+    """
+    terms = (np.multiply.outer(row, column) for row, column in zip(b, np.moveaxis(a, -1, 0), strict=True))
+    return np.moveaxis(reduce(np.add, terms), range(b.ndim - 1), range(1 - b.ndim, 0))
+
+
+def unit(vector: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """The unit vector of the same direction."""
+    return vector / np.sqrt(product(vector, vector))
 
 
 def enlarged(box: Box, factor: float) -> Box:
@@ -146,7 +144,7 @@ def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, 
 
 def towards(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """The rotation without roll that maps a direction to (0, 0, 1), as `geometry.motion.smallest_rotation`."""
-    a, b, c = direction / np.linalg.norm(direction)
+    a, b, c = unit(direction)
     ab = a * b / (1 + c)
     return np.array([[1 - a * a / (1 + c), -ab, -a], [-ab, 1 - b * b / (1 + c), -b], [a, b, c]])
 
@@ -183,21 +181,6 @@ def _fold(rows: tuple[tuple[float, ...], ...], lens: Lens, width: int, height: i
         f"the lens folds over inside the image of {width} x {height} pixels, {np.degrees(fold):.1f} degrees from "
         f"its axis, at pixel {pixel}; check its coefficients"
     )
-
-
-def _chebyshev(n: int) -> Float[np.ndarray, " n"]:
-    """n Chebyshev points, from -1 to 1."""
-    return -np.cos(np.pi * np.arange(n) / (n - 1))
-
-
-@lru_cache(maxsize=16)
-def _interpolations(n: int) -> tuple[Float[np.ndarray, "halfway nodes"], Float[np.ndarray, "corners nodes"]]:
-    """Matrices from values at Chebyshev points to those halfway between them, and at the ends of n equal parts."""
-    vandermonde = np.polynomial.chebyshev.chebvander
-    to_coefficients = np.linalg.inv(vandermonde(_chebyshev(NODES), NODES - 1))
-    places = (_chebyshev(2 * NODES - 1)[1::2], np.linspace(-1, 1, n + 1))
-    halfway, corners = (vandermonde(along, NODES - 1) @ to_coefficients for along in places)
-    return halfway, corners
 
 
 def _border(box: Box, n: int) -> Float[np.ndarray, "places 2"]:

@@ -20,6 +20,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
+from phd_exp.optics.virtual import product
 from phd_exp.records.cameras import CORNER
 from phd_exp.records.dataset import SPLITS, DatasetFolder
 from phd_exp.records.errors import writing
@@ -88,7 +89,7 @@ def _pose(record: SampleRecord, number: int) -> dict[str, Any]:
     item, rotation = record.objects[number], rays.rotation_matrix(record.pose.rotation)
     return {
         "obj_id": number_of(item.shape),
-        "cam_R_m2c": (rotation @ rays.rotation_matrix(item.rotation)).ravel().tolist(),
+        "cam_R_m2c": product(rotation, rays.rotation_matrix(item.rotation)).ravel().tolist(),
         "cam_t_m2c": (METRE * rays.in_camera_frame(np.array(item.position), record.pose)).tolist(),
         "scale": item.scale,
     }
@@ -141,10 +142,10 @@ def _write_model(shape: str, size: np.ndarray, mesh: Triangles | None, folder: P
 
 
 def _symmetries(shape: str, size: np.ndarray) -> dict[str, Any]:
-    kept = np.array([1, 1, 2]) if shape == "cylinder" else size
+    kept = np.array([1.0, 1.0, 2.0]) if shape == "cylinder" else size
     turns = np.tile(np.eye(4), (24, 1, 1))  # those of a cube, of which the identity is the only one with trace 4
     turns[:, :3, :3] = Rotation.create_group("O").as_matrix().round()
-    keeps = np.isclose(abs(turns[:, :3, :3]) @ kept, kept).all(axis=1) & (turns.trace(axis1=1, axis2=2) < 4)
+    keeps = np.isclose(product(abs(turns[:, :3, :3]), kept), kept).all(axis=1) & (turns.trace(axis1=1, axis2=2) < 4)
     return {
         "symmetries_discrete": turns[keeps].reshape(-1, 16).tolist(),
         "symmetries_continuous": [{"axis": axis, "offset": [0, 0, 0]} for axis in ROUND_ABOUT[shape]],

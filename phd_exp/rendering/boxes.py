@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from phd_exp.optics.virtual import Box, VirtualCamera, towards
+from phd_exp.optics.virtual import Box, VirtualCamera, product, towards
 from phd_exp.records.scenes import Pose, Scene, SceneObject, Vector
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.rays import (
@@ -65,7 +65,7 @@ def beside(item: SceneObject, radius: float, spec: DatasetSpec, rng: np.random.G
     """A random place near the line of sight to an object of some radius (m), at a depth of z_range, scene frame."""
     R, reach = towards(np.array(item.position)), NEIGHBOURHOOD * _half_width(item, radius)
     x, y = rng.uniform(-reach, reach, 2)
-    a, b, c = (rng.uniform(*spec.z_range) * np.array([x, y, 1.0]) @ R).tolist()
+    a, b, c = product(rng.uniform(*spec.z_range) * np.array([x, y, 1.0]), R).tolist()
     return a, b, c
 
 
@@ -84,7 +84,7 @@ def _aimed(scene: Scene, meshes: Meshes) -> Scene:
 
 def _box(visible: Mask, camera: VirtualCamera, size: tuple[int, int]) -> tuple[Box, int] | None:
     """The box of visible pixels of a virtual camera in the real image, and how many of them are inside that image."""
-    place = camera.corners  # (S + 1, S + 1, 2)
+    place = camera.grid(np.linspace(-1, 1, len(visible) + 1))  # the corners of pixels
     is_inside = ((place >= 0) & (place <= size)).all(axis=-1)
     used = np.zeros(is_inside.shape, bool)
     for rows, columns in ((0, 0), (0, 1), (1, 0), (1, 1)):

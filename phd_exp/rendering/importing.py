@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from phd_exp.optics.virtual import product
 from phd_exp.records.errors import RenderError, listed, one_line
 from phd_exp.records.mesh_files import MATERIALS, MeshFile, read_mesh
 from phd_exp.records.spec import NEAREST, DatasetSpec
@@ -149,7 +150,7 @@ def _in_metres(handle: Any, unit: float, reference: Any) -> Triangles:
             f"measures only {size:.3g} units; move it to the origin"
         )
     world = np.array(handle.matrix_world)
-    vertices = unit * (local @ world[:3, :3].T + world[:3, 3])
+    vertices = unit * (product(local, world[:3, :3].T) + world[:3, 3])
     if reference == "centroid":
         vertices -= Triangles(vertices, corners).centroid
     elif reference != "origin":
@@ -192,7 +193,7 @@ def _require_drawn(bpy: Any, handle: Any, mesh: Triangles) -> None:
     """Raise ValueError unless Blender draws the triangles where they are."""
     drawn = handle.evaluated_get(bpy.context.evaluated_depsgraph_get())
     world, (vertices, corners) = np.array(drawn.matrix_world), _geometry(drawn.data)
-    points, labels = vertices[corners] @ world[:3, :3].T + world[:3, 3], mesh.vertices[mesh.corners]
+    points, labels = product(vertices[corners], world[:3, :3].T) + world[:3, 3], mesh.vertices[mesh.corners]
     near = TOLERANCE * max(mesh.dimensions)
     if points.shape != labels.shape or not np.allclose(points, labels, rtol=0, atol=near):
         raise ValueError("Blender draws other triangles than its labels have; export it without modifiers or poses")

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from phd_exp.optics.virtual import unit
 from phd_exp.records.scenes import PATTERNS, Lamp, Look, Scene, SceneObject, Vector
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.pixels import linear
@@ -35,13 +36,13 @@ def draw_look(rng: Stream) -> Look:
     hue, saturation, value = TONES
     return Look(
         pattern=PATTERNS[rng.integers(len(PATTERNS))],
-        cells=float(np.exp(rng.uniform(math.log(2), math.log(60)))),
+        cells=math.exp(rng.uniform(math.log(2), math.log(60))),
         second=colour(rng),
         roughness=float(rng.uniform(0.15, 0.95)),
         metallic=float(rng.random() < 0.25),
         hue=float(rng.uniform(-hue, hue)),
         saturation=float(rng.uniform(1 - saturation, 1 + saturation)),
-        value=float(np.exp(rng.uniform(-value, value))),
+        value=math.exp(rng.uniform(-value, value)),
     )
 
 
@@ -56,7 +57,7 @@ def hard_lamp(spec: DatasetSpec, rng: Stream) -> Lamp:
     """A lamp in a random direction, as bright as a sky."""
     direction, far = rng.normal(size=3), remoteness(spec)
     middle: Vector = (0.0, 0.0, sum(spec.z_range) / 2)
-    x, y, z = (np.array(middle) + far * LAMP_DISTANCE * direction / np.linalg.norm(direction)).tolist()
+    x, y, z = (np.array(middle) + far * LAMP_DISTANCE * unit(direction)).tolist()
     name, _, _, power = LAMPS[0]
     side, power = rng.uniform(0.1, 3.0), power * rng.uniform(0.3, 2.0)
     return Lamp(name=name, position=(x, y, z), towards=middle, side=far * side, power=far**2 * power)

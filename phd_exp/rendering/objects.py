@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from phd_exp.optics.virtual import product, unit
 from phd_exp.records.assets import PHOTOS
 from phd_exp.records.scenes import SHAPES, Quaternion, Scene, SceneObject, Split, Surroundings, Vector
 from phd_exp.records.spec import DatasetSpec
@@ -90,18 +91,14 @@ def _lying(
     if spec.resting:
         onto_side = rests_of(mesh).draw(rng)
         rotation = quaternion_of(rotation_of(rotation) * onto_side)
-        upwards = onto_side.inv().apply(upwards)
+        upwards = product(upwards, onto_side.as_matrix())
     return item.model_copy(update={"rotation": rotation}), upwards
 
 
 def _foot(item: SceneObject, upwards: Array, mesh: Triangles) -> Array:
-    """The point below the reference point of an object that is as low as its lowest point, scene frame.
-
-    Records of data sets with a ground hold its last bit, which `verify` compares.
-    """
-    up = item.scale * rotation_matrix(item.rotation) @ upwards
-    foot: Array = np.array(item.position) + (mesh.vertices @ upwards).min() * up
-    return foot
+    """The point below the reference point of an object that is as low as its lowest point, scene frame."""
+    up = item.scale * product(rotation_matrix(item.rotation), upwards)
+    return np.array(item.position) + product(mesh.vertices, upwards).min() * up
 
 
 def _copy(
@@ -114,20 +111,19 @@ def _copy(
     free = item.model_copy(update={"rotation": uniform_rotation(rng)})
     other, others_upwards = _lying(spec, free, around, rng.uniform(0, math.tau), mesh, rng)
     direction = rng.normal(size=3)
-    up, lies = rotation_matrix(item.rotation) @ upwards, spec.upright or spec.resting
-    direction -= lies * (direction @ up) * up
-    direction /= np.linalg.norm(direction)
+    up, lies = product(rotation_matrix(item.rotation), upwards), spec.upright or spec.resting
+    direction = unit(direction - lies * product(direction, up) * up)
     shift = rng.uniform(*BESIDE) * (_extent(item, direction, mesh) + _extent(other, -direction, mesh)) * direction
     if lies:
-        shift += (_foot(item, upwards, mesh) - _foot(other, others_upwards, mesh)) @ up * up
+        shift += product(_foot(item, upwards, mesh) - _foot(other, others_upwards, mesh), up) * up
     x, y, z = (np.array(item.position) + shift).tolist()
     return other.model_copy(update={"position": (x, y, z)}) if z > item.scale * mesh.radius else None
 
 
 def _extent(item: SceneObject, direction: Array, mesh: Triangles) -> float:
     """How far an object reaches from its reference point along a unit vector of the scene's frame, m."""
-    local = direction @ rotation_matrix(item.rotation)
-    return float(item.scale * (mesh.vertices @ local).max())
+    local = product(direction, rotation_matrix(item.rotation))
+    return float(item.scale * product(mesh.vertices, local).max())
 
 
 def surroundings_of(spec: DatasetSpec, split: Split, number: int) -> tuple[Surroundings, float]:
@@ -190,7 +186,7 @@ def _distractors(spec: DatasetSpec, split: Split, number: int, scene: Scene, mes
             "dimensions": meshes[item.shape].dimensions if item.shape in meshes else (side,) * 3
         }
         if spec.looks == "varied" and item.shape in SHAPES:  # rods, slabs and discs
-            changes["dimensions"] = tuple((side * np.exp(rng.uniform(*STRETCH, 3))).tolist())
+            changes["dimensions"] = tuple(side * math.exp(log) for log in rng.uniform(*STRETCH, 3))
         if spec.is_box:
             changes["position"] = beside(first, first.scale * meshes["mesh"].radius, spec, rng)
         items.append(item.model_copy(update=changes))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phd_exp.optics.lens import Lens
-from phd_exp.optics.virtual import VirtualCamera
+from phd_exp.optics.virtual import VirtualCamera, product
 from phd_exp.records.cameras import Calibration
 from phd_exp.records.scenes import Pose, Scene, SceneObject
 from phd_exp.rendering.triangles import NO_MESHES, Meshes
@@ -147,7 +147,7 @@ def _clipped(whole: Window, within: Window | None) -> Window:
 
 def _placed(scene: Scene, item: SceneObject) -> tuple[Image, Image]:
     """The map of an object's local frame to the camera's: a scaled rotation (3, 3), and a shift (3,), m."""
-    turn = item.scale * rotation_matrix(scene.pose.rotation) @ rotation_matrix(item.rotation)
+    turn = item.scale * product(rotation_matrix(scene.pose.rotation), rotation_matrix(item.rotation))
     return turn, in_camera_frame(np.array(item.position), scene.pose)
 
 
@@ -171,7 +171,7 @@ def rotation_matrix(quaternion: tuple[float, float, float, float]) -> Image:
 
 def in_camera_frame(position: Image, pose: Pose) -> Image:
     """A point (3,) of the scene's frame in the camera's frame, m."""
-    return rotation_matrix(pose.rotation) @ position + np.array(pose.translation)
+    return product(rotation_matrix(pose.rotation), position) + np.array(pose.translation)
 
 
 def window(scene: Scene, item: SceneObject) -> tuple[range, range]:
@@ -195,14 +195,13 @@ def _shadow(off_axis: float, z: float, radius: float, scene: Scene) -> range:
 def _cast(scene: Scene, number: int, x: Image, y: Image) -> tuple[Image, Labels]:
     """Depth (...) at which the rays through points (...) of the image enter one object, and the surface."""
     item = scene.objects[number]
-    rotation = rotation_matrix(scene.pose.rotation) @ rotation_matrix(item.rotation)
+    rotation = product(rotation_matrix(scene.pose.rotation), rotation_matrix(item.rotation))
     to_unit = rotation.T / (0.5 * item.scale * np.array(item.dimensions))[:, None]
-    origin = -to_unit @ in_camera_frame(np.array(item.position), scene.pose)
-    rays = np.ones((*x.shape, 3))
-    rays[..., 0], rays[..., 1] = (x - scene.S / 2) / scene.f, (y - scene.S / 2) / scene.f
+    origin = product(-to_unit, in_camera_frame(np.array(item.position), scene.pose))
+    rays = np.stack([(x - scene.S / 2) / scene.f, (y - scene.S / 2) / scene.f, np.ones_like(x)])
     meet = {"cylinder": _cylinder, "cube": _cube, "sphere": _sphere}[item.shape]
     with np.errstate(divide="ignore", invalid="ignore"):
-        enter, leave, face = meet(origin, rays @ to_unit.T)
+        enter, leave, face = meet(origin, product(np.moveaxis(rays, 0, -1), to_unit.T))
         # an interval whose ends are NaN or reversed is empty; a camera shows nothing behind it
         hit = (enter <= leave) & (enter > 0)
     return np.where(hit, enter, np.inf), np.where(hit, 1 + FACES * number + face, NOTHING).astype(np.int8)
@@ -216,7 +215,7 @@ def _slabs(origin: Image, rays: Image) -> tuple[Image, Image]:
 
 def _ball(origin: Image, rays: Image) -> tuple[Image, Image]:
     """Interval of the parameter inside the unit ball of the given coordinates; NaN where the line misses."""
-    a, b, c = (rays * rays).sum(axis=-1), rays @ origin, origin @ origin - 1
+    a, b, c = (rays * rays).sum(axis=-1), product(rays, origin), product(origin, origin) - 1
     root = np.sqrt(b * b - a * c)
     return (-b - root) / a, (-b + root) / a
 

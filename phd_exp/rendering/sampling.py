@@ -1,4 +1,4 @@
-"""From (specification, split, index) to a scene: a pure function, with numpy alone."""
+"""From (specification, split, index) to a scene: a pure function, equal to the bit on all processors."""
 
 import colorsys
 import math
@@ -10,7 +10,7 @@ from typing import get_args
 import numpy as np
 from jaxtyping import Float
 
-from phd_exp.optics.virtual import rays
+from phd_exp.optics.virtual import product, rays
 from phd_exp.records.scenes import (
     FIRST_VIEW,
     SHAPES,
@@ -190,8 +190,9 @@ def _poses(
         matrix = rotation_matrix(rotation)
         first = _position(spec, f, rng)
         seen = [first, *(slid(first, spec, f, time, motion()) for time in times)]
-        shifts = np.array(seen) - places[:, 0] @ matrix.T
-        if (places @ matrix.T + shifts[:, None])[..., 2].min() >= min(CLEARANCE, spec.z_range[0]):
+        turned = product(places, matrix.T)
+        shifts = np.array(seen) - turned[:, 0]
+        if (turned + shifts[:, None])[..., 2].min() >= min(CLEARANCE, spec.z_range[0]):
             return [Pose(rotation=rotation, translation=(x, y, z)) for x, y, z in shifts.tolist()]
     raise ValueError(f"no camera sees all {places.shape[1]} objects: lower view_angle_range")
 

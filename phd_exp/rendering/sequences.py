@@ -13,6 +13,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
 
+from phd_exp.optics.virtual import product, unit
 from phd_exp.records.scenes import Pose, Quaternion, SceneObject, Vector
 from phd_exp.records.spec import DatasetSpec
 
@@ -32,7 +33,7 @@ def moved(item: SceneObject, spec: DatasetSpec, f: float, time: float, rng: Stre
     """
     position = slid(item.position, spec, f, time, rng)
     axis = rng.standard_normal(3)
-    turn = time * math.radians(rng.uniform(*spec.spin_range)) * axis / np.linalg.norm(axis)
+    turn = time * math.radians(rng.uniform(*spec.spin_range)) * unit(axis)
     rotation = quaternion_of(Rotation.from_rotvec(turn) * rotation_of(item.rotation))
     return item.model_copy(update={"position": position, "rotation": rotation})
 
@@ -59,14 +60,14 @@ def camera_pose(spec: DatasetSpec, time: float, rng: Stream) -> Pose:
     """
     turn, centre = ([_wandered(time, rng) for _ in range(3)] for _ in range(2))
     R = Rotation.from_rotvec(math.radians(spec.camera_turn) * np.array(turn))
-    x, y, z = (-R.apply(spec.camera_speed * np.array(centre))).tolist()
+    x, y, z = product(-R.as_matrix(), spec.camera_speed * np.array(centre)).tolist()
     return Pose(rotation=quaternion_of(R), translation=(x, y, z))
 
 
 def in_scene(item: SceneObject, pose: Pose, *, turned: bool) -> SceneObject:
     """An object given in the camera's frame, in the scene's; its rotation too if it is to be `turned`."""
     back = rotation_of(pose.rotation).inv()
-    x, y, z = back.apply(np.array(item.position) - pose.translation).tolist()
+    x, y, z = product(back.as_matrix(), np.array(item.position) - pose.translation).tolist()
     rotation = quaternion_of(back * rotation_of(item.rotation)) if turned else item.rotation
     return item.model_copy(update={"position": (x, y, z), "rotation": rotation})
 

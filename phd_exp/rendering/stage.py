@@ -10,6 +10,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from phd_exp.optics.virtual import product, unit
 from phd_exp.records.scenes import SHAPES, Backdrop, Lamp, LampName, Material, Scene, SceneObject, Shape
 from phd_exp.rendering.looks import show_look
 from phd_exp.rendering.meshes import build_mesh
@@ -49,7 +50,8 @@ def show_scene(bpy: Any, scene: Scene, meshes: Iterable[str] = (), brightness: f
     objects["camera"].data.lens = scene.f * SENSOR_WIDTH / scene.S
     # p_scene = R^T (p_camera - translation), with Blender's axes in both frames
     back = rotation_matrix(scene.pose.rotation).T
-    objects["camera"].matrix_basis = matrix_of(back @ TO_BLENDER, -back @ np.array(scene.pose.translation))
+    centre = product(-back, np.array(scene.pose.translation))
+    objects["camera"].matrix_basis = matrix_of(product(back, TO_BLENDER), centre)
     for shape in (*SHAPES, *meshes):
         objects[shape].hide_render = True
     for item, handle in zip(scene.objects, handles(bpy, scene), strict=True):
@@ -129,7 +131,7 @@ def _place_lamp(handle: Any, lamp: Lamp, brightness: float) -> None:
     """An area lamp shines along its local -z."""
     position = np.array(lamp.position)
     forward = np.array(lamp.towards) - position
-    handle.matrix_basis = matrix_of(TO_BLENDER @ _aimed_along(TO_BLENDER @ forward), position)
+    handle.matrix_basis = matrix_of(product(TO_BLENDER, _aimed_along(product(TO_BLENDER, forward))), position)
     handle.data.energy = lamp.power / brightness
     handle.data.size = lamp.side
 
@@ -137,17 +139,16 @@ def _place_lamp(handle: Any, lamp: Lamp, brightness: float) -> None:
 def matrix_of(linear: NDArray[np.float64], place: NDArray[np.float64]) -> list[list[float]]:
     """Blender's matrix, by columns, of the map p = linear local + place in our axes."""
     matrix = np.eye(4)
-    matrix[:3, :3] = TO_BLENDER @ linear
-    matrix[:3, 3] = TO_BLENDER @ place
+    matrix[:3, :3] = product(TO_BLENDER, linear)
+    matrix[:3, 3] = product(TO_BLENDER, place)
     columns: list[list[float]] = matrix.T.tolist()
     return columns
 
 
 def _aimed_along(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     """A rotation (3, 3) whose -z axis is `direction`, with x level."""
-    back = -direction / np.linalg.norm(direction)
-    right = np.cross([0.0, 1.0, 0.0], back)
-    right /= np.linalg.norm(right)
+    back = -unit(direction)
+    right = unit(np.cross([0.0, 1.0, 0.0], back))
     return np.column_stack([right, np.cross(back, right), back])
 
 

@@ -15,6 +15,7 @@ from PIL import Image, ImageOps
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from phd_exp.optics.virtual import product
 from phd_exp.records.assets import Asset
 from phd_exp.records.images import FORMATS, content_of, decoding, pillow_warnings
 from phd_exp.records.scenes import Scene, Surroundings
@@ -60,7 +61,7 @@ class World:
         self._frame.matrix_basis = np.eye(4).tolist()
         if around.is_sky and around.file:
             self._load(around.file)
-            self._frame.matrix_basis = matrix_of(TO_BLENDER @ to_sky(around), np.zeros(3))
+            self._frame.matrix_basis = matrix_of(product(TO_BLENDER, to_sky(around)), np.zeros(3))
         self._ground.hide_render = around.ground is None
         if around.ground is not None:
             level = rotation_matrix(about_axis((1.0, 0.0, 0.0), math.pi / 2 + around.pitch))
@@ -81,7 +82,7 @@ class World:
         around = scene.surroundings
         assert around is not None
         assert around.file is not None
-        turn = to_sky(around) @ TO_BLENDER @ rotation_matrix(scene.pose.rotation).T
+        turn = product(product(to_sky(around), TO_BLENDER), rotation_matrix(scene.pose.rotation).T)
         return around.brightness * sky_light(self._load(around.file), turn, scene.f / around.span, scene.S)
 
     def _load(self, file: str) -> NDArray[np.float32]:

@@ -8,6 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from phd_exp.optics.virtual import product
+
 Depths = NDArray[np.float64]
 
 
@@ -69,7 +71,7 @@ class Triangles:
 
     def _seen(self, turn: Depths, shift: Depths, f: float, S: int) -> tuple[Depths, Depths, Depths]:
         """Columns and rows of the vertices, counted from the middle of the first pixel, and their depths z, m."""
-        x, y, z = (self.vertices @ turn.T + shift).T
+        x, y, z = (product(self.vertices, turn.T) + shift).T
         return f * x / z + S / 2 - 0.5, f * y / z + S / 2 - 0.5, z
 
 

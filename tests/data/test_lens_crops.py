@@ -7,7 +7,7 @@ from PIL import Image
 
 from phd_exp.data import crops
 from phd_exp.data.areas import GREY, area_means, sums
-from phd_exp.data.crops import cut
+from phd_exp.data.crops import corners_of, cut
 from phd_exp.optics.lens import Lens
 from phd_exp.optics.virtual import Box, VirtualCamera, intrinsics, rays
 from tests.support.opencv import projected
@@ -100,7 +100,7 @@ def test_a_view_in_strips_is_that_of_the_whole_image(box: Box, monkeypatch: pyte
     """Of an array and of Pillow's image, to the bit, also beyond the edge and where the lens folds over."""
     noise = np.random.default_rng(0).integers(0, 256, (700, 900, 3), dtype=np.uint8)
     camera = VirtualCamera.of_box(intrinsics(900.0, 900.0, 450.0, 350.0), box, 64.0, Lens((-0.3,)))
-    corners = torch.from_numpy(camera.corners)[None]
+    corners = torch.from_numpy(corners_of(camera))[None]
     (whole,) = area_means(sums(torch.from_numpy(noise)), corners.new_zeros(1, 2), corners).numpy()
     for pixels in (crops.STRIP, 10_000, 1):
         monkeypatch.setattr(crops, "STRIP", pixels)

@@ -9,7 +9,7 @@ from scipy.optimize import linprog
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.fusion import Fused, Plane, Pose, Status, fuse
+from phd_exp.fusion import Plane, Pose, Status, fuse
 from phd_exp.fusion.newton import LEAST_DEPTHS
 from tests.support.random_problems import columns_of, random_problems, rotations
 
@@ -185,18 +185,9 @@ def test_extreme_predictions_are_fused_too(on_plane: bool) -> None:
     assert (torch.linalg.eigvalsh(fused.covariance)[:, -1] > 0).all()
 
 
-def same_bits(one: Fused, other: Fused, kept: Tensor) -> None:
-    """The optima bit for bit; what exp and log enter, to rounding."""
-    for name in ("point", "certificate", "subgradient", "status"):
-        assert torch.equal(getattr(one, name)[kept].nan_to_num(-1), getattr(other, name).nan_to_num(-1)), name
-    for name in ("mean", "covariance", "surprise"):
-        torch.testing.assert_close(
-            getattr(one, name)[kept], getattr(other, name), rtol=1e-9, atol=1e-12, equal_nan=True
-        )
-
-
-def test_failures_do_not_change_a_bit_of_the_others() -> None:
-    """Against the batch without them."""
+@pytest.mark.kernels
+def test_failures_do_not_change_the_others() -> None:
+    """Against the batch without them, up to the rounding errors of its matrix products."""
     predictions, pose, _ = random_problems(403, 3, seed=9)
     columns, R = columns_of(predictions), pose.R.clone()
     columns[3][5::7, 1], R[3::11, 0] = torch.nan, 2 * torch.eye(3, dtype=torch.float64)
@@ -204,7 +195,11 @@ def test_failures_do_not_change_a_bit_of_the_others() -> None:
     broken = (fused.status == Status.NOT_FINITE) | (fused.status == Status.NOT_A_ROTATION)
     kept = (~broken).nonzero().squeeze(-1)
     assert len(kept) == 403 - len({*range(5, 403, 7), *range(3, 403, 11)})
-    same_bits(fused, fuse(*chosen(predictions, pose, kept)), kept)
+    alone = fuse(*chosen(predictions, pose, kept))
+    assert torch.equal(fused.status[kept], alone.status)
+    for name in ("point", "mean", "covariance", "surprise"):
+        one, other = getattr(fused, name)[kept], getattr(alone, name)
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12, equal_nan=True)
 
 
 @pytest.mark.parametrize("shape", [(0,), (2, 0)])

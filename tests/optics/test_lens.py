@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from phd_exp.data.crops import corners_of
 from phd_exp.optics.lens import PINHOLE, Lens
 from phd_exp.optics.virtual import Box, VirtualCamera, intrinsics, rays, require_no_fold
 from tests.support.opencv import projected, undistorted
@@ -100,7 +101,7 @@ def test_interpolated_corners_of_pixels_are_exact(lens: Lens, box: Box) -> None:
     along = (np.arange(97) - 48) / camera.f
     exact = camera.real_pixels(np.stack(np.meshgrid(along, along), axis=-1))
     assert np.isnan(exact).any() == (lens.coefficients == (-0.3,))
-    np.testing.assert_allclose(camera.corners, exact, rtol=0, atol=2e-9)
+    np.testing.assert_allclose(corners_of(camera), exact, rtol=0, atol=2e-9)
 
 
 def test_a_fisheye_has_views_beyond_90_degrees() -> None:

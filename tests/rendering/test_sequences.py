@@ -119,6 +119,7 @@ def test_a_record_has_the_name_of_its_sequence_its_time_and_its_pose(make_spec: 
     assert not single.keys() & {"track", "time"}, "records of single images stay as they were"
 
 
+@pytest.mark.kernels
 def test_a_further_camera_follows_the_cylinder_and_sees_the_same_scene(make_spec: MakeSpec) -> None:
     """View 0 is that of one camera, and frame 0 that of single images from two; the later frames are smooth."""
     several, places = {"views": 2, "view_angle_range": (20.0, 60.0)}, []
