@@ -49,7 +49,8 @@ ENERGY = (
     "depth over that of the mode; h(x) = x^2/2 up to 1, x - 1/2 beyond. A region has the positions of energy up to "
     "W, which is interpolated linearly over log a"
 )
-OPSET = 18
+OPSET, IR = 18, 8
+"""Versions of the operators and of the format: those of onnx 1.13, since older runtimes refuse later formats."""
 TOLERANCE = 1e-5
 IN_FLOAT32 = {"covariance": 1e-3}
 """Tolerances of other outputs where these are computed in float32."""
@@ -134,7 +135,9 @@ def graph(deployed: Deployed) -> Any:
     results = program.model.graph.outputs
     for value in (value for node in program.model.graph for value in node.outputs if value not in results):
         value.name = f"inner_{value.name}"  # the exporter names a mean within the network "mean" too
-    return _with_axes_from_the_front(program.model_proto)
+    model = _with_axes_from_the_front(program.model_proto)
+    model.ir_version = IR
+    return model
 
 
 def _folded(model: Any) -> None:

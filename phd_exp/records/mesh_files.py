@@ -24,6 +24,8 @@ _OPTION += rb"-\w+(?:[ \t]+(?:on|off|[rgbmlz]|[-+]?[\d.]+(?:e[-+]?\d+)?)(?=[ \t]
 _MAP = re.compile(
     rb"^([ \t]*(?:map_(?!aat)\w+|bump|disp|decal|refl|norm)[ \t]+(?:%b)*)(.+?)[ \t\r]*$" % _OPTION, re.M | re.I
 )
+_UNIT = re.compile(rb"^[ \t]*#(?=[^\n]*\bunits?\b)[^\n]*?\b(milli|centi|inch|mm\b|cm\b|met(?:er|re))", re.M | re.I)
+_UNITS = {b"milli": 0.001, b"mm": 0.001, b"centi": 0.01, b"cm": 0.01, b"inch": 0.0254, b"meter": 1.0, b"metre": 1.0}
 _PLY_NAMES = {b"r": b"red", b"g": b"green", b"b": b"blue", b"a": b"alpha", b"u": b"s", b"v": b"t"}
 _PLY_NAMES |= {b"texture_u": b"s", b"texture_v": b"t"}
 _PLY_NAMES |= {b"diffuse_" + name: name for name in (b"red", b"green", b"blue", b"alpha")}
@@ -64,6 +66,14 @@ class MeshFile:
                 return path.absolute()
         self.lost.append(f"{name} is missing")
         return None
+
+    @property
+    def stated_unit(self) -> float | None:
+        """The unit that a comment of an OBJ states, m; that of glTF by its standard; None for other files."""
+        if self.path.suffix.lower() != ".obj":
+            return 1.0 if self.path.suffix.lower() in (".glb", ".gltf") else None
+        found = _UNIT.search(self.copy)
+        return _UNITS[found[1].lower()] if found else None
 
     def require_finite(self) -> None:
         """Raise ValueError unless all coordinates are finite 32-bit numbers; Blender reads others as 0."""

@@ -22,6 +22,7 @@ from phd_exp.rendering.triangles import Meshes, Triangles
 TEXELS = 4  # of a texture along a side of an image: Cycles takes its value at a point, so finer ones are noise
 MOST_FACES = 1_000_000
 SIZES = (0.001, 20.0)  # m: bounds of an object's longest side
+UNITS = (0.001, 0.01, 0.0254, 1.0)  # m: in which files may be
 TOLERANCE = 1e-3  # of an object's size, within which what is drawn and what is labelled agree
 PLAIN = "set data.ignore=[materials] for random colours"
 Y_UP = (".glb", ".gltf", ".obj")  # Blender turns their (x, y, z) to (x, -z, y)
@@ -39,13 +40,14 @@ def import_meshes(bpy: Any, spec: DatasetSpec) -> Meshes:
     for number, asset in enumerate(filter(None, (spec.mesh, *spec.distractor_meshes))):
         file, name = next(iter(asset.files)), f"mesh{number or ''}"
         try:
-            handle = _one_object(bpy, read_mesh(asset.path(file)), is_plain="materials" in spec.ignore)
+            read = read_mesh(asset.path(file))
+            handle = _one_object(bpy, read, is_plain="materials" in spec.ignore)
             reference = "centroid" if number else spec.reference
             if isinstance(reference, tuple):
                 reference = in_blenders_axes(reference, file)
             meshes[name] = _in_metres(handle, spec.unit, reference)
             _require_drawn(bpy, handle, meshes[name])
-            _require_size(meshes[name], spec)
+            _require_size(meshes[name], spec, read.stated_unit)
         except (OSError, ValueError, RuntimeError) as error:
             key = "distractor_meshes" if number else "mesh"
             raise RenderError(f"data.{key}: {file}: {one_line(str(error))}") from None
@@ -199,22 +201,30 @@ def _require_drawn(bpy: Any, handle: Any, mesh: Triangles) -> None:
         raise ValueError("Blender draws other triangles than its labels have; export it without modifiers or poses")
 
 
-def _require_size(mesh: Triangles, spec: DatasetSpec) -> None:
-    """Raise ValueError if a mesh is implausibly small or large, or may reach the camera."""
+def _require_size(mesh: Triangles, spec: DatasetSpec, stated: float | None) -> None:
+    """Raise ValueError if a mesh is implausibly small or large, or may reach the camera.
+
+    The error says which sizes other units lead to, and marks the one that the file states.
+    """
     longest, reach, room = max(mesh.dimensions), spec.scale_range[1] * mesh.radius, spec.z_range[0] / NEAREST
     if (fits := SIZES[0] <= longest <= SIZES[1]) and reach <= room:
         return
     central = spec.scale_range[1] * Triangles(mesh.vertices - mesh.centroid, mesh.corners).radius
-    factor = 1 if fits else 1000 if longest < SIZES[0] else 0.001
-    remedies = [] if fits else [f"data.unit={factor * spec.unit:g}"]
-    if factor * reach > room:
-        remedies.append(
-            "data.reference=centroid" if factor * central <= room else f"data.z_range above {NEAREST * reach:.3g} m"
-        )
+    factors = {unit: unit / spec.unit for unit in UNITS if unit != spec.unit}
+    likely = {u: k for u, k in factors.items() if SIZES[0] <= k * longest <= SIZES[1] and k * central <= room}
+    sizes = [f"{u:g} ({k * longest:.3g} m{', as the file states' * (u == stated)})" for u, k in likely.items()]
+    remedies = []
+    if fits and central <= room:
+        remedies.append("data.reference=centroid")
+    elif sizes:
+        centred = " and data.reference=centroid" if reach * min(likely.values()) > room else ""
+        remedies.append(f"data.unit={' or '.join(sizes)}{centred}")
+    if fits and central > room:
+        remedies.append(f"data.z_range above {NEAREST * reach:.3g} m")
     raise ValueError(
         f"its longest side is {longest:.3g} m, its farthest point {reach:.3g} m from the reference, with data.unit="
         f"{spec.unit:g}; expected {SIZES[0]:g} to {SIZES[1]:g} m, and less than the least depth, "
-        f"{spec.z_range[0]:g} m; set {' and '.join(remedies)}"
+        f"{spec.z_range[0]:g} m; {'set ' + ', or '.join(remedies) if remedies else 'no usual unit leads there'}"
     )
 
 

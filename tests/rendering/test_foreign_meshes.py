@@ -12,6 +12,7 @@ from PIL import Image
 
 from phd_exp.records.errors import RenderError
 from phd_exp.records.gltf import split_gltf
+from phd_exp.records.mesh_files import read_mesh
 from phd_exp.rendering import importing
 from phd_exp.rendering.blender import Renderer, Settings
 from phd_exp.rendering.objects import sample_object_scene
@@ -293,6 +294,29 @@ def test_the_reason_of_blenders_error_is_told(tmp_path: Path, drawn: Callable) -
         assert not re.search(r"Location|\.py|/tmp", text)
 
 
+BOTTLE = (
+    b"# This file uses centimeters as units for non-parametric coordinates.\n"
+    b"v 0 0 0\nv 0 0 3\nv 0 14.9 0\nv 0 14.9 3\nf 1 2 4 3\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [
+        ("# This file uses centimeters as units", 0.01),
+        ("# File units = Millimetres", 0.001),
+        ("#Units: mm", 0.001),
+        ("# units inches", 0.0254),
+        ("# File units = meters", 1.0),
+        ("# made for a diameter of 5 mm", None),
+        ("v 0 0 0 # unit cm", None),
+    ],
+)
+def test_the_unit_that_an_obj_states(tmp_path: Path, text: str, unit: float | None) -> None:
+    (tmp_path / "a.obj").write_text(f"# exported\n{text}\nv 0 0 0\n")
+    assert read_mesh(tmp_path / "a.obj").stated_unit == unit
+
+
 @pytest.mark.parametrize(
     ("name", "content", "changes", "message"),
     [
@@ -300,17 +324,34 @@ def test_the_reason_of_blenders_error_is_told(tmp_path: Path, drawn: Callable) -
         ("line.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", {}, "its faces have no area"),
         ("text.stl", b"not a mesh", {}, "text.stl: .*Failed to read"),
         ("short.ply", b"ply\nformat ascii 1.0\nelement face 10000000\nend_header\n", {}, "short.ply: "),
-        ("cup.stl", solid("cylinder", 200.0), {}, r"longest side is 200 m, .* set data\.unit=0\.001"),
-        ("cup.stl", solid("cylinder", 1e-4), {}, r"longest side is 0\.0001 m, .* set data\.unit=1000"),
-        ("cup.stl", solid("cylinder", 4.3), {}, r"farthest point 3\.04 m from the .* less than the least depth, 3 m"),
+        (
+            "cup.stl",
+            solid("cylinder", 200.0),
+            {},
+            r"longest side is 200 m, .* set data\.unit=0\.001 \(0\.2 m\) or 0\.01 \(2 m\)$",
+        ),
+        ("cup.stl", solid("cylinder", 1e-4), {}, r"longest side is 0\.0001 m, .*; no usual unit leads there$"),
+        ("cup.stl", solid("cylinder", 0.06), {"unit": 0.01}, r"side is 0\.0006 m, .* or 1 \(0\.06 m\)$"),
+        (
+            "cup.stl",
+            solid("cylinder", 4.3),
+            {},
+            r"3\.04 m from the .* depth, 3 m; .*0\.01 \(0\.043 m\).*, or data\.z_range",
+        ),
+        (
+            "bottle.obj",
+            BOTTLE,
+            {},
+            r"set data\.unit=0\.001 .* or 0\.01 \(0\.149 m, as the file states\) or 0\.0254 \(0",
+        ),
         (
             "cup.stl",
             solid("cylinder", 2.4),
             {"scale_range": (0.5, 2.0)},
-            r"farthest point 3\.39 m.* set data\.z_range",
+            r"farthest point 3\.39 m.* or data\.z_range above 3\.56 m",
         ),
         ("cup.stl", solid("cylinder", 0.2, (50, 0, 0)), {}, r"side is 0\.2 m, .* set data\.reference=centroid$"),
-        ("cup.stl", solid("cylinder", 200, (5e4, 0, 0)), {}, r"set data\.unit=0\.001 and data\.reference=centroid$"),
+        ("cup.stl", solid("cylinder", 200, (5e4, 0, 0)), {}, r"0\.001 .*2 m\) and data\.reference=centroid$"),
         (
             "cup.stl",
             solid("cylinder", 0.2, (5e4, 0, 0)),

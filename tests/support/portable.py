@@ -39,9 +39,11 @@ class NoChoiceOfTruths(TorchDispatchMode):
 
 
 def require_portable(model: Any) -> None:
-    """Fails unless all operators are TensorRT's, of opset 18, with constant axes, and no tensor is float64."""
-    from onnx import TensorProto
+    """Fails unless operators are TensorRT's, of opset 18, format 8 and constant axes, and no tensor is float64."""
+    from onnx import TensorProto, checker
 
+    assert model.ir_version == 8
+    checker.check_model(model)
     ((domain, version),) = [(opset.domain, opset.version) for opset in model.opset_import]
     assert (domain, version) == ("", 18)
     assert {node.op_type for node in model.graph.node} <= TENSORRT
