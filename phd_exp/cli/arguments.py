@@ -5,6 +5,7 @@ import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from glob import glob, has_magic
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
@@ -72,7 +73,20 @@ EXECUTED = "packages of the user's own parts that the run names, separated by co
 Trust = Annotated[str | None, Field(description=EXECUTED)]
 ENLARGED = "side of the view of each box over that of the box; 1.2 for tight boxes"
 Margin = Annotated[Annotated[float, Field(ge=1, le=3)], Field(description=ENLARGED)]
-Paths = Annotated[tuple[Path, ...], BeforeValidator(lambda text: [text] if os.path.exists(text) else text.split(","))]
+
+
+def _paths(text: str) -> list[str]:
+    """Paths separated by commas, and those that match patterns, sorted."""
+    found = []
+    for part in [text] if os.path.exists(text) else text.split(","):
+        matching = sorted(glob(part, recursive=True)) if has_magic(part) and not os.path.exists(part) else [part]
+        if not matching:
+            raise ValueError(f"no path matches {part}; expected a pattern such as images/*.png")
+        found += matching
+    return found
+
+
+Paths = Annotated[tuple[Path, ...], BeforeValidator(_paths)]
 
 
 class RunArguments(Arguments):

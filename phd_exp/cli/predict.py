@@ -12,7 +12,7 @@ from pydantic import model_validator
 from phd_exp.cli.arguments import Coverage, Paths, loaded, predicted
 from phd_exp.cli.detecting import DetectingArguments
 from phd_exp.cli.outputs import message_file, places
-from phd_exp.records.detections import detections_of
+from phd_exp.records.detections import detections_of, named_apart
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.files import write_atomic
 from phd_exp.records.foreign import boxes_in
@@ -30,9 +30,9 @@ class PredictArguments(DetectingArguments):
     """The run, the images and their cameras; lengths in pixels of the image file."""
 
     image: Paths | None = None
-    """one image or several, separated by commas, with their camera as f=, fx= and fy=, or camera="""
-    folder: Path | None = None
-    """instead of image=: a folder with metadata.jsonl, BOP or COCO, or images and f=; or a ROS 2 recording"""
+    """one image or several, separated by commas or as 'images/*.png', with their camera as f=, or camera="""
+    folder: Paths | None = None
+    """instead of image=: folders with metadata.jsonl, BOP or COCO, or images and f=; or a ROS 2 recording"""
     out: Path | None = None
     """a folder for predictions.jsonl and pictures; or FILE.mcap for ROS 2 messages, in addition to printed lines"""
     view: Path | None = None
@@ -54,7 +54,7 @@ class PredictArguments(DetectingArguments):
         several = self.folder or len(self.image or ()) > 1
         if self.boxes and not self.function and several:
             raise ValueError("boxes: the boxes of one image=FILE; expected no folder= and no further image")
-        is_recorded = self.folder is not None and is_recording(self.folder)
+        is_recorded = any(map(is_recording, self.folder or ()))
         if self.function and not (self.of_camera or is_recorded):
             raise ValueError("boxes: expected f=PIXELS or camera=FILE too")
         if self.object is not None and (self.image or self.of_camera or is_recorded) and not self.boxes:
@@ -99,12 +99,15 @@ def main(words: list[str]) -> int:
 
 def _detections(arguments: PredictArguments) -> Detections:
     """The detections; of a detector, the images without boxes."""
-    camera, folder = arguments.of_camera, arguments.folder
-    if recording := arguments.recording(folder):
+    camera, folders = arguments.of_camera, arguments.folder or ()
+    if len(folders) > 1 and any(map(is_recording, folders)):
+        raise ConfigError("folder: got a recording and more; expected one recording, or several folders")
+    if recording := arguments.recording(folders[0] if folders else None):
         return recording
-    if folder and not camera:
-        return detections_in(folder, object_name=arguments.object)
-    files = images_in(folder) if folder else arguments.image or ()
+    if folders and not camera:
+        found = [one for folder in folders for one in detections_in(folder, object_name=arguments.object)]
+        return named_apart(found) if len(folders) > 1 else found
+    files = [file for folder in folders for file in images_in(folder)] or arguments.image or ()
     boxes = boxes_in(arguments.boxes, arguments.object) if arguments.boxes and not arguments.function else [{}]
     return detections_of(files, camera, boxes)
 

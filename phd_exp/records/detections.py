@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os.path import commonpath
 from pathlib import Path
 from typing import Annotated, Any
@@ -206,11 +206,22 @@ def detections_of(
         >>> detection.focal_lengths_and_centre(640, 480)
         (900.0, 900.0, 320.0, 240.0)
     """
-    folder = commonpath([file.absolute().parent for file in files])
-    named = [({"file_name": file.absolute().relative_to(folder).as_posix(), **camera}, file) for file in files]
+    named = [({"file_name": name, **camera}, file) for name, file in zip(_names(files), files, strict=True)]
     lines = [(line_of({**values, **box}, str(file)), file) for values, file in named for box in boxes]
     calibration = read_camera(Path(camera["camera"])) if "camera" in camera else None
     return [Detection(line, file, str(file), calibration) for line, file in lines]
+
+
+def named_apart(detections: Sequence[Detection]) -> list[Detection]:
+    """Detections of several folders, whose `file_name` begins where the folders differ."""
+    names = _names([one.file for one in detections])
+    lines = [one.line.model_copy(update={"file_name": name}) for one, name in zip(detections, names, strict=True)]
+    return [replace(one, line=line) for one, line in zip(detections, lines, strict=True)]
+
+
+def _names(files: Sequence[Path]) -> list[str]:
+    folder = commonpath([file.absolute().parent for file in files])
+    return [file.absolute().relative_to(folder).as_posix() for file in files]
 
 
 def line_of(values: Any, where: str) -> DetectionLine:

@@ -50,6 +50,26 @@ def baseline(make: Callable[..., RunFolder]) -> RunFolder:
     return make(*NOWHERE, "model=mae_constf")
 
 
+def test_a_pattern_and_several_folders_are_predicted_as_their_files(
+    phd_exp: Callable, run: RunFolder, tmp_path: Path
+) -> None:
+    for name in ("a/1.png", "b/1.png", "b/2.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        Image.fromarray(np.full((40, 40, 3), 90, np.uint8)).save(tmp_path / name)
+        line = json.dumps({"file_name": Path(name).name, "f": 90})
+        with open(tmp_path / name[0] / "metadata.jsonl", "a") as lines:
+            lines.write(f"{line}\n")
+    given = ["image=a/1.png,b/1.png,b/2.png", "image=?/*.png", "image=a/*.png,b/[12].png"]
+    outcomes = [phd_exp("predict", f"run={run.path}", words, "f=90") for words in given]
+    outcomes.append(phd_exp("predict", f"run={run.path}", "folder=a,b"))
+    assert [outcome.err for outcome in outcomes] == [""] * 4
+    assert [row["file_name"] for row in read_lines(outcomes[0].out)] == ["a/1.png", "b/1.png", "b/2.png"]
+    assert {outcome.out for outcome in outcomes} == {outcomes[0].out}
+    nothing = phd_exp("predict", f"run={run.path}", "image=c/*.png", "f=90")
+    assert (nothing.status, "image: " in nothing.error) == (2, True)
+    assert "no path matches c/*.png; expected a pattern such as images/*.png" in nothing.error
+
+
 @pytest.fixture
 def spoiled(run: RunFolder, tmp_path: Path) -> RunFolder:
     """A copy of the run, to be changed."""
