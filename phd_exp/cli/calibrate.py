@@ -6,9 +6,11 @@ from typing import Annotated
 from pydantic import Field
 
 from phd_exp.cli.arguments import Arguments, Margin, Trust, trusted
+from phd_exp.cli.outputs import require_output
 from phd_exp.records.detections import NumberOrName
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.own_images import detections_in
+from phd_exp.records.runs import RunFolder
 
 COVERAGES = (0.5, 0.8, 0.9, 0.95, 0.99)
 
@@ -34,6 +36,8 @@ def main(words: list[str]) -> int:
     if arguments.run.is_file():
         raise ConfigError(f"run={arguments.run}: a packed run records nothing; expected the folder of a run")
     detections = detections_in(arguments.folder, object_name=arguments.object)
+    file = RunFolder(arguments.run).labelled(arguments.name)
+    require_output(file, str(file.relative_to(arguments.run)), arguments, key="name")
     from phd_exp.evaluation.conformal import samples_needed
     from phd_exp.inference.loading import load
     from phd_exp.inference.tables import record_labelled
@@ -44,7 +48,7 @@ def main(words: list[str]) -> int:
     assert temperature is not None
     inside = ", ".join(f"{int((table['level'] <= level).sum())} inside {100 * level:.0f} %" for level in (0.5, 0.9))
     error = 100 * (table["depth_error_mm"] / 1000 / table["z"]).mean()
-    print(f"{predictor.folders[0].labelled(name)}: {n} labelled detections")
+    print(f"{file}: {n} labelled detections")
     print(f"  as trained: depth error {error:.2f} %, {inside}")
     print(f"  temperatures of a typical prediction: {temperature}")
     enough = [f"{level:g}" for level in COVERAGES if samples_needed(level) <= n // 2]

@@ -7,7 +7,7 @@ from typing import Literal, Self
 from pydantic import model_validator
 
 from phd_exp.cli.arguments import Coverage, RunArguments, loaded
-from phd_exp.cli.outputs import output_folder, require_file
+from phd_exp.cli.outputs import output_folder, require_output
 from phd_exp.records.errors import ConfigError
 
 
@@ -37,7 +37,7 @@ def main(words: list[str]) -> int:
     file = arguments.out or (run.with_suffix(".onnx") if run.is_file() else run / "network.onnx")
     if missing := [name for name in ("onnx", "onnxscript", "onnxruntime") if find_spec(name) is None]:
         raise ConfigError(f"export needs {', '.join(missing)}: `pip install 'phd_exp[export]'`")
-    require_file(file, "network.onnx")
+    require_output(file, "network.onnx", arguments)
     predictor = loaded(arguments, "cpu", arguments.coverage)
     output_folder(file.parent)
     from phd_exp.inference.deployed import PHOTOGRAPHS, batches, require_exportable

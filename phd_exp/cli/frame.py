@@ -1,6 +1,7 @@
 """The boundary around every verb and every job: any error or signal becomes lines for the user and an exit status."""
 
 import os
+import re
 import signal
 import sys
 import threading
@@ -13,6 +14,8 @@ from typing import NamedTuple
 from phd_exp.records.errors import UNPRINTABLE, ConfigError, UserError, in_user_code, install, one_line
 
 RESUMES = "the same command resumes"
+HOME = re.compile(r"(?<=[=,'\"\[])~[\w.-]*(?=[/,'\"\]]|$)")
+"""A home folder at the beginning of a value; a shell replaces only those that begin a word."""
 
 
 class Stopped(SystemExit):
@@ -68,6 +71,7 @@ def failure(error: BaseException) -> Ending:
 def run_verb(main: Callable[[list[str]], int], words: list[str]) -> int:
     """Run a verb with the words of its command line; returns the exit status."""
     try:
+        words = [HOME.sub(lambda found: os.path.expanduser(found[0]), word) for word in words]
         for word in filter(UNPRINTABLE.search, words):
             raise ConfigError(f"{one_line(word)}: holds control characters; expected printable KEY=VALUE")
         with stopping_on_signals():

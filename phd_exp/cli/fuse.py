@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 from pydantic import field_validator, model_validator
 
 from phd_exp.cli.arguments import Coverage, RunArguments, four_numbers, loaded, predicted
-from phd_exp.cli.outputs import message_file, new_view, require_output
+from phd_exp.cli.outputs import message_file, new_view, output_folder, require_output
 from phd_exp.records.detections import NumberOrName
 from phd_exp.records.errors import ConfigError, RunError, listed
 from phd_exp.records.files import write_atomic
 from phd_exp.records.messages import MessageFile
 from phd_exp.records.own_images import Observed, annotations, detections_in, observed
-from phd_exp.records.recordings import is_recording
+from phd_exp.records.recordings import MCAP, is_recording
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
     from phd_exp.inference.predictor import Predictor
@@ -75,9 +75,10 @@ def main(words: list[str]) -> int:
     scenes = observed(detections)
     if out is not None:
         inputs = [*annotations(arguments.folder)[0], *(detection.file for detection in detections)]
-        require_output(out, "fused.jsonl", inputs)
+        require_output(out, f"fused{MCAP if out.suffix == MCAP else '.jsonl'}", arguments, inputs)
+        output_folder(out.parent)
     if arguments.view is not None:
-        new_view(arguments.view)
+        new_view(arguments.view, arguments, [] if out is None else [out])
     with message_file(out) as messages:
         answers = _answers(arguments, scenes, messages)
     text = "".join(json.dumps(answer, allow_nan=False) + "\n" for answer in answers)

@@ -6,7 +6,7 @@ from typing import Annotated
 from pydantic import Field
 
 from phd_exp.cli.arguments import Arguments, Trust, trusted
-from phd_exp.cli.outputs import output_folder, require_file
+from phd_exp.cli.outputs import output_folder, require_output
 from phd_exp.records.runs import RunFolder
 
 
@@ -26,13 +26,12 @@ def main(words: list[str]) -> int:
     """Pack a run; returns the exit status."""
     arguments = PackArguments.parsed("pack", words)
     out = arguments.out or arguments.run / "run.zip"
-    require_file(out, "run.zip")
+    if arguments.run.is_dir():
+        require_output(out, "run.zip", arguments)
+        output_folder(out.parent)
     from phd_exp.inference.packing import pack
 
-    run = RunFolder(arguments.run)
-    if run.path.is_dir():
-        output_folder(out.parent)
-    sizes = pack(run, out, arguments.license, trusted(arguments.trust))
+    sizes = pack(RunFolder(arguments.run), out, arguments.license, trusted(arguments.trust))
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {len(sizes)} files; README.md in it is the card")
     print(f"  use it: python -m phd_exp predict run={out} image=photo.jpg f=PIXELS")
     return 0

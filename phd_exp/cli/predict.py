@@ -12,17 +12,18 @@ from pydantic import model_validator
 from phd_exp.cli.arguments import Coverage, Paths, loaded, predicted
 from phd_exp.cli.detecting import DetectingArguments
 from phd_exp.cli.outputs import message_file, places
-from phd_exp.records.detections import detections_of, named_apart
-from phd_exp.records.errors import ConfigError, RunError
-from phd_exp.records.files import write_atomic
+from phd_exp.records.detections import Detection, detections_of, named_apart
+from phd_exp.records.errors import ConfigError, RunError, UserError, writing
 from phd_exp.records.foreign import boxes_in
 from phd_exp.records.own_images import detections_in, images_in
 from phd_exp.records.recordings import MCAP, Detections, Recording, is_recording
+from phd_exp.records.written import Written
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
     from phd_exp.inference.answers import Sighting
     from phd_exp.inference.predictor import Predictor
 
+LINES = "predictions.jsonl"
 LONGEST_STEM = 50  # characters of an image's name in the name of its picture
 
 
@@ -75,7 +76,9 @@ def main(words: list[str]) -> int:
     inputs = [detections.path] if isinstance(detections, Recording) else [one.file for one in detections]
     if out is not None and out.suffix != MCAP and find_spec("matplotlib") is None:
         raise ConfigError("out: pictures need `pip install 'phd_exp[report]'`; without out= there is JSON alone")
-    places(out, arguments.view, inputs, "predictions")
+    known = [] if isinstance(detections, Recording) or arguments.function else detections
+    names = [_picture(number, len(known), one) for number, one in enumerate(known, start=1)]
+    places(arguments, inputs, "predictions", [LINES, *names])
     detector = arguments.detector()  # whose mistakes need no network
     predictor = loaded(arguments, coverage=arguments.coverage)
     guarantee = predictor.guarantee(arguments.coverage, arguments.groups) if arguments.coverage else None
@@ -131,16 +134,22 @@ def _write(
     from phd_exp.inference.answers import answer
     from phd_exp.inference.pictures import picture
 
-    file, temperature = out / "predictions.jsonl", predictor.temperature
-    file.unlink(missing_ok=True)
-    with open(file, "x", buffering=1) as lines:
+    with (
+        writing(out, "out=DIR", UserError),
+        Written(out, "predictions") as written,
+        open(written.place(LINES), "w", buffering=1) as lines,
+    ):
         for number, sighting in enumerate(sightings, start=1):
-            stem = Path(sighting.detection.line.file_name).stem[:LONGEST_STEM]
-            name = f"{number:0{len(str(n))}}-{stem}.png"
-            line = answer(sighting, temperature) | {"picture": name}
+            name = _picture(number, n, sighting.detection)
+            line = answer(sighting, predictor.temperature) | {"picture": name}
             lines.write(json.dumps(line, allow_nan=False) + "\n")
-            write_atomic(out / name, picture(sighting, line, curve, guarantee))
-    print(f"{file}, and a picture for each line", file=sys.stderr)
+            written.write(name, picture(sighting, line, curve, guarantee))
+    print(f"{out / LINES}, and a picture for each line", file=sys.stderr)
+
+
+def _picture(number: int, n: int, detection: Detection) -> str:
+    """The name of the picture of a line."""
+    return f"{number:0{len(str(n))}}-{Path(detection.line.file_name).stem[:LONGEST_STEM]}.png"
 
 
 def _depth_curve(predictor: "Predictor") -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from phd_exp.cli.arguments import Arguments
 from phd_exp.records.errors import UserError, writing
 from phd_exp.records.processes import announce
+from phd_exp.records.written import Written
 
 if TYPE_CHECKING:
     from phd_exp.reports.runs import Report
@@ -32,6 +33,7 @@ def main(words: list[str]) -> int:
 
     # tables of a few thousand rows are too small for several threads
     with writing(folders.out, "out=DIR", UserError), one_thread():
+        Written(folders.out / "site", "report").require("index.html", "compare.html")
         _report(folders.runs, folders.out)
     return 0
 

@@ -19,7 +19,7 @@ from phd_exp.cli.starts import checked_start
 from phd_exp.cli.train import run_name, task
 from phd_exp.config.targets import TrainingTarget, build
 from phd_exp.records.errors import ConfigError, RunError, UserError, gist
-from phd_exp.records.files import read_plain, write_atomic
+from phd_exp.records.files import make_folder, read_plain, write_atomic
 from phd_exp.records.parsing import parse_yaml
 from phd_exp.records.processes import held, usable_cores
 from phd_exp.records.searches import RECORD, SEARCHES, Search, Trial, TrialState
@@ -67,7 +67,7 @@ def main(words: list[str]) -> int:
     if config.data.n_held_out == 0:
         raise ConfigError("data.n_held_out: got 0; a search is judged by held-out samples, expected at least 1")
     folder = config.runs / SEARCHES / file.stem
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     with held(folder / ".lock") as free:
         if not free:
             raise RunError(f"{folder}: another process works on this search; wait for it or stop it")

@@ -14,12 +14,13 @@ from phd_exp.cli.arguments import loaded, with_bar
 from phd_exp.cli.detecting import DetectingArguments
 from phd_exp.cli.outputs import message_file, places
 from phd_exp.records.detections import detections_of
-from phd_exp.records.errors import ConfigError
+from phd_exp.records.errors import ConfigError, UserError, writing
 from phd_exp.records.foreign import boxes_of_images
 from phd_exp.records.messages import optical_frame
 from phd_exp.records.own_images import detections_in, tracks_of
 from phd_exp.records.recordings import MCAP, is_recording
 from phd_exp.records.videos import length_of, require_av, shots_in
+from phd_exp.records.written import Written
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
     from phd_exp.inference.detectors import Detector
@@ -97,9 +98,10 @@ def main(words: list[str]) -> int:
     sequences = list(_sequences(arguments))
     if out is not None and out.suffix == MCAP and len(sequences) > 1:
         raise ConfigError(f"out: got {len(sequences)} tracks; expected one track for {out}, or out=DIR")
-    places(out, arguments.view, [arguments.folder or Path(str(arguments.video))], "track")
+    names = [_video(number, len(sequences)) for number in range(len(sequences))]
+    places(arguments, [arguments.folder or Path(str(arguments.video))], "track", ["track.jsonl", *names])
     predictor = loaded(arguments)
-    predictor.require_densities("a path needs")  # before outputs of an earlier command are removed
+    predictor.require_densities("a path needs")
     with _recording(arguments, sequences) as view:
         paths = [(sequence, _followed(arguments, predictor, detector, sequence, view)) for sequence in sequences]
         if out is not None and out.suffix != MCAP:
@@ -220,6 +222,11 @@ def _print(
                 print(_line(arguments, predictor, sequence, followed), flush=True)
 
 
+def _video(number: int, n: int) -> str:
+    """The name of the video of a path, which has a number if there are several."""
+    return f"{number + 1:0{len(str(n))}}.mp4" if n > 1 else "track.mp4"
+
+
 def _write(
     arguments: TrackArguments,
     predictor: "Predictor",
@@ -229,15 +236,13 @@ def _write(
     """Write each line before its frame of the video, whose name begins with the number of its sequence."""
     from phd_exp.inference.path_video import PathVideo
 
-    file = out / "track.jsonl"
-    if file.exists():  # of an earlier command, which may have had more paths
-        for earlier in (*out.glob("*.mp4"), file):
-            if earlier == file or earlier.stem == "track" or earlier.stem.isdecimal():
-                earlier.unlink(missing_ok=True)
-    with open(file, "x", buffering=1) as lines:
-        for number, (sequence, path) in enumerate(paths, start=1):
-            name = "track" if len(paths) == 1 else f"{number:0{len(str(len(paths)))}}"
-            with PathVideo(out / f"{name}.mp4") as video:
+    with (
+        writing(out, "out=DIR", UserError),
+        Written(out, "track") as written,
+        open(file := written.place("track.jsonl"), "w", buffering=1) as lines,
+    ):
+        for number, (sequence, path) in enumerate(paths):
+            with PathVideo(written.place(_video(number, len(paths)))) as video:
                 for followed in path:
                     lines.write(_line(arguments, predictor, sequence, followed) + "\n")
                     video.add(followed)

@@ -1,6 +1,7 @@
 """A cache of decoded images: a memory-mapped uint8 array next to the data set."""
 
 import json
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -66,12 +67,16 @@ def cached(
                     return mapped(file, shape)
             unfinished.unlink(missing_ok=True)  # if it is a link, writing would overwrite its target
             array = np.lib.format.open_memmap(unfinished, mode="w+", dtype=np.uint8, shape=shape)
+            with open(unfinished, "r+b") as stream:  # a mapped page without room on the disk would kill the process
+                os.posix_fallocate(stream.fileno(), 0, unfinished.stat().st_size)
             fill_all(array)
             array.flush()
             unfinished.replace(file)
             write_atomic(key_file, json.dumps(key) + "\n")
             return mapped(file, shape)
     except OSError as error:
+        with suppress(OSError):
+            unfinished.unlink()
         why = f"{file.parent}: decoded images cannot be kept here ({error.strerror})"
         announce(f"{why}; they are decoded into memory, each run anew")
         array = np.empty(shape, dtype=np.uint8)

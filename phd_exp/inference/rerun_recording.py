@@ -23,6 +23,7 @@ from phd_exp.distributions.surfaces import gaussian_radius, level_surface, outli
 from phd_exp.fusion import Pose
 from phd_exp.inference.answers import PER_CENT, Sighting
 from phd_exp.optics.virtual import VirtualCamera
+from phd_exp.records.errors import UserError, writing
 
 LEVELS = (0.5, 0.9)
 REGION, GAUSSIAN, TRUTH = (255, 176, 0), (100, 143, 255), (255, 255, 255)
@@ -53,9 +54,15 @@ class SceneFile:
     @cached_property
     def _stream(self) -> rr.RecordingStream:
         stream = rr.RecordingStream("phd_exp")
-        self._file.touch()  # an error of Rerun would not name the file
-        stream.save(self._file, default_blueprint=self._layout())
+        self._out = self._file.open("wb")  # Rerun itself ends without an error on a full disk
+        self._bytes = stream.binary_stream()
+        rr.send_blueprint(self._layout(), make_active=False, recording=stream)
         return stream
+
+    def _write(self) -> None:
+        with writing(self._file, "view=", UserError):
+            self._out.write(self._bytes.read() or b"")
+            self._out.flush()
 
     def _layout(self) -> rrb.Blueprint:
         """Space on the left; on the right the images, and the depth over time."""
@@ -75,16 +82,19 @@ class SceneFile:
         self, kind: type[BaseException] | None, error: BaseException | None, place: TracebackType | None
     ) -> None:
         if "_stream" in vars(self):
-            self._stream.flush()
+            with writing(self._file, "view=", UserError), self._out:
+                self._write()
             self._stream.disconnect()
 
     def at(self, timeline: str, number: int) -> None:
         """What follows belongs to this step of a timeline."""
         self._stream.set_time(timeline, sequence=number)
+        self._write()
 
     def at_time(self, seconds: float) -> None:
         """What follows belongs to this time."""
         self._stream.set_time("time", duration=seconds)
+        self._write()
 
     def in_camera(self) -> None:
         """The world is the frame of the camera, where y is down."""

@@ -29,6 +29,7 @@ from phd_exp.inference.predictor import BATCH, Predictor
 from phd_exp.records.choices import flatten
 from phd_exp.records.detections import Detection
 from phd_exp.records.errors import RunError
+from phd_exp.records.files import make_folder
 from phd_exp.records.processes import announce
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.cameras import f_factor
@@ -50,7 +51,7 @@ def record(
         table, known = _predicted(predictor, source, "test", shift), dict(source.known("test"))
         if isinstance(source, RenderedSource) and max(source.spec.views, source.spec.frames) > 1:
             known |= _poses_and_times(source)
-        file.parent.mkdir(exist_ok=True)
+        make_folder(file.parent)
         write_parquet(file, table, known, origin)
 
 
@@ -112,7 +113,7 @@ def record_labelled(predictor: Predictor, detections: Sequence[Detection], name:
     found["margin"] = torch.full_like(found["f"], predictor.margin)
     file = folder.labelled(name)
     with folder.held():
-        file.parent.mkdir(exist_ok=True)
+        make_folder(file.parent)
         write_parquet(file, found, {"file_name": [one.line.file_name for one in detections]})
     return found
 

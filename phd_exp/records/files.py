@@ -4,6 +4,7 @@ import errno
 import fcntl
 import hashlib
 import os
+import shutil
 import stat
 import uuid
 from collections.abc import Callable, Iterable
@@ -17,7 +18,7 @@ from phd_exp.records.parsing import parse_json
 
 Parsed = TypeVar("Parsed")
 
-_TEMPORARIES = f".?*.{'[0-9a-f]' * 32}.tmp"  # names of the temporary files of `write_atomic`
+TEMPORARY = ".phd_exp.tmp"  # ends the names of temporary files and folders, which nobody else gives
 MB = 10**6
 LARGEST_RECORD = 16 * MB  # bytes of a file that is read as a whole; the project's own files have a few thousand
 LONGEST_LINE = MB  # bytes of a line of a journal; the line of a sample has about two thousand
@@ -51,14 +52,34 @@ def checksum(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
+def beginning(path: Path, n: int = 64) -> bytes:
+    """The first bytes of the file at an output's place; empty if it is new, also where a link leads.
+
+    Raises OSError if a folder, a pipe or a device is there, or links go round.
+    """
+    with suppress(FileNotFoundError):
+        require_plain(path)
+        with open(path, "rb") as stream:
+            return stream.read(n)
+    return b""
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder to write into, without the temporary files of killed processes. Raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    remove_temporaries(folder)
+
+
 def write_atomic(path: Path | str, data: bytes | str | Iterable[bytes]) -> None:
     """Write `data`, in parts if it is large, to `path` so that a reader finds either the old content or the new.
 
     The bytes are written to a hidden temporary file in the same folder (a rename is atomic within one file system
     only), flushed to the disk, and renamed. The temporary file is removed on any failure. It is locked while its
-    writer lives, so that `remove_temporaries` recognises those of killed writers.
+    writer lives, so that `remove_temporaries` recognises those of killed writers. A link stays: what it leads to is
+    written.
 
-    Raises OSError if the folder is missing or unwritable, or the disk is full; `path` is then unchanged.
+    Raises OSError if the folder is missing or unwritable, the disk is full, or `path` is neither new nor a plain
+    file; it is then unchanged.
 
     Examples:
         >>> from tempfile import TemporaryDirectory
@@ -67,8 +88,9 @@ def write_atomic(path: Path | str, data: bytes | str | Iterable[bytes]) -> None:
         ...     Path(folder, "notes").read_text()
         'whole or absent'
     """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    beginning(path := Path(path), 0)
+    place = Path(os.path.realpath(path))
+    temporary = place.with_name(f".{place.name}.{uuid.uuid4().hex[:16]}{TEMPORARY}")
     try:
         with open(temporary, "xb") as stream:
             with suppress(OSError):  # on a file system without locks, nothing is removed later either
@@ -77,7 +99,7 @@ def write_atomic(path: Path | str, data: bytes | str | Iterable[bytes]) -> None:
             stream.writelines([parts] if isinstance(parts, bytes) else parts)
             stream.flush()
             os.fsync(stream.fileno())
-            os.replace(temporary, path)
+            os.replace(temporary, place)
     except BaseException as error:
         with suppress(OSError):
             temporary.unlink()
@@ -88,13 +110,16 @@ def write_atomic(path: Path | str, data: bytes | str | Iterable[bytes]) -> None:
 
 
 def remove_temporaries(folder: Path) -> None:
-    """Remove the temporary files in `folder` that killed calls of `write_atomic` left."""
-    for path in folder.glob(_TEMPORARIES):
-        if path.is_file() and not path.is_symlink():
-            # OSError: its writer lives, or has renamed it since
-            with suppress(OSError), open(path, "r+b") as stream:
-                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                path.unlink()
+    """Remove the temporary files and folders in `folder` that killed writers left."""
+    for path in folder.glob(f".?*{TEMPORARY}"):
+        if (path.is_file() or path.is_dir()) and not path.is_symlink():
+            with suppress(OSError):  # its writer lives, or has renamed it since
+                descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+                try:
+                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    shutil.rmtree(path) if path.is_dir() else path.unlink()
+                finally:
+                    os.close(descriptor)
 
 
 def open_journal(path: Path) -> TextIO:

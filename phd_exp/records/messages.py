@@ -7,6 +7,7 @@ z forward), which is also the camera frame of this package. The messages are tho
 Source: REP 103 and 105; the definitions of vision_msgs, geometry_msgs, sensor_msgs and tf2_msgs.
 """
 
+import fcntl
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from jaxtyping import Float
 from phd_exp.optics.lens import Lens
 from phd_exp.records.cameras import COEFFICIENTS, CORNER
 from phd_exp.records.errors import ConfigError
+from phd_exp.records.files import TEMPORARY
 
 SECOND = 10**9  # nanoseconds
 UNKNOWN = 1e6
@@ -111,7 +113,9 @@ class MessageFile:
 
         self.file = file
         # a recording is a folder to rosbags; its MCAP file is complete without the rest
-        self._folder = TemporaryDirectory(prefix=f".{file.name}.", suffix=".tmp", dir=file.parent)
+        self._folder = TemporaryDirectory(prefix=f".{file.name}.", suffix=TEMPORARY, dir=file.parent)
+        self._lock = os.open(self._folder.name, os.O_RDONLY)  # tells `remove_temporaries` that its writer lives
+        fcntl.flock(self._lock, fcntl.LOCK_SH)
         self._writer = Writer(Path(self._folder.name) / "all", version=8, storage_plugin=StoragePlugin.MCAP)
         self._writer.open()
         self._connections: dict[str, Any] = {}
@@ -160,6 +164,7 @@ class MessageFile:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, place: TracebackType | None
     ) -> None:
+        os.close(self._lock)
         with self._folder:
             self._writer.close()
             if error is None or self._connections:

@@ -223,7 +223,8 @@ class RunFolder:
         lock = ExitStack()
         with writing(self.path, "runs=DIR", RunError):
             self.path.mkdir(parents=True, exist_ok=True)
-            for place in self.path.iterdir():
+            ours = (self.checkpoints, self.calibration, self.shifts, self.sequences, self.path / "labelled")
+            for place in (*self.path.iterdir(), *(file for folder in ours for file in folder.glob("*"))):
                 if place.is_symlink():  # in a stranger's run, it would redirect what is written
                     raise RunError(f"{place}: is a link; put the file or folder itself in its place")
             free = lock.enter_context(held(self.path / ".lock"))

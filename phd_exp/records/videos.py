@@ -152,7 +152,8 @@ class VideoWriter:
         """`size`: even width and height, px."""
         import av
 
-        self._container: Any = av.open(str(file), "w", format="mp4", options=FRAGMENTED)
+        self._file = file.open("wb")  # to FFmpeg, a file that it opens itself is whole on a full disk too
+        self._container: Any = av.open(self._file, "w", format="mp4", options=FRAGMENTED)
         self._stream: Any = self._container.add_stream("libx264", rate=30, options=QUALITY)
         self._stream.width, self._stream.height = size
         self._stream.pix_fmt = "yuv420p"
@@ -168,6 +169,7 @@ class VideoWriter:
         frame = av.VideoFrame.from_ndarray(image, format="rgb24")
         frame.pts, frame.time_base = round((time - self._first) * CLOCK), Fraction(1, CLOCK)
         self._container.mux(self._stream.encode(frame))
+        self._file.flush()
 
     def __enter__(self) -> Self:
         return self
@@ -175,5 +177,5 @@ class VideoWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, place: TracebackType | None
     ) -> None:
-        self._container.mux(self._stream.encode())
-        self._container.close()
+        with self._file, self._container:
+            self._container.mux(self._stream.encode())

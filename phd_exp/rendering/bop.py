@@ -24,10 +24,10 @@ from phd_exp.optics.virtual import product
 from phd_exp.records.cameras import CORNER
 from phd_exp.records.dataset import SPLITS, DatasetFolder
 from phd_exp.records.errors import writing
-from phd_exp.records.files import write_atomic
 from phd_exp.records.foreign import METRE
 from phd_exp.records.images import content_of
 from phd_exp.records.scenes import SHAPES, SampleRecord
+from phd_exp.records.written import Written
 from phd_exp.rendering import rays
 from phd_exp.rendering.meshes import build_mesh
 from phd_exp.rendering.pixels import file_of
@@ -51,30 +51,30 @@ def write_bop(folder: DatasetFolder, bop: Path, meshes: Meshes = NO_MESHES) -> i
     """
     records = [record for split in SPLITS for record in folder.records(split)]
     several = folder.manifest.spec.views > 1
-    with writing(bop, instead="bop=FOLDER"), shown_progress(len(records), "writing BOP") as advance:
+    with (
+        writing(bop, instead="bop=FOLDER"),
+        Written(bop, "bop") as written,
+        shown_progress(len(records), "writing BOP") as advance,
+    ):
         for (split, scene), images in groupby(records, lambda record: (record.split, several * record.scene)):
-            target, tables = bop / split / f"{scene:06d}", defaultdict[str, dict[int, Any]](dict)
-            for name in ("rgb", "mask_visib"):
-                (target / name).mkdir(parents=True, exist_ok=True)
+            target, tables = f"{split}/{scene:06d}", defaultdict[str, dict[int, Any]](dict)
             for record in images:
                 content = content_of(folder.split_folder(split) / record.file_name)
-                write_atomic(target / "rgb" / record.file_name, content)
+                written.write(f"{target}/rgb/{record.file_name}", content)
                 hits, numbers = rays.trace_pixels(record.as_scene, meshes), range(len(record.objects))
                 tables["gt"][record.index] = [_pose(record, number) for number in numbers]
                 tables["gt_info"][record.index] = [
-                    _write_mask(record, number, hits, meshes, target) for number in numbers
+                    _write_mask(record, number, hits, meshes, written, target) for number in numbers
                 ]
                 tables["camera"][record.index] = _camera(record, several)
                 advance()
             for name, table in tables.items():
-                write_atomic(target / f"scene_{name}.json", json.dumps(table))
-        (bop / "models").mkdir(parents=True, exist_ok=True)
+                written.write(f"{target}/scene_{name}.json", json.dumps(table))
         sizes = {item.shape: METRE * np.array(item.dimensions) for record in records for item in record.objects}
         models = {
-            number_of(shape): _write_model(shape, size, meshes.get(shape), bop / "models")
-            for shape, size in sizes.items()
+            number_of(shape): _write_model(shape, size, meshes.get(shape), written) for shape, size in sizes.items()
         }
-        write_atomic(bop / "models" / "models_info.json", json.dumps(models))
+        written.write("models/models_info.json", json.dumps(models))
     return len(records)
 
 
@@ -95,12 +95,14 @@ def _pose(record: SampleRecord, number: int) -> dict[str, Any]:
     }
 
 
-def _write_mask(record: SampleRecord, number: int, hits: rays.Hits, meshes: Meshes, target: Path) -> dict[str, Any]:
+def _write_mask(
+    record: SampleRecord, number: int, hits: rays.Hits, meshes: Meshes, written: Written, target: str
+) -> dict[str, Any]:
     """Write the mask of an object; returns its boxes and pixels, of which those outside the image are not visible."""
     mask = rays.cylinder_mask(hits, number)
     whole, rows, columns = rays.silhouette(record.as_scene, number, meshes)
-    file = target / "mask_visib" / f"{record.index:06d}_{number:06d}.png"
-    write_atomic(file, file_of(Image.fromarray(np.uint8(255) * mask), "png"))
+    name = f"{target}/mask_visib/{record.index:06d}_{number:06d}.png"
+    written.write(name, file_of(Image.fromarray(np.uint8(255) * mask), "png"))
     return {
         "bbox_obj": _box(whole, columns.start, rows.start),
         "bbox_visib": _box(mask),
@@ -119,7 +121,7 @@ def _box(mask: rays.Mask, left: int = 0, top: int = 0) -> list[int]:
     return [int(value) for value in (columns.min() + left, rows.min() + top, np.ptp(columns), np.ptp(rows))]
 
 
-def _write_model(shape: str, size: np.ndarray, mesh: Triangles | None, folder: Path) -> dict[str, Any]:
+def _write_model(shape: str, size: np.ndarray, mesh: Triangles | None, written: Written) -> dict[str, Any]:
     """Write the triangles of a shape as PLY; returns its size, and the rotations that do not change a solid."""
     if mesh:
         vertices, faces = METRE * mesh.vertices, [(3, *corners) for corners in mesh.corners.tolist()]
@@ -131,7 +133,7 @@ def _write_model(shape: str, size: np.ndarray, mesh: Triangles | None, folder: P
     header += "".join(f"property float {axis}\n" for axis in "xyz")
     header += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     rows = (" ".join(map(str, row)) for row in (*vertices.round(6).tolist(), *faces))
-    write_atomic(folder / f"obj_{number_of(shape):06d}.ply", header + "\n".join(rows) + "\n")
+    written.write(f"models/obj_{number_of(shape):06d}.ply", header + "\n".join(rows) + "\n")
     outermost = vertices[ConvexHull(vertices, qhull_options="QJ").vertices]  # QJ: a mesh may be flat
     # in blocks, because all distances of a ball's 18,000 vertices at once take a gigabyte, and nine times as long
     farthest = (cdist(outermost[i : i + 64], outermost[i:]).max() for i in range(0, len(outermost), 64))

@@ -20,6 +20,7 @@ from phd_exp.records.files import remove_temporaries, write_atomic
 from phd_exp.records.processes import held
 from phd_exp.records.scenes import SampleRecord
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.records.written import Written
 from phd_exp.rendering.blender import Renderer
 from phd_exp.rendering.pixels import file_of
 from phd_exp.rendering.progress import shown_progress
@@ -102,13 +103,12 @@ def write_masks(folder: DatasetFolder, masks: Path, meshes: Meshes = NO_MESHES) 
     Raises DatasetError if there is no data set, or a broken one, RenderError if the masks cannot be written.
     """
     records = [record for split in SPLITS for record in folder.records(split)]
-    with writing(masks, instead="masks=FOLDER"):
-        for split in SPLITS:
-            (masks / split).mkdir(parents=True, exist_ok=True)
+    names = [f"{record.split}/{Path(record.file_name).stem}.png" for record in records]
+    with writing(masks, instead="masks=FOLDER"), Written(masks, "masks") as written:
+        written.require(*names)
         with shown_progress(len(records), "drawing masks") as advance:
-            for record in records:
+            for record, name in zip(records, names, strict=True):
                 image = Image.fromarray(cylinder_mask(trace_pixels(record.as_scene, meshes)))
-                path = (masks / record.split / record.file_name).with_suffix(".png")
-                write_atomic(path, file_of(image, "png"))
+                written.write(name, file_of(image, "png"))
                 advance()
     return len(records)

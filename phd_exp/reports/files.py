@@ -12,7 +12,7 @@ from typing import Any
 
 from phd_exp.records.choices import PLAIN_RECIPE, preset_and_recipe
 from phd_exp.records.errors import one_line
-from phd_exp.records.files import remove_temporaries
+from phd_exp.records.written import Written
 from phd_exp.reports.calibration_table import calibration_tables
 from phd_exp.reports.cells import interval
 from phd_exp.reports.ensembles import ensemble_tables
@@ -22,7 +22,7 @@ from phd_exp.reports.paper_tables import paper_tables
 from phd_exp.reports.runs import Report, Run
 from phd_exp.reports.searches import search_tables
 from phd_exp.reports.shift_tables import shift_tables
-from phd_exp.reports.table import Table, TableCell, TableRow, bounds, write_text
+from phd_exp.reports.table import Table, TableCell, TableRow, bounds
 from phd_exp.reports.tracks import tracks_tables
 from phd_exp.reports.variations import variation_tables
 
@@ -71,16 +71,14 @@ def all_tables(report: Report) -> list[Table]:
 
 def write_tables(report: Report, tables: Sequence[Table], out: Path) -> Path:
     """Write `<stem>.{md,tex}` per table, `<kind>.csv` per kind and `runs.csv`; returns the folder, `<out>/tables`."""
-    folder = out / "tables"
-    folder.mkdir(parents=True, exist_ok=True)
-    remove_temporaries(folder)  # of a killed process
-    for table in tables:
-        write_text(folder / f"{table.stem}.md", markdown(table))
-        write_text(folder / f"{table.stem}.tex", latex(table))
-    for kind, alike in groupby(tables, key=lambda table: table.kind):
-        write_text(folder / f"{kind}.csv", tidy([line for table in alike for line in table.numbers]))
-    write_text(folder / "runs.csv", tidy(run_lines(report)))
-    return folder
+    with Written(out / "tables", "report") as written:
+        for table in tables:
+            written.write(f"{table.stem}.md", markdown(table))
+            written.write(f"{table.stem}.tex", latex(table))
+        for kind, alike in groupby(tables, key=lambda table: table.kind):
+            written.write(f"{kind}.csv", tidy([line for table in alike for line in table.numbers]))
+        written.write("runs.csv", tidy(run_lines(report)))
+    return out / "tables"
 
 
 def run_lines(report: Report) -> list[dict[str, Any]]:

@@ -21,7 +21,7 @@ from phd_exp.evaluation.several_views import read_sequences, read_views
 from phd_exp.evaluation.shifts import ShiftScores, shift_scores
 from phd_exp.evaluation.tracks import TrackScores, choose, track_scores
 from phd_exp.records.errors import RunError, UserError, one_line
-from phd_exp.records.files import write_atomic
+from phd_exp.records.files import beginning, write_atomic
 from phd_exp.records.runs import HELD_OUT, RunFolder
 from phd_exp.reports.gallery import Gallery, images_folder, make_gallery
 from phd_exp.reports.scene import Scene, first_scene
@@ -149,6 +149,7 @@ def kept_or_measured(
     file = kept / f"{file_stem(*folder.names)}.json"
     key = _key(folder, config)
     try:
+        beginning(file)  # raises an error for a pipe, which would never be read
         content = json.loads(file.read_text())
         if content["key"] == key:
             return _ADAPTER.validate_python(content["measured"])
@@ -156,7 +157,8 @@ def kept_or_measured(
         pass  # nothing is stored, or another version stored it
     measured = measuring()
     with suppress(OSError):  # then the next report measures again
-        write_atomic(file, json.dumps({"key": key, "measured": asdict(measured)}))
+        if beginning(file)[:8] in (b"", b'{"key": '):  # otherwise another program's
+            write_atomic(file, json.dumps({"key": key, "measured": asdict(measured)}))
     return measured
 
 

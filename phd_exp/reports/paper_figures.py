@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from phd_exp.evaluation.parquet import read_table
-from phd_exp.records.files import remove_temporaries, write_atomic
+from phd_exp.records.written import Written
 from phd_exp.reports.figures import LABELS, decades, draw_birds_eye, draw_identity, draw_on_image, encoded
 from phd_exp.reports.gallery import curves_of, images_folder, load_image
 from phd_exp.reports.paper import PUBLISHED
@@ -25,20 +25,17 @@ def write_figures(report: Report, folder: Path) -> list[str]:
 
     Each shows the finished probabilistic run without overrides that has the lowest seed.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    remove_temporaries(folder)
-    names = []
+    names, plans = [], dict[str, Callable[[], Figure | None]]()
     for preset in report.presets:
         runs = _first_seeds(report, preset)
-        plans: dict[str, Callable[[], Figure | None]] = {
-            file_stem("calibration", preset): partial(_calibration, runs),
-            file_stem("precision", preset): partial(_precision, runs),
-        }
+        plans[file_stem("calibration", preset)] = partial(_calibration, runs)
+        plans[file_stem("precision", preset)] = partial(_precision, runs)
         plans |= {file_stem("level_curves", preset, run.data): partial(_level_curves, run) for run in runs}
+    with Written(folder, "report") as written:
         for name, draw in plans.items():
             files = report.notes.attempt(partial(_files, draw), f"figure {name}: ") or {}
             for kind, content in files.items():
-                write_atomic(folder / f"{name}.{kind}", content)
+                written.write(f"{name}.{kind}", content)
             names += [name] if files else []
     return names
 

@@ -12,7 +12,7 @@ from phd_exp.evaluation.parquet import Arrays, read_table
 from phd_exp.evaluation.point_errors import COLUMNS, Estimate, MeanErrors, mean_errors
 from phd_exp.records.choices import flatten, has_influence
 from phd_exp.records.errors import RunError, one_line
-from phd_exp.records.files import remove_temporaries
+from phd_exp.records.files import make_folder
 from phd_exp.records.runs import CHOOSE, SECTIONS, RunFolder, RunStatus, find_runs
 from phd_exp.records.searches import Search, read_searches
 from phd_exp.reports.measured import Measured, Notes, kept_or_measured, measure
@@ -120,8 +120,7 @@ def read_report(runs: Path, kept: Path | None = None, progress: Callable[[str], 
     found = []
     folders = find_runs(runs)
     if folders and kept:
-        kept.mkdir(parents=True, exist_ok=True)
-        remove_temporaries(kept)  # of a killed process
+        make_folder(kept)
     for folder in folders:
         progress("/".join(map(printable, folder.names)))
         notes = Notes()

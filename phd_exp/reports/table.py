@@ -5,12 +5,10 @@ import os
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 from phd_exp.metrics.bootstrap import Interval
 from phd_exp.records.errors import one_line
-from phd_exp.records.files import write_atomic
 
 NOTHING = "–"
 LONGEST_STEM = 120
@@ -108,8 +106,3 @@ def file_stem(*names: str) -> str:
     unmistakable = plain == "-".join(names) and not any("-" in name for name in names[:-1])
     digest = hashlib.sha256("/".join(names).encode(errors="surrogateescape")).hexdigest()[:8]
     return plain if unmistakable and len(plain) <= LONGEST_STEM else f"{plain[:100]}-{digest}"
-
-
-def write_text(file: Path, text: str) -> None:
-    """Write a file of the report atomically; a lone surrogate becomes `?`. Raises OSError."""
-    write_atomic(file, text.encode(errors="replace"))

@@ -30,8 +30,28 @@ def test_tables_are_printed_and_written(phd_exp: Callable, runs: Path, tmp_path:
         "table1-small-central.tex",
         "tables.csv",
         "runs.csv",
+        ".report.written",
     }
-    assert not list((tmp_path / "report" / "site" / "runs").glob("*.tmp"))
+
+
+def test_pages_of_others_stay_and_leftovers_go(phd_exp: Callable, runs: Path, tmp_path: Path) -> None:
+    site = tmp_path / "report" / "site"
+    (site / "runs").mkdir(parents=True)
+    mine, leftover = site / "runs" / "mine.html", site / ".index.html.0.phd_exp.tmp"
+    for file in (mine, leftover, site / "index.html"):
+        file.write_text("mine")
+    assert "site/index.html: cannot be written" in phd_exp("report").error
+    assert [path.name for path in (tmp_path / "report").iterdir()] == ["site"], "nothing is computed before"
+    (site / "index.html").unlink()
+    assert (phd_exp("report").status, leftover.exists()) == (0, False)
+    (page,) = set((site / "runs").iterdir()) - {mine}
+    record(runs, "default", "mae_vz", 0, predicted(0).frame)
+    (runs / "small" / "occl").rename(tmp_path / "away")
+    again = phd_exp("report")
+    assert again.status == 0
+    assert "report/site: of an earlier command, " in again.err
+    assert (page.exists(), mine.read_text()) == (False, "mine")
+    assert len(list((site / "runs").iterdir())) == 2
 
 
 def test_several_views_are_printed_and_written_where_they_are_recorded_and_both_folders_can_be_named(

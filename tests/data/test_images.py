@@ -14,6 +14,7 @@ from phd_exp.data import images
 from phd_exp.data.images import cached_images, shrunk
 from phd_exp.records.dataset import DatasetFolder, mapped, sha256
 from phd_exp.records.errors import DatasetError
+from tests.support.disks import small_disk
 
 SIDE, N = 64, 5
 
@@ -156,3 +157,15 @@ def test_images_of_a_read_only_data_set_are_decoded_into_memory(
     np.testing.assert_array_equal(found, expected)
     (line,) = capsys.readouterr().err.splitlines()
     assert ".cache: decoded images cannot be kept here (File exists); they are decoded into memory" in line
+
+
+def test_images_without_room_on_the_disk_are_decoded_into_memory(
+    folder: DatasetFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    expected = cached_images(folder, "train", folder.records("train"), 32)
+    shutil.rmtree(folder.cache)
+    with small_disk(folder.cache, 8) as disk:
+        found = cached_images(folder, "train", folder.records("train"), 32)
+        np.testing.assert_array_equal(found, expected)
+        assert "decoded images cannot be kept here (No space left on device)" in capsys.readouterr().err
+        assert [file.name for file in disk.iterdir()] == ["decoding.lock"]

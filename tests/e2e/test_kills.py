@@ -53,7 +53,7 @@ def end(process: BaseProcess) -> None:
 
 def contents(out: Path) -> dict[str, bytes]:
     """Every file, by its path, without those that have not their name yet."""
-    files = [path for path in out.rglob("*") if path.is_file() and path.suffix != ".tmp"]
+    files = [path for path in out.rglob("*") if path.is_file() and path.suffix not in (".tmp", ".written")]
     return {path.relative_to(out).as_posix(): path.read_bytes() for path in files}
 
 

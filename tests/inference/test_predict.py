@@ -272,7 +272,7 @@ def test_every_line_has_its_own_picture(
     assert [row["file_name"] for row in rows] == names
     files = {row["picture"] for row in rows}
     assert len(files) == len(names)
-    assert {file.name for file in (tmp_path / "drawn").iterdir()} == files | {"predictions.jsonl"}
+    assert files == {file.name for file in (tmp_path / "drawn").glob("*.png")}
     first, second = titles[0].split("\n")
     assert first == "a.png, f = 400.5 px"
     assert second.startswith("mode (")

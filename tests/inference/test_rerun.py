@@ -166,7 +166,7 @@ def test_a_recording_is_new_and_of_a_density(
     (tmp_path / "a.rrd").write_text("earlier")
     baseline = f"run={make(*NOWHERE, 'model=mae_constf').path}"
     for words, status, said in (
-        ((run, "view=a.rrd"), 2, "view: got a.rrd, which exists; expected a new file; delete it, or choose another"),
+        ((run, "view=a.rrd"), 2, "view=a.rrd: holds other data than this command writes; expected a new file, .*"),
         ((run, "view=photos"), 2, "view: got photos; expected a file *.rrd, such as view.rrd"),
         ((run, "view=/proc/no/a.rrd"), 2, "/proc/no: cannot be written (No such file or directory); make room, .*"),
         ((baseline, "view=b.rrd"), 2, "view: .* predicts no Projected Huber densities, .*"),

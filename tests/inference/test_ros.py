@@ -523,7 +523,7 @@ def test_a_recording_has_one_path(phd_exp: Callable, run: str, tmp_path: Path) -
 
 def test_a_file_that_exists_is_replaced_and_nothing_else_stays(phd_exp: Callable, run: str, tmp_path: Path) -> None:
     recorded(tmp_path / "a.mcap", n=1)
-    (tmp_path / "b.mcap").write_text("of last year")
+    recorded(tmp_path / "b.mcap", n=2)
     assert phd_exp("predict", run, "folder=a.mcap", "out=b.mcap").status == 0
     assert len(written(tmp_path / "b.mcap")["/detections"]) == 1
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.mcap", "b.mcap"]

@@ -3,12 +3,13 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from phd_exp.records.errors import CorruptFileError
-from phd_exp.records.files import open_journal, read_jsonl, remove_temporaries, write_atomic
+from phd_exp.records.files import TEMPORARY, make_folder, open_journal, read_jsonl, remove_temporaries, write_atomic
 
 
 @pytest.mark.parametrize("content", ["grün\n", b"\x00\xff", ""])
@@ -34,6 +35,28 @@ def test_a_failed_write_leaves_the_old_content_and_nothing_else(
     assert os.listdir(tmp_path) == ["file"]
 
 
+@pytest.mark.parametrize("content", ["old", None])
+def test_what_a_link_leads_to_is_written(tmp_path: Path, content: str | None) -> None:
+    (tmp_path / "far").mkdir()
+    if content:
+        (tmp_path / "far" / "file").write_text(content)
+    (tmp_path / "link").symlink_to("far/file")
+    write_atomic(tmp_path / "link", "new")
+    assert os.readlink(tmp_path / "link") == "far/file"
+    assert (tmp_path / "far" / "file").read_text() == "new"
+    assert os.listdir(tmp_path / "far") == ["file"]
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, lambda path: os.symlink("there", path)])
+def test_only_a_plain_file_is_replaced(tmp_path: Path, make: Callable[[Path], None]) -> None:
+    make(tmp_path / "there")
+    before = (tmp_path / "there").lstat()
+    with pytest.raises(OSError, match="there"):
+        write_atomic(tmp_path / "there", "new")
+    assert (tmp_path / "there").lstat() == before
+    assert os.listdir(tmp_path) == ["there"]
+
+
 def test_a_written_file_has_the_rights_of_an_ordinary_one(tmp_path: Path) -> None:
     (tmp_path / "ordinary").write_text("")
     write_atomic(tmp_path / "atomic", "")
@@ -48,12 +71,13 @@ def test_leftovers_of_killed_writers_are_removed_and_nothing_else(tmp_path: Path
     )
     subprocess.run([sys.executable, "-c", script], cwd=Path(__file__).parents[2], check=False)
     (leftover,) = tmp_path.iterdir()
-    kept = [tmp_path / "kept", tmp_path / ".of-another.tmp"]
+    kept = [tmp_path / name for name in ("kept", ".of-another.tmp", f".notes.{'0' * 32}.tmp")]
     for path in kept:
         path.write_text("")
-    remove_temporaries(tmp_path)
+    (tmp_path / f".a.mcap.0{TEMPORARY}").mkdir()
+    make_folder(tmp_path)
     assert not leftover.exists()
-    assert all(path.exists() for path in kept)
+    assert sorted(tmp_path.iterdir()) == sorted(kept)
 
 
 def test_what_is_being_written_is_no_leftover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -86,7 +86,7 @@ def test_an_interrupted_drawing_leaves_nothing(
     def stopped(_: Any, __: Any) -> np.ndarray:
         raise KeyboardInterrupt
 
-    (old.root / f".masks.npy.{'0' * 32}.tmp").touch()  # of a killed process
+    (old.root / ".masks.npy.0.phd_exp.tmp").touch()  # of a killed process
     before = {path for path in old.root.iterdir() if path.suffix != ".tmp"}
     monkeypatch.setitem(masks.DRAW, "masks.npy", stopped)
     with pytest.raises(KeyboardInterrupt):

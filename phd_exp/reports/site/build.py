@@ -7,13 +7,13 @@ from pathlib import Path
 
 from plotly.offline import get_plotlyjs
 
-from phd_exp.records.files import remove_temporaries, write_atomic
+from phd_exp.records.written import Written
 from phd_exp.reports.measured import Measured, Notes
 from phd_exp.reports.runs import Report, Run, unreadable
 from phd_exp.reports.site.overview import Drawn, overview_groups
 from phd_exp.reports.site.pages import as_script, comparison_page, overview_page, run_page, run_script
 from phd_exp.reports.site.run_charts import run_charts
-from phd_exp.reports.table import Table, write_text
+from phd_exp.reports.table import Table
 
 _ASSETS = Path(__file__).parent / "assets"
 
@@ -29,35 +29,29 @@ def write_site(report: Report, tables: Sequence[Table], figures: Sequence[str], 
 
     Links are relative, so that the folder can be moved.
     """
-    for folder in (site / "runs", site / "data", site / "assets"):
-        folder.mkdir(parents=True, exist_ok=True)
-        remove_temporaries(folder)  # of a killed process
-    for asset in sorted(_ASSETS.iterdir()):
-        write_atomic(site / "assets" / asset.name, asset.read_bytes())
-    write_atomic(site / "assets" / "plotly.min.js", get_plotlyjs())
-    several = len(report.runs) > 1
-    drawn = [_write_run(site, run, several) for run in report.runs]
-    groups = overview_groups(drawn, report.searches)
-    charts = {key: asdict(chart) for group, _ in groups.values() for key, chart in group.items()}
-    write_text(site / "data" / "overview.js", as_script("overview", {"charts": charts}))
-    write_text(site / "compare.html", comparison_page(report.runs))
-    write_text(site / "index.html", overview_page([one.run for one in drawn], tables, groups, figures))
-    kept = {"overview", *(run.slug for run in report.runs)}
-    for file in [*(site / "runs").glob("*.html"), *(site / "data").glob("*.js")]:
-        if file.stem not in kept:
-            file.unlink()
+    with Written(site, "report") as written:
+        for asset in sorted(_ASSETS.iterdir()):
+            written.write(f"assets/{asset.name}", asset.read_bytes())
+        written.write("assets/plotly.min.js", get_plotlyjs())
+        several = len(report.runs) > 1
+        drawn = [_write_run(written, run, several) for run in report.runs]
+        groups = overview_groups(drawn, report.searches)
+        charts = {key: asdict(chart) for group, _ in groups.values() for key, chart in group.items()}
+        written.write("data/overview.js", as_script("overview", {"charts": charts}))
+        written.write("compare.html", comparison_page(report.runs))
+        written.write("index.html", overview_page([one.run for one in drawn], tables, groups, figures))
     return site / "index.html"
 
 
-def _write_run(site: Path, run: Run, several: bool) -> Drawn:
+def _write_run(written: Written, run: Run, several: bool) -> Drawn:
     """Write the files of a run inside its boundary: its page reports what cannot be drawn."""
     notes = Notes(run.notes)
     charts = notes.attempt(partial(run_charts, run)) or {}
     whole, place_alone = replace(run, notes=notes), unreadable(run.folder, notes)
     tries = [Drawn(whole, charts), Drawn(replace(whole, measured=Measured()), {}), Drawn(place_alone, {})]
     drawn, texts = next((one, texts) for one in tries if (texts := notes.attempt(partial(_texts, one, several))))
-    write_text(site / "runs" / f"{run.slug}.html", texts[0])
-    write_text(site / "data" / f"{run.slug}.js", texts[1])
+    written.write(f"runs/{run.slug}.html", texts[0])
+    written.write(f"data/{run.slug}.js", texts[1])
     return drawn
 
 
