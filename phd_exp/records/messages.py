@@ -23,7 +23,7 @@ from jaxtyping import Float
 
 from phd_exp.optics.lens import Lens
 from phd_exp.records.cameras import COEFFICIENTS, CORNER
-from phd_exp.records.errors import ConfigError
+from phd_exp.records.errors import ConfigError, UserError, writing
 from phd_exp.records.files import TEMPORARY
 
 SECOND = 10**9  # nanoseconds
@@ -156,7 +156,8 @@ class MessageFile:
         store, kind = typestore(), message.__msgtype__
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(topic, kind, typestore=store)
-        self._writer.write(self._connections[topic], time, store.serialize_cdr(message, kind))
+        with writing(self.file, "out=", UserError):
+            self._writer.write(self._connections[topic], time, store.serialize_cdr(message, kind))
 
     def __enter__(self) -> Self:
         return self
@@ -165,7 +166,7 @@ class MessageFile:
         self, kind: type[BaseException] | None, error: BaseException | None, place: TracebackType | None
     ) -> None:
         os.close(self._lock)
-        with self._folder:
+        with writing(self.file, "out=", UserError), self._folder:
             self._writer.close()
             if error is None or self._connections:
                 os.replace(Path(self._folder.name) / "all" / "all.mcap", self.file)

@@ -243,7 +243,10 @@ def test_a_home_folder_is_found_in_every_value(
     assert not (here / "~").exists()
 
 
-@pytest.mark.parametrize("words", ["predict out=D", "predict view=D/a.rrd", "track out=D", "track view=D/a.rrd"])
+FULL_DISKS = [f"{verb} {key}" for verb in ("predict", "track") for key in ("out=D", "out=D/a.mcap", "view=D/a.rrd")]
+
+
+@pytest.mark.parametrize("words", FULL_DISKS)
 def test_a_full_disk_is_one_line_and_the_same_command_runs_later(phd_exp: Callable, here: Path, words: str) -> None:
     verb, word = words.replace("D", "disk").split()
     with small_disk(here / "disk", 1024) as disk:
