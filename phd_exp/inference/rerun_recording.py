@@ -5,6 +5,7 @@ outline of a region is the projection of its surface through the lens, in pixels
 projects through pinholes alone; therefore outlines belong to the image.
 """
 
+import os
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -54,15 +55,9 @@ class SceneFile:
     @cached_property
     def _stream(self) -> rr.RecordingStream:
         stream = rr.RecordingStream("phd_exp")
-        self._out = self._file.open("wb")  # Rerun itself ends without an error on a full disk
-        self._bytes = stream.binary_stream()
-        rr.send_blueprint(self._layout(), make_active=False, recording=stream)
+        self._require_room()
+        stream.save(self._file, default_blueprint=self._layout())
         return stream
-
-    def _write(self) -> None:
-        with writing(self._file, "view=", UserError):
-            self._out.write(self._bytes.read() or b"")
-            self._out.flush()
 
     def _layout(self) -> rrb.Blueprint:
         """Space on the left; on the right the images, and the depth over time."""
@@ -82,19 +77,24 @@ class SceneFile:
         self, kind: type[BaseException] | None, error: BaseException | None, place: TracebackType | None
     ) -> None:
         if "_stream" in vars(self):
-            with writing(self._file, "view=", UserError), self._out:
-                self._write()
+            self._stream.flush()
             self._stream.disconnect()
+            self._require_room()
+
+    def _require_room(self) -> None:
+        """Raise UserError if the disk is full, on which Rerun ends its file without an error."""
+        with writing(self._file, "view=", UserError), open(self._file, "ab") as stream:
+            end = stream.tell()
+            os.posix_fallocate(stream.fileno(), end, 1)
+            stream.truncate(end)
 
     def at(self, timeline: str, number: int) -> None:
         """What follows belongs to this step of a timeline."""
         self._stream.set_time(timeline, sequence=number)
-        self._write()
 
     def at_time(self, seconds: float) -> None:
         """What follows belongs to this time."""
         self._stream.set_time("time", duration=seconds)
-        self._write()
 
     def in_camera(self) -> None:
         """The world is the frame of the camera, where y is down."""
