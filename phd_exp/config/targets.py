@@ -149,6 +149,8 @@ def locate(name: Any, trust: Trust, where: str = "") -> Any:
         target = getattr(import_module(module), attribute)
     except Exception as error:  # a module of the user may raise any
         remedy = install(str(error)) if isinstance(error, ImportError) else ""
+        if trust is not None and _is_below(name, OURS):  # a part that has left
+            remedy = "; use the version of phd_exp that recorded the run, see its status.json"
         raise _error(f"{path}: {name!r} cannot be imported ({in_user_code(error) or error}){remedy}") from None
     if not callable(target):
         raise _error(f"{path}: {name!r} is a {type(target).__name__}; expected a class or function")

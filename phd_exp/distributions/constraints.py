@@ -22,7 +22,6 @@ from phd_exp.distributions.gaussian_mixture import GaussianMixture
 from phd_exp.distributions.natural import LARGEST_RATIO
 from phd_exp.distributions.point_estimate import PointDensity, PointEstimate
 from phd_exp.distributions.projected_huber import ProjectedHuber
-from phd_exp.distributions.quantiles import LEVELS, Quantiles
 from phd_exp.geometry import Camera, Cartesian, Chart, DepthScale, LogDepth, Projected
 
 F_RANGE, Z_RANGE, S = (1200.0, 2000.0), (3.0, 5.0), 224.0
@@ -30,7 +29,7 @@ MIDDLE_F = (F_RANGE[0] * F_RANGE[1]) ** 0.5
 DEPTH = DepthScale.from_ranges(F_RANGE, Z_RANGE)
 SCALE = 0.1
 """Scale of the baselines' residuals, in units of their charts."""
-Density = ProjectedHuber | shaped.Shaped | Quantiles | GaussianMixture | PointDensity
+Density = ProjectedHuber | shaped.Shaped | GaussianMixture | PointDensity
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,6 @@ def families() -> dict[str, Family]:
         "laplace_inverse": _shaped(shaped.InverseDepthLaplace),
         "decomposed": _shaped(shaped.Decomposed),
         "student_t": _shaped(shaped.StudentT),
-        "quantiles": _shaped(Quantiles.from_raw, _medians_and_gaps),
         "mae_vz": _baseline(Projected(DEPTH)),
         "mae_logz": _baseline(LogDepth(DEPTH)),
         "mae_xyz": _baseline(Cartesian(DEPTH)),
@@ -104,19 +102,8 @@ def _mixture(raw: Tensor, camera: Camera) -> GaussianMixture:
     return GaussianMixture.about(_projected_huber(parts, Camera(camera.f[..., None], S)), raw[..., 27:])
 
 
-def _medians_and_gaps(n: int, generator: torch.Generator) -> Tensor:
-    """Medians as of `_seven_numbers`, and gaps over four decades, alike for each coordinate."""
-    uniform = torch.rand(n, 6, generator=generator, dtype=torch.float64)
-    gaps = (9 * uniform[:, 3:] - 7).repeat_interleave(len(LEVELS) - 1, dim=-1)
-    gaps = gaps + torch.randn(gaps.shape, generator=generator, dtype=torch.float64) / 2
-    return torch.cat([2 * uniform[:, :2] - 1, torch.zeros(n, 5), uniform[:, 2:3] - 0.5, gaps], dim=-1)
-
-
-def _shaped(
-    density: Callable[[ProjectedHuber, Tensor], Density],
-    inputs: Callable[[int, torch.Generator], Tensor] = _ten_numbers,
-) -> Family:
-    return Family(lambda raw, camera: density(_projected_huber(raw[..., :7], camera), raw[..., 7:]), inputs)
+def _shaped(density: Callable[[ProjectedHuber, Tensor], Density]) -> Family:
+    return Family(lambda raw, camera: density(_projected_huber(raw[..., :7], camera), raw[..., 7:]), _ten_numbers)
 
 
 def _seven_numbers(n: int, generator: torch.Generator) -> Tensor:

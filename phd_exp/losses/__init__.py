@@ -2,6 +2,5 @@
 
 from phd_exp.losses.mae import MeanAbsoluteError
 from phd_exp.losses.nll import NegativeLogLikelihood
-from phd_exp.losses.pinball import Pinball
 
-__all__ = ["MeanAbsoluteError", "NegativeLogLikelihood", "Pinball"]
+__all__ = ["MeanAbsoluteError", "NegativeLogLikelihood"]

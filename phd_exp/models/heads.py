@@ -15,12 +15,11 @@ from phd_exp.distributions import Density, PointEstimate, ProjectedHuber
 from phd_exp.distributions.closest import closest_to_student
 from phd_exp.distributions.gaussian_mixture import GaussianMixture
 from phd_exp.distributions.natural import precision
-from phd_exp.distributions.quantiles import LEVELS, Quantiles
 from phd_exp.distributions.shaped import Shaped, StudentT
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import Chart, DepthScale
 
-Prediction = ProjectedHuber | Shaped | Quantiles | GaussianMixture | PointEstimate
+Prediction = ProjectedHuber | Shaped | GaussianMixture | PointEstimate
 
 
 @runtime_checkable
@@ -176,24 +175,6 @@ class MixtureHead:
     def _split(self, raw: Tensor) -> tuple[Tensor, Tensor]:
         numbers, log_weight = raw.split((9 * self.n_parts, self.n_parts), dim=-1)
         return numbers.unflatten(-1, (self.n_parts, 9)), log_weight
-
-
-class QuantileHead:
-    """Raw numbers of the medians of v_p and log z, and of the gaps between their quantiles -> `Quantiles`."""
-
-    n_outputs = 3 * len(LEVELS)
-    prediction = Quantiles
-
-    def __init__(self, depth: DepthScale) -> None:
-        self.seven = DistributionHead(depth)
-
-    def __call__(self, raw: Float[Tensor, "*batch n_outputs"], camera: Camera) -> Quantiles:
-        medians = torch.cat([raw[..., :2], torch.zeros_like(raw[..., :5])], dim=-1)
-        return Quantiles.from_raw(self.seven(medians, camera), raw[..., 2:])
-
-    def placed(self, raw: Float[Tensor, "*batch n"], place: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch n"]:
-        """Raw numbers with the medians of v_p shifted by `place`."""
-        return torch.cat([raw[..., :2] + place, raw[..., 2:]], dim=-1)
 
 
 class ChartHead:

@@ -27,8 +27,6 @@ KEPT = {
     "decomposed": {1, 2, 3, 4, 6, 7},
     "gaussian_logz": {1, 2, 3, 4, 6, 7},
     "laplace_inverse": {1, 2, 3, 4, 6, 7},
-    # and its density jumps at every quantile
-    "quantiles": {1, 2, 3, 4, 6},
     # blind to the camera's plane and to what is behind it
     "gaussian": {1, 2, 4, 5, 7},
     "gaussian_ray": {1, 2, 4, 5, 7},

@@ -35,7 +35,7 @@ RUNS = Path("runs")
         ["model=own", "camera=shown", "optimizer._target_=torch.optim.RMSprop", "~optimizer.fused"],
         ["model=student_t", "backbone._target_=torchvision.models.shufflenet_v2_x0_5"],
         ["camera=constant", "model=mae_vz"],
-        ["model=quantiles", "recipe=strong", "optimizer=adam"],
+        ["model=decomposed", "recipe=strong", "optimizer=adam"],
     ],
     ids=" ".join,
 )

@@ -10,7 +10,7 @@ from torchvision.models.resnet import BasicBlock, Bottleneck
 from torchvision.models.resnet import ResNet as TorchvisionResNet
 
 from phd_exp.geometry import Camera, Cartesian, DepthScale, LogDepth, Projected
-from phd_exp.losses import MeanAbsoluteError, NegativeLogLikelihood, Pinball
+from phd_exp.losses import MeanAbsoluteError, NegativeLogLikelihood
 from phd_exp.models.backbones import BackboneOutput, PooledFeatures, resnet
 from phd_exp.models.heads import ChartHead, DistributionHead, Head, SurrogateHead
 from phd_exp.models.regressor import Regressor
@@ -30,7 +30,7 @@ HEADS: dict[str, Head] = {
 }
 LOSSES = {
     name: NegativeLogLikelihood() for name in ("probabilistic", "free_axis", "free_axis_t", "rounded_t", *SHAPED)
-} | {"quantiles": Pinball()}
+}
 
 
 @pytest.fixture

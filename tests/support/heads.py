@@ -20,6 +20,6 @@ SHAPED = {
     name: head(name)
     for name in (
         *("gaussian", "gaussian_ray", "gaussian_logz", "gaussian_mixture"),
-        *("laplace_inverse", "decomposed", "student_t", "quantiles"),
+        *("laplace_inverse", "decomposed", "student_t"),
     )
 }

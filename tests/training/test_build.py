@@ -142,7 +142,7 @@ class Reads(TorchDispatchMode):
 @pytest.mark.parametrize(
     "words",
     [
-        *([], ["camera.f_error=0.05"], ["model=mae_constf"], ["model=quantiles"], ["model=student_t"]),
+        *([], ["camera.f_error=0.05"], ["model=mae_constf"], ["model=student_t"]),
         ["recipe.augmentation.largest_zoom=1.2"],
     ],
     ids=" ".join,

@@ -32,6 +32,7 @@ FOREIGN: list[tuple[dict[str, Any], str]] = [
     ({"_target_": "builtins.eval"}, r"^_target_: 'builtins.eval' is not built from .*; .* add trust=builtins"),
     ({"_target_": ADAM}, r"^_target_: 'torch.optim.Adam' is not built"),
     ({"_target_": "phd_exp.records.files.write_atomic"}, r"is not built from a stored configuration$"),
+    ({"_target_": "phd_exp.models.heads.Gone"}, r"no attribute 'Gone'\); use the version of phd_exp that recorded"),
     ({"_target_": "phd_exp.models_of_mine.Net"}, r"is not built from a stored configuration$"),
     ({"_target_": "phd_exp.geometry.camera.dataclass"}, r"is only imported there"),
     ({"_target_": HEAD, "chart": [{"_target_": "os.system"}]}, r"^chart\.0\._target_: 'os.system' is not"),
