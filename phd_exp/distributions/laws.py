@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from scipy import special
 from torch import Tensor
-from torch.distributions import Laplace, Normal
+from torch.distributions import Normal
 
 from phd_exp.distributions import depth, huber
 from phd_exp.distributions.level import credible_level
@@ -22,7 +22,7 @@ from phd_exp.distributions.special import log_scaled_normaliser
 
 Pair = Float[Tensor, "*#batch 2"]
 Number = Float[Tensor, "*#batch"]
-_NORMAL, _LAPLACE = (law(0.0, 1.0, validate_args=False) for law in (Normal, Laplace))  # a check waits for a GPU
+_NORMAL = Normal(0.0, 1.0, validate_args=False)  # a check waits for a GPU
 
 
 class Law(ABC):
@@ -118,33 +118,6 @@ class StudentLaw(Law):
         return self.freedom / (self.freedom - 2).clamp_min(torch.finfo(self.freedom.dtype).eps)
 
     depth_variance = variance
-
-
-@final
-@dataclass(frozen=True)
-class LaplaceLaw(Law):
-    """A standard normal q and, independently, Laplace's law of s < a."""
-
-    around: ProjectedHuber
-    depth_variance = 2.0
-
-    @property
-    def _in_front(self) -> Tensor:
-        return _LAPLACE.cdf(self.around.a)
-
-    def log_prob(self, q: Pair, s: Number) -> Number:
-        return _NORMAL.log_prob(q).sum(-1) + _LAPLACE.log_prob(s) - self._in_front.log()
-
-    def level(self, q: Pair, s: Number) -> Number:
-        energy = q.square().sum(-1) / 2 + s.abs()  # a sum of two exponential variables; that of s > 0 ends at a
-        end, decay = torch.minimum(energy, self.around.a), torch.exp(-energy)
-        return (2 - decay - torch.exp(-end) - (energy + end) * decay) / (2 * self._in_front)
-
-    def cdf(self, s: Number) -> Number:
-        return _LAPLACE.cdf(s) / self._in_front
-
-    def icdf(self, p: Number) -> Number:
-        return _LAPLACE.icdf(p * self._in_front)
 
 
 @final

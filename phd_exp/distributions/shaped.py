@@ -17,7 +17,7 @@ from torch.nn.functional import pad
 
 from phd_exp.distributions import spd
 from phd_exp.distributions.density import Density
-from phd_exp.distributions.laws import HuberLaw, LaplaceLaw, Law, NormalLaw, Number, Pair, StudentLaw
+from phd_exp.distributions.laws import HuberLaw, Law, NormalLaw, Number, Pair, StudentLaw
 from phd_exp.distributions.projected_huber import ProjectedHuber
 from phd_exp.geometry.camera import at_depth
 
@@ -25,14 +25,12 @@ from phd_exp.geometry.camera import at_depth
 @final
 @dataclass(frozen=True)
 class Whitening:
-    """The map from positions to (q, s): with q and t = z/mu_z of a Projected Huber density, s = a (t^e - 1)/e.
-
-    s is a log t for e = 0. For e = 1 positions fill all space. For e < 1 they have
-    z > 0 and it is the ray q/t.
+    """The map from positions to (q, s), with q and t = z/mu_z of a Projected Huber density.
 
     Args:
-        around: provides the parameters; it may have a free axis for e = 1 alone.
-        exponent: e, one of -1, 0 and 1.
+        around: provides the parameters; it may have a free axis for an exponent of 1 alone.
+        exponent: 1 for s = a (t - 1), where positions fill all space; 0 for s = a log t with the ray q/t in place of
+            q, where z > 0.
     """
 
     around: ProjectedHuber
@@ -47,7 +45,7 @@ class Whitening:
         if self.exponent == 1:
             return q, s, volume, visible
         t = xyz[..., 2] / around.mu_z
-        return q / t[..., None], s, volume + (self.exponent - 3) * t.log(), visible
+        return q / t[..., None], s, volume - 3 * t.log(), visible
 
     def s(self, z: Number) -> tuple[Number, Bool[Tensor, "*#batch"]]:
         """s of a depth (metres), and whether it has one."""
@@ -58,13 +56,13 @@ class Whitening:
         return (z > 0) | (self.exponent == 1)
 
     def _s(self, z: Tensor) -> Tensor:
-        t, e = z / self.around.mu_z, self.exponent
-        return self.around.a * ((t**e - 1) / e if e else t.log())
+        t = z / self.around.mu_z
+        return self.around.a * (t - 1 if self.exponent else t.log())
 
     def z(self, s: Number) -> Number:
         """The depth of s, metres."""
-        excess, e = s / self.around.a, self.exponent
-        return self.around.mu_z * ((1 + e * excess) ** e if e else excess.exp())
+        excess = s / self.around.a
+        return self.around.mu_z * (1 + excess if self.exponent else excess.exp())
 
     def position(self, q: Pair, s: Number) -> Float[Tensor, "*#batch 3"]:
         """The position of q and s, metres."""
@@ -83,8 +81,7 @@ class Whitening:
 class Shaped(Density):
     """The density of positions whose variables have a law.
 
-    Where moments do not exist, those of the linearisation about the mode replace them: of (x, y)/z for e = 1, and of
-    z for e = -1.
+    With an exponent of 1, (x, y)/z has no moments; those of the linearisation about the mode replace them.
     """
 
     has_closed_forms: ClassVar[Literal[False]] = False
@@ -163,11 +160,6 @@ def Gaussian(around: ProjectedHuber, further: Float[Tensor, "*batch n"]) -> Shap
     return Shaped(Whitening(around.with_axis(further[..., :2]), 1), NormalLaw())
 
 
-def RayGaussian(around: ProjectedHuber, _: Tensor) -> Shaped:
-    """A Gaussian in space whose longest axis, as that of the paper's density, is the viewing ray of its mode."""
-    return Shaped(Whitening(around, 1), NormalLaw())
-
-
 def StudentT(around: ProjectedHuber, further: Float[Tensor, "*batch n"]) -> Shaped:
     """Student's t in space with any scale matrix and 2 + phi(third further number) degrees of freedom."""
     law = StudentLaw(student_freedom(further[..., 2]))
@@ -177,16 +169,6 @@ def StudentT(around: ProjectedHuber, further: Float[Tensor, "*batch n"]) -> Shap
 def student_freedom(raw: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """The degrees of freedom of a raw number, more than 2, so that variances exist."""
     return 2 + spd.positive(raw)
-
-
-def LogDepthGaussian(around: ProjectedHuber, _: Tensor) -> Shaped:
-    """A Gaussian of the ray and, independently, of log z."""
-    return Shaped(Whitening(around, 0), NormalLaw())
-
-
-def InverseDepthLaplace(around: ProjectedHuber, _: Tensor) -> Shaped:
-    """A Gaussian of the ray and, independently, Laplace's law of 1/z > 0."""
-    return Shaped(Whitening(around, -1), LaplaceLaw(around))
 
 
 def Decomposed(around: ProjectedHuber, _: Tensor) -> Shaped:

@@ -8,7 +8,7 @@ import torch
 from scipy import stats
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.shaped import RayGaussian
+from phd_exp.distributions.shaped import Gaussian
 from phd_exp.evaluation.conformal import conformal_log_volumes
 from phd_exp.evaluation.volumes import LOG_VOLUMES, drawn_columns
 from phd_exp.records.errors import RunError
@@ -24,7 +24,7 @@ def predictions() -> ProjectedHuber:
 
 
 def test_volumes_of_a_gaussian_are_those_of_ellipsoids() -> None:
-    law = RayGaussian(predictions(), torch.zeros(N, 0))
+    law = Gaussian(predictions(), torch.zeros(N, 2))
     found = drawn_columns(law, law.mode, seed=0)
     half_log_det = float(law.covariance_matrix[0].logdet()) / 2
     for level, name in LOG_VOLUMES.items():

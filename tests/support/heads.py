@@ -16,10 +16,4 @@ def head(model: str) -> Head:
     return build(node, is_partial=True)(depth=DEPTH)
 
 
-SHAPED = {
-    name: head(name)
-    for name in (
-        *("gaussian", "gaussian_ray", "gaussian_logz", "gaussian_mixture"),
-        *("laplace_inverse", "decomposed", "student_t"),
-    )
-}
+SHAPED = {name: head(name) for name in ("gaussian", "gaussian_mixture", "decomposed", "student_t")}
