@@ -129,7 +129,7 @@ def summary(cells: pd.DataFrame) -> str:
         (PRESET, "whole", "mode"): "whole field: `preset=full recipe=strong`",
     }
     table = heading(*DATA) + line(
-        "paper: ResNet-50, 8,000 images, 50 epochs", *(published("probabilistic", data) for data in DATA)
+        "paper: ResNet-50, 8,000 images", *(published("probabilistic", data) for data in DATA)
     )
     for (preset, reading, estimate), label in labels.items():
         choice = {"preset": preset, "estimate": estimate, "reading": reading}
