@@ -11,28 +11,25 @@ ROUNDING = 2.0
 """The rounding of `model=rounded_t`, chosen by the NLL of held-out samples; see docs/ideas/heads.md."""
 # log factors of A and a, as polynomials in 1/n: least squares over n >= 2, within 1e-3
 _LOG_PROJECTED = (0.48232, -0.75329, -0.29228, -0.83828)
-_LOG_DEPTH = (0.22614, -0.77194, -0.30254, -0.88518)
-_LOG_ROUNDED_DEPTH = (0.60748, -0.82139, -0.31717, -0.97420)
+_LOG_DEPTH = (0.60748, -0.82139, -0.31717, -0.97420)
 
 
-def closest_to_student(
-    around: ProjectedHuber, further: Float[Tensor, "*batch 3"], is_rounded: bool = False
-) -> ProjectedHuber:
-    """The density with a free axis that gives samples of `shaped.StudentT(around, further)` the highest likelihood.
+def closest_to_student(around: ProjectedHuber, further: Float[Tensor, "*batch 3"]) -> ProjectedHuber:
+    """The density that gives samples of `shaped.StudentT(around, further)` the highest likelihood.
+
+    It has a free axis and a rounded mode.
 
     Mode and axis stay, since both laws are symmetric about them. A and a are multiplied by factors that depend on the
     degrees of freedom n alone. That of A is the c with E[c r h'(c r)] = 2, where r is the radius of the projection of
     a standard Student's t. That of a is the c with E[c |s| e'(c |s|)] = 1, where s is its depth and e the energy of
-    depth: e(s) = |s|, or sqrt(s^2 + ROUNDING^2) with a rounded mode. Both are exact in the limit of a large a, where
+    depth, sqrt(s^2 + ROUNDING^2). Both are exact in the limit of a large a, where
     depths in front of the mode and behind it have the same law.
 
     Source: own derivation; tests/distributions/test_closest.py checks the factors by samples.
     """
     inverse = 1 / student_freedom(further[..., 2])
-    of_depth = _LOG_ROUNDED_DEPTH if is_rounded else _LOG_DEPTH
-    projected, depth = (_polynomial(c, inverse).neg().exp() for c in (_LOG_PROJECTED, of_depth))
-    closest = around.with_axis(further[..., :2]).tempered(projected, depth)
-    return closest.with_rounding(ROUNDING) if is_rounded else closest
+    projected, depth = (_polynomial(c, inverse).neg().exp() for c in (_LOG_PROJECTED, _LOG_DEPTH))
+    return around.with_axis(further[..., :2]).tempered(projected, depth).with_rounding(ROUNDING)
 
 
 def _polynomial(coefficients: tuple[float, ...], x: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ Source: paper, section "Desired constraints for estimated distribution".
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 
 import torch
 from jaxtyping import Float
@@ -61,8 +61,7 @@ def families() -> dict[str, Family]:
     return {
         "probabilistic": Family(_projected_huber, _seven_numbers),
         "free_axis": Family(_projected_huber, _nine_numbers),
-        "free_axis_t": _shaped(closest_to_student),
-        "rounded_t": _shaped(partial(closest_to_student, is_rounded=True)),
+        "rounded_t": _shaped(closest_to_student),
         "gaussian": _shaped(shaped.Gaussian),
         "gaussian_mixture": Family(_mixture, _thirty_numbers),
         "decomposed": _shaped(shaped.Decomposed),

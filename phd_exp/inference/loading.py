@@ -143,4 +143,5 @@ def _built(folder: RunFolder, config: RunConfig, depth: DepthScale) -> Regressor
         raise
     except Exception as error:  # parts that a stranger has named may raise any
         reason = f"{type(error).__name__}: {gist(error)}"
-        raise ConfigError(f"{folder.config_file}: describes no network ({reason})") from error
+        remedy = "use the version of phd_exp that recorded the run, see its status.json"
+        raise ConfigError(f"{folder.config_file}: describes no network ({reason}); {remedy}") from error

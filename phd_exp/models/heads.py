@@ -5,7 +5,7 @@ alone. With a backbone that locates the object, the raw numbers are relative to 
 """
 
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -97,21 +97,21 @@ class DistributionHead:
 
 
 class SurrogateHead:
-    """Ten raw numbers -> the Projected Huber density with a free axis that is closest to a Student's t.
+    """Ten raw numbers -> the Projected Huber density with free axis and rounded mode closest to a Student's t.
 
     Training maximises the likelihood of the Student's t, which leads to better networks (docs/ideas/heads.md). The
     tenth number gives its degrees of freedom.
 
     Args:
         depth: constants of the data set.
-        is_rounded: whether the mode of depth is rounded.
+        is_rounded: stated by every configuration that this head can build; a head without rounding has left.
     """
 
     n_outputs = 10
     prediction = ProjectedHuber
 
-    def __init__(self, depth: DepthScale, is_rounded: bool = False) -> None:
-        self.seven, self.is_rounded = DistributionHead(depth), is_rounded
+    def __init__(self, depth: DepthScale, is_rounded: Literal[True]) -> None:
+        self.seven = DistributionHead(depth)
         self.placed, self.turned_back = self.seven.placed, self.seven.turned_back
 
     def surrogate(self, raw: Float[Tensor, "*batch 10"], camera: Camera) -> Shaped:
@@ -119,7 +119,7 @@ class SurrogateHead:
         return StudentT(self.seven(raw[..., :7], camera), raw[..., 7:])
 
     def __call__(self, raw: Float[Tensor, "*batch 10"], camera: Camera) -> ProjectedHuber:
-        return closest_to_student(self.seven(raw[..., :7], camera), raw[..., 7:], self.is_rounded)
+        return closest_to_student(self.seven(raw[..., :7], camera), raw[..., 7:])
 
 
 class ShapedHead:

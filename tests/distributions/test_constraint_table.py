@@ -21,7 +21,6 @@ KEPT = {
     # k = 0 is the paper's density; (q, t) stays affine in v, with q alone in (x, y)
     "free_axis": {1, 2, 3, 4, 5, 6, 7},
     # the same density, whose A and a a further number scales
-    "free_axis_t": {1, 2, 3, 4, 5, 6, 7},
     "rounded_t": {1, 2, 3, 4, 5, 6, 7},
     # Proposition 1 of the paper: -log p is not convex in v
     "decomposed": {1, 2, 3, 4, 6, 7},

@@ -115,7 +115,6 @@ def require_accurate(found: dict[str, np.ndarray]) -> None:
 HEADS = {
     "ray": DistributionHead(DEPTH),
     "free": DistributionHead(DEPTH, free_axis=True),
-    "t": SurrogateHead(DEPTH),
     "rounded": SurrogateHead(DEPTH, is_rounded=True),
 }
 

@@ -21,16 +21,13 @@ DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
 HEADS: dict[str, Head] = {
     "probabilistic": DistributionHead(DEPTH),
     "free_axis": DistributionHead(DEPTH, free_axis=True),
-    "free_axis_t": SurrogateHead(DEPTH),
     "rounded_t": SurrogateHead(DEPTH, is_rounded=True),
     "mae_vz": ChartHead(DEPTH, Projected),
     "mae_logz": ChartHead(DEPTH, LogDepth),
     "mae_xyz": ChartHead(DEPTH, Cartesian),
     **SHAPED,
 }
-LOSSES = {
-    name: NegativeLogLikelihood() for name in ("probabilistic", "free_axis", "free_axis_t", "rounded_t", *SHAPED)
-}
+LOSSES = {name: NegativeLogLikelihood() for name in ("probabilistic", "free_axis", "rounded_t", *SHAPED)}
 
 
 @pytest.fixture
@@ -168,7 +165,7 @@ def test_training_fits_the_surrogate_of_a_head_that_has_one(
 ) -> None:
     """So that its gradients are those of the Student's t."""
     gradients = []
-    for name in ("free_axis_t", "rounded_t", "student_t"):
+    for name in ("rounded_t", "student_t"):
         network = regressor(HEADS[name]).train()
         prediction, trained = network.trained(network.see(image), camera)
         NegativeLogLikelihood()(trained, xyz).mean().backward()

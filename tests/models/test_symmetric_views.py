@@ -8,7 +8,7 @@ from phd_exp.geometry.motion import EIGHT, symmetries, turned
 from phd_exp.models.heads import DistributionHead, SurrogateHead
 
 DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
-HEADS = [DistributionHead(DEPTH), DistributionHead(DEPTH, free_axis=True), SurrogateHead(DEPTH)]
+HEADS = [DistributionHead(DEPTH), DistributionHead(DEPTH, free_axis=True), SurrogateHead(DEPTH, is_rounded=True)]
 every_head = pytest.mark.parametrize("head", HEADS, ids=["seven numbers", "nine", "ten"])
 SIGNS = torch.tensor(EIGHT, dtype=torch.float64)
 CAMERA = Camera(torch.full((8,), 1500.0, dtype=torch.float64), 224.0)
