@@ -1,8 +1,7 @@
 """Fusion of several cameras, and of a ground plane: the most likely position is the solution of a convex problem.
 
-`newton.py` finds the optimum, `certificate.py` bounds its error independently, and `moments.py` adds mean and
-covariance. All three are compiled for one problem of a few cameras, which fits into the cache of a core; `kernels.py`
-runs them on a batch, and `fuse.py` is the interface.
+`newton.py` finds the optimum, and `moments.py` adds mean and covariance. Both are compiled for one problem of a few
+cameras, which fits into the cache of a core; `kernels.py` runs them on a batch, and `fuse.py` is the interface.
 """
 
 from phd_exp.fusion.fuse import Fused, fuse

@@ -27,17 +27,14 @@ class Fused:
 
     Args:
         point: the most likely position, world, metres.
-        certificate: upper bound on the distance from `point` to the true optimum, metres; inf where the energy is too
-            flat for a bound.
         subgradient: norm of a subgradient of the summed -log p at `point`, nats per metre; 0 proves the optimum.
-        status: `Status` of each problem.
+        status: `Status` of each problem: FUSED if the subgradient is at most 1e-6 of the pull of all depths.
         problems: the problems, `unknowns` their solution, and `excess` the energy of each view above its minimum;
             surprise, mean and covariance are computed from them on demand.
         shared: of `fuse_shared`: the estimated scale, mean and covariance.
     """
 
     point: Float[Tensor, "*problems 3"]
-    certificate: Float[Tensor, "*problems"]
     subgradient: Float[Tensor, "*problems"]
     status: Int[Tensor, "*problems"]
     problems: Problems
@@ -150,17 +147,15 @@ def fuse(
     with one_thread():
         problems = Problems.posed(predictions, pose, plane, mask)
         n, cameras = problems.mask.shape
-        u, certificate, excess = (torch.zeros(n, size, dtype=torch.float64) for size in (3, 3, cameras))
-        filled = (values.numpy() for values in (problems.status, u, certificate, excess))
+        u, gradient, excess = (torch.zeros(n, size, dtype=torch.float64) for size in (3, 2, cameras))
+        filled = (values.numpy() for values in (problems.status, u, gradient, excess))
         solve(*problems.views, problems.free_slope.numpy(), *filled)
         ruled_out = _improbable(excess, problems, contradiction).sum(-1)
         contradicted = (problems.status == Status.FUSED) & (2 * ruled_out >= problems.mask.sum(-1))
         problems.status[contradicted] = Status.CONTRADICTION
         status = problems.status.reshape(predictions.batch_shape[:-1]).to(predictions.a.device)
-        subgradient, _, distance = certificate.unbind(-1)
-        results = problems.in_world(u), distance, subgradient
-        point, distance, subgradient = (_entered(values, status) for values in results)
-        return Fused(point, distance, subgradient, status, problems, u, excess)
+        point, subgradient = (_entered(values, status) for values in (problems.in_world(u), gradient[:, 0]))
+        return Fused(point, subgradient, status, problems, u, excess)
 
 
 def _improbable(

@@ -8,9 +8,8 @@ import numpy as np
 from numba import njit, prange
 
 from phd_exp.fusion.arithmetic import compiled, depth_excess, huber, measured
-from phd_exp.fusion.certificate import certify
 from phd_exp.fusion.moments import moments
-from phd_exp.fusion.newton import optimum, polish
+from phd_exp.fusion.newton import optimum, polish, subgradient
 from phd_exp.fusion.views import Status
 
 CONVERGED = 1e-6  # the largest relative subgradient at which a problem counts as solved
@@ -19,18 +18,18 @@ _NO_COMMON_VIEW, _PLANE_BEHIND_CAMERA = int(Status.NO_COMMON_VIEW), int(Status.P
 
 
 @compiled
-def _solve(slope, at_origin, a, own, free_slope, u, certificate, excess):
+def _solve(slope, at_origin, a, own, free_slope, u, gradient, excess):
     """Moves u to the optimum of one problem; returns its status."""
     lam = np.zeros(len(a))
     if not optimum(slope, at_origin, a, own, u, lam):
         visible = optimum(free_slope, at_origin, a, own, np.zeros(3), lam)
         return _PLANE_BEHIND_CAMERA if visible else _NO_COMMON_VIEW
     polish(slope, at_origin, a, own, u, lam)
-    certificate[:] = certify(slope, at_origin, a, own, u, lam)
+    gradient[:] = subgradient(slope, at_origin, a, own, u, lam)
     for c in range(len(a)):
         q_x, q_y, t = measured(slope[c], at_origin[c], u)
         excess[c] = huber(q_x * q_x + q_y * q_y) + a[c] * depth_excess(t, own[c])
-    return _FUSED if certificate[1] <= CONVERGED else _NOT_CONVERGED
+    return _FUSED if gradient[1] <= CONVERGED else _NOT_CONVERGED
 
 
 def _loops(sources):
@@ -41,17 +40,17 @@ def _loops(sources):
     """
 
     @njit(cache=True, error_model="numpy", parallel=True)
-    def solve(slope, at_origin, a, own, free_slope, status, u, certificate, excess):
+    def solve(slope, at_origin, a, own, free_slope, status, u, gradient, excess):
         """Solves the problems whose status is FUSED, from u, and sets their status.
 
-        `free_slope` is the slope without the plane. Fills `certificate` with the values of `certify`, and `excess`
-        with the energy of u in each camera above the camera's lowest.
+        `free_slope` is the slope without the plane. Fills `gradient` with what `subgradient` returns, and
+        `excess` with the energy of u in each camera above the camera's lowest.
         """
         assert len(sources) > 0
         for i in prange(len(a)):
             if status[i] == _FUSED:
                 views = slope[i], at_origin[i], a[i], own[i]
-                status[i] = _solve(*views, free_slope[i], u[i], certificate[i], excess[i])
+                status[i] = _solve(*views, free_slope[i], u[i], gradient[i], excess[i])
 
     @njit(cache=True, error_model="numpy", parallel=True)
     def all_moments(chosen, slope, at_origin, a, own, u, points, log_density, radii, mean, covariance, inside):

@@ -32,6 +32,7 @@ from phd_exp.fusion.arithmetic import (
     measured,
     newton_step,
     rounded_slopes,
+    squared_norm,
 )
 
 WIDTH_FLOOR = 1e-9
@@ -71,7 +72,7 @@ def optimum(slope, at_origin, a, own, u, lam):
 def minimise(slope, at_origin, a, own, u, lam, least):
     """Moves u to the minimum with 1/t continued below t = least, and lam to the multipliers of the kinks.
 
-    It stops after 80 steps at the latest; the certificate bounds the error.
+    It stops after 80 steps at the latest; `subgradient` decides whether that was enough.
     """
     cameras = len(a)
     at, moved = np.empty((cameras, 3)), np.empty((cameras, 3))
@@ -225,3 +226,22 @@ def _linearise_exact(slope, at_origin, a, own, u, lam, kink):
         yy, tt = weight * (1 + EXACT_RIDGE - unit_y * unit_y), a[c] * (bend + EXACT_RIDGE)
         sums = add(sums, slope[c], weight * q_x, weight * q_y, a[c] * by_t, xx, xy, yy, tt)
     return sums
+
+
+@compiled
+def subgradient(slope, at_origin, a, own, u, lam):
+    """The norm of a subgradient at u, nats per metre, 0 at the optimum alone; and its ratio to sum a |dt/du|."""
+    sums, pull = ZERO, 0.0
+    for c in range(len(a)):
+        q_x, q_y, t = measured(slope[c], at_origin[c], u)
+        weight, _, _ = huber_weight(q_x, q_y)
+        if own[c] > 0:
+            by_t = rounded_slopes(t, own[c])[0]
+        elif abs(t - 1) <= KINK and abs(lam[c]) < 1:
+            by_t = lam[c]
+        else:
+            by_t = 1.0 if t >= 1 else -1 / (t * t)
+        sums = add(sums, slope[c], weight * q_x, weight * q_y, a[c] * by_t, 0.0, 0.0, 0.0, 0.0)
+        pull += a[c] * math.sqrt(squared_norm(slope[c, 2]))
+    norm = math.sqrt(squared_norm(sums))
+    return norm, norm / pull

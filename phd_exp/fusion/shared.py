@@ -58,7 +58,7 @@ def fuse_shared(
     (`own_part`). For a uniform v the density of v and s is proportional to exp(-sum_i E_i(R_i v + t_i; e^s mu_z,i) -
     3 s - s^2/(2 deviation^2)). Given s the problem is that of `fuse`. The law of s given all views is found at 9
     nodes, by Gauss's rule about its mean; the density at each is the highest one times the volume of the covariance.
-    `mean` and `covariance` are those of this mixture, `shared[0]` is e^(E[s]); `point`, `certificate`, `surprise` and
+    `mean` and `covariance` are those of this mixture, `shared[0]` is e^(E[s]); `point`, `surprise` and
     `coverage` are given that scale. One camera alone has s = 0. Results are on the CPU.
 
     The volume is that of a Gaussian, so the mixture is approximate. On 30 problems of two to four cameras, 3 to 86

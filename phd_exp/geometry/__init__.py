@@ -31,7 +31,7 @@ from the top left corner of the image; the centre of the pixel in column c and r
 | N | `log_normaliser` | normaliser of the depth law, e^(-a)/a + E_2(a) | - | `distributions.special.log_normaliser` |
 | g | `tail_moment(0, a)` | a e^a E_2(a), in (0, 1): the odds of t < 1 | - | `distributions.special.tail_moment` |
 | u | `u` | unknowns of a fusion: the position itself, or its place on a plane | metres | `fusion.problems` |
-| lam | `lam` | subgradient of max(t, 1/t) at its kink t = 1, in [-1, 1] | - | `fusion.certificate.certify` |
+| lam | `lam` | subgradient of max(t, 1/t) at its kink t = 1, in [-1, 1] | - | `fusion.newton.subgradient` |
 | 7 outputs | `raw` | (n_1, n_2, b_1, b_2, b_3, w_1, w_2): what a network returns; with a free axis also k_1, k_2 | - | `models.heads.DistributionHead` |
 """
 

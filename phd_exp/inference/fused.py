@@ -130,7 +130,7 @@ def _answer(scene: Observed, fused: Fused, place: int) -> dict[str, Any]:
     }
     if status != Status.FUSED:
         named["reason"] = status.reason
-    numbers = {name: getattr(fused, name)[place] for name in ("point", "mean", "covariance", "certificate")}
+    numbers = {name: getattr(fused, name)[place] for name in ("point", "mean", "covariance")}
     numbers["surprise"] = fused.surprise[place, : len(scene.detections)]
     if fused.shared is not None:
         numbers["shared_scale"] = fused.shared[0][place]

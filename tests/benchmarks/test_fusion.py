@@ -69,7 +69,7 @@ def test_a_batch_is_far_faster_than_one_by_one(device: str, unchecked: None, rec
     moments, _ = microseconds(lambda: fuse(predictions, pose).covariance, device, n)
     whole, solving = one_by_one()
     record(
-        f"fuse with certificate, {n} problems of {CAMERAS} cameras, {device}",
+        f"fuse, {n} problems of {CAMERAS} cameras, {device}",
         f"{point:.1f} us a problem ({processor:.1f} of processor time), {moments:.1f} with covariance",
         f"{whole:.0f} us, Clarabel, {solving:.0f} of it set-up and solution",
         f"{whole / point:.0f} and {solving / point:.0f} times",

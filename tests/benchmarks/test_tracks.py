@@ -51,7 +51,7 @@ def test_a_path_is_far_faster_than_by_a_conic_solver(unchecked: None, record: Ca
     tracker, steps = Tracker(LAW, lag=10), iter(range(FRAMES))
     step = seconds(lambda: tracker.update(times[k := next(steps)], predictions[k], pose), rounds=FRAMES)
     record(
-        f"track with certificate, {FRAMES} frames of one camera",
+        f"track, {FRAMES} frames of one camera",
         f"{1e3 * ours:.1f} ms; {LONG} frames with covariance {1e3 * long:.0f} ms; a live step {1e3 * step:.1f} ms",
         f"{1e3 * theirs:.0f} ms, Clarabel",
         f"{theirs / ours:.0f} times",

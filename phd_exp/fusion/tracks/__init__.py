@@ -1,8 +1,8 @@
 """Paths: the predictions of one or several cameras over time, smoothed with a motion model.
 
 `frames.py` checks the input, and `slow.py` weighs the frames. `newton.py` finds the most likely path,
-`certificate.py` bounds its error, and `gaussian.py` adds mean and covariance; these are compiled. `track.py` is the
-interface for whole sequences, `tracker.py` for live ones.
+and `gaussian.py` adds mean and covariance; these are compiled. `track.py` is the interface for whole sequences,
+`tracker.py` for live ones.
 """
 
 from phd_exp.fusion.tracks.frames import Gaussian

@@ -7,11 +7,9 @@ from pathlib import Path
 from numba import njit
 
 from phd_exp.fusion import arithmetic, views
-from phd_exp.fusion import certificate as fusion_certificate
 from phd_exp.fusion import newton as fusion_newton
 from phd_exp.fusion.newton import LEAST_DEPTHS
-from phd_exp.fusion.tracks import certificate, energy, gaussian, newton, tridiagonal
-from phd_exp.fusion.tracks.certificate import certify
+from phd_exp.fusion.tracks import energy, gaussian, newton, tridiagonal
 from phd_exp.fusion.tracks.energy import camera_energy, measure
 from phd_exp.fusion.tracks.gaussian import propagate
 from phd_exp.fusion.tracks.newton import optimum, polish, workspace
@@ -31,12 +29,6 @@ def _functions(sources):
         return found
 
     @njit(cache=True, error_model="numpy")
-    def bounds(chain, x, lam, distance):
-        """Calls `certify`."""
-        assert len(sources) > 0
-        return certify(chain, workspace(chain), x, lam, distance)
-
-    @njit(cache=True, error_model="numpy")
     def excesses(slope, at_origin, a, own, x, found):
         """Fills in the energy of each camera at x above its lowest, without weights."""
         assert len(sources) > 0
@@ -54,9 +46,9 @@ def _functions(sources):
         assert len(sources) > 0
         return propagate(chain, workspace(chain), mean, covariance, factors)
 
-    return most_likely, bounds, excesses, moments
+    return most_likely, excesses, moments
 
 
-_COMPILED = (arithmetic, views, fusion_newton, fusion_certificate, certificate, energy, gaussian, newton, tridiagonal)
+_COMPILED = (arithmetic, views, fusion_newton, energy, gaussian, newton, tridiagonal)
 _SOURCES = b"".join(Path(str(module.__file__)).read_bytes() for module in _COMPILED)
-most_likely, bounds, excesses, moments = _functions(hashlib.sha256(_SOURCES).hexdigest())
+most_likely, excesses, moments = _functions(hashlib.sha256(_SOURCES).hexdigest())

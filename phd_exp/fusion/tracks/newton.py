@@ -124,7 +124,7 @@ def nearest(at, a):
 def minimise(chain, work, x, lam, least):
     """Moves x to the minimum with 1/t continued below t = least, and lam to the multipliers of the kinks.
 
-    It stops after 80 steps at the latest; the certificate bounds the error.
+    It stops after 80 steps at the latest.
     """
     y = np.zeros((*lam.shape, 2))
     width = FIRST_WIDTH

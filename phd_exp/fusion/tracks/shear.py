@@ -13,7 +13,7 @@ where these have the weight of a few frames. Both are therefore taken about a gi
   camera, v~ slides to v = S v~ + offset, S = I + (d - n) n^T, offset = -(d - n) n.about. Several cameras, or one that
   moves, measure the distance by the motion; then S = I.
 
-Both are affine, so that the energy stays convex and its certificate holds; S keeps volumes.
+Both are affine, so that the energy stays convex; S keeps volumes.
 
 Source: own derivation; checked in tests/fusion/test_tracks_moments.py.
 """

@@ -42,22 +42,11 @@ class Solved:
         frames: of the track.
         chain: the energy.
         x: the most likely unknowns, see `phd_exp.fusion.tracks.chain`, sheared.
-        lam: multipliers of the kinks.
     """
 
     frames: Frames
     chain: Chain
     x: Float[Array, "frames d"]
-    lam: Float[Array, "frames cameras"]
-
-    @cached_property
-    def bounds(self) -> tuple[float, Float[Array, " frames"]]:
-        """The certificate: of the energy, nats, and of each position, metres."""
-        from phd_exp.fusion.tracks.kernels import bounds
-
-        distance = np.empty(len(self.x))
-        gap = bounds(self.chain, self.x, self.lam, distance)
-        return gap, distance * np.linalg.norm(self.frames.shear[:, :, :3], 2, (1, 2))
 
     @cached_property
     def unknowns(self) -> Float[Array, "frames d"]:
@@ -127,11 +116,11 @@ def solve(
         a, p = (weights(time, frames.since, frames.mask) for time in vars(slow).values())
         a, views = a * frames.a, apart(frames)
     chain = Chain(*views, a, p, frames.a, frames.own, *motion)
-    x, lam = x.copy(), np.zeros(a.shape)
-    if not most_likely(chain, x, lam):
+    x = x.copy()
+    if not most_likely(chain, x, np.zeros(a.shape)):
         status = Status.NO_COMMON_VIEW if np.isfinite(x).all() else Status.NOT_CONVERGED
         raise ValueError(f"predictions: {status.reason}")
-    return Solved(frames, chain, x, lam)
+    return Solved(frames, chain, x)
 
 
 def smoothed(frames: Frames, motion: Motion, slow: Slow) -> Solved:

@@ -53,16 +53,6 @@ class Path:
         return self._entered(self.solved.unknowns[:, VELOCITY])
 
     @property
-    def gap(self) -> float:
-        """Upper bound on the energy of the path above the lowest energy, nats; inf where that is too flat."""
-        return self.solved.bounds[0]
-
-    @property
-    def certificate(self) -> Float[Tensor, " frames"]:
-        """Upper bound on the distance of each position from the true optimum, metres; inf as `gap`."""
-        return self._entered(self.solved.bounds[1])
-
-    @property
     def surprise(self) -> Float[Tensor, "frames cameras"]:
         """Credible level of the path in each view, near 1 where they contradict; NaN where masked out."""
         return self._entered(self.solved.surprise)
