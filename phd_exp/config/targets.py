@@ -14,6 +14,7 @@ from phd_exp.records.errors import complaint, in_user_code, install, shown, unkn
 
 OURS = tuple(f"phd_exp.{room}" for room in ("models", "losses", "optimizers", "geometry", "distributions"))
 KNOWN = (*OURS, "torch.optim", "lightning")
+OTHER_VERSION = "; use the version of phd_exp that recorded the run, see its status.json"
 Trust = tuple[str, ...] | None
 """None: the user typed the configuration, which may name anything importable. Otherwise it is read from a run folder,
 and may name the parts in `OURS` and those in these packages.
@@ -150,7 +151,7 @@ def locate(name: Any, trust: Trust, where: str = "") -> Any:
     except Exception as error:  # a module of the user may raise any
         remedy = install(str(error)) if isinstance(error, ImportError) else ""
         if trust is not None and _is_below(name, OURS):  # a part that has left
-            remedy = "; use the version of phd_exp that recorded the run, see its status.json"
+            remedy = OTHER_VERSION
         raise _error(f"{path}: {name!r} cannot be imported ({in_user_code(error) or error}){remedy}") from None
     if not callable(target):
         raise _error(f"{path}: {name!r} is a {type(target).__name__}; expected a class or function")

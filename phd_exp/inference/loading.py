@@ -10,7 +10,7 @@ from torch.overrides import TorchFunctionMode
 
 from phd_exp.build import build_regressor, recorded_constants, require_same_shrinking
 from phd_exp.config import RunConfig, check
-from phd_exp.config.targets import Trust, custom_parts
+from phd_exp.config.targets import OTHER_VERSION, Trust, custom_parts, is_ours
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.inference.predictor import Predictor
 from phd_exp.models.heads import SymmetricHead
@@ -139,9 +139,10 @@ class _Uninitialised(TorchFunctionMode):
 def _built(folder: RunFolder, config: RunConfig, depth: DepthScale) -> Regressor:
     try:
         return build_regressor(config, depth, is_new=False)
-    except UserError:
-        raise
+    except UserError as error:
+        if not is_ours([config.model.head, config.backbone]):
+            raise
+        raise ConfigError(f"{error}{OTHER_VERSION}") from error
     except Exception as error:  # parts that a stranger has named may raise any
         reason = f"{type(error).__name__}: {gist(error)}"
-        remedy = "use the version of phd_exp that recorded the run, see its status.json"
-        raise ConfigError(f"{folder.config_file}: describes no network ({reason}); {remedy}") from error
+        raise ConfigError(f"{folder.config_file}: describes no network ({reason}){OTHER_VERSION}") from error
