@@ -5,8 +5,8 @@
     python docs/results/write.py --take report    # first take the numbers of a report
 
 `runs.csv`, `tables.csv`, `calibration.csv` and `heads.csv` hold lines of the same files in `<report>/tables/`;
-what is taken again replaces its lines. Lines of models that left (docs/ideas/heads.md) were
-measured with commit 05c5d40 (package version 0.1.0) or before. A table stands between `<!-- results: NAME -->` and `<!-- end -->`.
+what is taken again replaces its lines. Lines of models that left (docs/ideas/heads.md) were measured with commit
+05c5d40 (package version 0.1.0) or before. A table stands between `<!-- results: NAME -->` and `<!-- end -->`.
 """
 
 import argparse
