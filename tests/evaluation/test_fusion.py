@@ -154,7 +154,7 @@ def test_conditioning_is_the_limit_of_a_narrow_observation() -> None:
     covariance = factor @ factor.mT + 0.1 * torch.eye(3).double()
     plane = Plane(normal, torch.linspace(-1, 1, 8).double())
     point, left = conditioned(mean, covariance, plane)
-    narrow = 1e-9
+    narrow = 1e-8  # its own error is of this size, that of rounding about 1e-15 / narrow
     precision = torch.linalg.inv(covariance) + normal[:, :, None] * normal[:, None] / narrow
     expected = torch.linalg.inv(precision)
     shift = torch.linalg.inv(covariance) @ mean[..., None] + (normal * plane.offset[:, None])[..., None] / narrow
