@@ -108,7 +108,7 @@ def read_camera(path: Path) -> Calibration:
         # YAML takes seconds a megabyte
         text = read_plain(path, LARGEST_RECORD if path.suffix == ".json" else MB).decode("utf-8-sig")
         return calibration_in(content_of(text))
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError, LookupError, RecursionError) as error:
         raise DatasetError(f"{path}: {gist(error)}; see `Lenses` in docs/guides/own_images.md") from None
 
 
@@ -133,31 +133,25 @@ def _read_out(sensor: Calibration, found: Found, image: tuple[int, int] | None) 
     Source: the definition of sensor_msgs/CameraInfo.
     """
     region = found.get("roi", ("roi", {}))[1]
-    x, y, width, height = (_whole("roi", region.get(key, 0)) for key in ("x_offset", "y_offset", "width", "height"))
-    bins = [max(1, _whole(*found[name]) if name in found else 1) for name in ("binning_x", "binning_y")]
-    if (x, y, width, height, *bins) == (0, 0, 0, 0, 1, 1):
+    x, y, *cut = (int(_numbers("roi", region.get(key, 0))[0]) for key in ("x_offset", "y_offset", "width", "height"))
+    bins = [max(1, int(_numbers(*found.get(f"binning_{axis}", ("", 1)))[0])) for axis in "xy"]
+    if not any((x, y, *cut)) and bins == [1, 1]:
         return sensor
-    size, full = np.array([width or sensor.width or 0, height or sensor.height or 0]) // bins, sensor.intrinsics
-    scaled = np.diag([*np.divide(1, bins), 1]) @ (full - [[0, 0, x], [0, 0, y], [0, 0, 0]])
-    if image and tuple(size) != image:
-        away = [np.linalg.norm(K[:2, 2] - np.divide(image, 2)) for K in (scaled, full)]
-        if image != (sensor.width, sensor.height) or away[0] > away[1]:
+    full, whole = sensor.intrinsics, (sensor.width or 0, sensor.height or 0)
+    width, height = image or ((cut[0] or whole[0]) // bins[0], (cut[1] or whole[1]) // bins[1])
+    K = np.diag([*np.divide(1, bins), 1]) @ (full - [[0, 0, x], [0, 0, y], [0, 0, 0]])
+    if image and image != ((cut[0] or whole[0]) // bins[0], (cut[1] or whole[1]) // bins[1]):
+        nearer, farther = (np.linalg.norm(one[:2, 2] - np.divide(image, 2)) for one in (K, full))
+        if image != whole or nearer > farther:
             raise ValueError(
-                f"binning {bins[0]} x {bins[1]} and the region of {width} x {height} pixels at ({x}, {y}) of "
-                f"{sensor.width} x {sensor.height} make no images of {image[0]} x {image[1]}; expected width, height "
-                "and K of the whole sensor"
+                f"binning {bins[0]} x {bins[1]} and the region of {cut[0]} x {cut[1]} pixels at ({x}, {y}) of "
+                f"{whole[0]} x {whole[1]} make no images of {width} x {height}; expected width, height and K of the "
+                "whole sensor"
             )
-        size = np.array(image)
-    scaled[:2, 2] -= CORNER
-    return Calibration(
-        width=int(size[0]) or None, height=int(size[1]) or None, K=tuple(scaled.ravel().tolist()),
-        D=sensor.D, model=sensor.model,
-    )  # fmt: skip
-
-
-def _whole(key: str, value: Any) -> int:
-    (number,) = _numbers(key, value)
-    return int(number)
+    K[:2, 2] -= CORNER
+    return sensor.model_copy(
+        update={"width": width or None, "height": height or None, "K": tuple(K.ravel().tolist())}
+    )
 
 
 def calibration(given: Any) -> Calibration | None:
@@ -216,6 +210,10 @@ def _quantity(key: str, value: Any) -> str | None:
     *outer, name = map(_plain, key.split("."))
     is_list = isinstance(value, list | dict)
     quantity = _QUANTITIES.get(name)
+    if (quantity in ("K", "D") and isinstance(value, int | float)) or (
+        quantity == "roi" and not isinstance(value, dict)
+    ):
+        return None
     of_a_lens = _COEFFICIENT.fullmatch(name) or any(map(_LENS.search, [*outer, name] if is_list else outer))
     if quantity is None and of_a_lens and not isinstance(value, str) and re.search("[1-9]", str(value)):
         raise ValueError(f"{key}: got {shown(value)}, a part of a lens that is not supported; expected zero")

@@ -17,7 +17,7 @@ CameraUtility.py (the principal point); cocodataset.org/#format-data.
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache, partial
+from functools import partial
 from itertools import chain
 from os.path import normpath
 from pathlib import Path
@@ -30,7 +30,6 @@ from phd_exp.records.cameras import CORNER
 from phd_exp.records.errors import DatasetError, gist, listed
 from phd_exp.records.files import MB, read_plain
 from phd_exp.records.images import FORMATS, decoding, pillow_warnings
-from phd_exp.records.mesh_files import read_mesh
 from phd_exp.records.parsing import parse_json
 
 Entry = tuple[str, str, dict[str, Any]]
@@ -148,7 +147,7 @@ def _scenewise(folder: Path) -> Iterator[Pictured]:
         for image, items in scene.items():
             camera, picture = _of(image, calibrated, cameras), _of(f"{image:06d}", place, pictures)
             masks = file.with_name(f"mask_visib{sensor}") / picture.stem
-            known = _without_info(folder, masks, camera, items) if infos is None else _of(image, described, infos)
+            known = _of_masks(masks, len(items)) if infos is None else _of(image, described, infos)
             yield image, picture, camera, items, known
 
 
@@ -173,31 +172,14 @@ def _by_image(file: Path) -> dict[int, Any]:
         return {int(image): value for image, value in content.items()}
 
 
-def _without_info(
-    folder: Path, masks: Path, camera: dict[str, Any], items: list[dict[str, Any]]
-) -> Iterator[dict[str, Any]]:
-    """The boxes of the objects of an image: of `mask_visib/`, or else of all vertices of their models."""
-    for number, item in enumerate(items):
-        mask, name = Path(f"{masks}_{number:06d}.png"), f"models*/obj_{item['obj_id']:06d}.ply"
-        if mask.exists():
-            with decoding(mask), pillow_warnings(), Image.open(mask, formats=FORMATS) as image:
-                left, top, right, bottom = image.getbbox() or (-1, -1, -1, -1)
-        elif models := sorted(folder.parent.glob(name)):
-            to_camera, K = np.reshape(item["cam_R_m2c"], (3, 3)), np.reshape(camera["cam_K"], (3, 3))
-            u = (_vertices(models[0]) @ to_camera.T + item["cam_t_m2c"]) @ K.T
-            if not (u[:, 2] > 0).all():
-                raise ValueError(f"{models[0].name} reaches behind the camera")
-            pixels = u[:, :2] / u[:, 2:] + CORNER
-            left, top, right, bottom = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)]).tolist()
-        else:
-            written = "scene_gt_info.json, which bop_toolkit's calc_gt_info.py writes"
-            raise ValueError(f"expected {written}, {mask}, or {folder.parent / name}")
+def _of_masks(masks: Path, n: int) -> Iterator[dict[str, Any]]:
+    """The boxes of n objects of an image, of the files of `mask_visib/`."""
+    for mask in (Path(f"{masks}_{number:06d}.png") for number in range(n)):
+        if not mask.exists():
+            raise ValueError(f"expected scene_gt_info.json, which bop_toolkit's calc_gt_info.py writes, or {mask}")
+        with decoding(mask), pillow_warnings(), Image.open(mask, formats=FORMATS) as image:
+            left, top, right, bottom = image.getbbox() or (-1, -1, -1, -1)
         yield {"bbox_visib": [left, top, right - left - 1, bottom - top - 1]}
-
-
-@cache
-def _vertices(model: Path) -> Any:
-    return np.concatenate(read_mesh(model).coordinates())
 
 
 def _coco(file: Path, subfolder: str, folder: Path) -> Iterator[Entry]:

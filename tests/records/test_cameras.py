@@ -149,6 +149,7 @@ SAME: dict[str, tuple[Any, str, list[float]]] = {
     "cam_K.txt, commas": ("\n".join(", ".join(map(str, row)) for row in ROWS), BROWN, NONE),
     "fx fy cx cy": ("  400.5 401.2 319.5 239.5\n", BROWN, NONE),
     "fx fy cx cy, DROID-SLAM": (" ".join(map(str, [400.5, 401.2, 319.5, 239.5, *FIVE])), BROWN, FIVE),
+    "JSON of NumPy, other things of these names": ({"K": ROWS, "roi": 3, "k": 5, "d": 2}, BROWN, NONE),
     "JSON of NumPy, quoted": ({"K": str(ROWS), "D": str([FIVE])}, BROWN, FIVE),
     "JSON of NumPy": ({"K": ROWS, "dist": [FIVE]}, BROWN, FIVE),
     "JSON of NumPy, camera_matrix": (
@@ -280,6 +281,8 @@ BAD: list[tuple[Any, str]] = [
     ),
     ("{K: '[[400, 0], [0, 400]]'}\n{D: '[[0.1], [0]]'}\n", "Expecting property name enclosed in double quotes"),
     ("400 400 320\n", "3 numbers; expected K, 3 x 3, or one line of fx fy cx cy, or with k1 k2 p1 p2; expected ROS"),
+    (F | {"roi": {"x_offset": "left"}}, "roi: got 'left'; expected numbers up to 1000000"),
+    (F | {"binning_x": []}, "list index out of range"),
     ({"imu0": {"model": "kalibr"}}, "no camera matrix: found imu0.model"),
     ("1 FOV 640 480 400 400 320 240 0.9", "FOV with 5 parameters; expected one of SIMPLE_PINHOLE"),
     ("<calibration><f>900</f></calibration>", "XML of <calibration>; expected <opencv_storage>"),

@@ -144,7 +144,7 @@ def test_bop_of_several_sensors_is_read_as_each_of_them(tmp_path: Path, sensor: 
 
 
 def test_bop_of_other_programs_means_the_same(tmp_path: Path) -> None:
-    """Keys with zeros, a file for each image, and boxes of masks or of a model instead of `scene_gt_info.json`."""
+    """Keys with zeros, a file for each image, and boxes of masks instead of `scene_gt_info.json`."""
     scene = WRITERS["bop"](tmp_path / "test") / "000002"
     lines = [detection.line for detection in detections_in(tmp_path / "test")]
     for name, content in BOP.items():
@@ -173,23 +173,6 @@ def test_bop_of_other_programs_means_the_same(tmp_path: Path) -> None:
     assert [line.model_copy(update={"file_name": ""}) for line in found] == [
         line.model_copy(update={"file_name": ""}) for line in lines
     ]
-
-
-def test_a_box_without_mask_is_that_of_the_model(tmp_path: Path) -> None:
-    scene = WRITERS["bop"](tmp_path / "test") / "000002"
-    (scene / "scene_gt_info.json").unlink()
-    vertices = np.random.default_rng(0).uniform(-50, 50, (9, 3))
-    rows = "\n".join(" ".join(map(str, row)) for row in vertices)
-    names = "".join(f"property float {name}\n" for name in "xyz")
-    text = f"ply\nformat ascii 1.0\nelement vertex 9\n{names}element face 0\nproperty list uchar int vertex_indices\n"
-    (tmp_path / "models").mkdir()
-    for model in (5, 12):
-        (tmp_path / f"models/obj_{model:06d}.ply").write_text(f"{text}end_header\n{rows}\n")
-    item = BOP["scene_gt.json"]["3"][0]
-    place = vertices @ np.reshape(TURN, (3, 3)).T + item["cam_t_m2c"]
-    u, v = 107.5 * place[:, 0] / place[:, 2] + 60.5, 108.5 * place[:, 1] / place[:, 2] + 45.5
-    found = detections_in(tmp_path / "test")[2].line.box
-    np.testing.assert_allclose(found, [u.min(), v.min(), u.max(), v.max()], rtol=1e-6)
 
 
 def test_bop_without_anything_visible_says_so(tmp_path: Path) -> None:
