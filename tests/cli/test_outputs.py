@@ -251,9 +251,9 @@ def test_a_full_disk_is_one_line_and_the_same_command_runs_later(phd_exp: Callab
         for room in (0, 4 * KIB, 12 * KIB):
             leave_room(disk, room)
             outcome = phd_exp(verb, "run=run", "folder=photos", word)
-            *libraries, line = outcome.err.splitlines()
+            line = outcome.err.splitlines()[-1]  # Rerun has complained before
             assert re.match(r"error: disk.*: cannot be written \(No space left on device\); make room", line), outcome
-            assert all("re_log_encoding" in said for said in libraries), "Rerun has said so too"
+            assert "Traceback" not in outcome.err
         make_room(disk)
         outcome = phd_exp(verb, "run=run", "folder=photos", word)
         assert outcome.status == 0, outcome.err
