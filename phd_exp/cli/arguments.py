@@ -3,10 +3,10 @@
 import gc
 import os
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from glob import glob, has_magic
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
@@ -22,8 +22,7 @@ if TYPE_CHECKING:  # imports of seconds, which follow the checks of the argument
     from phd_exp.inference.detectors import Detector
     from phd_exp.inference.predictor import Predictor
 
-BEYOND = 1.1  # factor beyond the least and the largest focal length of held-out samples; training reaches further
-
+SEVERAL = 64  # views, all of them far beyond the training, after which the others are not read
 
 Item = TypeVar("Item")
 
@@ -73,6 +72,8 @@ EXECUTED = "packages of the user's own parts that the run names, separated by co
 Trust = Annotated[str | None, Field(description=EXECUTED)]
 ENLARGED = "side of the view of each box over that of the box; 1.2 for tight boxes"
 Margin = Annotated[Annotated[float, Field(ge=1, le=3)], Field(description=ENLARGED)]
+ANYWAY = "predict from views with focal lengths more than a fifth beyond those of the training too"
+Beyond = Annotated[bool, Field(description=ANYWAY)]
 
 
 def _paths(text: str) -> list[str]:
@@ -178,14 +179,52 @@ def predicted(
     detections: Detections,
     guarantee: "Guarantee | None" = None,
     detector: "Detector | None" = None,
+    beyond: bool = False,
+    needs_all: bool = False,
 ) -> Iterable["Sighting"]:
-    """The predictions, with a progress bar for several detections, or images of a detector, on a terminal."""
+    """The predictions, with a progress bar for several detections, or images of a detector, on a terminal.
+
+    The first one is made at once. Unless `beyond`, views far beyond the training are left out, and DatasetError names
+    them after the others, or at once if the caller needs all.
+    """
     from phd_exp.inference.answers import sightings
 
     each = detections if detector is None else chain.from_iterable(_found(detector, detections))
-    seen = _noting_focal_lengths(predictor, sightings(predictor, each, guarantee))
+    seen = sightings(predictor, each, guarantee)
+    near = seen if beyond else _without_far(seen, needs_all)
+    noted = noting(near, lambda one: (one.detection.where, one.warnings), "predictions")
     total = len(detections) if detector is None else None
-    return seen if len(detections) == 1 else with_bar(seen, "predicting", total)
+    begun = chain(list(islice(noted, 1)), noted)
+    return begun if len(detections) == 1 else with_bar(begun, "predicting", total)
+
+
+def _without_far(seen: Iterable["Sighting"], needs_all: bool) -> Iterator["Sighting"]:
+    """The predictions from views that are not far beyond the training; afterwards DatasetError names the others."""
+    n, refused = 0, list[str]()
+    for n, one in enumerate(seen, 1):
+        if reason := one.batch.ranges.refusal(one.view.camera):
+            refused.append(f"{one.detection.where}: {reason}")
+            if needs_all or n == len(refused) == SEVERAL:
+                break
+        else:
+            yield one
+    if refused:
+        several = f"{len(refused)} of {n} views are not predicted, first " if n > 1 else ""
+        raise DatasetError(several + refused[0])
+
+
+def noting(items: Iterable[Item], warned: Callable[[Item], tuple[str, Sequence[str]]], what: str) -> Iterator[Item]:
+    """The items; afterwards notes on standard error about the place and the warnings of each, one for each kind."""
+    n, found = 0, dict[str, list[str]]()
+    try:
+        for n, item in enumerate(items, 1):  # noqa: B007
+            where, warnings = warned(item)
+            for kind, _, fault in (warning.partition(": ") for warning in warnings):
+                found.setdefault(kind, []).append(f"{where}: {fault}")
+            yield item
+    finally:
+        for kind, faults in found.items():
+            print(f"note: {kind}: {len(faults)} of {n} {what}, first {faults[0]}", file=sys.stderr)
 
 
 def _found(detector: "Detector", images: Detections) -> Iterator[list[Detection]]:
@@ -209,38 +248,3 @@ def with_bar(items: Iterable[Item], words: str, total: int | None) -> Iterable[I
     from rich.progress import track
 
     return track(items, words, total, console=Console(stderr=True), transient=True)
-
-
-def _noting_focal_lengths(predictor: "Predictor", seen: Iterable["Sighting"]) -> Iterator["Sighting"]:
-    """The predictions; afterwards a note on standard error if the network views some at untrained focal lengths."""
-    low, high, remedy = _trained_focal_lengths(predictor)
-    first, n = "", 0
-    for sighting in seen:
-        f = sighting.view.camera.f
-        if not 0.999 * low <= f <= 1.001 * high:
-            first, n = first or f"{sighting.detection.where}: {f:.4g} px", n + 1
-        yield sighting
-    if n:
-        print(
-            f"note: f: {n} view(s) have a focal length that the network was not trained with, first "
-            f"{first}; expected {low:.4g} to {high:.4g} px in its images of {predictor.side} px; {remedy}",
-            file=sys.stderr,
-        )
-
-
-def _trained_focal_lengths(predictor: "Predictor") -> tuple[float, float, str]:
-    """The least and the largest focal length of the training, px of the network's image, and what to do beyond them.
-
-    Of views of boxes, where distance and size of the box decide them, those of the recorded held-out samples.
-    """
-    from phd_exp.config import RenderedConfig
-    from phd_exp.evaluation.parquet import read_table, require_columns
-
-    data, file = predictor.config.data, predictor.folders[0].held_out
-    if not (isinstance(data, RenderedConfig) and data.spec.is_box and file.exists()):
-        return *predictor.f_range, "give a box= around the object, or train with another data.f_range"
-    table = read_table(file)
-    require_columns(("f", "S"), table)
-    f = table["f"] / table["S"] * predictor.side
-    remedy = "expected distances in data.z_range, and boxes as data.box_size describes them"
-    return float(f.min()) / BEYOND, float(f.max()) * BEYOND, remedy

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import model_validator
 
-from phd_exp.cli.arguments import RunArguments, four_numbers
+from phd_exp.cli.arguments import Beyond, RunArguments, four_numbers
 from phd_exp.records.detections import NumberOrName
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.recordings import Recording, is_recording
@@ -42,6 +42,7 @@ class DetectingArguments(RunArguments):
     """with boxes= or annotations: the class to use, as COCO's category or BOP's obj_id; by default all"""
     boxes: Path | None = None
     """instead of box=, a file of COCO results (track: image_id counts frames from 0); or MODULE:FUNCTION in Python"""
+    beyond: Beyond = False
 
     def recording(self, folder: Path | None) -> Recording | None:
         """The images of a folder= that is a recording of ROS 2; None if it is not."""

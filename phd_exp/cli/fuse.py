@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import field_validator, model_validator
 
-from phd_exp.cli.arguments import Coverage, RunArguments, four_numbers, loaded, predicted
+from phd_exp.cli.arguments import Beyond, Coverage, RunArguments, four_numbers, loaded, predicted
 from phd_exp.cli.outputs import message_file, new_view, output_folder, require_output
 from phd_exp.records.detections import NumberOrName
 from phd_exp.records.errors import ConfigError, RunError, listed
@@ -37,6 +37,7 @@ class FuseArguments(RunArguments):
     """NX,NY,NZ,OFFSET: the object lies on this plane, metres"""
     shared_scale: bool = False
     """estimate one factor that the depths of all views share, as they do in the run's recorded scenes"""
+    beyond: Beyond = False
     coverage: Coverage = None
     out: Path | None = None
     """a file for the lines; or FILE.mcap for ROS 2 messages, in addition to printed lines"""
@@ -110,7 +111,8 @@ def _answers(
     guarantees, shared = _of_recorded_scenes(arguments, predictor, {len(scene.detections) for scene in scenes})
     numbers = torch.tensor(arguments.plane or (), dtype=torch.float64)
     plane = Plane(numbers[:3], numbers[3]) if arguments.plane else None
-    sightings = predicted(predictor, [detection for scene in scenes for detection in scene.detections])
+    detections = [detection for scene in scenes for detection in scene.detections]
+    sightings = predicted(predictor, detections, beyond=arguments.beyond, needs_all=True)
     with ExitStack() as ends:
         if messages is not None:
             from phd_exp.inference.ros import write_fused, write_views

@@ -83,7 +83,7 @@ def main(words: list[str]) -> int:
     predictor = loaded(arguments, coverage=arguments.coverage)
     guarantee = predictor.guarantee(arguments.coverage, arguments.groups) if arguments.coverage else None
     curve = _depth_curve(predictor) if arguments.curve else None
-    sightings = _viewed(arguments, predictor, predicted(predictor, detections, guarantee, detector))
+    sightings = _viewed(arguments, predictor, predicted(predictor, detections, guarantee, detector, arguments.beyond))
     if out is not None and out.suffix != MCAP:
         _write(predictor, sightings, len(detections), out, curve, guarantee)
         return 0

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from pydantic import Field, model_validator
 
-from phd_exp.cli.arguments import loaded, with_bar
+from phd_exp.cli.arguments import loaded, noting, with_bar
 from phd_exp.cli.detecting import DetectingArguments
 from phd_exp.cli.outputs import message_file, places
 from phd_exp.records.detections import detections_of
@@ -29,6 +29,7 @@ if TYPE_CHECKING:  # imports of seconds, which follow the checks of the argument
     from phd_exp.inference.rerun_recording import SceneFile
 
 Box = tuple[float, float, float, float]
+AFTER_LOSS = "boxes= begins another track; a larger noise= follows faster motion, least_familiar=0.01 a hidden object"
 LEAST_LAG = 4  # five frames in a row that contradict a path end it
 
 
@@ -192,15 +193,23 @@ def _followed(
     slow = Slow(arguments.depth_time, arguments.projection_time)
     motion, least = ConstantVelocity(arguments.noise, arguments.speed), arguments.least_familiar
     followed = follow(
-        predictor, sequence.frames, motion, arguments.lag, slow, least_familiar=least, detector=detector
+        predictor,
+        sequence.frames,
+        motion,
+        arguments.lag,
+        slow,
+        least_familiar=least,
+        detector=detector,
+        beyond=arguments.beyond,
     )
     if view is not None:
         from phd_exp.inference.rerun_view import viewed_path
 
         followed = viewed_path(view, sequence.name, followed)
+    followed = noting(followed, lambda one: (one.frame.where, one.warnings), "frames")
     for one in with_bar(followed, f"tracking {sequence.name}", sequence.length):
         if one.reason:
-            print(f"note: {one.frame.where}: {one.reason}", file=sys.stderr)
+            print(f"note: {one.frame.where}: {one.reason}; {AFTER_LOSS}", file=sys.stderr)
         yield one
 
 

@@ -20,6 +20,7 @@ from phd_exp.distributions import Density, ProjectedHuber, Temperature
 from phd_exp.distributions.along import quantiles_along
 from phd_exp.geometry.camera import Camera
 from phd_exp.inference.predictor import BATCH, Predictor
+from phd_exp.inference.ranges import UNKNOWN, Ranges
 from phd_exp.inference.views import View
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
 from phd_exp.models.heads import Prediction
@@ -46,7 +47,8 @@ class PredictedBatch:
     """Detections that are predicted together, with their images.
 
     `predictions` are in the frames of the views (float64), made by `Predictor.predict` from `raw`, the outputs of the
-    network; `familiar` is of runs with held-out samples; a `guarantee` gives each prediction a region.
+    network; `familiar` is of runs with held-out samples; a `guarantee` gives each prediction a region; `ranges` of
+    the training give warnings.
     """
 
     seen: Sequence[tuple[Detection, Image.Image, View]]
@@ -54,6 +56,7 @@ class PredictedBatch:
     predictions: Prediction
     familiar: Float[np.ndarray, " batch"] | None = None
     guarantee: "Guarantee | None" = None
+    ranges: Ranges = UNKNOWN
 
     @property
     def cameras(self) -> Camera:
@@ -179,6 +182,12 @@ class Sighting:
         """Its p-value among held-out samples."""
         return None if self.batch.familiar is None else float(self.batch.familiar[self.row])
 
+    @property
+    def warnings(self) -> list[str]:
+        """What is beyond the training, see `Ranges.warnings`."""
+        size = self.image.size
+        return self.batch.ranges.warnings(self.view.camera, self.mode, self.detection.box(*size), size, self.familiar)
+
 
 def _turned_back(
     points: Float[np.ndarray, "batch 3"], R: Float[np.ndarray, "batch 3 3"]
@@ -206,7 +215,8 @@ def sightings(
         n = int(finite.long().cumprod(0).sum())  # of those before the first that is not
         if n:
             made = predictor.predict(raw[:n], f[:n])
-            batch = PredictedBatch(seen[:n], raw[:n], made, predictor.familiar(raw[:n], f[:n], made), guarantee)
+            familiar = predictor.familiar(raw[:n], f[:n], made)
+            batch = PredictedBatch(seen[:n], raw[:n], made, familiar, guarantee, predictor.ranges)
             yield from (Sighting(*one, batch, row) for row, one in enumerate(batch.seen))
         if n < len(seen):
             raise RunError(
@@ -304,7 +314,7 @@ def answer(sighting: Sighting, temperature: Temperature | None) -> dict[str, Any
         origin = uncertainty(temperature)
     else:
         origin = "not reported: no Projected Huber density" if isinstance(made, Density) else NONE
-    return named | batch.positions[row] | {"uncertainty": origin} | batch.scores[row]
+    return named | batch.positions[row] | {"uncertainty": origin, "warnings": sighting.warnings} | batch.scores[row]
 
 
 def uncertainty(temperature: Temperature | None) -> str:

@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -64,6 +64,7 @@ class Followed:
         box: the part of the image that was predicted from, px; None if it was the whole image, or nothing.
         state: None if lost.
         familiar: p-value of the prediction among held-out samples, see `Predictor.familiar`.
+        warnings: what is beyond the training, see `Ranges.warnings`.
         reason: why the track ended, with the first frame after it.
     """
 
@@ -74,6 +75,7 @@ class Followed:
     box: Box | None = None
     state: State | None = None
     familiar: float | None = None
+    warnings: tuple[str, ...] = ()
     reason: str | None = None
 
     @property
@@ -87,7 +89,7 @@ class Followed:
     def answer(self, predictor: Predictor) -> dict[str, Any]:
         """The numbers of the frame as a JSON object; metres and seconds, in the world of the poses."""
         named: dict[str, Any] = {"frame": self.number, "time": self.frame.time, "track": self.track}
-        named["state"] = self.status
+        named |= {"state": self.status, "warnings": list(self.warnings)}
         if self.reason:
             named["reason"] = self.reason
         if self.state is not None:
@@ -117,6 +119,7 @@ def follow(
     lost: Lost | None = None,
     least_familiar: float = 0.0,
     detector: Detector | None = None,
+    beyond: bool = False,
 ) -> Iterator[Followed]:
     """Each frame with its state, `lag` frames later; frames may come from a live camera.
 
@@ -125,18 +128,19 @@ def follow(
     predicts. Where boxes are given, the one that overlaps most with the predicted one replaces it. After a track is
     lost, the next box begins another, and so does the next whole image. A prediction whose `familiar` is less than
     `least_familiar` takes no part after the first one: the object may be hidden. A detector finds the boxes of frames
-    with none of their own, as long as no path predicts one: in the first frames, and after a track is lost.
+    with none of their own, as long as no path predicts one: in the first frames, and after a track is lost. A view
+    whose focal length is more than a fifth beyond those of the training takes no part, unless `beyond`.
 
     Raises:
         ConfigError: the predictor has no uncertainty.
-        DatasetError: a box is not valid, a time is not later than the one before, or no path is found; the
-            states of earlier frames are yielded first.
+        DatasetError: a box is not valid, a time is not later than the one before, no path is found, or the first
+            view is that far beyond the training; the states of earlier frames are yielded first.
     """
     predictor.require_densities("a path needs")
 
     def begun(track: int) -> _Track:
         tracker = Tracker(motion, lag, slow or Slow(), lost or Lost())
-        return _Track(predictor, tracker, track, least_familiar, detector)
+        return _Track(predictor, tracker, track, least_familiar, detector, beyond)
 
     current = begun(0)
     try:
@@ -150,14 +154,38 @@ def follow(
     yield from current.finish()
 
 
+class _Seen(NamedTuple):
+    """The prediction in one frame.
+
+    Attributes:
+        prediction: in the frame of the virtual camera.
+        pose: of the virtual camera in the world.
+        familiar: its p-value.
+        warnings: what is beyond the training.
+        refusal: why it takes no part.
+    """
+
+    prediction: ProjectedHuber
+    pose: Pose
+    familiar: float | None
+    warnings: tuple[str, ...]
+    refusal: str | None
+
+
 class _Track:
     """One track: its tracker, the frames that wait for their state, and the outline of the last given box."""
 
     def __init__(
-        self, predictor: Predictor, tracker: Tracker, number: int, least_familiar: float, detector: Detector | None
+        self,
+        predictor: Predictor,
+        tracker: Tracker,
+        number: int,
+        least_familiar: float,
+        detector: Detector | None,
+        beyond: bool,
     ) -> None:
         self.predictor, self.tracker, self.number, self.least_familiar = predictor, tracker, number, least_familiar
-        self.detector = detector
+        self.detector, self.beyond = detector, beyond
         self.waiting: deque[Followed] = deque()
         self.last: tuple[ProjectedHuber, Pose] | None = None  # prediction and pose of the virtual camera
         self.outline: _Outline | None = None
@@ -165,13 +193,7 @@ class _Track:
     def add(self, number: int, frame: Frame) -> Iterator[Followed]:
         """The frames whose state is known with this one."""
         box, given = self._box(frame)
-        followed = Followed(number, frame, self.number)
-        is_seen = frame.boxes is None or box is not None
-        if is_seen:
-            before = self.last
-            self.last, familiar = self._predict(frame, box)
-            followed = replace(followed, box=box, familiar=familiar)
-            is_seen = before is None or familiar is None or familiar >= self.least_familiar
+        followed, is_seen = self._seen(number, frame, box)
         if self.last is None:
             yield followed
             return
@@ -203,8 +225,24 @@ class _Track:
         agrees = bool((state.surprise <= 1 - self.tracker.lost.probability).any())  # NaN without a prediction
         return replace(self.waiting.popleft(), state=state, status="tracked" if agrees else "bridged")
 
-    def _predict(self, frame: Frame, box: Box | None) -> tuple[tuple[ProjectedHuber, Pose], float | None]:
-        """The prediction from a box, or the whole image, the pose of its virtual camera, and `familiar`."""
+    def _seen(self, number: int, frame: Frame, box: Box | None) -> tuple[Followed, bool]:
+        """The frame, with its prediction if there is one, and whether that takes part in the path.
+
+        Raises DatasetError if the very first view is too far beyond the training.
+        """
+        followed = Followed(number, frame, self.number)
+        if frame.boxes is not None and box is None:
+            return followed, False
+        seen = self._predict(frame, box)
+        if seen.refusal and self.last is None and self.number == 0:
+            raise DatasetError(f"{frame.where}: {seen.refusal}")
+        is_usual = self.last is None or seen.familiar is None or seen.familiar >= self.least_familiar
+        if takes_part := is_usual and not seen.refusal:
+            self.last = seen.prediction, seen.pose
+        return replace(followed, box=box, familiar=seen.familiar, warnings=seen.warnings), takes_part
+
+    def _predict(self, frame: Frame, box: Box | None) -> "_Seen":
+        """The prediction from a box, or the whole image."""
         predictor, (height, width) = self.predictor, frame.image.shape[:2]
         try:
             camera = predictor.virtual_camera(frame.K, (width, height), box, frame.lens)
@@ -217,9 +255,12 @@ class _Track:
             raise RunError(f"{frame.where}: the network returns numbers that are not finite; train the run again")
         prediction = predictor.predict(raw, f)
         assert prediction.has_closed_forms  # checked by `follow`
-        R, familiar = torch.from_numpy(camera.R), predictor.familiar(raw, f, prediction)
+        R, p_values = torch.from_numpy(camera.R), predictor.familiar(raw, f, prediction)
         pose = Pose(R @ frame.pose.R, R @ frame.pose.t)
-        return (prediction, pose), None if familiar is None else float(familiar[0])
+        familiar, ranges = None if p_values is None else float(p_values[0]), predictor.ranges
+        part, mode = box or (0.0, 0.0, float(width), float(height)), prediction.mode[0].numpy()
+        warnings = ranges.warnings(camera, mode, part, (width, height), familiar)
+        return _Seen(prediction, pose, familiar, tuple(warnings), None if self.beyond else ranges.refusal(camera))
 
     def _box(self, frame: Frame) -> tuple[Box | None, bool]:
         """The part of the image to predict from, and whether the frame or the detector gives it."""

@@ -23,18 +23,18 @@ AGREE = 0.01
 
 def outputs(
     scenes: Sequence[Observed], sightings: Iterable[Sighting]
-) -> tuple[Float[Tensor, "views *members n"], Float[Tensor, " views"], Pose, list[float | None]]:
-    """Network outputs, focal lengths, poses of the virtual cameras in the world, and `familiar`, for each view.
+) -> tuple[Float[Tensor, "views *members n"], Float[Tensor, " views"], Pose, list[float | None], list[list[str]]]:
+    """Network outputs, focal lengths, poses of the virtual cameras in the world, `familiar` and warnings of views.
 
     No image is kept. A virtual camera is the real one turned, v_virtual = R_v v_camera, so that its pose is
     (R_v R, R_v t).
     """
-    views = [(sighting.raw, sighting.view.camera, sighting.familiar) for sighting in sightings]
-    raw, cameras, familiar = zip(*views, strict=True)
+    views = [(one.raw, one.view.camera, one.familiar, one.warnings) for one in sightings]
+    raw, cameras, familiar, warnings = zip(*views, strict=True)
     R = torch.stack([torch.from_numpy(camera.R) for camera in cameras])
     real = Pose.from_scene([pose for scene in scenes for pose in scene.poses])
     f = torch.tensor([camera.f for camera in cameras], dtype=torch.float64)
-    return torch.stack(raw), f, Pose(R @ real.R, (R @ real.t[..., None]).squeeze(-1)), list(familiar)
+    return torch.stack(raw), f, Pose(R @ real.R, (R @ real.t[..., None]).squeeze(-1)), list(familiar), list(warnings)
 
 
 def fused_answers(
@@ -58,7 +58,7 @@ def fused_answers(
     Raises DatasetError, before the first sighting is computed, if lines of a scene give different true positions.
     """
     truth = torch.stack([_true_position(scene) for scene in scenes])
-    raw, f, pose, familiar = outputs(scenes, sightings)
+    raw, f, pose, familiar, warnings = outputs(scenes, sightings)
     # the views of each scene, padded to the most cameras, and which of them exist
     counts = [len(scene.detections) for scene in scenes]
     rows = pad_sequence(torch.arange(sum(counts)).split(counts), batch_first=True)
@@ -78,9 +78,12 @@ def fused_answers(
     for place, scene in enumerate(scenes):
         known = bool(truth[place].isfinite().all())
         scores = {name: value[place].numpy() for name, value in errors.items() if known}
-        p_values = [familiar[row] for row in rows[place][mask[place]].tolist()]
+        views = rows[place][mask[place]].tolist()
+        p_values = [familiar[row] for row in views]
+        names = [detection.line.file_name for detection in scene.detections]
+        warned = [f"{one}; {name}" for row, name in zip(views, names, strict=True) for one in warnings[row]]
         unusual = {} if None in p_values else {"familiar": rounded(np.array(p_values))}
-        answers.append(_answer(scene, fused, place) | origin | unusual | scores)
+        answers.append(_answer(scene, fused, place) | origin | {"warnings": warned} | unusual | scores)
     return answers
 
 

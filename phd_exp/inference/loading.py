@@ -17,7 +17,7 @@ from phd_exp.models.heads import SymmetricHead
 from phd_exp.models.regressor import Regressor
 from phd_exp.models.weights import fill, regressor_weights
 from phd_exp.records.choices import first_difference, has_influence
-from phd_exp.records.errors import ConfigError, RunError, UserError, gist
+from phd_exp.records.errors import ConfigError, RunError, UserError, gist, listed
 from phd_exp.records.packed import opened
 from phd_exp.records.runs import RunFolder
 
@@ -91,10 +91,10 @@ def _require_alike(predictors: Sequence[Predictor], matters: Callable[[str], boo
 def _load(folder: RunFolder, device: str, trust: Trust) -> Predictor:
     """The network of one run, as trained."""
     if not folder.config_file.exists():
-        raise RunError(
-            f"{folder.path}: no run; expected a folder with config.yaml and checkpoints/last.ckpt, or a file "
-            "of `pack`"
-        )
+        below = [file.parent for depth in range(4) for file in folder.path.glob("*/" * depth + "seed*/config.yaml")]
+        one = f"one of the runs below it: {listed(sorted(map(str, below)))}"
+        run = "a folder with config.yaml and checkpoints/last.ckpt, or a file of `pack`"
+        raise RunError(f"{folder.path}: no run; expected {one if below else run}")
     config = check(folder.config(), trust)
     require_same_shrinking(folder, config.data)
     depth, constant_f = recorded_constants(folder)

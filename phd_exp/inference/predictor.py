@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
+from warnings import warn
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from phd_exp.distributions.columns import parameter_columns
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.geometry.motion import EIGHT, turned
+from phd_exp.inference.ranges import Ranges
 from phd_exp.inference.views import View, focal_lengths, image_batch
 from phd_exp.models.heads import Prediction, SymmetricHead
 from phd_exp.models.regressor import Regressor
@@ -249,8 +251,13 @@ class Predictor:
         return VirtualCamera.of_box(K, enlarged(box, self.margin), float(self.side), lens, self.largest_f)
 
     def see(self, views: View | Sequence[View]) -> Prediction:
-        """Predictions for views, each in the frame of its own virtual camera; for one view, one without a batch."""
+        """Predictions for views, each in the frame of its own virtual camera; for one view, one without a batch.
+
+        Warns (UserWarning) if the focal length of a view is beyond those of the training.
+        """
         sequence = [views] if isinstance(views, View) else views
+        if faults := list(filter(None, (self.ranges.of_view(view.camera) for view in sequence))):
+            warn(f"{len(faults)} of {len(sequence)} views, first {faults[0]}", stacklevel=2)
         f = torch.tensor([view.camera.f for view in sequence], dtype=torch.float32)
         raw = self.raw(np.stack([view.image for view in sequence]), f)
         return self.predict(raw, f) if sequence is views else self.predict(raw[0], f[0])
@@ -287,6 +294,11 @@ class Predictor:
         prediction = self.regressor.head(raw.to(dtype), self.camera(f.to(dtype)[..., None]))
         assert prediction.has_closed_forms  # checked by `load`
         return Mixture(prediction)
+
+    @cached_property
+    def ranges(self) -> Ranges:
+        """What the network was trained with. Raises RunError if recorded held-out samples cannot be read."""
+        return Ranges.of(self)
 
     @cached_property
     def familiarity(self) -> "Familiarity | None":

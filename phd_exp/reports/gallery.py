@@ -107,13 +107,17 @@ def make_gallery(table: Arrays, config: Mapping[str, str]) -> Gallery:
     def pictures(rows: np.ndarray) -> list[Picture]:
         return [_picture({name: table[name][row] for name in table}, source) for row in rows]
 
-    return Gallery(ranked_by, pictures(order[:each]), pictures(order[::-1][:each]), _why_no_images(source))
+    best, worst = pictures(order[:each]), pictures(order[::-1][:each])
+    return Gallery(ranked_by, best, worst, _why_no_images(source) if None in [p.image for p in best + worst] else "")
 
 
 def _why_no_images(source: Path | None) -> str:
     if source is None:
         return "These images are your own and are not kept with the run: the panels show positions alone."
-    return "" if source.is_dir() else f"{source}: no images here any more; the panels show positions alone."
+    return (
+        f"{source}: the renders of this run are missing, so the panels show positions alone; `render` with the words "
+        "of the training makes them again."
+    )
 
 
 def _picture(row: Mapping[str, Any], source: Path | None) -> Picture:

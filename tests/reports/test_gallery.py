@@ -34,7 +34,9 @@ def test_the_best_and_the_worst_by_their_density(table: Arrays) -> None:
 def test_a_baseline_is_ranked_by_distance_and_has_no_curves(tmp_path: Path) -> None:
     table = read_table(write_run(tmp_path, model="mae_vz", n=30).predictions)
     off = np.linalg.norm([table[f"mode_{axis}"] - table[axis] for axis in "xyz"], axis=0)
-    picture = make_gallery(table, {"data.root": "gone", "data.spec.variant": "default"}).worst[0]
+    gallery = make_gallery(table, {"data.root": "gone", "data.spec.variant": "default"})
+    assert gallery.note.startswith("gone/default/test: the renders of this run are missing")
+    picture = gallery.worst[0]
     assert picture.name == table["file_name"][off.argmax()]
     assert (picture.paths, picture.birds_eye, picture.image) == ([], None, None)
 
