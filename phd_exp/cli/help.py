@@ -47,7 +47,7 @@ EXAMPLES = {
     ],
     "report": ["python -m phd_exp report", "python -m phd_exp report runs=some/folder out=another"],
     "predict": [
-        "python -m phd_exp predict run=runs/small/default/probabilistic/seed0 image=photo.jpg f=1550 box=400,30,620,140",
+        "python -m phd_exp predict run=DIR image=photo.jpg f=1550 box=400,30,620,140",
         "python -m phd_exp predict run=DIR image=a.jpg fx=900 fy=900 cx=320 cy=240 box=400,30,620,140 out=pictures",
         "python -m phd_exp predict run=DIR folder=photos camera=camera.yaml boxes=mydetector:find out=pictures",
         "python -m phd_exp predict run=DIR folder=photos/test recalibrate=true > predictions.jsonl",

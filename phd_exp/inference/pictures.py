@@ -70,6 +70,8 @@ def _title(sighting: Sighting, line: Mapping[str, Any]) -> str:
         facts.append(f"depth with 90 %: {_metres(interval, ' to ')} m")
     if region := line.get("region"):
         facts.append(f"depths of the guaranteed region: {_metres(region['depth_interval'], ' to ')} m")
+    if kinds := ", ".join(one.partition(":")[0] for one in line["warnings"]):
+        facts.append(f"warnings: {kinds}")
     return ", ".join([name, f"f = {f} px", *recalibrated]) + "\n" + ", ".join(facts)
 
 

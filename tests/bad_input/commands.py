@@ -129,6 +129,7 @@ ARGUMENTS = [
     argument((*EXPORT, "margin=1.2"), r"margin: enlarges boxes; expected photographs=true too"),
     argument(("fuse", "run=nowhere"), r"folder: missing; fuse takes run=.*"),
     argument(NOWHERE, r"nowhere: no run; expected a folder with config\.yaml.*", 1, scene=1, pose=POSE),
+    argument(("predict", "run=runs/smoke", "image=photos/test/0.png", "f=300"), r"runs/smoke: no run; expected one of the runs below it: runs/smoke/folder/probabilistic/seed0-.*", 1),
     argument((*NOWHERE, "plane=0,0,0,1"), r"plane: .*a normal that is not zero.*", scene=1, pose=POSE),
     argument((*NOWHERE, "plane=0,nan,0,1"), r"plane: .*expected finite numbers.*", scene=1, pose=POSE),
     argument((*NOWHERE, "out=photos/test/metadata.jsonl"), r"out=.*: is one of the files that are read.*", scene=1, pose=POSE),

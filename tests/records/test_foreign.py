@@ -199,7 +199,7 @@ def test_a_folder_without_annotations_says_what_is_there_and_what_is_read(tmp_pa
     with pytest.raises(DatasetError) as caught:
         detections_in(folder)
     assert str(caught.value).startswith(f"{folder}: no annotations; found a.xml, images/; expected metadata.jsonl, ")
-    layouts = ("*/scene_gt.json (BOP)", "../annotations/instances_voc.json", "labels.json")
+    layouts = ("*/scene_gt.json (BOP)", "../annotations/instances_voc.json", "labels.json", "f=PIXELS")
     assert all(layout in str(caught.value) for layout in layouts)
 
 
