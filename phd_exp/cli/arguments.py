@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from glob import glob, has_magic
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
@@ -184,8 +184,8 @@ def predicted(
 ) -> Iterable["Sighting"]:
     """The predictions, with a progress bar for several detections, or images of a detector, on a terminal.
 
-    The first one is made at once. Unless `beyond`, views far beyond the training are left out, and DatasetError names
-    them after the others, or at once if the caller needs all.
+    Unless `beyond`, views far beyond the training are left out. DatasetError names them after the others, or at once if
+    the caller needs all.
     """
     from phd_exp.inference.answers import sightings
 
@@ -194,8 +194,7 @@ def predicted(
     near = seen if beyond else _without_far(seen, needs_all)
     noted = noting(near, lambda one: (one.detection.where, one.warnings), "predictions")
     total = len(detections) if detector is None else None
-    begun = chain(list(islice(noted, 1)), noted)
-    return begun if len(detections) == 1 else with_bar(begun, "predicting", total)
+    return noted if len(detections) == 1 else with_bar(noted, "predicting", total)
 
 
 def _without_far(seen: Iterable["Sighting"], needs_all: bool) -> Iterator["Sighting"]:

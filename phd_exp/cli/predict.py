@@ -4,6 +4,7 @@ import json
 import sys
 from collections.abc import Iterable
 from importlib.util import find_spec
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -83,7 +84,9 @@ def main(words: list[str]) -> int:
     predictor = loaded(arguments, coverage=arguments.coverage)
     guarantee = predictor.guarantee(arguments.coverage, arguments.groups) if arguments.coverage else None
     curve = _depth_curve(predictor) if arguments.curve else None
-    sightings = _viewed(arguments, predictor, predicted(predictor, detections, guarantee, detector, arguments.beyond))
+    found = iter(predicted(predictor, detections, guarantee, detector, arguments.beyond))
+    begun = chain(list(islice(found, 1)), found)  # a refused command leaves the files of an earlier one
+    sightings = _viewed(arguments, predictor, begun)
     if out is not None and out.suffix != MCAP:
         _write(predictor, sightings, len(detections), out, curve, guarantee)
         return 0
