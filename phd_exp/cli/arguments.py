@@ -184,8 +184,8 @@ def predicted(
 ) -> Iterable["Sighting"]:
     """The predictions, with a progress bar for several detections, or images of a detector, on a terminal.
 
-    Unless `beyond`, views far beyond the training are left out. DatasetError names them after the others, or at once if
-    the caller needs all.
+    Unless `beyond`, views far beyond the training are left out: DatasetError names them after the others, or at once
+    if the caller needs all.
     """
     from phd_exp.inference.answers import sightings
 
