@@ -215,15 +215,13 @@ def _without_far(seen: Iterable["Sighting"], needs_all: bool) -> Iterator["Sight
 def noting(items: Iterable[Item], warned: Callable[[Item], tuple[str, Sequence[str]]], what: str) -> Iterator[Item]:
     """The items; afterwards notes on standard error about the place and the warnings of each, one for each kind."""
     n, found = 0, dict[str, list[str]]()
-    try:
-        for n, item in enumerate(items, 1):  # noqa: B007
-            where, warnings = warned(item)
-            for kind, _, fault in (warning.partition(": ") for warning in warnings):
-                found.setdefault(kind, []).append(f"{where}: {fault}")
-            yield item
-    finally:
-        for kind, faults in found.items():
-            print(f"note: {kind}: {len(faults)} of {n} {what}, first {faults[0]}", file=sys.stderr)
+    for n, item in enumerate(items, 1):  # noqa: B007
+        where, warnings = warned(item)
+        for kind, _, fault in (warning.partition(": ") for warning in warnings):
+            found.setdefault(kind, []).append(f"{where}: {fault}")
+        yield item
+    for kind, faults in found.items():
+        print(f"note: {kind}: {len(faults)} of {n} {what}, first {faults[0]}", file=sys.stderr)
 
 
 def _found(detector: "Detector", images: Detections) -> Iterator[list[Detection]]:

@@ -82,11 +82,13 @@ def main(words: list[str]) -> int:
     places(arguments, inputs, "predictions", [LINES, *names])
     detector = arguments.detector()  # whose mistakes need no network
     predictor = loaded(arguments, coverage=arguments.coverage)
+    if arguments.view is not None or (out is not None and out.suffix == MCAP):
+        predictor.require_densities(f"{'view=' if arguments.view else f'out=*{MCAP}'} needs")
     guarantee = predictor.guarantee(arguments.coverage, arguments.groups) if arguments.coverage else None
     curve = _depth_curve(predictor) if arguments.curve else None
     found = iter(predicted(predictor, detections, guarantee, detector, arguments.beyond))
     begun = chain(list(islice(found, 1)), found)  # a refused command leaves the files of an earlier one
-    sightings = _viewed(arguments, predictor, begun)
+    sightings = _viewed(arguments, begun)
     if out is not None and out.suffix != MCAP:
         _write(predictor, sightings, len(detections), out, curve, guarantee)
         return 0
@@ -96,7 +98,6 @@ def main(words: list[str]) -> int:
         if messages is not None:
             from phd_exp.inference.ros import write_predictions
 
-            predictor.require_densities(f"out=*{MCAP} needs")
             sightings = write_predictions(messages, sightings)
         for sighting in sightings:
             print(json.dumps(answer(sighting, predictor.temperature), allow_nan=False), flush=True)
@@ -118,13 +119,10 @@ def _detections(arguments: PredictArguments) -> Detections:
     return detections_of(files, camera, boxes)
 
 
-def _viewed(
-    arguments: PredictArguments, predictor: "Predictor", sightings: Iterable["Sighting"]
-) -> Iterable["Sighting"]:
+def _viewed(arguments: PredictArguments, sightings: Iterable["Sighting"]) -> Iterable["Sighting"]:
     """The sightings, each of which is written to view= first."""
     if arguments.view is None:
         return sightings
-    predictor.require_densities("view= needs")
     from phd_exp.inference.rerun_view import viewed
 
     return viewed(arguments.view, sightings)

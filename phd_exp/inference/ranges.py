@@ -122,8 +122,8 @@ UNKNOWN = Ranges()
 
 
 def _contains(bounds: Range, value: float, factor: float) -> bool:
-    """Whether a value lies between the bounds, moved outwards by a factor; False for NaN."""
-    return bounds[0] / factor <= value <= bounds[1] * factor
+    """Whether a value lies between the bounds, moved outwards by a factor."""
+    return bounds == ANY or bounds[0] / factor <= value <= bounds[1] * factor
 
 
 def _trained(bounds: Range) -> str:

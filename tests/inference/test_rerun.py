@@ -13,9 +13,9 @@ import torch
 from matplotlib.path import Path as Outline
 from PIL import Image
 
-from phd_exp.cli import arguments
 from phd_exp.distributions.surfaces import gaussian_radius
 from phd_exp.geometry import Lens, intrinsics
+from phd_exp.inference.ranges import Ranges
 from phd_exp.records.runs import RunFolder
 from tests.support.opencv import projected
 from tests.support.rrd import Rows, read_rrd
@@ -114,9 +114,9 @@ def test_all_cameras_of_a_scene_see_the_regions_of_each(
 ) -> None:
     write_photos(tmp_path / "photos", 5)
     lines = poses(tmp_path / "photos")
-    monkeypatch.setattr(arguments, "_trained_focal_lengths", lambda _: (1e4, 1e5, "train with others"))
-    outcome = phd_exp("fuse", run, "folder=photos", "view=a.rrd")
-    assert outcome.err.startswith("note: f: 5 view(s) have a focal length"), "notes come after the last view"
+    monkeypatch.setattr(Ranges, "of", lambda _: Ranges(focal_length=(1e4, 1e5)))
+    outcome = phd_exp("fuse", run, "folder=photos", "view=a.rrd", "beyond=true")
+    assert outcome.err.startswith("note: focal_length: 5 of 5 predictions"), "notes come after the last view"
     answers = read_lines(outcome.out)
     rows = read_rrd(tmp_path / "a.rrd", "scene")
     for k in range(len(lines)):
