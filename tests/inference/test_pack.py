@@ -54,7 +54,7 @@ def run(composed: Callable, tmp_path: Path) -> RunFolder:
 
 def predict(phd_exp: Callable, run: Path, photos: Path, *words: str) -> str:
     outcome = phd_exp("predict", f"run={run}", f"folder={photos}", *words)
-    assert (outcome.status, outcome.err) == (0, "")
+    assert outcome.status == 0, outcome.err
     return outcome.out
 
 
