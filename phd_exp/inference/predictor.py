@@ -297,8 +297,8 @@ class Predictor:
 
     @cached_property
     def ranges(self) -> Ranges:
-        """What the network was trained with. Raises RunError if recorded held-out samples cannot be read."""
-        return Ranges.of(self)
+        """What the (first) network was trained with. Raises RunError if recorded held-out samples cannot be read."""
+        return Ranges.of(self.config, self.side, self.f_range, self.folders[0].held_out)
 
     @cached_property
     def familiarity(self) -> "Familiarity | None":

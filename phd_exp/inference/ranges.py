@@ -2,16 +2,13 @@
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from phd_exp.config import RenderedConfig
+from phd_exp.config import RenderedConfig, RunConfig
 from phd_exp.optics.virtual import Box, VirtualCamera
-
-if TYPE_CHECKING:  # imports a module that imports this one
-    from phd_exp.inference.predictor import Predictor
 
 Range = tuple[float, float]
 
@@ -41,13 +38,15 @@ class Ranges:
     is_exact: bool = True
 
     @classmethod
-    def of(cls, predictor: "Predictor") -> "Ranges":
-        """Those of the first run: of rendered whole images, what was drawn from; otherwise, of held-out samples."""
-        data, side, file = predictor.config.data, predictor.side, predictor.folders[0].held_out
-        zoom = predictor.config.recipe.augmentation.largest_zoom
+    def of(cls, config: RunConfig, side: int, f_range: Range, file: Path) -> "Ranges":
+        """Those of a run: of rendered whole images, what was drawn from; otherwise, of the held-out samples in a file.
+
+        `f_range` and `side` are those of the `Predictor`, px.
+        """
+        data, zoom = config.data, config.recipe.augmentation.largest_zoom
         spec = data.spec if isinstance(data, RenderedConfig) else None
         if spec and not spec.is_box:
-            (low, high), distance = predictor.f_range, spec.z_range if spec.views == 1 else ANY
+            (low, high), distance = f_range, spec.z_range if spec.views == 1 else ANY
             return cls((low / zoom, high * zoom), distance, edge=0.0)
         edge = spec.edge_distance / spec.box_size[1] if spec and spec.edge_distance >= 0 else -math.inf
         if not file.exists():

@@ -114,7 +114,7 @@ def test_all_cameras_of_a_scene_see_the_regions_of_each(
 ) -> None:
     write_photos(tmp_path / "photos", 5)
     lines = poses(tmp_path / "photos")
-    monkeypatch.setattr(Ranges, "of", lambda _: Ranges(focal_length=(1e4, 1e5)))
+    monkeypatch.setattr(Ranges, "of", lambda *_: Ranges(focal_length=(1e4, 1e5)))
     outcome = phd_exp("fuse", run, "folder=photos", "view=a.rrd", "beyond=true")
     assert outcome.err.startswith("note: focal_length: 5 of 5 predictions"), "notes come after the last view"
     answers = read_lines(outcome.out)
