@@ -39,7 +39,7 @@ class Ranges:
 
     @classmethod
     def of(cls, config: RunConfig, side: int, f_range: Range, file: Path) -> "Ranges":
-        """Those of a run: of rendered whole images, what was drawn from; otherwise, of the held-out samples in a file.
+        """Those of a run: of rendered whole images, what was drawn from; otherwise, of held-out samples in a file.
 
         `f_range` and `side` are those of the `Predictor`, px.
         """
